@@ -1,0 +1,201 @@
+"""Cameras, rigid poses and projection: the one convention of the platform.
+
+Frames: *camera* looks along +z, x to the right, y down (the field's pinhole convention).
+A pose ``T_a_b`` is a ``(4, 4)`` float64 matrix that maps points of frame *b* into frame *a*.
+Lengths are metres, image coordinates are pixels with the first pixel's centre at (0, 0).
+
+Promises not to touch clocks, sockets or image libraries.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, Any
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+
+from rse_pf.errors import InvalidCamera
+
+__all__ = [
+    "Array",
+    "Camera",
+    "exp_se3",
+    "from_quaternion",
+    "inverse",
+    "pose_difference",
+    "rotation_angle_deg",
+    "skew",
+    "to_quaternion",
+    "transform",
+]
+
+Array = npt.NDArray[np.float64]
+
+_MAX_IMAGE_PX = 16384
+"""No sensor that a robot carries is wider; larger is taken for a unit mistake."""
+
+
+class Camera(msgspec.Struct, frozen=True, kw_only=True):
+    """Pinhole intrinsics of undistorted images, in pixels.
+
+    Raises:
+        InvalidCamera: A number is not finite, a focal length is not positive or is absurd
+            for the image, or the principal point lies far outside the image.
+    """
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    width: Annotated[int, msgspec.Meta(ge=1)]
+    height: Annotated[int, msgspec.Meta(ge=1)]
+
+    def __post_init__(self) -> None:
+        numbers = (self.fx, self.fy, self.cx, self.cy)
+        if not all(math.isfinite(value) for value in numbers):
+            raise InvalidCamera("an intrinsic is not a finite number", hint="send fx fy cx cy in pixels")
+        longest = max(self.width, self.height)
+        if not (1 <= self.width <= _MAX_IMAGE_PX and 1 <= self.height <= _MAX_IMAGE_PX):
+            raise InvalidCamera(
+                f"image size {self.width}x{self.height} is not within 1..{_MAX_IMAGE_PX} px",
+                hint="send the size of the image the pixels come from",
+            )
+        for name, focal in (("fx", self.fx), ("fy", self.fy)):
+            if not 0.05 * longest <= focal <= 100.0 * longest:
+                raise InvalidCamera(
+                    f"{name} = {focal:g} px is absurd for an image of {self.width}x{self.height} px",
+                    hint="send the focal length in pixels of this image size",
+                )
+        if abs(self.cx - self.width / 2) > self.width or abs(self.cy - self.height / 2) > self.height:
+            raise InvalidCamera(
+                f"the principal point ({self.cx:g}, {self.cy:g}) lies far outside "
+                f"{self.width}x{self.height} px",
+                hint="send cx cy in pixels of this image size",
+            )
+
+    @property
+    def matrix(self) -> Array:
+        """The ``(3, 3)`` matrix K."""
+        return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
+
+    def project(self, points_camera: Array) -> Array:
+        """Return the ``(n, 2)`` pixels of ``(n, 3)`` points of the camera frame, z > 0."""
+        z = points_camera[:, 2]
+        pixels = np.empty((len(points_camera), 2))
+        pixels[:, 0] = self.fx * points_camera[:, 0] / z + self.cx
+        pixels[:, 1] = self.fy * points_camera[:, 1] / z + self.cy
+        return pixels
+
+    def back_project(self, pixels: Array, depth_m: Array) -> Array:
+        """Return the ``(n, 3)`` camera-frame points at ``(n,)`` depths (metres along z)."""
+        points = np.empty((len(pixels), 3))
+        points[:, 0] = (pixels[:, 0] - self.cx) / self.fx * depth_m
+        points[:, 1] = (pixels[:, 1] - self.cy) / self.fy * depth_m
+        points[:, 2] = depth_m
+        return points
+
+
+def transform(T_a_b: Array, points_b: Array) -> Array:
+    """Return ``(n, 3)`` points of frame *b* expressed in frame *a*."""
+    moved: Array = points_b @ T_a_b[:3, :3].T + T_a_b[:3, 3]
+    return moved
+
+
+def inverse(T_a_b: Array) -> Array:
+    """Return ``T_b_a`` of a rigid ``T_a_b``."""
+    T_b_a = np.eye(4)
+    rotation = T_a_b[:3, :3].T
+    T_b_a[:3, :3] = rotation
+    T_b_a[:3, 3] = -rotation @ T_a_b[:3, 3]
+    return T_b_a
+
+
+def skew(v: npt.ArrayLike) -> Array:
+    """Return the ``(3, 3)`` matrix of the cross product with *v*."""
+    x, y, z = np.asarray(v, dtype=np.float64)
+    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+
+
+def exp_se3(xi: npt.ArrayLike) -> Array:
+    """Return the pose of the twist ``xi = (rho, phi)``: metres, then radians.
+
+    Source:
+        Barfoot, State Estimation for Robotics (2017), eqs. 7.16 and 7.34.
+    """
+    twist = np.asarray(xi, dtype=np.float64)
+    rho, phi = twist[:3], twist[3:]
+    angle = float(np.linalg.norm(phi))
+    K = skew(phi)
+    if angle < 1e-9:
+        rotation, jacobian = np.eye(3) + K, np.eye(3) + 0.5 * K
+    else:
+        a = math.sin(angle) / angle
+        b = (1.0 - math.cos(angle)) / angle**2
+        c = (1.0 - a) / angle**2
+        rotation = np.eye(3) + a * K + b * K @ K
+        jacobian = np.eye(3) + b * K + c * K @ K
+    T = np.eye(4)
+    T[:3, :3] = rotation
+    T[:3, 3] = jacobian @ rho
+    return T
+
+
+def rotation_angle_deg(rotation: Array) -> float:
+    """Return the angle of a ``(3, 3)`` rotation, in degrees, accurate near zero."""
+    sine = 0.5 * math.sqrt(
+        (rotation[2, 1] - rotation[1, 2]) ** 2
+        + (rotation[0, 2] - rotation[2, 0]) ** 2
+        + (rotation[1, 0] - rotation[0, 1]) ** 2
+    )
+    cosine = 0.5 * (float(np.trace(rotation)) - 1.0)
+    return math.degrees(math.atan2(sine, cosine))
+
+
+def pose_difference(T_a_b: Array, S_a_b: Array) -> tuple[float, float]:
+    """Return how far two poses of the same frames are apart: ``(metres, degrees)``."""
+    difference = inverse(S_a_b) @ T_a_b
+    return float(np.linalg.norm(difference[:3, 3])), rotation_angle_deg(difference[:3, :3])
+
+
+def to_quaternion(rotation: Array) -> Array:
+    """Return ``(qx, qy, qz, qw)``, unit length, ``qw >= 0``, of a ``(3, 3)`` rotation.
+
+    Source:
+        Shepperd 1978: divide by the largest of the four components.
+    """
+    m: Any = rotation
+    four = np.array(
+        [
+            1.0 + m[0, 0] - m[1, 1] - m[2, 2],
+            1.0 - m[0, 0] + m[1, 1] - m[2, 2],
+            1.0 - m[0, 0] - m[1, 1] + m[2, 2],
+            1.0 + m[0, 0] + m[1, 1] + m[2, 2],
+        ]
+    )
+    largest = int(np.argmax(four))
+    if largest == 3:
+        q = np.array([m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1], four[3]])
+    elif largest == 0:
+        q = np.array([four[0], m[0, 1] + m[1, 0], m[0, 2] + m[2, 0], m[2, 1] - m[1, 2]])
+    elif largest == 1:
+        q = np.array([m[0, 1] + m[1, 0], four[1], m[1, 2] + m[2, 1], m[0, 2] - m[2, 0]])
+    else:
+        q = np.array([m[0, 2] + m[2, 0], m[1, 2] + m[2, 1], four[2], m[1, 0] - m[0, 1]])
+    q /= np.linalg.norm(q)
+    unit: Array = -q if q[3] < 0 else q
+    return unit
+
+
+def from_quaternion(q: npt.ArrayLike) -> Array:
+    """Return the ``(3, 3)`` rotation of ``(qx, qy, qz, qw)``; it is normalised first."""
+    quaternion = np.asarray(q, dtype=np.float64)
+    x, y, z, w = quaternion / np.linalg.norm(quaternion)
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+    )

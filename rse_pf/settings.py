@@ -1,0 +1,396 @@
+"""Every port, path and threshold of the platform: default, unit, source and help, as data.
+
+``cdk.json`` -> ``context."rse-pf"`` holds overrides only; `load_settings` merges and checks them.
+Promises to import nothing above it, to read a file only in `load_settings`, and never to look
+at the environment.  The file is longer than its neighbours because it is one table.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import hashlib
+import json
+import types
+import typing
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from rse_pf.errors import SettingsError
+
+__all__ = [
+    "AuthSettings",
+    "CloudSettings",
+    "DataSettings",
+    "HealthSettings",
+    "LocalSettings",
+    "PlatformSettings",
+    "PnpSettings",
+    "ScalingSettings",
+    "ServiceSettings",
+    "ServingSettings",
+    "SessionSettings",
+    "SettingRow",
+    "load_settings",
+    "setting_rows",
+]
+
+_OURS = "ours"
+
+
+def setting(
+    default: Any,
+    *,
+    doc: str,
+    unit: str = "",
+    source: str = _OURS,
+    low: float | None = None,
+    high: float | None = None,
+    choices: tuple[str, ...] = (),
+) -> Any:
+    """Declare one setting; the docs table, the CLI and the checks all come from here."""
+    metadata = {
+        "doc": doc, "unit": unit, "source": source, "low": low, "high": high, "choices": choices,
+    }  # fmt: skip
+    return field(default=default, metadata=metadata)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ServingSettings:
+    """One backend server: its sockets, workers and queue."""
+
+    host: str = setting("127.0.0.1", doc="address the robots' socket listens on")
+    port: int = setting(8765, doc="port of the robots' socket; 0 takes a free one", low=0, high=65535)
+    control_host: str = setting("127.0.0.1", doc="address of the control port")
+    control_port: int = setting(8766, doc="port of /healthz, /readyz, /metrics and drain; 0 takes a free one", low=0, high=65535)
+    path: str = setting("/ws", doc="path of the robots' WebSocket")
+    workers: int = setting(0, doc="worker processes; 0 means one per core", low=0, high=256)
+    solver_threads: int = setting(1, doc="solver threads of each worker", low=1, high=64)
+    backlog: int = setting(4096, doc="connections that wait for accept", low=16, high=65535)
+    max_robots: int = setting(10000, unit="robots", doc="connections of one server; more are refused with 503", low=1)
+    handshake_timeout_s: float = setting(5.0, unit="s", doc="a handshake that takes longer is cut", source="slowloris, OWASP", low=0.1)
+    read_buffer_bytes: int = setting(2048, unit="bytes", doc="first read buffer of a socket", low=256)
+    write_buffer_bytes: int = setting(262144, unit="bytes", doc="unsent bytes at which a reader counts as slow", low=4096)
+    slow_reader_s: float = setting(1.0, unit="s", doc="a reader that stays slow this long is cut off", low=0.05)
+    inline_bytes: int = setting(16384, unit="bytes", doc="a command up to this size is solved in the event loop when nothing waits", low=0)
+    queue_target_ms: float = setting(50.0, unit="ms", doc="waiting time above which the server counts as behind", source="CoDel, Nichols and Jacobson 2012", low=1)
+    queue_interval_ms: float = setting(100.0, unit="ms", doc="behind for this long, the server sheds", source="CoDel, Nichols and Jacobson 2012", low=1)
+    queue_per_robot: int = setting(8, unit="commands", doc="commands of one robot that wait; more are refused", low=1)
+    size: float = setting(0.0, unit="cores", doc="emulated size of each worker in CPU seconds per second; 0 is off", low=0, high=64)
+    size_burst_ms: float = setting(20.0, unit="ms", doc="CPU time an emulated server may run ahead", low=1)
+    drain_wait_s: float = setting(1.0, unit="s", doc="not ready, but still accepting, before robots are moved", low=0)
+    drain_within_ms: float = setting(5000.0, unit="ms", doc="time robots get to move to another server", low=100)
+    log_level: str = setting("info", doc="lines below this level are not written", choices=("debug", "info", "warning", "error"))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SessionSettings:
+    """What a robot and a server agree on: limits, pings, reconnects."""
+
+    max_message_bytes: int = setting(262144, unit="bytes", doc="one WebSocket message on the wire", low=1024)
+    max_inflated_bytes: int = setting(1048576, unit="bytes", doc="one message after inflating", low=1024)
+    max_inflate_ratio: float = setting(100.0, unit="x", doc="inflated size over wire size", low=2)
+    max_fragments: int = setting(64, doc="fragments of one message, empty ones included", source="GHSA-96hv-2xvq-fx4p", low=1)
+    max_json_depth: int = setting(16, unit="levels", doc="nesting of a JSON message", low=4, high=200)
+    max_control_per_s: float = setting(10.0, unit="frames/s", doc="control frames of one socket", low=1)
+    max_in_flight: int = setting(8, unit="commands", doc="unanswered commands of one robot", low=1)
+    ping_interval_s: float = setting(2.0, unit="s", doc="time between application pings", source="paper, Sect. 3.3 (delays); ours in value", low=0.05)
+    ping_patience_s: float = setting(3.0, unit="s", doc="silence after a ping that counts as a lost link", low=0.1)
+    hello_timeout_s: float = setting(5.0, unit="s", doc="a socket without a Hello is closed", low=0.1)
+    connect_timeout_s: float = setting(3.0, unit="s", doc="one try to connect", low=0.1)
+    reconnect_base_s: float = setting(0.1, unit="s", doc="first back-off; full jitter", source="AWS Architecture Blog, 2015", low=0.001)
+    reconnect_max_s: float = setting(1.0, unit="s", doc="longest back-off", low=0.01)
+    answer_timeout_s: float = setting(5.0, unit="s", doc="deadline of a command that names none", low=0.05)
+    silence_s: float = setting(1.0, unit="s", doc="an answer overdue by this, with no other sign of life, ends the socket", low=0.05)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PnpSettings:
+    """The perspective-n-point service."""
+
+    engine: str = setting("poselib", doc="solver when a command names none", choices=("poselib", "opencv"))
+    max_correspondences: int = setting(5000, doc="correspondences of one command", low=4)
+    max_iterations: int = setting(1000, doc="RANSAC iterations a command may ask for", low=1, high=100000)
+    min_iterations: int = setting(10, doc="RANSAC iterations that are always done (poselib)", source="measured: 2-5x faster than poselib's default at equal success", low=1)
+    weak_inliers: int = setting(12, unit="inliers", doc="a pose with fewer is called weak", low=4)
+    weak_inlier_percent: float = setting(25.0, unit="%", doc="a pose with a smaller share of inliers is called weak", low=0, high=100)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class HealthSettings:
+    """When a server counts as healthy."""
+
+    path: str = setting("/readyz", doc="path that the load balancer asks")
+    local_interval_s: float = setting(0.25, unit="s", doc="time between checks on one machine", low=0.01)
+    local_timeout_s: float = setting(0.25, unit="s", doc="a local check that takes longer failed", low=0.01)
+    cloud_interval_s: int = setting(5, unit="s", doc="time between checks of the ALB", low=5, high=300)
+    cloud_timeout_s: int = setting(4, unit="s", doc="an ALB check that takes longer failed", low=2, high=120)
+    unhealthy_checks: int = setting(2, unit="checks", doc="failed checks in a row that take a server out", low=2, high=10)
+    healthy_checks: int = setting(2, unit="checks", doc="good checks in a row that bring a server in", low=2, high=10)
+    grace_s: int = setting(90, unit="s", doc="a new server is not judged before", low=0)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ScalingSettings:
+    """When the cloud grows and shrinks."""
+
+    busy_cpu_percent: float = setting(70.0, unit="%", source="paper, Sect. 6.2", doc="add a server above this average CPU", low=1, high=100)
+    very_busy_cpu_percent: float = setting(85.0, unit="%", doc="add two servers above this average CPU", low=1, high=100)
+    idle_s: int = setting(300, unit="s", source="paper, Sect. 6.2", doc="remove a server after this long without work", low=60)
+    idle_cpu_percent: float = setting(20.0, unit="%", doc="idle means no requests and CPU below this", low=0, high=100)
+    period_s: int = setting(60, unit="s", doc="one sample of the monitor", low=10)
+    busy_periods: int = setting(2, unit="periods", doc="busy samples in a row before growing", low=1)
+    step: int = setting(1, unit="servers", doc="servers added when busy", low=1)
+    big_step: int = setting(2, unit="servers", doc="servers added when very busy", low=1)
+    min_servers: int = setting(2, unit="servers", doc="never fewer", low=1)
+    max_servers: int = setting(10, unit="servers", doc="never more", low=1)
+    warm_up_s: int = setting(60, unit="s", doc="a new server's CPU does not count for this long", low=0)
+    max_robots_per_server: int = setting(0, unit="robots", source="paper, Sect. 3.1", doc="add a server above this many robots each; 0 is off", low=0)
+    max_queue_ms: float = setting(0.0, unit="ms", doc="add a server above this queue delay; 0 is off", low=0)
+    deregistration_s: int = setting(30, unit="s", doc="time a leaving server keeps its robots", low=0, high=3600)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DataSettings:
+    """Data servers: images, keyframes, clouds and maps."""
+
+    enabled: bool = setting(False, doc="run the data service beside each backend server")
+    store: str = setting("memory:", doc="where objects live: dir:PATH, s3:BUCKET or memory:")
+    port: int = setting(8767, doc="port of the data service; 0 takes a free one", low=0, high=65535)
+    max_object_bytes: int = setting(268435456, unit="bytes", doc="one object", low=1024)
+    quota_bytes: int = setting(10737418240, unit="bytes", doc="all objects of one robot", low=1024)
+    infrequent_after_days: int = setting(30, unit="days", doc="maps move to infrequent access", low=30)
+    glacier_after_days: int = setting(90, unit="days", source="paper, Sect. 5.1", doc="maps move to Glacier", low=30)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AuthSettings:
+    """Robot tokens."""
+
+    issuer: str = setting("rse-pf", doc="who signs the tokens")
+    audience: str = setting("rse-pf", doc="whom the tokens are for")
+    token_life_s: int = setting(900, unit="s", doc="life of a robot token", source="RFC 8725; short-lived", low=10, high=900)
+    leeway_s: int = setting(30, unit="s", doc="clock difference that is forgiven", low=0, high=300)
+    max_token_bytes: int = setting(4096, unit="bytes", doc="a longer token is refused unread", low=512)
+    required: bool = setting(True, doc="robots without a token are refused")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ServiceSettings:
+    """Services that the operator installs, each robot in its own environment."""
+
+    folder: str = setting("", doc="folder of installed services; empty means none")
+    max_environments: int = setting(64, doc="isolated environments of one server", low=1)
+    memory_bytes: int = setting(536870912, unit="bytes", doc="address space of one environment", low=16777216)
+    grace_s: float = setting(5.0, unit="s", doc="an environment outlives its connection by this", low=0)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LocalSettings:
+    """The platform on one machine."""
+
+    port: int = setting(8700, doc="front door of the local platform; 0 takes a free one", low=0, high=65535)
+    servers: int = setting(2, unit="servers", doc="backend servers at the start", low=1, high=64)
+    workers: int = setting(1, doc="worker processes of each local server", low=1, high=64)
+    start_timeout_s: float = setting(20.0, unit="s", doc="a server that is not ready by then failed", low=1)
+    stop_timeout_s: float = setting(10.0, unit="s", doc="a process that does not leave by then is killed", low=0.5)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CloudSettings:
+    """The platform on AWS."""
+
+    region: str = setting("ap-northeast-2", doc="AWS region", source="paper, Sect. 6.1 (Seoul)")
+    lab: bool = setting(True, doc="true: ws:// without a certificate, for trials; false: wss://")
+    certificate_arn: str = setting("", doc="certificate of the front door; needed when lab is false")
+    domain_name: str = setting("", doc="name of the front door; needed when lab is false")
+    instance_type: str = setting("c7i.large", doc="EC2 type of a backend server (x86-64)")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PlatformSettings:
+    """All settings; contradictions are refused when the object is made."""
+
+    serving: ServingSettings = field(default_factory=ServingSettings)
+    session: SessionSettings = field(default_factory=SessionSettings)
+    pnp: PnpSettings = field(default_factory=PnpSettings)
+    health: HealthSettings = field(default_factory=HealthSettings)
+    scaling: ScalingSettings = field(default_factory=ScalingSettings)
+    data: DataSettings = field(default_factory=DataSettings)
+    auth: AuthSettings = field(default_factory=AuthSettings)
+    services: ServiceSettings = field(default_factory=ServiceSettings)
+    local: LocalSettings = field(default_factory=LocalSettings)
+    cloud: CloudSettings = field(default_factory=CloudSettings)
+
+    def __post_init__(self) -> None:
+        for row in setting_rows(self):
+            _check_range(row)
+        _check_contradictions(self)
+
+    @classmethod
+    def from_dict(cls, overrides: Mapping[str, Any]) -> PlatformSettings:
+        """Return the defaults with ``{group: {name: value}}`` laid over them."""
+        groups = {f.name: typing.get_type_hints(cls)[f.name] for f in dataclasses.fields(cls)}
+        made: dict[str, Any] = {}
+        for name, values in overrides.items():
+            if name not in groups:
+                raise SettingsError(f"unknown group {name!r}", hint=_did_you_mean(name, groups))
+            if not isinstance(values, Mapping):
+                raise SettingsError(
+                    f"{name} must be an object of settings, got {type(values).__name__}",
+                    hint=f'write "{name}": {{"setting": value}}',
+                )
+            made[name] = _make_group(name, groups[name], values)
+        return cls(**made)
+
+    def replace(self, **groups: Mapping[str, Any]) -> PlatformSettings:
+        """Return a copy with ``group={name: value}`` changed and checked anew."""
+        merged = self.to_dict()
+        for name, values in groups.items():
+            merged[name] = {**merged[name], **values}
+        return PlatformSettings.from_dict(merged)
+
+    def to_dict(self) -> dict[str, dict[str, Any]]:
+        """Return all settings as plain JSON values, defaults included."""
+        return dataclasses.asdict(self)
+
+    def digest(self) -> str:
+        """Return 16 hex digits that are equal wherever the settings are equal."""
+        canonical = json.dumps(self.to_dict(), sort_keys=True, separators=(",", ":"))
+        return hashlib.sha256(canonical.encode()).hexdigest()[:16]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SettingRow:
+    """One setting as a row of the documentation."""
+
+    group: str
+    name: str
+    value: Any
+    default: Any
+    unit: str
+    source: str
+    doc: str
+    low: float | None
+    high: float | None
+    choices: tuple[str, ...]
+
+
+def setting_rows(settings: PlatformSettings | None = None) -> Iterator[SettingRow]:
+    """Yield every setting, in the order of this file."""
+    for group in dataclasses.fields(PlatformSettings):
+        made: Any = group.default_factory() if settings is None else getattr(settings, group.name)  # type: ignore[misc]
+        for each in dataclasses.fields(made):
+            yield SettingRow(
+                group=group.name,
+                name=each.name,
+                value=getattr(made, each.name),
+                default=each.default,
+                **each.metadata,
+            )
+
+
+def load_settings(path: Path | None = None) -> PlatformSettings:
+    """Read ``context."rse-pf"`` of *path*, by default ``./cdk.json``, else the built-in defaults.
+
+    Raises:
+        SettingsError: The file is named but missing, is not JSON, or holds a bad setting.
+    """
+    chosen = path or Path("cdk.json")
+    if path is None and not chosen.exists():
+        return PlatformSettings()
+    try:
+        document = json.loads(chosen.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise SettingsError(
+            f"cannot read {chosen}: {error.strerror}", hint="name an existing file with --settings"
+        ) from error
+    except ValueError as error:
+        raise SettingsError(f"{chosen} is not JSON: {error}", hint="mend the file") from error
+    context = document.get("context", {}) if isinstance(document, dict) else None
+    overrides = context.get("rse-pf", {}) if isinstance(context, dict) else None
+    if not isinstance(overrides, dict):
+        raise SettingsError(
+            f'{chosen} has no object at context."rse-pf"',
+            hint='write {"context": {"rse-pf": {"scaling": {"max_servers": 4}}}}',
+        )
+    return PlatformSettings.from_dict(overrides)
+
+
+def _make_group(group: str, kind: type[Any], values: Mapping[str, Any]) -> Any:
+    hints = typing.get_type_hints(kind)
+    checked = {}
+    for name, value in values.items():
+        if name not in hints:
+            raise SettingsError(f"unknown setting {group}.{name}", hint=_did_you_mean(name, hints))
+        checked[name] = _typed(f"{group}.{name}", value, hints[name])
+    return kind(**checked)
+
+
+def _typed(name: str, value: Any, kind: Any) -> Any:
+    if kind is float and isinstance(value, int) and not isinstance(value, bool):
+        return float(value)
+    expected = kind if isinstance(kind, type) else typing.get_origin(kind)
+    if isinstance(expected, types.UnionType) or type(value) is not expected:
+        raise SettingsError(
+            f"{name} = {value!r} is not of type {getattr(expected, '__name__', kind)}",
+            hint="mend it in cdk.json, context.\"rse-pf\"",
+        )
+    return value
+
+
+def _check_range(row: SettingRow) -> None:
+    where = 'in cdk.json, context."rse-pf"'
+    if row.choices and row.value not in row.choices:
+        raise SettingsError(
+            f"{row.group}.{row.name} = {row.value!r} is not one of {', '.join(row.choices)}",
+            hint=f"choose one of them {where}",
+        )
+    if row.low is not None and not row.value >= row.low:
+        raise SettingsError(
+            f"{row.group}.{row.name} = {row.value} is below {row.low:g}", hint=f"raise it {where}"
+        )
+    if row.high is not None and not row.value <= row.high:
+        raise SettingsError(
+            f"{row.group}.{row.name} = {row.value} is above {row.high:g}", hint=f"lower it {where}"
+        )
+
+
+def _check_contradictions(s: PlatformSettings) -> None:
+    where = 'in cdk.json, context."rse-pf"'
+    pairs = [
+        ("scaling", "min_servers", "max_servers"),
+        ("scaling", "busy_cpu_percent", "very_busy_cpu_percent"),
+        ("scaling", "idle_cpu_percent", "busy_cpu_percent"),
+        ("scaling", "step", "big_step"),
+        ("session", "max_message_bytes", "max_inflated_bytes"),
+        ("session", "reconnect_base_s", "reconnect_max_s"),
+        ("pnp", "min_iterations", "max_iterations"),
+        ("health", "cloud_timeout_s", "cloud_interval_s"),
+        ("data", "infrequent_after_days", "glacier_after_days"),
+    ]
+    for group, small, large in pairs:
+        low, high = (getattr(getattr(s, group), name) for name in (small, large))
+        if low > high:
+            raise SettingsError(
+                f"{group}.{large} = {high:g} is less than {group}.{small} = {low:g}",
+                hint=f"raise {group}.{large} or lower {group}.{small} {where}",
+            )
+    if s.scaling.idle_s % s.scaling.period_s:
+        raise SettingsError(
+            f"scaling.idle_s = {s.scaling.idle_s} is no multiple of scaling.period_s = "
+            f"{s.scaling.period_s}",
+            hint=f"make it a multiple {where}",
+        )
+    if not s.cloud.lab and not (s.cloud.certificate_arn and s.cloud.domain_name):
+        raise SettingsError(
+            "cloud.lab = false needs cloud.certificate_arn and cloud.domain_name",
+            hint=f"set both {where}, or set cloud.lab to true",
+        )
+
+
+def _did_you_mean(name: str, known: Mapping[str, Any]) -> str:
+    close = difflib.get_close_matches(name, known, n=1)
+    return f"did you mean {close[0]}?" if close else f"known are {', '.join(known)}"
