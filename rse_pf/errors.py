@@ -54,9 +54,7 @@ class RsePfError(Exception):
 
     code: ClassVar[str] = "error"
 
-    def __init__(
-        self, message: str, *, hint: str = "", retry_after_ms: float | None = None
-    ) -> None:
+    def __init__(self, message: str, *, hint: str = "", retry_after_ms: float | None = None) -> None:
         super().__init__(message)
         self.message = message
         self.hint = hint
@@ -98,9 +96,7 @@ class MissingExtra(ConfigurationError):
     code = "missing-extra"
 
     def __init__(self, package: str, extra: str) -> None:
-        super().__init__(
-            f"{package} is not installed", hint=f"pip install 'rse-pf[{extra}]'"
-        )
+        super().__init__(f"{package} is not installed", hint=f"pip install 'rse-pf[{extra}]'")
 
 
 # --- the door --------------------------------------------------------------------------------

@@ -94,6 +94,7 @@ class SessionSettings:
     max_inflate_ratio: float = setting(100.0, unit="x", doc="inflated size over wire size", low=2)
     max_fragments: int = setting(64, doc="fragments of one message, empty ones included", source="GHSA-96hv-2xvq-fx4p", low=1)
     max_json_depth: int = setting(16, unit="levels", doc="nesting of a JSON message", low=4, high=200)
+    max_bad_messages: int = setting(10, unit="messages", doc="undecodable messages of one socket before it is closed", low=0)
     max_control_per_s: float = setting(10.0, unit="frames/s", doc="control frames of one socket", low=1)
     max_in_flight: int = setting(8, unit="commands", doc="unanswered commands of one robot", low=1)
     ping_interval_s: float = setting(2.0, unit="s", doc="time between application pings", source="paper, Sect. 3.3 (delays); ours in value", low=0.05)
@@ -103,7 +104,8 @@ class SessionSettings:
     reconnect_base_s: float = setting(0.1, unit="s", doc="first back-off; full jitter", source="AWS Architecture Blog, 2015", low=0.001)
     reconnect_max_s: float = setting(1.0, unit="s", doc="longest back-off", low=0.01)
     answer_timeout_s: float = setting(5.0, unit="s", doc="deadline of a command that names none", low=0.05)
-    silence_s: float = setting(1.0, unit="s", doc="an answer overdue by this, with no other sign of life, ends the socket", low=0.05)
+    silence_s: float = setting(1.0, unit="s", doc="an unanswered command and this much silence end the socket", low=0.05)
+    retry_percent: float = setting(10.0, unit="%", doc="retries after busy, as a share of commands", source="Google SRE book, ch. 21", low=0, high=100)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -281,7 +283,7 @@ class SettingRow:
 def setting_rows(settings: PlatformSettings | None = None) -> Iterator[SettingRow]:
     """Yield every setting, in the order of this file."""
     for group in dataclasses.fields(PlatformSettings):
-        made: Any = group.default_factory() if settings is None else getattr(settings, group.name)  # type: ignore[misc]
+        made: Any = getattr(settings or PlatformSettings(), group.name)
         for each in dataclasses.fields(made):
             yield SettingRow(
                 group=group.name,

@@ -1,1 +1,1 @@
-""""""
+"""Services: typed requests to typed replies."""

@@ -1,0 +1,224 @@
+"""Objects: bytes under a name, in a folder, in memory, and (in `rse_pf.aws`) in S3.
+
+One contract for all stores: what `put` returned for is there, whole, whatever crashes next.
+Promises no knowledge of what the bytes mean, and that no name leaves the store's own folder.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import hashlib
+import os
+import re
+import tempfile
+import threading
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+from rse_pf.errors import Conflict, NotFound, StoreError, StoreFull, UsageError
+
+__all__ = [
+    "DirectoryStore",
+    "MemoryStore",
+    "ObjectInfo",
+    "ObjectStore",
+    "check_name",
+    "digest_of",
+    "open_store",
+]
+
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._=-]{0,127}(/[A-Za-z0-9][A-Za-z0-9._=-]{0,127}){0,9}")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ObjectInfo:
+    """What a store knows of an object without reading it."""
+
+    name: str
+    size: int
+
+
+class ObjectStore(Protocol):
+    """Bytes by name.  Every method raises StoreError or one of its children, nothing else."""
+
+    def get(self, name: str) -> bytes:
+        """Return the object; raises NotFound."""
+
+    def put(self, name: str, data: bytes) -> None:
+        """Store the object durably, whole or not at all; raises StoreFull."""
+
+    def head(self, name: str) -> ObjectInfo:
+        """Return size and name; raises NotFound."""
+
+    def list(self, prefix: str = "") -> Iterator[ObjectInfo]:
+        """Yield the objects whose names begin with *prefix*, sorted by name."""
+
+    def delete(self, name: str) -> None:
+        """Remove the object; a missing one is no error."""
+
+    def compare_and_swap(self, name: str, expected: bytes | None, data: bytes) -> None:
+        """Replace the object if it still holds *expected* (None: is missing); raises Conflict."""
+
+
+def digest_of(data: bytes) -> str:
+    """Return the sha256 of *data* in hex: the name of an immutable object."""
+    return hashlib.sha256(data).hexdigest()
+
+
+def check_name(name: str) -> str:
+    """Return *name*, or raise StoreError: only plain path segments, at most ten."""
+    if not _NAME.fullmatch(name):
+        raise StoreError(
+            f"{name[:80]!r} is not a name of an object",
+            hint="use segments of letters, digits and . _ = -, joined by /",
+        )
+    return name
+
+
+def open_store(location: str) -> ObjectStore:
+    """Return the store at ``dir:PATH``, ``s3:BUCKET`` or ``memory:``."""
+    kind, _, place = location.partition(":")
+    if kind == "memory":
+        return MemoryStore()
+    if kind == "dir" and place:
+        return DirectoryStore(Path(place))
+    raise UsageError(f"{location!r} names no store", hint="write dir:PATH, s3:BUCKET or memory:")
+
+
+class MemoryStore:
+    """Objects of one process; gone when it ends."""
+
+    def __init__(self) -> None:
+        self._objects: dict[str, bytes] = {}
+        self._lock = threading.Lock()
+
+    def get(self, name: str) -> bytes:
+        """Return the object."""
+        with self._lock:
+            found = self._objects.get(check_name(name))
+        if found is None:
+            raise NotFound(f"no object named {name!r}")
+        return found
+
+    def put(self, name: str, data: bytes) -> None:
+        """Store the object."""
+        with self._lock:
+            self._objects[check_name(name)] = bytes(data)
+
+    def head(self, name: str) -> ObjectInfo:
+        """Return size and name."""
+        return ObjectInfo(name=name, size=len(self.get(name)))
+
+    def list(self, prefix: str = "") -> Iterator[ObjectInfo]:
+        """Yield the objects whose names begin with *prefix*."""
+        with self._lock:
+            found = sorted((name, len(data)) for name, data in self._objects.items())
+        for name, size in found:
+            if name.startswith(prefix):
+                yield ObjectInfo(name=name, size=size)
+
+    def delete(self, name: str) -> None:
+        """Remove the object."""
+        with self._lock:
+            self._objects.pop(check_name(name), None)
+
+    def compare_and_swap(self, name: str, expected: bytes | None, data: bytes) -> None:
+        """Replace the object if it still holds *expected*."""
+        with self._lock:
+            if self._objects.get(check_name(name)) != expected:
+                raise Conflict(f"{name!r} was changed meanwhile", hint="read it again and retry")
+            self._objects[name] = bytes(data)
+
+
+class DirectoryStore:
+    """Objects as files below one folder, written by temporary file, fsync and rename."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+
+    def get(self, name: str) -> bytes:
+        """Return the object."""
+        with _as_store_errors(name):
+            return self._path(name).read_bytes()
+
+    def put(self, name: str, data: bytes) -> None:
+        """Store the object durably."""
+        path = self._path(name)
+        with _as_store_errors(name):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            self._write(path, data)
+
+    def head(self, name: str) -> ObjectInfo:
+        """Return size and name."""
+        with _as_store_errors(name):
+            return ObjectInfo(name=name, size=self._path(name).stat().st_size)
+
+    def list(self, prefix: str = "") -> Iterator[ObjectInfo]:
+        """Yield the objects whose names begin with *prefix*."""
+        if not self._folder.is_dir():
+            return
+        names = (
+            path.relative_to(self._folder).as_posix()
+            for path in self._folder.rglob("*")
+            if path.is_file() and not path.is_symlink()
+        )
+        for name in sorted(names):
+            if name.startswith(prefix) and _NAME.fullmatch(name):
+                with contextlib.suppress(NotFound):
+                    yield self.head(name)
+
+    def delete(self, name: str) -> None:
+        """Remove the object."""
+        with _as_store_errors(name), contextlib.suppress(FileNotFoundError):
+            self._path(name).unlink()
+
+    def compare_and_swap(self, name: str, expected: bytes | None, data: bytes) -> None:
+        """Replace the object if it still holds *expected*; a lock file keeps others out."""
+        import fcntl
+
+        path = self._path(name)
+        with _as_store_errors(name):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            with (path.parent / f".lock-{path.name}").open("wb") as lock:
+                fcntl.flock(lock, fcntl.LOCK_EX)
+                current = path.read_bytes() if path.exists() else None
+                if current != expected:
+                    raise Conflict(f"{name!r} was changed meanwhile", hint="read it again and retry")
+                self._write(path, data)
+
+    def _path(self, name: str) -> Path:
+        return self._folder / check_name(name)
+
+    @staticmethod
+    def _write(path: Path, data: bytes) -> None:
+        handle, temporary = tempfile.mkstemp(prefix=".part-", dir=path.parent)
+        try:
+            with os.fdopen(handle, "wb") as file:
+                file.write(data)
+                file.flush()
+                os.fsync(file.fileno())
+            os.replace(temporary, path)
+        except BaseException:
+            with contextlib.suppress(FileNotFoundError):
+                os.unlink(temporary)
+            raise
+        folder = os.open(path.parent, os.O_RDONLY)
+        try:
+            os.fsync(folder)
+        finally:
+            os.close(folder)
+
+
+@contextlib.contextmanager
+def _as_store_errors(name: str) -> Iterator[None]:
+    try:
+        yield
+    except (FileNotFoundError, IsADirectoryError, NotADirectoryError) as error:
+        raise NotFound(f"no object named {name!r}") from error
+    except OSError as error:
+        if error.errno in (errno.ENOSPC, errno.EDQUOT):
+            raise StoreFull(f"no room for {name!r}", hint="free some space") from error
+        raise StoreError(f"{name!r}: {error.strerror}", hint="look at the store's folder") from error

@@ -1,0 +1,169 @@
+"""How a service is written, registered and dispatched.
+
+A service is a function from one typed request to one typed reply; it has no ``self``, so it has
+nowhere to keep state.  `dispatch` is the only way a command reaches it, on a backend server, in the
+Lambda and on the robot itself.  Promises that whatever a service raises becomes a `Failure`, and
+that nothing of a traceback leaves with it.
+"""
+
+from __future__ import annotations
+
+import inspect
+import typing
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any, Literal, TypeVar
+
+import msgspec
+
+from rse_pf.errors import (
+    BadMessage,
+    BadRequest,
+    ConfigurationError,
+    InternalError,
+    RsePfError,
+    UnknownService,
+)
+from rse_pf.wire import Command, Failure, Result, as_type
+
+__all__ = ["Kind", "Registry", "Service", "dispatch", "failure_of"]
+
+Kind = Literal["stateless", "per_robot_state", "long"]
+
+Function = TypeVar("Function", bound=Callable[[Any], Any])
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Service:
+    """A registered function with what the server must know about it."""
+
+    name: str
+    function: Callable[[Any], Any]
+    request_type: type[Any]
+    reply_type: type[Any]
+    kind: Kind = "stateless"
+    cheap: bool = False
+    """Cheap services may run in the event loop when nothing waits."""
+
+    @property
+    def summary(self) -> str:
+        """The first line of the function's docstring."""
+        return (inspect.getdoc(self.function) or "").split("\n")[0]
+
+
+class Registry:
+    """The services that one process offers."""
+
+    def __init__(self) -> None:
+        self._services: dict[str, Service] = {}
+
+    def service(
+        self, name: str, *, kind: Kind = "stateless", cheap: bool = False
+    ) -> Callable[[Function], Function]:
+        """Register the decorated function under *name*.
+
+        Raises:
+            ConfigurationError: The name is taken, or the function is not annotated with one
+                request and one reply type, both `msgspec.Struct`.
+        """
+
+        def register(function: Function) -> Function:
+            request_type, reply_type = _signature(name, function)
+            self.add(
+                Service(
+                    name=name, function=function, request_type=request_type, reply_type=reply_type,
+                    kind=kind, cheap=cheap,
+                )
+            )  # fmt: skip
+            return function
+
+        return register
+
+    def add(self, service: Service) -> None:
+        """Register *service*; its name must be free."""
+        if service.name in self._services:
+            raise ConfigurationError(f"two services are named {service.name!r}", hint="rename one")
+        self._services[service.name] = service
+
+    def get(self, name: str) -> Service:
+        """Return the service called *name*, or raise UnknownService with what is offered."""
+        found = self._services.get(name)
+        if found is None:
+            raise UnknownService(
+                f"no service named {name!r}; this server offers {', '.join(self._services)}",
+                hint="check the spelling, or install the service on the server",
+            )
+        return found
+
+    def __iter__(self) -> Iterator[Service]:
+        return iter(self._services.values())
+
+
+def dispatch(
+    registry: Registry,
+    command: Command,
+    clock: Callable[[], float],
+    *,
+    server: str = "",
+    on_defect: Callable[[Command, Exception], None] | None = None,
+) -> Result | Failure:
+    """Answer *command* with a result or a failure; never raise.
+
+    Args:
+        registry: The services on offer.
+        command: As decoded; its payload takes the service's request type here.
+        clock: Seconds, monotonic; read before and after the service.
+        server: Name that goes into the answer.
+        on_defect: Told of exceptions that are not ours, for the server's log.
+    """
+    started = clock()
+    try:
+        service = registry.get(command.service)
+        reply = service.function(_request(command, service))
+    except RsePfError as error:
+        return failure_of(error, command, server=server)
+    except Exception as error:  # noqa: BLE001  a service is foreign code: anything may come out
+        if on_defect is not None:
+            on_defect(command, error)
+        defect = InternalError(
+            f"service {command.service!r} failed", hint="the server's log has it under this trace"
+        )
+        return failure_of(defect, command, server=server)
+    return Result(id=command.id, reply=reply, server=server, compute_ms=(clock() - started) * 1e3)
+
+
+def failure_of(error: RsePfError, command: Command | None = None, *, server: str = "") -> Failure:
+    """Return *error* as the message that a robot gets."""
+    return Failure(
+        id=None if command is None else command.id,
+        code=error.code,
+        message=error.message,
+        hint=error.hint,
+        retry_after_ms=error.retry_after_ms,
+        server=server,
+        trace="" if command is None else command.trace,
+    )
+
+
+def _request(command: Command, service: Service) -> Any:
+    payload = {} if command.payload is None else command.payload
+    try:
+        return as_type(payload, service.request_type)
+    except BadMessage as error:
+        raise BadRequest(
+            f"{service.name}: {error.message}", hint=error.hint or "see the service's request type"
+        ) from error
+
+
+def _signature(name: str, function: Callable[[Any], Any]) -> tuple[type[Any], type[Any]]:
+    hints = typing.get_type_hints(function)
+    reply_type = hints.pop("return", None)
+    kinds = list(hints.values())
+    if len(kinds) != 1 or not all(
+        isinstance(kind, type) and issubclass(kind, msgspec.Struct) for kind in (*kinds, reply_type)
+    ):
+        raise ConfigurationError(
+            f"service {name!r} must take one msgspec.Struct and return one",
+            hint="write def f(request: MyRequest) -> MyReply",
+        )
+    return kinds[0], typing.cast("type[Any]", reply_type)

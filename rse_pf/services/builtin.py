@@ -1,0 +1,17 @@
+"""The services that every server of the platform offers."""
+
+from __future__ import annotations
+
+from rse_pf.service import Registry
+from rse_pf.services import echo, pnp
+from rse_pf.settings import PlatformSettings
+
+__all__ = ["builtin_services"]
+
+
+def builtin_services(settings: PlatformSettings) -> Registry:
+    """Return a registry with the platform's own services, set up after *settings*."""
+    registry = Registry()
+    pnp.register(registry, settings.pnp)
+    echo.register(registry)
+    return registry

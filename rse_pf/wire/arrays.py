@@ -1,0 +1,87 @@
+"""Numeric arrays inside messages: flat JSON lists, or raw little-endian bytes in MessagePack.
+
+A field annotated ``Array`` arrives as float64, whatever the encoding was; its owner gives it its
+shape.  Promises that only finite numbers pass, and that no array is larger than its message.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+
+from rse_pf.errors import BadMessage
+
+__all__ = ["Array", "binary_encode_hook", "decode_hook", "extension_hook", "json_encode_hook", "reshaped"]
+
+Array = np.ndarray
+"""Annotation of an array field of a message; ``(n,)`` on the wire, row-major."""
+
+_EXTENSIONS: dict[int, np.dtype[Any]] = {1: np.dtype("<f4"), 2: np.dtype("<u4"), 3: np.dtype("<f8")}
+_F4, _U4, _F8 = 1, 2, 3
+
+
+def json_encode_hook(value: Any) -> Any:
+    """Return what JSON can say of *value*: arrays become flat lists."""
+    if isinstance(value, np.ndarray):
+        return value.ravel().tolist()
+    raise _unknown(value)
+
+
+def binary_encode_hook(value: Any) -> Any:
+    """Return the MessagePack extension of an array: float32, float64 or uint32, little-endian."""
+    if isinstance(value, np.ndarray):
+        kind = _F4 if value.dtype == np.float32 else _F8 if value.dtype.kind == "f" else _U4
+        return msgspec.msgpack.Ext(kind, value.astype(_EXTENSIONS[kind], copy=False).tobytes())
+    raise _unknown(value)
+
+
+def extension_hook(kind: int, data: memoryview) -> npt.NDArray[Any]:
+    """Return the array of one MessagePack extension."""
+    dtype = _EXTENSIONS.get(kind)
+    if dtype is None:
+        raise BadMessage(
+            f"MessagePack extension {kind} is unknown", hint="use 1 float32, 2 uint32 or 3 float64"
+        )
+    if len(data) % dtype.itemsize:
+        raise BadMessage(
+            f"{len(data)} bytes do not hold whole {dtype.itemsize}-byte numbers",
+            hint="send the array's raw little-endian bytes",
+        )
+    return np.frombuffer(data, dtype)
+
+
+def decode_hook(kind: type[Any], value: Any) -> Any:
+    """Return *value* as a flat float64 array of finite numbers."""
+    if kind is not np.ndarray:
+        raise BadMessage(f"{kind.__name__} does not travel in messages")
+    if not isinstance(value, (list, np.ndarray)):
+        raise BadMessage(f"expected an array of numbers, got {type(value).__name__}", hint="send a flat list")
+    try:
+        array = np.array(value, dtype=np.float64).ravel()
+    except (ValueError, TypeError, OverflowError) as error:
+        raise BadMessage("an array holds something that is not a number", hint="send a flat list") from error
+    if not math.isfinite(array.dot(array)):
+        raise BadMessage("an array holds a number that is not finite or absurdly large", hint="leave it out")
+    return array
+
+
+def reshaped(name: str, array: npt.NDArray[np.float64], columns: int) -> npt.NDArray[np.float64]:
+    """Return a flat *array* as ``(n, columns)``.
+
+    Raises:
+        BadMessage: The length is no multiple of *columns*.
+    """
+    if array.size % columns:
+        raise BadMessage(
+            f"{name} has {array.size} numbers, which is no multiple of {columns}",
+            hint=f"send {columns} numbers for each row",
+        )
+    return array.reshape(-1, columns)
+
+
+def _unknown(value: Any) -> BadMessage:
+    return BadMessage(f"{type(value).__name__} does not travel in messages")

@@ -1,0 +1,71 @@
+"""Offset between a robot's clock and a server's, and the two one-way delays of the paper's Sect. 3.3.
+
+Promises never to read a clock: all four stamps of an exchange are arguments.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+
+__all__ = ["ClockOffset", "Exchange"]
+
+
+@dataclass(frozen=True, slots=True)
+class Exchange:
+    """One ping: robot sent, server received, server answered, robot received; seconds."""
+
+    sent_s: float
+    received_s: float
+    answered_s: float
+    returned_s: float
+
+    @property
+    def round_trip_s(self) -> float:
+        """Time on the network, both ways together."""
+        return max(0.0, (self.returned_s - self.sent_s) - (self.answered_s - self.received_s))
+
+    @property
+    def offset_s(self) -> float:
+        """Server clock minus robot clock, if both ways take equally long."""
+        return ((self.received_s - self.sent_s) + (self.answered_s - self.returned_s)) / 2
+
+
+class ClockOffset:
+    """The offset of the exchange with the shortest round trip among the last few.
+
+    The shortest round trip waited least in queues, so its two ways differ least.
+
+    Source:
+        Mills, RFC 5905 (NTP), Sect. 10: the clock filter.
+    """
+
+    def __init__(self, window: int = 8) -> None:
+        self._window: deque[Exchange] = deque(maxlen=window)
+
+    def add(self, exchange: Exchange) -> None:
+        """Take one exchange into account."""
+        self._window.append(exchange)
+
+    @property
+    def offset_s(self) -> float | None:
+        """Server clock minus robot clock, or None before the first exchange."""
+        return self._best.offset_s if self._window else None
+
+    @property
+    def uncertainty_s(self) -> float | None:
+        """Half the shortest round trip: the offset is not further off than this."""
+        return self._best.round_trip_s / 2 if self._window else None
+
+    def delays_s(self, exchange: Exchange) -> tuple[float, float] | None:
+        """Return ``(up, down)`` of *exchange*: the paper's two one-way delays."""
+        offset = self.offset_s
+        if offset is None:
+            return None
+        up = exchange.received_s - offset - exchange.sent_s
+        down = exchange.returned_s - (exchange.answered_s - offset)
+        return up, down
+
+    @property
+    def _best(self) -> Exchange:
+        return min(self._window, key=lambda exchange: exchange.round_trip_s)

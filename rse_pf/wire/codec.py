@@ -1,0 +1,195 @@
+"""Bytes to messages and back: JSON, JSON+zlib (the paper's) and MessagePack with raw arrays.
+
+Every byte comes from a stranger, so limits hold *while* decoding, and only errors of
+`rse_pf.errors` leave.  Promises no state between messages and no compression of the transport.
+"""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Callable
+from typing import Any, Protocol, TypeVar
+
+import msgspec
+
+from rse_pf.errors import BadMessage, LimitExceeded, RsePfError, UnsupportedProtocol
+from rse_pf.settings import SessionSettings
+from rse_pf.wire import arrays
+from rse_pf.wire.messages import FromRobot, FromServer, Message
+
+__all__ = ["CODECS", "SUBPROTOCOLS", "Codec", "as_type", "codec_for", "make_codec"]
+
+T = TypeVar("T")
+
+SUBPROTOCOLS = {
+    "zlib": "rse-pf.v1.json+zlib",
+    "json": "rse-pf.v1.json",
+    "bin": "rse-pf.v1.bin",
+}
+"""Short name to WebSocket sub-protocol, in the server's order of preference."""
+
+CODECS = tuple(SUBPROTOCOLS)
+
+_LEVEL = 6
+"""Robots' uplinks are slower than their processors: level 1 is 6 % longer (facts of docs/design.md)."""
+
+_NOT_BRACKETS = bytes(set(range(256)) - set(b"[]{}"))
+_OPENING = frozenset(b"[{")
+
+
+class Codec(Protocol):
+    """One way to write messages."""
+
+    name: str
+    is_text: bool
+
+    def encode(self, message: Message) -> bytes:
+        """Return the WebSocket message of *message*."""
+
+    def decode_from_robot(self, data: bytes) -> FromRobot:
+        """Return what a robot sent; raises BadMessage or LimitExceeded."""
+
+    def decode_from_server(self, data: bytes) -> FromServer:
+        """Return what a server sent; raises BadMessage or LimitExceeded."""
+
+
+def make_codec(name: str, limits: SessionSettings | None = None) -> Codec:
+    """Return the codec called *name*: ``zlib``, ``json`` or ``bin``."""
+    session = limits or SessionSettings()
+    if name == "bin":
+        return _BinaryCodec(session)
+    if name in ("zlib", "json"):
+        return _JsonCodec(session, compressed=name == "zlib")
+    raise UnsupportedProtocol(f"no codec named {name!r}", hint=f"choose one of {', '.join(CODECS)}")
+
+
+def as_type(value: Any, kind: type[T]) -> T:
+    """Return a message's ``payload`` or ``reply`` as *kind*, its arrays as float64.
+
+    Raises:
+        BadMessage: It does not fit.
+    """
+    result: T = _guarded(lambda plain: msgspec.convert(plain, kind, dec_hook=arrays.decode_hook), value)
+    return result
+
+
+def codec_for(offered: list[str]) -> str | None:
+    """Return the codec name of the first offered sub-protocol that we speak, else None."""
+    names = {protocol: name for name, protocol in SUBPROTOCOLS.items()}
+    return next((names[protocol] for protocol in offered if protocol in names), None)
+
+
+class _JsonCodec:
+    def __init__(self, limits: SessionSettings, *, compressed: bool) -> None:
+        self.name = "zlib" if compressed else "json"
+        self.is_text = not compressed
+        self._limits = limits
+        self._compressed = compressed
+        self._encode = msgspec.json.Encoder(enc_hook=arrays.json_encode_hook).encode
+        self._from_robot = msgspec.json.Decoder(FromRobot).decode
+        self._from_server = msgspec.json.Decoder(FromServer).decode
+
+    def encode(self, message: Message) -> bytes:
+        data = self._encode(message)
+        return zlib.compress(data, _LEVEL) if self._compressed else data
+
+    def decode_from_robot(self, data: bytes) -> FromRobot:
+        message: FromRobot = _guarded(self._from_robot, self._open(data))
+        return message
+
+    def decode_from_server(self, data: bytes) -> FromServer:
+        message: FromServer = _guarded(self._from_server, self._open(data))
+        return message
+
+    def _open(self, data: bytes) -> bytes:
+        _check_size(data, self._limits)
+        text = _inflate(data, self._limits) if self._compressed else data
+        _check_depth(text, self._limits.max_json_depth)
+        return text
+
+
+class _BinaryCodec:
+    name = "bin"
+    is_text = False
+
+    def __init__(self, limits: SessionSettings) -> None:
+        self._limits = limits
+        self._encode = msgspec.msgpack.Encoder(enc_hook=arrays.binary_encode_hook).encode
+        self._from_robot = msgspec.msgpack.Decoder(FromRobot, ext_hook=arrays.extension_hook).decode
+        self._from_server = msgspec.msgpack.Decoder(FromServer, ext_hook=arrays.extension_hook).decode
+
+    def encode(self, message: Message) -> bytes:
+        return self._encode(message)
+
+    def decode_from_robot(self, data: bytes) -> FromRobot:
+        _check_size(data, self._limits)
+        message: FromRobot = _guarded(self._from_robot, data)
+        return message
+
+    def decode_from_server(self, data: bytes) -> FromServer:
+        _check_size(data, self._limits)
+        message: FromServer = _guarded(self._from_server, data)
+        return message
+
+
+def _guarded(decode: Callable[[Any], Any], data: Any) -> Any:
+    """Let nothing but our own errors leave a decoder."""
+    try:
+        return decode(data)
+    except RsePfError:
+        raise
+    except msgspec.ValidationError as error:
+        raise BadMessage(str(error)[:200], hint="compare it with docs/protocol.md") from error
+    except (msgspec.DecodeError, UnicodeDecodeError) as error:
+        raise BadMessage(
+            f"not a message: {str(error)[:150]}", hint="is this the sub-protocol that was agreed?"
+        ) from error
+    except (RecursionError, ValueError, OverflowError) as error:
+        raise BadMessage("a message is nested too deeply or holds an absurd number") from error
+
+
+def _check_size(data: bytes, limits: SessionSettings) -> None:
+    if len(data) > limits.max_message_bytes:
+        raise LimitExceeded(
+            f"a message of {len(data)} bytes is above {limits.max_message_bytes}",
+            hint="send large data to the data server and name it by digest",
+        )
+
+
+def _inflate(data: bytes, limits: SessionSettings) -> bytes:
+    most = min(limits.max_inflated_bytes, int(max(len(data), 64) * limits.max_inflate_ratio))
+    stream = zlib.decompressobj()
+    try:
+        text = stream.decompress(data, most + 1)
+    except zlib.error as error:
+        raise BadMessage("not a zlib stream", hint="is this the sub-protocol that was agreed?") from error
+    if len(text) > most:
+        raise LimitExceeded(f"{len(data)} bytes inflate to more than {most}", hint="send smaller messages")
+    if not stream.eof or stream.unused_data:
+        raise BadMessage("the zlib stream does not end with the message", hint="one stream for each message")
+    return text
+
+
+def _check_depth(text: bytes, deepest: int) -> None:
+    """Count brackets; only where they look too deep are strings told apart."""
+    brackets = text.translate(None, _NOT_BRACKETS)
+    if len(brackets) <= deepest or _depth(brackets) <= deepest:
+        return
+    if _depth(_without_strings(text)) > deepest:
+        raise LimitExceeded(f"JSON is nested deeper than {deepest}", hint="send flat lists")
+
+
+def _depth(brackets: bytes) -> int:
+    depth = deepest = 0
+    for byte in brackets:
+        if byte in _OPENING:
+            depth += 1
+            deepest = max(deepest, depth)
+        else:
+            depth -= 1
+    return deepest
+
+
+def _without_strings(text: bytes) -> bytes:
+    outside = text.replace(b"\\\\", b"").replace(b'\\"', b"").split(b'"')[::2]
+    return b"".join(outside).translate(None, _NOT_BRACKETS)

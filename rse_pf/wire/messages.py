@@ -1,0 +1,133 @@
+"""The messages of protocol version 1, as types.
+
+``docs/protocol.md`` says the same in words; golden messages hold both together.  Promises to
+decide nothing: no clocks, no sockets, no defaults that depend on the machine.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+import msgspec
+
+__all__ = [
+    "PROTOCOL_VERSION",
+    "Command",
+    "Failure",
+    "FromRobot",
+    "FromServer",
+    "Hello",
+    "Limits",
+    "Message",
+    "Move",
+    "Ping",
+    "Pong",
+    "Result",
+    "Welcome",
+]
+
+PROTOCOL_VERSION = 1
+
+Word = Annotated[str, msgspec.Meta(max_length=64)]
+"""A name of at most 64 characters."""
+
+Identifier = Annotated[int, msgspec.Meta(ge=0, le=2**53 - 1)]
+"""A counter that every language's number type can hold."""
+
+Milliseconds = Annotated[float, msgspec.Meta(ge=0, le=3.6e6)]
+
+
+class _Message(msgspec.Struct, frozen=True, kw_only=True, tag_field="type", omit_defaults=True):
+    """Unknown fields are ignored, so that a newer side may say more."""
+
+
+class Limits(msgspec.Struct, frozen=True, kw_only=True):
+    """What the server accepts from this robot."""
+
+    max_message_bytes: int
+    max_in_flight: int
+
+
+class Hello(_Message, frozen=True, kw_only=True, tag="hello"):
+    """Robot, first message of a socket."""
+
+    protocol: int = PROTOCOL_VERSION
+    sdk: Word = ""
+    capabilities: Annotated[tuple[Word, ...], msgspec.Meta(max_length=32)] = ()
+
+
+class Welcome(_Message, frozen=True, kw_only=True, tag="welcome"):
+    """Server, answer to Hello: who serves, and what it accepts."""
+
+    server: str
+    session: str
+    robot: str
+    protocol: int
+    limits: Limits
+    clock_s: float
+
+
+class Command(_Message, frozen=True, kw_only=True, tag="command"):
+    """Robot asks a service.  ``payload`` takes its type when its service is known.
+
+    ``deadline_ms`` counts from arrival.  Within ``stream`` the newest ``seq`` wins, unless ``keep``.
+    """
+
+    id: Identifier
+    service: Word
+    payload: Any = None
+    stream: Word = ""
+    seq: Identifier = 0
+    keep: bool = False
+    deadline_ms: Milliseconds | None = None
+    trace: Word = ""
+
+
+class Result(_Message, frozen=True, kw_only=True, tag="result"):
+    """Server answers a command.  ``received_s`` and ``sent_s`` are readings of the server's clock."""
+
+    id: int
+    reply: Any = None
+    server: str = ""
+    queue_ms: float = 0.0
+    compute_ms: float = 0.0
+    received_s: float = 0.0
+    sent_s: float = 0.0
+
+
+class Failure(_Message, frozen=True, kw_only=True, tag="failure"):
+    """Server says why a command, or (without ``id``) a message or the session, failed."""
+
+    id: int | None = None
+    code: str
+    message: str
+    hint: str = ""
+    retry_after_ms: float | None = None
+    server: str = ""
+    trace: str = ""
+
+
+class Move(_Message, frozen=True, kw_only=True, tag="move"):
+    """Server asks the robot to open another socket first and then to leave this one."""
+
+    reason: str
+    within_ms: float
+
+
+class Ping(_Message, frozen=True, kw_only=True, tag="ping"):
+    """Robot reads its clock.  ``sent_s`` is the first of four stamps."""
+
+    sent_s: float
+
+
+class Pong(_Message, frozen=True, kw_only=True, tag="pong"):
+    """Server returns the robot's stamp and adds its own two; the robot reads the fourth."""
+
+    sent_s: float
+    received_s: float
+    answered_s: float
+
+
+FromRobot = Hello | Command | Ping
+FromServer = Welcome | Result | Failure | Move | Pong
+Message = FromRobot | FromServer

@@ -1,0 +1,173 @@
+"""The rules of a server's side of one connection, without any input or output.
+
+Bytes and readings of the clock go in, decisions come out (`Send`, `Submit`, `Close`).  The
+robot's side is in `rse_pf.wire.robot_session`.  Promises never to read a clock or touch a socket.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from rse_pf.errors import Busy, ProtocolError
+from rse_pf.settings import SessionSettings
+from rse_pf.wire.codec import Codec
+from rse_pf.wire.messages import (
+    PROTOCOL_VERSION,
+    Command,
+    Failure,
+    FromServer,
+    Hello,
+    Limits,
+    Move,
+    Ping,
+    Pong,
+    Result,
+    Welcome,
+)
+
+__all__ = [
+    "CLOSE_GOING_AWAY",
+    "CLOSE_NORMAL",
+    "CLOSE_PROTOCOL",
+    "CLOSE_REPLACED",
+    "CLOSE_TOKEN_OVER",
+    "CLOSE_UNSUPPORTED",
+    "Close",
+    "Decision",
+    "Send",
+    "ServerSession",
+    "Submit",
+]
+
+CLOSE_NORMAL = 1000
+CLOSE_GOING_AWAY = 1001
+CLOSE_PROTOCOL = 4400
+CLOSE_TOKEN_OVER = 4401
+CLOSE_UNSUPPORTED = 4406
+CLOSE_REPLACED = 4409
+
+
+@dataclass(frozen=True, slots=True)
+class Send:
+    """Write this WebSocket message."""
+
+    data: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class Submit:
+    """Hand this command to the scheduler."""
+
+    command: Command
+
+
+@dataclass(frozen=True, slots=True)
+class Close:
+    """Close the socket with this code."""
+
+    code: int
+    reason: str
+
+
+Decision = Send | Submit | Close
+
+
+class ServerSession:
+    """One robot's connection, as its server sees it."""
+
+    def __init__(
+        self, *, codec: Codec, robot: str, server: str, session: str, limits: SessionSettings
+    ) -> None:
+        self.robot = robot
+        self.state: Literal["opening", "open", "closed"] = "opening"
+        self.in_flight = 0
+        self.codec = codec
+        self._server = server
+        self._session = session
+        self._limits = limits
+        self._bad_messages = 0
+
+    def receive(self, data: bytes, now: float) -> list[Decision]:
+        """Return what to do about one WebSocket message that arrived at *now* (server clock, s)."""
+        if self.state == "closed":
+            return []
+        try:
+            message = self.codec.decode_from_robot(data)
+        except ProtocolError as error:
+            return self._refuse(error)
+        if isinstance(message, Hello):
+            return self._hello(message, now)
+        if self.state == "opening":
+            return self._leave(CLOSE_PROTOCOL, "say hello first")
+        if isinstance(message, Ping):
+            pong = Pong(sent_s=message.sent_s, received_s=now, answered_s=now)
+            return [self._send(pong)]
+        return self._command(message)
+
+    def answer(self, message: Result | Failure) -> Send:
+        """Return the bytes of the final answer to a command that was submitted."""
+        self.in_flight -= 1
+        return self._send(message)
+
+    def move(self, reason: str, within_ms: float) -> list[Decision]:
+        """Ask the robot to leave for another server, make before break."""
+        return [self._send(Move(reason=reason, within_ms=within_ms))] if self.state == "open" else []
+
+    def _hello(self, hello: Hello, now: float) -> list[Decision]:
+        if self.state == "open":
+            return self._leave(CLOSE_PROTOCOL, "hello came twice")
+        if hello.protocol != PROTOCOL_VERSION:
+            failure = Failure(
+                code="unsupported",
+                message=f"protocol {hello.protocol} is not {PROTOCOL_VERSION}",
+                hint="install a matching rse-pf on the robot",
+                server=self._server,
+            )
+            return [self._send(failure), *self._leave(CLOSE_UNSUPPORTED, "unsupported protocol")]
+        self.state = "open"
+        welcome = Welcome(
+            server=self._server,
+            session=self._session,
+            robot=self.robot,
+            protocol=PROTOCOL_VERSION,
+            limits=Limits(
+                max_message_bytes=self._limits.max_message_bytes,
+                max_in_flight=self._limits.max_in_flight,
+            ),
+            clock_s=now,
+        )
+        return [self._send(welcome)]
+
+    def _command(self, command: Command) -> list[Decision]:
+        if self.in_flight >= self._limits.max_in_flight:
+            busy = Busy(f"{self.in_flight} commands of this robot are unanswered")
+            return [
+                self._send(
+                    Failure(
+                        id=command.id,
+                        code=busy.code,
+                        message=busy.message,
+                        hint="wait for answers before sending more",
+                        retry_after_ms=self._limits.ping_interval_s * 100,
+                        server=self._server,
+                        trace=command.trace,
+                    )
+                )
+            ]
+        self.in_flight += 1
+        return [Submit(command)]
+
+    def _refuse(self, error: ProtocolError) -> list[Decision]:
+        self._bad_messages += 1
+        failure = Failure(code=error.code, message=error.message, hint=error.hint, server=self._server)
+        if self._bad_messages > self._limits.max_bad_messages:
+            return [self._send(failure), *self._leave(CLOSE_PROTOCOL, "too many bad messages")]
+        return [self._send(failure)]
+
+    def _leave(self, code: int, reason: str) -> list[Decision]:
+        self.state = "closed"
+        return [Close(code, reason)]
+
+    def _send(self, message: FromServer) -> Send:
+        return Send(self.codec.encode(message))
