@@ -1,0 +1,317 @@
+"""Point-cloud maps and trajectories of one robot, in memory and in the files that others read.
+
+Promises that adding a frame costs the same however large the map has grown, that the memory of
+a map is bounded, and not to touch a network, an image library or a clock.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+
+from rse_pf.errors import UsageError
+from rse_pf.geometry import Array, from_quaternion, to_quaternion, transform
+
+if TYPE_CHECKING:
+    from client_sdk.frontend import Frame
+
+__all__ = [
+    "MapOptions",
+    "PointMap",
+    "Trajectory",
+    "read_ply",
+    "read_trajectory",
+    "write_ply",
+    "write_trajectory",
+]
+
+_EMPTY = -1
+_REACH = 1 << 20
+"""Voxels on either side of the origin: three signed indices of 21 bits fill one int64 key."""
+
+_VERTEX = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("red", "u1"), ("green", "u1"), ("blue", "u1")])
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MapOptions:
+    """How dense a map is and which readings it believes."""
+
+    voxel_m: float = 0.015
+    min_depth_m: float = 0.3
+    max_depth_m: float = 3.5
+    every_px: int = 2
+    """Take every n-th row and column of a frame."""
+    edge_percent: float = 5.0
+    """Skip a reading whose neighbours differ by more of its depth: it flies between two surfaces."""
+    max_points: int = 4_000_000
+    """New voxels are refused beyond this; a point costs about 60 to 120 bytes."""
+
+    def __post_init__(self) -> None:
+        if not 0.001 <= self.voxel_m <= 1.0:
+            raise UsageError(f"voxel_m = {self.voxel_m:g} is not within 0.001..1", hint="use 0.01 to 0.02")
+        if self.every_px < 1 or self.max_points < 1:
+            raise UsageError(
+                f"every_px = {self.every_px} and max_points = {self.max_points} must be 1 or more",
+                hint="leave them out to get the defaults",
+            )
+
+
+class PointMap:
+    """A voxel grid that holds the mean position and colour of what was seen in each voxel.
+
+    Voxels live in an open-addressing hash table over flat arrays, both of which grow by
+    doubling: a frame costs time in its own points alone, amortised.
+
+    Source:
+        RSE-PF paper, Sect. 6.1: "it will join current frame into the point cloud".
+    """
+
+    def __init__(self, options: MapOptions | None = None) -> None:
+        self.options = options or MapOptions()
+        self.refused_points = 0
+        """Voxels that found the map full."""
+        self.probes = 0
+        """Hash-table slots looked at so far, growth included: the work done, for tests."""
+        self._size = 0
+        self._slot_keys: npt.NDArray[np.int64] = np.full(4096, _EMPTY, dtype=np.int64)
+        self._slot_rows: npt.NDArray[np.int32] = np.zeros(4096, dtype=np.int32)
+        self._keys: npt.NDArray[np.int64] = np.empty(2048, dtype=np.int64)
+        self._means: npt.NDArray[np.float32] = np.empty((2048, 6), dtype=np.float32)
+        self._counts: npt.NDArray[np.int32] = np.empty(2048, dtype=np.int32)
+
+    def __len__(self) -> int:
+        return self._size
+
+    def add(self, frame: Frame, T_world_camera: Array) -> int:
+        """Join *frame*, seen from *T_world_camera*, into the map; return the points used."""
+        points, colours = frame_points(frame, self.options)
+        return self.add_points(transform(T_world_camera, points), colours)
+
+    def add_points(self, points_world: Array, colours: npt.NDArray[np.uint8]) -> int:
+        """Join ``(n, 3)`` points in metres and ``(n, 3)`` uint8 colours; return how many were used."""
+        index = np.floor(points_world / self.options.voxel_m)
+        inside = (np.abs(index) < _REACH).all(axis=1)
+        index = index[inside].astype(np.int64) + _REACH
+        if not len(index):
+            return 0
+        keys = (index[:, 0] << 42) | (index[:, 1] << 21) | index[:, 2]
+        order = np.argsort(keys)
+        keys = keys[order]
+        first = np.flatnonzero(np.concatenate(([True], keys[1:] != keys[:-1])))
+        values = np.concatenate((points_world[inside], colours[inside]), axis=1)[order]
+        sums = np.add.reduceat(values, first, axis=0)
+        counts = np.diff(np.append(first, len(keys)))
+        rows = self._rows_of(keys[first])
+        kept = rows >= 0
+        self._average(rows[kept], sums[kept], counts[kept])
+        return int(counts[kept].sum())
+
+    def points(self, min_readings: int = 1) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.uint8]]:
+        """Return ``(n, 3)`` float32 points in metres and their ``(n, 3)`` uint8 colours.
+
+        Voxels with fewer than *min_readings* readings are left out.
+        """
+        seen = self._counts[: self._size] >= min_readings
+        means = self._means[: self._size][seen]
+        return means[:, :3].copy(), np.clip(np.round(means[:, 3:]), 0, 255).astype(np.uint8)
+
+    def _average(self, rows: npt.NDArray[np.int64], sums: Array, counts: npt.NDArray[np.int64]) -> None:
+        total = self._counts[rows] + counts
+        step = (sums - counts[:, None] * self._means[rows]) / total[:, None]
+        self._means[rows] += step.astype(np.float32)
+        self._counts[rows] = total
+
+    def _rows_of(self, keys: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+        """Return the row of each distinct key, making new ones; -1 where the map is full."""
+        self._make_room(len(keys))
+        slots = self._find_slots(keys)
+        is_new = self._slot_keys[slots] == _EMPTY
+        fits = np.cumsum(is_new) <= self.options.max_points - self._size
+        self.refused_points += int((is_new & ~fits).sum())
+        made = np.flatnonzero(is_new & fits)
+        new_rows = self._size + np.arange(len(made))
+        self._keys[new_rows] = keys[made]
+        self._means[new_rows] = 0.0
+        self._counts[new_rows] = 0
+        self._size += len(made)
+        self._insert(keys[made], new_rows)
+        rows = np.full(len(keys), -1, dtype=np.int64)
+        rows[~is_new] = self._slot_rows[slots[~is_new]]
+        rows[made] = new_rows
+        return rows
+
+    def _find_slots(self, keys: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+        """Return, for each key, the slot that holds it or the empty slot that ends its search."""
+        mask = len(self._slot_keys) - 1
+        slots = _hash(keys) & mask
+        searching = np.arange(len(keys))
+        while len(searching):
+            self.probes += len(searching)
+            held = self._slot_keys[slots[searching]]
+            searching = searching[(held != keys[searching]) & (held != _EMPTY)]
+            slots[searching] = (slots[searching] + 1) & mask
+        return slots
+
+    def _insert(self, keys: npt.NDArray[np.int64], rows: npt.NDArray[np.int64]) -> None:
+        waiting = np.arange(len(keys))
+        while len(waiting):
+            slots = self._find_slots(keys[waiting])
+            # Two new keys may ask for one slot; the last one written wins, the others search on.
+            self._slot_keys[slots] = keys[waiting]
+            won = self._slot_keys[slots] == keys[waiting]
+            self._slot_rows[slots[won]] = rows[waiting[won]]
+            waiting = waiting[~won]
+
+    def _make_room(self, more: int) -> None:
+        wanted = min(self._size + more, self.options.max_points)
+        if wanted > len(self._counts):
+            capacity = min(max(2 * len(self._counts), wanted), self.options.max_points)
+            self._keys = np.resize(self._keys, capacity)
+            self._means = np.resize(self._means, (capacity, 6))
+            self._counts = np.resize(self._counts, capacity)
+        if 2 * wanted > len(self._slot_keys):
+            slots = 1 << (2 * wanted - 1).bit_length()
+            self._slot_keys = np.full(slots, _EMPTY, dtype=np.int64)
+            self._slot_rows = np.zeros(slots, dtype=np.int32)
+            self._insert(self._keys[: self._size].copy(), np.arange(self._size))
+
+
+def frame_points(frame: Frame, options: MapOptions) -> tuple[Array, npt.NDArray[np.uint8]]:
+    """Return the camera-frame points ``(n, 3)`` and colours ``(n, 3)`` that a map takes of a frame."""
+    step = options.every_px
+    depth = frame.depth_m
+    kept = (depth >= options.min_depth_m) & (depth <= options.max_depth_m)
+    limit = depth * (options.edge_percent / 100.0)
+    across = np.abs(np.diff(depth, axis=1)) <= limit[:, 1:]
+    down = np.abs(np.diff(depth, axis=0)) <= limit[1:]
+    kept[:, 1:] &= across
+    kept[:, :-1] &= across
+    kept[1:] &= down
+    kept[:-1] &= down
+    rows, columns = np.nonzero(kept[::step, ::step])
+    rows, columns = rows * step, columns * step
+    pixels = np.column_stack((columns, rows)).astype(np.float64)
+    points = frame.camera.back_project(pixels, depth[rows, columns].astype(np.float64))
+    return points, frame.rgb[rows, columns]
+
+
+def _hash(keys: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+    """Return well-mixed non-negative hashes (the finaliser of MurmurHash3, Appleby 2011)."""
+    mixed = keys.astype(np.uint64)
+    mixed ^= mixed >> np.uint64(33)
+    mixed *= np.uint64(0xFF51AFD7ED558CCD)
+    mixed ^= mixed >> np.uint64(33)
+    return (mixed >> np.uint64(1)).astype(np.int64)
+
+
+def write_ply(path: Path, points: npt.ArrayLike, colours: npt.NDArray[np.uint8]) -> None:
+    """Write ``(n, 3)`` points in metres and ``(n, 3)`` uint8 colours as a binary PLY file."""
+    vertices = np.empty(len(colours), dtype=_VERTEX)
+    positions = np.asarray(points, dtype=np.float32)
+    for column, name in enumerate(("x", "y", "z")):
+        vertices[name] = positions[:, column]
+    for column, name in enumerate(("red", "green", "blue")):
+        vertices[name] = colours[:, column]
+    with path.open("wb") as file:
+        file.write(_ply_header(len(vertices)))
+        file.write(vertices.tobytes())
+
+
+def read_ply(path: Path) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.uint8]]:
+    """Return the points and colours of a file that `write_ply` wrote.
+
+    Raises:
+        UsageError: The file is missing, is not of that form, or is cut short.
+    """
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise UsageError(f"cannot read {path}: {error.strerror}", hint="name a .ply file") from error
+    head, mark, body = content.partition(b"end_header\n")
+    count = next((int(line.split()[2]) for line in head.splitlines() if line[:15] == b"element vertex "), -1)
+    if count < 0 or head + mark != _ply_header(count) or len(body) != count * _VERTEX.itemsize:
+        raise UsageError(f"{path} is not a map of this program", hint="name a .ply file that it wrote")
+    vertices = np.frombuffer(body, dtype=_VERTEX)
+    points = np.column_stack([vertices[name] for name in ("x", "y", "z")])
+    return points, np.column_stack([vertices[name] for name in ("red", "green", "blue")])
+
+
+def _ply_header(count: int) -> bytes:
+    lines = ["ply", "format binary_little_endian 1.0", "comment metres", f"element vertex {count}"]
+    lines += [f"property float {name}" for name in ("x", "y", "z")]
+    lines += [f"property uchar {name}" for name in ("red", "green", "blue")]
+    return ("\n".join([*lines, "end_header"]) + "\n").encode("ascii")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Trajectory:
+    """Poses ``T_world_camera`` ``(n, 4, 4)`` at ``timestamps_s`` ``(n,)``."""
+
+    timestamps_s: Array
+    T_world_camera: Array
+
+    def __post_init__(self) -> None:
+        if self.T_world_camera.shape != (len(self.timestamps_s), 4, 4):
+            raise UsageError(
+                f"{len(self.timestamps_s)} time stamps and poses of shape {self.T_world_camera.shape} "
+                "do not fit",
+                hint="give one (4, 4) pose for each time stamp",
+            )
+
+    def __len__(self) -> int:
+        return len(self.timestamps_s)
+
+    @property
+    def positions(self) -> Array:
+        """The ``(n, 3)`` camera positions in the world, metres."""
+        return self.T_world_camera[:, :3, 3]
+
+    @property
+    def length_m(self) -> float:
+        """The length of the path, metres."""
+        return float(np.linalg.norm(np.diff(self.positions, axis=0), axis=1).sum())
+
+
+def write_trajectory(path: Path, trajectory: Trajectory) -> None:
+    """Write a trajectory in TUM format: ``timestamp tx ty tz qx qy qz qw``, metres."""
+    lines = ["# timestamp tx ty tz qx qy qz qw  (T_world_camera, metres)"]
+    for timestamp_s, pose in zip(trajectory.timestamps_s, trajectory.T_world_camera, strict=True):
+        numbers = [*pose[:3, 3], *to_quaternion(pose[:3, :3])]
+        lines.append(f"{timestamp_s:.6f} " + " ".join(f"{number:.9f}" for number in numbers))
+    path.write_text("\n".join(lines) + "\n", encoding="ascii")
+
+
+def read_trajectory(path: Path) -> Trajectory:
+    """Return the trajectory of a file in TUM format; lines of ``#`` are comments.
+
+    Raises:
+        UsageError: The file is missing, or a line does not hold eight finite numbers.
+    """
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise UsageError(f"cannot read {path}: {error}", hint="name a trajectory in TUM format") from error
+    timestamps_s: list[float] = []
+    poses: list[Array] = []
+    for number, line in enumerate(text.splitlines(), start=1):
+        words = line.replace(",", " ").split()
+        if not words or words[0].startswith("#"):
+            continue
+        try:
+            values = np.array([float(word) for word in words])
+        except ValueError:
+            values = np.empty(0)
+        if len(values) != 8 or not np.isfinite(values).all() or not np.linalg.norm(values[4:]) > 0:
+            raise UsageError(
+                f"{path}, line {number} is not a pose", hint="write timestamp tx ty tz qx qy qz qw"
+            )
+        pose = np.eye(4)
+        pose[:3, :3] = from_quaternion(values[4:])
+        pose[:3, 3] = values[1:4]
+        timestamps_s.append(float(values[0]))
+        poses.append(pose)
+    return Trajectory(np.array(timestamps_s), np.array(poses).reshape(-1, 4, 4))
