@@ -1,0 +1,129 @@
+"""Judge a WebSocket handshake: path, room, token and sub-protocol, before anything is accepted.
+
+Every refusal has a fixed body; the cause of a refused token goes to the log alone.  Promises no
+socket and no clock: what a robot sent and the time come in, `Admitted` or `TurnedAway` goes out.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from rse_pf.auth import KeySet, token_problem, verify_token
+from rse_pf.errors import Unauthorized
+from rse_pf.settings import PlatformSettings
+from rse_pf.wire import SUBPROTOCOLS, codec_for
+
+__all__ = ["Admitted", "Door", "TurnedAway"]
+
+_RETRY_AFTER_S = 2
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Admitted:
+    """A robot that may upgrade.  ``expires_s`` is Unix time; None never expires."""
+
+    robot: str
+    codec: str
+    subprotocol: str
+    expires_s: float | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TurnedAway:
+    """An HTTP answer instead of the upgrade.  ``reason`` is for the log and never sent."""
+
+    status: int
+    body: bytes
+    result: str
+    reason: str = ""
+    headers: Mapping[str, str] = field(default_factory=dict)
+
+
+def _refusal(status: int, code: str, message: str, hint: str, **headers: str) -> TurnedAway:
+    body = json.dumps({"code": code, "message": message, "hint": hint}, separators=(",", ":")).encode()
+    named = {name.replace("_", "-"): value for name, value in headers.items()}
+    return TurnedAway(
+        status=status, body=body, result=code, headers={"Content-Type": "application/json", **named}
+    )
+
+
+class Door:
+    """The rules of one worker's front door."""
+
+    def __init__(
+        self, settings: PlatformSettings, keys: KeySet | None, *, conformance_echo: bool = False
+    ) -> None:
+        self._settings = settings
+        self._keys = keys
+        self._conformance_echo = conformance_echo
+        path = settings.serving.path
+        self._path = path.encode()
+        self.defect = _refusal(500, "internal", "the handshake failed", "try again")
+        self._not_found = _refusal(404, "not-found", "nothing is served here", f"connect to {path}")
+        self._full = _refusal(
+            503, "full", "this server has no room for another robot", "try again later",
+            Retry_After=str(_RETRY_AFTER_S),
+        )  # fmt: skip
+        self._no_token = _refusal(
+            401, "unauthorized", "the token is missing or not valid",
+            "issue one with rse-pf token issue ROBOT", WWW_Authenticate="Bearer",
+        )  # fmt: skip
+        self._no_subprotocol = _refusal(
+            400, "unsupported", "no sub-protocol that this server speaks was offered",
+            f"offer one of {', '.join(SUBPROTOCOLS.values())}",
+        )  # fmt: skip
+
+    def judge(
+        self,
+        *,
+        path: bytes,
+        authorization: str,
+        offered: list[str],
+        is_full: bool,
+        anonymous: str,
+        now_s: float,
+    ) -> Admitted | TurnedAway:
+        """Return who may come in, or the answer that turns them away.
+
+        Args:
+            path: As requested, with its query.
+            authorization: The header, "" if absent.
+            offered: Sub-protocols, in the robot's order.
+            is_full: Whether the worker has as many robots as it may.
+            anonymous: Name of a robot where no token is required.
+            now_s: Unix seconds.
+        """
+        if self._conformance_echo:
+            return Admitted(robot=anonymous, codec="", subprotocol="")
+        if path.split(b"?")[0] != self._path:
+            return self._not_found
+        if is_full:
+            return self._full
+        robot, expires_s = anonymous, None
+        if self._keys is not None:
+            scheme, _, token = authorization.partition(" ")
+            try:
+                if scheme.lower() != "bearer":
+                    raise Unauthorized("no bearer token")
+                claims = verify_token(token.strip(), keys=self._keys, now=now_s, settings=self._settings.auth)
+            except Unauthorized as error:
+                return _because(self._no_token, token_problem(error))
+            leeway_s = self._settings.auth.leeway_s
+            robot = claims.robot
+            expires_s = claims.expires_s if now_s < claims.expires_s else claims.expires_s + leeway_s
+        codec = codec_for(offered)
+        if codec is None:
+            return self._no_subprotocol
+        return Admitted(robot=robot, codec=codec, subprotocol=SUBPROTOCOLS[codec], expires_s=expires_s)
+
+
+def _because(refusal: TurnedAway, reason: str) -> TurnedAway:
+    return TurnedAway(
+        status=refusal.status,
+        body=refusal.body,
+        result=refusal.result,
+        reason=reason,
+        headers=refusal.headers,
+    )

@@ -1,0 +1,115 @@
+"""Write the server's log: one JSON object a line, off the hot path.
+
+Lines collect in memory and a thread of their own writes them, so that a slow disk or a full pipe
+never stops the event loop; what does not fit is counted and dropped.  Promises never to be given a
+payload or a token, and that a hostile string cannot break a line.
+"""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections.abc import Callable
+from typing import Any
+
+import msgspec
+
+__all__ = ["JsonLog"]
+
+_LEVELS = {"debug": 10, "info": 20, "warning": 30, "error": 40}
+_LONGEST_TEXT = 256
+_LONGEST_TRACEBACK = 8192
+_MOST_HELD_BYTES = 4_194_304
+_CHUNK_BYTES = 4096
+"""A write up to this size does not mix with other writers of the same pipe."""
+_FLUSH_S = 0.2
+
+_encode = msgspec.json.Encoder().encode
+
+
+class JsonLog:
+    """The log of one process; `info` and its siblings only append to a list."""
+
+    def __init__(self, *, level: str, server: str, wall_clock: Callable[[], float], fd: int = 2) -> None:
+        self.dropped = 0
+        self._lowest = _LEVELS[level]
+        self._server = server
+        self._wall_clock = wall_clock
+        self._fd = fd
+        self._lines: list[bytes] = []
+        self._held_bytes = 0
+        self._wake = threading.Event()
+        self._over = False
+        self._writer = threading.Thread(target=self._write_on, name="log", daemon=True)
+        self._writer.start()
+
+    def writes(self, level: str) -> bool:
+        """Whether lines of *level* are written at all."""
+        return _LEVELS[level] >= self._lowest
+
+    def debug(self, event: str, **fields: Any) -> None:
+        """Write what only a developer wants."""
+        self._line("debug", event, fields)
+
+    def info(self, event: str, **fields: Any) -> None:
+        """Write what happened."""
+        self._line("info", event, fields)
+
+    def warning(self, event: str, **fields: Any) -> None:
+        """Write what an operator should look at."""
+        self._line("warning", event, fields)
+
+    def error(self, event: str, **fields: Any) -> None:
+        """Write a defect."""
+        self._line("error", event, fields)
+
+    def close(self, timeout_s: float = 1.0) -> None:
+        """Write what is held, waiting at most *timeout_s*."""
+        self._over = True
+        self._wake.set()
+        self._writer.join(timeout_s)
+
+    def _line(self, level: str, event: str, fields: dict[str, Any]) -> None:
+        if _LEVELS[level] < self._lowest:
+            return
+        for name, value in fields.items():
+            if isinstance(value, str) and len(value) > _LONGEST_TEXT:
+                fields[name] = value[-_LONGEST_TRACEBACK:] if name == "traceback" else value[:_LONGEST_TEXT]
+        line = _encode(
+            {"time": self._wall_clock(), "level": level, "event": event, "server": self._server, **fields}
+        )
+        if self._held_bytes + len(line) > _MOST_HELD_BYTES:
+            self.dropped += 1
+            return
+        self._held_bytes += len(line)
+        self._lines.append(line)
+        if not self._wake.is_set():
+            self._wake.set()
+
+    def _write_on(self) -> None:
+        pause = threading.Event()
+        while not (self._over and not self._lines):
+            self._wake.wait()
+            if not self._over:
+                pause.wait(_FLUSH_S)
+            self._wake.clear()
+            lines, self._lines = self._lines, []
+            self._held_bytes = 0
+            try:
+                for chunk in _chunks(lines):
+                    os.write(self._fd, chunk)
+            except OSError:
+                self.dropped += len(lines)
+
+
+def _chunks(lines: list[bytes]) -> list[bytes]:
+    chunks: list[bytes] = []
+    current: list[bytes] = []
+    size = 0
+    for line in lines:
+        if current and size + len(line) + 1 > _CHUNK_BYTES:
+            chunks.append(b"\n".join(current) + b"\n")
+            current, size = [], 0
+        current.append(line)
+        size += len(line) + 1
+    return [*chunks, b"\n".join(current) + b"\n"] if current else chunks

@@ -1,0 +1,138 @@
+"""Count what a worker does, add the workers up, and say it in Prometheus' words.
+
+A worker only adds to plain numbers; the supervisor asks for a `snapshot`, merges, and renders.
+Promises no robot id in any label, and to read no clock.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_left
+from collections import Counter
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+from rse_pf.errors import MissingExtra
+
+__all__ = ["BUCKETS_S", "Metrics", "merge", "render"]
+
+BUCKETS_S = (0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0)
+"""Upper bounds of the duration histogram; the last bucket is open."""
+
+_GAUGES_OF_WORST = ("queue_oldest_s", "loop_lag_s")
+
+
+class Metrics:
+    """The numbers of one worker."""
+
+    def __init__(self) -> None:
+        self.requests: Counter[tuple[str, str]] = Counter()
+        self.shed: Counter[str] = Counter()
+        self.handshakes: Counter[str] = Counter()
+        self.closed: Counter[str] = Counter()
+        self.durations: dict[str, list[int]] = {}
+        self.duration_sum_s: Counter[str] = Counter()
+        self.bytes_in = 0
+        self.bytes_out = 0
+        self.gauges: dict[str, float] = {}
+
+    def answered(self, service: str, result: str, duration_s: float) -> None:
+        """Count a final answer; *result* is ``ok`` or a failure code."""
+        self.requests[service, result] += 1
+        buckets = self.durations.get(service)
+        if buckets is None:
+            buckets = self.durations[service] = [0] * (len(BUCKETS_S) + 1)
+        buckets[bisect_left(BUCKETS_S, duration_s)] += 1
+        self.duration_sum_s[service] += duration_s  # type: ignore[assignment]
+
+    def snapshot(self) -> dict[str, Any]:
+        """Return all numbers as plain JSON values."""
+        return {
+            "requests": [[service, result, n] for (service, result), n in self.requests.items()],
+            "shed": dict(self.shed),
+            "handshakes": dict(self.handshakes),
+            "closed": dict(self.closed),
+            "durations": self.durations,
+            "duration_sum_s": dict(self.duration_sum_s),
+            "bytes": {"in": self.bytes_in, "out": self.bytes_out},
+            "gauges": self.gauges,
+        }
+
+
+def merge(snapshots: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
+    """Return the sum of the workers' snapshots; ages and lags are the worst of all."""
+    requests: Counter[tuple[str, str]] = Counter()
+    sums: dict[str, Counter[str]] = {
+        name: Counter() for name in ("shed", "handshakes", "closed", "duration_sum_s", "bytes", "gauges")
+    }
+    durations: dict[str, list[int]] = {}
+    worst = dict.fromkeys(_GAUGES_OF_WORST, 0.0)
+    for snapshot in snapshots:
+        for service, result, n in snapshot["requests"]:
+            requests[service, result] += n
+        for name, counter in sums.items():
+            counter.update(snapshot[name])
+        for service, buckets in snapshot["durations"].items():
+            held = durations.setdefault(service, [0] * len(buckets))
+            durations[service] = [a + b for a, b in zip(held, buckets, strict=True)]
+        for name in worst:
+            worst[name] = max(worst[name], snapshot["gauges"].get(name, 0.0))
+    merged: dict[str, Any] = {name: dict(counter) for name, counter in sums.items()}
+    merged["gauges"].update(worst)
+    return {
+        **merged,
+        "requests": [[service, result, n] for (service, result), n in requests.items()],
+        "durations": durations,
+    }
+
+
+def render(merged: Mapping[str, Any]) -> bytes:
+    """Return *merged* in the text format of Prometheus; raises MissingExtra."""
+    try:
+        from prometheus_client import CollectorRegistry, generate_latest
+        from prometheus_client.core import (
+            CounterMetricFamily,
+            GaugeMetricFamily,
+            HistogramMetricFamily,
+            Metric,
+        )
+    except ImportError as error:
+        raise MissingExtra("prometheus-client", "backend") from error
+
+    def counter(name: str, doc: str, label: str, values: Mapping[str, float]) -> Metric:
+        family = CounterMetricFamily(f"rse_pf_{name}", doc, labels=[label])
+        for key, value in values.items():
+            family.add_metric([key], value)
+        return family
+
+    class Families:
+        def collect(self) -> Iterable[Metric]:
+            requests = CounterMetricFamily(
+                "rse_pf_requests", "final answers by service and result", labels=["service", "result"]
+            )
+            for service, result, n in merged["requests"]:
+                requests.add_metric([service, result], n)
+            yield requests
+            yield counter("shed", "commands refused for lack of time or room", "reason", merged["shed"])
+            yield counter("handshakes", "handshakes by result", "result", merged["handshakes"])
+            yield counter("closed", "sockets closed by the server", "reason", merged["closed"])
+            yield counter("bytes", "bytes of messages", "direction", merged["bytes"])
+            for name, value in merged["gauges"].items():
+                yield GaugeMetricFamily(f"rse_pf_{name}", name.replace("_", " "), value=value)
+            histogram = HistogramMetricFamily(
+                "rse_pf_duration_seconds", "arrival to answer, in the server", labels=["service"]
+            )
+            for service, buckets in merged["durations"].items():
+                histogram.add_metric([service], _cumulated(buckets), merged["duration_sum_s"][service])
+            yield histogram
+
+    registry = CollectorRegistry()
+    registry.register(Families())  # type: ignore[arg-type]
+    return generate_latest(registry)
+
+
+def _cumulated(buckets: list[int]) -> list[tuple[str, float]]:
+    total, found = 0, []
+    for bound, n in zip([*map(str, BUCKETS_S), "+Inf"], buckets, strict=True):
+        total += n
+        found.append((bound, float(total)))
+    return found

@@ -1,0 +1,265 @@
+"""Decide which command runs next: fair between robots, fresh within a stream, quick to refuse.
+
+At most one command of a robot runs; waiting robots take turns.  Within a stream the newest frame
+replaces the one that waits, unless it says ``keep``.  Expired commands never cost compute.  When
+robots have waited for their turn above the target for a whole interval, the server is behind, and
+what cannot start in time is refused with ``retry_after_ms``.  Time is an argument everywhere.
+Promises no clock, no thread, no loop and no socket: jobs go in, jobs and refusals come out.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass, field
+from typing import Any
+
+from rse_pf.errors import Busy, Expired, RsePfError, Stale
+from rse_pf.settings import ServingSettings
+from rse_pf.wire import Command
+
+__all__ = ["Job", "Refusal", "Scheduler"]
+
+_SMOOTHING = 0.1
+_LONGEST_RETRY_MS = 5000.0
+
+
+@dataclass(slots=True, eq=False)
+class Job:
+    """One command on its way; ``owner`` is the connection that waits for the answer."""
+
+    owner: Any
+    robot: str
+    command: Command
+    size_bytes: int
+    received_s: float
+    deadline_s: float
+    started_s: float = 0.0
+
+    def patience_s(self, target_s: float) -> float:
+        """How long it may wait for its turn when the server is behind."""
+        return min(target_s, (self.deadline_s - self.received_s) / 2)
+
+
+@dataclass(frozen=True, slots=True)
+class Refusal:
+    """A job that ends without compute.  ``reason`` is one of a closed list, for the metrics."""
+
+    job: Job
+    error: RsePfError
+    reason: str
+
+
+@dataclass(slots=True)
+class _Robot:
+    waiting: deque[Job] = field(default_factory=deque)
+    running: Job | None = None
+    free_since: float = 0.0
+
+
+class Scheduler:
+    """The queue of one worker."""
+
+    def __init__(self, settings: ServingSettings) -> None:
+        self.waiting = 0
+        self.running = 0
+        self.is_behind = False
+        self._target_s = settings.queue_target_ms / 1e3
+        self._interval_s = settings.queue_interval_ms / 1e3
+        self._most_waiting = settings.queue_per_robot
+        self._robots: dict[str, _Robot] = {}
+        self._round: deque[str] = deque()
+        self._above_since: float | None = None
+        self._turn_s = 0.0
+        self._last_start: float | None = None
+
+    def submit(self, job: Job, now: float) -> list[Refusal]:
+        """Let *job* wait for its turn; return the jobs that end instead, maybe *job* itself."""
+        if job.deadline_s <= now:
+            return [_expired(job, now)]
+        robot = self._robots.setdefault(job.robot, _Robot())
+        older = _replaceable(robot.waiting, job)
+        if older is not None:
+            return [self._replace(robot, older, job)]
+        refusal = self._refuse_at_the_door(robot, job)
+        if refusal is not None:
+            self._forget_if_idle(job.robot)
+            return [refusal]
+        robot.waiting.append(job)
+        self.waiting += 1
+        if robot.running is None and len(robot.waiting) == 1:
+            self._round.append(job.robot)
+        return []
+
+    def start(self, now: float) -> tuple[Job | None, list[Refusal]]:
+        """Return the job whose turn it is, now running, and the jobs given up on the way."""
+        refusals: list[Refusal] = []
+        while self._round:
+            name = self._round.popleft()
+            robot = self._robots[name]
+            job = robot.waiting.popleft()
+            self.waiting -= 1
+            refusal = self._give_up(robot, job, now)
+            if refusal is None:
+                robot.running, job.started_s = job, now
+                self.running += 1
+                self._measure_turn(now)
+                return job, refusals
+            refusals.append(refusal)
+            if robot.waiting:
+                self._round.append(name)
+            else:
+                self._forget_if_idle(name)
+        self._last_start = None
+        self._note_turn_wait(0.0, now)
+        return None, refusals
+
+    def done(self, job: Job, now: float) -> None:
+        """Note that the compute of *job* ended; its robot may take another turn."""
+        self.running -= 1
+        robot = self._robots[job.robot]
+        robot.running, robot.free_since = None, now
+        if robot.waiting:
+            self._round.append(job.robot)
+        else:
+            self._forget_if_idle(job.robot)
+
+    def sweep(self, now: float) -> list[Refusal]:
+        """Give up what expired or waited too long, without starting anything."""
+        refusals: list[Refusal] = []
+        if self._round:
+            first = self._robots[self._round[0]]
+            self._note_turn_wait(_turn_wait(first, first.waiting[0], now), now)
+        for name, robot in list(self._robots.items()):
+            kept: deque[Job] = deque()
+            for job in robot.waiting:
+                too_late = job.deadline_s <= now or (
+                    robot.running is None and self._is_hopeless(robot, job, now)
+                )
+                if too_late:
+                    refusals.append(self._refused_late(robot, job, now))
+                else:
+                    kept.append(job)
+            self._rewait(name, robot, kept)
+        return refusals
+
+    def leave(self, owner: Any) -> list[Job]:
+        """Drop the waiting jobs of a connection that ended, and return them."""
+        dropped: list[Job] = []
+        for name, robot in list(self._robots.items()):
+            gone = [job for job in robot.waiting if job.owner is owner]
+            if gone:
+                dropped += gone
+                self._rewait(name, robot, deque(job for job in robot.waiting if job.owner is not owner))
+        return dropped
+
+    def oldest_wait_s(self, now: float) -> float:
+        """Return the age of the oldest waiting job."""
+        received = [robot.waiting[0].received_s for robot in self._robots.values() if robot.waiting]
+        return max(0.0, now - min(received)) if received else 0.0
+
+    def runs_inline(self, *, cheap: bool, size_bytes: int, inline_bytes: int) -> bool:
+        """Whether the job just started may run in the event loop: small, and alone."""
+        return cheap and size_bytes <= inline_bytes and self.waiting == 0 and self.running <= 1
+
+    def _refuse_at_the_door(self, robot: _Robot, job: Job) -> Refusal | None:
+        if len(robot.waiting) >= self._most_waiting:
+            error = Busy(
+                f"{len(robot.waiting)} commands of this robot wait already",
+                hint="send slower, or let newer frames replace older ones",
+                retry_after_ms=self._retry_after_ms(len(robot.waiting) * self._turn_s * 1e3),
+            )
+            return Refusal(job, error, "robot-queue")
+        ahead_s = len(self._round) * self._turn_s
+        if self.is_behind and not robot.waiting and ahead_s > job.patience_s(self._target_s):
+            return Refusal(job, self._busy(ahead_s), "behind")
+        return None
+
+    def _replace(self, robot: _Robot, older: Job, newer: Job) -> Refusal:
+        if newer.command.seq < older.command.seq:
+            return _stale(newer)
+        robot.waiting[robot.waiting.index(older)] = newer
+        return _stale(older)
+
+    def _give_up(self, robot: _Robot, job: Job, now: float) -> Refusal | None:
+        self._note_turn_wait(_turn_wait(robot, job, now), now)
+        if job.deadline_s <= now or self._is_hopeless(robot, job, now):
+            return self._refused_late(robot, job, now)
+        return None
+
+    def _is_hopeless(self, robot: _Robot, job: Job, now: float) -> bool:
+        """Serving the oldest first serves those that are about to be late; give those up instead."""
+        if self.is_behind and _turn_wait(robot, job, now) > job.patience_s(self._target_s):
+            return True
+        newer_waits = bool(robot.waiting) and robot.waiting[-1] is not job
+        return newer_waits and now - job.received_s > (job.deadline_s - job.received_s) / 2
+
+    def _refused_late(self, robot: _Robot, job: Job, now: float) -> Refusal:
+        if job.deadline_s <= now:
+            return _expired(job, now)
+        return Refusal(job, self._busy(_turn_wait(robot, job, now)), "behind")
+
+    def _busy(self, delay_s: float) -> Busy:
+        return Busy(
+            "the server is behind with its work",
+            hint="try again later; the server list may grow meanwhile",
+            retry_after_ms=self._retry_after_ms(2e3 * delay_s),
+        )
+
+    def _retry_after_ms(self, wanted_ms: float) -> float:
+        return min(_LONGEST_RETRY_MS, max(self._interval_s * 1e3, wanted_ms))
+
+    def _note_turn_wait(self, wait_s: float, now: float) -> None:
+        """Enter *behind* after an interval above the target; leave it below half of the target."""
+        if wait_s < self._target_s / 2:
+            self._above_since, self.is_behind = None, False
+        elif wait_s > self._target_s:
+            if self._above_since is None:
+                self._above_since = now
+            self.is_behind = self.is_behind or now - self._above_since >= self._interval_s
+        elif not self.is_behind:
+            self._above_since = None
+
+    def _measure_turn(self, now: float) -> None:
+        """Average the time between two starts while robots wait: threads and size gate included."""
+        if self._last_start is not None:
+            self._turn_s += _SMOOTHING * (now - self._last_start - self._turn_s)
+        self._last_start = now if self._round else None
+
+    def _rewait(self, name: str, robot: _Robot, kept: deque[Job]) -> None:
+        if len(kept) == len(robot.waiting):
+            return
+        self.waiting -= len(robot.waiting) - len(kept)
+        robot.waiting = kept
+        if not kept:
+            if robot.running is None:
+                self._round.remove(name)
+            self._forget_if_idle(name)
+
+    def _forget_if_idle(self, name: str) -> None:
+        robot = self._robots.get(name)
+        if robot is not None and robot.running is None and not robot.waiting:
+            del self._robots[name]
+
+
+def _turn_wait(robot: _Robot, job: Job, now: float) -> float:
+    """How long *job* has waited for others, not for its own robot."""
+    return now - max(job.received_s, robot.free_since)
+
+
+def _replaceable(waiting: deque[Job], job: Job) -> Job | None:
+    stream = job.command.stream
+    if not stream or job.command.keep:
+        return None
+    return next((w for w in waiting if w.command.stream == stream and not w.command.keep), None)
+
+
+def _stale(job: Job) -> Refusal:
+    return Refusal(job, Stale("a newer frame of the stream took its place"), "stale")
+
+
+def _expired(job: Job, now: float) -> Refusal:
+    waited_ms = (now - job.received_s) * 1e3
+    error = Expired(
+        f"its deadline passed after {waited_ms:.0f} ms in the queue", hint="allow more time, or send fewer"
+    )
+    return Refusal(job, error, "expired")
