@@ -282,8 +282,9 @@ class Tracker:
             if usable < self.options.min_inliers:
                 return self._lose(0)
             return self._keep(self._T_world_start, inliers=0, matches=0, keyframe=True)
-        first, retry = ("frame", "keyframe") if self.options.chain == "frame" else ("keyframe", "frame")
-        self._to_try = [first, retry] if self._last is not self._keyframe else ["keyframe"]
+        self._to_try = ["frame", "keyframe"] if self.options.chain == "frame" else ["keyframe", "frame"]
+        if self._last is self._keyframe:
+            self._to_try = ["keyframe"]
         return self._next_query(0)
 
     def accept(

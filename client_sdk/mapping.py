@@ -205,7 +205,8 @@ def _hash(keys: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
     mixed ^= mixed >> np.uint64(33)
     mixed *= np.uint64(0xFF51AFD7ED558CCD)
     mixed ^= mixed >> np.uint64(33)
-    return (mixed >> np.uint64(1)).astype(np.int64)
+    hashes: npt.NDArray[np.int64] = (mixed >> np.uint64(1)).astype(np.int64)
+    return hashes
 
 
 def write_ply(path: Path, points: npt.ArrayLike, colours: npt.NDArray[np.uint8]) -> None:
