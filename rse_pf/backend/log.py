@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import os
 import threading
+from collections import deque
 from collections.abc import Callable
 from typing import Any
 
@@ -19,7 +20,7 @@ __all__ = ["JsonLog"]
 _LEVELS = {"debug": 10, "info": 20, "warning": 30, "error": 40}
 _LONGEST_TEXT = 256
 _LONGEST_TRACEBACK = 8192
-_MOST_HELD_BYTES = 4_194_304
+_MOST_HELD_LINES = 20_000
 _CHUNK_BYTES = 4096
 """A write up to this size does not mix with other writers of the same pipe."""
 _FLUSH_S = 0.2
@@ -36,8 +37,7 @@ class JsonLog:
         self._server = server
         self._wall_clock = wall_clock
         self._fd = fd
-        self._lines: list[bytes] = []
-        self._held_bytes = 0
+        self._lines: deque[bytes] = deque()
         self._wake = threading.Event()
         self._over = False
         self._writer = threading.Thread(target=self._write_on, name="log", daemon=True)
@@ -78,10 +78,9 @@ class JsonLog:
         line = _encode(
             {"time": self._wall_clock(), "level": level, "event": event, "server": self._server, **fields}
         )
-        if self._held_bytes + len(line) > _MOST_HELD_BYTES:
+        if len(self._lines) >= _MOST_HELD_LINES:
             self.dropped += 1
             return
-        self._held_bytes += len(line)
         self._lines.append(line)
         if not self._wake.is_set():
             self._wake.set()
@@ -93,8 +92,7 @@ class JsonLog:
             if not self._over:
                 pause.wait(_FLUSH_S)
             self._wake.clear()
-            lines, self._lines = self._lines, []
-            self._held_bytes = 0
+            lines = [self._lines.popleft() for _ in range(len(self._lines))]
             try:
                 for chunk in _chunks(lines):
                     os.write(self._fd, chunk)

@@ -126,7 +126,7 @@ def render(merged: Mapping[str, Any]) -> bytes:
             yield histogram
 
     registry = CollectorRegistry()
-    registry.register(Families())  # type: ignore[arg-type]
+    registry.register(Families())
     return generate_latest(registry)
 
 

@@ -1,0 +1,442 @@
+"""The inside of one worker: connections, scheduler and solver threads, without any socket library.
+
+Frames come in through `Connection.frame`, bytes leave through a `Wire`; `dispatch` is the only way
+to a service.  Promises that every submitted command gets exactly one answer while its socket lives,
+that nothing but `dispatch` and the encoding of its answer runs outside of the event loop, and that
+neither payloads nor tokens reach the log.
+"""
+
+from __future__ import annotations
+
+import traceback
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import msgspec
+
+from rse_pf.backend.door import Admitted
+from rse_pf.backend.executors import Executor, SolverThreads
+from rse_pf.backend.frames import CloseSocket, FrameAssembler, Received, SendPong
+from rse_pf.backend.log import JsonLog
+from rse_pf.backend.metrics import Metrics
+from rse_pf.backend.scheduler import Job, Refusal, Scheduler
+from rse_pf.backend.size_gate import SizeGate
+from rse_pf.errors import InternalError, LimitExceeded, UnknownService
+from rse_pf.service import Kind, Registry, Service, dispatch, failure_of
+from rse_pf.settings import PlatformSettings
+from rse_pf.wire import CODECS, Codec, Command, Failure, Result, make_codec
+from rse_pf.wire.session import (
+    CLOSE_GOING_AWAY,
+    CLOSE_PROTOCOL,
+    CLOSE_TOKEN_OVER,
+    Decision,
+    Send,
+    ServerSession,
+    Submit,
+)
+
+__all__ = ["Clocks", "Connection", "Core", "Handle", "Wire"]
+
+_SILENCE_MARGIN_S = 1.0
+_SLOWEST_TICK_S = 1.0
+_TICKS_PER_LIMIT = 4
+_UNKNOWN = "unknown"
+
+
+class Wire(Protocol):
+    """The socket of one robot, as the core sees it."""
+
+    def send(self, data: bytes, is_text: bool) -> None:
+        """Write one message; does nothing on a socket that ended."""
+
+    def send_pong(self, data: bytes) -> None:
+        """Write one pong frame."""
+
+    def close(self, code: int, reason: str) -> None:
+        """Write a close frame and end the connection."""
+
+
+class Handle(Protocol):
+    """A timer that can be taken back."""
+
+    def cancel(self) -> None:
+        """Do not call."""
+
+
+class Loop(Protocol):
+    """What the core needs of an event loop."""
+
+    def call_later(self, delay: float, callback: Callable[[], object]) -> Handle:
+        """Call *callback* in *delay* seconds."""
+
+    def call_soon_threadsafe(self, callback: Callable[..., object], *args: Any) -> object:
+        """Call *callback* in the loop's thread."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Clocks:
+    """The readings of time a worker takes: monotonic s, Unix s, CPU s of the process."""
+
+    monotonic: Callable[[], float]
+    wall: Callable[[], float]
+    cpu: Callable[[], float]
+
+
+@dataclass(frozen=True, slots=True)
+class _Outcome:
+    job: Job
+    answer: Result | Failure
+    data: bytes
+
+
+class Connection:
+    """One robot's socket between its handshake and its end."""
+
+    __slots__ = ("_core", "_wire", "assembler", "expires_s", "last_heard_s", "opened_s", "robot", "session")
+
+    def __init__(
+        self,
+        core: Core,
+        wire: Wire,
+        session: ServerSession | None,
+        robot: str,
+        now: float,
+        expires_s: float | None,
+    ) -> None:
+        self.robot = robot
+        self.session = session
+        self.assembler = FrameAssembler(core.settings.session)
+        self.opened_s = self.last_heard_s = now
+        self.expires_s = expires_s
+        self._core = core
+        self._wire = wire
+
+    def frame(self, opcode: int, fin: bool, rsv: bool, payload: bytes) -> None:
+        """Take one unmasked frame."""
+        now = self._core.clocks.monotonic()
+        decision = self.assembler.receive(opcode, fin, rsv, payload, now)
+        if isinstance(decision, Received):
+            self._message(decision, now)
+        elif isinstance(decision, SendPong):
+            self._wire.send_pong(decision.data)
+        elif isinstance(decision, CloseSocket):
+            self._core.metrics.closed[f"frames-{decision.code}"] += 1
+            self._wire.close(decision.code, decision.reason)
+
+    def ended(self) -> None:
+        """Note that the socket is gone."""
+        self._core.disconnect(self)
+
+    def apply(self, decisions: list[Decision], now: float, size_bytes: int = 0) -> None:
+        """Do what the session decided."""
+        for decision in decisions:
+            if isinstance(decision, Submit):
+                self._core.submit(self, decision.command, size_bytes, now)
+            elif isinstance(decision, Send):
+                self.write(decision.data)
+            else:
+                self.close(decision.code, decision.reason)
+
+    def write(self, data: bytes) -> None:
+        """Write one message, unless the socket is closing."""
+        if self.assembler.closed:
+            return
+        self._core.metrics.bytes_out += len(data)
+        self._wire.send(data, self.session is not None and self.session.codec.is_text)
+
+    def close(self, code: int, reason: str) -> None:
+        """Close the socket and take nothing more from it."""
+        self._core.metrics.closed[reason] += 1
+        self.assembler.closed = True
+        self._wire.close(code, reason)
+
+    def _message(self, received: Received, now: float) -> None:
+        self.last_heard_s = now
+        self._core.metrics.bytes_in += len(received.data)
+        session = self.session
+        if session is None:
+            self._core.metrics.bytes_out += len(received.data)
+            self._wire.send(received.data, received.is_text)
+            return
+        was_opening = session.state == "opening"
+        self.apply(session.receive(received.data, now), now, len(received.data))
+        if was_opening and session.state == "open":
+            self._core.welcomed(self, now)
+
+
+class Core:
+    """All connections of one worker and the work they asked for."""
+
+    def __init__(
+        self,
+        *,
+        settings: PlatformSettings,
+        registry: Registry,
+        server_id: str,
+        clocks: Clocks,
+        loop: Loop,
+        log: JsonLog,
+        new_session_id: Callable[[], str],
+    ) -> None:
+        self.settings = settings
+        self.clocks = clocks
+        self.metrics = Metrics()
+        self.connections: set[Connection] = set()
+        self._registry = registry
+        self._server_id = server_id
+        self._loop = loop
+        self._log = log
+        self._new_session_id = new_session_id
+        self._codecs: dict[str, Codec] = {name: make_codec(name, settings.session) for name in CODECS}
+        self._scheduler = Scheduler(settings.serving)
+        self._gate = SizeGate(
+            settings.serving.size,
+            settings.serving.size_burst_ms / 1e3,
+            now=clocks.monotonic(),
+            cpu_s=clocks.cpu(),
+        )
+        self._threads = SolverThreads(settings.serving.solver_threads, self._compute, self._from_thread)
+        self._executors: dict[Kind, Executor] = {"stateless": self._threads}
+        self._gate_timer: Handle | None = None
+        self._sweep_timer: Handle | None = None
+        self._move: tuple[str, float] | None = None
+        self._tick_s = _tick_s(settings)
+        self._next_tick_s = clocks.monotonic() + self._tick_s
+        self._lag_s = 0.0
+        loop.call_later(self._tick_s, self._tick)
+
+    @property
+    def held(self) -> int:
+        """Commands that wait or run."""
+        return self._scheduler.waiting + self._scheduler.running
+
+    def connect(self, wire: Wire, admitted: Admitted) -> Connection:
+        """Return the connection of a robot whose handshake is done."""
+        now = self.clocks.monotonic()
+        session = None
+        if admitted.codec:
+            session = ServerSession(
+                codec=self._codecs[admitted.codec],
+                robot=admitted.robot,
+                server=self._server_id,
+                session=self._new_session_id(),
+                limits=self.settings.session,
+            )
+        expires_s = None
+        if admitted.expires_s is not None:
+            expires_s = now + admitted.expires_s - self.clocks.wall()
+        connection = Connection(self, wire, session, admitted.robot, now, expires_s)
+        self.connections.add(connection)
+        return connection
+
+    def disconnect(self, connection: Connection) -> None:
+        """Forget a connection whose socket ended, and what it still waited for."""
+        self.connections.discard(connection)
+        for job in self._scheduler.leave(connection):
+            self.metrics.requests[self._label(job.command.service), "disconnected"] += 1
+        self._log.debug("disconnected", robot=connection.robot)
+
+    def welcomed(self, connection: Connection, now: float) -> None:
+        """Note that a robot said Hello; while the server leaves, ask the robot to move at once."""
+        self._log.debug("connected", robot=connection.robot)
+        if self._move is not None and connection.session is not None:
+            connection.apply(connection.session.move(*self._move), now)
+
+    def move_all(self, reason: str, within_ms: float) -> None:
+        """Ask every robot, now and from now on, to leave for another server."""
+        self._move = (reason, within_ms)
+        now = self.clocks.monotonic()
+        for connection in list(self.connections):
+            if connection.session is not None:
+                connection.apply(connection.session.move(reason, within_ms), now)
+
+    def close_all(self) -> None:
+        """Close every socket; what is held is lost, so wait for `held` to be 0 first."""
+        for connection in list(self.connections):
+            connection.close(CLOSE_GOING_AWAY, "leaving")
+        for executor in self._executors.values():
+            executor.close()
+
+    def submit(self, connection: Connection, command: Command, size_bytes: int, now: float) -> None:
+        """Queue one command, and start what may start."""
+        deadline_ms = command.deadline_ms
+        allowed_s = self.settings.session.answer_timeout_s if deadline_ms is None else deadline_ms / 1e3
+        job = Job(connection, connection.robot, command, size_bytes, now, now + allowed_s)
+        service = self._service(command.service)
+        if service is None:
+            self._answer(self._compute(job), now)
+            return
+        if service.kind not in self._executors:
+            error = UnknownService(
+                f"this server does not run {service.kind} services", hint="choose a stateless service"
+            )
+            self._refuse([Refusal(job, error, "kind")], now)
+            return
+        self._refuse(self._scheduler.submit(job, now), now)
+        self._start()
+
+    def snapshot(self) -> dict[str, Any]:
+        """Return the numbers of this worker for /metrics and /status."""
+        now = self.clocks.monotonic()
+        self.metrics.gauges = {
+            "robots": float(len(self.connections)),
+            "queue": float(self._scheduler.waiting),
+            "queue_oldest_s": self._scheduler.oldest_wait_s(now),
+            "in_flight": float(self._scheduler.running),
+            "loop_lag_s": self._lag_s,
+            "cpu_s": self.clocks.cpu(),
+            "log_lines_dropped": float(self._log.dropped),
+        }
+        self._lag_s = 0.0
+        return self.metrics.snapshot()
+
+    # --- from the queue to an answer -----------------------------------------------------------
+
+    def _start(self) -> None:
+        while self._scheduler.waiting and self._scheduler.running < self.settings.serving.solver_threads:
+            now = self.clocks.monotonic()
+            wait_s = self._gate.wait_s(now, self.clocks.cpu()) if self._gate.is_on else 0.0
+            if wait_s > 0:
+                if self._gate_timer is None:
+                    self._gate_timer = self._loop.call_later(wait_s, self._gate_opens)
+                break
+            job, refusals = self._scheduler.start(now)
+            self._refuse(refusals, now)
+            if job is not None:
+                self._run(job)
+        if self._scheduler.waiting and self._sweep_timer is None:
+            pause_s = self.settings.serving.queue_target_ms / 2e3
+            self._sweep_timer = self._loop.call_later(pause_s, self._sweep)
+
+    def _run(self, job: Job) -> None:
+        service = self._registry.get(job.command.service)
+        inline_bytes = self.settings.serving.inline_bytes
+        if service.kind == "stateless" and self._scheduler.runs_inline(
+            cheap=service.cheap, size_bytes=job.size_bytes, inline_bytes=inline_bytes
+        ):
+            self._finish(self._compute(job))
+        else:
+            self._executors[service.kind].run(job)
+
+    def _compute(self, job: Job) -> _Outcome:
+        """Solve and encode; runs in the loop or in a thread, so it touches nothing shared."""
+        monotonic, command = self.clocks.monotonic, job.command
+        started = monotonic()
+        answer = dispatch(
+            self._registry, command, monotonic, server=self._server_id, on_defect=self._log_defect
+        )
+        if isinstance(answer, Result):
+            answer = msgspec.structs.replace(
+                answer,
+                queue_ms=(started - job.received_s) * 1e3,
+                received_s=job.received_s,
+                sent_s=monotonic(),
+            )
+        codec: Codec = job.owner.session.codec
+        try:
+            data = codec.encode(answer)
+        except Exception as error:  # noqa: BLE001  a service's reply is foreign data: anything may come out
+            self._log_defect(command, error)
+            answer = failure_of(
+                InternalError(f"the reply of {command.service!r} cannot be encoded"),
+                command,
+                server=self._server_id,
+            )
+            return _Outcome(job, answer, codec.encode(answer))
+        most = self.settings.session.max_message_bytes
+        if len(data) > most:
+            too_large = LimitExceeded(f"the reply has {len(data)} bytes, above {most}", hint="ask for less")
+            answer = failure_of(too_large, command, server=self._server_id)
+            data = codec.encode(answer)
+        return _Outcome(job, answer, data)
+
+    def _from_thread(self, outcome: _Outcome) -> None:
+        self._loop.call_soon_threadsafe(self._finish_and_go_on, outcome)
+
+    def _finish_and_go_on(self, outcome: _Outcome) -> None:
+        self._finish(outcome)
+        self._start()
+
+    def _finish(self, outcome: _Outcome) -> None:
+        now = self.clocks.monotonic()
+        self._scheduler.done(outcome.job, now)
+        self._answer(outcome, now)
+
+    def _refuse(self, refusals: list[Refusal], now: float) -> None:
+        for refusal in refusals:
+            self.metrics.shed[refusal.reason] += 1
+            job = refusal.job
+            failure = failure_of(refusal.error, job.command, server=self._server_id)
+            self._answer(_Outcome(job, failure, job.owner.session.codec.encode(failure)), now)
+
+    def _answer(self, outcome: _Outcome, now: float) -> None:
+        job, answer = outcome.job, outcome.answer
+        connection: Connection = job.owner
+        code = "ok" if isinstance(answer, Result) else answer.code
+        service = self._label(job.command.service)
+        self.metrics.answered(service, code, now - job.received_s)
+        if connection in self.connections and connection.session is not None:
+            connection.session.in_flight -= 1
+            connection.write(outcome.data)
+        if self._log.writes("info"):
+            compute_ms = answer.compute_ms if isinstance(answer, Result) else 0.0
+            self._log.info(
+                "command", robot=job.robot, service=service, id=job.command.id, trace=job.command.trace,
+                code=code, queue_ms=round((job.started_s or now) * 1e3 - job.received_s * 1e3, 3),
+                compute_ms=round(compute_ms, 3),
+                bytes_in=job.size_bytes, bytes_out=len(outcome.data),
+            )  # fmt: skip
+
+    def _log_defect(self, command: Command, error: Exception) -> None:
+        text = "".join(traceback.format_exception(type(error), error, error.__traceback__))
+        self._log.error("defect", service=command.service, id=command.id, trace=command.trace, traceback=text)
+
+    def _service(self, name: str) -> Service | None:
+        try:
+            return self._registry.get(name)
+        except UnknownService:
+            return None
+
+    def _label(self, service: str) -> str:
+        return service if self._service(service) is not None else _UNKNOWN
+
+    # --- timers --------------------------------------------------------------------------------
+
+    def _gate_opens(self) -> None:
+        self._gate_timer = None
+        self._start()
+
+    def _sweep(self) -> None:
+        self._sweep_timer = None
+        now = self.clocks.monotonic()
+        self._refuse(self._scheduler.sweep(now), now)
+        self._start()
+
+    def _tick(self) -> None:
+        now = self.clocks.monotonic()
+        self._lag_s = max(self._lag_s, now - self._next_tick_s)
+        for connection in list(self.connections):
+            self._check(connection, now)
+        self._next_tick_s = now + self._tick_s
+        self._loop.call_later(self._tick_s, self._tick)
+
+    def _check(self, connection: Connection, now: float) -> None:
+        limits, session = self.settings.session, connection.session
+        if session is None or connection.assembler.closed:
+            return
+        if connection.expires_s is not None and now >= connection.expires_s:
+            connection.close(CLOSE_TOKEN_OVER, "token-over")
+        elif session.state == "opening":
+            if now - connection.opened_s >= limits.hello_timeout_s:
+                connection.close(CLOSE_PROTOCOL, "no-hello")
+        elif now - connection.last_heard_s >= _longest_silence_s(self.settings):
+            connection.close(CLOSE_GOING_AWAY, "silent")
+
+
+def _longest_silence_s(settings: PlatformSettings) -> float:
+    return settings.session.ping_interval_s + settings.session.ping_patience_s + _SILENCE_MARGIN_S
+
+
+def _tick_s(settings: PlatformSettings) -> float:
+    return min(_SLOWEST_TICK_S, settings.session.hello_timeout_s / _TICKS_PER_LIMIT)

@@ -1,0 +1,221 @@
+"""The robots' sockets of one worker: picows on uvloop, between the supervisor's descriptors and the core.
+
+The only file that knows picows.  Promises that no text of ours or of an exception reaches a stranger
+at the door, that a reader who stays slow is cut, and that the first CLOSE frame is the last one read.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+from collections.abc import Callable
+from typing import Any
+
+from rse_pf.backend.core import Connection, Core, Handle
+from rse_pf.backend.door import Admitted, Door, TurnedAway
+from rse_pf.backend.frames import CloseBorder
+from rse_pf.backend.log import JsonLog
+from rse_pf.errors import MissingExtra
+from rse_pf.settings import ServingSettings, SessionSettings
+
+__all__ = ["RobotSockets"]
+
+_MOST_CLOSE_REASON_BYTES = 123
+_LINGER_S = 2.0
+"""A close that the robot does not let through ends as an abort after this."""
+
+
+class _Quiet:
+    """The logger picows gets: it would make one logger object for each socket otherwise."""
+
+    def isEnabledFor(self, level: int) -> bool:
+        return False
+
+    def log(self, *args: Any) -> None: ...
+
+    debug = info = warning = error = exception = log
+
+
+class RobotSockets:
+    """Takes accepted sockets and gives the core a `Connection` for each robot that may come in."""
+
+    def __init__(
+        self,
+        *,
+        core: Core,
+        door: Door,
+        serving: ServingSettings,
+        session: SessionSettings,
+        most_robots: int,
+        new_name: Callable[[], str],
+        log: JsonLog,
+        loop: asyncio.AbstractEventLoop,
+    ) -> None:
+        self._core = core
+        self._door = door
+        self._most_robots = most_robots
+        self._new_name = new_name
+        self._log = log
+        self._loop = loop
+        self._serving = serving
+        self._tasks: set[asyncio.Task[None]] = set()
+        picows, self._connect_accepted_socket = _libraries()
+        self._picows = picows
+        self._protocol = _protocol_type(picows)
+        self._listener = _listener_type(picows, loop, serving)
+        self._arguments = (
+            None, None, False, self._judge, _Quiet(), True, serving.handshake_timeout_s,
+            False, 20.0, 20.0, picows.WSAutoPingStrategy.PING_WHEN_IDLE, False,
+            session.max_message_bytes, None, serving.read_buffer_bytes,
+        )  # fmt: skip
+
+    def take(self, fd: int, ended: Callable[[], None]) -> None:
+        """Serve the accepted socket *fd*; *ended* is called once when it is gone."""
+        accepted = socket.socket(fileno=fd)
+        accepted.setblocking(False)
+        task = self._loop.create_task(self._serve(accepted, ended))
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
+
+    async def _serve(self, accepted: socket.socket, ended: Callable[[], None]) -> None:
+        try:
+            await self._connect_accepted_socket(
+                self._loop, lambda: self._protocol(ended, *self._arguments), accepted
+            )
+        except OSError:
+            accepted.close()
+            ended()
+
+    def _judge(self, request: Any) -> Any:
+        """Answer a handshake; picows would send an exception's text, so none may leave."""
+        try:
+            verdict = self._verdict(request)
+        except Exception as error:  # noqa: BLE001  see above
+            self._log.error("defect", at="door", traceback=repr(error))
+            verdict = self._door.defect
+        if isinstance(verdict, TurnedAway):
+            self._core.metrics.handshakes[verdict.result] += 1
+            self._log.info("refused", result=verdict.result, reason=verdict.reason)
+            response = self._picows.WSUpgradeResponse.create_error_response(
+                verdict.status, verdict.body, dict(verdict.headers)
+            )
+            return self._picows.WSUpgradeResponseWithListener(response, None)
+        self._core.metrics.handshakes["ok"] += 1
+        chosen = {"Sec-WebSocket-Protocol": verdict.subprotocol} if verdict.subprotocol else None
+        response = self._picows.WSUpgradeResponse.create_101_response(chosen)
+        return self._picows.WSUpgradeResponseWithListener(response, self._listener(self._core, verdict))
+
+    def _verdict(self, request: Any) -> Admitted | TurnedAway:
+        headers = request.headers
+        connection = [word.strip().lower() for word in ",".join(headers.getall("Connection", [])).split(",")]
+        if "upgrade" in connection:
+            headers["Connection"] = "upgrade"
+        offered = ",".join(headers.getall("Sec-WebSocket-Protocol", [])).split(",")
+        return self._door.judge(
+            path=bytes(request.path),
+            authorization=headers.get("Authorization", ""),
+            offered=[word.strip() for word in offered],
+            is_full=len(self._core.connections) >= self._most_robots,
+            anonymous=self._new_name(),
+            now_s=self._core.clocks.wall(),
+        )
+
+
+def _libraries() -> tuple[Any, Any]:
+    try:
+        import aiofastnet
+        from picows import picows
+    except ImportError as error:
+        raise MissingExtra("picows", "backend") from error
+    return picows, aiofastnet.connect_accepted_socket
+
+
+def _protocol_type(picows: Any) -> Any:
+    base = picows.WSProtocol
+    get_buffer, buffer_updated, connection_lost = base.get_buffer, base.buffer_updated, base.connection_lost
+
+    class Protocol(base):  # type: ignore[misc, valid-type]
+        """Hands picows nothing behind the first CLOSE, and tells when the socket is gone."""
+
+        def __init__(self, ended: Callable[[], None], *arguments: Any) -> None:
+            super().__init__(*arguments)
+            self._ended = ended
+            self._border = CloseBorder()
+            self._room = memoryview(b"")
+
+        def get_buffer(self, hint: int) -> memoryview:
+            self._room = get_buffer(self, hint)
+            return self._room
+
+        def buffer_updated(self, n: int) -> None:
+            wanted = self._border.wanted(self._room[:n])
+            if wanted:
+                buffer_updated(self, wanted)
+
+        def connection_lost(self, error: Exception | None) -> None:
+            try:
+                connection_lost(self, error)
+            finally:
+                self._ended()
+
+    return Protocol
+
+
+def _listener_type(picows: Any, loop: asyncio.AbstractEventLoop, serving: ServingSettings) -> Any:
+    kinds = picows.WSMsgType
+
+    class Listener(picows.WSListener):  # type: ignore[misc]
+        """One robot's socket: frames to the core, and the core's `Wire`."""
+
+        def __init__(self, core: Core, admitted: Admitted) -> None:
+            self._core = core
+            self._admitted = admitted
+            self._transport: Any = None
+            self._connection: Connection | None = None
+            self._cut: Handle | None = None
+
+        def on_ws_connected(self, transport: Any) -> None:
+            self._transport = transport
+            high = serving.write_buffer_bytes
+            transport.underlying_transport.set_write_buffer_limits(high=high, low=high // 4)
+            self._connection = self._core.connect(self, self._admitted)
+
+        def on_ws_frame(self, transport: Any, frame: Any) -> None:
+            if self._connection is not None:
+                rsv = bool(frame.rsv1 or frame.rsv2 or frame.rsv3)
+                payload = frame.get_payload_as_bytes()
+                self._connection.frame(int(frame.msg_type), bool(frame.fin), rsv, payload)
+
+        def on_ws_disconnected(self, transport: Any) -> None:
+            if self._cut is not None:
+                self._cut.cancel()
+            if self._connection is not None:
+                self._connection.ended()
+                self._connection = None
+
+        def pause_writing(self) -> None:
+            if self._cut is None:
+                self._cut = loop.call_later(serving.slow_reader_s, self._cut_off)
+
+        def resume_writing(self) -> None:
+            if self._cut is not None:
+                self._cut.cancel()
+                self._cut = None
+
+        def send(self, data: bytes, is_text: bool) -> None:
+            if self._connection is not None:
+                self._transport.send(kinds.TEXT if is_text else kinds.BINARY, data)
+
+        def send_pong(self, data: bytes) -> None:
+            self._transport.send_pong(data)
+
+        def close(self, code: int, reason: str) -> None:
+            self._transport.send_close(code, reason.encode()[:_MOST_CLOSE_REASON_BYTES])
+            self._transport.disconnect()
+            loop.call_later(_LINGER_S, self._transport.disconnect, False)
+
+        def _cut_off(self) -> None:
+            self._core.metrics.closed["slow-reader"] += 1
+            self._transport.disconnect(False)
+
+    return Listener

@@ -1,0 +1,405 @@
+"""One backend server: listener, worker processes, control port and drain; the body of `rse-pf serve`.
+
+The supervisor accepts each robot and hands the socket to the least-loaded worker, so the spread is
+even.  Promises that supervisor and workers live and die together (it restarts nothing: the scale
+modifier replaces servers), that it never reads a robot's bytes, and that a drain loses no command.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import ipaddress
+import json
+import os
+import signal
+import socket
+import time
+from collections.abc import Awaitable, Callable
+from contextlib import suppress
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+from rse_pf.auth import KeySet
+from rse_pf.backend.control import Answer, Ask, serve_control
+from rse_pf.backend.log import JsonLog
+from rse_pf.backend.metrics import merge, render
+from rse_pf.backend.processes import cpu_seconds, resident_bytes
+from rse_pf.backend.worker_process import WorkerProcess
+from rse_pf.errors import ConfigurationError
+from rse_pf.settings import PlatformSettings
+
+__all__ = ["serve"]
+
+_BUILTIN = "rse_pf.services.builtin:builtin_services"
+_ACCEPTS_AT_ONCE = 64
+_FRESH_S = 0.25
+_REPORT_S = 0.3
+_LEAVE_S = 3.0
+_AT_ONCE_S = 0.0
+_EXIT_OK, _EXIT_LOST = 0, 1
+
+
+def serve(
+    settings: PlatformSettings,
+    *,
+    keys: KeySet | None,
+    server_id: str,
+    announce: Path | None = None,
+    conformance_echo: bool = False,
+    services: str = _BUILTIN,
+) -> int:
+    """Serve robots until a drain or a signal ends it; call it in the main thread of a process.
+
+    Args:
+        settings: ``serving.port`` and ``serving.control_port`` may be 0.
+        keys: Who may sign robots' tokens; None only where ``auth.required`` is false.
+        server_id: Name of this server in every Welcome, Result and log line.
+        announce: File that tells, once everything listens, pids and ports as JSON.
+        conformance_echo: Echo raw messages without token or sub-protocol, for conformance suites.
+        services: ``module:function`` that makes the registry of a worker from the settings.
+
+    Returns:
+        0 after a drain or a signal, 1 when a worker was lost.
+
+    Raises:
+        ConfigurationError: An open door on a public address, no keys, or the port is taken.
+    """
+    _check_open_door(settings, keys, conformance_echo)
+    listener = _bound(settings.serving.host, settings.serving.port)
+    with listener:
+        supervisor = _Supervisor(
+            settings, keys=keys, server_id=server_id, announce=announce,
+            conformance_echo=conformance_echo, services=services, listener=listener,
+        )  # fmt: skip
+        return asyncio.run(supervisor.run())
+
+
+def _check_open_door(settings: PlatformSettings, keys: KeySet | None, conformance_echo: bool) -> None:
+    host = settings.serving.host
+    if conformance_echo and not _is_loopback(host):
+        raise ConfigurationError(
+            f"conformance echo on {host} would let anybody in", hint="set serving.host to 127.0.0.1"
+        )
+    if conformance_echo:
+        return
+    if settings.auth.required and keys is None:
+        raise ConfigurationError(
+            "robots need tokens, but there are no keys to check them with",
+            hint="name a key set file, or set auth.required to false on a loopback address",
+        )
+    if not settings.auth.required and not _is_loopback(host):
+        raise ConfigurationError(
+            f"auth.required = false on {host} would let anybody in",
+            hint="set auth.required to true, or serving.host to 127.0.0.1",
+        )
+
+
+def _is_loopback(host: str) -> bool:
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
+
+
+def _bound(host: str, port: int) -> socket.socket:
+    try:
+        family, kind, protocol, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
+        listener = socket.socket(family, kind, protocol)
+        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        listener.setblocking(False)
+        listener.bind(address)
+    except OSError as error:
+        raise ConfigurationError(
+            f"cannot listen on {host}:{port}: {error.strerror}", hint="choose another serving.port, or 0"
+        ) from error
+    return listener
+
+
+class _Supervisor:
+    def __init__(
+        self,
+        settings: PlatformSettings,
+        *,
+        keys: KeySet | None,
+        server_id: str,
+        announce: Path | None,
+        conformance_echo: bool,
+        services: str,
+        listener: socket.socket,
+    ) -> None:
+        self._settings = settings
+        self._server_id = server_id
+        self._announce = announce
+        self._listener = listener
+        self._state = "starting"
+        self._began = time.monotonic()
+        self._reported = float("-inf")
+        self._reporting = asyncio.Lock()
+        self._tasks: set[asyncio.Task[None]] = set()
+        self._control_port = 0
+        self._signals = 0
+        self._refused_full = 0
+        self._log = JsonLog(level=settings.serving.log_level, server=server_id, wall_clock=time.time)
+        count = settings.serving.workers or len(os.sched_getaffinity(0))
+        config = {
+            "settings": settings.to_dict(), "server": server_id, "services": services, "workers": count,
+            "keys": keys.to_json() if keys is not None and settings.auth.required else None,
+            "conformance_echo": conformance_echo, "supervisor": os.getpid(),
+        }  # fmt: skip
+        self._configs = [{**config, "index": index} for index in range(count)]
+        self._workers: list[WorkerProcess] = []
+
+    async def run(self) -> int:
+        loop = asyncio.get_running_loop()
+        self._over: asyncio.Future[int] = loop.create_future()
+        for number in (signal.SIGTERM, signal.SIGINT):
+            loop.add_signal_handler(number, self._on_signal, number)
+        control = await self._open_control()
+        try:
+            self._workers = [WorkerProcess(config, self._on_lost) for config in self._configs]
+            await self._start(loop)
+            return await self._over
+        finally:
+            self._stop_accepting()
+            control.close()
+            for worker in self._workers:
+                worker.kill()
+            if self._announce is not None:
+                self._announce.unlink(missing_ok=True)
+            self._log.info("server-over", exit_code=self._over.result() if self._over.done() else None)
+            self._log.close()
+
+    async def _open_control(self) -> asyncio.Server:
+        host, port = self._settings.serving.control_host, self._settings.serving.control_port
+        try:
+            control = await serve_control(host, port, self._answer)
+        except OSError as error:
+            raise ConfigurationError(
+                f"cannot listen on {host}:{port}: {error.strerror}",
+                hint="choose another serving.control_port, or 0",
+            ) from error
+        self._control_port = control.sockets[0].getsockname()[1]
+        return control
+
+    async def _start(self, loop: asyncio.AbstractEventLoop) -> None:
+        readiness = [loop.create_task(worker.connect()) for worker in self._workers]
+        everything = asyncio.gather(*readiness)
+        either: list[asyncio.Future[Any]] = [self._over, everything]
+        await asyncio.wait(
+            either,
+            timeout=self._settings.local.start_timeout_s,
+            return_when=asyncio.FIRST_COMPLETED,
+        )
+        if self._over.done() or not everything.done():
+            everything.cancel()
+            with suppress(asyncio.CancelledError):
+                await everything
+            self._finish(_EXIT_LOST)
+            return
+        self._listener.listen(self._settings.serving.backlog)
+        loop.add_reader(self._listener.fileno(), self._accept_some)
+        self._state = "ready"
+        if self._announce is not None:
+            _write_atomically(self._announce, self._identity())
+        self._log.info("server-ready", **self._identity(), settings=self._settings.digest())
+
+    def _identity(self) -> dict[str, Any]:
+        return {
+            "server": self._server_id,
+            "pid": os.getpid(),
+            "port": self._listener.getsockname()[1],
+            "control_port": self._control_port,
+            "workers": [worker.pid for worker in self._workers],
+        }
+
+    # --- robots --------------------------------------------------------------------------------
+
+    def _accept_some(self) -> None:
+        for _ in range(_ACCEPTS_AT_ONCE):
+            try:
+                accepted, _ = self._listener.accept()
+            except BlockingIOError:
+                return
+            except OSError as error:  # out of descriptors, or the robot is gone already
+                self._log.warning("accept-failed", reason=str(error))
+                return
+            with accepted:
+                if not any(worker.give(accepted) for worker in sorted(self._workers, key=lambda w: w.load)):
+                    self._refused_full += 1
+
+    # --- the end -------------------------------------------------------------------------------
+
+    def _on_lost(self, worker: WorkerProcess) -> None:
+        if self._state != "leaving":
+            self._log.error("worker-lost", pid=worker.pid, exit_code=worker.exit_code())
+            self._finish(_EXIT_LOST)
+
+    def _on_signal(self, number: signal.Signals) -> None:
+        self._signals += 1
+        if number == signal.SIGINT or self._signals > 1 or self._state == "starting":
+            self._keep(self._leave(_AT_ONCE_S))
+        elif self._state == "ready":
+            self._keep(self._drain(self._settings.serving.drain_wait_s))
+
+    async def _drain(self, wait_s: float) -> None:
+        """Not ready but accepting, then Move to all, finish what is held, leave."""
+        self._state = "draining"
+        self._log.info("drain", wait_s=wait_s)
+        await asyncio.sleep(wait_s)
+        within_ms = self._settings.serving.drain_within_ms
+        for worker in self._workers:
+            worker.order(do="move", reason="drain", within_ms=within_ms)
+        empty = [asyncio.ensure_future(worker.empty.wait()) for worker in self._workers]
+        await asyncio.wait(empty, timeout=within_ms / 1e3)
+        for waiting in empty:
+            waiting.cancel()
+        await self._leave(self._settings.session.answer_timeout_s)
+
+    async def _leave(self, held_s: float) -> None:
+        if self._state == "leaving" and held_s > 0:
+            return
+        self._state = "leaving"
+        self._stop_accepting()
+        for worker in self._workers:
+            worker.order(do="leave", held_s=held_s)
+        gone = [asyncio.ensure_future(worker.gone.wait()) for worker in self._workers]
+        if gone:
+            await asyncio.wait(gone, timeout=held_s + _LEAVE_S)
+        self._finish(_EXIT_OK)
+
+    def _stop_accepting(self) -> None:
+        if self._listener.fileno() >= 0:
+            asyncio.get_running_loop().remove_reader(self._listener.fileno())
+            self._listener.close()
+
+    def _finish(self, code: int) -> None:
+        self._state = "leaving"
+        if not self._over.done():
+            self._over.set_result(code)
+
+    def _keep(self, work: Any) -> None:
+        task = asyncio.get_running_loop().create_task(work)
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
+
+    # --- the control port ------------------------------------------------------------------------
+
+    async def _answer(self, ask: Ask) -> Answer:
+        pages: dict[tuple[str, str], Callable[[Ask], Awaitable[Answer]]] = {
+            ("GET", "/healthz"): self._healthz,
+            ("GET", "/readyz"): self._readyz,
+            ("GET", "/metrics"): self._metrics,
+            ("GET", "/status"): self._status,
+            ("POST", "/drain"): self._post_drain,
+        }
+        page = pages.get((ask.method, ask.path))
+        if page is not None:
+            return await page(ask)
+        known = any(path == ask.path for _, path in pages)
+        return _json({"code": "not-found"}, status=405 if known else 404)
+
+    async def _healthz(self, ask: Ask) -> Answer:
+        return _json(
+            {
+                "server": self._server_id,
+                "version": _version(),
+                "settings": self._settings.digest(),
+                "uptime_s": round(time.monotonic() - self._began, 3),
+            }
+        )
+
+    async def _readyz(self, ask: Ask) -> Answer:
+        if self._state == "ready":
+            return _json({"state": self._state})
+        return _json({"state": self._state}, status=503, headers={"x-envoy-immediate-health-check-fail": "1"})
+
+    async def _metrics(self, ask: Ask) -> Answer:
+        merged = await self._merged()
+        merged["gauges"].update(
+            {
+                "cpu_s": self._cpu_s(),
+                "resident_bytes": float(sum(map(resident_bytes, self._pids()))),
+                "ready": float(self._state == "ready"),
+            }
+        )
+        return Answer(body=render(merged), content_type="text/plain; version=0.0.4; charset=utf-8")
+
+    async def _status(self, ask: Ask) -> Answer:
+        merged = await self._merged()
+        gauges = merged["gauges"]
+        results: dict[str, int] = {}
+        for _, result, n in merged["requests"]:
+            results[result] = results.get(result, 0) + n
+        return _json(
+            {
+                **self._identity_while_open(),
+                "version": _version(),
+                "state": self._state,
+                "uptime_s": round(time.monotonic() - self._began, 3),
+                "robots": int(gauges.get("robots", 0)),
+                "robots_of_workers": [worker.load for worker in self._workers],
+                "requests": sum(results.values()),
+                "results": results,
+                "queue": int(gauges.get("queue", 0)),
+                "queue_oldest_s": gauges["queue_oldest_s"],
+                "in_flight": int(gauges.get("in_flight", 0)),
+                "loop_lag_s": gauges["loop_lag_s"],
+                "cpu_s": self._cpu_s(),
+                "worker_cpu_s": [cpu_seconds(worker.pid) for worker in self._workers],
+                "resident_bytes": sum(map(resident_bytes, self._pids())),
+                "size": self._settings.serving.size,
+                "settings": self._settings.digest(),
+            }
+        )
+
+    async def _post_drain(self, ask: Ask) -> Answer:
+        if not ask.is_local:
+            return _json({"code": "forbidden", "hint": "drain from the server's own machine"}, status=403)
+        try:
+            wait_s = float(ask.query.get("wait", self._settings.serving.drain_wait_s))
+        except ValueError:
+            return _json({"code": "bad-request", "hint": "wait is a number of seconds"}, status=400)
+        if not 0 <= wait_s <= 3600:
+            return _json({"code": "bad-request", "hint": "wait is 0 to 3600 seconds"}, status=400)
+        if self._state == "ready":
+            self._state = "draining"
+            self._keep(self._drain(wait_s))
+        return _json({"state": self._state}, status=202)
+
+    def _identity_while_open(self) -> dict[str, Any]:
+        identity = {"server": self._server_id, "pid": os.getpid(), "workers": [w.pid for w in self._workers]}
+        return identity if self._listener.fileno() < 0 else self._identity()
+
+    async def _merged(self) -> dict[str, Any]:
+        """Ask the workers at most every quarter second; one that does not answer keeps its old numbers."""
+        async with self._reporting:
+            if time.monotonic() - self._reported >= _FRESH_S:
+                await asyncio.gather(*(worker.ask_report(_REPORT_S) for worker in self._workers))
+                self._reported = time.monotonic()
+        merged = merge(worker.report for worker in self._workers if worker.report is not None)
+        merged["handshakes"]["no-worker"] = self._refused_full
+        return merged
+
+    def _pids(self) -> list[int]:
+        return [os.getpid(), *(worker.pid for worker in self._workers)]
+
+    def _cpu_s(self) -> float:
+        return round(sum(map(cpu_seconds, self._pids())), 3)
+
+
+def _json(value: Any, *, status: int = 200, headers: dict[str, str] | None = None) -> Answer:
+    return Answer(status=status, body=json.dumps(value).encode() + b"\n", headers=headers or {})
+
+
+def _version() -> str:
+    try:
+        return metadata.version("rse-pf")
+    except metadata.PackageNotFoundError:
+        return "unknown"
+
+
+def _write_atomically(path: Path, value: dict[str, Any]) -> None:
+    temporary = path.with_name(f".{path.name}.{os.getpid()}")
+    temporary.write_text(json.dumps(value), encoding="utf-8")
+    temporary.replace(path)

@@ -1,0 +1,186 @@
+"""One worker process: `python -m rse_pf.backend.worker DATA_FD CONTROL_FD`, started by the supervisor.
+
+Accepted sockets arrive as descriptors on the data channel, orders as JSON lines on the control
+channel.  Promises to die with its supervisor (parent-death signal, and the end of either channel),
+and to leave signals of the terminal or of a service manager to the supervisor.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import gc
+import importlib
+import json
+import os
+import secrets
+import signal
+import socket
+import sys
+import time
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from rse_pf.auth import KeySet
+from rse_pf.backend.core import Clocks, Core
+from rse_pf.backend.door import Door
+from rse_pf.backend.log import JsonLog
+from rse_pf.backend.processes import die_with_parent
+from rse_pf.backend.server import RobotSockets
+from rse_pf.errors import ConfigurationError, MissingExtra
+from rse_pf.service import Registry
+from rse_pf.settings import PlatformSettings
+
+__all__ = ["load_services", "main"]
+
+_POLL_S = 0.01
+_MOST_LINE_BYTES = 1 << 20
+_FDS_AT_ONCE = 16
+_CLOSING_S = 1.0
+
+
+def main(arguments: list[str]) -> None:
+    """Run the worker until it is told to leave or its supervisor is gone."""
+    data, control = (socket.socket(fileno=int(fd)) for fd in arguments)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    with control.makefile("rb", buffering=0) as orders:
+        config = json.loads(orders.readline() or b"null")
+    if config is None or not die_with_parent(config["supervisor"]):
+        return
+    try:
+        import uvloop
+    except ImportError as error:
+        raise MissingExtra("uvloop", "backend") from error
+    loop = uvloop.new_event_loop()
+    asyncio.set_event_loop(loop)
+    loop.run_until_complete(_Worker(config, data, control, loop).run())
+
+
+def load_services(name: str, settings: PlatformSettings) -> Registry:
+    """Return the registry that ``module:function`` makes of *settings*; raises ConfigurationError."""
+    module, _, function = name.partition(":")
+    try:
+        make: Callable[[PlatformSettings], Registry] = getattr(importlib.import_module(module), function)
+    except (ImportError, AttributeError) as error:
+        raise ConfigurationError(
+            f"no services at {name!r}: {error}", hint="name them as module:function"
+        ) from error
+    return make(settings)
+
+
+class _Worker:
+    def __init__(
+        self,
+        config: Mapping[str, Any],
+        data: socket.socket,
+        control: socket.socket,
+        loop: asyncio.AbstractEventLoop,
+    ) -> None:
+        settings = PlatformSettings.from_dict(config["settings"])
+        self._data = data
+        self._control = control
+        self._loop = loop
+        self._ended = 0
+        self._flushing = False
+        self._tasks: set[asyncio.Task[None]] = set()
+        self._log = JsonLog(level=settings.serving.log_level, server=config["server"], wall_clock=time.time)
+        self._core = Core(
+            settings=settings,
+            registry=load_services(config["services"], settings),
+            server_id=config["server"],
+            clocks=Clocks(monotonic=time.monotonic, wall=time.time, cpu=time.process_time),
+            loop=loop,
+            log=self._log,
+            new_session_id=lambda: secrets.token_hex(8),
+        )
+        keys = None if config["keys"] is None else KeySet.from_json(config["keys"])
+        self._index, self._workers, self._named = config["index"], config["workers"], 0
+        self._sockets = RobotSockets(
+            core=self._core,
+            door=Door(settings, keys, conformance_echo=config["conformance_echo"]),
+            serving=settings.serving,
+            session=settings.session,
+            most_robots=-(-settings.serving.max_robots // self._workers),
+            new_name=self._new_name,
+            log=self._log,
+            loop=loop,
+        )
+
+    async def run(self) -> None:
+        reader, self._writer = await asyncio.open_unix_connection(sock=self._control, limit=_MOST_LINE_BYTES)
+        self._data.setblocking(False)
+        self._loop.add_reader(self._data.fileno(), self._take_sockets)
+        gc.collect()
+        gc.freeze()
+        self._say(event="ready")
+        while line := await reader.readline():
+            order = json.loads(line)
+            if order["do"] == "report":
+                self._say(event="report", report=self._core.snapshot())
+            elif order["do"] == "move":
+                self._core.move_all(order["reason"], order["within_ms"])
+                self._keep(self._tell_when_empty())
+            elif order["do"] == "leave":
+                await self._leave(order["held_s"])
+                break
+        self._log.close()
+        os._exit(0)  # sockets and threads of a worker that has no supervisor are nobody's
+
+    async def _tell_when_empty(self) -> None:
+        while self._core.connections:
+            await asyncio.sleep(_POLL_S)
+        self._say(event="empty")
+
+    async def _leave(self, held_s: float) -> None:
+        until = time.monotonic() + held_s
+        while self._core.held and time.monotonic() < until:
+            await asyncio.sleep(_POLL_S)
+        self._core.close_all()
+        until = time.monotonic() + _CLOSING_S
+        while self._core.connections and time.monotonic() < until:
+            await asyncio.sleep(_POLL_S)
+
+    def _take_sockets(self) -> None:
+        while True:
+            try:
+                message, fds, _, _ = socket.recv_fds(self._data, _FDS_AT_ONCE, _FDS_AT_ONCE)
+            except BlockingIOError:
+                return
+            if not message:
+                self._loop.remove_reader(self._data.fileno())
+                return
+            for fd in fds:
+                self._sockets.take(fd, self._count_end)
+
+    def _count_end(self) -> None:
+        self._ended += 1
+        if not self._flushing:
+            self._flushing = True
+            self._loop.call_soon(self._flush_ends)
+
+    def _flush_ends(self) -> None:
+        """Tell the supervisor, one byte for each socket that ended, so that it knows our load."""
+        self._flushing = False
+        try:
+            self._ended -= self._data.send(b"e" * self._ended)
+        except BlockingIOError:
+            self._flushing = True
+            self._loop.call_later(_POLL_S, self._flush_ends)
+        except OSError:
+            self._ended = 0  # the supervisor is gone; the control channel ends this process
+
+    def _new_name(self) -> str:
+        self._named += 1
+        return f"anonymous-{(self._named - 1) * self._workers + self._index + 1}"
+
+    def _say(self, **message: Any) -> None:
+        self._writer.write(json.dumps(message).encode() + b"\n")
+
+    def _keep(self, work: Any) -> None:
+        task = self._loop.create_task(work)
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
