@@ -1,0 +1,121 @@
+"""Two robust PnP engines behind one contract: PoseLib, and the paper's ``solvePnPRansac``.
+
+An engine proposes a pose; whether anybody should believe it is decided in `rse_pf.pnp.solver`.
+Promises the same answer to the same question (fixed seeds, one thread), and that no library's
+own exception leaves.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from functools import cache
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from rse_pf.errors import BadRequest, MissingExtra
+from rse_pf.geometry import Array, Camera
+
+if TYPE_CHECKING:
+    from rse_pf.pnp.solver import PnpOptions
+
+__all__ = ["ENGINES", "Engine", "available_engines", "engine_for"]
+
+Engine = Callable[[Array, Array, Camera, "PnpOptions"], "Array | None"]
+"""``(points_world (n, 3), pixels (n, 2), camera, options)`` to ``(3, 4)`` [R | t], or None."""
+
+
+def engine_for(name: str) -> Engine:
+    """Return the engine called *name*.
+
+    Raises:
+        BadRequest: There is none.
+        MissingExtra: Its library is not installed.
+    """
+    make = ENGINES.get(name)
+    if make is None:
+        raise BadRequest(f"no engine named {name!r}", hint=f"choose one of {', '.join(ENGINES)}")
+    return make()
+
+
+def available_engines() -> tuple[str, ...]:
+    """Return the names of the engines whose libraries are installed."""
+    found = []
+    for name, make in ENGINES.items():
+        try:
+            make()
+        except MissingExtra:
+            continue
+        found.append(name)
+    return tuple(found)
+
+
+@cache
+def _poselib_engine() -> Engine:
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
+    try:
+        import poselib
+    except ImportError as error:
+        raise MissingExtra("poselib", "solver") from error
+
+    estimate: Any = poselib.estimate_absolute_pose
+
+    def solve(points_world: Array, pixels: Array, camera: Camera, options: PnpOptions) -> Array | None:
+        """LO-RANSAC with P3P, then robust refinement (Larsson, PoseLib)."""
+        model = {
+            "model": "PINHOLE",
+            "width": camera.width,
+            "height": camera.height,
+            "params": [camera.fx, camera.fy, camera.cx, camera.cy],
+        }
+        ransac = {
+            "max_reproj_error": options.inlier_px,
+            "max_error": options.inlier_px,
+            "min_iterations": options.min_iterations,
+            "max_iterations": options.max_iterations,
+            "success_prob": options.confidence,
+        }
+        try:
+            pose, _ = estimate(pixels, points_world, model, ransac, {})
+        except (RuntimeError, ValueError):
+            return None
+        found: Array = pose.Rt
+        return found
+
+    return solve
+
+
+@cache
+def _opencv_engine() -> Engine:
+    try:
+        import cv2
+    except ImportError as error:
+        raise MissingExtra("opencv-python-headless", "vision") from error
+    cv2.setNumThreads(1)
+
+    def solve(points_world: Array, pixels: Array, camera: Camera, options: PnpOptions) -> Array | None:
+        """RANSAC with P3P, then Levenberg-Marquardt on the inliers (RSE-PF paper, Sect. 6.1)."""
+        matrix = camera.matrix
+        cv2.setRNGSeed(0)
+        try:
+            found, rotation, translation, inliers = cv2.solvePnPRansac(
+                points_world, pixels, matrix, None,
+                iterationsCount=options.max_iterations, reprojectionError=options.inlier_px,
+                confidence=options.confidence, flags=cv2.SOLVEPNP_P3P,
+            )  # fmt: skip
+            if not found or inliers is None or len(inliers) < 4:
+                return None
+            rows = inliers[:, 0]
+            rotation, translation = cv2.solvePnPRefineLM(
+                points_world[rows], pixels[rows], matrix, None, rotation, translation
+            )
+            pose: Array = np.hstack([cv2.Rodrigues(rotation)[0], translation])
+        except cv2.error:
+            return None
+        return pose
+
+    return solve
+
+
+ENGINES: dict[str, Callable[[], Engine]] = {"poselib": _poselib_engine, "opencv": _opencv_engine}

@@ -1,0 +1,105 @@
+"""Seeded PnP problems with known poses: what tests and benchmarks are measured against.
+
+Promises that equal arguments give equal problems, and to use no generator but its own.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from rse_pf.geometry import Array, Camera, exp_se3, inverse, transform
+
+__all__ = ["KINECT", "PnpProblem", "make_degenerate", "make_problem"]
+
+KINECT = Camera(fx=518.86, fy=519.47, cx=325.58, cy=253.74, width=640, height=480)
+"""The colour camera of NYU Depth V2 (its toolbox's calibration)."""
+
+_NEAREST_M, _FARTHEST_M, _BORDER_PX = 0.8, 6.0, 8.0
+
+DEGENERATE = ("collinear", "noisy-collinear", "coincident", "same-pixel", "noise", "behind", "line-of-sight")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class PnpProblem:
+    """Correspondences and the pose that made them."""
+
+    points_world: Array
+    pixels: Array
+    camera: Camera
+    T_camera_world: Array
+    is_inlier: npt.NDArray[np.bool_]
+
+
+def make_problem(
+    *,
+    seed: int,
+    n: int = 200,
+    noise_px: float = 1.0,
+    outlier_ratio: float = 0.3,
+    depth_noise: bool = False,
+    camera: Camera = KINECT,
+) -> PnpProblem:
+    """Return *n* correspondences of a room-sized scene, *outlier_ratio* of them uniformly wrong.
+
+    Points lie 0.8 to 6 m before the camera; with *depth_noise* they carry a Kinect's error.
+
+    Source:
+        Depth error after Nguyen et al., 3DIMPVT 2012.
+    """
+    rng = np.random.default_rng(seed)
+    T_camera_world = exp_se3(np.concatenate([rng.uniform(-2, 2, 3), rng.normal(size=3) * 0.6]))
+    size = np.array([camera.width, camera.height], dtype=np.float64)
+    exact = rng.uniform(_BORDER_PX, size - _BORDER_PX, (n, 2))
+    depth_m = rng.uniform(_NEAREST_M, _FARTHEST_M, n)
+    measured_m = depth_m
+    if depth_noise:
+        measured_m = depth_m + rng.normal(size=n) * (0.0012 + 0.0019 * (depth_m - 0.4) ** 2)
+    points_world = transform(inverse(T_camera_world), camera.back_project(exact, measured_m))
+    pixels = exact + rng.normal(size=(n, 2)) * noise_px
+    wrong = rng.permutation(n)[: round(outlier_ratio * n)]
+    pixels[wrong] = rng.uniform(0, size, (len(wrong), 2))
+    is_inlier = np.ones(n, dtype=np.bool_)
+    is_inlier[wrong] = False
+    return PnpProblem(
+        points_world=points_world, pixels=pixels, camera=camera, T_camera_world=T_camera_world,
+        is_inlier=is_inlier,
+    )  # fmt: skip
+
+
+def make_degenerate(kind: str, *, seed: int, n: int = 100, camera: Camera = KINECT) -> PnpProblem:
+    """Return correspondences that fix no pose; *kind* is one of `DEGENERATE`."""
+    rng = np.random.default_rng(seed)
+    problem = make_problem(seed=seed, n=n, noise_px=0.5, outlier_ratio=0.0, camera=camera)
+    T, points, pixels = problem.T_camera_world, problem.points_world, problem.pixels
+    if kind in ("collinear", "noisy-collinear"):
+        start = rng.uniform([-1.0, -0.7, 2.0], [1.0, 0.7, 4.0])
+        direction = rng.normal(size=3) * [1.0, 1.0, 0.3]
+        along = np.linspace(-0.5, 0.5, n)[:, None] * direction / np.linalg.norm(direction)
+        line_camera = start + along
+        pixels = camera.project(line_camera)
+        points = transform(inverse(T), line_camera)
+        if kind == "noisy-collinear":
+            points = points + rng.normal(size=(n, 3)) * 0.005
+            pixels = pixels + rng.normal(size=(n, 2)) * 0.5
+    elif kind == "coincident":
+        points = np.repeat(points[:1], n, axis=0)
+    elif kind == "same-pixel":
+        pixels = np.repeat(pixels[:1], n, axis=0)
+    elif kind == "line-of-sight":
+        ray = camera.back_project(pixels[:1], np.ones(1))
+        points = transform(inverse(T), ray * np.linspace(1, 5, n)[:, None])
+        pixels = pixels[:1] + rng.normal(size=(n, 2)) * 0.5
+    elif kind == "noise":
+        pixels = rng.uniform(0, [camera.width, camera.height], (n, 2))
+    elif kind == "behind":
+        T = np.diag([-1.0, -1.0, 1.0, 1.0]) @ T
+        points = transform(inverse(T), camera.back_project(pixels, -rng.uniform(1, 5, n)))
+    else:
+        raise ValueError(f"unknown kind {kind!r}")
+    return PnpProblem(
+        points_world=points, pixels=pixels, camera=camera, T_camera_world=T,
+        is_inlier=np.zeros(n, dtype=np.bool_),
+    )  # fmt: skip
