@@ -68,7 +68,7 @@ class Scheduler:
         self._most_waiting = settings.queue_per_robot
         self._robots: dict[str, _Robot] = {}
         self._round: deque[str] = deque()
-        self._above_since: float | None = None
+        self._otherwise_since: float | None = None
         self._turn_s = 0.0
         self._last_start: float | None = None
 
@@ -170,7 +170,8 @@ class Scheduler:
             )
             return Refusal(job, error, "robot-queue")
         ahead_s = len(self._round) * self._turn_s
-        if self.is_behind and not robot.waiting and ahead_s > job.patience_s(self._target_s):
+        # Behind, a second waiting command would keep its robot's place against those without one.
+        if self.is_behind and (robot.waiting or ahead_s > job.patience_s(self._target_s)):
             return Refusal(job, self._busy(ahead_s), "behind")
         return None
 
@@ -209,15 +210,16 @@ class Scheduler:
         return min(_LONGEST_RETRY_MS, max(self._interval_s * 1e3, wanted_ms))
 
     def _note_turn_wait(self, wait_s: float, now: float) -> None:
-        """Enter *behind* after an interval above the target; leave it below half of the target."""
-        if wait_s < self._target_s / 2:
-            self._above_since, self.is_behind = None, False
-        elif wait_s > self._target_s:
-            if self._above_since is None:
-                self._above_since = now
-            self.is_behind = self.is_behind or now - self._above_since >= self._interval_s
-        elif not self.is_behind:
-            self._above_since = None
+        """Enter *behind* after an interval above the target, leave it after one below half of it.
+
+        Both need a whole interval: shedding empties the queue for a moment, which is no recovery.
+        """
+        if self.is_behind == (wait_s > self._target_s / (2 if self.is_behind else 1)):
+            self._otherwise_since = None
+        elif self._otherwise_since is None:
+            self._otherwise_since = now
+        elif now - self._otherwise_since >= self._interval_s:
+            self.is_behind, self._otherwise_since = not self.is_behind, None
 
     def _measure_turn(self, now: float) -> None:
         """Average the time between two starts while robots wait: threads and size gate included."""
