@@ -12,46 +12,50 @@ import numpy.typing as npt
 
 from rse_pf.geometry import Array, Camera, exp_se3
 
-__all__ = ["Residuals", "flipped_rmse_px", "information", "log10_false_alarms", "residuals", "slenderness"]
+__all__ = ["Spread", "flipped_rmse_px", "information", "log10_false_alarms", "slenderness", "view_of"]
 
 _LOG10_E = math.log10(math.e)
 _SAMPLE = 3
 _POSES_OF_A_SAMPLE = 4
 _KEPT_SHARE = 0.8
+_NEAR_M = 1e-6
+_STRAYS = 4.0
+_PLAINLY_WIDE = 0.15
+
+# Rows of the Jacobian by (rho, phi) as signed rows of 1/z, a/z, b/z, ab, 1+a^2, 1+b^2, a, b.
+_ROWS_U, _SIGNS_U = np.array([0, 0, 1, 3, 4, 7]), np.array([1.0, 0, -1, -1, 1, -1])
+_ROWS_V, _SIGNS_V = np.array([0, 0, 2, 5, 3, 6]), np.array([0.0, 1, -1, -1, 1, 1])
+_TAKE_U, _SIGN_U = _ROWS_U[:, None] * 8 + _ROWS_U, np.outer(_SIGNS_U, _SIGNS_U)
+_TAKE_V, _SIGN_V = _ROWS_V[:, None] * 8 + _ROWS_V, np.outer(_SIGNS_V, _SIGNS_V)
+
+X, Y, Z, A, B, Z_INV = range(6)
+"""Rows of a view: camera-frame coordinates, slopes a = x/z and b = y/z, and 1/z."""
 
 
-class Residuals:
-    """Points in the camera's frame and their squared reprojection errors, ``(n,)`` px^2."""
+def view_of(pose: Array, points_world: Array, pixels: Array, camera: Camera) -> tuple[Array, Array]:
+    """Return the ``(6, n)`` view under ``(3, 4)`` *pose* and ``(n,)`` squared errors, px^2.
 
-    __slots__ = ("error2_px2", "points_camera")
-
-    def __init__(self, points_camera: Array, error2_px2: Array) -> None:
-        self.points_camera = points_camera
-        self.error2_px2 = error2_px2
-
-
-def residuals(pose: Array, points_world: Array, pixels: Array, camera: Camera) -> Residuals:
-    """Return the residuals under ``(3, 4)`` *pose*; a point behind the camera has infinite error."""
-    points_camera = points_world @ pose[:, :3].T
-    points_camera += pose[:, 3]
-    x, y, z = points_camera.T
-    in_front = z > 1e-6
-    if not in_front.all():
-        z = np.where(in_front, z, 1.0)
-    u = x / z
-    u *= camera.fx
-    u += camera.cx
-    u -= pixels[:, 0]
-    v = y / z
-    v *= camera.fy
-    v += camera.cy
-    v -= pixels[:, 1]
-    u *= u
-    v *= v
-    u += v
-    if not in_front.all():
-        u[~in_front] = np.inf
-    return Residuals(points_camera, u)
+    A point that is not before the camera has infinite error.
+    """
+    view = np.empty((6, len(pixels)))
+    np.matmul(pose[:, :3], points_world.T, out=view[:3])
+    view[:3] += pose[:, 3:]
+    z = view[Z]
+    behind = None if z.min() > _NEAR_M else z <= _NEAR_M
+    if behind is not None:
+        z[behind] = _NEAR_M
+    np.divide(1.0, z, out=view[Z_INV])
+    np.multiply(view[:2], view[Z_INV], out=view[A : B + 1])
+    error2 = view[A] * camera.fx
+    error2 += camera.cx - pixels[:, 0]
+    error2 *= error2
+    down = view[B] * camera.fy
+    down += camera.cy - pixels[:, 1]
+    down *= down
+    error2 += down
+    if behind is not None:
+        error2[behind] = np.inf
+    return view, error2
 
 
 def log10_false_alarms(n: int, inliers: int, largest_error2_px2: float, camera: Camera) -> float:
@@ -73,51 +77,102 @@ def log10_false_alarms(n: int, inliers: int, largest_error2_px2: float, camera: 
     return log * _LOG10_E
 
 
-def slenderness(rows: Array) -> float:
-    """Return width over length of ``(n, 2 or 3)`` *rows*: 0 on a line, 0 if they coincide.
+class Spread:
+    """How wide the inliers lie, in space and in the image.
 
-    Width is the distance from the main axis that 80 % of the rows stay below, so a few strays
-    beside a line do not make it wide.
+    ``thinness`` is width over length, of the slimmer of the two: 0 on a line, 0 if they coincide.
+    ``image_radius`` is the largest distance from their centre in the image, in slopes.
     """
-    centred = rows - rows.mean(axis=0)
-    _, axes = np.linalg.eigh(centred.T @ centred)
-    along = centred @ axes[:, -1]
+
+    __slots__ = ("image_radius", "thinness")
+
+    def __init__(self, view: Array) -> None:
+        k = view.shape[1]
+        centred = view[: B + 1] - np.add.reduce(view[: B + 1], axis=1, keepdims=True) / k
+        moments = centred @ centred.T
+        squares = centred * centred
+        radius2 = squares[X] + squares[Y] + squares[Z]
+        image2 = squares[A] + squares[B]
+        self.image_radius = math.sqrt(float(image2.max()))
+        self.thinness = min(
+            _thinness(centred[:A], moments[:A, :A], radius2), _thinness(centred[A:], moments[A:, A:], image2)
+        )
+
+
+def slenderness(rows: Array) -> float:
+    """Return width over length of ``(n, 2 or 3)`` *rows*: 0 on a line, 0 if they coincide."""
+    centred = (rows - rows.mean(axis=0)).T
+    return _thinness(centred, centred @ centred.T, (centred * centred).sum(axis=0))
+
+
+def _thinness(centred: Array, moments: Array, radius2: Array) -> float:
+    """Width is the distance from the main axis that 80 % of the rows stay below.
+
+    So a few strays beside a line do not make it wide.  Where the moments alone prove the rows wide
+    even without the four farthest of them, no axis is computed.
+    """
+    largest, middle = _two_largest_eigenvalues(moments.tolist())
+    if largest <= 1e-18:
+        return 0.0
+    spare = middle - _STRAYS * float(radius2.max())
+    if spare > _PLAINLY_WIDE**2 * largest:
+        return math.sqrt(spare / largest)
+    _, axes = np.linalg.eigh(moments)
+    along = axes[:, -1] @ centred
     along *= along
-    aside = np.einsum("ij,ij->i", centred, centred)
-    aside -= along
-    k = min(len(rows) - 1, int(_KEPT_SHARE * len(rows)))
+    aside = radius2 - along
+    k = min(len(along) - 1, int(_KEPT_SHARE * len(along)))
     width2, length2 = float(np.partition(aside, k)[k]), float(np.partition(along, k)[k])
     if length2 <= 1e-18:
         return 0.0
     return math.sqrt(max(0.0, width2) / length2)
 
 
-def information(points_camera: Array, camera: Camera) -> Array:
+def _two_largest_eigenvalues(m: list[list[float]]) -> tuple[float, float]:
+    """Return the two largest eigenvalues of a symmetric 2x2 or 3x3 matrix, largest first.
+
+    Source:
+        Smith, Communications of the ACM 4 (1961): the trigonometric closed form.
+    """
+    if len(m) == 2:
+        mean, half = (m[0][0] + m[1][1]) / 2, (m[0][0] - m[1][1]) / 2
+        root = math.hypot(half, m[0][1])
+        return mean + root, mean - root
+    mean = (m[0][0] + m[1][1] + m[2][2]) / 3
+    d0, d1, d2 = m[0][0] - mean, m[1][1] - mean, m[2][2] - mean
+    o01, o02, o12 = m[0][1], m[0][2], m[1][2]
+    p = math.sqrt((d0 * d0 + d1 * d1 + d2 * d2 + 2 * (o01 * o01 + o02 * o02 + o12 * o12)) / 6)
+    if p == 0.0:
+        return mean, mean
+    determinant = d0 * (d1 * d2 - o12 * o12) - o01 * (o01 * d2 - o12 * o02) + o02 * (o01 * o12 - d1 * o02)
+    angle = math.acos(max(-1.0, min(1.0, determinant / (2 * p**3)))) / 3
+    largest = mean + 2 * p * math.cos(angle)
+    smallest = mean + 2 * p * math.cos(angle + 2 * math.pi / 3)
+    return largest, 3 * mean - largest - smallest
+
+
+def information(view: Array, camera: Camera) -> Array:
     """Return the ``(6, 6)`` matrix J^T J of the pixels by the twist (rho, phi) left of the pose.
+
+    The Jacobian's rows are linear in eight products of a, b and 1/z, so one small product of
+    matrices replaces a tall one.
 
     Source:
         Barfoot, State Estimation for Robotics (2017), Sect. 7.3 (left perturbation).
     """
-    n = len(points_camera)
-    z_inv = 1.0 / points_camera[:, 2]
-    a = points_camera[:, 0] * z_inv
-    b = points_camera[:, 1] * z_inv
-    J = np.zeros((6, 2, n))
-    ab = a * b
-    J[0, 0] = z_inv
-    J[1, 1] = z_inv
-    J[2, 0] = -a * z_inv
-    J[2, 1] = -b * z_inv
-    J[3, 0] = -ab
-    J[3, 1] = -1.0 - b * b
-    J[4, 0] = 1.0 + a * a
-    J[4, 1] = ab
-    J[5, 0] = -b
-    J[5, 1] = a
-    J[:, 0] *= camera.fx
-    J[:, 1] *= camera.fy
-    flat = J.reshape(6, 2 * n)
-    matrix: Array = flat @ flat.T
+    products = np.empty((8, view.shape[1]))
+    products[0] = view[Z_INV]
+    np.multiply(view[A : B + 1], view[Z_INV], out=products[1:3])
+    np.multiply(view[A], view[B], out=products[3])
+    np.multiply(view[A : B + 1], view[A : B + 1], out=products[4:6])
+    products[4:6] += 1.0
+    products[6:] = view[A : B + 1]
+    moments = products @ products.T
+    matrix: Array = moments.take(_TAKE_U)
+    matrix *= _SIGN_U * camera.fx**2
+    other = moments.take(_TAKE_V)
+    other *= _SIGN_V * camera.fy**2
+    matrix += other
     return matrix
 
 
@@ -154,7 +209,7 @@ def flipped_rmse_px(pose: Array, points_world: Array, pixels: Array, camera: Cam
         flipped = moved
     if np.linalg.norm(flipped - pose) < 1e-3:
         return None
-    error2 = residuals(flipped, points_world, pixels, camera).error2_px2
+    _, error2 = view_of(flipped, points_world, pixels, camera)
     return math.sqrt(float(error2.mean()))
 
 

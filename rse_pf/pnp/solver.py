@@ -135,21 +135,29 @@ def solve_pnp(
     if pose is None or not math.isfinite(float(np.sum(pose))):
         _blame(points_world, pixels)
         raise _no_consensus(0, len(pixels), options)
-    seen = evidence.residuals(pose, points_world, pixels, camera)
-    inliers = np.flatnonzero(seen.error2_px2 <= options.inlier_px**2)
+    view, error2 = evidence.view_of(pose, points_world, pixels, camera)
+    inliers = np.flatnonzero(error2 <= options.inlier_px**2)
     count = len(inliers)
-    error2 = seen.error2_px2[inliers]
+    error2 = error2[inliers]
     if count < 4 or _is_chance(len(pixels), count, float(error2.max()), camera):
         _blame(points_world, pixels)
         raise _no_consensus(count, len(pixels), options)
-    points, observed = points_world[inliers], pixels[inliers]
-    thin_world = _not_collinear("points", points)
-    thin_image = _not_collinear("pixels", observed)
+    view = view[:, inliers]
+    spread = evidence.Spread(view)
+    if spread.thinness < _COLLINEAR:
+        raise _collinear(spread.thinness)
+    if spread.image_radius * camera.fx < 2.0 * options.inlier_px:
+        raise DegenerateGeometry(
+            f"the pixels that agree lie within {spread.image_radius * camera.fx:.1f} px of each other",
+            hint="match points all over the image, or skip this frame",
+        )
     squares = float(error2.sum())
-    covariance = _covariance(seen.points_camera[inliers], camera, squares)
+    covariance = _covariance(view, camera, squares)
     rmse_px = math.sqrt(squares / count)
-    reason = _weakness(count, len(pixels), min(thin_world, thin_image), observed, covariance, camera, weak)
-    twin = _twin(pose, seen.points_camera[inliers], points, observed, camera, rmse_px)
+    reason = _weakness(count, len(pixels), spread, covariance, camera, weak)
+    if _is_flat(view):
+        twin = _twin(pose, points_world[inliers], pixels[inliers], camera, rmse_px)
+        reason = reason or twin
     T_camera_world = np.eye(4)
     T_camera_world[:3] = pose
     return PnpSolution(
@@ -157,8 +165,8 @@ def solve_pnp(
         inliers=inliers,
         rmse_px=rmse_px,
         covariance=covariance,
-        verdict="weak" if reason or twin else "ok",
-        reason=reason or twin,
+        verdict="weak" if reason else "ok",
+        reason=reason,
         engine=engine,
     )
 
@@ -196,65 +204,60 @@ def _is_chance(n: int, count: int, largest_error2_px2: float, camera: Camera) ->
 
 def _blame(points_world: Array, pixels: Array) -> None:
     """Say so if the input as a whole is degenerate: it is a better reason than "no consensus"."""
-    _not_collinear("points", points_world)
-    _not_collinear("pixels", pixels)
+    for rows in (points_world, pixels):
+        thinness = evidence.slenderness(rows)
+        if thinness < _COLLINEAR:
+            raise _collinear(thinness)
 
 
-def _not_collinear(what: str, rows: Array) -> float:
-    thin = evidence.slenderness(rows)
-    if thin < _COLLINEAR:
-        raise DegenerateGeometry(
-            f"the {what} that agree lie on one line or coincide (width/length {thin:.3f} is below "
-            f"{_COLLINEAR})",
-            hint="match points all over the image, or skip this frame",
-        )
-    return thin
+def _collinear(thinness: float) -> DegenerateGeometry:
+    return DegenerateGeometry(
+        f"the points that agree lie on one line or coincide (width/length {thinness:.3f} is below "
+        f"{_COLLINEAR})",
+        hint="match points all over the image, or skip this frame",
+    )
 
 
-def _covariance(points_camera: Array, camera: Camera, squares_px2: float) -> Array:
-    count = len(points_camera)
-    variance = max(squares_px2 / max(1, 2 * count - 6), _NOISE_FLOOR_PX2)
+def _covariance(view: Array, camera: Camera, squares_px2: float) -> Array:
+    variance = max(squares_px2 / max(1, 2 * view.shape[1] - 6), _NOISE_FLOOR_PX2)
     try:
-        inverse: Array = np.asarray(
-            np.linalg.inv(evidence.information(points_camera, camera)), dtype=np.float64
-        )
-    except np.linalg.LinAlgError as error:
-        raise DegenerateGeometry(
-            "the correspondences leave a motion of the camera free", hint="match more of the scene"
-        ) from error
-    inverse *= variance
-    if not inverse.trace() > 0 or not (inverse.diagonal() > 0).all():
+        covariance = np.linalg.inv(evidence.information(view, camera)).astype(np.float64, copy=False)
+    except np.linalg.LinAlgError:
+        covariance = np.full((6, 6), -1.0)
+    covariance *= variance
+    if not min(covariance.diagonal().tolist()) > 0:
         raise DegenerateGeometry(
             "the correspondences leave a motion of the camera free", hint="match more of the scene"
         )
-    return inverse
+    return covariance
 
 
 def _weakness(
-    count: int, n: int, thinness: float, pixels: Array, covariance: Array, camera: Camera, weak: WeakLimits
+    count: int, n: int, spread: evidence.Spread, covariance: Array, camera: Camera, weak: WeakLimits
 ) -> str:
     if count < weak.inliers:
         return "few-inliers"
     if count < weak.inlier_ratio * n:
         return "low-inlier-ratio"
-    if thinness < _NEARLY_COLLINEAR:
+    if spread.thinness < _NEARLY_COLLINEAR:
         return "nearly-collinear"
-    size = pixels.max(axis=0) - pixels.min(axis=0)
-    if max(size[0] / camera.width, size[1] / camera.height) < weak.image_share:
+    if 2.0 * spread.image_radius * camera.fx < weak.image_share * camera.width:
         return "clustered"
-    variance = covariance.diagonal()
-    if variance[:3].max() > weak.translation_m**2 or variance[3:].max() > weak.rotation_rad**2:
+    variances = covariance.diagonal().tolist()
+    if max(variances[:3]) > weak.translation_m**2 or max(variances[3:]) > weak.rotation_rad**2:
         return "poorly-constrained"
     return ""
 
 
-def _twin(
-    pose: Array, points_camera: Array, points: Array, pixels: Array, camera: Camera, rmse_px: float
-) -> str:
-    """Look for the second pose of a plane, where perspective is too weak to tell the two apart."""
-    depth = points_camera[:, 2]
-    if float(depth.max() - depth.min()) > _FLAT_DEPTH * float(depth.mean()):
-        return ""
+def _is_flat(view: Array) -> bool:
+    """Whether perspective is weak: only then may a plane have two poses."""
+    z = view[evidence.Z]
+    nearest, farthest = float(z.min()), float(z.max())
+    return farthest - nearest < _FLAT_DEPTH * farthest
+
+
+def _twin(pose: Array, points: Array, pixels: Array, camera: Camera, rmse_px: float) -> str:
+    """Look for the second pose of a plane."""
     other = evidence.flipped_rmse_px(pose, points, pixels, camera)
     if other is None:
         return ""
