@@ -21,8 +21,8 @@ __all__ = ["RATE_HZ", "SIMULATED_CAMERA", "STEP_M", "render_frames", "true_traje
 
 RATE_HZ = 5.0
 """The paper's frame rate (Sect. 6.2)."""
-STEP_M = 0.07
-"""Distance between frames: a robot that drives at 0.35 m/s."""
+STEP_M = 0.068
+"""Distance between frames: a robot that drives at 0.34 m/s."""
 SIMULATED_CAMERA = Camera(fx=525.0, fy=525.0, cx=319.5, cy=239.5, width=640, height=480)
 
 _WAYPOINTS_M = (
@@ -55,8 +55,8 @@ def render_frames(robot: int, robots: int, frames: int, seed: int) -> Iterator[F
 def true_trajectory(robot: int, robots: int, frames: int, seed: int) -> Trajectory:
     """Return the exact ``T_world_camera`` of `render_frames`; the world's z axis points up.
 
-    Robots are spread evenly over the loop of about 28 m; a robot takes 7 cm and at most 4 degrees
-    from one frame to the next, so 80 frames are a path of 5.5 m.
+    Robots are spread evenly over the loop of about 28 m; a robot takes 6.8 cm and at most 4 degrees
+    from one frame to the next, so 80 frames are a path of 5.4 m.
 
     Raises:
         UsageError: The robot is not one of *robots*, or there are no frames.

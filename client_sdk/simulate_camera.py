@@ -36,19 +36,19 @@ class Painter:
         self._rays_camera = np.stack(
             [(columns - camera.cx) / camera.fx, (rows - camera.cy) / camera.fy, np.ones(size)]
         ).astype(np.float32)
-        self._ray_length = np.sqrt((self._rays_camera**2).sum(axis=0)).ravel()
+        self._shortening = 1.0 / np.sqrt((self._rays_camera**2).sum(axis=0)).ravel()
         self._starts, self._texels, self._levels = _mip_maps(world)
         faces = world.faces
-        self._axis = np.array([face.axis for face in faces])
-        self._texture = np.array([face.texture for face in faces])
+        self._axis = np.array([face.axis for face in faces], dtype=np.int8)
+        self._texture = np.array([face.texture for face in faces], dtype=np.int32)
         self._texel_m = np.array([face.texel_m for face in faces], dtype=np.float32)
-        self._low = np.array([face.low for face in faces], dtype=np.float32)
-        self._high = np.array([face.high for face in faces], dtype=np.float32)
-        self._a = np.array([face.a for face in faces], dtype=np.float32)
-        self._b = np.array([face.b for face in faces], dtype=np.float32) - self._a
-        self._side = np.array([len(texture) for texture in world.textures])
-        lamps = [((face.room + 0.5) * ROOM_M, DEPTH_M / 2, HEIGHT_M - 0.35) for face in faces]
-        self._lamp = np.array(lamps, dtype=np.float32)
+        # One row per coordinate or channel: a gather from a short row stays in the cache.
+        self._low = np.array([face.low for face in faces], dtype=np.float32).T.copy()
+        self._size = np.array([face.high for face in faces], dtype=np.float32).T - self._low
+        self._a = np.array([face.a for face in faces], dtype=np.float32).T.copy()
+        self._b = np.array([face.b for face in faces], dtype=np.float32).T - self._a
+        self._side = np.array([len(texture) for texture in world.textures], dtype=np.int32)
+        self._lamp_x = np.array([(face.room + 0.5) * ROOM_M for face in faces], dtype=np.float32)
 
     def draw(self, T_world_camera: Array) -> tuple[_Image, _Image, _Image]:
         """Return colour ``(h, w, 3)`` 0..255, depth ``(h, w)`` in metres and the cosine of incidence.
@@ -59,23 +59,31 @@ class Painter:
         rays = np.tensordot(rotation, self._rays_camera, axes=1)
         origin = T_world_camera[:3, 3].astype(np.float32)
         depth_m, ids = self._rasterise(T_world_camera, rays, origin)
-        size = depth_m.shape
-        hit = np.flatnonzero(ids >= 0)
-        face, t = ids.ravel()[hit], depth_m.ravel()[hit]
-        rays = rays.reshape(3, -1)[:, hit]
+        missed = ids < 0
+        depth_m[missed] = 1.0
+        face = np.maximum(ids, 0).ravel().astype(np.intp)
+        t, rays = depth_m.ravel(), rays.reshape(3, -1)
         points = origin[:, None] + t * rays
         axis = self._axis[face]
-        cosine = np.abs(np.choose(axis, rays)) / self._ray_length[hit]
-        u = np.where(axis == 0, points[1], points[0])
-        v = np.where(axis == 2, points[1], points[2])
+        along_x, along_z = axis == 0, axis == 2
+        cosine = np.abs(np.where(along_x, rays[0], np.where(along_z, rays[2], rays[1]))) * self._shortening
+        u = np.where(along_x, points[1], points[0])
+        v = np.where(along_z, points[1], points[2])
+        u, v, right, top = (
+            u - self._low[0][face],
+            v - self._low[1][face],
+            self._size[0][face],
+            self._size[1][face],
+        )
         value = self._sample(face, u, v, t, cosine)
-        light = self._light(face, points, u, v, cosine)
-        colour = np.zeros((len(ids.ravel()), 3), dtype=np.float32)
-        colour[hit] = (self._a[face] + value[:, None] * self._b[face]) * light[:, None]
-        seen_cosine = np.zeros(ids.size, dtype=np.float32)
-        seen_cosine[hit] = cosine
-        depth_m[ids < 0] = 0.0
-        return colour.reshape(*size, 3), depth_m, seen_cosine.reshape(size)
+        edge = np.minimum(np.minimum(u, right - u), np.minimum(v, top - v))
+        light = self._light(face, points, edge, cosine)
+        colour = np.empty((len(face), 3), dtype=np.float32)
+        for channel in range(3):
+            colour[:, channel] = (self._a[channel][face] + value * self._b[channel][face]) * light
+        depth_m[missed] = 0.0
+        colour[missed.ravel()] = 0.0
+        return colour.reshape(*ids.shape, 3), depth_m, cosine.reshape(ids.shape)
 
     def _rasterise(
         self, T_world_camera: Array, rays: _Image, origin: _Image
@@ -124,43 +132,36 @@ class Painter:
             return None
         return slice(int(low[1]), int(high[1])), slice(int(low[0]), int(high[0]))
 
-    def _sample(self, face: npt.NDArray[np.int32], u: _Image, v: _Image, t: _Image, cosine: _Image) -> _Image:
+    def _sample(self, face: npt.NDArray[np.intp], u: _Image, v: _Image, t: _Image, cosine: _Image) -> _Image:
         """Return texture values, bilinear in the mip level whose texel is as large as the pixel."""
         texel_m = self._texel_m[face]
-        pixel_m = t / np.float32(self._camera.fx) / np.sqrt(np.maximum(cosine, 0.05))
-        texture = self._texture[face]
-        wanted = np.rint(np.log2(np.maximum(pixel_m / texel_m, 1.0)) + 0.2).astype(np.int32)
+        pixel_m = t / np.float32(self._camera.fx) / np.sqrt(np.maximum(cosine, np.float32(0.05)))
+        texture = self._texture[face].astype(np.intp)
+        wanted = (np.log2(np.maximum(pixel_m / texel_m, 1.0)) + np.float32(0.7)).astype(np.int32)
         level = np.minimum(wanted, self._levels[texture])
         scale = np.exp2(-level.astype(np.float32)) / texel_m
-        side = self._side[texture].astype(np.int32) >> level
+        side = self._side[texture] >> level
         start = self._starts[texture, level]
-        x = (u - self._low[face, 0]) * scale - np.float32(0.5)
-        y = (v - self._low[face, 1]) * scale - np.float32(0.5)
+        x, y = u * scale - np.float32(0.5), v * scale - np.float32(0.5)
         x0, y0 = np.floor(x), np.floor(y)
         fx, fy = x - x0, y - y0
         mask = side - 1
-        left = x0.astype(np.int32) & mask
+        left, row = x0.astype(np.int32) & mask, y0.astype(np.int32) & mask
         right = (left + 1) & mask
-        row = y0.astype(np.int32) & mask
         lower, upper = start + row * side, start + ((row + 1) & mask) * side
-        texels = self._texels
-        below = texels[lower + left] * (1 - fx) + texels[lower + right] * fx
-        above = texels[upper + left] * (1 - fx) + texels[upper + right] * fx
-        value: _Image = below * (1 - fy) + above * fy
+        a, b, c, d = (
+            self._texels.take(place) for place in (lower + left, lower + right, upper + left, upper + right)
+        )
+        below, above = a + (b - a) * fx, c + (d - c) * fx
+        value: _Image = below + (above - below) * fy
         return value
 
-    def _light(
-        self, face: npt.NDArray[np.int32], points: _Image, u: _Image, v: _Image, cosine: _Image
-    ) -> _Image:
+    def _light(self, face: npt.NDArray[np.intp], points: _Image, edge: _Image, cosine: _Image) -> _Image:
         """Return brightness: a lamp in the middle of the room, and darker where surfaces meet."""
-        low, high = self._low[face], self._high[face]
-        edge = np.minimum(
-            np.minimum(u - low[:, 0], high[:, 0] - u), np.minimum(v - low[:, 1], high[:, 1] - v)
-        )
-        offset = points - self._lamp[face].T
-        square = offset[0] ** 2 + offset[1] ** 2 + offset[2] ** 2
-        corner = 1.0 - 0.28 / (1.0 + (edge / 0.12) ** 2)
-        light: _Image = (0.68 + 0.62 / (1.0 + 0.12 * square)) * corner * (0.94 + 0.06 * cosine)
+        x, y, z = points[0] - self._lamp_x[face], points[1] - DEPTH_M / 2, points[2] - (HEIGHT_M - 0.35)
+        lamp = 0.68 + 0.62 / (1.0 + 0.12 * (x * x + y * y + z * z))
+        corner = 1.0 - 0.28 / (1.0 + 70.0 * edge * edge)
+        light: _Image = lamp * corner * (0.94 + 0.06 * cosine)
         return light
 
 

@@ -6,6 +6,7 @@ Promises the same world for the same seed, and to draw nothing (`client_sdk.simu
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -223,6 +224,14 @@ def _noise(rng: np.random.Generator, n: int, low: float, high: float, power: flo
     return scaled
 
 
+_MOTIFS: tuple[Callable[[_Image, _Image], _Image], ...] = (
+    lambda a, b: np.sqrt(a * a + 3.2 * b * b),
+    lambda a, b: np.abs(a) + np.abs(b),
+    lambda a, b: np.maximum(np.abs(a), 2.2 * np.abs(b)),
+)
+"""Leaf, diamond and ribbon: below 1 inside, in units of their size."""
+
+
 def _wallpaper(rng: np.random.Generator, room: int) -> _Image:
     """Return marbled paper printed with motifs that never repeat exactly."""
     n = 1024
@@ -231,8 +240,8 @@ def _wallpaper(rng: np.random.Generator, room: int) -> _Image:
     for y in range(0, n, 64):
         for x in range(0, n, 64):
             angle, size = rng.uniform(0, np.pi), rng.uniform(12, 26)
-            a = (np.cos(angle) * columns + np.sin(angle) * rows) / size
-            b = (np.cos(angle) * rows - np.sin(angle) * columns) / size
+            cosine, sine = float(np.cos(angle) / size), float(np.sin(angle) / size)
+            a, b = cosine * columns + sine * rows, cosine * rows - sine * columns
             shape = (np.hypot(a, 1.8 * b), np.abs(a) + np.abs(b), np.maximum(np.abs(a), 2.2 * np.abs(b)))[
                 room
             ]
@@ -274,13 +283,13 @@ def _weave(rng: np.random.Generator) -> _Image:
 def _poster(rng: np.random.Generator, n: int) -> _Image:
     """Return a framed abstract print: overlapping discs and bars."""
     image = 0.12 + 0.08 * _noise(rng, n, 3, n / 6, 0.3)
-    rows, columns = np.mgrid[:n, :n] / n
+    rows, columns = (np.mgrid[:n, :n] / n).astype(np.float32)
     for _ in range(26):
         y, x, size = rng.uniform(0.1, 0.9), rng.uniform(0.1, 0.9), rng.uniform(0.03, 0.2)
-        angle = rng.uniform(0, np.pi)
-        a = np.cos(angle) * (columns - x) + np.sin(angle) * (rows - y)
-        b = np.cos(angle) * (rows - y) - np.sin(angle) * (columns - x)
-        inside = size - (np.hypot(a, b) if rng.random() < 0.5 else np.maximum(np.abs(a), 3 * np.abs(b)))
+        angle, is_disc = rng.uniform(0, np.pi), rng.random() < 0.5
+        cosine, sine = float(np.cos(angle)), float(np.sin(angle))
+        a, b = cosine * (columns - x) + sine * (rows - y), cosine * (rows - y) - sine * (columns - x)
+        inside = size - (np.sqrt(a * a + b * b) if is_disc else np.maximum(np.abs(a), 3 * np.abs(b)))
         cover = np.clip(inside * n / 1.5, 0, 1)
         image += cover * (rng.uniform(0.0, 1.0) - image)
     edge = np.minimum(np.minimum(rows, 1 - rows), np.minimum(columns, 1 - columns))
