@@ -1,0 +1,205 @@
+"""The paper's Fig. 7 as a picture: a coloured point cloud with the path of its camera.
+
+Drawn with Pillow alone, because matplotlib and its fonts would be a fifth of what the demo
+installs.  Promises to draw what is in the map and nothing else.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from rse_pf.errors import MissingExtra
+from rse_pf.geometry import Array
+
+__all__ = ["PathOfRobot", "draw_map"]
+
+_WIDTH, _HEIGHT, _CAPTION, _MARGIN = 1600, 900, 64, 40
+_BACKGROUND, _INK, _FAINT = (250, 250, 248), (30, 34, 42), (120, 126, 136)
+_COLOURS = ((214, 40, 57), (17, 105, 196), (27, 138, 70), (222, 125, 0), (126, 60, 178), (0, 140, 140))
+_FOCAL = 1.35
+_CEILING_M = 0.7
+"""Points this far above the camera hide the room from an observer above; they are not drawn."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class PathOfRobot:
+    """Where a robot's camera went: ``T_world_camera`` ``(n, 4, 4)``, in order."""
+
+    name: str
+    T_world_camera: Array
+
+
+def draw_map(
+    path: Path,
+    points_world: npt.NDArray[np.floating[Any]],
+    colours: npt.NDArray[np.uint8],
+    robots: list[PathOfRobot],
+    caption: str,
+) -> None:
+    """Write a PNG that shows ``(n, 3)`` points from obliquely above, with the robots' paths.
+
+    Raises:
+        MissingExtra: Pillow is not installed.
+    """
+    image_module, draw_module, font_module = _pillow()
+    up = _up(robots)
+    shown = _below_ceiling(points_world, robots, up)
+    points, tints = points_world[shown].astype(np.float64), colours[shown]
+    view = _Observer(points, robots, up)
+    image = image_module.fromarray(_splat(view, points, tints))
+    draw = draw_module.Draw(image)
+    big, small = font_module.load_default(size=26), font_module.load_default(size=20)
+    for number, robot in enumerate(robots):
+        _draw_path(draw, view, robot, _COLOURS[number % len(_COLOURS)])
+    _draw_scale(draw, view, small)
+    draw.text((_MARGIN, 18), caption, fill=_INK, font=big)
+    left = _MARGIN
+    for number, robot in enumerate(robots):
+        colour = _COLOURS[number % len(_COLOURS)]
+        draw.line([(left, _HEIGHT - 34), (left + 36, _HEIGHT - 34)], fill=colour, width=6)
+        label = f"{robot.name} (dot: start, ring: end)" if number == 0 else robot.name
+        draw.text((left + 46, _HEIGHT - 46), label, fill=_INK, font=small)
+        left += 76 + int(draw.textlength(label, font=small))
+    image.save(path)
+
+
+class _Observer:
+    """A pinhole camera that looks down on the scene from its most telling side."""
+
+    def __init__(self, points: Array, robots: list[PathOfRobot], up: Array) -> None:
+        low, high = (np.percentile(points, q, axis=0) if len(points) else np.zeros(3) for q in (2, 98))
+        self.centre = (low + high) / 2
+        forward = self._side(robots, up)
+        slope = math.radians(40)
+        self.axis_z = math.cos(slope) * forward - math.sin(slope) * up
+        self.axis_x = np.cross(self.axis_z, up)
+        self.axis_x /= np.linalg.norm(self.axis_x)
+        self.axis_y = np.cross(self.axis_z, self.axis_x)
+        self.axis_y *= -1 if self.axis_y @ up > 0 else 1
+        corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)]) * (high - low) + low
+        self.distance = max(1.0, float(np.linalg.norm(high - low)))
+        self.scale, self.shift = 1.0, np.zeros(2)
+        for _ in range(12):
+            flat = self._flat(corners)
+            size = flat.max(axis=0) - flat.min(axis=0)
+            room = np.array([_WIDTH - 2 * _MARGIN, _HEIGHT - 2 * _CAPTION - _MARGIN])
+            self.scale *= float((room / np.maximum(size, 1e-9)).min())
+        flat = self._flat(corners)
+        self.shift = np.array([_WIDTH / 2, _HEIGHT / 2]) - (flat.max(axis=0) + flat.min(axis=0)) / 2
+
+    @staticmethod
+    def _side(robots: list[PathOfRobot], up: Array) -> Array:
+        """Look the way the robots looked on average: from behind them into the room."""
+        looks = np.concatenate([robot.T_world_camera[:, :3, 2] for robot in robots])
+        mean = looks.mean(axis=0)
+        mean -= (mean @ up) * up
+        if np.linalg.norm(mean) < 0.05:
+            mean = np.cross(up, [1.0, 0.0, 0.0] if abs(up[0]) < 0.9 else [0.0, 1.0, 0.0])
+        side: Array = mean / np.linalg.norm(mean)
+        return side
+
+    def depth(self, points: Array) -> Array:
+        """Return the distances along the line of sight, metres."""
+        depth: Array = (points - self.centre) @ self.axis_z + 1.6 * self.distance
+        return depth
+
+    def project(self, points: Array) -> Array:
+        """Return the picture's ``(n, 2)`` pixels."""
+        return self._flat(points) + self.shift
+
+    def _flat(self, points: Array) -> Array:
+        moved = points - self.centre
+        flat = np.column_stack([moved @ self.axis_x, moved @ self.axis_y])
+        flat *= (_FOCAL * self.scale / np.maximum(self.depth(points), 0.1))[:, None]
+        return flat
+
+
+def _splat(view: _Observer, points: Array, colours: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
+    """Paint the points, nearest on top, each as a small square."""
+    picture = np.empty((_HEIGHT, _WIDTH, 3), dtype=np.uint8)
+    picture[:] = _BACKGROUND
+    if not len(points):
+        return picture
+    pixels = np.round(view.project(points)).astype(np.int64)
+    order = np.argsort(-view.depth(points))
+    size = _splat_size(pixels)
+    top, bottom = _CAPTION, _HEIGHT - _CAPTION
+    for dy in range(size):
+        for dx in range(size):
+            x, y = pixels[order, 0] + dx, pixels[order, 1] + dy
+            inside = (x >= 0) & (x < _WIDTH) & (y >= top) & (y < bottom)
+            picture[y[inside], x[inside]] = colours[order[inside]]
+    return picture
+
+
+def _splat_size(pixels: npt.NDArray[np.int64]) -> int:
+    """Choose squares just large enough to close the gaps between neighbours."""
+    spread = np.percentile(pixels, 98, axis=0) - np.percentile(pixels, 2, axis=0)
+    each = float(spread[0] * spread[1]) / max(1, len(pixels))
+    return int(np.clip(round(math.sqrt(2.5 * each)), 1, 4))
+
+
+def _draw_path(draw: Any, view: _Observer, robot: PathOfRobot, colour: tuple[int, int, int]) -> None:
+    if not len(robot.T_world_camera):
+        return
+    line = [(float(x), float(y)) for x, y in view.project(robot.T_world_camera[:, :3, 3])]
+    draw.line(line, fill=(255, 255, 255), width=9, joint="curve")
+    draw.line(line, fill=colour, width=5, joint="curve")
+    for pose in robot.T_world_camera[:: max(1, len(robot.T_world_camera) // 12)]:
+        _draw_camera(draw, view, pose, colour)
+    (x0, y0), (x1, y1) = line[0], line[-1]
+    draw.ellipse([x0 - 9, y0 - 9, x0 + 9, y0 + 9], fill=colour, outline=(255, 255, 255), width=3)
+    draw.ellipse([x1 - 11, y1 - 11, x1 + 11, y1 + 11], outline=(255, 255, 255), width=8)
+    draw.ellipse([x1 - 10, y1 - 10, x1 + 10, y1 + 10], outline=colour, width=5)
+
+
+def _draw_camera(draw: Any, view: _Observer, T_world_camera: Array, colour: tuple[int, int, int]) -> None:
+    corners = np.array([[-0.09, -0.07, 0.14], [0.09, -0.07, 0.14], [0.09, 0.07, 0.14], [-0.09, 0.07, 0.14]])
+    world = np.vstack([np.zeros(3), corners]) @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]
+    flat = [(float(x), float(y)) for x, y in view.project(world)]
+    for corner in flat[1:]:
+        draw.line([flat[0], corner], fill=colour, width=2)
+    draw.line([*flat[1:], flat[1]], fill=colour, width=2)
+
+
+def _draw_scale(draw: Any, view: _Observer, font: Any) -> None:
+    """Draw one metre as it looks at the centre of the scene."""
+    ends = view.project(np.stack([view.centre, view.centre + view.axis_x]))
+    length = float(np.linalg.norm(ends[1] - ends[0]))
+    right, y = _WIDTH - _MARGIN, _HEIGHT - 34
+    draw.line([(right - length, y), (right, y)], fill=_INK, width=3)
+    for x in (right - length, right):
+        draw.line([(x, y - 7), (x, y + 7)], fill=_INK, width=3)
+    draw.text((right - length - 52, y - 12), "1 m", fill=_FAINT, font=font)
+
+
+def _up(robots: list[PathOfRobot]) -> Array:
+    """Return the mean upward direction of the cameras: their -y axes."""
+    if not sum(len(robot.T_world_camera) for robot in robots):
+        return np.array([0.0, -1.0, 0.0])
+    mean = -np.concatenate([robot.T_world_camera[:, :3, 1] for robot in robots]).mean(axis=0)
+    up: Array = mean / np.linalg.norm(mean)
+    return up
+
+
+def _below_ceiling(
+    points: npt.NDArray[np.floating[Any]], robots: list[PathOfRobot], up: Array
+) -> npt.NDArray[np.bool_]:
+    heights = points @ up
+    cameras = np.concatenate([robot.T_world_camera[:, :3, 3] for robot in robots]) @ up
+    highest = float(cameras.max()) if len(cameras) else math.inf
+    return np.asarray(heights < highest + _CEILING_M)
+
+
+def _pillow() -> tuple[Any, Any, Any]:
+    try:
+        from PIL import Image, ImageDraw, ImageFont
+    except ImportError as error:
+        raise MissingExtra("pillow", "local") from error
+    return Image, ImageDraw, ImageFont
