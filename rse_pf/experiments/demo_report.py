@@ -51,7 +51,7 @@ def make_report(
 
 def as_markdown(report: Mapping[str, Any]) -> str:
     """Return ``report.md``."""
-    paper = report["paper"]
+    paper, around = report["paper"], report["environment"]
     trip, compute, payload = report["round_trip_ms"], report["compute_ms"], report["payload_bytes"]
     rows = [
         ("round trip, mean ms", trip["mean"], paper["round_trip_ms"]),
@@ -81,8 +81,8 @@ def as_markdown(report: Mapping[str, Any]) -> str:
         f"Commands: {commands['sent']} sent, {commands['answered']} answered, {commands['failed']} failed "
         f"{report['failures_by_code'] or ''}, {commands['lost']} lost, {commands['twice']} answered twice.",
         "",
-        f"Truth: {report['truth']}. Load average before {report['environment']['load_average']}, after "
-        f"{report['environment']['load_average_after']}; settings {report['environment']['settings_digest']}.",
+        f"Truth: {report['truth']}. Load average before {around['load_average']}, after "
+        f"{around['load_average_after']}; settings {around['settings_digest']}.",
         "",
         "Here robots and servers share one machine: the round trip has no network in it. The raw records "
         "are in commands.csv, events.jsonl and samples.csv.",

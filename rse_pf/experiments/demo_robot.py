@@ -9,7 +9,7 @@ from __future__ import annotations
 import asyncio
 import time
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
@@ -188,12 +188,15 @@ async def _solve(
 ) -> tuple[Array | None, int]:
     options = PnpOptions(inlier_px=query.inlier_px, max_iterations=query.max_iterations)
     sent = time.monotonic()
-    record = {
-        "id": len(diary.commands) + 1,
-        "robot": spec.name,
-        "planned": round(planned - began, 6),
-        "sent": round(sent - began, 6),
-    }
+    record = CommandRecord(
+        id=len(diary.commands) + 1,
+        robot=spec.name,
+        planned=round(planned - began, 6),
+        sent=round(sent - began, 6),
+        answered=None,
+        server="",
+        code="",
+    )
     try:
         answer = await robot.solve_pnp(
             query.correspondences.points_world,
@@ -204,13 +207,12 @@ async def _solve(
             keep=True,
         )
     except RsePfError as error:
-        answered = round(time.monotonic() - began, 6)
-        diary.commands.append(CommandRecord(**record, answered=answered, server="", code=error.code))
+        diary.commands.append(replace(record, answered=_since(began), code=error.code))
         return None, 0
     diary.commands.append(
-        CommandRecord(
-            **record,
-            answered=round(time.monotonic() - began, 6),
+        replace(
+            record,
+            answered=_since(began),
             server=answer.server,
             code="ok",
             source=answer.source,
@@ -224,6 +226,10 @@ async def _solve(
     )
     diary.weak_poses += answer.solution.verdict == "weak"
     return answer.solution.T_camera_world, len(answer.solution.inliers)
+
+
+def _since(began: float) -> float:
+    return round(time.monotonic() - began, 6)
 
 
 def _load(spec: RobotSpec, pipe: Connection) -> tuple[Any, Trajectory | None, str]:
