@@ -70,6 +70,7 @@ class Scheduler:
         self._round: deque[str] = deque()
         self._otherwise_since: float | None = None
         self._turn_s = 0.0
+        self._service_s = 0.0
         self._last_start: float | None = None
 
     def submit(self, job: Job, now: float) -> list[Refusal]:
@@ -116,6 +117,8 @@ class Scheduler:
     def done(self, job: Job, now: float) -> None:
         """Note that the compute of *job* ended; its robot may take another turn."""
         self.running -= 1
+        spent_s = now - job.started_s
+        self._service_s += _SMOOTHING * (spent_s - self._service_s) if self._service_s else spent_s
         robot = self._robots[job.robot]
         robot.running, robot.free_since = None, now
         if robot.waiting:
@@ -133,7 +136,7 @@ class Scheduler:
             kept: deque[Job] = deque()
             for job in robot.waiting:
                 too_late = job.deadline_s <= now or (
-                    robot.running is None and self._is_hopeless(robot, job, now)
+                    robot.running is None and self._is_hopeless(robot, job, now, len(self._round) - 1)
                 )
                 if too_late:
                     refusals.append(self._refused_late(robot, job, now))
@@ -171,7 +174,7 @@ class Scheduler:
             return Refusal(job, error, "robot-queue")
         ahead_s = len(self._round) * self._turn_s
         # Behind, a second waiting command would keep its robot's place against those without one.
-        if self.is_behind and (robot.waiting or ahead_s > job.patience_s(self._target_s)):
+        if self.is_behind and (robot.waiting or ahead_s > job.patience_s(self._wanted_s)):
             return Refusal(job, self._busy(ahead_s), "behind")
         return None
 
@@ -183,13 +186,18 @@ class Scheduler:
 
     def _give_up(self, robot: _Robot, job: Job, now: float) -> Refusal | None:
         self._note_turn_wait(_turn_wait(robot, job, now), now)
-        if job.deadline_s <= now or self._is_hopeless(robot, job, now):
+        if job.deadline_s <= now or self._is_hopeless(robot, job, now, len(self._round)):
             return self._refused_late(robot, job, now)
         return None
 
-    def _is_hopeless(self, robot: _Robot, job: Job, now: float) -> bool:
+    @property
+    def _wanted_s(self) -> float:
+        """The target, or what two of the present commands take: slow services are no overload."""
+        return max(self._target_s, 2 * self._service_s)
+
+    def _is_hopeless(self, robot: _Robot, job: Job, now: float, others: int) -> bool:
         """Serving the oldest first serves those that are about to be late; give those up instead."""
-        if self.is_behind and _turn_wait(robot, job, now) > job.patience_s(self._target_s):
+        if others and self.is_behind and _turn_wait(robot, job, now) > job.patience_s(self._wanted_s):
             return True
         newer_waits = bool(robot.waiting) and robot.waiting[-1] is not job
         return newer_waits and now - job.received_s > (job.deadline_s - job.received_s) / 2
@@ -214,7 +222,7 @@ class Scheduler:
 
         Both need a whole interval: shedding empties the queue for a moment, which is no recovery.
         """
-        if self.is_behind == (wait_s > self._target_s / (2 if self.is_behind else 1)):
+        if self.is_behind == (wait_s > self._wanted_s / (2 if self.is_behind else 1)):
             self._otherwise_since = None
         elif self._otherwise_since is None:
             self._otherwise_since = now

@@ -263,6 +263,43 @@ def test_nothing_is_shed_below_capacity():
     assert len(refused) <= 0.01 * len(good)
 
 
+def test_one_robot_may_wait_for_a_slow_command_of_another():
+    scheduler = Scheduler(SETTINGS)
+    scheduler.submit(job("slow"), 0.0)
+    slow, _ = scheduler.start(0.0)
+    assert slow is not None
+    scheduler.submit(job("a", at=0.01), 0.01)
+
+    refusals = [r for k in range(1, 12) for r in scheduler.sweep(0.025 * k)]
+    scheduler.done(slow, 0.3)
+
+    assert refusals == []
+    started, _ = scheduler.start(0.3)
+    assert started is not None
+    assert started.robot == "a"
+
+
+def test_slow_services_below_capacity_are_not_shed():
+    scheduler = Scheduler(SETTINGS)
+    refused, now, i = [], 0.0, 0
+    arrivals = sorted((1.0 * k + 0.1 * robot, f"r{robot}") for k in range(10) for robot in range(3))
+    while i < len(arrivals) or scheduler.waiting:
+        while i < len(arrivals) and arrivals[i][0] <= now:
+            at, robot = arrivals[i]
+            refused += scheduler.submit(job(robot, i, at=at, within=5.0), at)
+            i += 1
+        refused += scheduler.sweep(now)
+        started, gone = scheduler.start(now)
+        refused += gone
+        if started is None:
+            now = arrivals[i][0] if i < len(arrivals) else now
+            continue
+        now += 0.3
+        scheduler.done(started, now)
+
+    assert refused == []
+
+
 def test_no_robot_starves_under_overload():
     arrivals = poisson(5 * CAPACITY, 40, seed=9)
 
