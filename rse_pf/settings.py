@@ -11,7 +11,6 @@ import dataclasses
 import difflib
 import hashlib
 import json
-import types
 import typing
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
@@ -35,9 +34,12 @@ __all__ = [
     "SettingRow",
     "load_settings",
     "setting_rows",
+    "settings_page",
 ]
 
 _OURS = "ours"
+_LARGEST = 1e15
+_WHERE = 'in cdk.json, context."rse-pf"'
 
 
 def setting(
@@ -249,9 +251,10 @@ class PlatformSettings:
 
     def replace(self, **groups: Mapping[str, Any]) -> PlatformSettings:
         """Return a copy with ``group={name: value}`` changed and checked anew."""
-        merged = self.to_dict()
+        merged: dict[str, Any] = self.to_dict()
         for name, values in groups.items():
-            merged[name] = {**merged[name], **values}
+            known = isinstance(values, Mapping) and name in merged
+            merged[name] = {**merged[name], **values} if known else values
         return PlatformSettings.from_dict(merged)
 
     def to_dict(self) -> dict[str, dict[str, Any]]:
@@ -294,6 +297,36 @@ def setting_rows(settings: PlatformSettings | None = None) -> Iterator[SettingRo
             )
 
 
+def settings_page() -> str:
+    """Return ``docs/settings.md``: every setting with default, unit, range, source and meaning."""
+    lines = [
+        "# Settings",
+        "",
+        "Written by `make docs` from `rse_pf/settings.py`; do not edit it here. Override a setting in `cdk.json`:",
+        '`{"context": {"rse-pf": {"scaling": {"max_servers": 4}}}}`. `rse-pf settings` shows what is in force.',
+    ]
+    group = ""
+    for row in setting_rows():
+        if row.group != group:
+            group = row.group
+            kind = typing.get_type_hints(PlatformSettings)[group]
+            lines += ["", f"## {group}", "", kind.__doc__, ""]
+            lines += ["| Setting | Default | Unit | Allowed | Source | Meaning |", "|---|---|---|---|---|---|"]
+        cells = (f"`{row.name}`", f"`{json.dumps(row.default)}`", row.unit, _allowed(row), row.source, row.doc)
+        lines.append("| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |")
+    return "\n".join(lines) + "\n"
+
+
+def _allowed(row: SettingRow) -> str:
+    if row.choices:
+        return ", ".join(f"`{choice}`" for choice in row.choices)
+    if row.low is None and row.high is None:
+        return ""
+    if row.high is None:
+        return f"from {row.low:.12g}"
+    return f"{row.low:.12g} to {row.high:.12g}" if row.low is not None else f"up to {row.high:.12g}"
+
+
 def load_settings(path: Path | None = None) -> PlatformSettings:
     """Read ``context."rse-pf"`` of *path*, by default ``./cdk.json``, else the built-in defaults.
 
@@ -309,7 +342,7 @@ def load_settings(path: Path | None = None) -> PlatformSettings:
         raise SettingsError(
             f"cannot read {chosen}: {error.strerror}", hint="name an existing file with --settings"
         ) from error
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise SettingsError(f"{chosen} is not JSON: {error}", hint="mend the file") from error
     context = document.get("context", {}) if isinstance(document, dict) else None
     overrides = context.get("rse-pf", {}) if isinstance(context, dict) else None
@@ -332,19 +365,25 @@ def _make_group(group: str, kind: type[Any], values: Mapping[str, Any]) -> Any:
 
 
 def _typed(name: str, value: Any, kind: Any) -> Any:
-    if kind is float and isinstance(value, int) and not isinstance(value, bool):
+    if kind in (int, float) and type(value) in (int, float) and not abs(value) <= _LARGEST:
+        raise SettingsError(f"{name} is not a finite number below {_LARGEST:g}", hint=f"mend it {_WHERE}")
+    if kind is float and type(value) is int:
         return float(value)
-    expected = kind if isinstance(kind, type) else typing.get_origin(kind)
-    if isinstance(expected, types.UnionType) or type(value) is not expected:
-        raise SettingsError(
-            f"{name} = {value!r} is not of type {getattr(expected, '__name__', kind)}",
-            hint="mend it in cdk.json, context.\"rse-pf\"",
-        )
+    if type(value) is not kind:
+        raise SettingsError(f"{name} = {_shown(value)} is not of type {kind.__name__}", hint=f"mend it {_WHERE}")
     return value
 
 
+def _shown(value: Any) -> str:
+    try:
+        text = repr(value)
+    except (ValueError, RecursionError):
+        text = type(value).__name__
+    return text if len(text) <= 80 else f"{text[:77]}..."
+
+
 def _check_range(row: SettingRow) -> None:
-    where = 'in cdk.json, context."rse-pf"'
+    where = _WHERE
     if row.choices and row.value not in row.choices:
         raise SettingsError(
             f"{row.group}.{row.name} = {row.value!r} is not one of {', '.join(row.choices)}",
@@ -361,7 +400,7 @@ def _check_range(row: SettingRow) -> None:
 
 
 def _check_contradictions(s: PlatformSettings) -> None:
-    where = 'in cdk.json, context."rse-pf"'
+    where = _WHERE
     pairs = [
         ("scaling", "min_servers", "max_servers"),
         ("scaling", "busy_cpu_percent", "very_busy_cpu_percent"),

@@ -1,0 +1,38 @@
+"""What every test may ask for: the checkout, its sources, and the recordings beside it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import pytest
+
+_REPOSITORY = Path(__file__).resolve().parents[1]
+_SOURCES = ("rse_pf", "client_sdk", "lambda_pnp", "stacks")
+
+
+@pytest.fixture(scope="session")
+def repository() -> Path:
+    """The checkout."""
+    return _REPOSITORY
+
+
+@pytest.fixture(scope="session")
+def sources() -> Mapping[str, str]:
+    """Text of every module of the platform, by path from the checkout."""
+    files = [file for room in _SOURCES for file in sorted((_REPOSITORY / room).rglob("*.py"))]
+    files += [file for file in [_REPOSITORY / "app.py"] if file.exists()]
+    return {
+        file.relative_to(_REPOSITORY).as_posix(): file.read_text(encoding="utf-8")
+        for file in files
+        if "__pycache__" not in file.parts and "cdk.out" not in file.parts
+    }
+
+
+@pytest.fixture(scope="session")
+def recordings() -> Path:
+    """The folder of real recordings; tests that need it are skipped where it is missing."""
+    folder = _REPOSITORY.parent / "shared" / "data"
+    if not folder.is_dir():
+        pytest.skip("no recordings at ../shared/data")
+    return folder

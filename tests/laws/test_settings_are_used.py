@@ -1,0 +1,143 @@
+"""Settings are documented, read somewhere, and the only place where configuration is spelt."""
+
+from __future__ import annotations
+
+import ast
+import re
+from collections import Counter
+from collections.abc import Mapping
+from pathlib import Path
+
+import pytest
+
+from rse_pf.settings import PlatformSettings, setting_rows, settings_page
+
+GROUPS = set(PlatformSettings().to_dict())
+NAMES = [(row.group, row.name) for row in setting_rows()]
+OWNERS = Counter(name for _, name in NAMES)
+
+WAITING: dict[str, set[str]] = {
+    "session": {"connect_timeout_s", "reconnect_base_s", "reconnect_max_s"},
+    "health": {
+        "path", "local_interval_s", "local_timeout_s", "cloud_interval_s", "cloud_timeout_s",
+        "unhealthy_checks", "healthy_checks", "grace_s",
+    },
+    "scaling": {
+        "busy_cpu_percent", "very_busy_cpu_percent", "idle_s", "idle_cpu_percent", "period_s",
+        "busy_periods", "step", "big_step", "min_servers", "max_servers", "warm_up_s",
+        "max_robots_per_server", "max_queue_ms", "deregistration_s",
+    },
+    "data": {
+        "enabled", "store", "port", "max_object_bytes", "quota_bytes", "infrequent_after_days",
+        "glacier_after_days",
+    },
+    "services": {"folder", "max_environments", "memory_bytes", "grace_s"},
+    "local": {"port", "servers", "workers", "stop_timeout_s"},
+    "cloud": {"region", "lab", "certificate_arn", "domain_name", "instance_type"},
+}  # fmt: skip
+"""Settings whose readers are not written yet; whoever writes one strikes it out here."""
+
+LITERALS = re.compile(r"(?<![\w.])(?:8700|8765|8766|8767)(?![\w.])|\"/ws\"")
+
+
+def unread(tree: Mapping[str, str]) -> set[tuple[str, str]]:
+    """Return the settings, as ``(group, name)``, that no source of *tree* reads."""
+    seen: set[tuple[str, str]] = set()
+    for path, text in tree.items():
+        if path == "rse_pf/settings.py":
+            continue
+        for node in ast.walk(ast.parse(text)):
+            if isinstance(node, ast.Attribute) and isinstance(node.ctx, ast.Load):
+                base = ast.unparse(node.value).rpartition(".")[2].lstrip("_")
+                seen.add((base if base in GROUPS else "", node.attr))
+    return {
+        (group, name)
+        for group, name in NAMES
+        if (group, name) not in seen and not (OWNERS[name] == 1 and ("", name) in seen)
+    }
+
+
+def spelt_elsewhere(tree: Mapping[str, str]) -> list[str]:
+    """Return where a port or a path of the platform is spelt outside the settings."""
+    return [
+        f"{path}: {found.group()} is a setting"
+        for path, text in tree.items()
+        if path != "rse_pf/settings.py" and path.startswith(("rse_pf/", "client_sdk/", "stacks/", "app.py"))
+        for found in LITERALS.finditer(_without_comments(text))
+    ]
+
+
+def _without_comments(text: str) -> str:
+    tree = ast.parse(text)
+    for node in ast.walk(tree):
+        body = getattr(node, "body", None)
+        if isinstance(body, list):
+            node.body = [each for each in body if not _is_string(each)]  # type: ignore[attr-defined]
+    return ast.unparse(tree).replace("'", '"')
+
+
+def _is_string(node: ast.AST) -> bool:
+    return (
+        isinstance(node, ast.Expr)
+        and isinstance(node.value, ast.Constant)
+        and isinstance(node.value.value, str)
+    )
+
+
+def test_every_setting_is_read_or_waits_on_the_list(sources: Mapping[str, str]) -> None:
+    waiting = {(group, name) for group, names in WAITING.items() for name in names}
+
+    assert unread(sources) - waiting == set(), "nobody reads these settings"
+    assert waiting - unread(sources) == set(), "these are read by now: strike them out of WAITING"
+
+
+def test_an_unread_setting_is_caught(sources: Mapping[str, str]) -> None:
+    text = sources["rse_pf/auth.py"].replace("settings.max_token_bytes", "4096")
+
+    assert ("auth", "max_token_bytes") in unread({**sources, "rse_pf/auth.py": text})
+
+
+def test_the_same_name_in_another_group_is_not_taken_for_a_reader() -> None:
+    read = unread({"rse_pf/x.py": "use(settings.serving.port)"})
+
+    assert ("serving", "port") not in read
+    assert ("local", "port") in read
+
+
+def test_no_port_or_path_is_spelt_outside_the_settings(sources: Mapping[str, str]) -> None:
+    assert spelt_elsewhere(sources) == []
+
+
+@pytest.mark.parametrize("text", ["PORT = 8765", "url = '/ws'", "connect('127.0.0.1', 8700)"])
+def test_a_spelt_port_or_path_is_caught(text: str) -> None:
+    assert spelt_elsewhere({"rse_pf/local/box.py": text})
+
+
+def test_the_page_of_settings_is_up_to_date(repository: Path) -> None:
+    page = (repository / "docs" / "settings.md").read_text(encoding="utf-8")
+
+    assert page == settings_page(), "run make docs"
+
+
+def test_the_page_of_settings_names_every_setting_once() -> None:
+    lines = settings_page().splitlines()
+
+    for group, name in NAMES:
+        start = lines.index(f"## {group}")
+        rows = [line for line in lines[start:] if line.startswith(f"| `{name}` ")]
+        assert rows, f"{group}.{name}"
+    assert sum(line.startswith("| `") for line in lines) == len(NAMES)
+
+
+def test_every_setting_says_what_it_is_for_and_who_chose_it() -> None:
+    for row in setting_rows():
+        assert len(row.doc) > 8, row.name
+        assert row.source, row.name
+        assert row.doc[0].islower() or row.doc.split()[0].isupper() or row.doc.startswith("RANSAC"), row.doc
+
+
+def test_units_in_names_agree_with_the_unit_column() -> None:
+    for row in setting_rows():
+        for ending, unit in {"_s": "s", "_ms": "ms", "_bytes": "bytes", "_percent": "%"}.items():
+            if row.name.endswith(ending) and not row.name.endswith("_per_s"):
+                assert row.unit == unit, f"{row.group}.{row.name}"
