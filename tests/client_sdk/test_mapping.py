@@ -1,0 +1,168 @@
+"""Maps and trajectories: means, edges, bounded cost and memory, and files that others read."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from client_sdk.frontend import Frame
+from client_sdk.mapping import (
+    MapOptions,
+    PointMap,
+    Trajectory,
+    read_ply,
+    read_trajectory,
+    write_ply,
+    write_trajectory,
+)
+from rse_pf.errors import UsageError
+from rse_pf.geometry import Camera, exp_se3
+
+CAMERA = Camera(fx=20.0, fy=20.0, cx=9.5, cy=7.5, width=20, height=16)
+
+
+def flat_frame(depth_m: float = 2.0) -> Frame:
+    rgb = np.full((16, 20, 3), (10, 20, 30), dtype=np.uint8)
+    return Frame(timestamp_s=0.0, rgb=rgb, depth_m=np.full((16, 20), depth_m, np.float32), camera=CAMERA)
+
+
+def random_points(seed: int, count: int, spread_m: float = 5.0) -> tuple[np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(seed)
+    return rng.uniform(-spread_m, spread_m, (count, 3)), rng.integers(0, 256, (count, 3)).astype(np.uint8)
+
+
+def test_points_of_one_voxel_become_their_mean():
+    cloud = PointMap(MapOptions(voxel_m=0.02))
+
+    cloud.add_points(
+        np.array([[0.001, 0.001, 0.001], [0.003, 0.005, 0.007]]),
+        np.array([[0, 0, 0], [100, 50, 10]], np.uint8),
+    )
+    cloud.add_points(
+        np.array([[0.008, 0.006, 0.004], [-0.001, 0.001, 0.001]]),
+        np.array([[50, 70, 80], [1, 2, 3]], np.uint8),
+    )
+
+    points, colours = cloud.points()
+    np.testing.assert_allclose(points, [[0.004, 0.004, 0.004], [-0.001, 0.001, 0.001]], atol=1e-7)
+    np.testing.assert_array_equal(colours, [[50, 40, 30], [1, 2, 3]])
+    assert len(cloud.points(min_readings=2)[0]) == 1
+
+
+def test_a_map_in_many_pieces_equals_the_map_in_one():
+    points, colours = random_points(1, 30_000)
+    whole, pieces = PointMap(MapOptions(voxel_m=0.1)), PointMap(MapOptions(voxel_m=0.1))
+
+    whole.add_points(points, colours)
+    for rows in np.array_split(np.arange(len(points)), 13):
+        pieces.add_points(points[rows], colours[rows])
+
+    assert len(whole) == len(pieces) == len(np.unique(np.floor(points / 0.1), axis=0))
+    a, b = (cloud.points()[0] for cloud in (whole, pieces))
+    np.testing.assert_allclose(a[np.lexsort(a.T)], b[np.lexsort(b.T)], atol=1e-4)
+
+
+def test_the_work_of_a_frame_does_not_grow_with_the_map():
+    cloud = PointMap(MapOptions(voxel_m=0.01))
+    probes = []
+    for seed in range(64):
+        before = cloud.probes
+        cloud.add_points(*random_points(seed, 4000, spread_m=50.0))
+        probes.append(cloud.probes - before)
+
+    assert len(cloud) > 250_000
+    first, second = sum(probes[:32]), sum(probes[32:])
+    assert second < 1.5 * first  # amortised: a growing cost would triple it
+    assert np.median(probes[32:]) < 1.5 * np.median(probes[:32])
+
+
+def test_a_full_map_refuses_new_voxels_and_still_refines_old_ones():
+    cloud = PointMap(MapOptions(voxel_m=0.01, max_points=100))
+    points, colours = random_points(3, 500)
+
+    assert cloud.add_points(points, colours) == 100
+    again = cloud.add_points(points, colours)
+
+    assert (len(cloud), again, cloud.refused_points) == (100, 100, 800)
+    assert len(cloud.points(min_readings=2)[0]) == 100
+
+
+def test_a_frame_lands_where_its_pose_says():
+    cloud = PointMap(MapOptions(voxel_m=0.05, every_px=1))
+    pose = np.eye(4)
+    pose[:3, 3] = [1.0, 2.0, 3.0]
+
+    used = cloud.add(flat_frame(), pose)
+
+    points, colours = cloud.points()
+    assert used == 320
+    np.testing.assert_allclose(points[:, 2], 5.0, atol=1e-6)
+    # pixel (0, 0) lies at x = (0 - 9.5) / 20 * 2 = -0.95, y = (0 - 7.5) / 20 * 2 = -0.75
+    np.testing.assert_allclose(points.min(axis=0)[:2], [0.05, 1.25], atol=1e-6)
+    assert (colours == [10, 20, 30]).all()
+
+
+def test_readings_beside_a_depth_step_or_out_of_range_are_left_out():
+    frame = flat_frame(2.0)
+    frame.depth_m[:, 10:] = 3.0
+    frame.depth_m[:, 18:] = 3.6
+    options = MapOptions(voxel_m=0.01, every_px=1)
+    cloud = PointMap(options)
+
+    used = cloud.add(frame, np.eye(4))
+
+    assert used == 16 * (20 - 2 - 2 - 1)  # two columns at the step, two beyond 3.5 m, one beside them
+
+
+@pytest.mark.parametrize("bad", [{"voxel_m": 0.0}, {"every_px": 0}, {"max_points": 0}])
+def test_a_useless_map_option_is_refused(bad: dict[str, float]):
+    with pytest.raises(UsageError):
+        MapOptions(**bad)
+
+
+def test_a_ply_file_comes_back_bit_by_bit(tmp_path: Path):
+    points, colours = random_points(5, 1000)
+    points = points.astype(np.float32)
+
+    write_ply(tmp_path / "map.ply", points, colours)
+
+    content = (tmp_path / "map.ply").read_bytes()
+    assert content.startswith(b"ply\nformat binary_little_endian 1.0\n")
+    assert b"property float x\n" in content
+    assert b"property uchar red\n" in content
+    assert len(content.partition(b"end_header\n")[2]) == 15 * 1000
+    again, again_colours = read_ply(tmp_path / "map.ply")
+    np.testing.assert_array_equal(again, points)
+    np.testing.assert_array_equal(again_colours, colours)
+
+
+def test_a_cut_or_missing_ply_file_is_told_in_one_line(tmp_path: Path):
+    write_ply(tmp_path / "map.ply", *random_points(5, 10))
+    (tmp_path / "map.ply").write_bytes((tmp_path / "map.ply").read_bytes()[:-1])
+    for name in ("map.ply", "none.ply"):
+        with pytest.raises(UsageError) as caught:
+            read_ply(tmp_path / name)
+        assert "\n" not in str(caught.value)
+        assert caught.value.hint
+
+
+def test_a_trajectory_comes_back_from_its_file(tmp_path: Path):
+    poses = np.array([exp_se3([0.1 * i, -0.2, 0.3, 0.4 * i, 0.1, -0.2]) for i in range(8)])
+    trajectory = Trajectory(1305031102.1753 + np.arange(8) / 30, poses)
+
+    write_trajectory(tmp_path / "t.txt", trajectory)
+    again = read_trajectory(tmp_path / "t.txt")
+
+    np.testing.assert_allclose(again.timestamps_s, trajectory.timestamps_s, atol=1e-6)
+    np.testing.assert_allclose(again.T_world_camera, poses, atol=1e-8)
+    first = (tmp_path / "t.txt").read_text().splitlines()[1].split()
+    assert [float(word) for word in first[4:]] == pytest.approx([0, 0.05, -0.0998, 0.9938], abs=2e-3)
+
+
+@pytest.mark.parametrize("line", ["1 2 3", "0 0 0 0 0 0 0 0", "0 0 0 nan 0 0 0 1", "a b c d e f g h"])
+def test_a_line_that_is_no_pose_names_its_number(tmp_path: Path, line: str):
+    (tmp_path / "t.txt").write_text(f"# stamps\n0 0 0 0 0 0 0 1\n{line}\n")
+    with pytest.raises(UsageError, match="line 3"):
+        read_trajectory(tmp_path / "t.txt")
