@@ -1,0 +1,89 @@
+"""Measure what an idle robot costs a server: resident memory of all its processes, and idle CPU.
+
+    python benchmarks/idle_memory.py [--robots 300] [--workers 2]
+
+Prints machine, n, KiB a robot, and CPU ms a second with all of them connected and silent.
+Defends: <= 64 KiB a robot in all our processes.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import importlib.util
+import os
+import platform
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import websockets
+
+from rse_pf.wire import SUBPROTOCOLS, Hello, make_codec
+
+WATCH_S = 2.0
+
+
+def sibling(name: str) -> Any:
+    """Return the module of another benchmark in this folder."""
+    spec = importlib.util.spec_from_file_location(name, Path(__file__).with_name(f"{name}.py"))
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+async def measure(identity: dict[str, int], robots: int, status: Any) -> None:
+    codec, url = make_codec("bin"), f"ws://127.0.0.1:{identity['port']}/ws"
+    hello = codec.encode(Hello())
+
+    async def join() -> Any:
+        socket = await websockets.connect(
+            url, subprotocols=[SUBPROTOCOLS["bin"]], compression=None, ping_interval=None
+        )
+        await socket.send(hello)
+        await socket.recv()
+        return socket
+
+    warm = [await join() for _ in range(4)]
+    before = status(identity)
+    sockets = [await join() for _ in range(robots)]
+    joined = status(identity)
+    await asyncio.sleep(WATCH_S)
+    after = status(identity)
+    began = time.monotonic()
+    await asyncio.gather(*(socket.close() for socket in warm + sockets))
+    print(f"machine {platform.machine()}, {os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}")
+    print(f"command {' '.join(sys.argv)}, n {robots}, spread {joined['robots_of_workers']}")
+    grown = joined["resident_bytes"] - before["resident_bytes"]
+    print(
+        f"{grown / robots / 1024:.1f} KiB a robot, {before['resident_bytes'] / 2**20:.0f} MiB without robots"
+    )
+    print(f"idle CPU {(after['cpu_s'] - joined['cpu_s']) / WATCH_S * 1e3:.1f} ms/s")
+    print(f"handshake and hello {(joined['cpu_s'] - before['cpu_s']) / robots * 1e6:.0f} us CPU each")
+    print(f"all closed after {time.monotonic() - began:.2f} s")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--robots", type=int, default=300)
+    parser.add_argument("--workers", type=int, default=2)
+    options = parser.parse_args()
+    round_trip = sibling("round_trip")
+    with tempfile.TemporaryDirectory() as folder:
+        process, identity = round_trip.start(folder, workers=options.workers, log_level="warning")
+        try:
+            asyncio.run(measure(identity, options.robots, round_trip.status))
+        finally:
+            process.terminate()
+            process.terminate()
+            process.wait(20)
+
+
+if __name__ == "__main__":
+    main()
