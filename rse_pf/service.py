@@ -122,9 +122,10 @@ def dispatch(
         reply = service.function(_request(command, service))
     except RsePfError as error:
         return failure_of(error, command, server=server)
-    except Exception as error:  # noqa: BLE001  a service is foreign code: anything may come out
+    except (Exception, SystemExit) as error:  # noqa: BLE001  a service is foreign code
         if on_defect is not None:
-            on_defect(command, error)
+            left = RuntimeError(f"the service called exit({error})")
+            on_defect(command, error if isinstance(error, Exception) else left)
         defect = InternalError(
             f"service {command.service!r} failed", hint="the server's log has it under this trace"
         )
@@ -156,11 +157,21 @@ def _request(command: Command, service: Service) -> Any:
 
 
 def _signature(name: str, function: Callable[[Any], Any]) -> tuple[type[Any], type[Any]]:
-    hints = typing.get_type_hints(function)
+    try:
+        hints = typing.get_type_hints(function)
+    except (NameError, TypeError, AttributeError) as error:
+        raise ConfigurationError(
+            f"service {name!r} has annotations that cannot be read: {error}",
+            hint="define its request and reply types at the top of the module",
+        ) from error
     reply_type = hints.pop("return", None)
     kinds = list(hints.values())
-    if len(kinds) != 1 or not all(
-        isinstance(kind, type) and issubclass(kind, msgspec.Struct) for kind in (*kinds, reply_type)
+    if (
+        len(inspect.signature(function).parameters) != 1
+        or len(kinds) != 1
+        or not all(
+            isinstance(kind, type) and issubclass(kind, msgspec.Struct) for kind in (*kinds, reply_type)
+        )
     ):
         raise ConfigurationError(
             f"service {name!r} must take one msgspec.Struct and return one",

@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from rse_pf.errors import LimitExceeded, TooFewCorrespondences
 from rse_pf.geometry import Camera
-from rse_pf.pnp import PnpOptions, PnpSolution, solve_pnp
+from rse_pf.pnp import PnpOptions, PnpSolution, WeakLimits, solve_pnp
 from rse_pf.service import Registry
 from rse_pf.settings import PnpSettings
 from rse_pf.wire.arrays import Array, reshaped
@@ -105,6 +105,8 @@ def make_request(
 
 def register(registry: Registry, settings: PnpSettings) -> None:
     """Add ``pnp`` to *registry*, with the limits and the engine of *settings*."""
+    defaults = PnpOptions(max_iterations=settings.max_iterations, min_iterations=settings.min_iterations)
+    weak = WeakLimits(inliers=settings.weak_inliers, inlier_ratio=settings.weak_inlier_percent / 100.0)
 
     @registry.service("pnp", cheap=True)
     def pnp(request: PnpRequest) -> PnpReply:
@@ -122,12 +124,14 @@ def register(registry: Registry, settings: PnpSettings) -> None:
                 f"got {n} correspondences, a pose needs at least 4",
                 hint="loosen the matcher, or skip this frame",
             )
-        options = request.options or PnpOptions()
+        options = request.options or defaults
         if options.max_iterations > settings.max_iterations:
             raise LimitExceeded(
                 f"{options.max_iterations} iterations are above {settings.max_iterations}",
                 hint="ask for fewer",
             )
         return PnpReply.of(
-            solve_pnp(points_world, pixels, request.camera, options, default_engine=settings.engine)
+            solve_pnp(
+                points_world, pixels, request.camera, options, default_engine=settings.engine, weak=weak
+            )
         )

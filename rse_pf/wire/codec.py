@@ -11,6 +11,8 @@ from collections.abc import Callable
 from typing import Any, Protocol, TypeVar
 
 import msgspec
+import numpy as np
+import numpy.typing as npt
 
 from rse_pf.errors import BadMessage, LimitExceeded, RsePfError, UnsupportedProtocol
 from rse_pf.settings import SessionSettings
@@ -34,7 +36,7 @@ _LEVEL = 6
 """Robots' uplinks are slower than their processors: level 1 is 6 % longer (facts of docs/design.md)."""
 
 _NOT_BRACKETS = bytes(set(range(256)) - set(b"[]{}"))
-_OPENING = frozenset(b"[{")
+_NOT_BRACKETS_OR_QUOTES = bytes(set(range(256)) - set(b'[]{}"'))
 
 
 class Codec(Protocol):
@@ -44,7 +46,7 @@ class Codec(Protocol):
     is_text: bool
 
     def encode(self, message: Message) -> bytes:
-        """Return the WebSocket message of *message*."""
+        """Return the WebSocket message of *message*; raises BadMessage if it cannot be said."""
 
     def decode_from_robot(self, data: bytes) -> FromRobot:
         """Return what a robot sent; raises BadMessage or LimitExceeded."""
@@ -90,7 +92,7 @@ class _JsonCodec:
         self._from_server = msgspec.json.Decoder(FromServer).decode
 
     def encode(self, message: Message) -> bytes:
-        data = self._encode(message)
+        data = _encoded(self._encode, message)
         return zlib.compress(data, _LEVEL) if self._compressed else data
 
     def decode_from_robot(self, data: bytes) -> FromRobot:
@@ -119,16 +121,18 @@ class _BinaryCodec:
         self._from_server = msgspec.msgpack.Decoder(FromServer, ext_hook=arrays.extension_hook).decode
 
     def encode(self, message: Message) -> bytes:
-        return self._encode(message)
+        return _encoded(self._encode, message)
 
     def decode_from_robot(self, data: bytes) -> FromRobot:
         _check_size(data, self._limits)
         message: FromRobot = _guarded(self._from_robot, data)
+        _check_nesting(getattr(message, "payload", None), self._limits.max_json_depth)
         return message
 
     def decode_from_server(self, data: bytes) -> FromServer:
         _check_size(data, self._limits)
         message: FromServer = _guarded(self._from_server, data)
+        _check_nesting(getattr(message, "reply", None), self._limits.max_json_depth)
         return message
 
 
@@ -144,8 +148,20 @@ def _guarded(decode: Callable[[Any], Any], data: Any) -> Any:
         raise BadMessage(
             f"not a message: {str(error)[:150]}", hint="is this the sub-protocol that was agreed?"
         ) from error
-    except (RecursionError, ValueError, OverflowError) as error:
-        raise BadMessage("a message is nested too deeply or holds an absurd number") from error
+    except (RecursionError, ValueError, TypeError, OverflowError) as error:
+        raise BadMessage(
+            "a message is nested too deeply or holds an absurd number", hint="send flat lists of numbers"
+        ) from error
+
+
+def _encoded(encode: Callable[[Any], bytes], message: Message) -> bytes:
+    try:
+        return encode(message)
+    except (RecursionError, ValueError, TypeError, OverflowError) as error:
+        raise BadMessage(
+            f"a {type(message).__name__} cannot be encoded: {str(error)[:150]}",
+            hint="send numbers, strings, lists, arrays and structs",
+        ) from error
 
 
 def _check_size(data: bytes, limits: SessionSettings) -> None:
@@ -180,16 +196,29 @@ def _check_depth(text: bytes, deepest: int) -> None:
 
 
 def _depth(brackets: bytes) -> int:
-    depth = deepest = 0
-    for byte in brackets:
-        if byte in _OPENING:
-            depth += 1
-            deepest = max(deepest, depth)
-        else:
-            depth -= 1
-    return deepest
+    opening = np.isin(np.frombuffer(brackets, np.uint8), np.frombuffer(b"[{", np.uint8))
+    return int(np.cumsum(np.where(opening, np.int8(1), np.int8(-1)), dtype=np.int32).max(initial=0))
 
 
 def _without_strings(text: bytes) -> bytes:
-    outside = text.replace(b"\\\\", b"").replace(b'\\"', b"").split(b'"')[::2]
-    return b"".join(outside).translate(None, _NOT_BRACKETS)
+    marks = text.replace(b"\\\\", b"").replace(b'\\"', b"").translate(None, _NOT_BRACKETS_OR_QUOTES)
+    signs: npt.NDArray[np.uint8] = np.frombuffer(marks, np.uint8)
+    quotes = signs == ord('"')
+    inside = np.logical_xor.accumulate(quotes)
+    outside: npt.NDArray[np.uint8] = signs[~(inside | quotes)]
+    return outside.tobytes()
+
+
+def _check_nesting(value: Any, deepest: int) -> None:
+    """Refuse what JSON could not say within its depth either; the message itself is the first level."""
+    layer = [value]
+    for _ in range(deepest):
+        layer = [each for box in layer if isinstance(box, (dict, list, tuple)) for each in _inside(box)]
+        if not layer:
+            return
+    raise LimitExceeded(f"a message is nested deeper than {deepest}", hint="send flat lists")
+
+
+def _inside(box: Any) -> list[Any]:
+    every = [*box.keys(), *box.values()] if isinstance(box, dict) else box
+    return [each for each in every if isinstance(each, (dict, list, tuple))]

@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from rse_pf.errors import Busy, ProtocolError
+from rse_pf.errors import BadMessage, Busy, InternalError, LimitExceeded, ProtocolError
 from rse_pf.settings import SessionSettings
 from rse_pf.wire.codec import Codec
 from rse_pf.wire.messages import (
@@ -106,9 +106,30 @@ class ServerSession:
         return self._command(message)
 
     def answer(self, message: Result | Failure) -> Send:
-        """Return the bytes of the final answer to a command that was submitted."""
+        """Return the bytes of the final answer to a command that was submitted.
+
+        A reply that cannot be encoded, or that is larger than a message may be, becomes a failure.
+        """
         self.in_flight -= 1
-        return self._send(message)
+        try:
+            send = self._send(message)
+            if len(send.data) <= self._limits.max_message_bytes:
+                return send
+            error: ProtocolError = LimitExceeded(
+                f"the reply of {len(send.data)} bytes is above {self._limits.max_message_bytes}",
+                hint="ask for less, or fetch it from the data server",
+            )
+        except BadMessage as unencodable:
+            error = unencodable
+        return self._send(
+            Failure(
+                id=message.id,
+                code=error.code if isinstance(error, LimitExceeded) else InternalError.code,
+                message=error.message if isinstance(error, LimitExceeded) else "the reply does not travel",
+                hint=error.hint,
+                server=self._server,
+            )
+        )
 
     def move(self, reason: str, within_ms: float) -> list[Decision]:
         """Ask the robot to leave for another server, make before break."""
