@@ -102,7 +102,7 @@ def open_dataset(path: Path, *, scene: str | None = None) -> Dataset:
             raise UsageError(f"{path} is not a recording", hint="name a folder, or the labelled .mat file")
         return _open_labelled(path, scene)
     if not path.is_dir():
-        raise UsageError(f"no folder {path}", hint="name a folder in TUM layout, see docs/datasets.md")
+        raise UsageError(f"no folder {path}", hint="name a folder in TUM layout: rgb.txt, depth.txt, images")
     if scene is not None:
         raise UsageError(f"{path} has no scenes", hint="a scene picks from the labelled .mat file only")
     if not (path / "rgb.txt").exists() and any(path.glob("d-*.pgm")):
