@@ -388,7 +388,7 @@ class Core:
                 bytes_in=job.size_bytes, bytes_out=len(outcome.data),
             )  # fmt: skip
 
-    def _log_defect(self, command: Command, error: Exception) -> None:
+    def _log_defect(self, command: Command, error: BaseException) -> None:
         text = "".join(traceback.format_exception(type(error), error, error.__traceback__))
         self._log.error("defect", service=command.service, id=command.id, trace=command.trace, traceback=text)
 

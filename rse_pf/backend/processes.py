@@ -1,16 +1,17 @@
-"""Small facts of Linux about processes: die with the parent, CPU seconds, memory.
+"""Small facts of Linux about processes: die with the parent, open files, CPU seconds, memory.
 
-Promises to read only, but for `die_with_parent`, and to raise nothing for a process that is gone.
+Promises to raise nothing for a process that is gone, and to change no process but its own.
 """
 
 from __future__ import annotations
 
 import ctypes
 import os
+import resource
 import signal
 from pathlib import Path
 
-__all__ = ["cpu_seconds", "die_with_parent", "resident_bytes"]
+__all__ = ["cpu_seconds", "die_with_parent", "raise_descriptor_limit", "resident_bytes"]
 
 _PR_SET_PDEATHSIG = 1
 
@@ -20,6 +21,12 @@ def die_with_parent(parent: int) -> bool:
     libc = ctypes.CDLL(None, use_errno=True)
     libc.prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
     return os.getppid() == parent
+
+
+def raise_descriptor_limit() -> None:
+    """Allow this process and its children as many open files as the system lets it."""
+    _, most = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (most, most))
 
 
 def cpu_seconds(pid: int) -> float:

@@ -22,7 +22,7 @@ __all__ = ["RobotSockets"]
 
 _MOST_CLOSE_REASON_BYTES = 123
 _LINGER_S = 2.0
-"""A close that the robot does not let through ends as an abort after this."""
+"""Time a robot has to read our CLOSE and to end its side; then the connection is cut."""
 
 
 class _Quiet:
@@ -149,7 +149,7 @@ def _protocol_type(picows: Any) -> Any:
 
         def buffer_updated(self, n: int) -> None:
             wanted = self._border.wanted(self._room[:n])
-            if wanted:
+            if wanted and (self.transport is None or not self.transport.is_close_frame_sent):
                 buffer_updated(self, wanted)
 
         def connection_lost(self, error: Exception | None) -> None:
@@ -211,7 +211,8 @@ def _listener_type(picows: Any, loop: asyncio.AbstractEventLoop, serving: Servin
 
         def close(self, code: int, reason: str) -> None:
             self._transport.send_close(code, reason.encode()[:_MOST_CLOSE_REASON_BYTES])
-            self._transport.disconnect()
+            # Closing with unread bytes would reset the connection, and the robot would not see the code.
+            self._transport.underlying_transport.write_eof()
             loop.call_later(_LINGER_S, self._transport.disconnect, False)
 
         def _cut_off(self) -> None:

@@ -24,7 +24,7 @@ from rse_pf.auth import KeySet
 from rse_pf.backend.control import Answer, Ask, serve_control
 from rse_pf.backend.log import JsonLog
 from rse_pf.backend.metrics import merge, render
-from rse_pf.backend.processes import cpu_seconds, resident_bytes
+from rse_pf.backend.processes import cpu_seconds, raise_descriptor_limit, resident_bytes
 from rse_pf.backend.worker_process import WorkerProcess
 from rse_pf.errors import ConfigurationError
 from rse_pf.settings import PlatformSettings
@@ -33,6 +33,7 @@ __all__ = ["serve"]
 
 _BUILTIN = "rse_pf.services.builtin:builtin_services"
 _ACCEPTS_AT_ONCE = 64
+_ACCEPT_PAUSE_S = 0.1
 _FRESH_S = 0.25
 _REPORT_S = 0.3
 _LEAVE_S = 3.0
@@ -66,6 +67,7 @@ def serve(
         ConfigurationError: An open door on a public address, no keys, or the port is taken.
     """
     _check_open_door(settings, keys, conformance_echo)
+    raise_descriptor_limit()
     listener = _bound(settings.serving.host, settings.serving.port)
     with listener:
         supervisor = _Supervisor(
@@ -106,9 +108,13 @@ def _bound(host: str, port: int) -> socket.socket:
     try:
         family, kind, protocol, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
         listener = socket.socket(family, kind, protocol)
-        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        listener.setblocking(False)
-        listener.bind(address)
+        try:
+            listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            listener.setblocking(False)
+            listener.bind(address)
+        except OSError:
+            listener.close()
+            raise
     except OSError as error:
         raise ConfigurationError(
             f"cannot listen on {host}:{port}: {error.strerror}", hint="choose another serving.port, or 0"
@@ -223,10 +229,21 @@ class _Supervisor:
                 return
             except OSError as error:  # out of descriptors, or the robot is gone already
                 self._log.warning("accept-failed", reason=str(error))
+                self._pause_accepting()
                 return
             with accepted:
                 if not any(worker.give(accepted) for worker in sorted(self._workers, key=lambda w: w.load)):
                     self._refused_full += 1
+
+    def _pause_accepting(self) -> None:
+        """The listener stays readable while descriptors are short: do not spin on it."""
+        loop = asyncio.get_running_loop()
+        loop.remove_reader(self._listener.fileno())
+        loop.call_later(_ACCEPT_PAUSE_S, self._resume_accepting)
+
+    def _resume_accepting(self) -> None:
+        if self._listener.fileno() >= 0:
+            asyncio.get_running_loop().add_reader(self._listener.fileno(), self._accept_some)
 
     # --- the end -------------------------------------------------------------------------------
 

@@ -1,0 +1,52 @@
+"""The log: one JSON object a line, whatever strangers put into it."""
+
+from __future__ import annotations
+
+import json
+import os
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rse_pf.backend.log import JsonLog
+
+
+def written(*events: tuple[str, str, dict], level: str = "info") -> list[str]:
+    reading, writing = os.pipe()
+    log = JsonLog(level=level, server="s-1", wall_clock=lambda: 5.0, fd=writing)
+    for method, event, fields in events:
+        getattr(log, method)(event, **fields)
+    log.close(5.0)
+    os.close(writing)
+    with os.fdopen(reading, "r", newline="\n") as lines:
+        return lines.read().split("\n")[:-1]
+
+
+def test_a_line_tells_when_where_and_what():
+    (line,) = written(("info", "command", {"code": "ok", "id": 7}))
+
+    assert json.loads(line) == {
+        "time": 5.0, "level": "info", "event": "command", "server": "s-1", "code": "ok", "id": 7,
+    }  # fmt: skip
+
+
+def test_lines_below_the_level_are_not_written():
+    lines = written(
+        ("debug", "a", {}), ("info", "b", {}), ("warning", "c", {}), ("error", "d", {}), level="warning"
+    )
+
+    assert [json.loads(line)["event"] for line in lines] == ["c", "d"]
+
+
+@given(hostile=st.text(max_size=400))
+def test_a_hostile_word_stays_one_line_of_bounded_length(hostile):
+    (line,) = written(("info", "command", {"trace": hostile}))
+
+    assert json.loads(line)["trace"] == hostile[:256]
+    assert not any(ord(letter) < 32 for letter in line)
+
+
+def test_many_lines_keep_their_order():
+    lines = written(*(("info", "n", {"n": n}) for n in range(200)))
+
+    assert [json.loads(line)["n"] for line in lines] == list(range(200))

@@ -1,0 +1,51 @@
+"""Workers count, the supervisor adds up, Prometheus can read it."""
+
+from __future__ import annotations
+
+from prometheus_client.parser import text_string_to_metric_families
+
+from rse_pf.backend.metrics import Metrics, merge, render
+
+
+def worker(answers: list[tuple[str, str, float]], **gauges: float) -> dict:
+    metrics = Metrics()
+    for service, result, duration_s in answers:
+        metrics.answered(service, result, duration_s)
+    metrics.shed["behind"] += 1
+    metrics.bytes_in += 10
+    metrics.gauges = {"robots": 2.0, "queue_oldest_s": 0.0, **gauges}
+    return metrics.snapshot()
+
+
+def test_workers_add_up_and_ages_are_the_worst():
+    merged = merge(
+        [
+            worker([("pnp", "ok", 0.003), ("pnp", "busy", 0.0)], queue_oldest_s=0.2),
+            worker([("pnp", "ok", 0.03), ("icp", "ok", 9.0)], queue_oldest_s=0.1),
+        ]
+    )
+
+    assert sorted(merged["requests"]) == [["icp", "ok", 1], ["pnp", "busy", 1], ["pnp", "ok", 2]]
+    assert merged["gauges"]["robots"] == 4.0
+    assert merged["gauges"]["queue_oldest_s"] == 0.2
+    assert merged["shed"] == {"behind": 2}
+    assert merged["bytes"] == {"in": 20, "out": 0}
+
+
+def test_prometheus_reads_what_is_rendered():
+    text = render(
+        merge([worker([("pnp", "ok", 0.001), ("pnp", "ok", 0.0011), ("pnp", "ok", 60.0)])])
+    ).decode()
+
+    families = {family.name: family for family in text_string_to_metric_families(text)}
+    buckets = {
+        s.labels["le"]: s.value
+        for s in families["rse_pf_duration_seconds"].samples
+        if s.name.endswith("_bucket")
+    }
+    assert (buckets["0.001"], buckets["0.002"], buckets["5.0"], buckets["+Inf"]) == (1, 2, 2, 3)
+    assert [s.value for s in families["rse_pf_shed"].samples if s.name == "rse_pf_shed_total"] == [1]
+
+
+def test_a_server_without_workers_that_answered_can_be_rendered():
+    assert b"rse_pf_requests" in render(merge([]))
