@@ -1,0 +1,183 @@
+"""The core of a worker on fake wires and a loop that stands still until told."""
+
+from __future__ import annotations
+
+import heapq
+import os
+from collections.abc import Callable
+from typing import Any
+
+import msgspec
+import pytest
+
+from rse_pf.backend.core import Clocks, Core
+from rse_pf.backend.door import Admitted
+from rse_pf.backend.log import JsonLog
+from rse_pf.service import Registry
+from rse_pf.services import echo
+from rse_pf.settings import PlatformSettings
+from rse_pf.wire import Command, Failure, Hello, Move, Ping, Pong, Result, Welcome, make_codec
+
+CODEC = make_codec("bin")
+BINARY = 2
+
+
+class FakeLoop:
+    """Timers fire when `advance` passes them; nothing else happens."""
+
+    def __init__(self) -> None:
+        self.now = 100.0
+        self._timers: list[tuple[float, int, Callable[[], object]]] = []
+
+    def call_later(self, delay: float, callback: Callable[[], object]) -> Any:
+        heapq.heappush(self._timers, (self.now + delay, len(self._timers), callback))
+        return self
+
+    def call_soon_threadsafe(self, callback: Callable[..., object], *args: Any) -> object:
+        return callback(*args)
+
+    def cancel(self) -> None: ...
+
+    def advance(self, seconds: float) -> None:
+        until = self.now + seconds
+        while self._timers and self._timers[0][0] <= until:
+            self.now, _, callback = heapq.heappop(self._timers)
+            callback()
+        self.now = until
+
+
+class FakeWire:
+    def __init__(self) -> None:
+        self.sent: list[Any] = []
+        self.closed: tuple[int, str] | None = None
+
+    def send(self, data: bytes, is_text: bool) -> None:
+        self.sent.append(CODEC.decode_from_server(data))
+
+    def send_pong(self, data: bytes) -> None:
+        self.sent.append(data)
+
+    def close(self, code: int, reason: str) -> None:
+        self.closed = (code, reason)
+
+
+class Odd(msgspec.Struct, frozen=True, kw_only=True):
+    value: Any = None
+
+
+@pytest.fixture
+def made():
+    loop, log_fd = FakeLoop(), os.open(os.devnull, os.O_WRONLY)
+    settings = PlatformSettings()
+    registry = Registry()
+    echo.register(registry)
+
+    @registry.service("odd", cheap=True)
+    def odd(request: Odd) -> Odd:
+        return Odd(value=object())
+
+    @registry.service("kept", kind="per_robot_state")
+    def kept(request: Odd) -> Odd:
+        return request
+
+    log = JsonLog(level="error", server="s-1", wall_clock=lambda: 0.0, fd=log_fd)
+    core = Core(
+        settings=settings, registry=registry, server_id="s-1", loop=loop, log=log,
+        clocks=Clocks(monotonic=lambda: loop.now, wall=lambda: 5000.0 + loop.now, cpu=lambda: 0.0),
+        new_session_id=lambda: "session-1",
+    )  # fmt: skip
+    yield core, loop
+    core.close_all()
+    log.close()
+    os.close(log_fd)
+
+
+def join(core: Core, *, expires_s: float | None = None, hello: bool = True) -> tuple[Any, FakeWire]:
+    wire = FakeWire()
+    admitted = Admitted(robot="r", codec="bin", subprotocol="x", expires_s=expires_s)
+    connection = core.connect(wire, admitted)
+    if hello:
+        say(connection, Hello())
+    return connection, wire
+
+
+def say(connection: Any, message: Any) -> None:
+    connection.frame(BINARY, True, False, CODEC.encode(message))
+
+
+def test_hello_ping_and_a_cheap_command_are_answered_inline(made):
+    core, _ = made
+    connection, wire = join(core)
+
+    say(connection, Ping(sent_s=1.0))
+    say(connection, Command(id=3, service="echo", payload={"value": 1}))
+
+    assert [type(m) for m in wire.sent] == [Welcome, Pong, Result]
+    assert connection.session.in_flight == 0
+
+
+def test_a_reply_that_cannot_be_encoded_is_an_internal_failure(made):
+    core, _ = made
+    connection, wire = join(core)
+
+    say(connection, Command(id=3, service="odd", payload={}))
+
+    assert isinstance(wire.sent[-1], Failure)
+    assert (wire.sent[-1].id, wire.sent[-1].code) == (3, "internal")
+
+
+def test_a_kind_of_service_that_has_no_executor_is_refused(made):
+    core, _ = made
+    connection, wire = join(core)
+
+    say(connection, Command(id=3, service="kept", payload={}))
+
+    assert wire.sent[-1].code == "unknown-service"
+    assert core.held == 0
+
+
+@pytest.mark.parametrize(
+    ("hello", "expires_s", "seconds", "code"),
+    [(False, None, 5.0, 4400), (True, None, 6.0, 1001), (True, 5102.0, 2.0, 4401)],
+)
+def test_sockets_without_hello_life_or_token_are_closed_in_time(made, hello, expires_s, seconds, code):
+    core, loop = made
+    _, wire = join(core, hello=hello, expires_s=expires_s)
+
+    loop.advance(seconds - 0.1)
+    assert wire.closed is None
+    loop.advance(1.1)
+
+    assert wire.closed is not None
+    assert wire.closed[0] == code
+
+
+def test_a_robot_that_pings_stays(made):
+    core, loop = made
+    connection, wire = join(core)
+
+    for _ in range(20):
+        loop.advance(2.0)
+        say(connection, Ping(sent_s=loop.now))
+
+    assert wire.closed is None
+
+
+def test_nothing_is_written_behind_a_close(made):
+    core, _ = made
+    connection, wire = join(core)
+    connection.close(1001, "leaving")
+
+    connection.write(CODEC.encode(Move(reason="drain", within_ms=1.0)))
+    say(connection, Ping(sent_s=1.0))
+
+    assert [type(m) for m in wire.sent] == [Welcome]
+
+
+def test_a_robot_that_says_hello_while_the_server_leaves_is_moved(made):
+    core, _ = made
+    core.move_all("drain", 500.0)
+
+    _, wire = join(core)
+
+    assert [type(m) for m in wire.sent] == [Welcome, Move]
