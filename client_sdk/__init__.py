@@ -1,1 +1,73 @@
-""""""
+"""The robot SDK: connect, ask for poses, build maps.
+
+Names are imported when they are first used, so that ``import client_sdk`` stays quick and needs
+only numpy, websockets and msgspec.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from client_sdk.blocking import BlockingRobot, connect_blocking
+    from client_sdk.datasets import Dataset, open_dataset
+    from client_sdk.frontend import Frame, FrontEndOptions, PoseQuery, TrackedFrame, Tracker
+    from client_sdk.mapping import MapOptions, PointMap, Trajectory
+    from client_sdk.offload import CloudFirst
+    from client_sdk.robot import Answer, PoseAnswer, Robot, connect
+    from client_sdk.stats import Stats
+
+__all__ = [
+    "Answer",
+    "BlockingRobot",
+    "CloudFirst",
+    "Dataset",
+    "Frame",
+    "FrontEndOptions",
+    "MapOptions",
+    "PointMap",
+    "PoseAnswer",
+    "PoseQuery",
+    "Robot",
+    "Stats",
+    "TrackedFrame",
+    "Tracker",
+    "Trajectory",
+    "connect",
+    "connect_blocking",
+    "open_dataset",
+]
+
+_HOMES = {
+    "Answer": "robot",
+    "BlockingRobot": "blocking",
+    "CloudFirst": "offload",
+    "Dataset": "datasets",
+    "Frame": "frontend",
+    "FrontEndOptions": "frontend",
+    "MapOptions": "mapping",
+    "PointMap": "mapping",
+    "PoseAnswer": "robot",
+    "PoseQuery": "frontend",
+    "Robot": "robot",
+    "Stats": "stats",
+    "TrackedFrame": "frontend",
+    "Tracker": "frontend",
+    "Trajectory": "mapping",
+    "connect": "robot",
+    "connect_blocking": "blocking",
+    "open_dataset": "datasets",
+}
+
+
+def __getattr__(name: str) -> Any:
+    """Import *name* from its home."""
+    home = _HOMES.get(name)
+    if home is None:
+        raise AttributeError(f"module 'client_sdk' has no attribute {name!r}")
+    return getattr(importlib.import_module(f"client_sdk.{home}"), name)
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

@@ -31,6 +31,7 @@ class Answered:
     id: int
     answer: Result | Failure
     sent_s: float
+    wire_bytes: int = 0
     up_s: float | None = None
     down_s: float | None = None
 
@@ -73,6 +74,7 @@ class _Pending:
     deadline: float
     first_sent: float
     sent_at: float = 0.0
+    wire_bytes: int = 0
     link: Link | None = None
     not_before: float = 0.0
     losses: int = 0
@@ -220,6 +222,14 @@ class RobotSession:
                 self._write(pending, self.current, now)
         return events
 
+    def abandon(self, code: str, message: str, hint: str = "") -> list[Event]:
+        """End every command with a failure: there will be no other link."""
+        events: list[Event] = []
+        for identity, pending in list(self._pending.items()):
+            failure = Failure(id=identity, code=code, message=message, hint=hint, trace=pending.command.trace)
+            events += self._end(identity, failure)
+        return events
+
     def tend(self, link: Link, now: float) -> list[Event]:
         """Ping *link* when it is time; say when it is dead."""
         s = self.settings
@@ -253,7 +263,9 @@ class RobotSession:
         pending.link, pending.sent_at = link, now
         remaining_ms = max(0.0, (pending.deadline - now) * 1e3)
         command = msgspec.structs.replace(pending.command, deadline_ms=remaining_ms)
-        link.outgoing.append(self.codec.encode(command))
+        data = self.codec.encode(command)
+        pending.wire_bytes = len(data)
+        link.outgoing.append(data)
 
     def _answer(self, link: Link, answer: Result | Failure, now: float) -> list[Event]:
         pending = self._pending.get(-1 if answer.id is None else answer.id)
@@ -302,7 +314,16 @@ class RobotSession:
         self, identity: int, answer: Result | Failure, up_s: float | None = None, down_s: float | None = None
     ) -> list[Event]:
         pending = self._pending.pop(identity)
-        return [Answered(id=identity, answer=answer, sent_s=pending.first_sent, up_s=up_s, down_s=down_s)]
+        return [
+            Answered(
+                id=identity,
+                answer=answer,
+                sent_s=pending.first_sent,
+                wire_bytes=pending.wire_bytes,
+                up_s=up_s,
+                down_s=down_s,
+            )
+        ]
 
 
 def _failure(command: Command, code: str, message: str) -> Failure:

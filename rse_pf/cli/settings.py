@@ -1,0 +1,71 @@
+"""Show every setting: value, default, unit, where it comes from, and what it does.
+
+examples:
+  rse-pf settings scaling
+  rse-pf settings --json
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Sequence
+
+from rse_pf.errors import UsageError
+from rse_pf.settings import PlatformSettings, SettingRow, setting_rows
+
+__all__ = ["add_arguments", "markdown", "run"]
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    parser.add_argument("group", nargs="?", help="show one group only, such as scaling; or: digest")
+    shape = parser.add_mutually_exclusive_group()
+    shape.add_argument("--json", action="store_true", help="print all values as JSON")
+    shape.add_argument("--markdown", action="store_true", help="print docs/settings.md")
+
+
+def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
+    """Print the table."""
+    rows = list(setting_rows(settings))
+    if args.group == "digest":
+        print(settings.digest())
+        return 0
+    if args.markdown:
+        print(markdown(rows), end="")
+        return 0
+    if args.group is not None:
+        groups = list(dict.fromkeys(row.group for row in rows))
+        if args.group not in groups:
+            raise UsageError(f"no group named {args.group!r}", hint=f"groups are {', '.join(groups)}")
+        rows = [row for row in rows if row.group == args.group]
+    if args.json:
+        values: dict[str, dict[str, object]] = {}
+        for row in rows:
+            values.setdefault(row.group, {})[row.name] = row.value
+        print(json.dumps(values, indent=2))
+        return 0
+    for row in rows:
+        changed = "" if row.value == row.default else f"  (default {row.default})"
+        unit = f" {row.unit}" if row.unit else ""
+        print(f"{row.group}.{row.name} = {row.value}{unit}{changed}\n    {row.doc} [{row.source}]")
+    return 0
+
+
+def markdown(rows: Sequence[SettingRow]) -> str:
+    """Return ``docs/settings.md``: the defaults, group by group."""
+    lines = [
+        "# Settings",
+        "",
+        'Overrides go to `cdk.json`, `context."rse-pf"`: `{"scaling": {"max_servers": 4}}`. Every program of the',
+        "platform reads that one file (`--settings FILE`), and answers with the digest of what it read. This page is",
+        "generated: `make docs`.",
+    ]
+    group = ""
+    for row in rows:
+        if row.group != group:
+            group = row.group
+            lines += ["", f"## {group}", "", "| setting | default | unit | source | what it does |"]
+            lines += ["|---|---|---|---|---|"]
+        lines.append(f"| `{row.name}` | `{row.default!r}` | {row.unit} | {row.source} | {row.doc} |")
+    return "\n".join(lines) + "\n"
