@@ -5,6 +5,7 @@ Promises never to read a clock: all four stamps of an exchange are arguments.
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from dataclasses import dataclass
 
@@ -19,6 +20,15 @@ class Exchange:
     received_s: float
     answered_s: float
     returned_s: float
+
+    @property
+    def is_plausible(self) -> bool:
+        """Whether the stamps are numbers and neither clock ran backwards."""
+        return (
+            math.isfinite(self.sent_s + self.received_s + self.answered_s + self.returned_s)
+            and self.sent_s <= self.returned_s
+            and self.received_s <= self.answered_s
+        )
 
     @property
     def round_trip_s(self) -> float:

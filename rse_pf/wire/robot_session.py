@@ -2,36 +2,44 @@
 
 A `RobotSession` lives as long as the robot; a `Link` as long as one socket.  Commands survive the
 death of a link: they are sent again, by the same id, on the next one.  Promises that a command gets
-exactly one final answer, that nothing stale is delivered as fresh, and never to read a clock.
+exactly one final answer, that nothing stale is delivered as fresh, that no more commands are on
+their way than the server accepts, and never to read a clock.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from typing import Any
 
 import msgspec
 
+from rse_pf.errors import LimitExceeded
 from rse_pf.settings import SessionSettings
 from rse_pf.wire.clock_offset import ClockOffset, Exchange
 from rse_pf.wire.codec import Codec
 from rse_pf.wire.messages import Command, Failure, Hello, Move, Ping, Pong, Result, Welcome
 
-__all__ = ["Answered", "Link", "LinkLost", "MoveAsked", "Notice", "RobotSession", "Welcomed"]
+__all__ = ["Answered", "Event", "Link", "LinkLost", "MoveAsked", "Notice", "RobotSession", "Welcomed"]
 
 _MAX_TRIES_AFTER_LOSS = 2
 _RETRY_BURST = 5.0
-_PONGS_PER_SILENCE = 3.0
+_PINGS_PER_SILENCE = 3.0
+_LONGEST_MS = 3.6e6
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Answered:
-    """A command came to its end."""
+    """A command came to its end.
+
+    ``submitted_s`` is the robot's clock; ``up_s`` and ``down_s`` are the paper's two one-way delays,
+    None where no clock offset is known; ``message_bytes`` is what the command weighed on the wire.
+    """
 
     id: int
     answer: Result | Failure
-    sent_s: float
-    wire_bytes: int = 0
+    submitted_s: float
+    message_bytes: int = 0
     up_s: float | None = None
     down_s: float | None = None
 
@@ -72,12 +80,13 @@ Event = Answered | Welcomed | MoveAsked | LinkLost | Notice
 class _Pending:
     command: Command
     deadline: float
-    first_sent: float
-    sent_at: float = 0.0
-    wire_bytes: int = 0
+    submitted: float
+    message_bytes: int
+    sent_at: float | None = None
     link: Link | None = None
     not_before: float = 0.0
     losses: int = 0
+    cancelled: bool = False
 
 
 @dataclass(slots=True, kw_only=True, eq=False)
@@ -89,7 +98,8 @@ class Link:
     leaving: bool = False
     lost: bool = False
     last_heard: float = 0.0
-    next_ping: float = 0.0
+    last_tended: float = 0.0
+    last_ping: float | None = None
     ping_sent: float | None = None
     clock_offset: ClockOffset = field(default_factory=ClockOffset)
     last_exchange: Exchange | None = None
@@ -120,7 +130,7 @@ class RobotSession:
     @property
     def unanswered(self) -> int:
         """How many commands wait for their end."""
-        return len(self._pending)
+        return sum(not pending.cancelled for pending in self._pending.values())
 
     def submit(
         self,
@@ -133,29 +143,40 @@ class RobotSession:
         keep: bool = False,
         trace: str = "",
     ) -> int:
-        """Take a command; it is written to the current link as soon as there is one."""
-        identity, self._next_id = self._next_id, self._next_id + 1
-        sequence = self._sequence.get(stream, 0) + 1
-        self._sequence[stream] = sequence
+        """Take a command; it is written to the current link as soon as there is one with room.
+
+        Raises:
+            BadMessage: The payload does not travel in messages.
+            LimitExceeded: The message would be larger than the limit.
+        """
         wait = self.settings.answer_timeout_s if deadline_s is None else deadline_s
         command = Command(
-            id=identity, service=service, payload=payload, stream=stream, seq=sequence, keep=keep,
-            trace=trace,
+            id=self._next_id, service=service, payload=payload, stream=stream,
+            seq=self._sequence.get(stream, 0) + 1, keep=keep, trace=trace,
         )  # fmt: skip
-        pending = _Pending(command=command, deadline=now + wait, first_sent=now)
-        self._pending[identity] = pending
+        data = self.codec.encode(_with_deadline(command, wait))
+        self._check_size(data)
+        pending = _Pending(command=command, deadline=now + wait, submitted=now, message_bytes=len(data))
+        self._next_id += 1
+        self._sequence[stream] = command.seq
+        self._pending[command.id] = pending
         self._retry_tokens = min(_RETRY_BURST, self._retry_tokens + self.settings.retry_percent / 100)
-        if self.current is not None:
-            self._write(pending, self.current, now)
-        return identity
+        if self.current is not None and self._room(self.current) > 0:
+            self._write(pending, self.current, now, data)
+        return command.id
 
     def cancel(self, identity: int) -> None:
-        """Forget a command whose caller went away."""
-        self._pending.pop(identity, None)
+        """Forget a command whose caller went away; its answer, if one comes, is dropped."""
+        pending = self._pending.get(identity)
+        if pending is None:
+            return
+        if pending.link is None:
+            del self._pending[identity]
+        pending.cancelled = True
 
     def open_link(self, now: float) -> Link:
         """Return a new link with a Hello to send; call when a socket is open."""
-        link = Link(opened=now, last_heard=now, next_ping=now)
+        link = Link(opened=now, last_heard=now, last_tended=now)
         link.outgoing.append(self.codec.encode(Hello(sdk=self._sdk, capabilities=("move",))))
         return link
 
@@ -164,137 +185,161 @@ class RobotSession:
         link.lost = True
         if self.current is link:
             self.current = None
-        for pending in self._pending.values():
+        for identity, pending in list(self._pending.items()):
             if pending.link is link:
                 pending.link = None
+                if pending.cancelled:
+                    del self._pending[identity]
 
     def unanswered_on(self, link: Link) -> int:
-        """How many commands sent on *link* still wait for an answer."""
-        return sum(pending.link is link for pending in self._pending.values())
+        """How many commands sent on *link* still wait for an answer that somebody wants."""
+        return sum(pending.link is link and not pending.cancelled for pending in self._pending.values())
 
     def adopt(self, link: Link, now: float) -> list[Event]:
-        """Make a welcomed *link* the current one and resend what has no link.
+        """Make a welcomed *link* the current one and send on it what has no link.
 
         Of a latest-wins stream only the newest frame is sent again: no catch-up burst.
         """
         before, self.current = self.current, link
         if before is not None and before is not link:
             before.leaving = True
-        events: list[Event] = []
-        newest: dict[str, int] = {}
-        for pending in self._pending.values():
-            newest[pending.command.stream] = max(newest.get(pending.command.stream, 0), pending.command.seq)
-        for identity, pending in list(self._pending.items()):
-            if pending.link is not None:
-                continue
-            command = pending.command
-            if not command.keep and command.stream and command.seq < newest[command.stream]:
-                events += self._end(identity, _failure(command, "stale", "a newer frame took its place"))
-            else:
-                self._write(pending, link, now)
-        return events
+        return self._flush(now)
 
     def receive(self, link: Link, data: bytes, now: float) -> list[Event]:
         """Return what one WebSocket message on *link* means; raises ProtocolError if it is garbage."""
         link.last_heard = now
         message = self.codec.decode_from_server(data)
         if isinstance(message, Welcome):
+            if link.welcome is not None:
+                return []
             link.welcome = message
             return [Welcomed(message)]
         if isinstance(message, Pong):
             return self._pong(link, message, now)
         if isinstance(message, Move):
-            return [MoveAsked(message.reason, message.within_ms / 1e3)]
+            within_s = message.within_ms / 1e3
+            return [MoveAsked(message.reason, within_s if math.isfinite(within_s) else 0.0)]
         if isinstance(message, Failure) and message.id is None:
             return [Notice(message)]
         return self._answer(link, message, now)
 
     def due(self, now: float) -> list[Event]:
-        """Return the commands whose deadline has passed, and resend those whose pause is over."""
+        """Return the commands whose deadline has passed, and send those that may go (again)."""
         events: list[Event] = []
         for identity, pending in list(self._pending.items()):
             if now >= pending.deadline:
-                waited = now - pending.first_sent
-                events += self._end(
-                    identity, _failure(pending.command, "expired", f"no answer within {waited:.3f} s")
-                )
-            elif pending.link is None and self.current is not None and now >= pending.not_before:
-                self._write(pending, self.current, now)
-        return events
-
-    def abandon(self, code: str, message: str, hint: str = "") -> list[Event]:
-        """End every command with a failure: there will be no other link."""
-        events: list[Event] = []
-        for identity, pending in list(self._pending.items()):
-            failure = Failure(id=identity, code=code, message=message, hint=hint, trace=pending.command.trace)
-            events += self._end(identity, failure)
-        return events
+                waited = now - pending.submitted
+                failure = _failure(pending.command, "expired", f"no answer within {waited:.3f} s")
+                events += self._end(identity, failure)
+        return events + self._flush(now)
 
     def tend(self, link: Link, now: float) -> list[Event]:
-        """Ping *link* when it is time; say when it is dead."""
+        """Ping *link* when it is time; say when it is dead.
+
+        A robot that did not look for a while cannot tell whether the server was silent meanwhile,
+        so such a gap does not count.
+        """
         s = self.settings
         if link.lost:
             return []
+        if now - link.last_tended >= s.silence_s:
+            link.last_heard = now
+            link.ping_sent = None if link.ping_sent is None else now
+        link.last_tended = now
         if link.welcome is None:
             late = now - link.opened >= s.hello_timeout_s
             return self._lose(link, "no welcome") if late else []
         if link.ping_sent is not None and now - link.ping_sent >= s.ping_patience_s:
             return self._lose(link, "no pong")
-        waiting = [p.sent_at for p in self._pending.values() if p.link is link]
+        waiting = [p.sent_at for p in self._pending.values() if p.link is link and p.sent_at is not None]
         if waiting and now - max(link.last_heard, min(waiting)) >= s.silence_s:
             return self._lose(link, "silence")
-        if now >= link.next_ping:
-            if link.ping_sent is None:
-                link.ping_sent = now
+        pause = s.ping_interval_s
+        if waiting:
+            pause = min(pause, s.silence_s / _PINGS_PER_SILENCE)
+        if link.last_ping is None or now - link.last_ping >= pause:
+            link.ping_sent = now if link.ping_sent is None else link.ping_sent
+            link.last_ping = now
             link.outgoing.append(self.codec.encode(Ping(sent_s=now)))
-            pause = s.silence_s / _PONGS_PER_SILENCE if waiting else s.ping_interval_s
-            link.next_ping = now + min(pause, s.ping_interval_s)
         return []
 
     def next_due(self, now: float) -> float:
-        """Return when `due` or `tend` should be called again, at the latest."""
-        times = [now + self.settings.silence_s / _PONGS_PER_SILENCE]
+        """Return when `due` and `tend` should be called again, at the latest."""
+        times = [now + self.settings.silence_s / _PINGS_PER_SILENCE]
         times += [pending.deadline for pending in self._pending.values()]
         times += [p.not_before for p in self._pending.values() if p.link is None and p.not_before > now]
         return max(now, min(times))
 
-    def _write(self, pending: _Pending, link: Link, now: float) -> None:
-        self.resent += pending.sent_at > 0
+    def _flush(self, now: float) -> list[Event]:
+        """Send what has no link, oldest first, as far as the server has room."""
+        link = self.current
+        if link is None:
+            return []
+        events: list[Event] = []
+        room = self._room(link)
+        for identity, pending in list(self._pending.items()):
+            if pending.link is not None or now < pending.not_before:
+                continue
+            command = pending.command
+            if command.stream and not command.keep and command.seq < self._sequence[command.stream]:
+                events += self._end(identity, _failure(command, "stale", "a newer frame took its place"))
+            elif room > 0:
+                room -= 1
+                self._write(pending, link, now)
+        return events
+
+    def _room(self, link: Link) -> int:
+        most = link.welcome.limits.max_in_flight if link.welcome else self.settings.max_in_flight
+        return max(1, most) - sum(pending.link is link for pending in self._pending.values())
+
+    def _check_size(self, data: bytes) -> None:
+        most = self.settings.max_message_bytes
+        if self.current is not None and self.current.welcome is not None:
+            most = min(most, self.current.welcome.limits.max_message_bytes)
+        if len(data) > most:
+            raise LimitExceeded(
+                f"a command of {len(data)} bytes is above {most}",
+                hint="send fewer matches, or send large data to the data server",
+            )
+
+    def _write(self, pending: _Pending, link: Link, now: float, data: bytes | None = None) -> None:
+        self.resent += pending.sent_at is not None
         pending.link, pending.sent_at = link, now
-        remaining_ms = max(0.0, (pending.deadline - now) * 1e3)
-        command = msgspec.structs.replace(pending.command, deadline_ms=remaining_ms)
-        data = self.codec.encode(command)
-        pending.wire_bytes = len(data)
-        link.outgoing.append(data)
+        link.outgoing.append(
+            self.codec.encode(_with_deadline(pending.command, pending.deadline - now))
+            if data is None
+            else data
+        )
 
     def _answer(self, link: Link, answer: Result | Failure, now: float) -> list[Event]:
         pending = self._pending.get(-1 if answer.id is None else answer.id)
-        if pending is None:
+        elsewhere = pending is not None and pending.link is not link
+        if pending is None or (elsewhere and isinstance(answer, Failure)):
             self.dropped_answers += 1
             return []
+        if isinstance(answer, Failure):
+            again = self._try_again(pending, answer, now)
+            return self._flush(now) if again else self._end(pending.command.id, answer) + self._flush(now)
         command = pending.command
-        if isinstance(answer, Failure) and self._try_again(pending, answer, now):
-            return []
-        up_s = down_s = None
-        if isinstance(answer, Result):
-            last = self._delivered.get(command.stream, 0)
-            if command.stream and not command.keep and command.seq < last:
-                return self._end(command.id, _failure(command, "stale", "a newer answer came first"))
+        last = self._delivered.get(command.stream, 0)
+        if command.stream and not command.keep and command.seq < last:
+            stale = _failure(command, "stale", "a newer answer came first")
+            return self._end(command.id, stale) + self._flush(now)
+        if not pending.cancelled:
             self._delivered[command.stream] = max(last, command.seq)
-            offset = link.clock_offset.offset_s
-            if offset is not None:
-                up_s = answer.received_s - offset - pending.sent_at
-                down_s = now - (answer.sent_s - offset)
-        return self._end(command.id, answer, up_s, down_s)
+        up_s, down_s = (None, None) if elsewhere else _delays(link, answer, pending.sent_at, now)
+        return self._end(command.id, answer, up_s, down_s) + self._flush(now)
 
     def _try_again(self, pending: _Pending, failure: Failure, now: float) -> bool:
         """Retry what may succeed elsewhere or later, within the deadline and the budget."""
+        if pending.cancelled:
+            return False
         if failure.code == "worker-lost" and pending.losses < _MAX_TRIES_AFTER_LOSS:
             pending.losses += 1
             pending.link = None
             return True
-        after = now + (failure.retry_after_ms or 0.0) / 1e3
-        if failure.code != "busy" or after >= pending.deadline or self._retry_tokens < 1.0:
+        after = now + max(0.0, failure.retry_after_ms or 0.0) / 1e3
+        if failure.code != "busy" or not after < pending.deadline or self._retry_tokens < 1.0:
             return False
         self._retry_tokens -= 1.0
         pending.link, pending.not_before = None, after
@@ -302,8 +347,10 @@ class RobotSession:
 
     def _pong(self, link: Link, pong: Pong, now: float) -> list[Event]:
         link.ping_sent = None
-        link.last_exchange = Exchange(pong.sent_s, pong.received_s, pong.answered_s, now)
-        link.clock_offset.add(link.last_exchange)
+        exchange = Exchange(pong.sent_s, pong.received_s, pong.answered_s, now)
+        if link.opened <= pong.sent_s <= now and exchange.is_plausible:
+            link.last_exchange = exchange
+            link.clock_offset.add(exchange)
         return []
 
     def _lose(self, link: Link, reason: str) -> list[Event]:
@@ -314,17 +361,32 @@ class RobotSession:
         self, identity: int, answer: Result | Failure, up_s: float | None = None, down_s: float | None = None
     ) -> list[Event]:
         pending = self._pending.pop(identity)
+        if pending.cancelled:
+            self.dropped_answers += isinstance(answer, Result)
+            return []
         return [
             Answered(
-                id=identity,
-                answer=answer,
-                sent_s=pending.first_sent,
-                wire_bytes=pending.wire_bytes,
-                up_s=up_s,
-                down_s=down_s,
+                id=identity, answer=answer, submitted_s=pending.submitted,
+                message_bytes=pending.message_bytes, up_s=up_s, down_s=down_s,
             )
-        ]
+        ]  # fmt: skip
+
+
+def _with_deadline(command: Command, remaining_s: float) -> Command:
+    return msgspec.structs.replace(command, deadline_ms=min(_LONGEST_MS, max(0.0, remaining_s * 1e3)))
 
 
 def _failure(command: Command, code: str, message: str) -> Failure:
     return Failure(id=command.id, code=code, message=message, trace=command.trace)
+
+
+def _delays(
+    link: Link, result: Result, sent_at: float | None, now: float
+) -> tuple[float, float] | tuple[None, None]:
+    """Return the two one-way delays; what the offset's uncertainty makes negative counts as nothing."""
+    offset = link.clock_offset.offset_s
+    if offset is None or sent_at is None or not 0.0 < result.received_s <= result.sent_s:
+        return None, None
+    network = max(0.0, (now - sent_at) - (result.sent_s - result.received_s))
+    up_s = min(network, max(0.0, result.received_s - offset - sent_at))
+    return up_s, network - up_s
