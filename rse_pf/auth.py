@@ -57,7 +57,7 @@ class SigningKey:
         try:
             document = json.loads(text)
             return cls.from_seed(_unb64(document["d"]), str(document["kid"]))
-        except (ValueError, KeyError, TypeError) as error:
+        except (ValueError, KeyError, TypeError, RecursionError) as error:
             raise UsageError("this is not a signing key", hint="make one with rse-pf local") from error
 
     def to_json(self) -> str:
@@ -82,6 +82,8 @@ class SigningKey:
         """Return a token for *robot* that is good from *now* (Unix seconds) for *life_s*."""
         if not robot or len(robot) > 64 or not robot.isprintable():
             raise UsageError(f"{robot[:80]!r} is no name for a robot", hint="use 1 to 64 printable letters")
+        if not 0 < len(token_id) <= 64:
+            raise UsageError("a token id has 1 to 64 letters", hint="leave it to rse-pf token issue")
         life = settings.token_life_s if life_s is None else life_s
         if not 0 < life <= settings.token_life_s:
             raise UsageError(
@@ -121,7 +123,7 @@ class KeySet:
                     for jwk in json.loads(text)["keys"]
                 }
             )
-        except (ValueError, KeyError, TypeError) as error:
+        except (ValueError, KeyError, TypeError, RecursionError) as error:
             raise UsageError("this is not a key set", hint="write a JWKS of Ed25519 keys") from error
 
     def to_json(self) -> str:
@@ -174,7 +176,7 @@ def _checked(token: str, keys: KeySet, now: float, settings: AuthSettings) -> Cl
         raise _Refused("malformed")
     try:
         header = jwt.get_unverified_header(token)
-    except jwt.PyJWTError as error:
+    except (jwt.PyJWTError, RecursionError) as error:
         raise _Refused("malformed") from error
     if header.get("alg") != _ALGORITHM or header.get("typ") != _TYPE or "crit" in header:
         raise _Refused("wrong-algorithm-or-type")

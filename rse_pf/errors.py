@@ -63,6 +63,9 @@ class RsePfError(Exception):
     def __str__(self) -> str:
         return self.message
 
+    def __reduce__(self) -> tuple[object, ...]:
+        return _bare, (type(self), self.message), self.__dict__
+
     def report(self) -> str:
         """Return the two lines that a person sees: what is wrong, and what to do."""
         first = f"{type(self).__name__}: {self.message}"
@@ -299,7 +302,13 @@ def error_from_code(
     code: str, message: str, *, hint: str = "", retry_after_ms: float | None = None
 ) -> RsePfError:
     """Return the error that *code* stands for; an unknown code gives ``CommandFailed``."""
-    kind = _leaves(RsePfError).get(code, CommandFailed)
+    error = _bare(_leaves(RsePfError).get(code, CommandFailed), message)
+    error.hint, error.retry_after_ms = hint, retry_after_ms
+    return error
+
+
+def _bare(kind: type[RsePfError], message: str) -> RsePfError:
+    """Return an error of *kind* past its own constructor, whose arguments do not travel."""
     error = kind.__new__(kind)
-    RsePfError.__init__(error, message, hint=hint, retry_after_ms=retry_after_ms)
+    RsePfError.__init__(error, message)
     return error

@@ -132,7 +132,7 @@ def exp_se3(xi: npt.ArrayLike) -> Array:
         rotation, jacobian = np.eye(3) + K, np.eye(3) + 0.5 * K
     else:
         a = math.sin(angle) / angle
-        b = (1.0 - math.cos(angle)) / angle**2
+        b = 2.0 * (math.sin(0.5 * angle) / angle) ** 2  # (1 - cos) / angle**2, without its cancellation
         c = (1.0 - a) / angle**2
         rotation = np.eye(3) + a * K + b * K @ K
         jacobian = np.eye(3) + b * K + c * K @ K

@@ -1,0 +1,109 @@
+"""The exception tree: stable codes, and reports that say what to do."""
+
+from __future__ import annotations
+
+import pickle
+
+import pytest
+
+from rse_pf import errors
+from rse_pf.errors import CommandFailed, MissingExtra, RsePfError, error_from_code
+
+CODES = {
+    "AuthError": "auth",
+    "BadMessage": "bad-message",
+    "BadRequest": "bad-request",
+    "Busy": "busy",
+    "Cancelled": "cancelled",
+    "CommandFailed": "failed",
+    "ConfigurationError": "configuration",
+    "Conflict": "conflict",
+    "ConnectError": "connect",
+    "DegenerateGeometry": "degenerate",
+    "Disconnected": "disconnected",
+    "Expired": "expired",
+    "Forbidden": "forbidden",
+    "InternalError": "internal",
+    "InvalidCamera": "invalid-camera",
+    "LimitExceeded": "too-large",
+    "MissingExtra": "missing-extra",
+    "NoConsensus": "no-consensus",
+    "NotFound": "not-found",
+    "PnpError": "pnp",
+    "Poison": "poison",
+    "ProtocolError": "protocol",
+    "QuotaExceeded": "quota",
+    "RsePfError": "error",
+    "SettingsError": "settings",
+    "Stale": "stale",
+    "StoreError": "store",
+    "StoreFull": "store-full",
+    "TooFewCorrespondences": "too-few",
+    "Unauthorized": "unauthorized",
+    "UnknownService": "unknown-service",
+    "UnsupportedProtocol": "unsupported",
+    "UsageError": "usage",
+    "WorkerLost": "worker-lost",
+}
+"""Codes are on the wire: an entry may be added, never changed."""
+
+KINDS = [getattr(errors, name) for name in errors.__all__ if name != "error_from_code"]
+
+
+def test_every_error_keeps_its_code() -> None:
+    assert {kind.__name__: kind.code for kind in KINDS} == CODES
+
+
+def test_no_two_errors_share_a_code() -> None:
+    assert len({kind.code for kind in KINDS}) == len(KINDS)
+
+
+def test_the_tree_is_two_levels_deep() -> None:
+    for kind in KINDS:
+        assert kind.__mro__.index(RsePfError) <= 2, kind
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_code_gives_its_error_back_with_all_it_carried(kind: type[RsePfError]) -> None:
+    error = error_from_code(kind.code, "what went wrong", hint="do this", retry_after_ms=20.0)
+
+    assert type(error) is kind
+    assert (error.message, error.hint, error.retry_after_ms) == ("what went wrong", "do this", 20.0)
+    assert str(error) == "what went wrong"
+
+
+def test_an_unknown_code_of_a_newer_server_is_a_failed_command() -> None:
+    assert type(error_from_code("out-of-coffee", "later")) is CommandFailed
+
+
+def test_a_report_is_what_is_wrong_and_then_what_to_do() -> None:
+    error = errors.TooFewCorrespondences(
+        "got 3 correspondences, a pose needs at least 4", hint="loosen the matcher, or skip this frame"
+    )
+
+    assert error.report() == (
+        "TooFewCorrespondences: got 3 correspondences, a pose needs at least 4\n"
+        "  hint: loosen the matcher, or skip this frame"
+    )
+
+
+def test_a_report_without_a_hint_is_one_line() -> None:
+    assert errors.Busy("too much").report() == "Busy: too much"
+
+
+def test_a_missing_extra_names_the_pip_command() -> None:
+    assert MissingExtra("picows", "backend").report() == (
+        "MissingExtra: picows is not installed\n  hint: pip install 'rse-pf[backend]'"
+    )
+
+
+@pytest.mark.parametrize("error", [errors.Busy("m", hint="h", retry_after_ms=1.0), MissingExtra("a", "b")])
+def test_an_error_survives_the_way_between_processes(error: RsePfError) -> None:
+    copy = pickle.loads(pickle.dumps(error))
+
+    assert type(copy) is type(error)
+    assert (copy.message, copy.hint, copy.retry_after_ms) == (
+        error.message,
+        error.hint,
+        error.retry_after_ms,
+    )
