@@ -13,6 +13,7 @@ import asyncio
 import importlib.util
 import os
 import platform
+import signal
 import sys
 import tempfile
 import time
@@ -80,8 +81,7 @@ def main() -> None:
         try:
             asyncio.run(measure(identity, options.robots, round_trip.status))
         finally:
-            process.terminate()
-            process.terminate()
+            process.send_signal(signal.SIGINT)
             process.wait(20)
 
 

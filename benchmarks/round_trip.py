@@ -14,6 +14,7 @@ import asyncio
 import json
 import os
 import platform
+import signal
 import subprocess
 import sys
 import tempfile
@@ -94,8 +95,7 @@ def main() -> None:
         try:
             asyncio.run(drive(identity, options))
         finally:
-            process.terminate()
-            process.terminate()
+            process.send_signal(signal.SIGINT)
             process.wait(20)
 
 

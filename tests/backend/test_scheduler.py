@@ -233,7 +233,7 @@ def poisson(rate: float, robots: int, seed: int) -> list[tuple[float, str]]:
     return found
 
 
-@pytest.mark.parametrize("robots", [4, 40, 400])
+@pytest.mark.parametrize("robots", [4, 9, 40, 400])
 @pytest.mark.parametrize("load", [2, 5])
 def test_goodput_holds_under_overload(load, robots):
     arrivals = poisson(load * CAPACITY, robots, seed=load)
@@ -261,6 +261,14 @@ def test_nothing_is_shed_below_capacity():
 
     assert late == 0
     assert len(refused) <= 0.01 * len(good)
+
+
+def test_a_burst_shorter_than_the_interval_is_served_whole():
+    burst = [(0.001 * k, f"r{k}") for k in range(28)]
+
+    good, late, refused = simulate(Scheduler(ServingSettings()), burst, random.Random(1))
+
+    assert (len(good), late, refused) == (28, 0, [])
 
 
 def test_one_robot_may_wait_for_a_slow_command_of_another():
@@ -307,7 +315,7 @@ def test_no_robot_starves_under_overload():
 
     served = Counter(each.robot for each in good)
     assert len(served) == 40
-    assert min(served.values()) >= 0.6 * len(good) / 40
+    assert min(served.values()) >= 0.75 * len(good) / 40
 
 
 def test_a_flooding_robot_takes_nothing_from_the_others():
