@@ -12,7 +12,7 @@ import multiprocessing
 import os
 import shutil
 import time
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Callable, Mapping
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -90,13 +90,14 @@ async def _run(
     def now() -> float:
         return time.monotonic() - origin
 
+    def tell(event: Mapping[str, Any]) -> None:
+        events.write(now(), str(event["event"]), **{k: v for k, v in event.items() if k != "event"})
+
     with _screen(options) as screen:
         screen.say("starting the platform: Envoy and two servers")
         async with LocalCloud(
-            settings, servers=settings.local.servers, port=0, state=folder / "platform"
+            settings, port=0, state=folder / "platform", name="demo", on_event=tell
         ) as cloud:
-            for server in cloud.servers:
-                events.write(now(), "server-ready", server=server.name, pid=server.pid)
             samples = asyncio.create_task(_sample(cloud, folder / "samples.csv", now))
             robots = [_start(options, settings, folder, cloud, number) for number in range(options.robots)]
             try:
@@ -106,8 +107,6 @@ async def _run(
                 with contextlib.suppress(asyncio.CancelledError):
                     await samples
                 _end(robots)
-            for entry in cloud.events:
-                events.write(now(), "platform", **entry)
     screen.say("drawing the maps")
     finished = [robot.finished for robot in robots if robot.finished is not None]
     if len(finished) < len(robots):
