@@ -1,1 +1,1 @@
-"""The command line: one file for each verb."""
+"""The command line: ``rse-pf VERB``, one file per verb, everything heavy imported inside the verb."""

@@ -1,105 +1,154 @@
-"""``rse-pf VERB``: finds the verb, reads the settings, and turns errors into two lines.
+"""The front of the command line: find the verb, read the settings, turn errors into two lines.
 
-Promises that a user never sees a traceback, and that nothing heavy is imported before its verb.
+A verb is the module ``rse_pf.cli.VERB``: its docstring is its help page, ``add_arguments(parser)`` declares
+options, ``run(args, settings)`` returns the exit code; it is imported only when it is called for.  Promises
+exit codes (0 done, 1 failed, 2 called or set up wrongly, 130 interrupted), no traceback for what has a name.
 """
 
 from __future__ import annotations
 
 import argparse
-import contextlib
 import difflib
 import importlib
 import os
+import re
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
 from rse_pf.errors import ConfigurationError, RsePfError, UsageError
 from rse_pf.settings import load_settings
 
-__all__ = ["VERBS", "main"]
+__all__ = ["VERBS", "Parser", "main"]
 
 VERBS = {
-    "demo": "robots build point-cloud maps through the PnP service, on this machine",
-    "local": "the whole platform on this machine: start, stop",
-    "token": "issue or inspect robot tokens",
-    "serve": "one backend server, as EC2 runs it",
-    "settings": "every setting: value, unit, source, help",
-    "doctor": "what this machine can do, and how to mend what it cannot",
+    "demo": "let robots build point-cloud maps through the platform, on this machine",
+    "local": "run the platform on this machine: load balancer and backend servers",
+    "token": "issue a robot's token, or look into one",
+    "serve": "run one backend server, as EC2 runs it",
+    "settings": "show every setting: value, default, unit, source",
+    "doctor": "check what this machine needs, and say how to mend it",
 }
-"""Each verb is the module ``rse_pf.cli.VERB`` with ``add_arguments(parser)`` and ``run(args, settings)``."""
+"""Verb and one line of help."""
 
-_EXIT_FAILED, _EXIT_USAGE, _EXIT_INTERRUPTED = 1, 2, 130
+_EXIT_OK, _EXIT_FAILED, _EXIT_USAGE, _EXIT_INTERRUPTED, _EXIT_PIPE = 0, 1, 2, 130, 141
+_CHOICE = re.compile(r"invalid choice: '(?P<word>[^']*)' \(choose from (?P<known>.*)\)")
 
 
-class _Parser(argparse.ArgumentParser):
-    """argparse, with our kind of errors."""
+class Parser(argparse.ArgumentParser):
+    """Raises UsageError instead of printing a page and leaving."""
 
     def error(self, message: str) -> NoReturn:
-        raise UsageError(message, hint=f"see {self.prog} --help")
+        """Raise what is wrong, with the option or word that was perhaps meant."""
+        choice = _CHOICE.search(message)
+        if choice:
+            known = [word.strip(" '\"") for word in choice["known"].split(",")]
+            raise UsageError(
+                f"{self.prog}: {choice['word']!r} is not one of {', '.join(known)}",
+                hint=_did_you_mean(choice["word"], known, f"see {self.prog} --help"),
+            )
+        raise UsageError(
+            f"{self.prog}: {message}",
+            hint=_did_you_mean(_first_option(message), self._options(), f"see {self.prog} --help"),
+        )
+
+    def _options(self) -> list[str]:
+        return [word for action in self._actions for word in action.option_strings]
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one verb and return the exit code: 0, 1 failed, 2 wrong use, 130 interrupted."""
+    """Run one verb and return the exit code."""
+    words = list(sys.argv[1:] if argv is None else argv)
     try:
-        return _run(list(sys.argv[1:] if argv is None else argv))
+        code = _run(words)
+        sys.stdout.flush()
     except RsePfError as error:
-        print(error.report(), file=sys.stderr)
-        return _EXIT_USAGE if isinstance(error, ConfigurationError) else _EXIT_FAILED
+        return _report(error)
     except KeyboardInterrupt:
         return _EXIT_INTERRUPTED
     except BrokenPipeError:
-        with contextlib.suppress(OSError):
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 0
+        _discard_output()
+        return _EXIT_PIPE
+    except OSError as error:
+        return _report(RsePfError(str(error), hint="see what the system says about this file or address"))
+    return code
 
 
-def _run(argv: list[str]) -> int:
-    if not argv or argv[0] in ("-h", "--help"):
-        print(_overview())
-        return 0
-    if argv[0] == "--version":
-        from importlib import metadata
-
-        print(f"rse-pf {metadata.version('rse-pf')}")
-        return 0
-    verb, *rest = argv
-    if verb not in VERBS:
-        close = difflib.get_close_matches(verb, VERBS, n=1)
-        hint = f"did you mean {close[0]}?" if close else f"verbs are {', '.join(VERBS)}"
-        raise UsageError(f"no verb named {verb!r}", hint=hint)
-    module: Any = importlib.import_module(f"rse_pf.cli.{verb}")
-    parser = _Parser(
-        prog=f"rse-pf {verb}",
-        description=(module.__doc__ or "").strip(),
+def _run(words: list[str]) -> int:
+    if not words or words[0] in ("-h", "--help", "help"):
+        print(_front_page())
+        return _EXIT_OK
+    if words[0] == "--version":
+        print(f"rse-pf {_version()}")
+        return _EXIT_OK
+    name, *rest = words
+    if name.startswith("-"):
+        raise UsageError(
+            f"{name} stands before the verb", hint="write rse-pf VERB OPTIONS; see rse-pf --help"
+        )
+    if name not in VERBS:
+        raise UsageError(
+            f"there is no verb {name!r}", hint=_did_you_mean(name, VERBS, f"known are {', '.join(VERBS)}")
+        )
+    verb: Any = importlib.import_module(f"rse_pf.cli.{name}")
+    parser = Parser(
+        prog=f"rse-pf {name}",
+        description=(verb.__doc__ or "").strip(),
         formatter_class=argparse.RawDescriptionHelpFormatter,
         allow_abbrev=False,
     )
     parser.add_argument(
-        "--settings", type=Path, metavar="FILE", help="read settings from FILE (default: ./cdk.json)"
+        "--settings", type=Path, metavar="FILE", help="read settings from FILE (default: ./cdk.json, if any)"
     )
-    module.add_arguments(parser)
-    args = parser.parse_args(rest)
-    code: int = module.run(args, load_settings(args.settings))
-    sys.stdout.flush()
+    verb.add_arguments(parser)
+    try:
+        args = parser.parse_args(rest)
+    except SystemExit as over:  # --help has printed its page
+        return int(over.code or _EXIT_OK)
+    code: int = verb.run(args, load_settings(args.settings))
     return code
 
 
-def _overview() -> str:
+def _front_page() -> str:
     width = max(map(len, VERBS))
-    lines = [f"  {verb:<{width}}  {text}" for verb, text in VERBS.items()]
-    return "\n".join(
-        [
-            "usage: rse-pf VERB [options]",
-            "",
-            "RSE-PF: robust, secure, elastic cloud robotics for distributed visual SLAM.",
-            "",
-            *lines,
-            "",
-            "  rse-pf VERB --help tells more; try: rse-pf demo --out out",
-        ]
+    verbs = "\n".join(f"  {name:<{width}}  {text}" for name, text in VERBS.items())
+    return (
+        "usage: rse-pf VERB [OPTIONS]\n\n"
+        "RSE-PF, a robust, secure, elastic cloud robotics platform for distributed visual SLAM.\n\n"
+        f"verbs:\n{verbs}\n\n"
+        "rse-pf VERB --help explains a verb; rse-pf --version names the version.\n\n"
+        "example:\n  rse-pf demo --out out"
     )
+
+
+def _version() -> str:
+    from importlib import metadata
+
+    try:
+        return metadata.version("rse-pf")
+    except metadata.PackageNotFoundError:
+        return "(not installed)"
+
+
+def _report(error: RsePfError) -> int:
+    print(error.report(), file=sys.stderr)
+    return _EXIT_USAGE if isinstance(error, ConfigurationError) else _EXIT_FAILED
+
+
+def _did_you_mean(word: str, known: Iterable[str], otherwise: str) -> str:
+    close = difflib.get_close_matches(word, list(known), n=1) if word else []
+    return f"did you mean {close[0]}?" if close else otherwise
+
+
+def _first_option(message: str) -> str:
+    found = re.search(r"unrecognized arguments: (\S+)", message)
+    return found[1].partition("=")[0] if found else ""
+
+
+def _discard_output() -> None:
+    """Whoever read our output has left: let nothing complain at exit."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 if __name__ == "__main__":

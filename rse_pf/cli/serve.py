@@ -1,59 +1,90 @@
-"""Run one backend server: the PnP service and its neighbours behind a WebSocket.
+"""Run one backend server: a supervisor, its worker processes, and a control port.
+
+The control port answers /healthz, /readyz, /metrics and /status.  SIGTERM drains: robots are moved and
+nothing is lost.  Ctrl-C leaves at once.  To run a whole platform, use rse-pf local.
 
 example:
-  rse-pf serve --port 8765 --keys jwks.json
+  rse-pf serve --keys keys.json --port 0 --announce server.json
 """
 
 from __future__ import annotations
 
 import argparse
+import contextlib
+import os
+import resource
 from pathlib import Path
-from typing import Any
 
+from rse_pf.auth import KeySet
 from rse_pf.errors import UsageError
-from rse_pf.settings import PlatformSettings
+from rse_pf.settings import PlatformSettings, setting_rows
 
 __all__ = ["add_arguments", "run"]
+
+_OPTIONS: dict[str, type] = {
+    "host": str, "port": int, "control_port": int, "workers": int, "size": float, "log_level": str,
+}  # fmt: skip
+"""Options that are settings of the same name."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
-    parser.add_argument("--host", help="address for robots (setting serving.host)")
-    parser.add_argument("--port", type=int, help="port for robots; 0 takes a free one (serving.port)")
-    parser.add_argument("--control-port", type=int, help="port of /readyz, /metrics (serving.control_port)")
-    parser.add_argument("--workers", type=int, help="worker processes; 0: one per core (serving.workers)")
-    parser.add_argument("--size", type=float, help="emulated size in CPU s per s; 0 is off (serving.size)")
-    parser.add_argument("--log-level", help="debug, info, warning or error (serving.log_level)")
-    parser.add_argument("--keys", type=Path, metavar="FILE", help="public keys that sign tokens, as a JWKS")
-    parser.add_argument("--server-id", default="server", help="name in every answer and log line")
-    parser.add_argument("--announce", type=Path, metavar="FILE", help="write pids and ports there when ready")
+    rows = {row.name: row for row in setting_rows() if row.group == "serving"}
+    for name, kind in _OPTIONS.items():
+        row = rows[name]
+        unit = f" [{row.unit}]" if row.unit else ""
+        parser.add_argument(
+            f"--{name.replace('_', '-')}", type=kind, dest=name, choices=row.choices or None,
+            metavar=None if row.choices else name.rpartition("_")[2].upper(),
+            help=f"{row.doc}{unit} (serving.{name}, default {row.default})",
+        )  # fmt: skip
+    parser.add_argument("--keys", type=Path, metavar="FILE", help="public keys of the tokens, a JWKS")
+    parser.add_argument("--server-id", metavar="NAME", help="name of this server (default: server-PID)")
     parser.add_argument(
-        "--conformance-echo", action="store_true", help="echo raw messages, loopback only: for test suites"
+        "--announce", type=Path, metavar="FILE", help="write pids and ports there when all is ready"
+    )
+    parser.add_argument(
+        "--conformance-echo", action="store_true", help="echo raw messages without tokens, loopback only"
     )
 
 
 def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
-    """Serve until a signal or a drain ends it."""
-    from rse_pf.auth import KeySet
+    """Serve until a drain or a signal ends it."""
+    overrides = {name: getattr(args, name) for name in _OPTIONS if getattr(args, name) is not None}
+    chosen = settings.replace(serving=overrides)
+    server_id = args.server_id or f"server-{os.getpid()}"
+    if not 0 < len(server_id) <= 64 or not server_id.isprintable():
+        raise UsageError(f"{server_id[:80]!r} is no name for a server", hint="use 1 to 64 printable letters")
+    keys = None if args.keys is None else _keys(args.keys)
+    if args.announce is not None and not args.announce.absolute().parent.is_dir():
+        raise UsageError(
+            f"there is no folder {args.announce.absolute().parent}",
+            hint="make it, or name another --announce",
+        )
+    _open_many_files()
     from rse_pf.backend import serve
 
-    given: dict[str, Any] = {
-        name: getattr(args, name)
-        for name in ("host", "port", "control_port", "workers", "size", "log_level")
-        if getattr(args, name) is not None
-    }
-    keys = None
-    if args.keys is not None:
-        try:
-            keys = KeySet.from_json(args.keys.read_text(encoding="utf-8"))
-        except OSError as error:
-            raise UsageError(
-                f"cannot read {args.keys}: {error.strerror}", hint="name a JWKS file with --keys"
-            ) from error
     return serve(
-        settings.replace(serving=given),
+        chosen,
         keys=keys,
-        server_id=args.server_id,
+        server_id=server_id,
         announce=args.announce,
         conformance_echo=args.conformance_echo,
     )
+
+
+def _keys(path: Path) -> KeySet:
+    try:
+        return KeySet.from_json(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else "it is not text"
+        raise UsageError(
+            f"cannot read the keys {path}: {reason}", hint="name a JWKS; rse-pf local writes one as keys.json"
+        ) from error
+
+
+def _open_many_files() -> None:
+    """Every robot needs a descriptor; take as many as the system allows without asking."""
+    _, most = resource.getrlimit(resource.RLIMIT_NOFILE)
+    with contextlib.suppress(OSError, ValueError):
+        resource.setrlimit(resource.RLIMIT_NOFILE, (most, most))

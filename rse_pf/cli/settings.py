@@ -9,12 +9,11 @@ from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Sequence
 
 from rse_pf.errors import UsageError
-from rse_pf.settings import PlatformSettings, SettingRow, setting_rows
+from rse_pf.settings import PlatformSettings, setting_rows, settings_page
 
-__all__ = ["add_arguments", "markdown", "run"]
+__all__ = ["add_arguments", "run"]
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -32,7 +31,7 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
         print(settings.digest())
         return 0
     if args.markdown:
-        print(markdown(rows), end="")
+        print(settings_page(), end="")
         return 0
     if args.group is not None:
         groups = list(dict.fromkeys(row.group for row in rows))
@@ -50,22 +49,3 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
         unit = f" {row.unit}" if row.unit else ""
         print(f"{row.group}.{row.name} = {row.value}{unit}{changed}\n    {row.doc} [{row.source}]")
     return 0
-
-
-def markdown(rows: Sequence[SettingRow]) -> str:
-    """Return ``docs/settings.md``: the defaults, group by group."""
-    lines = [
-        "# Settings",
-        "",
-        'Overrides go to `cdk.json`, `context."rse-pf"`: `{"scaling": {"max_servers": 4}}`. Every program of the',
-        "platform reads that one file (`--settings FILE`), and answers with the digest of what it read. This page is",
-        "generated: `make docs`.",
-    ]
-    group = ""
-    for row in rows:
-        if row.group != group:
-            group = row.group
-            lines += ["", f"## {group}", "", "| setting | default | unit | source | what it does |"]
-            lines += ["|---|---|---|---|---|"]
-        lines.append(f"| `{row.name}` | `{row.default!r}` | {row.unit} | {row.source} | {row.doc} |")
-    return "\n".join(lines) + "\n"

@@ -1,0 +1,176 @@
+"""The backend servers box on one machine: ``rse-pf serve`` processes, the command that EC2 runs too.
+
+Starts, ends and kills them.  Promises to decide nothing (how many, and when, is the caller's matter),
+and to signal only processes that it knows by pid and time of birth.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import http.client
+import json
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from rse_pf.errors import ConfigurationError
+from rse_pf.local.envoy_config import Target
+from rse_pf.local.processes import ProcessMark, ended, last_line, mark_of, send_signal, spawn
+from rse_pf.settings import PlatformSettings
+
+__all__ = ["RSE_PF", "BackendServer", "BackendServers"]
+
+RSE_PF = (sys.executable, "-m", "rse_pf.cli.main")
+"""The program; ``serve`` and its options follow."""
+
+_LOOPBACK = "127.0.0.1"
+_LOOK_AGAIN_S = 0.01
+_ASK_S = 1.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class BackendServer:
+    """A server that has announced itself."""
+
+    name: str
+    pid: int
+    port: int
+    control_port: int
+    workers: tuple[int, ...]
+    log: Path
+    mark: ProcessMark
+
+    @property
+    def target(self) -> Target:
+        """This server as the load balancer sees it."""
+        return Target(name=self.name, port=self.port, control_port=self.control_port)
+
+
+class BackendServers:
+    """The server processes of one platform, by name."""
+
+    def __init__(
+        self,
+        settings: PlatformSettings,
+        *,
+        folder: Path,
+        settings_file: Path,
+        keys_file: Path,
+        dies_with_parent: bool = True,
+        program: Sequence[str] = RSE_PF,
+    ) -> None:
+        self._settings = settings
+        self._folder = folder
+        self._settings_file = settings_file
+        self._keys_file = keys_file
+        self._dies_with_parent = dies_with_parent
+        self._program = tuple(program)
+        self._processes: dict[str, subprocess.Popen[bytes]] = {}
+        self._marks: dict[str, ProcessMark] = {}
+
+    @property
+    def marks(self) -> dict[str, ProcessMark]:
+        """Every process that was launched and not yet ended by us, by server name."""
+        return dict(self._marks)
+
+    def launch(self, name: str) -> None:
+        """Start the process of server *name*, and return before it listens."""
+        self._announce(name).unlink(missing_ok=True)
+        command = [*self._program, "serve", "--settings", str(self._settings_file), "--server-id", name]
+        command += ["--keys", str(self._keys_file), "--announce", str(self._announce(name))]
+        process = spawn(
+            command, log=self._log(name), folder=self._folder, dies_with_parent=self._dies_with_parent
+        )
+        self._processes[name] = process
+        mark = mark_of(process.pid)
+        if mark is not None:
+            self._marks[name] = mark
+
+    async def wait_ready(self, name: str, timeout_s: float) -> BackendServer:
+        """Return server *name* once it has announced itself.
+
+        Raises:
+            ConfigurationError: It ended or was not ready in time; its last log line is in the message.
+        """
+        end = time.monotonic() + timeout_s
+        process, announce = self._processes[name], self._announce(name)
+        while not announce.exists():
+            code = process.poll()
+            if code is not None:
+                raise self._failed(name, f"ended with exit code {code}")
+            if time.monotonic() >= end:
+                raise self._failed(name, f"was not ready within {timeout_s:g} s")
+            await asyncio.sleep(_LOOK_AGAIN_S)
+        told = json.loads(announce.read_text(encoding="utf-8"))
+        mark = self._marks.get(name)
+        if mark is None or told["pid"] != mark.pid:
+            raise self._failed(name, f"announced pid {told['pid']}, but was started as {process.pid}")
+        return BackendServer(
+            name=name, pid=mark.pid, port=told["port"], control_port=told["control_port"],
+            workers=tuple(told["workers"]), log=self._log(name), mark=mark,
+        )  # fmt: skip
+
+    async def status(self, server: BackendServer) -> dict[str, Any] | None:
+        """Return what the server says of itself on its control port; None when it does not answer."""
+        return await asyncio.to_thread(_ask_status, server.control_port)
+
+    async def wait_over(self, name: str) -> int | None:
+        """Wait until the process of *name* has ended; return its exit code, negative for a signal."""
+        mark = self._marks.get(name)
+        if mark is not None:
+            await ended(mark)
+        process = self._processes.get(name)
+        return None if process is None else process.wait()
+
+    def send(self, name: str, number: signal.Signals) -> bool:
+        """Signal server *name*; return False if it is gone."""
+        mark = self._marks.get(name)
+        return mark is not None and send_signal(mark, number)
+
+    async def stop(self, timeout_s: float) -> None:
+        """Let all servers leave at once, and kill what has not left after *timeout_s*."""
+        for name in self._marks:
+            self.send(name, signal.SIGINT)
+        await asyncio.gather(*(ended(mark, timeout_s) for mark in self._marks.values()))
+        self.kill_all()
+
+    def kill_all(self) -> None:
+        """End what is left, at once, and reap it."""
+        for name, process in self._processes.items():
+            process.kill()  # a no-operation for one that was reaped
+            process.wait()
+            with contextlib.suppress(FileNotFoundError):
+                self._announce(name).unlink()
+        self._processes.clear()
+        self._marks.clear()
+
+    def _announce(self, name: str) -> Path:
+        return self._folder / f"{name}.json"
+
+    def _log(self, name: str) -> Path:
+        return self._folder / f"{name}.log"
+
+    def _failed(self, name: str, what: str) -> ConfigurationError:
+        last = last_line(self._log(name))
+        return ConfigurationError(
+            f"{name} {what}{': ' if last else ''}{last}", hint=f"its log is {self._log(name)}"
+        )
+
+
+def _ask_status(port: int) -> dict[str, Any] | None:
+    connection = http.client.HTTPConnection(_LOOPBACK, port, timeout=_ASK_S)
+    try:
+        connection.request("GET", "/status")
+        answer = connection.getresponse()
+        status: dict[str, Any] | None = json.loads(answer.read()) if answer.status == 200 else None
+    except (OSError, ValueError, http.client.HTTPException):
+        return None
+    finally:
+        connection.close()
+    return status

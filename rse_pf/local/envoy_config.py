@@ -1,0 +1,186 @@
+"""Write down what Envoy is told: one front door, one cluster, an endpoint file that changes alone.
+
+Pure.  Promises that every value which differs from Envoy's default has its reason beside it; each was
+found by measurement (docs/design.md, load balancer).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from rse_pf.settings import PlatformSettings
+
+__all__ = ["CLUSTER", "Target", "endpoints", "envoy_config"]
+
+CLUSTER = "backend-servers"
+_TYPES = "type.googleapis.com/envoy"
+_LOOPBACK = "127.0.0.1"
+_NO_LIMIT = 1_000_000
+"""A server counts its robots itself (``serving.max_robots``); Envoy's breakers must not act before."""
+_MOST_HEADER_KIB = 16
+_MOST_HEADERS = 64
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Target:
+    """A backend server as the load balancer sees it."""
+
+    name: str
+    port: int
+    control_port: int
+
+
+def envoy_config(settings: PlatformSettings, *, port: int, endpoints_file: Path) -> dict[str, Any]:
+    """Return the static configuration.
+
+    Args:
+        settings: Front door address and path, health checks, handshake limit.
+        port: Of the front door; 0 takes a free one.
+        endpoints_file: What `endpoints` returned, as JSON; replaced by rename, never written in place.
+    """
+    return {
+        "node": {"id": "front-door", "cluster": "rse-pf"},  # endpoint files are refused without
+        "admin": {"address": _address(_LOOPBACK, 0)},
+        "static_resources": {
+            "listeners": [_front_door(settings, port)],
+            "clusters": [_cluster(settings, endpoints_file)],
+        },
+    }
+
+
+def endpoints(targets: Sequence[Target]) -> dict[str, Any]:
+    """Return the endpoint file: robots go to ``port``, health checks to ``control_port``."""
+    members = [
+        {
+            "endpoint": {
+                "hostname": target.name,
+                **_endpoint_address(target.port),
+                "health_check_config": {"port_value": target.control_port},
+            }
+        }
+        for target in targets
+    ]
+    return {
+        "resources": [
+            {
+                "@type": f"{_TYPES}.config.endpoint.v3.ClusterLoadAssignment",
+                "cluster_name": CLUSTER,
+                "endpoints": [{"lb_endpoints": members}],
+            }
+        ]
+    }
+
+
+def _front_door(settings: PlatformSettings, port: int) -> dict[str, Any]:
+    manager = {
+        "@type": f"{_TYPES}.extensions.filters.network.http_connection_manager.v3.HttpConnectionManager",
+        "stat_prefix": "robots",
+        "codec_type": "HTTP1",
+        # An open WebSocket is one endless request: no clock may end it but the robot's and the server's.
+        "stream_idle_timeout": "0s",
+        "request_timeout": "0s",
+        "common_http_protocol_options": {
+            "idle_timeout": "0s",
+            "max_headers_count": _MOST_HEADERS,
+            "headers_with_underscores_action": "REJECT_REQUEST",
+        },
+        # The default of 1 s makes every close take a second, and hides a dead server from its robots.
+        "delayed_close_timeout": "0s",
+        "request_headers_timeout": _seconds(settings.serving.handshake_timeout_s),
+        "max_request_headers_kb": _MOST_HEADER_KIB,
+        "use_remote_address": True,
+        "upgrade_configs": [{"upgrade_type": "websocket"}],
+        "route_config": {"virtual_hosts": [_virtual_host(settings)]},
+        "http_filters": [
+            {
+                "name": "router",
+                "typed_config": {"@type": f"{_TYPES}.extensions.filters.http.router.v3.Router"},
+            }
+        ],
+    }
+    return {
+        "name": "front-door",
+        "address": _address(settings.serving.host, port),
+        # With the default a second Envoy would share a taken port in silence.
+        "enable_reuse_port": False,
+        "filter_chains": [{"filters": [{"name": "http", "typed_config": manager}]}],
+    }
+
+
+def _virtual_host(settings: PlatformSettings) -> dict[str, Any]:
+    retry = {
+        "retry_on": "connect-failure,refused-stream,reset-before-request,reset",
+        "num_retries": 3,
+        # A stalled server would keep a robot waiting for ever; ends with the upgrade, cuts no socket.
+        "per_try_timeout": "0.5s",
+        # A dead server has no requests and would look like the best choice until its check fails.
+        "retry_host_predicate": [
+            {
+                "name": "previous-hosts",
+                "typed_config": {
+                    "@type": f"{_TYPES}.extensions.retry.host.previous_hosts.v3.PreviousHostsPredicate"
+                },
+            }
+        ],
+        "host_selection_retry_max_attempts": "8",
+    }
+    route = {"cluster": CLUSTER, "timeout": "0s", "idle_timeout": "0s", "retry_policy": retry}
+    return {
+        "name": "platform",
+        "domains": ["*"],
+        "routes": [{"match": {"path": settings.serving.path}, "route": route}],
+    }
+
+
+def _cluster(settings: PlatformSettings, endpoints_file: Path) -> dict[str, Any]:
+    health = settings.health
+    limits = ("max_connections", "max_requests", "max_pending_requests", "max_retries")
+    return {
+        "name": CLUSTER,
+        "type": "EDS",
+        "eds_cluster_config": {
+            "eds_config": {
+                "path_config_source": {
+                    "path": str(endpoints_file),
+                    "watched_directory": {"path": str(endpoints_file.parent)},
+                }
+            }
+        },
+        "lb_policy": "LEAST_REQUEST",
+        "common_lb_config": {
+            # The default of 1 s holds a new server back for a second although it is healthy.
+            "update_merge_window": "0s",
+            # No traffic to servers that failed their checks, however many they are.
+            "healthy_panic_threshold": {"value": 0},
+        },
+        # A server that leaves the file gets nothing new, and keeps its open sockets.
+        "ignore_health_on_host_removal": True,
+        "connect_timeout": "0.5s",
+        "circuit_breakers": {"thresholds": [dict.fromkeys(limits, _NO_LIMIT)]},
+        "health_checks": [
+            {
+                "interval": _seconds(health.local_interval_s),
+                # By default a server without traffic is asked once a minute only.
+                "no_traffic_interval": _seconds(health.local_interval_s),
+                "timeout": _seconds(health.local_timeout_s),
+                "unhealthy_threshold": health.unhealthy_checks,
+                "healthy_threshold": health.healthy_checks,
+                "http_health_check": {"path": health.path},
+            }
+        ],
+    }
+
+
+def _address(host: str, port: int) -> dict[str, Any]:
+    return {"socket_address": {"address": host, "port_value": port}}
+
+
+def _endpoint_address(port: int) -> dict[str, Any]:
+    return {"address": _address(_LOOPBACK, port)}
+
+
+def _seconds(value: float) -> str:
+    return f"{value:.9f}".rstrip("0").rstrip(".") + "s"

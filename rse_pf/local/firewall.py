@@ -1,0 +1,99 @@
+"""The firewall box on one machine: the front door is on loopback, and nobody passes without a token.
+
+Keeps the signing key in a file that only its owner can read.  Promises to show the private half to
+nobody else, and never to open a port itself.
+"""
+
+from __future__ import annotations
+
+import ipaddress
+import os
+import socket
+import stat
+from pathlib import Path
+
+from rse_pf.auth import SigningKey
+from rse_pf.errors import ConfigurationError, UsageError
+
+__all__ = ["check_front_door", "ensure_key", "key_file", "key_set_file", "read_key"]
+
+
+def key_file(folder: Path) -> Path:
+    """Return where the platform in *folder* keeps its private key."""
+    return folder / "key.json"
+
+
+def key_set_file(folder: Path) -> Path:
+    """Return where its servers find the public half, a JWKS."""
+    return folder / "keys.json"
+
+
+def check_front_door(host: str, port: int) -> None:
+    """Refuse a front door that is open to other machines, or whose port is taken.
+
+    Raises:
+        ConfigurationError: *host* is not a loopback address, or something listens on *port*.
+    """
+    if not _is_loopback(host):
+        raise ConfigurationError(
+            f"serving.host = {host} would open the local platform to other machines",
+            hint="set serving.host to 127.0.0.1",
+        )
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    with socket.socket(family, socket.SOCK_STREAM) as trial:
+        trial.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            trial.bind((host, port))
+        except OSError as error:
+            raise ConfigurationError(
+                f"cannot listen on {host}:{port}: {error.strerror}",
+                hint="choose another port with --port; --port 0 takes a free one",
+            ) from error
+
+
+def ensure_key(folder: Path, *, seed: bytes, key_id: str) -> SigningKey:
+    """Return the key of *folder*; make it from *seed* (32 secret random bytes) if there is none.
+
+    A platform that starts again keeps its key, so that robots keep their tokens.
+    """
+    path = key_file(folder)
+    if not path.exists():
+        temporary = path.with_name(f".{path.name}")
+        temporary.unlink(missing_ok=True)
+        with open(os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w") as file:
+            file.write(SigningKey.from_seed(seed, key_id).to_json())
+        temporary.replace(path)
+    key = read_key(path)
+    public = key_set_file(folder)
+    temporary = public.with_name(f".{public.name}")
+    temporary.write_text(key.key_set().to_json(), encoding="utf-8")
+    temporary.replace(public)
+    return key
+
+
+def read_key(path: Path) -> SigningKey:
+    """Return the key in *path*.
+
+    Raises:
+        UsageError: There is no such file, others may read it, or it holds no signing key.
+    """
+    try:
+        mode = path.stat().st_mode
+        text = path.read_text(encoding="utf-8")
+    except OSError as error:
+        raise UsageError(
+            f"cannot read the key {path}: {error.strerror}",
+            hint="start a platform with rse-pf local, or name a key with --key",
+        ) from error
+    except ValueError as error:
+        raise UsageError(f"{path} holds no signing key", hint="name a key with --key") from error
+    if stat.S_IMODE(mode) & 0o077:
+        raise UsageError(f"others may read the key {path}", hint=f"chmod 600 {path}")
+    return SigningKey.from_json(text)
+
+
+def _is_loopback(host: str) -> bool:
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False

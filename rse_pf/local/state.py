@@ -1,0 +1,141 @@
+"""Where a local platform keeps its files, and what it tells other commands about itself.
+
+One folder per platform name under ``$XDG_STATE_HOME/rse-pf``; ``platform.json`` appears with the first
+process and goes with the last.  Promises to hold no secret (the key has a file of its own) and that
+every write is whole.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import os
+import re
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from rse_pf.errors import ConfigurationError, UsageError
+from rse_pf.local.processes import ProcessMark
+
+__all__ = ["PlatformLock", "PlatformState", "ServerState", "read_state", "remove_state", "state_folder"]
+
+_FILE = "platform.json"
+_LOCK = "lock"
+_NAME = re.compile(r"[a-z0-9][a-z0-9-]{0,31}")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ServerState:
+    """One backend server; ports are 0 until it has announced them."""
+
+    name: str
+    process: ProcessMark
+    port: int = 0
+    control_port: int = 0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PlatformState:
+    """A platform that runs; ``url`` is empty until the front door is open."""
+
+    name: str
+    control_plane: ProcessMark
+    url: str
+    settings_digest: str
+    settings_file: str
+    key_file: str
+    servers: tuple[ServerState, ...] = ()
+    load_balancer: ProcessMark | None = None
+    port: int = 0
+    admin_port: int = 0
+
+    def processes(self) -> tuple[ProcessMark, ...]:
+        """Return the data path: everything but the control plane."""
+        balancer = () if self.load_balancer is None else (self.load_balancer,)
+        return (*(server.process for server in self.servers), *balancer)
+
+    def write(self, folder: Path) -> None:
+        """Replace the file in *folder* in one step."""
+        temporary = folder / f".{_FILE}"
+        temporary.write_text(json.dumps(asdict(self), indent=2) + "\n", encoding="utf-8")
+        temporary.replace(folder / _FILE)
+
+
+class PlatformLock:
+    """At most one control plane per folder; Linux gives the lock back however its holder ends."""
+
+    def __init__(self, folder: Path) -> None:
+        self._path = folder / _LOCK
+        self._fd = -1
+
+    def take(self, name: str) -> None:
+        """Take the lock; raises ConfigurationError when a platform called *name* holds it."""
+        fd = os.open(self._path, os.O_RDWR | os.O_CREAT, 0o600)
+        try:
+            fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            os.close(fd)
+            raise ConfigurationError(
+                f"a platform named {name!r} is running already",
+                hint=f"end it with: rse-pf local stop --name {name}, or choose another --name",
+            ) from error
+        self._fd = fd
+
+    def release(self) -> None:
+        """Give the lock back."""
+        if self._fd >= 0:
+            os.close(self._fd)
+            self._fd = -1
+
+
+def state_folder(name: str, environment: Mapping[str, str]) -> Path:
+    """Return the folder of the platform called *name*; it need not exist.
+
+    Raises:
+        UsageError: The name is not made of 1 to 32 small letters, digits and hyphens.
+    """
+    if not _NAME.fullmatch(name):
+        raise UsageError(
+            f"{name[:80]!r} is no name for a platform", hint="use 1 to 32 small letters, digits and hyphens"
+        )
+    base = Path(environment.get("XDG_STATE_HOME", ""))
+    if not base.is_absolute():
+        base = Path(environment.get("HOME") or "~").expanduser() / ".local" / "state"
+    return base / "rse-pf" / name
+
+
+def read_state(folder: Path) -> PlatformState | None:
+    """Return what the platform in *folder* says of itself; None if there is none.
+
+    Raises:
+        ConfigurationError: The file is there, but is not readable.
+    """
+    path = folder / _FILE
+    try:
+        return _state(json.loads(path.read_text(encoding="utf-8")))
+    except FileNotFoundError:
+        return None
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise ConfigurationError(
+            f"{path} cannot be read: {error}", hint="end its processes by hand, then remove the file"
+        ) from error
+
+
+def remove_state(folder: Path) -> None:
+    """Remove the file, but neither key nor logs."""
+    (folder / _FILE).unlink(missing_ok=True)
+
+
+def _state(document: dict[str, Any]) -> PlatformState:
+    balancer = document.pop("load_balancer")
+    servers = tuple(
+        ServerState(**{**server, "process": ProcessMark(**server["process"])})
+        for server in document.pop("servers")
+    )
+    return PlatformState(
+        **{**document, "control_plane": ProcessMark(**document["control_plane"])},
+        servers=servers,
+        load_balancer=None if balancer is None else ProcessMark(**balancer),
+    )
