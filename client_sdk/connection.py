@@ -1,7 +1,8 @@
-"""Sockets of a robot: dial, read, write, ping, reconnect, move; all rules are in `RobotSession`.
+"""Sockets of a robot: dial, read, write, ping, reconnect, move; the rules are in `RobotSession`.
 
-Promises to be the only file that knows the WebSocket library, to keep at most one current socket
-(two during a move), and that no command is lost because a socket was.
+Promises to be the only file that knows the WebSocket library, to keep one current socket (two
+during a move), to dial with full jitter and one dial at a time, and that no command is lost
+because a socket was.
 """
 
 from __future__ import annotations
@@ -9,7 +10,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import random as random_module
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Coroutine
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -18,9 +19,18 @@ from websockets.asyncio.client import connect as websocket_connect
 from websockets.exceptions import ConnectionClosed, InvalidStatus, WebSocketException
 from websockets.typing import Subprotocol
 
-from rse_pf.errors import ConnectError, ProtocolError, RsePfError, Unauthorized, UsageError
+from rse_pf.errors import (
+    Conflict,
+    ConnectError,
+    Forbidden,
+    ProtocolError,
+    RsePfError,
+    Unauthorized,
+    UnsupportedProtocol,
+    UsageError,
+)
 from rse_pf.settings import SessionSettings
-from rse_pf.wire import SUBPROTOCOLS, codec_for
+from rse_pf.wire import SUBPROTOCOLS
 from rse_pf.wire.robot_session import (
     Answered,
     Event,
@@ -31,34 +41,42 @@ from rse_pf.wire.robot_session import (
     RobotSession,
     Welcomed,
 )
+from rse_pf.wire.session import CLOSE_REPLACED
 
 __all__ = ["Connection", "Token", "websocket_options"]
 
 Token = str | Callable[[], Awaitable[str]] | None
+"""A robot's token, or what gives a fresh one whenever the robot dials."""
 
 _FIRST_TRIES = 4
-_REFUSED_FOR_GOOD = (400, 401, 403, 404)
+_LONGEST_RETRY_AFTER_S = 30.0
+_SHORTEST_TICK_S = 0.001
+_IS_IT_RUNNING = "is the platform running? start it with rse-pf local start"
 
 
 def websocket_options(settings: SessionSettings) -> dict[str, Any]:
     """Return how we open every WebSocket: no compression, no pings of the library, our size limit."""
     return {
         "compression": None,
-        "max_size": settings.max_inflated_bytes,
+        "max_size": settings.max_message_bytes,
         "ping_interval": None,
         "open_timeout": settings.connect_timeout_s,
-        "close_timeout": 1.0,
+        "close_timeout": settings.silence_s,
         "proxy": None,
     }
 
 
 class _Refused(Exception):
-    """The door said no for now; carries how long it asks to wait."""
+    """A dial that failed: why, how long to wait, and whether trying again is of any use."""
 
-    def __init__(self, error: RsePfError, after_s: float = 0.0) -> None:
-        super().__init__(str(error))
+    def __init__(
+        self, error: RsePfError, *, after_s: float = 0.0, wrong_address: bool = False, for_good: bool = False
+    ) -> None:
+        super().__init__(error.message)
         self.error = error
         self.after_s = after_s
+        self.wrong_address = wrong_address
+        self.for_good = for_good
 
 
 class _Socket:
@@ -67,10 +85,12 @@ class _Socket:
     def __init__(self, websocket: ClientConnection, link: Link) -> None:
         self.websocket = websocket
         self.link = link
-        self.welcomed = asyncio.Event()
+        self.welcome: asyncio.Future[None] = asyncio.get_running_loop().create_future()
         self.ended = asyncio.Event()
         self.dirty = asyncio.Event()
         self.tasks: list[asyncio.Task[None]] = []
+        self.is_closing = False
+        self.bad_messages = 0
 
 
 class Connection:
@@ -86,7 +106,6 @@ class Connection:
         clock: Callable[[], float],
         random: random_module.Random,
     ) -> None:
-        _check_url(url)
         self.url = url
         self.reconnects = 0
         self.moves = 0
@@ -94,6 +113,7 @@ class Connection:
         self.bytes_out = 0
         self.last_error = ""
         self.fatal: RsePfError | None = None
+        self._address = _checked(url)
         self._token = token
         self._session = session
         self._settings = session.settings
@@ -101,110 +121,218 @@ class Connection:
         self._clock = clock
         self._random = random
         self._sockets: list[_Socket] = []
-        self._wake = asyncio.Event()
         self._tasks: set[asyncio.Task[Any]] = set()
-        self._dialling: asyncio.Task[None] | None = None
-        self._moving: asyncio.Task[None] | None = None
-        self._closed = False
+        self._changed = asyncio.Event()
+        self._wake = asyncio.Event()
+        self._next_tick = 0.0
+        self._attempt = 0
+        self._adopted = 0.0
+        self._move_asked: tuple[_Socket, float] | None = None
 
     async def open(self) -> None:
-        """Dial until a server says Welcome.
+        """Dial until a server says Welcome, a few times.
 
         Raises:
             Unauthorized: The token is refused.
+            UnsupportedProtocol: The two sides share no protocol.
             ConnectError: Nobody answers at the address.
         """
-        for attempt in range(_FIRST_TRIES):
+        for attempt in range(1, _FIRST_TRIES + 1):
             try:
-                socket = await self._dial()
-            except _Refused as refused:
-                if attempt + 1 == _FIRST_TRIES:
-                    raise refused.error from None
-                await asyncio.sleep(max(refused.after_s, self._back_off(attempt)))
-            else:
-                self._adopt(socket)
+                self._adopt(await self._dial())
                 break
+            except _Refused as refused:
+                if attempt == _FIRST_TRIES or refused.for_good or refused.wrong_address:
+                    raise refused.error from None
+                await asyncio.sleep(self._pause_s(refused.after_s))
+        self._spawn(self._tick())
         self._spawn(self._keep())
 
     async def close(self) -> None:
         """Close every socket and end every task."""
-        self._closed = True
-        for task in list(self._tasks):
+        readers = {task for socket in self._sockets for task in socket.tasks}
+        for task in self._tasks - readers:
             task.cancel()
-        for socket in list(self._sockets):
-            with contextlib.suppress(Exception):
-                await socket.websocket.close()
-            self._drop(socket)
-        await asyncio.gather(*self._tasks, return_exceptions=True)
+        await asyncio.gather(*(self._say_goodbye(socket) for socket in list(self._sockets)))
+        tasks = list(self._tasks)
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
 
     def flush(self) -> None:
-        """Tell that the session has something to send, or a new deadline."""
-        for socket in self._sockets:
+        """Tell that the session has something to send, or an earlier deadline."""
+        for socket in list(self._sockets):
             if socket.link.outgoing:
                 socket.dirty.set()
-        self._wake.set()
+            done = socket.link.leaving and not self._session.unanswered_on(socket.link)
+            if done and not socket.link.outgoing and not socket.is_closing:
+                self._spawn(self._say_goodbye(socket))
+        if self._session.next_due(self._clock()) < self._next_tick:
+            self._wake.set()
 
-    async def _dial(self, *, retried: bool = False) -> _Socket:
-        """Open a socket through the balancer and wait for its Welcome."""
-        headers = {}
-        token = await self._token() if callable(self._token) else self._token
-        if token is not None:
-            headers["Authorization"] = f"Bearer {token}"
-        codec = self._session.codec
+    # --- the two tasks that last -----------------------------------------------------------------
+
+    async def _tick(self) -> None:
+        """Call the session whenever something is due."""
+        while True:
+            now = self._clock()
+            self._take(None, self._session.due(now))
+            for socket in list(self._sockets):
+                self._take(socket, self._session.tend(socket.link, now))
+            self._next_tick = self._session.next_due(now)
+            self.flush()
+            pause_s = max(_SHORTEST_TICK_S, self._next_tick - self._clock())
+            with contextlib.suppress(asyncio.TimeoutError):
+                await asyncio.wait_for(self._wake.wait(), pause_s)
+            self._wake.clear()
+
+    async def _keep(self) -> None:
+        """Dial when there is no socket, and move when asked to."""
+        while self.fatal is None:
+            if self._session.current is None:
+                await self._redial()
+            elif self._move_asked is not None:
+                await self._move(*self._move_asked)
+                self._move_asked = None
+            else:
+                self._changed.clear()
+                await self._changed.wait()
+
+    async def _redial(self) -> None:
+        """Dial with full jitter until a server says Welcome."""
+        if self._clock() - self._adopted > self._settings.reconnect_max_s:
+            self._attempt = 0
+        after_s = 0.0
+        while True:
+            await asyncio.sleep(self._pause_s(after_s))
+            try:
+                socket = await self._dial()
+            except _Refused as refused:
+                after_s = refused.after_s
+                if refused.for_good:
+                    self._end(refused.error)
+                    return
+            else:
+                self.reconnects += 1
+                self._adopt(socket)
+                return
+
+    async def _move(self, old: _Socket, until: float) -> None:
+        """Make before break: leave *old* once another server has said Welcome."""
+        self._attempt = 0
+        while self._session.current is old.link and self._clock() < until:
+            after_s = 0.0
+            try:
+                fresh = await self._dial()
+            except _Refused as refused:
+                after_s = refused.after_s
+            else:
+                if self._session.current is not old.link:
+                    self.reconnects += 1
+                    self._adopt(fresh)
+                    return
+                if fresh.link.server != old.link.server:
+                    self.moves += 1
+                    self._adopt(fresh)
+                    return
+                self._spawn(self._say_goodbye(fresh))
+            pause_s = min(self._pause_s(after_s), max(0.0, until - self._clock()))
+            with contextlib.suppress(asyncio.TimeoutError):
+                await asyncio.wait_for(old.ended.wait(), pause_s)
+
+    # --- one socket ------------------------------------------------------------------------------
+
+    async def _dial(self) -> _Socket:
+        """Open a socket through the load balancer and wait for its Welcome."""
         try:
-            websocket = await websocket_connect(
-                self.url,
-                subprotocols=[Subprotocol(SUBPROTOCOLS[codec.name])],
-                additional_headers=headers,
-                **websocket_options(self._settings),
-            )
-        except InvalidStatus as error:
-            status = error.response.status_code
-            if status == 401 and callable(self._token) and not retried:
-                return await self._dial(retried=True)
-            raise _refusal(status, error.response.headers.get("Retry-After", "")) from error
-        except (OSError, TimeoutError, WebSocketException) as error:
-            self.last_error = str(error) or type(error).__name__
-            raise _Refused(
-                ConnectError(
-                    f"cannot connect to {self.url}: {self.last_error}",
-                    hint="is the platform running? start it with rse-pf local",
-                )
-            ) from error
+            websocket = await self._handshake()
+        except _Refused as refused:
+            if not callable(self._token) or not isinstance(refused.error, Unauthorized):
+                self.last_error = refused.error.message
+                raise
+            websocket = await self._handshake()
         socket = _Socket(websocket, self._session.open_link(self._clock()))
-        if codec_for([str(websocket.subprotocol)]) != codec.name:
-            await websocket.close()
-            raise ConnectError(f"{self.url} does not speak {SUBPROTOCOLS[codec.name]}", hint="check the URL")
         self._sockets.append(socket)
         socket.tasks = [self._spawn(self._read(socket)), self._spawn(self._write(socket))]
         socket.dirty.set()
-        welcome, end = (
-            asyncio.ensure_future(socket.welcomed.wait()),
-            asyncio.ensure_future(socket.ended.wait()),
-        )
-        done, left = await asyncio.wait(
-            {welcome, end}, timeout=self._settings.connect_timeout_s, return_when=asyncio.FIRST_COMPLETED
-        )
-        for task in left:
-            task.cancel()
-        if welcome not in done:
+        try:
+            await asyncio.wait_for(socket.welcome, self._settings.connect_timeout_s)
+        except asyncio.TimeoutError:
             self._abort(socket)
-            raise _Refused(ConnectError(f"{self.url} does not say welcome", hint="is it an RSE-PF server?"))
+            raise _Refused(
+                ConnectError(f"{self._address} does not say welcome", hint="is it an RSE-PF server?")
+            ) from None
+        except BaseException:
+            self._abort(socket)
+            raise
         return socket
+
+    async def _handshake(self) -> ClientConnection:
+        wanted = SUBPROTOCOLS[self._session.codec.name]
+        token = await self._read_token()
+        try:
+            websocket = await websocket_connect(
+                self.url,
+                subprotocols=[Subprotocol(wanted)],
+                additional_headers={} if token is None else {"Authorization": f"Bearer {token}"},
+                **websocket_options(self._settings),
+            )
+        except InvalidStatus as error:
+            response = error.response
+            raise self._refusal(response.status_code, response.headers.get("Retry-After", "")) from error
+        except (OSError, asyncio.TimeoutError, WebSocketException, EOFError) as error:
+            cause = getattr(error, "strerror", None) or str(error) or type(error).__name__
+            raise _Refused(
+                ConnectError(f"cannot connect to {self._address}: {cause}", hint=_IS_IT_RUNNING)
+            ) from error
+        if websocket.subprotocol != wanted:
+            websocket.transport.abort()
+            unsupported = UnsupportedProtocol(
+                f"{self._address} does not speak {wanted}", hint="is it an RSE-PF server?"
+            )
+            raise _Refused(unsupported, wrong_address=True)
+        return websocket
+
+    async def _read_token(self) -> str | None:
+        if not callable(self._token):
+            return self._token
+        try:
+            return await self._token()
+        except Exception as error:
+            told = ConnectError(
+                f"no token: the token callable raised {type(error).__name__}", hint="mend the token callable"
+            )
+            raise _Refused(told) from error
 
     async def _read(self, socket: _Socket) -> None:
         try:
-            async for message in socket.websocket:
-                data = message.encode() if isinstance(message, str) else message
+            while True:
+                data = await socket.websocket.recv(decode=False)
                 self.bytes_in += len(data)
-                self._handle(socket, self._session.receive(socket.link, data, self._clock()))
+                self._hear(socket, data)
         except (ConnectionClosed, OSError):
-            pass
+            replaced = socket.websocket.close_code == CLOSE_REPLACED
+            if replaced and self._session.current is socket.link and self._move_asked is None:
+                self._end(
+                    Conflict(
+                        "another connection of this robot took its place",
+                        hint="give every robot a token of its own",
+                    )
+                )
+        finally:
+            self._forget(socket)
+
+    def _hear(self, socket: _Socket, data: bytes) -> None:
+        try:
+            events = self._session.receive(socket.link, data, self._clock())
         except ProtocolError as error:
             self.last_error = error.message
-            socket.websocket.transport.abort()
-        finally:
-            self._drop(socket)
+            socket.bad_messages += 1
+            if socket.bad_messages > self._settings.max_bad_messages:
+                self._abort(socket)
+            return
+        self._take(socket, events)
+        self.flush()
 
     async def _write(self, socket: _Socket) -> None:
         is_text = self._session.codec.is_text
@@ -215,160 +343,112 @@ class Connection:
                 while socket.link.outgoing:
                     data = socket.link.outgoing.pop(0)
                     self.bytes_out += len(data)
-                    await socket.websocket.send(data.decode() if is_text else data)
+                    await socket.websocket.send(data, text=is_text)
         except (ConnectionClosed, OSError):
-            self._drop(socket)
+            return  # the reader sees the same end, after what still came in
 
-    async def _keep(self) -> None:
-        """Call the session whenever something is due."""
-        while not self._closed:
-            now = self._clock()
-            for event in self._session.due(now):
-                self._one(None, event)
-            for socket in list(self._sockets):
-                self._handle(socket, self._session.tend(socket.link, now))
-                leaving = socket.link.leaving and not self._session.unanswered_on(socket.link)
-                if leaving and not socket.link.outgoing:
-                    self._spawn(self._say_goodbye(socket))
-                elif socket.link.outgoing:
-                    socket.dirty.set()
-            pause = max(0.0, self._session.next_due(now) - now)
-            with contextlib.suppress(TimeoutError):
-                await asyncio.wait_for(self._wake.wait(), timeout=max(pause, 0.001))
-            self._wake.clear()
-
-    def _handle(self, socket: _Socket, events: list[Event]) -> None:
+    def _take(self, socket: _Socket | None, events: list[Event]) -> None:
         for event in events:
-            self._one(socket, event)
-        if socket.link.leaving or events:
-            self._wake.set()
+            if isinstance(event, Answered):
+                self._on_answer(event)
+            elif socket is not None:
+                self._about(socket, event)
 
-    def _one(self, socket: _Socket | None, event: Event) -> None:
-        if isinstance(event, Answered):
-            self._on_answer(event)
-        elif isinstance(event, Notice):
-            self.last_error = event.failure.message
-        elif socket is None:
-            return
-        elif isinstance(event, Welcomed):
-            socket.welcomed.set()
+    def _about(self, socket: _Socket, event: Event) -> None:
+        """Act on what concerns the socket itself."""
+        if isinstance(event, Welcomed) and not socket.welcome.done():
+            socket.welcome.set_result(None)
         elif isinstance(event, LinkLost):
-            self.last_error = event.reason
+            self.last_error = f"connection lost: {event.reason}"
             self._abort(socket)
-        elif isinstance(event, MoveAsked) and self._moving is None and socket.link is self._session.current:
-            self._moving = self._spawn(self._move(socket, event.within_s))
-
-    async def _move(self, old: _Socket, within_s: float) -> None:
-        """Make before break: leave *old* once another server has said Welcome."""
-        until, attempt = self._clock() + within_s, 0
-        try:
-            while not self._closed and not old.ended.is_set() and self._clock() < until:
-                try:
-                    fresh = await self._dial()
-                except (_Refused, RsePfError):
-                    fresh = None
-                if fresh is not None and (
-                    fresh.link.server != old.link.server or self._session.current is not old.link
-                ):
-                    self.moves += 1
-                    self._adopt(fresh)
-                    return
-                if fresh is not None:
-                    await self._say_goodbye(fresh)
-                await asyncio.sleep(self._back_off(attempt))
-                attempt += 1
-        finally:
-            self._moving = None
-
-    async def _redial(self) -> None:
-        """Dial with full jitter until somebody answers."""
-        attempt, wait_s = 0, 0.0
-        while not self._closed:
-            await asyncio.sleep(max(wait_s, self._back_off(attempt)) if attempt else 0.0)
-            attempt += 1
-            try:
-                socket = await self._dial()
-            except _Refused as refused:
-                wait_s = refused.after_s
-                continue
-            except RsePfError as error:
-                self.fatal = error
-                self._fail_all(error)
-                return
-            self.reconnects += 1
-            self._adopt(socket)
-            return
+        elif isinstance(event, Notice):
+            failure = event.failure
+            self.last_error = failure.message
+            if not socket.welcome.done():
+                unsupported = UnsupportedProtocol(failure.message, hint=failure.hint)
+                socket.welcome.set_exception(_Refused(unsupported, for_good=failure.code == unsupported.code))
+        elif isinstance(event, MoveAsked) and socket.link is self._session.current and not self._move_asked:
+            self._move_asked = (socket, self._clock() + event.within_s)
+            self._changed.set()
 
     def _adopt(self, socket: _Socket) -> None:
-        for event in self._session.adopt(socket.link, self._clock()):
-            self._one(socket, event)
-        self.flush()
-
-    def _drop(self, socket: _Socket) -> None:
-        """Forget a socket that ended, and dial again if it was the current one."""
-        if socket not in self._sockets:
+        self._adopted = self._clock()
+        if socket.ended.is_set():
             return
-        self._sockets.remove(socket)
-        was_current = self._session.current is socket.link
-        self._session.close_link(socket.link)
-        socket.ended.set()
-        for task in socket.tasks:
-            if task is not asyncio.current_task():
-                task.cancel()
-        nobody = self._session.current is None and (was_current or socket.link.lost)
-        if nobody and socket.welcomed.is_set() and not self._closed:
-            self._start_dialling()
-
-    def _start_dialling(self) -> None:
-        if (self._dialling is None or self._dialling.done()) and self._moving is None:
-            self._dialling = self._spawn(self._redial())
-        elif self._moving is not None:
-            moving = self._moving
-            moving.add_done_callback(lambda _: self._redial_if_alone())
-
-    def _redial_if_alone(self) -> None:
-        if self._session.current is None and not self._closed:
-            self._start_dialling()
+        self._take(socket, self._session.adopt(socket.link, self._adopted))
+        self._take(socket, self._session.tend(socket.link, self._adopted))
+        self.flush()
 
     def _abort(self, socket: _Socket) -> None:
         socket.websocket.transport.abort()
-        self._drop(socket)
+        self._forget(socket)
 
     async def _say_goodbye(self, socket: _Socket) -> None:
-        with contextlib.suppress(ConnectionClosed, OSError):
-            await socket.websocket.close()
-        self._drop(socket)
+        socket.is_closing = True
+        await socket.websocket.close()
+        self._forget(socket)
 
-    def _fail_all(self, error: RsePfError) -> None:
-        for event in self._session.abandon(error.code, error.message, error.hint):
-            self._one(None, event)
+    def _forget(self, socket: _Socket) -> None:
+        """Let the socket's commands wait for the next one, and have somebody dial."""
+        if socket.ended.is_set():
+            return
+        socket.ended.set()
+        self._sockets.remove(socket)
+        self._session.close_link(socket.link)
+        for task in socket.tasks:
+            if task is not asyncio.current_task():
+                task.cancel()
+        if not socket.welcome.done():
+            cut = ConnectError(f"{self._address} closed without a welcome", hint=_IS_IT_RUNNING)
+            socket.welcome.set_exception(_Refused(cut))
+            socket.welcome.exception()
+        self._changed.set()
+        self._wake.set()
 
-    def _back_off(self, attempt: int) -> float:
-        longest = min(self._settings.reconnect_max_s, self._settings.reconnect_base_s * 2.0**attempt)
-        return self._random.uniform(0.0, longest)
+    def _end(self, error: RsePfError) -> None:
+        """Give up for good: every command gets *error*."""
+        self.fatal = error
+        self.last_error = error.message
+        self._take(None, self._session.abandon(error.code, error.message, error.hint))
+        self._changed.set()
 
-    def _spawn(self, work: Any) -> asyncio.Task[Any]:
+    def _refusal(self, status: int, retry_after: str) -> _Refused:
+        if status == 401:
+            told = "the token is missing, wrong or over"
+            return _Refused(Unauthorized(told, hint="issue one: rse-pf token issue ROBOT"), for_good=True)
+        if status == 403:
+            told = f"{self._address} forbids this robot to connect"
+            return _Refused(Forbidden(told, hint="ask the operator"), for_good=True)
+        error = ConnectError(f"{self._address} answers {status}", hint="it is full or not ready; try later")
+        if 400 <= status < 500:
+            error.hint = "check the URL: it ends with the path of the servers, /ws"
+        after_s = float(retry_after) if retry_after.isdecimal() else 0.0
+        is_wrong = status in (400, 404)
+        return _Refused(error, after_s=min(after_s, _LONGEST_RETRY_AFTER_S), wrong_address=is_wrong)
+
+    def _pause_s(self, after_s: float) -> float:
+        """Return the next back-off, with full jitter on top of what the server asked for."""
+        s = self._settings
+        longest = min(s.reconnect_max_s, s.reconnect_base_s * 2.0 ** min(self._attempt, 16))
+        self._attempt += 1
+        return after_s + self._random.uniform(0.0, longest)
+
+    def _spawn(self, work: Coroutine[Any, Any, Any]) -> asyncio.Task[Any]:
         task = asyncio.get_running_loop().create_task(work)
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
         return task
 
 
-def _check_url(url: str) -> None:
+def _checked(url: str) -> str:
+    """Return *url* as it may be shown, or raise UsageError."""
     parts = urlsplit(url)
-    if parts.scheme not in ("ws", "wss") or not parts.hostname:
+    try:
+        port = parts.port
+    except ValueError:
+        port = -1
+    if parts.scheme not in ("ws", "wss") or not parts.hostname or port == -1:
         raise UsageError(
             f"{url!r} is not a WebSocket address", hint="write ws://HOST:PORT/ws or wss://HOST/ws"
         )
-
-
-def _refusal(status: int, retry_after: str) -> Exception:
-    if status in (401, 403):
-        return Unauthorized("the token is missing or not valid", hint="issue one: rse-pf token issue ROBOT")
-    if status in _REFUSED_FOR_GOOD:
-        return ConnectError(
-            f"the server answers {status}", hint="check the path of the URL: it ends with /ws"
-        )
-    after_s = float(retry_after) if retry_after.isdigit() else 0.0
-    busy = ConnectError(f"the server answers {status}", hint="it is full or not ready; try again later")
-    return _Refused(busy, min(after_s, 5.0))
+    return f"{parts.scheme}://{parts.netloc.rpartition('@')[2]}{parts.path}"

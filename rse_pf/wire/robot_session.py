@@ -32,14 +32,14 @@ _LONGEST_MS = 3.6e6
 class Answered:
     """A command came to its end.
 
-    ``submitted_s`` is the robot's clock; ``up_s`` and ``down_s`` are the paper's two one-way delays,
-    None where no clock offset is known; ``message_bytes`` is what the command weighed on the wire.
+    ``sent_s`` is when the robot took it (its clock); ``up_s`` and ``down_s`` are the paper's two
+    one-way delays, None where no clock offset is known; ``wire_bytes`` is what it weighed.
     """
 
     id: int
     answer: Result | Failure
-    submitted_s: float
-    message_bytes: int = 0
+    sent_s: float
+    wire_bytes: int = 0
     up_s: float | None = None
     down_s: float | None = None
 
@@ -81,7 +81,7 @@ class _Pending:
     command: Command
     deadline: float
     submitted: float
-    message_bytes: int
+    wire_bytes: int
     sent_at: float | None = None
     link: Link | None = None
     not_before: float = 0.0
@@ -156,7 +156,7 @@ class RobotSession:
         )  # fmt: skip
         data = self.codec.encode(_with_deadline(command, wait))
         self._check_size(data)
-        pending = _Pending(command=command, deadline=now + wait, submitted=now, message_bytes=len(data))
+        pending = _Pending(command=command, deadline=now + wait, submitted=now, wire_bytes=len(data))
         self._next_id += 1
         self._sequence[stream] = command.seq
         self._pending[command.id] = pending
@@ -232,6 +232,14 @@ class RobotSession:
                 failure = _failure(pending.command, "expired", f"no answer within {waited:.3f} s")
                 events += self._end(identity, failure)
         return events + self._flush(now)
+
+    def abandon(self, code: str, message: str, hint: str = "") -> list[Event]:
+        """End every command with a failure: there will be no other link."""
+        events: list[Event] = []
+        for identity, pending in list(self._pending.items()):
+            failure = Failure(id=identity, code=code, message=message, hint=hint, trace=pending.command.trace)
+            events += self._end(identity, failure)
+        return events
 
     def tend(self, link: Link, now: float) -> list[Event]:
         """Ping *link* when it is time; say when it is dead.
@@ -366,8 +374,8 @@ class RobotSession:
             return []
         return [
             Answered(
-                id=identity, answer=answer, submitted_s=pending.submitted,
-                message_bytes=pending.message_bytes, up_s=up_s, down_s=down_s,
+                id=identity, answer=answer, sent_s=pending.submitted,
+                wire_bytes=pending.wire_bytes, up_s=up_s, down_s=down_s,
             )
         ]  # fmt: skip
 
