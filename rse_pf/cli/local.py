@@ -110,7 +110,7 @@ def _welcome(cloud: Any, name: str) -> None:
         f"\nrobots connect to  {cloud.url}\n"
         f"a robot's token    rse-pf token issue robot-1{which}\n"
         f"to stop            Ctrl-C, or rse-pf local stop{which}\n"
-        f"logs and state     {cloud.folder}\n",
+        f"logs and state     {cloud.state}\n",
         flush=True,
     )
 

@@ -65,28 +65,28 @@ class LocalCloud:
         self.events: list[Event] = []
         self.url = ""
         self.name = name or state.name
-        self.folder = state.absolute()
+        self.state = state.absolute()
         self.settings = settings
         self._server_settings = _for_servers(settings)
         self._count = settings.local.servers if servers is None else servers
         self._adoptable = adoptable
         self._on_event = on_event
         self._servers: dict[str, BackendServer] = {}
-        self._lock = PlatformLock(self.folder)
+        self._lock = PlatformLock(self.state)
         self._key: SigningKey | None = None
         self._watchers: list[asyncio.Task[None]] = []
         self._wanted_port = settings.local.port if port is None else port
-        self._settings_file = self.folder / "settings.json"
+        self._settings_file = self.state / "settings.json"
         self.backend_servers = BackendServers(
             self._server_settings,
-            folder=self.folder,
+            folder=self.state,
             settings_file=self._settings_file,
-            keys_file=key_set_file(self.folder),
+            keys_file=key_set_file(self.state),
             dies_with_parent=not adoptable,
             program=program,
         )
         self.load_balancer = LoadBalancer(
-            self.settings, folder=self.folder, port=self._wanted_port, dies_with_parent=not adoptable
+            self.settings, folder=self.state, port=self._wanted_port, dies_with_parent=not adoptable
         )
 
     @property
@@ -156,16 +156,16 @@ class LocalCloud:
 
     def _make_folder(self) -> None:
         try:
-            self.folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-            self.folder.chmod(0o700)
+            self.state.mkdir(mode=0o700, parents=True, exist_ok=True)
+            self.state.chmod(0o700)
         except OSError as error:
             raise ConfigurationError(
-                f"cannot use the folder {self.folder}: {error.strerror}",
+                f"cannot use the folder {self.state}: {error.strerror}",
                 hint="make it writable for you, or set XDG_STATE_HOME",
             ) from error
 
     def _refuse_leftovers(self) -> None:
-        state = read_state(self.folder)
+        state = read_state(self.state)
         if state is not None and any(map(is_alive, state.processes())):
             raise ConfigurationError(
                 f"servers of platform {self.name!r} outlived their control plane",
@@ -173,7 +173,7 @@ class LocalCloud:
             )
 
     async def _start(self, end: float) -> None:
-        self._key = ensure_key(self.folder, seed=secrets.token_bytes(32), key_id=secrets.token_hex(4))
+        self._key = ensure_key(self.state, seed=secrets.token_bytes(32), key_id=secrets.token_hex(4))
         document = {"context": {"rse-pf": self._server_settings.to_dict()}}
         self._settings_file.write_text(json.dumps(document, indent=1), encoding="utf-8")
         names = [f"server-{number + 1}" for number in range(self._count)]
@@ -189,7 +189,7 @@ class LocalCloud:
         if not await self.load_balancer.wait_healthy(names, max(end - time.monotonic(), 0.0)):
             raise ConfigurationError(
                 f"the load balancer found no healthy server: {last_line(self.load_balancer.log)}",
-                hint=f"look at the logs in {self.folder}",
+                hint=f"look at the logs in {self.state}",
             )
         serving = self.settings.serving
         host = f"[{serving.host}]" if ":" in serving.host else serving.host
@@ -219,14 +219,14 @@ class LocalCloud:
             url=self.url,
             settings_digest=self._server_settings.digest(),
             settings_file=str(self._settings_file),
-            key_file=str(key_file(self.folder)),
+            key_file=str(key_file(self.state)),
             servers=tuple(
                 self._server_state(name, mark) for name, mark in self.backend_servers.marks.items()
             ),
             load_balancer=self.load_balancer.mark,
             port=self.load_balancer.port,
             admin_port=self.load_balancer.admin_port,
-        ).write(self.folder)
+        ).write(self.state)
 
     def _server_state(self, name: str, mark: ProcessMark) -> ServerState:
         server = self._servers.get(name)
@@ -250,7 +250,7 @@ class LocalCloud:
             self.load_balancer.kill()
             self._servers.clear()
             with contextlib.suppress(OSError):  # the folder may have been removed under our feet
-                remove_state(self.folder)
+                remove_state(self.state)
             self._lock.release()
         self._tell("platform-gone")
 

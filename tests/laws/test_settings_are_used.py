@@ -18,10 +18,7 @@ OWNERS = Counter(name for _, name in NAMES)
 
 WAITING: dict[str, set[str]] = {
     "session": {"connect_timeout_s", "reconnect_base_s", "reconnect_max_s"},
-    "health": {
-        "path", "local_interval_s", "local_timeout_s", "cloud_interval_s", "cloud_timeout_s",
-        "unhealthy_checks", "healthy_checks", "grace_s",
-    },
+    "health": {"cloud_interval_s", "cloud_timeout_s", "grace_s"},
     "scaling": {
         "busy_cpu_percent", "very_busy_cpu_percent", "idle_s", "idle_cpu_percent", "period_s",
         "busy_periods", "step", "big_step", "min_servers", "max_servers", "warm_up_s",
@@ -32,7 +29,6 @@ WAITING: dict[str, set[str]] = {
         "glacier_after_days",
     },
     "services": {"folder", "max_environments", "memory_bytes", "grace_s"},
-    "local": {"port", "servers", "workers", "stop_timeout_s"},
     "cloud": {"region", "lab", "certificate_arn", "domain_name", "instance_type"},
 }  # fmt: skip
 """Settings whose readers are not written yet; whoever writes one strikes it out here."""
