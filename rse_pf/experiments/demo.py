@@ -107,6 +107,8 @@ async def _run(
                 with contextlib.suppress(asyncio.CancelledError):
                     await samples
                 _end(robots)
+    for secret in ("key.json", "keys.json"):
+        (folder / "platform" / secret).unlink(missing_ok=True)
     screen.say("drawing the maps")
     finished = [robot.finished for robot in robots if robot.finished is not None]
     if len(finished) < len(robots):

@@ -23,6 +23,7 @@ _WIDTH, _HEIGHT, _CAPTION, _MARGIN = 1600, 900, 64, 40
 _BACKGROUND, _INK, _FAINT = (250, 250, 248), (30, 34, 42), (120, 126, 136)
 _COLOURS = ((214, 40, 57), (17, 105, 196), (27, 138, 70), (222, 125, 0), (126, 60, 178), (0, 140, 140))
 _FOCAL = 1.35
+_CAMERA_EVERY_M = 0.5
 _CEILING_M = 0.7
 """Points this far above the camera hide the room from an observer above; they are not drawn."""
 
@@ -82,16 +83,17 @@ class _Observer:
         self.axis_x /= np.linalg.norm(self.axis_x)
         self.axis_y = np.cross(self.axis_z, self.axis_x)
         self.axis_y *= -1 if self.axis_y @ up > 0 else 1
-        corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)]) * (high - low) + low
         self.distance = max(1.0, float(np.linalg.norm(high - low)))
         self.scale, self.shift = 1.0, np.zeros(2)
-        for _ in range(12):
-            flat = self._flat(corners)
-            size = flat.max(axis=0) - flat.min(axis=0)
+        shown = np.concatenate(
+            [points[:: max(1, len(points) // 20_000)]]
+            + [robot.T_world_camera[:, :3, 3] for robot in robots for _ in range(20)]
+        )
+        if len(shown):
+            low_px, high_px = np.percentile(self._flat(shown), (0.5, 99.5), axis=0)
             room = np.array([_WIDTH - 2 * _MARGIN, _HEIGHT - 2 * _CAPTION - _MARGIN])
-            self.scale *= float((room / np.maximum(size, 1e-9)).min())
-        flat = self._flat(corners)
-        self.shift = np.array([_WIDTH / 2, _HEIGHT / 2]) - (flat.max(axis=0) + flat.min(axis=0)) / 2
+            self.scale = float((room / np.maximum(high_px - low_px, 1e-9)).min())
+            self.shift = np.array([_WIDTH / 2, _HEIGHT / 2]) - self.scale * (high_px + low_px) / 2
 
     @staticmethod
     def _side(robots: list[PathOfRobot], up: Array) -> Array:
@@ -151,12 +153,21 @@ def _draw_path(draw: Any, view: _Observer, robot: PathOfRobot, colour: tuple[int
     line = [(float(x), float(y)) for x, y in view.project(robot.T_world_camera[:, :3, 3])]
     draw.line(line, fill=(255, 255, 255), width=9, joint="curve")
     draw.line(line, fill=colour, width=5, joint="curve")
-    for pose in robot.T_world_camera[:: max(1, len(robot.T_world_camera) // 12)]:
+    for pose in _spaced(robot.T_world_camera):
         _draw_camera(draw, view, pose, colour)
     (x0, y0), (x1, y1) = line[0], line[-1]
     draw.ellipse([x0 - 9, y0 - 9, x0 + 9, y0 + 9], fill=colour, outline=(255, 255, 255), width=3)
     draw.ellipse([x1 - 11, y1 - 11, x1 + 11, y1 + 11], outline=(255, 255, 255), width=8)
     draw.ellipse([x1 - 10, y1 - 10, x1 + 10, y1 + 10], outline=colour, width=5)
+
+
+def _spaced(poses: Array) -> list[Array]:
+    """Return the first pose and every one that lies far enough from the last chosen."""
+    chosen = [poses[0]]
+    for pose in poses[1:]:
+        if np.linalg.norm(pose[:3, 3] - chosen[-1][:3, 3]) >= _CAMERA_EVERY_M:
+            chosen.append(pose)
+    return chosen
 
 
 def _draw_camera(draw: Any, view: _Observer, T_world_camera: Array, colour: tuple[int, int, int]) -> None:
