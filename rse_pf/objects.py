@@ -11,6 +11,7 @@ import errno
 import hashlib
 import os
 import re
+import stat
 import tempfile
 import threading
 from collections.abc import Iterator
@@ -141,20 +142,24 @@ class DirectoryStore:
 
     def get(self, name: str) -> bytes:
         """Return the object."""
+        path = self._path(name)
         with _as_store_errors(name):
-            return self._path(name).read_bytes()
+            return _read(path)
 
     def put(self, name: str, data: bytes) -> None:
         """Store the object durably."""
         path = self._path(name)
         with _as_store_errors(name):
-            path.parent.mkdir(parents=True, exist_ok=True)
+            _make_folder(path.parent)
             self._write(path, data)
 
     def head(self, name: str) -> ObjectInfo:
         """Return size and name."""
         with _as_store_errors(name):
-            return ObjectInfo(name=name, size=self._path(name).stat().st_size)
+            found = self._path(name).lstat()
+        if not stat.S_ISREG(found.st_mode):
+            raise NotFound(f"no object named {name!r}")
+        return ObjectInfo(name=name, size=found.st_size)
 
     def list(self, prefix: str = "") -> Iterator[ObjectInfo]:
         """Yield the objects whose names begin with *prefix*."""
@@ -172,8 +177,10 @@ class DirectoryStore:
 
     def delete(self, name: str) -> None:
         """Remove the object."""
-        with _as_store_errors(name), contextlib.suppress(FileNotFoundError):
-            self._path(name).unlink()
+        path = self._path(name)
+        with _as_store_errors(name), contextlib.suppress(NotFound):
+            self.head(name)
+            path.unlink(missing_ok=True)
 
     def compare_and_swap(self, name: str, expected: bytes | None, data: bytes) -> None:
         """Replace the object if it still holds *expected*; a lock file keeps others out."""
@@ -181,10 +188,10 @@ class DirectoryStore:
 
         path = self._path(name)
         with _as_store_errors(name):
-            path.parent.mkdir(parents=True, exist_ok=True)
+            _make_folder(path.parent)
             with (path.parent / f".lock-{path.name}").open("wb") as lock:
                 fcntl.flock(lock, fcntl.LOCK_EX)
-                current = path.read_bytes() if path.exists() else None
+                current = _read(path) if os.path.lexists(path) else None
                 if current != expected:
                     raise Conflict(f"{name!r} was changed meanwhile", hint="read it again and retry")
                 self._write(path, data)
@@ -205,11 +212,37 @@ class DirectoryStore:
             with contextlib.suppress(FileNotFoundError):
                 os.unlink(temporary)
             raise
-        folder = os.open(path.parent, os.O_RDONLY)
+        _sync_folder(path.parent)
+
+
+def _read(path: Path) -> bytes:
+    """Return a plain file's bytes; a link is no object, wherever it points."""
+    with os.fdopen(os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC), "rb") as file:
+        return file.read()
+
+
+def _make_folder(folder: Path) -> None:
+    """Make *folder* and what is missing above it, each entry durable in its parent."""
+    missing = []
+    while not folder.is_dir():
+        missing.append(folder)
+        folder = folder.parent
+    for each in reversed(missing):
         try:
-            os.fsync(folder)
-        finally:
-            os.close(folder)
+            each.mkdir(exist_ok=True)
+        except (FileExistsError, NotADirectoryError) as error:
+            raise StoreError(
+                f"{each.name!r} is an object, not a folder", hint="choose another name"
+            ) from error
+        _sync_folder(each.parent)
+
+
+def _sync_folder(folder: Path) -> None:
+    handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
 
 
 @contextlib.contextmanager
@@ -219,6 +252,8 @@ def _as_store_errors(name: str) -> Iterator[None]:
     except (FileNotFoundError, IsADirectoryError, NotADirectoryError) as error:
         raise NotFound(f"no object named {name!r}") from error
     except OSError as error:
+        if error.errno == errno.ELOOP:
+            raise NotFound(f"no object named {name!r}") from error
         if error.errno in (errno.ENOSPC, errno.EDQUOT):
             raise StoreFull(f"no room for {name!r}", hint="free some space") from error
         raise StoreError(f"{name!r}: {error.strerror}", hint="look at the store's folder") from error

@@ -27,15 +27,17 @@ _F4, _U4, _F8 = 1, 2, 3
 
 def json_encode_hook(value: Any) -> Any:
     """Return what JSON can say of *value*: arrays become flat lists."""
-    if isinstance(value, np.ndarray):
+    if isinstance(value, np.ndarray) and value.dtype.kind in "fiu":
         return value.ravel().tolist()
     raise _unknown(value)
 
 
 def binary_encode_hook(value: Any) -> Any:
-    """Return the MessagePack extension of an array: float32, float64 or uint32, little-endian."""
-    if isinstance(value, np.ndarray):
-        kind = _F4 if value.dtype == np.float32 else _F8 if value.dtype.kind == "f" else _U4
+    """Return the MessagePack extension of an array: float32, uint32 if it fits, else float64."""
+    if isinstance(value, np.ndarray) and value.dtype.kind in "fiu":
+        kind = _F4 if value.dtype == np.float32 else _F8
+        if value.dtype.kind != "f" and value.min(initial=0) >= 0 and value.max(initial=0) < 2**32:
+            kind = _U4
         return msgspec.msgpack.Ext(kind, value.astype(_EXTENSIONS[kind], copy=False).tobytes())
     raise _unknown(value)
 
@@ -59,13 +61,17 @@ def decode_hook(kind: type[Any], value: Any) -> Any:
     """Return *value* as a flat float64 array of finite numbers."""
     if kind is not np.ndarray:
         raise BadMessage(f"{kind.__name__} does not travel in messages")
-    if isinstance(value, list):
-        array = _from_list(value)
-    elif isinstance(value, np.ndarray) and value.dtype.kind in "fiu":
-        array = np.array(value, dtype=np.float64).ravel()
-    else:
-        raise BadMessage(f"expected an array of numbers, got {type(value).__name__}", hint="send a flat list")
-    if not math.isfinite(array.dot(array)):
+    with np.errstate(over="ignore", invalid="ignore"):
+        if isinstance(value, list):
+            array = _from_list(value)
+        elif isinstance(value, np.ndarray) and value.dtype.kind in "fiu":
+            array = np.array(value, dtype=np.float64).ravel()
+        else:
+            raise BadMessage(
+                f"expected an array of numbers, got {type(value).__name__}", hint="send a flat list"
+            )
+        good = math.isfinite(array.dot(array))
+    if not good:
         raise BadMessage("an array holds a number that is not finite or absurdly large", hint="leave it out")
     return array
 

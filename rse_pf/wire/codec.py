@@ -211,9 +211,9 @@ def _without_strings(text: bytes) -> bytes:
 
 def _check_nesting(value: Any, deepest: int) -> None:
     """Refuse what JSON could not say within its depth either; the message itself is the first level."""
-    layer = [value]
-    for _ in range(deepest):
-        layer = [each for box in layer if isinstance(box, (dict, list, tuple)) for each in _inside(box)]
+    layer = [value] if isinstance(value, (dict, list, tuple)) else []
+    for _ in range(deepest - 1):
+        layer = [each for box in layer for each in _inside(box)]
         if not layer:
             return
     raise LimitExceeded(f"a message is nested deeper than {deepest}", hint="send flat lists")
