@@ -7,9 +7,8 @@ own exception leaves.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
-from functools import cache
+from functools import cache, lru_cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -21,6 +20,9 @@ if TYPE_CHECKING:
     from rse_pf.pnp.solver import PnpOptions
 
 __all__ = ["ENGINES", "Engine", "available_engines", "engine_for"]
+
+_ROUNDS = 4
+"""Refinements of the opencv engine, each on the inliers that the one before left."""
 
 Engine = Callable[[Array, Array, Camera, "PnpOptions"], "Array | None"]
 """``(points_world (n, 3), pixels (n, 2), camera, options)`` to ``(3, 4)`` [R | t], or None."""
@@ -53,7 +55,6 @@ def available_engines() -> tuple[str, ...]:
 
 @cache
 def _poselib_engine() -> Engine:
-    os.environ.setdefault("OMP_NUM_THREADS", "1")
     try:
         import poselib
     except ImportError as error:
@@ -61,23 +62,23 @@ def _poselib_engine() -> Engine:
 
     estimate: Any = poselib.estimate_absolute_pose
 
+    @lru_cache(maxsize=64)
+    def model_of(camera: Camera) -> Any:
+        return poselib.Camera(
+            "PINHOLE", [camera.fx, camera.fy, camera.cx, camera.cy], camera.width, camera.height
+        )
+
     def solve(points_world: Array, pixels: Array, camera: Camera, options: PnpOptions) -> Array | None:
         """LO-RANSAC with P3P, then robust refinement (Larsson, PoseLib)."""
-        model = {
-            "model": "PINHOLE",
-            "width": camera.width,
-            "height": camera.height,
-            "params": [camera.fx, camera.fy, camera.cx, camera.cy],
-        }
         ransac = {
             "max_reproj_error": options.inlier_px,
             "max_error": options.inlier_px,
-            "min_iterations": options.min_iterations,
+            "min_iterations": min(options.min_iterations, options.max_iterations),
             "max_iterations": options.max_iterations,
             "success_prob": options.confidence,
         }
         try:
-            pose, _ = estimate(pixels, points_world, model, ransac, {})
+            pose, _ = estimate(pixels, points_world, model_of(camera), ransac)
         except (RuntimeError, ValueError):
             return None
         found: Array = pose.Rt
@@ -107,9 +108,22 @@ def _opencv_engine() -> Engine:
             if not found or inliers is None or len(inliers) < 4:
                 return None
             rows = inliers[:, 0]
-            rotation, translation = cv2.solvePnPRefineLM(
-                points_world[rows], pixels[rows], matrix, None, rotation, translation
+            # EPnP, which ends solvePnPRansac, may fall into the wrong one of a plane's two minima.
+            found, better, shift = cv2.solvePnP(
+                points_world[rows], pixels[rows], matrix, None, flags=cv2.SOLVEPNP_SQPNP
             )
+            if found:
+                rotation, translation = better, shift
+            for _round in range(_ROUNDS):
+                rotation, translation = cv2.solvePnPRefineLM(
+                    points_world[rows], pixels[rows], matrix, None, rotation, translation
+                )
+                projected, _ = cv2.projectPoints(points_world, rotation, translation, matrix, None)
+                error = projected[:, 0] - pixels
+                agree = (error * error).sum(axis=1) <= options.inlier_px**2
+                before, rows = rows, np.flatnonzero(agree)
+                if len(rows) < 4 or np.array_equal(before, rows):
+                    break
             pose: Array = np.hstack([cv2.Rodrigues(rotation)[0], translation])
         except cv2.error:
             return None

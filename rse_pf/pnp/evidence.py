@@ -1,58 +1,79 @@
 """What speaks for and against a proposed pose: residuals, chance, geometry, covariance.
 
-Closed forms on small matrices, because this runs for every frame.  Promises to change no pose.
+Sums of products instead of tall matrices, because this runs for every frame.  Promises to change
+no pose, and to know nothing of engines.
 """
 
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 
 import numpy as np
-import numpy.typing as npt
 
-from rse_pf.geometry import Array, Camera, exp_se3
+from rse_pf.geometry import Array, Camera
 
-__all__ = ["Spread", "flipped_rmse_px", "information", "log10_false_alarms", "slenderness", "view_of"]
+__all__ = ["Shape", "log10_false_alarms", "places", "slenderness", "view_of"]
+
+U, V, ONE, Z_INV = range(4)
+"""Rows of a view: projected pixel, ones, and 1/z in the camera's frame."""
 
 _LOG10_E = math.log10(math.e)
-_SAMPLE = 3
-_POSES_OF_A_SAMPLE = 4
+_SAMPLE, _POSES_OF_A_SAMPLE = 3, 4
+_SHARPEST_PX2 = 0.01
+"""No residual counts as smaller: the wire rounds, and luck with four points is no proof."""
 _KEPT_SHARE = 0.8
 _NEAR_M = 1e-6
 _STRAYS = 4.0
 _PLAINLY_WIDE = 0.15
-
-# Rows of the Jacobian by (rho, phi) as signed rows of 1/z, a/z, b/z, ab, 1+a^2, 1+b^2, a, b.
-_ROWS_U, _SIGNS_U = np.array([0, 0, 1, 3, 4, 7]), np.array([1.0, 0, -1, -1, 1, -1])
-_ROWS_V, _SIGNS_V = np.array([0, 0, 2, 5, 3, 6]), np.array([0.0, 1, -1, -1, 1, 1])
-_TAKE_U, _SIGN_U = _ROWS_U[:, None] * 8 + _ROWS_U, np.outer(_SIGNS_U, _SIGNS_U)
-_TAKE_V, _SIGN_V = _ROWS_V[:, None] * 8 + _ROWS_V, np.outer(_SIGNS_V, _SIGNS_V)
-
-X, Y, Z, A, B, Z_INV = range(6)
-"""Rows of a view: camera-frame coordinates, slopes a = x/z and b = y/z, and 1/z."""
+_CELLS_ACROSS = 40
+_PLAINLY_MANY, _ENOUGH = 48, 64
+_ROW = 1 << 20
+_NUMBER_OF_CELL = np.array([1.0, _ROW])
 
 
-def view_of(pose: Array, points_world: Array, pixels: Array, camera: Camera) -> tuple[Array, Array]:
-    """Return the ``(6, n)`` view under ``(3, 4)`` *pose* and ``(n,)`` squared errors, px^2.
+@lru_cache(maxsize=64)
+def _optics(camera: Camera) -> tuple[Array, Array]:
+    """Return ``(4, 4)`` from camera-frame points to (u z, v z, z, 1), and ``(36, 256)`` to J^T J.
+
+    Both rows of the Jacobian are linear in the products of a = x/z, b = y/z, 1 and 1/z with each
+    other, and those in the products of a view's rows; so J^T J is linear in the moments of the latter.
+
+    Source:
+        Barfoot, State Estimation for Robotics (2017), Sect. 7.3 (left perturbation).
+    """
+    project = np.eye(4)
+    project[:3, :3] = camera.matrix
+    a, b, one, z_inv = range(4)
+    by_u, by_v = np.zeros((6, 4, 4)), np.zeros((6, 4, 4))
+    # d(a, b) by (rho, phi): [1/z, 0, -a/z, -ab, 1+a^2, -b] and [0, 1/z, -b/z, -1-b^2, ab, a]
+    by_u[0, z_inv, one] = by_v[1, z_inv, one] = 1.0
+    by_u[2, a, z_inv] = by_v[2, b, z_inv] = -1.0
+    by_u[3, a, b] = by_v[3, one, one] = by_v[3, b, b] = -1.0
+    by_u[4, one, one] = by_u[4, a, a] = by_v[4, a, b] = 1.0
+    by_u[5, b, one], by_v[5, a, one] = -1.0, 1.0
+    slopes_of_view = np.linalg.inv(project)
+    pairs = np.kron(slopes_of_view, slopes_of_view)
+    u, v = camera.fx * by_u.reshape(6, 16) @ pairs, camera.fy * by_v.reshape(6, 16) @ pairs
+    return project, np.kron(u, u) + np.kron(v, v)
+
+
+def view_of(T_camera_world: Array, points_world: Array, pixels: Array, camera: Camera) -> tuple[Array, Array]:
+    """Return the ``(4, n)`` view of the points and their ``(n,)`` squared errors, px^2.
 
     A point that is not before the camera has infinite error.
     """
-    view = np.empty((6, len(pixels)))
-    np.matmul(pose[:, :3], points_world.T, out=view[:3])
-    view[:3] += pose[:, 3:]
-    z = view[Z]
-    behind = None if z.min() > _NEAR_M else z <= _NEAR_M
+    project = _optics(camera)[0] @ T_camera_world
+    view: Array = project[:, :3] @ points_world.T
+    view += project[:, 3:]
+    z = view[2]
+    behind = None if np.minimum.reduce(z) > _NEAR_M else z <= _NEAR_M
     if behind is not None:
         z[behind] = _NEAR_M
-    np.divide(1.0, z, out=view[Z_INV])
-    np.multiply(view[:2], view[Z_INV], out=view[A : B + 1])
-    error2 = view[A] * camera.fx
-    error2 += camera.cx - pixels[:, 0]
-    error2 *= error2
-    down = view[B] * camera.fy
-    down += camera.cy - pixels[:, 1]
-    down *= down
-    error2 += down
+    view = view / z
+    error = view[:ONE] - pixels.T
+    error *= error
+    error2: Array = error[0] + error[1]
     if behind is not None:
         error2[behind] = np.inf
     return view, error2
@@ -66,10 +87,12 @@ def log10_false_alarms(n: int, inliers: int, largest_error2_px2: float, camera: 
     Source:
         Moisan and Stival, IJCV 2004; for PnP: Moulon et al., ACCV 2012.
     """
+    if inliers <= _SAMPLE:
+        return math.inf
     area = float(camera.width * camera.height)
-    share = min(1.0, math.pi * max(largest_error2_px2, 0.25) / area)
+    share = min(1.0, math.pi * max(largest_error2_px2, _SHARPEST_PX2) / area)
     log = (
-        math.log(_POSES_OF_A_SAMPLE * max(1, n - _SAMPLE))
+        math.log(_POSES_OF_A_SAMPLE * (n - _SAMPLE))
         + _log_choose(n, inliers)
         + _log_choose(inliers, _SAMPLE)
         + (inliers - _SAMPLE) * math.log(share)
@@ -77,164 +100,87 @@ def log10_false_alarms(n: int, inliers: int, largest_error2_px2: float, camera: 
     return log * _LOG10_E
 
 
-class Spread:
-    """How wide the inliers lie, in space and in the image.
+def places(view: Array, camera: Camera) -> int:
+    """Return how many of the inliers in *view* count as independent observations.
 
-    ``thinness`` is width over length, of the slimmer of the two: 0 on a line, 0 if they coincide.
-    ``image_radius`` is the largest distance from their centre in the image, in slopes.
+    Twenty copies of one correspondence agree with each other under any pose that fits one of them.
+    Inliers in the same or in touching cells of the image (40 across) count once; where so many
+    cells are taken that this cannot matter, every inlier counts.
+    """
+    scale = _CELLS_ACROSS / camera.width
+    if len(_cells(view[:ONE, :_ENOUGH], scale)) >= _PLAINLY_MANY:
+        return int(view.shape[1])
+    cells = _cells(view[:ONE], scale)
+    if len(cells) >= _PLAINLY_MANY:
+        return int(view.shape[1])
+    alone: set[float] = set()
+    for cell in sorted(cells):
+        if not (
+            cell - 1 in alone or cell - _ROW in alone or cell - _ROW - 1 in alone or cell - _ROW + 1 in alone
+        ):
+            alone.add(cell)
+    return len(alone)
+
+
+def _cells(pixels: Array, scale: float) -> set[float]:
+    """Return one number per taken cell: row * _ROW + column."""
+    cells: Array = _NUMBER_OF_CELL @ np.floor(pixels * scale)
+    return set(cells.tolist())
+
+
+class Shape:
+    """How the inliers of a ``(4, k)`` view lie, and how firmly they hold the pose.
+
+    ``thinness`` is width over length in the image: 0 on a line, 0 if they coincide; whatever lies
+    on one line in space lies on one line there.  ``radius_px`` bounds the distances from their
+    centre.  ``depth_variation`` is the standard deviation of 1/z over its mean.
+    ``information`` is the ``(6, 6)`` J^T J by the twist (rho, phi) left of the pose.
     """
 
-    __slots__ = ("image_radius", "thinness")
+    __slots__ = ("depth_variation", "information", "radius_px", "thinness")
 
-    def __init__(self, view: Array) -> None:
+    def __init__(self, view: Array, camera: Camera) -> None:
         k = view.shape[1]
-        centred = view[: B + 1] - np.add.reduce(view[: B + 1], axis=1, keepdims=True) / k
-        moments = centred @ centred.T
-        squares = centred * centred
-        radius2 = squares[X] + squares[Y] + squares[Z]
-        image2 = squares[A] + squares[B]
-        self.image_radius = math.sqrt(float(image2.max()))
-        self.thinness = min(
-            _thinness(centred[:A], moments[:A, :A], radius2), _thinness(centred[A:], moments[A:, A:], image2)
-        )
+        products = (view[:, None] * view).reshape(16, k)
+        moments = products @ products.T
+        self.information: Array = (_optics(camera)[1] @ moments.ravel()).reshape(6, 6)
+        # Product 10 is 1 * 1, so its row holds the plain sums of all products.
+        uu, uv, u, _, _, vv, v, _, _, _, _, w, _, _, _, ww = moments[10].tolist()
+        self.depth_variation = math.sqrt(max(0.0, ww * k / (w * w) - 1.0))
+        left, top = np.minimum.reduce(view[:ONE], axis=1).tolist()
+        right, bottom = np.maximum.reduce(view[:ONE], axis=1).tolist()
+        mean_u, mean_v = u / k, v / k
+        self.radius_px = math.hypot(max(right - mean_u, mean_u - left), max(bottom - mean_v, mean_v - top))
+        length2, width2 = _eigenvalues(uu - u * mean_u, uv - u * mean_v, vv - v * mean_v)
+        spare = width2 - _STRAYS * self.radius_px**2
+        if spare > _PLAINLY_WIDE**2 * length2:
+            self.thinness = math.sqrt(spare / length2)
+        else:
+            self.thinness = slenderness(view[:ONE].T)
 
 
 def slenderness(rows: Array) -> float:
-    """Return width over length of ``(n, 2 or 3)`` *rows*: 0 on a line, 0 if they coincide."""
-    centred = (rows - rows.mean(axis=0)).T
-    return _thinness(centred, centred @ centred.T, (centred * centred).sum(axis=0))
+    """Return width over length of ``(n, 2 or 3)`` *rows*: 0 on a line, 0 if they coincide.
 
-
-def _thinness(centred: Array, moments: Array, radius2: Array) -> float:
-    """Width is the distance from the main axis that 80 % of the rows stay below.
-
-    So a few strays beside a line do not make it wide.  Where the moments alone prove the rows wide
-    even without the four farthest of them, no axis is computed.
+    Width is the distance from the main axis that 80 % of the rows stay below, so a few strays
+    beside a line do not make it wide.
     """
-    largest, middle = _two_largest_eigenvalues(moments.tolist())
-    if largest <= 1e-18:
-        return 0.0
-    spare = middle - _STRAYS * float(radius2.max())
-    if spare > _PLAINLY_WIDE**2 * largest:
-        return math.sqrt(spare / largest)
-    _, axes = np.linalg.eigh(moments)
+    centred = (rows - rows.mean(axis=0)).T
+    radius2 = np.add.reduce(centred * centred, axis=0)
+    _, axes = np.linalg.eigh(centred @ centred.T)
     along = axes[:, -1] @ centred
     along *= along
     aside = radius2 - along
-    k = min(len(along) - 1, int(_KEPT_SHARE * len(along)))
-    width2, length2 = float(np.partition(aside, k)[k]), float(np.partition(along, k)[k])
+    kth = min(len(along) - 1, int(_KEPT_SHARE * len(along)))
+    width2, length2 = float(np.partition(aside, kth)[kth]), float(np.partition(along, kth)[kth])
     if length2 <= 1e-18:
         return 0.0
     return math.sqrt(max(0.0, width2) / length2)
 
 
-def _two_largest_eigenvalues(m: list[list[float]]) -> tuple[float, float]:
-    """Return the two largest eigenvalues of a symmetric 2x2 or 3x3 matrix, largest first.
-
-    Source:
-        Smith, Communications of the ACM 4 (1961): the trigonometric closed form.
-    """
-    if len(m) == 2:
-        mean, half = (m[0][0] + m[1][1]) / 2, (m[0][0] - m[1][1]) / 2
-        root = math.hypot(half, m[0][1])
-        return mean + root, mean - root
-    mean = (m[0][0] + m[1][1] + m[2][2]) / 3
-    d0, d1, d2 = m[0][0] - mean, m[1][1] - mean, m[2][2] - mean
-    o01, o02, o12 = m[0][1], m[0][2], m[1][2]
-    p = math.sqrt((d0 * d0 + d1 * d1 + d2 * d2 + 2 * (o01 * o01 + o02 * o02 + o12 * o12)) / 6)
-    if p == 0.0:
-        return mean, mean
-    determinant = d0 * (d1 * d2 - o12 * o12) - o01 * (o01 * d2 - o12 * o02) + o02 * (o01 * o12 - d1 * o02)
-    angle = math.acos(max(-1.0, min(1.0, determinant / (2 * p**3)))) / 3
-    largest = mean + 2 * p * math.cos(angle)
-    smallest = mean + 2 * p * math.cos(angle + 2 * math.pi / 3)
-    return largest, 3 * mean - largest - smallest
-
-
-def information(view: Array, camera: Camera) -> Array:
-    """Return the ``(6, 6)`` matrix J^T J of the pixels by the twist (rho, phi) left of the pose.
-
-    The Jacobian's rows are linear in eight products of a, b and 1/z, so one small product of
-    matrices replaces a tall one.
-
-    Source:
-        Barfoot, State Estimation for Robotics (2017), Sect. 7.3 (left perturbation).
-    """
-    products = np.empty((8, view.shape[1]))
-    products[0] = view[Z_INV]
-    np.multiply(view[A : B + 1], view[Z_INV], out=products[1:3])
-    np.multiply(view[A], view[B], out=products[3])
-    np.multiply(view[A : B + 1], view[A : B + 1], out=products[4:6])
-    products[4:6] += 1.0
-    products[6:] = view[A : B + 1]
-    moments = products @ products.T
-    matrix: Array = moments.take(_TAKE_U)
-    matrix *= _SIGN_U * camera.fx**2
-    other = moments.take(_TAKE_V)
-    other *= _SIGN_V * camera.fy**2
-    matrix += other
-    return matrix
-
-
-def flipped_rmse_px(pose: Array, points_world: Array, pixels: Array, camera: Camera) -> float | None:
-    """Return the error of the second pose of a plane seen from afar, or None if points fill space.
-
-    A plane's mirror image about the line of sight projects almost alike when perspective is weak;
-    the flipped pose is refined before it is judged.
-
-    Source:
-        Schweighofer and Pinz, PAMI 2006; Collins and Bartoli, IJCV 2014.
-    """
-    points_camera = points_world @ pose[:, :3].T + pose[:, 3]
-    centre = points_camera.mean(axis=0)
-    centred = points_camera - centre
-    spread, axes = np.linalg.eigh(centred.T @ centred)
-    if spread[0] > 1e-3 * spread[2]:
-        return None
-    sight = centre / np.linalg.norm(centre)
-    normal = axes[:, 0]
-    mirrored = normal - 2.0 * (normal @ sight) * sight
-    axis = np.cross(normal, mirrored)
-    sine, cosine = float(np.linalg.norm(axis)), float(normal @ mirrored)
-    if cosine < 0.0:
-        axis, cosine = -axis, -cosine
-    if sine < 1e-6:
-        return None
-    turn = exp_se3(np.concatenate([np.zeros(3), axis / sine * math.atan2(sine, cosine)]))[:3, :3]
-    flipped = np.hstack([turn @ pose[:, :3], (turn @ (pose[:, 3] - centre) + centre)[:, None]])
-    for _ in range(8):
-        moved = _gauss_newton(flipped, points_world, pixels, camera)
-        if moved is None:
-            return None
-        flipped = moved
-    if np.linalg.norm(flipped - pose) < 1e-3:
-        return None
-    _, error2 = view_of(flipped, points_world, pixels, camera)
-    return math.sqrt(float(error2.mean()))
-
-
-def _gauss_newton(pose: Array, points_world: Array, pixels: Array, camera: Camera) -> Array | None:
-    points = points_world @ pose[:, :3].T + pose[:, 3]
-    if points[:, 2].min() <= 1e-6:
-        return None
-    x, y, z = points.T
-    a, b = x / z, y / z
-    zero = np.zeros_like(z)
-    Ju = camera.fx * np.array([1 / z, zero, -a / z, -a * b, 1 + a * a, -b])
-    Jv = camera.fy * np.array([zero, 1 / z, -b / z, -1 - b * b, a * b, a])
-    ru = pixels[:, 0] - (camera.fx * a + camera.cx)
-    rv = pixels[:, 1] - (camera.fy * b + camera.cy)
-    try:
-        step = np.linalg.solve(Ju @ Ju.T + Jv @ Jv.T + 1e-9 * np.eye(6), Ju @ ru + Jv @ rv)
-    except np.linalg.LinAlgError:
-        return None
-    if not np.isfinite(step).all() or np.linalg.norm(step) > 10.0:
-        return None
-    T = exp_se3(step)
-    turned: npt.NDArray[np.float64] = np.hstack(
-        [T[:3, :3] @ pose[:, :3], (T[:3, :3] @ pose[:, 3] + T[:3, 3])[:, None]]
-    )
-    return turned
+def _eigenvalues(xx: float, xy: float, yy: float) -> tuple[float, float]:
+    mean, root = (xx + yy) / 2.0, math.hypot((xx - yy) / 2.0, xy)
+    return mean + root, mean - root
 
 
 def _log_choose(n: int, k: int) -> float:

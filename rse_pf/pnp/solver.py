@@ -13,19 +13,22 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from rse_pf.errors import BadRequest, DegenerateGeometry, NoConsensus, TooFewCorrespondences
+from rse_pf.errors import BadRequest, DegenerateGeometry, NoConsensus, PnpError, TooFewCorrespondences
 from rse_pf.geometry import Array, Camera
 from rse_pf.pnp import evidence
-from rse_pf.pnp.engines import engine_for
+from rse_pf.pnp.engines import Engine, engine_for
+from rse_pf.pnp.twin import twin_of
 
 __all__ = ["PnpOptions", "PnpSolution", "WeakLimits", "solve_pnp"]
 
 _LARGEST = 1e6
-_CHANCE = -3.0
+_CHANCE = -5.0
 """log10 of the false alarms at which chance is ruled out."""
 _COLLINEAR, _NEARLY_COLLINEAR = 0.02, 0.1
-_SAME_POSE, _SIMILAR_POSE = 1.1, 2.0
-_FLAT_DEPTH = 0.2
+_WEAK_PERSPECTIVE = 0.08
+"""Variation of 1/z below which a plane may have two poses."""
+_SAME_FIT, _SIMILAR_FIT = 9.0, 40.0
+"""Differences of squared error, in units of the noise, that tell two poses apart: not, hardly."""
 _NOISE_FLOOR_PX2 = 0.01
 
 
@@ -52,19 +55,21 @@ class PnpOptions(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     def __post_init__(self) -> None:
         _within("inlier_px", self.inlier_px, 1e-3, 100.0)
         _within("max_iterations", self.max_iterations, 1, 100_000)
-        _within("min_iterations", self.min_iterations, 1, self.max_iterations)
+        _within("min_iterations", self.min_iterations, 1, 100_000)
         _within("confidence", self.confidence, 1e-6, 1.0 - 1e-9)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class WeakLimits:
-    """Below these a pose is called weak."""
+    """Where a pose is called weak: fewer inliers, a smaller ratio, larger standard deviations.
+
+    Fewer places in the image than half of *inliers* are weak, too.
+    """
 
     inliers: int = 12
     inlier_ratio: float = 0.25
-    translation_m: float = 0.1
-    rotation_rad: float = math.radians(2.0)
-    image_share: float = 0.05
+    translation_m: float = 0.05
+    rotation_rad: float = math.radians(1.0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -131,39 +136,35 @@ def solve_pnp(
     options = options or _DEFAULT_OPTIONS
     points_world, pixels = _checked(points_world, pixels)
     engine = options.engine or default_engine
-    pose = engine_for(engine)(points_world, pixels, camera, options)
-    if pose is None or not math.isfinite(float(np.sum(pose))):
-        _blame(points_world, pixels)
-        raise _no_consensus(0, len(pixels), options)
-    view, error2 = evidence.view_of(pose, points_world, pixels, camera)
-    inliers = np.flatnonzero(error2 <= options.inlier_px**2)
+    propose = engine_for(engine)
+    n = len(pixels)
+    T_camera_world = _proposed(propose, points_world, pixels, camera, options)
+    if T_camera_world is None:
+        raise _no_pose(points_world, pixels, 0, options)
+    view, error2 = evidence.view_of(T_camera_world, points_world, pixels, camera)
+    inliers = (error2 <= options.inlier_px**2).nonzero()[0]
     count = len(inliers)
-    error2 = error2[inliers]
-    if count < 4 or _is_chance(len(pixels), count, float(error2.max()), camera):
-        _blame(points_world, pixels)
-        raise _no_consensus(count, len(pixels), options)
-    view = view[:, inliers]
-    spread = evidence.Spread(view)
-    if spread.thinness < _COLLINEAR:
-        raise _collinear(spread.thinness)
-    if spread.image_radius * camera.fx < 2.0 * options.inlier_px:
-        raise DegenerateGeometry(
-            f"the pixels that agree lie within {spread.image_radius * camera.fx:.1f} px of each other",
-            hint="match points all over the image, or skip this frame",
-        )
-    squares = float(error2.sum())
-    covariance = _covariance(view, camera, squares)
-    rmse_px = math.sqrt(squares / count)
-    reason = _weakness(count, len(pixels), spread, covariance, camera, weak)
-    if _is_flat(view):
-        twin = _twin(pose, points_world[inliers], pixels[inliers], camera, rmse_px)
-        reason = reason or twin
-    T_camera_world = np.eye(4)
-    T_camera_world[:3] = pose
+    if count < 4:
+        raise _no_pose(points_world, pixels, count, options)
+    view, error2 = view.take(inliers, axis=1), error2.take(inliers)
+    seen = evidence.places(view, camera)
+    if _is_chance(n - (count - seen), seen, float(np.maximum.reduce(error2)), camera):
+        raise _no_pose(points_world, pixels, count, options)
+    shape = evidence.Shape(view, camera)
+    _refuse_degenerate(shape, options)
+    squares = float(np.add.reduce(error2))
+    variance = max(squares / max(1, 2 * count - 6), _NOISE_FLOOR_PX2)
+    covariance, variances = _covariance(shape.information, variance)
+    reason = _weakness(count, seen, n, shape, variances, weak)
+    if shape.depth_variation < _WEAK_PERSPECTIVE:
+        found = _ambiguity(T_camera_world, points_world[inliers], pixels[inliers], camera, squares, variance)
+        reason = found or reason
+    if 2 * count < n:
+        _refuse_mirrored(propose, points_world, pixels, camera, options, count)
     return PnpSolution(
         T_camera_world=T_camera_world,
         inliers=inliers,
-        rmse_px=rmse_px,
+        rmse_px=math.sqrt(squares / count),
         covariance=covariance,
         verdict="weak" if reason else "ok",
         reason=reason,
@@ -189,8 +190,7 @@ def _checked(points_world: Array, pixels: Array) -> tuple[Array, Array]:
         )
     for name, rows in (("points_world", points), ("pixels", seen)):
         flat = rows.ravel()
-        total = float(flat.dot(flat))
-        if not total < _LARGEST**2 and not (np.abs(flat) <= _LARGEST).all():
+        if not flat.dot(flat) < _LARGEST**2 and not (np.abs(rows) <= _LARGEST).all():
             raise BadRequest(
                 f"{name} holds a number that is not finite or is beyond {_LARGEST:g}",
                 hint="leave such rows out",
@@ -198,16 +198,33 @@ def _checked(points_world: Array, pixels: Array) -> tuple[Array, Array]:
     return points, seen
 
 
+def _proposed(
+    propose: Engine, points_world: Array, pixels: Array, camera: Camera, options: PnpOptions
+) -> Array | None:
+    pose = propose(points_world, pixels, camera, options)
+    if pose is None:
+        return None
+    T_camera_world = np.zeros((4, 4))
+    T_camera_world[:3] = pose
+    T_camera_world[3, 3] = 1.0
+    return T_camera_world if math.isfinite(float(np.add.reduce(T_camera_world, axis=None))) else None
+
+
 def _is_chance(n: int, count: int, largest_error2_px2: float, camera: Camera) -> bool:
     return evidence.log10_false_alarms(n, count, largest_error2_px2, camera) > _CHANCE
 
 
-def _blame(points_world: Array, pixels: Array) -> None:
-    """Say so if the input as a whole is degenerate: it is a better reason than "no consensus"."""
+def _no_pose(points_world: Array, pixels: Array, count: int, options: PnpOptions) -> PnpError:
+    """Return the best reason there is: degenerate input says more than "no consensus"."""
     for rows in (points_world, pixels):
         thinness = evidence.slenderness(rows)
         if thinness < _COLLINEAR:
-            raise _collinear(thinness)
+            return _collinear(thinness)
+    return NoConsensus(
+        f"the best pose agrees with {count} of {len(pixels)} correspondences within "
+        f"{options.inlier_px:g} px, no more than chance would give",
+        hint="tighten the matcher, or skip this frame",
+    )
 
 
 def _collinear(thinness: float) -> DegenerateGeometry:
@@ -218,61 +235,87 @@ def _collinear(thinness: float) -> DegenerateGeometry:
     )
 
 
-def _covariance(view: Array, camera: Camera, squares_px2: float) -> Array:
-    variance = max(squares_px2 / max(1, 2 * view.shape[1] - 6), _NOISE_FLOOR_PX2)
+def _refuse_degenerate(shape: evidence.Shape, options: PnpOptions) -> None:
+    if shape.thinness < _COLLINEAR:
+        raise _collinear(shape.thinness)
+    least_px = 2.0 * options.inlier_px
+    if shape.radius_px < least_px:
+        raise DegenerateGeometry(
+            f"the pixels that agree lie within {shape.radius_px:.1f} px of their centre, "
+            f"less than {least_px:g} px",
+            hint="match points all over the image, or skip this frame",
+        )
+
+
+def _covariance(information: Array, variance_px2: float) -> tuple[Array, list[float]]:
+    """Return the covariance and its diagonal, all of it positive."""
     try:
-        covariance = np.linalg.inv(evidence.information(view, camera)).astype(np.float64, copy=False)
+        covariance = np.linalg.inv(information).astype(np.float64, copy=False)
     except np.linalg.LinAlgError:
         covariance = np.full((6, 6), -1.0)
-    covariance *= variance
-    if not min(covariance.diagonal().tolist()) > 0:
+    covariance *= variance_px2
+    variances: list[float] = covariance.diagonal().tolist()
+    if not min(variances) > 0.0:
         raise DegenerateGeometry(
             "the correspondences leave a motion of the camera free", hint="match more of the scene"
         )
-    return covariance
+    return covariance, variances
 
 
 def _weakness(
-    count: int, n: int, spread: evidence.Spread, covariance: Array, camera: Camera, weak: WeakLimits
+    count: int, seen: int, n: int, shape: evidence.Shape, variances: list[float], weak: WeakLimits
 ) -> str:
     if count < weak.inliers:
         return "few-inliers"
     if count < weak.inlier_ratio * n:
         return "low-inlier-ratio"
-    if spread.thinness < _NEARLY_COLLINEAR:
+    if shape.thinness < _NEARLY_COLLINEAR:
         return "nearly-collinear"
-    if 2.0 * spread.image_radius * camera.fx < weak.image_share * camera.width:
+    if 2 * seen < weak.inliers:
         return "clustered"
-    variances = covariance.diagonal().tolist()
     if max(variances[:3]) > weak.translation_m**2 or max(variances[3:]) > weak.rotation_rad**2:
         return "poorly-constrained"
     return ""
 
 
-def _is_flat(view: Array) -> bool:
-    """Whether perspective is weak: only then may a plane have two poses."""
-    z = view[evidence.Z]
-    nearest, farthest = float(z.min()), float(z.max())
-    return farthest - nearest < _FLAT_DEPTH * farthest
-
-
-def _twin(pose: Array, points: Array, pixels: Array, camera: Camera, rmse_px: float) -> str:
-    """Look for the second pose of a plane."""
-    other = evidence.flipped_rmse_px(pose, points, pixels, camera)
-    if other is None:
+def _ambiguity(
+    T_camera_world: Array,
+    points: Array,
+    pixels: Array,
+    camera: Camera,
+    squares_px2: float,
+    variance_px2: float,
+) -> str:
+    """Compare with the second pose of a plane; the difference is a likelihood ratio."""
+    twin = twin_of(T_camera_world, points, pixels, camera)
+    if twin is None:
         return ""
-    ratio = other / max(rmse_px, math.sqrt(_NOISE_FLOOR_PX2))
-    if ratio < _SAME_POSE:
+    difference = (twin[1] - squares_px2) / variance_px2
+    if difference < _SAME_FIT:
+        rmse, other = (math.sqrt(squares / len(pixels)) for squares in (squares_px2, twin[1]))
         raise DegenerateGeometry(
-            f"two poses fit alike ({rmse_px:.2f} and {other:.2f} px)",
+            f"two poses fit alike ({rmse:.2f} and {other:.2f} px)",
             hint="match points that do not lie in one far plane",
         )
-    return "ambiguous" if ratio < _SIMILAR_POSE else ""
+    return "ambiguous" if difference < _SIMILAR_FIT else ""
 
 
-def _no_consensus(count: int, n: int, options: PnpOptions) -> NoConsensus:
-    return NoConsensus(
-        f"the best pose agrees with {count} of {n} correspondences within {options.inlier_px:g} px, "
-        "no more than chance would give",
-        hint="tighten the matcher, or skip this frame",
-    )
+def _refuse_mirrored(
+    propose: Engine, points_world: Array, pixels: Array, camera: Camera, options: PnpOptions, count: int
+) -> None:
+    """Where most rows disagree, ask whether the whole world is inside out.
+
+    The point reflection of a world projects alike, so points behind the camera and left-handed
+    worlds are told by a far better pose of the reflected points.
+    """
+    reflected = -points_world
+    T_camera_world = _proposed(propose, reflected, pixels, camera, options)
+    if T_camera_world is None:
+        return
+    _, error2 = evidence.view_of(T_camera_world, reflected, pixels, camera)
+    better = int(np.count_nonzero(error2 <= options.inlier_px**2))
+    if better >= 2 * count:
+        raise DegenerateGeometry(
+            f"{better} points agree behind the camera or mirrored, and only {count} as they are",
+            hint="check the handedness of the world frame and the sign of the depth",
+        )
