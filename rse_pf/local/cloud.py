@@ -25,7 +25,14 @@ from rse_pf.local.backend_servers import RSE_PF, BackendServer, BackendServers
 from rse_pf.local.firewall import check_front_door, ensure_key, key_file, key_set_file
 from rse_pf.local.load_balancer import LoadBalancer
 from rse_pf.local.processes import ProcessMark, is_alive, last_line, mark_of
-from rse_pf.local.state import PlatformLock, PlatformState, ServerState, read_state, remove_state
+from rse_pf.local.state import (
+    PlatformLock,
+    PlatformState,
+    ServerState,
+    read_state,
+    remove_state,
+    settings_file,
+)
 from rse_pf.settings import PlatformSettings
 
 __all__ = ["LocalCloud"]
@@ -76,7 +83,7 @@ class LocalCloud:
         self._key: SigningKey | None = None
         self._watchers: list[asyncio.Task[None]] = []
         self._wanted_port = settings.local.port if port is None else port
-        self._settings_file = self.state / "settings.json"
+        self._settings_file = settings_file(self.state)
         self.backend_servers = BackendServers(
             self._server_settings,
             folder=self.state,

@@ -19,7 +19,15 @@ from typing import Any
 from rse_pf.errors import ConfigurationError, UsageError
 from rse_pf.local.processes import ProcessMark
 
-__all__ = ["PlatformLock", "PlatformState", "ServerState", "read_state", "remove_state", "state_folder"]
+__all__ = [
+    "PlatformLock",
+    "PlatformState",
+    "ServerState",
+    "read_state",
+    "remove_state",
+    "settings_file",
+    "state_folder",
+]
 
 _FILE = "platform.json"
 _LOCK = "lock"
@@ -104,6 +112,11 @@ def state_folder(name: str, environment: Mapping[str, str]) -> Path:
     if not base.is_absolute():
         base = Path(environment.get("HOME") or "~").expanduser() / ".local" / "state"
     return base / "rse-pf" / name
+
+
+def settings_file(folder: Path) -> Path:
+    """Return where the platform in *folder* writes the settings that its servers read."""
+    return folder / "settings.json"
 
 
 def read_state(folder: Path) -> PlatformState | None:

@@ -1,0 +1,200 @@
+"""Check what this machine needs to run the platform, and say how to mend what it lacks.
+
+Each line is ok, warn or fail; a failure is something that rse-pf local or rse-pf demo cannot do without.
+
+example:
+  rse-pf doctor
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import os
+import platform
+import resource
+import subprocess
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from importlib import metadata
+from pathlib import Path
+
+from rse_pf.errors import ConfigurationError, MissingExtra
+from rse_pf.settings import PlatformSettings
+
+__all__ = ["Finding", "add_arguments", "check_machine", "run"]
+
+_EXTRAS: dict[str, tuple[tuple[str, ...], bool]] = {
+    "base": (("numpy", "websockets", "msgspec"), True),
+    "backend": (("picows", "aiofastnet", "uvloop", "prometheus_client", "jwt", "cryptography"), True),
+    "local": (("envoy", "rich", "PIL"), True),
+    "demo": (("cv2",), False),
+    "vision": (("h5py",), False),
+    "services": (("lupa",), False),
+    "experiments": (("matplotlib",), False),
+    "aws": (("boto3",), False),
+    "infra": (("aws_cdk", "cdk_nag"), False),
+}
+"""Modules of each extra, and whether the local platform needs them."""
+
+_DESCRIPTORS_PER_ROBOT = 2
+_OTHER_DESCRIPTORS = 256
+_LITTLE_MEMORY_MIB = 1024
+_ENVOY_ANSWERS_S = 10.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Finding:
+    """One line: ``grade`` is ok, warn or fail; ``fix`` says what to do unless it is ok."""
+
+    grade: str
+    what: str
+    fix: str = ""
+
+    def __str__(self) -> str:
+        line = f"{self.grade:<4}  {self.what}"
+        return f"{line}\n      fix: {self.fix}" if self.fix else line
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare no options but the common ones."""
+
+
+def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
+    """Print every finding; 1 if something required failed."""
+    failed = 0
+    for finding in check_machine(settings):
+        print(finding, flush=True)
+        failed += finding.grade == "fail"
+    print(f"\n{failed} to mend first" if failed else "\nready: rse-pf local, or rse-pf demo")
+    return 1 if failed else 0
+
+
+def check_machine(settings: PlatformSettings) -> Iterator[Finding]:
+    """Yield what is found, in the order in which it should be mended."""
+    checks: tuple[Callable[[PlatformSettings], Iterator[Finding]], ...] = (
+        _system, _extras, _engines, _balancer, _front_door, _open_files, _size,
+    )  # fmt: skip
+    for check in checks:
+        yield from check(settings)
+
+
+def _system(settings: PlatformSettings) -> Iterator[Finding]:
+    yield Finding(grade="ok", what=f"Python {platform.python_version()}")
+    system, machine = platform.system(), platform.machine()
+    fix = "run the platform on Linux, x86-64" if (system, machine) != ("Linux", "x86_64") else ""
+    grade = "ok" if not fix else ("warn" if system == "Linux" else "fail")
+    yield Finding(grade=grade, what=f"{system} on {machine}", fix=fix)
+
+
+def _extras(settings: PlatformSettings) -> Iterator[Finding]:
+    for extra, (modules, required) in _EXTRAS.items():
+        missing = [module for module in modules if not _has(module)]
+        if not missing:
+            yield Finding(grade="ok", what=f"extra {extra}")
+            continue
+        fix = "pip install rse-pf" if extra == "base" else f"pip install 'rse-pf[{extra}]'"
+        what = f"extra {extra}: {', '.join(missing)} cannot be imported"
+        yield Finding(grade="fail" if required else "warn", what=what, fix=fix)
+
+
+def _engines(settings: PlatformSettings) -> Iterator[Finding]:
+    for engine, module, extra in (("poselib", "poselib", "solver"), ("opencv", "cv2", "vision")):
+        if _has(module):
+            yield Finding(grade="ok", what=f"engine {engine} {_version_of(module)}")
+        else:
+            chosen = settings.pnp.engine == engine
+            yield Finding(
+                grade="fail" if chosen else "warn",
+                what=f"engine {engine} is not installed" + (" but chosen by pnp.engine" if chosen else ""),
+                fix=f"pip install 'rse-pf[{extra}]'",
+            )
+
+
+def _balancer(settings: PlatformSettings) -> Iterator[Finding]:
+    from rse_pf.local.load_balancer import envoy_binary
+
+    try:
+        binary = envoy_binary()
+        told = subprocess.run(
+            [binary, "--version"], capture_output=True, text=True, timeout=_ENVOY_ANSWERS_S, check=True
+        )
+    except MissingExtra as error:
+        yield Finding(grade="fail", what=error.message, fix=error.hint)
+    except (OSError, subprocess.SubprocessError) as error:
+        yield Finding(
+            grade="fail",
+            what=f"Envoy does not run: {error}",
+            fix="it needs glibc 2.31 and x86-64; update both",
+        )
+    else:
+        parts = told.stdout.strip().partition("version:")[2].split("/")
+        yield Finding(grade="ok", what=f"Envoy {parts[1] if len(parts) > 1 else ''} runs")
+
+
+def _front_door(settings: PlatformSettings) -> Iterator[Finding]:
+    from rse_pf.local.firewall import check_front_door
+
+    door = f"{settings.serving.host}:{settings.local.port}"
+    try:
+        check_front_door(settings.serving.host, settings.local.port)
+    except ConfigurationError as error:
+        yield Finding(
+            grade="warn", what=f"front door {door}: {error.message}", fix="rse-pf local stop, or --port 0"
+        )
+    else:
+        yield Finding(grade="ok", what=f"front door {door} is free")
+
+
+def _open_files(settings: PlatformSettings) -> Iterator[Finding]:
+    _, most = resource.getrlimit(resource.RLIMIT_NOFILE)
+    if most == resource.RLIM_INFINITY:
+        yield Finding(grade="ok", what="open files: no limit")
+        return
+    needed = settings.serving.max_robots * _DESCRIPTORS_PER_ROBOT + _OTHER_DESCRIPTORS
+    robots = max(0, (most - _OTHER_DESCRIPTORS) // _DESCRIPTORS_PER_ROBOT)
+    what = f"open files: {most}, enough for {robots} robots through one load balancer"
+    if most >= needed:
+        yield Finding(grade="ok", what=what)
+    else:
+        yield Finding(
+            grade="warn", what=f"{what}; serving.max_robots is {settings.serving.max_robots}",
+            fix=f"raise the hard limit (ulimit -Hn) to {needed}, or lower serving.max_robots",
+        )  # fmt: skip
+
+
+def _size(settings: PlatformSettings) -> Iterator[Finding]:
+    cores = len(os.sched_getaffinity(0))
+    wanted = settings.local.servers * settings.local.workers
+    fix = f"expect shared cores: local.servers x local.workers = {wanted}" if cores < wanted else ""
+    yield Finding(grade="warn" if fix else "ok", what=f"{cores} cores", fix=fix)
+    mebibytes = _available_mebibytes()
+    little = mebibytes is not None and mebibytes < _LITTLE_MEMORY_MIB
+    yield Finding(
+        grade="warn" if little else "ok",
+        what="memory unknown" if mebibytes is None else f"{mebibytes} MiB of memory available",
+        fix=f"free some: the demo needs about {_LITTLE_MEMORY_MIB} MiB" if little else "",
+    )
+
+
+def _available_mebibytes() -> int | None:
+    try:
+        lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
+    except OSError:
+        return None
+    found = [int(line.split()[1]) // 1024 for line in lines if line.startswith("MemAvailable:")]
+    return found[0] if found else None
+
+
+def _has(module: str) -> bool:
+    """Whether *module* can be imported; a broken native library counts as absent."""
+    try:
+        importlib.import_module(module)
+    except (ImportError, OSError):
+        return False
+    return True
+
+
+def _version_of(module: str) -> str:
+    names = metadata.packages_distributions().get(module, [])
+    return metadata.version(names[0]) if names else ""
