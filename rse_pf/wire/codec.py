@@ -173,7 +173,9 @@ def _check_size(data: bytes, limits: SessionSettings) -> None:
 
 
 def _inflate(data: bytes, limits: SessionSettings) -> bytes:
-    most = min(limits.max_inflated_bytes, int(max(len(data), 64) * limits.max_inflate_ratio))
+    # The ratio is for large results: what may be sent plain is no bomb, however small it was.
+    allowed = max(limits.max_message_bytes, int(len(data) * limits.max_inflate_ratio))
+    most = min(limits.max_inflated_bytes, allowed)
     stream = zlib.decompressobj()
     try:
         text = stream.decompress(data, most + 1)
