@@ -1,0 +1,125 @@
+"""Write the golden messages: exact bytes and their meaning, for every client in any language.
+
+Run it only when the protocol changes on purpose, and say so in CHANGELOG.md.
+Promises equal files from equal sources, so that a test can compare them.
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from rse_pf.pnp import PnpOptions, solve_pnp
+from rse_pf.pnp.problems import make_problem
+from rse_pf.services.pnp import PnpReply, make_request
+from rse_pf.wire import (
+    CODECS,
+    SUBPROTOCOLS,
+    Command,
+    Failure,
+    Hello,
+    Limits,
+    Message,
+    Move,
+    Ping,
+    Pong,
+    Result,
+    Welcome,
+    make_codec,
+)
+
+__all__ = ["MESSAGES", "golden_messages", "golden_poses"]
+
+MESSAGES: dict[str, Message] = {
+    "hello": Hello(sdk="rse-pf 0.1.0", capabilities=("pnp",)),
+    "hello-shortest": Hello(),
+    "welcome": Welcome(
+        server="server-1", session="5f0c", robot="robot-7", protocol=1, clock_s=1234.5,
+        limits=Limits(max_message_bytes=262144, max_in_flight=8),
+    ),
+    "command": Command(
+        id=7, service="echo", payload={"value": [1, -2.5, "drei", None, True]}, stream="front", seq=41,
+        keep=True, deadline_ms=250.0, trace="4bf92f35",
+    ),
+    "command-shortest": Command(id=0, service="echo"),
+    "command-largest-id": Command(id=2**53 - 1, service="echo", payload={"value": "\u00e9\u2603 \"[{\\"}),
+    "command-arrays": Command(
+        id=8, service="echo",
+        payload={
+            "value": {
+                "float32": np.array([0.5, -1.25, 3.0], dtype=np.float32),
+                "uint32": np.array([0, 1, 4294967295], dtype=np.uint32),
+                "float64": np.array([0.1, 1e-300, -12345.6789]),
+            }
+        },
+    ),
+    "result": Result(
+        id=7, reply={"value": 1.5}, server="server-1", queue_ms=0.25, compute_ms=0.5, received_s=1235.0,
+        sent_s=1235.001,
+    ),
+    "failure": Failure(
+        id=7, code="busy", message="4 commands of this robot wait", hint="send fewer", retry_after_ms=20.0,
+        server="server-1", trace="4bf92f35",
+    ),
+    "failure-of-a-message": Failure(code="bad-message", message="not a message"),
+    "move": Move(reason="drain", within_ms=5000.0),
+    "ping": Ping(sent_s=10.25),
+    "pong": Pong(sent_s=10.25, received_s=1300.5, answered_s=1300.75),
+}  # fmt: skip
+
+POSES = {
+    "200 points, 30 % wrong": {"seed": 1},
+    "300 points, half of them wrong": {"seed": 2, "n": 300, "outlier_ratio": 0.5},
+    "12 exact points": {"seed": 3, "n": 12, "outlier_ratio": 0.0, "noise_px": 0.0},
+}
+
+
+def meaning(message: Message) -> Any:
+    """Return *message* as plain JSON values, with arrays as lists and defaults left out."""
+    return json.loads(make_codec("json").encode(message))
+
+
+def golden_messages() -> dict[str, Any]:
+    """Return name -> sub-protocol -> base64 of the WebSocket message, and the meaning."""
+    return {
+        name: {
+            "meaning": meaning(message),
+            "bytes": {
+                SUBPROTOCOLS[codec]: base64.b64encode(make_codec(codec).encode(message)).decode()
+                for codec in CODECS
+            },
+        }
+        for name, message in MESSAGES.items()
+    }
+
+
+def golden_poses() -> dict[str, Any]:
+    """Return name -> pnp command and the reply that an ``ok`` server gives, as JSON values."""
+    found = {}
+    for name, arguments in POSES.items():
+        problem = make_problem(**arguments)  # type: ignore[arg-type]
+        request = make_request(problem.points_world, problem.pixels, problem.camera, PnpOptions())
+        solution = solve_pnp(request.points_world, request.pixels, problem.camera)
+        command = Command(id=1, service="pnp", payload=request)
+        found[name] = {"command": meaning(command), "reply": json.loads(_plain(PnpReply.of(solution)))}
+    return found
+
+
+def _plain(reply: PnpReply) -> bytes:
+    return msgspec.json.encode(reply, enc_hook=lambda array: array.tolist())
+
+
+def write(folder: Path) -> None:
+    """Write all golden files into *folder*."""
+    for name, document in (("messages", golden_messages()), ("poses", golden_poses())):
+        text = json.dumps(document, indent=1, ensure_ascii=False)
+        (folder / f"{name}.json").write_text(text + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    write(Path(__file__).resolve().parent)
