@@ -1,27 +1,52 @@
 """The SDK for programs without asyncio: the same robot, its event loop in a thread of its own.
 
-Promises no rules of its own: every method hands over to `client_sdk.robot.Robot`.
+Promises no rules of its own: every method hands over to `client_sdk.robot.Robot`, and any number of
+threads may call at the same time.
 """
 
 from __future__ import annotations
 
 import asyncio
+import random as random_module
 import threading
-from collections.abc import Coroutine
+import time
+from collections.abc import Callable, Coroutine
 from types import TracebackType
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
+from client_sdk.connection import Token
+from client_sdk.offload import CloudFirst
 from client_sdk.robot import Answer, PoseAnswer, Robot, connect
 from client_sdk.stats import Stats
+from rse_pf.errors import Disconnected
+from rse_pf.settings import SessionSettings
+
+if TYPE_CHECKING:
+    import numpy as np
+    import numpy.typing as npt
+
+    from rse_pf.geometry import Camera
+    from rse_pf.pnp import PnpOptions
 
 __all__ = ["BlockingRobot", "connect_blocking"]
 
 T = TypeVar("T")
 
 
-def connect_blocking(url: str, **options: Any) -> BlockingRobot:
+def connect_blocking(
+    url: str,
+    *,
+    token: Token = None,
+    codec: str = "zlib",
+    settings: SessionSettings | None = None,
+    offload: CloudFirst | None = None,
+    clock: Callable[[], float] = time.monotonic,
+    random: random_module.Random | None = None,
+) -> BlockingRobot:
     """Return a robot for ``with connect_blocking(url, token=...) as robot``; see `connect`."""
-    return BlockingRobot(connect(url, **options))
+    return BlockingRobot(
+        connect(url, token=token, codec=codec, settings=settings, offload=offload, clock=clock, random=random)
+    )
 
 
 class BlockingRobot:
@@ -29,11 +54,13 @@ class BlockingRobot:
 
     def __init__(self, robot: Robot) -> None:
         self._robot = robot
-        self._loop = asyncio.new_event_loop()
-        self._thread = threading.Thread(target=self._loop.run_forever, name="rse-pf-robot", daemon=True)
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._thread: threading.Thread | None = None
 
     def __enter__(self) -> BlockingRobot:
         """Connect; raises Unauthorized or ConnectError."""
+        self._loop = asyncio.new_event_loop()
+        self._thread = threading.Thread(target=self._loop.run_forever, name="rse-pf-robot", daemon=True)
         self._thread.start()
         try:
             self._wait(self._robot.__aenter__())
@@ -53,21 +80,50 @@ class BlockingRobot:
 
     def close(self) -> None:
         """Close the connection and end the thread."""
-        if self._thread.is_alive():
-            self._wait(self._robot.close())
-            self._end()
+        if self._loop is not None:
+            try:
+                self._wait(self._robot.close())
+            finally:
+                self._end()
 
-    def solve_pnp(self, *args: Any, **options: Any) -> PoseAnswer:
+    def solve_pnp(
+        self,
+        points_world: npt.NDArray[np.float64],
+        pixels: npt.NDArray[np.float64],
+        camera: Camera,
+        options: PnpOptions | None = None,
+        *,
+        deadline_s: float | None = None,
+        stream: str = "pose",
+        keep: bool = False,
+    ) -> PoseAnswer:
         """Estimate the camera pose of one frame in the cloud; see `Robot.solve_pnp`."""
-        return self._wait(self._robot.solve_pnp(*args, **options))
+        return self._wait(
+            self._robot.solve_pnp(
+                points_world, pixels, camera, options, deadline_s=deadline_s, stream=stream, keep=keep
+            )
+        )
 
-    def call(self, *args: Any, **options: Any) -> Answer:
+    def call(
+        self,
+        service: str,
+        request: Any,
+        reply_type: type[Any] | None = None,
+        *,
+        deadline_s: float | None = None,
+        stream: str = "",
+        keep: bool = False,
+    ) -> Answer:
         """Ask a service; see `Robot.call`."""
-        return self._wait(self._robot.call(*args, **options))
+        return self._wait(
+            self._robot.call(service, request, reply_type, deadline_s=deadline_s, stream=stream, keep=keep)
+        )
 
     @property
     def stats(self) -> Stats:
         """A snapshot of the robot's traffic."""
+        if self._loop is None:
+            return self._robot.stats
 
         async def snapshot() -> Stats:
             return self._robot.stats
@@ -75,9 +131,22 @@ class BlockingRobot:
         return self._wait(snapshot())
 
     def _wait(self, work: Coroutine[Any, Any, T]) -> T:
-        return asyncio.run_coroutine_threadsafe(work, self._loop).result()
+        if self._loop is None:
+            work.close()
+            raise Disconnected(
+                "the robot is not connected", hint="use with client_sdk.connect_blocking(...) as robot"
+            )
+        future = asyncio.run_coroutine_threadsafe(work, self._loop)
+        try:
+            return future.result()
+        except BaseException:
+            future.cancel()
+            raise
 
     def _end(self) -> None:
-        self._loop.call_soon_threadsafe(self._loop.stop)
-        self._thread.join()
-        self._loop.close()
+        loop, thread = self._loop, self._thread
+        self._loop = self._thread = None
+        if loop is not None and thread is not None:
+            loop.call_soon_threadsafe(loop.stop)
+            thread.join()
+            loop.close()

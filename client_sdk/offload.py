@@ -1,8 +1,7 @@
-"""Where a command is solved: in the cloud, on the robot, or on both.
+"""Where a command is solved: in the cloud, on the robot, or in the cloud with the robot ready to help.
 
-The paper's rule (Sect. 6.2): offload only if the time saved is more than the transmission delay, and
-assign work to the cloud that is not sensitive to delay.  Promises to decide only: no clock, no
-socket, no solver.
+The paper's rule (Sect. 6.2): "the saved time should be more than transmission delay so that real-time
+performance gains from cloud computing".  Promises to decide only: no clock, no socket, no solver.
 """
 
 from __future__ import annotations
@@ -12,22 +11,30 @@ from typing import Literal
 
 from rse_pf.service import Registry
 
-__all__ = ["CloudFirst", "Plan"]
+__all__ = ["CloudFirst", "Plan", "gains_from_cloud"]
 
-_MARGIN = 1.25
-"""A fallback begins this much earlier than the robot's own solver needs."""
+_MARGIN = 2.0
+"""A fallback begins this many of the robot's own solving times before the deadline."""
+
+_MENDABLE = frozenset(
+    {
+        "busy", "quota", "expired", "worker-lost", "poison", "internal", "disconnected", "connect",
+        "unknown-service", "unauthorized", "forbidden", "conflict",
+    }
+)  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Plan:
     """What to do with one command.
 
-    ``robot_after_s`` is when the robot starts to solve it itself, in seconds from now, if the cloud
-    has not answered; None means never.
+    ``cloud`` asks the cloud alone, ``robot`` the robot alone; ``both`` asks the cloud, and
+    ``robot_after_s`` seconds from now the robot too, if the cloud has not answered by then.
+    ``why`` is what the answer says if it comes from the robot.
     """
 
-    where: Literal["cloud", "robot"]
-    robot_after_s: float | None
+    where: Literal["cloud", "robot", "both"]
+    robot_after_s: float = 0.0
     why: str = ""
 
 
@@ -37,11 +44,15 @@ class CloudFirst:
 
     Attributes:
         registry: The services that the robot has itself; None means the platform's own.
-        robot_solve_s: How long the robot's own solver takes; measured as it is used.
+        robot_solve_s: How long the robot's own solver takes, until that is measured.
+        slack_s: A fallback begins so much earlier still, for what else the robot's processor does.
+        take_faster: Apply the paper's rule: do not ask a cloud that is slower than the robot.
     """
 
     registry: Registry | None = None
     robot_solve_s: float = 0.02
+    slack_s: float = 0.02
+    take_faster: bool = False
 
     def plan(
         self,
@@ -50,6 +61,7 @@ class CloudFirst:
         connected: bool,
         expected_round_trip_s: float | None,
         robot_solve_s: float | None = None,
+        robot_can: bool = True,
     ) -> Plan:
         """Return the plan for a command that must be answered within *deadline_s*.
 
@@ -58,15 +70,40 @@ class CloudFirst:
             connected: Whether a link is open.
             expected_round_trip_s: The 95th percentile of recent round trips, or None if unknown.
             robot_solve_s: The robot's own recent time for such a command, or None if unknown.
+            robot_can: Whether the robot has the service.
         """
-        mine_s = _MARGIN * (self.robot_solve_s if robot_solve_s is None else robot_solve_s)
-        latest_s = max(0.0, deadline_s - mine_s)
+        if not robot_can:
+            return Plan(where="cloud")
+        mine_s = self.robot_solve_s if robot_solve_s is None else robot_solve_s
         if not connected:
-            return Plan(where="robot", robot_after_s=0.0, why="no connection to the cloud")
-        if expected_round_trip_s is not None and expected_round_trip_s > deadline_s:
-            return Plan(
-                where="cloud",
-                robot_after_s=0.0,
-                why=f"the cloud takes {expected_round_trip_s * 1e3:.0f} ms, more than the deadline",
-            )
-        return Plan(where="cloud", robot_after_s=latest_s, why="the cloud did not answer in time")
+            return Plan(where="robot", why="no connection to the cloud")
+        if expected_round_trip_s is None:
+            return self._both(deadline_s, mine_s)
+        if expected_round_trip_s >= deadline_s:
+            why = f"the cloud takes {expected_round_trip_s * 1e3:.0f} ms of {deadline_s * 1e3:.0f} ms"
+            return Plan(where="both", robot_after_s=0.0, why=why)
+        if self.take_faster and mine_s <= expected_round_trip_s:
+            why = f"the robot takes {mine_s * 1e3:.1f} ms, the cloud {expected_round_trip_s * 1e3:.1f} ms"
+            return Plan(where="robot", why=why)
+        return self._both(deadline_s, mine_s)
+
+    @staticmethod
+    def can_mend(code: str) -> bool:
+        """Whether the robot may succeed where the cloud failed with *code*.
+
+        What is wrong with the command itself (too few points, no consensus) stays wrong.
+        """
+        return code in _MENDABLE
+
+    def _both(self, deadline_s: float, mine_s: float) -> Plan:
+        latest_s = max(0.0, deadline_s - _MARGIN * mine_s - self.slack_s)
+        return Plan(where="both", robot_after_s=latest_s, why="the cloud did not answer in time")
+
+
+def gains_from_cloud(*, robot_s: float, cloud_compute_s: float, transmission_s: float) -> bool:
+    """Return whether the cloud pays in time: what it saves is more than the way there and back.
+
+    Source:
+        RSE-PF paper, Sect. 6.2.
+    """
+    return robot_s - cloud_compute_s > transmission_s

@@ -8,19 +8,19 @@ from __future__ import annotations
 import asyncio
 import random as random_module
 import time
-from collections.abc import Callable, Generator
-from dataclasses import dataclass
+from collections.abc import Callable, Coroutine, Generator
+from dataclasses import dataclass, replace
 from importlib import metadata
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 from client_sdk.connection import Connection, Token
 from client_sdk.offload import CloudFirst
+from client_sdk.own_services import OwnServices
 from client_sdk.stats import Stats, StatsKeeper
 from rse_pf.errors import Disconnected, RsePfError, UsageError, error_from_code
-from rse_pf.service import Registry, dispatch
 from rse_pf.settings import SessionSettings
-from rse_pf.wire import CODECS, Command, Failure, FromServer, Result, as_type, make_codec
+from rse_pf.wire import CODECS, Command, Failure, Result, as_type, make_codec
 from rse_pf.wire.robot_session import Answered, RobotSession
 
 if TYPE_CHECKING:
@@ -32,7 +32,11 @@ if TYPE_CHECKING:
 
 __all__ = ["Answer", "PoseAnswer", "Robot", "connect"]
 
+T = TypeVar("T")
+
 Source = Literal["cloud", "robot"]
+
+_LONGEST_DEADLINE_S = 3600.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -68,6 +72,17 @@ class PoseAnswer:
     down_ms: float | None = None
     payload_bytes: int = 0
     why: str = ""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Ask:
+    """One command as its caller gave it."""
+
+    service: str
+    request: Any
+    deadline_s: float
+    stream: str
+    keep: bool
 
 
 def connect(
@@ -130,17 +145,20 @@ class Robot:
         self._settings = settings
         self._offload = offload
         self._clock = clock
-        self._registry: Registry | None = None
+        self._own = None if offload is None else OwnServices(offload.registry, clock)
         self._waiting: dict[int, asyncio.Future[Answered]] = {}
-        self._keeper = StatsKeeper()
+        self._tasks: set[asyncio.Task[Answer | Failure]] = set()
+        self._keeper = StatsKeeper(random)
         self._open = False
 
     async def __aenter__(self) -> Robot:
-        """Connect; raises Unauthorized or ConnectError."""
+        """Connect; raises Unauthorized or ConnectError, and MissingExtra with an offload."""
         try:
+            if self._own is not None:
+                await self._own.prepare()
             await self._connection.open()
         except BaseException:
-            await self._connection.close()
+            await self.close()
             raise
         self._open = True
         return self
@@ -164,6 +182,11 @@ class Robot:
             if isinstance(event, Answered):
                 self._answered(event)
         await self._connection.close()
+        for task in self._tasks:
+            task.cancel()
+        await asyncio.gather(*self._tasks, return_exceptions=True)
+        if self._own is not None:
+            self._own.close()
 
     async def solve_pnp(
         self,
@@ -235,18 +258,27 @@ class Robot:
         """
         if not self._open:
             raise Disconnected("the robot is not connected", hint="use async with client_sdk.connect(...)")
-        if self._connection.fatal is not None:
-            raise self._connection.fatal
         wait_s = self._settings.answer_timeout_s if deadline_s is None else deadline_s
-        if not wait_s > 0:
-            raise UsageError(f"deadline_s = {wait_s} is not above 0", hint="give the seconds it may take")
+        if not 0 < wait_s <= _LONGEST_DEADLINE_S:
+            raise UsageError(
+                f"deadline_s = {wait_s} is not within 0..{_LONGEST_DEADLINE_S:g}",
+                hint="give the seconds it may take",
+            )
         self._keeper.sent += 1
+        ask = _Ask(service=service, request=request, deadline_s=wait_s, stream=stream, keep=keep)
         started = self._clock()
-        if self._offload is None:
-            answer = await self._ask_cloud(service, request, wait_s, stream, keep)
-        else:
-            answer = await self._ask_both(self._offload, service, request, wait_s, stream, keep)
-        return self._typed(answer, reply_type, started)
+        try:
+            fatal = self._connection.fatal
+            if fatal is not None:
+                raise error_from_code(fatal.code, fatal.message, hint=fatal.hint)
+            if self._offload is None or self._own is None:
+                answer = await self._ask_cloud(ask)
+            else:
+                answer = await self._ask_both(self._offload, self._own, ask)
+            return self._typed(answer, reply_type, started)
+        except RsePfError as error:
+            self._keeper.failures[error.code] += 1
+            raise
 
     @property
     def stats(self) -> Stats:
@@ -284,13 +316,11 @@ class Robot:
             last_error=connection.last_error,
         )
 
-    async def _ask_cloud(
-        self, service: str, request: Any, wait_s: float, stream: str, keep: bool
-    ) -> Answer | Failure:
-        now = self._clock()
+    async def _ask_cloud(self, ask: _Ask) -> Answer | Failure:
         identity = self._session.submit(
-            service, request, now=now, deadline_s=wait_s, stream=stream, keep=keep
-        )
+            ask.service, ask.request, now=self._clock(), deadline_s=ask.deadline_s, stream=ask.stream,
+            keep=ask.keep,
+        )  # fmt: skip
         future: asyncio.Future[Answered] = asyncio.get_running_loop().create_future()
         self._waiting[identity] = future
         self._connection.flush()
@@ -299,120 +329,123 @@ class Robot:
         finally:
             self._waiting.pop(identity, None)
             self._session.cancel(identity)
+            self._connection.flush()
+        round_trip_s = self._clock() - ended.sent_s
         if isinstance(ended.answer, Failure):
+            if ended.answer.code == "expired":
+                self._keeper.add_round_trip(round_trip_s)
             return ended.answer
-        return self._from_cloud(ended, ended.answer)
+        self._keeper.add_round_trip(round_trip_s)
+        return self._from_cloud(ended, ended.answer, round_trip_s)
 
-    async def _ask_both(
-        self, offload: CloudFirst, service: str, request: Any, wait_s: float, stream: str, keep: bool
-    ) -> Answer | Failure:
-        """Ask the cloud, and after the planned time the robot's own solver; the first answer wins."""
-        p95_ms, mine_ms = (self._keeper.percentile(name, 0.95) for name in ("round_trip_ms", "robot_ms"))
+    async def _ask_both(self, offload: CloudFirst, own: OwnServices, ask: _Ask) -> Answer | Failure:
+        """Carry out the plan of *offload*: the cloud, the robot, or the first of the two."""
+        started = self._clock()
         plan = offload.plan(
-            deadline_s=wait_s,
+            deadline_s=ask.deadline_s,
             connected=self._session.current is not None,
-            expected_round_trip_s=None if p95_ms is None else p95_ms / 1e3,
-            robot_solve_s=None if mine_ms is None else mine_ms / 1e3,
+            expected_round_trip_s=self._keeper.expected_round_trip_s(),
+            robot_solve_s=own.solve_s,
+            robot_can=own.offers(ask.service),
         )
-        if plan.where == "robot" or plan.robot_after_s is None:
-            return await self._ask_robot(offload, service, request, plan.why)
-        cloud = asyncio.create_task(self._ask_cloud(service, request, wait_s, stream, keep))
+        if plan.where == "cloud":
+            return await self._ask_cloud(ask)
+        racing: list[asyncio.Task[Answer | Failure]] = []
         try:
-            done, _ = await asyncio.wait({cloud}, timeout=plan.robot_after_s)
-            if done and not self._is_cloud_trouble(cloud.result()):
-                return cloud.result()
-            why = plan.why
-            if done:
-                why = f"the cloud answered {getattr(cloud.result(), 'code', '')}"
-            return await self._ask_robot(offload, service, request, why)
-        finally:
-            cloud.cancel()
-            await asyncio.gather(cloud, return_exceptions=True)
+            why, cloud = plan.why, None
+            if plan.where == "both":
+                cloud = self._spawn(self._ask_cloud(ask))
+                racing.append(cloud)
+                done = await _first(cloud, plan.robot_after_s)
+                if done is not None:
+                    if not (isinstance(done, Failure) and offload.can_mend(done.code)):
+                        return done
+                    why, cloud = f"the cloud answered {done.code}", None
+            robot = self._spawn(self._ask_robot(own, ask, why))
+            racing.append(robot)
+            remaining_s = max(0.0, ask.deadline_s - (self._clock() - started))
+            return await self._first_answer(offload, cloud, robot, remaining_s)
+        except asyncio.CancelledError:
+            for task in racing:
+                task.cancel()
+            raise
 
-    async def _ask_robot(self, offload: CloudFirst, service: str, request: Any, why: str) -> Answer | Failure:
-        if self._registry is None:
-            self._registry = offload.registry or _own_services()
-        codec, registry = self._session.codec, self._registry
-        command = Command(id=0, service=service, payload=request)
+    async def _first_answer(
+        self,
+        offload: CloudFirst,
+        cloud: asyncio.Task[Answer | Failure] | None,
+        robot: asyncio.Task[Answer | Failure],
+        remaining_s: float,
+    ) -> Answer | Failure:
+        """Return what comes first; a cloud that is too late goes on being measured."""
+        until = self._clock() + remaining_s
+        racing = {robot} if cloud is None else {cloud, robot}
+        while racing:
+            timeout_s = max(0.0, until - self._clock())
+            done, racing = await asyncio.wait(racing, timeout=timeout_s, return_when=asyncio.FIRST_COMPLETED)
+            if not done:
+                break
+            for task in sorted(done, key=lambda task: task is robot):
+                answer = task.result()
+                mendable = task is cloud and isinstance(answer, Failure) and offload.can_mend(answer.code)
+                if not mendable:
+                    return answer
+        robot.cancel()
+        message = "neither the cloud nor the robot answered in time"
+        return Failure(code="expired", message=message, hint="allow more time")
 
-        def work() -> FromServer:
-            """The same bytes and the same dispatch as on a server."""
-            same = codec.decode_from_robot(codec.encode(command))
-            assert isinstance(same, Command)
-            return codec.decode_from_server(codec.encode(dispatch(registry, same, self._clock)))
-
-        ended = await asyncio.to_thread(work)
+    async def _ask_robot(self, own: OwnServices, ask: _Ask, why: str) -> Answer | Failure:
+        started = self._clock()
+        ended = await own.ask(Command(id=0, service=ask.service, payload=ask.request))
         if isinstance(ended, Failure):
             return ended
-        assert isinstance(ended, Result)
-        self._keeper.add("robot_ms", ended.compute_ms)
+        round_trip_ms = (self._clock() - started) * 1e3
         return Answer(
-            reply=ended.reply,
-            source="robot",
-            server="robot",
-            round_trip_ms=ended.compute_ms,
-            queue_ms=0.0,
-            compute_ms=ended.compute_ms,
-            why=why,
-        )
+            reply=ended.reply, source="robot", server=ended.server, round_trip_ms=round_trip_ms,
+            queue_ms=0.0, compute_ms=ended.compute_ms, why=why,
+        )  # fmt: skip
 
-    @staticmethod
-    def _is_cloud_trouble(answer: Answer | Failure) -> bool:
-        """A failure of the cloud may be mended on the robot; a failure of the request may not."""
-        troubles = ("busy", "expired", "worker-lost", "internal", "disconnected", "unknown-service")
-        return isinstance(answer, Failure) and answer.code in troubles
-
-    def _from_cloud(self, ended: Answered, result: Result) -> Answer:
-        keeper = self._keeper
-        up_ms, down_ms = (None if s is None else max(0.0, s * 1e3) for s in (ended.up_s, ended.down_s))
-        round_trip_ms = (self._clock() - ended.sent_s) * 1e3
-        keeper.add_payload(ended.wire_bytes)
-        for name, value in (
-            ("round_trip_ms", round_trip_ms), ("up_ms", up_ms), ("queue_ms", result.queue_ms),
-            ("compute_ms", result.compute_ms), ("down_ms", down_ms),
-        ):  # fmt: skip
-            keeper.add(name, value)
+    def _from_cloud(self, ended: Answered, result: Result, round_trip_s: float) -> Answer:
+        up_ms, down_ms = (None if s is None else s * 1e3 for s in (ended.up_s, ended.down_s))
         return Answer(
-            reply=result.reply,
-            source="cloud",
-            server=result.server,
-            round_trip_ms=round_trip_ms,
-            queue_ms=result.queue_ms,
-            compute_ms=result.compute_ms,
-            up_ms=up_ms,
-            down_ms=down_ms,
+            reply=result.reply, source="cloud", server=result.server, round_trip_ms=round_trip_s * 1e3,
+            queue_ms=result.queue_ms, compute_ms=result.compute_ms, up_ms=up_ms, down_ms=down_ms,
             payload_bytes=ended.wire_bytes,
-        )
+        )  # fmt: skip
 
     def _typed(self, answer: Answer | Failure, reply_type: type[Any] | None, started: float) -> Answer:
+        """Return the answer with its reply typed and the caller's round trip, or raise its failure."""
         if isinstance(answer, Failure):
-            self._keeper.failures[answer.code] += 1
             raise error_from_code(
                 answer.code, answer.message, hint=answer.hint, retry_after_ms=answer.retry_after_ms
             )
-        self._keeper.answered += 1
-        self._keeper.answered_by_robot += answer.source == "robot"
-        changes: dict[str, Any] = {"round_trip_ms": (self._clock() - started) * 1e3}
-        if reply_type is not None:
-            try:
-                changes["reply"] = as_type(answer.reply, reply_type)
-            except RsePfError:
-                self._keeper.failures["bad-message"] += 1
-                raise
-        values = {name: getattr(answer, name) for name in Answer.__slots__}
-        return Answer(**{**values, **changes})
+        reply = answer.reply if reply_type is None else as_type(answer.reply, reply_type)
+        answer = replace(answer, reply=reply, round_trip_ms=(self._clock() - started) * 1e3)
+        keeper = self._keeper
+        keeper.answered += 1
+        keeper.answered_by_robot += answer.source == "robot"
+        if answer.source == "cloud":
+            keeper.add_payload(answer.payload_bytes)
+            for name in ("round_trip_ms", "up_ms", "queue_ms", "compute_ms", "down_ms"):
+                keeper.add(name, getattr(answer, name))
+        return answer
 
     def _answered(self, event: Answered) -> None:
         future = self._waiting.get(event.id)
         if future is not None and not future.done():
             future.set_result(event)
 
+    def _spawn(self, work: Coroutine[Any, Any, Answer | Failure]) -> asyncio.Task[Answer | Failure]:
+        task = asyncio.get_running_loop().create_task(work)
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
+        return task
 
-def _own_services() -> Registry:
-    from rse_pf.services.builtin import builtin_services
-    from rse_pf.settings import PlatformSettings
 
-    return builtin_services(PlatformSettings())
+async def _first(task: asyncio.Task[T], timeout_s: float) -> T | None:
+    """Return what *task* gives within *timeout_s*, else None; the task goes on."""
+    done, _ = await asyncio.wait({task}, timeout=timeout_s)
+    return task.result() if done else None
 
 
 def _version() -> str:

@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter, deque
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from random import Random
 
 __all__ = ["Percentiles", "Stats", "StatsKeeper"]
 
 _KEPT = 2048
-"""The last so many commands are remembered for percentiles."""
+"""So many commands of a run, drawn evenly, are remembered for percentiles."""
+
+_RECENT = 32
+"""So many of the last round trips say what to expect of the next."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Percentiles:
-    """Of the last 2,048 commands; None before the first."""
+    """Over the run, from an even sample of up to 2,048 commands; None before the first."""
 
     p50: float | None
     p95: float | None
@@ -55,33 +60,64 @@ class Stats:
 class StatsKeeper:
     """Counts and remembers; `Robot.stats` makes the snapshot."""
 
-    def __init__(self) -> None:
+    def __init__(self, random: Random) -> None:
         self.sent = 0
         self.answered = 0
         self.answered_by_robot = 0
         self.failures: Counter[str] = Counter()
         self.payload_bytes_max = 0
-        self._values: dict[str, deque[float]] = {}
+        self._random = random
+        self._samples: dict[str, _Sample] = {}
+        self._recent_round_trips_s: deque[float] = deque(maxlen=_RECENT)
 
     def add(self, name: str, value: float | None) -> None:
         """Remember one measured value."""
         if value is not None:
-            self._values.setdefault(name, deque(maxlen=_KEPT)).append(value)
+            self._samples.setdefault(name, _Sample()).add(value, self._random)
 
     def add_payload(self, size: int) -> None:
         """Remember the bytes of one command."""
         self.payload_bytes_max = max(self.payload_bytes_max, size)
         self.add("payload_bytes", size)
 
+    def add_round_trip(self, seconds: float) -> None:
+        """Remember how long the cloud took, or at least took, for `expected_round_trip_s`."""
+        self._recent_round_trips_s.append(seconds)
+
+    def expected_round_trip_s(self) -> float | None:
+        """Return the 95th percentile of the last few round trips, or None before the first."""
+        return _percentile(sorted(self._recent_round_trips_s), 0.95)
+
     def percentile(self, name: str, share: float) -> float | None:
         """Return a percentile of the remembered values: the nearest rank."""
-        values = sorted(self._values.get(name, ()))
-        if not values:
-            return None
-        return values[min(len(values) - 1, int(share * len(values)))]
+        sample = self._samples.get(name)
+        return None if sample is None else _percentile(sorted(sample.values), share)
 
     def percentiles(self, name: str) -> Percentiles:
         """Return the three that everybody asks for."""
+        sample = self._samples.get(name)
+        values = [] if sample is None else sorted(sample.values)
         return Percentiles(
-            p50=self.percentile(name, 0.5), p95=self.percentile(name, 0.95), p99=self.percentile(name, 0.99)
+            p50=_percentile(values, 0.5), p95=_percentile(values, 0.95), p99=_percentile(values, 0.99)
         )
+
+
+class _Sample:
+    """A uniform sample of a stream, in bounded memory (Vitter 1985, algorithm R)."""
+
+    def __init__(self) -> None:
+        self.values: list[float] = []
+        self._seen = 0
+
+    def add(self, value: float, random: Random) -> None:
+        self._seen += 1
+        if len(self.values) < _KEPT:
+            self.values.append(value)
+            return
+        place = random.randrange(self._seen)
+        if place < _KEPT:
+            self.values[place] = value
+
+
+def _percentile(ordered: Sequence[float], share: float) -> float | None:
+    return ordered[max(0, math.ceil(share * len(ordered)) - 1)] if ordered else None
