@@ -98,6 +98,8 @@ async def _run(
         async with LocalCloud(
             settings, port=0, state=folder / "platform", name="demo", on_event=tell
         ) as cloud:
+            pids = ", ".join(f"{server.name} {server.pid}" for server in cloud.servers)
+            screen.say(f"running at {cloud.url}: {pids} (kill -9 one, and watch the robots go on)")
             samples = asyncio.create_task(_sample(cloud, folder / "samples.csv", now))
             robots = [_start(options, settings, folder, cloud, number) for number in range(options.robots)]
             try:
@@ -154,6 +156,7 @@ async def _play(
     await asyncio.gather(*(_until_ready(*pair, cloud, screen) for pair in zip(robots, inboxes, strict=True)))
     began = time.monotonic() + 0.2
     events.write(now(), "robots-start", robots=len(robots))
+    screen.say("the robots start")
     screen.phase("mapping", robots)
     for robot in robots:
         robot.pipe.send(began)
