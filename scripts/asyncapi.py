@@ -31,7 +31,7 @@ def asyncapi_document() -> dict[str, Any]:
     _, schemas = msgspec.json.schema_components(
         [*up, *down, *payloads], schema_hook=_array_schema, ref_template=_REF
     )
-    return {
+    document = {
         "asyncapi": "3.0.0",
         "info": {
             "title": "RSE-PF robots and servers",
@@ -74,6 +74,8 @@ def asyncapi_document() -> dict[str, Any]:
             for service in services
         },
     }
+    plain: dict[str, Any] = json.loads(json.dumps(document))
+    return plain
 
 
 def main() -> None:
