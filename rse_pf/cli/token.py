@@ -48,7 +48,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
     """Issue or inspect, by the settings that the platform was started with unless told otherwise."""
-    chosen = settings if args.settings is not None else _of_platform(args.name) or settings
+    named = args.settings is not None or args.key is not None or args.keys is not None
+    chosen = settings if named else _of_platform(args.name) or settings
     if args.action == "issue":
         if args.keys is not None:
             raise UsageError("--keys only checks tokens", hint="name the signing key with --key")

@@ -141,7 +141,9 @@ def remove_state(folder: Path) -> None:
     (folder / _FILE).unlink(missing_ok=True)
 
 
-def _state(document: dict[str, Any]) -> PlatformState:
+def _state(document: Any) -> PlatformState:
+    if not isinstance(document, dict):
+        raise TypeError("it is not an object")
     balancer = document.pop("load_balancer")
     servers = tuple(
         ServerState(**{**server, "process": ProcessMark(**server["process"])})

@@ -1,0 +1,112 @@
+"""What Envoy is told: the values that decided between good and bad, and nothing open to others."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from rse_pf.local.envoy_config import CLUSTER, Target, endpoints, envoy_config
+from rse_pf.settings import PlatformSettings
+
+ENDPOINTS = Path("/somewhere/endpoints.json")
+
+
+def config(**groups: dict[str, Any]) -> dict[str, Any]:
+    return envoy_config(PlatformSettings().replace(**groups), port=0, endpoints_file=ENDPOINTS)
+
+
+def listener(made: dict[str, Any]) -> dict[str, Any]:
+    (only,) = made["static_resources"]["listeners"]
+    return only
+
+
+def manager(made: dict[str, Any]) -> dict[str, Any]:
+    return listener(made)["filter_chains"][0]["filters"][0]["typed_config"]
+
+
+def cluster(made: dict[str, Any]) -> dict[str, Any]:
+    (only,) = made["static_resources"]["clusters"]
+    return only
+
+
+def only_route(made: dict[str, Any]) -> dict[str, Any]:
+    (host,) = manager(made)["route_config"]["virtual_hosts"]
+    (route,) = host["routes"]
+    return route
+
+
+def test_no_clock_of_the_balancer_ends_an_open_socket() -> None:
+    made = config()
+
+    assert manager(made)["stream_idle_timeout"] == "0s"
+    assert manager(made)["request_timeout"] == "0s"
+    assert manager(made)["common_http_protocol_options"]["idle_timeout"] == "0s"
+    assert only_route(made)["route"]["timeout"] == "0s"
+    assert only_route(made)["route"]["idle_timeout"] == "0s"
+
+
+def test_the_settings_that_decided_between_good_and_bad_are_set() -> None:
+    made = config()
+    retry = only_route(made)["route"]["retry_policy"]
+    (breaker,) = cluster(made)["circuit_breakers"]["thresholds"]
+
+    assert cluster(made)["common_lb_config"]["update_merge_window"] == "0s"
+    assert cluster(made)["common_lb_config"]["healthy_panic_threshold"] == {"value": 0}
+    assert cluster(made)["ignore_health_on_host_removal"] is True
+    assert manager(made)["delayed_close_timeout"] == "0s"
+    assert retry["per_try_timeout"] == "0.5s"
+    assert retry["host_selection_retry_max_attempts"] == "8"
+    assert min(breaker.values()) > 1024
+    assert listener(made)["enable_reuse_port"] is False
+
+
+def test_health_checks_follow_the_settings() -> None:
+    health = {"local_interval_s": 0.125, "local_timeout_s": 2.0, "unhealthy_checks": 3, "path": "/ok"}
+
+    (check,) = cluster(config(health=health))["health_checks"]
+
+    assert check["interval"] == check["no_traffic_interval"] == "0.125s"
+    assert check["timeout"] == "2s"
+    assert check["unhealthy_threshold"] == 3
+    assert check["http_health_check"] == {"path": "/ok"}
+
+
+def test_the_door_and_the_admin_page_listen_on_loopback() -> None:
+    made = config()
+
+    for place in (listener(made)["address"], made["admin"]["address"]):
+        assert place["socket_address"]["address"] == "127.0.0.1"
+
+
+def test_only_the_path_of_the_robots_leads_to_a_server() -> None:
+    assert only_route(config(serving={"path": "/robots"}))["match"] == {"path": "/robots"}
+
+
+def test_headers_are_bounded_in_number_size_and_time() -> None:
+    made = manager(config(serving={"handshake_timeout_s": 1.5}))
+
+    assert made["request_headers_timeout"] == "1.5s"
+    assert made["max_request_headers_kb"] <= 60
+    assert made["common_http_protocol_options"]["max_headers_count"] <= 100
+
+
+def test_the_endpoint_file_sends_robots_and_checks_to_different_ports() -> None:
+    made = endpoints([Target(name="a", port=1001, control_port=2001)])
+    (resource,) = made["resources"]
+    ((member,),) = [each["lb_endpoints"] for each in resource["endpoints"]]
+
+    assert resource["cluster_name"] == CLUSTER
+    assert member["endpoint"]["address"]["socket_address"]["port_value"] == 1001
+    assert member["endpoint"]["health_check_config"]["port_value"] == 2001
+
+
+def test_no_targets_are_an_empty_list_not_a_missing_one() -> None:
+    assert endpoints([])["resources"][0]["endpoints"] == [{"lb_endpoints": []}]
+
+
+@pytest.mark.parametrize("made", [config(), endpoints([Target(name="a", port=1, control_port=2)])])
+def test_everything_is_plain_json(made: dict[str, Any]) -> None:
+    assert json.loads(json.dumps(made)) == made

@@ -1,0 +1,71 @@
+"""The door is on loopback; the key is its owner's alone."""
+
+from __future__ import annotations
+
+import socket
+from pathlib import Path
+
+import pytest
+
+from rse_pf.auth import KeySet, verify_token
+from rse_pf.errors import ConfigurationError, UsageError
+from rse_pf.local.firewall import check_front_door, ensure_key, key_file, key_set_file, read_key
+from rse_pf.settings import AuthSettings
+
+SEED = b"s" * 32
+
+
+@pytest.mark.parametrize("host", ["0.0.0.0", "192.0.2.1", "::", "example.org"])
+def test_a_door_that_others_can_reach_is_refused(host: str) -> None:
+    with pytest.raises(ConfigurationError, match="other machines"):
+        check_front_door(host, 0)
+
+
+@pytest.mark.system
+def test_a_taken_port_is_refused_and_a_free_one_is_not() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        with pytest.raises(ConfigurationError, match=f":{port}: Address already in use"):
+            check_front_door("127.0.0.1", port)
+
+    check_front_door("127.0.0.1", port)
+
+
+def test_the_key_is_its_owners_alone_and_the_public_half_verifies(tmp_path: Path) -> None:
+    key = ensure_key(tmp_path, seed=SEED, key_id="k")
+    token = key.issue("robot-1", now=1000.0, token_id="t", settings=AuthSettings())
+    public = KeySet.from_json(key_set_file(tmp_path).read_text())
+
+    assert key_file(tmp_path).stat().st_mode & 0o777 == 0o600
+    assert '"d"' not in key_set_file(tmp_path).read_text()
+    assert verify_token(token, keys=public, now=1001.0, settings=AuthSettings()).robot == "robot-1"
+
+
+def test_a_platform_that_starts_again_keeps_its_key(tmp_path: Path) -> None:
+    first = ensure_key(tmp_path, seed=SEED, key_id="k").to_json()
+
+    assert ensure_key(tmp_path, seed=b"t" * 32, key_id="l").to_json() == first
+
+
+def test_a_key_that_others_may_read_is_refused(tmp_path: Path) -> None:
+    ensure_key(tmp_path, seed=SEED, key_id="k")
+    key_file(tmp_path).chmod(0o640)
+
+    with pytest.raises(UsageError, match="others may read"):
+        read_key(key_file(tmp_path))
+
+
+@pytest.mark.parametrize("content", [b"", b"{}", b"\xff\xfe"])
+def test_a_file_that_holds_no_key_is_refused(tmp_path: Path, content: bytes) -> None:
+    (tmp_path / "key.json").write_bytes(content)
+    (tmp_path / "key.json").chmod(0o600)
+
+    with pytest.raises(UsageError, match="signing key"):
+        read_key(tmp_path / "key.json")
+
+
+def test_a_missing_key_says_how_to_get_one(tmp_path: Path) -> None:
+    with pytest.raises(UsageError) as told:
+        read_key(tmp_path / "none.json")
+
+    assert "rse-pf local" in told.value.hint

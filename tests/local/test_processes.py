@@ -1,0 +1,162 @@
+"""A process is its pid and the time it began; nobody else is ever signalled."""
+
+from __future__ import annotations
+
+import asyncio
+import dataclasses
+import os
+import resource
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from rse_pf.local.processes import (
+    ProcessMark,
+    ended,
+    is_alive,
+    last_line,
+    mark_of,
+    send_signal,
+    spawn,
+    wait_ended,
+)
+
+pytestmark = pytest.mark.system
+
+SOON_S = 10.0
+WAIT_FOR_EVER = "import signal; signal.pause()"
+
+
+@pytest.fixture
+def child() -> Iterator[subprocess.Popen[bytes]]:
+    with subprocess.Popen([sys.executable, "-c", WAIT_FOR_EVER]) as process:
+        yield process
+        process.kill()
+
+
+def marked(process: subprocess.Popen[bytes]) -> ProcessMark:
+    mark = mark_of(process.pid)
+    assert mark is not None
+    return mark
+
+
+def test_a_mark_stays_the_same_while_the_process_lives(child: subprocess.Popen[bytes]) -> None:
+    assert mark_of(child.pid) == mark_of(child.pid)
+    assert is_alive(marked(child))
+
+
+def test_a_process_that_re_uses_the_pid_is_not_signalled(child: subprocess.Popen[bytes]) -> None:
+    earlier = dataclasses.replace(marked(child), began="1@another-boot")
+
+    assert not is_alive(earlier)
+    assert not send_signal(earlier, signal.SIGKILL)
+    assert wait_ended(earlier, 0.0)
+    assert child.poll() is None
+
+
+def test_the_right_process_is_signalled_and_its_end_is_noticed(child: subprocess.Popen[bytes]) -> None:
+    mark = marked(child)
+
+    assert not wait_ended(mark, 0.0)
+    assert send_signal(mark, signal.SIGKILL)
+    assert wait_ended(mark, SOON_S)
+    assert child.wait() == -signal.SIGKILL
+    assert not send_signal(mark, signal.SIGKILL)
+
+
+def test_a_zombie_counts_as_gone(child: subprocess.Popen[bytes]) -> None:
+    mark = marked(child)
+    os.kill(child.pid, signal.SIGKILL)
+
+    assert wait_ended(mark, SOON_S)
+    assert mark_of(child.pid) is None
+
+
+def test_the_end_can_be_awaited(child: subprocess.Popen[bytes]) -> None:
+    mark = marked(child)
+
+    async def run() -> tuple[bool, bool, bool]:
+        early = await ended(mark, 0.0)
+        waiting = asyncio.create_task(ended(mark, SOON_S))
+        send_signal(mark, signal.SIGKILL)
+        return early, await waiting, await ended(mark)
+
+    assert asyncio.run(run()) == (False, True, True)
+
+
+def test_a_spawned_process_reads_nothing_and_writes_its_log(tmp_path: Path) -> None:
+    log = tmp_path / "log"
+    told = "import os, sys; sys.stdin.read(); print(os.getcwd()); sys.stderr.write('last')"
+
+    process = spawn([sys.executable, "-c", told], log=log, folder=tmp_path, dies_with_parent=True)
+
+    assert process.wait(SOON_S) == 0
+    assert log.read_text().splitlines() == [str(tmp_path), "last"]
+
+
+def test_a_spawned_process_may_open_as_many_files_as_the_system_allows(tmp_path: Path) -> None:
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (min(soft, 512), hard))
+    try:
+        process = spawn(
+            [sys.executable, "-c", WAIT_FOR_EVER],
+            log=tmp_path / "log",
+            folder=tmp_path,
+            dies_with_parent=True,
+        )
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
+    try:
+        assert resource.prlimit(process.pid, resource.RLIMIT_NOFILE) == (hard, hard)
+    finally:
+        process.kill()
+        process.wait()
+
+
+@pytest.mark.parametrize("dies", [True, False])
+def test_a_process_dies_with_its_parent_only_if_told_to(tmp_path: Path, dies: bool) -> None:
+    parent = f"""
+import signal, sys
+from pathlib import Path
+from rse_pf.local.processes import spawn
+command = [sys.executable, "-c", {WAIT_FOR_EVER!r}]
+child = spawn(command, log=Path("log"), folder=Path("."), dies_with_parent={dies})
+print(child.pid, flush=True)
+signal.pause()
+"""
+    with subprocess.Popen([sys.executable, "-c", parent], cwd=tmp_path, stdout=subprocess.PIPE) as process:
+        assert process.stdout is not None
+        mark = mark_of(int(process.stdout.readline()))
+        assert mark is not None
+        process.kill()
+
+    if dies:
+        assert wait_ended(mark, SOON_S)
+    else:
+        assert is_alive(mark)
+        send_signal(mark, signal.SIGKILL)
+        assert wait_ended(mark, SOON_S)
+
+
+@pytest.mark.parametrize(
+    ("text", "line"),
+    [
+        ("first\nlast\n\n", "last"),
+        ("UsageError: no cheese\n  hint: buy some\n", "UsageError: no cheese"),
+        ("  hint: buy some\n", "hint: buy some"),
+        ("", ""),
+        ("x" * 9000, "x" * 300),
+    ],
+)
+def test_the_last_line_of_a_log_is_the_one_that_tells_most(tmp_path: Path, text: str, line: str) -> None:
+    (tmp_path / "log").write_text(text)
+
+    assert last_line(tmp_path / "log") == line
+
+
+def test_a_log_that_is_not_there_says_nothing(tmp_path: Path) -> None:
+    assert last_line(tmp_path / "none") == ""
