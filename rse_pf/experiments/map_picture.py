@@ -24,6 +24,8 @@ _BACKGROUND, _INK, _FAINT = (250, 250, 248), (30, 34, 42), (120, 126, 136)
 _COLOURS = ((214, 40, 57), (17, 105, 196), (27, 138, 70), (222, 125, 0), (126, 60, 178), (0, 140, 140))
 _FOCAL = 1.35
 _CAMERA_EVERY_M = 0.5
+_LONG_SCENE = 1.25
+"""Longer than wide by this, a scene lies across the picture."""
 _CEILING_M = 0.7
 """Points this far above the camera hide the room from an observer above; they are not drawn."""
 
@@ -76,7 +78,7 @@ class _Observer:
     def __init__(self, points: Array, robots: list[PathOfRobot], up: Array) -> None:
         low, high = (np.percentile(points, q, axis=0) if len(points) else np.zeros(3) for q in (2, 98))
         self.centre = (low + high) / 2
-        forward = self._side(robots, up)
+        forward = self._side(points, robots, up)
         slope = math.radians(40)
         self.axis_z = math.cos(slope) * forward - math.sin(slope) * up
         self.axis_x = np.cross(self.axis_z, up)
@@ -96,11 +98,18 @@ class _Observer:
             self.shift = np.array([_WIDTH / 2, _HEIGHT / 2]) - self.scale * (high_px + low_px) / 2
 
     @staticmethod
-    def _side(robots: list[PathOfRobot], up: Array) -> Array:
-        """Look the way the robots looked on average: from behind them into the room."""
+    def _side(points: Array, robots: list[PathOfRobot], up: Array) -> Array:
+        """Look the way the robots looked on average, or across the scene if it is much longer than wide."""
         looks = np.concatenate([robot.T_world_camera[:, :3, 2] for robot in robots])
-        mean = looks.mean(axis=0)
-        mean -= (mean @ up) * up
+        mean = looks.mean(axis=0) if len(looks) else np.zeros(3)
+        level = np.eye(3) - np.outer(up, up)
+        mean = level @ mean
+        if len(points):
+            flat = (points - points.mean(axis=0)) @ level
+            spread, axes = np.linalg.eigh(flat.T @ flat)
+            if spread[2] > _LONG_SCENE**2 * spread[1]:
+                across = level @ axes[:, 1]
+                mean = across if across @ mean >= 0 else -across
         if np.linalg.norm(mean) < 0.05:
             mean = np.cross(up, [1.0, 0.0, 0.0] if abs(up[0]) < 0.9 else [0.0, 1.0, 0.0])
         side: Array = mean / np.linalg.norm(mean)
