@@ -26,7 +26,6 @@ test: ## the tests that CI runs, under ten minutes on two cores
 	@$(BIN)/ruff check . && $(BIN)/ruff format --check .
 	@$(BIN)/mypy
 	@$(PYTEST) -m "not slow" $(ARGS)
-	@echo "left out: tests marked slow; run them with make slow"
 
 quick: ## pure tests only, in seconds
 	@$(SETUP) dev

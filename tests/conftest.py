@@ -36,3 +36,21 @@ def recordings() -> Path:
     if not folder.is_dir():
         pytest.skip("no recordings at ../shared/data")
     return folder
+
+
+_LEFT_OUT: dict[str, int] = {}
+
+
+def pytest_deselected(items: list[pytest.Item]) -> None:
+    """Remember what the marker left out."""
+    for item in items:
+        file = item.path.relative_to(_REPOSITORY).as_posix()
+        _LEFT_OUT[file] = _LEFT_OUT.get(file, 0) + 1
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    """Say what was not run, and how to run it."""
+    if _LEFT_OUT:
+        terminalreporter.section("left out by the marker; make slow runs them")
+        for file, count in sorted(_LEFT_OUT.items()):
+            terminalreporter.write_line(f"{count:4d}  {file}")
