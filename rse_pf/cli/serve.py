@@ -52,7 +52,7 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
     """Serve until a drain or a signal ends it."""
     overrides = {name: getattr(args, name) for name in _OPTIONS if getattr(args, name) is not None}
     chosen = settings.replace(serving=overrides)
-    server_id = args.server_id or f"server-{os.getpid()}"
+    server_id = f"server-{os.getpid()}" if args.server_id is None else args.server_id
     if not 0 < len(server_id) <= 64 or not server_id.isprintable():
         raise UsageError(f"{server_id[:80]!r} is no name for a server", hint="use 1 to 64 printable letters")
     keys = None if args.keys is None else _keys(args.keys)

