@@ -12,14 +12,18 @@ import numpy.typing as npt
 
 from rse_pf.geometry import Array, Camera, exp_se3, inverse, transform
 
-__all__ = ["KINECT", "PnpProblem", "make_degenerate", "make_problem"]
+__all__ = ["DEGENERATE", "KINECT", "PnpProblem", "make_degenerate", "make_problem"]
 
 KINECT = Camera(fx=518.86, fy=519.47, cx=325.58, cy=253.74, width=640, height=480)
 """The colour camera of NYU Depth V2 (its toolbox's calibration)."""
 
 _NEAREST_M, _FARTHEST_M, _BORDER_PX = 0.8, 6.0, 8.0
 
-DEGENERATE = ("collinear", "noisy-collinear", "coincident", "same-pixel", "noise", "behind", "line-of-sight")
+DEGENERATE = (
+    "collinear", "noisy-collinear", "strayed-collinear", "coincident", "same-pixel", "line-of-sight",
+    "duplicated", "noise", "behind", "mirrored", "corner", "nan", "infinite", "huge",
+)  # fmt: skip
+"""Kinds of correspondences that fix no pose; for ``duplicated``, four wrong ones are repeated."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -74,16 +78,18 @@ def make_degenerate(kind: str, *, seed: int, n: int = 100, camera: Camera = KINE
     rng = np.random.default_rng(seed)
     problem = make_problem(seed=seed, n=n, noise_px=0.5, outlier_ratio=0.0, camera=camera)
     T, points, pixels = problem.T_camera_world, problem.points_world, problem.pixels
-    if kind in ("collinear", "noisy-collinear"):
+    if kind.endswith("collinear"):
         start = rng.uniform([-1.0, -0.7, 2.0], [1.0, 0.7, 4.0])
         direction = rng.normal(size=3) * [1.0, 1.0, 0.3]
         along = np.linspace(-0.5, 0.5, n)[:, None] * direction / np.linalg.norm(direction)
         line_camera = start + along
         pixels = camera.project(line_camera)
         points = transform(inverse(T), line_camera)
-        if kind == "noisy-collinear":
+        if kind != "collinear":
             points = points + rng.normal(size=(n, 3)) * 0.005
             pixels = pixels + rng.normal(size=(n, 2)) * 0.5
+        if kind == "strayed-collinear":
+            pixels[: n // 10] = rng.uniform(0, [camera.width, camera.height], (n // 10, 2))
     elif kind == "coincident":
         points = np.repeat(points[:1], n, axis=0)
     elif kind == "same-pixel":
@@ -97,6 +103,17 @@ def make_degenerate(kind: str, *, seed: int, n: int = 100, camera: Camera = KINE
     elif kind == "behind":
         T = np.diag([-1.0, -1.0, 1.0, 1.0]) @ T
         points = transform(inverse(T), camera.back_project(pixels, -rng.uniform(1, 5, n)))
+    elif kind == "mirrored":
+        points = points * [-1.0, 1.0, 1.0]
+    elif kind == "corner":
+        pixels = rng.uniform(20.0, 25.0, (n, 2))
+        points = transform(inverse(T), camera.back_project(pixels, rng.uniform(1, 5, n)))
+    elif kind == "duplicated":
+        four = rng.integers(0, 4, n)
+        points, pixels = points[four], np.roll(pixels, 7, axis=0)[four] + rng.normal(size=(n, 2)) * 0.5
+    elif kind in ("nan", "infinite", "huge"):
+        points = points.copy()
+        points[rng.integers(n), 1] = {"nan": np.nan, "infinite": np.inf, "huge": 1e300}[kind]
     else:
         raise ValueError(f"unknown kind {kind!r}")
     return PnpProblem(
