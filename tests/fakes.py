@@ -1,15 +1,16 @@
-"""Fakes that keep the contracts of the real things.
+"""Fakes for tests: a server that speaks the protocol with the real `ServerSession`, on demand badly.
 
-`FakePlatform` is a load balancer with any number of servers behind it, in the event loop of the
-test: real sockets, the real `ServerSession`, the real `dispatch`.  Promises nothing about speed.
+It answers ``echo`` through the real `dispatch`; what it does otherwise, a test decides.
 """
 
 from __future__ import annotations
 
 import asyncio
-import http
+import contextlib
 import time
-from collections.abc import Awaitable, Callable, Iterator
+from collections.abc import AsyncIterator, Callable
+from dataclasses import dataclass, field
+from http import HTTPStatus
 from typing import Any
 
 from websockets.asyncio.server import Server, ServerConnection, serve
@@ -23,225 +24,120 @@ from rse_pf.settings import SessionSettings
 from rse_pf.wire import SUBPROTOCOLS, Command, Failure, Result, codec_for, make_codec
 from rse_pf.wire.session import Close, Send, ServerSession, Submit
 
-__all__ = ["FakePlatform", "FakeSocket", "echo_services"]
-
-Answer = Result | Failure
+Answerer = Callable[["FakeServer", "FakeRobot", Command], Result | Failure | None]
 
 
-def echo_services() -> Registry:
-    """Return a registry with the echo service alone."""
-    registry = Registry()
-    echo.register(registry)
-    return registry
+def answer_at_once(server: FakeServer, robot: FakeRobot, command: Command) -> Result | Failure | None:
+    """Answer like a real server."""
+    return dispatch(server.registry, command, time.monotonic, server=server.name)
 
 
-class FakeSocket:
-    """One robot's connection to one of the servers."""
+def answer_nothing(server: FakeServer, robot: FakeRobot, command: Command) -> Result | Failure | None:
+    """Keep silent about commands; pings are still answered."""
+    return None
 
-    def __init__(self, platform: FakePlatform, server: str, websocket: ServerConnection) -> None:
-        codec_name = codec_for([str(websocket.subprotocol)]) or "zlib"
-        self.server = server
-        self.websocket = websocket
-        self.session = ServerSession(
-            codec=make_codec(codec_name),
-            robot="robot-1",
-            server=server,
-            session=f"s-{len(platform.sockets)}",
-            limits=platform.settings,
-        )
-        self.commands: list[Command] = []
-        self.muted = False
-        self._platform = platform
 
-    async def serve(self) -> None:
-        """Answer until the socket ends."""
-        try:
-            while True:
-                data = await self.websocket.recv(decode=False)
-                if not self.muted:
-                    await self._apply(self.session.receive(data, self._platform.clock()))
-        except ConnectionClosed:
-            return
+@dataclass(eq=False)
+class FakeRobot:
+    """One connection as the server sees it."""
 
-    async def _apply(self, decisions: list[Any]) -> None:
+    websocket: ServerConnection
+    session: ServerSession
+    commands: list[Command] = field(default_factory=list)
+
+    async def send(self, decisions: list[Any]) -> None:
         for decision in decisions:
             if isinstance(decision, Send):
-                await self.send(decision.data)
+                text = self.session.codec.is_text
+                await self.websocket.send(decision.data.decode() if text else decision.data)
             elif isinstance(decision, Close):
                 await self.websocket.close(decision.code, decision.reason)
-            elif isinstance(decision, Submit):
-                self.commands.append(decision.command)
-                self._platform.submitted(self, decision.command)
-
-    async def answer(self, message: Answer) -> None:
-        """Send the final answer to a command, as the session would."""
-        await self.send(self.session.answer(message).data)
-
-    async def move(self, within_ms: float = 5000.0) -> None:
-        """Ask the robot to leave this server."""
-        await self._apply(self.session.move("drain", within_ms))
-
-    async def send(self, data: bytes) -> None:
-        """Write one WebSocket message, whatever it says."""
-        try:
-            await self.websocket.send(data, text=self.session.codec.is_text)
-        except ConnectionClosed:
-            return
-
-    def cut(self) -> None:
-        """End the socket as kill -9 of its server does."""
-        self.websocket.transport.abort()
-
-    @property
-    def is_open(self) -> bool:
-        """Whether the robot could still send on it."""
-        return self.websocket.close_code is None and not self.websocket.transport.is_closing()
 
 
-class FakePlatform:
-    """A front door on 127.0.0.1; ``landing`` names the server that the next robot meets.
+class FakeServer:
+    """Start it with `running`; tests change ``answer``, ``refuse`` and ``deaf`` as they like."""
 
-    ``token`` is the only one let in (None lets in everybody); ``refusals`` are HTTP statuses (with a
-    Retry-After in seconds or None) for the next handshakes; ``hold`` keeps commands unanswered.
-    """
-
-    def __init__(
-        self,
-        *,
-        settings: SessionSettings | None = None,
-        registry: Registry | None = None,
-        clock: Callable[[], float] = time.monotonic,
-    ) -> None:
-        self.settings = settings or SessionSettings()
-        self.registry = registry or echo_services()
-        self.clock = clock
-        self.landing = "server-a"
-        self.token: str | None = None
-        self.tokens_seen: list[str] = []
-        self.refusals: list[tuple[int, int | None]] = []
-        self.hold = False
-        self.welcomes = True
-        self.on_command: Callable[[FakeSocket, Command], Awaitable[Answer | None]] | None = None
-        self.sockets: list[FakeSocket] = []
-        self.handshakes: list[float] = []
-        self._listener: Server | None = None
-        self._tasks: set[asyncio.Task[None]] = set()
-        self._news = asyncio.Condition()
-
-    @property
-    def port(self) -> int:
-        """Where the front door listens."""
-        assert self._listener is not None
-        port: int = next(iter(self._listener.sockets)).getsockname()[1]
-        return port
+    def __init__(self, name: str = "fake", answer: Answerer = answer_at_once) -> None:
+        self.name = name
+        self.answer = answer
+        self.refuse: tuple[int, dict[str, str]] | None = None
+        self.deaf = False
+        self.tokens: list[str] = []
+        self.robots: list[FakeRobot] = []
+        self.all_commands: list[Command] = []
+        self.changed = asyncio.Condition()
+        self.registry = Registry()
+        echo.register(self.registry)
+        self._server: Server | None = None
+        self._limits = SessionSettings()
 
     @property
     def url(self) -> str:
-        """What a robot connects to."""
-        return f"ws://127.0.0.1:{self.port}/ws"
+        assert self._server is not None
+        port = next(iter(self._server.sockets)).getsockname()[1]
+        return f"ws://127.0.0.1:{port}/ws"
 
-    async def __aenter__(self) -> FakePlatform:
-        """Listen."""
-        await self.listen()
-        return self
+    @contextlib.asynccontextmanager
+    async def running(self, port: int = 0) -> AsyncIterator[FakeServer]:
+        async with serve(
+            self._talk,
+            "127.0.0.1",
+            port,
+            process_request=self._door,
+            subprotocols=list(SUBPROTOCOLS.values()),  # type: ignore[arg-type]
+            compression=None,
+            ping_interval=None,
+            close_timeout=0.2,
+        ) as self._server:
+            yield self
+            for robot in list(self.robots):
+                robot.websocket.transport.abort()
 
-    async def __aexit__(self, *_: object) -> None:
-        """Cut every socket and stop listening."""
-        await self.stop()
-
-    async def listen(self, port: int = 0) -> None:
-        """Open the front door, at *port* if it matters."""
-        self._listener = await serve(
-            self._serve, "127.0.0.1", port, compression=None, ping_interval=None, close_timeout=1,
-            process_request=self._door, subprotocols=list(SUBPROTOCOLS.values()),  # type: ignore[arg-type]
-        )  # fmt: skip
-
-    async def stop(self) -> None:
-        """Shut the front door and cut every socket: the load balancer dies."""
-        assert self._listener is not None
-        for socket in self.sockets:
-            socket.cut()
-        self._listener.close()
-        await self._listener.wait_closed()
-        for task in self._tasks:
-            task.cancel()
-        await asyncio.gather(*self._tasks, return_exceptions=True)
-
-    def open_sockets(self) -> list[FakeSocket]:
-        """Return the sockets that are still open."""
-        return [socket for socket in self.sockets if socket.is_open]
-
-    def commands(self) -> Iterator[Command]:
-        """Yield every command that any server got, resent ones again."""
-        for socket in self.sockets:
-            yield from socket.commands
-
-    async def until(self, true: Callable[[], bool], within_s: float = 5.0) -> None:
-        """Wait until *true*, looking whenever something happened at a server."""
+    async def until(self, condition: Callable[[], bool], deadline_s: float = 10.0) -> None:
+        """Wait until *condition* holds; it is looked at whenever something happened."""
 
         async def wait() -> None:
-            async with self._news:
-                await self._news.wait_for(true)
+            async with self.changed:
+                await self.changed.wait_for(condition)
 
-        await asyncio.wait_for(wait(), within_s)
+        await asyncio.wait_for(wait(), deadline_s)
 
-    def submitted(self, socket: FakeSocket, command: Command) -> None:
-        """Answer *command* in a task of its own, unless commands are held."""
-        self._spawn(self._answer(socket, command))
+    def cut(self) -> None:
+        """End every connection without a goodbye."""
+        for robot in list(self.robots):
+            robot.websocket.transport.abort()
 
-    async def _answer(self, socket: FakeSocket, command: Command) -> None:
-        await self._tell()
-        if self.on_command is not None:
-            answer = await self.on_command(socket, command)
-            if answer is not None:
-                await socket.answer(answer)
-        elif not self.hold:
-            await socket.answer(self.result(command, socket.server))
+    async def _door(self, connection: ServerConnection, request: Request) -> Response | None:
+        self.tokens.append(request.headers.get("Authorization", ""))
+        if self.refuse is None:
+            return None
+        status, headers = self.refuse
+        return Response(status, HTTPStatus(status).phrase, Headers(headers), b"{}")
 
-    def result(self, command: Command, server: str = "") -> Answer:
-        """Return what the registry says to *command*, stamped."""
-        received_s = self.clock()
-        answer = dispatch(self.registry, command, self.clock, server=server)
-        if isinstance(answer, Failure):
-            return answer
-        return Result(
-            id=answer.id, reply=answer.reply, server=server, compute_ms=answer.compute_ms,
-            received_s=received_s, sent_s=self.clock(),
-        )  # fmt: skip
+    async def _talk(self, websocket: ServerConnection) -> None:
+        codec = make_codec(codec_for([str(websocket.subprotocol)]) or "json")
+        session = ServerSession(codec=codec, robot="r", server=self.name, session="s", limits=self._limits)
+        robot = FakeRobot(websocket, session)
+        self.robots.append(robot)
+        await self._notify()
+        with contextlib.suppress(ConnectionClosed):
+            async for message in websocket:
+                if self.deaf:
+                    continue
+                data = message.encode() if isinstance(message, str) else message
+                for decision in session.receive(data, time.monotonic()):
+                    if not isinstance(decision, Submit):
+                        await robot.send([decision])
+                        continue
+                    robot.commands.append(decision.command)
+                    self.all_commands.append(decision.command)
+                    answer = self.answer(self, robot, decision.command)
+                    if answer is not None:
+                        await robot.send([session.answer(answer)])
+                await self._notify()
+        self.robots.remove(robot)
+        await self._notify()
 
-    def _door(self, connection: ServerConnection, request: Request) -> Response | None:
-        self.handshakes.append(self.clock())
-        given = request.headers.get("Authorization", "").removeprefix("Bearer ")
-        self.tokens_seen.append(given)
-        if self.refusals:
-            status, retry_after = self.refusals.pop(0)
-            return _refusal(status, retry_after)
-        if self.token is not None and given != self.token:
-            return _refusal(401, None)
-        if request.path != "/ws":
-            return _refusal(404, None)
-        return None
-
-    async def _serve(self, websocket: ServerConnection) -> None:
-        socket = FakeSocket(self, self.landing, websocket)
-        socket.muted = not self.welcomes
-        self.sockets.append(socket)
-        await self._tell()
-        await socket.serve()
-        await self._tell()
-
-    async def _tell(self) -> None:
-        async with self._news:
-            self._news.notify_all()
-
-    def _spawn(self, work: Any) -> None:
-        task = asyncio.get_running_loop().create_task(work)
-        self._tasks.add(task)
-        task.add_done_callback(self._tasks.discard)
-
-
-def _refusal(status: int, retry_after: int | None) -> Response:
-    headers = Headers({"Content-Length": "0", "Connection": "close"})
-    if retry_after is not None:
-        headers["Retry-After"] = str(retry_after)
-    return Response(status, http.HTTPStatus(status).phrase, headers, b"")
+    async def _notify(self) -> None:
+        async with self.changed:
+            self.changed.notify_all()

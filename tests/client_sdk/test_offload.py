@@ -1,36 +1,90 @@
-"""The paper's rule of thumb as decisions."""
+"""The paper's recommendation as decisions: who solves a command, and when."""
 
 from __future__ import annotations
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
-from client_sdk.offload import CloudFirst
+from client_sdk.offload import CloudFirst, gains_from_cloud
+from rse_pf.errors import CommandFailed, ConnectError, Disconnected, PnpError
+
+seconds = st.floats(1e-4, 10)
 
 
-def plan(**changes):
+def plan(offload=None, **changes):
     values = {"deadline_s": 0.2, "connected": True, "expected_round_trip_s": 0.05, "robot_solve_s": 0.01}
-    return CloudFirst().plan(**{**values, **changes})
+    return (offload or CloudFirst(slack_s=0.02)).plan(**{**values, **changes})
 
 
 def test_asks_the_cloud_and_keeps_just_enough_time_for_itself():
     decided = plan()
-    assert decided.where == "cloud"
-    assert decided.robot_after_s == pytest.approx(0.2 - 1.25 * 0.01)
+
+    assert decided.where == "both"
+    assert decided.robot_after_s == pytest.approx(0.2 - 2 * 0.01 - 0.02)
 
 
-def test_solves_at_once_without_a_connection():
-    assert plan(connected=False).where == "robot"
+def test_solves_at_once_without_a_connection_and_says_so():
+    decided = plan(connected=False)
+
+    assert (decided.where, decided.why) == ("robot", "no connection to the cloud")
 
 
 def test_starts_both_at_once_when_the_cloud_is_known_to_be_too_slow():
     decided = plan(expected_round_trip_s=0.3)
-    assert decided.robot_after_s == 0.0
-    assert "300 ms" in decided.why
+
+    assert (decided.where, decided.robot_after_s) == ("both", 0.0)
+    assert "300 ms of 200 ms" in decided.why
 
 
-def test_knows_nothing_yet_and_asks_the_cloud():
-    assert plan(expected_round_trip_s=None, robot_solve_s=None).where == "cloud"
+def test_knows_nothing_yet_and_asks_the_cloud_with_the_robot_ready():
+    decided = plan(expected_round_trip_s=None, robot_solve_s=None)
+
+    assert decided.where == "both"
+    assert 0 < decided.robot_after_s < 0.2
 
 
-def test_a_deadline_shorter_than_its_own_solver_starts_at_once():
-    assert plan(deadline_s=0.005).robot_after_s == 0.0
+def test_a_service_that_the_robot_does_not_have_is_the_clouds_alone():
+    assert plan(robot_can=False, connected=False).where == "cloud"
+
+
+@given(deadline_s=seconds, mine_s=seconds, round_trip_s=st.none() | seconds, connected=st.booleans())
+def test_a_fallback_always_leaves_the_robot_its_time_or_starts_at_once(
+    deadline_s, mine_s, round_trip_s, connected
+):
+    decided = plan(
+        deadline_s=deadline_s, robot_solve_s=mine_s, expected_round_trip_s=round_trip_s, connected=connected
+    )
+
+    assert decided.robot_after_s == 0.0 or decided.robot_after_s + mine_s < deadline_s
+
+
+@given(robot_s=seconds, compute_s=seconds, transmission_s=seconds)
+def test_the_papers_rule_is_that_the_cloud_must_be_faster_all_in_all(robot_s, compute_s, transmission_s):
+    gains = gains_from_cloud(robot_s=robot_s, cloud_compute_s=compute_s, transmission_s=transmission_s)
+
+    if abs(compute_s + transmission_s - robot_s) > 1e-9:
+        assert gains == (compute_s + transmission_s < robot_s)
+
+
+def test_the_papers_own_figures_do_not_gain_from_the_cloud_below_153_ms():
+    cloud = {"cloud_compute_s": 0.02982, "transmission_s": 0.12318}
+
+    assert not gains_from_cloud(robot_s=0.150, **cloud)
+    assert gains_from_cloud(robot_s=0.160, **cloud)
+
+
+def test_the_faster_side_is_taken_only_when_asked_for():
+    assert plan(robot_solve_s=0.001).where == "both"
+    assert plan(CloudFirst(take_faster=True), robot_solve_s=0.001).where == "robot"
+    assert plan(CloudFirst(take_faster=True), robot_solve_s=0.06).where == "both"
+
+
+def test_the_robot_mends_what_the_cloud_broke_but_not_what_the_command_broke():
+    assert CloudFirst.can_mend("busy")
+    assert CloudFirst.can_mend("worker-lost")
+    assert CloudFirst.can_mend(Disconnected.code)
+    assert CloudFirst.can_mend(ConnectError.code)
+    for code in ("degenerate", "no-consensus", "too-few", "bad-request", "stale", PnpError.code):
+        assert not CloudFirst.can_mend(code)
+    assert not CloudFirst.can_mend(CommandFailed.code)

@@ -290,16 +290,6 @@ def test_busy_for_longer_than_the_deadline_is_told() -> None:
     run(work())
 
 
-def test_garbage_from_a_server_ends_that_socket_only() -> None:
-    async def work() -> None:
-        async with FakeServer().running() as server, connect(server) as robot:
-            await server.robots[0].websocket.send(b"\x00garbage")
-            await server.until(lambda: len(server.tokens) == 2)
-            assert (await robot.call("echo", {"value": 1})).reply == {"value": 1}
-
-    run(work())
-
-
 def test_cloud_first_answers_from_the_robot_when_the_cloud_is_late_and_says_so() -> None:
     async def work() -> None:
         problem = make_problem(seed=3)

@@ -1,0 +1,432 @@
+"""The robot's sockets against real ones on 127.0.0.1: reconnect, move, refusals, garbage."""
+
+from __future__ import annotations
+
+import asyncio
+import random
+import socket
+import time
+
+import pytest
+from fake_platform import FakePlatform
+
+import client_sdk
+from client_sdk.connection import websocket_options
+from rse_pf.errors import (
+    Conflict,
+    ConnectError,
+    Expired,
+    Forbidden,
+    Unauthorized,
+    UnsupportedProtocol,
+    UsageError,
+)
+from rse_pf.settings import SessionSettings
+from rse_pf.wire.session import CLOSE_REPLACED, CLOSE_TOKEN_OVER
+
+pytestmark = pytest.mark.system
+
+QUICK = SessionSettings(
+    connect_timeout_s=0.5, silence_s=0.3, ping_interval_s=0.1, ping_patience_s=0.5, reconnect_base_s=0.01,
+    reconnect_max_s=0.05, hello_timeout_s=1.0,
+)  # fmt: skip
+
+
+def run(test):
+    """Run an async test within a deadline."""
+    return asyncio.run(asyncio.wait_for(test, 20))
+
+
+def robot(url, **options):
+    return client_sdk.connect(url, settings=QUICK, random=random.Random(1), **options)
+
+
+def ask(a_robot, value, **options):
+    return asyncio.create_task(a_robot.call("echo", {"value": value}, **options))
+
+
+@pytest.mark.parametrize("codec", ["zlib", "json", "bin"])
+def test_fifty_commands_share_one_socket_and_each_gets_its_own_answer(codec):
+    async def test():
+        async with FakePlatform() as platform, robot(platform.url, codec=codec) as a_robot:
+            answers = await asyncio.gather(*(ask(a_robot, n) for n in range(50)))
+
+            assert [answer.reply["value"] for answer in answers] == list(range(50))
+            assert len(platform.sockets) == 1
+            assert {answer.server for answer in answers} == {"server-a"}
+
+    run(test())
+
+
+def test_a_socket_that_dies_under_load_loses_no_command():
+    async def test():
+        async with FakePlatform() as platform, robot(platform.url) as a_robot:
+            platform.hold = True
+            asked = [ask(a_robot, n, deadline_s=10) for n in range(20)]
+            for death in range(3):
+                await platform.until(
+                    lambda n=death: len(platform.sockets) > n and platform.sockets[-1].commands
+                )
+                platform.hold = death < 2
+                platform.sockets[-1].cut()
+
+            answers = await asyncio.gather(*asked)
+
+            assert [answer.reply["value"] for answer in answers] == list(range(20))
+            assert a_robot.stats.reconnects == 3
+            assert a_robot.stats.resent >= 8
+            assert a_robot.stats.answered == 20
+
+    run(test())
+
+
+def test_a_load_balancer_that_comes_back_finds_the_robot_waiting():
+    async def test():
+        platform = FakePlatform()
+        await platform.listen()
+        port = platform.port
+        async with robot(platform.url) as a_robot:
+            await platform.stop()
+            asked = ask(a_robot, "after the cut", deadline_s=10)
+            await asyncio.sleep(0)
+            await platform.listen(port)
+
+            assert (await asked).reply == {"value": "after the cut"}
+            await platform.stop()
+
+    run(test())
+
+
+def test_a_silent_server_is_left_in_time_although_its_socket_stays_open():
+    async def test():
+        async with FakePlatform() as platform, robot(platform.url) as a_robot:
+            platform.sockets[0].muted = True
+            began = time.monotonic()
+
+            answer = await ask(a_robot, 1, deadline_s=10)
+
+            assert answer.reply == {"value": 1}
+            assert time.monotonic() - began >= QUICK.silence_s
+            assert a_robot.stats.reconnects == 1
+            assert "silence" in a_robot.stats.last_error or "no pong" in a_robot.stats.last_error
+
+    run(test())
+
+
+def test_a_deadline_holds_whatever_the_server_does():
+    async def test():
+        async with FakePlatform() as platform, robot(platform.url) as a_robot:
+            platform.hold = True
+            began = time.monotonic()
+
+            with pytest.raises(Expired):
+                await ask(a_robot, 1, deadline_s=0.1)
+
+            assert 0.1 <= time.monotonic() - began < 1.0
+
+    run(test())
+
+
+def test_a_move_opens_the_new_socket_first_and_finishes_what_the_old_one_holds():
+    async def test():
+        async with FakePlatform() as platform, robot(platform.url) as a_robot:
+            platform.hold = True
+            held = ask(a_robot, "old", deadline_s=10)
+            old = platform.sockets[0]
+            await platform.until(lambda: old.commands)
+            platform.hold, platform.landing = False, "server-b"
+
+            await old.move()
+            await platform.until(lambda: len(platform.sockets) == 2)
+            assert old.is_open
+            while a_robot.stats.server != "server-b":
+                await ask(a_robot, "meanwhile")
+            assert (await ask(a_robot, "new")).server == "server-b"
+            await old.answer(platform.result(old.commands[0], "server-a"))
+
+            assert (await held).server == "server-a"
+            await old.websocket.wait_closed()
+            assert old.websocket.close_code == 1000
+            assert (a_robot.stats.moves, a_robot.stats.reconnects, a_robot.stats.resent) == (1, 0, 0)
+
+    run(test())
+
+
+def test_a_robot_that_lands_where_it_came_from_keeps_its_socket_and_tries_again():
+    async def test():
+        async with FakePlatform() as platform, robot(platform.url) as a_robot:
+            await platform.sockets[0].move()
+            await platform.until(lambda: len(platform.sockets) >= 3)
+            assert platform.sockets[0].is_open
+            assert (await ask(a_robot, 1)).reply == {"value": 1}
+            assert not platform.sockets[1].commands
+            platform.landing = "server-b"
+
+            await platform.until(lambda: platform.sockets[-1].server == "server-b")
+            await platform.sockets[0].websocket.wait_closed()
+
+            assert (await ask(a_robot, 2)).server == "server-b"
+            assert a_robot.stats.moves == 1
+
+    run(test())
+
+
+def test_a_robot_that_cannot_move_stays_until_it_is_sent_away():
+    async def test():
+        async with FakePlatform() as platform, robot(platform.url) as a_robot:
+            await platform.sockets[0].move(within_ms=50)
+            await platform.until(lambda: len(platform.sockets) >= 2)
+            await platform.sockets[1].websocket.wait_closed()
+            answer = await ask(a_robot, 1)
+
+            assert answer.server == "server-a"
+            assert platform.sockets[0].is_open
+            assert a_robot.stats.moves == 0
+
+    run(test())
+
+
+def test_a_server_that_dies_during_a_move_loses_nothing():
+    async def test():
+        async with FakePlatform() as platform, robot(platform.url) as a_robot:
+            platform.hold = True
+            held = ask(a_robot, "kept", deadline_s=10)
+            await platform.until(lambda: platform.sockets[0].commands)
+            platform.hold = False
+            await platform.sockets[0].move()
+            await platform.until(lambda: len(platform.sockets) >= 2)
+            platform.sockets[0].cut()
+
+            assert (await held).reply == {"value": "kept"}
+
+    run(test())
+
+
+def test_a_wrong_token_is_told_at_once():
+    async def test():
+        async with FakePlatform() as platform:
+            platform.token = "right"
+            with pytest.raises(Unauthorized) as told:
+                await robot(platform.url, token="wrong").__aenter__()
+
+            assert "rse-pf token issue" in told.value.hint
+            assert "wrong" not in str(told.value).replace("missing, wrong or over", "")
+            assert platform.tokens_seen == ["wrong"]
+
+    run(test())
+
+
+def test_a_token_callable_is_asked_once_more_when_its_token_is_over():
+    async def test():
+        tokens = iter(["over", "fresh", "second"])
+
+        async def token():
+            return next(tokens)
+
+        async with FakePlatform() as platform:
+            platform.token = "fresh"
+            async with robot(platform.url, token=token) as a_robot:
+                platform.token = "second"
+                await platform.sockets[0].websocket.close(CLOSE_TOKEN_OVER, "token over")
+
+                assert (await ask(a_robot, 1, deadline_s=5)).reply == {"value": 1}
+                assert platform.tokens_seen == ["over", "fresh", "second"]
+
+    run(test())
+
+
+def test_a_token_that_is_refused_later_ends_the_robot_with_a_typed_error():
+    async def test():
+        async with FakePlatform() as platform:
+            platform.token = "right"
+            async with robot(platform.url, token="right") as a_robot:
+                platform.hold = True
+                waiting = ask(a_robot, 1, deadline_s=10)
+                await platform.until(lambda: platform.sockets[0].commands)
+                platform.token = "another"
+                platform.sockets[0].cut()
+
+                with pytest.raises(Unauthorized):
+                    await waiting
+                with pytest.raises(Unauthorized):
+                    await ask(a_robot, 2)
+
+    run(test())
+
+
+def test_a_token_callable_that_fails_is_a_passing_trouble():
+    async def test():
+        told = iter([OSError("issuer is away"), OSError("still"), "fresh"])
+
+        async def token():
+            next_one = next(told)
+            if isinstance(next_one, OSError):
+                raise next_one
+            return next_one
+
+        async with FakePlatform() as platform, robot(platform.url, token=token) as a_robot:
+            assert (await ask(a_robot, 1)).reply == {"value": 1}
+
+    run(test())
+
+
+def test_a_full_server_is_asked_again_no_sooner_than_it_said():
+    async def test():
+        async with FakePlatform() as platform:
+            platform.refusals = [(503, 1)]
+            async with robot(platform.url) as a_robot:
+                assert (await ask(a_robot, 1)).reply == {"value": 1}
+
+            first, second = platform.handshakes
+            assert second - first >= 1.0
+
+    run(test())
+
+
+@pytest.mark.parametrize(("status", "error"), [(403, Forbidden), (404, ConnectError), (400, ConnectError)])
+def test_a_refusal_for_good_is_not_tried_again(status, error):
+    async def test():
+        async with FakePlatform() as platform:
+            platform.refusals = [(status, None)]
+            with pytest.raises(error):
+                await robot(platform.url).__aenter__()
+            assert len(platform.handshakes) == 1
+
+    run(test())
+
+
+def test_a_missing_route_is_waited_out_once_the_robot_was_in():
+    async def test():
+        async with FakePlatform() as platform, robot(platform.url) as a_robot:
+            platform.refusals = [(404, None), (503, None), (400, None)]
+            platform.sockets[0].cut()
+
+            assert (await ask(a_robot, 1, deadline_s=10)).reply == {"value": 1}
+
+    run(test())
+
+
+def test_a_door_that_never_says_welcome_is_a_connect_error():
+    async def test():
+        async with FakePlatform() as platform:
+            platform.welcomes = False
+            began = time.monotonic()
+            with pytest.raises(ConnectError, match="welcome"):
+                await robot(platform.url).__aenter__()
+            assert time.monotonic() - began < QUICK.connect_timeout_s * 6
+
+    run(test())
+
+
+def test_nobody_at_the_address_is_one_line_with_a_hint():
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        url = f"ws://127.0.0.1:{free.getsockname()[1]}/ws"
+
+    async def test():
+        with pytest.raises(ConnectError) as told:
+            await robot(url).__aenter__()
+        assert "\n" not in told.value.message
+        assert url in told.value.message
+        assert "rse-pf local" in told.value.hint
+
+    run(test())
+
+
+@pytest.mark.parametrize("url", ["http://localhost/ws", "localhost:8700", "ws://", "ws://h:99999/ws", ""])
+def test_what_is_no_websocket_address_is_refused_before_anything_is_opened(url):
+    with pytest.raises(UsageError, match="not a WebSocket address"):
+        robot(url)
+
+
+def test_an_unknown_codec_is_refused_with_the_choices():
+    with pytest.raises(UsageError) as told:
+        robot("ws://localhost/ws", codec="xml")
+
+    assert "zlib, json, bin" in told.value.hint
+
+
+def test_garbage_from_a_server_harms_no_command_until_it_is_too_much():
+    async def test():
+        async with FakePlatform() as platform, robot(platform.url) as a_robot:
+            first = platform.sockets[0]
+            for _ in range(QUICK.max_bad_messages):
+                await first.send(b"\x00garbage")
+            assert (await ask(a_robot, 1)).reply == {"value": 1}
+            assert a_robot.stats.reconnects == 0
+
+            await first.send(b"\x00garbage")
+            await platform.until(lambda: len(platform.sockets) == 2)
+            assert (await ask(a_robot, 2)).reply == {"value": 2}
+
+    run(test())
+
+
+def test_a_message_above_the_limit_costs_a_reconnect_and_no_command():
+    async def test():
+        async with FakePlatform() as platform, robot(platform.url) as a_robot:
+            await platform.sockets[0].send(bytes(QUICK.max_message_bytes + 1))
+
+            assert (await ask(a_robot, 1, deadline_s=5)).reply == {"value": 1}
+
+    run(test())
+
+
+def test_another_robot_with_the_same_token_is_told_and_not_fought():
+    async def test():
+        async with FakePlatform() as platform, robot(platform.url) as a_robot:
+            platform.hold = True
+            waiting = ask(a_robot, 1, deadline_s=10)
+            await platform.until(lambda: platform.sockets[0].commands)
+            await platform.sockets[0].websocket.close(CLOSE_REPLACED, "replaced")
+
+            with pytest.raises(Conflict):
+                await waiting
+            assert len(platform.sockets) == 1
+
+    run(test())
+
+
+def test_an_old_server_says_which_protocol_it_wants(monkeypatch):
+    async def test():
+        async with FakePlatform() as platform:
+            with pytest.raises(UnsupportedProtocol, match="protocol 1 is not 99"):
+                await robot(platform.url).__aenter__()
+
+    monkeypatch.setattr("rse_pf.wire.session.PROTOCOL_VERSION", 99)
+    run(test())
+
+
+def test_reconnects_spread_over_the_whole_back_off():
+    async def test():
+        async with FakePlatform() as platform:
+            robots = [
+                client_sdk.connect(
+                    platform.url, settings=SessionSettings(reconnect_base_s=0.4), random=random.Random(seed)
+                )
+                for seed in range(30)
+            ]
+            for each in robots:
+                await each.__aenter__()
+            platform.handshakes.clear()
+            began = time.monotonic()
+            for each in platform.open_sockets():
+                each.cut()
+            await platform.until(lambda: len(platform.handshakes) == 30)
+            delays = sorted(at - began for at in platform.handshakes)
+            for each in robots:
+                await each.close()
+
+            assert delays[-1] - delays[0] > 0.2
+            assert delays[15] > 0.1
+
+    run(test())
+
+
+def test_every_socket_is_opened_without_compression_and_with_our_limits():
+    options = websocket_options(QUICK)
+
+    assert options["compression"] is None
+    assert options["ping_interval"] is None
+    assert options["proxy"] is None
+    assert options["max_size"] == QUICK.max_message_bytes

@@ -1,0 +1,246 @@
+"""A fake load balancer with any number of servers behind it, in the event loop of the test.
+
+Real sockets, the real `ServerSession`, the real `dispatch`.  Promises nothing about speed.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import http
+import time
+from collections.abc import Awaitable, Callable, Iterator
+from typing import Any
+
+from websockets.asyncio.server import Server, ServerConnection, serve
+from websockets.datastructures import Headers
+from websockets.exceptions import ConnectionClosed
+from websockets.http11 import Request, Response
+
+from rse_pf.service import Registry, dispatch
+from rse_pf.services import echo
+from rse_pf.settings import SessionSettings
+from rse_pf.wire import SUBPROTOCOLS, Command, Failure, Result, codec_for, make_codec
+from rse_pf.wire.session import Close, Send, ServerSession, Submit
+
+__all__ = ["FakePlatform", "FakeSocket", "echo_services"]
+
+Answer = Result | Failure
+
+
+def echo_services() -> Registry:
+    """Return a registry with the echo service alone."""
+    registry = Registry()
+    echo.register(registry)
+    return registry
+
+
+class FakeSocket:
+    """One robot's connection to one of the servers."""
+
+    def __init__(self, platform: FakePlatform, server: str, websocket: ServerConnection) -> None:
+        codec_name = codec_for([str(websocket.subprotocol)]) or "zlib"
+        self.server = server
+        self.websocket = websocket
+        self.session = ServerSession(
+            codec=make_codec(codec_name),
+            robot="robot-1",
+            server=server,
+            session=f"s-{len(platform.sockets)}",
+            limits=platform.settings,
+        )
+        self.commands: list[Command] = []
+        self.muted = False
+        self._platform = platform
+
+    async def serve(self) -> None:
+        """Answer until the socket ends."""
+        try:
+            while True:
+                data = await self.websocket.recv(decode=False)
+                if not self.muted:
+                    await self._apply(self.session.receive(data, self._platform.clock()))
+        except ConnectionClosed:
+            return
+
+    async def _apply(self, decisions: list[Any]) -> None:
+        for decision in decisions:
+            if isinstance(decision, Send):
+                await self.send(decision.data)
+            elif isinstance(decision, Close):
+                await self.websocket.close(decision.code, decision.reason)
+            elif isinstance(decision, Submit):
+                self.commands.append(decision.command)
+                self._platform.submitted(self, decision.command)
+
+    async def answer(self, message: Answer) -> None:
+        """Send the final answer to a command, as the session would."""
+        await self.send(self.session.answer(message).data)
+
+    async def move(self, within_ms: float = 5000.0) -> None:
+        """Ask the robot to leave this server."""
+        await self._apply(self.session.move("drain", within_ms))
+
+    async def send(self, data: bytes) -> None:
+        """Write one WebSocket message, whatever it says."""
+        try:
+            await self.websocket.send(data, text=self.session.codec.is_text)
+        except ConnectionClosed:
+            return
+
+    def cut(self) -> None:
+        """End the socket as kill -9 of its server does."""
+        self.websocket.transport.abort()
+
+    @property
+    def is_open(self) -> bool:
+        """Whether the robot could still send on it."""
+        return self.websocket.close_code is None and not self.websocket.transport.is_closing()
+
+
+class FakePlatform:
+    """A front door on 127.0.0.1; ``landing`` names the server that the next robot meets.
+
+    ``token`` is the only one let in (None lets in everybody); ``refusals`` are HTTP statuses (with a
+    Retry-After in seconds or None) for the next handshakes; ``hold`` keeps commands unanswered.
+    """
+
+    def __init__(
+        self,
+        *,
+        settings: SessionSettings | None = None,
+        registry: Registry | None = None,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self.settings = settings or SessionSettings()
+        self.registry = registry or echo_services()
+        self.clock = clock
+        self.landing = "server-a"
+        self.token: str | None = None
+        self.tokens_seen: list[str] = []
+        self.refusals: list[tuple[int, int | None]] = []
+        self.hold = False
+        self.welcomes = True
+        self.on_command: Callable[[FakeSocket, Command], Awaitable[Answer | None]] | None = None
+        self.sockets: list[FakeSocket] = []
+        self.handshakes: list[float] = []
+        self._listener: Server | None = None
+        self._tasks: set[asyncio.Task[None]] = set()
+        self._news = asyncio.Condition()
+
+    @property
+    def port(self) -> int:
+        """Where the front door listens."""
+        assert self._listener is not None
+        port: int = next(iter(self._listener.sockets)).getsockname()[1]
+        return port
+
+    @property
+    def url(self) -> str:
+        """What a robot connects to."""
+        return f"ws://127.0.0.1:{self.port}/ws"
+
+    async def __aenter__(self) -> FakePlatform:
+        """Listen."""
+        await self.listen()
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        """Cut every socket and stop listening."""
+        await self.stop()
+
+    async def listen(self, port: int = 0) -> None:
+        """Open the front door, at *port* if it matters."""
+        self._listener = await serve(
+            self._serve, "127.0.0.1", port, compression=None, ping_interval=None, close_timeout=1,
+            process_request=self._door, subprotocols=list(SUBPROTOCOLS.values()),  # type: ignore[arg-type]
+        )  # fmt: skip
+
+    async def stop(self) -> None:
+        """Shut the front door and cut every socket: the load balancer dies."""
+        assert self._listener is not None
+        for socket in self.sockets:
+            socket.cut()
+        self._listener.close()
+        await self._listener.wait_closed()
+        for task in self._tasks:
+            task.cancel()
+        await asyncio.gather(*self._tasks, return_exceptions=True)
+
+    def open_sockets(self) -> list[FakeSocket]:
+        """Return the sockets that are still open."""
+        return [socket for socket in self.sockets if socket.is_open]
+
+    def commands(self) -> Iterator[Command]:
+        """Yield every command that any server got, resent ones again."""
+        for socket in self.sockets:
+            yield from socket.commands
+
+    async def until(self, true: Callable[[], bool], within_s: float = 5.0) -> None:
+        """Wait until *true*, looking whenever something happened at a server."""
+
+        async def wait() -> None:
+            async with self._news:
+                await self._news.wait_for(true)
+
+        await asyncio.wait_for(wait(), within_s)
+
+    def submitted(self, socket: FakeSocket, command: Command) -> None:
+        """Answer *command* in a task of its own, unless commands are held."""
+        self._spawn(self._answer(socket, command))
+
+    async def _answer(self, socket: FakeSocket, command: Command) -> None:
+        await self._tell()
+        if self.on_command is not None:
+            answer = await self.on_command(socket, command)
+            if answer is not None:
+                await socket.answer(answer)
+        elif not self.hold:
+            await socket.answer(self.result(command, socket.server))
+
+    def result(self, command: Command, server: str = "") -> Answer:
+        """Return what the registry says to *command*, stamped."""
+        received_s = self.clock()
+        answer = dispatch(self.registry, command, self.clock, server=server)
+        if isinstance(answer, Failure):
+            return answer
+        return Result(
+            id=answer.id, reply=answer.reply, server=server, compute_ms=answer.compute_ms,
+            received_s=received_s, sent_s=self.clock(),
+        )  # fmt: skip
+
+    def _door(self, connection: ServerConnection, request: Request) -> Response | None:
+        self.handshakes.append(self.clock())
+        given = request.headers.get("Authorization", "").removeprefix("Bearer ")
+        self.tokens_seen.append(given)
+        if self.refusals:
+            status, retry_after = self.refusals.pop(0)
+            return _refusal(status, retry_after)
+        if self.token is not None and given != self.token:
+            return _refusal(401, None)
+        if request.path != "/ws":
+            return _refusal(404, None)
+        return None
+
+    async def _serve(self, websocket: ServerConnection) -> None:
+        socket = FakeSocket(self, self.landing, websocket)
+        socket.muted = not self.welcomes
+        self.sockets.append(socket)
+        await self._tell()
+        await socket.serve()
+        await self._tell()
+
+    async def _tell(self) -> None:
+        async with self._news:
+            self._news.notify_all()
+
+    def _spawn(self, work: Any) -> None:
+        task = asyncio.get_running_loop().create_task(work)
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
+
+
+def _refusal(status: int, retry_after: int | None) -> Response:
+    headers = Headers({"Content-Length": "0", "Connection": "close"})
+    if retry_after is not None:
+        headers["Retry-After"] = str(retry_after)
+    return Response(status, http.HTTPStatus(status).phrase, headers, b"")
