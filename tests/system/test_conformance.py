@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import importlib.util
 import json
 import subprocess
@@ -9,6 +10,10 @@ import sys
 from pathlib import Path
 
 import pytest
+
+from rse_pf.local.envoy_config import Target
+from rse_pf.local.load_balancer import LoadBalancer
+from rse_pf.settings import PlatformSettings
 
 pytestmark = [pytest.mark.system, pytest.mark.slow]
 
@@ -18,13 +23,13 @@ SMALL_FRAGMENTS = {f"9.{group}.{case}" for group in (3, 4) for case in range(1, 
 BIG = {"max_message_bytes": 17_000_000, "max_inflated_bytes": 17_000_000}
 
 
-def run_suite(server, folder: Path, *selection: str) -> tuple[int, set[str], str]:
+def run_suite(port: int, folder: Path, *selection: str, path: str = "/") -> tuple[int, set[str], str]:
     """Return how many cases passed, which failed, and what the suite printed."""
     if importlib.util.find_spec("kosoku") is None:
         pytest.skip("kosoku is not installed (no wheel for this machine)")
     suite = subprocess.run(
         [Path(sys.executable).with_name("kosoku"), "-p", "2", "-o", folder, *selection,
-         f"ws://127.0.0.1:{server.port}"],
+         f"ws://127.0.0.1:{port}{path}"],
         capture_output=True, text=True, timeout=110, check=False,
     )  # fmt: skip
     (index,) = json.loads((folder / "index.json").read_text()).values()
@@ -40,7 +45,7 @@ PASSED = {"OK", "NON-STRICT", "INFORMATIONAL"}
 def test_all_247_cases_pass_with_the_products_limits(start_server, tmp_path):
     server = start_server(echo=True, serving={"workers": 2})
 
-    passed, failed, printed = run_suite(server, tmp_path / "r", "-x", "9.*", "-x", "12.*", "-x", "13.*")
+    passed, failed, printed = run_suite(server.port, tmp_path / "r", "-x", "9.*", "-x", "12.*", "-x", "13.*")
 
     assert failed == set(), printed
     assert passed == 247
@@ -50,7 +55,7 @@ def test_all_54_large_cases_pass_with_raised_limits(start_server, tmp_path):
     limits = {**BIG, "max_fragments": 100_000}
     server = start_server(echo=True, serving={"slow_reader_s": 30.0}, session=limits)
 
-    passed, failed, printed = run_suite(server, tmp_path / "r", "-i", "9.*")
+    passed, failed, printed = run_suite(server.port, tmp_path / "r", "-i", "9.*")
 
     assert failed == set(), printed
     assert passed == 54
@@ -59,6 +64,32 @@ def test_all_54_large_cases_pass_with_raised_limits(start_server, tmp_path):
 def test_the_fragment_limit_refuses_exactly_the_ten_cases_above_it(start_server, tmp_path):
     server = start_server(echo=True, serving={"slow_reader_s": 30.0}, session=BIG)
 
-    _, failed, printed = run_suite(server, tmp_path / "r", "-i", "9.*")
+    _, failed, printed = run_suite(server.port, tmp_path / "r", "-i", "9.*")
 
     assert failed == SMALL_FRAGMENTS, printed
+
+
+def test_through_the_load_balancer_only_the_order_of_closing_differs(start_server, tmp_path):
+    server = start_server(echo=True, serving={"workers": 2})
+    settings = PlatformSettings()
+    balancer = LoadBalancer(settings, folder=tmp_path, port=0, dies_with_parent=True)
+    target = Target(name="echo", port=server.port, control_port=server.identity["control_port"])
+
+    async def start() -> None:
+        balancer.launch()
+        await balancer.wait_live(20)
+        balancer.set_targets([target])
+        assert await balancer.wait_healthy(["echo"], 10)
+
+    try:
+        asyncio.run(start())
+        path = settings.serving.path
+        select = ("-x", "9.*", "-x", "12.*", "-x", "13.*")
+        passed, failed, printed = run_suite(balancer.port, tmp_path / "r", *select, path=path)
+    finally:
+        balancer.kill()
+    (index,) = json.loads((tmp_path / "r" / "index.json").read_text()).values()
+
+    assert len(index) == 247
+    assert {case for case, told in index.items() if told["behavior"] not in PASSED} == set(), printed
+    print(f"through the load balancer {passed} of 247 pass; {len(failed)} differ in who closes first")
