@@ -57,7 +57,7 @@ class PnpReply(msgspec.Struct, frozen=True, kw_only=True):
         """Return *solution* as it travels."""
         return cls(
             T_camera_world=solution.T_camera_world.ravel(),
-            inliers=solution.inliers,
+            inliers=solution.inliers.astype(np.uint32),
             rmse_px=solution.rmse_px,
             covariance=solution.covariance[_UPPER].astype(np.float32),
             verdict=solution.verdict,

@@ -35,8 +35,13 @@ def json_encode_hook(value: Any) -> Any:
 def binary_encode_hook(value: Any) -> Any:
     """Return the MessagePack extension of an array: float32, uint32 if it fits, else float64."""
     if isinstance(value, np.ndarray) and value.dtype.kind in "fiu":
-        kind = _F4 if value.dtype == np.float32 else _F8
-        if value.dtype.kind != "f" and value.min(initial=0) >= 0 and value.max(initial=0) < 2**32:
+        kind = {"f4": _F4, "u4": _U4}.get(value.dtype.str[1:], _F8)
+        if (
+            kind == _F8
+            and value.dtype.kind != "f"
+            and value.min(initial=0) >= 0
+            and value.max(initial=0) < 2**32
+        ):
             kind = _U4
         return msgspec.msgpack.Ext(kind, value.astype(_EXTENSIONS[kind], copy=False).tobytes())
     raise _unknown(value)
@@ -61,17 +66,13 @@ def decode_hook(kind: type[Any], value: Any) -> Any:
     """Return *value* as a flat float64 array of finite numbers."""
     if kind is not np.ndarray:
         raise BadMessage(f"{kind.__name__} does not travel in messages")
-    with np.errstate(over="ignore", invalid="ignore"):
-        if isinstance(value, list):
-            array = _from_list(value)
-        elif isinstance(value, np.ndarray) and value.dtype.kind in "fiu":
-            array = np.array(value, dtype=np.float64).ravel()
-        else:
-            raise BadMessage(
-                f"expected an array of numbers, got {type(value).__name__}", hint="send a flat list"
-            )
-        good = math.isfinite(array.dot(array))
-    if not good:
+    if isinstance(value, list):
+        array = _from_list(value)
+    elif isinstance(value, np.ndarray) and value.dtype.kind in "fiu":
+        array = np.array(value, dtype=np.float64).ravel()
+    else:
+        raise BadMessage(f"expected an array of numbers, got {type(value).__name__}", hint="send a flat list")
+    if not math.isfinite(array.dot(array)):
         raise BadMessage("an array holds a number that is not finite or absurdly large", hint="leave it out")
     return array
 

@@ -14,10 +14,11 @@ from rse_pf.settings import PlatformSettings, setting_rows, settings_page
 
 GROUPS = set(PlatformSettings().to_dict())
 NAMES = [(row.group, row.name) for row in setting_rows()]
+SPELLINGS = {"settings", "limits", "s"}
+"""What a group is called where it is an argument on its own."""
 OWNERS = Counter(name for _, name in NAMES)
 
 WAITING: dict[str, set[str]] = {
-    "session": {"connect_timeout_s", "reconnect_base_s", "reconnect_max_s"},
     "health": {"cloud_interval_s", "cloud_timeout_s", "grace_s"},
     "scaling": {
         "busy_cpu_percent", "very_busy_cpu_percent", "idle_s", "idle_cpu_percent", "period_s",
@@ -45,7 +46,8 @@ def unread(tree: Mapping[str, str]) -> set[tuple[str, str]]:
         for node in ast.walk(ast.parse(text)):
             if isinstance(node, ast.Attribute) and isinstance(node.ctx, ast.Load):
                 base = ast.unparse(node.value).rpartition(".")[2].lstrip("_")
-                seen.add((base if base in GROUPS else "", node.attr))
+                if base in GROUPS | SPELLINGS:
+                    seen.add((base if base in GROUPS else "", node.attr))
     return {
         (group, name)
         for group, name in NAMES
