@@ -15,8 +15,8 @@ from rse_pf.geometry import Array, Camera
 
 __all__ = ["Shape", "log10_false_alarms", "places", "slenderness", "view_of"]
 
-U, V, ONE, Z_INV = range(4)
-"""Rows of a view: projected pixel, ones, and 1/z in the camera's frame."""
+U, V, ONE, Z_INV, ERROR2 = range(5)
+"""Rows of a view: projected pixel, ones, 1/z in the camera's frame, and squared error, px^2."""
 
 _LOG10_E = math.log10(math.e)
 _SAMPLE, _POSES_OF_A_SAMPLE = 3, 4
@@ -28,8 +28,6 @@ _STRAYS = 4.0
 _PLAINLY_WIDE = 0.15
 _CELLS_ACROSS = 40
 _PLAINLY_MANY, _ENOUGH = 48, 64
-_ROW = 1 << 20
-_NUMBER_OF_CELL = np.array([1.0, _ROW])
 
 
 @lru_cache(maxsize=64)
@@ -58,25 +56,26 @@ def _optics(camera: Camera) -> tuple[Array, Array]:
     return project, np.kron(u, u) + np.kron(v, v)
 
 
-def view_of(T_camera_world: Array, points_world: Array, pixels: Array, camera: Camera) -> tuple[Array, Array]:
-    """Return the ``(4, n)`` view of the points and their ``(n,)`` squared errors, px^2.
+def view_of(T_camera_world: Array, points_world: Array, pixels: Array, camera: Camera) -> Array:
+    """Return the ``(5, n)`` view of the points, among it their squared reprojection errors.
 
     A point that is not before the camera has infinite error.
     """
     project = _optics(camera)[0] @ T_camera_world
-    view: Array = project[:, :3] @ points_world.T
-    view += project[:, 3:]
-    z = view[2]
+    homogeneous = project[:, :3] @ points_world.T
+    homogeneous += project[:, 3:]
+    z = homogeneous[2]
     behind = None if np.minimum.reduce(z) > _NEAR_M else z <= _NEAR_M
     if behind is not None:
         z[behind] = _NEAR_M
-    view = view / z
+    view = np.empty((5, len(pixels)))
+    np.divide(homogeneous, z, out=view[:ERROR2])
     error = view[:ONE] - pixels.T
     error *= error
-    error2: Array = error[0] + error[1]
+    np.add(error[0], error[1], out=view[ERROR2])
     if behind is not None:
-        error2[behind] = np.inf
-    return view, error2
+        view[ERROR2, behind] = np.inf
+    return view
 
 
 def log10_false_alarms(n: int, inliers: int, largest_error2_px2: float, camera: Camera) -> float:
@@ -113,46 +112,45 @@ def places(view: Array, camera: Camera) -> int:
     cells = _cells(view[:ONE], scale)
     if len(cells) >= _PLAINLY_MANY:
         return int(view.shape[1])
-    alone: set[float] = set()
-    for cell in sorted(cells):
-        if not (
-            cell - 1 in alone or cell - _ROW in alone or cell - _ROW - 1 in alone or cell - _ROW + 1 in alone
-        ):
-            alone.add(cell)
+    alone: set[tuple[int, int]] = set()
+    for u, v in sorted(cells):
+        if not {(u - 1, v - 1), (u - 1, v), (u - 1, v + 1), (u, v - 1)} & alone:
+            alone.add((u, v))
     return len(alone)
 
 
-def _cells(pixels: Array, scale: float) -> set[float]:
-    """Return one number per taken cell: row * _ROW + column."""
-    cells: Array = _NUMBER_OF_CELL @ np.floor(pixels * scale)
-    return set(cells.tolist())
+def _cells(pixels: Array, scale: float) -> set[tuple[int, int]]:
+    columns, rows = (pixels * scale).astype(np.int64).tolist()
+    return set(zip(columns, rows, strict=True))
 
 
 class Shape:
-    """How the inliers of a ``(4, k)`` view lie, and how firmly they hold the pose.
+    """How the inliers of a ``(5, k)`` view lie, and how firmly they hold the pose.
 
     ``thinness`` is width over length in the image: 0 on a line, 0 if they coincide; whatever lies
-    on one line in space lies on one line there.  ``radius_px`` bounds the distances from their
-    centre.  ``depth_variation`` is the standard deviation of 1/z over its mean.
+    on one line in space lies on one line there.  ``radius_px`` is the root mean square distance
+    from their centre.  ``depth_variation`` is the standard deviation of 1/z over its mean.
     ``information`` is the ``(6, 6)`` J^T J by the twist (rho, phi) left of the pose.
     """
 
     __slots__ = ("depth_variation", "information", "radius_px", "thinness")
 
-    def __init__(self, view: Array, camera: Camera) -> None:
+    def __init__(self, view: Array, camera: Camera, box_px: Array) -> None:
+        """Measure; *box_px* holds the corners of a box around all pixels, ``(2, 2)``."""
         k = view.shape[1]
-        products = (view[:, None] * view).reshape(16, k)
+        base = view[:ERROR2]
+        products = (base[:, None] * base).reshape(16, k)
         moments = products @ products.T
         self.information: Array = (_optics(camera)[1] @ moments.ravel()).reshape(6, 6)
         # Product 10 is 1 * 1, so its row holds the plain sums of all products.
         uu, uv, u, _, _, vv, v, _, _, _, _, w, _, _, _, ww = moments[10].tolist()
         self.depth_variation = math.sqrt(max(0.0, ww * k / (w * w) - 1.0))
-        left, top = np.minimum.reduce(view[:ONE], axis=1).tolist()
-        right, bottom = np.maximum.reduce(view[:ONE], axis=1).tolist()
         mean_u, mean_v = u / k, v / k
-        self.radius_px = math.hypot(max(right - mean_u, mean_u - left), max(bottom - mean_v, mean_v - top))
         length2, width2 = _eigenvalues(uu - u * mean_u, uv - u * mean_v, vv - v * mean_v)
-        spare = width2 - _STRAYS * self.radius_px**2
+        self.radius_px = math.sqrt(max(0.0, length2 + width2) / k)
+        (left, top), (right, bottom) = box_px.tolist()
+        far_u, far_v = max(right - mean_u, mean_u - left), max(bottom - mean_v, mean_v - top)
+        spare = width2 - _STRAYS * (far_u * far_u + far_v * far_v)
         if spare > _PLAINLY_WIDE**2 * length2:
             self.thinness = math.sqrt(spare / length2)
         else:

@@ -30,6 +30,8 @@ _WEAK_PERSPECTIVE = 0.08
 _SAME_FIT, _SIMILAR_FIT = 9.0, 40.0
 """Differences of squared error, in units of the noise, that tell two poses apart: not, hardly."""
 _NOISE_FLOOR_PX2 = 0.01
+_MIRROR_ITERATIONS = 50
+"""Enough where half of the matches agree: a whole world that is mirrored, not a part of it."""
 
 
 def _within(name: str, value: float, low: float, high: float) -> None:
@@ -135,26 +137,27 @@ def solve_pnp(
         RSE-PF paper, Sect. 6.1 and Fig. 6; minimal solver after Gao et al. 2003, its ref. [13].
     """
     options = options or _DEFAULT_OPTIONS
-    points_world, pixels = _checked(points_world, pixels)
+    points_world, pixels, box_px = _checked(points_world, pixels)
     engine = options.engine or default_engine
     propose = engine_for(engine)
     n = len(pixels)
     T_camera_world = _proposed(propose, points_world, pixels, camera, options)
     if T_camera_world is None:
         raise _no_pose(points_world, pixels, 0, options)
-    view, error2 = evidence.view_of(T_camera_world, points_world, pixels, camera)
-    inliers = (error2 <= options.inlier_px**2).nonzero()[0]
+    view = evidence.view_of(T_camera_world, points_world, pixels, camera)
+    inliers = (view[evidence.ERROR2] <= options.inlier_px**2).nonzero()[0]
     count = len(inliers)
     if count < 4:
         raise _no_pose(points_world, pixels, count, options)
-    view, error2 = view.take(inliers, axis=1), error2.take(inliers)
+    view = view.take(inliers, axis=1)
+    error2 = view[evidence.ERROR2]
     seen = evidence.places(view, camera)
     largest = float(np.maximum.reduce(error2))
     if _is_chance(n - (count - seen), seen, largest, camera):
         if not _is_chance(n, count, largest, camera):
             raise _in_few_places(count, seen)
         raise _no_pose(points_world, pixels, count, options)
-    shape = evidence.Shape(view, camera)
+    shape = evidence.Shape(view, camera, box_px)
     _refuse_degenerate(shape, options)
     squares = float(np.add.reduce(error2))
     variance = max(squares / max(1, 2 * count - 6), _NOISE_FLOOR_PX2)
@@ -163,7 +166,7 @@ def solve_pnp(
     if shape.depth_variation < _WEAK_PERSPECTIVE:
         found = _ambiguity(T_camera_world, points_world[inliers], pixels[inliers], camera, squares, variance)
         reason = found or reason
-    if 2 * count < n:
+    if count < weak.inlier_ratio * n:
         _refuse_mirrored(propose, points_world, pixels, camera, options, count)
     return PnpSolution(
         T_camera_world=T_camera_world,
@@ -176,7 +179,8 @@ def solve_pnp(
     )
 
 
-def _checked(points_world: Array, pixels: Array) -> tuple[Array, Array]:
+def _checked(points_world: Array, pixels: Array) -> tuple[Array, Array, Array]:
+    """Return points, pixels and the corners of the box around the pixels."""
     try:
         points = np.ascontiguousarray(points_world, dtype=np.float64)
         seen = np.ascontiguousarray(pixels, dtype=np.float64)
@@ -192,14 +196,21 @@ def _checked(points_world: Array, pixels: Array) -> tuple[Array, Array]:
             f"got {len(points)} correspondences, a pose needs at least 4",
             hint="loosen the matcher, or skip this frame",
         )
-    for name, rows in (("points_world", points), ("pixels", seen)):
-        least, most = np.minimum.reduce(rows, axis=None), np.maximum.reduce(rows, axis=None)
-        if not (least >= -_LARGEST and most <= _LARGEST):
-            raise BadRequest(
-                f"{name} holds a number that is not finite or is beyond {_LARGEST:g}",
-                hint="leave such rows out",
-            )
-    return points, seen
+    box_px = np.empty((2, 2))
+    np.minimum.reduce(seen, axis=0, out=box_px[0])
+    np.maximum.reduce(seen, axis=0, out=box_px[1])
+    _refuse_absurd("pixels", box_px)
+    _refuse_absurd("points_world", points)
+    return points, seen, box_px
+
+
+def _refuse_absurd(name: str, rows: Array) -> None:
+    least, most = np.minimum.reduce(rows, axis=None), np.maximum.reduce(rows, axis=None)
+    if not (least >= -_LARGEST and most <= _LARGEST):
+        raise BadRequest(
+            f"{name} holds a number that is not finite or is beyond {_LARGEST:g}",
+            hint="leave such rows out",
+        )
 
 
 def _proposed(
@@ -211,7 +222,7 @@ def _proposed(
     T_camera_world = np.zeros((4, 4))
     T_camera_world[:3] = pose
     T_camera_world[3, 3] = 1.0
-    return T_camera_world if math.isfinite(float(np.add.reduce(T_camera_world, axis=None))) else None
+    return T_camera_world if math.isfinite(sum(T_camera_world.ravel().tolist())) else None
 
 
 def _is_chance(n: int, count: int, largest_error2_px2: float, camera: Camera) -> bool:
@@ -249,10 +260,10 @@ def _in_few_places(count: int, seen: int) -> DegenerateGeometry:
 def _refuse_degenerate(shape: evidence.Shape, options: PnpOptions) -> None:
     if shape.thinness < _COLLINEAR:
         raise _collinear(shape.thinness)
-    least_px = 2.0 * options.inlier_px
+    least_px = options.inlier_px
     if shape.radius_px < least_px:
         raise DegenerateGeometry(
-            f"the pixels that agree lie within {shape.radius_px:.1f} px of their centre, "
+            f"the pixels that agree lie {shape.radius_px:.1f} px (rms) from their centre, "
             f"less than {least_px:g} px",
             hint="match points all over the image, or skip this frame",
         )
@@ -320,10 +331,11 @@ def _refuse_mirrored(
     worlds are told by a far better pose of the reflected points.
     """
     reflected = -points_world
-    T_camera_world = _proposed(propose, reflected, pixels, camera, options)
+    few = msgspec.structs.replace(options, max_iterations=min(options.max_iterations, _MIRROR_ITERATIONS))
+    T_camera_world = _proposed(propose, reflected, pixels, camera, few)
     if T_camera_world is None:
         return
-    _, error2 = evidence.view_of(T_camera_world, reflected, pixels, camera)
+    error2 = evidence.view_of(T_camera_world, reflected, pixels, camera)[evidence.ERROR2]
     better = int(np.count_nonzero(error2 <= options.inlier_px**2))
     if better >= 2 * count:
         raise DegenerateGeometry(

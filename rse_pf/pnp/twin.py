@@ -10,7 +10,7 @@ import math
 import numpy as np
 
 from rse_pf.geometry import Array, Camera, exp_se3, pose_difference, transform
-from rse_pf.pnp.evidence import view_of
+from rse_pf.pnp.evidence import ERROR2, view_of
 
 __all__ = ["twin_of"]
 
@@ -50,8 +50,7 @@ def twin_of(
     other = _refined(turn @ T_camera_world, points_world, pixels, camera)
     if other is None or _is_same(T_camera_world, other):
         return None
-    _, error2 = view_of(other, points_world, pixels, camera)
-    return other, float(error2.sum())
+    return other, float(view_of(other, points_world, pixels, camera)[ERROR2].sum())
 
 
 def _is_same(T_camera_world: Array, other: Array) -> bool:

@@ -24,13 +24,19 @@ def at(pixels, depth_m=3.0):
     """A view of points that project to *pixels*."""
     pixels = np.asarray(pixels, dtype=np.float64)
     ones = np.ones(len(pixels))
-    return np.vstack([pixels.T, ones, ones / depth_m])
+    return np.vstack([pixels.T, ones, ones / depth_m, 0 * ones])
+
+
+def shape(seen):
+    box_px = np.array([seen[:2].min(axis=1), seen[:2].max(axis=1)])
+    return evidence.Shape(seen, KINECT, box_px)
 
 
 def test_the_view_projects_like_the_camera():
     problem = exact()
 
-    seen, error2 = view(problem)
+    seen = view(problem)
+    error2 = seen[evidence.ERROR2]
 
     points = transform(problem.T_camera_world, problem.points_world)
     np.testing.assert_allclose(seen[:2].T, problem.camera.project(points), atol=1e-9)
@@ -42,9 +48,9 @@ def test_a_point_behind_the_camera_is_infinitely_wrong():
     problem = exact()
     turned = np.diag([-1.0, 1.0, -1.0, 1.0]) @ problem.T_camera_world
 
-    _, error2 = evidence.view_of(turned, problem.points_world, problem.pixels, problem.camera)
+    seen = evidence.view_of(turned, problem.points_world, problem.pixels, problem.camera)
 
-    assert np.isinf(error2).all()
+    assert np.isinf(seen[evidence.ERROR2]).all()
 
 
 def test_the_information_matrix_is_that_of_numeric_derivatives():
@@ -59,7 +65,7 @@ def test_the_information_matrix_is_that_of_numeric_derivatives():
         rows.append((ahead - back).ravel() / (2 * h))
     jacobian = np.array(rows)
 
-    information = evidence.Shape(view(problem)[0], problem.camera).information
+    information = shape(view(problem)).information
 
     expected = jacobian @ jacobian.T
     np.testing.assert_allclose(information, expected, atol=1e-7 * np.abs(expected).max())
@@ -112,20 +118,20 @@ def test_a_few_strays_do_not_make_a_line_wide(strays):
     pixels = np.column_stack([np.linspace(50, 600, 60), np.linspace(100, 400, 60)]) + rng.normal(size=(60, 2))
     pixels[:strays] = rng.uniform(0, [640, 480], (strays, 2))
 
-    assert evidence.Shape(at(pixels), KINECT).thinness < 0.05
+    assert shape(at(pixels)).thinness < 0.05
 
 
 def test_a_filled_image_is_wide_and_one_place_has_no_width():
     pixels = np.random.default_rng(0).uniform(0, [640, 480], (200, 2))
 
-    assert evidence.Shape(at(pixels), KINECT).thinness > 0.15
+    assert shape(at(pixels)).thinness > 0.15
     assert evidence.slenderness(np.ones((20, 2))) == 0.0
 
 
 def test_depth_variation_is_that_of_the_inverse_depth():
-    seen, _ = view(exact())
+    seen = view(exact())
     inverse_depth = seen[evidence.Z_INV]
 
-    found = evidence.Shape(seen, KINECT).depth_variation
+    found = shape(seen).depth_variation
 
     assert found == pytest.approx(inverse_depth.std() / inverse_depth.mean())
