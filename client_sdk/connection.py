@@ -8,7 +8,6 @@ because a socket was.
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import random as random_module
 from collections.abc import Awaitable, Callable, Coroutine
 from typing import Any
@@ -128,6 +127,8 @@ class Connection:
         self._attempt = 0
         self._adopted = 0.0
         self._move_asked: tuple[_Socket, float] | None = None
+        self._lasting: list[asyncio.Task[None]] = []
+        self._closed = False
 
     async def open(self) -> None:
         """Dial until a server says Welcome, a few times.
@@ -145,14 +146,15 @@ class Connection:
                 if attempt == _FIRST_TRIES or refused.for_good or refused.wrong_address:
                     raise refused.error from None
                 await asyncio.sleep(self._pause_s(refused.after_s))
-        self._spawn(self._tick())
-        self._spawn(self._keep())
+        self._lasting = [self._spawn(self._tick()), self._spawn(self._keep())]
 
     async def close(self) -> None:
         """Close every socket and end every task."""
-        readers = {task for socket in self._sockets for task in socket.tasks}
-        for task in self._tasks - readers:
+        self._closed = True
+        lasting = self._lasting
+        for task in lasting:
             task.cancel()
+        await asyncio.gather(*lasting, return_exceptions=True)
         await asyncio.gather(*(self._say_goodbye(socket) for socket in list(self._sockets)))
         tasks = list(self._tasks)
         for task in tasks:
@@ -174,7 +176,7 @@ class Connection:
 
     async def _tick(self) -> None:
         """Call the session whenever something is due."""
-        while True:
+        while not self._closed:
             now = self._clock()
             self._take(None, self._session.due(now))
             for socket in list(self._sockets):
@@ -182,13 +184,12 @@ class Connection:
             self._next_tick = self._session.next_due(now)
             self.flush()
             pause_s = max(_SHORTEST_TICK_S, self._next_tick - self._clock())
-            with contextlib.suppress(asyncio.TimeoutError):
-                await asyncio.wait_for(self._wake.wait(), pause_s)
+            await _either(self._wake, pause_s)
             self._wake.clear()
 
     async def _keep(self) -> None:
         """Dial when there is no socket, and move when asked to."""
-        while self.fatal is None:
+        while self.fatal is None and not self._closed:
             if self._session.current is None:
                 await self._redial()
             elif self._move_asked is not None:
@@ -237,8 +238,7 @@ class Connection:
                     return
                 self._spawn(self._say_goodbye(fresh))
             pause_s = min(self._pause_s(after_s), max(0.0, until - self._clock()))
-            with contextlib.suppress(asyncio.TimeoutError):
-                await asyncio.wait_for(old.ended.wait(), pause_s)
+            await _either(old.ended, pause_s)
 
     # --- one socket ------------------------------------------------------------------------------
 
@@ -256,12 +256,11 @@ class Connection:
         socket.tasks = [self._spawn(self._read(socket)), self._spawn(self._write(socket))]
         socket.dirty.set()
         try:
-            await asyncio.wait_for(socket.welcome, self._settings.connect_timeout_s)
-        except asyncio.TimeoutError:
-            self._abort(socket)
-            raise _Refused(
-                ConnectError(f"{self._address} does not say welcome", hint="is it an RSE-PF server?")
-            ) from None
+            done, _ = await asyncio.wait({socket.welcome}, timeout=self._settings.connect_timeout_s)
+            if not done:
+                mute = ConnectError(f"{self._address} does not say welcome", hint="is it an RSE-PF server?")
+                raise _Refused(mute)
+            socket.welcome.result()
         except BaseException:
             self._abort(socket)
             raise
@@ -438,6 +437,15 @@ class Connection:
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
         return task
+
+
+async def _either(event: asyncio.Event, timeout_s: float) -> None:
+    """Wait for *event*, at most *timeout_s*; unlike ``wait_for``, never swallow a cancellation."""
+    waiting = asyncio.ensure_future(event.wait())
+    try:
+        await asyncio.wait({waiting}, timeout=timeout_s)
+    finally:
+        waiting.cancel()
 
 
 def _checked(url: str) -> str:
