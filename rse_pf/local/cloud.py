@@ -262,6 +262,8 @@ class LocalCloud:
             self._servers.clear()
             with contextlib.suppress(OSError):  # the folder may have been removed under our feet
                 remove_state(self.state)
+                if not self._adoptable:  # nobody can come back to this platform: nor may its tokens
+                    key_file(self.state).unlink(missing_ok=True)
             self._lock.release()
         self._tell("platform-gone")
 

@@ -18,6 +18,7 @@ from websockets.asyncio.client import ClientConnection
 
 from rse_pf.errors import ConfigurationError, UsageError
 from rse_pf.local.cloud import LocalCloud
+from rse_pf.local.firewall import key_file
 from rse_pf.local.processes import mark_of, wait_ended
 from rse_pf.local.state import read_state
 from rse_pf.settings import PlatformSettings
@@ -116,6 +117,7 @@ def test_robots_with_a_token_are_welcomed_by_both_servers_and_nothing_is_left(
     for pid in asyncio.run(run()):
         gone(pid)
     assert read_state(tmp_path / "a") is None
+    assert not key_file(tmp_path / "a").exists(), "a key that nobody needs any more"
 
 
 def test_the_door_refuses_who_has_no_token_and_knows_one_path_only(tmp_path: Path) -> None:
