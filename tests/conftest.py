@@ -6,6 +6,10 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import pytest
+from hypothesis import settings
+
+settings.register_profile("rse-pf", deadline=None)  # a crowded machine is no defect
+settings.load_profile("rse-pf")
 
 _REPOSITORY = Path(__file__).resolve().parents[1]
 _SOURCES = ("rse_pf", "client_sdk", "lambda_pnp", "stacks")
