@@ -135,8 +135,7 @@ class Shape:
 
     __slots__ = ("depth_variation", "information", "radius_px", "thinness")
 
-    def __init__(self, view: Array, camera: Camera, box_px: Array) -> None:
-        """Measure; *box_px* holds the corners of a box around all pixels, ``(2, 2)``."""
+    def __init__(self, view: Array, camera: Camera) -> None:
         k = view.shape[1]
         base = view[:ERROR2]
         products = (base[:, None] * base).reshape(16, k)
@@ -148,7 +147,8 @@ class Shape:
         mean_u, mean_v = u / k, v / k
         length2, width2 = _eigenvalues(uu - u * mean_u, uv - u * mean_v, vv - v * mean_v)
         self.radius_px = math.sqrt(max(0.0, length2 + width2) / k)
-        (left, top), (right, bottom) = box_px.tolist()
+        left, top = np.minimum.reduce(view[:ONE], axis=1).tolist()
+        right, bottom = np.maximum.reduce(view[:ONE], axis=1).tolist()
         far_u, far_v = max(right - mean_u, mean_u - left), max(bottom - mean_v, mean_v - top)
         spare = width2 - _STRAYS * (far_u * far_u + far_v * far_v)
         if spare > _PLAINLY_WIDE**2 * length2:

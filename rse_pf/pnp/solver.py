@@ -137,7 +137,7 @@ def solve_pnp(
         RSE-PF paper, Sect. 6.1 and Fig. 6; minimal solver after Gao et al. 2003, its ref. [13].
     """
     options = options or _DEFAULT_OPTIONS
-    points_world, pixels, box_px = _checked(points_world, pixels)
+    points_world, pixels = _checked(points_world, pixels)
     engine = options.engine or default_engine
     propose = engine_for(engine)
     n = len(pixels)
@@ -157,7 +157,7 @@ def solve_pnp(
         if not _is_chance(n, count, largest, camera):
             raise _in_few_places(count, seen)
         raise _no_pose(points_world, pixels, count, options)
-    shape = evidence.Shape(view, camera, box_px)
+    shape = evidence.Shape(view, camera)
     _refuse_degenerate(shape, options)
     squares = float(np.add.reduce(error2))
     variance = max(squares / max(1, 2 * count - 6), _NOISE_FLOOR_PX2)
@@ -179,8 +179,7 @@ def solve_pnp(
     )
 
 
-def _checked(points_world: Array, pixels: Array) -> tuple[Array, Array, Array]:
-    """Return points, pixels and the corners of the box around the pixels."""
+def _checked(points_world: Array, pixels: Array) -> tuple[Array, Array]:
     try:
         points = np.ascontiguousarray(points_world, dtype=np.float64)
         seen = np.ascontiguousarray(pixels, dtype=np.float64)
@@ -196,21 +195,15 @@ def _checked(points_world: Array, pixels: Array) -> tuple[Array, Array, Array]:
             f"got {len(points)} correspondences, a pose needs at least 4",
             hint="loosen the matcher, or skip this frame",
         )
-    box_px = np.empty((2, 2))
-    np.minimum.reduce(seen, axis=0, out=box_px[0])
-    np.maximum.reduce(seen, axis=0, out=box_px[1])
-    _refuse_absurd("pixels", box_px)
-    _refuse_absurd("points_world", points)
-    return points, seen, box_px
-
-
-def _refuse_absurd(name: str, rows: Array) -> None:
-    least, most = np.minimum.reduce(rows, axis=None), np.maximum.reduce(rows, axis=None)
-    if not (least >= -_LARGEST and most <= _LARGEST):
-        raise BadRequest(
-            f"{name} holds a number that is not finite or is beyond {_LARGEST:g}",
-            hint="leave such rows out",
-        )
+    with np.errstate(over="ignore"):
+        for name, rows in (("points_world", points), ("pixels", seen)):
+            flat = rows.ravel()
+            if not flat.dot(flat) < _LARGEST**2 and not (np.abs(flat) <= _LARGEST).all():
+                raise BadRequest(
+                    f"{name} holds a number that is not finite or is beyond {_LARGEST:g}",
+                    hint="leave such rows out",
+                )
+    return points, seen
 
 
 def _proposed(

@@ -28,8 +28,7 @@ def at(pixels, depth_m=3.0):
 
 
 def shape(seen):
-    box_px = np.array([seen[:2].min(axis=1), seen[:2].max(axis=1)])
-    return evidence.Shape(seen, KINECT, box_px)
+    return evidence.Shape(seen, KINECT)
 
 
 def test_the_view_projects_like_the_camera():
