@@ -210,6 +210,7 @@ class FakePlatform:
 
     def _door(self, connection: ServerConnection, request: Request) -> Response | None:
         self.handshakes.append(self.clock())
+        self._spawn(self._tell())
         given = request.headers.get("Authorization", "").removeprefix("Bearer ")
         self.tokens_seen.append(given)
         if self.refusals:

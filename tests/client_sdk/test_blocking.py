@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import asyncio
+import inspect
 import threading
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 from fakes import FakeServer
 
 import client_sdk
-from rse_pf.errors import UnknownService
+from rse_pf.errors import Disconnected, UnknownService
 
 
 @pytest.fixture
@@ -40,6 +42,34 @@ def test_has_the_public_methods_of_the_robot():
         return {name for name in vars(kind) if not name.startswith("_")}
 
     assert public(client_sdk.BlockingRobot) == public(client_sdk.Robot)
+
+
+@pytest.mark.parametrize("method", ["call", "solve_pnp", "close"])
+def test_takes_the_same_arguments_as_the_robot(method):
+    ours, theirs = (getattr(kind, method) for kind in (client_sdk.BlockingRobot, client_sdk.Robot))
+
+    assert inspect.signature(ours).parameters == inspect.signature(theirs).parameters
+
+
+def test_connects_with_the_same_arguments_as_the_robot():
+    ours, theirs = client_sdk.connect_blocking, client_sdk.connect
+
+    assert inspect.signature(ours).parameters == inspect.signature(theirs).parameters
+
+
+def test_a_closed_robot_is_disconnected_and_may_be_closed_again(url):
+    with client_sdk.connect_blocking(url) as robot:
+        robot.close()
+        with pytest.raises(Disconnected):
+            robot.call("echo", {})
+    assert robot.stats.sent == 0
+
+
+def test_many_threads_share_one_robot(url):
+    with client_sdk.connect_blocking(url) as robot, ThreadPoolExecutor(6) as threads:
+        values = threads.map(lambda n: robot.call("echo", {"value": n}).reply["value"], range(60))
+
+        assert list(values) == list(range(60))
 
 
 def test_calls_and_raises_like_the_robot(url):

@@ -1,0 +1,261 @@
+"""Who answers a command, what its caller is told, and what the robot remembers of it."""
+
+from __future__ import annotations
+
+import asyncio
+import dataclasses
+import subprocess
+import sys
+from random import Random
+
+import pytest
+from fake_platform import FakePlatform, echo_services
+
+import client_sdk
+from client_sdk.own_services import OwnServices
+from client_sdk.stats import StatsKeeper
+from rse_pf.errors import (
+    BadMessage,
+    Busy,
+    LimitExceeded,
+    MissingExtra,
+    NoConsensus,
+    TooFewCorrespondences,
+    UsageError,
+)
+from rse_pf.pnp.problems import make_degenerate, make_problem
+from rse_pf.services.builtin import builtin_services
+from rse_pf.services.echo import EchoReply
+from rse_pf.settings import PlatformSettings, SessionSettings
+from rse_pf.wire import Failure
+
+FAST = SessionSettings(reconnect_base_s=0.01, reconnect_max_s=0.05, silence_s=0.4)
+OWN_ECHO = client_sdk.CloudFirst(registry=echo_services(), robot_solve_s=0.01)
+
+
+def run(test):
+    return asyncio.run(asyncio.wait_for(test, 30))
+
+
+def connect(platform, **options):
+    return client_sdk.connect(platform.url, settings=FAST, random=Random(1), **options)
+
+
+def test_a_typed_reply_comes_typed_and_a_wrong_type_is_a_bad_message():
+    async def test():
+        async with FakePlatform() as platform, connect(platform) as robot:
+            typed = await robot.call("echo", {"value": 3}, EchoReply)
+            with pytest.raises(BadMessage):
+                await robot.call("echo", {"value": 3}, client_sdk.Stats)
+
+            assert typed.reply == EchoReply(value=3)
+            assert robot.stats.failures_by_code == {"bad-message": 1}
+
+    run(test())
+
+
+def test_the_hint_and_the_pause_of_a_failure_reach_the_caller():
+    async def busy(_, command):
+        return Failure(id=command.id, code="busy", message="full", hint="later", retry_after_ms=9e4)
+
+    async def test():
+        async with FakePlatform() as platform, connect(platform) as robot:
+            platform.on_command = busy
+            with pytest.raises(Busy, match="full") as told:
+                await robot.call("echo", {}, deadline_s=1)
+
+            assert (told.value.hint, told.value.retry_after_ms) == ("later", 9e4)
+
+    run(test())
+
+
+def test_a_cancelled_call_is_forgotten_and_not_sent_again():
+    async def test():
+        async with FakePlatform() as platform, connect(platform) as robot:
+            platform.hold = True
+            call = asyncio.create_task(robot.call("echo", {"value": "gone"}))
+            await platform.until(lambda: platform.sockets[0].commands)
+            call.cancel()
+            with pytest.raises(asyncio.CancelledError):
+                await call
+            platform.hold = False
+            platform.sockets[0].cut()
+
+            assert (await robot.call("echo", {"value": "here"})).reply == {"value": "here"}
+            assert [command.payload for command in platform.sockets[1].commands] == [{"value": "here"}]
+            assert robot.stats.unanswered == 0
+
+    run(test())
+
+
+def test_a_command_that_is_too_large_is_told_with_both_numbers_and_never_sent():
+    async def test():
+        async with FakePlatform() as platform, connect(platform, codec="json") as robot:
+            with pytest.raises(LimitExceeded, match=r"\d+ bytes is above 262144"):
+                await robot.call("echo", {"value": "x" * 300_000})
+
+            assert not list(platform.commands())
+
+    run(test())
+
+
+@pytest.mark.parametrize("deadline_s", [0, -1, float("nan"), float("inf"), 1e9])
+def test_an_absurd_deadline_is_refused(deadline_s):
+    async def test():
+        async with FakePlatform() as platform, connect(platform) as robot:
+            with pytest.raises(UsageError, match="deadline_s"):
+                await robot.call("echo", {}, deadline_s=deadline_s)
+
+    run(test())
+
+
+def test_the_cloud_answers_when_it_can_although_the_robot_could_too():
+    async def test():
+        async with FakePlatform() as platform, connect(platform, offload=OWN_ECHO) as robot:
+            answer = await robot.call("echo", {"value": 1}, deadline_s=2)
+
+            assert (answer.source, answer.server, answer.why) == ("cloud", "server-a", "")
+
+    run(test())
+
+
+def test_the_robot_mends_a_busy_cloud_and_says_why():
+    async def busy(_, command):
+        return Failure(id=command.id, code="busy", message="full", retry_after_ms=9e4)
+
+    async def test():
+        async with FakePlatform() as platform, connect(platform, offload=OWN_ECHO) as robot:
+            platform.on_command = busy
+            answer = await robot.call("echo", {"value": 1}, deadline_s=2)
+
+            assert (answer.source, answer.server, answer.reply) == ("robot", "robot", {"value": 1})
+            assert answer.why == "the cloud answered busy"
+            assert robot.stats.answered_by_robot == 1
+            assert robot.stats.failed == 0
+
+    run(test())
+
+
+def test_the_robot_answers_at_once_while_there_is_no_connection():
+    async def test():
+        async with FakePlatform() as platform, connect(platform, offload=OWN_ECHO) as robot:
+            platform.refusals = [(503, None)] * 1000
+            platform.sockets[0].cut()
+            await platform.until(lambda: len(platform.handshakes) > 1)
+            answer = await robot.call("echo", {"value": 1}, deadline_s=2)
+
+            assert (answer.source, answer.why) == ("robot", "no connection to the cloud")
+
+    run(test())
+
+
+def test_after_late_answers_the_robot_starts_at_once_and_the_cloud_wins_again_when_it_is_quick():
+    async def test():
+        async with FakePlatform() as platform, connect(platform, offload=OWN_ECHO) as robot:
+            platform.hold = True
+            late = await robot.call("echo", {"value": 1}, deadline_s=0.1)
+            while "cloud takes" not in (await robot.call("echo", {"value": 2}, deadline_s=0.1)).why:
+                pass
+            platform.hold = False
+            sources = {(await robot.call("echo", {"value": 3}, deadline_s=5)).source for _ in range(3)}
+
+            assert late.why == "the cloud did not answer in time"
+            assert sources == {"cloud"}
+
+    run(test())
+
+
+def test_a_frame_without_a_pose_is_no_reason_to_solve_it_again():
+    async def test():
+        registry = builtin_services(PlatformSettings())
+        async with FakePlatform(registry=registry) as platform:
+            offload = client_sdk.CloudFirst(registry=registry)
+            async with connect(platform, offload=offload) as robot:
+                noise = make_degenerate("noise", seed=1)
+                with pytest.raises(NoConsensus):
+                    await robot.solve_pnp(noise.points_world, noise.pixels, noise.camera, deadline_s=5)
+                good = make_problem(seed=1)
+                with pytest.raises(TooFewCorrespondences):
+                    await robot.solve_pnp(good.points_world[:3], good.pixels[:3], good.camera, deadline_s=5)
+
+                assert robot.stats.answered_by_robot == 0
+
+    run(test())
+
+
+def test_a_robot_without_a_solver_is_told_what_to_install(monkeypatch):
+    monkeypatch.setattr("rse_pf.pnp.available_engines", lambda: ())
+
+    async def test():
+        async with FakePlatform() as platform:
+            with pytest.raises(MissingExtra, match="poselib") as told:
+                await connect(platform, offload=client_sdk.CloudFirst()).__aenter__()
+            assert "rse-pf[solver]" in told.value.hint
+            assert not platform.sockets
+
+    run(test())
+
+
+def test_the_robots_own_services_take_the_engine_that_is_there(monkeypatch):
+    pytest.importorskip("cv2")
+    monkeypatch.setattr("rse_pf.pnp.available_engines", lambda: ("opencv",))
+    own = OwnServices(None, clock=lambda: 0.0)
+
+    run(own.prepare())
+    own.close()
+
+    assert own.offers("pnp")
+
+
+def test_the_stats_are_a_snapshot_that_nobody_can_change():
+    async def test():
+        async with FakePlatform() as platform, connect(platform) as robot:
+            before = robot.stats
+            await robot.call("echo", {"value": 1})
+
+            assert (before.sent, robot.stats.sent) == (0, 1)
+            with pytest.raises(dataclasses.FrozenInstanceError):
+                before.sent = 5
+            assert robot.stats.payload_bytes_max == robot.stats.payload_bytes_median > 0
+
+    run(test())
+
+
+def test_the_stats_of_a_long_run_keep_their_size_and_their_percentiles():
+    keeper = StatsKeeper(Random(3))
+    for value in range(50_000):
+        keeper.add("round_trip_ms", value)
+
+    assert len(keeper._samples["round_trip_ms"].values) == 2048
+    assert keeper.percentile("round_trip_ms", 0.5) == pytest.approx(25_000, abs=2_000)
+    assert keeper.percentile("round_trip_ms", 0.95) == pytest.approx(47_500, abs=1_000)
+
+
+def test_percentiles_are_the_nearest_rank():
+    keeper = StatsKeeper(Random(0))
+    for value in range(1, 101):
+        keeper.add("round_trip_ms", value)
+
+    assert [keeper.percentile("round_trip_ms", share) for share in (0.5, 0.95, 0.99)] == [50, 95, 99]
+    assert keeper.percentile("up_ms", 0.5) is None
+
+
+def test_importing_the_sdk_is_quick_and_pulls_in_no_heavy_package():
+    program = (
+        "import time, sys; began = time.perf_counter(); import client_sdk;"
+        "took = time.perf_counter() - began;"
+        "client_sdk.connect; client_sdk.connect_blocking; client_sdk.CloudFirst;"
+        "heavy = {'cv2', 'boto3', 'aws_cdk', 'cryptography', 'jwt', 'poselib', 'picows', 'h5py'};"
+        "sys.exit(f'{took} {heavy & set(sys.modules)}' if took > 0.3 or heavy & set(sys.modules) else 0)"
+    )
+
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
+
+    assert done.returncode == 0, done.stderr
+
+
+def test_every_public_name_is_there_and_an_unknown_one_is_not():
+    assert {"connect", "connect_blocking", "CloudFirst", "PointMap", "Stats"} <= set(client_sdk.__all__)
+    assert dir(client_sdk) == sorted(client_sdk.__all__)
+    with pytest.raises(AttributeError, match="teleport"):
+        client_sdk.teleport  # noqa: B018
