@@ -296,6 +296,17 @@ def test_a_cancelled_command_is_forgotten_and_never_resent():
     assert commands(open_link(session, now=1.0)) == []
 
 
+def test_a_command_cancelled_on_its_way_is_not_sent_again_when_its_link_dies():
+    session = make_session()
+    link = open_link(session)
+    session.cancel(session.submit("pnp", None, now=0.0))
+    commands(link)
+
+    session.close_link(link)
+
+    assert commands(open_link(session, now=1.0)) == []
+
+
 def test_a_cancelled_command_still_takes_its_room_until_the_server_answered():
     session = make_session()
     link = open_link(session, room=1)
