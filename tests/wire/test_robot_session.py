@@ -9,7 +9,7 @@ import pytest
 from rse_pf.errors import BadMessage, LimitExceeded, ProtocolError
 from rse_pf.settings import SessionSettings
 from rse_pf.wire import Command, Failure, Hello, Limits, Move, Ping, Pong, Result, Welcome, make_codec
-from rse_pf.wire.robot_session import Answered, Link, LinkLost, MoveAsked, Notice, RobotSession, Welcomed
+from rse_pf.wire.robot_session import Answered, Link, LinkLost, MoveAsked, RobotSession, Welcomed
 
 SETTINGS = SessionSettings()
 CODEC = make_codec("json", SETTINGS)
@@ -62,6 +62,15 @@ def codes(events) -> dict[int, str]:
         for event in events
         if isinstance(event, Answered)
     }
+
+
+def tend_until_lost(session: RobotSession, link: Link) -> tuple[float, list]:
+    """Return when an unanswering *link* was given up, and what the session said then."""
+    now, events = 0.0, []
+    while not events:
+        now = session.next_due(now)
+        events = session.tend(link, now)
+    return now, events
 
 
 def test_a_link_begins_with_hello():
@@ -290,7 +299,6 @@ def test_a_cancelled_command_is_forgotten_and_never_resent():
     session.cancel(identity)
     assert session.unanswered == 0
     assert tell(session, link, result(command), 0.1) == []
-    session.cancel(identity)
     session.close_link(link)
 
     assert commands(open_link(session, now=1.0)) == []
@@ -325,11 +333,7 @@ def test_silence_ends_a_link_with_an_unanswered_command_in_time():
     link = open_link(session)
     session.submit("pnp", None, now=0.0, deadline_s=60.0)
 
-    now, events = 0.0, []
-    while not events:
-        now = session.next_due(now)
-        events = session.tend(link, now)
-
+    now, events = tend_until_lost(session, link)
     assert events == [LinkLost("silence")]
     assert now <= SETTINGS.silence_s + SETTINGS.silence_s / 3 + 1e-9
     assert session.current is None
@@ -368,11 +372,7 @@ def test_an_idle_link_is_lost_when_its_ping_stays_unanswered():
     session = make_session()
     link = open_link(session)
 
-    now, events = 0.0, []
-    while not events:
-        now = session.next_due(now)
-        events = session.tend(link, now)
-
+    now, events = tend_until_lost(session, link)
     assert events == [LinkLost("no pong")]
     assert now <= SETTINGS.ping_interval_s + SETTINGS.ping_patience_s
 
@@ -390,11 +390,7 @@ def test_a_socket_without_a_welcome_is_given_up():
     session = make_session()
     link = session.open_link(0.0)
 
-    now, events = 0.0, []
-    while not events:
-        now = session.next_due(now)
-        events = session.tend(link, now)
-
+    now, events = tend_until_lost(session, link)
     assert events == [LinkLost("no welcome")]
     assert now <= SETTINGS.hello_timeout_s + SETTINGS.silence_s
 
@@ -474,14 +470,6 @@ def test_an_absurd_move_or_pause_cannot_stop_the_clockwork():
     assert session.next_due(0.1) <= 1.0
     assert set(codes(session.due(1.0))) <= {identity}
     assert session.unanswered == 0
-
-
-def test_a_failure_without_an_id_is_a_notice():
-    session = make_session()
-    link = open_link(session)
-    told = Failure(code="bad-message", message="what?")
-
-    assert tell(session, link, told, 0.1) == [Notice(told)]
 
 
 def test_what_does_not_travel_is_refused_before_it_becomes_a_command():

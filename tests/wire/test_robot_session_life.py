@@ -10,7 +10,7 @@ from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, 
 
 from rse_pf.settings import SessionSettings
 from rse_pf.wire import Command, Failure, Limits, Ping, Pong, Result, Welcome, make_codec
-from rse_pf.wire.robot_session import Answered, Link, RobotSession
+from rse_pf.wire.robot_session import Answered, Link, Notice, RobotSession
 
 SETTINGS = SessionSettings()
 CODEC = make_codec("json", SETTINGS)
@@ -143,3 +143,10 @@ class RobotLife(RuleBasedStateMachine):
 
 TestRobotLife = RobotLife.TestCase
 TestRobotLife.settings = hypothesis_settings(max_examples=30, stateful_step_count=40, deadline=None)
+
+
+def test_a_failure_without_an_id_is_a_notice():
+    session = RobotSession(codec=CODEC, settings=SETTINGS, sdk="test")
+    told = Failure(code="bad-message", message="what?")
+
+    assert session.receive(session.open_link(0.0), CODEC.encode(told), 0.1) == [Notice(told)]
