@@ -68,17 +68,20 @@ def _poselib_engine() -> Engine:
             "PINHOLE", [camera.fx, camera.fy, camera.cx, camera.cy], camera.width, camera.height
         )
 
-    def solve(points_world: Array, pixels: Array, camera: Camera, options: PnpOptions) -> Array | None:
-        """LO-RANSAC with P3P, then robust refinement (Larsson, PoseLib)."""
-        ransac = {
+    @lru_cache(maxsize=64)
+    def settings_of(options: PnpOptions) -> dict[str, float]:
+        return {
             "max_reproj_error": options.inlier_px,
             "max_error": options.inlier_px,
             "min_iterations": min(options.min_iterations, options.max_iterations),
             "max_iterations": options.max_iterations,
             "success_prob": options.confidence,
         }
+
+    def solve(points_world: Array, pixels: Array, camera: Camera, options: PnpOptions) -> Array | None:
+        """LO-RANSAC with P3P, then robust refinement (Larsson, PoseLib)."""
         try:
-            pose, _ = estimate(pixels, points_world, model_of(camera), ransac)
+            pose, _ = estimate(pixels, points_world, model_of(camera), settings_of(options))
         except (RuntimeError, ValueError):
             return None
         found: Array = pose.Rt

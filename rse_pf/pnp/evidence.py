@@ -13,7 +13,7 @@ import numpy as np
 
 from rse_pf.geometry import Array, Camera
 
-__all__ = ["Shape", "log10_false_alarms", "places", "slenderness", "view_of"]
+__all__ = ["Shape", "inverse_of_information", "log10_false_alarms", "places", "slenderness", "view_of"]
 
 U, V, ONE, Z_INV, ERROR2 = range(5)
 """Rows of a view: projected pixel, ones, 1/z in the camera's frame, and squared error, px^2."""
@@ -27,7 +27,7 @@ _NEAR_M = 1e-6
 _STRAYS = 4.0
 _PLAINLY_WIDE = 0.15
 _CELLS_ACROSS = 40
-_PLAINLY_MANY, _ENOUGH = 48, 64
+_PLAINLY_MANY, _ENOUGH = 24, 32
 
 
 @lru_cache(maxsize=64)
@@ -147,14 +147,92 @@ class Shape:
         mean_u, mean_v = u / k, v / k
         length2, width2 = _eigenvalues(uu - u * mean_u, uv - u * mean_v, vv - v * mean_v)
         self.radius_px = math.sqrt(max(0.0, length2 + width2) / k)
-        left, top = np.minimum.reduce(view[:ONE], axis=1).tolist()
-        right, bottom = np.maximum.reduce(view[:ONE], axis=1).tolist()
-        far_u, far_v = max(right - mean_u, mean_u - left), max(bottom - mean_v, mean_v - top)
-        spare = width2 - _STRAYS * (far_u * far_u + far_v * far_v)
+        # No inlier lies further out than the corner of the image (or, outside it, than thrice the rms).
+        reach_u, reach_v = max(mean_u, camera.width - mean_u), max(mean_v, camera.height - mean_v)
+        spare = width2 - _STRAYS * max(reach_u * reach_u + reach_v * reach_v, 9.0 * self.radius_px**2)
         if spare > _PLAINLY_WIDE**2 * length2:
             self.thinness = math.sqrt(spare / length2)
         else:
             self.thinness = slenderness(view[:ONE].T)
+
+
+def inverse_of_information(information: Array, variance_px2: float) -> tuple[Array, list[float]]:
+    """Return *variance_px2* times the inverse of a symmetric ``(6, 6)`` matrix, and its diagonal.
+
+    By blocks of 3x3 with plain numbers: a third of the time of a general inverse at this size.
+
+    Raises:
+        ZeroDivisionError: A block is singular: some motion of the camera changes no pixel.
+    """
+    rows = (information / variance_px2).tolist()
+    (a0, a1, a2, b00, b01, b02), (_, a3, a4, b10, b11, b12), (_, _, a5, b20, b21, b22) = rows[:3]
+    (_, _, _, d0, d1, d2), (_, _, _, _, d3, d4), (_, _, _, _, _, d5) = rows[3:]
+    p0, p1, p2, p3, p4, p5 = _symmetric_inverse(a0, a1, a2, a3, a4, a5)
+    # W = A^-1 B, then the Schur complement S = D - B^T W.
+    w00, w01, w02 = (
+        p0 * b00 + p1 * b10 + p2 * b20,
+        p0 * b01 + p1 * b11 + p2 * b21,
+        p0 * b02 + p1 * b12 + p2 * b22,
+    )
+    w10, w11, w12 = (
+        p1 * b00 + p3 * b10 + p4 * b20,
+        p1 * b01 + p3 * b11 + p4 * b21,
+        p1 * b02 + p3 * b12 + p4 * b22,
+    )
+    w20, w21, w22 = (
+        p2 * b00 + p4 * b10 + p5 * b20,
+        p2 * b01 + p4 * b11 + p5 * b21,
+        p2 * b02 + p4 * b12 + p5 * b22,
+    )
+    q0, q1, q2, q3, q4, q5 = _symmetric_inverse(
+        d0 - b00 * w00 - b10 * w10 - b20 * w20,
+        d1 - b00 * w01 - b10 * w11 - b20 * w21,
+        d2 - b00 * w02 - b10 * w12 - b20 * w22,
+        d3 - b01 * w01 - b11 * w11 - b21 * w21,
+        d4 - b01 * w02 - b11 * w12 - b21 * w22,
+        d5 - b02 * w02 - b12 * w12 - b22 * w22,
+    )
+    # X = W S^-1 is minus the block off the diagonal, and the first block is A^-1 + X W^T.
+    x00, x01, x02 = (
+        w00 * q0 + w01 * q1 + w02 * q2,
+        w00 * q1 + w01 * q3 + w02 * q4,
+        w00 * q2 + w01 * q4 + w02 * q5,
+    )
+    x10, x11, x12 = (
+        w10 * q0 + w11 * q1 + w12 * q2,
+        w10 * q1 + w11 * q3 + w12 * q4,
+        w10 * q2 + w11 * q4 + w12 * q5,
+    )
+    x20, x21, x22 = (
+        w20 * q0 + w21 * q1 + w22 * q2,
+        w20 * q1 + w21 * q3 + w22 * q4,
+        w20 * q2 + w21 * q4 + w22 * q5,
+    )
+    p0 += x00 * w00 + x01 * w01 + x02 * w02
+    p1 += x00 * w10 + x01 * w11 + x02 * w12
+    p2 += x00 * w20 + x01 * w21 + x02 * w22
+    p3 += x10 * w10 + x11 * w11 + x12 * w12
+    p4 += x10 * w20 + x11 * w21 + x12 * w22
+    p5 += x20 * w20 + x21 * w21 + x22 * w22
+    inverse = np.array(
+        [
+            p0, p1, p2, -x00, -x01, -x02, p1, p3, p4, -x10, -x11, -x12, p2, p4, p5, -x20, -x21, -x22,
+            -x00, -x10, -x20, q0, q1, q2, -x01, -x11, -x21, q1, q3, q4, -x02, -x12, -x22, q2, q4, q5,
+        ]
+    )  # fmt: skip
+    return inverse.reshape(6, 6), [p0, p3, p5, q0, q3, q5]
+
+
+def _symmetric_inverse(
+    a: float, b: float, c: float, d: float, e: float, f: float
+) -> tuple[float, float, float, float, float, float]:
+    """Return the upper triangle of the inverse of [[a, b, c], [b, d, e], [c, e, f]]."""
+    first, second, third = d * f - e * e, c * e - b * f, b * e - c * d
+    scale = 1.0 / (a * first + b * second + c * third)
+    return (
+        first * scale, second * scale, third * scale,
+        (a * f - c * c) * scale, (b * c - a * e) * scale, (a * d - b * b) * scale,
+    )  # fmt: skip
 
 
 def slenderness(rows: Array) -> float:

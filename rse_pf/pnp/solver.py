@@ -75,8 +75,7 @@ class WeakLimits:
     rotation_rad: float = math.radians(2.0 / 3.0)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class PnpSolution:
+class PnpSolution(msgspec.Struct, frozen=True, kw_only=True, eq=False):
     """A pose and what speaks for it.
 
     Attributes:
@@ -99,6 +98,7 @@ class PnpSolution:
     engine: str
 
 
+_LAST_ROW = np.diag([0.0, 0.0, 0.0, 1.0])
 _DEFAULT_OPTIONS = PnpOptions()
 _DEFAULT_LIMITS = WeakLimits()
 
@@ -152,11 +152,8 @@ def solve_pnp(
     view = view.take(inliers, axis=1)
     error2 = view[evidence.ERROR2]
     seen = evidence.places(view, camera)
-    largest = float(np.maximum.reduce(error2))
-    if _is_chance(n - (count - seen), seen, largest, camera):
-        if not _is_chance(n, count, largest, camera):
-            raise _in_few_places(count, seen)
-        raise _no_pose(points_world, pixels, count, options)
+    if _is_chance(n - (count - seen), seen, options.inlier_px**2, camera):
+        _refuse_chance(points_world, pixels, camera, options, count, seen, float(error2.max()))
     shape = evidence.Shape(view, camera)
     _refuse_degenerate(shape, options)
     squares = float(np.add.reduce(error2))
@@ -195,31 +192,51 @@ def _checked(points_world: Array, pixels: Array) -> tuple[Array, Array]:
             f"got {len(points)} correspondences, a pose needs at least 4",
             hint="loosen the matcher, or skip this frame",
         )
-    with np.errstate(over="ignore"):
-        for name, rows in (("points_world", points), ("pixels", seen)):
-            flat = rows.ravel()
-            if not flat.dot(flat) < _LARGEST**2 and not (np.abs(flat) <= _LARGEST).all():
-                raise BadRequest(
-                    f"{name} holds a number that is not finite or is beyond {_LARGEST:g}",
-                    hint="leave such rows out",
-                )
+    # vdot of a row of numbers with itself is their sum of squares; it overflows without a warning.
+    if not np.vdot(points, points) < _LARGEST**2 and not (np.abs(points) <= _LARGEST).all():
+        raise _absurd("points_world")
+    if not np.vdot(seen, seen) < _LARGEST**2 and not (np.abs(seen) <= _LARGEST).all():
+        raise _absurd("pixels")
     return points, seen
+
+
+def _absurd(name: str) -> BadRequest:
+    return BadRequest(
+        f"{name} holds a number that is not finite or is beyond {_LARGEST:g}", hint="leave such rows out"
+    )
 
 
 def _proposed(
     propose: Engine, points_world: Array, pixels: Array, camera: Camera, options: PnpOptions
 ) -> Array | None:
+    """Return the engine's pose; one that is not finite agrees with no point, so it is found out below."""
     pose = propose(points_world, pixels, camera, options)
     if pose is None:
         return None
-    T_camera_world = np.zeros((4, 4))
+    T_camera_world: Array = _LAST_ROW.copy()
     T_camera_world[:3] = pose
-    T_camera_world[3, 3] = 1.0
-    return T_camera_world if math.isfinite(sum(T_camera_world.ravel().tolist())) else None
+    return T_camera_world
 
 
 def _is_chance(n: int, count: int, largest_error2_px2: float, camera: Camera) -> bool:
     return evidence.log10_false_alarms(n, count, largest_error2_px2, camera) > _CHANCE
+
+
+def _refuse_chance(
+    points_world: Array,
+    pixels: Array,
+    camera: Camera,
+    options: PnpOptions,
+    count: int,
+    seen: int,
+    largest_error2_px2: float,
+) -> None:
+    """Judge once more by the largest error that there is, not by the largest that is allowed."""
+    n = len(pixels)
+    if _is_chance(n - (count - seen), seen, largest_error2_px2, camera):
+        if not _is_chance(n, count, largest_error2_px2, camera):
+            raise _in_few_places(count, seen)
+        raise _no_pose(points_world, pixels, count, options)
 
 
 def _no_pose(points_world: Array, pixels: Array, count: int, options: PnpOptions) -> PnpError:
@@ -265,12 +282,10 @@ def _refuse_degenerate(shape: evidence.Shape, options: PnpOptions) -> None:
 def _covariance(information: Array, variance_px2: float) -> tuple[Array, list[float]]:
     """Return the covariance and its diagonal, all of it positive."""
     try:
-        covariance = np.linalg.inv(information).astype(np.float64, copy=False)
-    except np.linalg.LinAlgError:
-        covariance = np.full((6, 6), -1.0)
-    covariance *= variance_px2
-    variances: list[float] = covariance.diagonal().tolist()
-    if not min(variances) > 0.0:
+        covariance, variances = evidence.inverse_of_information(information, variance_px2)
+    except ZeroDivisionError:
+        variances = [-1.0]
+    if not all(value > 0.0 for value in variances):
         raise DegenerateGeometry(
             "the correspondences leave a motion of the camera free", hint="match more of the scene"
         )
