@@ -19,18 +19,11 @@ SPELLINGS = {"settings", "limits", "s"}
 OWNERS = Counter(name for _, name in NAMES)
 
 WAITING: dict[str, set[str]] = {
-    "health": {"cloud_interval_s", "cloud_timeout_s", "grace_s"},
-    "scaling": {
-        "busy_cpu_percent", "very_busy_cpu_percent", "idle_s", "idle_cpu_percent", "period_s",
-        "busy_periods", "step", "big_step", "min_servers", "max_servers", "warm_up_s",
-        "max_robots_per_server", "max_queue_ms", "deregistration_s",
-    },
-    "data": {
-        "enabled", "store", "port", "max_object_bytes", "quota_bytes", "infrequent_after_days",
-        "glacier_after_days",
-    },
-    "services": {"folder", "max_environments", "memory_bytes", "grace_s"},
-    "cloud": {"region", "lab", "certificate_arn", "domain_name", "instance_type"},
+    "health": {"grace_s"},
+    "scaling": {"deregistration_s", "warm_up_s"},
+    "data": {"enabled", "glacier_after_days", "infrequent_after_days", "max_object_bytes", "port", "quota_bytes", "store"},
+    "services": {"folder", "grace_s", "max_environments", "memory_bytes"},
+    "cloud": {"certificate_arn", "domain_name", "instance_type", "lab", "region"},
 }  # fmt: skip
 """Settings whose readers are not written yet; whoever writes one strikes it out here."""
 

@@ -1,0 +1,48 @@
+"""Judge a server by its health checks as a target group does: counts in a row, after a grace.
+
+The same numbers go to the ALB, to Envoy and to this rule.  Promises no clock and no socket: the outcome of
+a check and the time come in, a new state comes out.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from typing import Literal
+
+from rse_pf.settings import HealthSettings
+
+__all__ = ["Health", "observe", "time_to_notice_s"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Health:
+    """What is known of one server.  ``row`` counts equal outcomes; ``started_s`` begins the grace."""
+
+    started_s: float
+    state: Literal["starting", "healthy", "unhealthy"] = "starting"
+    last_ok: bool = False
+    row: int = 0
+
+
+def observe(health: Health, ok: bool, settings: HealthSettings, *, now_s: float) -> Health:
+    """Return the health after one more check.
+
+    A server becomes healthy after ``healthy_checks`` good ones in a row, and unhealthy after
+    ``unhealthy_checks`` failed ones; one that was never healthy only after ``grace_s``.
+    """
+    row = health.row + 1 if ok == health.last_ok else 1
+    state = health.state
+    if ok and row >= settings.healthy_checks:
+        state = "healthy"
+    elif not ok and row >= settings.unhealthy_checks:
+        in_grace = state == "starting" and now_s - health.started_s < settings.grace_s
+        state = "starting" if in_grace else "unhealthy"
+    return dataclasses.replace(health, state=state, last_ok=ok, row=row)
+
+
+def time_to_notice_s(settings: HealthSettings, *, local: bool) -> float:
+    """Return the longest time between a failure and its verdict, in seconds; a drain waits for it."""
+    interval_s = settings.local_interval_s if local else settings.cloud_interval_s
+    timeout_s = settings.local_timeout_s if local else settings.cloud_timeout_s
+    return interval_s * settings.unhealthy_checks + timeout_s

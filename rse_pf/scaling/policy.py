@@ -1,0 +1,148 @@
+"""Decide when the platform grows, shrinks or replaces a server: the paper's scale modifier as a pure rule.
+
+`decide` is told what was measured and what time it is, and says what to do; whoever calls it does it.
+`rse_pf.scaling.alarms` says the same to CloudWatch, and a law test holds both together.  Promises no clock,
+no memory between calls, and that a period without a sample is no reason to act.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+from rse_pf.settings import ScalingSettings
+
+__all__ = ["Action", "Fleet", "Kind", "Sample", "decide"]
+
+Kind = Literal["grow", "shrink", "replace", "stay"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Sample:
+    """What the monitor saw in one whole period, over all servers that are past their warm-up.
+
+    ``start_s`` is where the period *began*, so a sample speaks for ``[start_s, start_s + period)``.
+    """
+
+    start_s: float
+    cpu_percent: float
+    requests: float
+    robots_per_server: float = 0.0
+    queue_ms: float = 0.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Fleet:
+    """The servers as they stand: all of them, those still warming up, those that failed their checks."""
+
+    servers: int
+    warming: int = 0
+    unhealthy: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Action:
+    """One thing to do.  ``names`` says which servers (replace only); ``reason`` goes into the log."""
+
+    kind: Kind
+    servers: int = 0
+    names: tuple[str, ...] = ()
+    reason: str = ""
+
+
+def decide(
+    samples: Sequence[Sample],
+    fleet: Fleet,
+    settings: ScalingSettings,
+    *,
+    now_s: float,
+    acted_s: float = -math.inf,
+    compress: float = 1.0,
+) -> tuple[Action, ...]:
+    """Return what to do now: replacements first, then exactly one of grow, shrink or stay.
+
+    A busy platform grows again in every period that stays busy; servers that still warm up count as
+    already added, as in step scaling of Amazon EC2 Auto Scaling, and block every shrink.
+
+    Args:
+        samples: Whole periods, in order; later ones than *now_s* are ignored.
+        fleet: The servers now.
+        settings: Thresholds and bounds.
+        now_s: Any clock, seconds; the one of the samples.
+        acted_s: When the scale was last acted on; each period is acted on once.
+        compress: Periods are shorter by this factor; for experiments.
+
+    Source:
+        RSE-PF paper, Sect. 6.2: busy above 70 % CPU, one server less after five idle minutes.
+    """
+    replacements: tuple[Action, ...] = ()
+    if fleet.unhealthy:
+        replacements = (
+            Action(
+                kind="replace",
+                servers=len(fleet.unhealthy),
+                names=fleet.unhealthy,
+                reason=f"{len(fleet.unhealthy)} failed their health checks",
+            ),
+        )
+    period_s = settings.period_s / compress
+    # The half guards against a start that is a rounding error below its multiple.
+    ended = math.floor(now_s / period_s + 1e-6)
+    if fleet.servers < settings.min_servers:
+        missing = settings.min_servers - fleet.servers
+        return (*replacements, Action(kind="grow", servers=missing, reason="fewer than scaling.min_servers"))
+    if math.isfinite(acted_s) and ended <= math.floor(acted_s / period_s + 1e-6):
+        return (*replacements, Action(kind="stay", reason="this period was acted on"))
+    by_period = {round(sample.start_s / period_s): sample for sample in samples}
+    return (*replacements, _scale(by_period, ended, fleet, settings))
+
+
+def _scale(by_period: dict[int, Sample], ended: int, fleet: Fleet, settings: ScalingSettings) -> Action:
+    wish, reason = _growth(_last(by_period, ended, settings.busy_periods), settings)
+    if wish:
+        most = min(settings.max_servers, fleet.servers - fleet.warming + wish)
+        more = most - fleet.servers
+        if more > 0:
+            return Action(kind="grow", servers=more, reason=reason)
+        bound = most == settings.max_servers
+        return Action(
+            kind="stay", reason=f"{reason}, but {'at scaling.max_servers' if bound else 'still warming up'}"
+        )
+    if _idle(_last(by_period, ended, settings.idle_s // settings.period_s), settings):
+        if fleet.warming:
+            return Action(kind="stay", reason="idle, but still warming up")
+        if fleet.servers > settings.min_servers:
+            return Action(kind="shrink", servers=1, reason=f"idle for {settings.idle_s} s")
+        return Action(kind="stay", reason="idle, at scaling.min_servers")
+    return Action(kind="stay", reason="neither busy nor idle")
+
+
+def _last(by_period: dict[int, Sample], ended: int, count: int) -> list[Sample]:
+    """Return the samples of the last *count* whole periods, or nothing if one is missing."""
+    found = [by_period[each] for each in range(ended - count, ended) if each in by_period]
+    return found if len(found) == count else []
+
+
+def _growth(last: list[Sample], settings: ScalingSettings) -> tuple[int, str]:
+    """Return by how many servers the busiest reason asks to grow, and the reason."""
+    if not last:
+        return 0, ""
+    if all(sample.cpu_percent >= settings.busy_cpu_percent for sample in last):
+        newest = last[-1].cpu_percent
+        very = newest >= settings.very_busy_cpu_percent
+        return (settings.big_step if very else settings.step), f"CPU at {newest:.0f} %"
+    if settings.max_robots_per_server and all(
+        sample.robots_per_server >= settings.max_robots_per_server for sample in last
+    ):
+        return settings.step, f"{last[-1].robots_per_server:.0f} robots on each server"
+    if settings.max_queue_ms and all(sample.queue_ms >= settings.max_queue_ms for sample in last):
+        return settings.step, f"commands wait {last[-1].queue_ms:.0f} ms"
+    return 0, ""
+
+
+def _idle(last: list[Sample], settings: ScalingSettings) -> bool:
+    return bool(last) and all(
+        sample.requests == 0 and sample.cpu_percent < settings.idle_cpu_percent for sample in last
+    )
