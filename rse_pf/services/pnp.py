@@ -19,6 +19,7 @@ from rse_pf.wire.arrays import Array, reshaped
 __all__ = ["PnpReply", "PnpRequest", "make_request", "register"]
 
 _UPPER = np.triu_indices(6)
+_FLAT_UPPER = 6 * _UPPER[0] + _UPPER[1]
 _POINT_DECIMALS = 4
 _PIXEL_DECIMALS = 2
 
@@ -59,7 +60,7 @@ class PnpReply(msgspec.Struct, frozen=True, kw_only=True):
             T_camera_world=solution.T_camera_world.ravel(),
             inliers=solution.inliers.astype(np.uint32),
             rmse_px=solution.rmse_px,
-            covariance=solution.covariance[_UPPER].astype(np.float32),
+            covariance=solution.covariance.take(_FLAT_UPPER).astype(np.float32),
             verdict=solution.verdict,
             reason=solution.reason,
             engine=solution.engine,

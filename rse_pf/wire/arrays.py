@@ -23,6 +23,7 @@ Array = np.ndarray
 
 _EXTENSIONS: dict[int, np.dtype[Any]] = {1: np.dtype("<f4"), 2: np.dtype("<u4"), 3: np.dtype("<f8")}
 _F4, _U4, _F8 = 1, 2, 3
+_KINDS = {np.dtype(np.float32): _F4, np.dtype(np.uint32): _U4, np.dtype(np.float64): _F8}
 
 
 def json_encode_hook(value: Any) -> Any:
@@ -34,16 +35,12 @@ def json_encode_hook(value: Any) -> Any:
 
 def binary_encode_hook(value: Any) -> Any:
     """Return the MessagePack extension of an array: float32, uint32 if it fits, else float64."""
-    if isinstance(value, np.ndarray) and value.dtype.kind in "fiu":
-        kind = {"f4": _F4, "u4": _U4}.get(value.dtype.str[1:], _F8)
-        if (
-            kind == _F8
-            and value.dtype.kind != "f"
-            and value.min(initial=0) >= 0
-            and value.max(initial=0) < 2**32
-        ):
-            kind = _U4
-        return msgspec.msgpack.Ext(kind, value.astype(_EXTENSIONS[kind], copy=False).tobytes())
+    if isinstance(value, np.ndarray):
+        kind = _KINDS.get(value.dtype)
+        if kind is None and value.dtype.kind in "fiu":
+            kind = _U4 if _fits_uint32(value) else _F8
+        if kind is not None:
+            return msgspec.msgpack.Ext(kind, value.astype(_EXTENSIONS[kind], copy=False).tobytes())
     raise _unknown(value)
 
 
@@ -66,13 +63,14 @@ def decode_hook(kind: type[Any], value: Any) -> Any:
     """Return *value* as a flat float64 array of finite numbers."""
     if kind is not np.ndarray:
         raise BadMessage(f"{kind.__name__} does not travel in messages")
-    if isinstance(value, list):
+    if type(value) is np.ndarray and value.dtype.kind in "fiu":
+        array = value.astype(np.float64).ravel() if value.ndim != 1 else value.astype(np.float64)
+    elif isinstance(value, list):
         array = _from_list(value)
-    elif isinstance(value, np.ndarray) and value.dtype.kind in "fiu":
-        array = np.array(value, dtype=np.float64).ravel()
     else:
         raise BadMessage(f"expected an array of numbers, got {type(value).__name__}", hint="send a flat list")
-    if not math.isfinite(array.dot(array)):
+    # The sum of squares is finite only if every number is; vdot overflows without a warning.
+    if not math.isfinite(np.vdot(array, array)):
         raise BadMessage("an array holds a number that is not finite or absurdly large", hint="leave it out")
     return array
 
@@ -102,6 +100,10 @@ def _from_list(numbers: list[Any]) -> npt.NDArray[np.float64]:
     buffer = bytearray(8 * len(floats))
     struct.pack_into(f"{len(floats)}d", buffer, 0, *floats)
     return np.frombuffer(buffer, np.float64)
+
+
+def _fits_uint32(value: npt.NDArray[Any]) -> bool:
+    return value.dtype.kind != "f" and value.min(initial=0) >= 0 and bool(value.max(initial=0) < 2**32)
 
 
 def _unknown(value: Any) -> BadMessage:

@@ -75,8 +75,7 @@ def as_type(value: Any, kind: type[T]) -> T:
     Raises:
         BadMessage: It does not fit.
     """
-    with np.errstate(over="ignore", invalid="ignore"):
-        result: T = _guarded(lambda plain: msgspec.convert(plain, kind, dec_hook=arrays.decode_hook), value)
+    result: T = _guarded(lambda plain: msgspec.convert(plain, kind, dec_hook=arrays.decode_hook), value)
     return result
 
 
