@@ -211,6 +211,17 @@ class CloudSettings:
     certificate_arn: str = setting("", doc="certificate of the front door; needed when lab is false")
     domain_name: str = setting("", doc="name of the front door; needed when lab is false")
     instance_type: str = setting("c7i.large", doc="EC2 type of a backend server (x86-64)")
+    image_parameter: str = setting("/aws/service/debian/release/12/latest/amd64", doc="SSM parameter that names the machine image", source="Debian's public parameter")
+    endpoints: str = setting("minimal", doc="interface endpoints: minimal (monitoring, autoscaling, logs) or full (also ssm, secretsmanager)", choices=("minimal", "full"))
+    s3_prefix_list: str = setting("", doc="S3's prefix list of the region; empty takes it from the table in stacks/firewall.py")
+    robot_cidr: str = setting("0.0.0.0/0", doc="addresses that robots may come from")
+    idle_timeout_s: int = setting(120, unit="s", doc="the ALB ends a silent connection after this; above the ping interval", low=30, high=4000)
+    requests_per_5_minutes: int = setting(2000, unit="requests", doc="WAF: handshakes of one address in five minutes", low=100)
+    drain_s: int = setting(60, unit="s", doc="time the termination hook gives a leaving server", low=30, high=7200)
+    lambda_memory_mb: int = setting(1769, unit="MB", doc="memory of the serverless PnP; 1769 is one vCPU", low=128, high=10240)
+    lambda_concurrency: int = setting(20, doc="executions of the serverless PnP at a time", low=1)
+    lambda_timeout_s: int = setting(10, unit="s", doc="longest execution of the serverless PnP", low=1, high=900)
+    log_days: int = setting(30, unit="days", doc="logs are kept this long", low=1)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
