@@ -213,7 +213,7 @@ class CloudSettings:
     instance_type: str = setting("c7i.large", doc="EC2 type of a backend server (x86-64)")
     image_parameter: str = setting("/aws/service/debian/release/12/latest/amd64", doc="SSM parameter that names the machine image", source="Debian's public parameter")
     endpoints: str = setting("minimal", doc="interface endpoints: minimal (monitoring, autoscaling, logs) or full (also ssm, secretsmanager)", choices=("minimal", "full"))
-    s3_prefix_list: str = setting("", doc="S3's prefix list of the region; empty takes it from the table in stacks/firewall.py")
+    s3_prefix_list: str = setting("", doc="prefix list of S3 in the region; empty takes it from the table in stacks/firewall.py")
     robot_cidr: str = setting("0.0.0.0/0", doc="addresses that robots may come from")
     idle_timeout_s: int = setting(120, unit="s", doc="the ALB ends a silent connection after this; above the ping interval", low=30, high=4000)
     requests_per_5_minutes: int = setting(2000, unit="requests", doc="WAF: handshakes of one address in five minutes", low=100)

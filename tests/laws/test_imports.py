@@ -55,6 +55,7 @@ PACKAGES: dict[str, tuple[str, ...]] = {
     "botocore": ("rse_pf/aws/",),
     "aws_cdk": ("stacks/", "app.py"),
     "constructs": ("stacks/", "app.py"),
+    "jsii": ("stacks/",),
     "cdk_nag": ("stacks/", "app.py"),
     "matplotlib": ("rse_pf/experiments/pictures.py",),
     "PIL": ("rse_pf/experiments/map_picture.py",),

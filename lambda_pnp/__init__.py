@@ -1,0 +1,1 @@
+"""Pose estimation without a server: the PnP service as an AWS Lambda function."""

@@ -1,0 +1,134 @@
+"""From one HTTP event to one answer, with keys, settings and time as arguments.
+
+Promises that nothing is decoded before the token is verified, and that whatever comes in, a typed failure or
+a result goes out.
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+import os
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import Any
+
+from lambda_pnp.keys import read_object
+from rse_pf.auth import KeySet, verify_token
+from rse_pf.errors import BadMessage, Expired, RsePfError, Unauthorized, UnsupportedProtocol
+from rse_pf.service import Registry, dispatch, failure_of
+from rse_pf.services import pnp
+from rse_pf.settings import PlatformSettings, load_settings
+from rse_pf.wire import SUBPROTOCOLS, Codec, Command, codec_for, make_codec
+
+__all__ = ["Answered", "Answering", "load_answering"]
+
+_ROOT = Path(__file__).resolve().parents[1]
+_SERVER = "lambda"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Answered:
+    """One answer: HTTP status, sub-protocol (empty: a JSON body of the door) and the bytes."""
+
+    status: int
+    content_type: str
+    body: bytes
+
+    def as_http(self, *, init_ms: float, cold: bool) -> dict[str, Any]:
+        """Return what a Function URL wants; ``init_ms`` and ``cold`` travel as headers beside the bytes."""
+        return {
+            "statusCode": self.status,
+            "headers": {
+                "content-type": self.content_type,
+                "x-rse-pf-init-ms": f"{init_ms:.1f}",
+                "x-rse-pf-cold": str(cold).lower(),
+            },
+            "isBase64Encoded": True,
+            "body": base64.b64encode(self.body).decode(),
+        }
+
+
+class Answering:
+    """Keys and settings of one function, and the one service it offers."""
+
+    def __init__(self, settings: PlatformSettings, keys: KeySet) -> None:
+        self._settings = settings
+        self._keys = keys
+        self._registry = Registry()
+        pnp.register(self._registry, settings.pnp)
+        self._codecs: dict[str, Codec] = {name: make_codec(name, settings.session) for name in SUBPROTOCOLS}
+
+    def answer(
+        self, event: Mapping[str, Any], *, now_s: float, left_ms: float, clock: Callable[[], float]
+    ) -> Answered:
+        """Answer *event*: Unix time *now_s*, *left_ms* before the function is cut, *clock* in seconds."""
+        arrived = clock()
+        headers = {str(name).lower(): str(each) for name, each in (event.get("headers") or {}).items()}
+        try:
+            kind, _, token = headers.get("authorization", "").partition(" ")
+            verify_token(
+                token.strip() if kind.lower() == "bearer" else "",
+                keys=self._keys, now=now_s, settings=self._settings.auth,
+            )  # fmt: skip
+            codec = self._codec(headers.get("content-type", ""))
+        except RsePfError as error:
+            return _turned_away(error)
+        try:
+            message = codec.decode_from_robot(_body(event))
+            if not isinstance(message, Command):
+                raise BadMessage("this is no command", hint="send commands only; there is no session here")
+        except RsePfError as error:
+            return self._said(codec, failure_of(error, server=_SERVER))
+        allowed_ms = self._settings.session.answer_timeout_s * 1e3
+        allowed_ms = min(left_ms, allowed_ms if message.deadline_ms is None else message.deadline_ms)
+        if (clock() - arrived) * 1e3 >= allowed_ms:
+            return self._said(codec, self._late(message))
+        answer = dispatch(self._registry, message, clock, server=_SERVER)
+        late = (clock() - arrived) * 1e3 > allowed_ms
+        return self._said(codec, self._late(message) if late else answer)
+
+    def _codec(self, content_type: str) -> Codec:
+        subprotocol = content_type.partition(";")[0].strip().removeprefix("application/")
+        name = codec_for([subprotocol])
+        if name is None:
+            raise UnsupportedProtocol(
+                "no sub-protocol that this function speaks was named",
+                hint=f"set Content-Type to one of {', '.join(SUBPROTOCOLS.values())}",
+            )
+        return self._codecs[name]
+
+    @staticmethod
+    def _late(command: Command) -> Any:
+        error = Expired("the deadline passed before the answer was ready", hint="allow more time")
+        return failure_of(error, command, server=_SERVER)
+
+    @staticmethod
+    def _said(codec: Codec, message: Any) -> Answered:
+        return Answered(
+            status=200, content_type=f"application/{SUBPROTOCOLS[codec.name]}", body=codec.encode(message)
+        )
+
+
+def _turned_away(error: RsePfError) -> Answered:
+    told = {"code": error.code, "message": error.message, "hint": error.hint}
+    status = 401 if isinstance(error, Unauthorized) else 400
+    return Answered(status=status, content_type="application/json", body=json.dumps(told).encode())
+
+
+def _body(event: Mapping[str, Any]) -> bytes:
+    body = event.get("body") or ""
+    if not event.get("isBase64Encoded"):
+        return str(body).encode()
+    try:
+        return base64.b64decode(body, validate=True)
+    except ValueError as error:
+        raise BadMessage("the body is not base64", hint="send the bytes of one message") from error
+
+
+def load_answering() -> Answering:
+    """Return what a cold start needs: the settings of the package, the keys of the artifact bucket."""
+    now = datetime.now(timezone.utc)
+    return Answering(load_settings(_ROOT / "settings.json"), KeySet.from_json(read_object(os.environ, now)))

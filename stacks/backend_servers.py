@@ -1,0 +1,120 @@
+"""The backend servers of Fig. 2: an Auto Scaling group of Debian machines without a way to the internet.
+
+They boot from one package in S3, whose address carries its hash.  Promises no SSH, no public address, IMDSv2
+with one hop, and that an instance is replaced when the load balancer finds it unhealthy.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import cast
+
+import aws_cdk as cdk
+from aws_cdk import aws_autoscaling as autoscaling
+from aws_cdk import aws_ec2 as ec2
+from aws_cdk import aws_elasticloadbalancingv2 as elbv2
+from aws_cdk import aws_iam as iam
+from aws_cdk import aws_s3_assets as s3_assets
+from aws_cdk import aws_sns as sns
+from constructs import Construct
+
+from rse_pf.scaling.alarms import NAMESPACE
+from rse_pf.settings import PlatformSettings
+from stacks.findings import acknowledge
+
+__all__ = ["BackendServers"]
+
+_BOOT = Path(__file__).parent / "boot" / "first_boot.py"
+_GIB = 8
+_START_S = 300
+
+
+class BackendServers(Construct):
+    """Role, launch template and group; ``group`` is what the scale modifier acts on."""
+
+    def __init__(
+        self,
+        scope: Construct,
+        construct_id: str,
+        *,
+        vpc: ec2.IVpc,
+        firewall_group: ec2.ISecurityGroup,
+        package: s3_assets.Asset,
+        topic: sns.ITopic,
+        targets: Sequence[elbv2.IApplicationTargetGroup],
+        key_set_url: str,
+        settings: PlatformSettings,
+    ) -> None:
+        super().__init__(scope, construct_id)
+        scaling = settings.scaling
+        self.role = self._role(package)
+        self.group = autoscaling.AutoScalingGroup(
+            self, "Group", vpc=vpc, min_capacity=scaling.min_servers, max_capacity=scaling.max_servers,
+            vpc_subnets=ec2.SubnetSelection(subnet_type=ec2.SubnetType.PRIVATE_ISOLATED),
+            launch_template=self._template(firewall_group, package, key_set_url, settings),
+            health_checks=autoscaling.HealthChecks.with_additional_checks(
+                additional_types=[autoscaling.AdditionalHealthCheckType.ELB],
+                grace_period=cdk.Duration.seconds(settings.health.grace_s),
+            ),
+            default_instance_warmup=cdk.Duration.seconds(scaling.warm_up_s),
+            group_metrics=[autoscaling.GroupMetrics.all()],
+            notifications=[autoscaling.NotificationConfiguration(topic=topic)],
+            update_policy=autoscaling.UpdatePolicy.rolling_update(
+                max_batch_size=1, min_instances_in_service=scaling.min_servers,
+                pause_time=cdk.Duration.seconds(settings.health.grace_s + _START_S),
+            ),
+        )  # fmt: skip
+        cast("autoscaling.CfnAutoScalingGroup", self.group.node.default_child).target_group_arns = [
+            each.target_group_arn for each in targets
+        ]
+        self.group.add_lifecycle_hook(
+            "Drain", lifecycle_transition=autoscaling.LifecycleTransition.INSTANCE_TERMINATING,
+            heartbeat_timeout=cdk.Duration.seconds(settings.cloud.drain_s),
+            default_result=autoscaling.DefaultResult.CONTINUE,
+        )  # fmt: skip
+
+    def _role(self, package: s3_assets.Asset) -> iam.Role:
+        role = iam.Role(self, "Role", assumed_by=iam.ServicePrincipal("ec2.amazonaws.com"))
+        role.add_to_policy(
+            iam.PolicyStatement(
+                actions=["s3:GetObject"], resources=[package.bucket.arn_for_objects(package.s3_object_key)]
+            )
+        )
+        role.add_to_policy(
+            iam.PolicyStatement(
+                actions=["cloudwatch:PutMetricData"], resources=["*"],
+                conditions={"StringEquals": {"cloudwatch:namespace": NAMESPACE}},
+            )
+        )  # fmt: skip
+        acknowledge(
+            role, "PutMetricData knows no resources; the condition allows one namespace", "IAM5[Resource::*]"
+        )
+        return role
+
+    def _template(
+        self,
+        firewall_group: ec2.ISecurityGroup,
+        package: s3_assets.Asset,
+        key_set_url: str,
+        settings: PlatformSettings,
+    ) -> ec2.LaunchTemplate:
+        encrypted = ec2.BlockDeviceVolume.ebs(
+            _GIB, encrypted=True, volume_type=ec2.EbsDeviceVolumeType.GP3, delete_on_termination=True
+        )
+        facts = {
+            "package": package.s3_object_url, "sha256": package.asset_hash, "keys": key_set_url,
+            "region": settings.cloud.region,
+        }  # fmt: skip
+        script = _BOOT.read_text(encoding="utf-8")
+        commands = f"{script}\nmain({cdk.Stack.of(self).to_json_string(facts)!s})\n"
+        return ec2.LaunchTemplate(
+            self, "Template", instance_type=ec2.InstanceType(settings.cloud.instance_type), role=self.role,
+            machine_image=ec2.MachineImage.from_ssm_parameter(
+                settings.cloud.image_parameter, os=ec2.OperatingSystemType.LINUX
+            ),
+            security_group=firewall_group, require_imdsv2=True, http_put_response_hop_limit=1,
+            http_endpoint=True, detailed_monitoring=True, associate_public_ip_address=False,
+            user_data=ec2.UserData.custom(commands),
+            block_devices=[ec2.BlockDevice(device_name="/dev/xvda", volume=encrypted)],
+        )  # fmt: skip

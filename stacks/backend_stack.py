@@ -1,0 +1,95 @@
+"""The platform itself: load balancer, backend servers, monitor, scale modifier, and who is told."""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+
+import aws_cdk as cdk
+from aws_cdk import aws_iam as iam
+from aws_cdk import aws_s3_assets as s3_assets
+from aws_cdk import aws_sns as sns
+from constructs import Construct
+
+from rse_pf.settings import PlatformSettings
+from stacks.assets import staged
+from stacks.backend_servers import BackendServers
+from stacks.data_stack import DataStack
+from stacks.findings import acknowledge
+from stacks.load_balancer import LoadBalancer
+from stacks.network_stack import NetworkStack
+from stacks.scale_modifier import ScaleModifier
+
+__all__ = ["KEY_SET", "BackendStack"]
+
+KEY_SET = "keys.json"
+"""Name of the public key set in the artifact bucket."""
+
+
+class BackendStack(cdk.Stack):
+    """Everything that a release changes."""
+
+    def __init__(
+        self,
+        scope: Construct,
+        construct_id: str,
+        *,
+        settings: PlatformSettings,
+        assets: Path,
+        network: NetworkStack,
+        data: DataStack,
+        env: cdk.Environment,
+    ) -> None:
+        super().__init__(scope, construct_id, env=env)
+        self.topic = sns.Topic(self, "Events", enforce_ssl=True)
+        self.balancer = LoadBalancer(
+            self, "LoadBalancer", vpc=network.vpc, group=network.firewall.balancer, settings=settings,
+            logs=data.access_logs,
+        )  # fmt: skip
+        with tempfile.TemporaryDirectory() as folder:
+            path = staged(assets, "wheelhouse", settings, Path(folder))
+            package = s3_assets.Asset(self, "Package", path=str(path))
+        self.servers = BackendServers(
+            self, "Servers", vpc=network.vpc, firewall_group=network.firewall.servers, package=package,
+            topic=self.topic, targets=list(self.balancer.targets.values()), settings=settings,
+            key_set_url=data.artifacts.s3_url_for_object(KEY_SET),
+        )  # fmt: skip
+        self.servers.role.add_to_policy(
+            iam.PolicyStatement(actions=["s3:GetObject"], resources=[data.artifacts.arn_for_objects(KEY_SET)])
+        )
+        group = self.servers.group
+        # The group's own name is Amazon's; written as a pattern it makes no cycle with the group.
+        self.servers.role.add_to_policy(
+            iam.PolicyStatement(
+                actions=["autoscaling:CompleteLifecycleAction"],
+                resources=[
+                    self.format_arn(
+                        service="autoscaling", resource="autoScalingGroup:*",
+                        resource_name=f"autoScalingGroupName/{self.stack_name}-*",
+                    )
+                ],
+            )
+        )  # fmt: skip
+        finding = (
+            f"IAM5[Resource::arn:aws:autoscaling:{self.region}:<AWS::AccountId>:autoScalingGroup:*"
+            f"/autoScalingGroupName/{self.stack_name}-*]"
+        )
+        reason = "the ARN of an Auto Scaling group holds an id that only AWS knows"
+        acknowledge(self.servers.role, reason, finding)
+        ScaleModifier(
+            self, "ScaleModifier", group_name=group.auto_scaling_group_name, topic_arn=self.topic.topic_arn,
+            settings=settings,
+        )  # fmt: skip
+        self._say_where(settings)
+
+    def _say_where(self, settings: PlatformSettings) -> None:
+        name = self.balancer.alb.load_balancer_dns_name
+        path = settings.serving.path
+        if settings.cloud.lab:
+            cdk.Annotations.of(self).add_warning_v2(
+                "rse-pf:lab", "cloud.lab is true: robots and tokens travel without TLS; for trials only"
+            )
+            cdk.CfnOutput(self, "Url", value=f"ws://{name}{path}")
+            return
+        cdk.CfnOutput(self, "Url", value=f"wss://{settings.cloud.domain_name}{path}")
+        cdk.CfnOutput(self, "Cname", value=f"{settings.cloud.domain_name} CNAME {name}")

@@ -1,0 +1,76 @@
+"""The firewall of Fig. 2: world -> load balancer -> backend servers, and nothing else in any direction.
+
+Servers reach S3's addresses and the interface endpoints alone.  Promises one open range of addresses only,
+``cloud.robot_cidr`` at the front door.
+"""
+
+from __future__ import annotations
+
+from aws_cdk import aws_ec2 as ec2
+from constructs import Construct
+
+from rse_pf.errors import ConfigurationError
+from rse_pf.settings import PlatformSettings
+from stacks.findings import acknowledge
+
+__all__ = ["S3_PREFIX_LISTS", "Firewall", "front_port", "inner_ports", "s3_prefix_list"]
+
+_HTTP, _HTTPS = 80, 443
+
+S3_PREFIX_LISTS = {
+    "us-east-1": "pl-63a5400a", "us-east-2": "pl-7ba54012", "us-west-1": "pl-6ba54002",
+    "us-west-2": "pl-68a54001", "eu-west-1": "pl-6da54004", "eu-central-1": "pl-6ea54007",
+    "ap-northeast-1": "pl-61a54008", "ap-northeast-2": "pl-78a54011", "ap-southeast-1": "pl-6fa54006",
+    "ap-southeast-2": "pl-6ca54005",
+}  # fmt: skip
+"""AWS-managed prefix lists com.amazonaws.REGION.s3; the AWS CLI names others."""
+
+
+def s3_prefix_list(settings: PlatformSettings) -> str:
+    """Return the prefix list of S3 in ``cloud.region``; raises ConfigurationError for an unknown region."""
+    region = settings.cloud.region
+    found = settings.cloud.s3_prefix_list or S3_PREFIX_LISTS.get(region)
+    if not found:
+        raise ConfigurationError(
+            f"no S3 prefix list is known for cloud.region = {region!r}",
+            hint=f"set cloud.s3_prefix_list, or choose one of {', '.join(S3_PREFIX_LISTS)}",
+        )
+    return found
+
+
+def front_port(settings: PlatformSettings) -> int:
+    """Return the port of the front door: plain in the lab, TLS otherwise."""
+    return _HTTP if settings.cloud.lab else _HTTPS
+
+
+class Firewall(Construct):
+    """Security groups of the load balancer, the servers and the endpoints."""
+
+    def __init__(
+        self, scope: Construct, construct_id: str, *, vpc: ec2.IVpc, settings: PlatformSettings
+    ) -> None:
+        super().__init__(scope, construct_id)
+        self.balancer = self._group("Balancer", vpc, "load balancer: robots in, servers out")
+        self.servers = self._group("Servers", vpc, "backend servers: load balancer in, S3 and endpoints out")
+        self.endpoints = self._group("Endpoints", vpc, "interface endpoints: servers in")
+        self.balancer.add_ingress_rule(
+            ec2.Peer.ipv4(settings.cloud.robot_cidr), ec2.Port.tcp(front_port(settings)), "robots"
+        )
+        acknowledge(self.balancer, "robots come from anywhere; cloud.robot_cidr narrows it", "EC23")
+        for port in inner_ports(settings):
+            self.balancer.add_egress_rule(self.servers, ec2.Port.tcp(port), "to the servers")
+            self.servers.add_ingress_rule(self.balancer, ec2.Port.tcp(port), "from the load balancer")
+        self.servers.add_egress_rule(
+            ec2.Peer.prefix_list(s3_prefix_list(settings)), ec2.Port.tcp(_HTTPS), "S3"
+        )
+        self.servers.add_egress_rule(self.endpoints, ec2.Port.tcp(_HTTPS), "to the endpoints")
+        self.endpoints.add_ingress_rule(self.servers, ec2.Port.tcp(_HTTPS), "from the servers")
+
+    def _group(self, name: str, vpc: ec2.IVpc, description: str) -> ec2.SecurityGroup:
+        return ec2.SecurityGroup(self, name, vpc=vpc, description=description, allow_all_outbound=False)
+
+
+def inner_ports(settings: PlatformSettings) -> list[int]:
+    """Return the ports of a server that the load balancer uses."""
+    ports = [settings.serving.port, settings.serving.control_port]
+    return [*ports, settings.data.port] if settings.data.enabled else ports

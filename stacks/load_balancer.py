@@ -1,0 +1,100 @@
+"""The load balancer of Fig. 2: an ALB that takes WebSockets and asks servers if they are ready."""
+
+from __future__ import annotations
+
+import aws_cdk as cdk
+from aws_cdk import aws_ec2 as ec2
+from aws_cdk import aws_elasticloadbalancingv2 as elbv2
+from aws_cdk import aws_s3 as s3
+from aws_cdk import aws_wafv2 as wafv2
+from constructs import Construct
+
+from rse_pf.settings import PlatformSettings
+from stacks.firewall import front_port
+
+__all__ = ["LoadBalancer"]
+
+_FIVE_MINUTES_S = 300
+
+
+class LoadBalancer(Construct):
+    """Listener, target groups of the services that run, and a WAF with a rate rule."""
+
+    def __init__(
+        self,
+        scope: Construct,
+        construct_id: str,
+        *,
+        vpc: ec2.IVpc,
+        group: ec2.ISecurityGroup,
+        logs: s3.IBucket,
+        settings: PlatformSettings,
+    ) -> None:
+        super().__init__(scope, construct_id)
+        self.alb = elbv2.ApplicationLoadBalancer(
+            self, "Alb", vpc=vpc, internet_facing=True, security_group=group, drop_invalid_header_fields=True,
+            idle_timeout=cdk.Duration.seconds(settings.cloud.idle_timeout_s),
+        )  # fmt: skip
+        self.alb.log_access_logs(logs, "alb")
+        self.targets = {"robots": self._targets("Robots", vpc, settings.serving.port, settings)}
+        lab = settings.cloud.lab
+        listener = self.alb.add_listener(
+            "Front", port=front_port(settings), open=False,
+            protocol=elbv2.ApplicationProtocol.HTTP if lab else elbv2.ApplicationProtocol.HTTPS,
+            ssl_policy=None if lab else elbv2.SslPolicy.TLS13_RES,
+            certificates=[] if lab else [elbv2.ListenerCertificate(settings.cloud.certificate_arn)],
+            default_target_groups=[self.targets["robots"]],
+        )  # fmt: skip
+        if settings.data.enabled:
+            self.targets["data"] = self._targets("Data", vpc, settings.data.port, settings)
+            listener.add_target_groups(
+                "DataRule", priority=10, conditions=[elbv2.ListenerCondition.path_patterns(["/data/*"])],
+                target_groups=[self.targets["data"]],
+            )  # fmt: skip
+        self._waf(settings)
+
+    def _targets(
+        self, name: str, vpc: ec2.IVpc, port: int, settings: PlatformSettings
+    ) -> elbv2.ApplicationTargetGroup:
+        health = settings.health
+        # The data service answers for itself; robots' servers are asked at their control port.
+        asked = settings.serving.control_port if name == "Robots" else port
+        return elbv2.ApplicationTargetGroup(
+            self, name, vpc=vpc, port=port, protocol=elbv2.ApplicationProtocol.HTTP,
+            target_type=elbv2.TargetType.INSTANCE,
+            load_balancing_algorithm_type=elbv2.TargetGroupLoadBalancingAlgorithmType.LEAST_OUTSTANDING_REQUESTS,
+            deregistration_delay=cdk.Duration.seconds(settings.scaling.deregistration_s),
+            health_check=elbv2.HealthCheck(
+                path=health.path, port=str(asked), healthy_http_codes="200",
+                interval=cdk.Duration.seconds(health.cloud_interval_s),
+                timeout=cdk.Duration.seconds(health.cloud_timeout_s),
+                healthy_threshold_count=health.healthy_checks,
+                unhealthy_threshold_count=health.unhealthy_checks,
+            ),
+        )  # fmt: skip
+
+    def _waf(self, settings: PlatformSettings) -> None:
+        def seen(name: str) -> wafv2.CfnWebACL.VisibilityConfigProperty:
+            return wafv2.CfnWebACL.VisibilityConfigProperty(
+                cloud_watch_metrics_enabled=True, metric_name=name, sampled_requests_enabled=True
+            )
+
+        acl = wafv2.CfnWebACL(
+            self, "Waf", scope="REGIONAL", visibility_config=seen("rse-pf-waf"),
+            default_action=wafv2.CfnWebACL.DefaultActionProperty(allow={}),
+            rules=[
+                wafv2.CfnWebACL.RuleProperty(
+                    name="rate", priority=0, action=wafv2.CfnWebACL.RuleActionProperty(block={}),
+                    visibility_config=seen("rse-pf-rate"),
+                    statement=wafv2.CfnWebACL.StatementProperty(
+                        rate_based_statement=wafv2.CfnWebACL.RateBasedStatementProperty(
+                            aggregate_key_type="IP", limit=settings.cloud.requests_per_5_minutes,
+                            evaluation_window_sec=_FIVE_MINUTES_S,
+                        )
+                    ),
+                )
+            ],
+        )  # fmt: skip
+        wafv2.CfnWebACLAssociation(
+            self, "WafOfAlb", resource_arn=self.alb.load_balancer_arn, web_acl_arn=acl.attr_arn
+        )

@@ -1,0 +1,114 @@
+"""The ground: a VPC in two zones without a way to the internet but the load balancer's, and its firewall."""
+
+from __future__ import annotations
+
+from typing import Any, cast
+
+import aws_cdk as cdk
+import jsii
+from aws_cdk import aws_ec2 as ec2
+from aws_cdk import aws_iam as iam
+from aws_cdk import aws_logs as logs
+from constructs import Construct
+
+from rse_pf.settings import PlatformSettings
+from stacks.findings import acknowledge
+from stacks.firewall import Firewall, front_port, inner_ports
+
+__all__ = ["NetworkStack"]
+
+_ENDPOINTS = {
+    "minimal": {
+        "Monitoring": ec2.InterfaceVpcEndpointAwsService.CLOUDWATCH_MONITORING,
+        "AutoScaling": ec2.InterfaceVpcEndpointAwsService.AUTOSCALING,
+        "Logs": ec2.InterfaceVpcEndpointAwsService.CLOUDWATCH_LOGS,
+    },
+    "full": {
+        "Ssm": ec2.InterfaceVpcEndpointAwsService.SSM,
+        "Secrets": ec2.InterfaceVpcEndpointAwsService.SECRETS_MANAGER,
+    },
+}
+_FIRST_ANSWER_PORT, _LAST_PORT = 1024, 65535
+_HTTPS = 443
+_WHY_LISTS = "the paper's firewall has access control lists (Sect. 3.1); they stand behind security groups"
+_CIDR = "10.20.0.0/16"
+
+
+class NetworkStack(cdk.Stack):
+    """VPC, endpoints, access control lists, flow logs and the firewall."""
+
+    def __init__(
+        self, scope: Construct, construct_id: str, *, settings: PlatformSettings, env: cdk.Environment
+    ) -> None:
+        super().__init__(scope, construct_id, env=env)
+        self.vpc = ec2.Vpc(
+            self, "Vpc", ip_addresses=ec2.IpAddresses.cidr(_CIDR), max_azs=2, nat_gateways=0,
+            restrict_default_security_group=False,
+            subnet_configuration=[
+                ec2.SubnetConfiguration(
+                    name="front", subnet_type=ec2.SubnetType.PUBLIC, map_public_ip_on_launch=False
+                ),
+                ec2.SubnetConfiguration(name="servers", subnet_type=ec2.SubnetType.PRIVATE_ISOLATED),
+            ],
+        )  # fmt: skip
+        self.firewall = Firewall(self, "Firewall", vpc=self.vpc, settings=settings)
+        self.s3 = self.vpc.add_gateway_endpoint("S3", service=ec2.GatewayVpcEndpointAwsService.S3)
+        self.s3.add_to_policy(
+            iam.PolicyStatement(
+                principals=[iam.AnyPrincipal()], actions=["s3:GetObject", "s3:PutObject", "s3:ListBucket"],
+                resources=["*"], conditions={"StringEquals": {"aws:ResourceAccount": self.account}},
+            )
+        )  # fmt: skip
+        chosen = dict(_ENDPOINTS["minimal"])
+        if settings.cloud.endpoints == "full":
+            chosen.update(_ENDPOINTS["full"])
+        for name, service in chosen.items():
+            self.vpc.add_interface_endpoint(
+                name, service=service, open=False, security_groups=[self.firewall.endpoints]
+            )
+        self._control_lists(settings)
+        self._flow_logs(settings)
+
+    @property
+    @jsii.member(jsii_name="availabilityZones")
+    def availability_zones(self) -> list[str]:
+        """The two zones, so that synthesis asks nobody."""
+        return [cdk.Fn.select(at, cdk.Fn.get_azs()) for at in range(2)]
+
+    def _control_lists(self, settings: PlatformSettings) -> None:
+        """Second fence, without memory: what the security groups allow, and the answers to it."""
+        answers = ec2.AclTraffic.tcp_port_range(_FIRST_ANSWER_PORT, _LAST_PORT)
+        anywhere, inside = ec2.AclCidr.any_ipv4(), ec2.AclCidr.ipv4(self.vpc.vpc_cidr_block)
+        front = self._control_list("FrontList", ec2.SubnetType.PUBLIC)
+        robots = ec2.AclCidr.ipv4(settings.cloud.robot_cidr)
+        self._entry(front, "Robots", 100, robots, ec2.AclTraffic.tcp_port(front_port(settings)), inward=True)
+        self._entry(front, "FromServers", 110, inside, answers, inward=True)
+        self._entry(front, "ToRobots", 100, robots, answers, inward=False)
+        self._entry(front, "ToServers", 110, inside, answers, inward=False)
+        back = self._control_list("ServerList", ec2.SubnetType.PRIVATE_ISOLATED)
+        for at, port in enumerate(inner_ports(settings)):
+            traffic = ec2.AclTraffic.tcp_port(port)
+            self._entry(back, f"Balancer{at}", 100 + at, inside, traffic, inward=True)
+        https = ec2.AclTraffic.tcp_port(_HTTPS)
+        self._entry(back, "Endpoints", 110, inside, https, inward=True)
+        self._entry(back, "Answers", 120, anywhere, answers, inward=True)
+        self._entry(back, "Https", 100, anywhere, https, inward=False)
+        self._entry(back, "ToInside", 110, inside, answers, inward=False)
+
+    def _control_list(self, name: str, kind: ec2.SubnetType) -> ec2.NetworkAcl:
+        where = ec2.SubnetSelection(subnet_type=kind)
+        made = ec2.NetworkAcl(self, name, vpc=self.vpc, subnet_selection=where)
+        acknowledge(made, _WHY_LISTS, "VPC3")
+        return made
+
+    def _entry(
+        self, of: ec2.NetworkAcl, name: str, number: int, cidr: Any, traffic: ec2.AclTraffic, *, inward: bool
+    ) -> None:
+        direction = ec2.TrafficDirection.INGRESS if inward else ec2.TrafficDirection.EGRESS
+        made = of.add_entry(name, cidr=cidr, rule_number=number, traffic=traffic, direction=direction)
+        acknowledge(made, _WHY_LISTS, "VPC3")
+
+    def _flow_logs(self, settings: PlatformSettings) -> None:
+        group = logs.LogGroup(self, "FlowLog", removal_policy=cdk.RemovalPolicy.DESTROY)
+        cast("logs.CfnLogGroup", group.node.default_child).retention_in_days = settings.cloud.log_days
+        self.vpc.add_flow_log("Flow", destination=ec2.FlowLogDestination.to_cloud_watch_logs(group))

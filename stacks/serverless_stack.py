@@ -1,0 +1,58 @@
+"""Pose estimation without a server: `lambda_pnp` behind a Function URL, for robots that ask now and then."""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+from typing import cast
+
+import aws_cdk as cdk
+from aws_cdk import aws_iam as iam
+from aws_cdk import aws_lambda as lambda_
+from aws_cdk import aws_logs as logs
+from constructs import Construct
+
+from rse_pf.settings import PlatformSettings
+from stacks.assets import staged
+from stacks.backend_stack import KEY_SET
+from stacks.data_stack import DataStack
+from stacks.findings import acknowledge
+
+__all__ = ["ServerlessStack"]
+
+
+class ServerlessStack(cdk.Stack):
+    """The function, its URL and its log."""
+
+    def __init__(
+        self,
+        scope: Construct,
+        construct_id: str,
+        *,
+        settings: PlatformSettings,
+        assets: Path,
+        data: DataStack,
+        env: cdk.Environment,
+    ) -> None:
+        super().__init__(scope, construct_id, env=env)
+        log = logs.LogGroup(self, "Log", removal_policy=cdk.RemovalPolicy.DESTROY)
+        cast("logs.CfnLogGroup", log.node.default_child).retention_in_days = settings.cloud.log_days
+        role = iam.Role(self, "Role", assumed_by=iam.ServicePrincipal("lambda.amazonaws.com"))
+        role.add_to_policy(
+            iam.PolicyStatement(actions=["s3:GetObject"], resources=[data.artifacts.arn_for_objects(KEY_SET)])
+        )
+        log.grant_write(role)
+        with tempfile.TemporaryDirectory() as folder:
+            code = lambda_.Code.from_asset(str(staged(assets, "lambda", settings, Path(folder))))
+            function = lambda_.Function(
+                self, "Pnp", runtime=lambda_.Runtime.PYTHON_3_13, architecture=lambda_.Architecture.X86_64,
+                handler="lambda_pnp.handler.handler", code=code, role=role, log_group=log,
+                memory_size=settings.cloud.lambda_memory_mb,
+                timeout=cdk.Duration.seconds(settings.cloud.lambda_timeout_s),
+                reserved_concurrent_executions=settings.cloud.lambda_concurrency,
+                environment={"RSE_PF_KEYS": f"{data.artifacts.bucket_name}/{KEY_SET}"},
+            )  # fmt: skip
+        acknowledge(function, "the newest runtime with wheels of every package in the lock", "L1")
+        # Robots carry our own tokens, which the handler checks; AWS's signatures are not for robots.
+        url = function.add_function_url(auth_type=lambda_.FunctionUrlAuthType.NONE)
+        cdk.CfnOutput(self, "Url", value=url.url)

