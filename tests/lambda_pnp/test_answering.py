@@ -1,0 +1,148 @@
+"""The function answers as a backend server does: same bytes, same poses, same typed failures."""
+
+from __future__ import annotations
+
+import base64
+import itertools
+import json
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from lambda_pnp.answering import Answering
+from rse_pf.auth import SigningKey
+from rse_pf.settings import PlatformSettings
+from rse_pf.wire import SUBPROTOCOLS, Command, Failure, Hello, Message, Result, make_codec
+
+SETTINGS = PlatformSettings()
+KEY = SigningKey.from_seed(bytes(range(32)), "key-1")
+NOW_S = 1_800_000_000.0
+TOKEN = KEY.issue("robot-1", now=NOW_S, token_id="t", settings=SETTINGS.auth)
+GOLDEN = json.loads(
+    (Path(__file__).parents[1] / "wire" / "golden" / "poses.json").read_text(encoding="utf-8")
+)
+
+
+def event(body: bytes, codec: str = "zlib", token: str = TOKEN) -> dict[str, Any]:
+    """An event of a Function URL, payload format 2.0."""
+    return {
+        "version": "2.0",
+        "rawPath": "/",
+        "headers": {"authorization": f"Bearer {token}", "content-type": f"application/{SUBPROTOCOLS[codec]}"},
+        "requestContext": {"http": {"method": "POST", "path": "/"}},
+        "body": base64.b64encode(body).decode(),
+        "isBase64Encoded": True,
+    }
+
+
+def answer(what: dict[str, Any], *, codec: str = "zlib", clock: Callable[[], float] = lambda: 0.0) -> Message:
+    answered = Answering(SETTINGS, KEY.key_set()).answer(what, now_s=NOW_S, left_ms=9e3, clock=clock)
+    assert answered.status == 200
+    return make_codec(codec).decode_from_server(answered.body)
+
+
+def failure(what: dict[str, Any]) -> str:
+    message = answer(what)
+    assert isinstance(message, Failure)
+    return message.code
+
+
+def compressed(text: str) -> bytes:
+    return zlib.compress(text.encode())
+
+
+@pytest.mark.parametrize("codec", SUBPROTOCOLS)
+@pytest.mark.parametrize("name", GOLDEN)
+def test_every_golden_command_gets_the_backends_answer(name: str, codec: str) -> None:
+    from rse_pf.service import dispatch
+    from rse_pf.services.builtin import builtin_services
+
+    raw = json.dumps(GOLDEN[name]["command"]).encode()
+    command = make_codec("json").decode_from_robot(raw)
+    assert isinstance(command, Command)
+    expected = dispatch(builtin_services(SETTINGS), command, lambda: 0.0)
+
+    given = answer(event(make_codec(codec).encode(command), codec), codec=codec)
+
+    if isinstance(expected, Failure):
+        assert isinstance(given, Failure)
+        assert given.code == expected.code
+        return
+    assert isinstance(given, Result)
+    reply = given.reply
+    assert reply["verdict"] == expected.reply.verdict
+    np.testing.assert_array_equal(reply["inliers"], expected.reply.inliers)
+    np.testing.assert_allclose(reply["T_camera_world"], expected.reply.T_camera_world, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("token", ["", "a.b.c", TOKEN[:-4] + "AAAA"])
+def test_a_bad_token_is_turned_away_before_anything_is_decoded(token: str) -> None:
+    answered = Answering(SETTINGS, KEY.key_set()).answer(
+        event(b"not even a message", token=token), now_s=NOW_S, left_ms=9e3, clock=lambda: 0.0
+    )
+
+    assert answered.status == 401
+    assert json.loads(answered.body)["code"] == "unauthorized"
+
+
+def test_an_expired_token_is_turned_away() -> None:
+    late = NOW_S + SETTINGS.auth.token_life_s + SETTINGS.auth.leeway_s + 1
+    answered = Answering(SETTINGS, KEY.key_set()).answer(
+        event(b""), now_s=late, left_ms=9e3, clock=lambda: 0.0
+    )
+
+    assert answered.status == 401
+
+
+def test_an_unknown_sub_protocol_is_turned_away() -> None:
+    what = event(b"")
+    what["headers"]["content-type"] = "text/html"
+    answered = Answering(SETTINGS, KEY.key_set()).answer(what, now_s=NOW_S, left_ms=9e3, clock=lambda: 0.0)
+
+    assert (answered.status, json.loads(answered.body)["code"]) == (400, "unsupported")
+
+
+def test_a_bomb_does_not_inflate() -> None:
+    assert failure(event(zlib.compress(b" " * 50_000_000))) == "too-large"
+
+
+@pytest.mark.parametrize("number", ["NaN", "Infinity", "1e999"])
+def test_what_is_no_finite_number_is_a_bad_message(number: str) -> None:
+    text = '{"type":"command","id":1,"service":"pnp","payload":{"points_world":[' + number + "]}}"
+
+    assert failure(event(compressed(text))) in ("bad-message", "bad-request")
+
+
+def test_what_is_not_base64_or_no_command_is_a_bad_message() -> None:
+    assert failure({**event(b""), "body": "%%%"}) == "bad-message"
+    assert failure(event(make_codec("zlib").encode(Hello()))) == "bad-message"
+
+
+def test_a_late_answer_is_expired_before_and_after_the_work() -> None:
+    body = make_codec("zlib").encode(Command(id=1, service="pnp", deadline_ms=0.0))
+    slow = itertools.count()
+    later = make_codec("zlib").encode(Command(id=1, service="pnp", deadline_ms=1500.0))
+
+    assert failure(event(body)) == "expired"
+    told = answer(event(later), clock=lambda: float(next(slow)))
+    assert isinstance(told, Failure)
+    assert told.code == "expired"
+    assert told.id == 1
+
+
+def test_another_service_is_unknown_here() -> None:
+    assert failure(event(make_codec("zlib").encode(Command(id=1, service="echo")))) == "unknown-service"
+
+
+def test_the_answer_says_whether_the_start_was_cold() -> None:
+    made = Answering(SETTINGS, KEY.key_set()).answer(event(b""), now_s=NOW_S, left_ms=9e3, clock=lambda: 0.0)
+
+    http = made.as_http(init_ms=12.34, cold=True)
+
+    assert http["headers"]["x-rse-pf-init-ms"] == "12.3"
+    assert http["headers"]["x-rse-pf-cold"] == "true"
+    assert base64.b64decode(http["body"]) == made.body
