@@ -55,6 +55,8 @@ async def serve_control(host: str, port: int, answer: Callable[[Ask], Awaitable[
             asyncio.TimeoutError,
         ):
             pass  # a stranger's broken request ends its own connection, and only that
+        except asyncio.CancelledError:
+            pass  # the loop ends: a kept-alive connection is no error, and asyncio would log one
         finally:
             writer.close()
 

@@ -22,7 +22,8 @@ from rse_pf.settings import PlatformSettings, setting_rows
 __all__ = ["add_arguments", "run"]
 
 _OPTIONS: dict[str, type] = {
-    "host": str, "port": int, "control_port": int, "workers": int, "size": float, "log_level": str,
+    "host": str, "port": int, "control_host": str, "control_port": int, "workers": int, "size": float,
+    "log_level": str,
 }  # fmt: skip
 """Options that are settings of the same name."""
 
