@@ -1,77 +1,93 @@
-"""Measure the whole handler against the bare solver call, interleaved in one process.
+"""Where the time of one PnP command goes on a server, stage by stage.
 
-    python benchmarks/handler.py [--n 150] [--matches 200] [--outliers 0.3]
+    python benchmarks/handler.py [--n 500] [--out FILE]
 
-Prints machine, n, p50/p95/p99 of decode + dispatch + encode for each codec, and the ratio of the
-medians to the bare solver.  Defends: `bin` <= 1.15x, `zlib` <= 1.4x of the bare solver (Sect. 6 of
-the performance notes reached 1.05x and 1.34x).
+Thread-CPU microseconds of each stage of the handler, every stage measured right after another
+problem was solved, because code is slower when a solver has just used the caches.  The ratio of the
+whole handler to the solver is in ``benchmarks/codec.py``.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import os
 import platform
-import statistics
-import sys
 import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
-from rse_pf.pnp import solve_pnp
-from rse_pf.pnp.problems import make_problem
-from rse_pf.service import dispatch
-from rse_pf.services.builtin import builtin_services
-from rse_pf.services.pnp import make_request
-from rse_pf.settings import PlatformSettings
-from rse_pf.wire import CODECS, Command, Result, make_codec
+import numpy as np
+
+from rse_pf.pnp import PnpSolution, solve_pnp
+from rse_pf.pnp.problems import PnpProblem, make_problem
+from rse_pf.services.pnp import PnpReply, PnpRequest, make_request
+from rse_pf.wire import CODECS, Command, Result, as_type, make_codec
+
+PROBLEMS = 32
+MATCHES = 200
+STAGES = ("decode message", "payload to arrays", "solve", "solution to reply", "encode reply")
 
 
 def main() -> None:
+    """Measure, print the table, write ``--out``."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--n", type=int, default=150)
-    parser.add_argument("--matches", type=int, default=200)
-    parser.add_argument("--outliers", type=float, default=0.3)
-    options = parser.parse_args()
-    registry = builtin_services(PlatformSettings())
-    problem = make_problem(seed=7, n=options.matches, outlier_ratio=options.outliers)
-    codecs = {name: make_codec(name) for name in CODECS}
-    messages = {
-        name: codec.encode(
-            Command(
-                id=1,
-                service="pnp",
-                payload=make_request(
-                    problem.points_world, problem.pixels, problem.camera, binary=name == "bin"
-                ),
-            )
-        )
-        for name, codec in codecs.items()
+    parser.add_argument("--n", type=int, default=500, help="samples of each stage")
+    parser.add_argument("--out", type=Path, help="write the figures as JSON")
+    args = parser.parse_args()
+    problems = [make_problem(seed=seed, n=MATCHES) for seed in range(PROBLEMS)]
+    report: dict[str, Any] = {
+        "machine": f"{platform.machine()}, {os.cpu_count()} cores",
+        "n": args.n,
+        "matches": MATCHES,
+        "load_before": os.getloadavg(),
+        "stages_us": {codec: stages(codec, problems, args.n) for codec in CODECS},
+        "load_after": os.getloadavg(),
     }
-    times: dict[str, list[float]] = {name: [] for name in ("solver", *codecs)}
-    for _ in range(options.n):
-        began = time.thread_time()
-        solve_pnp(problem.points_world, problem.pixels, problem.camera)
-        times["solver"].append(time.thread_time() - began)
-        for name, codec in codecs.items():
-            began = time.thread_time()
-            command = codec.decode_from_robot(messages[name])
-            assert isinstance(command, Command)
-            answer = dispatch(registry, command, time.monotonic)
-            codec.encode(answer)
-            times[name].append(time.thread_time() - began)
-            assert isinstance(answer, Result), answer
-    base = statistics.median(times["solver"])
-    print(f"machine {platform.machine()}, {os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}")
-    print(f"command {' '.join(sys.argv)}, n {options.n}, thread CPU us")
-    for name, taken in times.items():
-        taken.sort()
-        p50, p95, p99 = (taken[int(q * len(taken))] * 1e6 for q in (0.5, 0.95, 0.99))
-        size = len(messages[name]) if name in messages else 0
-        print(
-            f"{name:7} p50 {p50:6.0f}  p95 {p95:6.0f}  p99 {p99:6.0f}  "
-            f"{statistics.median(taken) / base:.2f}x solver  {size} bytes"
-        )
+    print(f"{report['machine']}, n {args.n}, {MATCHES} matches, p50 / p95 / p99 us")
+    print(f"{'stage':20}", *(f"{codec:>22}" for codec in CODECS))
+    for stage in STAGES:
+        cells = (" / ".join(f"{v:.0f}" for v in report["stages_us"][codec][stage]) for codec in CODECS)
+        print(f"{stage:20}", *(f"{cell:>22}" for cell in cells))
+    print(f"load average {report['load_before'][0]:.2f} before, {report['load_after'][0]:.2f} after")
+    if args.out:
+        args.out.write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
+
+
+def stages(codec_name: str, problems: list[PnpProblem], samples: int) -> dict[str, list[float]]:
+    """Return p50, p95 and p99 of every stage."""
+    codec = make_codec(codec_name)
+    requests = [
+        make_request(p.points_world, p.pixels, p.camera, binary=codec_name == "bin") for p in problems
+    ]
+    messages = [codec.encode(Command(id=1, service="pnp", payload=request)) for request in requests]
+    commands = [codec.decode_from_robot(message) for message in messages]
+    solutions = [solved(problem) for problem in problems]
+    results = [Result(id=1, reply=PnpReply.of(solution)) for solution in solutions]
+    payloads = [command.payload for command in commands if isinstance(command, Command)]
+    work: dict[str, Callable[[int], Any]] = {
+        "decode message": lambda i: codec.decode_from_robot(messages[i]),
+        "payload to arrays": lambda i: as_type(payloads[i], PnpRequest),
+        "solve": lambda i: solved(problems[i]),
+        "solution to reply": lambda i: PnpReply.of(solutions[i]),
+        "encode reply": lambda i: codec.encode(results[i]),
+    }
+    spent: dict[str, list[float]] = {stage: [] for stage in work}
+    for sample in range(samples):
+        for stage, run in work.items():
+            solved(problems[(sample + PROBLEMS // 2) % PROBLEMS])
+            began = time.thread_time_ns()
+            run(sample % PROBLEMS)
+            spent[stage].append((time.thread_time_ns() - began) / 1e3)
+    return {stage: np.percentile(values, (50, 95, 99)).round(1).tolist() for stage, values in spent.items()}
+
+
+def solved(problem: PnpProblem) -> PnpSolution:
+    """Solve with the service's defaults."""
+    return solve_pnp(problem.points_world, problem.pixels, problem.camera)
 
 
 if __name__ == "__main__":

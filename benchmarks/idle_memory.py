@@ -1,6 +1,6 @@
 """Measure what an idle robot costs a server: resident memory of all its processes, and idle CPU.
 
-    python benchmarks/idle_memory.py [--robots 300] [--workers 2]
+    python benchmarks/idle_memory.py [--robots 2000] [--workers 2] [--out FILE]
 
 Prints machine, n, KiB a robot, and CPU ms a second with all of them connected and silent.
 Defends: <= 64 KiB a robot in all our processes.
@@ -11,6 +11,7 @@ from __future__ import annotations
 import argparse
 import asyncio
 import importlib.util
+import json
 import os
 import platform
 import signal
@@ -37,7 +38,7 @@ def sibling(name: str) -> Any:
     return module
 
 
-async def measure(identity: dict[str, int], robots: int, status: Any) -> None:
+async def measure(identity: dict[str, int], robots: int, status: Any) -> dict[str, Any]:
     codec, url = make_codec("bin"), f"ws://127.0.0.1:{identity['port']}/ws"
     hello = codec.encode(Hello())
 
@@ -60,29 +61,38 @@ async def measure(identity: dict[str, int], robots: int, status: Any) -> None:
     print(f"machine {platform.machine()}, {os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}")
     print(f"command {' '.join(sys.argv)}, n {robots}, spread {joined['robots_of_workers']}")
     grown = joined["resident_bytes"] - before["resident_bytes"]
-    print(
-        f"{grown / robots / 1024:.1f} KiB a robot, {before['resident_bytes'] / 2**20:.0f} MiB without robots"
-    )
-    print(f"idle CPU {(after['cpu_s'] - joined['cpu_s']) / WATCH_S * 1e3:.1f} ms/s")
-    print(f"handshake and hello {(joined['cpu_s'] - before['cpu_s']) / robots * 1e6:.0f} us CPU each")
-    print(f"all closed after {time.monotonic() - began:.2f} s")
+    report = {
+        "robots": robots,
+        "kib_per_robot": round(grown / robots / 1024, 2),
+        "mib_without_robots": round(before["resident_bytes"] / 2**20, 1),
+        "idle_cpu_ms_per_s": round((after["cpu_s"] - joined["cpu_s"]) / WATCH_S * 1e3, 2),
+        "handshake_cpu_us": round((joined["cpu_s"] - before["cpu_s"]) / robots * 1e6),
+        "closed_after_s": round(time.monotonic() - began, 2),
+        "load": os.getloadavg(),
+    }
+    for name, value in report.items():
+        print(f"{name:20} {value}")
+    return report
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--robots", type=int, default=300)
+    parser.add_argument("--robots", type=int, default=2000, help="idle connections")
     parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--out", type=Path, help="write the figures as JSON")
     options = parser.parse_args()
     round_trip = sibling("round_trip")
     with tempfile.TemporaryDirectory() as folder:
         process, identity = round_trip.start(folder, workers=options.workers, log_level="warning")
         try:
-            asyncio.run(measure(identity, options.robots, round_trip.status))
+            report = asyncio.run(measure(identity, options.robots, round_trip.status))
         finally:
             process.send_signal(signal.SIGINT)
             process.wait(20)
+    if options.out:
+        options.out.write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":
