@@ -1,0 +1,57 @@
+"""The README's own words, run: the ten-line robot, and the verbs it names."""
+
+from __future__ import annotations
+
+import asyncio
+import re
+from pathlib import Path
+
+import pytest
+
+from rse_pf.cli.main import VERBS
+from rse_pf.local.cloud import LocalCloud
+from rse_pf.pnp.problems import make_problem
+from rse_pf.settings import PlatformSettings
+
+pytestmark = pytest.mark.system
+
+
+def blocks(repository: Path, language: str) -> list[str]:
+    text = (repository / "README.md").read_text(encoding="utf-8")
+    return re.findall(rf"```{language}\n(.*?)```", text, flags=re.DOTALL)
+
+
+def test_the_robot_in_ten_lines_gets_its_pose(repository, tmp_path, capsys):
+    (code,) = blocks(repository, "python")
+    problem = make_problem(seed=5, camera=make_problem(seed=0).camera)
+
+    async def work() -> None:
+        async with LocalCloud(PlatformSettings(), state=tmp_path / "platform", servers=1, port=0) as cloud:
+            names: dict = {}
+            mine = code.replace("127.0.0.1:8700", f"127.0.0.1:{cloud.port}")
+            assert mine != code
+            exec(compile(mine, "README.md", "exec"), names)
+            token = cloud.issue_token("robot-1")
+            await names["main"](token, problem.points_world, problem.pixels)
+
+    asyncio.run(asyncio.wait_for(work(), 60))
+
+    assert capsys.readouterr().out.split()[0] in ("ok", "weak")
+
+
+def test_every_verb_the_readme_names_exists(repository):
+    named = {
+        word for block in blocks(repository, "") for word in re.findall(r"^rse-pf (\w+)", block, re.MULTILINE)
+    }
+    assert {"demo", "local", "token"} <= named <= set(VERBS)
+
+
+def test_every_make_verb_the_pages_name_exists(repository):
+    verbs = set(re.findall(r"^([a-z]+):.*##", (repository / "Makefile").read_text(), re.MULTILINE))
+    for page in ("README.md", "CONTRIBUTING.md"):
+        text = (repository / page).read_text(encoding="utf-8")
+        named = set(re.findall(r"`make ([a-z]+)", text)) | set(
+            re.findall(r"^make ([a-z]+)", text, re.MULTILINE)
+        )
+        assert named
+        assert named <= verbs
