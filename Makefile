@@ -22,7 +22,7 @@ demo: ## robots build point-cloud maps through the PnP service; writes ./out
 	@$(BIN)/rse-pf demo --out out $(ARGS)
 
 test: ## the tests that CI runs, under ten minutes on two cores
-	@$(SETUP) dev
+	@$(SETUP) dev infra
 	@$(BIN)/ruff check . && $(BIN)/ruff format --check .
 	@$(BIN)/mypy
 	@$(PYTEST) -m "not slow" $(ARGS)
