@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import argparse
 import importlib
+import importlib.util
 import os
 import platform
 import resource
@@ -37,6 +38,8 @@ _EXTRAS: dict[str, tuple[tuple[str, ...], bool]] = {
 }
 """Modules of each extra, and whether the local platform needs them."""
 
+_STARTS_NODE = ("aws_cdk", "cdk_nag")
+"""Looked for but not imported: they start Node at once."""
 _DESCRIPTORS_PER_ROBOT = 2
 _OTHER_DESCRIPTORS = 256
 _LITTLE_MEMORY_MIB = 1024
@@ -188,6 +191,8 @@ def _available_mebibytes() -> int | None:
 
 def _has(module: str) -> bool:
     """Whether *module* can be imported; a broken native library counts as absent."""
+    if module in _STARTS_NODE:
+        return importlib.util.find_spec(module) is not None
     try:
         importlib.import_module(module)
     except (ImportError, OSError):
