@@ -12,7 +12,7 @@ import pytest
 MOST_LINES = 500
 WRITTEN_BY_MACHINES = ("locks/", "tests/wire/golden/", "docs/asyncapi.json", "LICENSE")
 
-_PLACES = re.compile(r"/work/|/home/\w|/Users/\w|/tmp/brief|file:///|[a-z0-9-]+\.internal\b")
+_PLACES = re.compile(r"/(?:home|Users|root)/\w|file:///|[a-z0-9-]+\.internal\b")
 _REGISTRY = re.compile(r"https?://[^\s\"')>]*(?:artifactory|nexus|:8080|:3128|/simple\b)")
 _LATER = re.compile(r"\b(?:TODO|FIXME|XXX|HACK)\b")
 _ADDRESS = re.compile(r"(?<![\d.])(\d{1,3})\.(\d{1,3})\.(\d{1,3})\.(\d{1,3})(?![\d.])")
