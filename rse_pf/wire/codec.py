@@ -115,7 +115,7 @@ class _JsonCodec:
     def _open(self, data: bytes) -> bytes:
         _check_size(data, self._limits)
         text = _inflate(data, self._limits) if self._compressed else data
-        _check_depth(text, self._limits.max_json_depth)
+        _check_boxes(text, self._limits)
         return text
 
 
@@ -197,13 +197,18 @@ def _inflate(data: bytes, limits: SessionSettings) -> bytes:
     return text
 
 
-def _check_depth(text: bytes, deepest: int) -> None:
-    """Count brackets; only where they look too deep are strings told apart."""
-    if text.count(b"[") + text.count(b"{") <= deepest:
+def _check_boxes(text: bytes, limits: SessionSettings) -> None:
+    """Count brackets before any list is made; only where they look too many are strings told apart."""
+    deepest, most = limits.max_json_depth, limits.max_json_lists
+    count = text.count(b"[") + text.count(b"{")
+    if count <= deepest:
         return
-    if _depth(text.translate(None, _NOT_BRACKETS)) <= deepest:
+    if count <= most and _depth(text.translate(None, _NOT_BRACKETS)) <= deepest:
         return
-    if _depth(_without_strings(text)) > deepest:
+    brackets = _without_strings(text)
+    if brackets.count(b"[") + brackets.count(b"{") > most:
+        raise LimitExceeded(f"JSON of more than {most} lists and objects", hint="send flat lists of numbers")
+    if _depth(brackets) > deepest:
         raise LimitExceeded(f"JSON is nested deeper than {deepest}", hint="send flat lists")
 
 

@@ -278,6 +278,15 @@ def test_quotes_and_backslashes_hide_no_depth(padding: str) -> None:
     assert isinstance(refused("json", command(f"[{padding},{deep}]")), LimitExceeded)
 
 
+def test_more_lists_than_allowed_are_refused_and_those_in_strings_do_not_count() -> None:
+    most = LIMITS.max_json_lists - 2  # the message and its payload are boxes too
+    flat = "[" + "[]," * (most - 1) + "[]]"
+
+    assert len(payload_of("json", command(flat))) == most
+    assert "lists" in refused("json", command(flat[:-1] + ",{}]")).message
+    assert payload_of("json", command('["' + "[{" * most + '"]')) == ["[{" * most]
+
+
 HEAVY = {
     "brackets": command("[" * 250_000),
     "flat brackets": command("[" + "[]," * 80_000 + "[]]"),
