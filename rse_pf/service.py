@@ -26,7 +26,7 @@ from rse_pf.errors import (
 )
 from rse_pf.wire import Command, Failure, Result, as_type
 
-__all__ = ["Kind", "Registry", "Service", "dispatch", "failure_of"]
+__all__ = ["Kind", "Registry", "Service", "dispatch", "failure_of", "request_of"]
 
 Kind = Literal["stateless", "per_robot_state", "long"]
 
@@ -119,7 +119,7 @@ def dispatch(
     started = clock()
     try:
         service = registry.get(command.service)
-        reply = service.function(_request(command, service))
+        reply = service.function(request_of(command.payload, service))
     except RsePfError as error:
         return failure_of(error, command, server=server)
     except (Exception, SystemExit) as error:  # noqa: BLE001  a service is foreign code
@@ -146,10 +146,10 @@ def failure_of(error: RsePfError, command: Command | None = None, *, server: str
     )
 
 
-def _request(command: Command, service: Service) -> Any:
-    payload = {} if command.payload is None else command.payload
+def request_of(payload: Any, service: Service) -> Any:
+    """Return a command's *payload* as the request type of *service*; raises BadRequest."""
     try:
-        return as_type(payload, service.request_type)
+        return as_type({} if payload is None else payload, service.request_type)
     except BadMessage as error:
         raise BadRequest(
             f"{service.name}: {error.message}", hint=error.hint or "see the service's request type"
