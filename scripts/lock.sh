@@ -17,3 +17,14 @@ lock() { # lock FILE EXTRA...
 lock demo demo build
 lock dev dev
 lock infra infra dev
+# What boots has one platform, so its locks have no conditions.
+for_platform() { # for_platform FILE PYTHON INPUT...
+  file=$1 python=$2
+  shift 2
+  .venv/bin/uv pip compile "$@" --quiet --python-version "$python" --python-platform x86_64-manylinux_2_28 \
+    --generate-hashes --no-emit-index-url --no-emit-find-links --no-annotate --no-emit-package rse-pf \
+    --constraint locks/constraints.txt --custom-compile-command 'make lock' --output-file "locks/$file.txt"
+}
+
+for_platform boot 3.11 pyproject.toml --extra boot       # Debian 12
+for_platform lambda 3.13 lambda_pnp/requirements.txt     # the runtime of stacks/serverless_stack.py

@@ -1,0 +1,145 @@
+"""Build what the cloud boots from: a folder of wheels for the servers, an unpacked folder for the function.
+
+    python scripts/assets.py [--into build]
+
+Reads the hashed locks alone, takes finished wheels only, and gives the same bytes again: the clock of every
+entry is SOURCE_DATE_EPOCH (default: the first second that a zip can hold).  Does nothing when neither a lock
+nor a source changed since.  Promises to run nothing that it downloads.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+import zipfile
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+ROOMS = ("rse_pf", "client_sdk", "lambda_pnp")
+EPOCH = "315532800"
+LAMBDA_PACKAGES = ("rse_pf", "lambda_pnp")
+NEEDLESS = ("tests", "__pycache__", "f2py", "_pyinstaller", "include", "testing")
+"""Folders of wheels that no command ever reads."""
+NEEDLESS_ENDINGS = (".pyi", ".pxd", ".c", ".h", ".a")
+DEBIAN_12 = ("3.11", 36)
+AMAZON_2023 = ("3.13", 34)
+
+
+def main() -> int:
+    """Build both folders, or say in two lines why not."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--into", type=Path, default=ROOT / "build", metavar="DIR")
+    into = parser.parse_args().into
+    stamp = into / "assets.sha256"
+    wanted = _state_of_the_sources()
+    if stamp.is_file() and stamp.read_text(encoding="utf-8") == wanted:
+        return 0
+    sys.stderr.write("assets: building the packages of the cloud (once per change)\n")
+    stamp.unlink(missing_ok=True)
+    try:
+        with tempfile.TemporaryDirectory() as work:
+            ours = _our_wheel(Path(work))
+            _wheelhouse(into / "wheelhouse", ours)
+            _function(into / "lambda", ours, Path(work) / "lambda-wheels")
+    except subprocess.CalledProcessError as error:
+        sys.stderr.write(
+            f"assets: {error.cmd[3]} {error.cmd[4]} failed\n  hint: look above; is the network there?\n"
+        )
+        return 2
+    stamp.write_text(wanted, encoding="utf-8")
+    for name in ("wheelhouse", "lambda"):
+        size = sum(file.stat().st_size for file in (into / name).rglob("*") if file.is_file())
+        sys.stderr.write(f"assets: {into / name} {size / 1e6:.1f} MB\n")
+    return 0
+
+
+def _sources() -> list[Path]:
+    files = [file for room in ROOMS for file in (ROOT / room).rglob("*") if file.suffix in (".py", ".typed")]
+    files += [ROOT / name for name in ("pyproject.toml", "README.md", "LICENSE")]
+    return sorted(file for file in files if "__pycache__" not in file.parts)
+
+
+def _state_of_the_sources() -> str:
+    state = hashlib.sha256(os.environ.get("SOURCE_DATE_EPOCH", EPOCH).encode())
+    for file in [*_sources(), Path(__file__), ROOT / "locks/boot.txt", ROOT / "locks/lambda.txt"]:
+        state.update(f"{file.relative_to(ROOT)}\0".encode() + hashlib.sha256(file.read_bytes()).digest())
+    return state.hexdigest() + "\n"
+
+
+def _our_wheel(work: Path) -> Path:
+    """Build our own wheel from a copy, so that nothing of an older build gets in."""
+    copy = work / "source"
+    for file in _sources():
+        target = copy / file.relative_to(ROOT)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        target.write_bytes(file.read_bytes())
+        target.chmod(0o644)
+    _pip("wheel", "--no-deps", "--no-build-isolation", "--wheel-dir", str(work / "ours"), str(copy))
+    (wheel,) = (work / "ours").glob("rse_pf-*.whl")
+    return wheel
+
+
+def _wheelhouse(folder: Path, ours: Path) -> None:
+    """Put all wheels of a server into *folder*, with a list that pip checks by hash."""
+    _empty(folder)
+    _download(ROOT / "locks/boot.txt", folder, *DEBIAN_12)
+    shutil.copyfile(ours, folder / ours.name)
+    lines = []
+    for wheel in sorted(folder.glob("*.whl")):
+        name, version, *_ = wheel.name.split("-")
+        lines.append(f"{name}=={version} --hash=sha256:{hashlib.sha256(wheel.read_bytes()).hexdigest()}\n")
+    (folder / "requirements.txt").write_text("".join(lines), encoding="utf-8")
+
+
+def _function(folder: Path, ours: Path, wheels: Path) -> None:
+    """Unpack the function's wheels into *folder*, without what never runs."""
+    _empty(folder)
+    _download(ROOT / "locks/lambda.txt", wheels, *AMAZON_2023)
+    for wheel in sorted(wheels.glob("*.whl")):
+        _unpack(wheel, folder, None)
+    _unpack(ours, folder, LAMBDA_PACKAGES)
+
+
+def _unpack(wheel: Path, folder: Path, only: tuple[str, ...] | None) -> None:
+    with zipfile.ZipFile(wheel) as archive:
+        for name in sorted(archive.namelist()):
+            parts = Path(name).parts
+            needless = set(parts[:-1]) & set(NEEDLESS) or name.endswith((*NEEDLESS_ENDINGS, "/"))
+            if needless or (only and parts[0] not in only and not parts[0].endswith(".dist-info")):
+                continue
+            target = folder / name
+            target.parent.mkdir(parents=True, exist_ok=True)
+            target.write_bytes(archive.read(name))
+            target.chmod(0o644)
+
+
+def _download(lock: Path, folder: Path, python: str, glibc: int) -> None:
+    tags = [f"manylinux_2_{minor}_x86_64" for minor in range(glibc, 4, -1)]
+    tags += ["manylinux2014_x86_64", "manylinux2010_x86_64", "manylinux1_x86_64"]
+    platforms = [part for tag in tags for part in ("--platform", tag)]
+    _pip(
+        "download", "--quiet", "--require-hashes", "--no-deps", "--only-binary=:all:", "--implementation=cp",
+        f"--python-version={python}", *platforms, "--dest", str(folder), "--requirement", str(lock),
+    )  # fmt: skip
+
+
+def _pip(verb: str, *arguments: str) -> None:
+    environment = {"SOURCE_DATE_EPOCH": EPOCH, **os.environ}
+    subprocess.run(
+        [sys.executable, "-m", "pip", verb, "--disable-pip-version-check", *arguments],
+        check=True, env=environment, stdout=sys.stderr,
+    )  # fmt: skip
+
+
+def _empty(folder: Path) -> None:
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
