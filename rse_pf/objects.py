@@ -14,7 +14,7 @@ import re
 import stat
 import tempfile
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
@@ -79,13 +79,20 @@ def check_name(name: str) -> str:
     return name
 
 
-def open_store(location: str) -> ObjectStore:
-    """Return the store at ``dir:PATH``, ``s3:BUCKET`` or ``memory:``."""
+def open_store(
+    location: str, openers: Mapping[str, Callable[[str], ObjectStore]] | None = None
+) -> ObjectStore:
+    """Return the store at ``dir:PATH``, ``memory:``, or what *openers* know by kind, as ``s3:BUCKET``.
+
+    Whoever may use AWS passes ``{"s3": lambda bucket: open_bucket(bucket, region)}`` of `rse_pf.aws`.
+    """
     kind, _, place = location.partition(":")
     if kind == "memory":
         return MemoryStore()
     if kind == "dir" and place:
         return DirectoryStore(Path(place))
+    if openers and kind in openers and place:
+        return openers[kind](place)
     raise UsageError(f"{location!r} names no store", hint="write dir:PATH, s3:BUCKET or memory:")
 
 

@@ -8,7 +8,7 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -16,6 +16,8 @@ from hypothesis import HealthCheck, given
 from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 
+from rse_pf.aws import open_bucket
+from rse_pf.aws.clients import make_client
 from rse_pf.errors import Conflict, NotFound, StoreError, StoreFull, UsageError
 from rse_pf.objects import (
     DirectoryStore,
@@ -31,13 +33,27 @@ STORES: dict[str, Callable[[Path], ObjectStore]] = {
     "directory": lambda folder: DirectoryStore(folder / "objects"),
     "memory": lambda folder: MemoryStore(),
 }
-"""Whoever writes another store adds it here."""
+"""Whoever writes another store adds it here; S3 comes with its emulator, in the fixture."""
+REGION = "ap-northeast-2"
 
 
-@pytest.fixture(params=STORES)
-def store(request: pytest.FixtureRequest, tmp_path: Path) -> ObjectStore:
+@pytest.fixture(params=[*STORES, "s3"])
+def store(
+    request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> Iterator[ObjectStore]:
     """Each kind of store, empty."""
-    return STORES[request.param](tmp_path)
+    if request.param in STORES:
+        yield STORES[request.param](tmp_path)
+        return
+    moto = pytest.importorskip("moto", reason="the dev extra is not installed")
+    for name in ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY"):
+        monkeypatch.setenv(name, "testing")
+    with moto.mock_aws():
+        bucket = open_bucket("objects", REGION)
+        make_client("s3", REGION).create_bucket(
+            Bucket="objects", CreateBucketConfiguration={"LocationConstraint": REGION}
+        )
+        yield bucket
 
 
 def names(store: ObjectStore, prefix: str = "") -> list[str]:
@@ -212,6 +228,8 @@ def test_a_crash_in_the_middle_of_a_write_leaves_the_old_version(tmp_path: Path,
 RACE = """
 import sys
 from pathlib import Path
+from rse_pf.aws import open_bucket
+from rse_pf.aws.clients import make_client
 from rse_pf.errors import Conflict
 from rse_pf.objects import DirectoryStore
 store = DirectoryStore(Path(sys.argv[1]))
@@ -249,6 +267,15 @@ def test_a_location_names_its_store(tmp_path: Path) -> None:
 def test_a_location_without_a_store_is_a_usage_error(location: str) -> None:
     with pytest.raises(UsageError, match="names no store"):
         open_store(location)
+
+
+def test_a_kind_that_the_caller_can_open_is_opened() -> None:
+    store = MemoryStore()
+
+    assert open_store("s3:maps", {"s3": lambda bucket: {"maps": store}[bucket]}) is store
+    for location in ("s3:maps", "s3:"):
+        with pytest.raises(UsageError, match="names no store"):
+            open_store(location)
 
 
 def test_a_digest_is_a_name() -> None:
