@@ -34,6 +34,8 @@ HEADER = struct.Struct("<I")
 """Length of the MessagePack body that follows."""
 
 _PR_SET_PDEATHSIG = 1
+_FRAMES_SHOWN = -3
+"""The last ones: those of the service."""
 _SYSTEM_PATHS = ("/usr", "/lib", "/lib64", "/bin", "/etc/ld.so.cache", "/etc/localtime")
 
 
@@ -132,7 +134,7 @@ def _serve(plan: EnvironmentPlan, connection: socket.socket) -> None:
             except RsePfError as error:
                 answer = [False, error.code, error.message, error.hint]
             except BaseException as error:  # noqa: BLE001  foreign code: anything may come out, exit too
-                traceback.print_exc()
+                traceback.print_exc(limit=_FRAMES_SHOWN)
                 what = f"{type(error).__name__} in service {name!r}"
                 answer = [False, InternalError.code, what, "the server's log has it"]
             answer.append((time.perf_counter() - began) * 1e3)

@@ -34,6 +34,7 @@ _LIBC = ctypes.CDLL(None, use_errno=True)
 
 _CLONE_NEWNS, _CLONE_NEWUTS, _CLONE_NEWIPC = 0x00020000, 0x04000000, 0x08000000
 _CLONE_NEWUSER, _CLONE_NEWPID, _CLONE_NEWNET = 0x10000000, 0x20000000, 0x40000000
+_PLACES = tuple(map(Path, ("/mnt", "/media", "/srv", "/opt", "/tmp", "/run")))
 _MS_NOSUID, _MS_NODEV, _MS_BIND, _MS_REC, _MS_PRIVATE = 0x2, 0x4, 0x1000, 0x4000, 1 << 18
 _MNT_DETACH = 2
 _AT_RECURSIVE = 0x8000
@@ -116,7 +117,7 @@ def make_root(readable: Sequence[Path], scratch_bytes: int, owner: int) -> None:
         owner: User of the scratch folder.
     """
     _mount(None, "/", None, _MS_REC | _MS_PRIVATE, None)
-    base = "/tmp"  # any folder: a fresh file system lies over it, and only this process sees that
+    base = _free_place(readable)
     _mount("root", base, "tmpfs", _MS_NOSUID | _MS_NODEV, "size=1m,mode=755")
     for path in (*_outermost(readable), *(Path("/dev") / name for name in ("null", "zero", "urandom"))):
         _show(path, base)
@@ -124,7 +125,8 @@ def make_root(readable: Sequence[Path], scratch_bytes: int, owner: int) -> None:
     os.mkdir(scratch)
     _mount("scratch", scratch, "tmpfs", _MS_NOSUID | _MS_NODEV, f"size={scratch_bytes},mode=700")
     os.chown(scratch, owner, owner if os.getuid() == 0 else os.getgid())
-    os.symlink("scratch", base + "/tmp")
+    if not os.path.lexists(base + "/tmp"):
+        os.symlink("scratch", base + "/tmp")
     old = base + "/old"
     os.mkdir(old)
     number = _SYS_PIVOT_ROOT.get(platform.machine())
@@ -222,6 +224,14 @@ def _filter(forbidden: Sequence[int]) -> bytes:
         *tail,
     ]
     return b"".join(steps)
+
+
+def _free_place(readable: Sequence[Path]) -> str:
+    """Return a folder to put a fresh file system over: nothing that will be shown may lie below it."""
+    for place in _PLACES:
+        if place.is_dir() and not any(Path(path).is_relative_to(place) for path in readable):
+            return str(place)
+    raise WallMissing("root", f"none of {', '.join(map(str, _PLACES))} is free")
 
 
 def _outermost(paths: Sequence[Path]) -> list[Path]:
