@@ -190,6 +190,10 @@ class ServiceSettings:
     max_environments: int = setting(64, doc="isolated environments of one server", low=1)
     memory_bytes: int = setting(536870912, unit="bytes", doc="address space of one environment", low=16777216)
     grace_s: float = setting(5.0, unit="s", doc="an environment outlives its connection by this", low=0)
+    max_graph_edges: int = setting(100000, doc="edges of one pose graph that a map service takes", low=1)
+    max_cloud_points: int = setting(1000000, doc="points of one cloud that icp takes", low=100)
+    max_map_keyframes: int = setting(2000, doc="keyframes of one map that a map service takes", low=1)
+    max_fingerprints: int = setting(5000, doc="fingerprints of one wifi request", low=1)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

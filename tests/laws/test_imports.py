@@ -61,6 +61,9 @@ PACKAGES: dict[str, tuple[str, ...]] = {
     "PIL": ("rse_pf/experiments/map_picture.py",),
     "rich": ("rse_pf/cli/", "rse_pf/experiments/"),
     "lupa": ("rse_pf/services/",),
+    "gtsam": ("rse_pf/services/optimise.py",),
+    "small_gicp": ("rse_pf/services/icp.py",),
+    "faiss": ("rse_pf/services/descriptors.py", "rse_pf/services/place.py"),
     "envoy": ("rse_pf/local/",),
 }
 BASE = {"numpy", "msgspec", "websockets"}

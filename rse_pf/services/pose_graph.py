@@ -1,0 +1,279 @@
+"""Pose graphs: poses, measured steps between them, their misfit, and the g2o text that others read.
+
+Promises that a graph is checked once, where it is made, and not to need anything but numpy.
+
+Residual of edge *k* between poses *a* and *b*: ``log(inverse(T_a_b) @ inverse(T_world_a) @ T_world_b)``,
+a twist ``(rho metres, phi radians)``; ``information`` is the inverse covariance of that twist.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from rse_pf.errors import BadRequest
+from rse_pf.geometry import Array, from_quaternion, to_quaternion
+
+__all__ = ["PoseGraph", "components", "inverses", "log_se3", "misfit", "read_g2o", "write_g2o"]
+
+_UPPER = np.triu_indices(6)
+_FROM_G2O = np.diag([1.0, 1.0, 1.0, 0.5, 0.5, 0.5])
+"""g2o's rotation error is the vector part of a quaternion, half of phi."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class PoseGraph:
+    """*n* poses and *m* edges between them.
+
+    Attributes:
+        T_world_pose: ``(n, 4, 4)``, metres.
+        a, b: ``(m,)`` row numbers of the poses that an edge joins.
+        T_a_b: ``(m, 4, 4)``, the measured steps.
+        information: ``(m, 6, 6)``, symmetric, positive definite, of the twist (metres, radians).
+        robust: ``(m,)``, whether an edge may be an error (loops and merges) or not (odometry).
+        ids: ``(n,)``, what the poses are called outside.
+
+    Raises:
+        BadRequest: Shapes do not fit, an edge joins a pose to itself or to none, a number is not
+            finite, a rotation is none, or an information matrix is not positive definite.
+    """
+
+    T_world_pose: Array
+    a: npt.NDArray[np.int64]
+    b: npt.NDArray[np.int64]
+    T_a_b: Array
+    information: Array
+    robust: npt.NDArray[np.bool_]
+    ids: npt.NDArray[np.int64]
+
+    def __post_init__(self) -> None:
+        n, m = len(self.T_world_pose), len(self.a)
+        shapes = (
+            self.T_world_pose.shape == (n, 4, 4) and self.ids.shape == (n,) and n > 0
+            and self.b.shape == self.a.shape == self.robust.shape == (m,)
+            and self.T_a_b.shape == (m, 4, 4) and self.information.shape == (m, 6, 6)
+        )  # fmt: skip
+        if not shapes:
+            raise BadRequest("the parts of the pose graph do not fit", hint="send one row for each edge")
+        if m and (min(self.a.min(), self.b.min()) < 0 or max(self.a.max(), self.b.max()) >= n):
+            raise BadRequest(f"an edge names a pose that is not one of 0..{n - 1}", hint="send all poses")
+        if (self.a == self.b).any():
+            raise BadRequest("an edge joins a pose to itself", hint="leave it out")
+        if len(np.unique(self.ids)) != n:
+            raise BadRequest("two poses have one id", hint="number them anew")
+        _check_rigid("a pose", self.T_world_pose)
+        _check_rigid("an edge", self.T_a_b)
+        if not _is_positive_definite(self.information):
+            raise BadRequest(
+                "an information matrix is not symmetric and positive definite", hint="invert a covariance"
+            )
+
+    def with_poses(self, T_world_pose: Array) -> PoseGraph:
+        """Return the graph with its poses replaced."""
+        return PoseGraph(
+            T_world_pose=T_world_pose, a=self.a, b=self.b, T_a_b=self.T_a_b,
+            information=self.information, robust=self.robust, ids=self.ids,
+        )  # fmt: skip
+
+    def chi2(self, T_world_pose: Array | None = None) -> float:
+        """Return the sum of squared residuals, each weighted with its information."""
+        poses = self.T_world_pose if T_world_pose is None else T_world_pose
+        return float(self.squared_residuals(poses).sum())
+
+    def squared_residuals(self, T_world_pose: Array) -> Array:
+        """Return the ``(m,)`` squared Mahalanobis norms of the residuals at *T_world_pose*."""
+        predicted = inverses(T_world_pose[self.a]) @ T_world_pose[self.b]
+        return misfit(self.T_a_b, predicted, self.information)
+
+
+def misfit(measured: Array, predicted: Array, information: Array) -> Array:
+    """Return the ``(m,)`` squared Mahalanobis norms between ``(m, 4, 4)`` poses."""
+    error = log_se3(inverses(measured) @ predicted)
+    squares: Array = np.einsum("mi,mij,mj->m", error, information, error)
+    return squares
+
+
+def inverses(T_a_b: Array) -> Array:
+    """Return ``(m, 4, 4)`` inverse poses."""
+    T_b_a = np.zeros_like(T_a_b)
+    rotations = np.swapaxes(T_a_b[:, :3, :3], 1, 2)
+    T_b_a[:, :3, :3] = rotations
+    T_b_a[:, :3, 3] = -np.einsum("mij,mj->mi", rotations, T_a_b[:, :3, 3])
+    T_b_a[:, 3, 3] = 1.0
+    return T_b_a
+
+
+def log_se3(T: Array) -> Array:
+    """Return the ``(m, 6)`` twists ``(rho, phi)`` of ``(m, 4, 4)`` poses; `exp_se3` undoes it.
+
+    Source:
+        Barfoot, State Estimation for Robotics (2017), eqs. 7.18 and 7.36.
+    """
+    rotation = T[:, :3, :3]
+    q = _quaternions(rotation)
+    sine = np.linalg.norm(q[:, :3], axis=1)
+    angle = 2.0 * np.arctan2(sine, q[:, 3])
+    scale = np.where(sine > 1e-9, angle / np.maximum(sine, 1e-300), 2.0)
+    phi = scale[:, None] * q[:, :3]
+    half = 0.5 * angle
+    small = angle < 1e-4
+    safe = np.where(small, 1.0, half)
+    c = np.where(small, 1.0 / 12.0, (1.0 - safe / np.tan(safe)) / (4.0 * safe**2))
+    K = np.zeros((len(T), 3, 3))
+    K[:, 0, 1], K[:, 0, 2], K[:, 1, 2] = -phi[:, 2], phi[:, 1], -phi[:, 0]
+    K -= np.swapaxes(K, 1, 2)
+    inverse_jacobian = np.eye(3) - 0.5 * K + c[:, None, None] * (K @ K)
+    rho = np.einsum("mij,mj->mi", inverse_jacobian, T[:, :3, 3])
+    return np.concatenate([rho, phi], axis=1)
+
+
+def components(n: int, a: npt.NDArray[np.int64], b: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+    """Return for each of *n* poses the smallest row number that edges connect it to."""
+    root = list(range(n))
+
+    def find(i: int) -> int:
+        while root[i] != i:
+            root[i] = root[root[i]]
+            i = root[i]
+        return i
+
+    for one, other in zip(a.tolist(), b.tolist(), strict=True):
+        one, other = find(one), find(other)
+        root[max(one, other)] = min(one, other)
+    return np.array([find(i) for i in range(n)], dtype=np.int64)
+
+
+def write_g2o(graph: PoseGraph) -> str:
+    """Return *graph* as g2o text (``VERTEX_SE3:QUAT``, ``EDGE_SE3:QUAT``).
+
+    g2o measures rotations by the vector part of a quaternion, so its information matrices are
+    written for ``phi / 2``.
+    """
+    lines = []
+    for name, T in zip(graph.ids.tolist(), graph.T_world_pose, strict=True):
+        lines.append(f"VERTEX_SE3:QUAT {name} {_numbers(_seven(T))}")
+    back = np.linalg.inv(_FROM_G2O)
+    for k, (a, b) in enumerate(zip(graph.a.tolist(), graph.b.tolist(), strict=True)):
+        information = (back @ graph.information[k] @ back)[_UPPER]
+        ends = f"{graph.ids[a]} {graph.ids[b]}"
+        lines.append(f"EDGE_SE3:QUAT {ends} {_numbers(_seven(graph.T_a_b[k]))} {_numbers(information)}")
+    return "\n".join(lines) + "\n"
+
+
+def read_g2o(text: str) -> PoseGraph:
+    """Return the graph of g2o *text*; edges between consecutive ids are odometry.
+
+    Raises:
+        BadRequest: A line is not one of ``VERTEX_SE3:QUAT``, ``EDGE_SE3:QUAT`` and ``FIX``, or does
+            not hold the numbers it should; the line is named.
+    """
+    vertices: dict[int, Array] = {}
+    edges: list[tuple[int, int, Array, Array]] = []
+    for number, tag, words in _lines(text):
+        try:
+            if tag == "VERTEX_SE3:QUAT":
+                vertices[int(words[0])] = _pose(words[1:])
+            elif tag == "EDGE_SE3:QUAT":
+                information = np.zeros((6, 6))
+                information[_UPPER] = [float(word) for word in words[9:]]
+                information = np.triu(information) + np.triu(information, 1).T
+                edges.append((int(words[0]), int(words[1]), _pose(words[2:9]), information))
+            elif tag != "FIX":
+                raise ValueError(f"{tag[:40]!r} is not a 3-D pose or edge")
+        except (ValueError, IndexError) as error:
+            raise BadRequest(f"g2o, line {number}: {error}", hint="send 3-D pose graphs only") from error
+    row = {name: i for i, name in enumerate(vertices)}
+    missing = next((name for a, b, _, _ in edges for name in (a, b) if name not in row), None)
+    if missing is not None:
+        raise BadRequest(f"g2o: an edge names vertex {missing}, which is missing", hint="send all vertices")
+    m = len(edges)
+    ids = np.array(list(vertices), dtype=np.int64)
+    a = np.array([row[edge[0]] for edge in edges], dtype=np.int64)
+    b = np.array([row[edge[1]] for edge in edges], dtype=np.int64)
+    return PoseGraph(
+        T_world_pose=np.array(list(vertices.values())).reshape(-1, 4, 4),
+        a=a,
+        b=b,
+        T_a_b=np.array([edge[2] for edge in edges]).reshape(m, 4, 4),
+        information=_FROM_G2O @ np.array([edge[3] for edge in edges]).reshape(m, 6, 6) @ _FROM_G2O,
+        robust=np.abs(ids[a] - ids[b]) != 1,
+        ids=ids,
+    )
+
+
+def _lines(text: str) -> Iterator[tuple[int, str, list[str]]]:
+    for number, line in enumerate(text.splitlines(), start=1):
+        words = line.split()
+        if words and not words[0].startswith("#"):
+            yield number, words[0], words[1:]
+
+
+def _seven(T: Array) -> Array:
+    return np.concatenate([T[:3, 3], to_quaternion(T[:3, :3])])
+
+
+def _numbers(values: Array) -> str:
+    return " ".join(f"{value:.17g}" for value in values)
+
+
+def _pose(words: list[str]) -> Array:
+    numbers = [float(word) for word in words]
+    if len(numbers) != 7 or not all(math.isfinite(value) for value in numbers):
+        raise ValueError("a pose is x y z qx qy qz qw")
+    if np.linalg.norm(numbers[3:]) < 1e-6:
+        raise ValueError("a quaternion is zero")
+    T = np.eye(4)
+    T[:3, :3] = from_quaternion(numbers[3:])
+    T[:3, 3] = numbers[:3]
+    return T
+
+
+def _quaternions(rotation: Array) -> Array:
+    """Return ``(m, 4)`` unit quaternions ``(x, y, z, w)``, ``w >= 0``; Shepperd 1978."""
+    m = rotation.transpose(1, 2, 0)
+    four = np.stack(
+        [
+            1 + m[0, 0] - m[1, 1] - m[2, 2],
+            1 - m[0, 0] + m[1, 1] - m[2, 2],
+            1 - m[0, 0] - m[1, 1] + m[2, 2],
+            1 + m[0, 0] + m[1, 1] + m[2, 2],
+        ]
+    )
+    xy, xz, yz = m[0, 1] + m[1, 0], m[0, 2] + m[2, 0], m[1, 2] + m[2, 1]
+    wx, wy, wz = m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]
+    rows = np.stack(
+        [
+            np.stack([four[0], xy, xz, wx]),
+            np.stack([xy, four[1], yz, wy]),
+            np.stack([xz, yz, four[2], wz]),
+            np.stack([wx, wy, wz, four[3]]),
+        ]
+    )
+    q: Array = rows[np.argmax(four, axis=0), :, np.arange(rotation.shape[0])]
+    q = q / np.linalg.norm(q, axis=1, keepdims=True)
+    return np.where(q[:, 3:] < 0, -q, q)
+
+
+def _check_rigid(what: str, T: Array) -> None:
+    if not len(T):
+        return
+    if not np.isfinite(T).all() or not np.allclose(T[:, 3], [0, 0, 0, 1]):
+        raise BadRequest(f"{what} is not a rigid motion", hint="send (4, 4) matrices of finite numbers")
+    rotation = T[:, :3, :3]
+    off = np.abs(rotation @ np.swapaxes(rotation, 1, 2) - np.eye(3)).max()
+    if off > 1e-4 or np.linalg.det(rotation).min() < 0:
+        raise BadRequest(f"{what} holds a matrix that is no rotation", hint="orthonormalise it")
+
+
+def _is_positive_definite(information: Array) -> bool:
+    if not len(information):
+        return True
+    if not np.isfinite(information).all():
+        return False
+    scale = np.abs(information).max(axis=(1, 2))
+    skewed = np.abs(information - np.swapaxes(information, 1, 2)).max(axis=(1, 2)) > 1e-6 * scale
+    return not skewed.any() and bool((np.linalg.eigvalsh(information)[:, 0] > 0).all())
