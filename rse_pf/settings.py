@@ -223,6 +223,7 @@ class CloudSettings:
     idle_timeout_s: int = setting(120, unit="s", doc="the ALB ends a silent connection after this; above the ping interval", low=30, high=4000)
     requests_per_5_minutes: int = setting(2000, unit="requests", doc="WAF: handshakes of one address in five minutes", low=100)
     drain_s: int = setting(60, unit="s", doc="time the termination hook gives a leaving server", low=30, high=7200)
+    poll_s: int = setting(5, unit="s", doc="time between an instance's looks at its lifecycle state", low=1, high=60)
     lambda_memory_mb: int = setting(1769, unit="MB", doc="memory of the serverless PnP; 1769 is one vCPU", low=128, high=10240)
     lambda_concurrency: int = setting(20, doc="executions of the serverless PnP at a time", low=1)
     lambda_timeout_s: int = setting(10, unit="s", doc="longest execution of the serverless PnP", low=1, high=900)

@@ -10,9 +10,9 @@ import time
 from collections.abc import Callable
 from typing import Any, TypeVar
 
-from rse_pf.errors import MissingExtra, StoreError
+from rse_pf.errors import ConfigurationError, MissingExtra, StoreError
 
-__all__ = ["MOST_S", "MOST_TRIES", "make_client", "patiently", "status_of"]
+__all__ = ["MOST_S", "MOST_TRIES", "ask", "make_client", "patiently", "status_of"]
 
 MOST_TRIES = 3
 MOST_S = 10.0
@@ -69,6 +69,20 @@ def patiently(
     raise StoreError(
         f"AWS does not answer: {last}", hint="look at the endpoints of the VPC and at status.aws.amazon.com"
     ) from last
+
+
+def ask(client: Any, method: str, **arguments: Any) -> dict[str, Any]:
+    """Return the answer of one call, patiently; raises StoreError, or ConfigurationError when refused."""
+    from botocore.exceptions import ClientError
+
+    try:
+        found: dict[str, Any] = patiently(lambda: getattr(client, method)(**arguments))
+    except ClientError as error:
+        code = error.response.get("Error", {}).get("Code", "")
+        raise ConfigurationError(
+            f"AWS refuses {method}: {code}", hint="look at the role's policy in the template"
+        ) from error
+    return found
 
 
 def status_of(error: Any) -> int:

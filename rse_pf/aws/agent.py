@@ -1,0 +1,168 @@
+"""Stand beside a backend server on its instance: publish its numbers, fetch the keys, drain it at the end.
+
+    python -m rse_pf.aws.agent --settings FILE --bucket B --keys-file FILE --group G --hook H
+
+Without it the idle alarm never fires and a scale-in cuts robots off.  Each duty fails by itself, with one
+line in the log, and is tried again.  Promises to write one file, the public keys, and never a secret.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from rse_pf.auth import KeySet
+from rse_pf.aws.clients import ask, make_client
+from rse_pf.aws.drain_hook import leave_group
+from rse_pf.aws.instance import Instance, Machine
+from rse_pf.aws.metrics import Reading, datums, read_page
+from rse_pf.aws.s3_store import open_bucket
+from rse_pf.errors import NotFound, RsePfError
+from rse_pf.objects import ObjectStore
+from rse_pf.scaling.alarms import NAMESPACE
+from rse_pf.settings import PlatformSettings, load_settings
+
+__all__ = ["Agent", "Post", "main"]
+
+_NO_KEYS = "no keys in the bucket yet, robots are refused; run rse-pf token init --cloud"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Post:
+    """Where this agent stands: group, hook, and where the keys are and go."""
+
+    group: str
+    hook: str
+    keys_name: str
+    keys_file: Path
+
+
+class Agent:
+    """The duties, each when it is due; `step` is called again and again."""
+
+    def __init__(
+        self,
+        machine: Machine,
+        *,
+        cloudwatch: Any,
+        autoscaling: Any,
+        artifacts: ObjectStore,
+        post: Post,
+        settings: PlatformSettings,
+        log: Callable[..., None],
+        clock: Callable[[], float] = time.monotonic,
+        rest: Callable[[float], None] = time.sleep,
+    ) -> None:
+        self._machine = machine
+        self._cloudwatch = cloudwatch
+        self._autoscaling = autoscaling
+        self._artifacts = artifacts
+        self._post = post
+        self._settings = settings
+        self._log = log
+        self._clock = clock
+        self._rest = rest
+        self._before: Reading | None = None
+        self._due_s = 0.0
+        self.has_left = False
+
+    def step(self) -> None:
+        """Look at the lifecycle; once in a period, fetch keys and publish numbers."""
+        if not self.has_left:
+            self._try("lifecycle", self._look_at_lifecycle)
+        if self._clock() >= self._due_s:
+            self._due_s = self._clock() + self._settings.scaling.period_s
+            self._try("keys", self.fetch_keys)
+            if not self.has_left:
+                self._try("metrics", self._publish)
+
+    def fetch_keys(self) -> None:
+        """Write the public keys if they changed; what is no key set is refused and the old one stays."""
+        file = self._post.keys_file
+        try:
+            fresh = self._artifacts.get(self._post.keys_name)
+        except NotFound:
+            if not file.exists():
+                self._replace(file, b'{"keys":[]}\n')
+                self._log("no-keys", hint=_NO_KEYS)
+            return
+        if file.exists() and file.read_bytes() == fresh:
+            return
+        KeySet.from_json(fresh.decode("utf-8", "replace"))
+        self._replace(file, fresh)
+        self._log("keys", bytes=len(fresh))
+
+    def _look_at_lifecycle(self) -> None:
+        if self._machine.is_leaving():
+            self._log("leaving", group=self._post.group)
+            drained = leave_group(
+                self._machine, self._autoscaling, group=self._post.group, hook=self._post.hook,
+                settings=self._settings, clock=self._clock, rest=self._rest,
+            )  # fmt: skip
+            self.has_left = True
+            self._log("left", drained=drained)
+
+    def _publish(self) -> None:
+        now = read_page(self._machine.page())
+        if self._before is None:
+            self._before = now  # what was before this agent began is not this period's
+        data = datums(self._before, now, self._post.group)
+        ask(self._cloudwatch, "put_metric_data", Namespace=NAMESPACE, MetricData=data)
+        self._before = now
+
+    def _try(self, duty: str, work: Callable[[], None]) -> None:
+        try:
+            work()
+        except (RsePfError, OSError) as error:
+            self._log("failed", duty=duty, why=str(error)[:200])
+
+    def _replace(self, file: Path, data: bytes) -> None:
+        temporary = file.with_name(f".{file.name}.new")
+        temporary.write_bytes(data)
+        os.replace(temporary, file)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Stand at the post until a signal ends it; ``--once`` only fetches the keys."""
+    parser = argparse.ArgumentParser(prog="rse-pf-agent", description="the agent of a backend server on AWS")
+    parser.add_argument("--settings", type=Path, required=True, metavar="FILE")
+    for name in ("bucket", "keys-name", "group", "hook"):
+        parser.add_argument(f"--{name}", required=True)
+    parser.add_argument("--keys-file", type=Path, required=True, metavar="FILE")
+    parser.add_argument("--once", action="store_true", help="fetch the keys and leave")
+    args = parser.parse_args(arguments)
+    try:
+        settings = load_settings(args.settings)
+        region = settings.cloud.region
+        post = Post(group=args.group, hook=args.hook, keys_name=args.keys_name, keys_file=args.keys_file)
+        agent = Agent(
+            Instance(settings.serving.control_port), cloudwatch=make_client("cloudwatch", region),
+            autoscaling=make_client("autoscaling", region), artifacts=open_bucket(args.bucket, region),
+            post=post, settings=settings, log=_log,
+        )  # fmt: skip
+        if args.once:
+            agent.fetch_keys()
+            return 0
+    except RsePfError as error:
+        sys.stderr.write(f"{error.report()}\n")
+        return 2
+    while True:
+        agent.step()
+        time.sleep(settings.cloud.poll_s)
+
+
+def _log(event: str, **fields: Any) -> None:
+    line = {"at_s": round(time.time(), 3), "event": f"agent-{event}", **fields}
+    sys.stderr.write(json.dumps(line) + "\n")
+    sys.stderr.flush()
+
+
+if __name__ == "__main__":
+    sys.exit(main())
