@@ -16,6 +16,7 @@ from typing import Any, Protocol
 import msgspec
 
 from rse_pf.backend.door import Admitted
+from rse_pf.backend.environments import Environments
 from rse_pf.backend.executors import Executor, SolverThreads
 from rse_pf.backend.frames import CloseSocket, FrameAssembler, Received, SendPong
 from rse_pf.backend.log import JsonLog
@@ -198,6 +199,8 @@ class Core:
         )
         self._threads = SolverThreads(settings.serving.solver_threads, self._compute, self._from_thread)
         self._executors: dict[Kind, Executor] = {"stateless": self._threads}
+        self.environments: Environments | None = None
+        """Of installed services; set by whoever can make processes."""
         self._gate_timer: Handle | None = None
         self._sweep_timer: Handle | None = None
         self._move: tuple[str, float] | None = None
@@ -209,7 +212,8 @@ class Core:
     @property
     def held(self) -> int:
         """Commands that wait or run."""
-        return self._scheduler.waiting + self._scheduler.running
+        isolated = 0 if self.environments is None else self.environments.held
+        return self._scheduler.waiting + self._scheduler.running + isolated
 
     def connect(self, wire: Wire, admitted: Admitted) -> Connection:
         """Return the connection of a robot whose handshake is done."""
@@ -228,10 +232,14 @@ class Core:
             expires_s = now + admitted.expires_s - self.clocks.wall()
         connection = Connection(self, wire, session, admitted.robot, now, expires_s)
         self.connections.add(connection)
+        if self.environments is not None:
+            self.environments.connected(connection.robot)
         return connection
 
     def disconnect(self, connection: Connection) -> None:
         """Forget a connection whose socket ended, and what it still waited for."""
+        if connection in self.connections and self.environments is not None:
+            self.environments.disconnected(connection.robot)
         self.connections.discard(connection)
         for job in self._scheduler.leave(connection):
             self.metrics.requests[self._label(job.command.service), "disconnected"] += 1
@@ -257,12 +265,17 @@ class Core:
             connection.close(CLOSE_GOING_AWAY, "leaving")
         for executor in self._executors.values():
             executor.close()
+        if self.environments is not None:
+            self.environments.close()
 
     def submit(self, connection: Connection, command: Command, size_bytes: int, now: float) -> None:
         """Queue one command, and start what may start."""
         deadline_ms = command.deadline_ms
         allowed_s = self.settings.session.answer_timeout_s if deadline_ms is None else deadline_ms / 1e3
         job = Job(connection, connection.robot, command, size_bytes, now, now + allowed_s)
+        if self.environments is not None and self.environments.offers(command.service):
+            self.environments.submit(job)
+            return
         service = self._service(command.service)
         if service is None:
             self._answer(self._compute(job), now)
@@ -289,7 +302,19 @@ class Core:
             "log_lines_dropped": float(self._log.dropped),
         }
         self._lag_s = 0.0
-        return self.metrics.snapshot()
+        if self.environments is None:
+            return self.metrics.snapshot()
+        isolation = self.environments.report()
+        self.metrics.gauges["environments"] = float(isolation["environments"])
+        return {**self.metrics.snapshot(), "isolation": isolation}
+
+    def answer_isolated(self, job: Job, answer: Result | Failure) -> None:
+        """Send what an environment came to; it may answer a robot that is gone."""
+        now = self.clocks.monotonic()
+        if isinstance(answer, Result):
+            queue_ms = (job.started_s - job.received_s) * 1e3
+            answer = msgspec.structs.replace(answer, queue_ms=queue_ms, received_s=job.received_s, sent_s=now)
+        self._answer(self._encoded(job, answer), now)
 
     # --- from the queue to an answer -----------------------------------------------------------
 
@@ -333,7 +358,10 @@ class Core:
                 received_s=job.received_s,
                 sent_s=monotonic(),
             )
-        codec: Codec = job.owner.session.codec
+        return self._encoded(job, answer)
+
+    def _encoded(self, job: Job, answer: Result | Failure) -> _Outcome:
+        codec, command = job.owner.session.codec, job.command
         try:
             data = codec.encode(answer)
         except Exception as error:  # noqa: BLE001  a service's reply is foreign data: anything may come out
@@ -399,7 +427,8 @@ class Core:
             return None
 
     def _label(self, service: str) -> str:
-        return service if self._service(service) is not None else _UNKNOWN
+        installed = self.environments is not None and self.environments.offers(service)
+        return service if installed or self._service(service) is not None else _UNKNOWN
 
     # --- timers --------------------------------------------------------------------------------
 

@@ -15,10 +15,9 @@ from typing import Any, Literal, Protocol
 
 from rse_pf.backend.conversation import Conversation, Watching
 from rse_pf.backend.environment_process import encoded
-from rse_pf.backend.log import JsonLog
 from rse_pf.backend.quarantine import Quarantine
 from rse_pf.backend.scheduler import Job
-from rse_pf.backend.template import Template
+from rse_pf.backend.template import EventLog, Template
 from rse_pf.errors import (
     Busy,
     Conflict,
@@ -98,7 +97,7 @@ class Environments:
         store: ObjectStore | None,
         monotonic: Callable[[], float],
         loop: Loop,
-        log: JsonLog,
+        log: EventLog,
         answer: Callable[[Job, Result | Failure], None],
     ) -> None:
         """Start the template process and wait until it is warm.
@@ -141,6 +140,11 @@ class Environments:
         return service in self._services
 
     @property
+    def missing(self) -> tuple[str, ...]:
+        """Names of the walls that this machine lacks."""
+        return self._template.missing
+
+    @property
     def held(self) -> int:
         """Commands that wait or run."""
         return sum(len(each.waiting) + (each.running is not None) for each in self._by_number.values())
@@ -149,7 +153,7 @@ class Environments:
         """Return what /readyz and /metrics say of this worker's environments."""
         return {
             "environments": len(self._by_number),
-            "missing_walls": list(self._template.missing),
+            "missing_walls": list(self.missing),
             "quarantined": self._quarantine.resting(self._monotonic()),
             "counts": dict(self.counts),
         }

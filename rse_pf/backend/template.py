@@ -14,14 +14,26 @@ import sys
 from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 
-from rse_pf.backend.log import JsonLog
 from rse_pf.errors import ConfigurationError
 from rse_pf.services.installed import InstalledService
 from rse_pf.settings import PlatformSettings
 
-__all__ = ["Reading", "Template"]
+__all__ = ["EventLog", "Reading", "Template"]
 
 _MOST_MESSAGE = 1 << 16
+
+
+class EventLog(Protocol):
+    """Where events go; `rse_pf.backend.log.JsonLog` is one."""
+
+    def info(self, event: str, **fields: Any) -> None:
+        """Write what happened."""
+
+    def warning(self, event: str, **fields: Any) -> None:
+        """Write what an operator should look at."""
+
+    def error(self, event: str, **fields: Any) -> None:
+        """Write a defect."""
 
 
 class Reading(Protocol):
@@ -43,7 +55,7 @@ class Template:
         settings: PlatformSettings,
         *,
         loop: Reading,
-        log: JsonLog,
+        log: EventLog,
         on_gone: Callable[[int, str], None],
         on_lost: Callable[[], None],
     ) -> None:

@@ -18,16 +18,20 @@ import socket
 import sys
 import time
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Any
 
 from rse_pf.auth import KeySet
 from rse_pf.backend.core import Clocks, Core
 from rse_pf.backend.door import Door
+from rse_pf.backend.environments import Environments
 from rse_pf.backend.log import JsonLog
 from rse_pf.backend.processes import die_with_parent
 from rse_pf.backend.server import RobotSockets
 from rse_pf.errors import ConfigurationError, MissingExtra
+from rse_pf.objects import open_store
 from rse_pf.service import Registry
+from rse_pf.services.installed import installed_services
 from rse_pf.settings import PlatformSettings
 
 __all__ = ["load_services", "main"]
@@ -93,6 +97,8 @@ class _Worker:
             log=self._log,
             new_session_id=lambda: secrets.token_hex(8),
         )
+        if settings.services.folder:
+            self._core.environments = self._environments(settings, config["server"], config["workers"])
         keys = None if config["keys"] is None else KeySet.from_json(config["keys"])
         self._index, self._workers, self._named = config["index"], config["workers"], 0
         self._sockets = RobotSockets(
@@ -104,6 +110,19 @@ class _Worker:
             new_name=self._new_name,
             log=self._log,
             loop=loop,
+        )
+
+    def _environments(self, settings: PlatformSettings, server: str, workers: int) -> Environments:
+        return Environments(
+            installed_services(Path(settings.services.folder)),
+            settings=settings,
+            most=-(-settings.services.max_environments // workers),
+            server_id=server,
+            store=open_store(settings.data.store),
+            monotonic=time.monotonic,
+            loop=self._loop,
+            log=self._log,
+            answer=self._core.answer_isolated,
         )
 
     async def run(self) -> None:

@@ -1,0 +1,21 @@
+-- @NAME@: where a cloud of points lies, and how far it reaches.
+-- Request: points, 3n metres, row after row.  Reply: centroid, 3 metres; radius, the largest distance from it.
+
+return function(request)
+  local points = request.points
+  if type(points) ~= "table" or #points == 0 or #points % 3 ~= 0 then
+    error({code = "bad-request", message = "points must hold rows of 3 numbers"})
+  end
+  local n = #points / 3
+  local centroid = {0, 0, 0}
+  for i, value in ipairs(points) do
+    local axis = (i - 1) % 3 + 1
+    centroid[axis] = centroid[axis] + value / n
+  end
+  local radius = 0
+  for i = 1, #points, 3 do
+    local dx, dy, dz = points[i] - centroid[1], points[i + 1] - centroid[2], points[i + 2] - centroid[3]
+    radius = math.max(radius, math.sqrt(dx * dx + dy * dy + dz * dz))
+  end
+  return {centroid = centroid, radius = radius}
+end
