@@ -22,6 +22,7 @@ from typing import Any
 from rse_pf.backend import walls
 from rse_pf.backend.environment_process import EnvironmentPlan, readable_paths, run_environment
 from rse_pf.backend.processes import die_with_parent
+from rse_pf.errors import MissingExtra
 from rse_pf.services.installed import InstalledService
 
 __all__ = ["main"]
@@ -184,10 +185,10 @@ def _warm_up(languages: set[str]) -> None:
     if "cpp" in languages:
         import rse_pf.services.native
     if "lua" in languages:
-        import rse_pf.services.lua  # noqa: F401
+        from rse_pf.services.lua import warm_up
 
-        with contextlib.suppress(ImportError):  # said when a robot calls the service
-            import lupa.luajit21  # noqa: F401
+        with contextlib.suppress(MissingExtra):  # said when a robot calls the service
+            warm_up()
 
 
 if __name__ == "__main__":

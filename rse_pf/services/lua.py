@@ -25,7 +25,7 @@ from rse_pf.errors import (
 )
 from rse_pf.services.installed import InstalledService
 
-__all__ = ["LuaRuntime"]
+__all__ = ["LuaRuntime", "warm_up"]
 
 _MOST_INFLATED = 1 << 24
 _SETUP = """
@@ -40,14 +40,20 @@ return pcall
 """
 
 
+def warm_up() -> Any:
+    """Load LuaJIT into this process and return its module; raises MissingExtra."""
+    try:
+        import lupa.luajit21 as lupa
+    except ImportError as error:
+        raise MissingExtra("lupa", "services") from error
+    return lupa
+
+
 class LuaRuntime:
     """One virtual machine with one script."""
 
     def __init__(self, service: InstalledService) -> None:
-        try:
-            import lupa.luajit21 as lupa
-        except ImportError as error:
-            raise MissingExtra("lupa", "services") from error
+        lupa = warm_up()
         self._name = service.name
         self._lupa = lupa
         self._lua = lupa.LuaRuntime(

@@ -8,6 +8,8 @@ import numpy as np
 from rse_pf.errors import BadRequest
 from rse_pf.wire.arrays import Array, reshaped
 
+__all__ = ["Reply", "Request", "serve"]
+
 
 class Request(msgspec.Struct):
     """``points`` holds 3n metres, row after row."""
