@@ -42,10 +42,13 @@ from rse_pf.wire.robot_session import (
 )
 from rse_pf.wire.session import CLOSE_REPLACED
 
-__all__ = ["Connection", "Token", "websocket_options"]
+__all__ = ["Connection", "OnChange", "Token", "websocket_options"]
 
 Token = str | Callable[[], Awaitable[str]] | None
 """A robot's token, or what gives a fresh one whenever the robot dials."""
+
+OnChange = Callable[[str, str], None] | None
+"""Is told ``link-lost`` with a reason, and ``link-back`` or ``moved`` with the server's name."""
 
 _FIRST_TRIES = 4
 _LONGEST_RETRY_AFTER_S = 30.0
@@ -104,6 +107,7 @@ class Connection:
         on_answer: Callable[[Answered], None],
         clock: Callable[[], float],
         random: random_module.Random,
+        on_change: OnChange = None,
     ) -> None:
         self.url = url
         self.reconnects = 0
@@ -117,6 +121,7 @@ class Connection:
         self._session = session
         self._settings = session.settings
         self._on_answer = on_answer
+        self._on_change = on_change
         self._clock = clock
         self._random = random
         self._sockets: list[_Socket] = []
@@ -216,6 +221,7 @@ class Connection:
             else:
                 self.reconnects += 1
                 self._adopt(socket)
+                self._changed_to("link-back", socket.link.server)
                 return
 
     async def _move(self, old: _Socket, until: float) -> None:
@@ -231,10 +237,12 @@ class Connection:
                 if self._session.current is not old.link:
                     self.reconnects += 1
                     self._adopt(fresh)
+                    self._changed_to("link-back", fresh.link.server)
                     return
                 if fresh.link.server != old.link.server:
                     self.moves += 1
                     self._adopt(fresh)
+                    self._changed_to("moved", fresh.link.server)
                     return
                 self._spawn(self._say_goodbye(fresh))
             pause_s = min(self._pause_s(after_s), max(0.0, until - self._clock()))
@@ -359,6 +367,8 @@ class Connection:
             socket.welcome.set_result(None)
         elif isinstance(event, LinkLost):
             self.last_error = f"connection lost: {event.reason}"
+            if not socket.link.leaving and self._session.current is None:
+                self._changed_to("link-lost", event.reason)
             self._abort(socket)
         elif isinstance(event, Notice):
             failure = event.failure
@@ -369,6 +379,10 @@ class Connection:
         elif isinstance(event, MoveAsked) and socket.link is self._session.current and not self._move_asked:
             self._move_asked = (socket, self._clock() + event.within_s)
             self._changed.set()
+
+    def _changed_to(self, what: str, why: str) -> None:
+        if self._on_change is not None:
+            self._on_change(what, why)
 
     def _adopt(self, socket: _Socket) -> None:
         self._adopted = self._clock()
@@ -393,6 +407,8 @@ class Connection:
             return
         socket.ended.set()
         self._sockets.remove(socket)
+        if self._session.current is socket.link and not self._closed:
+            self._changed_to("link-lost", "closed")
         self._session.close_link(socket.link)
         for task in socket.tasks:
             if task is not asyncio.current_task():

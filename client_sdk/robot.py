@@ -14,7 +14,7 @@ from importlib import metadata
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
-from client_sdk.connection import Connection, Token
+from client_sdk.connection import Connection, OnChange, Token
 from client_sdk.offload import CloudFirst
 from client_sdk.own_services import OwnServices
 from client_sdk.stats import Stats, StatsKeeper
@@ -94,6 +94,7 @@ def connect(
     offload: CloudFirst | None = None,
     clock: Callable[[], float] = time.monotonic,
     random: random_module.Random | None = None,
+    on_change: OnChange = None,
 ) -> Robot:
     """Return a robot to be used as ``async with connect(...) as robot``, or awaited.
 
@@ -105,6 +106,7 @@ def connect(
         offload: `CloudFirst` lets the robot answer itself when the cloud cannot.
         clock: Seconds, monotonic.
         random: Jitter of the reconnects.
+        on_change: Called with ``link-lost``, ``link-back`` or ``moved``, and the reason or the server.
 
     Raises:
         UsageError: The address or the codec cannot be used.
@@ -117,6 +119,7 @@ def connect(
         offload=offload,
         clock=clock,
         random=random or random_module.Random(),
+        on_change=on_change,
     )
 
 
@@ -133,6 +136,7 @@ class Robot:
         offload: CloudFirst | None,
         clock: Callable[[], float],
         random: random_module.Random,
+        on_change: OnChange = None,
     ) -> None:
         if codec not in CODECS:
             raise UsageError(f"no codec named {codec!r}", hint=f"choose one of {', '.join(CODECS)}")
@@ -140,13 +144,14 @@ class Robot:
             codec=make_codec(codec, settings), settings=settings, sdk=f"rse-pf-python/{_version()}"
         )
         self._connection = Connection(
-            url, token=token, session=self._session, on_answer=self._answered, clock=clock, random=random
-        )
+            url, token=token, session=self._session, on_answer=self._answered, clock=clock, random=random,
+            on_change=on_change,
+        )  # fmt: skip
         self._settings = settings
         self._offload = offload
         self._clock = clock
         self._own = None if offload is None else OwnServices(offload.registry, clock)
-        self._waiting: dict[int, asyncio.Future[Answered]] = {}
+        self._waiting: dict[int, asyncio.Future[Answered] | Callable[[Answered], None]] = {}
         self._tasks: set[asyncio.Task[Answer | Failure]] = set()
         self._keeper = StatsKeeper(random)
         self._open = False
@@ -280,6 +285,35 @@ class Robot:
             self._keeper.failures[error.code] += 1
             raise
 
+    def post(
+        self,
+        service: str,
+        request: Any,
+        on_end: Callable[[Answered], None],
+        *,
+        deadline_s: float | None = None,
+        stream: str = "",
+        keep: bool = False,
+    ) -> int:
+        """Ask *service* without waiting, and return the command's number; *on_end* hears its one end.
+
+        For generators of load: no task, no future and no statistics, and *request* may be `Prepared`.
+        Once the robot is connected it works without a link too, as `call` does; it never asks the robot
+        itself.
+
+        Raises:
+            Disconnected: The robot is not open, or has given up for good.
+            LimitExceeded: The message would be larger than the limit.
+        """
+        if not self._open or self._connection.fatal is not None:
+            raise Disconnected("the robot is not connected", hint="use async with client_sdk.connect(...)")
+        identity = self._session.submit(
+            service, request, now=self._clock(), deadline_s=deadline_s, stream=stream, keep=keep
+        )
+        self._waiting[identity] = on_end
+        self._connection.flush()
+        return identity
+
     @property
     def stats(self) -> Stats:
         """A snapshot of the robot's traffic."""
@@ -297,6 +331,7 @@ class Robot:
             unanswered=session.unanswered,
             resent=session.resent,
             dropped_answers=session.dropped_answers,
+            twice=keeper.twice,
             reconnects=connection.reconnects,
             moves=connection.moves,
             bytes_out=connection.bytes_out,
@@ -431,9 +466,17 @@ class Robot:
         return answer
 
     def _answered(self, event: Answered) -> None:
-        future = self._waiting.get(event.id)
-        if future is not None and not future.done():
-            future.set_result(event)
+        waiting = self._waiting.get(event.id)
+        if isinstance(waiting, asyncio.Future):
+            if waiting.done():
+                self._keeper.twice += not waiting.cancelled()
+            else:
+                waiting.set_result(event)
+        elif waiting is not None:
+            del self._waiting[event.id]
+            waiting(event)
+        else:
+            self._keeper.twice += 1
 
     def _spawn(self, work: Coroutine[Any, Any, Answer | Failure]) -> asyncio.Task[Answer | Failure]:
         task = asyncio.get_running_loop().create_task(work)

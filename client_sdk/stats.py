@@ -28,7 +28,7 @@ class Percentiles:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Stats:
-    """A snapshot; times in ms, clocks in s."""
+    """A snapshot; times in ms, clocks in s.  ``twice`` counts commands that ended twice: always 0."""
 
     sent: int
     answered: int
@@ -38,6 +38,7 @@ class Stats:
     unanswered: int
     resent: int
     dropped_answers: int
+    twice: int
     reconnects: int
     moves: int
     bytes_out: int
@@ -64,6 +65,7 @@ class StatsKeeper:
         self.sent = 0
         self.answered = 0
         self.answered_by_robot = 0
+        self.twice = 0
         self.failures: Counter[str] = Counter()
         self.payload_bytes_max = 0
         self._random = random

@@ -19,6 +19,7 @@ from rse_pf.settings import SessionSettings
 from rse_pf.wire.clock_offset import ClockOffset, Exchange
 from rse_pf.wire.codec import Codec
 from rse_pf.wire.messages import Command, Failure, Hello, Move, Ping, Pong, Result, Welcome
+from rse_pf.wire.prepared import encode_command
 
 __all__ = ["Answered", "Event", "Link", "LinkLost", "MoveAsked", "Notice", "RobotSession", "Welcomed"]
 
@@ -154,7 +155,7 @@ class RobotSession:
             id=self._next_id, service=service, payload=payload, stream=stream,
             seq=self._sequence.get(stream, 0) + 1, keep=keep, trace=trace,
         )  # fmt: skip
-        data = self.codec.encode(_with_deadline(command, wait))
+        data = encode_command(self.codec, _with_deadline(command, wait))
         self._check_size(data)
         pending = _Pending(command=command, deadline=now + wait, submitted=now, wire_bytes=len(data))
         self._next_id += 1
@@ -314,7 +315,7 @@ class RobotSession:
         self.resent += pending.sent_at is not None
         pending.link, pending.sent_at = link, now
         link.outgoing.append(
-            self.codec.encode(_with_deadline(pending.command, pending.deadline - now))
+            encode_command(self.codec, _with_deadline(pending.command, pending.deadline - now))
             if data is None
             else data
         )
