@@ -125,7 +125,7 @@ def _servers(axis: Any, records: Records, asked: Mapping[str, Any]) -> None:
     )
     limit = float(asked["busy_cpu_percent"])
     axis.axhline(limit, color=_RED, linestyle="--", linewidth=1, label=f"{limit:g} %, as in the paper")
-    axis.set_ylim(0, max(105.0, max(cpu, default=0.0) * 1.05))
+    axis.set_ylim(0, max(125.0, max(cpu, default=0.0) * 1.2))
     axis.set_ylabel("mean CPU utilization, %", color=_BLUE)
     count = axis.twinx()
     count.step(
@@ -137,7 +137,7 @@ def _servers(axis: Any, records: Records, asked: Mapping[str, Any]) -> None:
         label="healthy servers",
     )
     most = max((r.healthy_servers for r in records.readings), default=1)
-    count.set_ylim(0, most + 2)
+    count.set_ylim(0, 1.3 * most + 1)
     count.yaxis.get_major_locator().set_params(integer=True)
     count.set_ylabel("healthy server count", color=_ORANGE)
     count.spines["top"].set_visible(False)
@@ -175,11 +175,12 @@ def _round_trips(axis: Any, records: Records) -> None:
         rug.bar(middle, counts, width=np.diff(edges), color=_RED, alpha=0.15, label="failures")
         rug.set_ylabel("failures", color=_RED, fontsize=8)
         rug.set_ylim(0, 4 * max(counts.max(), 1))
+        rug.set_yticks([0, int(counts.max())])
         rug.spines["top"].set_visible(False)
     axis.axhline(
         PAPER["round_trip_ms"], color=_GREY, linestyle=":", linewidth=1, label="paper's mean, 156 ms"
     )
-    axis.set_yscale("log")
+    _log_ms(axis, [c.round_trip_ms or 0.0 for c in done])
     axis.set_ylabel("round trip, ms")
     axis.legend(fontsize=7.5, ncols=2, loc="upper center", framealpha=0.9)
     _phase_lines(axis, records)
@@ -195,8 +196,10 @@ def _robots(axis: Any, records: Records) -> None:
         times = [time_s for time_s, _ in known]
         axis.plot(times, [np.nan if n is None else n for _, n in known], linewidth=1.3, label=name)
     axis.set_ylabel("robots on each server")
-    axis.set_ylim(bottom=0)
-    axis.legend(fontsize=7, ncols=min(5, max(len(names), 1)), loc="upper center", framealpha=0.9)
+    most = max((each.robots for r in records.readings for each in r.servers), default=1)
+    axis.set_ylim(0, 1.45 * max(most, 1))
+    if names:
+        axis.legend(fontsize=7, ncols=min(5, len(names)), loc="upper center", framealpha=0.9)
     _phase_lines(axis, records)
     _plain(axis)
 
@@ -308,11 +311,18 @@ def _fault(axis: Any, name: str, records: Records, row: Mapping[str, Any]) -> No
         fontsize=9,
         color="black" if held else _RED,
     )
-    axis.set_yscale("log")
+    _log_ms(axis, [each.round_trip_ms or 0.0 for each in answered])
     axis.set_ylabel("round trip, ms", fontsize=8)
     axis.set_xlabel("planned at, s", fontsize=8)
     axis.tick_params(labelsize=8)
     _plain(axis)
+
+
+def _log_ms(axis: Any, values: Sequence[float]) -> None:
+    """Scale *axis* from 1 ms to well above the largest value, so that a legend finds room."""
+    axis.set_yscale("log")
+    axis.set_ylim(max(min(values, default=1.0) / 2, 0.3), max(4 * max(values, default=1.0), 1000.0))
+    axis.yaxis.set_major_formatter("{x:g}")
 
 
 def _plain(*axes: Any) -> None:
