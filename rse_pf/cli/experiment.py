@@ -1,0 +1,179 @@
+"""Run Section 6 of the paper again on this machine, or check a run by its raw records.
+
+Each experiment writes report.json, report.md, commands.csv, events.jsonl, samples.csv and a picture.
+--speed K shortens the paper's waiting times by K: how often a robot joins, the policy's periods, idle time
+and warm-up (elasticity), how long a fault lasts (robustness); nothing else.
+
+examples:
+  rse-pf experiment elasticity --speed 30 --robots 40 --out fig8
+  rse-pf experiment robustness --only kill,stop --repeat 3 --out faults
+  rse-pf experiment verify fig8
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+from pathlib import Path
+
+from rse_pf.errors import UsageError
+from rse_pf.settings import PlatformSettings
+
+__all__ = ["KINDS", "add_arguments", "run"]
+
+KINDS = ("latency", "elasticity", "robustness", "map", "verify")
+_ROBOTS = {"latency": 100, "elasticity": 100, "robustness": 100, "map": 3}
+_MOST_ROBOTS = {"latency": 2000, "elasticity": 2000, "robustness": 2000, "map": 32}
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    parser.add_argument("kind", choices=KINDS, help="which experiment, or verify")
+    parser.add_argument("folder", nargs="?", type=Path, metavar="DIR", help="verify: the run to check")
+    parser.add_argument("--out", type=Path, metavar="DIR", help="results (default: out-KIND)")
+    parser.add_argument("--robots", type=int, metavar="N", help="how many (default: 100; map: 3)")
+    parser.add_argument("--fps", type=float, default=5.0, help="frames per second of each (default: 5)")
+    parser.add_argument("--speed", type=float, default=1.0, metavar="K", help="compress time (default: 1)")
+    parser.add_argument("--codec", choices=("zlib", "json", "bin"), default="zlib", help="default: zlib")
+    parser.add_argument("--seed", type=int, default=0, help="of problems, worlds and random faults")
+    elasticity = parser.add_argument_group("elasticity")
+    elasticity.add_argument("--size", type=float, metavar="S", help="cores of a server (default: measured)")
+    elasticity.add_argument(
+        "--no-rebalance", action="store_true", help="connected robots stay where they are"
+    )
+    elasticity.add_argument("--compare", action="store_true", help="with and without rebalancing, in one run")
+    robustness = parser.add_argument_group("robustness")
+    robustness.add_argument("--only", metavar="A,B", help="these faults (default: all but random)")
+    robustness.add_argument("--repeat", type=int, default=1, metavar="N", help="each so often (default: 1)")
+    latency = parser.add_argument_group("latency")
+    latency.add_argument("--link", default="paper", help="a link profile, or none (default: paper)")
+    latency.add_argument("--seconds", type=float, default=30.0, help="how long all robots ask (default: 30)")
+    mapping = parser.add_argument_group("map")
+    mapping.add_argument("--data", type=Path, metavar="DIR", help="a recording (default: a rendered world)")
+    mapping.add_argument("--frames", type=int, default=80, help="of each robot, rendered world (default: 80)")
+
+
+def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
+    """Check the options and run the experiment."""
+    if args.kind == "verify":
+        return _verify(args.folder if args.folder is not None else args.out)
+    if args.folder is not None:
+        raise UsageError(f"{args.kind} takes no folder", hint=f"name the results with --out {args.folder}")
+    if args.out is None:
+        args.out = Path(f"out-{args.kind}")
+    if args.robots is None:
+        args.robots = _ROBOTS[args.kind]
+    _check(args)
+    return {"elasticity": _elasticity, "latency": _latency, "robustness": _robustness, "map": _map}[
+        args.kind
+    ](args, settings)
+
+
+def _check(args: argparse.Namespace) -> None:
+    most = _MOST_ROBOTS[args.kind]
+    if not 1 <= args.robots <= most:
+        raise UsageError(f"--robots {args.robots} is not within 1..{most}", hint="the paper has 100")
+    _within("--fps", args.fps, 0.1, 60, "the paper has 5")
+    _within("--speed", args.speed, 1, 100, "1 takes as long as the paper; 30 suits CI")
+    _within("--seconds", args.seconds, 1, 3600, "30 is enough for percentiles")
+    if args.size is not None:
+        _within("--size", args.size, 0.001, 64, "leave it out, and it is measured")
+    if not 1 <= args.repeat <= 20:
+        raise UsageError(f"--repeat {args.repeat} is not within 1..20", hint="3 shows the spread")
+    if not 2 <= args.frames <= 2000:
+        raise UsageError(f"--frames {args.frames} is not within 2..2000", hint="80 is a path of 5.5 m")
+    if args.seed < 0:
+        raise UsageError(f"--seed {args.seed} is below 0", hint="choose 0 or more")
+
+
+def _within(name: str, value: float, low: float, high: float, hint: str) -> None:
+    if not (math.isfinite(value) and low <= value <= high):
+        raise UsageError(f"{name} {value:g} is not within {low:g}..{high:g}", hint=hint)
+
+
+def _elasticity(args: argparse.Namespace, settings: PlatformSettings) -> int:
+    from rse_pf.experiments.elasticity import ElasticityOptions, run_elasticity
+
+    if settings.scaling.period_s / args.speed < 0.5:
+        raise UsageError(
+            f"--speed {args.speed:g} makes a period shorter than 0.5 s, which no monitor can judge",
+            hint=f"use at most {2 * settings.scaling.period_s}",
+        )
+    options = ElasticityOptions(
+        out=args.out,
+        robots=args.robots,
+        fps=args.fps,
+        speed=args.speed,
+        codec=args.codec,
+        size=args.size,
+        rebalance=not args.no_rebalance,
+        compare=args.compare,
+        seed=args.seed,
+    )
+    return run_elasticity(options, settings)
+
+
+def _latency(args: argparse.Namespace, settings: PlatformSettings) -> int:
+    from rse_pf.experiments.latency import LatencyOptions, run_latency
+    from rse_pf.local.link import profile_named
+
+    link = None if args.link == "none" else profile_named(args.link).name
+    options = LatencyOptions(
+        out=args.out,
+        robots=args.robots,
+        fps=args.fps,
+        seconds=args.seconds,
+        link=link,
+        codec=args.codec,
+        seed=args.seed,
+    )
+    return run_latency(options, settings)
+
+
+def _robustness(args: argparse.Namespace, settings: PlatformSettings) -> int:
+    from rse_pf.experiments.robustness import RobustnessOptions, run_robustness
+    from rse_pf.experiments.scenarios import SCENARIOS
+
+    only = tuple(word for word in (args.only or "").split(",") if word)
+    for word in only:
+        if word not in SCENARIOS:
+            raise UsageError(f"there is no fault {word!r}", hint=f"known are {', '.join(SCENARIOS)}")
+    options = RobustnessOptions(
+        out=args.out,
+        robots=args.robots,
+        fps=args.fps,
+        speed=args.speed,
+        codec=args.codec,
+        only=tuple(dict.fromkeys(only)),
+        repeat=args.repeat,
+        seed=args.seed,
+    )
+    return run_robustness(options, settings)
+
+
+def _map(args: argparse.Namespace, settings: PlatformSettings) -> int:
+    from rse_pf.experiments.mapping_run import MapRunOptions, run_map
+
+    options = MapRunOptions(
+        out=args.out,
+        robots=args.robots,
+        fps=args.fps,
+        data=args.data,
+        frames=args.frames,
+        codec=args.codec,
+        seed=args.seed,
+    )
+    return run_map(options, settings)
+
+
+def _verify(folder: Path | None) -> int:
+    from rse_pf.experiments.verify import verify
+
+    if folder is None:
+        raise UsageError("verify needs a folder", hint="rse-pf experiment verify DIR")
+    findings = verify(folder)
+    for finding in findings:
+        print(finding)
+    differing = sum(not finding.agrees for finding in findings)
+    print(f"{len(findings)} figures and laws checked, {differing} differ")
+    return int(differing > 0)
