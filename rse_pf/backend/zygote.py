@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import gc
+import importlib
 import json
 import os
 import select
@@ -180,10 +181,10 @@ def _wait_for(go: int) -> None:
 
 def _warm_up(languages: set[str]) -> None:
     """Import once what every environment would import again."""
-    import numpy.linalg  # noqa: F401
+    importlib.import_module("numpy.linalg")
 
     if "cpp" in languages:
-        import rse_pf.services.native
+        importlib.import_module("rse_pf.services.native")
     if "lua" in languages:
         from rse_pf.services.lua import warm_up
 

@@ -140,25 +140,25 @@ def _services_folder(settings: PlatformSettings) -> Path:
 
 
 def _build(source: Path) -> None:
-    """Build a C++ service whose sources are newer than its library."""
+    """Build a service that has a CMakeLists.txt and sources newer than its libraries."""
     from rse_pf.services.installed import read_service
 
-    service = read_service(source)
-    if service.language != "cpp" or not (service.folder / "CMakeLists.txt").exists():
+    folder = read_service(source).folder
+    if not (folder / "CMakeLists.txt").exists():
         return
-    built = service.entry_path.stat().st_mtime if service.entry_path.exists() else -1.0
-    if all(mtime <= built for mtime in _mtimes(service.folder, without="build")):
+    libraries = [path.stat().st_mtime for path in (folder / "build").glob("*.so")]
+    if libraries and max(_mtimes(folder, without="build")) <= max(libraries):
         return
     if shutil.which("cmake") is None:
         raise UsageError(
             "cmake is not installed, so the service cannot be built", hint="apt install cmake g++"
         )
     for command in (["cmake", "-S", ".", "-B", "build"], ["cmake", "--build", "build"]):
-        done = subprocess.run(command, cwd=service.folder, capture_output=True, text=True, check=False)
+        done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
         if done.returncode != 0:
             told = (done.stderr or done.stdout).strip()[-1500:]
-            raise CommandFailed(f"{' '.join(command)} failed:\n{told}", hint=f"mend it in {service.folder}")
-    print(f"built {service.entry_path}")
+            raise CommandFailed(f"{' '.join(command)} failed:\n{told}", hint=f"mend it in {folder}")
+    print(f"built {folder / 'build'}")
 
 
 def _mtimes(folder: Path, *, without: str) -> Iterable[float]:

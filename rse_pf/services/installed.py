@@ -25,8 +25,11 @@ _MANIFEST, _PINS = "service.json", "pins.json"
 _NAME = re.compile(r"[a-z][a-z0-9_-]{0,39}")
 _KINDS = ("stateless", "per_robot_state")
 _FIELDS = {"name", "language", "entry", "kind"}
-_LEFT_OUT = {"__pycache__", ".git", ".pytest_cache", "requests", "tests", _PINS}
-"""What a server does not need; recorded requests and tests stay with their author."""
+_LEFT_OUT = {
+    "__pycache__", ".git", ".pytest_cache", "requests", "tests", _PINS,
+    "CMakeFiles", "CMakeCache.txt", "cmake_install.cmake", "Makefile",
+}  # fmt: skip
+"""What a server does not need: recorded requests, tests and the clutter of a build stay with their author."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
