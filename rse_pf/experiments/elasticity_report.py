@@ -10,7 +10,7 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from rse_pf.experiments.records import Event, Reading, Records, asked_of
+from rse_pf.experiments.records import Event, Reading, Records, asked_of, summary_of
 from rse_pf.experiments.report import CommandRecord, summarise
 
 __all__ = ["busy_periods_before", "crashes", "judge_elasticity", "unjustified_scale_outs"]
@@ -27,7 +27,7 @@ def judge_elasticity(records: Records) -> dict[str, Any]:
         UsageError: The events do not begin with what was asked.
     """
     asked, readings = asked_of(records), records.readings
-    summary = summarise(records.commands)
+    summary = summary_of(records)
     found = crashes(records.events)
     replaced = [each["replaced_in_s"] for each in found]
     whole = [value for value in replaced if value is not None]
@@ -41,6 +41,7 @@ def judge_elasticity(records: Records) -> dict[str, Any]:
         "replaced_in_s": max(whole) if whole and len(whole) == len(replaced) else None,
         "commands": summary["commands"],
         "failures_by_code": summary["failures_by_code"],
+        "wrong_poses": summary["wrong_poses"],
         "round_trip_ms": summary["round_trip_ms"],
         "phases": _phases(records),
         "queue_ms": summary["queue_ms"],

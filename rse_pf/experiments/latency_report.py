@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from rse_pf.experiments.records import Records, asked_of
-from rse_pf.experiments.report import PAPER, CommandRecord, summarise
+from rse_pf.experiments.records import Records, asked_of, summary_of
+from rse_pf.experiments.report import PAPER, CommandRecord
 
 __all__ = ["PARTS", "judge_latency"]
 
@@ -23,7 +23,7 @@ PARTS = ("up_ms", "queue_ms", "compute_ms", "down_ms")
 def judge_latency(records: Records) -> dict[str, Any]:
     """Return round trip, its parts and the frame rate; raises UsageError if nothing says what was asked."""
     asked = asked_of(records)
-    summary = summarise(records.commands)
+    summary = summary_of(records)
     trip = summary["round_trip_ms"]
     known = {name: summary[name]["mean"] for name in PARTS}
     rest = None
@@ -33,6 +33,7 @@ def judge_latency(records: Records) -> dict[str, Any]:
     return {
         "commands": summary["commands"],
         "failures_by_code": summary["failures_by_code"],
+        "wrong_poses": summary["wrong_poses"],
         "payload_bytes": summary["payload_bytes"],
         "round_trip_ms": trip,
         **{name: summary[name] for name in PARTS},

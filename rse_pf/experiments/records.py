@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, TextIO
 
 from rse_pf.errors import UsageError
-from rse_pf.experiments.report import CommandRecord, read_commands
+from rse_pf.experiments.report import CommandRecord, read_commands, summarise
 
 __all__ = [
     "COMMANDS",
@@ -30,6 +30,7 @@ __all__ = [
     "read_records",
     "read_samples",
     "reading_of",
+    "summary_of",
 ]
 
 COMMANDS, EVENTS, SAMPLES = "commands.csv", "events.jsonl", "samples.csv"
@@ -138,6 +139,19 @@ def asked_of(records: Records) -> dict[str, Any]:
         if event["action"] == "experiment":
             return {name: value for name, value in event.items() if name not in ("time", "action")}
     raise UsageError("the events do not say which experiment this was", hint=f"look into {EVENTS}")
+
+
+def summary_of(records: Records) -> dict[str, Any]:
+    """Return `summarise` of the commands, with what the robots' processes saw besides: second answers.
+
+    A second answer has no row of its own; the generator's event counts what reached a caller twice, and the
+    poses that were far from the truth.
+    """
+    summary = summarise(records.commands)
+    told = [event for event in records.events if event["action"] == "generator"]
+    summary["commands"]["twice"] += sum(int(event.get("twice", 0)) for event in told)
+    summary["wrong_poses"] = sum(int(event.get("wrong_poses", 0)) for event in told)
+    return summary
 
 
 def _read_events(path: Path) -> list[Event]:

@@ -11,8 +11,8 @@ from typing import Any
 
 from rse_pf.experiments.elasticity_report import crashes
 from rse_pf.experiments.gaps import gap_figures, robots_on
-from rse_pf.experiments.records import Event, Reading, Records, asked_of
-from rse_pf.experiments.report import CommandRecord, percentiles, summarise
+from rse_pf.experiments.records import Event, Reading, Records, asked_of, summary_of
+from rse_pf.experiments.report import CommandRecord, percentiles
 
 __all__ = ["BARS", "evened_out_s", "judge_scenario"]
 
@@ -59,7 +59,7 @@ def judge_scenario(records: Records) -> dict[str, Any]:
     """
     asked = asked_of(records)
     scenario = str(asked["scenario"])
-    summary = summarise(records.commands)
+    summary = summary_of(records)
     faults = [event for event in records.events if event["action"] == "fault"]
     found = crashes(records.events)
     replaced = [each["replaced_in_s"] for each in found]
@@ -67,6 +67,7 @@ def judge_scenario(records: Records) -> dict[str, Any]:
         "scenario": scenario,
         "commands": summary["commands"],
         "failures_by_code": summary["failures_by_code"],
+        "wrong_poses": summary["wrong_poses"],
         "answered_percent": _percent(records.commands, None),
         "answered_within_1_s_percent": _percent(records.commands, 1000.0),
         "round_trip_ms": summary["round_trip_ms"],

@@ -201,3 +201,10 @@ def test_what_the_monitor_says_comes_back_from_the_file_unchanged(tmp_path):
     assert read_samples(tmp_path / "samples.csv") == readings
     assert readings[0].time == 1.5
     assert readings[0].servers[0].warming is True
+
+
+def test_answers_that_reached_a_caller_twice_are_the_generators_to_tell(run):
+    with (run / "events.jsonl").open("a") as file:
+        EventLog(file).write(10.0, "generator", twice=2, wrong_poses=1)
+
+    assert differing(run) == ["commands/twice", "wrong_poses", "law: no answer was delivered twice"]
