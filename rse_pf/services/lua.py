@@ -64,7 +64,7 @@ class LuaRuntime:
             setup = self._lua.execute(f"return function(...) {_SETUP} end".encode())
             folder = str(service.folder).encode()
             self._pcall = setup(self._decode, self._encode, _inflate, zlib.compress, folder)
-            made = self._lua.execute(service.entry_path.read_bytes())
+            made = self._lua.execute(service.entry_path.read_bytes(), name=b"=" + service.entry.encode())
         except (lupa.LuaError, OSError, ValueError) as error:
             raise ConfigurationError(
                 f"{service.name} cannot be loaded: {_first_line(error)}", hint="mend the script"
