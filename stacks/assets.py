@@ -1,10 +1,11 @@
-"""Find the packages that `make assets` built, and lay the settings beside them.
+"""Find the packages that `make assets` built, and lay settings and boot files beside them.
 
-Promises to build nothing itself: synthesis only hashes what it finds.
+Promises to build nothing itself: synthesis only copies and hashes what it finds.
 """
 
 from __future__ import annotations
 
+import hashlib
 import json
 import shutil
 from pathlib import Path
@@ -12,27 +13,50 @@ from pathlib import Path
 from rse_pf.errors import ConfigurationError
 from rse_pf.settings import PlatformSettings
 
-__all__ = ["SETTINGS_FILE", "staged"]
+__all__ = ["SETTINGS_FILE", "SUMS_FILE", "WHEELHOUSE", "staged", "sums_digest"]
 
 SETTINGS_FILE = "settings.json"
+SUMS_FILE = "SHA256SUMS"
+WHEELHOUSE = "wheelhouse"
+_BOOT = Path(__file__).parent / "boot"
+_IN_USER_DATA = "first_boot.py"
 
 
 def staged(assets: Path, name: str, settings: PlatformSettings, into: Path) -> Path:
     """Return a copy of the folder *name* of *assets* below *into*, with the merged settings inside.
 
-    The settings file has the form of cdk.json, so that `rse-pf --settings` reads it.
+    The settings file has the form of cdk.json, so that `rse-pf --settings` reads it.  The wheelhouse gets the
+    boot files too, and a list of all sums for `first_boot.py`.
 
     Raises:
         ConfigurationError: The folder is missing, empty or cannot be read.
     """
-    source = assets / name
+    source, target = assets / name, into / name
+    document = {"context": {"rse-pf": settings.to_dict()}}
     try:
         if not any(source.iterdir()):
             raise FileNotFoundError(f"{source} is empty")
-        target = into / name
         shutil.copytree(source, target, dirs_exist_ok=True)
     except OSError as error:
         raise ConfigurationError(f"no packages in {source}", hint="run make assets") from error
-    document = {"context": {"rse-pf": settings.to_dict()}}
     (target / SETTINGS_FILE).write_text(json.dumps(document, sort_keys=True) + "\n", encoding="utf-8")
+    if name == WHEELHOUSE:
+        for file in sorted(_BOOT.iterdir()):
+            if file.is_file() and file.name != _IN_USER_DATA:
+                shutil.copyfile(file, target / file.name)
+        (target / SUMS_FILE).write_text(_sums(target), encoding="utf-8")
     return target
+
+
+def sums_digest(package: Path) -> str:
+    """Return the sha256 of a staged package's list of sums: it vouches for every byte of the package."""
+    return hashlib.sha256((package / SUMS_FILE).read_bytes()).hexdigest()
+
+
+def _sums(folder: Path) -> str:
+    """Return one line for each file, as sha256sum writes it."""
+    files = sorted(file for file in folder.rglob("*") if file.is_file() and file.name != SUMS_FILE)
+    return "".join(
+        f"{hashlib.sha256(file.read_bytes()).hexdigest()}  {file.relative_to(folder).as_posix()}\n"
+        for file in files
+    )

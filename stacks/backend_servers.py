@@ -1,12 +1,12 @@
 """The backend servers of Fig. 2: an Auto Scaling group of Debian machines without a way to the internet.
 
-They boot from one package in S3, whose address carries its hash.  Promises no SSH, no public address, IMDSv2
-with one hop, and that an instance is replaced when the load balancer finds it unhealthy.
+They boot from one package in S3; the template carries the digest that vouches for it.  Promises no SSH, no
+public address, IMDSv2 with one hop, and that an instance is replaced when the load balancer finds it ill.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import cast
 
@@ -15,6 +15,7 @@ from aws_cdk import aws_autoscaling as autoscaling
 from aws_cdk import aws_ec2 as ec2
 from aws_cdk import aws_elasticloadbalancingv2 as elbv2
 from aws_cdk import aws_iam as iam
+from aws_cdk import aws_s3 as s3
 from aws_cdk import aws_s3_assets as s3_assets
 from aws_cdk import aws_sns as sns
 from constructs import Construct
@@ -23,7 +24,12 @@ from rse_pf.scaling.alarms import NAMESPACE
 from rse_pf.settings import PlatformSettings
 from stacks.findings import acknowledge
 
-__all__ = ["BackendServers"]
+__all__ = ["GROUP", "HOOK", "BackendServers"]
+
+GROUP = "rse-pf"
+"""Name of the Auto Scaling group; fixed, so that an instance knows it before the group exists."""
+HOOK = "rse-pf-drain"
+"""Name of the hook that an instance completes when its robots are gone."""
 
 _BOOT = Path(__file__).parent / "boot" / "first_boot.py"
 _GIB = 8
@@ -41,18 +47,27 @@ class BackendServers(Construct):
         vpc: ec2.IVpc,
         firewall_group: ec2.ISecurityGroup,
         package: s3_assets.Asset,
+        package_sums: str,
         topic: sns.ITopic,
         targets: Sequence[elbv2.IApplicationTargetGroup],
-        key_set_url: str,
+        artifacts: s3.IBucket,
+        key_set: str,
         settings: PlatformSettings,
     ) -> None:
         super().__init__(scope, construct_id)
         scaling = settings.scaling
-        self.role = self._role(package)
+        self.role = self._role(package, artifacts)
         self.group = autoscaling.AutoScalingGroup(
-            self, "Group", vpc=vpc, min_capacity=scaling.min_servers, max_capacity=scaling.max_servers,
+            self, "Group", auto_scaling_group_name=GROUP, vpc=vpc,
+            min_capacity=scaling.min_servers, max_capacity=scaling.max_servers,
             vpc_subnets=ec2.SubnetSelection(subnet_type=ec2.SubnetType.PRIVATE_ISOLATED),
-            launch_template=self._template(firewall_group, package, key_set_url, settings),
+            launch_template=self._template(
+                firewall_group, settings,
+                {
+                    "package": package.s3_object_url, "sha256": package_sums, "region": settings.cloud.region,
+                    "bucket": artifacts.bucket_name, "keys": key_set, "group": GROUP, "hook": HOOK,
+                },
+            ),
             health_checks=autoscaling.HealthChecks.with_additional_checks(
                 additional_types=[autoscaling.AdditionalHealthCheckType.ELB],
                 grace_period=cdk.Duration.seconds(settings.health.grace_s),
@@ -69,18 +84,21 @@ class BackendServers(Construct):
             each.target_group_arn for each in targets
         ]
         self.group.add_lifecycle_hook(
-            "Drain", lifecycle_transition=autoscaling.LifecycleTransition.INSTANCE_TERMINATING,
+            "Drain", lifecycle_hook_name=HOOK,
+            lifecycle_transition=autoscaling.LifecycleTransition.INSTANCE_TERMINATING,
             heartbeat_timeout=cdk.Duration.seconds(settings.cloud.drain_s),
             default_result=autoscaling.DefaultResult.CONTINUE,
         )  # fmt: skip
 
-    def _role(self, package: s3_assets.Asset) -> iam.Role:
+    def _role(self, package: s3_assets.Asset, artifacts: s3.IBucket) -> iam.Role:
         role = iam.Role(self, "Role", assumed_by=iam.ServicePrincipal("ec2.amazonaws.com"))
         role.add_to_policy(
             iam.PolicyStatement(
                 actions=["s3:GetObject"], resources=[package.bucket.arn_for_objects(package.s3_object_key)]
             )
         )
+        # Without it S3 answers "forbidden" for a key set that is not there yet, instead of "not found".
+        role.add_to_policy(iam.PolicyStatement(actions=["s3:ListBucket"], resources=[artifacts.bucket_arn]))
         role.add_to_policy(
             iam.PolicyStatement(
                 actions=["cloudwatch:PutMetricData"], resources=["*"],
@@ -95,19 +113,14 @@ class BackendServers(Construct):
     def _template(
         self,
         firewall_group: ec2.ISecurityGroup,
-        package: s3_assets.Asset,
-        key_set_url: str,
         settings: PlatformSettings,
+        facts: Mapping[str, str],
     ) -> ec2.LaunchTemplate:
         encrypted = ec2.BlockDeviceVolume.ebs(
             _GIB, encrypted=True, volume_type=ec2.EbsDeviceVolumeType.GP3, delete_on_termination=True
         )
-        facts = {
-            "package": package.s3_object_url, "sha256": package.asset_hash, "keys": key_set_url,
-            "region": settings.cloud.region,
-        }  # fmt: skip
         script = _BOOT.read_text(encoding="utf-8")
-        commands = f"{script}\nmain({cdk.Stack.of(self).to_json_string(facts)!s})\n"
+        commands = f"{script}\nmain({cdk.Stack.of(self).to_json_string(dict(facts))!s})\n"
         return ec2.LaunchTemplate(
             self, "Template", instance_type=ec2.InstanceType(settings.cloud.instance_type), role=self.role,
             machine_image=ec2.MachineImage.from_ssm_parameter(

@@ -12,8 +12,8 @@ from aws_cdk import aws_sns as sns
 from constructs import Construct
 
 from rse_pf.settings import PlatformSettings
-from stacks.assets import staged
-from stacks.backend_servers import BackendServers
+from stacks.assets import WHEELHOUSE, staged, sums_digest
+from stacks.backend_servers import GROUP, BackendServers
 from stacks.data_stack import DataStack
 from stacks.findings import acknowledge
 from stacks.load_balancer import LoadBalancer
@@ -47,32 +47,33 @@ class BackendStack(cdk.Stack):
             logs=data.access_logs,
         )  # fmt: skip
         with tempfile.TemporaryDirectory() as folder:
-            path = staged(assets, "wheelhouse", settings, Path(folder))
-            package = s3_assets.Asset(self, "Package", path=str(path))
+            path = staged(assets, WHEELHOUSE, settings, Path(folder))
+            package, sums = s3_assets.Asset(self, "Package", path=str(path)), sums_digest(path)
         self.servers = BackendServers(
             self, "Servers", vpc=network.vpc, firewall_group=network.firewall.servers, package=package,
-            topic=self.topic, targets=list(self.balancer.targets.values()), settings=settings,
-            key_set_url=data.artifacts.s3_url_for_object(KEY_SET),
+            package_sums=sums, topic=self.topic, targets=list(self.balancer.targets.values()),
+            settings=settings, artifacts=data.artifacts, key_set=KEY_SET,
         )  # fmt: skip
         self.servers.role.add_to_policy(
             iam.PolicyStatement(actions=["s3:GetObject"], resources=[data.artifacts.arn_for_objects(KEY_SET)])
         )
         group = self.servers.group
-        # The group's own name is Amazon's; written as a pattern it makes no cycle with the group.
+        # By name, not by reference: a reference would make a cycle with the group.
         self.servers.role.add_to_policy(
             iam.PolicyStatement(
                 actions=["autoscaling:CompleteLifecycleAction"],
                 resources=[
                     self.format_arn(
-                        service="autoscaling", resource="autoScalingGroup:*",
-                        resource_name=f"autoScalingGroupName/{self.stack_name}-*",
+                        service="autoscaling", resource="autoScalingGroup",
+                        resource_name=f"*:autoScalingGroupName/{GROUP}",
+                        arn_format=cdk.ArnFormat.COLON_RESOURCE_NAME,
                     )
                 ],
             )
         )  # fmt: skip
         finding = (
             f"IAM5[Resource::arn:aws:autoscaling:{self.region}:<AWS::AccountId>:autoScalingGroup:*"
-            f"/autoScalingGroupName/{self.stack_name}-*]"
+            f":autoScalingGroupName/{GROUP}]"
         )
         reason = "the ARN of an Auto Scaling group holds an id that only AWS knows"
         acknowledge(self.servers.role, reason, finding)

@@ -23,7 +23,8 @@ S3_PREFIX_LISTS = {
     "ap-northeast-1": "pl-61a54008", "ap-northeast-2": "pl-78a54011", "ap-southeast-1": "pl-6fa54006",
     "ap-southeast-2": "pl-6ca54005",
 }  # fmt: skip
-"""AWS-managed prefix lists com.amazonaws.REGION.s3; the AWS CLI names others."""
+"""AWS-managed prefix lists com.amazonaws.REGION.s3, each seen in at least two published route tables."""
+_LOOK_UP = "aws ec2 describe-managed-prefix-lists --filters Name=prefix-list-name,Values=com.amazonaws.{}.s3"
 
 
 def s3_prefix_list(settings: PlatformSettings) -> str:
@@ -33,7 +34,7 @@ def s3_prefix_list(settings: PlatformSettings) -> str:
     if not found:
         raise ConfigurationError(
             f"no S3 prefix list is known for cloud.region = {region!r}",
-            hint=f"set cloud.s3_prefix_list, or choose one of {', '.join(S3_PREFIX_LISTS)}",
+            hint=f"set cloud.s3_prefix_list to the id that this prints: {_LOOK_UP.format(region)}",
         )
     return found
 

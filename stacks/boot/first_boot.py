@@ -1,8 +1,8 @@
 #!/usr/bin/python3
-"""Turn a bare Debian 12 machine into a backend server; cloud-init runs this once, as root.
+"""Fetch a backend server's package, verify it, let it install itself; cloud-init runs this once, as root.
 
-Fetches the package from S3 with the machine's own credentials (IMDSv2, SigV4; standard library alone),
-installs its wheels without any index, and starts the unit.  Promises no address but IMDS and S3.
+Standard library alone: credentials from IMDSv2, one GET signed with SigV4.  Promises no address but IMDS and
+S3, and that not one byte is written or run that the template's digest does not vouch for.
 """
 
 import datetime
@@ -10,35 +10,21 @@ import hashlib
 import hmac
 import io
 import json
-import os
 import pathlib
 import subprocess
+import sys
+import time
+import urllib.error
 import urllib.parse
 import urllib.request
 import zipfile
 
-__all__ = ["main", "signed_headers"]
+__all__ = ["main", "signed_headers", "verified"]
 
 IMDS = "http://169.254.169.254/latest/"
-HOME = pathlib.Path("/opt/rse-pf")
-UNIT = """[Unit]
-Description=RSE-PF backend server
-After=network-online.target
-[Service]
-User=rse-pf
-Environment=PYTHONPATH=/opt/rse-pf/lib
-ExecStart=/usr/bin/python3 -m rse_pf.cli.main serve --settings /opt/rse-pf/package/settings.json \\
-  --host 0.0.0.0 --control-host 0.0.0.0 --keys /opt/rse-pf/keys.json --server-id {server}
-Restart=always
-RestartSec=2
-TimeoutStopSec=60
-LimitNOFILE=65536
-NoNewPrivileges=yes
-ProtectSystem=strict
-PrivateTmp=yes
-[Install]
-WantedBy=multi-user.target
-"""
+PACKAGE = pathlib.Path("/opt/rse-pf/package")
+SUMS = "SHA256SUMS"
+TRIES, PAUSE_S = 30, 5.0
 
 
 def signed_headers(host, path, region, credentials, now):
@@ -63,43 +49,68 @@ def signed_headers(host, path, region, credentials, now):
     return headers
 
 
-def _imds(path, token=None):
-    if token is None:
-        request = urllib.request.Request(IMDS + path, method="PUT")
-        request.add_header("X-aws-ec2-metadata-token-ttl-seconds", "300")
+def verified(data, sha256):
+    """Return the zip archive *data* once every file in it is vouched for.
+
+    *sha256* is the digest of its list of sums, which names each other file exactly once.
+    """
+    archive = zipfile.ZipFile(io.BytesIO(data))
+    sums = archive.read(SUMS) if SUMS in archive.namelist() else b""
+    if hashlib.sha256(sums).hexdigest() != sha256:
+        raise SystemExit("first boot: the package is not the one that the template names")
+    wanted = dict(reversed(line.split("  ", 1)) for line in sums.decode().splitlines())
+    files = [name for name in archive.namelist() if not name.endswith("/") and name != SUMS]
+    if sorted(files) != sorted(wanted):
+        raise SystemExit("first boot: the package holds other files than its list")
+    for name in files:
+        if hashlib.sha256(archive.read(name)).hexdigest() != wanted[name]:
+            raise SystemExit(f"first boot: {name} is not what the package's list says")
+    return archive
+
+
+def main(facts):
+    """Fetch, verify, install; any failure ends the boot, and the group replaces the machine."""
+    data, server = patiently(lambda: fetched(facts))
+    PACKAGE.mkdir(parents=True, exist_ok=True)
+    verified(data, facts["sha256"]).extractall(PACKAGE)
+    told = json.dumps({**facts, "server": server})
+    subprocess.run([sys.executable, str(PACKAGE / "install.py"), told], check=True)
+
+
+def fetched(facts):
+    """Return the package's bytes and the name of this instance."""
+    token = imds("api/token")
+    role = imds("meta-data/iam/security-credentials/", token).split()[0]
+    credentials = json.loads(imds("meta-data/iam/security-credentials/" + role, token))
+    bucket, _, name = facts["package"].split("://", 1)[1].partition("/")
+    host = f"{bucket}.s3.{facts['region']}.amazonaws.com"
+    path = "/" + urllib.parse.quote(name)
+    now = datetime.datetime.now(datetime.timezone.utc)
+    headers = signed_headers(host, path, facts["region"], credentials, now)
+    request = urllib.request.Request(f"https://{host}{path}", headers=headers)
+    with urllib.request.urlopen(request, timeout=60) as answer:
+        return answer.read(), imds("meta-data/instance-id", token)
+
+
+def imds(path, token=None):
+    """Return a fact of this instance, or a session token when there is none yet."""
+    request = urllib.request.Request(IMDS + path, method="GET" if token else "PUT")
+    if token:
+        request.add_header("X-aws-ec2-metadata-token", token)
     else:
-        request = urllib.request.Request(IMDS + path, headers={"X-aws-ec2-metadata-token": token})
+        request.add_header("X-aws-ec2-metadata-token-ttl-seconds", "300")
     with urllib.request.urlopen(request, timeout=10) as answer:
         return answer.read().decode()
 
 
-def _get(url, region, credentials):
-    bucket, _, name = url.split("://", 1)[1].partition("/")
-    host = f"{bucket}.s3.{region}.amazonaws.com"
-    path = "/" + urllib.parse.quote(name)
-    now = datetime.datetime.now(datetime.timezone.utc)
-    headers = signed_headers(host, path, region, credentials, now)
-    request = urllib.request.Request(f"https://{host}{path}", headers=headers)
-    with urllib.request.urlopen(request, timeout=60) as answer:
-        return answer.read()
-
-
-def main(facts):
-    """Do it all; any failure ends the boot, and the load balancer replaces the machine."""
-    token = _imds("api/token")
-    role = _imds("meta-data/iam/security-credentials/", token)
-    credentials = json.loads(_imds("meta-data/iam/security-credentials/" + role, token))
-    HOME.mkdir(parents=True, exist_ok=True)
-    package = HOME / "package"
-    zipfile.ZipFile(io.BytesIO(_get(facts["package"], facts["region"], credentials))).extractall(package)
-    (HOME / "keys.json").write_bytes(_get(facts["keys"], facts["region"], credentials))
-    pip = next(package.glob("pip-*.whl"))
-    subprocess.run(
-        ["/usr/bin/python3", f"{pip}/pip", "install", "--no-index", "--find-links", str(package), "--target",
-         str(HOME / "lib"), "rse-pf[backend]"], check=True,
-    )  # fmt: skip
-    subprocess.run(["/usr/sbin/useradd", "--system", "--no-create-home", "rse-pf"], check=False)
-    unit = pathlib.Path("/etc/systemd/system/rse-pf.service")
-    unit.write_text(UNIT.replace("{server}", _imds("meta-data/instance-id", token)))
-    os.sync()
-    subprocess.run(["/usr/bin/systemctl", "enable", "--now", "rse-pf"], check=True)
+def patiently(call):
+    """Return what *call* returns; roles and endpoints may come a little later than the machine."""
+    for left in range(TRIES - 1, -1, -1):
+        try:
+            return call()
+        except OSError as error:
+            sys.stderr.write(f"first boot: {error}\n")
+            if not left:
+                raise
+            time.sleep(PAUSE_S)
+    return None

@@ -1,15 +1,26 @@
-"""The boot script's signature, and how little of the machine's script Amazon allows."""
+"""The boot script: its signature, what it refuses to install, and how little script Amazon allows."""
 
 from __future__ import annotations
 
+import configparser
+import hashlib
+import io
+import json
+import zipfile
 from datetime import datetime, timezone
 from pathlib import Path
+from typing import Any
+
+import pytest
 
 from lambda_pnp.keys import signed_request
-from stacks.boot.first_boot import signed_headers
+from rse_pf.settings import PlatformSettings
+from stacks.boot.first_boot import signed_headers, verified
+from stacks.boot.install import environment_file, units_of
 
 NOW = datetime(2026, 11, 21, 6, 0, 0, tzinfo=timezone.utc)
 USER_DATA_BYTES = 16384
+FACTS = {"server": "i-0abc", "bucket": "artifacts", "keys": "keys.json", "group": "rse-pf", "hook": "drain"}
 
 
 def test_the_boot_script_signs_as_the_function_does() -> None:
@@ -29,5 +40,119 @@ def test_the_boot_script_signs_as_the_function_does() -> None:
     assert ours["authorization"] == theirs.get_header("Authorization")
 
 
-def test_the_script_fits_into_the_user_data(repository: Path) -> None:
-    assert len((repository / "stacks/boot/first_boot.py").read_bytes()) < USER_DATA_BYTES - 1024
+def test_the_script_with_its_facts_fits_into_the_user_data(assembly: Any) -> None:
+    data = assembly.one("AWS::EC2::LaunchTemplate")["LaunchTemplateData"]["UserData"]["Fn::Base64"]
+    parts = data["Fn::Join"][1]
+    length = sum(len(part) if isinstance(part, str) else 128 for part in parts)
+
+    assert length < USER_DATA_BYTES
+
+
+def packed(files: dict[str, bytes], listed: dict[str, bytes] | None = None) -> tuple[bytes, str]:
+    """Return a package and the digest of its list; *listed* is what the list was made of."""
+    sums = "".join(
+        f"{hashlib.sha256(data).hexdigest()}  {name}\n"
+        for name, data in (files if listed is None else listed).items()
+    ).encode()
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w") as archive:
+        for name, data in {**files, "SHA256SUMS": sums}.items():
+            archive.writestr(name, data)
+    return buffer.getvalue(), hashlib.sha256(sums).hexdigest()
+
+
+GOOD = {"install.py": b"import json", "a.whl": b"wheel"}
+
+
+def test_a_package_that_its_list_vouches_for_is_opened() -> None:
+    data, digest = packed(GOOD)
+
+    assert verified(data, digest).read("a.whl") == b"wheel"
+
+
+@pytest.mark.parametrize(
+    ("files", "complaint"),
+    [
+        ({**GOOD, "install.py": b"import evil"}, "install.py is not what"),
+        ({**GOOD, "more.py": b"evil"}, "other files"),
+        ({**GOOD, "../../etc/cron.d/x": b"evil"}, "other files"),
+        ({"install.py": b"import json"}, "other files"),
+    ],
+)
+def test_a_package_that_differs_from_its_list_is_refused(files: dict[str, bytes], complaint: str) -> None:
+    data, digest = packed(files, GOOD)
+
+    with pytest.raises(SystemExit, match=complaint):
+        verified(data, digest)
+
+
+def test_a_package_with_another_list_than_the_templates_is_refused() -> None:
+    evil, _ = packed({**GOOD, "install.py": b"import evil"})
+    _, digest = packed(GOOD)
+
+    with pytest.raises(SystemExit, match="not the one that the template names"):
+        verified(evil, digest)
+
+
+def test_a_package_without_a_list_is_refused() -> None:
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w") as archive:
+        archive.writestr("install.py", b"x")
+
+    with pytest.raises(SystemExit, match="not the one"):
+        verified(buffer.getvalue(), "0" * 64)
+
+
+def unit(repository: Path, name: str) -> configparser.ConfigParser:
+    parser = configparser.ConfigParser(interpolation=None, strict=True)
+    parser.optionxform = str  # type: ignore[assignment, method-assign]
+    parser.read(repository / "stacks" / "boot" / name)
+    return parser
+
+
+@pytest.mark.parametrize("name", ["rse-pf.service", "rse-pf-agent.service", "rse-pf-data.service"])
+def test_every_service_has_its_own_user_and_walls_and_comes_back(repository: Path, name: str) -> None:
+    service = unit(repository, name)["Service"]
+
+    assert service["User"] == "rse-pf"
+    assert service["Restart"] in ("on-failure", "always")
+    assert service["NoNewPrivileges"] == "yes"
+    assert service["ProtectSystem"] == "strict"
+    assert service["CapabilityBoundingSet"] == ""
+    assert service["StateDirectory"] == "rse-pf"
+    assert unit(repository, name)["Unit"]["StartLimitIntervalSec"] == "0", "a unit that gives up stays down"
+
+
+def test_a_server_that_was_drained_stays_down(repository: Path) -> None:
+    assert unit(repository, "rse-pf.service")["Service"]["Restart"] == "on-failure"
+
+
+def test_a_data_group_is_attached_exactly_when_the_data_unit_starts(assembly: Any) -> None:
+    units = units_of(json.loads(json.dumps(assembly.settings.to_dict())))
+    ports = {each["Port"] for each in assembly.all("AWS::ElasticLoadBalancingV2::TargetGroup")}
+
+    assert ("rse-pf-data.service" in units) == (assembly.settings.data.port in ports)
+    assert "rse-pf.service" in units
+
+
+def test_the_environment_file_holds_plain_words_only() -> None:
+    assert environment_file(FACTS).splitlines() == [
+        "SERVER_ID=i-0abc", "BUCKET=artifacts", "KEYS_NAME=keys.json", "GROUP=rse-pf", "HOOK=drain",
+    ]  # fmt: skip
+    for bad in ("", "a\nUser=root", "a b", '"', "$HOME"):
+        with pytest.raises(SystemExit, match="no plain word"):
+            environment_file({**FACTS, "server": bad})
+
+
+def test_an_unknown_region_says_how_to_look_its_prefix_list_up() -> None:
+    pytest.importorskip("aws_cdk", reason="the infra extra is not installed")
+    from rse_pf.errors import ConfigurationError
+    from stacks.firewall import s3_prefix_list
+
+    with pytest.raises(ConfigurationError) as told:
+        s3_prefix_list(PlatformSettings.from_dict({"cloud": {"region": "mars-north-1"}}))
+
+    assert "cloud.s3_prefix_list" in told.value.hint
+    assert "com.amazonaws.mars-north-1.s3" in told.value.hint
+    known = PlatformSettings.from_dict({"cloud": {"region": "mars-north-1", "s3_prefix_list": "pl-1"}})
+    assert s3_prefix_list(known) == "pl-1"

@@ -1,0 +1,111 @@
+"""What is laid beside the packages, and what the template vouches for."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from rse_pf.errors import ConfigurationError
+from rse_pf.settings import PlatformSettings, load_settings
+from stacks.assets import SETTINGS_FILE, SUMS_FILE, WHEELHOUSE, staged, sums_digest
+
+
+@pytest.fixture
+def assets(tmp_path: Path) -> Path:
+    """Packages with one file each."""
+    for name in (WHEELHOUSE, "lambda"):
+        (tmp_path / "build" / name).mkdir(parents=True)
+        (tmp_path / "build" / name / "thing-1-py3-none-any.whl").write_bytes(b"wheel")
+    return tmp_path / "build"
+
+
+def test_a_package_carries_the_merged_settings(assets: Path, tmp_path: Path) -> None:
+    settings = PlatformSettings.from_dict({"scaling": {"busy_cpu_percent": 61.5}})
+
+    for name in (WHEELHOUSE, "lambda"):
+        package = staged(assets, name, settings, tmp_path / "out")
+        assert load_settings(package / SETTINGS_FILE).digest() == settings.digest()
+
+
+def test_the_sums_name_every_file_of_the_wheelhouse_once(assets: Path, tmp_path: Path) -> None:
+    package = staged(assets, WHEELHOUSE, PlatformSettings(), tmp_path / "out")
+
+    lines = (package / SUMS_FILE).read_text().splitlines()
+
+    assert sorted(line.split("  ")[1] for line in lines) == sorted(
+        file.name for file in package.iterdir() if file.name != SUMS_FILE
+    )
+    for line in lines:
+        digest, name = line.split("  ")
+        assert digest == hashlib.sha256((package / name).read_bytes()).hexdigest()
+
+
+def test_the_boot_files_travel_with_the_wheels_and_the_script_of_the_user_data_does_not(
+    assets: Path, tmp_path: Path
+) -> None:
+    names = {file.name for file in staged(assets, WHEELHOUSE, PlatformSettings(), tmp_path / "out").iterdir()}
+
+    assert {"install.py", "rse-pf.service", "rse-pf-agent.service", "rse-pf-keys.path"} <= names
+    assert "first_boot.py" not in names
+
+
+def test_the_same_input_gives_the_same_sums_and_another_setting_others(assets: Path, tmp_path: Path) -> None:
+    def digest(folder: str, **groups: Any) -> str:
+        return sums_digest(staged(assets, WHEELHOUSE, PlatformSettings.from_dict(groups), tmp_path / folder))
+
+    assert digest("a") == digest("b")
+    assert digest("a") != digest("c", scaling={"max_servers": 9})
+
+
+@pytest.mark.parametrize("damage", ["missing", "empty", "file"])
+def test_a_wheelhouse_that_cannot_be_read_is_one_line_and_a_hint(
+    assets: Path, tmp_path: Path, damage: str
+) -> None:
+    folder = assets / WHEELHOUSE
+    shutil.rmtree(folder)
+    if damage == "empty":
+        folder.mkdir()
+    if damage == "file":
+        folder.write_text("not a folder")
+
+    with pytest.raises(ConfigurationError) as told:
+        staged(assets, WHEELHOUSE, PlatformSettings(), tmp_path / "out")
+
+    assert told.value.hint == "run make assets"
+    assert "\n" not in told.value.message
+
+
+def test_the_template_vouches_for_the_package_it_names(assembly: Any) -> None:
+    data = assembly.one("AWS::EC2::LaunchTemplate")["LaunchTemplateData"]
+    (package,) = [path.parent for path in assembly.folder.glob(f"asset.*/{SUMS_FILE}")]
+
+    script = json.dumps(data["UserData"])
+
+    assert sums_digest(package) in script
+    assert package.name.removeprefix("asset.") in script
+    for name in ("rse-pf-drain", "keys.json", assembly.settings.cloud.region):
+        assert name in script
+
+
+def test_the_group_and_the_hook_are_those_that_an_instance_is_told(assembly: Any) -> None:
+    assert assembly.one("AWS::AutoScaling::AutoScalingGroup")["AutoScalingGroupName"] == "rse-pf"
+    hook = assembly.one("AWS::AutoScaling::LifecycleHook")
+    assert hook["LifecycleHookName"] == "rse-pf-drain"
+    assert hook["HeartbeatTimeout"] == assembly.settings.cloud.drain_s
+
+
+def test_an_instance_may_complete_the_hook_of_its_own_group_only(assembly: Any) -> None:
+    statements = [
+        statement
+        for policy in assembly.all("AWS::IAM::Policy")
+        for statement in policy["PolicyDocument"]["Statement"]
+        if statement["Action"] == "autoscaling:CompleteLifecycleAction"
+    ]
+
+    (statement,) = statements
+    assert json.dumps(statement["Resource"]).rstrip('"}]').endswith(":autoScalingGroupName/rse-pf")
