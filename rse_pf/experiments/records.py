@@ -149,7 +149,8 @@ def summary_of(records: Records) -> dict[str, Any]:
     """
     summary = summarise(records.commands)
     told = [event for event in records.events if event["action"] == "generator"]
-    summary["commands"]["twice"] += sum(int(event.get("twice", 0)) for event in told)
+    twice = sum(int(event.get("twice", 0)) for event in told)
+    summary["commands"]["twice"] = max(summary["commands"]["twice"], twice)
     summary["wrong_poses"] = sum(int(event.get("wrong_poses", 0)) for event in told)
     return summary
 

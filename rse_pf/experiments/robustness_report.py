@@ -167,18 +167,19 @@ def _adoption(events: Sequence[Event]) -> dict[str, Any]:
 def _cut(records: Records, faults: Sequence[Event]) -> dict[str, Any]:
     """Return what a silent link did: who noticed when, and the first answers after it healed."""
     healed = [float(event["time"]) for event in records.events if event["action"] == "healed"]
-    noticed = [
-        float(event["time"]) - float(faults[0]["time"])
-        for event in records.events
-        if event["action"] == "link-lost" and faults and event["time"] >= faults[0]["time"]
-    ]
+    noticed: dict[str, float] = {}
+    for event in records.events:
+        if event["action"] == "link-lost" and faults and event["time"] >= faults[0]["time"]:
+            noticed.setdefault(str(event["robot"]), float(event["time"]) - float(faults[0]["time"]))
     first = _first_answers(records.commands, healed[0]) if healed else []
     deadline_ms = 1000.0 * float(asked_of(records)["deadline_s"])
     stale = sum(
         each.code == "ok" and each.round_trip_ms is not None and each.round_trip_ms > deadline_ms
         for each in records.commands
     )
-    figures = {name: percentiles(values) for name, values in (("noticed", noticed), ("first", first))}
+    figures = {
+        name: percentiles(values) for name, values in (("noticed", list(noticed.values())), ("first", first))
+    }
     shown = {name: {key: value[key] for key in ("n", "p50", "p99", "max")} for name, value in figures.items()}
     return {
         "noticed_s": shown["noticed"],

@@ -1,0 +1,74 @@
+"""The experiments run for real, end, and their reports can be computed again from what they wrote."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from rse_pf.cli.main import main
+from rse_pf.experiments.verify import verify
+
+pytestmark = [pytest.mark.system, pytest.mark.slow]
+
+
+def run(folder, *words):
+    code = main(["experiment", *words, "--out", str(folder)])
+    findings = verify(folder)
+    return code, json.loads((folder / "report.json").read_text()), [str(f) for f in findings if not f.agrees]
+
+
+def test_elasticity_grows_heals_shrinks_and_loses_nothing(tmp_path):
+    code, report, differing = run(
+        tmp_path / "out", "elasticity", "--speed", "60", "--robots", "16", "--fps", "5"
+    )
+
+    assert differing == []
+    assert code == 0
+    assert report["commands"]["sent"] > 500
+    assert (report["commands"]["lost"], report["commands"]["twice"]) == (0, 0)
+    assert report["scale_outs"] >= 1
+    assert report["max_servers"] >= report["min_servers"] + 2
+    assert report["final_servers"] == report["min_servers"]
+    assert report["scale_ins"] >= 2
+    assert report["crashes"] == 1
+    assert report["replaced_in_s"] <= 10
+    assert (tmp_path / "out" / "elasticity.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_kill_under_load_loses_nothing(tmp_path):
+    code, report, differing = run(
+        tmp_path / "out", "robustness", "--only", "kill", "--robots", "20", "--fps", "5"
+    )
+
+    assert (code, differing) == (0, [])
+    figures = report["runs"]["kill"]
+    assert figures["crashes"] == 1
+    assert figures["commands"]["failed"] == 0
+    assert figures["gap_s"]["robots"] >= 5
+    assert figures["gap_s"]["p99"] <= 2.0
+    assert figures["replaced_in_s"] <= 10.0
+
+
+def test_latency_under_the_papers_link_is_the_link_and_little_more(tmp_path):
+    code, report, differing = run(
+        tmp_path / "out", "latency", "--robots", "10", "--seconds", "4", "--link", "paper"
+    )
+
+    assert (code, differing) == (0, [])
+    assert 130.0 < report["round_trip_ms"]["p50"] < 156.36
+    assert 60.0 < report["up_ms"]["p50"] < 75.0
+    assert 60.0 < report["down_ms"]["p50"] < 75.0
+
+
+def test_two_robots_map_and_their_errors_are_those_of_their_files(tmp_path):
+    code, report, differing = run(tmp_path / "out", "map", "--robots", "2", "--frames", "12")
+
+    assert (code, differing) == (0, [])
+    assert report["lost_frames"] == [0, 0]
+    assert all(0.0 < error < 5.0 for error in report["ate_cm"])
+
+    path = tmp_path / "out" / "robot-1" / "trajectory.txt"
+    lines = path.read_text().splitlines()
+    path.write_text("\n".join(lines[:-2]) + "\n")
+    assert "lost_frames" in {finding.what for finding in verify(tmp_path / "out") if not finding.agrees}
