@@ -9,7 +9,7 @@ from collections.abc import Iterator, Mapping
 import pytest
 
 GROUND = {"errors", "settings"}
-FIRST = {"geometry", "wire", "scaling", "auth", "service", "objects"}
+FIRST = {"geometry", "wire", "scaling", "auth", "service", "objects", "maps"}
 SECOND = {"pnp", "services", "aws"}
 LEAVES = {"backend", "data_server", "local", "client_sdk", "lambda_pnp", "stacks"}
 BELOW_LEAVES = GROUND | FIRST | SECOND
@@ -20,6 +20,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "geometry": GROUND,
     "wire": GROUND,
     "scaling": GROUND,
+    "maps": GROUND | {"geometry"},
     "auth": GROUND,
     "objects": GROUND,
     "service": GROUND | {"wire", "geometry"},
@@ -29,7 +30,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "backend": BELOW_LEAVES - {"scaling"},
     "data_server": BELOW_LEAVES,
     "local": {"settings", "scaling", "errors", "auth", "objects"},
-    "client_sdk": {"settings", "errors", "geometry", "wire", "service", "services", "pnp"},
+    "client_sdk": {"settings", "errors", "geometry", "maps", "wire", "service", "services", "pnp"},
     "lambda_pnp": BELOW_LEAVES - {"scaling", "aws"},
     "stacks": {"settings", "scaling", "errors"},
     "experiments": BELOW_LEAVES | LEAVES - {"stacks"},
