@@ -22,7 +22,7 @@ __all__ = ["draw_elasticity", "draw_latency", "draw_robustness", "require_matplo
 _BLUE, _ORANGE, _GREEN, _RED, _GREY = "#1f5fa8", "#d9822b", "#3a8f4d", "#c0392b", "#8a8f98"
 _PARTS_COLOURS = {"up_ms": "#7aa6d6", "queue_ms": _ORANGE, "compute_ms": _GREEN, "down_ms": _BLUE}
 _PARTS_NAMES = {"up_ms": "up", "queue_ms": "queue", "compute_ms": "compute", "down_ms": "down"}
-_TRANSMISSION = "transmission (not split)"
+_TRANSMISSION = "transmission, the paper's: not split"
 _BINS = 80
 _DPI = 130
 
@@ -77,7 +77,7 @@ def draw_latency(path: Path, figures: Mapping[str, Any], caption: str) -> None:
     names = ("p50", "p95", "p99", "max")
     values = [trip[name] or 0.0 for name in names]
     drawn = shares.barh(names[::-1], values[::-1], color=_BLUE, height=0.55)
-    shares.bar_label(drawn, fmt="%.1f ms", padding=3, fontsize=9)
+    shares.bar_label(drawn, fmt="%.1f ms", padding=-60, fontsize=9, color="white")
     shares.axvline(PAPER["round_trip_ms"], color=_RED, linestyle="--", linewidth=1.2)
     shares.text(
         PAPER["round_trip_ms"],
@@ -257,12 +257,13 @@ def _stacked_bars(axis: Any, figures: Mapping[str, Any]) -> None:
     bottom = 0.0
     for name in PARTS:
         mean = figures[name]["mean"] or 0.0
-        axis.bar(1, mean, bottom=bottom, color=_PARTS_COLOURS[name], width=0.55, label=_PARTS_NAMES[name])
+        label = f"{_PARTS_NAMES[name]}, here {mean:.1f} ms"
+        axis.bar(1, mean, bottom=bottom, color=_PARTS_COLOURS[name], width=0.55, label=label)
         if mean > 0.04 * PAPER["round_trip_ms"]:
-            _inside(axis, 1, bottom + mean / 2, f"{mean:.1f}")
+            _inside(axis, 1, bottom + mean / 2, f"{mean:.1f}", colour="white")
         bottom += mean
     rest = max((figures["round_trip_ms"]["mean"] or 0.0) - bottom, 0.0)
-    axis.bar(1, rest, bottom=bottom, color=_GREY, width=0.55, label="the robot's own")
+    axis.bar(1, rest, bottom=bottom, color=_GREY, width=0.55, label=f"the robot's own, {rest:.1f} ms")
     totals = (PAPER["round_trip_ms"], bottom + rest)
     for place, total in enumerate(totals):
         axis.text(place, total + 2, f"{total:.1f} ms", ha="center", fontweight="bold", fontsize=10)
@@ -273,8 +274,8 @@ def _stacked_bars(axis: Any, figures: Mapping[str, Any]) -> None:
     axis.legend(fontsize=8, loc="center right", frameon=False)
 
 
-def _inside(axis: Any, x: float, y: float, text: str) -> None:
-    axis.text(x, y, text, ha="center", va="center", fontsize=9)
+def _inside(axis: Any, x: float, y: float, text: str, colour: str = "black") -> None:
+    axis.text(x, y, text, ha="center", va="center", fontsize=9, color=colour)
 
 
 def _fault(axis: Any, name: str, records: Records, row: Mapping[str, Any]) -> None:
