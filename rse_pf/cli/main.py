@@ -26,6 +26,7 @@ VERBS = {
     "demo": "let robots build point-cloud maps through the platform, on this machine",
     "experiment": "run Section 6 of the paper again, or verify a run by its records",
     "local": "run the platform on this machine: load balancer and backend servers",
+    "swarm": "load a platform with many robots, and measure what they see",
     "token": "issue a robot's token, or look into one",
     "service": "write, test, run and install a service of your own: Python, C/C++ or Lua",
     "serve": "run one backend server, as EC2 runs it",
