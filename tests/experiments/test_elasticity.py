@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 
 from rse_pf.errors import UsageError
+from rse_pf.experiments.elasticity import Cost
 from rse_pf.experiments.elasticity_report import (
     busy_periods_before,
     crashes,
@@ -153,3 +154,12 @@ def test_phases_split_the_commands_by_plan():
 def test_a_run_that_does_not_say_what_was_asked_is_no_run():
     with pytest.raises(UsageError, match="which experiment"):
         judge_elasticity(Records(commands=[], events=[], readings=[]))
+
+
+def test_the_size_is_such_that_the_fleet_needs_five_servers_at_the_limit():
+    cost = Cost(command_s=0.002, idle_s_per_s=0.01, commands=400)
+
+    size = cost.size(commands_per_s=500.0, busy_percent=70.0)
+
+    cpu_percent_of_five = 100.0 * (500.0 * 0.002 + 5 * 0.01) / (5 * size)
+    assert cpu_percent_of_five == pytest.approx(70.0, abs=0.05)
