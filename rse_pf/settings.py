@@ -155,6 +155,8 @@ class ScalingSettings:
     max_robots_per_server: int = setting(0, unit="robots", source="paper, Sect. 3.1", doc="add a server above this many robots each; 0 is off", low=0)
     max_queue_ms: float = setting(0.0, unit="ms", doc="add a server above this queue delay; 0 is off", low=0)
     deregistration_s: int = setting(30, unit="s", doc="time a leaving server keeps its robots", low=0, high=3600)
+    rebalance_percent: float = setting(20.0, unit="%", doc="crowded servers hand robots over until all are within this of even", low=0, high=100)
+    moves_per_s: float = setting(20.0, unit="robots/s", doc="robots that one server asks to move each second when it is crowded", low=0.1)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -164,8 +166,17 @@ class DataSettings:
     enabled: bool = setting(False, doc="run the data service beside each backend server")
     store: str = setting("memory:", doc="where objects live: dir:PATH, s3:BUCKET or memory:")
     port: int = setting(8767, doc="port of the data service; 0 takes a free one", low=0, high=65535)
+    host: str = setting("127.0.0.1", doc="address the data service listens on")
     max_object_bytes: int = setting(268435456, unit="bytes", doc="one object", low=1024)
     quota_bytes: int = setting(10737418240, unit="bytes", doc="all objects of one robot", low=1024)
+    part_bytes: int = setting(4194304, unit="bytes", doc="body of one request; larger objects are sent in parts", low=1024)
+    most_uploads: int = setting(32, doc="bodies received at once; more are told to come again", low=1)
+    upload_life_s: int = setting(86400, unit="s", doc="an unfinished upload is forgotten after this", low=60)
+    body_timeout_s: float = setting(10.0, unit="s", doc="longest silence within a body", low=0.1)
+    body_grace_s: float = setting(5.0, unit="s", doc="then the lowest body rate applies", low=0.1)
+    min_body_bytes_per_s: int = setting(1024, unit="bytes/s", doc="a slower body is refused", low=1)
+    background_bytes_per_s: int = setting(262144, unit="bytes/s", doc="keyframes a robot sends beside its live poses", low=1024)
+    spool_bytes: int = setting(1073741824, unit="bytes", doc="keyframes a robot keeps on its disk while offline", low=1024)
     infrequent_after_days: int = setting(30, unit="days", doc="maps move to infrequent access", low=30)
     glacier_after_days: int = setting(90, unit="days", source="paper, Sect. 5.1", doc="maps move to Glacier", low=30)
 
