@@ -7,6 +7,7 @@ line a reading of the monitor; `summarise` needs nothing else, so anybody can do
 from __future__ import annotations
 
 import csv
+import gzip
 import json
 import os
 import platform
@@ -97,9 +98,14 @@ def write_commands(path: Path, commands: Iterable[CommandRecord]) -> None:
 
 
 def read_commands(path: Path) -> list[CommandRecord]:
-    """Return what `write_commands` wrote; raises UsageError."""
+    """Return what `write_commands` wrote, or its ``.gz`` beside it; raises UsageError."""
+    packed = path.with_name(f"{path.name}.gz")
     try:
-        with path.open(newline="", encoding="utf-8") as file:
+        with (
+            gzip.open(packed, "rt", newline="", encoding="utf-8")
+            if packed.exists() and not path.exists()
+            else path.open(newline="", encoding="utf-8")
+        ) as file:
             return [_record(row) for row in csv.DictReader(file)]
     except (OSError, ValueError, KeyError) as error:
         raise UsageError(f"cannot read {path}: {error}", hint="name the folder of a run") from error

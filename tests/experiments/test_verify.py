@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import json
 from dataclasses import replace
 
@@ -208,3 +209,14 @@ def test_answers_that_reached_a_caller_twice_are_the_generators_to_tell(run):
         EventLog(file).write(10.0, "generator", twice=2, wrong_poses=1)
 
     assert differing(run) == ["commands/twice", "wrong_poses", "law: no answer was delivered twice"]
+
+
+def test_packed_commands_are_read_like_plain_ones(run):
+    plain = run / "commands.csv"
+    (run / "commands.csv.gz").write_bytes(gzip.compress(plain.read_bytes()))
+    plain.unlink()
+    assert differing(run) == []
+
+    (run / "commands.csv.gz").write_bytes(b"not packed at all")
+    with pytest.raises(UsageError, match="cannot read"):
+        verify(run)
