@@ -13,7 +13,7 @@ from typing import Any
 
 from rse_pf.errors import MissingExtra
 
-__all__ = ["BUCKETS_S", "Metrics", "merge", "render"]
+__all__ = ["BUCKETS_S", "Metrics", "merge", "merge_isolation", "render"]
 
 BUCKETS_S = (0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0)
 """Upper bounds of the duration histogram; the last bucket is open."""
@@ -82,6 +82,20 @@ def merge(snapshots: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
         **merged,
         "requests": [[service, result, n] for (service, result), n in requests.items()],
         "durations": durations,
+    }
+
+
+def merge_isolation(snapshots: Iterable[Mapping[str, Any] | None]) -> dict[str, Any]:
+    """Return what the workers say of isolated environments, added up; empty without installed services."""
+    told = [snapshot["isolation"] for snapshot in snapshots if snapshot and "isolation" in snapshot]
+    counts: Counter[str] = Counter()
+    for each in told:
+        counts.update(each["counts"])
+    return {
+        "environments": sum(each["environments"] for each in told),
+        "missing_walls": sorted({wall for each in told for wall in each["missing_walls"]}),
+        "quarantined": sorted({service for each in told for service in each["quarantined"]}),
+        "counts": dict(counts),
     }
 
 

@@ -23,7 +23,7 @@ from typing import Any
 from rse_pf.auth import KeySet
 from rse_pf.backend.control import Answer, Ask, serve_control
 from rse_pf.backend.log import JsonLog
-from rse_pf.backend.metrics import merge, render
+from rse_pf.backend.metrics import merge, merge_isolation, render
 from rse_pf.backend.processes import cpu_seconds, raise_descriptor_limit, resident_bytes
 from rse_pf.backend.worker_process import WorkerProcess
 from rse_pf.errors import ConfigurationError
@@ -327,9 +327,14 @@ class _Supervisor:
         )
 
     async def _readyz(self, ask: Ask) -> Answer:
+        told: dict[str, Any] = {"state": self._state}
+        if self._settings.services.folder:
+            await self._merged()
+            isolation = merge_isolation(worker.report for worker in self._workers)
+            told.update(missing_walls=isolation["missing_walls"], quarantined=isolation["quarantined"])
         if self._state == "ready":
-            return _json({"state": self._state})
-        return _json({"state": self._state}, status=503, headers={"x-envoy-immediate-health-check-fail": "1"})
+            return _json(told)
+        return _json(told, status=503, headers={"x-envoy-immediate-health-check-fail": "1"})
 
     async def _metrics(self, ask: Ask) -> Answer:
         merged = await self._merged()
@@ -367,6 +372,7 @@ class _Supervisor:
                 "resident_bytes": sum(map(resident_bytes, self._pids())),
                 "size": self._settings.serving.size,
                 "settings": self._settings.digest(),
+                "isolation": merge_isolation(worker.report for worker in self._workers),
             }
         )
 

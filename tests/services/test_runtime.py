@@ -98,7 +98,8 @@ uint32_t rse_pf_service_abi(void) { return ABI; }
 int rse_pf_service_open(const char *scratch, void **state) { *state = 0; return scratch[0] != '/'; }
 void rse_pf_service_close(void *state) { (void)state; }
 void rse_pf_service_free(void *state, void *memory) { (void)state; free(memory); }
-int rse_pf_service_call(void *state, const uint8_t *request, uint64_t size, uint8_t **reply, uint64_t *reply_size) {
+int rse_pf_service_call(void *state, const uint8_t *request, uint64_t size, uint8_t **reply,
+                        uint64_t *reply_size) {
   (void)state;
   if (memchr(request, '!', size)) return RSE_PF_FAILED;
   *reply = malloc(size);
