@@ -205,16 +205,20 @@ class Connection:
                 await self._changed.wait()
 
     async def _redial(self) -> None:
-        """Dial with full jitter until a server says Welcome."""
+        """Dial with full jitter until a server says Welcome.
+
+        The pause counts from the last dial's begin: one that found nobody for seconds was pause enough.
+        """
         if self._clock() - self._adopted > self._settings.reconnect_max_s:
             self._attempt = 0
-        after_s = 0.0
+        after_s, spent_s = 0.0, 0.0
         while True:
-            await asyncio.sleep(self._pause_s(after_s))
+            await asyncio.sleep(max(after_s, self._pause_s(after_s) - spent_s))
+            began = self._clock()
             try:
                 socket = await self._dial()
             except _Refused as refused:
-                after_s = refused.after_s
+                after_s, spent_s = refused.after_s, self._clock() - began
                 if refused.for_good:
                     self._end(refused.error)
                     return

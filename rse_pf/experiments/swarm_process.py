@@ -417,7 +417,7 @@ class _Player:
         try:
             self.robot.post(
                 spec.service, problem.payload, functools.partial(self._ended, identity, problem),
-                deadline_s=spec.deadline_s, stream="pose", keep=spec.keep,
+                deadline_s=max(0.0, spec.deadline_s - (sent - planned)), stream="pose", keep=spec.keep,
             )  # fmt: skip
         except RsePfError as error:
             row = (identity, planned, sent, sent)

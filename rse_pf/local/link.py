@@ -10,6 +10,7 @@ from __future__ import annotations
 import asyncio
 import functools
 import heapq
+import math
 import multiprocessing
 import random
 import socket
@@ -241,12 +242,12 @@ class _Timers:
 class _Way:
     """Bytes on their way from one socket to the other; None stands for the end."""
 
-    def __init__(self, link: Link, lane: Lane, opens_s: float) -> None:
+    def __init__(self, link: Link, lane: Lane) -> None:
         self.source: asyncio.Transport | None = None
         self.sink: asyncio.Transport | None = None
         self._link = link
         self._lane = lane
-        self._opens_s = opens_s
+        self._opens_s: float | None = None
         self._queue: deque[tuple[float, float, bytes | None]] = deque()
         self._held = 0
         self._armed_s: float | None = None
@@ -257,7 +258,7 @@ class _Way:
         """Take bytes from the source; hold it back when too many are on their way."""
         now = self._link.timers.now()
         size = len(data) if data is not None else 0
-        due = self._lane.arrival_s(max(now, self._opens_s), size)
+        due = math.inf if self._opens_s is None else self._lane.arrival_s(max(now, self._opens_s), size)
         self._queue.append((due, now, data))
         self._held += size
         if self._held > _HELD_BYTES and self.source is not None and not self._is_paused:
@@ -270,14 +271,22 @@ class _Way:
         self.sink = sink
         self._arm()
 
+    def open(self, when_s: float) -> None:
+        """Tell when the handshake is over: only then is anything sent."""
+        self._opens_s = when_s
+        self._queue = deque(
+            (self._lane.arrival_s(when_s, len(data or b"")), when_s, data) for _, _, data in self._queue
+        )
+        self._arm()
+
     def retry(self, healed_s: float) -> None:
         """Deliver what fell into the cut, when TCP sends the first of it again."""
-        if not self._queue:
+        if not self._queue or self._opens_s is None:
             return
         first = retransmitted_s(self._queue[0][1], healed_s)
         again = self._lane.arrival_s(first, 0)
         self._queue = deque((max(due, again), sent, data) for due, sent, data in self._queue)
-        self._armed_s = None
+        self._armed_s = None  # the timer that was set finds another time here, and does nothing
         self._arm()
 
     def end(self) -> None:
@@ -289,7 +298,8 @@ class _Way:
                 transport.abort()
 
     def _arm(self) -> None:
-        if self._queue and self.sink is not None and not self._link.is_cut and self._armed_s is None:
+        is_ready = self.sink is not None and self._opens_s is not None and not self._link.is_cut
+        if self._queue and is_ready and self._armed_s is None:
             self._armed_s = self._queue[0][0]
             self._link.timers.at(self._armed_s, functools.partial(self._deliver, self._armed_s))
 
@@ -349,8 +359,8 @@ class _RobotEnd(_End):
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         up, down = self._link.lanes()
         now, link = self._link.timers.now(), self._link
-        self.out = _Way(link, up, opens_s=now + link.profile.round_trip_s)
-        self.back = _Way(link, down, opens_s=now)
+        self.out, self.back = _Way(link, up), _Way(link, down)
+        self.back.open(now)
         super().connection_made(transport)
         self._dial_when_open(now, now + link.profile.up_s)
 
@@ -364,6 +374,7 @@ class _RobotEnd(_End):
             again = retransmitted_s(accepted_s, link.timers.now() + _SHORTEST_S, _FIRST_DIAL_RETRY_S)
             self._dial_when_open(accepted_s, again)
         elif self.out.source is not None and not self.out.source.is_closing():
+            self.out.open(link.timers.now() + link.profile.down_s)
             link.dial(lambda: _ServerEnd(self.out, self.back), self._refused)
         else:
             self._refused()

@@ -330,6 +330,9 @@ class RobotSession:
             again = self._try_again(pending, answer, now)
             return self._flush(now) if again else self._end(pending.command.id, answer) + self._flush(now)
         command = pending.command
+        if now >= pending.deadline:
+            late = _failure(command, "expired", f"its answer came after {now - pending.submitted:.3f} s")
+            return self._end(command.id, late) + self._flush(now)
         last = self._delivered.get(command.stream, 0)
         if command.stream and not command.keep and command.seq < last:
             stale = _failure(command, "stale", "a newer answer came first")
