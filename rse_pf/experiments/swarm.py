@@ -201,6 +201,11 @@ class Swarm:
         wanted = self.options.robots
         await self._until(lambda: len(self.joined) >= wanted, timeout_s, "join")
 
+    async def wait_answered(self, count: int, timeout_s: float) -> None:
+        """Return when *count* more commands than now have ended; raises CommandFailed if that is too late."""
+        wanted = count + sum(map(len, self.rows))
+        await self._until(lambda: sum(map(len, self.rows)) >= wanted, timeout_s, f"answer {count} times")
+
     async def leave(self, n: int | None = None) -> None:
         """Have *n* robots, the youngest, or all stop and disconnect; returns when they have."""
         count = len(self._staying) if n is None else min(n, len(self._staying))
