@@ -494,15 +494,3 @@ def test_abandoned_commands_end_with_the_reason():
 
     assert codes(events) == dict.fromkeys(ids, "unauthorized")
     assert {event.answer.hint for event in events} == {"get another"}
-
-
-def test_an_answer_that_comes_after_the_deadline_is_not_delivered_as_fresh():
-    session = make_session()
-    link = open_link(session)
-    for now in (0.0, 0.1):
-        session.submit("echo", 1, now=now, deadline_s=1.0)
-    first, second = commands(link)
-
-    assert codes(tell(session, link, result(first), 0.99)) == {1: "ok"}
-    assert codes(tell(session, link, result(second), 1.1)) == {2: "expired"}
-    assert session.unanswered == 0

@@ -45,6 +45,7 @@ class RobotLife(RuleBasedStateMachine):
             if isinstance(event.answer, Result) and stream and not keep:
                 assert event.answer.reply >= self.delivered.get(stream, 0)
             if isinstance(event.answer, Result):
+                assert self.now < self.deadline[event.id]
                 self.delivered[stream] = max(self.delivered.get(stream, 0), event.answer.reply)
         self._read()
 
