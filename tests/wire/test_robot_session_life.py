@@ -151,3 +151,20 @@ def test_a_failure_without_an_id_is_a_notice():
     told = Failure(code="bad-message", message="what?")
 
     assert session.receive(session.open_link(0.0), CODEC.encode(told), 0.1) == [Notice(told)]
+
+
+def test_an_answer_that_comes_after_the_deadline_is_not_delivered_as_fresh() -> None:
+    session = RobotSession(codec=CODEC, settings=SETTINGS, sdk="test")
+    link = session.open_link(0.0)
+    limits = Limits(max_message_bytes=4096, max_in_flight=ROOM)
+    welcome = Welcome(server="a", session="s", robot="r", protocol=1, clock_s=0.0, limits=limits)
+    session.receive(link, CODEC.encode(welcome), 0.0)
+    session.adopt(link, 0.0)
+    for _ in range(2):
+        session.submit("x", None, now=0.0, deadline_s=1.0)
+
+    in_time = session.receive(link, CODEC.encode(Result(id=1)), 0.99)
+    late = session.receive(link, CODEC.encode(Result(id=2)), 1.0)
+
+    assert [getattr(event.answer, "code", "ok") for event in in_time + late] == ["ok", "expired"]
+    assert session.unanswered == 0
