@@ -198,6 +198,7 @@ class ServiceSettings:
     """Services that the operator installs, each robot in its own environment."""
 
     folder: str = setting("", doc="folder of installed services; empty means none")
+    published: bool = setting(False, doc="also run the services that installed Python packages publish (entry points rse_pf.services)")
     max_environments: int = setting(64, doc="isolated environments of one server", low=1)
     memory_bytes: int = setting(536870912, unit="bytes", doc="address space of one environment", low=16777216)
     scratch_bytes: int = setting(16777216, unit="bytes", doc="private folder of one environment, in memory", low=65536)
@@ -225,6 +226,8 @@ class LocalSettings:
     workers: int = setting(1, doc="worker processes of each local server", low=1, high=64)
     start_timeout_s: float = setting(20.0, unit="s", doc="a server that is not ready by then failed", low=1)
     stop_timeout_s: float = setting(10.0, unit="s", doc="a process that does not leave by then is killed", low=0.5)
+    restarts_per_minute: int = setting(5, unit="servers", doc="replacements of servers that died young, in any minute", low=1)
+    young_s: float = setting(10.0, unit="s", doc="a server that ends this soon after it became healthy died young", low=0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -7,7 +7,6 @@ and to signal only processes that it knows by pid and time of birth.
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import http.client
 import json
 import signal
@@ -21,7 +20,7 @@ from typing import Any
 
 from rse_pf.errors import ConfigurationError
 from rse_pf.local.envoy_config import Target
-from rse_pf.local.processes import ProcessMark, ended, last_line, mark_of, send_signal, spawn
+from rse_pf.local.processes import ProcessMark, ended, is_alive, last_line, mark_of, send_signal, spawn
 from rse_pf.settings import PlatformSettings
 
 __all__ = ["RSE_PF", "BackendServer", "BackendServers"]
@@ -45,6 +44,7 @@ class BackendServer:
     workers: tuple[int, ...]
     log: Path
     mark: ProcessMark
+    worker_marks: tuple[ProcessMark, ...] = ()
 
     @property
     def target(self) -> Target:
@@ -92,6 +92,10 @@ class BackendServers:
         if mark is not None:
             self._marks[name] = mark
 
+    def adopt(self, name: str, mark: ProcessMark) -> None:
+        """Know a server that an earlier control plane launched as *name*, ready or not."""
+        self._marks[name] = mark
+
     async def wait_ready(self, name: str, timeout_s: float) -> BackendServer:
         """Return server *name* once it has announced itself.
 
@@ -99,21 +103,24 @@ class BackendServers:
             ConfigurationError: It ended or was not ready in time; its last log line is in the message.
         """
         end = time.monotonic() + timeout_s
-        process, announce = self._processes[name], self._announce(name)
+        process, announce = self._processes.get(name), self._announce(name)
         while not announce.exists():
-            code = process.poll()
-            if code is not None:
-                raise self._failed(name, f"ended with exit code {code}")
+            if not self._runs(name):
+                code = None if process is None else process.poll()
+                raise self._failed(name, "ended" if code is None else f"ended with exit code {code}")
             if time.monotonic() >= end:
                 raise self._failed(name, f"was not ready within {timeout_s:g} s")
             await asyncio.sleep(_LOOK_AGAIN_S)
         told = json.loads(announce.read_text(encoding="utf-8"))
         mark = self._marks.get(name)
         if mark is None or told["pid"] != mark.pid:
-            raise self._failed(name, f"announced pid {told['pid']}, but was started as {process.pid}")
+            started = "nothing" if mark is None else mark.pid
+            raise self._failed(name, f"announced pid {told['pid']}, but was started as {started}")
+        worker_marks = (mark_of(pid) for pid in told["workers"])
         return BackendServer(
             name=name, pid=mark.pid, port=told["port"], control_port=told["control_port"],
             workers=tuple(told["workers"]), log=self._log(name), mark=mark,
+            worker_marks=tuple(worker for worker in worker_marks if worker is not None),
         )  # fmt: skip
 
     async def status(self, server: BackendServer) -> dict[str, Any] | None:
@@ -121,7 +128,10 @@ class BackendServers:
         return await asyncio.to_thread(_ask_status, server.control_port)
 
     async def wait_over(self, name: str) -> int | None:
-        """Wait until the process of *name* has ended; return its exit code, negative for a signal."""
+        """Wait until the process of *name* has ended; return its exit code, negative for a signal.
+
+        None means that it is not known: the server was adopted, and is no child of this process.
+        """
         mark = self._marks.get(name)
         if mark is not None:
             await ended(mark)
@@ -133,6 +143,16 @@ class BackendServers:
         mark = self._marks.get(name)
         return mark is not None and send_signal(mark, number)
 
+    def forget(self, name: str) -> None:
+        """Drop a server whose process is over, and reap it; kills it first if it is not."""
+        self.send(name, signal.SIGKILL)
+        process = self._processes.pop(name, None)
+        if process is not None:
+            process.kill()  # a no-operation for one that was reaped
+            process.wait()
+        self._marks.pop(name, None)
+        self._announce(name).unlink(missing_ok=True)
+
     async def stop(self, timeout_s: float) -> None:
         """Let all servers leave at once, and kill what has not left after *timeout_s*."""
         for name in self._marks:
@@ -142,13 +162,16 @@ class BackendServers:
 
     def kill_all(self) -> None:
         """End what is left, at once, and reap it."""
-        for name, process in self._processes.items():
-            process.kill()  # a no-operation for one that was reaped
-            process.wait()
-            with contextlib.suppress(FileNotFoundError):
-                self._announce(name).unlink()
-        self._processes.clear()
-        self._marks.clear()
+        for name in {**self._marks, **self._processes}:
+            self.send(name, signal.SIGKILL)
+        for name in {**self._marks, **self._processes}:
+            self.forget(name)
+
+    def _runs(self, name: str) -> bool:
+        process, mark = self._processes.get(name), self._marks.get(name)
+        if process is not None:
+            return process.poll() is None
+        return mark is not None and is_alive(mark)
 
     def _announce(self, name: str) -> Path:
         return self._folder / f"{name}.json"

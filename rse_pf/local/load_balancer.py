@@ -19,7 +19,7 @@ from typing import Any
 
 from rse_pf.errors import ConfigurationError, MissingExtra
 from rse_pf.local.envoy_config import CLUSTER, Target, endpoints, envoy_config
-from rse_pf.local.processes import ProcessMark, ended, last_line, mark_of, send_signal, spawn
+from rse_pf.local.processes import ProcessMark, ended, is_alive, last_line, mark_of, send_signal, spawn
 from rse_pf.settings import PlatformSettings
 
 __all__ = ["LoadBalancer", "TargetStats", "envoy_binary"]
@@ -65,9 +65,16 @@ class LoadBalancer:
         self._names: dict[int, str] = {}
 
     def launch(self) -> None:
-        """Start the process without targets, and return before it listens."""
+        """Start the process without targets, and return before it listens.
+
+        One that ran before comes back on the same port, with the targets that it had.
+        """
         binary = envoy_binary()
-        self.set_targets(())
+        if self.mark is None:
+            self.set_targets(())
+        self.kill()  # reaps one that ended by itself
+        self._wanted_port = self.port or self._wanted_port
+        self.admin_port = 0
         config = self._folder / "envoy.json"
         admin = self._folder / "admin-address"
         admin.unlink(missing_ok=True)
@@ -79,6 +86,10 @@ class LoadBalancer:
             command, log=self.log, folder=self._folder, dies_with_parent=self._dies_with_parent
         )
         self.mark = mark_of(self._process.pid)
+
+    def adopt(self, mark: ProcessMark | None, *, port: int, admin_port: int) -> None:
+        """Know the balancer of an earlier control plane, which may be gone; its port stays its port."""
+        self.mark, self.port, self.admin_port = mark, port, admin_port
 
     async def wait_live(self, timeout_s: float) -> None:
         """Wait until the front door is open; sets ``port`` and ``admin_port``.
@@ -97,7 +108,7 @@ class LoadBalancer:
             listeners = page.get("listener_statuses", [])
             if listeners:
                 self.port = listeners[0]["local_address"]["socket_address"]["port_value"]
-            return bool(self.port)
+            return bool(listeners)
 
         if not await self._until(live, timeout_s):
             code = None if self._process is None else self._process.poll()
@@ -135,6 +146,12 @@ class LoadBalancer:
 
         return await self._until(gone, timeout_s)
 
+    def is_running(self) -> bool:
+        """Return whether the process is there."""
+        if self._process is not None:
+            return self._process.poll() is None
+        return self.mark is not None and is_alive(self.mark)
+
     async def wait_over(self) -> str:
         """Wait until the process ends by itself; return the last line of its log."""
         if self.mark is not None:
@@ -149,8 +166,10 @@ class LoadBalancer:
 
     def kill(self) -> None:
         """End the process at once, if it is there, and reap it."""
+        if self.mark is not None:
+            send_signal(self.mark, signal.SIGKILL)
         if self._process is not None:
-            self._process.kill()
+            self._process.kill()  # no mark: it ended before it could be told from others
             self._process.wait()
 
     def _targets(self, page: Mapping[str, Any]) -> dict[str, TargetStats]:
@@ -173,7 +192,7 @@ class LoadBalancer:
     async def _until(self, condition: Callable[[], Any], timeout_s: float) -> bool:
         """Ask *condition* until it holds, the time is over, or Envoy has ended."""
         end = time.monotonic() + timeout_s
-        while self._process is not None and self._process.poll() is None:
+        while self.is_running():
             if await condition():
                 return True
             if time.monotonic() >= end:

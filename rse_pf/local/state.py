@@ -46,7 +46,11 @@ class ServerState:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PlatformState:
-    """A platform that runs; ``url`` is empty until the front door is open."""
+    """A platform that runs; ``url`` is empty until the front door is open.
+
+    ``status_port`` is where the control plane answers ``GET /status``, ``launched`` the highest number that
+    a server's name ever had.
+    """
 
     name: str
     control_plane: ProcessMark
@@ -58,6 +62,8 @@ class PlatformState:
     load_balancer: ProcessMark | None = None
     port: int = 0
     admin_port: int = 0
+    status_port: int = 0
+    launched: int = 0
 
     def processes(self) -> tuple[ProcessMark, ...]:
         """Return the data path: everything but the control plane."""
