@@ -20,7 +20,7 @@ from rse_pf.backend.environments import Environments
 from rse_pf.backend.executors import Executor, SolverThreads
 from rse_pf.backend.frames import CloseSocket, FrameAssembler, Received, SendPong
 from rse_pf.backend.log import JsonLog
-from rse_pf.backend.metrics import Metrics
+from rse_pf.backend.metrics import LongestRecently, Metrics
 from rse_pf.backend.scheduler import Job, Refusal, Scheduler
 from rse_pf.backend.size_gate import SizeGate
 from rse_pf.errors import InternalError, LimitExceeded, UnknownService
@@ -129,6 +129,16 @@ class Connection:
         """Note that the socket is gone."""
         self._core.disconnect(self)
 
+    @property
+    def may_move(self) -> bool:
+        """Whether the robot said Hello and can be asked to leave for another server."""
+        return self.session is not None and self.session.state == "open" and not self.assembler.closed
+
+    def move(self, reason: str, within_ms: float, now: float) -> None:
+        """Ask the robot to leave for another server."""
+        if self.session is not None:
+            self.apply(self.session.move(reason, within_ms), now)
+
     def apply(self, decisions: list[Decision], now: float, size_bytes: int = 0) -> None:
         """Do what the session decided."""
         for decision in decisions:
@@ -191,6 +201,7 @@ class Core:
         self._new_session_id = new_session_id
         self._codecs: dict[str, Codec] = {name: make_codec(name, settings.session) for name in CODECS}
         self._scheduler = Scheduler(settings.serving)
+        self._waits = LongestRecently()
         self._gate = SizeGate(
             settings.serving.size,
             settings.serving.size_burst_ms / 1e3,
@@ -248,16 +259,15 @@ class Core:
     def welcomed(self, connection: Connection, now: float) -> None:
         """Note that a robot said Hello; while the server leaves, ask the robot to move at once."""
         self._log.debug("connected", robot=connection.robot)
-        if self._move is not None and connection.session is not None:
-            connection.apply(connection.session.move(*self._move), now)
+        if self._move is not None:
+            connection.move(*self._move, now)
 
     def move_all(self, reason: str, within_ms: float) -> None:
         """Ask every robot, now and from now on, to leave for another server."""
         self._move = (reason, within_ms)
         now = self.clocks.monotonic()
         for connection in list(self.connections):
-            if connection.session is not None:
-                connection.apply(connection.session.move(reason, within_ms), now)
+            connection.move(reason, within_ms, now)
 
     def close_all(self) -> None:
         """Close every socket; what is held is lost, so wait for `held` to be 0 first."""
@@ -296,6 +306,7 @@ class Core:
             "robots": float(len(self.connections)),
             "queue": float(self._scheduler.waiting),
             "queue_oldest_s": self._scheduler.oldest_wait_s(now),
+            "queue_ms": max(self._waits.longest_s(now), self._scheduler.oldest_wait_s(now)) * 1e3,
             "in_flight": float(self._scheduler.running),
             "loop_lag_s": self._lag_s,
             "cpu_s": self.clocks.cpu(),
@@ -329,6 +340,7 @@ class Core:
             job, refusals = self._scheduler.start(now)
             self._refuse(refusals, now)
             if job is not None:
+                self._waits.note(now - job.received_s, now)
                 self._run(job)
         if self._scheduler.waiting and self._sweep_timer is None:
             pause_s = self.settings.serving.queue_target_ms / 2e3

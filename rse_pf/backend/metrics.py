@@ -13,12 +13,13 @@ from typing import Any
 
 from rse_pf.errors import MissingExtra
 
-__all__ = ["BUCKETS_S", "Metrics", "merge", "merge_isolation", "render"]
+__all__ = ["BUCKETS_S", "LongestRecently", "Metrics", "merge", "merge_isolation", "render"]
 
 BUCKETS_S = (0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0)
 """Upper bounds of the duration histogram; the last bucket is open."""
 
-_GAUGES_OF_WORST = ("queue_oldest_s", "loop_lag_s")
+_GAUGES_OF_WORST = ("queue_oldest_s", "queue_ms", "loop_lag_s")
+_RECENT_S = 1.0
 
 
 class Metrics:
@@ -56,6 +57,30 @@ class Metrics:
             "bytes": {"in": self.bytes_in, "out": self.bytes_out},
             "gauges": self.gauges,
         }
+
+
+class LongestRecently:
+    """The longest of the durations noted in the last one to two seconds, in constant space."""
+
+    def __init__(self) -> None:
+        self._second = -1
+        self._longest_s = [0.0, 0.0]
+
+    def note(self, duration_s: float, now: float) -> None:
+        """Take one more, noted at *now* (s, monotonic)."""
+        self._turn(now)
+        self._longest_s[1] = max(self._longest_s[1], duration_s)
+
+    def longest_s(self, now: float) -> float:
+        """Return the longest, 0 if nothing was noted recently."""
+        self._turn(now)
+        return max(self._longest_s)
+
+    def _turn(self, now: float) -> None:
+        second = int(now // _RECENT_S)
+        if second != self._second:
+            self._longest_s = [self._longest_s[1] if second == self._second + 1 else 0.0, 0.0]
+            self._second = second
 
 
 def merge(snapshots: Iterable[Mapping[str, Any]]) -> dict[str, Any]:

@@ -11,6 +11,7 @@ import asyncio
 import ipaddress
 import json
 import os
+import random
 import signal
 import socket
 import time
@@ -22,6 +23,7 @@ from typing import Any
 
 from rse_pf.auth import KeySet
 from rse_pf.backend.control import Answer, Ask, serve_control
+from rse_pf.backend.hand_over import plan
 from rse_pf.backend.log import JsonLog
 from rse_pf.backend.metrics import merge, merge_isolation, render
 from rse_pf.backend.processes import cpu_seconds, raise_descriptor_limit, resident_bytes
@@ -38,6 +40,8 @@ _FRESH_S = 0.25
 _REPORT_S = 0.3
 _LEAVE_S = 3.0
 _AT_ONCE_S = 0.0
+_MOST_MOVES = 10000
+_LONGEST_SPREAD_S = 3600.0
 _EXIT_OK, _EXIT_LOST = 0, 1
 
 
@@ -144,6 +148,7 @@ class _Supervisor:
         self._reporting = asyncio.Lock()
         self._tasks: set[asyncio.Task[None]] = set()
         self._control_port = 0
+        self._moving_until = 0.0
         self._signals = 0
         self._refused_full = 0
         self._log = JsonLog(level=settings.serving.log_level, server=server_id, wall_clock=time.time)
@@ -309,6 +314,7 @@ class _Supervisor:
             ("GET", "/metrics"): self._metrics,
             ("GET", "/status"): self._status,
             ("POST", "/drain"): self._post_drain,
+            ("POST", "/move"): self._post_move,
         }
         page = pages.get((ask.method, ask.path))
         if page is not None:
@@ -328,7 +334,7 @@ class _Supervisor:
 
     async def _readyz(self, ask: Ask) -> Answer:
         told: dict[str, Any] = {"state": self._state}
-        if self._settings.services.folder:
+        if self._settings.services.folder or self._settings.services.published:
             await self._merged()
             isolation = merge_isolation(worker.report for worker in self._workers)
             told.update(missing_walls=isolation["missing_walls"], quarantined=isolation["quarantined"])
@@ -365,8 +371,12 @@ class _Supervisor:
                 "results": results,
                 "queue": int(gauges.get("queue", 0)),
                 "queue_oldest_s": gauges["queue_oldest_s"],
+                "queue_ms": round(gauges["queue_ms"], 3),
                 "in_flight": int(gauges.get("in_flight", 0)),
                 "loop_lag_s": gauges["loop_lag_s"],
+                "bytes_in": int(merged["bytes"].get("in", 0)),
+                "bytes_out": int(merged["bytes"].get("out", 0)),
+                "moved": int(gauges.get("moved", 0)),
                 "cpu_s": self._cpu_s(),
                 "worker_cpu_s": [cpu_seconds(worker.pid) for worker in self._workers],
                 "resident_bytes": sum(map(resident_bytes, self._pids())),
@@ -389,6 +399,37 @@ class _Supervisor:
             self._state = "draining"
             self._keep(self._drain(wait_s))
         return _json({"state": self._state}, status=202)
+
+    async def _post_move(self, ask: Ask) -> Answer:
+        """Hand robots over; while one hand-over is under way, a further ask moves nobody."""
+        if not ask.is_local:
+            return _json({"code": "forbidden", "hint": "move from the server's own machine"}, status=403)
+        try:
+            robots, spread_s = int(ask.query["robots"]), float(ask.query.get("spread_s", "0"))
+        except (KeyError, ValueError):
+            hint = "robots is a whole number, spread_s a number of seconds"
+            return _json({"code": "bad-request", "hint": hint}, status=400)
+        if not (0 <= robots <= _MOST_MOVES and 0 <= spread_s <= _LONGEST_SPREAD_S):
+            hint = f"robots is 0 to {_MOST_MOVES}, spread_s 0 to {_LONGEST_SPREAD_S:g} seconds"
+            return _json({"code": "bad-request", "hint": hint}, status=400)
+        if self._state != "ready":
+            return _json({"code": "draining", "hint": "all its robots move already"}, status=409)
+        now = time.monotonic()
+        if now < self._moving_until:
+            left_s = self._moving_until - now
+            return _json({"robots": 0, "spread_s": round(left_s, 3), "under_way": True}, status=202)
+        delays = plan(
+            [worker.load for worker in self._workers], robots, spread_s=spread_s,
+            moves_per_s=self._settings.scaling.moves_per_s, random=random.random,
+        )  # fmt: skip
+        asked, last_s = sum(map(len, delays)), max((each[-1] for each in delays if each), default=0.0)
+        self._moving_until = now + last_s
+        for worker, delays_s in zip(self._workers, delays, strict=True):
+            if delays_s:
+                within_ms = self._settings.serving.drain_within_ms
+                worker.order(do="hand-over", delays_s=delays_s, within_ms=within_ms)
+        self._log.info("hand-over", robots=asked, spread_s=round(last_s, 3))
+        return _json({"robots": asked, "spread_s": round(last_s, 3), "under_way": False}, status=202)
 
     def _identity_while_open(self) -> dict[str, Any]:
         identity = {"server": self._server_id, "pid": os.getpid(), "workers": [w.pid for w in self._workers]}

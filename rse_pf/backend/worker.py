@@ -25,13 +25,14 @@ from rse_pf.auth import KeySet
 from rse_pf.backend.core import Clocks, Core
 from rse_pf.backend.door import Door
 from rse_pf.backend.environments import Environments
+from rse_pf.backend.hand_over import HandOver
 from rse_pf.backend.log import JsonLog
 from rse_pf.backend.processes import die_with_parent
 from rse_pf.backend.server import RobotSockets
 from rse_pf.errors import ConfigurationError, MissingExtra
 from rse_pf.objects import open_store
 from rse_pf.service import Registry
-from rse_pf.services.installed import installed_services
+from rse_pf.services.installed import installed_services, published_services
 from rse_pf.settings import PlatformSettings
 
 __all__ = ["load_services", "main"]
@@ -97,8 +98,11 @@ class _Worker:
             log=self._log,
             new_session_id=lambda: secrets.token_hex(8),
         )
-        if settings.services.folder:
+        if settings.services.folder or settings.services.published:
             self._core.environments = self._environments(settings, config["server"], config["workers"])
+        self._hand_over = HandOver(
+            self._core.connections, timers=loop, now=time.monotonic, choose=secrets.choice
+        )
         keys = None if config["keys"] is None else KeySet.from_json(config["keys"])
         self._index, self._workers, self._named = config["index"], config["workers"], 0
         self._sockets = RobotSockets(
@@ -113,8 +117,11 @@ class _Worker:
         )
 
     def _environments(self, settings: PlatformSettings, server: str, workers: int) -> Environments:
+        chosen = settings.services
+        services = installed_services(Path(chosen.folder)) if chosen.folder else []
+        services += published_services() if chosen.published else []
         return Environments(
-            installed_services(Path(settings.services.folder)),
+            services,
             settings=settings,
             most=-(-settings.services.max_environments // workers),
             server_id=server,
@@ -135,15 +142,22 @@ class _Worker:
         while line := await reader.readline():
             order = json.loads(line)
             if order["do"] == "report":
-                self._say(event="report", report=self._core.snapshot())
+                self._say(event="report", report=self._report())
             elif order["do"] == "move":
                 self._core.move_all(order["reason"], order["within_ms"])
                 self._keep(self._tell_when_empty())
+            elif order["do"] == "hand-over":
+                self._hand_over.begin(order["delays_s"], order["within_ms"])
             elif order["do"] == "leave":
                 await self._leave(order["held_s"])
                 break
         self._log.close()
         os._exit(0)  # sockets and threads of a worker that has no supervisor are nobody's
+
+    def _report(self) -> dict[str, Any]:
+        report = self._core.snapshot()
+        report["gauges"]["moved"] = float(self._hand_over.asked)
+        return report
 
     async def _tell_when_empty(self) -> None:
         while self._core.connections:
