@@ -162,19 +162,22 @@ def encode_map(version: MapVersion) -> bytes:
     return _MAGIC + zlib.compress(msgspec.msgpack.encode(packed, order="deterministic"), 1)
 
 
-def decode_map(data: bytes) -> MapVersion:
+def decode_map(data: bytes, most_bytes: int = _MOST_BYTES) -> MapVersion:
     """Return the map of *data*.
 
     Raises:
-        BadRequest: The bytes are no map, are damaged, or hold more than 1 GiB.
+        BadRequest: The bytes are no map, are damaged, or hold more than *most_bytes*.
     """
     if data[: len(_MAGIC)] != _MAGIC:
         raise BadRequest("these bytes are no map", hint="send what encode_map returned")
     try:
         inflater = zlib.decompressobj()
-        raw = inflater.decompress(data[len(_MAGIC) :], _MOST_BYTES)
+        raw = inflater.decompress(data[len(_MAGIC) :], most_bytes)
         if not inflater.eof:
-            raise BadRequest("the map is cut short, or holds more than 1 GiB", hint="send it in parts")
+            raise BadRequest(
+                f"the map is cut short, or holds more than {most_bytes} bytes",
+                hint="send it whole, or thinned",
+            )
         packed = msgspec.msgpack.decode(raw, type=_Map)
         return MapVersion(
             keyframes=tuple(_keyframe(each) for each in packed.keyframes),

@@ -17,7 +17,7 @@ import threading
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import BinaryIO, Protocol, runtime_checkable
 
 from rse_pf.errors import Conflict, NotFound, StoreError, StoreFull, UsageError
 
@@ -26,11 +26,17 @@ __all__ = [
     "MemoryStore",
     "ObjectInfo",
     "ObjectStore",
+    "RangedStore",
     "check_name",
     "digest_of",
+    "name_segment",
+    "object_name",
     "open_store",
+    "read_range",
 ]
 
+_PLAIN_SEGMENT = re.compile(r"[a-z0-9][a-z0-9-]{0,63}")
+_LEFT_BEHIND = ".part-*"
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._=-]{0,127}(/[A-Za-z0-9][A-Za-z0-9._=-]{0,127}){0,9}")
 
 
@@ -62,6 +68,33 @@ class ObjectStore(Protocol):
 
     def compare_and_swap(self, name: str, expected: bytes | None, data: bytes) -> None:
         """Replace the object if it still holds *expected* (None: is missing); raises Conflict."""
+
+
+@runtime_checkable
+class RangedStore(Protocol):
+    """A store that reads a piece of an object without reading the rest."""
+
+    def get_range(self, name: str, start: int, length: int) -> bytes:
+        """Return at most *length* bytes from *start* on; raises NotFound."""
+
+
+def read_range(store: ObjectStore, name: str, start: int, length: int) -> bytes:
+    """Return at most *length* bytes of an object from *start* on, by the cheapest way of *store*."""
+    if isinstance(store, RangedStore):
+        return store.get_range(name, start, length)
+    return store.get(name)[start : start + length]
+
+
+def name_segment(text: str) -> str:
+    """Return a segment of a name for any *text*; two texts never share one (sha256 if it is not plain)."""
+    if _PLAIN_SEGMENT.fullmatch(text):
+        return text
+    return "x=" + digest_of(text.encode("utf-8", "surrogatepass"))
+
+
+def object_name(tenant: str, robot: str, digest: str) -> str:
+    """Return where the object *digest* of a robot lives: ``objects/TENANT/ROBOT/DIGEST``."""
+    return f"objects/{name_segment(tenant)}/{name_segment(robot)}/{digest}"
 
 
 def digest_of(data: bytes) -> str:
@@ -111,6 +144,10 @@ class MemoryStore:
             raise NotFound(f"no object named {name!r}")
         return found
 
+    def get_range(self, name: str, start: int, length: int) -> bytes:
+        """Return a piece of the object."""
+        return self.get(name)[start : start + length]
+
     def put(self, name: str, data: bytes) -> None:
         """Store the object."""
         with self._lock:
@@ -153,6 +190,13 @@ class DirectoryStore:
         with _as_store_errors(name):
             return _read(path)
 
+    def get_range(self, name: str, start: int, length: int) -> bytes:
+        """Return a piece of the object."""
+        path = self._path(name)
+        with _as_store_errors(name), _open(path) as file:
+            file.seek(start)
+            return file.read(length)
+
     def put(self, name: str, data: bytes) -> None:
         """Store the object durably."""
         path = self._path(name)
@@ -170,11 +214,13 @@ class DirectoryStore:
 
     def list(self, prefix: str = "") -> Iterator[ObjectInfo]:
         """Yield the objects whose names begin with *prefix*."""
-        if not self._folder.is_dir():
+        above = prefix.rpartition("/")[0]
+        start = self._folder / above if _NAME.fullmatch(above) else self._folder
+        if not start.is_dir():
             return
         names = (
             path.relative_to(self._folder).as_posix()
-            for path in self._folder.rglob("*")
+            for path in start.rglob("*")
             if path.is_file() and not path.is_symlink()
         )
         for name in sorted(names):
@@ -203,6 +249,16 @@ class DirectoryStore:
                     raise Conflict(f"{name!r} was changed meanwhile", hint="read it again and retry")
                 self._write(path, data)
 
+    def sweep(self, *, now: float, older_than_s: float) -> int:
+        """Remove what writers that died left behind; return how many files.  *now* is Unix time."""
+        gone = 0
+        for path in self._folder.rglob(_LEFT_BEHIND):
+            with contextlib.suppress(FileNotFoundError):
+                if now - path.lstat().st_mtime > older_than_s:
+                    path.unlink()
+                    gone += 1
+        return gone
+
     def _path(self, name: str) -> Path:
         return self._folder / check_name(name)
 
@@ -224,8 +280,12 @@ class DirectoryStore:
 
 def _read(path: Path) -> bytes:
     """Return a plain file's bytes; a link is no object, wherever it points."""
-    with os.fdopen(os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC), "rb") as file:
+    with _open(path) as file:
         return file.read()
+
+
+def _open(path: Path) -> BinaryIO:
+    return os.fdopen(os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC), "rb")
 
 
 def _make_folder(folder: Path) -> None:
