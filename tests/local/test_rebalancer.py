@@ -1,0 +1,42 @@
+"""Crowded servers are asked while it is worth it, and not again before their robots have moved."""
+
+from __future__ import annotations
+
+from rse_pf.local.rebalancer import Order, Rebalancer
+from rse_pf.settings import ScalingSettings
+
+SCALING = ScalingSettings(moves_per_s=20.0)
+UNEVEN = {"server-1": 50, "server-2": 50, "server-3": 0}
+
+
+def test_nobody_is_asked_before_something_happened() -> None:
+    assert Rebalancer(SCALING).orders(UNEVEN, 100.0) == ()
+
+
+def test_crowded_servers_are_asked_at_the_rate_that_is_allowed() -> None:
+    rebalancer = Rebalancer(SCALING)
+    rebalancer.watch(100.0)
+
+    orders = rebalancer.orders(UNEVEN, 100.5)
+
+    assert {order.server for order in orders} == {"server-1", "server-2"}
+    assert all(order.robots > 0 and order.spread_s == order.robots / 20.0 for order in orders)
+
+
+def test_an_order_is_not_repeated_before_its_robots_had_time_to_move_and_then_it_is() -> None:
+    rebalancer = Rebalancer(SCALING)
+    rebalancer.watch(100.0)
+    longest_s = max(order.spread_s for order in rebalancer.orders(UNEVEN, 100.0))
+
+    assert rebalancer.orders(UNEVEN, 100.0 + longest_s) == ()
+    assert rebalancer.orders(UNEVEN, 100.0 + longest_s + 2.0) != ()
+
+
+def test_even_servers_and_an_old_event_ask_nobody() -> None:
+    rebalancer = Rebalancer(SCALING)
+    rebalancer.watch(100.0)
+
+    assert rebalancer.orders({"server-1": 5, "server-2": 5}, 101.0) == ()
+    assert rebalancer.orders(UNEVEN, 131.0) == ()
+    rebalancer.watch(131.0)
+    assert isinstance(rebalancer.orders(UNEVEN, 131.0)[0], Order)
