@@ -8,6 +8,7 @@ from __future__ import annotations
 import hashlib
 import json
 import shutil
+import zipfile
 from pathlib import Path
 
 from rse_pf.errors import ConfigurationError
@@ -20,6 +21,8 @@ SUMS_FILE = "SHA256SUMS"
 WHEELHOUSE = "wheelhouse"
 _BOOT = Path(__file__).parent / "boot"
 _IN_USER_DATA = "first_boot.py"
+_ROOT = Path(__file__).resolve().parents[1]
+_OURS = "rse_pf"
 
 
 def staged(assets: Path, name: str, settings: PlatformSettings, into: Path) -> Path:
@@ -29,7 +32,7 @@ def staged(assets: Path, name: str, settings: PlatformSettings, into: Path) -> P
     boot files too, and a list of all sums for `first_boot.py`.
 
     Raises:
-        ConfigurationError: The folder is missing, empty or cannot be read.
+        ConfigurationError: The folder is missing, empty, cannot be read, or holds other sources than these.
     """
     source, target = assets / name, into / name
     document = {"context": {"rse-pf": settings.to_dict()}}
@@ -39,6 +42,7 @@ def staged(assets: Path, name: str, settings: PlatformSettings, into: Path) -> P
         shutil.copytree(source, target, dirs_exist_ok=True)
     except OSError as error:
         raise ConfigurationError(f"no packages in {source}", hint="run make assets") from error
+    _check_fresh(source)
     (target / SETTINGS_FILE).write_text(json.dumps(document, sort_keys=True) + "\n", encoding="utf-8")
     if name == WHEELHOUSE:
         for file in sorted(_BOOT.iterdir()):
@@ -51,6 +55,27 @@ def staged(assets: Path, name: str, settings: PlatformSettings, into: Path) -> P
 def sums_digest(package: Path) -> str:
     """Return the sha256 of a staged package's list of sums: it vouches for every byte of the package."""
     return hashlib.sha256((package / SUMS_FILE).read_bytes()).hexdigest()
+
+
+def _check_fresh(packages: Path) -> None:
+    """Refuse packages that were built of other sources: they might not even know the settings beside them."""
+    built = {
+        file.relative_to(packages).as_posix(): file.read_bytes() for file in (packages / _OURS).rglob("*.py")
+    }
+    for wheel in packages.glob(f"{_OURS}-*.whl"):
+        with zipfile.ZipFile(wheel) as archive:
+            built.update({each: archive.read(each) for each in archive.namelist() if _is_ours(each)})
+    if not built:
+        return
+    sources = {file.relative_to(_ROOT).as_posix(): file for file in (_ROOT / _OURS).rglob("*.py")}
+    if built.keys() != sources.keys() or any(sources[each].read_bytes() != built[each] for each in built):
+        raise ConfigurationError(
+            f"the packages in {packages} were built of other sources", hint="run make assets"
+        )
+
+
+def _is_ours(name: str) -> bool:
+    return name.startswith(f"{_OURS}/") and name.endswith(".py")
 
 
 def _sums(folder: Path) -> str:

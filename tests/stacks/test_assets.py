@@ -5,6 +5,8 @@ from __future__ import annotations
 import hashlib
 import json
 import shutil
+import zipfile
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -78,6 +80,29 @@ def test_a_wheelhouse_that_cannot_be_read_is_one_line_and_a_hint(
 
     assert told.value.hint == "run make assets"
     assert "\n" not in told.value.message
+
+
+@pytest.mark.parametrize("change", ["none", "older", "missing", "more"])
+def test_packages_of_other_sources_are_refused(
+    assets: Path, tmp_path: Path, sources: Mapping[str, str], change: str
+) -> None:
+    files = {name: text for name, text in sources.items() if name.startswith("rse_pf/")}
+    if change == "older":
+        files["rse_pf/settings.py"] += "# before\n"
+    if change == "missing":
+        del files["rse_pf/errors.py"]
+    if change == "more":
+        files["rse_pf/attic.py"] = ""
+    with zipfile.ZipFile(assets / WHEELHOUSE / "rse_pf-0.1.0-py3-none-any.whl", "w") as wheel:
+        for name, text in files.items():
+            wheel.writestr(name, text)
+
+    if change == "none":
+        staged(assets, WHEELHOUSE, PlatformSettings(), tmp_path / "out")
+        return
+    with pytest.raises(ConfigurationError, match="other sources") as told:
+        staged(assets, WHEELHOUSE, PlatformSettings(), tmp_path / "out")
+    assert told.value.hint == "run make assets"
 
 
 def test_the_template_vouches_for_the_package_it_names(assembly: Any) -> None:

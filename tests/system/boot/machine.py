@@ -1,0 +1,119 @@
+"""Process 1 of the machine under test: runs the user data, then starts units as systemd would.
+
+Runs inside the Debian root, with its Python and standard library alone.  Of a unit it knows what ours use:
+User, EnvironmentFile, StateDirectory, ExecStartPre, ExecStart, Restart, RestartSec, and PathChanged.  The
+`systemctl` in the root only writes its arguments to ORDERS.
+"""
+
+import os
+import pathlib
+import pwd
+import re
+import shlex
+import signal
+import subprocess
+import sys
+import time
+
+ORDERS = pathlib.Path("/run/orders")
+UNITS = pathlib.Path("/etc/systemd/system")
+CA = "/etc/ssl/certs/ca-certificates.crt"
+LOOK_S = 0.2
+
+
+def say(*words):
+    print("machine:", *words, flush=True)
+
+
+def entries(name):
+    """Return a unit's settings; the last of a repeated one counts."""
+    lines = (UNITS / name).read_text().splitlines()
+    return dict(line.split("=", 1) for line in lines if "=" in line and not line.startswith("#"))
+
+
+class Service:
+    """One running service unit."""
+
+    def __init__(self, name):
+        self.name, self.unit, self.process, self.again_at = name, entries(name), None, 0.0
+        self.wanted = True
+        user = pwd.getpwnam(self.unit["User"])
+        state = pathlib.Path("/var/lib", self.unit["StateDirectory"])
+        state.mkdir(exist_ok=True)
+        os.chown(state, user.pw_uid, user.pw_gid)
+        text = pathlib.Path(self.unit["EnvironmentFile"]).read_text()
+        self.environment = dict(line.split("=", 1) for line in text.splitlines())
+        self.options = {
+            "user": user.pw_uid,
+            "group": user.pw_gid,
+            "extra_groups": [],
+            "cwd": "/",
+            "env": {"PATH": "/usr/bin:/bin", "AWS_CA_BUNDLE": CA, **self.environment},
+        }
+
+    def words(self, command):
+        return [
+            re.sub(r"\$\{(\w+)\}", lambda found: self.environment[found[1]], word)
+            for word in shlex.split(command)
+        ]
+
+    def start(self):
+        before = self.unit.get("ExecStartPre")
+        if before and subprocess.run(self.words(before), **self.options).returncode:
+            say(self.name, "ExecStartPre failed")
+            self.again_at = time.monotonic() + float(self.unit["RestartSec"])
+            return
+        self.process = subprocess.Popen(self.words(self.unit["ExecStart"]), **self.options)
+        say("started", self.name)
+
+    def stop(self):
+        if self.process and self.process.poll() is None:
+            self.process.terminate()
+            self.process.wait(float(self.unit["TimeoutStopSec"]))
+
+    def look(self):
+        if not self.wanted:
+            return
+        if self.process is None:
+            if time.monotonic() >= self.again_at:
+                self.start()
+        elif self.process.poll() is not None:
+            code, self.process = self.process.returncode, None
+            say(self.name, "ended with", code)
+            self.wanted = bool(code) or self.unit["Restart"] == "always"
+            self.again_at = time.monotonic() + float(self.unit["RestartSec"])
+
+
+def main():
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
+    ORDERS.write_text("")
+    began = time.monotonic()
+    code = subprocess.run(["/usr/bin/python3", "/root/user-data"]).returncode
+    say("user-data ended with", code, f"after {time.monotonic() - began:.1f} s")
+    services, watched, done = {}, {}, 0
+    while True:
+        orders = ORDERS.read_text().splitlines()
+        for order in orders[done:]:
+            say("systemctl", order)
+            verb, *names = [word for word in order.split() if not word.startswith("--")]
+            for name in names:
+                if verb == "enable" and name.endswith(".service"):
+                    services[name] = Service(name)
+                elif verb == "enable" and name.endswith(".path"):
+                    watched[name] = pathlib.Path(entries(name)["PathChanged"])
+                elif verb == "try-restart" and services[name].process:
+                    services[name].stop()
+                    services[name].process = None
+        done = len(orders)
+        for service in services.values():
+            service.look()
+        for name, path in watched.items():
+            stamp = path.stat().st_mtime_ns if path.exists() else None
+            if stamp != seen.setdefault(name, stamp):
+                seen[name] = stamp
+                subprocess.run(shlex.split(entries(name.replace(".path", ".service"))["ExecStart"]))
+        time.sleep(LOOK_S)
+
+
+seen = {}
+main()

@@ -1,0 +1,200 @@
+"""A bare Debian machine in a network of its own, with IMDS and S3 in reach and nothing else.
+
+Needs root, `ip`, `openssl` and `debootstrap` (once: the root is kept in build/).  The default route leads to
+a device that counts and drops, so whoever tries to leave is seen.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import shutil
+import subprocess
+import sys
+import threading
+import time
+import zipfile
+from pathlib import Path
+from typing import Any
+
+HERE = Path(__file__).parent
+REGION = "ap-northeast-2"
+AWS = "127.0.0.2"
+NAMES = [
+    f"{name}.{REGION}.amazonaws.com"
+    for name in ("assets.s3", "artifacts.s3", "s3", "monitoring", "autoscaling")
+]
+PACKAGES = "python3,ca-certificates,systemd"
+TOOLS = ("ip", "unshare", "openssl", "chroot", "cp")
+
+
+def missing() -> str:
+    """Return why no machine can be made here, or nothing."""
+    if os.geteuid():
+        return "needs root: a root file system and a network namespace are made"
+    lacking = [tool for tool in TOOLS if not shutil.which(tool)]
+    return f"needs {', '.join(lacking)}" if lacking else ""
+
+
+def debian_root(kept: Path) -> Path:
+    """Return a bare Debian 12, made once; raises FileNotFoundError without debootstrap."""
+    if not (kept / "made").is_file():
+        shutil.rmtree(kept, ignore_errors=True)
+        kept.parent.mkdir(parents=True, exist_ok=True)
+        subprocess.run(
+            ["debootstrap", "--variant=minbase", f"--include={PACKAGES}", "bookworm", str(kept)],
+            check=True, stdout=subprocess.DEVNULL,
+        )  # fmt: skip
+        (kept / "made").touch()
+    return kept
+
+
+class World:
+    """One machine; leave the context and nothing of it is left."""
+
+    def __init__(self, folder: Path, kept_root: Path) -> None:
+        self.folder = folder
+        self.root = folder / "root"
+        self.space = f"rse-pf-boot-{os.getpid()}"
+        self.ca = folder / "ca.pem"
+        self.lifecycle = folder / "lifecycle"
+        self.log: list[str] = []
+        self._heard = threading.Condition()
+        self._kept_root = kept_root
+        self._ends = contextlib.ExitStack()
+
+    def __enter__(self) -> World:
+        with contextlib.ExitStack() as ends:
+            self._make_network(ends)
+            self._make_root()
+            self.lifecycle.write_text("InService")
+            self._serve(ends, [sys.executable, str(HERE / "imds.py"), str(self.lifecycle)])
+            moto = [str(Path(sys.executable).with_name("moto_server")), "-H", AWS, "-p", "443"]
+            self._serve(ends, [*moto, "-s", "-c", str(self.ca), "-k", str(self.folder / "ca.key")])
+            self.wait(lambda: self._opens("169.254.169.254", 80) and self._opens(AWS, 443), 60, "IMDS and S3")
+            self._ends = ends.pop_all()
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self._ends.close()
+
+    def boot(self, package: Path, digest: str) -> None:
+        """Put the package into S3 and switch the machine on."""
+        archive = self.folder / "package.zip"
+        with zipfile.ZipFile(archive, "w") as made:
+            for file in sorted(package.rglob("*")):
+                if file.is_file():
+                    made.write(file, file.relative_to(package).as_posix())
+        self.inside("fill", str(archive))
+        facts = {
+            "package": "s3://assets/package.zip", "sha256": digest, "region": REGION, "bucket": "artifacts",
+            "keys": "keys.json", "group": "rse-pf", "hook": "rse-pf-drain",
+        }  # fmt: skip
+        script = (HERE.parents[2] / "stacks/boot/first_boot.py").read_text()
+        (self.root / "root/user-data").write_text(f"{script}\nmain({json.dumps(facts)})\n")
+        machine = [
+            "unshare", "--mount", "--pid", "--fork", "--kill-child", f"--mount-proc={self.root}/proc",
+            "chroot", str(self.root), "/usr/bin/python3", "/root/machine.py",
+        ]  # fmt: skip
+        process = self._serve(
+            self._ends, machine, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+        )
+        listener = threading.Thread(target=self._listen, args=(process,), daemon=True)
+        listener.start()
+        self._ends.callback(listener.join, 10)
+
+    def inside(self, *arguments: str) -> Any:
+        """Run inside.py in the machine's network; return what it printed, as JSON."""
+        told = self.run([sys.executable, str(HERE / "inside.py"), str(self.ca), *arguments])
+        return json.loads(told) if told.strip() else None
+
+    def run(self, command: list[str]) -> str:
+        """Run *command* in the machine's network and return its output."""
+        environment = {**os.environ, "PYTHONPATH": str(HERE.parents[2])}
+        done = subprocess.run(
+            ["ip", "netns", "exec", self.space, *command], capture_output=True, text=True, env=environment,
+            timeout=120, check=False,
+        )  # fmt: skip
+        assert not done.returncode, f"{command}: {done.stderr}\n{self.text()}"
+        return done.stdout
+
+    def status(self, port: int, path: str) -> int:
+        """Return the HTTP status that the machine's port answers, 0 when nobody listens."""
+        ask = (
+            "import sys,http.client as h\ntry:\n c=h.HTTPConnection('127.0.0.1',int(sys.argv[1]),timeout=2)\n"
+            " c.request('GET',sys.argv[2]); print(c.getresponse().status)\nexcept OSError: print(0)"
+        )
+        return int(self.run([sys.executable, "-c", ask, str(port), path]))
+
+    def packets_to_the_outside(self) -> int:
+        """Return how many packets took the default route since the machine was made."""
+        counted = self.run(["cat", "/sys/class/net/out0/statistics/tx_packets"])
+        return int(counted) - self._packets_before
+
+    def wait(self, happened: Any, within_s: float, what: str) -> None:
+        """Wait until *happened()*, or fail with the machine's console."""
+        until = time.monotonic() + within_s
+        with self._heard:
+            while not happened():
+                assert time.monotonic() < until, f"no {what} within {within_s} s:\n{self.text()}"
+                self._heard.wait(0.2)
+
+    def text(self) -> str:
+        """Return the console."""
+        return "".join(self.log)
+
+    def _listen(self) -> None:
+        with self._console.stdout as console:
+            for line in console:
+                with self._heard:
+                    self.log.append(line)
+                    self._heard.notify_all()
+
+    def _serve(self, ends: contextlib.ExitStack, command: list[str], **options: Any) -> subprocess.Popen[Any]:
+        silent = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+        process = subprocess.Popen(["ip", "netns", "exec", self.space, *command], **{**silent, **options})
+        ends.callback(process.wait, 20)
+        ends.callback(process.kill)
+        return process
+
+    def _opens(self, host: str, port: int) -> bool:
+        script = (
+            f"import socket\ntry: socket.create_connection(({host!r}, {port}), 1); print(1)\n"
+            "except OSError: print(0)"
+        )
+        return self.run([sys.executable, "-c", script]).strip() == "1"
+
+    def _make_network(self, ends: contextlib.ExitStack) -> None:
+        subprocess.run(["ip", "netns", "add", self.space], check=True)
+        ends.callback(subprocess.run, ["ip", "netns", "delete", self.space], check=False)
+        for line in (
+            "link set lo up", "address add 169.254.169.254/32 dev lo",
+            "link add out0 type veth peer name out1", "address add 192.0.2.2/24 dev out0",
+        ):  # fmt: skip
+            self.run(["ip", *line.split()])
+        for device in ("out0", "out1"):
+            self.run(["sh", "-c", f"echo 1 > /proc/sys/net/ipv6/conf/{device}/disable_ipv6"])
+            self.run(["ip", "link", "set", device, "up"])
+        self.run(["ip", "neighbour", "add", "192.0.2.1", "lladdr", "02:00:00:00:00:01", "dev", "out0"])
+        self.run(["ip", "route", "add", "default", "via", "192.0.2.1"])
+        self._packets_before = int(self.run(["cat", "/sys/class/net/out0/statistics/tx_packets"]))
+
+    def _make_root(self) -> None:
+        subprocess.run(["cp", "-a", "--reflink=auto", str(self._kept_root), str(self.root)], check=True)
+        names = ",".join(f"DNS:{name}" for name in NAMES) + f",IP:{AWS}"
+        subprocess.run(
+            ["openssl", "req", "-x509", "-newkey", "rsa:2048", "-nodes", "-days", "2", "-subj", "/CN=aws",
+             "-addext", f"subjectAltName={names}", "-keyout", str(self.folder / "ca.key"),
+             "-out", str(self.ca)],
+            check=True, capture_output=True,
+        )  # fmt: skip
+        with (self.root / "etc/ssl/certs/ca-certificates.crt").open("a") as trusted:
+            trusted.write(self.ca.read_text())
+        (self.root / "etc/hosts").write_text(f"127.0.0.1 localhost\n{AWS} {' '.join(NAMES)}\n")
+        (self.root / "etc/resolv.conf").write_text("nameserver 192.0.2.53\n")
+        shutil.copyfile(HERE / "machine.py", self.root / "root/machine.py")
+        systemctl = self.root / "usr/bin/systemctl"
+        systemctl.unlink(missing_ok=True)
+        systemctl.write_text('#!/bin/sh\necho "$@" >> /run/orders\n')
+        systemctl.chmod(0o755)

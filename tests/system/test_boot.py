@@ -1,0 +1,123 @@
+"""A bare Debian machine becomes a healthy backend server, and asks nobody but AWS."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from system.boot.world import World, debian_root, missing
+
+from rse_pf.auth import SigningKey
+from rse_pf.settings import PlatformSettings
+
+pytestmark = [pytest.mark.slow, pytest.mark.system, pytest.mark.timeout(900)]
+
+SETTINGS = PlatformSettings.from_dict({"scaling": {"period_s": 10}, "cloud": {"poll_s": 1, "drain_s": 120}})
+KEY = SigningKey.from_seed(b"k" * 32, "boot-key")
+TOLERANCE = 0.02
+"""Metres and radians: ten times what half a pixel of noise moves a pose by."""
+
+
+@pytest.fixture(scope="module")
+def world(repository: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[World]:
+    """The machine, switched on, without keys in the bucket."""
+    if missing():
+        pytest.skip(missing())
+    pytest.importorskip("flask", reason="the infra extra is not installed: moto's server")
+    from stacks.assets import WHEELHOUSE, staged, sums_digest
+
+    if not (repository / "build" / WHEELHOUSE / "requirements.txt").is_file():
+        pytest.skip("no wheelhouse in build: run make assets")
+    kept = repository / "build" / "debian12"
+    if not (kept / "made").is_file() and not shutil.which("debootstrap"):
+        pytest.skip("needs debootstrap, to make a bare Debian once")
+    folder = tmp_path_factory.mktemp("boot")
+    package = staged(repository / "build", WHEELHOUSE, SETTINGS, folder)
+    with World(folder, debian_root(kept)) as made:
+        made.boot(package, sums_digest(package))
+        yield made
+    shutil.rmtree(made.root, ignore_errors=True)
+
+
+def token() -> str:
+    return KEY.issue("robot-1", now=time.time(), token_id="t-1", settings=SETTINGS.auth)
+
+
+def ask_for_a_pose(world: World) -> dict:
+    serving = SETTINGS.serving
+    return world.inside("pose", token(), f"ws://127.0.0.1:{serving.port}{serving.path}")
+
+
+def test_the_machine_becomes_healthy_in_every_attached_target_group(world: World) -> None:
+    serving, health = SETTINGS.serving, SETTINGS.health
+
+    world.wait(lambda: world.status(serving.control_port, health.path) == 200, 120, "healthy server")
+
+    assert "user-data ended with 0" in world.text()
+
+
+def test_without_keys_robots_are_refused_and_one_line_says_why(world: World) -> None:
+    assert ask_for_a_pose(world) == {"failed": "unauthorized"}
+    assert world.text().count("agent-no-keys") == 1
+
+
+def test_once_the_keys_appear_a_robot_gets_a_right_pose(world: World) -> None:
+    world.inside("keys", KEY.key_set().to_json())
+    world.wait(lambda: "try-restart" in world.text(), 60, "restart for the new keys")
+    world.wait(lambda: "verdict" in (found := ask_for_a_pose(world)) or found.clear(), 60, "answer")
+
+    answer = ask_for_a_pose(world)
+
+    assert answer["server"] == "i-0123456789abcdef0"
+    assert answer["verdict"] == "ok"
+    assert answer["off"] < TOLERANCE
+
+
+def test_the_agent_publishes_what_the_alarms_read(world: World) -> None:
+    ask_for_a_pose(world)
+
+    world.wait(lambda: world.inside("numbers")["Sum"] >= 1, 60, "published request")
+
+    assert world.inside("numbers")["SampleCount"] >= 2
+
+
+def test_the_server_runs_as_its_own_user_with_the_settings_of_the_template(world: World) -> None:
+    owner = (world.root / "var/lib/rse-pf").stat().st_uid
+    settings = json.loads((world.root / "opt/rse-pf/package/settings.json").read_text())["context"]["rse-pf"]
+
+    assert owner != 0
+    assert PlatformSettings.from_dict(settings).digest() == SETTINGS.digest()
+    assert (world.root / "var/lib/rse-pf/keys.json").read_text() == KEY.key_set().to_json()
+
+
+def test_systemd_itself_finds_the_units_sound(world: World) -> None:
+    units = ["rse-pf.service", "rse-pf-agent.service", "rse-pf-data.service", "rse-pf-keys.path"]
+    shutil.copyfile(
+        world.root / "opt/rse-pf/package/rse-pf-data.service",
+        world.root / "etc/systemd/system/rse-pf-data.service",
+    )
+    told = world.run(
+        ["sh", "-c", f"chroot {world.root} /usr/bin/systemd-analyze verify {' '.join(units)} 2>&1"]
+    )
+
+    assert [line for line in told.splitlines() if "rse-pf" in line] == []
+
+
+def test_a_leaving_instance_drains_and_its_server_stays_down(world: World) -> None:
+    world.lifecycle.write_text("Terminated")
+
+    world.wait(lambda: "rse-pf.service ended with 0" in world.text(), 90, "drained server")
+
+    assert "agent-leaving" in world.text()
+    assert world.status(SETTINGS.serving.control_port, "/healthz") == 0
+
+
+def test_no_packet_left_the_machine_and_one_would_have_been_seen(world: World) -> None:
+    assert world.packets_to_the_outside() == 0
+
+    world.run(["python3", "-c", "import socket; socket.socket(2, 2).sendto(b'x', ('198.51.100.1', 9))"])
+    assert world.packets_to_the_outside() == 1
