@@ -30,6 +30,8 @@ VERBS = {
     "token": "issue a robot's token, or look into one",
     "service": "write, test, run and install a service of your own: Python, C/C++ or Lua",
     "serve": "run one backend server, as EC2 runs it",
+    "data": "run the data service: images, keyframes, clouds and maps by HTTP",
+    "map": "list, show, compare, roll back and export the maps that robots share",
     "settings": "show every setting: value, default, unit, source",
     "doctor": "check what this machine needs, and say how to mend it",
 }

@@ -1,0 +1,242 @@
+"""What each route of the data service does, in a thread where it waits for the store.
+
+Promises that identity comes from the token alone, and that what belongs to others is not there.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import time
+from collections.abc import AsyncIterator, Awaitable, Callable
+from dataclasses import asdict
+from typing import Any, TypeVar
+
+import msgspec
+
+from rse_pf.auth import Claims
+from rse_pf.data_server.http import Reply, Request, failure_reply, json_reply, wanted_range
+from rse_pf.data_server.maps import MapRecord, MapRegistry
+from rse_pf.data_server.openapi import openapi
+from rse_pf.data_server.routes import (
+    BYTES,
+    Begin,
+    Commit,
+    Health,
+    MapName,
+    MapPage,
+    MapVersionInfo,
+    MoveHead,
+    ObjectPage,
+    StoredObject,
+    Upload,
+)
+from rse_pf.data_server.uploads import Objects, UploadState
+from rse_pf.errors import BadRequest, NotFound
+from rse_pf.objects import ObjectStore, read_range
+from rse_pf.settings import DataSettings
+
+__all__ = ["Handler", "Handlers"]
+
+_T = TypeVar("_T")
+Handler = Callable[[Request, Claims, dict[str, str]], Awaitable[Reply]]
+
+_PIECE_BYTES = 1 << 20
+_JSON_BYTES = 16384
+_NOTE_LETTERS = 500
+_PAGE = 1000
+_PROBE = "ready/probe"
+
+
+class Handlers:
+    """One method for each operation of `rse_pf.data_server.routes`."""
+
+    def __init__(
+        self,
+        store: ObjectStore,
+        settings: DataSettings,
+        *,
+        clock: Callable[[], float] = time.monotonic,
+        wall_clock: Callable[[], float] = time.time,
+    ) -> None:
+        self._store = store
+        self._settings = settings
+        self._wall_clock = wall_clock
+        self.objects = Objects(store, settings, clock, wall_clock)
+        self._document = msgspec.json.encode(openapi())
+
+    async def healthz(self, request: Request, who: Claims, path: dict[str, str]) -> Reply:
+        """Answer at once."""
+        return json_reply(200, Health(status="ok"))
+
+    async def readyz(self, request: Request, who: Claims, path: dict[str, str]) -> Reply:
+        """Ask the store for something that is not there; any other failure means not ready."""
+        with contextlib.suppress(NotFound):
+            await asyncio.to_thread(self._store.head, _PROBE)
+        return json_reply(200, Health(status="ready"))
+
+    async def document(self, request: Request, who: Claims, path: dict[str, str]) -> Reply:
+        """Return the OpenAPI document."""
+        return Reply(status=200, body=self._document)
+
+    async def list_objects(self, request: Request, who: Claims, path: dict[str, str]) -> Reply:
+        """List a page of objects."""
+        text = request.query.get("limit", str(_PAGE))
+        limit = int(text) if text.isdecimal() and text.isascii() and len(text) < 6 else 0
+        if not 1 <= limit <= _PAGE:
+            raise BadRequest(f"limit {text[:40]!r} is not in 1 to {_PAGE}", hint="leave it out")
+        found, more = await asyncio.to_thread(self.objects.list, who, request.query.get("after", ""), limit)
+        page = [StoredObject(digest=info.name.rpartition("/")[2], size=info.size) for info in found]
+        return json_reply(200, ObjectPage(objects=page, next=page[-1].digest if more else None))
+
+    async def get_object(self, request: Request, who: Claims, path: dict[str, str]) -> Reply:
+        """Send an object or a range."""
+        info = await asyncio.to_thread(self.objects.head, who, path["digest"])
+        return self._content(request, info.name, info.size, path["digest"])
+
+    async def head_object(self, request: Request, who: Claims, path: dict[str, str]) -> Reply:
+        """Send the size alone."""
+        info = await asyncio.to_thread(self.objects.head, who, path["digest"])
+        headers = {**_content_headers(path["digest"]), "Content-Length": str(info.size)}
+        return Reply(status=200, headers=headers, media_type=BYTES)
+
+    async def put_object(self, request: Request, who: Claims, path: dict[str, str]) -> Reply:
+        """Store a small object."""
+        self.objects.name(who, path["digest"])
+        data = await request.body(self._settings.part_bytes)
+        new = await asyncio.to_thread(self.objects.put, who, path["digest"], data)
+        return json_reply(201 if new else 200, StoredObject(digest=path["digest"], size=len(data)))
+
+    async def delete_object(self, request: Request, who: Claims, path: dict[str, str]) -> Reply:
+        """Remove an object."""
+        await asyncio.to_thread(self.objects.delete, who, path["digest"])
+        return Reply(status=204)
+
+    async def begin_upload(self, request: Request, who: Claims, path: dict[str, str]) -> Reply:
+        """Open an upload."""
+        begin = await _json_body(request, Begin)
+        if begin.size < 1:
+            raise BadRequest(f"a size of {begin.size} bytes needs no upload", hint="PUT the object")
+        return _upload(200, await asyncio.to_thread(self.objects.begin, who, path["digest"], begin.size))
+
+    async def get_upload(self, request: Request, who: Claims, path: dict[str, str]) -> Reply:
+        """Tell how far an upload has come."""
+        return _upload(200, await asyncio.to_thread(self.objects.progress, who, path["digest"]))
+
+    head_upload = get_upload
+
+    async def append_part(self, request: Request, who: Claims, path: dict[str, str]) -> Reply:
+        """Store a part."""
+        offset = request.header_number("Upload-Offset")
+        if offset is None:
+            raise BadRequest("the header Upload-Offset is missing", hint="say where this part begins")
+        self.objects.name(who, path["digest"])
+        data = await request.body(self._settings.part_bytes)
+        state = await asyncio.to_thread(self.objects.append, who, path["digest"], offset, data)
+        return _upload(201 if state.offset == state.size else 200, state)
+
+    async def abandon_upload(self, request: Request, who: Claims, path: dict[str, str]) -> Reply:
+        """Forget an upload."""
+        await asyncio.to_thread(self.objects.abandon, who, path["digest"])
+        return Reply(status=204)
+
+    async def list_maps(self, request: Request, who: Claims, path: dict[str, str]) -> Reply:
+        """List maps with their heads."""
+        maps = self._maps(who)
+
+        def named() -> MapPage:
+            return MapPage(maps=[MapName(name=name, head=maps.head(name).id) for name in maps.names()])
+
+        return json_reply(200, await asyncio.to_thread(named))
+
+    async def list_versions(self, request: Request, who: Claims, path: dict[str, str]) -> Reply:
+        """List versions."""
+        records = await asyncio.to_thread(self._maps(who).versions, path["name"])
+        return json_reply(200, [MapVersionInfo(id=record.id, record=record) for record in records])
+
+    async def commit_version(self, request: Request, who: Claims, path: dict[str, str]) -> Reply:
+        """Commit an object of this robot as a version."""
+        commit = await _json_body(request, Commit)
+        if len(commit.note) > _NOTE_LETTERS:
+            raise BadRequest(
+                f"the note has {len(commit.note)} letters, at most {_NOTE_LETTERS}", hint="shorten it"
+            )
+        name = self.objects.name(who, commit.digest)
+
+        def work() -> MapRecord:
+            return self._maps(who).commit(
+                path["name"], self._store.get(name), parent=commit.parent, author=who.robot,
+                created_s=self._wall_clock(), note=commit.note,
+            )  # fmt: skip
+
+        return _version(201, await asyncio.to_thread(work))
+
+    async def show_version(self, request: Request, who: Claims, path: dict[str, str]) -> Reply:
+        """Show a version."""
+        return _version(200, await asyncio.to_thread(self._maps(who).record, path["name"], path["version"]))
+
+    async def get_version(self, request: Request, who: Claims, path: dict[str, str]) -> Reply:
+        """Send the bytes of a version or a range of them."""
+        maps = self._maps(who)
+        record = await asyncio.to_thread(maps.record, path["name"], path["version"])
+        return self._content(request, maps.blob_name(path["name"], record), record.size, record.digest)
+
+    async def move_head(self, request: Request, who: Claims, path: dict[str, str]) -> Reply:
+        """Move a head."""
+        wanted = await _json_body(request, MoveHead)
+
+        def work() -> MapRecord:
+            return self._maps(who).move_head(path["name"], wanted.version, expected=wanted.expected)
+
+        return _version(200, await asyncio.to_thread(work))
+
+    def _maps(self, who: Claims) -> MapRegistry:
+        return MapRegistry(self._store, who.tenant, most_bytes=4 * self._settings.max_object_bytes)
+
+    def _content(self, request: Request, name: str, size: int, digest: str) -> Reply:
+        try:
+            wanted = wanted_range(request.headers.get("range"), size)
+        except BadRequest as error:
+            refused = failure_reply(error)
+            return Reply(status=416, body=refused.body, headers={"Content-Range": f"bytes */{size}"})
+        start, end = wanted or (0, size)
+        headers = {**_content_headers(digest), "Content-Length": str(end - start)}
+        if wanted:
+            headers["Content-Range"] = f"bytes {start}-{end - 1}/{size}"
+        return Reply(
+            status=206 if wanted else 200, body=self._pieces(name, start, end), headers=headers,
+            media_type=BYTES,
+        )  # fmt: skip
+
+    async def _pieces(self, name: str, start: int, end: int) -> AsyncIterator[bytes]:
+        while start < end:
+            piece = await asyncio.to_thread(
+                read_range, self._store, name, start, min(_PIECE_BYTES, end - start)
+            )
+            if not piece:
+                raise NotFound("the object was removed while it was read")
+            start += len(piece)
+            yield piece
+
+
+def _content_headers(digest: str) -> dict[str, str]:
+    return {
+        "ETag": f'"{digest}"', "Accept-Ranges": "bytes", "Content-Disposition": "attachment",
+        "X-Content-Type-Options": "nosniff",
+    }  # fmt: skip
+
+
+def _upload(status: int, state: UploadState) -> Reply:
+    return json_reply(status, Upload(**asdict(state)), Upload_Offset=str(state.offset))
+
+
+def _version(status: int, record: MapRecord) -> Reply:
+    return json_reply(status, MapVersionInfo(id=record.id, record=record))
+
+
+async def _json_body(request: Request, kind: type[_T]) -> _T:
+    raw: Any = await request.body(_JSON_BYTES)
+    try:
+        return msgspec.json.decode(raw, type=kind)
+    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
+        raise BadRequest(f"the body is not understood: {error}", hint="see /data/openapi.json") from error

@@ -1,0 +1,207 @@
+"""HTTP as values: a request, a reply, a body with limits on its size, its silence and its slowness.
+
+Promises that an error leaves as a status, a code, a sentence and a hint, never as a traceback, and to
+hold no more of a body than the limit that it was given.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import re
+from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+from urllib.parse import parse_qsl
+
+import msgspec
+
+from rse_pf.errors import (
+    BadRequest,
+    Busy,
+    Conflict,
+    Disconnected,
+    Expired,
+    Forbidden,
+    LimitExceeded,
+    NotFound,
+    QuotaExceeded,
+    RsePfError,
+    StoreError,
+    StoreFull,
+    Unauthorized,
+)
+from rse_pf.settings import DataSettings
+
+__all__ = [
+    "Failure",
+    "MethodNotAllowed",
+    "Receive",
+    "Reply",
+    "Request",
+    "Send",
+    "failure_reply",
+    "json_reply",
+    "wanted_range",
+]
+
+Receive = Callable[[], Awaitable[Mapping[str, Any]]]
+Send = Callable[[Mapping[str, Any]], Awaitable[None]]
+
+
+class MethodNotAllowed(BadRequest):
+    """The path is known, the method is not; *allowed* are."""
+
+    allowed = ""
+
+
+_STATUS: dict[type[RsePfError], int] = {
+    MethodNotAllowed: 405,
+    Unauthorized: 401, Forbidden: 403, NotFound: 404, Expired: 408, Conflict: 409, LimitExceeded: 413,
+    QuotaExceeded: 413, BadRequest: 400, Busy: 503, StoreFull: 507, StoreError: 503,
+}  # fmt: skip
+_INTERNAL = 500
+_RANGE = re.compile(r"bytes=(\d{0,18})-(\d{0,18})")
+
+
+class Failure(msgspec.Struct, frozen=True, kw_only=True):
+    """What went wrong: a stable code, a sentence, and what to do."""
+
+    code: str
+    message: str
+    hint: str = ""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Reply:
+    """An answer; *body* is bytes, or pieces that are read while they are sent."""
+
+    status: int
+    body: bytes | AsyncIterator[bytes] = b""
+    headers: Mapping[str, str] = field(default_factory=dict)
+    media_type: str = "application/json"
+
+
+class Request:
+    """One request whose body has not been read yet."""
+
+    def __init__(
+        self, scope: Mapping[str, Any], receive: Receive, clock: Callable[[], float], limits: DataSettings
+    ) -> None:
+        self.method = str(scope["method"])
+        self.path = str(scope["path"])
+        self.headers = {
+            name.decode("latin-1").lower(): value.decode("latin-1") for name, value in scope["headers"]
+        }
+        self.query = dict(parse_qsl(scope["query_string"].decode("latin-1"), keep_blank_values=True))
+        self.received_bytes = 0
+        self.over = False
+        self._receive = receive
+        self._clock = clock
+        self._limits = limits
+
+    def header_number(self, name: str) -> int | None:
+        """Return a header that is a whole number; None if it is missing; raises BadRequest."""
+        text = self.headers.get(name.lower())
+        if text is None:
+            return None
+        if not re.fullmatch(r"[0-9]{1,18}", text):
+            raise BadRequest(f"{name}: {text[:40]!r} is no number of bytes", hint="send decimal digits")
+        return int(text)
+
+    async def body(self, most_bytes: int) -> bytes:
+        """Return the whole body.
+
+        Raises:
+            LimitExceeded: It holds more than *most_bytes*.
+            Expired: It pauses for ``data.body_timeout_s`` or stays below ``data.min_body_bytes_per_s``.
+            Disconnected: The robot left in the middle.
+        """
+        announced = self.header_number("content-length")
+        if announced is not None and announced > most_bytes:
+            raise _too_long(announced, most_bytes)
+        held = bytearray()
+        async for piece in self._pieces():
+            held += piece
+            if len(held) > most_bytes:
+                raise _too_long(len(held), most_bytes)
+        return bytes(held)
+
+    async def drain(self, most_bytes: int) -> bool:
+        """Read what is left and forget it, so that the robot reads our answer; say whether all was read."""
+        announced = self.header_number("content-length") or 0
+        if announced > most_bytes:
+            return False
+        async for _ in self._pieces():
+            if self.received_bytes > most_bytes:
+                return False
+        return True
+
+    async def _pieces(self) -> AsyncIterator[bytes]:
+        began = self._clock()
+        while not self.over:
+            try:
+                message = await asyncio.wait_for(self._receive(), self._limits.body_timeout_s)
+            except asyncio.TimeoutError:
+                raise _too_slow(f"nothing came for {self._limits.body_timeout_s:g} s") from None
+            if message["type"] == "http.disconnect":
+                self.over = True
+                raise Disconnected("the robot left within its request")
+            piece: bytes = message.get("body", b"")
+            self.received_bytes += len(piece)
+            self.over = not message.get("more_body", False)
+            yield piece
+            lasted = self._clock() - began
+            lowest = self._limits.min_body_bytes_per_s
+            if not self.over and lasted > self._limits.body_grace_s and self.received_bytes < lowest * lasted:
+                raise _too_slow(f"{self.received_bytes} bytes in {lasted:.1f} s; at least {lowest} a second")
+
+
+def json_reply(status: int, value: Any, **headers: str) -> Reply:
+    """Return *value* as JSON."""
+    named = {name.replace("_", "-"): text for name, text in headers.items()}
+    return Reply(status=status, body=msgspec.json.encode(value), headers=named)
+
+
+def failure_reply(error: RsePfError) -> Reply:
+    """Return the answer that *error* is."""
+    status = next((_STATUS[kind] for kind in type(error).__mro__ if kind in _STATUS), _INTERNAL)
+    headers: dict[str, str] = {}
+    if isinstance(error, MethodNotAllowed):
+        headers["Allow"] = error.allowed
+    if status == 401:
+        headers["WWW-Authenticate"] = "Bearer"
+    if error.retry_after_ms is not None:
+        headers["Retry-After"] = str(max(1, round(error.retry_after_ms / 1000)))
+    said = Failure(code=error.code, message=error.message, hint=error.hint)
+    return Reply(status=status, body=msgspec.json.encode(said), headers=headers)
+
+
+def wanted_range(text: str | None, size: int) -> tuple[int, int] | None:
+    """Return ``(start, end)`` of one byte range, end excluded; None for the whole object.
+
+    What is no single range is ignored, as RFC 9110 Sect. 14.2 allows.
+
+    Raises:
+        BadRequest: The range lies outside the object; whoever calls answers 416.
+    """
+    found = _RANGE.fullmatch(text.strip()) if text else None
+    if found is None or found[1] == found[2] == "":
+        return None
+    if found[1] == "":
+        start, end = max(0, size - int(found[2])), size
+    else:
+        start = int(found[1])
+        end = size if found[2] == "" else min(size, int(found[2]) + 1)
+        if found[2] and int(found[2]) < start:
+            return None
+    if start >= size or start >= end:
+        raise BadRequest(f"{text!r} lies outside of {size} bytes", hint="ask HEAD for the size")
+    return start, end
+
+
+def _too_long(got: int, most: int) -> LimitExceeded:
+    return LimitExceeded(f"got {got} bytes, the limit is {most}", hint="send it in parts: PUT an upload")
+
+
+def _too_slow(what: str) -> Expired:
+    return Expired(f"the body is too slow: {what}", hint="send smaller parts and resume")

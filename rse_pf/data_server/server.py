@@ -1,0 +1,155 @@
+"""Run the data service: one process, uvicorn, a socket that is announced when all is ready.
+
+Promises to sweep up what a crash left behind before the first request, and to leave on SIGTERM and SIGINT
+with what it is doing done, at most `local.stop_timeout_s` later.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+import signal
+import socket
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from rse_pf.auth import KeySet
+from rse_pf.data_server.app import DataServer
+from rse_pf.errors import ConfigurationError, MissingExtra, StoreError, UsageError
+from rse_pf.objects import DirectoryStore, ObjectStore
+from rse_pf.settings import PlatformSettings
+
+__all__ = ["KeysFile", "serve_data"]
+
+_SWEEP_S = 3600.0
+_BACKLOG = 1024
+_LOOK_AGAIN_S = 1.0
+
+
+class KeysFile:
+    """The public keys in a file, read again when it changes; a broken file keeps the last good keys."""
+
+    def __init__(self, path: Path, clock: Callable[[], float] = time.monotonic) -> None:
+        self._path = path
+        self._clock = clock
+        self._looked = float("-inf")
+        self._stamp: tuple[int, int] | None = None
+        self._keys: KeySet | None = None
+
+    def __call__(self) -> KeySet | None:
+        """Return the keys; None while there are none."""
+        if self._clock() - self._looked < _LOOK_AGAIN_S:
+            return self._keys
+        self._looked = self._clock()
+        try:
+            found = self._path.stat()
+            stamp = (found.st_mtime_ns, found.st_ino)
+            if stamp != self._stamp:
+                self._keys = KeySet.from_json(self._path.read_text(encoding="utf-8"))
+                self._stamp = stamp
+        except (OSError, UnicodeDecodeError, UsageError):
+            pass  # it comes later, or is being replaced
+        return self._keys
+
+
+def serve_data(
+    settings: PlatformSettings,
+    store: ObjectStore,
+    *,
+    keys: Callable[[], KeySet | None],
+    announce: Path | None,
+) -> int:
+    """Serve until a signal comes; return the exit code.
+
+    Args:
+        settings: Groups data, auth; ``data.port`` 0 takes a free one.
+        store: Where objects and maps live.
+        keys: Who may sign tokens, asked for each request.
+        announce: Gets pid and port as JSON, by rename, when requests are answered.
+
+    Raises:
+        ConfigurationError: The address is taken.
+        MissingExtra: uvicorn is not installed.
+    """
+    try:
+        import uvicorn
+    except ImportError as error:
+        raise MissingExtra("uvicorn", "data") from error
+    app = DataServer(settings, store, keys=keys, log=_write_line)
+    listening = _listen(settings)
+    config = uvicorn.Config(
+        app, http="h11", ws="none", lifespan="off", access_log=False, log_level="warning", backlog=_BACKLOG,
+        server_header=False, date_header=False, proxy_headers=False, timeout_keep_alive=30,
+        timeout_graceful_shutdown=int(settings.local.stop_timeout_s),
+    )  # fmt: skip
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, _stay)  # uvicorn sends itself the signal again when it is done
+    asyncio.run(_run(uvicorn.Server(config), app, store, listening, settings, announce))
+    return 0
+
+
+def _stay(number: int, frame: object) -> None:
+    """Let the process end by itself, with exit code 0."""
+
+
+async def _run(
+    server: Any, app: DataServer, store: ObjectStore, listening: socket.socket, settings: PlatformSettings,
+    announce: Path | None,
+) -> None:  # fmt: skip
+    await asyncio.to_thread(_sweep, app, store, settings.data.upload_life_s)
+    sweeping = asyncio.create_task(_sweep_on(app, store, settings.data.upload_life_s))
+    serving = asyncio.create_task(server.serve(sockets=[listening]))
+    try:
+        while not server.started and not serving.done():
+            await asyncio.sleep(0.005)
+        if announce is not None and server.started:
+            _announce(announce, listening.getsockname()[1])
+        _write_line({"event": "ready", "port": listening.getsockname()[1], "store": settings.data.store})
+        await serving
+    finally:
+        sweeping.cancel()
+
+
+async def _sweep_on(app: DataServer, store: ObjectStore, life_s: float) -> None:
+    while True:
+        await asyncio.sleep(_SWEEP_S)
+        await asyncio.to_thread(_sweep, app, store, life_s)
+
+
+def _sweep(app: DataServer, store: ObjectStore, life_s: float) -> None:
+    try:
+        uploads = app.handlers.objects.sweep()
+        files = store.sweep(now=time.time(), older_than_s=life_s) if isinstance(store, DirectoryStore) else 0
+    except StoreError as error:
+        _write_line({"event": "sweep-failed", "error": str(error)})
+        return
+    if uploads or files:
+        _write_line({"event": "swept", "uploads": uploads, "files": files})
+
+
+def _listen(settings: PlatformSettings) -> socket.socket:
+    host, port = settings.data.host, settings.data.port
+    try:
+        return socket.create_server(
+            (host, port), backlog=_BACKLOG, family=socket.AF_INET6 if ":" in host else socket.AF_INET
+        )
+    except OSError as error:
+        raise ConfigurationError(
+            f"cannot listen on {host}:{port}: {error.strerror}", hint="choose another data.port"
+        ) from error
+
+
+def _announce(path: Path, port: int) -> None:
+    temporary = path.with_name(f".{path.name}.{os.getpid()}")
+    temporary.write_text(json.dumps({"pid": os.getpid(), "port": port}), encoding="utf-8")
+    os.replace(temporary, path)
+
+
+def _write_line(fields: dict[str, Any]) -> None:
+    sys.stderr.write(msgspec.json.encode({"t": round(time.time(), 3), **fields}).decode() + "\n")
