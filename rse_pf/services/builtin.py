@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from rse_pf.service import Registry
-from rse_pf.services import echo, pnp
+from rse_pf.services import echo, icp, localise, merge, optimise, place, pnp, wifi
 from rse_pf.settings import PlatformSettings
 
 __all__ = ["builtin_services"]
@@ -14,4 +14,7 @@ def builtin_services(settings: PlatformSettings) -> Registry:
     registry = Registry()
     pnp.register(registry, settings.pnp)
     echo.register(registry)
+    # Extras are looked for when a command comes: a server without them answers missing-extra.
+    for room in (icp, place, localise, merge, optimise, wifi):
+        room.register(registry, settings.services)
     return registry
