@@ -1,0 +1,207 @@
+"""The data servers box on one machine: an ``rse-pf data`` process, started, watched and replaced.
+
+A replacement takes the port of the one before, so the load balancer's configuration never changes.
+Promises to keep no state of its own: objects are in the store, tokens' keys in a file.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import http.client
+import json
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from rse_pf.errors import ConfigurationError
+from rse_pf.local.processes import ProcessMark, ended, last_line, mark_of, send_signal, spawn
+from rse_pf.settings import PlatformSettings
+
+__all__ = ["DataServer", "DataServers"]
+
+_RSE_PF = (sys.executable, "-m", "rse_pf.cli.main")
+_LOOPBACK = "127.0.0.1"
+_LOOK_AGAIN_S = 0.01
+_ASK_S = 1.0
+_FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.1, 5.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DataServer:
+    """A data server that has announced itself."""
+
+    name: str
+    pid: int
+    port: int
+    log: Path
+    mark: ProcessMark
+
+
+class DataServers:
+    """The data service of one platform: one process with a name, and its successors."""
+
+    def __init__(
+        self,
+        settings: PlatformSettings,
+        *,
+        folder: Path,
+        settings_file: Path,
+        keys_file: Path,
+        store: str | None = None,
+        name: str = "data-1",
+        dies_with_parent: bool = True,
+        program: Sequence[str] = _RSE_PF,
+        tell: Callable[..., None] = lambda event, **details: None,
+    ) -> None:
+        """Remember what to start.
+
+        Args:
+            settings: Groups data and local.
+            folder: For the log and the announcement.
+            settings_file: Given to the process.
+            keys_file: Public keys of the tokens.
+            store: Overrides ``data.store``; a platform whose store is ``memory:`` names a folder here.
+            name: Of the process, in log and events.
+            dies_with_parent: Whether the process ends when this one does.
+            program: What to run; ``data`` and its options follow.
+            tell: Gets ``data-server-up`` and ``data-server-down``, with name, pid and, when down, code.
+        """
+        self._settings = settings
+        self._folder = folder
+        self._name = name
+        self._dies_with_parent = dies_with_parent
+        self._tell = tell
+        self._port = 0
+        self._process: subprocess.Popen[bytes] | None = None
+        self._mark: ProcessMark | None = None
+        self._watching: asyncio.Task[None] | None = None
+        self._command = [
+            *program, "data", "--settings", str(settings_file), "--keys", str(keys_file),
+            "--host", _LOOPBACK, "--announce", str(self._announce),
+            *(() if store is None else ("--store", store)),
+        ]  # fmt: skip
+
+    @property
+    def mark(self) -> ProcessMark | None:
+        """The process that runs now."""
+        return self._mark
+
+    @property
+    def port(self) -> int:
+        """Where it listens, and its successors will; 0 before the first start."""
+        return self._port
+
+    async def start(self) -> DataServer:
+        """Start the process, wait until it answers, and replace it whenever it ends.
+
+        Raises:
+            ConfigurationError: It ended or was not ready within ``local.start_timeout_s``.
+        """
+        server = await self._launch()
+        self._watching = asyncio.create_task(self._watch())
+        return server
+
+    async def is_ready(self) -> bool:
+        """Return whether the service answers and its store does."""
+        return self._port > 0 and await asyncio.to_thread(_ask_ready, self._port)
+
+    def send(self, number: signal.Signals) -> bool:
+        """Signal the process; return False if it is gone."""
+        return self._mark is not None and send_signal(self._mark, number)
+
+    async def stop(self, timeout_s: float) -> None:
+        """Let the service leave, and kill it after *timeout_s*."""
+        if self._watching is not None:
+            self._watching.cancel()
+            await asyncio.gather(self._watching, return_exceptions=True)
+        if self._mark is not None:
+            self.send(signal.SIGTERM)
+            await ended(self._mark, timeout_s)
+        self.kill_all()
+
+    def kill_all(self) -> None:
+        """End what is left, at once, and reap it."""
+        if self._process is not None:
+            self._process.kill()  # a no-operation for one that was reaped
+            self._process.wait()
+        self._announce.unlink(missing_ok=True)
+        self._process = self._mark = None
+
+    async def _watch(self) -> None:
+        pause_s = _FIRST_PAUSE_S
+        while True:
+            if self._mark is not None:
+                await ended(self._mark)
+            code = None if self._process is None else self._process.wait()
+            self._tell("data-server-down", name=self._name, code=code)
+            try:
+                await self._launch()
+                pause_s = _FIRST_PAUSE_S
+            except ConfigurationError as error:
+                self._tell("data-server-failed", name=self._name, error=str(error))
+                await asyncio.sleep(pause_s)
+                pause_s = min(2 * pause_s, _LONGEST_PAUSE_S)
+
+    async def _launch(self) -> DataServer:
+        self._announce.unlink(missing_ok=True)
+        process = spawn(
+            [*self._command, "--port", str(self._port)],
+            log=self._log, folder=self._folder, dies_with_parent=self._dies_with_parent,
+        )  # fmt: skip
+        self._process, self._mark = process, mark_of(process.pid)
+        try:
+            server = await self._announced(process)
+        except (ConfigurationError, asyncio.CancelledError):
+            process.kill()
+            process.wait()
+            raise
+        self._port = server.port
+        self._tell("data-server-up", name=self._name, pid=server.pid)
+        return server
+
+    async def _announced(self, process: subprocess.Popen[bytes]) -> DataServer:
+        timeout_s = self._settings.local.start_timeout_s
+        end = time.monotonic() + timeout_s
+        while not self._announce.exists():
+            code = process.poll()
+            if code is not None:
+                raise self._failed(f"ended with exit code {code}")
+            if time.monotonic() >= end:
+                raise self._failed(f"was not ready within {timeout_s:g} s")
+            await asyncio.sleep(_LOOK_AGAIN_S)
+        told: dict[str, Any] = json.loads(self._announce.read_text(encoding="utf-8"))
+        if self._mark is None or told["pid"] != self._mark.pid:
+            raise self._failed(f"announced pid {told['pid']}, but was started as {process.pid}")
+        return DataServer(
+            name=self._name, pid=self._mark.pid, port=told["port"], log=self._log, mark=self._mark
+        )
+
+    @property
+    def _announce(self) -> Path:
+        return self._folder / f"{self._name}.json"
+
+    @property
+    def _log(self) -> Path:
+        return self._folder / f"{self._name}.log"
+
+    def _failed(self, what: str) -> ConfigurationError:
+        last = last_line(self._log)
+        return ConfigurationError(
+            f"{self._name} {what}{': ' if last else ''}{last}", hint=f"its log is {self._log}"
+        )
+
+
+def _ask_ready(port: int) -> bool:
+    connection = http.client.HTTPConnection(_LOOPBACK, port, timeout=_ASK_S)
+    with contextlib.closing(connection):
+        try:
+            connection.request("GET", "/data/readyz")
+            return connection.getresponse().status == 200
+        except (OSError, http.client.HTTPException):
+            return False
