@@ -159,15 +159,21 @@ class ControlPlane:
     # --- readings --------------------------------------------------------------------------------
 
     async def _read_on(self) -> None:
-        while True:
-            now_s = time.monotonic()
-            await asyncio.sleep((math.floor(now_s / self._every_s) + 1) * self._every_s - now_s)
-            reading = await self._read()
-            self.reading = reading
-            if self._on_reading is not None:
-                self._on_reading(reading.document())
-            self._act(period_over=self._periods.add(reading))
-            self._even_out(reading)
+        try:
+            while True:
+                now_s = time.monotonic()
+                await asyncio.sleep((math.floor(now_s / self._every_s) + 1) * self._every_s - now_s)
+                self._take(await self._read())
+        finally:
+            for port in self._ports.values():
+                port.close()
+
+    def _take(self, reading: Reading) -> None:
+        self.reading = reading
+        if self._on_reading is not None:
+            self._on_reading(reading.document())
+        self._act(period_over=self._periods.add(reading))
+        self._even_out(reading)
 
     async def _read(self) -> Reading:
         members = list(self._fleet.members.values())
@@ -239,8 +245,9 @@ class ControlPlane:
             return  # the next reading asks again
         finally:
             port.close()
-        if reply.status < 300:
-            self._tell("rebalance", server=order.server, robots=order.robots, spread_s=order.spread_s)
+        told = reply.document()
+        if reply.status < 300 and told.get("robots"):
+            self._tell("rebalance", server=order.server, robots=told["robots"], spread_s=told["spread_s"])
 
     # --- the balancer ----------------------------------------------------------------------------
 

@@ -227,9 +227,14 @@ class Fleet:
         return least.name
 
     def put_in_place_of(self, name: str, reason: str) -> str:
-        """Launch a server in place of *name*; one that lives is cut off so that its robots go elsewhere."""
+        """Launch a server in place of *name*; one that lives is cut off so that its robots go elsewhere.
+
+        One that leaves in order already is left alone.
+        """
         self.dead.pop(name, None)
         member = self.members.get(name)
+        if member is not None and member.leaving:
+            member = None
         if member is not None:
             member.out = True
             self._set_targets()
