@@ -202,7 +202,10 @@ def _chordal(gtsam: Any, graph: PoseGraph, anchors: Rows) -> Array | None:
     """Return poses from the chordal relaxation of the rotations, or None where it cannot be had."""
     if len(anchors) > 1:
         return None
-    values = gtsam.InitializePose3.initialize(_factors(gtsam, graph, anchors, 0.0))
+    try:
+        values = gtsam.InitializePose3.initialize(_factors(gtsam, graph, anchors, 0.0))
+    except RuntimeError:  # gtsam's word for a graph without loops: nothing to relax
+        return None
     poses = np.array([values.atPose3(row).matrix() for row in range(len(graph.T_world_pose))])
     return poses if np.isfinite(poses).all() else None
 
