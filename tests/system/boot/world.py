@@ -97,12 +97,13 @@ class World:
             "unshare", "--mount", "--pid", "--fork", "--kill-child", f"--mount-proc={self.root}/proc",
             "chroot", str(self.root), "/usr/bin/python3", "/root/machine.py",
         ]  # fmt: skip
-        process = self._serve(
+        listener = threading.Thread(target=self._listen, daemon=True)
+        self._ends.callback(listener.join, 10)
+        self._packets_before = self._packets()  # moto and the metadata server look their own names up
+        self._console = self._serve(
             self._ends, machine, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
         )
-        listener = threading.Thread(target=self._listen, args=(process,), daemon=True)
         listener.start()
-        self._ends.callback(listener.join, 10)
 
     def inside(self, *arguments: str) -> Any:
         """Run inside.py in the machine's network; return what it printed, as JSON."""
@@ -128,9 +129,8 @@ class World:
         return int(self.run([sys.executable, "-c", ask, str(port), path]))
 
     def packets_to_the_outside(self) -> int:
-        """Return how many packets took the default route since the machine was made."""
-        counted = self.run(["cat", "/sys/class/net/out0/statistics/tx_packets"])
-        return int(counted) - self._packets_before
+        """Return how many packets took the default route since the machine was switched on."""
+        return self._packets() - self._packets_before
 
     def wait(self, happened: Any, within_s: float, what: str) -> None:
         """Wait until *happened()*, or fail with the machine's console."""
@@ -143,6 +143,9 @@ class World:
     def text(self) -> str:
         """Return the console."""
         return "".join(self.log)
+
+    def _packets(self) -> int:
+        return int(self.run(["cat", "/sys/class/net/out0/statistics/tx_packets"]))
 
     def _listen(self) -> None:
         with self._console.stdout as console:
@@ -178,7 +181,6 @@ class World:
             self.run(["ip", "link", "set", device, "up"])
         self.run(["ip", "neighbour", "add", "192.0.2.1", "lladdr", "02:00:00:00:00:01", "dev", "out0"])
         self.run(["ip", "route", "add", "default", "via", "192.0.2.1"])
-        self._packets_before = int(self.run(["cat", "/sys/class/net/out0/statistics/tx_packets"]))
 
     def _make_root(self) -> None:
         subprocess.run(["cp", "-a", "--reflink=auto", str(self._kept_root), str(self.root)], check=True)
