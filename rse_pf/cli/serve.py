@@ -45,6 +45,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--announce", type=Path, metavar="FILE", help="write pids and ports there when all is ready"
     )
     parser.add_argument(
+        "--services", type=Path, metavar="DIR", help="run the services installed there (services.folder)"
+    )
+    parser.add_argument(
+        "--accept-weak-isolation", action="store_true",
+        help="run them even where this kernel lacks a wall (services.accept_weak_isolation)",
+    )  # fmt: skip
+    parser.add_argument(
         "--conformance-echo", action="store_true", help="echo raw messages without tokens, loopback only"
     )
 
@@ -52,7 +59,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
     """Serve until a drain or a signal ends it."""
     overrides = {name: getattr(args, name) for name in _OPTIONS if getattr(args, name) is not None}
-    chosen = settings.replace(serving=overrides)
+    services: dict[str, object] = {}
+    if args.services is not None:
+        services["folder"] = str(args.services.absolute())
+    if args.accept_weak_isolation:
+        services["accept_weak_isolation"] = True
+    chosen = settings.replace(serving=overrides, services=services)
     server_id = f"server-{os.getpid()}" if args.server_id is None else args.server_id
     if not 0 < len(server_id) <= 64 or not server_id.isprintable():
         raise UsageError(f"{server_id[:80]!r} is no name for a server", hint="use 1 to 64 printable letters")

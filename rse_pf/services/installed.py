@@ -7,20 +7,35 @@ Promises to execute nothing of a service, and to refuse a folder of which one by
 from __future__ import annotations
 
 import hashlib
+import importlib.util
 import json
 import re
 import shutil
 from collections.abc import Iterator
 from dataclasses import dataclass
+from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 from rse_pf.errors import ConfigurationError, UsageError
 from rse_pf.service import Kind
 
-__all__ = ["LANGUAGES", "InstalledService", "install", "installed_services", "read_service"]
+__all__ = [
+    "ENTRY_POINTS",
+    "LANGUAGES",
+    "InstalledService",
+    "install",
+    "installed_services",
+    "published_services",
+    "read_service",
+]
 
 LANGUAGES = ("python", "cpp", "lua")
+
+ENTRY_POINTS = "rse_pf.services"
+"""Entry-point group by which Python packages publish services: ``name = "package.module"``."""
+
+_PACKAGE = "package"
 _MANIFEST, _PINS = "service.json", "pins.json"
 _NAME = re.compile(r"[a-z][a-z0-9_-]{0,39}")
 _KINDS = ("stateless", "per_robot_state")
@@ -36,7 +51,8 @@ _LEFT_OUT = {
 class InstalledService:
     """One service folder.
 
-    ``entry`` is the file that is run: a Python or Lua source, or a shared library.  A ``stateless``
+    ``entry`` is the file that is run: a Python or Lua source, or a shared library; for a service that a
+    Python package publishes (language ``package``) it is the module's dotted name.  A ``stateless``
     service may be tried again on another environment; a ``per_robot_state`` one lives as long as
     the robot's connection.
     """
@@ -118,6 +134,30 @@ def installed_services(folder: Path) -> list[InstalledService]:
             _check_pins(place)
             found.append(read_service(place))
     return found
+
+
+def published_services() -> list[InstalledService]:
+    """Return the services that installed Python packages publish; no package is imported for that.
+
+    The module holds ``serve`` or ``Service``, as a service folder's file does.
+
+    Raises:
+        ConfigurationError: A name is none, or published twice.
+    """
+    found: dict[str, InstalledService] = {}
+    for point in metadata.entry_points(group=ENTRY_POINTS):
+        if not _NAME.fullmatch(point.name) or point.name in found:
+            raise ConfigurationError(
+                f"the service {point.name!r} of {point.value} has a bad name, or one that is taken",
+                hint="uninstall the package, or set services.published to false",
+            )
+        top = point.value.partition(".")[0]
+        spec = importlib.util.find_spec(top)
+        folder = Path(spec.origin).parent if spec is not None and spec.origin else Path()
+        found[point.name] = InstalledService(
+            name=point.name, language=_PACKAGE, entry=point.value, kind="per_robot_state", folder=folder
+        )
+    return sorted(found.values(), key=lambda service: service.name)
 
 
 def _checked(folder: Path, path: Path, told: dict[str, Any]) -> InstalledService:

@@ -7,6 +7,7 @@ sent: names, numbers, texts, lists and arrays.
 
 from __future__ import annotations
 
+import importlib
 import importlib.util
 import inspect
 import sys
@@ -43,7 +44,7 @@ def open_runtime(service: InstalledService, scratch: Path) -> Runtime:
         ConfigurationError: It cannot be loaded; the message says why.
         MissingExtra: Its language is not installed on this server.
     """
-    if service.language == "python":
+    if service.language in ("python", "package"):
         return _PythonRuntime(service)
     if service.language == "cpp":
         from rse_pf.services.native import NativeRuntime
@@ -58,7 +59,7 @@ class _PythonRuntime:
     """A function ``serve(request: Request) -> Reply``, or a class ``Service`` with such a method."""
 
     def __init__(self, service: InstalledService) -> None:
-        module = _load(service)
+        module = _load_package(service) if service.language == "package" else _load(service)
         maker = getattr(module, "Service", None)
         self._object = maker() if callable(maker) else None
         function: Callable[[Any], Any] | None = getattr(self._object or module, "serve", None)
@@ -84,6 +85,16 @@ class _PythonRuntime:
     def restore(self, data: bytes) -> None:
         assert self._object is not None
         self._object.restore(data)
+
+
+def _load_package(service: InstalledService) -> Any:
+    try:
+        return importlib.import_module(service.entry)
+    except Exception as error:
+        where = f"{type(error).__name__}: {error}"
+        raise ConfigurationError(
+            f"{service.name} cannot be loaded: {where}", hint="mend the package"
+        ) from error
 
 
 def _load(service: InstalledService) -> Any:

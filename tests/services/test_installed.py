@@ -7,7 +7,8 @@ import json
 import pytest
 
 from rse_pf.errors import ConfigurationError, UsageError
-from rse_pf.services.installed import install, installed_services, read_service
+from rse_pf.services.installed import install, installed_services, published_services, read_service
+from rse_pf.services.runtime import open_runtime
 
 GOOD = {"name": "adder", "language": "python", "entry": "service.py"}
 
@@ -107,3 +108,43 @@ def test_a_library_that_was_not_built_is_one_line(folder, tmp_path):
 def test_a_services_folder_that_is_not_there_is_one_line(tmp_path):
     with pytest.raises(ConfigurationError, match="no services folder"):
         installed_services(tmp_path / "none")
+
+
+PUBLISHED = """
+import msgspec
+class Request(msgspec.Struct):
+    x: int
+class Reply(msgspec.Struct):
+    y: int
+def serve(request: Request) -> Reply:
+    return Reply(y=2 * request.x)
+"""
+
+
+@pytest.fixture
+def package(tmp_path, monkeypatch):
+    """A function that pretends to install a package with entry points."""
+
+    def installed(entry_points):
+        (tmp_path / "doubling_for_tests.py").write_text(PUBLISHED)
+        info = tmp_path / "doubling_for_tests-1.0.dist-info"
+        info.mkdir()
+        (info / "METADATA").write_text("Metadata-Version: 2.1\nName: doubling-for-tests\nVersion: 1.0\n")
+        (info / "entry_points.txt").write_text(f"[rse_pf.services]\n{entry_points}\n")
+        monkeypatch.syspath_prepend(tmp_path)
+
+    return installed
+
+
+def test_a_package_publishes_a_service_by_an_entry_point(package, tmp_path):
+    package("doubling = doubling_for_tests")
+    (service,) = [each for each in published_services() if each.name == "doubling"]
+
+    assert open_runtime(service, tmp_path).call({"x": 21}).y == 42
+
+
+def test_a_published_service_with_a_bad_name_is_one_line(package):
+    package("Doubling! = doubling_for_tests")
+
+    with pytest.raises(ConfigurationError, match="Doubling!"):
+        published_services()
