@@ -21,12 +21,13 @@ from rse_pf.backend.executors import Executor, SolverThreads
 from rse_pf.backend.frames import CloseSocket, FrameAssembler, Received, SendPong
 from rse_pf.backend.log import JsonLog
 from rse_pf.backend.metrics import LongestRecently, Metrics
-from rse_pf.backend.scheduler import Job, Refusal, Scheduler
+from rse_pf.backend.scheduler import BEHIND, BEHIND_HINT, Job, Refusal, Scheduler
 from rse_pf.backend.size_gate import SizeGate
-from rse_pf.errors import InternalError, LimitExceeded, UnknownService
+from rse_pf.errors import Busy, InternalError, LimitExceeded, UnknownService
 from rse_pf.service import Kind, Registry, Service, dispatch, failure_of
 from rse_pf.settings import PlatformSettings
 from rse_pf.wire import CODECS, Codec, Command, Failure, Result, make_codec
+from rse_pf.wire.envelope import encode_refusal, peek
 from rse_pf.wire.session import (
     CLOSE_GOING_AWAY,
     CLOSE_PROTOCOL,
@@ -39,7 +40,7 @@ from rse_pf.wire.session import (
 
 __all__ = ["Clocks", "Connection", "Core", "Handle", "Wire"]
 
-_SILENCE_MARGIN_S = 1.0
+_SILENCE_MARGIN_S = 0.0
 _SLOWEST_TICK_S = 1.0
 _TICKS_PER_LIMIT = 4
 _UNKNOWN = "unknown"
@@ -170,6 +171,8 @@ class Connection:
             self._core.metrics.bytes_out += len(received.data)
             self._wire.send(received.data, received.is_text)
             return
+        if session.state == "open" and self._core.refuses_unread(self, session.codec, received.data, now):
+            return
         was_opening = session.state == "opening"
         self.apply(session.receive(received.data, now), now, len(received.data))
         if was_opening and session.state == "open":
@@ -298,6 +301,27 @@ class Core:
             return
         self._refuse(self._scheduler.submit(job, now), now)
         self._start()
+
+    def refuses_unread(self, connection: Connection, codec: Codec, data: bytes, now: float) -> bool:
+        """Refuse the command in *data* for a fraction of what reading it costs; False if it must be read."""
+        retry_after_ms = self._scheduler.refuse_unread(connection.robot, now)
+        envelope = None if retry_after_ms is None else peek(codec, data)
+        if envelope is None or not self._is_stateless(envelope.service):
+            return False
+        failure = Failure(
+            id=envelope.id, code=Busy.code, message=BEHIND, hint=BEHIND_HINT,
+            retry_after_ms=retry_after_ms, server=self._server_id,
+        )  # fmt: skip
+        refusal = encode_refusal(codec, failure)
+        self.metrics.shed["unread"] += 1
+        self.metrics.answered(envelope.service, Busy.code, 0.0)
+        connection.write(refusal)
+        if self._log.writes("info"):
+            self._log.info(
+                "command", robot=connection.robot, service=envelope.service, id=envelope.id, trace="",
+                code=Busy.code, queue_ms=0.0, compute_ms=0.0, bytes_in=len(data), bytes_out=len(refusal),
+            )  # fmt: skip
+        return True
 
     def snapshot(self) -> dict[str, Any]:
         """Return the numbers of this worker for /metrics and /status."""
@@ -437,6 +461,12 @@ class Core:
             return self._registry.get(name)
         except UnknownService:
             return None
+
+    def _is_stateless(self, name: str) -> bool:
+        if self.environments is not None and self.environments.offers(name):
+            return False
+        service = self._service(name)
+        return service is not None and service.kind in self._executors
 
     def _label(self, service: str) -> str:
         installed = self.environments is not None and self.environments.offers(service)

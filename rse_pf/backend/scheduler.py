@@ -9,6 +9,7 @@ Promises no clock, no thread, no loop and no socket: jobs go in, jobs and refusa
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from dataclasses import dataclass, field
 from typing import Any
@@ -17,10 +18,18 @@ from rse_pf.errors import Busy, Expired, RsePfError, Stale
 from rse_pf.settings import ServingSettings
 from rse_pf.wire import Command
 
-__all__ = ["Job", "Refusal", "Scheduler"]
+__all__ = ["BEHIND", "BEHIND_HINT", "Job", "Refusal", "Scheduler"]
 
+BEHIND = "the server is behind with its work"
+BEHIND_HINT = "try again later; the server list may grow meanwhile"
 _SMOOTHING = 0.1
 _LONGEST_RETRY_MS = 5000.0
+_AT_ONCE_S = 0.0005
+"""A command that waited less found the server free."""
+_PATIENCE = 3.0
+"""What was let in before the server fell behind is served up to so many targets later."""
+_CALM_SHARE = 0.1
+"""A server that refuses a smaller share of its commands has caught up."""
 
 
 @dataclass(slots=True, eq=False)
@@ -35,9 +44,9 @@ class Job:
     deadline_s: float
     started_s: float = 0.0
 
-    def patience_s(self, target_s: float) -> float:
-        """How long it may wait for its turn when the server is behind."""
-        return min(target_s, (self.deadline_s - self.received_s) / 2)
+    def patience_s(self, longest_s: float) -> float:
+        """How long it may wait for its turn: at most *longest_s*, and half of its time."""
+        return min(longest_s, (self.deadline_s - self.received_s) / 2)
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,10 +77,12 @@ class Scheduler:
         self._most_waiting = settings.queue_per_robot
         self._robots: dict[str, _Robot] = {}
         self._round: deque[str] = deque()
-        self._otherwise_since: float | None = None
+        self._late_since: float | None = None
+        self._judged_s = 0.0
+        self._started = self._refused = 0
         self._turn_s = 0.0
         self._service_s = 0.0
-        self._last_start: float | None = None
+        self._last_start = float("-inf")
 
     def submit(self, job: Job, now: float) -> list[Refusal]:
         """Let *job* wait for its turn; return the jobs that end instead, maybe *job* itself."""
@@ -91,6 +102,24 @@ class Scheduler:
             self._round.append(job.robot)
         return []
 
+    def refuse_unread(self, robot_name: str, now: float) -> float | None:
+        """Return ``retry_after_ms`` if the next command of a robot is refused whatever it says, else None.
+
+        Only while the server is behind, and never where the command might replace one that waits.
+        """
+        if not self.is_behind:
+            return None
+        robot = self._robots.get(robot_name)
+        ahead_s = len(self._round) * self._turn_s
+        if robot is not None and robot.waiting:
+            if any(map(_is_replaceable, robot.waiting)):
+                return None
+        elif ahead_s <= self._wanted_s / 2:
+            return None
+        self._refused += 1
+        self._judge(now)
+        return self._retry_after_ms(2e3 * ahead_s)
+
     def start(self, now: float) -> tuple[Job | None, list[Refusal]]:
         """Return the job whose turn it is, now running, and the jobs given up on the way."""
         refusals: list[Refusal] = []
@@ -103,14 +132,14 @@ class Scheduler:
             if refusal is None:
                 robot.running, job.started_s = job, now
                 self.running += 1
-                self._measure_turn(now)
+                self._started += 1
+                self._measure_turn(_turn_wait(robot, job, now), now)
                 return job, refusals
             refusals.append(refusal)
             if robot.waiting:
                 self._round.append(name)
             else:
                 self._forget_if_idle(name)
-        self._last_start = None
         self._note_turn_wait(0.0, now)
         return None, refusals
 
@@ -173,8 +202,11 @@ class Scheduler:
             )
             return Refusal(job, error, "robot-queue")
         ahead_s = len(self._round) * self._turn_s
-        # Behind, a second waiting command would keep its robot's place against those without one.
-        if self.is_behind and (robot.waiting or ahead_s > job.patience_s(self._wanted_s)):
+        # Behind, a second waiting command would keep its robot's place against those without one; and with
+        # half of the target kept in hand, what is let in is served: nobody waits for a refusal.
+        longest_s = self._wanted_s / 2 if self.is_behind else math.inf
+        if (self.is_behind and robot.waiting) or ahead_s > job.patience_s(longest_s):
+            self._refused += 1
             return Refusal(job, self._busy(ahead_s), "behind")
         return None
 
@@ -197,43 +229,50 @@ class Scheduler:
 
     def _is_hopeless(self, robot: _Robot, job: Job, now: float, others: int) -> bool:
         """Serving the oldest first serves those that are about to be late; give those up instead."""
-        if others and self.is_behind and _turn_wait(robot, job, now) > job.patience_s(self._wanted_s):
+        patience_s = job.patience_s(_PATIENCE * self._wanted_s)
+        if others and self.is_behind and _turn_wait(robot, job, now) > patience_s:
             return True
         newer_waits = bool(robot.waiting) and robot.waiting[-1] is not job
         return newer_waits and now - job.received_s > (job.deadline_s - job.received_s) / 2
 
     def _refused_late(self, robot: _Robot, job: Job, now: float) -> Refusal:
+        self._refused += 1
         if job.deadline_s <= now:
             return _expired(job, now)
         return Refusal(job, self._busy(_turn_wait(robot, job, now)), "behind")
 
     def _busy(self, delay_s: float) -> Busy:
-        return Busy(
-            "the server is behind with its work",
-            hint="try again later; the server list may grow meanwhile",
-            retry_after_ms=self._retry_after_ms(2e3 * delay_s),
-        )
+        return Busy(BEHIND, hint=BEHIND_HINT, retry_after_ms=self._retry_after_ms(2e3 * delay_s))
 
     def _retry_after_ms(self, wanted_ms: float) -> float:
         return min(_LONGEST_RETRY_MS, max(self._interval_s * 1e3, wanted_ms))
 
     def _note_turn_wait(self, wait_s: float, now: float) -> None:
-        """Enter *behind* after an interval above the target, leave it after one below half of it.
+        """Enter *behind* after an interval above the target."""
+        if self.is_behind:
+            self._judge(now)
+        elif wait_s <= self._wanted_s:
+            self._late_since = None
+        elif self._late_since is None:
+            self._late_since = now
+        elif now - self._late_since >= self._interval_s:
+            self.is_behind, self._late_since = True, None
+            self._judged_s, self._started, self._refused = now, 0, 0
 
-        Both need a whole interval: shedding empties the queue for a moment, which is no recovery.
+    def _judge(self, now: float) -> None:
+        """Leave *behind* after an interval that refused hardly any.
+
+        The waits say nothing then: what is refused at the door keeps them short however much is offered.
         """
-        if self.is_behind == (wait_s > self._wanted_s / (2 if self.is_behind else 1)):
-            self._otherwise_since = None
-        elif self._otherwise_since is None:
-            self._otherwise_since = now
-        elif now - self._otherwise_since >= self._interval_s:
-            self.is_behind, self._otherwise_since = not self.is_behind, None
+        if now - self._judged_s >= self._interval_s:
+            self.is_behind = self._refused > _CALM_SHARE * (self._refused + self._started)
+            self._judged_s, self._started, self._refused = now, 0, 0
 
-    def _measure_turn(self, now: float) -> None:
+    def _measure_turn(self, waited_s: float, now: float) -> None:
         """Average the time between two starts while robots wait: threads and size gate included."""
-        if self._last_start is not None:
+        if waited_s > _AT_ONCE_S and self._last_start > float("-inf"):
             self._turn_s += _SMOOTHING * (now - self._last_start - self._turn_s)
-        self._last_start = now if self._round else None
+        self._last_start = now
 
     def _rewait(self, name: str, robot: _Robot, kept: deque[Job]) -> None:
         if len(kept) == len(robot.waiting):
@@ -258,9 +297,13 @@ def _turn_wait(robot: _Robot, job: Job, now: float) -> float:
 
 def _replaceable(waiting: deque[Job], job: Job) -> Job | None:
     stream = job.command.stream
-    if not stream or job.command.keep:
+    if not _is_replaceable(job):
         return None
     return next((w for w in waiting if w.command.stream == stream and not w.command.keep), None)
+
+
+def _is_replaceable(job: Job) -> bool:
+    return bool(job.command.stream) and not job.command.keep
 
 
 def _stale(job: Job) -> Refusal:

@@ -341,6 +341,8 @@ def test_the_server_stops_shedding_when_the_load_is_over():
     while scheduler.start(3.0)[0] is not None:
         pass
     scheduler.start(3.2)
+    assert scheduler.is_behind
+    scheduler.start(3.4)
 
     assert not scheduler.is_behind
     assert scheduler.waiting == 0
