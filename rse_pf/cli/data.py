@@ -10,6 +10,7 @@ example:
 from __future__ import annotations
 
 import argparse
+import sys
 from pathlib import Path
 
 from rse_pf.errors import UsageError
@@ -29,8 +30,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         parser.add_argument(
             f"--{name}", type=kind, help=f"{rows[name].doc} (data.{name}, default {rows[name].default})"
         )
+    parser.add_argument("--keys", type=Path, metavar="FILE", help="public keys of the tokens, a JWKS")
     parser.add_argument(
-        "--keys", type=Path, required=True, metavar="FILE", help="public keys of the tokens, a JWKS"
+        "--openapi", action="store_true", help="print the OpenAPI document and do nothing else"
     )
     parser.add_argument(
         "--announce", type=Path, metavar="FILE", help="write pid and port there when all is ready"
@@ -39,6 +41,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
     """Serve until a signal ends it."""
+    if args.openapi:
+        from rse_pf.data_server.openapi import openapi_page
+
+        sys.stdout.write(openapi_page())
+        return 0
+    if args.keys is None:
+        raise UsageError("--keys is missing", hint="name a JWKS; rse-pf local writes one as keys.json")
     chosen = settings.replace(
         data={name: getattr(args, name) for name in _OPTIONS if getattr(args, name) is not None}
     )

@@ -35,6 +35,7 @@ __all__ = ["DataServer"]
 _NOBODY = Claims(robot="", token_id="", issued_s=0.0, expires_s=0.0, key_id="")
 _PROBES = ("/data/healthz", "/data/readyz")
 _COME_AGAIN_MS = 1000.0
+_TOO_SLOW = 408
 
 
 class DataServer:
@@ -102,7 +103,7 @@ class DataServer:
             trace = uuid.uuid4().hex
             said |= {"code": InternalError.code, "trace": trace, "error": repr(error)[:500]}
             reply = failure_reply(InternalError("the data server failed", hint=f"its log has {trace}"))
-        if not request.over and not await self._drained(request):
+        if not request.over and (reply.status == _TOO_SLOW or not await self._drained(request)):
             reply = Reply(
                 status=reply.status, body=reply.body, media_type=reply.media_type,
                 headers={**reply.headers, "Connection": "close"},

@@ -5,6 +5,7 @@ Promises to describe what the dispatcher does, because both read `rse_pf.data_se
 
 from __future__ import annotations
 
+import json
 import re
 from typing import Any
 
@@ -13,7 +14,7 @@ import msgspec
 from rse_pf.data_server.http import Failure
 from rse_pf.data_server.routes import BYTES, ROUTES, Field, Route
 
-__all__ = ["openapi"]
+__all__ = ["openapi", "openapi_page"]
 
 _DIGEST = {"type": "string", "pattern": "^[0-9a-f]{64}$"}
 _PATH_SCHEMAS: dict[str, dict[str, Any]] = {
@@ -54,6 +55,11 @@ def openapi() -> dict[str, Any]:
             "securitySchemes": {"robot": {"type": "http", "scheme": "bearer", "bearerFormat": "JWT"}},
         },
     }
+
+
+def openapi_page() -> str:
+    """Return ``docs/openapi.json``."""
+    return json.dumps(openapi(), indent=1, sort_keys=True) + "\n"
 
 
 def _operation(route: Route) -> dict[str, Any]:

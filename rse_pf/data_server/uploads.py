@@ -62,7 +62,7 @@ class Objects:
 
     def head(self, who: Claims, digest: str) -> ObjectInfo:
         """Return size and name; raises NotFound, also for what belongs to others."""
-        return self._store.head(self.name(who, digest))
+        return self._head(self.name(who, digest))
 
     def name(self, who: Claims, digest: str) -> str:
         """Return where the object of *who* lives in the store."""
@@ -123,7 +123,7 @@ class Objects:
         with self._lock_of(name):
             opened = self._opened(who, digest)
             if opened is None:
-                size = self._store.head(name).size
+                size = self._head(name).size
                 return self._state(digest, size, size)
             return self._resumed(who, digest, name, opened)
 
@@ -142,7 +142,7 @@ class Objects:
             if size is None:
                 if not self._exists(name):
                     raise NotFound("no such upload", hint="begin it with PUT")
-                size = self._store.head(name).size
+                size = self._head(name).size
                 return self._state(digest, size, size)
             stands = self._offset(who, digest)
             if offset != stands:
@@ -224,6 +224,12 @@ class Objects:
 
     def _state(self, digest: str, size: int, offset: int) -> UploadState:
         return UploadState(digest=digest, size=size, offset=offset, part_bytes=self._settings.part_bytes)
+
+    def _head(self, name: str) -> ObjectInfo:
+        try:
+            return self._store.head(name)
+        except NotFound:
+            raise NotFound("no such object", hint="list yours with GET /data/v1/objects") from None
 
     def _exists(self, name: str) -> bool:
         try:

@@ -1,0 +1,14 @@
+"""A data service in this process, with an empty store in memory."""
+
+from __future__ import annotations
+
+import pytest
+from fake_data_service import Service, small_settings
+
+from rse_pf.objects import MemoryStore
+
+
+@pytest.fixture
+def service() -> Service:
+    """A service with an empty store in memory and small limits."""
+    return Service(small_settings(), MemoryStore())

@@ -1,0 +1,300 @@
+"""The data service's answers: who may see what, limits, ranges, and no way out of the store."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from pathlib import Path
+
+import pytest
+from fake_data_service import KEY, Service, small_settings
+from hypothesis import HealthCheck, given
+from hypothesis import settings as hypothesis_settings
+from hypothesis import strategies as st
+
+from rse_pf.auth import SigningKey
+from rse_pf.errors import StoreError, StoreFull
+from rse_pf.objects import DirectoryStore, MemoryStore, ObjectInfo, digest_of
+
+DATA = bytes(range(256)) * 4
+DIGEST = digest_of(DATA)
+OBJECT = f"/data/v1/objects/{DIGEST}"
+
+
+def test_an_object_comes_back_as_it_was_stored(service: Service) -> None:
+    first, second = service.ask("PUT", OBJECT, DATA), service.ask("PUT", OBJECT, DATA)
+
+    assert (first.status, second.status) == (201, 200)
+    assert first.json == {"digest": DIGEST, "size": len(DATA)}
+    answer = service.ask("GET", OBJECT)
+    assert (answer.status, answer.body) == (200, DATA)
+    assert service.ask("HEAD", OBJECT).headers["content-length"] == str(len(DATA))
+    assert service.ask("HEAD", OBJECT).body == b""
+
+
+def test_the_server_makes_the_name(service: Service) -> None:
+    service.ask("PUT", OBJECT, DATA, robot="../../etc", tenant="a/b")
+
+    (info,) = service.store.list()
+    assert info.name.split("/")[0] == "objects"
+    assert info.name.split("/")[3] == DIGEST
+    assert ".." not in info.name
+
+
+def test_bytes_with_another_digest_are_refused(service: Service) -> None:
+    assert service.ask("PUT", OBJECT, DATA + b"x").status == 400
+    assert list(service.store.list()) == []
+
+
+@pytest.mark.parametrize("method", ["GET", "HEAD"])
+def test_what_belongs_to_others_is_not_there(service: Service, method: str) -> None:
+    service.ask("PUT", OBJECT, DATA)
+    missing = service.ask(method, f"/data/v1/objects/{'0' * 64}", robot="robot-2")
+
+    for stranger in ({"robot": "robot-2"}, {"tenant": "other"}):
+        answer = service.ask(method, OBJECT, **stranger)
+        assert answer.status == 404
+        assert answer.body.replace(b"robot-2", b"") == missing.body
+    assert service.ask("GET", "/data/v1/objects", robot="robot-2").json["objects"] == []
+
+
+def test_nobody_deletes_what_belongs_to_others(service: Service) -> None:
+    service.ask("PUT", OBJECT, DATA)
+
+    assert service.ask("DELETE", OBJECT, robot="robot-2").status == 204
+    assert service.ask("GET", OBJECT).status == 200
+    assert service.ask("DELETE", OBJECT).status == 204
+    assert service.ask("GET", OBJECT).status == 404
+
+
+@pytest.mark.parametrize("token", ["", "x", "a.b.c", "forged", "expired"])
+def test_a_bad_token_is_told_nothing(service: Service, token: str) -> None:
+    if token == "forged":
+        token = SigningKey.from_seed(b"z" * 32, KEY.key_id).issue(
+            "robot-1", now=service.wall, token_id="t", settings=service.settings.auth
+        )
+    if token == "expired":
+        token = service.token()
+        service.wall += 2000
+
+    answer = service.ask("GET", OBJECT, token=token)
+
+    assert answer.status == 401
+    assert answer.json["message"] == "the token is missing or not valid"
+    assert answer.headers["www-authenticate"] == "Bearer"
+
+
+def test_scopes_limit_a_token_and_none_does_not(service: Service) -> None:
+    reader, writer = service.token(scopes=("data:read",)), service.token(scopes=("data:write",))
+
+    assert service.ask("PUT", OBJECT, DATA, token=reader).status == 403
+    assert service.ask("PUT", OBJECT, DATA, token=writer).status == 201
+    assert service.ask("GET", OBJECT, token=writer).status == 403
+    assert service.ask("GET", OBJECT, token=reader).status == 200
+    assert service.ask("GET", "/data/v1/maps", token=reader).status == 403
+
+
+@pytest.mark.parametrize(
+    ("asked", "status", "part", "told"),
+    [
+        ("bytes=0-9", 206, DATA[:10], "bytes 0-9/1024"),
+        ("bytes=1000-", 206, DATA[1000:], "bytes 1000-1023/1024"),
+        ("bytes=-24", 206, DATA[-24:], "bytes 1000-1023/1024"),
+        ("bytes=1000-99999", 206, DATA[1000:], "bytes 1000-1023/1024"),
+        ("bytes=0-0", 206, DATA[:1], "bytes 0-0/1024"),
+        ("bytes=9-3", 200, DATA, None),
+        ("bytes=0-1,5-6", 200, DATA, None),
+        ("lines=1-2", 200, DATA, None),
+    ],
+)
+def test_a_range_is_answered(
+    service: Service, asked: str, status: int, part: bytes, told: str | None
+) -> None:
+    service.ask("PUT", OBJECT, DATA)
+
+    answer = service.ask("GET", OBJECT, headers={"range": asked})
+
+    assert (answer.status, answer.body) == (status, part)
+    assert answer.headers.get("content-range") == told
+
+
+@pytest.mark.parametrize("asked", ["bytes=1024-", "bytes=5000-6000", "bytes=-0"])
+def test_a_range_outside_is_refused_with_the_size(service: Service, asked: str) -> None:
+    service.ask("PUT", OBJECT, DATA)
+
+    answer = service.ask("GET", OBJECT, headers={"range": asked})
+
+    assert (answer.status, answer.headers["content-range"]) == (416, "bytes */1024")
+
+
+def test_a_list_comes_in_pages(service: Service) -> None:
+    digests = sorted(digest_of(bytes([n])) for n in range(5))
+    for n in range(5):
+        service.ask("PUT", f"/data/v1/objects/{digest_of(bytes([n]))}", bytes([n]))
+
+    first = service.ask("GET", "/data/v1/objects", query="limit=3").json
+    second = service.ask("GET", "/data/v1/objects", query=f"limit=3&after={first['next']}").json
+
+    assert [each["digest"] for each in first["objects"] + second["objects"]] == digests
+    assert second["next"] is None
+    assert service.ask("GET", "/data/v1/objects", query="limit=0").status == 400
+
+
+def test_a_body_over_the_limit_is_refused_by_its_announcement_and_by_its_length(service: Service) -> None:
+    large = b"x" * 4097
+    path = f"/data/v1/objects/{digest_of(large)}"
+
+    assert service.ask("PUT", path, large).status == 413
+    announced = service.ask("PUT", path, b"", headers={"content-length": "999999"})
+    assert (announced.status, announced.headers["connection"]) == (413, "close")
+    assert list(service.store.list()) == []
+
+
+def test_a_slow_body_is_refused(service: Service) -> None:
+    drops = [{"type": "http.request", "body": b"x", "more_body": True, "after_s": 2.0} for _ in range(9)]
+
+    answer = service.ask("PUT", OBJECT, drops)
+
+    assert answer.status == 408
+    assert service.now == 6.0
+
+
+def test_a_silent_body_is_refused() -> None:
+    service = Service(small_settings(body_timeout_s=0.1), MemoryStore())
+
+    answer = service.ask("PUT", OBJECT, [{"type": "http.request", "body": b"x", "more_body": True}])
+
+    assert answer.status == 408
+
+
+def test_a_robot_that_leaves_in_the_middle_stores_nothing(service: Service) -> None:
+    cut = [{"type": "http.request", "body": DATA[:9], "more_body": True}, {"type": "http.disconnect"}]
+
+    service.ask("PUT", OBJECT, cut)
+
+    assert list(service.store.list()) == []
+    assert service.lines[-1]["status"] == "left"
+
+
+def test_the_quota_counts_what_is_stored_and_what_is_begun(service: Service) -> None:
+    for n in range(2):
+        assert service.ask("PUT", f"/data/v1/uploads/{n:064d}", b'{"size": 20000}').status == 200
+    for n in range(2):
+        data = bytes([n]) * 4096
+        assert service.ask("PUT", f"/data/v1/objects/{digest_of(data)}", data).status == 201
+
+    over = service.ask("PUT", f"/data/v1/objects/{digest_of(b'y' * 4096)}", b"y" * 4096)
+    assert (over.status, over.json["code"]) == (413, "quota")
+    service.restart()
+    assert service.ask("PUT", f"/data/v1/objects/{digest_of(b'y' * 4096)}", b"y" * 4096).status == 413
+    assert service.ask("PUT", OBJECT, DATA, robot="robot-2").status == 201
+    service.ask("DELETE", f"/data/v1/uploads/{0:064d}")
+    assert service.ask("PUT", f"/data/v1/objects/{digest_of(b'y' * 4096)}", b"y" * 4096).status == 201
+
+
+class Failing(MemoryStore):
+    """Refuses to write, or to do anything."""
+
+    error: StoreError = StoreFull("no room", hint="free some space")
+    reads = True
+
+    def put(self, name: str, data: bytes) -> None:
+        raise self.error
+
+    def head(self, name: str) -> ObjectInfo:
+        if not self.reads:
+            raise self.error
+        return super().head(name)
+
+
+def test_a_full_disk_is_507_and_costs_no_quota() -> None:
+    service = Service(small_settings(quota_bytes=1500), Failing())
+
+    for _ in range(3):
+        answer = service.ask("PUT", OBJECT, DATA)
+        assert (answer.status, answer.json["code"]) == (507, "store-full")
+    assert service.ask("GET", "/data/readyz").status == 200
+
+
+def test_a_store_that_fails_means_not_ready_but_alive() -> None:
+    store = Failing()
+    store.error, store.reads = StoreError("gone"), False
+    service = Service(small_settings(), store)
+
+    assert service.ask("GET", "/data/readyz", token="").status == 503
+    assert service.ask("GET", "/data/healthz", token="").status == 200
+
+
+def test_a_defect_is_a_500_that_tells_nothing(service: Service, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(service.store, "head", lambda name: 1 / 0)
+
+    answer = service.ask("GET", OBJECT)
+
+    assert answer.status == 500
+    assert b"division" not in answer.body
+    assert "division" in service.lines[-1]["error"]
+    assert service.lines[-1]["trace"] in answer.json["hint"]
+
+
+def test_a_known_path_with_another_method_says_which_are_offered(service: Service) -> None:
+    answer = service.ask("POST", "/data/v1/objects")
+
+    assert (answer.status, answer.headers["allow"]) == (405, "GET")
+
+
+def test_the_log_holds_neither_token_nor_payload(service: Service) -> None:
+    service.ask("PUT", OBJECT, b"secret-payload")
+
+    assert "secret-payload" not in str(service.lines)
+    assert service.token() not in str(service.lines)
+    assert service.lines[-1]["robot"] == "robot-1"
+
+
+WORDS = st.text(max_size=80) | st.sampled_from(
+    ["..", "../../etc/passwd", "%2e%2e", "\x00", "a" * 5000, "/", "//", "\\", "CON", ".lock-x", "\ud800"]
+)
+HOSTILE_ROBOTS = st.sampled_from(["../../etc", "/etc/passwd", "..", ".", "a/b", "~", "x=" + "0" * 62])
+PATHS = st.builds(
+    lambda kind, words, tail: f"/data/v1/{kind}/" + "/".join(words) + tail,
+    st.sampled_from(["objects", "uploads", "maps", "maps/a/versions", ".."]),
+    st.lists(WORDS, max_size=4),
+    st.sampled_from(["", "/versions", "/head", "/content"]),
+)
+
+
+def files_below(folder: Path) -> set[str]:
+    return {
+        os.path.relpath(os.path.join(at, name), folder) for at, _, names in os.walk(folder) for name in names
+    }
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1200)
+@hypothesis_settings(
+    max_examples=int(os.environ.get("RSE_PF_HOSTILE_NAMES", "1000")),
+    suppress_health_check=[HealthCheck.too_slow],
+)
+@given(
+    method=st.sampled_from(["GET", "PUT", "PATCH", "POST", "DELETE", "HEAD"]),
+    path=PATHS,
+    robot=st.text(min_size=1, max_size=64).filter(lambda text: text.isprintable()) | HOSTILE_ROBOTS,
+    body=st.binary(max_size=64) | st.sampled_from([b'{"size": 5}', b'{"digest": "' + b"0" * 64 + b'"}']),
+)
+def test_no_name_leaves_the_store_and_none_breaks_the_server(
+    method: str, path: str, robot: str, body: bytes
+) -> None:
+    with tempfile.TemporaryDirectory() as made:
+        above = Path(made)
+        service = Service(small_settings(), DirectoryStore(above / "in" / "store"))
+
+        answer = service.ask(method, path, body, robot=robot, headers={"upload-offset": "0"})
+        stored = service.ask("PUT", f"/data/v1/objects/{digest_of(body)}", body, robot=robot)
+
+        assert 200 <= answer.status < 500
+        assert stored.status == 201
+        found = files_below(above)
+        assert {tuple(name.split("/")[:3]) for name in found} <= {
+            ("in", "store", "objects"),
+            ("in", "store", "uploads"),
+        }
+        assert len(found) <= 2

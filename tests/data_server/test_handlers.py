@@ -1,0 +1,97 @@
+"""Maps over HTTP: commit, conflict, read, roll back."""
+
+from __future__ import annotations
+
+import json
+
+from fake_data_service import Answer, Service, small_settings
+
+from rse_pf.maps import MapVersion, encode_map
+from rse_pf.objects import MemoryStore, digest_of
+
+MAPS = "/data/v1/maps/kitchen"
+
+
+def send(service: Service, seed: int, parent: str | None, robot: str = "robot-1") -> Answer:
+    data = encode_map(MapVersion(keyframes=(), provenance={"seed": seed}))
+    service.ask("PUT", f"/data/v1/objects/{digest_of(data)}", data, robot=robot)
+    body = {"digest": digest_of(data), "parent": parent, "note": f"seed {seed}"}
+    return service.ask("POST", f"{MAPS}/versions", json.dumps(body).encode(), robot=robot)
+
+
+def test_a_committed_map_is_there_for_the_whole_tenant(service: Service) -> None:
+    first = send(service, 1, None)
+    second = send(service, 2, first.json["id"], robot="robot-2")
+
+    assert (first.status, second.status) == (201, 201)
+    assert second.json["record"]["author"] == "robot-2"
+    maps = service.ask("GET", "/data/v1/maps", robot="robot-3").json["maps"]
+    assert maps == [{"name": "kitchen", "head": second.json["id"]}]
+    numbers = [each["record"]["number"] for each in service.ask("GET", f"{MAPS}/versions").json]
+    assert numbers == [1, 2]
+    assert service.ask("GET", f"{MAPS}/versions/head", robot="robot-3").json == second.json
+    content = service.ask("GET", f"{MAPS}/versions/head/content", robot="robot-3")
+    assert digest_of(content.body) == second.json["record"]["digest"]
+    assert service.ask("GET", "/data/v1/maps", tenant="other").json["maps"] == []
+
+
+def test_who_comes_second_is_told_and_changes_nothing(service: Service) -> None:
+    first = send(service, 1, None)
+    send(service, 2, first.json["id"])
+
+    assert send(service, 3, first.json["id"]).status == 409
+    assert service.ask("GET", f"{MAPS}/versions/head").json["record"]["note"] == "seed 2"
+
+
+def test_a_map_outlives_the_object_it_came_from(service: Service) -> None:
+    made = send(service, 1, None).json["record"]["digest"]
+
+    service.ask("DELETE", f"/data/v1/objects/{made}")
+
+    assert digest_of(service.ask("GET", f"{MAPS}/versions/head/content").body) == made
+
+
+def test_a_rollback_is_a_move_of_the_head(service: Service) -> None:
+    first = send(service, 1, None).json["id"]
+    second = send(service, 2, first).json["id"]
+
+    body = json.dumps({"version": first, "expected": second}).encode()
+    assert service.ask("PUT", f"{MAPS}/head", body).status == 200
+    assert service.ask("PUT", f"{MAPS}/head", body).status == 409
+    assert service.ask("GET", f"{MAPS}/versions/head").json["id"] == first
+
+
+def test_what_is_no_map_or_not_ones_own_object_is_refused(service: Service) -> None:
+    service.ask("PUT", f"/data/v1/objects/{digest_of(b'x')}", b"x")
+    body = json.dumps({"digest": digest_of(b"x")}).encode()
+
+    assert service.ask("POST", f"{MAPS}/versions", body).status == 400
+    assert service.ask("POST", f"{MAPS}/versions", body, robot="robot-2").status == 404
+    assert service.ask("POST", f"{MAPS}/versions", b"{").status == 400
+    assert service.ask("GET", "/data/v1/maps/none/versions").status == 404
+
+
+def test_more_bodies_than_allowed_are_told_to_come_again() -> None:
+    service = Service(small_settings(most_uploads=1), MemoryStore())
+    inner: list[Answer] = []
+    body = iter([{"type": "http.request", "body": b"x", "more_body": False}])
+
+    original = service.app.handlers.objects.name
+
+    def name_and_ask(who: object, digest: str) -> str:
+        service.app.handlers.objects.name = original  # type: ignore[method-assign]
+        inner.append(_in_thread(lambda: service.ask("PUT", f"/data/v1/objects/{'0' * 64}", b"y")))
+        return original(who, digest)  # type: ignore[arg-type]
+
+    service.app.handlers.objects.name = name_and_ask  # type: ignore[method-assign]
+    outer = service.ask("PUT", f"/data/v1/objects/{digest_of(b'x')}", body)
+
+    assert (inner[0].status, inner[0].json["code"], outer.status) == (503, "busy", 201)
+    assert inner[0].headers["retry-after"] == "1"
+
+
+def _in_thread(work: object) -> Answer:
+    from concurrent.futures import ThreadPoolExecutor
+
+    with ThreadPoolExecutor(1) as pool:
+        return pool.submit(work).result()  # type: ignore[arg-type]

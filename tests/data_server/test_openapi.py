@@ -1,0 +1,46 @@
+"""The OpenAPI document says what the service does."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from fake_data_service import Service
+
+from rse_pf.data_server.handlers import Handlers
+from rse_pf.data_server.openapi import openapi, openapi_page
+from rse_pf.data_server.routes import ROUTES, Route
+
+
+def test_the_published_document_is_up_to_date(repository: Path) -> None:
+    page = (repository / "docs" / "openapi.json").read_text(encoding="utf-8")
+
+    assert page == openapi_page(), "run rse-pf data --openapi > docs/openapi.json"
+
+
+def test_the_service_publishes_the_same_document_to_everybody(service: Service) -> None:
+    answer = service.ask("GET", "/data/openapi.json", token="")
+
+    assert (answer.status, answer.json) == (200, openapi())
+
+
+def test_every_reference_leads_somewhere() -> None:
+    document = openapi()
+    text = openapi_page()
+
+    names = {part.split('"')[0] for part in text.split("#/components/schemas/")[1:]}
+    assert names <= set(document["components"]["schemas"])
+    assert {"Failure", "MapRecord", "Upload"} <= names
+
+
+@pytest.mark.parametrize("route", ROUTES, ids=lambda route: route.operation)
+def test_each_route_has_a_handler_and_asks_for_a_token_as_it_says(service: Service, route: Route) -> None:
+    path = route.path.format(digest="0" * 64, name="a", version="head")
+
+    answer = service.ask(route.method, path, token="")
+
+    assert hasattr(Handlers, route.operation)
+    assert (answer.status == 401) == (route.scope is not None)
+    described = openapi()["paths"][route.path][route.method.lower()]
+    assert ("security" in described) == (route.scope is not None)
+    assert str(answer.status) in described["responses"]

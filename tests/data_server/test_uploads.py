@@ -1,0 +1,152 @@
+"""Uploads in parts: they resume, also elsewhere, and only the right bytes become an object."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+from fake_data_service import Answer, Service, small_settings
+
+from rse_pf.objects import MemoryStore, digest_of
+
+DATA = bytes(n % 251 for n in range(10_000))
+DIGEST = digest_of(DATA)
+UPLOAD, OBJECT = f"/data/v1/uploads/{DIGEST}", f"/data/v1/objects/{DIGEST}"
+
+
+def begin(service: Service, size: int = len(DATA)) -> Answer:
+    return service.ask("PUT", UPLOAD, json.dumps({"size": size}).encode())
+
+
+def part(service: Service, start: int, end: int, data: bytes = DATA) -> Answer:
+    return service.ask("PATCH", UPLOAD, data[start:end], headers={"upload-offset": str(start)})
+
+
+def test_parts_become_an_object_with_the_last_one(service: Service) -> None:
+    assert begin(service).json == {"digest": DIGEST, "size": 10_000, "offset": 0, "part_bytes": 4096}
+
+    assert [part(service, *ends).status for ends in [(0, 4096), (4096, 8192)]] == [200, 200]
+    assert service.ask("GET", OBJECT).status == 404
+    last = part(service, 8192, 10_000)
+
+    assert (last.status, last.headers["upload-offset"]) == (201, "10000")
+    assert service.ask("GET", OBJECT).body == DATA
+    assert [info.name for info in service.store.list("uploads/")] == []
+
+
+def test_another_server_goes_on_where_the_first_one_died(service: Service) -> None:
+    begin(service)
+    part(service, 0, 4096)
+
+    service.restart()
+
+    assert service.ask("HEAD", UPLOAD).headers["upload-offset"] == "4096"
+    part(service, 4096, 8192)
+    service.restart()
+    assert part(service, 8192, 10_000).status == 201
+
+
+def test_a_server_that_died_before_it_put_the_parts_together_is_made_up_for(service: Service) -> None:
+    begin(service)
+    part(service, 0, 4096)
+    part(service, 4096, 8192)
+    (size,) = [info.name for info in service.store.list("uploads/") if info.name.endswith("/size")]
+    service.store.put(size.replace("/size", f"/part-{8192:015d}"), DATA[8192:])  # stored, then killed
+
+    assert begin(service).json["offset"] == 10_000
+
+    assert service.ask("GET", OBJECT).body == DATA
+
+
+def test_a_part_in_the_wrong_place_is_a_conflict_that_says_where(service: Service) -> None:
+    begin(service)
+    part(service, 0, 4096)
+
+    for start in (0, 100, 8192):
+        answer = part(service, start, start + 10)
+        assert answer.status == 409
+        assert "4096" in answer.json["message"]
+    assert part(service, 4096, 8192).status == 200
+
+
+def test_wrong_bytes_never_become_an_object_and_are_forgotten(service: Service) -> None:
+    begin(service)
+    wrong = b"x" * 10_000
+    part(service, 0, 4096, wrong)
+    part(service, 4096, 8192, wrong)
+
+    assert part(service, 8192, 10_000, wrong).status == 400
+
+    assert list(service.store.list()) == []
+    assert service.ask("GET", UPLOAD).status == 404
+
+
+@pytest.mark.parametrize("size", [0, -1, 20_001])
+def test_a_size_that_cannot_be_is_refused(service: Service, size: int) -> None:
+    assert begin(service, size).status in (400, 413)
+    assert list(service.store.list()) == []
+
+
+def test_more_than_was_announced_is_refused(service: Service) -> None:
+    begin(service, 100)
+
+    assert part(service, 0, 101).status == 400
+    assert begin(service, 200).status == 409
+
+
+def test_an_upload_of_what_is_there_is_done_at_once(service: Service) -> None:
+    begin(service)
+    for ends in [(0, 4096), (4096, 8192), (8192, 10_000)]:
+        part(service, *ends)
+
+    assert begin(service).json["offset"] == 10_000
+    assert part(service, 0, 4096).status == 201
+
+
+def test_nobody_sees_or_continues_the_upload_of_another_robot(service: Service) -> None:
+    begin(service)
+
+    assert service.ask("GET", UPLOAD, robot="robot-2").status == 404
+    headers = {"upload-offset": "0"}
+    assert service.ask("PATCH", UPLOAD, b"x", robot="robot-2", headers=headers).status == 404
+    assert service.ask("DELETE", UPLOAD, robot="robot-2").status == 204
+    assert service.ask("GET", UPLOAD).status == 200
+
+
+def test_an_old_upload_and_parts_without_one_are_swept_up_and_a_young_one_is_not(service: Service) -> None:
+    begin(service)
+    part(service, 0, 4096)
+    service.store.put(f"uploads/default/robot-9/{DIGEST}/part-{0:015d}", b"left by a crash")
+
+    assert service.app.handlers.objects.sweep() == 1
+    assert service.ask("GET", UPLOAD).json["offset"] == 4096
+    service.wall += service.settings.data.upload_life_s + 1
+    assert service.app.handlers.objects.sweep() == 1
+    assert list(service.store.list()) == []
+
+
+class SwallowsTheLast(MemoryStore):
+    """Dies while the object itself is written."""
+
+    def put(self, name: str, data: bytes) -> None:
+        if name.startswith("objects/") and not self.well:
+            raise SystemExit
+        super().put(name, data)
+
+    well = False
+
+
+def test_a_death_while_the_object_is_written_loses_no_part() -> None:
+    store = SwallowsTheLast()
+    service = Service(small_settings(), store)
+    begin(service)
+    part(service, 0, 4096)
+    part(service, 4096, 8192)
+    with pytest.raises(SystemExit):
+        part(service, 8192, 10_000)
+
+    store.well = True
+    service.restart()
+
+    assert begin(service).json["offset"] == 10_000
+    assert service.ask("GET", OBJECT).body == DATA
