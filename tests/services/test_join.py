@@ -12,7 +12,7 @@ from rse_pf.services.join import Atlas, Merged, MergeOptions, Proposals, join_ma
 from rse_pf.services.loops import Link, OdometryNoise, consistent, largest_clique
 from rse_pf.services.map_problems import make_world
 from rse_pf.services.merge import MergeRequest, merge_maps
-from rse_pf.services.optimise import Report
+from rse_pf.services.optimise import Report, silent
 from rse_pf.settings import ServiceSettings
 
 for package in ("faiss", "gtsam"):
@@ -96,6 +96,13 @@ def test_planted_wrong_loops_are_refused_and_do_not_bend_the_map(seed: int) -> N
 
     assert wrong.joined == (0, 1)
     assert rmse_m(wrong, truth) <= max(1.1 * rmse_m(clean, truth), rmse_m(clean, truth) + 0.005)
+    wrongs = planted(0.1, seed)(Atlas.of(maps), MergeOptions(), silent).links
+    rights = propose_links(Atlas.of(maps), MergeOptions()).links
+    fakes = {
+        w.T_a_b.tobytes() for w, r in zip(wrongs, rights, strict=True) if not np.array_equal(w.T_a_b, r.T_a_b)
+    }
+    assert len(fakes) >= 1
+    assert not fakes & {edge.T_a_b.tobytes() for edge in wrong.version.edges}
     refusals = sum(count for (_, _, why), count in wrong.refused.items() if why in JUDGED)
     assert refusals >= sum(count for (_, _, why), count in clean.refused.items() if why in JUDGED) + 1
 
