@@ -31,6 +31,7 @@ __all__ = ["Fleet", "Member"]
 _ASK_S = 2.0
 _LOOK_UP_S = 0.5
 _PAUSE_S = 0.02
+_CANCEL_AGAIN_S = 0.2
 _PREFIX = "server-"
 
 
@@ -298,10 +299,15 @@ class Fleet:
         task.add_done_callback(self._done)
 
     async def close(self) -> None:
-        """End everything that still waits; no process is touched."""
-        for task in self._tasks:
-            task.cancel()
-        await asyncio.gather(*self._tasks, return_exceptions=True)
+        """End everything that still waits; no process is touched.
+
+        Cancels again until it is so: `asyncio.wait_for` before Python 3.12 loses a cancellation that comes
+        together with the result.
+        """
+        while self._tasks:
+            for task in self._tasks:
+                task.cancel()
+            await asyncio.wait(self._tasks, timeout=_CANCEL_AGAIN_S)
 
     # --- helpers ---------------------------------------------------------------------------------
 
