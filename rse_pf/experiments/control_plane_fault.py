@@ -91,7 +91,7 @@ async def play_control_plane(
                 after = read_state(state_at) or after
                 tell("processes", when="after", pids=_pids(after))
                 result = await swarm.finish()
-            write_commands(folder / "commands.csv", result.commands)
+            await asyncio.to_thread(write_commands, folder / "commands.csv", result.commands)
             tell("generator", **generator_facts(result))
         finally:
             await asyncio.to_thread(_end, child, state_at, settings)

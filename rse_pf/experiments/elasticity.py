@@ -188,7 +188,7 @@ async def _run(options: ElasticityOptions, settings: PlatformSettings, folder: P
             await _crash(stage, quiet_s)
             _phase(stage, "leaving")
             await swarm.leave()
-            stage.close_books(await swarm.finish())
+            await stage.close_books(await swarm.finish())
         _phase(stage, "idle")
         at_min = scaling.min_servers
         await stage.until(

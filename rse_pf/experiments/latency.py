@@ -88,7 +88,7 @@ async def _run(options: LatencyOptions, settings: PlatformSettings, folder: Path
             await swarm.start()
             await swarm.wait_joined(_JOIN_S)
             await watch(stage, options.seconds)
-            stage.close_books(await swarm.finish())
+            await stage.close_books(await swarm.finish())
 
 
 def _round_trip_ms(link: str | None) -> float:

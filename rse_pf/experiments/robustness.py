@@ -129,7 +129,7 @@ async def _run(
         stage.tell("joined")
         await watch(stage, _LEAD_S)
         await scenario.play(stage, seconds, seed)
-        stage.close_books(await swarm.finish())
+        await stage.close_books(await swarm.finish())
 
 
 def _line(name: str, row: Mapping[str, Any]) -> str:

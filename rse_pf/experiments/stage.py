@@ -173,9 +173,9 @@ class Stage:
         os.kill(victim.pid, signal.SIGKILL)
         return str(victim.name)
 
-    def close_books(self, result: SwarmResult) -> None:
-        """Write the robots' commands, and what the generator says of itself."""
-        write_commands(self.folder / COMMANDS, result.commands)
+    async def close_books(self, result: SwarmResult) -> None:
+        """Write the robots' commands, and what the generator says of itself; nobody waits meanwhile."""
+        await asyncio.to_thread(write_commands, self.folder / COMMANDS, result.commands)
         self.tell("generator", **generator_facts(result))
 
     def _note(self, time_s: float, action: str, details: Mapping[str, Any]) -> None:
