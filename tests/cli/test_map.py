@@ -1,0 +1,115 @@
+"""rse-pf map: what a person sees of a store's maps, and what it writes."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rse_pf.cli.main import main
+from rse_pf.data_server.maps import MapRegistry
+from rse_pf.geometry import Camera
+from rse_pf.maps import Keyframe, MapVersion, encode_map
+from rse_pf.objects import DirectoryStore
+
+
+def make(keyframes: int) -> bytes:
+    rng = np.random.default_rng(keyframes)
+    frames = []
+    for n in range(keyframes):
+        pose = np.eye(4)
+        pose[0, 3] = n
+        frames.append(
+            Keyframe(
+                id=n, robot="robot-1", timestamp_s=float(n), T_world_camera=pose,
+                camera=Camera(fx=500.0, fy=500.0, cx=320.0, cy=240.0, width=640, height=480),
+                pixels=np.zeros((0, 2), np.float32), descriptors=np.zeros((0, 32), np.uint8),
+                points_camera=np.zeros((0, 3), np.float32),
+            )
+        )  # fmt: skip
+    points = rng.uniform(-2, 2, (500, 3)).astype(np.float32)
+    colours = np.full((500, 3), 90, np.uint8)
+    return encode_map(MapVersion(keyframes=tuple(frames), points=points, colours=colours))
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> Path:
+    """A store with map "hall" of two versions: of 2 and of 3 keyframes."""
+    maps = MapRegistry(DirectoryStore(tmp_path / "store"))
+    first = maps.commit("hall", make(2), parent=None, author="robot-1", created_s=1e9, note="first")
+    maps.commit("hall", make(3), parent=first.id, author="robot-1", created_s=2e9, note="second")
+    return tmp_path / "store"
+
+
+def run(store: Path, *words: str) -> int:
+    return main(["map", *words, "--store", f"dir:{store}"])
+
+
+def asked(capsys: pytest.CaptureFixture[str], store: Path, *words: str) -> object:
+    assert run(store, *words, "--json") == 0
+    return json.loads(capsys.readouterr().out)
+
+
+def test_list_names_each_map_with_its_head(store: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(store, "list") == 0
+
+    assert "hall" in (said := capsys.readouterr().out)
+    assert "3 keyframes" in said
+    (only,) = asked(capsys, store, "list")  # type: ignore[misc]
+    assert (only["name"], only["number"], only["note"]) == ("hall", 2, "second")
+
+
+def test_show_tells_a_version_and_draws_it(store: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(store, "show", "hall", "--png", str(store.parent / "hall.png")) == 0
+
+    assert "keyframes   3  (robot-1 3)" in capsys.readouterr().out
+    assert (store.parent / "hall.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_diff_rollback_and_show_all_agree(store: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    versions = asked(capsys, store, "show", "hall", "--all")
+    first, second = (each["id"] for each in versions)  # type: ignore[attr-defined]
+    assert asked(capsys, store, "diff", "hall", first[:8])["added"] == [2]  # type: ignore[index]
+
+    assert asked(capsys, store, "rollback", "hall", first[:8]) == {"was": second, "head": first}
+
+    again = asked(capsys, store, "show", "hall", "--all")
+    assert [each["head"] for each in again] == [True, False]  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize(
+    ("kind", "begins"), [("ply", b"ply"), ("pcd", b"# .PCD"), ("tum", b"#"), ("g2o", b"VERTEX")]
+)
+def test_export_writes_the_file(store: Path, kind: str, begins: bytes) -> None:
+    out = store.parent / f"hall.{kind}"
+
+    assert run(store, "export", "hall", "--format", kind, "--out", str(out)) == 0
+
+    assert out.read_bytes().startswith(begins)
+
+
+@pytest.mark.parametrize(
+    ("words", "code"),
+    [
+        (["show", "nowhere"], 1),
+        (["show", "../x"], 1),
+        (["rollback", "hall", "abc"], 1),
+        (["export", "hall", "--format", "obj", "--out", "x"], 2),
+        (["export", "hall", "--format", "ply", "--out", "/nowhere/x"], 2),
+    ],
+)
+def test_what_cannot_be_done_is_one_sentence_and_a_hint(
+    store: Path, capsys: pytest.CaptureFixture[str], words: list[str], code: int
+) -> None:
+    assert run(store, *words) == code
+
+    said = capsys.readouterr().err
+    assert "hint:" in said
+    assert "Traceback" not in said
+
+
+def test_maps_in_memory_are_nobody_elses(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["map", "list", "--store", "memory:"]) == 2
+    assert "dir:PATH" in capsys.readouterr().err

@@ -1,0 +1,100 @@
+"""The data server is started, announced, and replaced on its own port; a bad start is told."""
+
+from __future__ import annotations
+
+import asyncio
+import sys
+from pathlib import Path
+
+import pytest
+
+from rse_pf.errors import ConfigurationError
+from rse_pf.local.data_servers import DataServers
+from rse_pf.local.processes import is_alive
+from rse_pf.settings import PlatformSettings
+
+pytestmark = pytest.mark.system
+
+_PROGRAM = """
+import json, os, signal, sys, time
+args = dict(zip(sys.argv[2::2], sys.argv[3::2]))
+port = int(args["--port"]) or 40001
+with open("starts", "a") as file:
+    file.write(f"{port} {args['--store']}\\n")
+temporary = args["--announce"] + ".new"
+json.dump({"pid": os.getpid(), "port": port}, open(temporary, "w"))
+os.replace(temporary, args["--announce"])
+signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
+signal.pause()
+"""
+
+
+class Box:
+    """Data servers that run a program of the test, and what they told."""
+
+    def __init__(self, folder: Path, program: str) -> None:
+        self.told: asyncio.Queue[str] = asyncio.Queue()
+        self.servers = DataServers(
+            PlatformSettings().replace(local={"start_timeout_s": 15.0}),
+            folder=folder, settings_file=folder / "s", keys_file=folder / "k", store="dir:objects",
+            program=(sys.executable, "-W", "ignore", "-c", program),
+            tell=lambda event, **_: self.told.put_nowait(event),
+        )  # fmt: skip
+
+    async def next(self) -> str:
+        return await asyncio.wait_for(self.told.get(), 15)
+
+
+def test_a_server_that_dies_is_replaced_on_its_port(tmp_path: Path) -> None:
+    async def run() -> None:
+        box = Box(tmp_path, _PROGRAM)
+        first = await box.servers.start()
+        assert await box.next() == "data-server-up"
+
+        assert box.servers.send(9)  # type: ignore[arg-type]
+        assert [await box.next(), await box.next()] == ["data-server-down", "data-server-up"]
+        second = box.servers.mark
+        await box.servers.stop(10.0)
+
+        assert second is not None
+        assert second != first.mark
+        assert not is_alive(first.mark)
+        assert not is_alive(second)
+        assert box.servers.mark is None
+        assert (tmp_path / "starts").read_text() == "40001 dir:objects\n" * 2
+        assert not (tmp_path / "data-1.json").exists()
+
+    asyncio.run(run())
+
+
+def test_a_server_that_ends_at_once_is_told_with_its_last_words(tmp_path: Path) -> None:
+    async def run() -> None:
+        box = Box(tmp_path, "import sys; sys.exit('the disk is gone')")
+
+        with pytest.raises(ConfigurationError, match=r"exit code 1.*the disk is gone"):
+            await box.servers.start()
+
+        box.servers.kill_all()
+
+    asyncio.run(run())
+
+
+def test_a_server_that_stays_is_killed(tmp_path: Path) -> None:
+    async def run() -> None:
+        stays = "signal.signal(signal.SIGTERM, signal.SIG_IGN)\ntemporary = "
+        stubborn = _PROGRAM.replace("temporary = ", stays).replace("lambda *_: sys.exit(0)", "signal.SIG_IGN")
+        box = Box(tmp_path, stubborn)
+        server = await box.servers.start()
+
+        await box.servers.stop(0.2)
+
+        assert not is_alive(server.mark)
+
+    asyncio.run(run())
+
+
+def test_nobody_is_ready_before_the_first_start(tmp_path: Path) -> None:
+    box = Box(tmp_path, _PROGRAM)
+
+    assert asyncio.run(box.servers.is_ready()) is False
+    assert box.servers.send(15) is False  # type: ignore[arg-type]
