@@ -1,0 +1,187 @@
+"""Create every stack on moto: references resolve, and what moto makes is what the settings say.
+
+moto runs no alarms, policies, hooks or checks, and ignores some types altogether.  The list of these is
+exact, so that a new one is noticed; what they hold is asserted in the templates instead.
+"""
+
+from __future__ import annotations
+
+import copy
+import json
+import re
+import warnings
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Any
+
+import pytest
+
+boto3 = pytest.importorskip("boto3", reason="the infra extra is not installed")
+moto = pytest.importorskip("moto", reason="the infra extra is not installed")
+
+Assembly = Any
+
+ORDER = ("Network", "Data", "Backend", "Serverless", "Observability")
+IGNORED = {
+    "AWS::AutoScaling::LifecycleHook",
+    "AWS::AutoScaling::ScalingPolicy",
+    "AWS::CloudWatch::Alarm",
+    "AWS::EC2::NetworkAcl",
+    "AWS::EC2::NetworkAclEntry",
+    "AWS::EC2::SecurityGroupEgress",
+    "AWS::EC2::SubnetNetworkAclAssociation",
+    "AWS::Lambda::Url",
+    "AWS::S3::BucketPolicy",
+    "AWS::SNS::TopicPolicy",
+    "AWS::SecretsManager::Secret",
+    "AWS::WAFv2::WebACL",
+    "AWS::WAFv2::WebACLAssociation",
+}
+"""Types of ours that moto 5.2 accepts and then forgets."""
+
+REGION = "ap-northeast-2"
+_MISSING = "not-on-moto"
+_TRIED = re.compile(r"Tried to parse (\S+) but")
+
+
+@dataclass
+class Created:
+    """What became of the stacks, and the types that moto said it ignores."""
+
+    statuses: dict[str, str] = field(default_factory=dict)
+    ignored: set[str] = field(default_factory=set)
+
+
+def references(value: Any) -> Iterator[tuple[str, str]]:
+    """Yield every resource that *value* reads, with the attribute."""
+    if isinstance(value, dict):
+        if "Ref" in value:
+            yield value["Ref"], ""
+        if "Fn::GetAtt" in value:
+            yield value["Fn::GetAtt"][0], value["Fn::GetAtt"][1]
+        for each in value.values():
+            yield from references(each)
+    elif isinstance(value, list):
+        for each in value:
+            yield from references(each)
+
+
+def without_imports(value: Any, dropped: set[str]) -> Any:
+    """Return *value* with a plain text where it imports an output that moto cannot give."""
+    if isinstance(value, dict):
+        if value.get("Fn::ImportValue") in dropped:
+            return _MISSING
+        return {key: without_imports(each, dropped) for key, each in value.items()}
+    return [without_imports(each, dropped) for each in value] if isinstance(value, list) else value
+
+
+def adapted(template: dict[str, Any], dropped: set[str], image: str) -> dict[str, Any]:
+    """Return *template* without the outputs that read what moto ignores; their names go into *dropped*.
+
+    The machine image is given: moto knows no parameters of Debian, and lets nobody write them.
+    """
+    made = without_imports(copy.deepcopy(template), dropped)
+    for parameter in made.get("Parameters", {}).values():
+        if parameter["Type"].startswith("AWS::SSM::Parameter::Value"):
+            is_image = "Image::Id" in parameter["Type"]
+            parameter.update(Type="String", Default=image if is_image else "30")
+    ignored = {name for name, each in made["Resources"].items() if each["Type"] in IGNORED}
+    for name, output in list(made.get("Outputs", {}).items()):
+        read = set(references(output["Value"]))
+        if any(resource in ignored or attribute == "TargetGroupFullName" for resource, attribute in read):
+            if "Export" in output:
+                dropped.add(output["Export"]["Name"])
+            del made["Outputs"][name]
+    for resource in made["Resources"].values():
+        depends = resource.get("DependsOn", [])
+        depends = [depends] if isinstance(depends, str) else depends
+        resource["DependsOn"] = [name for name in depends if name not in ignored]
+    return made
+
+
+@pytest.fixture
+def created(assembly: Assembly, monkeypatch: pytest.MonkeyPatch) -> Iterator[Created]:
+    """Every stack, created on moto in the order of a deployment."""
+    for name in ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY", "AWS_SESSION_TOKEN"):
+        monkeypatch.setenv(name, "testing")
+    monkeypatch.setenv("AWS_DEFAULT_REGION", REGION)
+    monkeypatch.delenv("AWS_PROFILE", raising=False)
+    with moto.mock_aws(config={"lambda": {"use_docker": False}}):
+        account = boto3.client("sts", region_name=REGION).get_caller_identity()["Account"]
+        image = boto3.client("ec2", region_name=REGION).describe_images()["Images"][0]["ImageId"]
+        certificate = boto3.client("acm", region_name=REGION).request_certificate(DomainName="example.org")
+        s3 = boto3.client("s3", region_name=REGION)
+        bucket = f"cdk-hnb659fds-assets-{account}-{REGION}"
+        s3.create_bucket(Bucket=bucket, CreateBucketConfiguration={"LocationConstraint": REGION})
+        for path in sorted(assembly.folder.glob("*.assets.json")):
+            for asset in json.loads(path.read_text(encoding="utf-8"))["files"].values():
+                for where in asset["destinations"].values():
+                    s3.put_object(Bucket=bucket, Key=where["objectKey"], Body=_EMPTY_ZIP)
+        formation = boto3.client("cloudformation", region_name=REGION)
+        dropped: set[str] = set()
+        made = Created()
+        for stack in ORDER:
+            template = adapted(assembly.templates[f"RsePf-{stack}"], dropped, image)
+            text = json.dumps(template)
+            if arn := assembly.settings.cloud.certificate_arn:  # moto wants one that it made
+                text = text.replace(arn, certificate["CertificateArn"])
+            with warnings.catch_warnings(record=True) as caught:
+                warnings.simplefilter("always")
+                formation.create_stack(
+                    StackName=f"RsePf-{stack}",
+                    TemplateBody=text,
+                    Capabilities=["CAPABILITY_IAM"],
+                )
+            made.ignored.update(_TRIED.findall(" ".join(str(each.message) for each in caught)))
+            told = formation.describe_stacks(StackName=f"RsePf-{stack}")["Stacks"][0]
+            made.statuses[stack] = told["StackStatus"]
+        yield made
+
+
+_EMPTY_ZIP = b"PK\x05\x06" + b"\0" * 18
+
+
+def client(service: str) -> Any:
+    """Return a client of the pretended account."""
+    return boto3.client(service, region_name=REGION)
+
+
+def test_every_stack_is_created_and_what_moto_made_equals_the_settings(
+    created: Created, assembly: Assembly
+) -> None:
+    settings, scaling = assembly.settings, assembly.settings.scaling
+
+    assert created.ignored == IGNORED, "the exact list of what moto does not make"
+    assert created.statuses == dict.fromkeys(ORDER, "CREATE_COMPLETE")
+    (group,) = client("autoscaling").describe_auto_scaling_groups()["AutoScalingGroups"]
+    assert (group["MinSize"], group["MaxSize"]) == (scaling.min_servers, scaling.max_servers)
+    assert group["HealthCheckType"] == "ELB"
+    assert group["HealthCheckGracePeriod"] == settings.health.grace_s
+    elb = client("elbv2")
+    targets = elb.describe_target_groups()["TargetGroups"]
+    robots = next(each for each in targets if each["Port"] == settings.serving.port)
+    assert robots["HealthCheckPath"] == settings.health.path
+    assert robots["HealthCheckPort"] == str(settings.serving.control_port)
+    assert robots["HealthCheckIntervalSeconds"] == settings.health.cloud_interval_s
+    assert robots["UnhealthyThresholdCount"] == settings.health.unhealthy_checks
+    assert len(targets) == len(group["TargetGroupARNs"]) == (2 if settings.data.enabled else 1)
+    (balancer,) = elb.describe_load_balancers()["LoadBalancers"]
+    (listener,) = elb.describe_listeners(LoadBalancerArn=balancer["LoadBalancerArn"])["Listeners"]
+    expected = ("HTTP", 80) if settings.cloud.lab else ("HTTPS", 443)
+    assert (listener["Protocol"], listener["Port"]) == expected
+    buckets = [each["Name"] for each in client("s3").list_buckets()["Buckets"]]
+    for word in ("map", "artifact", "log"):
+        assert any(word in name.lower() for name in buckets), (word, buckets)
+    (function,) = client("lambda").list_functions()["Functions"]
+    assert function["MemorySize"] == settings.cloud.lambda_memory_mb
+    assert function["Timeout"] == settings.cloud.lambda_timeout_s
+    groups = client("ec2").describe_security_groups()["SecurityGroups"]
+    open_to_all = [
+        (each["GroupName"], rule.get("FromPort"))
+        for each in groups
+        if each["GroupName"] != "default"
+        for rule in each["IpPermissions"]
+        for cidr in rule.get("IpRanges", [])
+        if cidr["CidrIp"] == "0.0.0.0/0"
+    ]
+    assert [port for _, port in open_to_all] == [80 if settings.cloud.lab else 443]
