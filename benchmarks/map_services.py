@@ -11,6 +11,7 @@ Promises to write nothing but ``--out``; times from a busy machine are the reade
 from __future__ import annotations
 
 import argparse
+import functools
 import json
 import math
 import os
@@ -61,9 +62,10 @@ class Robots:
         return ate_m(T_world_camera, self.truth)
 
 
+@functools.lru_cache(maxsize=3)
 def robots_of(
     recordings: Path,
-    cuts: Sequence[tuple[int, int]] = THREE_ROBOTS,
+    cuts: tuple[tuple[int, int], ...] = THREE_ROBOTS,
     name: str = "7scenes_redkitchen",
 ) -> Robots:
     """Return the robots that drive the *cuts* (rows from, to) of a recording, each from its own origin."""
