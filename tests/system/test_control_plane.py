@@ -19,7 +19,7 @@ from typing import Any
 import pytest
 
 from client_sdk import connect
-from rse_pf.errors import UsageError
+from rse_pf.errors import ConfigurationError, UsageError
 from rse_pf.local.cloud import LocalCloud
 from rse_pf.local.processes import is_alive, mark_of, send_signal, wait_ended
 from rse_pf.local.state import read_state
@@ -323,6 +323,8 @@ def test_a_new_control_plane_adopts_what_a_killed_one_left_and_robots_notice_not
             first = await robot.call("echo", {"value": 1})
             program.kill()
             program.wait()
+            with pytest.raises(ConfigurationError, match="outlived their control plane"):
+                await platform(tmp_path / "a", news).__aenter__()
             changed = SETTINGS.replace(scaling={"max_servers": 7})
             async with platform(tmp_path / "a", news, settings=changed, adoptable=True) as cloud:
                 adopted = await news.heard("adopted")
