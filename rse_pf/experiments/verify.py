@@ -84,7 +84,7 @@ def verify(folder: Path) -> list[Finding]:
             found.append(Finding(what=f"{prefix}run", agrees=False, detail="is not in the report"))
             continue
         judged = json.loads(json.dumps(judge_folder(part)))
-        found += [_compare(prefix + path, told, path, value) for path, value in _leaves(judged)]
+        found += [_compare(prefix, told, path, value) for path, value in _leaves(judged)]
         found += [
             Finding(what=f"{prefix}law: {law}", agrees=not broken, detail=broken)
             for law, broken in broken_laws(read_records(part)).items()
@@ -135,10 +135,10 @@ def _clocks(records: Records) -> str:
     return ""
 
 
-def _compare(what: str, told: Mapping[str, Any], path: str, value: Any) -> Finding:
-    missing = object()
+def _compare(prefix: str, told: Mapping[str, Any], path: tuple[str, ...], value: Any) -> Finding:
+    what, missing = prefix + "/".join(path), object()
     here: Any = told
-    for step in path.split("/"):
+    for step in path:
         here = here.get(step, missing) if isinstance(here, dict) else missing
     if here is missing:
         return Finding(what=what, agrees=False, detail="is not in the report")
@@ -147,11 +147,11 @@ def _compare(what: str, told: Mapping[str, Any], path: str, value: Any) -> Findi
     return Finding(what=what, agrees=False, detail=f"report {_short(here)}, records {_short(value)}")
 
 
-def _leaves(judged: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, Any]]:
+def _leaves(judged: Mapping[str, Any], before: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
     for name, value in judged.items():
-        path = f"{before}{name}"
+        path = (*before, name)
         if isinstance(value, dict) and value:
-            yield from _leaves(value, f"{path}/")
+            yield from _leaves(value, path)
         else:
             yield path, value
 

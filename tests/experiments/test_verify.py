@@ -220,3 +220,16 @@ def test_packed_commands_are_read_like_plain_ones(run):
     (run / "commands.csv.gz").write_bytes(b"not packed at all")
     with pytest.raises(UsageError, match="cannot read"):
         verify(run)
+
+
+def test_the_bars_of_a_fault_are_verified_too(run):
+    events = (run / "events.jsonl").read_text().splitlines()
+    asked = {**json.loads(events[0]), "kind": "robustness", "scenario": "kill"}
+    (run / "events.jsonl").write_text("\n".join([json.dumps(asked), *events[1:]]) + "\n")
+    write_report(run)
+    assert differing(run) == []
+
+    report = json.loads((run / "report.json").read_text())
+    report["bars"]["replaced_in_s"]["held"] = True
+    write_json(run / "report.json", report)
+    assert differing(run) == ["bars/replaced_in_s/held"]
