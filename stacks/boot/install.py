@@ -47,7 +47,7 @@ def main(facts):
     if subprocess.run(["/usr/bin/id", USER], capture_output=True, check=False).returncode:
         run("/usr/sbin/useradd", "--system", "--no-create-home", "--shell", "/usr/sbin/nologin", USER)
     python = HOME / "venv" / "bin" / "python"
-    run("/usr/bin/python3", "-m", "venv", "--without-pip", str(HOME / "venv"))
+    run("/usr/bin/python3", "-m", "venv", "--clear", "--without-pip", str(HOME / "venv"))
     (pip,) = PACKAGE.glob("pip-*.whl")
     run(
         str(python), f"{pip}/pip", "install", "--quiet", "--no-index", "--no-deps", "--require-hashes",

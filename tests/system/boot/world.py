@@ -183,7 +183,7 @@ class World:
         self.run(["ip", "route", "add", "default", "via", "192.0.2.1"])
 
     def _make_root(self) -> None:
-        subprocess.run(["cp", "-a", "--reflink=auto", str(self._kept_root), str(self.root)], check=True)
+        subprocess.run(["cp", "-a", "--reflink=auto", f"{self._kept_root}/.", str(self.root)], check=True)
         names = ",".join(f"DNS:{name}" for name in NAMES) + f",IP:{AWS}"
         subprocess.run(
             ["openssl", "req", "-x509", "-newkey", "rsa:2048", "-nodes", "-days", "2", "-subj", "/CN=aws",
