@@ -150,7 +150,9 @@ class Generator:
         message = self.codec.decode_from_server(data)
         if not isinstance(message, Result | Failure):
             return
-        index = self.waiting.pop((wire, message.id or 0))
+        index = self.waiting.pop((wire, message.id or 0), None)
+        if index is None:  # so late that its id went round: it stays counted as lost
+            return
         self.answered[index] = now
         if isinstance(message, Result):
             self.outcome[index], self.compute_ms[index] = "ok", message.compute_ms

@@ -11,7 +11,7 @@ from __future__ import annotations
 import traceback
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import msgspec
 
@@ -22,6 +22,7 @@ from rse_pf.backend.frames import CloseSocket, FrameAssembler, Received, SendPon
 from rse_pf.backend.log import JsonLog
 from rse_pf.backend.metrics import LongestRecently, Metrics
 from rse_pf.backend.scheduler import BEHIND, BEHIND_HINT, Job, Refusal, Scheduler
+from rse_pf.backend.seams import Clocks, Handle, Loop, Wire
 from rse_pf.backend.size_gate import SizeGate
 from rse_pf.errors import Busy, InternalError, LimitExceeded, UnknownService
 from rse_pf.service import Kind, Registry, Service, dispatch, failure_of
@@ -38,51 +39,12 @@ from rse_pf.wire.session import (
     Submit,
 )
 
-__all__ = ["Clocks", "Connection", "Core", "Handle", "Wire"]
+__all__ = ["Connection", "Core"]
 
 _SILENCE_MARGIN_S = 0.0
 _SLOWEST_TICK_S = 1.0
 _TICKS_PER_LIMIT = 4
 _UNKNOWN = "unknown"
-
-
-class Wire(Protocol):
-    """The socket of one robot, as the core sees it."""
-
-    def send(self, data: bytes, is_text: bool) -> None:
-        """Write one message; does nothing on a socket that ended."""
-
-    def send_pong(self, data: bytes) -> None:
-        """Write one pong frame."""
-
-    def close(self, code: int, reason: str) -> None:
-        """Write a close frame and end the connection."""
-
-
-class Handle(Protocol):
-    """A timer that can be taken back."""
-
-    def cancel(self) -> None:
-        """Do not call."""
-
-
-class Loop(Protocol):
-    """What the core needs of an event loop."""
-
-    def call_later(self, delay: float, callback: Callable[[], object]) -> Handle:
-        """Call *callback* in *delay* seconds."""
-
-    def call_soon_threadsafe(self, callback: Callable[..., object], *args: Any) -> object:
-        """Call *callback* in the loop's thread."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Clocks:
-    """The readings of time a worker takes: monotonic s, Unix s, CPU s of the process."""
-
-    monotonic: Callable[[], float]
-    wall: Callable[[], float]
-    cpu: Callable[[], float]
 
 
 @dataclass(frozen=True, slots=True)
@@ -216,6 +178,7 @@ class Core:
         self.environments: Environments | None = None
         """Of installed services; set by whoever can make processes."""
         self._gate_timer: Handle | None = None
+        self._ran_inline = False
         self._sweep_timer: Handle | None = None
         self._move: tuple[str, float] | None = None
         self._tick_s = _tick_s(settings)
@@ -354,7 +317,11 @@ class Core:
     # --- from the queue to an answer -----------------------------------------------------------
 
     def _start(self) -> None:
-        while self._scheduler.waiting and self._scheduler.running < self.settings.serving.solver_threads:
+        while (
+            not self._ran_inline
+            and self._scheduler.waiting
+            and self._scheduler.running < self.settings.serving.solver_threads
+        ):
             now = self.clocks.monotonic()
             wait_s = self._gate.wait_s(now, self.clocks.cpu()) if self._gate.is_on else 0.0
             if wait_s > 0:
@@ -371,11 +338,17 @@ class Core:
             self._sweep_timer = self._loop.call_later(pause_s, self._sweep)
 
     def _run(self, job: Job) -> None:
+        """Begin *job*; in the event loop only one in each of its rounds.
+
+        Otherwise a slow round would hide the queue in the kernel, where nobody sees how long it is.
+        """
         service = self._registry.get(job.command.service)
         inline_bytes = self.settings.serving.inline_bytes
         if service.kind == "stateless" and self._scheduler.runs_inline(
             cheap=service.cheap, size_bytes=job.size_bytes, inline_bytes=inline_bytes
         ):
+            self._ran_inline = True
+            self._loop.call_later(0.0, self._next_round)
             self._finish(self._compute(job))
         else:
             self._executors[service.kind].run(job)
@@ -473,6 +446,10 @@ class Core:
         return service if installed or self._service(service) is not None else _UNKNOWN
 
     # --- timers --------------------------------------------------------------------------------
+
+    def _next_round(self) -> None:
+        self._ran_inline = False
+        self._start()
 
     def _gate_opens(self) -> None:
         self._gate_timer = None

@@ -75,6 +75,7 @@ class Scheduler:
         self._target_s = settings.queue_target_ms / 1e3
         self._interval_s = settings.queue_interval_ms / 1e3
         self._most_waiting = settings.queue_per_robot
+        self._threads = settings.solver_threads
         self._robots: dict[str, _Robot] = {}
         self._round: deque[str] = deque()
         self._late_since: float | None = None
@@ -190,8 +191,12 @@ class Scheduler:
         return max(0.0, now - min(received)) if received else 0.0
 
     def runs_inline(self, *, cheap: bool, size_bytes: int, inline_bytes: int) -> bool:
-        """Whether the job just started may run in the event loop: small, and alone."""
-        return cheap and size_bytes <= inline_bytes and self.waiting == 0 and self.running <= 1
+        """Whether the job just started may run in the event loop: small, and nobody could do it meanwhile.
+
+        A lone solver thread has nothing to overlap with but refusals, which cost less than the hand-over.
+        """
+        saves_time = self.waiting == 0 or (self.is_behind and self._threads == 1)
+        return cheap and size_bytes <= inline_bytes and saves_time and self.running <= 1
 
     def _refuse_at_the_door(self, robot: _Robot, job: Job) -> Refusal | None:
         if len(robot.waiting) >= self._most_waiting:

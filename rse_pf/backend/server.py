@@ -11,10 +11,11 @@ import socket
 from collections.abc import Callable
 from typing import Any
 
-from rse_pf.backend.core import Connection, Core, Handle
+from rse_pf.backend.core import Connection, Core
 from rse_pf.backend.door import Admitted, Door, TurnedAway
 from rse_pf.backend.frames import CloseBorder
 from rse_pf.backend.log import JsonLog
+from rse_pf.backend.seams import Handle
 from rse_pf.errors import MissingExtra
 from rse_pf.settings import ServingSettings, SessionSettings
 

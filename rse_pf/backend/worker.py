@@ -22,12 +22,13 @@ from pathlib import Path
 from typing import Any
 
 from rse_pf.auth import KeySet
-from rse_pf.backend.core import Clocks, Core
+from rse_pf.backend.core import Core
 from rse_pf.backend.door import Door
 from rse_pf.backend.environments import Environments
 from rse_pf.backend.hand_over import HandOver
 from rse_pf.backend.log import JsonLog
 from rse_pf.backend.processes import die_with_parent
+from rse_pf.backend.seams import Clocks
 from rse_pf.backend.server import RobotSockets
 from rse_pf.errors import ConfigurationError, MissingExtra
 from rse_pf.objects import open_store

@@ -10,9 +10,10 @@ from typing import Any
 import msgspec
 import pytest
 
-from rse_pf.backend.core import Clocks, Core
+from rse_pf.backend.core import Core
 from rse_pf.backend.door import Admitted
 from rse_pf.backend.log import JsonLog
+from rse_pf.backend.seams import Clocks
 from rse_pf.service import Registry
 from rse_pf.services import echo
 from rse_pf.settings import PlatformSettings
@@ -138,7 +139,7 @@ def test_a_kind_of_service_that_has_no_executor_is_refused(made):
 
 @pytest.mark.parametrize(
     ("hello", "expires_s", "seconds", "code"),
-    [(False, None, 5.0, 4400), (True, None, 6.0, 1001), (True, 5102.0, 2.0, 4401)],
+    [(False, None, 5.0, 4400), (True, None, 5.0, 1001), (True, 5102.0, 2.0, 4401)],
 )
 def test_sockets_without_hello_life_or_token_are_closed_in_time(made, hello, expires_s, seconds, code):
     core, loop = made
@@ -181,3 +182,70 @@ def test_a_robot_that_says_hello_while_the_server_leaves_is_moved(made):
     _, wire = join(core)
 
     assert [type(m) for m in wire.sent] == [Welcome, Move]
+
+
+def behind(core: Core, *, ahead: int = 1) -> None:
+    """Let the scheduler be behind, with *ahead* robots waiting for half a second each."""
+    core._scheduler.is_behind, core._scheduler._judged_s = True, 100.0
+    core._scheduler._turn_s = 0.5
+    core._scheduler._round.extend(f"other-{i}" for i in range(ahead))
+
+
+def test_a_server_that_is_behind_refuses_without_reading(made):
+    core, _ = made
+    connection, wire = join(core)
+    behind(core)
+
+    say(connection, Command(id=8, service="echo", payload={"value": 1}))
+
+    refused = wire.sent[-1]
+    assert (refused.id, refused.code) == (8, "busy")
+    assert refused.retry_after_ms >= 1000.0
+    assert connection.session.in_flight == 0
+    assert core.metrics.shed["unread"] == 1
+    assert core.metrics.requests["echo", "busy"] == 1
+
+
+def test_hellos_pings_and_unknown_services_are_read_even_behind(made):
+    core, _ = made
+    behind(core)
+    connection, wire = join(core)
+
+    say(connection, Ping(sent_s=1.0))
+    say(connection, Command(id=3, service="nothing", payload={}))
+
+    assert [type(m) for m in wire.sent] == [Welcome, Pong, Failure]
+    assert wire.sent[-1].code == "unknown-service"
+    assert core.metrics.shed["unread"] == 0
+
+
+def test_one_command_runs_in_each_round_of_the_loop_so_that_the_queue_is_seen(made):
+    core, loop = made
+    robots = []
+    for name in ("a", "b", "c"):
+        wire = FakeWire()
+        admitted = Admitted(robot=name, codec="bin", subprotocol="x", expires_s=None)
+        robots.append((core.connect(wire, admitted), wire))
+        say(robots[-1][0], Hello())
+
+    for connection, _ in robots:
+        say(connection, Command(id=1, service="echo", payload={"value": 1}))
+
+    assert [sum(isinstance(m, Result) for m in wire.sent) for _, wire in robots] == [1, 0, 0]
+    assert core.held == 2
+    assert core._ran_inline
+    loop.advance(0.0)
+    assert not core._ran_inline
+
+
+def test_the_longest_recent_wait_is_told(made):
+    core, loop = made
+    connection, _ = join(core)
+    core._ran_inline = True
+    say(connection, Command(id=1, service="echo", payload={"value": 1}))
+    loop.now += 0.3
+    core._next_round()
+
+    assert core.snapshot()["gauges"]["queue_ms"] == pytest.approx(300.0)
+    loop.now += 3.0
+    assert core.snapshot()["gauges"]["queue_ms"] == 0.0

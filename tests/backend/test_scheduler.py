@@ -346,3 +346,94 @@ def test_the_server_stops_shedding_when_the_load_is_over():
 
     assert not scheduler.is_behind
     assert scheduler.waiting == 0
+
+
+def test_nothing_is_refused_unread_before_the_server_is_behind():
+    scheduler = Scheduler(SETTINGS)
+    for i in range(50):
+        scheduler.submit(job(f"r{i}"), 0.0)
+
+    assert scheduler.refuse_unread("new", 0.0) is None
+
+
+def test_behind_only_a_short_queue_lets_another_robot_in():
+    scheduler = Scheduler(SETTINGS)
+    scheduler.submit(job("a"), 0.0)
+    scheduler.is_behind, scheduler._judged_s = True, 0.0
+
+    scheduler._turn_s = 0.024
+    assert scheduler.refuse_unread("new", 0.01) is None
+    assert scheduler.refuse_unread("a", 0.01) is not None
+    scheduler._turn_s = 0.026
+    assert scheduler.refuse_unread("new", 0.01) is not None
+
+
+def test_a_frame_that_may_replace_a_waiting_one_is_always_read():
+    scheduler = Scheduler(SETTINGS)
+    scheduler.submit(job("a", 1, stream="cam", seq=1), 0.0)
+    scheduler.submit(job("b", 1), 0.0)
+    scheduler.is_behind, scheduler._turn_s, scheduler._judged_s = True, 1.0, 0.0
+
+    assert scheduler.refuse_unread("a", 0.01) is None
+    assert scheduler.refuse_unread("b", 0.01) is not None
+
+
+def test_what_cannot_be_had_in_half_of_its_time_is_refused_at_the_door():
+    scheduler = Scheduler(SETTINGS)
+    scheduler._turn_s = 0.1
+    for i in range(4):
+        scheduler.submit(job(f"r{i}"), 0.0)
+
+    (refusal,) = scheduler.submit(job("short", within=0.25), 0.0)
+
+    assert refusal.error.code == "busy"
+    assert refusal.error.retry_after_ms is not None
+    assert scheduler.submit(job("long", within=5.0), 0.0) == []
+
+
+def test_a_server_that_refuses_half_of_its_commands_stays_behind_however_short_the_queue():
+    scheduler = Scheduler(SETTINGS)
+    scheduler.is_behind, scheduler._turn_s = True, 0.1
+    for step in range(20):
+        now = step * 0.05
+        scheduler.submit(job(f"in-{step}", at=now), now)
+        assert scheduler.refuse_unread("out", now) is not None
+        started, _ = scheduler.start(now)
+        assert started is not None
+        scheduler.done(started, now)
+
+    assert scheduler.is_behind
+
+
+def test_one_long_pause_does_not_make_the_server_refuse_for_ever():
+    scheduler = Scheduler(SETTINGS)
+    now, refused = 0.0, 0
+    scheduler._turn_s, scheduler.is_behind = 3.0, True
+    for step in range(400):
+        now = step * 0.02
+        for robot in ("a", "b"):
+            if scheduler.refuse_unread(robot, now) is None:
+                refused += bool(scheduler.submit(job(f"{robot}{step}", at=now), now)) and step > 300
+            else:
+                refused += step > 300
+        for later in (now + 0.005, now + 0.01):
+            started, _ = scheduler.start(later)
+            if started is not None:
+                scheduler.done(started, later)
+
+    assert refused == 0
+    assert not scheduler.is_behind
+
+
+def test_a_lone_solver_thread_lends_its_work_to_the_loop_only_while_behind():
+    alone, pair = Scheduler(SETTINGS), Scheduler(ServingSettings(solver_threads=2))
+    for scheduler in (alone, pair):
+        scheduler.submit(job("a"), 0.0)
+        scheduler.submit(job("b"), 0.0)
+        scheduler.start(0.0)
+        assert not scheduler.runs_inline(cheap=True, size_bytes=1, inline_bytes=10)
+        scheduler.is_behind = True
+
+    assert alone.runs_inline(cheap=True, size_bytes=1, inline_bytes=10)
+    assert not alone.runs_inline(cheap=False, size_bytes=1, inline_bytes=10)
+    assert not pair.runs_inline(cheap=True, size_bytes=1, inline_bytes=10)
