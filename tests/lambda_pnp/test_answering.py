@@ -134,6 +134,68 @@ def test_a_late_answer_is_expired_before_and_after_the_work() -> None:
     assert told.id == 1
 
 
+def over_the_websocket(body: bytes) -> Failure:
+    """Return what a backend's session, scheduler and dispatch say to the same bytes."""
+    from rse_pf.backend.scheduler import Job, Scheduler
+    from rse_pf.service import dispatch, failure_of
+    from rse_pf.services.builtin import builtin_services
+    from rse_pf.wire.session import Send, ServerSession, Submit
+
+    codec = make_codec("zlib", SETTINGS.session)
+    session = ServerSession(
+        codec=codec, robot="robot-1", server="lambda", session="s", limits=SETTINGS.session
+    )
+    session.receive(codec.encode(Hello()), 0.0)
+    decision = session.receive(body, 0.0)[0]
+    if isinstance(decision, Send):
+        told = codec.decode_from_server(decision.data)
+    else:
+        assert isinstance(decision, Submit)
+        command = decision.command
+        allowed_s = SETTINGS.session.answer_timeout_s
+        if command.deadline_ms is not None:
+            allowed_s = command.deadline_ms / 1e3
+        job = Job(None, "robot-1", command, len(body), 0.0, allowed_s)
+        refusals = Scheduler(SETTINGS.serving).submit(job, 0.0)
+        if refusals:
+            told = failure_of(refusals[0].error, command, server="lambda")
+        else:
+            told = dispatch(builtin_services(SETTINGS), command, lambda: 0.0, server="lambda")
+    assert isinstance(told, Failure)
+    return told
+
+
+PNP = '{"type":"command","id":7,"trace":"t-1","service":"pnp","payload":%s}'
+BAD = {
+    "bomb": zlib.compress(b" " * 50_000_000),
+    "no zlib": b"hello",
+    "two streams": compressed("1") * 2,
+    "no JSON": compressed("{"),
+    "no command": compressed('{"type":"something"}'),
+    "NaN": compressed(PNP % '{"points_world":[NaN]}'),
+    "infinite": compressed(PNP % '{"points_world":[1e999]}'),
+    "deep": compressed("[" * 1000),
+    "no payload": compressed(PNP % "{}"),
+    "wrong type": compressed(PNP % '{"camera":5}'),
+    "late": make_codec("zlib").encode(Command(id=7, service="pnp", deadline_ms=0.0)),
+    "too few": compressed(
+        PNP % '{"camera":{"fx":500,"fy":500,"cx":320,"cy":240,"width":640,"height":480},'
+        '"points_world":[0,0,1],"pixels":[320,240]}'
+    ),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_a_bad_command_gets_the_failure_that_the_websocket_gives(name: str) -> None:
+    given = answer(event(BAD[name]))
+    expected = over_the_websocket(BAD[name])
+
+    assert isinstance(given, Failure)
+    assert (given.id, given.code, given.trace) == (expected.id, expected.code, expected.trace)
+    if name != "late":  # the moment differs, and with it the words
+        assert (given.message, given.hint) == (expected.message, expected.hint)
+
+
 def test_another_service_is_unknown_here() -> None:
     assert failure(event(make_codec("zlib").encode(Command(id=1, service="echo")))) == "unknown-service"
 

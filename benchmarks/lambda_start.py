@@ -1,0 +1,84 @@
+"""What a cold start of the serverless PnP costs in processor time: import, set up, first solve.
+
+Each run is a fresh process; fetching the keys from S3 is left out, it costs time but no processor.
+``python benchmarks/lambda_start.py --out FILE``; run it in build/lambda's own Python for its own figures.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import statistics
+import subprocess
+import sys
+from pathlib import Path
+
+RUNS = 10
+BAR_S = 0.5
+ONE_START = """
+import time
+began = time.process_time()
+import base64, json, sys, zlib
+from lambda_pnp.answering import Answering
+from rse_pf.auth import KeySet
+from rse_pf.settings import PlatformSettings
+imported = time.process_time()
+told = json.loads(sys.stdin.read())
+answering = Answering(PlatformSettings(), KeySet.from_json(told["keys"]))
+answered = answering.answer(told["event"], now_s=told["now_s"], left_ms=9e3, clock=time.monotonic)
+solved = time.process_time()
+assert answered.status == 200, answered
+print(json.dumps({"import_s": imported - began, "first_s": solved - imported, "all_s": solved,
+                  "cv2": "cv2" in sys.modules, "result": b"result" in zlib.decompress(answered.body)}))
+"""
+
+
+def order() -> str:
+    """Return keys and one event, as JSON: a problem of 200 matches, a third of them wrong."""
+    import base64
+
+    from rse_pf.auth import SigningKey
+    from rse_pf.pnp.problems import make_problem
+    from rse_pf.services.pnp import make_request
+    from rse_pf.settings import PlatformSettings
+    from rse_pf.wire import SUBPROTOCOLS, Command, make_codec
+
+    key, now_s = SigningKey.from_seed(bytes(32), "k"), 1_800_000_000.0
+    problem = make_problem(seed=1)
+    request = make_request(problem.points_world, problem.pixels, problem.camera)
+    body = make_codec("zlib").encode(Command(id=1, service="pnp", payload=request))
+    token = key.issue("robot-1", now=now_s, token_id="t", settings=PlatformSettings().auth)
+    headers = {"authorization": f"Bearer {token}", "content-type": SUBPROTOCOLS["zlib"]}
+    event = {"headers": headers, "body": base64.b64encode(body).decode(), "isBase64Encoded": True}
+    return json.dumps({"keys": key.key_set().to_json(), "event": event, "now_s": now_s})
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--out", type=Path)
+    args = parser.parse_args()
+    sent, rows, load = order(), [], os.getloadavg()
+    for _ in range(RUNS):
+        done = subprocess.run(
+            [sys.executable, "-c", ONE_START], input=sent, capture_output=True, text=True, check=True
+        )
+        rows.append(json.loads(done.stdout))
+    assert all(row["result"] and not row["cv2"] for row in rows)
+    figures = {
+        name: {
+            "p50": round(statistics.median(row[name] for row in rows), 3),
+            "max": round(max(row[name] for row in rows), 3),
+        }
+        for name in ("import_s", "first_s", "all_s")
+    }
+    for name, each in figures.items():
+        print(f"{name:<10} p50 {each['p50']:.3f}  max {each['max']:.3f} s of processor time (n = {RUNS})")
+    print(f"bar: import and first solve within {BAR_S} s; load average before: {load[0]:.2f}")
+    if args.out:
+        args.out.write_text(json.dumps({"runs": RUNS, "load_average": load, **figures}, indent=2) + "\n")
+
+
+if __name__ == "__main__":
+    main()
