@@ -107,6 +107,11 @@ class DataServers:
         self._watching = asyncio.create_task(self._watch())
         return server
 
+    def adopt(self, mark: ProcessMark, port: int) -> None:
+        """Watch the process of an earlier control plane, and replace it when it ends."""
+        self._mark, self._port = mark, port
+        self._watching = asyncio.create_task(self._watch())
+
     async def is_ready(self) -> bool:
         """Return whether the service answers and its store does."""
         return self._port > 0 and await asyncio.to_thread(_ask_ready, self._port)
@@ -115,11 +120,16 @@ class DataServers:
         """Signal the process; return False if it is gone."""
         return self._mark is not None and send_signal(self._mark, number)
 
-    async def stop(self, timeout_s: float) -> None:
-        """Let the service leave, and kill it after *timeout_s*."""
+    async def forget(self) -> None:
+        """Stop watching and leave the process to whoever adopts it."""
         if self._watching is not None:
             self._watching.cancel()
             await asyncio.gather(self._watching, return_exceptions=True)
+        self._watching = None
+
+    async def stop(self, timeout_s: float) -> None:
+        """Let the service leave, and kill it after *timeout_s*."""
+        await self.forget()
         if self._mark is not None:
             self.send(signal.SIGTERM)
             await ended(self._mark, timeout_s)
@@ -127,6 +137,7 @@ class DataServers:
 
     def kill_all(self) -> None:
         """End what is left, at once, and reap it."""
+        self.send(signal.SIGKILL)
         if self._process is not None:
             self._process.kill()  # a no-operation for one that was reaped
             self._process.wait()

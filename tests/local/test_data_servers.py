@@ -67,6 +67,24 @@ def test_a_server_that_dies_is_replaced_on_its_port(tmp_path: Path) -> None:
     asyncio.run(run())
 
 
+def test_the_server_of_an_earlier_control_plane_is_adopted_and_replaced(tmp_path: Path) -> None:
+    async def run() -> None:
+        earlier, later = Box(tmp_path, _PROGRAM), Box(tmp_path, _PROGRAM)
+        server = await earlier.servers.start()
+        later.servers.adopt(server.mark, server.port)
+        await earlier.servers.forget()
+
+        assert later.servers.send(9)  # type: ignore[arg-type]
+        assert [await later.next(), await later.next()] == ["data-server-down", "data-server-up"]
+        await later.servers.stop(10.0)
+        earlier.servers.kill_all()  # reaps its child
+
+        assert later.servers.port == server.port
+        assert earlier.told.qsize() == 1
+
+    asyncio.run(run())
+
+
 def test_a_server_that_ends_at_once_is_told_with_its_last_words(tmp_path: Path) -> None:
     async def run() -> None:
         box = Box(tmp_path, "import sys; sys.exit('the disk is gone')")
