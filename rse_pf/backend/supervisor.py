@@ -53,6 +53,7 @@ def serve(
     announce: Path | None = None,
     conformance_echo: bool = False,
     services: str = _BUILTIN,
+    settings_digest: str = "",
 ) -> int:
     """Serve robots until a drain or a signal ends it; call it in the main thread of a process.
 
@@ -63,6 +64,8 @@ def serve(
         announce: File that tells, once everything listens, pids and ports as JSON.
         conformance_echo: Echo raw messages without token or sub-protocol, for conformance suites.
         services: ``module:function`` that makes the registry of a worker from the settings.
+        settings_digest: What /healthz says; empty means that of *settings*.  Whoever lays an address of this
+            machine over shared settings names the digest of the shared ones.
 
     Returns:
         0 after a drain or a signal, 1 when a worker was lost.
@@ -77,6 +80,7 @@ def serve(
         supervisor = _Supervisor(
             settings, keys=keys, server_id=server_id, announce=announce,
             conformance_echo=conformance_echo, services=services, listener=listener,
+            digest=settings_digest or settings.digest(),
         )  # fmt: skip
         return asyncio.run(supervisor.run())
 
@@ -137,8 +141,10 @@ class _Supervisor:
         conformance_echo: bool,
         services: str,
         listener: socket.socket,
+        digest: str,
     ) -> None:
         self._settings = settings
+        self._digest = digest
         self._server_id = server_id
         self._announce = announce
         self._listener = listener
@@ -213,7 +219,7 @@ class _Supervisor:
         self._state = "ready"
         if self._announce is not None:
             _write_atomically(self._announce, self._identity())
-        self._log.info("server-ready", **self._identity(), settings=self._settings.digest())
+        self._log.info("server-ready", **self._identity(), settings=self._digest)
 
     def _identity(self) -> dict[str, Any]:
         return {
@@ -327,7 +333,7 @@ class _Supervisor:
             {
                 "server": self._server_id,
                 "version": _version(),
-                "settings": self._settings.digest(),
+                "settings": self._digest,
                 "uptime_s": round(time.monotonic() - self._began, 3),
             }
         )
@@ -381,7 +387,7 @@ class _Supervisor:
                 "worker_cpu_s": [cpu_seconds(worker.pid) for worker in self._workers],
                 "resident_bytes": sum(map(resident_bytes, self._pids())),
                 "size": self._settings.serving.size,
-                "settings": self._settings.digest(),
+                "settings": self._digest,
                 "isolation": merge_isolation(worker.report for worker in self._workers),
             }
         )

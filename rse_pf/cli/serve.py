@@ -44,6 +44,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--announce", type=Path, metavar="FILE", help="write pids and ports there when all is ready"
     )
+    parser.add_argument("--store", metavar="PLACE", help="where objects live (data.store)")
     parser.add_argument(
         "--services", type=Path, metavar="DIR", help="run the services installed there (services.folder)"
     )
@@ -64,7 +65,8 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
         services["folder"] = str(args.services.absolute())
     if args.accept_weak_isolation:
         services["accept_weak_isolation"] = True
-    chosen = settings.replace(serving=overrides, services=services)
+    data = {} if args.store is None else {"store": args.store}
+    chosen = settings.replace(serving=overrides, services=services, data=data)
     server_id = f"server-{os.getpid()}" if args.server_id is None else args.server_id
     if not 0 < len(server_id) <= 64 or not server_id.isprintable():
         raise UsageError(f"{server_id[:80]!r} is no name for a server", hint="use 1 to 64 printable letters")
@@ -83,6 +85,7 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
         server_id=server_id,
         announce=args.announce,
         conformance_echo=args.conformance_echo,
+        settings_digest=settings.digest(),
     )
 
 

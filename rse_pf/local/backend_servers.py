@@ -82,7 +82,12 @@ class BackendServers:
     def launch(self, name: str) -> None:
         """Start the process of server *name*, and return before it listens."""
         self._announce(name).unlink(missing_ok=True)
+        serving = self._settings.serving
         command = [*self._program, "serve", "--settings", str(self._settings_file), "--server-id", name]
+        # Where it runs is said beside the settings, whose digest is then the same on every machine.
+        command += ["--host", serving.host, "--port", str(serving.port), "--workers", str(serving.workers)]
+        command += ["--control-host", serving.control_host, "--control-port", str(serving.control_port)]
+        command += ["--store", self._settings.data.store]
         command += ["--keys", str(self._keys_file), "--announce", str(self._announce(name))]
         process = spawn(
             command, log=self._log(name), folder=self._folder, dies_with_parent=self._dies_with_parent

@@ -90,7 +90,7 @@ class LocalCloud:
         self.name = name or state.name
         self.state = state.absolute()
         self.settings = settings
-        self._server_settings = _for_servers(settings)
+        self._server_settings = _for_servers(settings, self.state)
         self._count = settings.local.servers if servers is None else servers
         self._adoptable = adoptable
         self._on_event = on_event
@@ -215,7 +215,7 @@ class LocalCloud:
         return {
             "platform": self.name,
             "url": self.url,
-            "settings_digest": self._server_settings.digest(),
+            "settings_digest": self.settings.digest(),
             "balancer": {
                 "pid": None if mark is None else mark.pid,
                 "port": self.load_balancer.port,
@@ -349,7 +349,7 @@ class LocalCloud:
 
     async def _start(self, left: PlatformState | None, end: float) -> None:
         self._key = ensure_key(self.state, seed=secrets.token_bytes(32), key_id=secrets.token_hex(4))
-        document = {"context": {"rse-pf": self._server_settings.to_dict()}}
+        document = {"context": {"rse-pf": self.settings.to_dict()}}
         self._settings_file.write_text(json.dumps(document, indent=1), encoding="utf-8")
         if self._monitored:
             self._control.attend()
@@ -380,7 +380,7 @@ class LocalCloud:
             name=self.name,
             control_plane=control_plane,
             url=self.url,
-            settings_digest=self._server_settings.digest(),
+            settings_digest=self.settings.digest(),
             settings_file=str(self._settings_file),
             key_file=str(key_file(self.state)),
             servers=tuple(
@@ -436,10 +436,17 @@ def _bounds(scaling: ScalingSettings, count: int) -> ScalingSettings:
     return dataclasses.replace(scaling, min_servers=least, max_servers=most)
 
 
-def _for_servers(settings: PlatformSettings) -> PlatformSettings:
-    """Return the settings of every local server: loopback, ephemeral ports, workers as on this machine."""
+def _for_servers(settings: PlatformSettings, state: Path) -> PlatformSettings:
+    """Return the settings of every local server: loopback, ephemeral ports, workers as on this machine.
+
+    Objects of servers that come and go lie in the platform's folder, if they were to lie in memory.
+    """
     address = {"host": _LOOPBACK, "port": 0, "control_host": _LOOPBACK, "control_port": 0}
-    return settings.replace(serving={**address, "workers": settings.local.workers})
+    store = settings.data.store
+    return settings.replace(
+        serving={**address, "workers": settings.local.workers},
+        data={"store": f"dir:{state / 'objects'}" if store == "memory:" else store},
+    )
 
 
 async def _all(*works: Any) -> None:
