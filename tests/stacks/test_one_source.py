@@ -1,0 +1,68 @@
+"""One place to edit: what cdk.json says arrives in templates, boot files, Lambda and local servers alike."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from rse_pf.local.cloud import LocalCloud
+from rse_pf.settings import PlatformSettings, load_settings
+
+Assembly = Any
+
+WATCHED = {
+    "scaling": ("busy_cpu_percent", "min_servers", "max_servers", "idle_s"),
+    "serving": ("port", "control_port"),
+}
+
+
+def carried(assembly: Assembly) -> list[PlatformSettings]:
+    """Return the settings inside of every asset: the servers' package and the Lambda's."""
+    return [load_settings(path) for path in sorted(assembly.folder.glob("asset.*/settings.json"))]
+
+
+def test_boot_files_and_lambda_carry_the_very_settings(assembly: Assembly) -> None:
+    found = carried(assembly)
+
+    assert len(found) == 2
+    assert {each.digest() for each in found} == {assembly.settings.digest()}
+    for group, names in WATCHED.items():
+        for name in names:
+            expected = getattr(getattr(assembly.settings, group), name)
+            assert [getattr(getattr(each, group), name) for each in found] == [expected] * 2
+
+
+def test_what_can_be_tagged_carries_the_digest(assembly: Assembly) -> None:
+    for kind in ("AWS::EC2::VPC", "AWS::S3::Bucket", "AWS::Lambda::Function"):
+        for resource in assembly.all(kind):
+            assert {"Key": "rse-pf", "Value": assembly.settings.digest()} in resource["Tags"]
+
+
+def test_the_template_follows_each_watched_setting(assembly: Assembly) -> None:
+    backend = json.dumps(assembly.templates["RsePf-Backend"])
+    network = json.dumps(assembly.templates["RsePf-Network"])
+    settings = assembly.settings
+
+    assert f'"Threshold": {settings.scaling.busy_cpu_percent:g}' in backend
+    assert f'"EvaluationPeriods": {settings.scaling.idle_s // settings.scaling.period_s}' in backend
+    assert f'"Port": {settings.serving.port}' in backend
+    assert f'"HealthCheckPort": "{settings.serving.control_port}"' in backend
+    assert f'"FromPort": {settings.serving.port}' in network
+    assert f'"FromPort": {settings.serving.control_port}' in network
+
+
+@pytest.mark.system
+def test_local_servers_answer_with_the_digest_of_the_same_file(assembly: Assembly, tmp_path: Path) -> None:
+    settings = assembly.settings.replace(data={"enabled": False})
+
+    async def run() -> tuple[dict[str, Any], Any]:
+        async with LocalCloud(settings, state=tmp_path / "state", servers=1, port=0) as cloud:
+            return (await cloud.status())[0], load_settings(tmp_path / "state" / "settings.json")
+
+    status, written = asyncio.run(run())
+    assert status["settings"] == written.digest() == settings.digest()
+    assert written.scaling == settings.scaling
