@@ -20,7 +20,7 @@ from rse_pf.experiments.elasticity_report import judge_elasticity
 from rse_pf.experiments.pictures import draw_elasticity, require_matplotlib
 from rse_pf.experiments.records import read_records
 from rse_pf.experiments.report import PAPER
-from rse_pf.experiments.results import finish_report, fresh_folder
+from rse_pf.experiments.results import finish_report, fresh_folder, generator_of
 from rse_pf.experiments.stage import Stage, watch
 from rse_pf.experiments.swarm import SwarmOptions
 from rse_pf.experiments.tables import elasticity_markdown
@@ -78,20 +78,21 @@ def run_elasticity(options: ElasticityOptions, settings: PlatformSettings) -> in
     chosen = settings.replace(serving={"size": size}, local={"servers": settings.scaling.min_servers})
     for part, rebalance in runs.values():
         asyncio.run(_run(options, chosen, part, rebalance))
-    judged = {name: judge_elasticity(read_records(part)) for name, (part, _) in runs.items()}
+    records = {name: read_records(part) for name, (part, _) in runs.items()}
+    judged = {name: judge_elasticity(each) for name, each in records.items()}
+    generator = {name: generator_of(each) for name, each in records.items()}
     asked = {**asdict(options), "out": options.out.name, "size": size}
     own = {"speed": options.speed, "size": size, "cost": None if cost is None else asdict(cost)}
     body: Mapping[str, Any] = {"runs": judged} if options.compare else next(iter(judged.values()))
     report = finish_report(
         folder,
-        {"experiment": "elasticity", "asked": asked, **own, **body, "paper": PAPER},
+        {"experiment": "elasticity", "asked": asked, **own, **body, "generator": generator, "paper": PAPER},
         chosen,
         load_before,
     )
     (folder / "report.md").write_text(elasticity_markdown(report, judged), encoding="utf-8")
     captions = {"": "with rebalancing" if options.rebalance else "without rebalancing"}
-    drawn = {captions.get(name, name): read_records(part) for name, (part, _) in runs.items()}
-    draw_elasticity(folder / PICTURE, drawn)
+    draw_elasticity(folder / PICTURE, {captions.get(name, name): each for name, each in records.items()})
     print((folder / "report.md").read_text(encoding="utf-8"))
     print(f"wrote {PICTURE}, report.json, report.md and the raw records to {options.out}")
     return int(any(run["commands"]["lost"] or run["commands"]["twice"] for run in judged.values()))
