@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import socket
@@ -150,7 +151,9 @@ def test_stop_without_a_platform_says_so(terminal: Terminal) -> None:
     assert (told.returncode, told.stdout) == (0, "platform 'default' was not running\n")
 
 
-def test_a_killed_control_plane_leaves_the_data_path_and_stop_cleans_it_up(terminal: Terminal) -> None:
+def test_without_a_control_plane_robots_are_served_status_works_and_stop_cleans_up(
+    terminal: Terminal,
+) -> None:
     process, state, _ = terminal.platform()
     process.kill()
     process.wait(SOON_S)
@@ -159,9 +162,10 @@ def test_a_killed_control_plane_leaves_the_data_path_and_stop_cleans_it_up(termi
     control = f"http://127.0.0.1:{state.servers[0].control_port}/readyz"
     with urllib.request.urlopen(control, timeout=SOON_S) as answer:
         assert answer.status == 200
-    again = terminal.run("local", "--port", "0")
-    assert again.returncode == 2
-    assert "outlived their control plane\n  hint: end them with: rse-pf local stop" in again.stderr
+    seen = json.loads(terminal.run("local", "status", "--json").stdout)
+    assert not seen["control_plane"]["running"]
+    assert seen["balancer"]["running"]
+    assert [(each["name"], each["state"]) for each in seen["servers"]] == [("server-1", "ready")]
 
     told = terminal.run("local", "stop")
     assert told.stdout == "platform 'default' is stopped\n"
@@ -208,17 +212,109 @@ def test_a_taken_port_is_two_lines_and_starts_nothing(terminal: Terminal) -> Non
         f"ConfigurationError: cannot listen on 127.0.0.1:{port}: Address already in use",
         "  hint: choose another port with --port; --port 0 takes a free one",
     ]
-    assert not terminal.folder.exists()
+    assert read_state(terminal.folder) is None
 
 
-def test_it_ends_with_the_reason_when_the_balancer_dies(terminal: Terminal) -> None:
+def until_said(process: subprocess.Popen[str], words: str) -> str:
+    """Return what the platform said up to *words*."""
+    assert process.stdout is not None
+    said = ""
+    for line in process.stdout:
+        said += line
+        if words in line:
+            return said
+    raise AssertionError(said)
+
+
+def test_a_new_control_plane_takes_over_what_runs(terminal: Terminal) -> None:
+    process, before, _ = terminal.platform()
+    process.kill()
+    process.wait(SOON_S)
+
+    _, after, said = terminal.platform()
+
+    assert "took over what an earlier control plane left: server-1" in said
+    assert after.processes() == before.processes()
+    assert (after.url, after.key_file) == (before.url, before.key_file)
+
+
+def test_a_killed_balancer_comes_back_on_the_same_port(terminal: Terminal) -> None:
     process, state, _ = terminal.platform()
+
+    told = terminal.run("local", "kill-balancer")
+
     assert state.load_balancer is not None
+    assert told.stdout == f"killed the load balancer (pid {state.load_balancer.pid})\n"
+    until_said(process, "the load balancer is back")
+    assert terminal.state().url == state.url
 
-    send_signal(state.load_balancer, signal.SIGKILL)
-    _, errors = process.communicate(timeout=SOON_S)
 
-    assert process.returncode == 1
-    assert errors.startswith("RsePfError: the load balancer ended")
-    assert len(errors.splitlines()) == 2
-    assert_gone(state)
+def test_a_killed_server_is_replaced_and_both_are_told_in_words(terminal: Terminal) -> None:
+    process, state, _ = terminal.platform()
+    server = state.servers[0]
+
+    told = terminal.run("local", "kill", "server-1")
+
+    assert told.stdout == f"killed: server-1 (pid {server.process.pid}, 2 processes)\n"
+    assert "server-1 ended" in until_said(process, "server-2 is ready")
+    terminal.state()
+
+
+def test_pause_for_a_moment_stops_the_tree_and_lets_it_go_on(terminal: Terminal) -> None:
+    _, state, _ = terminal.platform()
+
+    told = terminal.run("local", "pause", "server-1", "--for", "0.2")
+
+    assert told.returncode == 0
+    assert told.stdout.splitlines()[1] == "server-1 goes on"
+    assert is_alive(state.servers[0].process)
+    table = terminal.run("local", "status").stdout
+    assert table.splitlines()[0].split()[:4] == ["server", "pid", "state", "robots"]
+    assert table.splitlines()[1].split()[:3] == ["server-1", str(state.servers[0].process.pid), "ready"]
+    assert state.url in table
+
+
+def test_slow_ends_with_ctrl_c_and_the_server_is_whole(terminal: Terminal) -> None:
+    _, state, _ = terminal.platform()
+    process = terminal.start("local", "slow", "server-1", "--percent", "50")
+    assert process.stdout is not None
+    assert process.stdout.readline() == "server-1 has 50 % of its time; Ctrl-C ends that\n"
+
+    process.send_signal(signal.SIGINT)
+    said, errors = process.communicate(timeout=SOON_S)
+
+    assert (process.returncode, said, errors) == (0, "server-1 has all of its time again\n", "")
+    fields = Path(f"/proc/{state.servers[0].process.pid}/stat").read_text().rpartition(")")[2].split()
+    assert fields[0] in "SR"
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("kill", "server-9"), "no server named 'server-9' is running"),
+        (("kill",), "rse-pf local kill needs a server"),
+        (("status", "server-1"), "rse-pf local status takes no server"),
+        (("slow", "server-1"), "--percent belongs to slow"),
+        (("pause", "server-1", "--for", "-1"), "--for takes a positive number"),
+        (("kill", "server-1", "--for", "1"), "--for takes a positive number"),
+    ],
+)
+def test_a_wrong_word_is_two_lines_and_breaks_nothing(
+    terminal: Terminal, words: tuple[str, ...], said: str
+) -> None:
+    _, state, _ = terminal.platform() if words[-1] == "server-9" else (None, None, "")
+
+    told = terminal.run("local", *words)
+
+    assert told.returncode == 2
+    assert said in told.stderr.splitlines()[0]
+    assert len(told.stderr.splitlines()) == 2
+    assert state is None or ("running: server-1" in told.stderr and all(map(is_alive, state.processes())))
+
+
+@pytest.mark.parametrize("action", ["status", "kill-balancer"])
+def test_without_a_platform_there_is_nothing_to_look_at_or_to_break(terminal: Terminal, action: str) -> None:
+    told = terminal.run("local", action)
+
+    assert (told.returncode, told.stdout) == (2, "")
+    assert "hint: start it with: rse-pf local" in told.stderr

@@ -1,0 +1,160 @@
+"""Break a running platform on purpose: kill, stop, slow down or cut off one of its processes.
+
+Works from the state file alone, so also while the control plane is dead.  Promises to signal only processes
+that the file names by pid and time of birth and what these started, and that a server which is slowed or cut
+off is whole again when the block ends, also if we are killed inside `cut_off`.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import shutil
+import signal
+import subprocess
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+
+from rse_pf.errors import ConfigurationError, UsageError
+from rse_pf.local.processes import ProcessMark, is_alive, mark_of, send_signal
+from rse_pf.local.state import PlatformState, ServerState
+
+__all__ = ["cut_off", "find_server", "kill_balancer", "nft_commands", "signal_tree", "slow_down", "tree"]
+
+PERIOD_S = 0.04
+"""One round of stopping and going on: long against a switch of processes, short against a health check."""
+
+_KERNEL = "the kernel needs nf_tables, and nft 1.0 or later"
+
+
+def find_server(state: PlatformState, name: str) -> ServerState:
+    """Return the running server called *name*; raises UsageError, which names those that run."""
+    alive = [server for server in state.servers if is_alive(server.process)]
+    for server in alive:
+        if server.name == name:
+            return server
+    running = ", ".join(server.name for server in alive) or "none"
+    raise UsageError(f"no server named {name[:80]!r} is running", hint=f"running: {running}")
+
+
+def tree(root: ProcessMark) -> list[ProcessMark]:
+    """Return *root* and every process that it or its children started, parents first; empty if it is gone."""
+    found, seen = [root] if is_alive(root) else [], {root.pid}
+    for mark in found:  # grows while it is walked
+        for pid in _children(mark.pid):
+            child = mark_of(pid)
+            if child is not None and pid not in seen:
+                seen.add(pid)
+                found.append(child)
+    return found if is_alive(root) else []
+
+
+def signal_tree(root: ProcessMark, number: signal.Signals) -> int:
+    """Signal *root* and all that it started; return how many there were.
+
+    Looks again until nothing new was found: a process may start another one before it is stopped.
+    """
+    told: set[ProcessMark] = set()
+    while new := [mark for mark in tree(root) if mark not in told]:
+        for mark in new:
+            send_signal(mark, number)
+        told.update(new)
+    return len(told)
+
+
+def kill_balancer(state: PlatformState) -> int:
+    """End the load balancer with SIGKILL; return its pid, or raise UsageError if none runs."""
+    mark = state.load_balancer
+    if mark is None or not send_signal(mark, signal.SIGKILL):
+        raise UsageError("no load balancer is running", hint="rse-pf local status shows what runs")
+    return mark.pid
+
+
+def slow_down(root: ProcessMark, percent: float, wait: Callable[[float], bool]) -> None:
+    """Give *root* and all that it started *percent* of the time, until it is gone or *wait* returns True.
+
+    Args:
+        root: A server.
+        percent: Above 0, below 100.
+        wait: Waits so many seconds, or shorter; returns whether it is over.
+    """
+    if not 0 < percent < 100:
+        raise UsageError(f"a server cannot have {percent:g} % of its time", hint="choose 1 to 99")
+    running_s = PERIOD_S * percent / 100
+    try:
+        while signal_tree(root, signal.SIGSTOP):
+            over = wait(PERIOD_S - running_s)
+            signal_tree(root, signal.SIGCONT)
+            if over or wait(running_s):
+                return
+    finally:
+        signal_tree(root, signal.SIGCONT)
+
+
+@contextlib.contextmanager
+def cut_off(server: ServerState, platform: str) -> Iterator[None]:
+    """Drop everything to and from the ports of *server* on the loopback interface, inside the block.
+
+    The rules are in a table that belongs to a child of ours: Linux removes it with its owner.
+
+    Raises:
+        UsageError: We are not root.
+        ConfigurationError: There is no ``nft``, or it refuses.
+    """
+    if os.geteuid() != 0:
+        hint = f"nearest without root: rse-pf local pause {server.name}"
+        raise UsageError("a partition needs root", hint=hint)
+    path = shutil.which("nft", path=f"{os.environ.get('PATH', '')}{os.pathsep}/usr/sbin")
+    if path is None:
+        raise ConfigurationError("there is no nft here", hint="install nftables, or use pause")
+    commands = nft_commands(f"rse_pf_{platform}_{server.name}", [server.port, server.control_port])
+    child = subprocess.Popen(
+        [path, "--interactive"], stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
+        text=True, start_new_session=True,
+    )  # fmt: skip
+    try:
+        assert child.stdin is not None
+        child.stdin.write(commands)
+        child.stdin.flush()
+        _wait_until_it_holds(child)
+        yield
+    finally:
+        child.kill()
+        child.communicate()
+
+
+def nft_commands(table: str, ports: Sequence[int]) -> str:
+    """Return what makes *table* drop TCP to and from *ports* of this machine; it ends with its owner."""
+    name = "".join(letter if letter.isalnum() else "_" for letter in table)
+    chosen = ", ".join(str(port) for port in ports if port)
+    return (
+        f"add table inet {name} {{ flags owner; }}\n"
+        f"add chain inet {name} cut {{ type filter hook input priority -10; policy accept; }}\n"
+        f'add rule inet {name} cut iifname "lo" tcp dport {{ {chosen} }} drop\n'
+        f'add rule inet {name} cut iifname "lo" tcp sport {{ {chosen} }} drop\n'
+        f"list table inet {name}\n"
+    )
+
+
+def _wait_until_it_holds(child: subprocess.Popen[str]) -> None:
+    """Read what nft says: the last command lists both rules, or something went wrong."""
+    assert child.stdout is not None
+    rules = 0
+    for line in child.stdout:
+        rules += line.rstrip().endswith("drop") and "port" in line and "add rule" not in line
+        if rules == 2:
+            return
+        if "Error" in line:
+            raise ConfigurationError(
+                f"nft refuses: {line.strip()[:200]}", hint="does the kernel have nf_tables?"
+            )
+    raise ConfigurationError("nft ended at once", hint="does the kernel have nf_tables?")
+
+
+def _children(pid: int) -> list[int]:
+    found: list[int] = []
+    with contextlib.suppress(OSError):  # it may be gone by now
+        for each in Path(f"/proc/{pid}/task").glob("*/children"):
+            with contextlib.suppress(OSError):
+                found += map(int, each.read_text(encoding="ascii").split())
+    return found
