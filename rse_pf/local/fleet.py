@@ -111,8 +111,10 @@ class Fleet:
         return self.members[name]
 
     def is_warming(self, member: Member, now_s: float) -> bool:
-        """Return whether the CPU of *member* does not count yet."""
-        return now_s - member.launched_s < self._warm_up_s
+        """Return whether the CPU of *member* does not count yet: it counts some time after it took robots."""
+        if member.adopted:
+            return False
+        return member.healthy_s is None or now_s - member.healthy_s < self._warm_up_s
 
     # --- from the launch to the first robot -----------------------------------------------------
 
