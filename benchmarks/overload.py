@@ -163,7 +163,7 @@ class Generator:
             self.on_done(wire, index)
 
     async def capacity(self, seconds: float) -> float:
-        """Return answers per second with always five commands at work."""
+        """Return answers per second with always a dozen commands at work."""
         loop, end, done, numbers = asyncio.get_running_loop(), time.perf_counter() + seconds, [0], Counter()
         over = loop.create_future()
 
@@ -179,7 +179,7 @@ class Generator:
 
         self.on_done = more
         begin = len(self.outcome)
-        for robot in range(5):
+        for robot in range(12):
             self.send(robot, 0, time.perf_counter())
         await over
         self.on_done = None

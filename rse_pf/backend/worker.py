@@ -98,6 +98,7 @@ class _Worker:
             loop=loop,
             log=self._log,
             new_session_id=lambda: secrets.token_hex(8),
+            rest=time.sleep,
         )
         if settings.services.folder or settings.services.published:
             self._core.environments = self._environments(settings, config["server"], config["workers"])

@@ -14,6 +14,7 @@ from rse_pf.backend.core import Core
 from rse_pf.backend.door import Admitted
 from rse_pf.backend.log import JsonLog
 from rse_pf.backend.seams import Clocks
+from rse_pf.backend.size_gate import SizeGate
 from rse_pf.service import Registry
 from rse_pf.services import echo
 from rse_pf.settings import PlatformSettings
@@ -66,8 +67,12 @@ class Odd(msgspec.Struct, frozen=True, kw_only=True):
     value: Any = None
 
 
+rests: list[float] = []
+
+
 @pytest.fixture
 def made():
+    rests.clear()
     loop, log_fd = FakeLoop(), os.open(os.devnull, os.O_WRONLY)
     settings = PlatformSettings()
     registry = Registry()
@@ -85,7 +90,7 @@ def made():
     core = Core(
         settings=settings, registry=registry, server_id="s-1", loop=loop, log=log,
         clocks=Clocks(monotonic=lambda: loop.now, wall=lambda: 5000.0 + loop.now, cpu=lambda: 0.0),
-        new_session_id=lambda: "session-1",
+        new_session_id=lambda: "session-1", rest=rests.append,
     )  # fmt: skip
     yield core, loop
     core.close_all()
@@ -249,3 +254,16 @@ def test_the_longest_recent_wait_is_told(made):
     assert core.snapshot()["gauges"]["queue_ms"] == pytest.approx(300.0)
     loop.now += 3.0
     assert core.snapshot()["gauges"]["queue_ms"] == 0.0
+
+
+@pytest.mark.parametrize(("is_behind", "rested"), [(True, [0.005]), (False, [])])
+def test_a_small_server_out_of_budget_rests_a_moment_only_while_it_is_behind(made, is_behind, rested):
+    core, loop = made
+    connection, wire = join(core)
+    core._gate = SizeGate(0.25, 0.02, now=loop.now, cpu_s=-1.0)
+    core._scheduler.is_behind, core._scheduler._judged_s = is_behind, loop.now
+
+    say(connection, Command(id=1, service="echo", payload={"value": 1}))
+
+    assert rests == rested
+    assert len(wire.sent) == 1, "only the welcome: the budget is used up"
