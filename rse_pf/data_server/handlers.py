@@ -17,7 +17,7 @@ import msgspec
 from rse_pf.auth import Claims
 from rse_pf.data_server.http import Reply, Request, failure_reply, json_reply, wanted_range
 from rse_pf.data_server.maps import MapRecord, MapRegistry
-from rse_pf.data_server.openapi import openapi
+from rse_pf.data_server.openapi import openapi_page
 from rse_pf.data_server.routes import (
     BYTES,
     Begin,
@@ -63,7 +63,7 @@ class Handlers:
         self._settings = settings
         self._wall_clock = wall_clock
         self.objects = Objects(store, settings, clock, wall_clock)
-        self._document = msgspec.json.encode(openapi())
+        self._document = openapi_page().encode()
 
     async def healthz(self, request: Request, who: Claims, path: dict[str, str]) -> Reply:
         """Answer at once."""

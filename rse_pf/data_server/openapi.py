@@ -5,6 +5,7 @@ Promises to describe what the dispatcher does, because both read `rse_pf.data_se
 
 from __future__ import annotations
 
+import functools
 import json
 import re
 from typing import Any
@@ -57,6 +58,7 @@ def openapi() -> dict[str, Any]:
     }
 
 
+@functools.cache
 def openapi_page() -> str:
     """Return ``docs/openapi.json``."""
     return json.dumps(openapi(), indent=1, sort_keys=True) + "\n"
