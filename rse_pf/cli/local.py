@@ -21,6 +21,7 @@ import os
 import signal
 import sys
 import time
+from pathlib import Path
 from typing import Any
 
 from rse_pf.errors import UsageError
@@ -59,6 +60,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--port", type=int, metavar="P",
         help=f"front door; 0 takes a free one (local.port, default {defaults.port})",
     )  # fmt: skip
+    parser.add_argument(
+        "--services", metavar="DIR", help="also run the services installed there (rse-pf service install)"
+    )
+    parser.add_argument(
+        "--accept-weak-isolation", action="store_true", help="run them even where the kernel lacks a wall"
+    )
 
 
 def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
@@ -77,7 +84,19 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
         return _on_running(args, folder)
     wanted = {"servers": args.servers, "port": args.port}
     chosen = settings.replace(local={name: value for name, value in wanted.items() if value is not None})
-    return asyncio.run(_foreground(args.name, folder, chosen))
+    return asyncio.run(_foreground(args.name, folder, _with_services(chosen, args)))
+
+
+def _with_services(settings: PlatformSettings, args: argparse.Namespace) -> PlatformSettings:
+    """Return *settings* with what the options say of installed services; a changed one is refused here."""
+    told: dict[str, Any] = {"accept_weak_isolation": True} if args.accept_weak_isolation else {}
+    if args.services is not None:
+        from rse_pf.services.installed import installed_services
+
+        folder = Path(args.services).absolute()
+        installed_services(folder)
+        told["folder"] = str(folder)
+    return settings.replace(services=told)
 
 
 def _check(args: argparse.Namespace) -> None:

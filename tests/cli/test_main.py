@@ -13,7 +13,9 @@ import pytest
 from rse_pf.cli.main import VERBS, main
 from rse_pf.settings import PlatformSettings, settings_page
 
-EMPTY = ["demo", "local", "token", "serve", "settings", "doctor"]
+EMPTY = [
+    "demo", "experiment", "local", "swarm", "token", "service", "serve", "data", "map", "settings", "doctor",
+]  # fmt: skip
 HELP_S = 0.3
 
 
@@ -38,7 +40,7 @@ def _alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     ("words", "first", "hint"),
     [
         ("lcoal", "no verb 'lcoal'", "did you mean local?"),
-        ("xyzzy", "no verb 'xyzzy'", "known are demo, local"),
+        ("xyzzy", "no verb 'xyzzy'", "known are demo, experiment, local"),
         ("--settings a.json serve", "--settings stands before the verb", "rse-pf VERB OPTIONS"),
         ("serve --prot 1", "unrecognized arguments: --prot", "did you mean --port?"),
         ("serve --prot=1", "unrecognized arguments: --prot", "did you mean --port?"),

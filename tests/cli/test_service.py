@@ -1,0 +1,116 @@
+"""The service verb, without a server: what new writes, and what a wrong folder or request is told."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+
+from rse_pf.cli.main import main
+from rse_pf.services.installed import read_service
+
+
+@pytest.fixture(autouse=True)
+def in_an_empty_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def complaint(capsys: pytest.CaptureFixture[str], *words: str) -> str:
+    capsys.readouterr()
+    assert main(["service", *words]) != 0
+    told = capsys.readouterr()
+    assert "Traceback" not in told.out + told.err
+    return told.err
+
+
+@pytest.mark.parametrize("language", ["python", "cpp", "lua"])
+def test_new_writes_a_folder_that_is_a_service_with_a_recorded_request(language: str) -> None:
+    assert main(["service", "new", "mine", "--lang", language]) == 0
+
+    service = read_service(Path("mine"))
+    recorded = json.loads(Path("mine/requests/example.json").read_text())
+    assert (service.name, service.language) == ("mine", language)
+    assert {"request", "reply"} <= set(recorded)
+    assert "@NAME@" not in "".join(p.read_text() for p in Path("mine").rglob("*") if p.is_file())
+
+
+def test_new_never_writes_over_a_folder(capsys: pytest.CaptureFixture[str]) -> None:
+    Path("mine").mkdir()
+
+    assert "exists already" in complaint(capsys, "new", "mine")
+    assert list(Path("mine").iterdir()) == []
+
+
+@pytest.mark.parametrize("name", ["../up", "Mine", "", "a b", "x" * 41])
+def test_a_name_that_could_be_a_path_is_refused(capsys: pytest.CaptureFixture[str], name: str) -> None:
+    assert "no name for a service" in complaint(capsys, "new", name)
+
+
+def test_an_installed_service_is_listed_and_serves_no_more_once_changed(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    main(["service", "new", "mine"])
+    assert main(["service", "install", "mine", "--services", "all"]) == 0
+    capsys.readouterr()
+    assert main(["service", "list", "--services", "all"]) == 0
+    assert capsys.readouterr().out.split()[:2] == ["mine", "python"]
+
+    with Path("all/mine/service.py").open("a") as file:
+        file.write("# one byte more\n")
+
+    assert "was changed after it was installed" in complaint(capsys, "list", "--services", "all")
+    assert main(["local", "--services", "all", "--port", "0"]) != 0
+    assert "was changed after it was installed" in capsys.readouterr().err
+
+
+def test_a_request_that_is_not_json_says_where(capsys: pytest.CaptureFixture[str]) -> None:
+    assert "--request is not JSON" in complaint(capsys, "call", "mine", "--request", "{points")
+
+
+def test_a_recorded_request_that_is_not_json_names_its_file(capsys: pytest.CaptureFixture[str]) -> None:
+    main(["service", "new", "mine"])
+    Path("mine/requests/bad.json").write_text("{")
+
+    assert "bad.json is not JSON" in complaint(capsys, "test", "mine")
+
+
+def test_a_folder_that_is_no_service_says_how_to_make_one(capsys: pytest.CaptureFixture[str]) -> None:
+    told = complaint(capsys, "test", "nothing-here")
+    assert "rse-pf service new NAME" in told
+
+
+def test_a_missing_cmake_is_named(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    main(["service", "new", "mine", "--lang", "cpp"])
+    monkeypatch.setattr(shutil, "which", lambda name: None)
+
+    assert "cmake is not installed" in complaint(capsys, "install", "mine")
+
+
+@pytest.mark.system
+def test_a_wrong_reply_fails_the_test_and_says_where(capsys: pytest.CaptureFixture[str]) -> None:
+    main(["service", "new", "mine"])
+    assert main(["service", "test", "mine"]) == 0
+    path = Path("mine/requests/example.json")
+    recorded = json.loads(path.read_text())
+    path.write_text(json.dumps({**recorded, "reply": {"no_such_field": 1}}))
+    capsys.readouterr()
+
+    assert main(["service", "test", "mine"]) == 1
+    assert "WRONG" in capsys.readouterr().out
+
+
+@pytest.mark.system
+def test_a_service_that_crashes_at_load_is_told_so(capsys: pytest.CaptureFixture[str]) -> None:
+    main(["service", "new", "mine"])
+    Path("mine/service.py").write_text("raise ValueError('no table')\n")
+    capsys.readouterr()
+
+    assert main(["service", "test", "mine"]) != 0
+    told = capsys.readouterr()
+    assert "no table" in told.out + told.err
+    assert "Traceback" not in told.out + told.err
