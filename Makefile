@@ -9,13 +9,24 @@ SETUP := PYTHON=$(PYTHON) sh scripts/setup.sh
 PYTEST := $(BIN)/python -m pytest
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test quick slow lint types bench docs lock clean
+.PHONY: help setup assets synth demo test quick slow lint types bench docs lock clean
 
 help: ## show these verbs
 	@awk -F':.*## ' '/^[a-z-]+:.*## /{printf "  make %-8s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
 
-setup: ## install everything a developer needs, Node and the CDK included
+setup: ## install everything a developer needs: Node, the CDK, the cloud's packages
 	@$(SETUP) dev infra
+	@$(BIN)/python scripts/assets.py
+	@sh scripts/cdk.sh
+
+assets: ## the packages that the cloud boots from, into build/
+	@$(SETUP) dev infra
+	@$(BIN)/python scripts/assets.py
+
+synth: ## the cloud's templates, into cdk.out; no account, no network once set up
+	@$(SETUP) dev infra
+	@$(BIN)/python scripts/assets.py
+	@sh scripts/cdk.sh synth --quiet
 
 demo: ## robots build point-cloud maps through the PnP service; writes ./out
 	@$(SETUP) demo
@@ -31,8 +42,9 @@ quick: ## pure tests only, in seconds
 	@$(SETUP) dev
 	@$(PYTEST) -q -m "not slow and not system" $(ARGS)
 
-slow: ## conformance suites, recordings, empty venvs: what make test leaves out
-	@$(SETUP) dev
+slow: ## conformance suites, recordings, a bare Debian: what make test leaves out
+	@$(SETUP) dev infra
+	@$(BIN)/python scripts/assets.py
 	@$(PYTEST) -m slow $(ARGS)
 
 lint: ## ruff, check only
@@ -59,4 +71,4 @@ lock: ## choose the newest versions and write the hashes into locks/
 	@sh scripts/lock.sh
 
 clean: ## remove the virtual environment and everything built
-	rm -rf $(VENV) build dist out *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) build dist out cdk.out node_modules *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis

@@ -4,7 +4,8 @@
 
 Reads the hashed locks alone, takes finished wheels only, and gives the same bytes again: the clock of every
 entry is SOURCE_DATE_EPOCH (default: the first second that a zip can hold).  Does nothing when neither a lock
-nor a source changed since.  Promises to run nothing that it downloads.
+nor a source changed since, and needs the network only for a changed lock.  Promises to run nothing that it
+downloads.
 """
 
 from __future__ import annotations
@@ -44,12 +45,10 @@ def main() -> int:
     try:
         with tempfile.TemporaryDirectory() as work:
             ours = _our_wheel(Path(work))
-            _wheelhouse(into / "wheelhouse", ours)
-            _function(into / "lambda", ours, Path(work) / "lambda-wheels")
+            _wheelhouse(into / "wheelhouse", ours, into / "downloads" / "boot")
+            _function(into / "lambda", ours, into / "downloads" / "lambda")
     except subprocess.CalledProcessError as error:
-        sys.stderr.write(
-            f"assets: {error.cmd[3]} {error.cmd[4]} failed\n  hint: look above; is the network there?\n"
-        )
+        sys.stderr.write(f"assets: pip {error.cmd[3]} failed\n  hint: look above; is the network there?\n")
         return 2
     stamp.write_text(wanted, encoding="utf-8")
     for name in ("wheelhouse", "lambda"):
@@ -79,16 +78,19 @@ def _our_wheel(work: Path) -> Path:
         target.parent.mkdir(parents=True, exist_ok=True)
         target.write_bytes(file.read_bytes())
         target.chmod(0o644)
-    _pip("wheel", "--no-deps", "--no-build-isolation", "--wheel-dir", str(work / "ours"), str(copy))
+    _pip(
+        "wheel", "--quiet", "--no-deps", "--no-build-isolation", "--wheel-dir", str(work / "ours"), str(copy)
+    )
     (wheel,) = (work / "ours").glob("rse_pf-*.whl")
     return wheel
 
 
-def _wheelhouse(folder: Path, ours: Path) -> None:
+def _wheelhouse(folder: Path, ours: Path, wheels: Path) -> None:
     """Put all wheels of a server into *folder*, with a list that pip checks by hash."""
     _empty(folder)
-    _download(ROOT / "locks/boot.txt", folder, *DEBIAN_12)
-    shutil.copyfile(ours, folder / ours.name)
+    _download(ROOT / "locks/boot.txt", wheels, *DEBIAN_12)
+    for wheel in (*wheels.glob("*.whl"), ours):
+        shutil.copyfile(wheel, folder / wheel.name)
     lines = []
     for wheel in sorted(folder.glob("*.whl")):
         name, version, *_ = wheel.name.split("-")
@@ -119,6 +121,11 @@ def _unpack(wheel: Path, folder: Path, only: tuple[str, ...] | None) -> None:
 
 
 def _download(lock: Path, folder: Path, python: str, glibc: int) -> None:
+    """Fill *folder* with the wheels of *lock* for a Python and a glibc 2.x, unless they are there."""
+    stamp, wanted = folder / "lock.sha256", hashlib.sha256(lock.read_bytes()).hexdigest()
+    if stamp.is_file() and stamp.read_text(encoding="utf-8") == wanted:
+        return
+    _empty(folder)
     tags = [f"manylinux_2_{minor}_x86_64" for minor in range(glibc, 4, -1)]
     tags += ["manylinux2014_x86_64", "manylinux2010_x86_64", "manylinux1_x86_64"]
     platforms = [part for tag in tags for part in ("--platform", tag)]
@@ -126,6 +133,7 @@ def _download(lock: Path, folder: Path, python: str, glibc: int) -> None:
         "download", "--quiet", "--require-hashes", "--no-deps", "--only-binary=:all:", "--implementation=cp",
         f"--python-version={python}", *platforms, "--dest", str(folder), "--requirement", str(lock),
     )  # fmt: skip
+    stamp.write_text(wanted, encoding="utf-8")
 
 
 def _pip(verb: str, *arguments: str) -> None:

