@@ -28,6 +28,8 @@ _AT_ONCE_S = 0.0005
 """A command that waited less found the server free."""
 _PATIENCE = 3.0
 """What was let in before the server fell behind is served up to so many targets later."""
+_SHARE_OF_TIME = 0.3
+"""Of a command's time may pass in the queue, even behind; the rest is for the work and the way."""
 _CALM_SHARE = 0.1
 """A server that refuses a smaller share of its commands has caught up."""
 
@@ -45,8 +47,8 @@ class Job:
     started_s: float = 0.0
 
     def patience_s(self, longest_s: float) -> float:
-        """How long it may wait for its turn: at most *longest_s*, and half of its time."""
-        return min(longest_s, (self.deadline_s - self.received_s) / 2)
+        """How long it may wait for its turn; see `_patience_s`."""
+        return _patience_s(self.deadline_s - self.received_s, longest_s)
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,7 +77,7 @@ class Scheduler:
         self._target_s = settings.queue_target_ms / 1e3
         self._interval_s = settings.queue_interval_ms / 1e3
         self._most_waiting = settings.queue_per_robot
-        self._threads = settings.solver_threads
+        self._is_serial = settings.solver_threads == 1 or 0 < settings.size <= 1
         self._robots: dict[str, _Robot] = {}
         self._round: deque[str] = deque()
         self._late_since: float | None = None
@@ -103,19 +105,23 @@ class Scheduler:
             self._round.append(job.robot)
         return []
 
-    def refuse_unread(self, robot_name: str, now: float) -> float | None:
-        """Return ``retry_after_ms`` if the next command of a robot is refused whatever it says, else None.
+    def refuse_unread(self, robot_name: str, allowed_s: float, now: float) -> float | None:
+        """Return ``retry_after_ms`` if the next command of a robot is refused unless its deadline is longer.
 
         Only while the server is behind, and never where the command might replace one that waits.
+
+        Args:
+            robot_name: Who sends it.
+            allowed_s: What the robot's last command allowed.
+            now: The clock of `submit`.
         """
         if not self.is_behind:
             return None
         robot = self._robots.get(robot_name)
-        ahead_s = len(self._round) * self._turn_s
-        if robot is not None and robot.waiting:
-            if any(map(_is_replaceable, robot.waiting)):
-                return None
-        elif ahead_s <= self._wanted_s / 2:
+        ahead_s = self._ahead_s(robot)
+        if robot is not None and any(map(_is_replaceable, robot.waiting)):
+            return None
+        if ahead_s <= _patience_s(allowed_s, self._wanted_s / 2):
             return None
         self._refused += 1
         self._judge(now)
@@ -193,9 +199,10 @@ class Scheduler:
     def runs_inline(self, *, cheap: bool, size_bytes: int, inline_bytes: int) -> bool:
         """Whether the job just started may run in the event loop: small, and nobody could do it meanwhile.
 
-        A lone solver thread has nothing to overlap with but refusals, which cost less than the hand-over.
+        Behind, a lone solver thread and a server of one core have nothing to overlap with but refusals, which
+        cost less than the hand-over.
         """
-        saves_time = self.waiting == 0 or (self.is_behind and self._threads == 1)
+        saves_time = self.waiting == 0 or (self.is_behind and self._is_serial)
         return cheap and size_bytes <= inline_bytes and saves_time and self.running <= 1
 
     def _refuse_at_the_door(self, robot: _Robot, job: Job) -> Refusal | None:
@@ -206,11 +213,10 @@ class Scheduler:
                 retry_after_ms=self._retry_after_ms(len(robot.waiting) * self._turn_s * 1e3),
             )
             return Refusal(job, error, "robot-queue")
-        ahead_s = len(self._round) * self._turn_s
-        # Behind, a second waiting command would keep its robot's place against those without one; and with
-        # half of the target kept in hand, what is let in is served: nobody waits for a refusal.
+        ahead_s = self._ahead_s(robot)
+        # With half of the target kept in hand, what is let in is served: nobody waits for a refusal.
         longest_s = self._wanted_s / 2 if self.is_behind else math.inf
-        if (self.is_behind and robot.waiting) or ahead_s > job.patience_s(longest_s):
+        if ahead_s > job.patience_s(longest_s):
             self._refused += 1
             return Refusal(job, self._busy(ahead_s), "behind")
         return None
@@ -226,6 +232,11 @@ class Scheduler:
         if job.deadline_s <= now or self._is_hopeless(robot, job, now, len(self._round)):
             return self._refused_late(robot, job, now)
         return None
+
+    def _ahead_s(self, robot: _Robot | None) -> float:
+        """How long the next command of *robot* will wait: a round of all for each of its own before it."""
+        rounds = 1 + (len(robot.waiting) if robot is not None else 0)
+        return rounds * len(self._round) * self._turn_s
 
     @property
     def _wanted_s(self) -> float:
@@ -293,6 +304,15 @@ class Scheduler:
         robot = self._robots.get(name)
         if robot is not None and robot.running is None and not robot.waiting:
             del self._robots[name]
+
+
+def _patience_s(allowed_s: float, longest_s: float) -> float:
+    """How long a command may wait for its turn on a server that is behind.
+
+    *longest_s*, or a share of what it allows if that is more: who can wait is served, not refused, when a
+    server has the robots of another one for some seconds.  In any case at most half of its time.
+    """
+    return min(max(longest_s, _SHARE_OF_TIME * allowed_s), allowed_s / 2)
 
 
 def _turn_wait(robot: _Robot, job: Job, now: float) -> float:

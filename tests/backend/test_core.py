@@ -199,9 +199,10 @@ def behind(core: Core, *, ahead: int = 1) -> None:
 def test_a_server_that_is_behind_refuses_without_reading(made):
     core, _ = made
     connection, wire = join(core)
+    say(connection, Command(id=7, service="echo", payload={"value": 1}, deadline_ms=250.0))
     behind(core)
 
-    say(connection, Command(id=8, service="echo", payload={"value": 1}))
+    say(connection, Command(id=8, service="echo", payload={"value": 1}, deadline_ms=250.0))
 
     refused = wire.sent[-1]
     assert (refused.id, refused.code) == (8, "busy")
@@ -209,6 +210,18 @@ def test_a_server_that_is_behind_refuses_without_reading(made):
     assert connection.session.in_flight == 0
     assert core.metrics.shed["unread"] == 1
     assert core.metrics.requests["echo", "busy"] == 1
+
+
+def test_the_first_command_of_a_robot_is_read_whatever_waits(made):
+    core, _ = made
+    connection, wire = join(core)
+    behind(core, ahead=1)
+    core._scheduler._round.clear()
+
+    say(connection, Command(id=8, service="echo", payload={"value": 1}))
+
+    assert core.metrics.shed["unread"] == 0
+    assert isinstance(wire.sent[-1], Result)
 
 
 def test_hellos_pings_and_unknown_services_are_read_even_behind(made):
@@ -256,7 +269,7 @@ def test_the_longest_recent_wait_is_told(made):
     assert core.snapshot()["gauges"]["queue_ms"] == 0.0
 
 
-@pytest.mark.parametrize(("is_behind", "rested"), [(True, [0.005]), (False, [])])
+@pytest.mark.parametrize(("is_behind", "rested"), [(True, [0.01]), (False, [])])
 def test_a_small_server_out_of_budget_rests_a_moment_only_while_it_is_behind(made, is_behind, rested):
     core, loop = made
     connection, wire = join(core)

@@ -333,7 +333,7 @@ def test_the_server_stops_shedding_when_the_load_is_over():
     scheduler = Scheduler(SETTINGS)
     for second in range(3):
         for robot in range(400):
-            scheduler.submit(job(f"r{robot}", at=second, within=1.0), float(second))
+            scheduler.submit(job(f"r{robot}", at=second, within=0.4), float(second))
         scheduler.sweep(second + 0.06)
         scheduler.sweep(second + 0.2)
     assert scheduler.is_behind
@@ -353,7 +353,35 @@ def test_nothing_is_refused_unread_before_the_server_is_behind():
     for i in range(50):
         scheduler.submit(job(f"r{i}"), 0.0)
 
-    assert scheduler.refuse_unread("new", 0.0) is None
+    assert scheduler.refuse_unread("new", 0.05, 0.0) is None
+
+
+def test_who_can_wait_is_let_in_where_who_cannot_is_refused():
+    scheduler = Scheduler(SETTINGS)
+    scheduler.is_behind, scheduler._turn_s, scheduler._judged_s = True, 0.01, 0.0
+    for i in range(50):
+        scheduler.submit(job(f"r{i}", within=5.0), 0.0)
+    assert scheduler.waiting == 50
+
+    assert scheduler.refuse_unread("new", 0.25, 0.01) is not None
+    assert scheduler.submit(job("hurried", within=0.25), 0.01)[0].error.code == "busy"
+    assert scheduler.refuse_unread("new", 5.0, 0.01) is None
+    assert scheduler.submit(job("patient", within=5.0), 0.01) == []
+    scheduler._judged_s = 1.6
+    assert scheduler.sweep(1.4) == [], "0.3 of five seconds"
+    assert len(scheduler.sweep(1.6)) == 50, "all but the one whose turn it is"
+
+
+def test_a_robots_own_waiting_commands_count_as_rounds():
+    scheduler = Scheduler(SETTINGS)
+    scheduler.is_behind, scheduler._turn_s, scheduler._judged_s = True, 0.01, 0.0
+    for i in range(60):
+        scheduler.submit(job(f"r{i}", within=5.0), 0.0)
+
+    taken = 0
+    while not scheduler.submit(job("r0", taken + 1, within=5.0), 0.0):
+        taken += 1
+    assert taken == 1, "the third command of r0 would wait three rounds of 0.6 s"
 
 
 def test_behind_only_a_short_queue_lets_another_robot_in():
@@ -362,10 +390,10 @@ def test_behind_only_a_short_queue_lets_another_robot_in():
     scheduler.is_behind, scheduler._judged_s = True, 0.0
 
     scheduler._turn_s = 0.024
-    assert scheduler.refuse_unread("new", 0.01) is None
-    assert scheduler.refuse_unread("a", 0.01) is not None
+    assert scheduler.refuse_unread("new", 0.05, 0.01) is None
+    assert scheduler.refuse_unread("a", 0.05, 0.01) is not None
     scheduler._turn_s = 0.026
-    assert scheduler.refuse_unread("new", 0.01) is not None
+    assert scheduler.refuse_unread("new", 0.05, 0.01) is not None
 
 
 def test_a_frame_that_may_replace_a_waiting_one_is_always_read():
@@ -374,8 +402,8 @@ def test_a_frame_that_may_replace_a_waiting_one_is_always_read():
     scheduler.submit(job("b", 1), 0.0)
     scheduler.is_behind, scheduler._turn_s, scheduler._judged_s = True, 1.0, 0.0
 
-    assert scheduler.refuse_unread("a", 0.01) is None
-    assert scheduler.refuse_unread("b", 0.01) is not None
+    assert scheduler.refuse_unread("a", 0.05, 0.01) is None
+    assert scheduler.refuse_unread("b", 0.05, 0.01) is not None
 
 
 def test_what_cannot_be_had_in_half_of_its_time_is_refused_at_the_door():
@@ -397,7 +425,7 @@ def test_a_server_that_refuses_half_of_its_commands_stays_behind_however_short_t
     for step in range(20):
         now = step * 0.05
         scheduler.submit(job(f"in-{step}", at=now), now)
-        assert scheduler.refuse_unread("out", now) is not None
+        assert scheduler.refuse_unread("out", 0.05, now) is not None
         started, _ = scheduler.start(now)
         assert started is not None
         scheduler.done(started, now)
@@ -412,7 +440,7 @@ def test_one_long_pause_does_not_make_the_server_refuse_for_ever():
     for step in range(400):
         now = step * 0.02
         for robot in ("a", "b"):
-            if scheduler.refuse_unread(robot, now) is None:
+            if scheduler.refuse_unread(robot, 0.05, now) is None:
                 refused += bool(scheduler.submit(job(f"{robot}{step}", at=now), now)) and step > 300
             else:
                 refused += step > 300
@@ -427,7 +455,8 @@ def test_one_long_pause_does_not_make_the_server_refuse_for_ever():
 
 def test_a_lone_solver_thread_lends_its_work_to_the_loop_only_while_behind():
     alone, pair = Scheduler(SETTINGS), Scheduler(ServingSettings(solver_threads=2))
-    for scheduler in (alone, pair):
+    small = Scheduler(ServingSettings(solver_threads=2, size=0.25))
+    for scheduler in (alone, pair, small):
         scheduler.submit(job("a"), 0.0)
         scheduler.submit(job("b"), 0.0)
         scheduler.start(0.0)
@@ -437,3 +466,4 @@ def test_a_lone_solver_thread_lends_its_work_to_the_loop_only_while_behind():
     assert alone.runs_inline(cheap=True, size_bytes=1, inline_bytes=10)
     assert not alone.runs_inline(cheap=False, size_bytes=1, inline_bytes=10)
     assert not pair.runs_inline(cheap=True, size_bytes=1, inline_bytes=10)
+    assert small.runs_inline(cheap=True, size_bytes=1, inline_bytes=10)
