@@ -88,7 +88,7 @@ def main():
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
     ORDERS.write_text("")
     began = time.monotonic()
-    code = subprocess.run(["/usr/bin/python3", "/root/user-data"]).returncode
+    code = subprocess.run(["/usr/bin/python3", "/boot-test/user-data"]).returncode
     say("user-data ended with", code, f"after {time.monotonic() - began:.1f} s")
     services, watched, done = {}, {}, 0
     while True:

@@ -92,10 +92,10 @@ class World:
             "keys": "keys.json", "group": "rse-pf", "hook": "rse-pf-drain",
         }  # fmt: skip
         script = (HERE.parents[2] / "stacks/boot/first_boot.py").read_text()
-        (self.root / "root/user-data").write_text(f"{script}\nmain({json.dumps(facts)})\n")
+        (self.root / "boot-test/user-data").write_text(f"{script}\nmain({json.dumps(facts)})\n")
         machine = [
             "unshare", "--mount", "--pid", "--fork", "--kill-child", f"--mount-proc={self.root}/proc",
-            "chroot", str(self.root), "/usr/bin/python3", "/root/machine.py",
+            "chroot", str(self.root), "/usr/bin/python3", "/boot-test/machine.py",
         ]  # fmt: skip
         listener = threading.Thread(target=self._listen, daemon=True)
         self._ends.callback(listener.join, 10)
@@ -195,7 +195,8 @@ class World:
             trusted.write(self.ca.read_text())
         (self.root / "etc/hosts").write_text(f"127.0.0.1 localhost\n{AWS} {' '.join(NAMES)}\n")
         (self.root / "etc/resolv.conf").write_text("nameserver 192.0.2.53\n")
-        shutil.copyfile(HERE / "machine.py", self.root / "root/machine.py")
+        (self.root / "boot-test").mkdir()
+        shutil.copyfile(HERE / "machine.py", self.root / "boot-test/machine.py")
         systemctl = self.root / "usr/bin/systemctl"
         systemctl.unlink(missing_ok=True)
         systemctl.write_text('#!/bin/sh\necho "$@" >> /run/orders\n')
