@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 import zlib
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import msgspec
 
@@ -35,8 +35,7 @@ _decode_binary = msgspec.msgpack.Decoder(_Command).decode
 _encode_json = msgspec.json.Encoder().encode
 
 
-@dataclass(frozen=True, slots=True)
-class Envelope:
+class Envelope(NamedTuple):
     """What a refusal has to name."""
 
     id: int
@@ -58,9 +57,10 @@ def peek(codec: Codec, data: bytes) -> Envelope | None:
         except zlib.error:
             return None
     found = _HEAD.match(head)
-    if found is None or int(found[1]) >= 2**53:
+    if found is None:
         return None
-    return Envelope(int(found[1]), found[2].decode("ascii"))
+    identity, service = found.groups()
+    return Envelope(int(identity), service.decode()) if len(identity) < 16 or int(identity) < 2**53 else None
 
 
 def encode_refusal(codec: Codec, failure: Failure) -> bytes:
