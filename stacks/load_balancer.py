@@ -57,15 +57,18 @@ class LoadBalancer(Construct):
         self, name: str, vpc: ec2.IVpc, port: int, settings: PlatformSettings
     ) -> elbv2.ApplicationTargetGroup:
         health = settings.health
-        # The data service answers for itself; robots' servers are asked at their control port.
-        asked = settings.serving.control_port if name == "Robots" else port
+        # The data service answers for itself, below /data; robots' servers are asked at their control port.
+        robots = name == "Robots"
+        asked, path = (
+            (settings.serving.control_port, health.path) if robots else (port, f"/data{health.path}")
+        )
         return elbv2.ApplicationTargetGroup(
             self, name, vpc=vpc, port=port, protocol=elbv2.ApplicationProtocol.HTTP,
             target_type=elbv2.TargetType.INSTANCE,
             load_balancing_algorithm_type=elbv2.TargetGroupLoadBalancingAlgorithmType.LEAST_OUTSTANDING_REQUESTS,
             deregistration_delay=cdk.Duration.seconds(settings.scaling.deregistration_s),
             health_check=elbv2.HealthCheck(
-                path=health.path, port=str(asked), healthy_http_codes="200",
+                path=path, port=str(asked), healthy_http_codes="200",
                 interval=cdk.Duration.seconds(health.cloud_interval_s),
                 timeout=cdk.Duration.seconds(health.cloud_timeout_s),
                 healthy_threshold_count=health.healthy_checks,

@@ -163,6 +163,9 @@ def test_every_stack_is_created_and_what_moto_made_equals_the_settings(
     assert robots["HealthCheckPath"] == settings.health.path
     assert robots["HealthCheckPort"] == str(settings.serving.control_port)
     assert robots["HealthCheckIntervalSeconds"] == settings.health.cloud_interval_s
+    if settings.data.enabled:
+        data = next(each for each in targets if each["Port"] == settings.data.port)
+        assert data["HealthCheckPath"] == "/data/readyz"
     assert robots["UnhealthyThresholdCount"] == settings.health.unhealthy_checks
     assert len(targets) == len(group["TargetGroupARNs"]) == (2 if settings.data.enabled else 1)
     (balancer,) = elb.describe_load_balancers()["LoadBalancers"]
