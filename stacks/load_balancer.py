@@ -57,7 +57,7 @@ class LoadBalancer(Construct):
         self, name: str, vpc: ec2.IVpc, port: int, settings: PlatformSettings
     ) -> elbv2.ApplicationTargetGroup:
         health = settings.health
-        # The data service answers for itself, below /data; robots' servers are asked at their control port.
+        # The data service answers for itself, below /data; a backend server at its control port.
         robots = name == "Robots"
         asked, path = (
             (settings.serving.control_port, health.path) if robots else (port, f"/data{health.path}")
