@@ -20,8 +20,7 @@ pytestmark = pytest.mark.system
 
 COUNTER = """
 from __future__ import annotations
-import ctypes, os, signal, sys, threading, time
-import msgspec
+import ctypes, os, signal, sys, threading, time, msgspec
 
 class Request(msgspec.Struct):
     do: str = "add"
@@ -360,6 +359,20 @@ def test_state_survives_the_death_of_its_server(serve_isolated, gone):
     second = serve_isolated()
 
     assert ask_all(second, "robot-1", [("counter", {})])[0].reply["count"] == 3
+
+
+def test_an_environment_whose_state_went_on_elsewhere_answers_with_no_older_count(serve_isolated):
+    first, second = serve_isolated(), serve_isolated()
+
+    async def run():
+        tokens = first.token("robot-1"), second.token("robot-1")
+        async with first.robot(token=tokens[0]) as old, second.robot(token=tokens[1]) as new:
+            assert (await old.ask(1, "counter", {})).reply["count"] == 1
+            assert (await new.ask(1, "counter", {})).reply["count"] == 2
+            return [await old.ask(i, "counter", {}, keep=True) for i in (2, 3)]
+
+    stale, after = asyncio.run(run())
+    assert (getattr(stale, "code", stale), after.reply["count"]) == ("worker-lost", 3)
 
 
 def test_more_robots_than_environments_are_busy_and_come_in_when_one_leaves(serve_isolated):
