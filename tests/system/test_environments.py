@@ -357,7 +357,6 @@ def test_state_survives_the_death_of_its_server(serve_isolated, gone):
     for pid in pids[1:]:
         gone(pid)
     second = serve_isolated()
-
     assert ask_all(second, "robot-1", [("counter", {})])[0].reply["count"] == 3
 
 
