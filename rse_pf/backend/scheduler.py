@@ -26,7 +26,9 @@ _SMOOTHING = 0.1
 _LONGEST_RETRY_MS = 5000.0
 _AT_ONCE_S = 0.0005
 """A command that waited less found the server free."""
-_PATIENCE = 3.0
+_LAST_CHANCE = 0.75
+"""What was let in and waited longer than this share of its time is given up, while others can be in time."""
+_PATIENCE = 4.0
 """What was let in before the server fell behind is served up to so many targets later."""
 _SHARE_OF_TIME = 0.3
 """Of a command's time may pass in the queue, even behind; the rest is for the work and the way."""
@@ -245,7 +247,9 @@ class Scheduler:
 
     def _is_hopeless(self, robot: _Robot, job: Job, now: float, others: int) -> bool:
         """Serving the oldest first serves those that are about to be late; give those up instead."""
-        patience_s = job.patience_s(_PATIENCE * self._wanted_s)
+        allowed_s = job.deadline_s - job.received_s
+        patience_s = max(_PATIENCE * self._wanted_s, _SHARE_OF_TIME * allowed_s)
+        patience_s = min(patience_s, _LAST_CHANCE * allowed_s)
         if others and self.is_behind and _turn_wait(robot, job, now) > patience_s:
             return True
         newer_waits = bool(robot.waiting) and robot.waiting[-1] is not job
