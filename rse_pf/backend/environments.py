@@ -346,7 +346,7 @@ class Environments:
         if call is not None:
             self._quarantine.died(service, call.digest, now)
             call.tries += 1
-            if not call.answered and self._may_try_again(call, now):
+            if not call.answered and self._may_try_again(call, environment, now):
                 waiting.insert(0, call)
             else:
                 self._answer_lost(call, self._refusal(call, now) or _lost(service, why))
@@ -359,12 +359,12 @@ class Environments:
     def _answer_lost(self, call: _Call, error: RsePfError) -> None:
         self._answer(call, failure_of(error, call.job.command, server=self._server_id))
 
-    def _may_try_again(self, call: _Call, now: float) -> bool:
+    def _may_try_again(self, call: _Call, environment: _Environment, now: float) -> bool:
         service = self._services[call.job.command.service]
         return (
             call.tries < _MOST_TRIES
             and call.job.deadline_s > now
-            and (service.kind == "stateless" or self._store is not None)
+            and (service.kind == "stateless" or environment.restored.get(service.name) is not None)
             and self._quarantine.verdict(service.name, call.digest, now) == "run"
         )
 
