@@ -116,7 +116,8 @@ def _raise_walls(plan: EnvironmentPlan, uid: int | None) -> None:
     owner = os.getuid() if uid is None else uid
     if "root" not in plan.missing:
         walls.make_root(readable_paths(list(plan.services.values())), plan.scratch_bytes, owner)
-    walls.limit_resources(plan.memory_bytes, plan.scratch_bytes)
+    alone = uid is not None or "namespaces" not in plan.missing
+    walls.limit_resources(plan.memory_bytes, plan.scratch_bytes, alone=alone)
     if "privileges" not in plan.missing:
         walls.give_up_privileges(uid)
     if "seccomp" not in plan.missing:

@@ -46,6 +46,7 @@ _PR_SET_DUMPABLE = 4
 _SECCOMP_MODE_FILTER = 2
 _CAP_VERSION_3 = 0x20080522
 _LAST_CAP = 63
+_MOST_THREADS = 64
 
 _AUDIT_ARCH_X86_64 = 0xC000003E
 _X32 = 0x40000000
@@ -140,11 +141,18 @@ def make_root(readable: Sequence[Path], scratch_bytes: int, owner: int) -> None:
     os.chdir("/scratch")
 
 
-def limit_resources(memory_bytes: int, scratch_bytes: int) -> None:
-    """Bound address space, file size, open files; no core files.
+def limit_resources(memory_bytes: int, scratch_bytes: int, *, alone: bool) -> None:
+    """Bound address space, file size, open files and threads; no core files.
 
     Processes are bounded by seccomp, processor time by the deadline.
+
+    Args:
+        memory_bytes: Address space.
+        scratch_bytes: One file.
+        alone: Whether user or user namespace are this environment's own, so that threads can be counted.
     """
+    if alone:
+        resource.setrlimit(resource.RLIMIT_NPROC, (_MOST_THREADS, _MOST_THREADS))
     for which, most in (
         (resource.RLIMIT_AS, memory_bytes),
         (resource.RLIMIT_FSIZE, scratch_bytes),
