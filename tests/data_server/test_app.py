@@ -18,6 +18,7 @@ from rse_pf.objects import DirectoryStore, MemoryStore, ObjectInfo, digest_of
 
 DATA = bytes(range(256)) * 4
 DIGEST = digest_of(DATA)
+SMALL = small_settings()
 OBJECT = f"/data/v1/objects/{DIGEST}"
 
 
@@ -285,7 +286,7 @@ def test_no_name_leaves_the_store_and_none_breaks_the_server(
 ) -> None:
     with tempfile.TemporaryDirectory() as made:
         above = Path(made)
-        service = Service(small_settings(), DirectoryStore(above / "in" / "store"))
+        service = Service(SMALL, DirectoryStore(above / "in" / "store"))
 
         answer = service.ask(method, path, body, robot=robot, headers={"upload-offset": "0"})
         stored = service.ask("PUT", f"/data/v1/objects/{digest_of(body)}", body, robot=robot)
