@@ -1,6 +1,6 @@
 """The inside of one worker: connections, scheduler and solver threads, without any socket library.
 
-Frames come in through `Connection.frame`, bytes leave through a `Wire`; `dispatch` is the only way
+Frames come in through `connection.Connection.frame`, bytes leave through a `Wire`; `dispatch` is the only way
 to a service.  Promises that every submitted command gets exactly one answer while its socket lives,
 that nothing but `dispatch` and the encoding of its answer runs outside of the event loop, and that
 neither payloads nor tokens reach the log.
@@ -15,10 +15,10 @@ from typing import Any
 
 import msgspec
 
+from rse_pf.backend.connection import Connection
 from rse_pf.backend.door import Admitted
 from rse_pf.backend.environments import Environments
 from rse_pf.backend.executors import Executor, SolverThreads
-from rse_pf.backend.frames import CloseSocket, FrameAssembler, Received, SendPong
 from rse_pf.backend.log import JsonLog
 from rse_pf.backend.metrics import LongestRecently, Metrics
 from rse_pf.backend.scheduler import BEHIND, BEHIND_HINT, Job, Refusal, Scheduler
@@ -33,13 +33,10 @@ from rse_pf.wire.session import (
     CLOSE_GOING_AWAY,
     CLOSE_PROTOCOL,
     CLOSE_TOKEN_OVER,
-    Decision,
-    Send,
     ServerSession,
-    Submit,
 )
 
-__all__ = ["Connection", "Core"]
+__all__ = ["Core"]
 
 _SILENCE_MARGIN_S = 0.0
 _SLOWEST_TICK_S = 1.0
@@ -54,98 +51,6 @@ class _Outcome:
     job: Job
     answer: Result | Failure
     data: bytes
-
-
-class Connection:
-    """One robot's socket between its handshake and its end."""
-
-    __slots__ = (
-        "_core", "_wire", "allowed_s", "assembler", "expires_s", "last_heard_s", "opened_s", "robot",
-        "session",
-    )  # fmt: skip
-
-    def __init__(
-        self,
-        core: Core,
-        wire: Wire,
-        session: ServerSession | None,
-        robot: str,
-        now: float,
-        expires_s: float | None,
-    ) -> None:
-        self.robot = robot
-        self.session = session
-        self.assembler = FrameAssembler(core.settings.session)
-        self.opened_s = self.last_heard_s = now
-        self.expires_s = expires_s
-        self.allowed_s: float | None = None
-        """What the last command allowed, from its arrival to its deadline."""
-        self._core = core
-        self._wire = wire
-
-    def frame(self, opcode: int, fin: bool, rsv: bool, payload: bytes) -> None:
-        """Take one unmasked frame."""
-        now = self._core.clocks.monotonic()
-        decision = self.assembler.receive(opcode, fin, rsv, payload, now)
-        if isinstance(decision, Received):
-            self._message(decision, now)
-        elif isinstance(decision, SendPong):
-            self._wire.send_pong(decision.data)
-        elif isinstance(decision, CloseSocket):
-            self._core.metrics.closed[f"frames-{decision.code}"] += 1
-            self._wire.close(decision.code, decision.reason)
-
-    def ended(self) -> None:
-        """Note that the socket is gone."""
-        self._core.disconnect(self)
-
-    @property
-    def may_move(self) -> bool:
-        """Whether the robot said Hello and can be asked to leave for another server."""
-        return self.session is not None and self.session.state == "open" and not self.assembler.closed
-
-    def move(self, reason: str, within_ms: float, now: float) -> None:
-        """Ask the robot to leave for another server."""
-        if self.session is not None:
-            self.apply(self.session.move(reason, within_ms), now)
-
-    def apply(self, decisions: list[Decision], now: float, size_bytes: int = 0) -> None:
-        """Do what the session decided."""
-        for decision in decisions:
-            if isinstance(decision, Submit):
-                self._core.submit(self, decision.command, size_bytes, now)
-            elif isinstance(decision, Send):
-                self.write(decision.data)
-            else:
-                self.close(decision.code, decision.reason)
-
-    def write(self, data: bytes) -> None:
-        """Write one message, unless the socket is closing."""
-        if self.assembler.closed:
-            return
-        self._core.metrics.bytes_out += len(data)
-        self._wire.send(data, self.session is not None and self.session.codec.is_text)
-
-    def close(self, code: int, reason: str) -> None:
-        """Close the socket and take nothing more from it."""
-        self._core.metrics.closed[reason] += 1
-        self.assembler.closed = True
-        self._wire.close(code, reason)
-
-    def _message(self, received: Received, now: float) -> None:
-        self.last_heard_s = now
-        self._core.metrics.bytes_in += len(received.data)
-        session = self.session
-        if session is None:
-            self._core.metrics.bytes_out += len(received.data)
-            self._wire.send(received.data, received.is_text)
-            return
-        if session.state == "open" and self._core.refuses_unread(self, session.codec, received.data, now):
-            return
-        was_opening = session.state == "opening"
-        self.apply(session.receive(received.data, now), now, len(received.data))
-        if was_opening and session.state == "open":
-            self._core.welcomed(self, now)
 
 
 class Core:

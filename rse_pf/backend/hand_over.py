@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from typing import Protocol
 
-from rse_pf.backend.core import Connection
+from rse_pf.backend.connection import Connection
 
 __all__ = ["HandOver", "plan"]
 

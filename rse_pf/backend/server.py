@@ -11,7 +11,8 @@ import socket
 from collections.abc import Callable
 from typing import Any
 
-from rse_pf.backend.core import Connection, Core
+from rse_pf.backend.connection import Connection
+from rse_pf.backend.core import Core
 from rse_pf.backend.door import Admitted, Door, TurnedAway
 from rse_pf.backend.frames import CloseBorder
 from rse_pf.backend.log import JsonLog

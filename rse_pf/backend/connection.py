@@ -1,0 +1,110 @@
+"""One robot's socket inside a worker: frames in, what its session decided out, everything else to the core.
+
+Promises to know no socket library and no clock but the core's, and that a socket which closes takes nothing
+more.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from rse_pf.backend.frames import CloseSocket, FrameAssembler, Received, SendPong
+from rse_pf.backend.seams import Wire
+from rse_pf.wire.session import Decision, Send, ServerSession, Submit
+
+if TYPE_CHECKING:
+    from rse_pf.backend.core import Core
+
+__all__ = ["Connection"]
+
+
+class Connection:
+    """One robot's socket between its handshake and its end."""
+
+    __slots__ = (
+        "_core", "_wire", "allowed_s", "assembler", "expires_s", "last_heard_s", "opened_s", "robot",
+        "session",
+    )  # fmt: skip
+
+    def __init__(
+        self,
+        core: Core,
+        wire: Wire,
+        session: ServerSession | None,
+        robot: str,
+        now: float,
+        expires_s: float | None,
+    ) -> None:
+        self.robot = robot
+        self.session = session
+        self.assembler = FrameAssembler(core.settings.session)
+        self.opened_s = self.last_heard_s = now
+        self.expires_s = expires_s
+        self.allowed_s: float | None = None
+        """What the last command allowed, from its arrival to its deadline."""
+        self._core = core
+        self._wire = wire
+
+    def frame(self, opcode: int, fin: bool, rsv: bool, payload: bytes) -> None:
+        """Take one unmasked frame."""
+        now = self._core.clocks.monotonic()
+        decision = self.assembler.receive(opcode, fin, rsv, payload, now)
+        if isinstance(decision, Received):
+            self._message(decision, now)
+        elif isinstance(decision, SendPong):
+            self._wire.send_pong(decision.data)
+        elif isinstance(decision, CloseSocket):
+            self._core.metrics.closed[f"frames-{decision.code}"] += 1
+            self._wire.close(decision.code, decision.reason)
+
+    def ended(self) -> None:
+        """Note that the socket is gone."""
+        self._core.disconnect(self)
+
+    @property
+    def may_move(self) -> bool:
+        """Whether the robot said Hello and can be asked to leave for another server."""
+        return self.session is not None and self.session.state == "open" and not self.assembler.closed
+
+    def move(self, reason: str, within_ms: float, now: float) -> None:
+        """Ask the robot to leave for another server."""
+        if self.session is not None:
+            self.apply(self.session.move(reason, within_ms), now)
+
+    def apply(self, decisions: list[Decision], now: float, size_bytes: int = 0) -> None:
+        """Do what the session decided."""
+        for decision in decisions:
+            if isinstance(decision, Submit):
+                self._core.submit(self, decision.command, size_bytes, now)
+            elif isinstance(decision, Send):
+                self.write(decision.data)
+            else:
+                self.close(decision.code, decision.reason)
+
+    def write(self, data: bytes) -> None:
+        """Write one message, unless the socket is closing."""
+        if self.assembler.closed:
+            return
+        self._core.metrics.bytes_out += len(data)
+        self._wire.send(data, self.session is not None and self.session.codec.is_text)
+
+    def close(self, code: int, reason: str) -> None:
+        """Close the socket and take nothing more from it."""
+        self._core.metrics.closed[reason] += 1
+        self.assembler.closed = True
+        self._wire.close(code, reason)
+
+    def _message(self, received: Received, now: float) -> None:
+        self.last_heard_s = now
+        self._core.metrics.bytes_in += len(received.data)
+        session = self.session
+        if session is None:
+            self._core.metrics.bytes_out += len(received.data)
+            self._wire.send(received.data, received.is_text)
+            return
+        if session.state == "open" and self._core.refuses_unread(self, session.codec, received.data, now):
+            return
+        was_opening = session.state == "opening"
+        self.apply(session.receive(received.data, now), now, len(received.data))
+        if was_opening and session.state == "open":
+            self._core.welcomed(self, now)
