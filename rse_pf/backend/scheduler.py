@@ -30,7 +30,7 @@ _LAST_CHANCE = 0.75
 """What was let in and waited longer than this share of its time is given up, while others can be in time."""
 _PATIENCE = 4.0
 """What was let in before the server fell behind is served up to so many targets later."""
-_SHARE_OF_TIME = 0.3
+_SHARE_OF_TIME = 0.4
 """Of a command's time may pass in the queue, even behind; the rest is for the work and the way."""
 _CALM_SHARE = 0.1
 """A server that refuses a smaller share of its commands has caught up."""

@@ -367,9 +367,9 @@ def test_who_can_wait_is_let_in_where_who_cannot_is_refused():
     assert scheduler.submit(job("hurried", within=0.25), 0.01)[0].error.code == "busy"
     assert scheduler.refuse_unread("new", 5.0, 0.01) is None
     assert scheduler.submit(job("patient", within=5.0), 0.01) == []
-    scheduler._judged_s = 1.6
-    assert scheduler.sweep(1.4) == [], "0.3 of five seconds"
-    assert len(scheduler.sweep(1.6)) == 50, "all but the one whose turn it is"
+    scheduler._judged_s = 2.1
+    assert scheduler.sweep(1.9) == [], "0.4 of five seconds"
+    assert len(scheduler.sweep(2.1)) == 50, "all but the one whose turn it is"
 
 
 def test_a_robots_own_waiting_commands_count_as_rounds():
@@ -381,7 +381,7 @@ def test_a_robots_own_waiting_commands_count_as_rounds():
     taken = 0
     while not scheduler.submit(job("r0", taken + 1, within=5.0), 0.0):
         taken += 1
-    assert taken == 1, "the third command of r0 would wait three rounds of 0.6 s"
+    assert taken == 2, "the fourth command of r0 would wait four rounds of 0.6 s"
 
 
 def test_behind_only_a_short_queue_lets_another_robot_in():
