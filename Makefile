@@ -64,6 +64,7 @@ bench: ## every benchmark, short; tables on the screen, JSON in out/bench
 docs: ## write the generated pages anew
 	@$(SETUP) dev
 	@$(BIN)/rse-pf settings --markdown > docs/settings.md
+	@$(BIN)/rse-pf data --openapi > docs/openapi.json
 	@$(BIN)/python scripts/asyncapi.py
 
 lock: ## choose the newest versions and write the hashes into locks/

@@ -10,7 +10,9 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from client_sdk.background import BackgroundUploader
     from client_sdk.blocking import BlockingRobot, connect_blocking
+    from client_sdk.data import DataClient, DataOptions
     from client_sdk.datasets import Dataset, open_dataset
     from client_sdk.frontend import Frame, FrontEndOptions, PoseQuery, TrackedFrame, Tracker
     from client_sdk.mapping import MapOptions, PointMap, Trajectory
@@ -20,8 +22,11 @@ if TYPE_CHECKING:
 
 __all__ = [
     "Answer",
+    "BackgroundUploader",
     "BlockingRobot",
     "CloudFirst",
+    "DataClient",
+    "DataOptions",
     "Dataset",
     "Frame",
     "FrontEndOptions",
@@ -41,8 +46,11 @@ __all__ = [
 
 _HOMES = {
     "Answer": "robot",
+    "BackgroundUploader": "background",
     "BlockingRobot": "blocking",
     "CloudFirst": "offload",
+    "DataClient": "data",
+    "DataOptions": "data",
     "Dataset": "datasets",
     "Frame": "frontend",
     "FrontEndOptions": "frontend",

@@ -16,7 +16,7 @@ _FEWEST_POINTS = 3
 
 
 class Request(msgspec.Struct):
-    """``source`` and ``target`` hold 3n and 3m metres, row after row; ``iterations`` is how often to match."""
+    """``source`` and ``target`` hold 3n and 3m metres, row after row; matched so many times."""
 
     source: Array
     target: Array
