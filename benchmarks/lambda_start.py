@@ -21,11 +21,11 @@ import time
 began = time.process_time()
 import base64, json, sys, zlib
 from lambda_pnp.answering import Answering
-from rse_pf.auth import KeySet
+from lambda_pnp.keys import KeyCache
 from rse_pf.settings import PlatformSettings
 imported = time.process_time()
 told = json.loads(sys.stdin.read())
-answering = Answering(PlatformSettings(), KeySet.from_json(told["keys"]))
+answering = Answering(PlatformSettings(), KeyCache(lambda: told["keys"], 60.0))
 answered = answering.answer(told["event"], now_s=told["now_s"], left_ms=9e3, clock=time.monotonic)
 solved = time.process_time()
 assert answered.status == 200, answered

@@ -15,8 +15,8 @@ from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
-from lambda_pnp.keys import read_object
-from rse_pf.auth import KeySet, verify_token
+from lambda_pnp.keys import KeyCache, read_object
+from rse_pf.auth import verify_token
 from rse_pf.errors import BadMessage, Expired, RsePfError, Unauthorized, UnsupportedProtocol
 from rse_pf.service import Registry, dispatch, failure_of
 from rse_pf.services import pnp
@@ -54,7 +54,7 @@ class Answered:
 class Answering:
     """Keys and settings of one function, and the one service it offers."""
 
-    def __init__(self, settings: PlatformSettings, keys: KeySet) -> None:
+    def __init__(self, settings: PlatformSettings, keys: KeyCache) -> None:
         self._settings = settings
         self._keys = keys
         self._registry = Registry()
@@ -71,7 +71,7 @@ class Answering:
             kind, _, token = headers.get("authorization", "").partition(" ")
             verify_token(
                 token.strip() if kind.lower() == "bearer" else "",
-                keys=self._keys, now=now_s, settings=self._settings.auth,
+                keys=self._keys.at(arrived), now=now_s, settings=self._settings.auth,
             )  # fmt: skip
             codec = self._codec(headers.get("content-type", ""))
         except RsePfError as error:
@@ -130,5 +130,9 @@ def _body(event: Mapping[str, Any]) -> bytes:
 
 def load_answering() -> Answering:
     """Return what a cold start needs: the settings of the package, the keys of the artifact bucket."""
-    now = datetime.now(timezone.utc)
-    return Answering(load_settings(_ROOT / "settings.json"), KeySet.from_json(read_object(os.environ, now)))
+    settings = load_settings(_ROOT / "settings.json")
+
+    def read() -> str:
+        return read_object(os.environ, datetime.now(timezone.utc))
+
+    return Answering(settings, KeyCache(read, settings.scaling.period_s))

@@ -1,20 +1,49 @@
 """Read the public keys from the artifact bucket with the standard library alone.
 
-The package stays small and imports fast without an AWS SDK.  Promises one signed GET and no retry: a cold
-start that fails is tried again by the caller.
+The package stays small and imports fast without an AWS SDK.  A function may live for hours, so the keys are
+fetched again once in a period: a new key is learned, a retired one forgotten.  Promises one signed GET at a
+time and no retry within it; a fetch that fails leaves the keys as they were.
 """
 
 from __future__ import annotations
 
 import hashlib
 import hmac
+import sys
 import urllib.request
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from datetime import datetime
 
-__all__ = ["read_object", "signed_request"]
+from rse_pf.auth import KeySet
+from rse_pf.errors import RsePfError
+
+__all__ = ["KeyCache", "read_object", "signed_request"]
 
 _TIMEOUT_S = 3.0
+_AGAIN_S = 5.0
+
+
+class KeyCache:
+    """The public keys, as old as a period at most while S3 answers."""
+
+    def __init__(self, read: Callable[[], str], period_s: float) -> None:
+        self._read = read
+        self._period_s = period_s
+        self._keys = KeySet({})
+        self._due_s: float | None = None
+
+    def at(self, clock_s: float) -> KeySet:
+        """Return the keys at *clock_s*, in monotonic seconds; empty if none could ever be fetched."""
+        if self._due_s is None or clock_s >= self._due_s:
+            try:
+                self._keys = KeySet.from_json(self._read())
+                self._due_s = clock_s + self._period_s
+            except (OSError, RsePfError) as error:
+                self._due_s = clock_s + min(_AGAIN_S, self._period_s)
+                sys.stderr.write(
+                    f"no keys were fetched: {error}; is there a key? rse-pf token init --cloud\n"
+                )
+        return self._keys
 
 
 def read_object(environment: Mapping[str, str], now: datetime) -> str:

@@ -1,12 +1,16 @@
-"""Issue a token for a robot, or look into one.
+"""Issue a token for a robot, or look into one; make and change the keys of a cloud.
 
-A token is signed with the key of a platform that rse-pf local made, or with --key FILE.  inspect needs
-no secret: it shows what the token says, and whether the platform's public keys vouch for it.
+A token is signed with the key of a platform that rse-pf local made, with --key FILE, or with --cloud by the
+key in the deployment's secret.  inspect needs no secret: it shows what the token says, and whether the
+platform's public keys vouch for it.  init, rotate and retire are for --cloud: the first key, one more that
+takes over when every server knows it, and the end of the one before.
 
 examples:
   rse-pf token issue robot-1
   rse-pf token issue robot-1 --life 60
   rse-pf token inspect "$TOKEN"
+  rse-pf token init --cloud
+  rse-pf token issue robot-1 --cloud
 """
 
 from __future__ import annotations
@@ -19,22 +23,31 @@ import secrets
 import sys
 import time
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+from rse_pf.auth import SigningKey
 from rse_pf.errors import ConfigurationError, Unauthorized, UsageError
 from rse_pf.settings import PlatformSettings, load_settings
+
+if TYPE_CHECKING:
+    from rse_pf.aws.key_store import KeyStore
 
 __all__ = ["add_arguments", "run"]
 
 _NAME = "default"
 _LAST_TIME = 1e11
+_KEY_ACTIONS = ("init", "rotate", "retire")
+_SEED_BYTES = 32
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     life_s = PlatformSettings().auth.token_life_s
-    parser.add_argument("action", choices=("issue", "inspect"), help="what to do")
-    parser.add_argument("subject", metavar="ROBOT|TOKEN", help="name of the robot; or the token, - reads it")
+    parser.add_argument("action", choices=("issue", "inspect", *_KEY_ACTIONS), help="what to do")
+    parser.add_argument(
+        "subject", nargs="?", metavar="ROBOT|TOKEN", help="name of the robot; or the token, - reads it"
+    )
+    parser.add_argument("--cloud", action="store_true", help="the deployment on AWS in cloud.region")
     parser.add_argument("--name", default=_NAME, help=f"which local platform (default: {_NAME})")
     parser.add_argument("--key", type=Path, metavar="FILE", help="issue: sign with this key")
     parser.add_argument(
@@ -47,8 +60,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
-    """Issue or inspect, by the settings that the platform was started with unless told otherwise."""
-    named = args.settings is not None or args.key is not None or args.keys is not None
+    """Do one action, by the settings that the platform was started with unless told otherwise."""
+    if args.action in _KEY_ACTIONS:
+        return _change_keys(args, settings)
+    if args.subject is None:
+        what = "the name of a robot" if args.action == "issue" else "a token"
+        raise UsageError(f"rse-pf token {args.action} needs {what}", hint="see rse-pf token --help")
+    if args.cloud and args.key is not None:
+        raise UsageError("--cloud and --key name two keys", hint="leave one of them out")
+    named = args.settings is not None or args.key is not None or args.keys is not None or args.cloud
     chosen = settings if named else _of_platform(args.name) or settings
     if args.action == "issue":
         if args.keys is not None:
@@ -60,12 +80,10 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
 
 
 def _issue(args: argparse.Namespace, settings: PlatformSettings) -> int:
-    from rse_pf.local.firewall import key_file, read_key
-
-    path = args.key if args.key is not None else key_file(_folder(args.name))
-    token = read_key(path).issue(
+    now = time.time()
+    token = _signing_key(args, settings, now).issue(
         args.subject,
-        now=time.time(),
+        now=now,
         token_id=secrets.token_hex(8),
         settings=settings.auth,
         life_s=args.life,
@@ -74,11 +92,56 @@ def _issue(args: argparse.Namespace, settings: PlatformSettings) -> int:
     return 0
 
 
+def _signing_key(args: argparse.Namespace, settings: PlatformSettings, now: float) -> SigningKey:
+    from rse_pf.local.firewall import key_file, read_key
+
+    if args.cloud:
+        return _key_store(settings).ring().signer(now)
+    return read_key(args.key if args.key is not None else key_file(_folder(args.name)))
+
+
+def _change_keys(args: argparse.Namespace, settings: PlatformSettings) -> int:
+    from rse_pf.aws.key_store import KeyRing, spread_s
+
+    if not args.cloud or args.subject is not None:
+        raise UsageError(
+            f"rse-pf token {args.action} is for a cloud, and names no robot",
+            hint=f"write rse-pf token {args.action} --cloud; rse-pf local makes its own key",
+        )
+    store, now = _key_store(settings), time.time()
+    new = SigningKey.from_seed(secrets.token_bytes(_SEED_BYTES), secrets.token_hex(8))
+    if args.action == "rotate":
+        ring = store.ring().rotated(new, now=now, settings=settings)
+        store.write(ring)
+        print(f"key {new.key_id} is published, and signs in {spread_s(settings):g} s")
+        return 0
+    if args.action == "retire":
+        ring = store.ring().retired(now=now)
+        store.write(ring)
+        print(f"key {ring.keys[0][0].key_id} alone is trusted; servers know it in {spread_s(settings):g} s")
+        return 0
+    there = store.read()
+    if there is not None:  # perhaps it was never published
+        store.publish(there)
+        print(f"key {there.signer(now).key_id} is there already; its public half is published again")
+        return 0
+    store.write(KeyRing(keys=((new, now),)))
+    print(f"key {new.key_id} is made; servers know it in {spread_s(settings):g} s")
+    return 0
+
+
+def _key_store(settings: PlatformSettings) -> KeyStore:
+    from rse_pf.aws.account import open_account
+    from rse_pf.aws.key_store import open_key_store
+
+    return open_key_store(open_account(settings.cloud.region))
+
+
 def _inspect(args: argparse.Namespace, settings: PlatformSettings) -> int:
     token = sys.stdin.readline().strip() if args.subject == "-" else args.subject.strip()
     header, claims = _parts(token)
     now = time.time()
-    verdict, code = _verdict(token, _keys(args), now, settings)
+    verdict, code = _verdict(token, _keys(args, settings), now, settings)
     told = {"header": header, "claims": claims, "seconds_left": _left(claims, now), "verified": verdict}
     print(json.dumps(told, indent=2))
     return code
@@ -115,11 +178,13 @@ def _verdict(token: str, keys: Any, now: float, settings: PlatformSettings) -> t
     return "yes", 0
 
 
-def _keys(args: argparse.Namespace) -> Any:
+def _keys(args: argparse.Namespace, settings: PlatformSettings) -> Any:
     """Return the public keys that were named, or the platform's; None if it has none."""
     from rse_pf.auth import KeySet
     from rse_pf.local.firewall import key_set_file
 
+    if args.cloud:
+        return _key_store(settings).ring().key_set()
     path = args.keys if args.keys is not None else key_set_file(_folder(args.name))
     try:
         return KeySet.from_json(path.read_text(encoding="utf-8"))

@@ -14,12 +14,14 @@ import numpy as np
 import pytest
 
 from lambda_pnp.answering import Answering
+from lambda_pnp.keys import KeyCache
 from rse_pf.auth import SigningKey
 from rse_pf.settings import PlatformSettings
 from rse_pf.wire import SUBPROTOCOLS, Command, Failure, Hello, Message, Result, make_codec
 
 SETTINGS = PlatformSettings()
 KEY = SigningKey.from_seed(bytes(range(32)), "key-1")
+KEYS = KeyCache(lambda: KEY.key_set().to_json(), 60.0)
 NOW_S = 1_800_000_000.0
 TOKEN = KEY.issue("robot-1", now=NOW_S, token_id="t", settings=SETTINGS.auth)
 GOLDEN = json.loads(
@@ -40,7 +42,7 @@ def event(body: bytes, codec: str = "zlib", token: str = TOKEN) -> dict[str, Any
 
 
 def answer(what: dict[str, Any], *, codec: str = "zlib", clock: Callable[[], float] = lambda: 0.0) -> Message:
-    answered = Answering(SETTINGS, KEY.key_set()).answer(what, now_s=NOW_S, left_ms=9e3, clock=clock)
+    answered = Answering(SETTINGS, KEYS).answer(what, now_s=NOW_S, left_ms=9e3, clock=clock)
     assert answered.status == 200
     return make_codec(codec).decode_from_server(answered.body)
 
@@ -81,7 +83,7 @@ def test_every_golden_command_gets_the_backends_answer(name: str, codec: str) ->
 
 @pytest.mark.parametrize("token", ["", "a.b.c", TOKEN[:-4] + "AAAA"])
 def test_a_bad_token_is_turned_away_before_anything_is_decoded(token: str) -> None:
-    answered = Answering(SETTINGS, KEY.key_set()).answer(
+    answered = Answering(SETTINGS, KEYS).answer(
         event(b"not even a message", token=token), now_s=NOW_S, left_ms=9e3, clock=lambda: 0.0
     )
 
@@ -91,9 +93,7 @@ def test_a_bad_token_is_turned_away_before_anything_is_decoded(token: str) -> No
 
 def test_an_expired_token_is_turned_away() -> None:
     late = NOW_S + SETTINGS.auth.token_life_s + SETTINGS.auth.leeway_s + 1
-    answered = Answering(SETTINGS, KEY.key_set()).answer(
-        event(b""), now_s=late, left_ms=9e3, clock=lambda: 0.0
-    )
+    answered = Answering(SETTINGS, KEYS).answer(event(b""), now_s=late, left_ms=9e3, clock=lambda: 0.0)
 
     assert answered.status == 401
 
@@ -101,7 +101,7 @@ def test_an_expired_token_is_turned_away() -> None:
 def test_an_unknown_sub_protocol_is_turned_away() -> None:
     what = event(b"")
     what["headers"]["content-type"] = "text/html"
-    answered = Answering(SETTINGS, KEY.key_set()).answer(what, now_s=NOW_S, left_ms=9e3, clock=lambda: 0.0)
+    answered = Answering(SETTINGS, KEYS).answer(what, now_s=NOW_S, left_ms=9e3, clock=lambda: 0.0)
 
     assert (answered.status, json.loads(answered.body)["code"]) == (400, "unsupported")
 
@@ -201,7 +201,7 @@ def test_another_service_is_unknown_here() -> None:
 
 
 def test_the_answer_says_whether_the_start_was_cold() -> None:
-    made = Answering(SETTINGS, KEY.key_set()).answer(event(b""), now_s=NOW_S, left_ms=9e3, clock=lambda: 0.0)
+    made = Answering(SETTINGS, KEYS).answer(event(b""), now_s=NOW_S, left_ms=9e3, clock=lambda: 0.0)
 
     http = made.as_http(init_ms=12.34, cold=True)
 

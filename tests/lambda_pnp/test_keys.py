@@ -6,7 +6,8 @@ from datetime import datetime, timezone
 
 import pytest
 
-from lambda_pnp.keys import signed_request
+from lambda_pnp.keys import KeyCache, signed_request
+from rse_pf.auth import SigningKey
 
 ENVIRONMENT = {
     "RSE_PF_KEYS": "artifacts/keys.json", "AWS_REGION": "ap-northeast-2", "AWS_ACCESS_KEY_ID": "AKIDEXAMPLE",
@@ -38,3 +39,57 @@ def test_the_request_goes_to_the_bucket_by_tls() -> None:
     assert request.full_url == "https://artifacts.s3.ap-northeast-2.amazonaws.com/keys.json"
     assert request.get_header("X-amz-security-token") == "session"
     assert "secret" not in str(request.header_items())
+
+
+class Bucket:
+    """A bucket whose object may change, or be away."""
+
+    def __init__(self, *key_ids: str) -> None:
+        self.holds(*key_ids)
+        self.reads = 0
+
+    def holds(self, *key_ids: str) -> None:
+        keys = [SigningKey.from_seed(name.encode() * 32, name).key_set().to_json()[10:-2] for name in key_ids]
+        self.text = f'{{"keys": [{", ".join(keys)}]}}' if keys else ""
+
+    def read(self) -> str:
+        self.reads += 1
+        if not self.text:
+            raise OSError("HTTP Error 403: Forbidden")
+        return self.text
+
+
+def test_a_function_that_lives_on_learns_new_keys_and_forgets_retired_ones() -> None:
+    bucket = Bucket("a")
+    keys = KeyCache(bucket.read, 60.0)
+
+    assert keys.at(0.0).get("a") is not None
+    bucket.holds("b")
+
+    assert keys.at(59.9).get("b") is None, "within the period nobody asks"
+    assert bucket.reads == 1
+    assert keys.at(60.0).get("b") is not None
+    assert keys.at(60.0).get("a") is None
+
+
+def test_a_bucket_that_is_away_leaves_the_keys_and_is_asked_again_soon(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    bucket = Bucket("a")
+    keys = KeyCache(bucket.read, 60.0)
+    keys.at(0.0)
+    bucket.holds()
+
+    assert keys.at(60.0).get("a") is not None
+    assert "403" in capsys.readouterr().err
+    assert keys.at(64.9).get("a") is not None
+    assert bucket.reads == 2
+    keys.at(65.0)
+    assert bucket.reads == 3
+
+
+def test_before_the_first_key_nobody_is_trusted_and_nothing_falls_over(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert KeyCache(Bucket().read, 60.0).at(0.0).get("a") is None
+    assert "rse-pf token init --cloud" in capsys.readouterr().err

@@ -1,0 +1,136 @@
+"""Look at a fleet that runs: its servers, what the load balancer thinks of them, alarms, and robots.
+
+Promises to change nothing, and to say when nobody told a number instead of calling it zero.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from datetime import datetime, timedelta
+from typing import Any
+
+from rse_pf.aws.account import Account
+from rse_pf.errors import ConfigurationError
+from rse_pf.scaling.alarms import NAMESPACE
+from rse_pf.settings import PlatformSettings
+
+__all__ = ["GROUP", "Fleet", "Server", "look_at"]
+
+GROUP = "rse-pf"
+"""Name of the Auto Scaling group."""
+_ALARMS = "rse-pf-"
+_PERIODS = 3
+_STATISTICS = ("Sum", "Minimum", "Maximum", "SampleCount")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Server:
+    """One instance; ``targets`` is its health in each target group, ``robots`` is None if it did not tell."""
+
+    name: str
+    zone: str
+    state: str
+    targets: tuple[str, ...]
+    robots: float | None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Fleet:
+    """Everything `rse-pf cloud status` shows.
+
+    ``robots`` maps Sum, Minimum, Maximum and SampleCount, over the servers, of the last period that has any.
+    """
+
+    least: int
+    wanted: int
+    most: int
+    servers: tuple[Server, ...]
+    alarms: dict[str, str]
+    robots: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def is_well(self) -> bool:
+        """Whether every wanted server is there, and healthy wherever it is asked."""
+        good = [
+            each
+            for each in self.servers
+            if each.targets and each.state == "InService" and set(each.targets) == {"healthy"}
+        ]
+        return len(good) >= self.wanted
+
+
+def look_at(account: Account, settings: PlatformSettings, *, now: datetime) -> Fleet:
+    """Return how the fleet is at *now*, in UTC.
+
+    Raises:
+        ConfigurationError: There is no fleet in the region, or AWS refused.
+        StoreError: AWS does not answer.
+    """
+    found = account.pages(
+        "autoscaling", "describe_auto_scaling_groups", "AutoScalingGroups", AutoScalingGroupNames=[GROUP]
+    )
+    if not found:
+        raise ConfigurationError(
+            f"no platform runs in {account.region}", hint="deploy it: npx cdk deploy --all"
+        )
+    group = found[0]
+    health = _health(account, group["TargetGroupARNs"])
+    names = [each["InstanceId"] for each in group["Instances"]]
+    told = _robots(account, names, settings.scaling.period_s, now)
+    alarms = account.pages("cloudwatch", "describe_alarms", "MetricAlarms", AlarmNamePrefix=_ALARMS)
+    return Fleet(
+        least=group["MinSize"],
+        wanted=group["DesiredCapacity"],
+        most=group["MaxSize"],
+        servers=tuple(
+            Server(
+                name=each["InstanceId"],
+                zone=each["AvailabilityZone"],
+                state=each["LifecycleState"],
+                targets=tuple(one.get(each["InstanceId"], "absent") for one in health),
+                robots=told.get(each["InstanceId"]),
+            )
+            for each in sorted(group["Instances"], key=lambda one: str(one["InstanceId"]))
+        ),
+        alarms={each["AlarmName"].removeprefix(_ALARMS): each["StateValue"] for each in alarms},
+        robots={name: told[name] for name in _STATISTICS if name in told},
+    )
+
+
+def _health(account: Account, target_groups: list[str]) -> list[dict[str, str]]:
+    """Return, for each target group, what it says of each instance."""
+    made = []
+    for arn in target_groups:
+        found = account.find("elbv2", "describe_target_health", TargetGroupArn=arn) or {}
+        rows = found.get("TargetHealthDescriptions", ())
+        made.append({row["Target"]["Id"]: row["TargetHealth"]["State"] for row in rows})
+    return made
+
+
+def _robots(account: Account, servers: list[str], period_s: int, now: datetime) -> dict[str, float]:
+    """Return the newest values of the metric Robots, by statistic and by server; absent is absent."""
+    asked: list[tuple[str, str, dict[str, str]]] = [(each, each, {}) for each in _STATISTICS]
+    asked += [(each, "Average", {"InstanceId": each}) for each in servers]
+    queries = [
+        {
+            "Id": f"q{at}",
+            "MetricStat": {"Metric": _metric(more), "Period": period_s, "Stat": statistic},
+        }
+        for at, (_, statistic, more) in enumerate(asked)
+    ]
+    found = account.pages(
+        "cloudwatch", "get_metric_data", "MetricDataResults",
+        MetricDataQueries=queries, ScanBy="TimestampDescending",
+        StartTime=now - timedelta(seconds=_PERIODS * period_s), EndTime=now,
+    )  # fmt: skip
+    newest = {row["Id"]: row["Values"][0] for row in found if row["Values"]}
+    return {name: newest[f"q{at}"] for at, (name, _, _) in enumerate(asked) if f"q{at}" in newest}
+
+
+def _metric(more: dict[str, str]) -> dict[str, Any]:
+    dimensions = {"AutoScalingGroupName": GROUP, **more}
+    return {
+        "Namespace": NAMESPACE,
+        "MetricName": "Robots",
+        "Dimensions": [{"Name": name, "Value": value} for name, value in dimensions.items()],
+    }

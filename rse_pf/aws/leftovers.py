@@ -1,0 +1,95 @@
+"""Find what is still in an account after `cdk destroy`: what was kept on purpose, and what was forgotten.
+
+Everything of ours carries the tag ``rse-pf`` or a name that begins with ours; what a living stack owns is no
+leftover.  Promises to delete nothing, and to say for each how a person would.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+from rse_pf.aws.account import Account
+
+__all__ = ["Leftover", "find_leftovers", "living_stacks"]
+
+_TAG = "rse-pf"
+_STACKS = "RsePf-"
+_ALARMS = "rse-pf-"
+_GONE = ("DELETE_COMPLETE", "REVIEW_IN_PROGRESS")
+_KEPT = {
+    "bucket": "kept on purpose: holds maps, packages or access logs",
+    "secret": "kept on purpose: the signing key",
+}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, order=True)
+class Leftover:
+    """One thing that is still there; ``remove`` is a command."""
+
+    kind: str
+    name: str
+    why: str
+    remove: str
+
+
+def living_stacks(account: Account) -> list[str]:
+    """Return the names of our stacks that stand."""
+    found = account.pages("cloudformation", "describe_stacks", "Stacks")
+    names = [row["StackName"] for row in found if row["StackStatus"] not in _GONE]
+    return sorted(name for name in names if name.startswith(_STACKS))
+
+
+def find_leftovers(account: Account) -> list[Leftover]:
+    """Return what no living stack owns, sorted by kind and name; raises as `Account.find`."""
+    owned = {
+        str(row.get("PhysicalResourceId", ""))
+        for stack in living_stacks(account)
+        for row in account.pages(
+            "cloudformation", "list_stack_resources", "StackResourceSummaries", StackName=stack
+        )
+    }
+    found = {(kind, name) for kind, name, alias in _all_of_ours(account) if not owned & {name, alias}}
+    return sorted(
+        Leftover(kind=kind, name=name, why=_KEPT.get(kind, "forgotten"), remove=_remove(kind, name))
+        for kind, name in found
+    )
+
+
+def _all_of_ours(account: Account) -> Iterator[tuple[str, str, str]]:
+    """Yield kind, name, and the other name that CloudFormation may know it by."""
+    for row in account.pages("s3", "list_buckets", "Buckets"):
+        if _is_tagged(account, row["Name"]):
+            yield "bucket", row["Name"], ""
+    for row in account.pages("secretsmanager", "list_secrets", "SecretList"):
+        if any(tag["Key"] == _TAG for tag in row.get("Tags", ())):
+            yield "secret", row["Name"], row["ARN"]
+    for prefix in (_STACKS, f"/aws/lambda/{_STACKS}"):
+        for row in account.pages("logs", "describe_log_groups", "logGroups", logGroupNamePrefix=prefix):
+            yield "log group", row["logGroupName"], ""
+    for row in account.pages("cloudwatch", "describe_alarms", "MetricAlarms", AlarmNamePrefix=_ALARMS):
+        yield "alarm", row["AlarmName"], row["AlarmArn"]
+    free: list[dict[str, Any]] = [{"Name": "tag-key", "Values": [_TAG]}]
+    unattached = [*free, {"Name": "status", "Values": ["available"]}]
+    for row in account.pages("ec2", "describe_volumes", "Volumes", Filters=unattached):
+        yield "volume", row["VolumeId"], ""
+    for row in account.pages("ec2", "describe_network_interfaces", "NetworkInterfaces", Filters=unattached):
+        yield "network interface", row["NetworkInterfaceId"], ""
+
+
+def _is_tagged(account: Account, bucket: str) -> bool:
+    found = account.find("s3", "get_bucket_tagging", Bucket=bucket) or {}
+    return any(tag["Key"] == _TAG for tag in found.get("TagSet", ()))
+
+
+def _remove(kind: str, name: str) -> str:
+    commands = {
+        "bucket": f"empty it in the console, all versions; then aws s3api delete-bucket --bucket {name}",
+        "secret": f"aws secretsmanager delete-secret --secret-id {name}",
+        "log group": f"aws logs delete-log-group --log-group-name {name}",
+        "alarm": f"aws cloudwatch delete-alarms --alarm-names {name}",
+        "volume": f"aws ec2 delete-volume --volume-id {name}",
+        "network interface": f"aws ec2 delete-network-interface --network-interface-id {name}",
+    }
+    return commands[kind]

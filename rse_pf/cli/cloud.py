@@ -1,0 +1,222 @@
+"""Look after the platform on AWS: what a deployment lacks, what it costs, how it is, what is left of it.
+
+It reads only; npx cdk deploy and npx cdk destroy do the rest, see docs/operations.md.
+
+examples:
+  rse-pf cloud doctor
+  rse-pf cloud cost --robots 20 --fps 5 --hours-per-day 8
+  rse-pf cloud status
+  rse-pf cloud leftovers
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import os
+import re
+import shutil
+import subprocess
+import sysconfig
+from collections.abc import Iterator
+from datetime import datetime, timezone
+from importlib import metadata
+from pathlib import Path
+
+from rse_pf.cli.doctor import Finding
+from rse_pf.errors import RsePfError, UsageError
+from rse_pf.settings import PlatformSettings
+
+__all__ = ["add_arguments", "check_tools", "run"]
+
+_OLDEST_NODE = 22
+_NODE_ANSWERS_S = 10.0
+_CLI = Path("node_modules", "aws-cdk", "package.json")
+_PINNED = Path("package.json")
+_PACKAGES = Path("build")
+_SCHEMA = "@aws-cdk/cloud-assembly-schema"
+_MOST_ROBOTS = 1_000_000
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the actions and their options."""
+    actions = parser.add_subparsers(dest="action", required=True, metavar="ACTION")
+    made = {
+        name: actions.add_parser(name, help=text, description=text)
+        for name, text in {
+            "doctor": "check tools, packages, account, certificate and quotas before a deployment",
+            "cost": "what a load costs a month, on the fleet and on the Lambda",
+            "status": "servers, their health, alarms, robots",
+            "leftovers": "what is still in the account and belongs to no stack",
+        }.items()
+    }
+    made["cost"].add_argument("--robots", type=int, default=10, metavar="N", help="default: %(default)s")
+    made["cost"].add_argument(
+        "--fps", type=float, default=5.0, metavar="F", help="frames a second of each (default: %(default)s)"
+    )
+    made["cost"].add_argument(
+        "--hours-per-day", type=float, default=24.0, metavar="H", help="hours at work (default: %(default)s)"
+    )
+
+
+def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
+    """Do one action and return the exit code; 1 says that somebody has to act."""
+    actions = {"doctor": _doctor, "cost": _cost, "status": _status, "leftovers": _leftovers}
+    return actions[args.action](args, settings)
+
+
+def _doctor(args: argparse.Namespace, settings: PlatformSettings) -> int:
+    failed = 0
+    for finding in (*check_tools(Path.cwd()), *_account_findings(settings)):
+        print(finding, flush=True)
+        failed += finding.grade == "fail"
+    print(f"\n{failed} to mend first" if failed else "\nready: npx cdk deploy --all")
+    return 1 if failed else 0
+
+
+def _account_findings(settings: PlatformSettings) -> Iterator[Finding]:
+    from rse_pf.aws.account import open_account
+    from rse_pf.aws.quotas import check_account
+
+    try:
+        for check in check_account(open_account(settings.cloud.region), settings):
+            yield Finding(grade=check.grade, what=check.what, fix=check.fix)
+    except RsePfError as error:
+        yield Finding(grade="fail", what=error.message, fix=error.hint)
+
+
+def check_tools(checkout: Path) -> Iterator[Finding]:
+    """Yield what a deployment from *checkout* needs on this machine; no account is asked."""
+    yield _node()
+    yield _cli(checkout)
+    built = [name for name in ("wheelhouse", "lambda") if _has_files(checkout / _PACKAGES / name)]
+    yield (
+        Finding(grade="ok", what="packages are built")
+        if len(built) == 2
+        else Finding(grade="fail", what=f"no packages in {_PACKAGES}", fix="make assets")
+    )
+
+
+def _node() -> Finding:
+    fix = f"make setup installs Node {_OLDEST_NODE} or newer into .venv"
+    path = os.pathsep.join((sysconfig.get_path("scripts"), os.environ.get("PATH", "")))
+    found = shutil.which("node", path=path)
+    if found is None:
+        return Finding(grade="fail", what="Node is not installed", fix=fix)
+    try:
+        told = subprocess.run(
+            [found, "--version"], capture_output=True, text=True, timeout=_NODE_ANSWERS_S, check=True
+        ).stdout.strip()
+    except (OSError, subprocess.SubprocessError) as error:
+        return Finding(grade="fail", what=f"Node does not run: {error}", fix=fix)
+    version = re.match(r"v(\d+)\.", told)
+    if version is None or int(version[1]) < _OLDEST_NODE:
+        return Finding(grade="fail", what=f"Node {told} is too old for the CDK", fix=fix)
+    return Finding(grade="ok", what=f"Node {told}")
+
+
+def _cli(checkout: Path) -> Finding:
+    """Compare the assembly that the library writes with the newest that the command line reads."""
+    fix = "make setup installs the one in package-lock.json; never npm install aws-cdk"
+    try:
+        writes = metadata.version("aws-cdk.cloud-assembly-schema")
+    except metadata.PackageNotFoundError:
+        return Finding(grade="fail", what="aws-cdk-lib is not installed", fix="pip install 'rse-pf[infra]'")
+    try:
+        cli = json.loads((checkout / _CLI).read_text(encoding="utf-8"))
+        pinned = json.loads((checkout / _PINNED).read_text(encoding="utf-8"))["devDependencies"]["aws-cdk"]
+        version, reads = str(cli["version"]), str(cli["devDependencies"][_SCHEMA])
+        newest = int(re.sub(r"^\D*", "", reads).partition(".")[0])
+    except (OSError, ValueError, KeyError, TypeError):
+        return Finding(grade="fail", what="the CDK's command line is not installed here", fix=fix)
+    line = f"CDK command line {version} reads assembly schema {newest}, the library writes {writes}"
+    if newest < int(writes.partition(".")[0]):
+        return Finding(grade="fail", what=line, fix=fix)
+    if version != pinned:
+        return Finding(grade="warn", what=f"{line}; package.json pins {pinned}", fix=fix)
+    return Finding(grade="ok", what=line)
+
+
+def _has_files(folder: Path) -> bool:
+    return folder.is_dir() and any(folder.iterdir())
+
+
+def _cost(args: argparse.Namespace, settings: PlatformSettings) -> int:
+    from rse_pf.aws.costs import HOURS, NOT_INCLUDED, Load, compare
+
+    if not 1 <= args.robots <= _MOST_ROBOTS:
+        raise UsageError(
+            f"--robots is not within 1 and {_MOST_ROBOTS}", hint="name how many robots there are"
+        )
+    if not (math.isfinite(args.fps) and 0 < args.fps <= 1000 and 0 < args.hours_per_day <= 24):
+        raise UsageError(
+            "--fps or --hours-per-day is out of range", hint="up to 1000 a second, up to 24 hours"
+        )
+    load = Load(robots=args.robots, fps=args.fps, hours_per_day=args.hours_per_day)
+    costs = compare(settings, load)
+    most, at_once = settings.scaling.max_servers, settings.cloud.lambda_concurrency
+    rows = [
+        ("USD a month", "EC2 fleet", "Lambda"),
+        ("nobody asks", f"{costs.floor_usd:.2f}", "0.00"),
+        ("this load", f"{costs.fleet_usd:.2f}", f"{costs.lambda_usd:.2f}"),
+        ("needs", f"{costs.servers} servers", f"{costs.at_once:.1f} at once"),
+        ("may have", f"{most} servers", f"{at_once} at once"),
+    ]
+    print(
+        f"{load.robots} robots, {load.fps:g} commands/s each, {load.hours_per_day:g} h a day: "
+        f"{load.commands_per_s:g} commands/s of {settings.prices.command_cpu_ms:g} ms\n"
+    )
+    for name, fleet, function in rows:
+        print(f"{name:<12}{fleet:>14}{function:>16}")
+    rate = costs.crossing_commands_per_s
+    print(
+        f"\nthe fleet is cheaper from {rate:.1f} commands/s, {math.ceil(rate / load.fps)} such robots"
+        if rate is not None
+        else f"\nthe Lambda is cheaper up to {most} servers"
+    )
+    if costs.servers > most or costs.at_once > at_once:
+        print("more than scaling.max_servers or cloud.lambda_concurrency allows: robots would be refused")
+    print(f"\nprices: {settings.prices.as_of} (settings, group prices); a month has {HOURS:g} h")
+    print(f"not included: {NOT_INCLUDED}")
+    return 0
+
+
+def _status(args: argparse.Namespace, settings: PlatformSettings) -> int:
+    from rse_pf.aws.account import open_account
+    from rse_pf.aws.fleet import look_at
+
+    account = open_account(settings.cloud.region)
+    fleet = look_at(account, settings, now=datetime.now(timezone.utc))
+    print(f"{len(fleet.servers)} servers, wanted {fleet.wanted} of {fleet.least} to {fleet.most}")
+    for each in fleet.servers:
+        health = ", ".join(each.targets) or "in no target group"
+        robots = "robots: not told" if each.robots is None else f"{each.robots:g} robots"
+        print(f"  {each.name}  {each.zone}  {each.state:<12}  {health:<20}  {robots}")
+    if fleet.robots:
+        told = {name: f"{value:g}" for name, value in fleet.robots.items()}
+        print(
+            f"{told['Sum']} robots on {told['SampleCount']} servers, "
+            f"{told['Minimum']} to {told['Maximum']} on each"
+        )
+    else:
+        print("robots: no server told how many it has")
+    for name, state in sorted(fleet.alarms.items()):
+        hint = f"  docs/operations.md#{name}" if state == "ALARM" else ""
+        print(f"  alarm {name:<12} {state}{hint}")
+    return 0 if fleet.is_well else 1
+
+
+def _leftovers(args: argparse.Namespace, settings: PlatformSettings) -> int:
+    from rse_pf.aws.account import open_account
+    from rse_pf.aws.leftovers import find_leftovers, living_stacks
+
+    account = open_account(settings.cloud.region)
+    stacks = living_stacks(account)
+    if stacks:
+        print(f"these stacks stand, and what they own is not listed: {', '.join(stacks)}")
+    found = find_leftovers(account)
+    for each in found:
+        print(f"{each.kind}  {each.name}\n  {each.why}\n  remove: {each.remove}")
+    print(f"{len(found)} left over")
+    return 1 if found else 0

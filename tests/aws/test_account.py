@@ -1,0 +1,84 @@
+"""An operator's account: no credentials is said at once, refusals by name, and what is absent is None."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import pytest
+
+from rse_pf.aws.account import Account, open_account
+from rse_pf.errors import ConfigurationError
+
+WITHIN_S = 8.0
+
+
+@pytest.fixture
+def nobody(monkeypatch: pytest.MonkeyPatch, tmp_path: Any) -> None:
+    """A person who never signed in."""
+    for name in ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY", "AWS_SESSION_TOKEN", "AWS_PROFILE"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("AWS_SHARED_CREDENTIALS_FILE", str(tmp_path / "none"))
+    monkeypatch.setenv("AWS_CONFIG_FILE", str(tmp_path / "none"))
+
+
+def test_without_credentials_it_is_said_in_seconds(nobody: None) -> None:
+    pytest.importorskip("boto3", reason="the dev extra is not installed")
+    began = time.monotonic()
+
+    with pytest.raises(ConfigurationError) as told:
+        open_account("ap-northeast-2")
+
+    assert told.value.message == "no AWS credentials"
+    assert "aws sso login" in told.value.hint
+    assert time.monotonic() - began < WITHIN_S, "the instance metadata service was waited for"
+
+
+def test_a_profile_that_is_not_there_is_said(nobody: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("boto3", reason="the dev extra is not installed")
+    monkeypatch.setenv("AWS_PROFILE", "forgotten")
+
+    with pytest.raises(ConfigurationError, match="forgotten"):
+        open_account("ap-northeast-2")
+
+
+def test_what_is_not_there_is_none_and_has_no_pages(region: str) -> None:
+    account = open_account(region)
+
+    assert account.find("ssm", "get_parameter", Name="/nothing") is None
+    assert account.find("cloudformation", "describe_stacks", StackName="nothing") is None
+    rows = account.pages(
+        "cloudformation", "list_stack_resources", "StackResourceSummaries", StackName="nothing"
+    )
+    assert rows == []
+
+
+def test_all_pages_are_read(region: str) -> None:
+    account = open_account(region)
+    for at in range(60):
+        account.client("logs").create_log_group(logGroupName=f"RsePf-{at:02d}")
+
+    found = account.pages("logs", "describe_log_groups", "logGroups", logGroupNamePrefix="RsePf-", limit=7)
+
+    assert [row["logGroupName"] for row in found] == [f"RsePf-{at:02d}" for at in range(60)]
+
+
+def test_a_refusal_names_the_call_and_the_code() -> None:
+    errors = pytest.importorskip("botocore.exceptions", reason="the dev extra is not installed")
+
+    class Refusing:
+        def get_parameter(self, **arguments: Any) -> None:
+            answer = {"Error": {"Code": "AccessDeniedException"}, "ResponseMetadata": {"HTTPStatusCode": 400}}
+            raise errors.ClientError(answer, "GetParameter")
+
+    with pytest.raises(ConfigurationError) as told:
+        Account("ap-northeast-2", lambda service, region: Refusing()).find("ssm", "get_parameter", Name="x")
+
+    assert told.value.message == "AWS refuses ssm get_parameter: AccessDeniedException"
+
+
+def test_a_region_without_name_is_a_mistake_in_the_settings() -> None:
+    pytest.importorskip("boto3", reason="the dev extra is not installed")
+
+    with pytest.raises(ConfigurationError, match=r"cloud\.region"):
+        Account("Seoul!").client("s3")
