@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import io
 import json
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from rse_pf.auth import KeySet
+from rse_pf.aws.account import Account
+from rse_pf.aws.clients import make_client
 from rse_pf.cli.main import main
 from rse_pf.local.firewall import ensure_key, key_file, key_set_file
 from rse_pf.local.state import settings_file
@@ -109,3 +113,124 @@ def test_a_longer_life_than_the_settings_allow_is_refused(
 ) -> None:
     assert main(["token", "issue", "robot-1", "--life", "901"]) == 2
     assert "901 s is not within 900 s" in capsys.readouterr().err
+
+
+REGION = "ap-northeast-2"
+ROWS = (
+    ("SigningKey8FF1", "AWS::SecretsManager::Secret", "signing-key"),
+    ("Artifacts1F2E", "AWS::S3::Bucket", "artifacts"),
+)
+
+
+class Formation:
+    """The stack RsePf-Data, as far as its secret and its bucket; moto does not make secrets."""
+
+    def can_paginate(self, method: str) -> bool:
+        return False
+
+    def list_stack_resources(self, *, StackName: str) -> dict[str, Any]:
+        names = ("LogicalResourceId", "ResourceType", "PhysicalResourceId")
+        return {"StackResourceSummaries": [dict(zip(names, row, strict=True)) for row in ROWS]}
+
+
+@pytest.fixture
+def cloud(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
+    """A deployment without keys; the S3 client that sees its bucket."""
+    moto = pytest.importorskip("moto", reason="the dev extra is not installed")
+    monkeypatch.chdir(tmp_path)
+    for name in ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY"):
+        monkeypatch.setenv(name, "testing")
+    with moto.mock_aws():
+        s3 = make_client("s3", REGION)
+        s3.create_bucket(Bucket="artifacts", CreateBucketConfiguration={"LocationConstraint": REGION})
+        make_client("secretsmanager", REGION).create_secret(Name="signing-key", SecretString="k]:vE{")
+        account = Account(
+            REGION, lambda name, at: Formation() if name == "cloudformation" else make_client(name, at)
+        )
+        monkeypatch.setattr("rse_pf.aws.account.open_account", lambda region: account)
+        yield s3
+
+
+def published(s3: Any) -> list[str]:
+    text = s3.get_object(Bucket="artifacts", Key="keys.json")["Body"].read().decode()
+    KeySet.from_json(text)
+    return [row["kid"] for row in json.loads(text)["keys"]]
+
+
+def test_a_clouds_token_is_good_for_its_servers_and_the_private_half_is_never_printed(
+    capsys: pytest.CaptureFixture[str], cloud: Any
+) -> None:
+    assert main(["token", "init", "--cloud"]) == 0
+    (key_id,) = published(cloud)
+    secret = make_client("secretsmanager", REGION).get_secret_value(SecretId="signing-key")["SecretString"]
+    told = capsys.readouterr()
+
+    assert key_id in told.out
+    assert json.loads(secret)["keys"][0]["jwk"]["d"] not in told.out + told.err
+    code, said = inspected(capsys, issued(capsys, "--cloud"), "--cloud")
+    assert (code, said["verified"], said["header"]["kid"]) == (0, "yes", key_id)
+
+
+def test_init_again_keeps_the_key_and_publishes_it_again(
+    capsys: pytest.CaptureFixture[str], cloud: Any
+) -> None:
+    main(["token", "init", "--cloud"])
+    before = published(cloud)
+    cloud.delete_object(Bucket="artifacts", Key="keys.json")
+
+    assert main(["token", "init", "--cloud"]) == 0
+
+    assert published(cloud) == before
+    assert "there already" in capsys.readouterr().out
+
+
+def test_a_rotation_publishes_both_keys_and_signs_with_the_old_one_until_servers_know(
+    capsys: pytest.CaptureFixture[str], cloud: Any
+) -> None:
+    main(["token", "init", "--cloud"])
+    (old,) = published(cloud)
+
+    assert main(["token", "rotate", "--cloud"]) == 0
+
+    assert published(cloud)[0] == old
+    assert len(published(cloud)) == 2
+    capsys.readouterr()
+    _, said = inspected(capsys, issued(capsys, "--cloud"), "--cloud")
+    assert said["header"]["kid"] == old
+    assert main(["token", "rotate", "--cloud"]) == 2, "the rotation before is not over"
+
+
+def test_a_retired_key_vouches_for_nothing(capsys: pytest.CaptureFixture[str], cloud: Any) -> None:
+    main(["token", "init", "--cloud"])
+    capsys.readouterr()
+    stolen = issued(capsys, "--cloud")
+    main(["token", "rotate", "--cloud"])
+    new = published(cloud)[1]
+
+    assert main(["token", "retire", "--cloud"]) == 0
+
+    assert published(cloud) == [new]
+    capsys.readouterr()
+    assert inspected(capsys, stolen, "--cloud")[1]["verified"] == "no: unknown-key"
+    assert inspected(capsys, issued(capsys, "--cloud"), "--cloud")[1]["verified"] == "yes"
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["init"], ["rotate"], ["init", "robot-1", "--cloud"], ["issue", "--cloud"], ["issue"], ["inspect"],
+        ["issue", "robot-1", "--cloud", "--key", "k.json"], ["issue", "robot-1", "--cloud", "--keys", "k"],
+    ],
+)  # fmt: skip
+def test_words_that_contradict_are_refused(
+    capsys: pytest.CaptureFixture[str], cloud: Any, words: list[str]
+) -> None:
+    assert main(["token", *words]) == 2
+    assert "hint:" in capsys.readouterr().err
+
+
+def test_issuing_before_the_first_key_says_how_to_make_one(
+    capsys: pytest.CaptureFixture[str], cloud: Any
+) -> None:
+    assert main(["token", "issue", "robot-1", "--cloud"]) == 2
+    assert "rse-pf token init --cloud" in capsys.readouterr().err

@@ -1,0 +1,251 @@
+"""rse-pf cloud: what it prints, its exit codes, and one line with a hint where there is no account."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from rse_pf.aws.account import Account
+from rse_pf.aws.clients import make_client
+from rse_pf.aws.fleet import Fleet, Server
+from rse_pf.cli import cloud
+from rse_pf.cli.cloud import check_tools
+from rse_pf.cli.main import main
+
+REGION = "ap-northeast-2"
+
+
+@pytest.fixture(autouse=True)
+def in_an_empty_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """No settings file of the checkout plays a part."""
+    monkeypatch.chdir(tmp_path)
+
+
+@pytest.fixture
+def nobody(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """A person who never signed in."""
+    pytest.importorskip("boto3", reason="the dev extra is not installed")
+    for name in ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY", "AWS_SESSION_TOKEN", "AWS_PROFILE"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("AWS_SHARED_CREDENTIALS_FILE", str(tmp_path / "none"))
+    monkeypatch.setenv("AWS_CONFIG_FILE", str(tmp_path / "none"))
+
+
+@pytest.fixture
+def emulator(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """An account in this process."""
+    moto = pytest.importorskip("moto", reason="the dev extra is not installed")
+    for name in ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY"):
+        monkeypatch.setenv(name, "testing")
+    with moto.mock_aws():
+        yield
+
+
+def test_the_costs_are_a_table_with_crossing_floor_date_and_what_is_left_out(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert main(["cloud", "cost", "--robots", "20", "--fps", "5", "--hours-per-day", "8"]) == 0
+
+    page = capsys.readouterr().out
+    rows = {line[:12].strip(): line[12:].split() for line in page.splitlines() if line[:1].islower()}
+    assert float(rows["nobody asks"][0]) > 0
+    assert rows["nobody asks"][1] == "0.00"
+    assert float(rows["this load"][0]) > float(rows["this load"][1]), "20 robots leave servers idle"
+    assert "the fleet is cheaper from" in page
+    assert "2025-06, Seoul, from memory" in page
+    assert "not included: taxes" in page
+    assert "100 commands/s" in page
+
+
+def test_the_prices_follow_the_settings(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    chosen = {"context": {"rse-pf": {"prices": {"lambda_million_usd": 1e6, "as_of": "today"}}}}
+    (tmp_path / "mine.json").write_text(json.dumps(chosen), encoding="utf-8")
+
+    assert main(["cloud", "--settings", "mine.json", "cost", "--robots", "1", "--fps", "1"]) == 0
+
+    page = capsys.readouterr().out
+    assert "prices: today" in page
+    assert f"{730 * 3600}." in page, "a dollar for each command"
+
+
+def test_a_load_beyond_the_settings_is_said(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["cloud", "cost", "--robots", "10000", "--fps", "30"]) == 0
+
+    assert "robots would be refused" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    "words", [["--robots", "0"], ["--fps", "0"], ["--fps", "nan"], ["--hours-per-day", "25"], ["--fps", "-1"]]
+)
+def test_a_load_that_nobody_can_have_is_refused(capsys: pytest.CaptureFixture[str], words: list[str]) -> None:
+    assert main(["cloud", "cost", *words]) == 2
+    assert "hint:" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("action", ["status", "leftovers"])
+def test_without_credentials_there_is_one_line_and_a_hint(
+    capsys: pytest.CaptureFixture[str], nobody: None, action: str
+) -> None:
+    assert main(["cloud", action]) == 2
+
+    assert capsys.readouterr().err.splitlines() == [
+        "ConfigurationError: no AWS credentials",
+        "  hint: set AWS_PROFILE, or sign in with aws sso login or aws configure",
+    ]
+
+
+def test_without_boto3_the_extra_is_named(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(__import__("sys").modules, "boto3", None)
+
+    assert main(["cloud", "status"]) == 2
+    assert "pip install 'rse-pf[aws]'" in capsys.readouterr().err
+
+
+def test_the_doctor_says_all_it_can_without_an_account(
+    capsys: pytest.CaptureFixture[str], nobody: None
+) -> None:
+    assert main(["cloud", "doctor"]) == 1
+
+    lines = capsys.readouterr().out.splitlines()
+    assert "fail  no packages in build" in lines
+    assert "      fix: make assets" in lines
+    assert "fail  no AWS credentials" in lines
+    assert lines[-1].endswith("to mend first")
+
+
+class NoRoom:
+    """Service quotas of nothing at all; moto lacks a call of them."""
+
+    def __getattr__(self, method: str) -> Any:
+        return lambda **asked: {"Quota": {"Value": 0.0}}
+
+
+def test_the_doctor_asks_the_account(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, emulator: None
+) -> None:
+    account = Account(
+        REGION, lambda name, at: NoRoom() if name == "service-quotas" else make_client(name, at)
+    )
+    monkeypatch.setattr("rse_pf.aws.account.open_account", lambda region: account)
+
+    assert main(["cloud", "doctor"]) == 1
+
+    page = capsys.readouterr().out
+    assert "ok    signed in as arn:aws:" in page
+    assert "      fix: npx cdk bootstrap" in page
+    assert "fail  quota 0, needed 22" in page
+
+
+def checkout(folder: Path, *, version: str = "2.1148.1", reads: str = ">=55.5.0") -> Path:
+    """A checkout with packages and a command line of the CDK."""
+    for name in ("wheelhouse", "lambda"):
+        (folder / "build" / name).mkdir(parents=True)
+        (folder / "build" / name / "file").touch()
+    cli = folder / "node_modules" / "aws-cdk"
+    cli.mkdir(parents=True)
+    document = {"version": version, "devDependencies": {"@aws-cdk/cloud-assembly-schema": reads}}
+    (cli / "package.json").write_text(json.dumps(document), encoding="utf-8")
+    pinned = {"devDependencies": {"aws-cdk": "2.1148.1"}}
+    (folder / "package.json").write_text(json.dumps(pinned), encoding="utf-8")
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("changes", "grade"),
+    [
+        ({}, "ok"),
+        ({"version": "2.1150.0"}, "warn"),
+        ({"version": "3.0.0", "reads": ">=43.0.0"}, "fail"),
+        ({"reads": "newest"}, "fail"),
+    ],
+)
+def test_a_command_line_that_cannot_read_the_librarys_assembly_is_caught(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, changes: dict[str, str], grade: str
+) -> None:
+    monkeypatch.setattr(cloud.metadata, "version", lambda name: "55.3.0")
+
+    _, cli, packages = check_tools(checkout(tmp_path, **changes))
+
+    assert (cli.grade, packages.grade) == (grade, "ok")
+    assert bool(cli.fix) == (grade != "ok")
+
+
+def test_the_command_line_of_the_lock_reads_what_the_library_writes(repository: Path) -> None:
+    if not (repository / "node_modules" / "aws-cdk").is_dir():
+        pytest.skip("the CDK's command line is not installed: make setup")
+
+    _, cli, _ = check_tools(repository)
+
+    assert cli.grade == "ok", cli
+
+
+@pytest.mark.system
+@pytest.mark.parametrize(("told", "grade"), [("v24.1.0", "ok"), ("v20.9.9", "fail"), ("nonsense", "fail")])
+def test_a_node_that_the_cdk_no_longer_supports_is_caught(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, told: str, grade: str
+) -> None:
+    node = tmp_path / "node"
+    node.write_text(f"#!/bin/sh\necho {told}\n", encoding="utf-8")
+    node.chmod(0o755)
+    monkeypatch.setattr(cloud.sysconfig, "get_path", lambda name: str(tmp_path))
+
+    assert next(check_tools(tmp_path)).grade == grade
+
+
+def show(monkeypatch: pytest.MonkeyPatch, fleet: Fleet) -> None:
+    monkeypatch.setattr("rse_pf.aws.account.open_account", lambda region: Account(region))
+    monkeypatch.setattr("rse_pf.aws.fleet.look_at", lambda *args, **named: fleet)
+
+
+def server(name: str, **changes: Any) -> Server:
+    facts: dict[str, Any] = {"zone": "a", "state": "InService", "targets": ("healthy",), "robots": 7.0}
+    return Server(name=name, **{**facts, **changes})
+
+
+def test_the_status_of_a_well_fleet(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    told = {"Sum": 7.0, "Minimum": 7.0, "Maximum": 7.0, "SampleCount": 1.0}
+    fleet = Fleet(least=1, wanted=1, most=4, servers=(server("i-1"),), alarms={"idle": "OK"}, robots=told)
+    show(monkeypatch, fleet)
+
+    assert main(["cloud", "status"]) == 0
+
+    page = capsys.readouterr().out
+    assert "1 servers, wanted 1 of 1 to 4" in page
+    assert "7 robots on 1 servers, 7 to 7 on each" in page
+    assert "alarm idle         OK\n" in page
+
+
+def test_the_status_of_an_ill_fleet_leads_to_the_runbook(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ill = server("i-1", targets=("unhealthy",), robots=None)
+    show(monkeypatch, Fleet(least=1, wanted=1, most=4, servers=(ill,), alarms={"unhealthy": "ALARM"}))
+
+    assert main(["cloud", "status"]) == 1
+
+    page = capsys.readouterr().out
+    assert "robots: not told" in page
+    assert "no server told" in page
+    assert "docs/operations.md#unhealthy" in page
+
+
+def test_leftovers_are_listed_with_the_command_that_removes_them(
+    capsys: pytest.CaptureFixture[str], emulator: None
+) -> None:
+    import boto3
+
+    assert main(["cloud", "leftovers"]) == 0
+    boto3.client("logs", region_name=REGION).create_log_group(logGroupName="RsePf-Network-Flow")
+
+    assert main(["cloud", "leftovers"]) == 1
+    page = capsys.readouterr().out
+    assert "remove: aws logs delete-log-group --log-group-name RsePf-Network-Flow" in page
+    assert page.endswith("1 left over\n")
