@@ -14,7 +14,7 @@ from collections.abc import Callable, Coroutine
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from client_sdk.connection import Token
+from client_sdk.connection import OnChange, Token
 from client_sdk.offload import CloudFirst
 from client_sdk.robot import Answer, PoseAnswer, Robot, connect
 from client_sdk.stats import Stats
@@ -42,11 +42,18 @@ def connect_blocking(
     offload: CloudFirst | None = None,
     clock: Callable[[], float] = time.monotonic,
     random: random_module.Random | None = None,
+    on_change: OnChange = None,
 ) -> BlockingRobot:
-    """Return a robot for ``with connect_blocking(url, token=...) as robot``; see `connect`."""
+    """Return a robot for ``with connect_blocking(url, token=...) as robot``; see `connect`.
+
+    *on_change* is called in the robot's own thread.
+    """
     return BlockingRobot(
-        connect(url, token=token, codec=codec, settings=settings, offload=offload, clock=clock, random=random)
-    )
+        connect(
+            url, token=token, codec=codec, settings=settings, offload=offload, clock=clock, random=random,
+            on_change=on_change,
+        )
+    )  # fmt: skip
 
 
 class BlockingRobot:

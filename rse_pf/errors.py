@@ -294,7 +294,8 @@ class StoreFull(StoreError):
 def _leaves(of: type[RsePfError]) -> dict[str, type[RsePfError]]:
     found = {of.code: of}
     for child in of.__subclasses__():
-        found.update(_leaves(child))
+        for code, kind in _leaves(child).items():
+            found.setdefault(code, kind)  # a room's own kind of an error has no code of its own
     return found
 
 

@@ -41,7 +41,8 @@ def test_has_the_public_methods_of_the_robot():
     def public(kind: type) -> set[str]:
         return {name for name in vars(kind) if not name.startswith("_")}
 
-    assert public(client_sdk.BlockingRobot) == public(client_sdk.Robot)
+    for_loops_only = {"post"}  # its callback would come in the robot's thread
+    assert public(client_sdk.BlockingRobot) == public(client_sdk.Robot) - for_loops_only
 
 
 @pytest.mark.parametrize("method", ["call", "solve_pnp", "close"])
