@@ -57,6 +57,8 @@ def chosen_scenarios(only: tuple[str, ...]) -> dict[str, Scenario]:
 def run_robustness(options: RobustnessOptions, settings: PlatformSettings) -> int:
     """Run the faults, write records, report and picture; return 1 if a command was lost or answered twice."""
     require_matplotlib()
+    # One server must be able to carry the robots of another one: give it a worker for each of two cores.
+    settings = settings.replace(local={"workers": max(settings.local.workers, min(2, os.cpu_count() or 1))})
     folder = fresh_folder(options.out, (PICTURE,))
     load_before = [round(value, 2) for value in os.getloadavg()]
     names: dict[str, tuple[str, Scenario]] = {}
