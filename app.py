@@ -1,13 +1,20 @@
-"""Say which stacks there are.  Every number is in `rse_pf.settings`; overrides are in cdk.json."""
+"""Say which stacks there are.  Every number is in `rse_pf.settings`; overrides are in cdk.json.
+
+Promises to complain in two lines before anything is synthesised, and to let no ``-c`` of the command line
+pass that nobody reads.
+"""
 
 from __future__ import annotations
 
+import json
 import sys
+import zipfile
 from pathlib import Path
+from typing import Any
 
 import aws_cdk as cdk
 
-from rse_pf.errors import RsePfError
+from rse_pf.errors import ConfigurationError, RsePfError, SettingsError
 from rse_pf.settings import PlatformSettings, load_settings
 from stacks.backend_stack import BackendStack
 from stacks.data_stack import DataStack
@@ -36,17 +43,42 @@ def build(app: cdk.App, settings: PlatformSettings, assets: Path) -> dict[str, c
     return {stack.stack_name: stack for stack in stacks}
 
 
+def check_context(given: dict[str, Any], written: dict[str, Any]) -> None:
+    """Refuse context of the command line that nobody would read; there is one place to edit.
+
+    Raises:
+        SettingsError: A key of *given* is neither the CDK's own nor, with the same value, in *written*.
+    """
+    for name, value in given.items():
+        if ":" not in name and not name.startswith("@") and written.get(name) != value:
+            raise SettingsError(
+                f"context {name!r} of the command line is read by nobody",
+                hint='write settings into cdk.json, context."rse-pf", and leave -c out',
+            )
+
+
 def main() -> int:
     """Synthesise, or say in two lines why not."""
     root = Path(__file__).parent
     try:
-        app = cdk.App()
-        build(app, load_settings(root / "cdk.json"), root / "build")
+        settings = load_settings(root / "cdk.json")
+        written = json.loads((root / "cdk.json").read_text(encoding="utf-8")).get("context", {})
+        app = cdk.App(context=written)
+        check_context(dict(app.node.get_all_context()), written)
+        build(app, settings, root / "build")
     except RsePfError as error:
-        sys.stderr.write(f"{error.report()}\n")
-        return 2
+        return _complain(error)
+    except (OSError, zipfile.BadZipFile) as error:
+        return _complain(
+            ConfigurationError(f"cannot read the packages in build: {error}", hint="run make assets")
+        )
     app.synth()
     return 0
+
+
+def _complain(error: RsePfError) -> int:
+    sys.stderr.write(f"{error.report()}\n")
+    return 2
 
 
 if __name__ == "__main__":
