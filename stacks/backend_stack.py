@@ -42,6 +42,14 @@ class BackendStack(cdk.Stack):
     ) -> None:
         super().__init__(scope, construct_id, env=env)
         self.topic = sns.Topic(self, "Events", enforce_ssl=True)
+        # A topic with a policy of its own forgets the one that lets the account's alarms in.
+        self.topic.add_to_resource_policy(
+            iam.PolicyStatement(
+                principals=[iam.ServicePrincipal("cloudwatch.amazonaws.com")], actions=["sns:Publish"],
+                resources=[self.topic.topic_arn],
+                conditions={"StringEquals": {"aws:SourceAccount": self.account}},
+            )
+        )  # fmt: skip
         self.balancer = LoadBalancer(
             self, "LoadBalancer", vpc=network.vpc, group=network.firewall.balancer, settings=settings,
             logs=data.access_logs,
@@ -84,6 +92,7 @@ class BackendStack(cdk.Stack):
         self._say_where(settings)
 
     def _say_where(self, settings: PlatformSettings) -> None:
+        cdk.CfnOutput(self, "Topic", value=self.topic.topic_arn, description="subscribe to be told of alarms")
         name = self.balancer.alb.load_balancer_dns_name
         path = settings.serving.path
         if settings.cloud.lab:

@@ -77,6 +77,57 @@ def test_the_group_has_the_settings_bounds_and_asks_the_load_balancer(assembly: 
     assert len(group["TargetGroupARNs"]) == (2 if assembly.settings.data.enabled else 1)
 
 
+def test_alarms_of_this_account_may_publish_to_the_topic_and_nobody_without_tls(assembly: Assembly) -> None:
+    statements = assembly.one("AWS::SNS::TopicPolicy")["PolicyDocument"]["Statement"]
+    allowed = [each for each in statements if each["Effect"] == "Allow"]
+
+    assert [each["Principal"] for each in allowed] == [{"Service": "cloudwatch.amazonaws.com"}]
+    assert allowed[0]["Condition"] == {"StringEquals": {"aws:SourceAccount": {"Ref": "AWS::AccountId"}}}
+    assert [each["Condition"] for each in statements if each["Effect"] == "Deny"] == [
+        {"Bool": {"aws:SecureTransport": "false"}}
+    ]
+
+
+def test_no_role_may_do_anything_to_everything_but_publish_numbers(assembly: Assembly) -> None:
+    statements = [
+        each
+        for policy in assembly.all("AWS::IAM::Policy")
+        for each in policy["PolicyDocument"]["Statement"]
+        if each["Effect"] == "Allow"
+    ]
+
+    assert len(statements) >= 6
+    wide = [each for each in statements if each["Resource"] == "*"]
+    assert [(each["Action"], each["Condition"]) for each in wide] == [
+        ("cloudwatch:PutMetricData", {"StringEquals": {"cloudwatch:namespace": "RsePf"}})
+    ]
+    actions = [action for each in statements for action in _listed(each["Action"])]
+    assert not [action for action in actions if "*" in action]
+    assert not [action for action in actions if action.startswith(("secretsmanager:", "kms:", "iam:"))], (
+        "no server and no function may read the signing key"
+    )
+
+
+def _listed(value: str | list[str]) -> list[str]:
+    return [value] if isinstance(value, str) else value
+
+
+def test_what_the_commands_look_for_is_what_the_stacks_call_it(assembly: Assembly) -> None:
+    from rse_pf.aws.costs import interface_endpoints
+    from rse_pf.aws.fleet import GROUP
+    from rse_pf.aws.key_store import DATA_STACK, KEYS_NAME
+    from stacks import backend_servers, backend_stack
+
+    assert (GROUP, KEYS_NAME) == (backend_servers.GROUP, backend_stack.KEY_SET)
+    resources = assembly.templates[DATA_STACK]["Resources"]
+    for word, kind in (("SigningKey", "AWS::SecretsManager::Secret"), ("Artifacts", "AWS::S3::Bucket")):
+        assert [each["Type"] for name, each in resources.items() if name.startswith(word)].count(kind) == 1
+    interfaces = [
+        each for each in assembly.all("AWS::EC2::VPCEndpoint") if each["VpcEndpointType"] == "Interface"
+    ]
+    assert sum(len(each["SubnetIds"]) for each in interfaces) == interface_endpoints(assembly.settings)
+
+
 def test_no_target_group_belongs_to_a_service_that_does_not_run(assembly: Assembly) -> None:
     settings = assembly.settings
     ports = {settings.serving.port} | ({settings.data.port} if settings.data.enabled else set())
