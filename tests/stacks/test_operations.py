@@ -1,0 +1,150 @@
+"""docs/operations.md: every command is run here, on an emulator, or is marked as needing an account."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from rse_pf.aws.account import Account
+from rse_pf.aws.clients import make_client
+from rse_pf.aws.costs import Load, compare
+from rse_pf.cli.main import main
+from rse_pf.settings import PlatformSettings
+
+REGION = "ap-northeast-2"
+MARK = "needs an account"
+
+RUN_HERE = {
+    "rse-pf cloud cost --robots 20 --fps 5 --hours-per-day 8": 0,
+    "rse-pf cloud doctor": 1,
+    "rse-pf token init --cloud": 0,
+    "rse-pf token issue robot-1 --cloud": 0,
+    "rse-pf cloud status": 2,
+    "rse-pf token rotate --cloud": 0,
+    "rse-pf token retire --cloud": 0,
+    "rse-pf cloud leftovers": 1,
+}
+"""Each with its exit code on an account that has the Data stack and nothing else."""
+NEEDS_AN_ACCOUNT = {
+    "npx cdk bootstrap",
+    "npx cdk deploy --all",
+    "aws sns subscribe --topic-arn TOPIC --protocol email --notification-endpoint you@example.org",
+    "make assets",
+    "npx cdk diff",
+    "npx cdk deploy RsePf-Backend",
+    "aws cloudformation cancel-update-stack --stack-name RsePf-Backend",
+    "rse-pf map show kitchen --all --store s3:BUCKET",
+    "rse-pf map rollback kitchen VERSION --store s3:BUCKET",
+    "aws s3api list-object-versions --bucket BUCKET --prefix NAME",
+    "aws s3api copy-object --bucket BUCKET --key NAME --copy-source BUCKET/NAME?versionId=VERSION",
+    "npx cdk destroy RsePf-Observability RsePf-Serverless RsePf-Backend RsePf-Network",
+    "aws cloudformation update-termination-protection --no-enable-termination-protection"
+    " --stack-name RsePf-Data",
+    "npx cdk destroy RsePf-Data",
+}
+
+
+@pytest.fixture
+def page(repository: Path) -> str:
+    """The page."""
+    return (repository / "docs" / "operations.md").read_text(encoding="utf-8")
+
+
+def blocks(page: str) -> list[tuple[str, list[str]]]:
+    """Return the paragraph before each fenced block, and the block's commands."""
+    found = re.findall(r"((?:[^\n]+\n)+)\n```\n(.*?)^```", page, re.DOTALL | re.MULTILINE)
+    assert len(found) == page.count("```") // 2, "a block without a paragraph before it"
+    return [(before.lower(), block.splitlines()) for before, block in found]
+
+
+def test_every_command_is_run_here_or_marked_as_needing_an_account(page: str) -> None:
+    told = {command: MARK in before for before, commands in blocks(page) for command in commands}
+
+    assert {command for command, marked in told.items() if marked} == NEEDS_AN_ACCOUNT
+    assert {command for command, marked in told.items() if not marked} == set(RUN_HERE)
+
+
+class Formation:
+    """The stack RsePf-Data; moto does not make secrets."""
+
+    def can_paginate(self, method: str) -> bool:
+        return False
+
+    def describe_stacks(self, **asked: Any) -> dict[str, Any]:
+        return {"Stacks": []}
+
+    def list_stack_resources(self, *, StackName: str) -> dict[str, Any]:
+        kinds = {"SigningKey": "AWS::SecretsManager::Secret", "Artifacts": "AWS::S3::Bucket"}
+        rows = [
+            {"LogicalResourceId": name, "ResourceType": kind, "PhysicalResourceId": name.lower()}
+            for name, kind in kinds.items()
+        ]
+        return {"StackResourceSummaries": rows}
+
+
+class NoRoom:
+    """Service quotas of nothing at all; moto lacks a call of them."""
+
+    def __getattr__(self, method: str) -> Any:
+        return lambda **asked: {"Quota": {"Value": 0.0}}
+
+
+@pytest.fixture
+def account(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[None]:
+    """An account in this process, with what the Data stack leaves."""
+    moto = pytest.importorskip("moto", reason="the dev extra is not installed")
+    monkeypatch.chdir(tmp_path)
+    for name in ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY"):
+        monkeypatch.setenv(name, "testing")
+    own: dict[str, Any] = {"cloudformation": Formation(), "service-quotas": NoRoom()}
+    made = Account(REGION, lambda name, at: own.get(name) or make_client(name, at))
+    with moto.mock_aws():
+        s3 = make_client("s3", REGION)
+        s3.create_bucket(Bucket="artifacts", CreateBucketConfiguration={"LocationConstraint": REGION})
+        tag = [{"Key": "rse-pf", "Value": "digest"}]
+        make_client("secretsmanager", REGION).create_secret(Name="signingkey", SecretString="x", Tags=tag)
+        monkeypatch.setattr("rse_pf.aws.account.open_account", lambda region: made)
+        yield
+
+
+def test_what_runs_here_runs_in_the_order_of_the_page(
+    page: str, account: None, capsys: pytest.CaptureFixture[str]
+) -> None:
+    commands = [one for before, block in blocks(page) if MARK not in before for one in block]
+
+    for command in commands:
+        code = main(shlex.split(command)[1:])
+        told = capsys.readouterr()
+        assert code == RUN_HERE[command], f"{command}: {told.err}"
+        assert "Traceback" not in told.err
+
+
+def test_the_floor_on_the_page_is_the_floor_of_the_prices(page: str) -> None:
+    nobody = Load(robots=1, fps=1e-9)
+    settings = PlatformSettings()
+    floor = compare(settings, nobody).floor_usd
+    full = compare(settings.replace(cloud={"endpoints": "full"}), nobody).floor_usd
+    prices = settings.prices
+
+    assert f"about **{floor:.0f} USD**" in page
+    assert f"`full` adds {full - floor:.0f}." in page
+    parts = (
+        prices.server_hour_usd * 730 * settings.scaling.min_servers,
+        prices.endpoint_hour_usd * 730 * 6,
+        prices.balancer_hour_usd * 730,
+    )
+    words = "two `c7i.large` {:.0f}, interface endpoints {:.0f}, the load balancer {:.0f}, the rest {:.0f}."
+    assert words.format(*parts, floor - sum(parts)) in " ".join(page.split())
+
+
+def test_the_minutes_on_the_page_are_those_of_the_template(page: str, assembly: Any) -> None:
+    resources = assembly.templates["RsePf-Backend"]["Resources"].values()
+    (group,) = [each for each in resources if each["Type"] == "AWS::AutoScaling::AutoScalingGroup"]
+
+    assert group["UpdatePolicy"]["AutoScalingRollingUpdate"]["PauseTime"] == "PT6M30S"
+    assert "six and a half minutes for each" in page
