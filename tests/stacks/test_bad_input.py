@@ -16,6 +16,8 @@ import pytest
 
 from rse_pf.errors import SettingsError
 
+if shutil.which("node") is None:
+    pytest.skip("the CDK needs Node.js", allow_module_level=True)
 pytest.importorskip("aws_cdk", reason="the infra extra is not installed")
 
 NOT_PUBLIC = {"cloud": {"lab": False, "domain_name": "robots.example.org"}}
