@@ -259,7 +259,7 @@ async def _run(source: Path, settings: PlatformSettings, *, once: bool) -> int:
             asyncio.get_running_loop().add_signal_handler(number, stopped.set)
         async with LocalCloud(chosen, state=place / "platform", servers=1, port=0, name="service") as cloud:
             print(f"{service.name} is served at {cloud.url}", flush=True)
-            good = await _ask_recorded(cloud, service.name, recorded)
+            good = await _ask_recorded(cloud, service, recorded, settings)
             if once:
                 return 0 if good else 1
             print(f"save a file in {source} to load it anew; Ctrl-C ends", flush=True)
@@ -271,38 +271,47 @@ async def _run(source: Path, settings: PlatformSettings, *, once: bool) -> int:
                     newest = max(_mtimes(service.folder, without="build"))
                     if newest > seen:
                         seen = newest
-                        await _reload(cloud, source, place / "services", recorded)
+                        await _reload(cloud, source, place / "services", recorded, settings)
     return 0
 
 
-async def _reload(cloud: Any, source: Path, services: Path, recorded: Recorded) -> None:
+async def _reload(
+    cloud: Any, source: Path, services: Path, recorded: Recorded, settings: PlatformSettings
+) -> None:
     from rse_pf.services.installed import install, read_service
 
     try:
         _build(source)
         service = install(read_service(source).folder, services)
         await cloud.roll()
-        await _ask_recorded(cloud, service.name, recorded)
+        await _ask_recorded(cloud, service, recorded, settings)
     except RsePfError as error:  # the author mends it and saves again
         print(error.report(), flush=True)
 
 
-async def _ask_recorded(cloud: Any, name: str, recorded: Recorded) -> bool:
-    """Let a robot send every recorded request; return whether all were answered."""
-    from client_sdk import connect
+async def _ask_recorded(cloud: Any, service: Any, recorded: Recorded, settings: PlatformSettings) -> bool:
+    """Let a robot send every recorded request; return whether all were answered.
 
-    good = True
+    A robot is not told why a service failed; its author is: the first such request is tried once more here.
+    """
+    from client_sdk import connect
+    from rse_pf.backend.trial import try_service
+
+    failed = []
     async with connect(cloud.url, token=cloud.issue_token("robot-1")) as robot:
         for path, each in recorded:
             try:
-                answer = await robot.call(name, each["request"])
+                answer = await robot.call(service.name, each["request"])
             except RsePfError as error:
-                good = good and each.get("failure") == error.code
+                if each.get("failure") != error.code:
+                    failed.append(each["request"])
                 print(f"{path}: {error.code}: {error.message}", flush=True)
                 continue
             shown = json.dumps(_plain(answer.reply))
             print(f"{path}: {shown[:500]}  ({answer.round_trip_ms:.1f} ms)", flush=True)
-    return good
+    if failed:
+        await asyncio.to_thread(try_service, service, failed[:1], settings, lambda line: print(f"  {line}"))
+    return not failed
 
 
 async def _call(name: str, request: str | None, platform: str, settings: PlatformSettings) -> int:

@@ -114,3 +114,16 @@ def test_a_service_that_crashes_at_load_is_told_so(capsys: pytest.CaptureFixture
     told = capsys.readouterr()
     assert "no table" in told.out + told.err
     assert "Traceback" not in told.out + told.err
+
+
+@pytest.mark.system
+def test_run_tells_the_author_why_and_the_robot_only_that(capsys: pytest.CaptureFixture[str]) -> None:
+    main(["service", "new", "mine"])
+    Path("mine/service.py").write_text("def serve(:\n")
+    capsys.readouterr()
+
+    assert main(["service", "run", "mine", "--once"]) == 1
+    told = capsys.readouterr().out.splitlines()
+    (to_robot,) = (line for line in told if line.startswith("example.json"))
+    assert "SyntaxError" not in to_robot
+    assert any("SyntaxError" in line and "service.py, line 1" in line for line in told)
