@@ -8,7 +8,6 @@ at the environment.  The file is longer than its neighbours because it is one ta
 from __future__ import annotations
 
 import dataclasses
-import difflib
 import hashlib
 import json
 import typing
@@ -18,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from rse_pf.errors import SettingsError
+from rse_pf.setting_checks import check_contradictions, check_range, did_you_mean, typed
 
 __all__ = [
     "AuthSettings",
@@ -40,8 +40,6 @@ __all__ = [
 
 _OURS = "ours"
 _LIST = "AWS list prices, as dated"
-_LARGEST = 1e15
-_WHERE = 'in cdk.json, context."rse-pf"'
 
 
 def setting(
@@ -75,6 +73,13 @@ class ServingSettings:
     backlog: int = setting(4096, doc="connections that wait for accept", low=16, high=65535)
     max_robots: int = setting(10000, unit="robots", doc="connections of one server; more are refused with 503", low=1)
     handshake_timeout_s: float = setting(5.0, unit="s", doc="a handshake that takes longer is cut", source="slowloris, OWASP", low=0.1)
+    max_handshake_bytes: int = setting(8192, unit="bytes", doc="head of a handshake; a longer one is cut", source="slowloris, OWASP", low=1024, high=16384)
+    max_unauthenticated: int = setting(200, unit="sockets", doc="sockets that have shown no token yet; the one that waited longest leaves", low=1)
+    max_unauthenticated_per_source: int = setting(50, unit="sockets", doc="the same, of one address; not counted behind trusted proxies; 0 is off", low=0)
+    accepts_per_s: float = setting(500.0, unit="sockets/s", doc="sockets accepted in a second; more wait in the backlog; 0 is off", low=0)
+    handshakes_per_source_per_s: float = setting(200.0, unit="handshakes/s", doc="handshakes of one address; more are refused with 429; 0 is off", low=0)
+    handshake_burst: int = setting(1000, unit="handshakes", doc="handshakes of one address at once, and sockets accepted at once", low=1)
+    trusted_proxies: int = setting(1, unit="proxies", doc="load balancers that append to x-forwarded-for; 0: robots come directly", low=0, high=8)
     read_buffer_bytes: int = setting(2048, unit="bytes", doc="first read buffer of a socket", low=256)
     write_buffer_bytes: int = setting(262144, unit="bytes", doc="unsent bytes at which a reader counts as slow", low=4096)
     slow_reader_s: float = setting(1.0, unit="s", doc="a reader that stays slow this long is cut off", low=0.05)
@@ -98,10 +103,16 @@ class SessionSettings:
     max_inflate_ratio: float = setting(100.0, unit="x", doc="inflated size over wire size", low=2)
     max_fragments: int = setting(64, doc="fragments of one message, empty ones included", source="GHSA-96hv-2xvq-fx4p", low=1)
     max_json_depth: int = setting(16, unit="levels", doc="nesting of a JSON message", low=4, high=200)
-    max_json_lists: int = setting(10000, doc="lists and objects of a JSON message, at any depth", low=16)
+    max_json_lists: int = setting(10000, doc="lists and objects of a message, at any depth", low=16)
+    max_json_values: int = setting(50000, doc="numbers, words, lists and objects of a robot's message outside of raw arrays", low=64)
     max_bad_messages: int = setting(10, unit="messages", doc="undecodable messages of one socket before it is closed", low=0)
     max_control_per_s: float = setting(10.0, unit="frames/s", doc="control frames of one socket", low=1)
     max_in_flight: int = setting(8, unit="commands", doc="unanswered commands of one robot", low=1)
+    max_commands_per_s: float = setting(20.0, unit="commands/s", doc="messages of one robot; more are refused; 0 is off", source="AWS IoT and Discord limit so", low=0)
+    command_burst: int = setting(40, unit="commands", doc="messages of one robot at once", low=1)
+    rate_strikes: int = setting(3, unit="strikes", doc="a strike is command_burst refusals; so many within rate_window_s close the socket with 4429", low=1)
+    rate_window_s: float = setting(10.0, unit="s", doc="see rate_strikes", low=0.1)
+    rate_rest_s: float = setting(5.0, unit="s", doc="a robot that was cut off for its rate is refused this long", low=0)
     ping_interval_s: float = setting(2.0, unit="s", doc="time between application pings", source="paper, Sect. 3.3 (delays); ours in value", low=0.05)
     ping_patience_s: float = setting(3.0, unit="s", doc="silence after a ping that counts as a lost link", low=0.1)
     hello_timeout_s: float = setting(5.0, unit="s", doc="a socket without a Hello is closed", low=0.1)
@@ -291,8 +302,8 @@ class PlatformSettings:
 
     def __post_init__(self) -> None:
         for row in setting_rows(self):
-            _check_range(row)
-        _check_contradictions(self)
+            check_range(row)
+        check_contradictions(self)
 
     @classmethod
     def from_dict(cls, overrides: Mapping[str, Any]) -> PlatformSettings:
@@ -301,7 +312,7 @@ class PlatformSettings:
         made: dict[str, Any] = {}
         for name, values in overrides.items():
             if name not in groups:
-                raise SettingsError(f"unknown group {name!r}", hint=_did_you_mean(name, groups))
+                raise SettingsError(f"unknown group {name!r}", hint=did_you_mean(name, groups))
             if not isinstance(values, Mapping):
                 raise SettingsError(
                     f"{name} must be an object of settings, got {type(values).__name__}",
@@ -420,79 +431,6 @@ def _make_group(group: str, kind: type[Any], values: Mapping[str, Any]) -> Any:
     checked = {}
     for name, value in values.items():
         if name not in hints:
-            raise SettingsError(f"unknown setting {group}.{name}", hint=_did_you_mean(name, hints))
-        checked[name] = _typed(f"{group}.{name}", value, hints[name])
+            raise SettingsError(f"unknown setting {group}.{name}", hint=did_you_mean(name, hints))
+        checked[name] = typed(f"{group}.{name}", value, hints[name])
     return kind(**checked)
-
-
-def _typed(name: str, value: Any, kind: Any) -> Any:
-    if kind in (int, float) and type(value) in (int, float) and not abs(value) <= _LARGEST:
-        raise SettingsError(f"{name} is not a finite number below {_LARGEST:g}", hint=f"mend it {_WHERE}")
-    if kind is float and type(value) is int:
-        return float(value)
-    if type(value) is not kind:
-        raise SettingsError(f"{name} = {_shown(value)} is not of type {kind.__name__}", hint=f"mend it {_WHERE}")
-    return value
-
-
-def _shown(value: Any) -> str:
-    try:
-        text = repr(value)
-    except (ValueError, RecursionError):
-        text = type(value).__name__
-    return text if len(text) <= 80 else f"{text[:77]}..."
-
-
-def _check_range(row: SettingRow) -> None:
-    where = _WHERE
-    if row.choices and row.value not in row.choices:
-        raise SettingsError(
-            f"{row.group}.{row.name} = {row.value!r} is not one of {', '.join(row.choices)}",
-            hint=f"choose one of them {where}",
-        )
-    if row.low is not None and not row.value >= row.low:
-        raise SettingsError(
-            f"{row.group}.{row.name} = {row.value} is below {row.low:g}", hint=f"raise it {where}"
-        )
-    if row.high is not None and not row.value <= row.high:
-        raise SettingsError(
-            f"{row.group}.{row.name} = {row.value} is above {row.high:g}", hint=f"lower it {where}"
-        )
-
-
-def _check_contradictions(s: PlatformSettings) -> None:
-    where = _WHERE
-    pairs = [
-        ("scaling", "min_servers", "max_servers"),
-        ("scaling", "busy_cpu_percent", "very_busy_cpu_percent"),
-        ("scaling", "idle_cpu_percent", "busy_cpu_percent"),
-        ("scaling", "step", "big_step"),
-        ("session", "max_message_bytes", "max_inflated_bytes"),
-        ("session", "reconnect_base_s", "reconnect_max_s"),
-        ("pnp", "min_iterations", "max_iterations"),
-        ("health", "cloud_timeout_s", "cloud_interval_s"),
-        ("data", "infrequent_after_days", "glacier_after_days"),
-    ]
-    for group, small, large in pairs:
-        low, high = (getattr(getattr(s, group), name) for name in (small, large))
-        if low > high:
-            raise SettingsError(
-                f"{group}.{large} = {high:g} is less than {group}.{small} = {low:g}",
-                hint=f"raise {group}.{large} or lower {group}.{small} {where}",
-            )
-    if s.scaling.idle_s % s.scaling.period_s:
-        raise SettingsError(
-            f"scaling.idle_s = {s.scaling.idle_s} is no multiple of scaling.period_s = "
-            f"{s.scaling.period_s}",
-            hint=f"make it a multiple {where}",
-        )
-    if not s.cloud.lab and not (s.cloud.certificate_arn and s.cloud.domain_name):
-        raise SettingsError(
-            "cloud.lab = false needs cloud.certificate_arn and cloud.domain_name",
-            hint=f"set both {where}, or set cloud.lab to true",
-        )
-
-
-def _did_you_mean(name: str, known: Mapping[str, Any]) -> str:
-    close = difflib.get_close_matches(name, known, n=1)
-    return f"did you mean {close[0]}?" if close else f"known are {', '.join(known)}"

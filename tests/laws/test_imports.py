@@ -16,7 +16,8 @@ BELOW_LEAVES = GROUND | FIRST | SECOND
 
 MAY_IMPORT: dict[str, set[str]] = {
     "errors": set(),
-    "settings": {"errors"},
+    "settings": {"errors", "setting_checks"},
+    "setting_checks": {"errors"},
     "geometry": GROUND,
     "wire": GROUND,
     "scaling": GROUND,
@@ -69,7 +70,7 @@ PACKAGES: dict[str, tuple[str, ...]] = {
     "envoy": ("rse_pf/local/",),
 }
 BASE = {"numpy", "msgspec", "websockets"}
-BASE_ROOMS = MAY_IMPORT["client_sdk"] | {"client_sdk", "auth", "scaling", "objects"}
+BASE_ROOMS = MAY_IMPORT["client_sdk"] | {"client_sdk", "setting_checks", "auth", "scaling", "objects"}
 
 PURE = ("rse_pf/wire/", "rse_pf/scaling/", "rse_pf/auth.py", "client_sdk/offload.py")
 IMPURE = {
