@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from rse_pf.backend.frames import CloseSocket, FrameAssembler, Received, SendPong
 from rse_pf.backend.seams import Wire
-from rse_pf.wire.session import Decision, Send, ServerSession, Submit
+from rse_pf.wire.session import Decision, Send, ServerSession, Submit, Withdraw
 
 if TYPE_CHECKING:
     from rse_pf.backend.core import Core
@@ -78,6 +78,8 @@ class Connection:
                 self._core.submit(self, decision.command, size_bytes, now)
             elif isinstance(decision, Send):
                 self.write(decision.data)
+            elif isinstance(decision, Withdraw):
+                self._core.withdraw(self, decision.id)
             else:
                 self.close(decision.code, decision.reason)
 

@@ -3,6 +3,7 @@
 from rse_pf.wire.codec import CODECS, SUBPROTOCOLS, Codec, as_type, codec_for, make_codec
 from rse_pf.wire.messages import (
     PROTOCOL_VERSION,
+    Cancel,
     Command,
     Failure,
     FromRobot,
@@ -13,6 +14,7 @@ from rse_pf.wire.messages import (
     Move,
     Ping,
     Pong,
+    Progress,
     Result,
     Welcome,
 )
@@ -21,6 +23,7 @@ __all__ = [
     "CODECS",
     "PROTOCOL_VERSION",
     "SUBPROTOCOLS",
+    "Cancel",
     "Codec",
     "Command",
     "Failure",
@@ -32,6 +35,7 @@ __all__ = [
     "Move",
     "Ping",
     "Pong",
+    "Progress",
     "Result",
     "Welcome",
     "as_type",

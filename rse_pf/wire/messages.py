@@ -12,6 +12,7 @@ import msgspec
 
 __all__ = [
     "PROTOCOL_VERSION",
+    "Cancel",
     "Command",
     "Failure",
     "FromRobot",
@@ -22,6 +23,7 @@ __all__ = [
     "Move",
     "Ping",
     "Pong",
+    "Progress",
     "Result",
     "Welcome",
 ]
@@ -83,8 +85,29 @@ class Command(_Message, frozen=True, kw_only=True, tag="command"):
     trace: Word = ""
 
 
+class Cancel(_Message, frozen=True, kw_only=True, tag="cancel"):
+    """Robot takes back a command that reported progress; its answer may still come first."""
+
+    id: Identifier
+
+
+class Progress(_Message, frozen=True, kw_only=True, tag="progress"):
+    """Server tells how far a long command is: the share *done* (0..1), and *what* was done last.
+
+    Only to robots whose Hello names the capability ``progress``; the first one says that it was taken.
+    """
+
+    id: int
+    done: float
+    what: str = ""
+
+
 class Result(_Message, frozen=True, kw_only=True, tag="result"):
-    """Server answers a command.  ``received_s`` and ``sent_s`` are readings of the server's clock."""
+    """Server answers a command.  ``received_s`` and ``sent_s`` are readings of the server's clock.
+
+    ``object`` is the sha256 of a reply that is kept as an object; where it is too large for a message,
+    ``reply`` is left out.
+    """
 
     id: int
     reply: Any = None
@@ -93,6 +116,7 @@ class Result(_Message, frozen=True, kw_only=True, tag="result"):
     compute_ms: float = 0.0
     received_s: float = 0.0
     sent_s: float = 0.0
+    object: str = ""
 
 
 class Failure(_Message, frozen=True, kw_only=True, tag="failure"):
@@ -128,6 +152,6 @@ class Pong(_Message, frozen=True, kw_only=True, tag="pong"):
     answered_s: float
 
 
-FromRobot = Hello | Command | Ping
-FromServer = Welcome | Result | Failure | Move | Pong
+FromRobot = Hello | Command | Ping | Cancel
+FromServer = Welcome | Result | Failure | Move | Pong | Progress
 Message = FromRobot | FromServer

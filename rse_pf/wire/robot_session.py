@@ -18,10 +18,13 @@ from rse_pf.errors import LimitExceeded
 from rse_pf.settings import SessionSettings
 from rse_pf.wire.clock_offset import ClockOffset, Exchange
 from rse_pf.wire.codec import Codec
-from rse_pf.wire.messages import Command, Failure, Hello, Move, Ping, Pong, Result, Welcome
+from rse_pf.wire.messages import Cancel, Command, Failure, Hello, Move, Ping, Pong, Progress, Result, Welcome
 from rse_pf.wire.prepared import encode_command
+from rse_pf.wire.session import PROGRESS
 
-__all__ = ["Answered", "Event", "Link", "LinkLost", "MoveAsked", "Notice", "RobotSession", "Welcomed"]
+__all__ = [
+    "Answered", "Event", "Link", "LinkLost", "MoveAsked", "Notice", "Progressed", "RobotSession", "Welcomed",
+]  # fmt: skip
 
 _MAX_TRIES_AFTER_LOSS = 2
 _RETRY_BURST = 5.0
@@ -74,7 +77,16 @@ class Notice:
     failure: Failure
 
 
-Event = Answered | Welcomed | MoveAsked | LinkLost | Notice
+@dataclass(frozen=True, slots=True)
+class Progressed:
+    """A long command is so far: the share *done* (0..1), and *what* was done last."""
+
+    id: int
+    done: float
+    what: str
+
+
+Event = Answered | Welcomed | MoveAsked | LinkLost | Notice | Progressed
 
 
 @dataclass(slots=True, kw_only=True)
@@ -88,6 +100,8 @@ class _Pending:
     not_before: float = 0.0
     losses: int = 0
     cancelled: bool = False
+    is_open_ended: bool = False
+    is_long: bool = False
 
 
 @dataclass(slots=True, kw_only=True, eq=False)
@@ -143,21 +157,29 @@ class RobotSession:
         stream: str = "",
         keep: bool = False,
         trace: str = "",
+        patient: bool = False,
     ) -> int:
         """Take a command; it is written to the current link as soon as there is one with room.
+
+        A command without *deadline_s* has the setting's, unless it is *patient* or turns out to be long: the
+        server says so by reporting progress.
 
         Raises:
             BadMessage: The payload does not travel in messages.
             LimitExceeded: The message would be larger than the limit.
         """
-        wait = self.settings.answer_timeout_s if deadline_s is None else deadline_s
+        default_s = math.inf if patient else self.settings.answer_timeout_s
+        wait = default_s if deadline_s is None else deadline_s
         command = Command(
             id=self._next_id, service=service, payload=payload, stream=stream,
             seq=self._sequence.get(stream, 0) + 1, keep=keep, trace=trace,
         )  # fmt: skip
         data = encode_command(self.codec, _with_deadline(command, wait))
         self._check_size(data)
-        pending = _Pending(command=command, deadline=now + wait, submitted=now, wire_bytes=len(data))
+        pending = _Pending(
+            command=command, deadline=now + wait, submitted=now, wire_bytes=len(data),
+            is_open_ended=deadline_s is None,
+        )  # fmt: skip
         self._next_id += 1
         self._sequence[stream] = command.seq
         self._pending[command.id] = pending
@@ -173,12 +195,14 @@ class RobotSession:
             return
         if pending.link is None:
             del self._pending[identity]
+        elif pending.is_long and not pending.cancelled:
+            self._take_back(pending.link, identity)
         pending.cancelled = True
 
     def open_link(self, now: float) -> Link:
         """Return a new link with a Hello to send; call when a socket is open."""
         link = Link(opened=now, last_heard=now, last_tended=now)
-        link.outgoing.append(self.codec.encode(Hello(sdk=self._sdk, capabilities=("move",))))
+        link.outgoing.append(self.codec.encode(Hello(sdk=self._sdk, capabilities=("move", PROGRESS))))
         return link
 
     def close_link(self, link: Link) -> None:
@@ -204,6 +228,9 @@ class RobotSession:
         before, self.current = self.current, link
         if before is not None and before is not link:
             before.leaving = True
+            for pending in self._pending.values():
+                if pending.link is before and pending.is_long and not pending.cancelled:
+                    pending.link = None  # it goes on elsewhere: ask there, and do not hold the old server up
         return self._flush(now)
 
     def receive(self, link: Link, data: bytes, now: float) -> list[Event]:
@@ -222,6 +249,8 @@ class RobotSession:
             return [MoveAsked(message.reason, within_s if math.isfinite(within_s) else 0.0)]
         if isinstance(message, Failure) and message.id is None:
             return [Notice(message)]
+        if isinstance(message, Progress):
+            return self._progress(link, message)
         return self._answer(link, message, now)
 
     def due(self, now: float) -> list[Event]:
@@ -231,6 +260,8 @@ class RobotSession:
             if now >= pending.deadline:
                 waited = now - pending.submitted
                 failure = _failure(pending.command, "expired", f"no answer within {waited:.3f} s")
+                if pending.is_long and pending.link is not None and not pending.cancelled:
+                    self._take_back(pending.link, identity)
                 events += self._end(identity, failure)
         return events + self._flush(now)
 
@@ -260,7 +291,11 @@ class RobotSession:
             return self._lose(link, "no welcome") if late else []
         if link.ping_sent is not None and now - link.ping_sent >= s.ping_patience_s:
             return self._lose(link, "no pong")
-        waiting = [p.sent_at for p in self._pending.values() if p.link is link and p.sent_at is not None]
+        waiting = [
+            pending.sent_at
+            for pending in self._pending.values()
+            if pending.link is link and pending.sent_at is not None and not pending.is_long
+        ]
         if waiting and now - max(link.last_heard, min(waiting)) >= s.silence_s:
             return self._lose(link, "silence")
         pause = s.ping_interval_s
@@ -356,6 +391,25 @@ class RobotSession:
         self._retry_tokens -= 1.0
         pending.link, pending.not_before = None, after
         return True
+
+    def _progress(self, link: Link, progress: Progress) -> list[Event]:
+        """Note that a command is a long one: the default deadline is not for it."""
+        pending = self._pending.get(progress.id)
+        if pending is None or pending.link is not link:
+            return []
+        if pending.cancelled:
+            if not pending.is_long:
+                self._take_back(link, progress.id)
+            pending.is_long = True
+            return []
+        pending.is_long = True
+        if pending.is_open_ended:
+            pending.deadline = math.inf
+        share = min(1.0, max(0.0, progress.done)) if math.isfinite(progress.done) else 0.0
+        return [Progressed(progress.id, share, progress.what)]
+
+    def _take_back(self, link: Link, identity: int) -> None:
+        link.outgoing.append(self.codec.encode(Cancel(id=identity)))
 
     def _pong(self, link: Link, pong: Pong, now: float) -> list[Event]:
         link.ping_sent = None

@@ -14,6 +14,7 @@ from rse_pf.settings import SessionSettings
 from rse_pf.wire.codec import Codec
 from rse_pf.wire.messages import (
     PROTOCOL_VERSION,
+    Cancel,
     Command,
     Failure,
     FromServer,
@@ -30,15 +31,21 @@ __all__ = [
     "CLOSE_GOING_AWAY",
     "CLOSE_NORMAL",
     "CLOSE_PROTOCOL",
+    "CLOSE_RATE",
     "CLOSE_REPLACED",
     "CLOSE_TOKEN_OVER",
     "CLOSE_UNSUPPORTED",
+    "PROGRESS",
     "Close",
     "Decision",
     "Send",
     "ServerSession",
     "Submit",
+    "Withdraw",
 ]
+
+PROGRESS = "progress"
+"""Capability of a robot that takes progress and may take commands back."""
 
 CLOSE_NORMAL = 1000
 CLOSE_GOING_AWAY = 1001
@@ -46,6 +53,7 @@ CLOSE_PROTOCOL = 4400
 CLOSE_TOKEN_OVER = 4401
 CLOSE_UNSUPPORTED = 4406
 CLOSE_REPLACED = 4409
+CLOSE_RATE = 4429
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,7 +78,14 @@ class Close:
     reason: str
 
 
-Decision = Send | Submit | Close
+@dataclass(frozen=True, slots=True)
+class Withdraw:
+    """The robot takes this command back."""
+
+    id: int
+
+
+Decision = Send | Submit | Withdraw | Close
 
 
 class ServerSession:
@@ -82,6 +97,8 @@ class ServerSession:
         self.robot = robot
         self.state: Literal["opening", "open", "closed"] = "opening"
         self.in_flight = 0
+        self.hears_progress = False
+        """Whether the robot knows of long commands."""
         self.codec = codec
         self._server = server
         self._session = session
@@ -103,6 +120,8 @@ class ServerSession:
         if isinstance(message, Ping):
             pong = Pong(sent_s=message.sent_s, received_s=now, answered_s=now)
             return [self._send(pong)]
+        if isinstance(message, Cancel):
+            return [Withdraw(message.id)]
         return self._command(message)
 
     def answer(self, message: Result | Failure) -> Send:
@@ -147,6 +166,7 @@ class ServerSession:
             )
             return [self._send(failure), *self._leave(CLOSE_UNSUPPORTED, "unsupported protocol")]
         self.state = "open"
+        self.hears_progress = PROGRESS in hello.capabilities
         welcome = Welcome(
             server=self._server,
             session=self._session,

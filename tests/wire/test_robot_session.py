@@ -76,7 +76,7 @@ def tend_until_lost(session: RobotSession, link: Link) -> tuple[float, list]:
 def test_a_link_begins_with_hello():
     (hello,) = sent(make_session().open_link(0.0))
 
-    assert hello == Hello(sdk="test", capabilities=("move",))
+    assert hello == Hello(sdk="test", capabilities=("move", "progress"))
 
 
 def test_a_command_waits_for_a_link_and_then_tells_the_time_it_has_left():

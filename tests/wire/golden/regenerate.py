@@ -20,6 +20,7 @@ from rse_pf.services.pnp import PnpReply, make_request
 from rse_pf.wire import (
     CODECS,
     SUBPROTOCOLS,
+    Cancel,
     Command,
     Failure,
     Hello,
@@ -28,6 +29,7 @@ from rse_pf.wire import (
     Move,
     Ping,
     Pong,
+    Progress,
     Result,
     Welcome,
     make_codec,
@@ -69,6 +71,9 @@ MESSAGES: dict[str, Message] = {
     "failure-of-a-message": Failure(code="bad-message", message="not a message"),
     "move": Move(reason="drain", within_ms=5000.0),
     "ping": Ping(sent_s=10.25),
+    "cancel": Cancel(id=7),
+    "progress": Progress(id=7, done=0.25, what="3 of 12 keyframe pairs"),
+    "result-as-object": Result(id=7, server="server-1", object="ab" * 32),
     "pong": Pong(sent_s=10.25, received_s=1300.5, answered_s=1300.75),
 }  # fmt: skip
 

@@ -1,0 +1,120 @@
+"""Long commands on the robot's side: progress, no deadline but the caller's, taken back, asked again."""
+
+from __future__ import annotations
+
+from rse_pf.settings import SessionSettings
+from rse_pf.wire import Cancel, Command, Failure, Limits, Progress, Result, Welcome, make_codec
+from rse_pf.wire.robot_session import Answered, Link, Progressed, RobotSession
+
+SETTINGS = SessionSettings()
+CODEC = make_codec("json", SETTINGS)
+
+
+def make_session() -> RobotSession:
+    return RobotSession(codec=CODEC, settings=SETTINGS, sdk="test")
+
+
+def tell(session: RobotSession, link: Link, message, now: float):
+    return session.receive(link, CODEC.encode(message), now)
+
+
+def open_link(session: RobotSession, now: float = 0.0, server: str = "a") -> Link:
+    """Open, welcome and adopt a link."""
+    link = session.open_link(now)
+    limits = Limits(max_message_bytes=4096, max_in_flight=8)
+    tell(
+        session,
+        link,
+        Welcome(server=server, session="s", robot="r", protocol=1, clock_s=now, limits=limits),
+        now,
+    )
+    session.adopt(link, now)
+    return link
+
+
+def sent(link: Link) -> list:
+    """Return and forget what the session wrote on *link*."""
+    messages = [CODEC.decode_from_robot(data) for data in link.outgoing]
+    link.outgoing.clear()
+    return messages
+
+
+def commands(link: Link) -> list[Command]:
+    return [message for message in sent(link) if isinstance(message, Command)]
+
+
+def result(command: Command) -> Result:
+    return Result(id=command.id, reply=command.seq, server="a")
+
+
+def codes(events) -> dict[int, str]:
+    """Return how each answered command ended."""
+    return {
+        event.id: event.answer.code if isinstance(event.answer, Failure) else "ok"
+        for event in events
+        if isinstance(event, Answered)
+    }
+
+
+def test_a_command_that_reports_progress_has_no_deadline_but_its_callers():
+    session = make_session()
+    link = open_link(session)
+    session.submit("merge", None, now=0.0)
+    (command,) = commands(link)
+
+    (progressed,) = tell(session, link, Progress(id=command.id, done=0.25, what="pairs"), 1.0)
+
+    assert progressed == Progressed(command.id, 0.25, "pairs")
+    assert session.due(4000.0) == []
+    assert codes(tell(session, link, result(command), 5000.0)) == {command.id: "ok"}
+
+
+def test_a_long_command_ends_at_the_deadline_of_its_caller_and_is_taken_back():
+    session = make_session()
+    link = open_link(session)
+    identity = session.submit("merge", None, now=0.0, deadline_s=10.0)
+    tell(session, link, Progress(id=identity, done=0.0), 1.0)
+    sent(link)
+
+    assert codes(session.due(10.0)) == {identity: "expired"}
+    assert sent(link) == [Cancel(id=identity)]
+
+
+def test_a_long_command_is_sent_again_after_a_cut_and_on_a_move_without_waiting_for_the_old_server():
+    session = make_session()
+    first = open_link(session)
+    identity = session.submit("merge", None, now=0.0, patient=True)
+    tell(session, first, Progress(id=identity, done=0.0), 1.0)
+
+    second = open_link(session, now=50.0, server="b")
+    assert [command.id for command in commands(second)] == [identity]
+    assert session.unanswered_on(first) == 0
+    session.close_link(second)
+    third = open_link(session, now=99.0, server="c")
+
+    assert [command.id for command in commands(third)] == [identity]
+
+
+def test_a_cancelled_command_is_taken_back_even_if_the_caller_left_before_it_was_known_to_be_long():
+    session = make_session()
+    link = open_link(session)
+    identity = session.submit("merge", None, now=0.0)
+    session.cancel(identity)
+    assert Cancel(id=identity) not in sent(link)
+
+    assert tell(session, link, Progress(id=identity, done=0.0), 0.1) == []
+    tell(session, link, Progress(id=identity, done=0.1), 0.6)
+
+    assert sent(link).count(Cancel(id=identity)) == 1
+
+
+def test_waiting_for_a_long_command_is_no_silence():
+    session = make_session()
+    link = open_link(session)
+    identity = session.submit("merge", None, now=0.0)
+    tell(session, link, Progress(id=identity, done=0.0), 0.1)
+    session.tend(link, 0.1)
+    sent(link)
+
+    assert session.tend(link, 0.1 + SETTINGS.ping_interval_s / 2) == []
+    assert sent(link) == []
