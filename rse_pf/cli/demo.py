@@ -1,10 +1,12 @@
 """Let robots build point-cloud maps through the PnP service, all on this machine.
 
-Without --data, robots drive through a rendered world whose true poses are known.
+Without --data, robots drive through a rendered world whose true poses are known.  With --merge each robot
+starts in a world of its own, and at the end their maps become one.
 
 examples:
   rse-pf demo --out out
   rse-pf demo --data recordings/kitchen --rate 10 --robots 1 --out out-kitchen
+  rse-pf demo --data recordings/kitchen --rate 10 --robots 3 --merge --out out-merged
 """
 
 from __future__ import annotations
@@ -23,9 +25,11 @@ _MOST_ROBOTS = 32
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
-    parser.add_argument("--data", type=Path, metavar="DIR", help="a recording in TUM layout, or NYU Depth V2")
     parser.add_argument(
-        "--robots", type=int, help="how many robots share it (default: 1 with --data, else 3)"
+        "--data", "--recording", type=Path, metavar="DIR", help="a recording in TUM layout, or NYU Depth V2"
+    )
+    parser.add_argument(
+        "--robots", type=int, help="how many robots share it (default: 3; with --data and no --merge: 1)"
     )
     parser.add_argument(
         "--rate", type=float, default=5.0, metavar="HZ", help="frames per second (default: 5)"
@@ -40,18 +44,27 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="encoding (default: zlib, the paper's)",
     )
     parser.add_argument("--out", type=Path, default=Path("out"), metavar="DIR", help="results (default: out)")
-    parser.add_argument("--frames", type=int, help="frames of each robot in the rendered world (default: 80)")
+    parser.add_argument(
+        "--frames", type=int, help="frames of each robot in the rendered world (default: 80, to merge: 170)"
+    )
     parser.add_argument("--seed", type=int, default=0, help="another rendered world (default: 0)")
     parser.add_argument(
         "--frontend", choices=("standard", "wide-baseline"), default="standard",
         help="wide-baseline: for views that lie 0.4 to 0.8 m apart, such as NYU's",
     )  # fmt: skip
+    parser.add_argument(
+        "--merge",
+        action="store_true",
+        help="end with one map of all robots; of one robot, with its loops closed",
+    )
     parser.add_argument("--quiet", action="store_true", help="no progress bars")
 
 
 def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
     """Check the options and run the demo."""
-    robots = args.robots if args.robots is not None else (1 if args.data is not None else 3)
+    robots = (
+        args.robots if args.robots is not None else (1 if args.data is not None and not args.merge else 3)
+    )
     if not 1 <= robots <= _MOST_ROBOTS:
         raise UsageError(f"--robots {robots} is not within 1..{_MOST_ROBOTS}", hint="choose fewer robots")
     if not (math.isfinite(args.rate) and 0.1 <= args.rate <= 60):
@@ -78,6 +91,7 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
         frames=args.frames,
         seed=args.seed,
         frontend=args.frontend,
+        merge=args.merge,
         quiet=args.quiet,
     )
     return run_demo(options, settings)

@@ -24,6 +24,7 @@ from client_sdk.frontend import FrontEndOptions
 from client_sdk.mapping import read_ply
 from rse_pf.errors import CommandFailed, UsageError
 from rse_pf.experiments import demo_report
+from rse_pf.experiments.demo_merge import MERGED_MAP, merge_here, write_merged
 from rse_pf.experiments.demo_robot import (
     Failed,
     Finished,
@@ -41,6 +42,8 @@ from rse_pf.settings import PlatformSettings
 __all__ = ["DemoOptions", "run_demo"]
 
 _DEFAULT_FRAMES = 80
+_MERGE_FRAMES = 170
+"""So far that each of three robots comes to see what the next one saw at its start."""
 _LOST_AFTER_S = 5.0
 _START_TIMEOUT_S = 120.0
 
@@ -58,6 +61,7 @@ class DemoOptions:
     frames: int | None = None
     seed: int = 0
     frontend: str = "standard"
+    merge: bool = False
     quiet: bool = False
 
 
@@ -109,19 +113,26 @@ async def _run(
                 with contextlib.suppress(asyncio.CancelledError):
                     await samples
                 _end(robots)
+            finished = [robot.finished for robot in robots if robot.finished is not None]
+            if len(finished) < len(robots):
+                raise CommandFailed(
+                    "a robot ended before its last frame", hint=f"look at {folder}/platform/*.log"
+                )
+            merged = None
+            if options.merge:
+                screen.say("merging the maps")
+                merged = await asyncio.to_thread(_merge, settings, folder, finished)
+                events.write(now(), "merged", joined=merged["joined"])
     for secret in ("key.json", "keys.json"):
         (folder / "platform" / secret).unlink(missing_ok=True)
     screen.say("drawing the maps")
-    finished = [robot.finished for robot in robots if robot.finished is not None]
-    if len(finished) < len(robots):
-        raise CommandFailed("a robot ended before its last frame", hint=f"look at {folder}/platform/*.log")
-    return _judge(options, settings, folder, finished, before)
+    return _judge(options, folder, finished, before, merged)
 
 
 def _start(
     options: DemoOptions, settings: PlatformSettings, folder: Path, cloud: LocalCloud, number: int
 ) -> _Robot:
-    name = f"robot-{number + 1}"
+    name = _name(number)
     (folder / name).mkdir()
     frontend = FrontEndOptions.wide_baseline() if options.frontend == "wide-baseline" else FrontEndOptions()
     spec = RobotSpec(
@@ -134,10 +145,11 @@ def _start(
         rate_hz=options.rate_hz,
         folder=folder / name,
         data=options.data,
-        frames=options.frames or _DEFAULT_FRAMES,
+        frames=options.frames or (_MERGE_FRAMES if options.merge else _DEFAULT_FRAMES),
         seed=options.seed,
         frontend=frontend,
         session=settings.session,
+        merge=options.merge,
     )
     context = multiprocessing.get_context("spawn")
     mine, theirs = context.Pipe()
@@ -240,12 +252,26 @@ def _end(robots: list[_Robot]) -> None:
         robot.pipe.close()
 
 
+def _merge(settings: PlatformSettings, folder: Path, finished: list[Finished]) -> dict[str, Any]:
+    return write_merged(
+        folder,
+        [_name(number) for number in range(len(finished))],
+        [robot.trajectory for robot in finished],
+        [robot.truth for robot in finished],
+        lambda request: merge_here(request, settings.services, lambda done, what: None),
+    )
+
+
+def _name(number: int) -> str:
+    return f"robot-{number + 1}"
+
+
 def _judge(
     options: DemoOptions,
-    settings: PlatformSettings,
     folder: Path,
     finished: list[Finished],
     before: dict[str, Any],
+    merged: dict[str, Any] | None,
 ) -> dict[str, Any]:
     commands = [command for robot in finished for command in robot.commands]
     write_commands(folder / "commands.csv", commands)
@@ -253,17 +279,20 @@ def _judge(
     asked = {**{name: getattr(options, name) for name in ("rate_hz", "engine", "codec", "seed", "frontend")}}
     asked["data"] = None if options.data is None else options.data.name
     report = demo_report.make_report(finished, commands, asked, before, after)
+    if merged is not None:
+        report["merged"] = merged
     write_json(folder / "report.json", report)
     (folder / "report.md").write_text(demo_report.as_markdown(report), encoding="utf-8")
     paths = [
-        PathOfRobot(name=f"robot-{number + 1}", T_world_camera=robot.trajectory.T_world_camera)
+        PathOfRobot(name=_name(number), T_world_camera=robot.trajectory.T_world_camera)
         for number, robot in enumerate(finished)
     ]
     clouds = [read_ply(folder / path.name / "map.ply") for path in paths]
     for path, (points, colours), robot in zip(paths, clouds, finished, strict=True):
         caption = f"{path.name}: {robot.frames} frames, {robot.lost_frames} lost, {len(points):,} points"
         draw_map(folder / path.name / "map.png", points, colours, [path], caption)
-    if len(paths) > 1 and all(robot.truth is not None for robot in finished):
+    # Robots that merge start in worlds of their own: side by side in one picture they would tell a lie.
+    if len(paths) > 1 and not options.merge and all(robot.truth is not None for robot in finished):
         points = np.concatenate([points for points, _ in clouds])
         colours = np.concatenate([colours for _, colours in clouds])
         caption = f"{len(paths)} robots, {sum(robot.frames for robot in finished)} frames, one world"
@@ -280,7 +309,8 @@ def _fresh_folder(folder: Path) -> Path:
             raise UsageError(f"{folder} holds other files", hint="name an empty folder with --out")
         for old in [folder / "platform", *folder.glob("robot-*")]:
             shutil.rmtree(old, ignore_errors=True)
-        for name in ("report.json", "report.md", "commands.csv", "samples.csv", "map.png"):
+        written = ("report.json", "report.md", "commands.csv", "samples.csv", "map.png")
+        for name in (*written, "map_merged.png", "merged.ply", MERGED_MAP):
             (folder / name).unlink(missing_ok=True)
     try:
         folder.mkdir(parents=True, exist_ok=True)

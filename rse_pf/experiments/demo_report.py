@@ -10,6 +10,7 @@ import numpy as np
 
 from rse_pf.errors import UsageError
 from rse_pf.experiments.demo_robot import Finished
+from rse_pf.experiments.merge_report import merged_lines, merged_rows
 from rse_pf.experiments.report import PAPER, CommandRecord, summarise
 from rse_pf.experiments.trajectories import absolute_error, relative_error
 
@@ -78,6 +79,7 @@ def as_markdown(report: Mapping[str, Any]) -> str:
         "|---|---|---|",
         *(f"| {what} | {ours} | {theirs} |" for what, ours, theirs in rows),
         "",
+        *merged_rows(report.get("merged")),
         f"Commands: {commands['sent']} sent, {commands['answered']} answered, {commands['failed']} failed "
         f"{report['failures_by_code'] or ''}, {commands['lost']} lost, {commands['twice']} answered twice.",
         "",
@@ -103,8 +105,12 @@ def closing_lines(report: Mapping[str, Any], folder: Path) -> str:
     second = f"ATE {_list(known)} cm over paths of {_list(report['path_m'])} m\n" if known else ""
     shown = _relative(folder)
     pictures = f"{shown}/map.png and " if (folder / "map.png").exists() else ""
+    third = ""
+    if "merged" in report:
+        third = merged_lines(report["merged"])
+        pictures = f"{shown}/map_merged.png, {shown}/merged.ply and "
     return (
-        f"{first}\n{second}wrote {pictures}{shown}/robot-*/{{map.ply,map.png,trajectory.txt}}, "
+        f"{first}\n{second}{third}wrote {pictures}{shown}/robot-*/{{map.ply,map.png,trajectory.txt}}, "
         f"{shown}/report.md, report.json, commands.csv, events.jsonl, samples.csv"
     )
 

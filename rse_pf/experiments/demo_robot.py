@@ -19,6 +19,7 @@ import numpy as np
 from client_sdk.frontend import Frame, FrontEndOptions, PoseQuery, TrackedFrame, Tracker
 from client_sdk.mapping import MapOptions, PointMap, Trajectory, write_ply, write_trajectory
 from rse_pf.errors import RsePfError
+from rse_pf.experiments.demo_keyframes import MAP_FILE, KeyframeKeeper
 from rse_pf.experiments.report import CommandRecord
 from rse_pf.geometry import Array
 from rse_pf.pnp import PnpOptions
@@ -46,6 +47,8 @@ class RobotSpec:
     seed: int
     frontend: FrontEndOptions
     session: SessionSettings
+    merge: bool = False
+    """Whether it keeps its keyframes and starts in a world of its own, not at its true pose."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,9 +134,10 @@ async def _run(spec: RobotSpec, pipe: Connection) -> None:
     async with connect(spec.url, token=token, codec=spec.codec, settings=spec.session) as robot:
         pipe.send(Ready(len(frames)))
         began: float = await asyncio.to_thread(pipe.recv)
-        start = np.eye(4) if truth is None else truth.T_world_camera[0]
+        start = np.eye(4) if truth is None or spec.merge else truth.T_world_camera[0]
         tracker = Tracker(spec.frontend, T_world_start=start)
         point_map = PointMap(MapOptions())
+        keeper = KeyframeKeeper(spec.name, spec.frontend) if spec.merge else None
         diary = _Diary()
         first_s = time.monotonic()
         for row, frame in enumerate(frames):
@@ -142,11 +146,13 @@ async def _run(spec: RobotSpec, pipe: Connection) -> None:
             done = await _track(robot, tracker, frame, planned, began, spec, diary)
             if done.T_world_camera is not None:
                 await asyncio.to_thread(point_map.add, frame, done.T_world_camera)
+                if keeper is not None:
+                    await asyncio.to_thread(keeper.see, done)
             diary.tracked.append(done)
             pipe.send(Progress(row + 1, done.lost))
         took_s = time.monotonic() - first_s
         trajectory = _trajectory(diary.tracked)
-        await asyncio.to_thread(_write, spec.folder, point_map, trajectory)
+        await asyncio.to_thread(_write, spec.folder, point_map, trajectory, keeper)
         pipe.send(
             Finished(
                 frames=tracker.frames,
@@ -258,7 +264,9 @@ def _trajectory(tracked: Iterable[TrackedFrame]) -> Trajectory:
     )
 
 
-def _write(folder: Path, point_map: PointMap, trajectory: Trajectory) -> None:
+def _write(folder: Path, point_map: PointMap, trajectory: Trajectory, keeper: KeyframeKeeper | None) -> None:
     points, colours = point_map.points(min_readings=_PRUNE_READINGS)
     write_ply(folder / "map.ply", points, colours)
     write_trajectory(folder / "trajectory.txt", trajectory)
+    if keeper is not None:
+        (folder / MAP_FILE).write_bytes(keeper.encoded_map(points, colours))
