@@ -1,6 +1,7 @@
 """Robot tokens: issue, verify; Ed25519-signed JWTs after the RFC 8725 profile.
 
-A key set maps ``kid`` to a public key; the algorithm is fixed, never read from a token.  Promises
+A key set maps ``kid`` to a public key; the algorithm is fixed, never read from a token.  A robot that is
+enrolled signs its own tokens, and then its name, tenant, scopes and quotas come from the roster.  Promises
 never to read a clock (the library's own checks are off; ``now`` is an argument) and to tell a caller
 only `Unauthorized`, whatever the cause; the cause is in ``__cause__`` and ``reason`` for the log.
 """
@@ -10,16 +11,26 @@ from __future__ import annotations
 import base64
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
+from rse_pf.enrolment import (
+    ROBOT_KEY,
+    DenyList,
+    EnrolledRobot,
+    Roster,
+    check_robot,
+    check_scopes,
+    check_tenant,
+    key_id_of,
+)
 from rse_pf.errors import MissingExtra, Unauthorized, UsageError
 from rse_pf.settings import AuthSettings
 
 if TYPE_CHECKING:
     from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey, Ed25519PublicKey
 
-__all__ = ["Claims", "KeySet", "SigningKey", "token_problem", "verify_token"]
+__all__ = ["Claims", "KeySet", "SigningKey", "standing_problem", "token_problem", "verify_token"]
 
 _ALGORITHM = "EdDSA"
 _TYPE = "robot+jwt"
@@ -37,6 +48,11 @@ class Claims:
     key_id: str
     tenant: str = "default"
     scopes: tuple[str, ...] = ()
+    quotas: tuple[tuple[str, float], ...] = ()
+
+    def quota(self, name: str) -> float | None:
+        """Return what the roster limits this robot to, None if it says nothing (see `enrolment.QUOTAS`)."""
+        return dict(self.quotas).get(name)
 
 
 class SigningKey:
@@ -50,6 +66,12 @@ class SigningKey:
     def from_seed(cls, seed: bytes, key_id: str) -> SigningKey:
         """Return the key of 32 secret random bytes."""
         return cls(_ed25519().Ed25519PrivateKey.from_private_bytes(seed), key_id)
+
+    @classmethod
+    def of_robot(cls, seed: bytes) -> SigningKey:
+        """Return a robot's own key, made of 32 secret random bytes; its id is its RFC 7638 thumbprint."""
+        private = _ed25519().Ed25519PrivateKey.from_private_bytes(seed)
+        return cls(private, key_id_of(_b64(private.public_key().public_bytes_raw())))
 
     @classmethod
     def from_json(cls, text: str) -> SigningKey:
@@ -80,8 +102,9 @@ class SigningKey:
         tenant: str = "default",
     ) -> str:
         """Return a token for *robot* that is good from *now* (Unix seconds) for *life_s*."""
-        if not robot or len(robot) > 64 or not robot.isprintable():
-            raise UsageError(f"{robot[:80]!r} is no name for a robot", hint="use 1 to 64 printable letters")
+        check_robot(robot)
+        check_tenant(tenant)
+        check_scopes(scopes)
         if not 0 < len(token_id) <= 64:
             raise UsageError("a token id has 1 to 64 letters", hint="leave it to rse-pf token issue")
         life = settings.token_life_s if life_s is None else life_s
@@ -98,6 +121,10 @@ class SigningKey:
         token: str = _jwt().encode(claims, self._private, algorithm=_ALGORITHM, headers=headers)
         return token
 
+    def public_json(self) -> str:
+        """Return the public half as a JWK."""
+        return json.dumps(self._public_jwk())
+
     def _public_jwk(self) -> dict[str, str]:
         x = _b64(self._private.public_key().public_bytes_raw())
         return {"kty": "OKP", "crv": "Ed25519", "kid": self.key_id, "x": x}
@@ -107,10 +134,25 @@ class SigningKey:
 
 
 class KeySet:
-    """The public keys that tokens may be signed with, by ``kid``."""
+    """Whom a server trusts: keys that may sign, robots that are enrolled, less what is denied."""
 
-    def __init__(self, keys: Mapping[str, Ed25519PublicKey]) -> None:
+    def __init__(
+        self,
+        keys: Mapping[str, Ed25519PublicKey],
+        *,
+        roster: Roster | None = None,
+        denied: DenyList | None = None,
+    ) -> None:
         self._keys = dict(keys)
+        denied = denied or DenyList()
+        self._robots = {robot.key_id: robot for robot in (roster or Roster()).robots}
+        self._revoked = {(each.tenant, each.robot, each.id) for each in denied.tokens}
+        self._disabled = {(each.tenant, each.robot) for each in denied.disabled}
+        self._not_before = {(each.tenant, each.robot): each.at_s for each in denied.not_before}
+
+    def governed_by(self, roster: Roster, denied: DenyList) -> KeySet:
+        """Return the same platform keys under what the control room says."""
+        return KeySet(self._keys, roster=roster, denied=denied)
 
     @classmethod
     def from_json(cls, text: str) -> KeySet:
@@ -135,8 +177,29 @@ class KeySet:
         return json.dumps({"keys": keys})
 
     def get(self, key_id: Any) -> Ed25519PublicKey | None:
-        """Return the key called *key_id*, if it is in the set."""
-        return self._keys.get(key_id) if isinstance(key_id, str) else None
+        """Return the key called *key_id*, of the platform or of an enrolled robot, if it is in the set."""
+        if not isinstance(key_id, str):
+            return None
+        if not key_id.startswith(ROBOT_KEY):
+            return self._keys.get(key_id)
+        robot = self._robots.get(key_id)
+        if robot is None:
+            return None
+        key: Ed25519PublicKey = _ed25519().Ed25519PublicKey.from_public_bytes(_unb64(robot.x))
+        return key
+
+    def robot_of(self, key_id: str) -> EnrolledRobot | None:
+        """Return the enrolled robot whose key *key_id* is."""
+        return self._robots.get(key_id)
+
+    def denies(self, claims: Claims) -> str:
+        """Return why *claims* are refused although they are signed; empty if they are not."""
+        robot = (claims.tenant, claims.robot)
+        if robot in self._disabled:
+            return "disabled"
+        if (*robot, claims.token_id) in self._revoked:
+            return "revoked"
+        return "issued-too-early" if claims.issued_s < self._not_before.get(robot, 0.0) else ""
 
 
 def verify_token(token: str, *, keys: KeySet, now: float, settings: AuthSettings) -> Claims:
@@ -157,6 +220,19 @@ def verify_token(token: str, *, keys: KeySet, now: float, settings: AuthSettings
         raise Unauthorized(
             "the token is missing or not valid", hint="issue one with rse-pf token issue ROBOT"
         ) from refused
+
+
+def standing_problem(claims: Claims, keys: KeySet) -> str:
+    """Return why *claims* that were verified once no longer stand under *keys*; empty if they do.
+
+    Whoever lives on them, as a socket does, has to go then.  Their end in time is not looked at.
+    """
+    if keys.get(claims.key_id) is None:
+        return "unknown-key"
+    enrolled = keys.robot_of(claims.key_id)
+    if enrolled is not None and (enrolled.tenant, enrolled.robot) != (claims.tenant, claims.robot):
+        return "wrong-robot"
+    return keys.denies(claims)
 
 
 def token_problem(error: Unauthorized) -> str:
@@ -196,7 +272,18 @@ def _checked(token: str, keys: KeySet, now: float, settings: AuthSettings) -> Cl
         )  # fmt: skip
     except jwt.PyJWTError as error:
         raise _Refused("bad-signature-or-claims") from error
-    return _timed(claims, str(header["kid"]), now, settings)
+    told = _timed(claims, str(header["kid"]), now, settings)
+    enrolled = keys.robot_of(told.key_id)
+    if enrolled is not None:
+        if enrolled.robot != told.robot:
+            raise _Refused("wrong-robot")
+        told = replace(
+            told, tenant=enrolled.tenant, scopes=enrolled.scopes, quotas=tuple(enrolled.quotas.items())
+        )
+    denied = keys.denies(told)
+    if denied:
+        raise _Refused(denied)
+    return told
 
 
 def _timed(claims: dict[str, Any], key_id: str, now: float, settings: AuthSettings) -> Claims:

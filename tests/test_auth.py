@@ -56,11 +56,11 @@ def without(name: str) -> dict[str, Any]:
 
 
 def test_a_good_token_says_who_the_robot_is() -> None:
-    token = issue(scopes=("pnp", "maps"), tenant="lab", life_s=60.0)
+    token = issue(scopes=("services:pnp", "maps:*"), tenant="lab", life_s=60.0)
 
     assert verify_token(token, keys=KEYS, now=NOW + 1, settings=SETTINGS) == Claims(
         robot="robot-7", token_id="t1", issued_s=NOW, expires_s=NOW + 60, key_id="key-1", tenant="lab",
-        scopes=("pnp", "maps"),
+        scopes=("services:pnp", "maps:*"),
     )  # fmt: skip
 
 

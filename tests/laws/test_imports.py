@@ -9,7 +9,7 @@ from collections.abc import Iterator, Mapping
 import pytest
 
 GROUND = {"errors", "settings"}
-FIRST = {"geometry", "wire", "scaling", "auth", "service", "objects", "maps"}
+FIRST = {"geometry", "wire", "scaling", "auth", "enrolment", "control", "service", "objects", "maps"}
 SECOND = {"pnp", "services", "aws"}
 LEAVES = {"backend", "data_server", "local", "client_sdk", "lambda_pnp", "stacks"}
 BELOW_LEAVES = GROUND | FIRST | SECOND
@@ -22,8 +22,10 @@ MAY_IMPORT: dict[str, set[str]] = {
     "wire": GROUND,
     "scaling": GROUND,
     "maps": GROUND | {"geometry"},
-    "auth": GROUND,
+    "enrolment": GROUND,
+    "auth": GROUND | {"enrolment"},
     "objects": GROUND,
+    "control": GROUND | {"enrolment", "auth", "objects"},
     "service": GROUND | {"wire", "geometry"},
     "pnp": GROUND | FIRST,
     "services": GROUND | FIRST | {"pnp"},
