@@ -20,10 +20,16 @@ from rse_pf.geometry import Array
 __all__ = ["PathOfRobot", "draw_map"]
 
 _WIDTH, _HEIGHT, _CAPTION, _MARGIN = 1600, 900, 64, 40
-_BACKGROUND, _INK, _FAINT = (250, 250, 248), (30, 34, 42), (120, 126, 136)
-_COLOURS = ((214, 40, 57), (17, 105, 196), (27, 138, 70), (222, 125, 0), (126, 60, 178), (0, 140, 140))
+_BACKGROUND, _INK, _WHITE = (228, 231, 236), (30, 34, 42), (255, 255, 255)
+"""Not white: white walls and tables must be told from places that nobody saw."""
+_COLOURS = ((0, 114, 178), (213, 94, 0), (0, 158, 115), (204, 121, 167), (230, 159, 0), (86, 180, 233))
+"""Apart for colour-blind eyes, too; Okabe and Ito 2008."""
+_MOST_LABELS = 8
+"""More robots than this have their names in the legend only."""
 _FOCAL = 1.35
 _CAMERA_EVERY_M = 0.5
+_SCALES_M = (1.0, 0.5, 2.0, 0.2, 5.0, 0.1, 10.0, 20.0, 50.0, 100.0, 0.05, 0.02, 0.01)
+_SCALE_PX = (80.0, 400.0)
 _LONG_SCENE = 1.25
 """Longer than wide by this, a scene lies across the picture."""
 _CEILING_M = 0.7
@@ -60,16 +66,15 @@ def draw_map(
     big, small = font_module.load_default(size=26), font_module.load_default(size=20)
     for number, robot in enumerate(robots):
         _draw_path(draw, view, robot, _COLOURS[number % len(_COLOURS)])
-    _draw_scale(draw, view, small)
-    draw.text((_MARGIN, 18), caption, fill=_INK, font=big)
-    left = _MARGIN
-    for number, robot in enumerate(robots):
-        colour = _COLOURS[number % len(_COLOURS)]
-        draw.line([(left, _HEIGHT - 34), (left + 36, _HEIGHT - 34)], fill=colour, width=6)
-        label = f"{robot.name} (dot: start, ring: end)" if number == 0 else robot.name
-        draw.text((left + 46, _HEIGHT - 46), label, fill=_INK, font=small)
-        left += 76 + int(draw.textlength(label, font=small))
-    image.save(path)
+    if 1 < len(robots) <= _MOST_LABELS:
+        for robot, place in zip(robots, _label_places(view, robots), strict=True):
+            draw.text(
+                place, robot.name, fill=_INK, font=small, anchor="mm", stroke_width=4, stroke_fill=_WHITE
+            )
+    scale_left = _draw_scale(draw, view, small)
+    draw.text((_MARGIN, 18), _fitting(draw, caption, big, _WIDTH - 2 * _MARGIN), fill=_INK, font=big)
+    _draw_legend(draw, robots, small, scale_left - _MARGIN)
+    image.save(path, format="PNG")
 
 
 class _Observer:
@@ -170,6 +175,53 @@ def _draw_path(draw: Any, view: _Observer, robot: PathOfRobot, colour: tuple[int
     draw.ellipse([x1 - 10, y1 - 10, x1 + 10, y1 + 10], outline=colour, width=5)
 
 
+def _label_places(view: _Observer, robots: list[PathOfRobot]) -> list[tuple[float, float]]:
+    """Return for each robot a place beside its path, as far from the other paths as there is one."""
+    lines = [view.project(robot.T_world_camera[:, :3, 3]) for robot in robots]
+    places = []
+    for number, line in enumerate(lines):
+        if not len(line):
+            places.append((-100.0, -100.0))
+            continue
+        spots = line[:: max(1, len(line) // 50)]
+        spots = np.concatenate([spots + np.array(off) for off in ((0, -34), (0, 34), (70, 0), (-70, 0))])
+        taken = [other for row, other in enumerate(lines) if row != number] + [
+            np.array(places).reshape(-1, 2)
+        ]
+        others = np.concatenate(taken)
+        if len(others):
+            free = np.linalg.norm(spots[:, None] - others[None], axis=2).min(axis=1)
+        else:
+            free = np.zeros(len(spots))
+        inside = (np.abs(spots - [_WIDTH / 2, _HEIGHT / 2]) < [_WIDTH / 2 - 60, _HEIGHT / 2 - 80]).all(axis=1)
+        x, y = spots[int(np.argmax(np.where(inside, free, -1.0)))]
+        places.append((float(x), float(y)))
+    return places
+
+
+def _draw_legend(draw: Any, robots: list[PathOfRobot], font: Any, most_px: float) -> None:
+    """Draw one line of names; those that do not fit are counted."""
+    left, y = _MARGIN, _HEIGHT - 34
+    for number, robot in enumerate(robots):
+        label = f"{robot.name} (dot: start, ring: end)" if number == 0 else robot.name
+        length = int(draw.textlength(label, font=font))
+        if left + 46 + length > most_px:
+            draw.text((left, y), f"and {len(robots) - number} more", fill=_INK, font=font, anchor="lm")
+            return
+        draw.line([(left, y), (left + 36, y)], fill=_COLOURS[number % len(_COLOURS)], width=6)
+        draw.text((left + 46, y), label, fill=_INK, font=font, anchor="lm")
+        left += 76 + length
+
+
+def _fitting(draw: Any, text: str, font: Any, most_px: float) -> str:
+    """Return *text*, cut where it is wider than there is room."""
+    if draw.textlength(text, font=font) <= most_px:
+        return text
+    while text and draw.textlength(f"{text} ...", font=font) > most_px:
+        text = text[:-1]
+    return f"{text} ..."
+
+
 def _spaced(poses: Array) -> list[Array]:
     """Return the first pose and every one that lies far enough from the last chosen."""
     chosen = [poses[0]]
@@ -188,15 +240,18 @@ def _draw_camera(draw: Any, view: _Observer, T_world_camera: Array, colour: tupl
     draw.line([*flat[1:], flat[1]], fill=colour, width=2)
 
 
-def _draw_scale(draw: Any, view: _Observer, font: Any) -> None:
-    """Draw one metre as it looks at the centre of the scene."""
+def _draw_scale(draw: Any, view: _Observer, font: Any) -> float:
+    """Draw one metre (or a round number of them) as it looks at the scene's centre; return its left end."""
     ends = view.project(np.stack([view.centre, view.centre + view.axis_x]))
-    length = float(np.linalg.norm(ends[1] - ends[0]))
+    one_px = max(float(np.linalg.norm(ends[1] - ends[0])), 1e-9)
+    metres = next((m for m in _SCALES_M if _SCALE_PX[0] <= m * one_px <= _SCALE_PX[1]), 1.0)
+    length, label = min(metres * one_px, _WIDTH / 2), f"{metres:g} m"
     right, y = _WIDTH - _MARGIN, _HEIGHT - 34
     draw.line([(right - length, y), (right, y)], fill=_INK, width=3)
     for x in (right - length, right):
         draw.line([(x, y - 7), (x, y + 7)], fill=_INK, width=3)
-    draw.text((right - length - 52, y - 12), "1 m", fill=_FAINT, font=font)
+    draw.text((right - length - 16, y), label, fill=_INK, font=font, anchor="rm")
+    return right - length - 16 - float(draw.textlength(label, font=font))
 
 
 def _up(robots: list[PathOfRobot]) -> Array:

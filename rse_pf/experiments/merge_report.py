@@ -99,8 +99,10 @@ def merge_section(
 ) -> dict[str, Any]:
     """Return ``merged`` of ``report.json``.
 
-    ``ate_cm`` is over all frames of the joined robots after one rigid alignment; ``ate_before_cm`` is over
-    the same frames with every robot aligned by itself, which no robot could do: maps apart at their best.
+    ``ate_cm`` is over all frames of the joined robots after one rigid alignment to the truth.  Before the
+    merge no robot knows where the others are, so ``ate_before_cm`` aligns every robot to the truth by itself:
+    it holds their drift, and no error of how they lie to each other.  For ``ate_stiff_cm`` every map lies
+    where the merge laid it, but is not bent.
     ``origins`` is how far a robot's first pose is off, seen from the first robot's.
     """
     return {
@@ -130,9 +132,10 @@ def merged_lines(section: Mapping[str, Any]) -> str:
     )
     lines = [f"merged {', '.join(joined)}: {section['keyframes']} keyframes, {what}"]
     if section["ate_cm"] is not None:
-        before = "with every robot aligned by itself" if len(joined) > 1 else "before"
+        alone = ", every robot aligned to the truth by itself" if len(joined) > 1 else ""
         lines.append(
-            f"ATE {section['ate_cm']:.2f} cm in the merged map ({section['ate_before_cm']:.2f} cm {before})"
+            f"ATE {section['ate_cm']:.2f} cm in the merged map "
+            f"(before: {section['ate_before_cm']:.2f} cm{alone})"
         )
     lines += [f"{each['robot']} not joined: {each['reason']}" for each in section["not_joined"]]
     refused = sum(each["count"] for each in section["refused"])
@@ -154,9 +157,9 @@ def merged_rows(section: Mapping[str, Any] | None) -> list[str]:
         ("not joined", "; ".join(f"{e['robot']}: {e['reason']}" for e in section["not_joined"]) or "-"),
         ("keyframes / links between robots / loops",
          f"{section['keyframes']} / {section['links_between_robots']} / {section['loops']}"),
-        ("ATE cm", "-" if section["ate_cm"] is None else f"{section['ate_cm']:.2f}"),
-        ("ATE cm before, every robot aligned by itself",
-         "-" if section["ate_before_cm"] is None else f"{section['ate_before_cm']:.2f}"),
+        ("ATE cm", _two(section["ate_cm"])),
+        ("ATE cm before, every robot aligned to the truth by itself", _two(section["ate_before_cm"])),
+        ("ATE cm of the maps laid beside each other, not bent", _two(section["ate_stiff_cm"])),
         *((f"origin of {e['robot']} off", f"{e['cm']:.1f} cm, {e['deg']:.2f} deg")
           for e in section["origins"]),
         *((f"refused between {' and '.join(dict.fromkeys(e['robots']))}, {e['reason']}", e["count"])
@@ -165,16 +168,24 @@ def merged_rows(section: Mapping[str, Any] | None) -> list[str]:
     return ["| merged map | |", "|---|---|", *(f"| {what} | {value} |" for what, value in rows), ""]
 
 
+def _two(value: float | None) -> str:
+    return "-" if value is None else f"{value:.2f}"
+
+
 def _errors(robots: Sequence[JoinedRobot]) -> dict[str, Any]:
     pairs = [_matched(robot) for robot in robots]
     if not robots or any(pair is None for pair in pairs):
-        return {"ate_cm": None, "ate_before_cm": None, "origins": []}
+        return {"ate_cm": None, "ate_before_cm": None, "ate_stiff_cm": None, "origins": []}
     known = [pair for pair in pairs if pair is not None]
     together = _residuals(
         np.concatenate([merged[:, :3, 3] for _, merged, _ in known]),
         np.concatenate([truth[:, :3, 3] for _, _, truth in known]),
     )
-    apart = np.concatenate([_residuals(own[:, :3, 3], truth[:, :3, 3]) for own, _, truth in known])
+    stiff = _residuals(
+        np.concatenate([(_laid(own, merged) @ own)[:, :3, 3] for own, merged, _ in known]),
+        np.concatenate([truth[:, :3, 3] for _, _, truth in known]),
+    )
+    before = np.concatenate([_residuals(own[:, :3, 3], truth[:, :3, 3]) for own, _, truth in known])
     _, first, first_truth = known[0]
     origins = []
     for robot, (_, merged, truth) in zip(robots[1:], known[1:], strict=True):
@@ -182,7 +193,8 @@ def _errors(robots: Sequence[JoinedRobot]) -> dict[str, Any]:
         origins.append({"robot": robot.name, "cm": round(100 * off_m, 3), "deg": round(off_deg, 3)})
     return {
         "ate_cm": round(100 * _rms(together), 4),
-        "ate_before_cm": round(100 * _rms(apart), 4),
+        "ate_before_cm": round(100 * _rms(before), 4),
+        "ate_stiff_cm": round(100 * _rms(stiff), 4),
         "origins": origins,
     }
 
@@ -200,6 +212,15 @@ def _matched(robot: JoinedRobot) -> tuple[Array, Array, Array] | None:
         robot.merged.T_world_camera[mine],
         robot.truth.T_world_camera[theirs],
     )
+
+
+def _laid(own: Array, merged: Array) -> Array:
+    """Return the rigid motion that brings whole poses ``(n, 4, 4)`` closest: mean rotation, then shift."""
+    U, _, Vt = np.linalg.svd((merged[:, :3, :3] @ np.swapaxes(own[:, :3, :3], 1, 2)).sum(axis=0))
+    T = np.eye(4)
+    T[:3, :3] = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+    T[:3, 3] = (merged[:, :3, 3] - own[:, :3, 3] @ T[:3, :3].T).mean(axis=0)
+    return T
 
 
 def _residuals(points: Array, wanted: Array) -> Array:
