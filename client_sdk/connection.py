@@ -37,6 +37,7 @@ from rse_pf.wire.robot_session import (
     LinkLost,
     MoveAsked,
     Notice,
+    RenewalDue,
     RobotSession,
     Welcomed,
 )
@@ -45,7 +46,7 @@ from rse_pf.wire.session import CLOSE_REPLACED
 __all__ = ["Connection", "OnChange", "Token", "websocket_options"]
 
 Token = str | Callable[[], Awaitable[str]] | None
-"""A robot's token, or what gives a fresh one whenever the robot dials."""
+"""A robot's token, or what gives a fresh one whenever the robot dials, and before that is over."""
 
 OnChange = Callable[[str, str], None] | None
 """Is told ``link-lost`` with a reason, and ``link-back`` or ``moved`` with the server's name."""
@@ -315,6 +316,17 @@ class Connection:
             )
             raise _Refused(told) from error
 
+    async def _renew(self, socket: _Socket) -> None:
+        """Show a fresh token on a live socket; without one its end brings a new dial, with a new try."""
+        try:
+            token = await self._read_token()
+        except _Refused as refused:
+            self.last_error = refused.error.message
+            return
+        if token and not socket.ended.is_set() and not socket.is_closing:
+            self._session.renew(socket.link, token)
+            self.flush()
+
     async def _read(self, socket: _Socket) -> None:
         try:
             while True:
@@ -374,6 +386,8 @@ class Connection:
             if not socket.link.leaving and self._session.current is None:
                 self._changed_to("link-lost", event.reason)
             self._abort(socket)
+        elif isinstance(event, RenewalDue) and callable(self._token):
+            self._spawn(self._renew(socket))
         elif isinstance(event, Notice):
             failure = event.failure
             self.last_error = failure.message

@@ -15,6 +15,8 @@ from rse_pf.wire.messages import (
     Ping,
     Pong,
     Progress,
+    Renew,
+    Renewed,
     Result,
     Welcome,
 )
@@ -36,6 +38,8 @@ __all__ = [
     "Ping",
     "Pong",
     "Progress",
+    "Renew",
+    "Renewed",
     "Result",
     "Welcome",
     "as_type",

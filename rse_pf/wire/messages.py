@@ -24,6 +24,8 @@ __all__ = [
     "Ping",
     "Pong",
     "Progress",
+    "Renew",
+    "Renewed",
     "Result",
     "Welcome",
 ]
@@ -59,7 +61,10 @@ class Hello(_Message, frozen=True, kw_only=True, tag="hello"):
 
 
 class Welcome(_Message, frozen=True, kw_only=True, tag="welcome"):
-    """Server, answer to Hello: who serves, and what it accepts."""
+    """Server, answer to Hello: who serves, and what it accepts.
+
+    ``token_s``: the socket ends in so many seconds, unless a fresh token comes first.
+    """
 
     server: str
     session: str
@@ -67,6 +72,7 @@ class Welcome(_Message, frozen=True, kw_only=True, tag="welcome"):
     protocol: int
     limits: Limits
     clock_s: float
+    token_s: float | None = None
 
 
 class Command(_Message, frozen=True, kw_only=True, tag="command"):
@@ -152,6 +158,18 @@ class Pong(_Message, frozen=True, kw_only=True, tag="pong"):
     answered_s: float
 
 
-FromRobot = Hello | Command | Ping | Cancel
-FromServer = Welcome | Result | Failure | Move | Pong | Progress
+class Renew(_Message, frozen=True, kw_only=True, tag="renew"):
+    """Robot shows a fresh token of its own, so that the socket outlives the one it was opened with."""
+
+    token: Annotated[str, msgspec.Meta(max_length=65536)]
+
+
+class Renewed(_Message, frozen=True, kw_only=True, tag="renewed"):
+    """Server took the fresh token: the socket ends in ``token_s`` seconds, counted from this answer."""
+
+    token_s: float
+
+
+FromRobot = Hello | Command | Ping | Cancel | Renew
+FromServer = Welcome | Result | Failure | Move | Pong | Progress | Renewed
 Message = FromRobot | FromServer

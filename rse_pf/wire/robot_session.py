@@ -18,12 +18,27 @@ from rse_pf.errors import LimitExceeded
 from rse_pf.settings import SessionSettings
 from rse_pf.wire.clock_offset import ClockOffset, Exchange
 from rse_pf.wire.codec import Codec
-from rse_pf.wire.messages import Cancel, Command, Failure, Hello, Move, Ping, Pong, Progress, Result, Welcome
+from rse_pf.wire.messages import (
+    Cancel,
+    Command,
+    Failure,
+    Hello,
+    Move,
+    Ping,
+    Pong,
+    Progress,
+    Renew,
+    Renewed,
+    Result,
+    Welcome,
+)
 from rse_pf.wire.prepared import encode_command
+from rse_pf.wire.renewal import Lease
 from rse_pf.wire.session import PROGRESS
 
 __all__ = [
-    "Answered", "Event", "Link", "LinkLost", "MoveAsked", "Notice", "Progressed", "RobotSession", "Welcomed",
+    "Answered", "Event", "Link", "LinkLost", "MoveAsked", "Notice", "Progressed", "RenewalDue",
+    "RobotSession", "Welcomed",
 ]  # fmt: skip
 
 _MAX_TRIES_AFTER_LOSS = 2
@@ -86,7 +101,12 @@ class Progressed:
     what: str
 
 
-Event = Answered | Welcomed | MoveAsked | LinkLost | Notice | Progressed
+@dataclass(frozen=True, slots=True)
+class RenewalDue:
+    """The link ends soon unless a fresh token is shown: see `RobotSession.renew`."""
+
+
+Event = RenewalDue | Answered | Welcomed | MoveAsked | LinkLost | Notice | Progressed
 
 
 @dataclass(slots=True, kw_only=True)
@@ -119,6 +139,7 @@ class Link:
     clock_offset: ClockOffset = field(default_factory=ClockOffset)
     last_exchange: Exchange | None = None
     outgoing: list[bytes] = field(default_factory=list)
+    lease: Lease = field(default_factory=Lease)
 
     @property
     def server(self) -> str:
@@ -241,17 +262,26 @@ class RobotSession:
             if link.welcome is not None:
                 return []
             link.welcome = message
+            if message.token_s is not None:
+                link.lease.lasts(message.token_s, now)
             return [Welcomed(message)]
         if isinstance(message, Pong):
             return self._pong(link, message, now)
         if isinstance(message, Move):
             within_s = message.within_ms / 1e3
             return [MoveAsked(message.reason, within_s if math.isfinite(within_s) else 0.0)]
+        if isinstance(message, Renewed):
+            link.lease.lasts(message.token_s, now)
+            return []
         if isinstance(message, Failure) and message.id is None:
             return [Notice(message)]
         if isinstance(message, Progress):
             return self._progress(link, message)
         return self._answer(link, message, now)
+
+    def renew(self, link: Link, token: str) -> None:
+        """Show a fresh *token* on *link*, whose end the server then moves."""
+        link.outgoing.append(self.codec.encode(Renew(token=token)))
 
     def due(self, now: float) -> list[Event]:
         """Return the commands whose deadline has passed, and send those that may go (again)."""
@@ -305,7 +335,7 @@ class RobotSession:
             link.ping_sent = now if link.ping_sent is None else link.ping_sent
             link.last_ping = now
             link.outgoing.append(self.codec.encode(Ping(sent_s=now)))
-        return []
+        return [RenewalDue()] if not link.leaving and link.lease.is_due(now) else []
 
     def next_due(self, now: float) -> float:
         """Return when `due` and `tend` should be called again, at the latest."""

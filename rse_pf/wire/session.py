@@ -9,7 +9,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from rse_pf.errors import BadMessage, Busy, InternalError, LimitExceeded, ProtocolError
+from rse_pf.errors import (
+    BadMessage,
+    Busy,
+    InternalError,
+    LimitExceeded,
+    ProtocolError,
+    RsePfError,
+    Unauthorized,
+)
 from rse_pf.settings import SessionSettings
 from rse_pf.wire.codec import Codec
 from rse_pf.wire.messages import (
@@ -23,6 +31,8 @@ from rse_pf.wire.messages import (
     Move,
     Ping,
     Pong,
+    Renew,
+    Renewed,
     Result,
     Welcome,
 )
@@ -33,11 +43,14 @@ __all__ = [
     "CLOSE_PROTOCOL",
     "CLOSE_RATE",
     "CLOSE_REPLACED",
+    "CLOSE_REVOKED",
     "CLOSE_TOKEN_OVER",
     "CLOSE_UNSUPPORTED",
     "PROGRESS",
+    "RENEWAL_PAUSE_S",
     "Close",
     "Decision",
+    "Renewal",
     "Send",
     "ServerSession",
     "Submit",
@@ -47,10 +60,14 @@ __all__ = [
 PROGRESS = "progress"
 """Capability of a robot that takes progress and may take commands back."""
 
+RENEWAL_PAUSE_S = 1.0
+"""A robot that shows fresh tokens faster is told to wait: each costs a signature check."""
+
 CLOSE_NORMAL = 1000
 CLOSE_GOING_AWAY = 1001
 CLOSE_PROTOCOL = 4400
 CLOSE_TOKEN_OVER = 4401
+CLOSE_REVOKED = 4403
 CLOSE_UNSUPPORTED = 4406
 CLOSE_REPLACED = 4409
 CLOSE_RATE = 4429
@@ -85,7 +102,14 @@ class Withdraw:
     id: int
 
 
-Decision = Send | Submit | Withdraw | Close
+@dataclass(frozen=True, slots=True)
+class Renewal:
+    """Judge this fresh token and answer with `ServerSession.renewed`."""
+
+    token: str
+
+
+Decision = Send | Submit | Withdraw | Renewal | Close
 
 
 class ServerSession:
@@ -97,6 +121,8 @@ class ServerSession:
         self.robot = robot
         self.state: Literal["opening", "open", "closed"] = "opening"
         self.in_flight = 0
+        self.token_s: float | None = None
+        """How long the robot's token is still good when it says Hello; set by whoever knows."""
         self.hears_progress = False
         """Whether the robot knows of long commands."""
         self.codec = codec
@@ -104,6 +130,7 @@ class ServerSession:
         self._session = session
         self._limits = limits
         self._bad_messages = 0
+        self._next_renewal_s = float("-inf")
 
     def receive(self, data: bytes, now: float) -> list[Decision]:
         """Return what to do about one WebSocket message that arrived at *now* (server clock, s)."""
@@ -122,6 +149,8 @@ class ServerSession:
             return [self._send(pong)]
         if isinstance(message, Cancel):
             return [Withdraw(message.id)]
+        if isinstance(message, Renew):
+            return self._renew(message, now)
         return self._command(message)
 
     def answer(self, message: Result | Failure) -> Send:
@@ -154,6 +183,34 @@ class ServerSession:
         """Ask the robot to leave for another server, make before break."""
         return [self._send(Move(reason=reason, within_ms=within_ms))] if self.state == "open" else []
 
+    def renewed(self, token_s: float | None) -> list[Decision]:
+        """Answer a `Renewal`: the socket lives *token_s* more, or (None) the token was no good.
+
+        A refusal says as little as the door does, and the socket keeps the end that it had.
+        """
+        if token_s is not None:
+            return [self._send(Renewed(token_s=token_s))]
+        error = Unauthorized(
+            "the fresh token is not valid for this robot", hint="the socket keeps the end that it had"
+        )
+        return [self._send(self._complaint(error))]
+
+    def _renew(self, message: Renew, now: float) -> list[Decision]:
+        if now < self._next_renewal_s:
+            error = Busy(
+                "a fresh token was shown a moment ago", hint="renew once in a token's life",
+                retry_after_ms=1e3 * (self._next_renewal_s - now),
+            )  # fmt: skip
+            return [self._send(self._complaint(error))]
+        self._next_renewal_s = now + RENEWAL_PAUSE_S
+        return [Renewal(message.token)]
+
+    def _complaint(self, error: RsePfError) -> Failure:
+        return Failure(
+            code=error.code, message=error.message, hint=error.hint, retry_after_ms=error.retry_after_ms,
+            server=self._server,
+        )  # fmt: skip
+
     def _hello(self, hello: Hello, now: float) -> list[Decision]:
         if self.state == "open":
             return self._leave(CLOSE_PROTOCOL, "hello came twice")
@@ -177,6 +234,7 @@ class ServerSession:
                 max_in_flight=self._limits.max_in_flight,
             ),
             clock_s=now,
+            token_s=self.token_s,
         )
         return [self._send(welcome)]
 

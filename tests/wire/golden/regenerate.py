@@ -30,6 +30,8 @@ from rse_pf.wire import (
     Ping,
     Pong,
     Progress,
+    Renew,
+    Renewed,
     Result,
     Welcome,
     make_codec,
@@ -44,6 +46,12 @@ MESSAGES: dict[str, Message] = {
         server="server-1", session="5f0c", robot="robot-7", protocol=1, clock_s=1234.5,
         limits=Limits(max_message_bytes=262144, max_in_flight=8),
     ),
+    "welcome-for-a-while": Welcome(
+        server="server-1", session="5f0c", robot="robot-7", protocol=1, clock_s=1234.5, token_s=899.5,
+        limits=Limits(max_message_bytes=262144, max_in_flight=8),
+    ),
+    "renew": Renew(token="eyJhbGciOiJFZERTQSJ9.eyJzdWIiOiJyb2JvdC03In0.c2lnbmF0dXJl"),
+    "renewed": Renewed(token_s=900.0),
     "command": Command(
         id=7, service="echo", payload={"value": [1, -2.5, "drei", None, True]}, stream="front", seq=41,
         keep=True, deadline_ms=250.0, trace="4bf92f35",
