@@ -19,6 +19,7 @@ from rse_pf.backend.connection import Connection
 from rse_pf.backend.door import Admitted
 from rse_pf.backend.environments import Environments
 from rse_pf.backend.executors import Executor, SolverThreads
+from rse_pf.backend.limits import CutOff, RobotRates, TooFast
 from rse_pf.backend.log import JsonLog
 from rse_pf.backend.metrics import LongestRecently, Metrics
 from rse_pf.backend.scheduler import BEHIND, BEHIND_HINT, Job, Refusal, Scheduler
@@ -32,6 +33,7 @@ from rse_pf.wire.envelope import encode_refusal, peek
 from rse_pf.wire.session import (
     CLOSE_GOING_AWAY,
     CLOSE_PROTOCOL,
+    CLOSE_RATE,
     CLOSE_TOKEN_OVER,
     ServerSession,
 )
@@ -44,6 +46,8 @@ _TICKS_PER_LIMIT = 4
 _UNKNOWN = "unknown"
 _BATCH_S = 0.01
 """Behind and out of budget, a small server refuses in batches: alone, a refusal costs three times as much."""
+_TOO_FAST = "this robot sends more than its rate"
+_TOO_FAST_HINT = "send fewer, or have the operator raise session.max_commands_per_s"
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,6 +77,7 @@ class Core:
         self.clocks = clocks
         self.metrics = Metrics()
         self.connections: set[Connection] = set()
+        self.rates = RobotRates(settings.session)
         self._registry = registry
         self._server_id = server_id
         self._loop = loop
@@ -182,6 +187,10 @@ class Core:
 
     def refuses_unread(self, connection: Connection, codec: Codec, data: bytes, now: float) -> bool:
         """Refuse the command in *data* for a fraction of what reading it costs; False if it must be read."""
+        verdict = self.rates.judge(connection.robot, now)
+        if verdict is not None:
+            self._too_fast(connection, codec, data, verdict)
+            return True
         if connection.allowed_s is None:
             return False
         retry_after_ms = self._scheduler.refuse_unread(connection.robot, connection.allowed_s, now)
@@ -202,6 +211,22 @@ class Core:
                 code=Busy.code, queue_ms=0.0, compute_ms=0.0, bytes_in=len(data), bytes_out=len(refusal),
             )  # fmt: skip
         return True
+
+    def _too_fast(self, connection: Connection, codec: Codec, data: bytes, verdict: TooFast | CutOff) -> None:
+        """Tell a robot to slow down, or cut it off; without a line in the log for each refusal."""
+        self.metrics.shed["rate"] += 1
+        if isinstance(verdict, CutOff):
+            self._log.warning("cut-off", robot=connection.robot, reason="rate")
+            connection.close(CLOSE_RATE, "rate")
+            return
+        envelope = peek(codec, data)
+        failure = Failure(
+            id=None if envelope is None else envelope.id, code=Busy.code, message=_TOO_FAST,
+            hint=_TOO_FAST_HINT, retry_after_ms=verdict.retry_after_ms, server=self._server_id,
+        )  # fmt: skip
+        connection.write(encode_refusal(codec, failure))
+        if envelope is not None:
+            self.metrics.answered(self._label(envelope.service), Busy.code, 0.0)
 
     def snapshot(self) -> dict[str, Any]:
         """Return the numbers of this worker for /metrics and /status."""

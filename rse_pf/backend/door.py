@@ -7,6 +7,7 @@ socket and no clock: what a robot sent and the time come in, `Admitted` or `Turn
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
@@ -65,6 +66,11 @@ class Door:
         self._full = _refusal(
             503, "full", "this server has no room for another robot", "try again later",
             Retry_After=str(_RETRY_AFTER_S),
+        )  # fmt: skip
+        rest_s = settings.session.rate_rest_s
+        self.too_fast = _refusal(
+            429, "quota", "too many messages, or handshakes of this address", "wait, and slow down",
+            Retry_After=str(max(1, math.ceil(rest_s))),
         )  # fmt: skip
         self._no_token = _refusal(
             401, "unauthorized", "the token is missing or not valid",

@@ -188,6 +188,11 @@ class CloseBorder:
         self._left = 0
         self._is_close = False
 
+    @property
+    def is_upgraded(self) -> bool:
+        """Whether the handshake's head is over."""
+        return self._upgraded
+
     def wanted(self, data: memoryview) -> int:
         """Return how many of the next bytes of the stream belong to the conversation."""
         if self.shut:

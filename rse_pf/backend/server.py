@@ -9,12 +9,14 @@ from __future__ import annotations
 import asyncio
 import socket
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 from rse_pf.backend.connection import Connection
 from rse_pf.backend.core import Core
 from rse_pf.backend.door import Admitted, Door, TurnedAway
 from rse_pf.backend.frames import CloseBorder
+from rse_pf.backend.limits import SourceRates, WaitingRoom
 from rse_pf.backend.log import JsonLog
 from rse_pf.backend.seams import Handle
 from rse_pf.errors import MissingExtra
@@ -23,6 +25,7 @@ from rse_pf.settings import ServingSettings, SessionSettings
 __all__ = ["RobotSockets"]
 
 _MOST_CLOSE_REASON_BYTES = 123
+_TOO_LONG = b"HTTP/1.1 431 Request Header Fields Too Large\r\nConnection: close\r\nContent-Length: 0\r\n\r\n"
 _LINGER_S = 2.0
 """Time a robot has to read our CLOSE and to end its side; then the connection is cut."""
 
@@ -38,6 +41,41 @@ class _Quiet:
     debug = info = warning = error = exception = log
 
 
+class _Arrival:
+    """A socket until its handshake is judged."""
+
+    __slots__ = ("_is_cut", "_transport", "peer", "room")
+
+    def __init__(self, peer: str, room: int) -> None:
+        self.peer = peer
+        self.room = room
+        """Bytes that the head of its handshake may still have."""
+        self._transport: Any = None
+        self._is_cut = False
+
+    def made(self, transport: Any) -> None:
+        """Know the transport, which may be too late to matter."""
+        self._transport = transport
+        if self._is_cut:
+            transport.abort()
+
+    def cut(self) -> None:
+        """End the socket without a word."""
+        self._is_cut = True
+        if self._transport is not None:
+            self._transport.abort()
+
+    def is_too_long(self, size: int) -> bool:
+        """Take *size* more bytes of the head; answer one that is too long."""
+        self.room -= size
+        if self.room < 0 and not self._is_cut:
+            self._is_cut = True
+            self._transport.write(_TOO_LONG)
+            self._transport.close()
+            return True
+        return self._is_cut
+
+
 class RobotSockets:
     """Takes accepted sockets and gives the core a `Connection` for each robot that may come in."""
 
@@ -49,6 +87,7 @@ class RobotSockets:
         serving: ServingSettings,
         session: SessionSettings,
         most_robots: int,
+        workers: int,
         new_name: Callable[[], str],
         log: JsonLog,
         loop: asyncio.AbstractEventLoop,
@@ -56,6 +95,11 @@ class RobotSockets:
         self._core = core
         self._door = door
         self._most_robots = most_robots
+        self._sources = SourceRates(serving)
+        per_source = 0 if serving.trusted_proxies else serving.max_unauthenticated_per_source
+        self._waiting: WaitingRoom[_Arrival] = WaitingRoom(
+            -(-serving.max_unauthenticated // workers), -(-per_source // workers)
+        )
         self._new_name = new_name
         self._log = log
         self._loop = loop
@@ -66,7 +110,7 @@ class RobotSockets:
         self._protocol = _protocol_type(picows)
         self._listener = _listener_type(picows, loop, serving)
         self._arguments = (
-            None, None, False, self._judge, _Quiet(), True, serving.handshake_timeout_s,
+            _Quiet(), True, serving.handshake_timeout_s,
             False, 20.0, 20.0, picows.WSAutoPingStrategy.PING_WHEN_IDLE, False,
             session.max_message_bytes, None, serving.read_buffer_bytes,
         )  # fmt: skip
@@ -75,23 +119,37 @@ class RobotSockets:
         """Serve the accepted socket *fd*; *ended* is called once when it is gone."""
         accepted = socket.socket(fileno=fd)
         accepted.setblocking(False)
-        task = self._loop.create_task(self._serve(accepted, ended))
+        arrival = _Arrival(_peer(accepted), self._serving.max_handshake_bytes)
+        leaving = self._waiting.enter(arrival, arrival.peer)
+        if leaving is not None:
+            self._core.metrics.closed["unauthenticated"] += 1
+            leaving.cut()
+
+        def gone() -> None:
+            self._waiting.leave(arrival)
+            ended()
+
+        task = self._loop.create_task(self._serve(accepted, arrival, gone))
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
 
-    async def _serve(self, accepted: socket.socket, ended: Callable[[], None]) -> None:
+    async def _serve(self, accepted: socket.socket, arrival: _Arrival, ended: Callable[[], None]) -> None:
+        judge = partial(self._judge, arrival)
         try:
             await self._connect_accepted_socket(
-                self._loop, lambda: self._protocol(ended, *self._arguments), accepted
+                self._loop,
+                lambda: self._protocol(arrival, ended, None, None, False, judge, *self._arguments),
+                accepted,
             )
         except OSError:
             accepted.close()
             ended()
 
-    def _judge(self, request: Any) -> Any:
+    def _judge(self, arrival: _Arrival, request: Any) -> Any:
         """Answer a handshake; picows would send an exception's text, so none may leave."""
+        self._waiting.leave(arrival)
         try:
-            verdict = self._verdict(request)
+            verdict = self._verdict(arrival, request)
         except Exception as error:  # noqa: BLE001  see above
             self._log.error("defect", at="door", traceback=repr(error))
             verdict = self._door.defect
@@ -107,13 +165,16 @@ class RobotSockets:
         response = self._picows.WSUpgradeResponse.create_101_response(chosen)
         return self._picows.WSUpgradeResponseWithListener(response, self._listener(self._core, verdict))
 
-    def _verdict(self, request: Any) -> Admitted | TurnedAway:
-        headers = request.headers
+    def _verdict(self, arrival: _Arrival, request: Any) -> Admitted | TurnedAway:
+        headers, now = request.headers, self._core.clocks.monotonic()
+        source = self._sources.source(arrival.peer, ",".join(headers.getall("X-Forwarded-For", [])))
+        if self._sources.wait_s(source, now) > 0:
+            return self._door.too_fast
         connection = [word.strip().lower() for word in ",".join(headers.getall("Connection", [])).split(",")]
         if "upgrade" in connection:
             headers["Connection"] = "upgrade"
         offered = ",".join(headers.getall("Sec-WebSocket-Protocol", [])).split(",")
-        return self._door.judge(
+        verdict = self._door.judge(
             path=bytes(request.path),
             authorization=headers.get("Authorization", ""),
             offered=[word.strip() for word in offered],
@@ -121,6 +182,16 @@ class RobotSockets:
             anonymous=self._new_name(),
             now_s=self._core.clocks.wall(),
         )
+        if isinstance(verdict, Admitted) and self._core.rates.rests_s(verdict.robot, now) > 0:
+            return self._door.too_fast
+        return verdict
+
+
+def _peer(accepted: socket.socket) -> str:
+    try:
+        return str(accepted.getpeername()[0])
+    except OSError:
+        return ""  # gone already
 
 
 def _libraries() -> tuple[Any, Any]:
@@ -135,21 +206,29 @@ def _libraries() -> tuple[Any, Any]:
 def _protocol_type(picows: Any) -> Any:
     base = picows.WSProtocol
     get_buffer, buffer_updated, connection_lost = base.get_buffer, base.buffer_updated, base.connection_lost
+    connection_made = base.connection_made
 
     class Protocol(base):  # type: ignore[misc, valid-type]
         """Hands picows nothing behind the first CLOSE, and tells when the socket is gone."""
 
-        def __init__(self, ended: Callable[[], None], *arguments: Any) -> None:
+        def __init__(self, arrival: _Arrival, ended: Callable[[], None], *arguments: Any) -> None:
             super().__init__(*arguments)
+            self._arrival = arrival
             self._ended = ended
             self._border = CloseBorder()
             self._room = memoryview(b"")
+
+        def connection_made(self, transport: Any) -> None:
+            connection_made(self, transport)
+            self._arrival.made(transport)
 
         def get_buffer(self, hint: int) -> memoryview:
             self._room = get_buffer(self, hint)
             return self._room
 
         def buffer_updated(self, n: int) -> None:
+            if not self._border.is_upgraded and self._arrival.is_too_long(n):
+                return
             wanted = self._border.wanted(self._room[:n])
             if wanted and (self.transport is None or not self.transport.is_close_frame_sent):
                 buffer_updated(self, wanted)

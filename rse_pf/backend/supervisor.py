@@ -24,6 +24,7 @@ from typing import Any
 from rse_pf.auth import KeySet
 from rse_pf.backend.control import Answer, Ask, serve_control
 from rse_pf.backend.hand_over import plan
+from rse_pf.backend.limits import Bucket
 from rse_pf.backend.log import JsonLog
 from rse_pf.backend.metrics import merge, merge_isolation, render
 from rse_pf.backend.processes import cpu_seconds, raise_descriptor_limit, resident_bytes
@@ -36,6 +37,7 @@ __all__ = ["serve"]
 _BUILTIN = "rse_pf.services.builtin:builtin_services"
 _ACCEPTS_AT_ONCE = 64
 _ACCEPT_PAUSE_S = 0.1
+_SHORTEST_PAUSE_S = 0.01
 _FRESH_S = 0.25
 _REPORT_S = 0.3
 _LEAVE_S = 3.0
@@ -157,6 +159,8 @@ class _Supervisor:
         self._moving_until = 0.0
         self._signals = 0
         self._refused_full = 0
+        self._accepts = Bucket(settings.serving.accepts_per_s, float(settings.serving.handshake_burst))
+        self._accept_pauses = 0
         self._log = JsonLog(level=settings.serving.log_level, server=server_id, wall_clock=time.time)
         count = settings.serving.workers or len(os.sched_getaffinity(0))
         config = {
@@ -234,23 +238,28 @@ class _Supervisor:
 
     def _accept_some(self) -> None:
         for _ in range(_ACCEPTS_AT_ONCE):
+            wait_s = self._accepts.take(time.monotonic()) if self._accepts.rate > 0 else 0.0
+            if wait_s > 0:
+                self._accept_pauses += 1
+                self._pause_accepting(max(wait_s, _SHORTEST_PAUSE_S))
+                return
             try:
                 accepted, _ = self._listener.accept()
             except BlockingIOError:
                 return
             except OSError as error:  # out of descriptors, or the robot is gone already
                 self._log.warning("accept-failed", reason=str(error))
-                self._pause_accepting()
+                self._pause_accepting(_ACCEPT_PAUSE_S)
                 return
             with accepted:
                 if not any(worker.give(accepted) for worker in sorted(self._workers, key=lambda w: w.load)):
                     self._refused_full += 1
 
-    def _pause_accepting(self) -> None:
-        """The listener stays readable while descriptors are short: do not spin on it."""
+    def _pause_accepting(self, pause_s: float) -> None:
+        """The listener stays readable meanwhile: do not spin on it."""
         loop = asyncio.get_running_loop()
         loop.remove_reader(self._listener.fileno())
-        loop.call_later(_ACCEPT_PAUSE_S, self._resume_accepting)
+        loop.call_later(pause_s, self._resume_accepting)
 
     def _resume_accepting(self) -> None:
         if self._listener.fileno() >= 0:
@@ -355,6 +364,7 @@ class _Supervisor:
                 "cpu_s": self._cpu_s(),
                 "resident_bytes": float(sum(map(resident_bytes, self._pids()))),
                 "ready": float(self._state == "ready"),
+                "accept_pauses": float(self._accept_pauses),
             }
         )
         return Answer(body=render(merged), content_type="text/plain; version=0.0.4; charset=utf-8")

@@ -113,6 +113,7 @@ class _Worker:
             serving=settings.serving,
             session=settings.session,
             most_robots=-(-settings.serving.max_robots // self._workers),
+            workers=self._workers,
             new_name=self._new_name,
             log=self._log,
             loop=loop,

@@ -7,14 +7,15 @@ import logging
 
 from picows import picows
 
-from rse_pf.backend.server import _protocol_type
+from rse_pf.backend.server import _Arrival, _protocol_type
 
 
 def test_the_protocol_takes_the_fifteen_arguments_that_we_give_it():
     async def make() -> object:
         return _protocol_type(picows)(
-            lambda: None, None, None, False, lambda request: None, logging.getLogger("t"), True, 5.0,
-            False, 20.0, 20.0, picows.WSAutoPingStrategy.PING_WHEN_IDLE, False, 1000, None, 2048,
+            _Arrival("127.0.0.1", 8192), lambda: None, None, None, False, lambda request: None,
+            logging.getLogger("t"), True, 5.0, False, 20.0, 20.0, picows.WSAutoPingStrategy.PING_WHEN_IDLE,
+            False, 1000, None, 2048,
         )  # fmt: skip
 
     protocol = asyncio.run(make())

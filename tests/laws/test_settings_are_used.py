@@ -19,9 +19,6 @@ SPELLINGS = {"settings", "limits", "s"}
 OWNERS = Counter(name for _, name in NAMES)
 
 WAITING: dict[str, set[str]] = {
-    "serving": {
-        "max_handshake_bytes", "max_unauthenticated", "max_unauthenticated_per_source", "accepts_per_s",
-    },
     "session": {"max_json_values"},
 }  # fmt: skip
 """Settings whose readers are not written yet; whoever writes one strikes it out here."""

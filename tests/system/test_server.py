@@ -76,7 +76,7 @@ def test_the_door_answers_with_fixed_bodies(start_server):
             {"Authorization": ""},
             {"Authorization": "Basic abc"},
             {"Authorization": f"Bearer {server.token()[:-4]}AAAA"},
-            {"Authorization": "Bearer " + "x" * 9000},
+            {"Authorization": "Bearer " + "x" * 7000},
         )
     ]
 
@@ -293,7 +293,7 @@ def test_a_silent_robot_is_closed(start_server):
 
 
 def test_a_reader_that_does_not_read_is_cut(start_server):
-    server = start_server(serving={"slow_reader_s": 0.3})
+    server = start_server(serving={"slow_reader_s": 0.3}, session={"max_commands_per_s": 0.0})
 
     async def run():
         async with server.robot(max_queue=1, max_size=1 << 20) as robot:
