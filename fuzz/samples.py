@@ -1,0 +1,126 @@
+"""What fuzzing starts from: well-formed messages, frames and problems, the kept corpus, and dear messages.
+
+`DEAR` are messages within every size limit that were built to cost as much as they can.  Promises that what
+is made here is the same on every machine.
+"""
+
+from __future__ import annotations
+
+import zlib
+from functools import cache
+from pathlib import Path
+
+import msgspec
+
+from rse_pf.pnp.problems import DEGENERATE, KINECT, make_degenerate, make_problem
+from rse_pf.services.pnp import make_request
+from rse_pf.wire import Cancel, Command, Failure, Hello, Ping, Result, make_codec
+
+__all__ = ["CORPUS", "DEAR", "LONGEST", "samples"]
+
+CORPUS = Path(__file__).parent / "corpus"
+LONGEST = 262_144
+"""``session.max_message_bytes``: more never reaches a decoder."""
+
+
+@cache
+def samples(target: str) -> tuple[bytes, ...]:
+    """Return the inputs that *target* starts from, the kept corpus last."""
+    kept = [file.read_bytes() for file in sorted((CORPUS / target).glob("*"))]
+    return (*_MADE[target](), *kept)
+
+
+def _messages() -> list[bytes]:
+    problem = make_problem(seed=3, n=12)
+    asked = make_request(problem.points_world, problem.pixels, KINECT)
+    said = (
+        Hello(sdk="fuzz", capabilities=("progress",)), Ping(sent_s=1.5), Cancel(id=3),
+        Command(id=1, service="pnp", payload=asked, stream="camera", seq=4, deadline_ms=200.0, trace="t"),
+        Command(id=2, service="echo", payload={"a": [1, "x", None, {"b": 2.5}]}),
+        Result(id=1, reply=[1.0, 2.0]), Failure(id=2, code="busy", message="m", retry_after_ms=5.0),
+    )  # fmt: skip
+    return [
+        bytes([kind]) + make_codec(name).encode(message)
+        for kind, name in ((0, "bin"), (1, "json"), (2, "zlib"), (3, "json"))
+        for message in said
+    ]
+
+
+def _frames() -> list[bytes]:
+    def frame(opcode: int, payload: bytes, *, fin: bool = True, pause: int = 0) -> bytes:
+        return bytes([opcode | (128 if fin else 0), len(payload), pause]) + payload
+
+    close = (1000).to_bytes(2, "big")
+    talks = (
+        frame(1, b"hello") + frame(9, b"?") + frame(2, b"\xff" * 20) + frame(8, close),
+        frame(1, b"a", fin=False) + frame(0, b"", fin=False) + frame(9, b"") + frame(0, "é".encode()),
+        frame(2, b"", fin=False) + frame(0, b"", fin=False) * 70 + frame(0, b""),
+        frame(9, b"x", pause=2) * 60,
+        bytes([0x80 | 32 | 2, 255, 0]) + frame(10, b"") * 3 + frame(8, close + b"bye"),
+    )
+    return [limits + talk for limits in (b"\x00", b"\xff") for talk in talks]
+
+
+def _streams() -> list[bytes]:
+    small = b"\x82\x83\1\2\3\4abc"
+    long = b"\x82\xfe\x01\x00\0\0\0\0" + b"\x88" * 256
+    huge = b"\x82\xff" + (5_000).to_bytes(8, "big") + b"\0\0\0\0" + b"." * 5_000
+    close = b"\x88\x82\0\0\0\0\x03\xe8"
+    talks = (small + close + b"more", long + small * 3 + close, huge + close + close, close, small * 9)
+    return [bytes([step]) + talk for step in (0, 6, 22) for talk in talks]
+
+
+def _problems() -> list[bytes]:
+    found = []
+    for k, kind in enumerate((*DEGENERATE, "sound")):
+        if kind in ("nan", "infinite", "huge"):
+            continue
+        problem = make_problem(seed=k, n=20) if kind == "sound" else make_degenerate(kind, seed=k, n=20)
+        numbers = problem.points_world.astype("<f8").tobytes() + problem.pixels.astype("<f8").tobytes()
+        found += [bytes([engine, 20, 0, 64, 120, 250, 18, 19]) + numbers for engine in (0, 1)]
+    return found
+
+
+def _json(payload: bytes) -> bytes:
+    return b'{"type":"command","id":1,"service":"echo","payload":' + payload + b"}"
+
+
+def _binary(payload: bytes) -> bytes:
+    start = msgspec.msgpack.encode({"type": "command", "id": 1, "service": "echo"})
+    return bytes([start[0] + 1]) + start[1:] + b"\xa7payload" + payload
+
+
+def _array(item: bytes, count: int) -> bytes:
+    return _binary(b"\xdd" + count.to_bytes(4, "big") + item * count)
+
+
+_COUNT = 24_900
+_KEYS = b",".join(b'"k%d":%d' % (i, i + 1000) for i in range(_COUNT))
+_NUMBERED = b"".join(b"\xcd%c%c\x90" % divmod(i, 256) for i in range(_COUNT))
+
+DEAR: dict[str, tuple[str, bytes]] = {
+    "empty lists": ("bin", _array(b"\x90", 262_000)),
+    "empty maps": ("bin", _array(b"\x80", 262_000)),
+    "small integers": ("bin", _array(b"\x01", 262_000)),
+    "numbers": ("bin", _array(b"\xcb\x3f\xf1\1\1\1\1\1\1", 29_000)),
+    "short numbers": ("bin", _array(b"\xca\x3f\xf1\1\1", 49_000)),
+    "letters": ("bin", _array(b"\xa1a", 130_000)),
+    "byte strings": ("bin", _array(b"\xc4\x01a", 87_000)),
+    "numbered maps": ("bin", _binary(b"\xdf" + _COUNT.to_bytes(4, "big") + _NUMBERED)),
+    "announced list": ("bin", _binary(b"\xdd\x7f\xff\xff\xff")),
+    "announced text": ("bin", _binary(b"\xdb\x7f\xff\xff\xff")),
+    "deep": ("bin", _binary(b"\x91" * 260_000)),
+    "json numbers": ("json", _json(b"[" + b"1.5," * 49_900 + b"1]")),
+    "json words": ("json", _json(b"[" + b'"ab",' * 49_000 + b"1]")),
+    "json lists": ("json", _json(b"[" + b"[]," * 9_900 + b"1]")),
+    "json brackets in words": ("json", _json(b"[" + b'"",' * 80_000 + b'"",' + b"[" * 20 + b"]" * 21)),
+    "json long integers": ("json", _json(b"[" + (b"9" * 4300 + b",") * 55 + b"1]")),
+    "json backslashes": ("json", _json(b'"' + b"\\\\" * 120_000 + b'"')),
+    "deflated keys": ("zlib", zlib.compress(_json(b"{" + _KEYS + b"}"), 9)),
+    "deflated small maps": ("zlib", zlib.compress(_json(b"[" + b'{"a":1},' * 9_900 + b"1]"), 9)),
+    "deflated words": ("zlib", zlib.compress(_json(b"[" + b'"ab",' * 49_000 + b"1]"), 9)),
+    "bomb": ("zlib", zlib.compress(b"[" * 50_000_000, 9)),
+}  # fmt: skip
+"""Name to codec and message."""
+
+_MADE = {"codec": _messages, "frames": _frames, "stream": _streams, "geometry": _problems}

@@ -1,0 +1,214 @@
+"""What must hold for any bytes at all: one function for each place that a stranger's bytes reach.
+
+A target takes bytes and returns; it raises `Finding`, or whatever escaped, when the product is wrong.
+Promises to be deterministic and to touch no socket, file or clock but the processor's.
+"""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from fuzz.meter import Meter
+from rse_pf.backend.frames import CloseBorder, CloseSocket, FrameAssembler, FrameDecision, Received, SendPong
+from rse_pf.errors import InternalError, ProtocolError, RsePfError
+from rse_pf.service import Service, dispatch, request_of
+from rse_pf.services.builtin import builtin_services
+from rse_pf.settings import PlatformSettings, SessionSettings
+from rse_pf.wire import Command, Failure, Result, make_codec
+from rse_pf.wire.envelope import peek
+
+__all__ = ["TARGETS", "Finding", "Target", "codec", "framed", "frames", "geometry", "stream"]
+
+Target = Callable[[bytes, Meter], None]
+
+PLATFORM = PlatformSettings()
+NARROW = SessionSettings(max_message_bytes=2000, max_fragments=4, max_control_per_s=3.0)
+_CONTINUATION, _TEXT, _BINARY, _CLOSE, _PING, _PONG = 0, 1, 2, 8, 9, 10
+
+_CODECS = ("bin", "json", "zlib", "zlib")
+_MADE = {name: make_codec(name, PLATFORM.session) for name in ("bin", "json", "zlib")}
+_SHORT = 8192
+"""Longer payloads are not tried on every service: time is better spent on other inputs."""
+_REGISTRY = builtin_services(PLATFORM)
+_SERVICES: tuple[Service, ...] = tuple(_REGISTRY)
+
+
+class Finding(AssertionError):
+    """The product did what it promises not to do."""
+
+
+def codec(data: bytes, meter: Meter) -> None:
+    """The first byte chooses the codec, the rest is the message; the fourth choice deflates it first.
+
+    Only errors of the protocol leave; what is understood can be said again; a payload becomes a request of
+    a service or an error of ours.
+    """
+    if not data:
+        return
+    kind, body = data[0] % 4, data[1:]
+    spoken = _MADE[_CODECS[kind]]
+    if kind == 3:
+        body = zlib.compress(body, 1)
+    meter.call(lambda sent: peek(spoken, sent), body, ProtocolError)
+    # A robot reads what its own server says: nobody promises that to be cheap.
+    for decode, counted in ((spoken.decode_from_robot, meter), (spoken.decode_from_server, Meter())):
+        message = counted.call(decode, body, ProtocolError)
+        if message is None:
+            continue
+        again = spoken.encode(message)
+        # What is said by us may be longer than what strangers may say.
+        if len(again) <= PLATFORM.session.max_message_bytes and spoken.encode(decode(again)) != again:
+            raise Finding(f"a {type(message).__name__} is not what it was after a second journey")
+        if isinstance(message, Command) and len(body) < _SHORT:
+            _as_requests(message.payload)
+
+
+def _as_requests(payload: Any) -> None:
+    for service in _SERVICES:
+        try:
+            request_of(payload, service)
+        except InternalError as error:
+            raise Finding(f"{service.name} calls a payload a defect") from error
+        except RsePfError:
+            continue
+
+
+def framed(data: bytes) -> list[tuple[int, bool, bool, bytes, float]]:
+    """Read any bytes as frames: opcode, fin, rsv, payload and the time of each."""
+    found, i, now = [], 1, 0.0
+    while i + 3 <= len(data) and len(found) < 300:
+        head, size, pause = data[i], data[i + 1], data[i + 2]
+        size *= 16 if head & 32 else 1
+        i += 3
+        payload = data[i : i + size]
+        i += len(payload)
+        payload += b"." * (size - len(payload))
+        now += pause / 64.0
+        opcode = head & 15
+        found.append((opcode, bool(head & 128), bool(head & 64) and head & 16 != 0, payload, now))
+    return found
+
+
+def frames(data: bytes, meter: Meter) -> None:
+    """Any frames give messages of allowed size, pongs at an allowed rate, or one close with a code."""
+    limits = NARROW if data[:1] < b"\x80" else PLATFORM.session
+    sent = framed(data)
+
+    def conversation(_: bytes) -> list[FrameDecision | None]:
+        assembler = FrameAssembler(limits)
+        return [assembler.receive(*frame) for frame in sent]
+
+    decisions = meter.call(conversation, data, ProtocolError)
+    parts, opened, pongs, over = list[bytes](), 0, list[float](), False
+    for (opcode, fin, rsv, payload, now), decision in zip(sent, decisions, strict=True):
+        if over:
+            _expect(decision is None, f"{decision!r} after the close")
+            continue
+        if opcode in (_TEXT, _BINARY):
+            parts, opened = [payload], opcode
+        elif opcode == _CONTINUATION:
+            parts.append(payload)
+        over = isinstance(decision, CloseSocket)
+        if rsv or opcode not in (_CONTINUATION, _TEXT, _BINARY, _CLOSE, _PING, _PONG):
+            _expect(over, "a frame that RFC 6455 forbids did not end the socket")
+        if isinstance(decision, CloseSocket):
+            _expect(1000 <= decision.code <= 4999, "a close code that nobody may send")
+        elif isinstance(decision, Received):
+            _check_message(decision, parts, opened, limits, fin)
+            parts = []
+        elif isinstance(decision, SendPong):
+            pongs.append(now)
+            _expect(opcode == _PING and decision.data == payload and len(payload) <= 125, "a wrong pong")
+            recent = [at for at in pongs if at > now - 1.0]
+            _expect(len(recent) <= 2 * max(1.0, limits.max_control_per_s), "pongs beyond the rate")
+        else:
+            _expect(decision is None, f"{decision!r} is no decision")
+            _expect(len(parts) <= limits.max_fragments, "more fragments than allowed are held")
+            _expect(sum(map(len, parts)) <= limits.max_message_bytes, "more bytes than allowed are held")
+
+
+def _check_message(
+    message: Received, parts: list[bytes], opened: int, limits: SessionSettings, fin: bool
+) -> None:
+    _expect(fin, "a message ended without its last frame")
+    _expect(message.data == b"".join(parts), "a message is not what its frames held")
+    _expect(message.is_text == (opened == _TEXT), "a message changed its kind")
+    _expect(len(message.data) <= limits.max_message_bytes, "a message above the limit")
+    _expect(len(parts) <= limits.max_fragments, "a message of more fragments than allowed")
+    if message.is_text:
+        message.data.decode()
+
+
+def stream(data: bytes, meter: Meter) -> None:
+    """The end of a conversation is found at the same byte, wherever the network cut the stream."""
+    if len(data) < 2:
+        return
+    step, body = data[0] % 23 + 1, data[1:]
+
+    def taken(pieces: list[memoryview]) -> int:
+        border = CloseBorder(upgraded=True)
+        return sum(border.wanted(piece) for piece in pieces)
+
+    whole = meter.call(lambda sent: taken([memoryview(sent)]), body, ProtocolError)
+    cut = [memoryview(body)[i : i + step] for i in range(0, len(body), step)]
+    _expect(taken(cut) == whole, f"cut each {step} bytes, the stream ends elsewhere")
+
+
+def geometry(data: bytes, meter: Meter) -> None:
+    """Any numbers give a pose that is a motion, or a typed failure; never a defect, nor a line that is ok."""
+    if len(data) < 8:
+        return
+    engine = ("poselib", "opencv", None)[data[0] % 3]
+    n = data[1] % 40
+    numbers = _numbers(data[2] % 3, data[8:], 5 * n)
+    points, pixels = numbers[: 3 * n], numbers[3 * n :]
+    options = {"inlier_px": data[3] / 8.0, "max_iterations": data[4] * 8, "confidence": data[5] / 255.0}
+    camera = {
+        "fx": 500.0 + data[6], "fy": 500.0 + data[7], "cx": 320.0, "cy": 240.0, "width": 640, "height": 480,
+    }  # fmt: skip
+    payload: dict[str, Any] = {"camera": camera, "points_world": points, "pixels": pixels}
+    if data[3]:
+        payload["options"] = options | ({"engine": engine} if engine else {})
+    command = Command(id=1, service="pnp", payload=payload)
+    answer = meter.call(lambda _: dispatch(_REGISTRY, command, lambda: 0.0), data, ProtocolError)
+    if isinstance(answer, Failure):
+        _expect(answer.code != "internal", f"a defect: {answer.message}")
+        return
+    check_pose(answer, np.reshape(points, (-1, 3)))
+
+
+def check_pose(answer: Result, points: np.ndarray) -> None:
+    """Raise `Finding` unless the pose is a motion, and unless no line and no single point is called ok."""
+    reply = answer.reply
+    T = np.asarray(reply.T_camera_world).reshape(4, 4)
+    _expect(bool(np.isfinite(T).all() and np.isfinite(reply.covariance).all()), "a pose that is not finite")
+    _expect(bool(np.abs(T[:3, :3] @ T[:3, :3].T - np.eye(3)).max() < 1e-6), "not a rotation")
+    _expect(bool(np.linalg.det(T[:3, :3]) > 0.0), "a reflection")
+    inliers = points[np.asarray(reply.inliers, dtype=int)]
+    _expect(len(inliers) >= 4, "a pose of fewer than four matches")
+    spread = np.linalg.svd(inliers - inliers.mean(axis=0), compute_uv=False)
+    on_a_line = spread[1] <= 1e-6 * max(spread[0], 1e-300)
+    _expect(not (on_a_line and reply.verdict == "ok"), "points on one line were called ok")
+
+
+def _numbers(kind: int, data: bytes, count: int) -> list[float]:
+    if kind == 0:
+        whole = np.frombuffer(data[: len(data) // 8 * 8], "<f8")
+        found = whole[np.isfinite(whole)]
+    elif kind == 1:
+        found = np.frombuffer(data, np.int8).astype(np.float64)
+    else:
+        found = np.frombuffer(data[: len(data) // 2 * 2], "<i2").astype(np.float64) / 32.0
+    return np.resize(found, count).tolist() if len(found) else [0.0] * count
+
+
+def _expect(holds: bool, otherwise: str) -> None:
+    if not holds:
+        raise Finding(otherwise)
+
+
+TARGETS: dict[str, Target] = {"codec": codec, "frames": frames, "stream": stream, "geometry": geometry}

@@ -1,0 +1,71 @@
+"""Strangers' bytes against the codecs: only our own errors leave, in bounded time and memory (T7, T8)."""
+
+from __future__ import annotations
+
+import itertools
+import subprocess
+import sys
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from fuzz.meter import MOST_MIB, MOST_MS, Meter
+from fuzz.mutations import mutations
+from fuzz.samples import CORPUS, LONGEST, samples
+from fuzz.targets import TARGETS
+from rse_pf.wire import codec
+
+_SLOW_MACHINE = 3.0
+"""The bar is for a quiet core; what is held on a crowded one still tells a tenth of a second from it."""
+
+
+def fuzzed(target: str, *, seed: int, inputs: int) -> Meter:
+    meter, run = Meter(), TARGETS[target]
+    for data in itertools.islice(mutations(samples(target), seed=seed, longest=LONGEST), inputs):
+        run(data, meter)
+    return meter
+
+
+def test_thousands_of_damaged_messages_give_a_message_or_a_protocol_error() -> None:
+    meter = fuzzed("codec", seed=7, inputs=4000)
+
+    assert meter.refusals.keys() <= {"bad-message", "too-large"}
+    assert meter.refusals["bad-message"] > 1000, "the damage did no damage"
+    assert meter.worst_ms < _SLOW_MACHINE * MOST_MS, meter.line()
+    assert meter.worst_mib < MOST_MIB, meter.line()
+
+
+def test_equal_seeds_give_equal_inputs_and_others_do_not() -> None:
+    def inputs(seed: int) -> list[bytes]:
+        return list(itertools.islice(mutations(samples("codec"), seed=seed, longest=LONGEST), 300))
+
+    assert inputs(1) == inputs(1)
+    assert inputs(1) != inputs(2)
+    assert all(len(data) <= LONGEST for data in inputs(1))
+
+
+def test_a_decoder_that_lets_a_foreign_error_out_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(codec, "_guarded", lambda decode, data: decode(data))
+
+    with pytest.raises(msgspec.DecodeError):
+        fuzzed("codec", seed=7, inputs=4000)
+
+
+def test_every_target_keeps_a_corpus() -> None:
+    assert {target: bool(list((CORPUS / target).glob("*"))) for target in TARGETS} == dict.fromkeys(
+        TARGETS, True
+    )
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(180)
+@pytest.mark.parametrize("target", ["codec", "frames", "stream"])
+def test_a_minute_of_fuzzing_finds_nothing(target: str, repository: Path, tmp_path: Path) -> None:
+    pytest.importorskip("atheris", reason="atheris has no wheel for this Python")
+    command = [sys.executable, "-m", "fuzz", target, "--engine", "atheris", "--found", str(tmp_path)]
+
+    done = subprocess.run(command, cwd=repository, capture_output=True, text=True, check=False)
+
+    print(done.stderr[-1500:])
+    assert done.returncode == 0, done.stderr[-3000:]

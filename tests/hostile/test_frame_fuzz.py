@@ -1,0 +1,77 @@
+"""Any frames at all: messages of allowed size, pongs at an allowed rate, or one close (T13)."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from fuzz.meter import Meter
+from fuzz.mutations import mutations
+from fuzz.samples import LONGEST, samples
+from fuzz.targets import TARGETS, Finding
+from rse_pf.backend import frames as frame_layer
+from rse_pf.backend.frames import CloseBorder, FrameAssembler
+
+
+def fuzzed(target: str, *, seed: int, inputs: int) -> Meter:
+    meter, run = Meter(), TARGETS[target]
+    for data in itertools.islice(mutations(samples(target), seed=seed, longest=LONGEST), inputs):
+        run(data, meter)
+    return meter
+
+
+@pytest.mark.parametrize(("target", "inputs"), [("frames", 5000), ("stream", 200)])
+def test_thousands_of_damaged_conversations_keep_the_rules(target: str, inputs: int) -> None:
+    assert fuzzed(target, seed=5, inputs=inputs).worst_mib < 1.0
+
+
+@given(data=st.binary(max_size=600))
+@settings(max_examples=400)
+def test_random_frames_keep_the_rules(data: bytes) -> None:
+    for target in ("frames", "stream"):
+        TARGETS[target](data, Meter())
+
+
+def _endless(self: FrameAssembler, fin: bool, payload: bytes) -> Any:
+    if self._message is None:
+        return self._close(1002, "nothing to continue")
+    self._message.append(payload)
+    if not fin:
+        return None
+    whole, self._message = b"".join(self._message), None
+    return self._finish(self._opcode, whole)
+
+
+_read_head = CloseBorder._read_head
+
+
+def _forgetful(self: CloseBorder, data: memoryview, i: int) -> int:
+    self._head = b""
+    return _read_head(self, data, i)
+
+
+WRONG: dict[str, tuple[str, type[Any], str, Callable[..., Any]]] = {
+    "fragments are not counted": ("frames", FrameAssembler, "_continue", _endless),
+    "control frames have no rate": ("frames", FrameAssembler, "_may_control", lambda self, now: True),
+    "a close is forgotten": (
+        "frames", FrameAssembler, "_close",
+        lambda self, code, reason: frame_layer.CloseSocket(code, reason),
+    ),
+    "a head that is cut is read as if it were whole": (
+        "stream", CloseBorder, "_read_head", _forgetful,
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_a_wrong_frame_layer_is_found(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    target, kind, method, wrong = WRONG[name]
+    monkeypatch.setattr(kind, method, wrong)
+
+    with pytest.raises(Finding):
+        fuzzed(target, seed=5, inputs=1000)
