@@ -104,7 +104,7 @@ class SessionSettings:
     max_fragments: int = setting(64, doc="fragments of one message, empty ones included", source="GHSA-96hv-2xvq-fx4p", low=1)
     max_json_depth: int = setting(16, unit="levels", doc="nesting of a JSON message", low=4, high=200)
     max_json_lists: int = setting(10000, doc="lists and objects of a message, at any depth", low=16)
-    max_json_values: int = setting(50000, doc="numbers, words, lists and objects of a robot's message outside of raw arrays", low=64)
+    max_json_values: int = setting(50000, doc="values of a robot's message outside of raw arrays; a list counts as three, an object as six", low=64)
     max_bad_messages: int = setting(10, unit="messages", doc="undecodable messages of one socket before it is closed", low=0)
     max_control_per_s: float = setting(10.0, unit="frames/s", doc="control frames of one socket", low=1)
     max_in_flight: int = setting(8, unit="commands", doc="unanswered commands of one robot", low=1)

@@ -18,6 +18,7 @@ from rse_pf.errors import BadMessage, LimitExceeded, RsePfError, UnsupportedProt
 from rse_pf.settings import SessionSettings
 from rse_pf.wire import arrays
 from rse_pf.wire.messages import FromRobot, FromServer, Message
+from rse_pf.wire.packed import LIST_VALUES, MAP_VALUES, check_packed, too_many_values
 
 __all__ = ["CODECS", "SUBPROTOCOLS", "Codec", "as_type", "codec_for", "make_codec"]
 
@@ -38,9 +39,11 @@ _LEVEL = 6
 _REPLY_LEVEL, _REPLY_WINDOW_BITS, _REPLY_MEMORY = 1, 12, 5
 """A server's messages are short: level 6 saves 5 of 794 bytes and costs a third more time."""
 
+_PIECE_BYTES = 65536
 _NOT_BRACKETS = bytes(set(range(256)) - set(b"[]{}"))
 _BOXES = frozenset((dict, list, tuple))
 _NOT_BRACKETS_OR_QUOTES = bytes(set(range(256)) - set(b'[]{}"'))
+_NOT_MARKS_OR_QUOTES = bytes(set(range(256)) - set(b',:[]{}"'))
 
 
 class Codec(Protocol):
@@ -105,7 +108,9 @@ class _JsonCodec:
         return stream.compress(data) + stream.flush()
 
     def decode_from_robot(self, data: bytes) -> FromRobot:
-        message: FromRobot = _guarded(self._from_robot, self._open(data))
+        text = self._open(data)
+        _check_values(text, self._limits.max_json_values)
+        message: FromRobot = _guarded(self._from_robot, text)
         return message
 
     def decode_from_server(self, data: bytes) -> FromServer:
@@ -134,6 +139,7 @@ class _BinaryCodec:
 
     def decode_from_robot(self, data: bytes) -> FromRobot:
         _check_size(data, self._limits)
+        check_packed(data, self._limits)
         message: FromRobot = _guarded(self._from_robot, data)
         _check_nesting(getattr(message, "payload", None), self._limits.max_json_depth)
         return message
@@ -205,11 +211,24 @@ def _check_boxes(text: bytes, limits: SessionSettings) -> None:
         return
     if count <= most and _depth(text.translate(None, _NOT_BRACKETS)) <= deepest:
         return
-    brackets = _without_strings(text)
+    brackets = _without_strings(text, _NOT_BRACKETS_OR_QUOTES)
     if brackets.count(b"[") + brackets.count(b"{") > most:
         raise LimitExceeded(f"JSON of more than {most} lists and objects", hint="send flat lists of numbers")
     if _depth(brackets) > deepest:
         raise LimitExceeded(f"JSON is nested deeper than {deepest}", hint="send flat lists")
+
+
+def _check_values(text: bytes, most: int) -> None:
+    """Count values before any is made; only where they look too many are strings told apart."""
+    if _values(text) < most:
+        return
+    if _values(_without_strings(text, _NOT_MARKS_OR_QUOTES)) >= most:
+        raise too_many_values(most)
+
+
+def _values(text: bytes) -> int:
+    boxes = LIST_VALUES * text.count(b"[") + MAP_VALUES * text.count(b"{")
+    return text.count(b",") + text.count(b":") + boxes
 
 
 def _depth(brackets: bytes) -> int:
@@ -217,13 +236,16 @@ def _depth(brackets: bytes) -> int:
     return int(np.cumsum(np.where(opening, np.int8(1), np.int8(-1)), dtype=np.int32).max(initial=0))
 
 
-def _without_strings(text: bytes) -> bytes:
-    marks = text.replace(b"\\\\", b"").replace(b'\\"', b"").translate(None, _NOT_BRACKETS_OR_QUOTES)
-    signs: npt.NDArray[np.uint8] = np.frombuffer(marks, np.uint8)
-    quotes = signs == ord('"')
-    inside = np.logical_xor.accumulate(quotes)
-    outside: npt.NDArray[np.uint8] = signs[~(inside | quotes)]
-    return outside.tobytes()
+def _without_strings(text: bytes, dropped: bytes) -> bytes:
+    marks = text.replace(b"\\\\", b"").replace(b'\\"', b"").translate(None, dropped)
+    kept, is_inside = [], False
+    for begin in range(0, len(marks), _PIECE_BYTES):
+        signs: npt.NDArray[np.uint8] = np.frombuffer(marks[begin : begin + _PIECE_BYTES], np.uint8)
+        quotes = signs == ord('"')
+        inside = np.logical_xor.accumulate(quotes) ^ is_inside
+        kept.append(signs[~(inside | quotes)].tobytes())
+        is_inside = bool(inside[-1])
+    return b"".join(kept)
 
 
 def _check_nesting(value: Any, deepest: int) -> None:
