@@ -87,6 +87,8 @@ class ServingSettings:
     queue_target_ms: float = setting(50.0, unit="ms", doc="waiting time above which the server counts as behind", source="CoDel, Nichols and Jacobson 2012", low=1)
     queue_interval_ms: float = setting(100.0, unit="ms", doc="behind for this long, the server sheds", source="CoDel, Nichols and Jacobson 2012", low=1)
     queue_per_robot: int = setting(8, unit="commands", doc="commands of one robot that wait; more are refused", low=1)
+    objects_per_command: int = setting(64, doc="stored objects that one command may name in the place of bytes", low=0)
+    object_bytes_per_command: int = setting(134217728, unit="bytes", doc="of all objects that one command names", low=1024)
     size: float = setting(0.0, unit="cores", doc="emulated size of each worker in CPU seconds per second; 0 is off", low=0, high=64)
     size_burst_ms: float = setting(20.0, unit="ms", doc="CPU time an emulated server may run ahead", low=1)
     drain_wait_s: float = setting(1.0, unit="s", doc="not ready, but still accepting, before robots are moved", low=0)
