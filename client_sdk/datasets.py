@@ -22,7 +22,7 @@ from client_sdk.mapping import Trajectory, read_trajectory
 from rse_pf.errors import InvalidCamera, MissingExtra, UsageError
 from rse_pf.geometry import Camera
 
-__all__ = ["Dataset", "associate_stamps", "open_dataset"]
+__all__ = ["Dataset", "associate_stamps", "open_dataset", "read_colour"]
 
 _MAX_STAMP_DIFFERENCE_S = 0.02
 _MAX_RAW_STAMP_DIFFERENCE_S = 0.05
@@ -108,6 +108,16 @@ def open_dataset(path: Path, *, scene: str | None = None) -> Dataset:
     if not (path / "rgb.txt").exists() and any(path.glob("d-*.pgm")):
         return _open_raw(path)
     return _open_tum(path)
+
+
+def read_colour(path: Path) -> npt.NDArray[np.uint8]:
+    """Return a colour image ``(h, w, 3)``, red first, as it is in its file.
+
+    Raises:
+        UsageError: It is no image.
+        MissingExtra: OpenCV is not installed.
+    """
+    return _read_image(path, is_depth=False)
 
 
 def associate_stamps(

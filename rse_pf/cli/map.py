@@ -1,11 +1,15 @@
-"""List, show, compare, roll back and export the maps that robots share.
+"""Work with the maps that robots share: look at them, merge them, find a camera in them, go back.
 
-Works on the store itself (--store, by default data.store).  A VERSION is head, or six or more digits of
-an id; show --all lists the ids.  rollback lets the head name an earlier version and deletes nothing.
+Works on the store itself (--store, by default data.store; rse-pf local keeps its own in STATE/objects).  A
+VERSION is head, or six or more digits of an id; show --all lists the ids.  rollback lets the head name an
+earlier version and deletes nothing.  Each action has a page of its own: rse-pf map merge --help.
 
 examples:
   rse-pf map list --store dir:objects
   rse-pf map show kitchen --store dir:objects --png kitchen.png
+  rse-pf map merge robot-1 robot-2 robot-3 --into kitchen --store dir:objects
+  rse-pf map localise kitchen recordings/kitchen:0-40 --store dir:objects
+  rse-pf map view kitchen --out kitchen.png --store dir:objects
   rse-pf map diff kitchen 3f9bd1 head --store dir:objects
   rse-pf map export kitchen --format ply --out kitchen.ply --store dir:objects
 """
@@ -13,8 +17,10 @@ examples:
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
 import os
+import threading
 import time
 from collections import Counter
 from pathlib import Path
@@ -32,6 +38,17 @@ from rse_pf.settings import PlatformSettings
 __all__ = ["add_arguments", "run"]
 
 _SHORT = 12
+_ACTIONS = {
+    "list": ("list the maps", "list"),
+    "show": ("show a version: what is in it, and where it came from", "show kitchen --png kitchen.png"),
+    "view": ("draw a version, or walk around in it in the browser", "view kitchen --out kitchen.png"),
+    "merge": ("make one map of several, or close the loops of one", "merge robot-1 robot-2 --into kitchen"),
+    "localise": ("find where frames were taken in a map", "localise kitchen frame.png"),
+    "diff": ("show what differs between two versions", "diff kitchen 3f9bd1 head"),
+    "rollback": ("let the head name an earlier version", "rollback kitchen 3f9bd1"),
+    "export": ("write a version for another program", "export kitchen --format ply --out kitchen.ply"),
+}
+"""Name, one line of help, and an example."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -42,23 +59,28 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     common.add_argument("--tenant", default="default", help="whose maps (default: %(default)s)")
     common.add_argument("--json", action="store_true", help="print JSON")
     made = {
-        name: actions.add_parser(name, parents=[common], help=text, description=text)
-        for name, text in {
-            "list": "list the maps",
-            "show": "show a version: what is in it, and where it came from",
-            "diff": "show what differs between two versions",
-            "rollback": "let the head name an earlier version",
-            "export": "write a version for another program",
-        }.items()
-    }
-    for name in ("show", "diff", "rollback", "export"):
+        name: actions.add_parser(
+            name, parents=[common], help=text, description=f"{text[0].upper()}{text[1:]}.",
+            epilog=f"example:\n  rse-pf map {example} --store dir:objects",
+            formatter_class=argparse.RawDescriptionHelpFormatter,
+        )
+        for name, (text, example) in _ACTIONS.items()
+    }  # fmt: skip
+    for name in ("show", "view", "diff", "rollback", "export", "localise"):
         made[name].add_argument("name", metavar="MAP", help="name of the map")
-    for name in ("show", "export"):
+    for name in ("show", "view", "export"):
         made[name].add_argument(
             "version", nargs="?", default="head", metavar="VERSION", help="default: %(default)s"
         )
     made["show"].add_argument("--all", action="store_true", help="list every version")
     made["show"].add_argument("--png", type=Path, metavar="FILE", help="draw the map there")
+    made["view"].add_argument("--out", type=Path, metavar="FILE", help="the picture (default: MAP.png)")
+    made["view"].add_argument(
+        "--browser",
+        action="store_true",
+        help='walk around in it in the browser (extra "view"); Ctrl-C ends it',
+    )
+    made["view"].add_argument("--port", type=int, default=8080, help="of the browser's page (default: 8080)")
     made["diff"].add_argument("before", metavar="BEFORE", help="a version")
     made["diff"].add_argument(
         "after", nargs="?", default="head", metavar="AFTER", help="default: %(default)s"
@@ -67,6 +89,25 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     made["export"].add_argument("--format", choices=tuple(FORMATS), required=True, help="which program's")
     made["export"].add_argument("--out", type=Path, required=True, metavar="FILE", help="where to")
     made["export"].add_argument("--robot", help="tum: this robot's keyframes only")
+    merge, localise = made["merge"], made["localise"]
+    merge.add_argument(
+        "names", nargs="+", metavar="MAP", help="MAP or MAP@VERSION; the first one's world is kept; "
+        "of one map alone the loops are closed",
+    )  # fmt: skip
+    merge.add_argument("--into", required=True, metavar="NAME", help="the map that gets a new version")
+    merge.add_argument("--note", default="", help="what is written beside the version")
+    localise.add_argument(
+        "frames",
+        nargs="+",
+        metavar="FRAME",
+        help="an image, a recording, RECORDING:ROW or RECORDING:FIRST-LAST",
+    )
+    localise.add_argument("--every", type=int, default=1, metavar="N", help="only every n-th of them")
+    localise.add_argument(
+        "--camera",
+        metavar="FX,FY,CX,CY",
+        help="of images, pixels (default: the map's, if the size is the same)",
+    )
 
 
 def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
@@ -75,9 +116,28 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
     if chosen.data.store == "memory:":
         raise UsageError("maps in memory belong to another process", hint="name --store dir:PATH")
     maps = MapRegistry(open_any_store(chosen), args.tenant, most_bytes=4 * chosen.data.max_object_bytes)
-    actions = {"list": _list, "show": _show, "diff": _diff, "rollback": _rollback, "export": _export}
+    if args.action in ("merge", "localise"):
+        return _work(args, maps, chosen)
+    actions = {
+        "list": _list,
+        "show": _show,
+        "view": _view,
+        "diff": _diff,
+        "rollback": _rollback,
+        "export": _export,
+    }
     actions[args.action](args, maps)
     return 0
+
+
+def _work(args: argparse.Namespace, maps: MapRegistry, settings: PlatformSettings) -> int:
+    from rse_pf.cli import map_work
+
+    if args.action == "merge":
+        return map_work.merge_into(args, maps, settings.services)
+    if args.every < 1:
+        raise UsageError(f"--every {args.every} is below 1", hint="1 takes every frame")
+    return map_work.localise_frames(args, maps, settings.services)
 
 
 def _list(args: argparse.Namespace, maps: MapRegistry) -> None:
@@ -124,6 +184,27 @@ def _show(args: argparse.Namespace, maps: MapRegistry) -> None:
         _draw(args, maps, record)
 
 
+def _view(args: argparse.Namespace, maps: MapRegistry) -> None:
+    record = maps.record(args.name, args.version)
+    if args.browser:
+        from rse_pf.experiments.map_browser import browse_map
+
+        version = maps.load(args.name, record.id)
+        with contextlib.suppress(KeyboardInterrupt):
+            browse_map(version, args.port, _say_page, threading.Event())
+        return
+    args.png = args.out or Path(f"{args.name}.png")
+    _draw(args, maps, record)
+    if args.json:
+        _print_json({"file": str(args.png), "id": record.id})
+    else:
+        print(f"{args.png}: {args.name}, version {record.number}")
+
+
+def _say_page(url: str) -> None:
+    print(f"{url}  (Ctrl-C ends it)", flush=True)
+
+
 def _diff(args: argparse.Namespace, maps: MapRegistry) -> None:
     found = difference(maps.load(args.name, args.before), maps.load(args.name, args.after))
     if args.json:
@@ -160,6 +241,8 @@ def _export(args: argparse.Namespace, maps: MapRegistry) -> None:
 def _draw(args: argparse.Namespace, maps: MapRegistry, record: MapRecord) -> None:
     from rse_pf.experiments.map_picture import PathOfRobot, draw_map
 
+    if not args.png.absolute().parent.is_dir():
+        raise UsageError(f"there is no folder {args.png.absolute().parent}", hint="make it")
     version = maps.load(args.name, record.id)
     if not version.keyframes:
         raise UsageError("a map without keyframes cannot be drawn", hint="export its cloud as ply")
@@ -167,7 +250,7 @@ def _draw(args: argparse.Namespace, maps: MapRegistry, record: MapRecord) -> Non
     for robot in record.robots:
         own = sorted((k for k in version.keyframes if k.robot == robot), key=lambda k: k.timestamp_s)
         robots.append(PathOfRobot(name=robot, T_world_camera=np.stack([k.T_world_camera for k in own])))
-    caption = f"{args.name}, version {record.number}: {record.keyframes} keyframes, {record.points} points"
+    caption = f"{args.name}, version {record.number}: {record.keyframes} keyframes, {record.points:,} points"
     draw_map(args.png, version.points, version.colours, robots, caption)
 
 

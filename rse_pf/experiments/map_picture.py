@@ -17,12 +17,12 @@ import numpy.typing as npt
 from rse_pf.errors import MissingExtra
 from rse_pf.geometry import Array
 
-__all__ = ["PathOfRobot", "draw_map"]
+__all__ = ["COLOURS", "PathOfRobot", "draw_map"]
 
 _WIDTH, _HEIGHT, _CAPTION, _MARGIN = 1600, 900, 64, 40
 _BACKGROUND, _INK, _WHITE = (228, 231, 236), (30, 34, 42), (255, 255, 255)
 """Not white: white walls and tables must be told from places that nobody saw."""
-_COLOURS = ((0, 114, 178), (213, 94, 0), (0, 158, 115), (204, 121, 167), (230, 159, 0), (86, 180, 233))
+COLOURS = ((0, 114, 178), (213, 94, 0), (0, 158, 115), (204, 121, 167), (230, 159, 0), (86, 180, 233))
 """Apart for colour-blind eyes, too; Okabe and Ito 2008."""
 _MOST_LABELS = 8
 """More robots than this have their names in the legend only."""
@@ -65,7 +65,9 @@ def draw_map(
     draw = draw_module.Draw(image)
     big, small = font_module.load_default(size=26), font_module.load_default(size=20)
     for number, robot in enumerate(robots):
-        _draw_path(draw, view, robot, _COLOURS[number % len(_COLOURS)])
+        _draw_path(draw, view, robot, COLOURS[number % len(COLOURS)])
+    for number, robot in enumerate(robots):
+        _draw_ends(draw, view, robot, COLOURS[number % len(COLOURS)])
     if 1 < len(robots) <= _MOST_LABELS:
         for robot, place in zip(robots, _label_places(view, robots), strict=True):
             draw.text(
@@ -169,10 +171,16 @@ def _draw_path(draw: Any, view: _Observer, robot: PathOfRobot, colour: tuple[int
     draw.line(line, fill=colour, width=5, joint="curve")
     for pose in _spaced(robot.T_world_camera):
         _draw_camera(draw, view, pose, colour)
-    (x0, y0), (x1, y1) = line[0], line[-1]
-    draw.ellipse([x0 - 9, y0 - 9, x0 + 9, y0 + 9], fill=colour, outline=(255, 255, 255), width=3)
-    draw.ellipse([x1 - 11, y1 - 11, x1 + 11, y1 + 11], outline=(255, 255, 255), width=8)
-    draw.ellipse([x1 - 10, y1 - 10, x1 + 10, y1 + 10], outline=colour, width=5)
+
+
+def _draw_ends(draw: Any, view: _Observer, robot: PathOfRobot, colour: tuple[int, int, int]) -> None:
+    """Draw start and end; the ring is so wide that another robot's start within it leaves it in sight."""
+    if not len(robot.T_world_camera):
+        return
+    (x0, y0), (x1, y1) = view.project(robot.T_world_camera[[0, -1], :3, 3])
+    draw.ellipse([x1 - 16, y1 - 16, x1 + 16, y1 + 16], outline=_WHITE, width=9)
+    draw.ellipse([x1 - 14, y1 - 14, x1 + 14, y1 + 14], outline=colour, width=5)
+    draw.ellipse([x0 - 9, y0 - 9, x0 + 9, y0 + 9], fill=colour, outline=_WHITE, width=3)
 
 
 def _label_places(view: _Observer, robots: list[PathOfRobot]) -> list[tuple[float, float]]:
@@ -208,7 +216,7 @@ def _draw_legend(draw: Any, robots: list[PathOfRobot], font: Any, most_px: float
         if left + 46 + length > most_px:
             draw.text((left, y), f"and {len(robots) - number} more", fill=_INK, font=font, anchor="lm")
             return
-        draw.line([(left, y), (left + 36, y)], fill=_COLOURS[number % len(_COLOURS)], width=6)
+        draw.line([(left, y), (left + 36, y)], fill=COLOURS[number % len(COLOURS)], width=6)
         draw.text((left + 46, y), label, fill=_INK, font=font, anchor="lm")
         left += 76 + length
 

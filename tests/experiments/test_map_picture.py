@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rse_pf.experiments.map_picture import _BACKGROUND, _COLOURS, PathOfRobot, draw_map
+from rse_pf.experiments.map_picture import _BACKGROUND, COLOURS, PathOfRobot, draw_map
 
 image = pytest.importorskip("PIL.Image")
 
@@ -47,7 +47,7 @@ def test_leaves_the_ceiling_out_because_it_hides_the_room(tmp_path):
 def test_draws_the_path_of_the_robot(tmp_path):
     points = plane(y=1.0)
     picture = draw(tmp_path, points, np.full((len(points), 3), 128, dtype=np.uint8))
-    assert count(picture[64:836], _COLOURS[0]) > 300
+    assert count(picture[64:836], COLOURS[0]) > 300
 
 
 def test_an_empty_map_is_an_empty_picture(tmp_path):

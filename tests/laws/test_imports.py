@@ -64,6 +64,7 @@ PACKAGES: dict[str, tuple[str, ...]] = {
     "cdk_nag": ("stacks/", "app.py"),
     "matplotlib": ("rse_pf/experiments/pictures.py",),
     "PIL": ("rse_pf/experiments/map_picture.py",),
+    "viser": ("rse_pf/experiments/map_browser.py",),
     "rich": ("rse_pf/cli/", "rse_pf/experiments/"),
     "lupa": ("rse_pf/services/",),
     "gtsam": ("rse_pf/services/optimise.py",),
