@@ -93,6 +93,7 @@ class Trust:
         self._keys_file = keys_file
         self._store = DirectoryStore(keys_file.parent)
         self._parts: dict[str, str] = {}
+        self._found: set[str] = set()
 
     def look(self) -> bool:
         """Read what there is; return whether it changed.  What cannot be read stays as it was known."""
@@ -106,16 +107,16 @@ class Trust:
             try:
                 text = read()
             except NotFound as error:
-                if name == "keys" or name in parts:  # what was there once has not become empty
+                if name == "keys" or name in self._found:  # what was there once has not become empty
                     self.problem = f"{name}: {error.message}"
                 else:
-                    text = "{}"
-                    parts[name] = text
+                    parts[name] = "{}"
                 continue
             except (RsePfError, OSError, UnicodeDecodeError) as error:
                 self.problem = f"{name}: {error}"[:200]
                 continue
             parts[name] = text
+            self._found.add(name)
         if parts == self._parts or len(parts) < 3:
             return False
         self._parts = parts

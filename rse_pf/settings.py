@@ -206,6 +206,7 @@ class AuthSettings:
     leeway_s: int = setting(30, unit="s", doc="clock difference that is forgiven", low=0, high=300)
     max_token_bytes: int = setting(4096, unit="bytes", doc="a longer token is refused unread", low=512)
     required: bool = setting(True, doc="robots without a token are refused")
+    deny_list_refresh_s: float = setting(0.5, unit="s", doc="time between two looks of a server at revoked tokens, disabled and enrolled robots", source="live sockets end within 2 s", low=0.05, high=30)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

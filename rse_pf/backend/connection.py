@@ -10,9 +10,11 @@ from typing import TYPE_CHECKING
 
 from rse_pf.backend.frames import CloseSocket, FrameAssembler, Received, SendPong
 from rse_pf.backend.seams import Wire
-from rse_pf.wire.session import Decision, Send, ServerSession, Submit, Withdraw
+from rse_pf.enrolment import holds
+from rse_pf.wire.session import Decision, Renewal, Send, ServerSession, Submit, Withdraw
 
 if TYPE_CHECKING:
+    from rse_pf.auth import Claims
     from rse_pf.backend.core import Core
 
 __all__ = ["Connection"]
@@ -22,8 +24,8 @@ class Connection:
     """One robot's socket between its handshake and its end."""
 
     __slots__ = (
-        "_core", "_wire", "allowed_s", "assembler", "expires_s", "last_heard_s", "opened_s", "robot",
-        "session",
+        "_core", "_wire", "allowed_s", "assembler", "claims", "expires_s", "last_heard_s", "moving_until_s",
+        "number", "opened_s", "robot", "session", "tenant",
     )  # fmt: skip
 
     def __init__(
@@ -36,12 +38,18 @@ class Connection:
         expires_s: float | None,
     ) -> None:
         self.robot = robot
+        self.tenant = "default"
         self.session = session
         self.assembler = FrameAssembler(core.settings.session)
         self.opened_s = self.last_heard_s = now
         self.expires_s = expires_s
         self.allowed_s: float | None = None
         """What the last command allowed, from its arrival to its deadline."""
+        self.claims: Claims | None = None
+        """What the robot's token says; None where no token is asked for."""
+        self.number = 0
+        """Which socket of the server this is, in the order of acceptance."""
+        self.moving_until_s = float("-inf")
         self._core = core
         self._wire = wire
 
@@ -66,9 +74,14 @@ class Connection:
         """Whether the robot said Hello and can be asked to leave for another server."""
         return self.session is not None and self.session.state == "open" and not self.assembler.closed
 
+    def may_use(self, service: str) -> bool:
+        """Whether the scopes of the robot's token allow *service*."""
+        return self.claims is None or holds(self.claims.scopes, f"services:{service}")
+
     def move(self, reason: str, within_ms: float, now: float) -> None:
         """Ask the robot to leave for another server."""
         if self.session is not None:
+            self.moving_until_s = now + within_ms / 1e3
             self.apply(self.session.move(reason, within_ms), now)
 
     def apply(self, decisions: list[Decision], now: float, size_bytes: int = 0) -> None:
@@ -76,6 +89,8 @@ class Connection:
         for decision in decisions:
             if isinstance(decision, Submit):
                 self._core.submit(self, decision.command, size_bytes, now)
+            elif isinstance(decision, Renewal):
+                self._core.renew(self, decision.token)
             elif isinstance(decision, Send):
                 self.write(decision.data)
             elif isinstance(decision, Withdraw):

@@ -11,7 +11,7 @@ from __future__ import annotations
 import traceback
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 
@@ -25,10 +25,10 @@ from rse_pf.backend.metrics import LongestRecently, Metrics
 from rse_pf.backend.scheduler import BEHIND, BEHIND_HINT, Job, Refusal, Scheduler
 from rse_pf.backend.seams import Clocks, Handle, Loop, Wire
 from rse_pf.backend.size_gate import SizeGate
-from rse_pf.errors import Busy, InternalError, LimitExceeded, UnknownService
+from rse_pf.errors import Busy, Forbidden, InternalError, LimitExceeded, UnknownService
 from rse_pf.service import Kind, Registry, Service, dispatch, failure_of
 from rse_pf.settings import PlatformSettings
-from rse_pf.wire import CODECS, Codec, Command, Failure, Result, make_codec
+from rse_pf.wire import CODECS, Codec, Command, Failure, Progress, Result, make_codec
 from rse_pf.wire.envelope import encode_refusal, peek
 from rse_pf.wire.session import (
     CLOSE_GOING_AWAY,
@@ -37,6 +37,10 @@ from rse_pf.wire.session import (
     CLOSE_TOKEN_OVER,
     ServerSession,
 )
+
+if TYPE_CHECKING:
+    from rse_pf.backend.jobs import Jobs
+    from rse_pf.backend.revocation import Standing
 
 __all__ = ["Core"]
 
@@ -96,6 +100,10 @@ class Core:
         self._executors: dict[Kind, Executor] = {"stateless": self._threads}
         self.environments: Environments | None = None
         """Of installed services; set by whoever can make processes."""
+        self.jobs: Jobs | None = None
+        """For long services; set by whoever can make processes."""
+        self.standing: Standing | None = None
+        """What the connections' tokens are worth; set by whoever can hear of it."""
         self._gate_timer: Handle | None = None
         self._ran_inline = False
         self._sweep_timer: Handle | None = None
@@ -111,8 +119,8 @@ class Core:
         isolated = 0 if self.environments is None else self.environments.held
         return self._scheduler.waiting + self._scheduler.running + isolated
 
-    def connect(self, wire: Wire, admitted: Admitted) -> Connection:
-        """Return the connection of a robot whose handshake is done."""
+    def connect(self, wire: Wire, admitted: Admitted, number: int = 0) -> Connection:
+        """Return the connection of a robot whose handshake is done; *number* says which socket it is."""
         now = self.clocks.monotonic()
         session = None
         if admitted.codec:
@@ -127,7 +135,12 @@ class Core:
         if admitted.expires_s is not None:
             expires_s = now + admitted.expires_s - self.clocks.wall()
         connection = Connection(self, wire, session, admitted.robot, now, expires_s)
+        connection.tenant, connection.claims, connection.number = admitted.tenant, admitted.claims, number
+        if session is not None:
+            session.ends_s = expires_s
         self.connections.add(connection)
+        if self.standing is not None:
+            self.standing.connected(connection)
         if self.environments is not None:
             self.environments.connected(connection.robot)
         return connection
@@ -137,6 +150,10 @@ class Core:
         if connection in self.connections and self.environments is not None:
             self.environments.disconnected(connection.robot)
         self.connections.discard(connection)
+        if self.standing is not None:
+            self.standing.left(connection)
+        if self.jobs is not None:
+            self.jobs.left(connection)
         for job in self._scheduler.leave(connection):
             self.metrics.requests[self._label(job.command.service), "disconnected"] += 1
         self._log.debug("disconnected", robot=connection.robot)
@@ -144,12 +161,16 @@ class Core:
     def welcomed(self, connection: Connection, now: float) -> None:
         """Note that a robot said Hello; while the server leaves, ask the robot to move at once."""
         self._log.debug("connected", robot=connection.robot)
+        if self.standing is not None:
+            self.standing.arrived(connection)
         if self._move is not None:
             connection.move(*self._move, now)
 
     def move_all(self, reason: str, within_ms: float) -> None:
         """Ask every robot, now and from now on, to leave for another server."""
         self._move = (reason, within_ms)
+        if self.jobs is not None:
+            self.jobs.give_up()
         now = self.clocks.monotonic()
         for connection in list(self.connections):
             connection.move(reason, within_ms, now)
@@ -160,6 +181,8 @@ class Core:
             connection.close(CLOSE_GOING_AWAY, "leaving")
         for executor in self._executors.values():
             executor.close()
+        if self.jobs is not None:
+            self.jobs.close()
         if self.environments is not None:
             self.environments.close()
 
@@ -169,12 +192,21 @@ class Core:
         allowed_s = self.settings.session.answer_timeout_s if deadline_ms is None else deadline_ms / 1e3
         connection.allowed_s = allowed_s
         job = Job(connection, connection.robot, command, size_bytes, now, now + allowed_s)
+        if not connection.may_use(command.service):
+            forbidden = Forbidden(
+                f"this token does not hold the scope services:{command.service}", hint="issue one that does"
+            )
+            self._refuse([Refusal(job, forbidden, "scope")], now)
+            return
         if self.environments is not None and self.environments.offers(command.service):
             self.environments.submit(job)
             return
         service = self._service(command.service)
         if service is None:
             self._answer(self._compute(job), now)
+            return
+        if service.kind == "long" and self.jobs is not None:
+            self.jobs.submit(job)
             return
         if service.kind not in self._executors:
             error = UnknownService(
@@ -184,6 +216,24 @@ class Core:
             return
         self._refuse(self._scheduler.submit(job, now), now)
         self._start()
+
+    def renew(self, connection: Connection, token: str) -> None:
+        """Judge a fresh token of a live connection."""
+        if self.standing is not None:
+            self.standing.renew(connection, token)
+        elif connection.session is not None:
+            connection.apply(connection.session.renewed(None), self.clocks.monotonic())
+
+    def withdraw(self, connection: Connection, identity: int) -> None:
+        """Take back a long command; any other is answered soon in any case."""
+        if self.jobs is not None:
+            self.jobs.withdraw(connection, identity)
+
+    def progress(self, connection: Connection, progress: Progress) -> None:
+        """Tell a robot that understands it how far its long command is."""
+        session = connection.session
+        if connection in self.connections and session is not None and session.hears_progress:
+            connection.write(session.codec.encode(progress))
 
     def refuses_unread(self, connection: Connection, codec: Codec, data: bytes, now: float) -> bool:
         """Refuse the command in *data* for a fraction of what reading it costs; False if it must be read."""
@@ -327,6 +377,8 @@ class Core:
             )
             return _Outcome(job, answer, codec.encode(answer))
         most = self.settings.session.max_message_bytes
+        if len(data) > most and isinstance(answer, Result) and answer.object and answer.reply is not None:
+            return self._encoded(job, msgspec.structs.replace(answer, reply=None))
         if len(data) > most:
             too_large = LimitExceeded(f"the reply has {len(data)} bytes, above {most}", hint="ask for less")
             answer = failure_of(too_large, command, server=self._server_id)

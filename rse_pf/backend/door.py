@@ -11,7 +11,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from rse_pf.auth import KeySet, token_problem, verify_token
+from rse_pf.auth import Claims, KeySet, token_problem, verify_token
 from rse_pf.errors import Unauthorized
 from rse_pf.settings import PlatformSettings
 from rse_pf.wire import SUBPROTOCOLS, codec_for
@@ -29,6 +29,8 @@ class Admitted:
     codec: str
     subprotocol: str
     expires_s: float | None = None
+    claims: Claims | None = field(default=None, compare=False)
+    tenant: str = "default"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -57,7 +59,7 @@ class Door:
         self, settings: PlatformSettings, keys: KeySet | None, *, conformance_echo: bool = False
     ) -> None:
         self._settings = settings
-        self._keys = keys
+        self.keys = keys
         self._conformance_echo = conformance_echo
         path = settings.serving.path
         self._path = path.encode()
@@ -107,22 +109,39 @@ class Door:
             return self._not_found
         if is_full:
             return self._full
-        robot, expires_s = anonymous, None
-        if self._keys is not None:
+        robot, tenant, expires_s = anonymous, "default", None
+        claims = None
+        if self.keys is not None:
             scheme, _, token = authorization.partition(" ")
             try:
                 if scheme.lower() != "bearer":
                     raise Unauthorized("no bearer token")
-                claims = verify_token(token.strip(), keys=self._keys, now=now_s, settings=self._settings.auth)
+                claims = verify_token(token.strip(), keys=self.keys, now=now_s, settings=self._settings.auth)
             except Unauthorized as error:
                 return _because(self._no_token, token_problem(error))
-            leeway_s = self._settings.auth.leeway_s
-            robot = claims.robot
-            expires_s = claims.expires_s if now_s < claims.expires_s else claims.expires_s + leeway_s
+            robot, tenant = claims.robot, claims.tenant
+            expires_s = self.ends_s(claims, now_s)
         codec = codec_for(offered)
         if codec is None:
             return self._no_subprotocol
-        return Admitted(robot=robot, codec=codec, subprotocol=SUBPROTOCOLS[codec], expires_s=expires_s)
+        return Admitted(
+            robot=robot, codec=codec, subprotocol=SUBPROTOCOLS[codec], expires_s=expires_s, tenant=tenant,
+            claims=claims,
+        )  # fmt: skip
+
+    def ends_s(self, claims: Claims, now_s: float) -> float:
+        """Return when a socket on *claims* ends, in Unix seconds; one within the leeway lives to its end."""
+        leeway_s = self._settings.auth.leeway_s
+        return claims.expires_s if now_s < claims.expires_s else claims.expires_s + leeway_s
+
+    def renewed(self, token: str, now_s: float) -> Claims | str:
+        """Return the claims of a fresh token, or, for the log alone, why it is refused."""
+        if self.keys is None:
+            return "no-keys"
+        try:
+            return verify_token(token, keys=self.keys, now=now_s, settings=self._settings.auth)
+        except Unauthorized as error:
+            return token_problem(error)
 
 
 def _because(refusal: TurnedAway, reason: str) -> TurnedAway:

@@ -44,10 +44,11 @@ class _Quiet:
 class _Arrival:
     """A socket until its handshake is judged."""
 
-    __slots__ = ("_is_cut", "_transport", "peer", "room")
+    __slots__ = ("_is_cut", "_transport", "number", "peer", "room")
 
-    def __init__(self, peer: str, room: int) -> None:
+    def __init__(self, peer: str, room: int, number: int = 0) -> None:
         self.peer = peer
+        self.number = number
         self.room = room
         """Bytes that the head of its handshake may still have."""
         self._transport: Any = None
@@ -115,11 +116,11 @@ class RobotSockets:
             session.max_message_bytes, None, serving.read_buffer_bytes,
         )  # fmt: skip
 
-    def take(self, fd: int, ended: Callable[[], None]) -> None:
-        """Serve the accepted socket *fd*; *ended* is called once when it is gone."""
+    def take(self, fd: int, ended: Callable[[], None], number: int) -> None:
+        """Serve the accepted socket *fd*, the server's *number*-th; *ended* is called once, at its end."""
         accepted = socket.socket(fileno=fd)
         accepted.setblocking(False)
-        arrival = _Arrival(_peer(accepted), self._serving.max_handshake_bytes)
+        arrival = _Arrival(_peer(accepted), self._serving.max_handshake_bytes, number)
         leaving = self._waiting.enter(arrival, arrival.peer)
         if leaving is not None:
             self._core.metrics.closed["unauthenticated"] += 1
@@ -163,7 +164,9 @@ class RobotSockets:
         self._core.metrics.handshakes["ok"] += 1
         chosen = {"Sec-WebSocket-Protocol": verdict.subprotocol} if verdict.subprotocol else None
         response = self._picows.WSUpgradeResponse.create_101_response(chosen)
-        return self._picows.WSUpgradeResponseWithListener(response, self._listener(self._core, verdict))
+        return self._picows.WSUpgradeResponseWithListener(
+            response, self._listener(self._core, verdict, arrival.number)
+        )
 
     def _verdict(self, arrival: _Arrival, request: Any) -> Admitted | TurnedAway:
         headers, now = request.headers, self._core.clocks.monotonic()
@@ -248,9 +251,10 @@ def _listener_type(picows: Any, loop: asyncio.AbstractEventLoop, serving: Servin
     class Listener(picows.WSListener):  # type: ignore[misc]
         """One robot's socket: frames to the core, and the core's `Wire`."""
 
-        def __init__(self, core: Core, admitted: Admitted) -> None:
+        def __init__(self, core: Core, admitted: Admitted, number: int) -> None:
             self._core = core
             self._admitted = admitted
+            self._number = number
             self._transport: Any = None
             self._connection: Connection | None = None
             self._cut: Handle | None = None
@@ -259,7 +263,7 @@ def _listener_type(picows: Any, loop: asyncio.AbstractEventLoop, serving: Servin
             self._transport = transport
             high = serving.write_buffer_bytes
             transport.underlying_transport.set_write_buffer_limits(high=high, low=high // 4)
-            self._connection = self._core.connect(self, self._admitted)
+            self._connection = self._core.connect(self, self._admitted, self._number)
 
         def on_ws_frame(self, transport: Any, frame: Any) -> None:
             if self._connection is not None:

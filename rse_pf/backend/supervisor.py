@@ -8,7 +8,6 @@ modifier replaces servers), that it never reads a robot's bytes, and that a drai
 from __future__ import annotations
 
 import asyncio
-import ipaddress
 import json
 import os
 import random
@@ -23,12 +22,16 @@ from typing import Any
 
 from rse_pf.auth import KeySet
 from rse_pf.backend.control import Answer, Ask, serve_control
+from rse_pf.backend.front_door import bound, check_open_door
 from rse_pf.backend.hand_over import plan
 from rse_pf.backend.limits import Bucket
 from rse_pf.backend.log import JsonLog
 from rse_pf.backend.metrics import merge, merge_isolation, render
+from rse_pf.backend.presence import Presence
 from rse_pf.backend.processes import cpu_seconds, raise_descriptor_limit, resident_bytes
+from rse_pf.backend.revocation import Watch, first_order
 from rse_pf.backend.worker_process import WorkerProcess
+from rse_pf.control import Trust
 from rse_pf.errors import ConfigurationError
 from rse_pf.settings import PlatformSettings
 
@@ -51,6 +54,7 @@ def serve(
     settings: PlatformSettings,
     *,
     keys: KeySet | None,
+    trust: Trust | None = None,
     server_id: str,
     announce: Path | None = None,
     conformance_echo: bool = False,
@@ -62,6 +66,7 @@ def serve(
     Args:
         settings: ``serving.port`` and ``serving.control_port`` may be 0.
         keys: Who may sign robots' tokens; None only where ``auth.required`` is false.
+        trust: Reads the same again and again, and who is enrolled and who is denied; None: *keys* stay.
         server_id: Name of this server in every Welcome, Result and log line.
         announce: File that tells, once everything listens, pids and ports as JSON.
         conformance_echo: Echo raw messages without token or sub-protocol, for conformance suites.
@@ -75,61 +80,19 @@ def serve(
     Raises:
         ConfigurationError: An open door on a public address, no keys, or the port is taken.
     """
-    _check_open_door(settings, keys, conformance_echo)
+    if trust is not None:
+        trust.first()
+        keys = trust.keys
+    check_open_door(settings, keys, conformance_echo)
     raise_descriptor_limit()
-    listener = _bound(settings.serving.host, settings.serving.port)
+    listener = bound(settings.serving.host, settings.serving.port)
     with listener:
         supervisor = _Supervisor(
-            settings, keys=keys, server_id=server_id, announce=announce,
+            settings, keys=keys, trust=trust, server_id=server_id, announce=announce,
             conformance_echo=conformance_echo, services=services, listener=listener,
             digest=settings_digest or settings.digest(),
         )  # fmt: skip
         return asyncio.run(supervisor.run())
-
-
-def _check_open_door(settings: PlatformSettings, keys: KeySet | None, conformance_echo: bool) -> None:
-    host = settings.serving.host
-    if conformance_echo and not _is_loopback(host):
-        raise ConfigurationError(
-            f"conformance echo on {host} would let anybody in", hint="set serving.host to 127.0.0.1"
-        )
-    if conformance_echo:
-        return
-    if settings.auth.required and keys is None:
-        raise ConfigurationError(
-            "robots need tokens, but there are no keys to check them with",
-            hint="name a key set file, or set auth.required to false on a loopback address",
-        )
-    if not settings.auth.required and not _is_loopback(host):
-        raise ConfigurationError(
-            f"auth.required = false on {host} would let anybody in",
-            hint="set auth.required to true, or serving.host to 127.0.0.1",
-        )
-
-
-def _is_loopback(host: str) -> bool:
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return host == "localhost"
-
-
-def _bound(host: str, port: int) -> socket.socket:
-    try:
-        family, kind, protocol, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
-        listener = socket.socket(family, kind, protocol)
-        try:
-            listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            listener.setblocking(False)
-            listener.bind(address)
-        except OSError:
-            listener.close()
-            raise
-    except OSError as error:
-        raise ConfigurationError(
-            f"cannot listen on {host}:{port}: {error.strerror}", hint="choose another serving.port, or 0"
-        ) from error
-    return listener
 
 
 class _Supervisor:
@@ -138,6 +101,7 @@ class _Supervisor:
         settings: PlatformSettings,
         *,
         keys: KeySet | None,
+        trust: Trust | None,
         server_id: str,
         announce: Path | None,
         conformance_echo: bool,
@@ -158,7 +122,8 @@ class _Supervisor:
         self._control_port = 0
         self._moving_until = 0.0
         self._signals = 0
-        self._refused_full = 0
+        self._accepted = self._refused_full = 0
+        self._trust = trust if settings.auth.required else None
         self._accepts = Bucket(settings.serving.accepts_per_s, float(settings.serving.handshake_burst))
         self._accept_pauses = 0
         self._log = JsonLog(level=settings.serving.log_level, server=server_id, wall_clock=time.time)
@@ -178,7 +143,8 @@ class _Supervisor:
             loop.add_signal_handler(number, self._on_signal, number)
         control = await self._open_control()
         try:
-            self._workers = [WorkerProcess(config, self._on_lost) for config in self._configs]
+            hear = Presence().hear
+            self._workers = [WorkerProcess(config, self._on_lost, hear) for config in self._configs]
             await self._start(loop)
             return await self._over
         finally:
@@ -204,7 +170,7 @@ class _Supervisor:
         return control
 
     async def _start(self, loop: asyncio.AbstractEventLoop) -> None:
-        readiness = [loop.create_task(worker.connect()) for worker in self._workers]
+        readiness = [loop.create_task(worker.connect(first_order(self._trust))) for worker in self._workers]
         everything = asyncio.gather(*readiness)
         either: list[asyncio.Future[Any]] = [self._over, everything]
         await asyncio.wait(
@@ -223,6 +189,10 @@ class _Supervisor:
         self._state = "ready"
         if self._announce is not None:
             _write_atomically(self._announce, self._identity())
+        if self._trust is not None:
+            pause_s = self._settings.auth.deny_list_refresh_s
+            watch = Watch(self._trust, workers=lambda: self._workers, log=self._log, pause_s=pause_s)
+            self._keep(watch.run())
         self._log.info("server-ready", **self._identity(), settings=self._digest)
 
     def _identity(self) -> dict[str, Any]:
@@ -251,8 +221,12 @@ class _Supervisor:
                 self._log.warning("accept-failed", reason=str(error))
                 self._pause_accepting(_ACCEPT_PAUSE_S)
                 return
+            self._accepted += 1
             with accepted:
-                if not any(worker.give(accepted) for worker in sorted(self._workers, key=lambda w: w.load)):
+                if not any(
+                    worker.give(accepted, self._accepted)
+                    for worker in sorted(self._workers, key=lambda w: w.load)
+                ):
                     self._refused_full += 1
 
     def _pause_accepting(self, pause_s: float) -> None:

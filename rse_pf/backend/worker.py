@@ -28,8 +28,11 @@ from rse_pf.backend.environments import Environments
 from rse_pf.backend.hand_over import HandOver
 from rse_pf.backend.log import JsonLog
 from rse_pf.backend.processes import die_with_parent
+from rse_pf.backend.revocation import Standing
 from rse_pf.backend.seams import Clocks
 from rse_pf.backend.server import RobotSockets
+from rse_pf.backend.worker_process import NUMBER_BYTES
+from rse_pf.control import key_set_of
 from rse_pf.errors import ConfigurationError, MissingExtra
 from rse_pf.objects import open_store
 from rse_pf.service import Registry
@@ -39,8 +42,8 @@ from rse_pf.settings import PlatformSettings
 __all__ = ["load_services", "main"]
 
 _POLL_S = 0.01
-_MOST_LINE_BYTES = 1 << 20
-_FDS_AT_ONCE = 16
+_MOST_LINE_BYTES = 1 << 26
+"""An order may name every robot that is enrolled."""
 _CLOSING_S = 1.0
 
 
@@ -107,9 +110,13 @@ class _Worker:
         )
         keys = None if config["keys"] is None else KeySet.from_json(config["keys"])
         self._index, self._workers, self._named = config["index"], config["workers"], 0
+        door = Door(settings, keys, conformance_echo=config["conformance_echo"])
+        self._standing = self._core.standing = Standing(
+            self._core, door, loop=loop, log=self._log, tell=self._say
+        )
         self._sockets = RobotSockets(
             core=self._core,
-            door=Door(settings, keys, conformance_echo=config["conformance_echo"]),
+            door=door,
             serving=settings.serving,
             session=settings.session,
             most_robots=-(-settings.serving.max_robots // self._workers),
@@ -139,6 +146,7 @@ class _Worker:
         reader, self._writer = await asyncio.open_unix_connection(sock=self._control, limit=_MOST_LINE_BYTES)
         self._data.setblocking(False)
         self._loop.add_reader(self._data.fileno(), self._take_sockets)
+        self._obey_trust(json.loads(await reader.readline()))
         gc.collect()
         gc.freeze()
         self._say(event="ready")
@@ -151,11 +159,19 @@ class _Worker:
                 self._keep(self._tell_when_empty())
             elif order["do"] == "hand-over":
                 self._hand_over.begin(order["delays_s"], order["within_ms"])
+            elif order["do"] == "trust":
+                self._obey_trust(order)
+            elif order["do"] == "replace":
+                self._standing.replace(order["number"])
             elif order["do"] == "leave":
                 await self._leave(order["held_s"])
                 break
         self._log.close()
         os._exit(0)  # sockets and threads of a worker that has no supervisor are nobody's
+
+    def _obey_trust(self, order: Mapping[str, Any]) -> None:
+        if order["text"]:
+            self._standing.trust(key_set_of(order["text"]))
 
     def _report(self) -> dict[str, Any]:
         report = self._core.snapshot()
@@ -179,14 +195,14 @@ class _Worker:
     def _take_sockets(self) -> None:
         while True:
             try:
-                message, fds, _, _ = socket.recv_fds(self._data, _FDS_AT_ONCE, _FDS_AT_ONCE)
+                message, fds, _, _ = socket.recv_fds(self._data, NUMBER_BYTES, 1)
             except BlockingIOError:
                 return
             if not message:
                 self._loop.remove_reader(self._data.fileno())
                 return
             for fd in fds:
-                self._sockets.take(fd, self._count_end)
+                self._sockets.take(fd, self._count_end, int.from_bytes(message, "big"))
 
     def _count_end(self) -> None:
         self._ended += 1

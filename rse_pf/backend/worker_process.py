@@ -13,21 +13,29 @@ import sys
 from collections.abc import Callable, Mapping
 from typing import Any
 
-__all__ = ["WorkerProcess"]
+__all__ = ["NUMBER_BYTES", "WorkerProcess"]
 
 _MOST_LINE_BYTES = 1 << 20
 _READ_BYTES = 4096
+NUMBER_BYTES = 8
+"""Length of a socket's number, which travels with its descriptor."""
 
 
 class WorkerProcess:
     """One worker process, started at once; `connect` waits until it is ready."""
 
-    def __init__(self, config: Mapping[str, Any], on_lost: Callable[[WorkerProcess], None]) -> None:
+    def __init__(
+        self,
+        config: Mapping[str, Any],
+        on_lost: Callable[[WorkerProcess], None],
+        on_robot: Callable[[WorkerProcess, dict[str, Any]], None],
+    ) -> None:
         self.load = 0
         self.report: dict[str, Any] | None = None
         self.empty = asyncio.Event()
         self.gone = asyncio.Event()
         self._on_lost = on_lost
+        self._on_robot = on_robot
         self._data, data = socket.socketpair()
         self._control, control = socket.socketpair()
         with data, control:
@@ -51,19 +59,20 @@ class WorkerProcess:
         """Return how the process ended, None while it runs or is not reaped."""
         return self._process.poll()
 
-    async def connect(self) -> None:
+    async def connect(self, first_order: Mapping[str, Any]) -> None:
         """Wait until the worker takes sockets; `on_lost` is called if it never does."""
         reader, self._writer = await asyncio.open_unix_connection(sock=self._control, limit=_MOST_LINE_BYTES)
         loop = asyncio.get_running_loop()
+        self.order(**first_order)
         ready = asyncio.Event()
         self._reading = loop.create_task(self._listen(reader, ready))
         await ready.wait()
         loop.add_reader(self._data.fileno(), self._count_ends)
 
-    def give(self, accepted: socket.socket) -> bool:
-        """Hand over an accepted socket; False if the worker's channel is full or gone."""
+    def give(self, accepted: socket.socket, number: int) -> bool:
+        """Hand over the *number*-th accepted socket; False if the worker's channel is full or gone."""
         try:
-            socket.send_fds(self._data, [b"c"], [accepted.fileno()])
+            socket.send_fds(self._data, [number.to_bytes(NUMBER_BYTES, "big")], [accepted.fileno()])
         except OSError:
             return False
         self.load += 1
@@ -109,6 +118,8 @@ class WorkerProcess:
             ready.set()
         elif message["event"] == "empty":
             self.empty.set()
+        elif message["event"] != "report":
+            self._on_robot(self, message)
         else:
             self.report = message["report"]
             if self._reported is not None and not self._reported.done():

@@ -16,6 +16,7 @@ import resource
 from pathlib import Path
 
 from rse_pf.auth import KeySet
+from rse_pf.control import Trust
 from rse_pf.errors import UsageError
 from rse_pf.settings import PlatformSettings, setting_rows
 
@@ -39,7 +40,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
             metavar=None if row.choices else name.rpartition("_")[2].upper(),
             help=f"{row.doc}{unit} (serving.{name}, default {row.default})",
         )  # fmt: skip
-    parser.add_argument("--keys", type=Path, metavar="FILE", help="public keys of the tokens, a JWKS")
+    parser.add_argument(
+        "--keys", type=Path, metavar="FILE",
+        help="public keys of the tokens, a JWKS; roster and deny-list lie beside it in control/",
+    )  # fmt: skip
     parser.add_argument("--server-id", metavar="NAME", help="name of this server (default: server-PID)")
     parser.add_argument(
         "--announce", type=Path, metavar="FILE", help="write pids and ports there when all is ready"
@@ -82,6 +86,7 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
     return serve(
         chosen,
         keys=keys,
+        trust=None if args.keys is None else Trust(args.keys),
         server_id=server_id,
         announce=args.announce,
         conformance_echo=args.conformance_echo,

@@ -122,8 +122,8 @@ class ServerSession:
         self.robot = robot
         self.state: Literal["opening", "open", "closed"] = "opening"
         self.in_flight = 0
-        self.token_s: float | None = None
-        """How long the robot's token is still good when it says Hello; set by whoever knows."""
+        self.ends_s: float | None = None
+        """When the robot's token is over, on the server's clock; set by whoever knows."""
         self.hears_progress = False
         """Whether the robot knows of long commands."""
         self.codec = codec
@@ -235,7 +235,7 @@ class ServerSession:
                 max_in_flight=self._limits.max_in_flight,
             ),
             clock_s=now,
-            token_s=self.token_s,
+            token_s=None if self.ends_s is None else max(0.0, self.ends_s - now),
         )
         return [self._send(welcome)]
 

@@ -1,0 +1,162 @@
+"""Live sockets stand on a token: they end with it, when it is revoked, and when a newer one comes.
+
+`Standing` does it in a worker, `Watch` in the supervisor that reads the control room for all of them.
+Promises that no token and no reason beyond "revoked" reaches a robot, and that what cannot be read leaves
+everything as it was known.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable, Iterable
+from functools import partial
+
+from rse_pf.auth import Claims, KeySet, standing_problem
+from rse_pf.backend.connection import Connection
+from rse_pf.backend.core import Core
+from rse_pf.backend.door import Door
+from rse_pf.backend.log import JsonLog
+from rse_pf.backend.presence import Orderly
+from rse_pf.backend.seams import Handle, Loop
+from rse_pf.control import Trust
+from rse_pf.wire.session import CLOSE_REPLACED, CLOSE_REVOKED, CLOSE_TOKEN_OVER
+
+__all__ = ["Standing", "Watch", "first_order"]
+
+
+class Standing:
+    """The claims of one worker's connections; the core tells who comes and goes."""
+
+    def __init__(
+        self, core: Core, door: Door, *, loop: Loop, log: JsonLog, tell: Callable[..., None]
+    ) -> None:
+        """Serve *core*.
+
+        Args:
+            core: Its connections stand or fall here.
+            door: Judges fresh tokens, and gets new keys.
+            loop: For the ends of tokens.
+            log: One line for each socket that is ended.
+            tell: Says something to the supervisor.
+        """
+        self._core = core
+        self._door = door
+        self._loop = loop
+        self._log = log
+        self._tell = tell
+        self._of_number: dict[int, Connection] = {}
+        self._ends: dict[Connection, Handle] = {}
+
+    def trust(self, keys: KeySet) -> None:
+        """Believe *keys* from now on, and end every connection that they no longer support."""
+        self._door.keys = keys
+        for connection in list(self._core.connections):
+            problem = "" if connection.claims is None else standing_problem(connection.claims, keys)
+            if problem and not connection.assembler.closed:
+                self._log.info("revoked", robot=connection.robot, reason=problem)
+                connection.close(CLOSE_REVOKED, "revoked")
+
+    def connected(self, connection: Connection) -> None:
+        """Know a connection whose handshake is done."""
+        if connection.claims is not None:
+            self._of_number[connection.number] = connection
+        self._end_in_time(connection)
+
+    def arrived(self, connection: Connection) -> None:
+        """Tell that a robot said Hello; its older connections end."""
+        self._say("arrived", connection)
+
+    def left(self, connection: Connection) -> None:
+        """Forget a connection."""
+        timer = self._ends.pop(connection, None)
+        if timer is not None:
+            timer.cancel()
+        if self._of_number.pop(connection.number, None) is not None:
+            self._say("left", connection)
+
+    def replace(self, number: int) -> None:
+        """End the connection *number*: the robot has a newer one.  One that is moving gets its time first."""
+        connection = self._of_number.get(number)
+        if connection is None or connection.assembler.closed:
+            return
+        left_s = connection.moving_until_s - self._core.clocks.monotonic()
+        if left_s > 0:
+            self._loop.call_later(left_s, partial(self._say, "stays", connection))
+            return
+        self._log.info("replaced", robot=connection.robot)
+        connection.close(CLOSE_REPLACED, "replaced")
+
+    def renew(self, connection: Connection, token: str) -> None:
+        """Judge a fresh token of a live connection, and move its end or leave it."""
+        core, before = self._core, connection.claims
+        now, wall_s = core.clocks.monotonic(), core.clocks.wall()
+        claims = self._door.renewed(token, wall_s)
+        if isinstance(claims, Claims) and before is not None and _is_same_robot(before, claims):
+            connection.claims = claims
+            token_s = self._door.ends_s(claims, wall_s) - wall_s
+            connection.expires_s = now + token_s
+            self._end_in_time(connection)
+            core.metrics.handshakes["renewed"] += 1
+        else:
+            token_s = None
+            core.metrics.handshakes["renewal-refused"] += 1
+            reason = claims if isinstance(claims, str) else "wrong-robot"
+            self._log.info("renewal-refused", robot=connection.robot, reason=reason)
+        if connection.session is not None:
+            connection.apply(connection.session.renewed(token_s), now)
+
+    def _end_in_time(self, connection: Connection) -> None:
+        timer = self._ends.pop(connection, None)
+        if timer is not None:
+            timer.cancel()
+        if connection.expires_s is not None:
+            left_s = connection.expires_s - self._core.clocks.monotonic()
+            self._ends[connection] = self._loop.call_later(max(0.0, left_s), partial(self._end, connection))
+
+    def _end(self, connection: Connection) -> None:
+        if not connection.assembler.closed:
+            connection.close(CLOSE_TOKEN_OVER, "token-over")
+
+    def _say(self, event: str, connection: Connection) -> None:
+        claims = connection.claims
+        if claims is not None and (event == "left" or connection in self._core.connections):
+            self._tell(event=event, tenant=claims.tenant, robot=claims.robot, number=connection.number)
+
+
+class Watch:
+    """Looks into the control room again and again, and has every worker know what is new."""
+
+    def __init__(
+        self, trust: Trust, *, workers: Callable[[], Iterable[Orderly]], log: JsonLog, pause_s: float
+    ) -> None:
+        self._trust = trust
+        self._workers = workers
+        self._log = log
+        self._pause_s = pause_s
+        self._problem = ""
+
+    async def run(self) -> None:
+        """Look until cancelled."""
+        while True:
+            await asyncio.sleep(self._pause_s)
+            self.tell(await asyncio.to_thread(self._trust.look))
+
+    def tell(self, is_new: bool) -> None:
+        """Say once what went wrong, and hand on what *is_new*."""
+        if self._trust.problem != self._problem:
+            self._problem = self._trust.problem
+            if self._problem:
+                self._log.warning("control-room-unread", reason=self._problem)
+        if is_new:
+            for worker in self._workers():
+                worker.order(do="trust", text=self._trust.text)
+            self._log.info("trust", bytes=len(self._trust.text))
+
+
+def first_order(trust: Trust | None) -> dict[str, str]:
+    """Return what a worker is told before it takes sockets; without a control room its keys stay."""
+    return {"do": "trust", "text": "" if trust is None else trust.text}
+
+
+def _is_same_robot(before: Claims, after: Claims) -> bool:
+    return (before.tenant, before.robot) == (after.tenant, after.robot)
