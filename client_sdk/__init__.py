@@ -10,6 +10,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from client_sdk.answers import Answer, PoseAnswer, decode_reply
     from client_sdk.background import BackgroundUploader
     from client_sdk.blocking import BlockingRobot, connect_blocking
     from client_sdk.data import DataClient, DataOptions
@@ -17,7 +18,7 @@ if TYPE_CHECKING:
     from client_sdk.frontend import Frame, FrontEndOptions, PoseQuery, TrackedFrame, Tracker
     from client_sdk.mapping import MapOptions, PointMap, Trajectory
     from client_sdk.offload import CloudFirst
-    from client_sdk.robot import Answer, PoseAnswer, Robot, connect
+    from client_sdk.robot import Robot, connect
     from client_sdk.stats import Stats
 
 __all__ = [
@@ -41,11 +42,12 @@ __all__ = [
     "Trajectory",
     "connect",
     "connect_blocking",
+    "decode_reply",
     "open_dataset",
 ]
 
 _HOMES = {
-    "Answer": "robot",
+    "Answer": "answers",
     "BackgroundUploader": "background",
     "BlockingRobot": "blocking",
     "CloudFirst": "offload",
@@ -56,7 +58,7 @@ _HOMES = {
     "FrontEndOptions": "frontend",
     "MapOptions": "mapping",
     "PointMap": "mapping",
-    "PoseAnswer": "robot",
+    "PoseAnswer": "answers",
     "PoseQuery": "frontend",
     "Robot": "robot",
     "Stats": "stats",
@@ -65,6 +67,7 @@ _HOMES = {
     "Trajectory": "mapping",
     "connect": "robot",
     "connect_blocking": "blocking",
+    "decode_reply": "answers",
     "open_dataset": "datasets",
 }
 

@@ -14,9 +14,10 @@ from collections.abc import Callable, Coroutine
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, TypeVar
 
+from client_sdk.answers import Answer, PoseAnswer
 from client_sdk.connection import OnChange, Token
 from client_sdk.offload import CloudFirst
-from client_sdk.robot import Answer, PoseAnswer, Robot, connect
+from client_sdk.robot import Robot, connect
 from client_sdk.stats import Stats
 from rse_pf.errors import Disconnected
 from rse_pf.settings import SessionSettings

@@ -37,6 +37,7 @@ from rse_pf.wire.robot_session import (
     LinkLost,
     MoveAsked,
     Notice,
+    Progressed,
     RenewalDue,
     RobotSession,
     Welcomed,
@@ -105,7 +106,7 @@ class Connection:
         *,
         token: Token,
         session: RobotSession,
-        on_answer: Callable[[Answered], None],
+        on_answer: Callable[[Answered | Progressed], None],
         clock: Callable[[], float],
         random: random_module.Random,
         on_change: OnChange = None,
@@ -372,7 +373,7 @@ class Connection:
 
     def _take(self, socket: _Socket | None, events: list[Event]) -> None:
         for event in events:
-            if isinstance(event, Answered):
+            if isinstance(event, Answered | Progressed):
                 self._on_answer(event)
             elif socket is not None:
                 self._about(socket, event)

@@ -12,8 +12,9 @@ from collections.abc import Callable, Coroutine, Generator
 from dataclasses import dataclass, replace
 from importlib import metadata
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, Literal, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
+from client_sdk.answers import Answer, PoseAnswer
 from client_sdk.connection import Connection, OnChange, Token
 from client_sdk.offload import CloudFirst
 from client_sdk.own_services import OwnServices
@@ -21,57 +22,23 @@ from client_sdk.stats import Stats, StatsKeeper
 from rse_pf.errors import Disconnected, RsePfError, UsageError, error_from_code
 from rse_pf.settings import SessionSettings
 from rse_pf.wire import CODECS, Command, Failure, Result, as_type, make_codec
-from rse_pf.wire.robot_session import Answered, RobotSession
+from rse_pf.wire.robot_session import Answered, Progressed, RobotSession
 
 if TYPE_CHECKING:
     import numpy as np
     import numpy.typing as npt
 
     from rse_pf.geometry import Camera
-    from rse_pf.pnp import PnpOptions, PnpSolution
+    from rse_pf.pnp import PnpOptions
 
-__all__ = ["Answer", "PoseAnswer", "Robot", "connect"]
+__all__ = ["OnProgress", "Robot", "connect"]
 
 T = TypeVar("T")
 
-Source = Literal["cloud", "robot"]
+OnProgress = Callable[[float, str], None]
+"""Told the share of a long command that is done (0..1), and what was done last."""
 
 _LONGEST_DEADLINE_S = 3600.0
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Answer:
-    """A reply and how it came: who answered, and where the time went (ms; None if unknown).
-
-    ``why`` says, if *source* is ``robot``, why the cloud did not answer.
-    """
-
-    reply: Any
-    source: Source
-    server: str
-    round_trip_ms: float
-    queue_ms: float
-    compute_ms: float
-    up_ms: float | None = None
-    down_ms: float | None = None
-    payload_bytes: int = 0
-    why: str = ""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class PoseAnswer:
-    """A pose with its evidence, and how it came; the fields are those of `Answer`."""
-
-    solution: PnpSolution
-    source: Source
-    server: str
-    round_trip_ms: float
-    queue_ms: float
-    compute_ms: float
-    up_ms: float | None = None
-    down_ms: float | None = None
-    payload_bytes: int = 0
-    why: str = ""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -83,6 +50,8 @@ class _Ask:
     deadline_s: float
     stream: str
     keep: bool
+    is_open_ended: bool = False
+    on_progress: OnProgress | None = None
 
 
 def connect(
@@ -152,6 +121,7 @@ class Robot:
         self._clock = clock
         self._own = None if offload is None else OwnServices(offload.registry, clock)
         self._waiting: dict[int, asyncio.Future[Answered] | Callable[[Answered], None]] = {}
+        self._hearing: dict[int, OnProgress] = {}
         self._tasks: set[asyncio.Task[Answer | Failure]] = set()
         self._keeper = StatsKeeper(random)
         self._open = False
@@ -247,16 +217,21 @@ class Robot:
         deadline_s: float | None = None,
         stream: str = "",
         keep: bool = False,
+        on_progress: OnProgress | None = None,
     ) -> Answer:
         """Ask *service*; many calls may wait at the same time.
+
+        A long service (``merge``, ``optimise``) runs as a job: it has no deadline but *deadline_s*, survives
+        reconnects and its server's death, and ends when the call is cancelled or its deadline passes.
 
         Args:
             service: Its name, such as ``pnp``.
             request: A `msgspec.Struct`, or plain lists and dicts.
             reply_type: Type of the reply; None leaves it plain.
-            deadline_s: Seconds until the answer is of no use; None means the setting.
+            deadline_s: Seconds until the answer is of no use; None means the setting, or none if it is long.
             stream: Within a stream the newest command wins; empty means no stream.
             keep: Answer this one even if newer ones follow.
+            on_progress: Told how far a long service is; with it the call waits for as long as it takes.
 
         Raises:
             RsePfError: The typed failure of the command.
@@ -270,7 +245,10 @@ class Robot:
                 hint="give the seconds it may take",
             )
         self._keeper.sent += 1
-        ask = _Ask(service=service, request=request, deadline_s=wait_s, stream=stream, keep=keep)
+        ask = _Ask(
+            service=service, request=request, deadline_s=wait_s, stream=stream, keep=keep,
+            is_open_ended=deadline_s is None, on_progress=on_progress,
+        )  # fmt: skip
         started = self._clock()
         try:
             fatal = self._connection.fatal
@@ -353,15 +331,18 @@ class Robot:
 
     async def _ask_cloud(self, ask: _Ask) -> Answer | Failure:
         identity = self._session.submit(
-            ask.service, ask.request, now=self._clock(), deadline_s=ask.deadline_s, stream=ask.stream,
-            keep=ask.keep,
+            ask.service, ask.request, now=self._clock(), stream=ask.stream, keep=ask.keep,
+            deadline_s=None if ask.is_open_ended else ask.deadline_s, patient=ask.on_progress is not None,
         )  # fmt: skip
         future: asyncio.Future[Answered] = asyncio.get_running_loop().create_future()
         self._waiting[identity] = future
+        if ask.on_progress is not None:
+            self._hearing[identity] = ask.on_progress
         self._connection.flush()
         try:
             ended = await future
         finally:
+            self._hearing.pop(identity, None)
             self._waiting.pop(identity, None)
             self._session.cancel(identity)
             self._connection.flush()
@@ -445,7 +426,7 @@ class Robot:
         return Answer(
             reply=result.reply, source="cloud", server=result.server, round_trip_ms=round_trip_s * 1e3,
             queue_ms=result.queue_ms, compute_ms=result.compute_ms, up_ms=up_ms, down_ms=down_ms,
-            payload_bytes=ended.wire_bytes,
+            payload_bytes=ended.wire_bytes, object=result.object,
         )  # fmt: skip
 
     def _typed(self, answer: Answer | Failure, reply_type: type[Any] | None, started: float) -> Answer:
@@ -454,7 +435,8 @@ class Robot:
             raise error_from_code(
                 answer.code, answer.message, hint=answer.hint, retry_after_ms=answer.retry_after_ms
             )
-        reply = answer.reply if reply_type is None else as_type(answer.reply, reply_type)
+        is_named = answer.reply is None and answer.object != ""
+        reply = answer.reply if reply_type is None or is_named else as_type(answer.reply, reply_type)
         answer = replace(answer, reply=reply, round_trip_ms=(self._clock() - started) * 1e3)
         keeper = self._keeper
         keeper.answered += 1
@@ -465,7 +447,11 @@ class Robot:
                 keeper.add(name, getattr(answer, name))
         return answer
 
-    def _answered(self, event: Answered) -> None:
+    def _answered(self, event: Answered | Progressed) -> None:
+        if isinstance(event, Progressed):
+            if event.id in self._hearing:
+                self._hearing[event.id](event.done, event.what)
+            return
         waiting = self._waiting.get(event.id)
         if isinstance(waiting, asyncio.Future):
             if waiting.done():

@@ -17,6 +17,7 @@ __all__ = [
     "ConfigurationError",
     "Conflict",
     "ConnectError",
+    "Crashed",
     "DegenerateGeometry",
     "Disconnected",
     "Expired",
@@ -217,6 +218,12 @@ class WorkerLost(CommandFailed):
     """The process that worked on the command died."""
 
     code = "worker-lost"
+
+
+class Crashed(CommandFailed):
+    """The process that worked on a long command died of it, or needed more memory than it may."""
+
+    code = "crashed"
 
 
 class Poison(CommandFailed):

@@ -26,11 +26,16 @@ from rse_pf.errors import (
 )
 from rse_pf.wire import Command, Failure, Result, as_type
 
-__all__ = ["Kind", "Registry", "Service", "dispatch", "failure_of", "request_of"]
+__all__ = ["Kind", "Registry", "Report", "Service", "dispatch", "failure_of", "request_of"]
 
 Kind = Literal["stateless", "per_robot_state", "long"]
 
-Function = TypeVar("Function", bound=Callable[[Any], Any])
+Report = Callable[[float, str], None]
+"""Told the share that is done (0..1) and what was done; raises `errors.Cancelled` to end the work."""
+
+Function = TypeVar("Function", bound=Callable[..., Any])
+
+_REPORT = "report"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -38,12 +43,14 @@ class Service:
     """A registered function with what the server must know about it."""
 
     name: str
-    function: Callable[[Any], Any]
+    function: Callable[..., Any]
     request_type: type[Any]
     reply_type: type[Any]
     kind: Kind = "stateless"
     cheap: bool = False
     """Cheap services may run in the event loop when nothing waits."""
+    reports: bool = False
+    """Whether it takes ``report``: a long service that tells how far it is, and can be cancelled there."""
 
     @property
     def summary(self) -> str:
@@ -60,7 +67,7 @@ class Registry:
     def service(
         self, name: str, *, kind: Kind = "stateless", cheap: bool = False
     ) -> Callable[[Function], Function]:
-        """Register the decorated function under *name*.
+        """Register the decorated function under *name*; a long one may take a keyword ``report``, too.
 
         Raises:
             ConfigurationError: The name is taken, or the function is not annotated with one
@@ -68,11 +75,12 @@ class Registry:
         """
 
         def register(function: Function) -> Function:
-            request_type, reply_type = _signature(name, function)
+            request_type, reply_type = _signature(name, function, kind)
             self.add(
                 Service(
                     name=name, function=function, request_type=request_type, reply_type=reply_type,
                     kind=kind, cheap=cheap,
+                    reports=kind == "long" and _REPORT in inspect.signature(function).parameters,
                 )
             )  # fmt: skip
             return function
@@ -106,6 +114,7 @@ def dispatch(
     *,
     server: str = "",
     on_defect: Callable[[Command, Exception], None] | None = None,
+    report: Report | None = None,
 ) -> Result | Failure:
     """Answer *command* with a result or a failure; never raise.
 
@@ -115,11 +124,14 @@ def dispatch(
         clock: Seconds, monotonic; read before and after the service.
         server: Name that goes into the answer.
         on_defect: Told of exceptions that are not ours, for the server's log.
+        report: For a service that tells how far it is.
     """
     started = clock()
     try:
         service = registry.get(command.service)
-        reply = service.function(request_of(command.payload, service))
+        request = request_of(command.payload, service)
+        told = {_REPORT: report} if service.reports and report is not None else {}
+        reply = service.function(request, **told)
     except RsePfError as error:
         return failure_of(error, command, server=server)
     except (Exception, SystemExit) as error:  # noqa: BLE001  a service is foreign code
@@ -156,7 +168,7 @@ def request_of(payload: Any, service: Service) -> Any:
         ) from error
 
 
-def _signature(name: str, function: Callable[[Any], Any]) -> tuple[type[Any], type[Any]]:
+def _signature(name: str, function: Callable[..., Any], kind: Kind) -> tuple[type[Any], type[Any]]:
     try:
         hints = typing.get_type_hints(function)
     except (NameError, TypeError, AttributeError) as error:
@@ -165,9 +177,17 @@ def _signature(name: str, function: Callable[[Any], Any]) -> tuple[type[Any], ty
             hint="define its request and reply types at the top of the module",
         ) from error
     reply_type = hints.pop("return", None)
+    parameters = dict(inspect.signature(function).parameters)
+    if (
+        kind == "long"
+        and _REPORT in parameters
+        and parameters[_REPORT].kind is inspect.Parameter.KEYWORD_ONLY
+    ):
+        parameters.pop(_REPORT)
+        hints.pop(_REPORT, None)
     kinds = list(hints.values())
     if (
-        len(inspect.signature(function).parameters) != 1
+        len(parameters) != 1
         or len(kinds) != 1
         or not all(
             isinstance(kind, type) and issubclass(kind, msgspec.Struct) for kind in (*kinds, reply_type)

@@ -19,6 +19,7 @@ CODES = {
     "ConfigurationError": "configuration",
     "Conflict": "conflict",
     "ConnectError": "connect",
+    "Crashed": "crashed",
     "DegenerateGeometry": "degenerate",
     "Disconnected": "disconnected",
     "Expired": "expired",

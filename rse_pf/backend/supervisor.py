@@ -24,6 +24,7 @@ from rse_pf.auth import KeySet
 from rse_pf.backend.control import Answer, Ask, serve_control
 from rse_pf.backend.front_door import bound, check_open_door
 from rse_pf.backend.hand_over import plan
+from rse_pf.backend.job_slots import make_pipe
 from rse_pf.backend.limits import Bucket
 from rse_pf.backend.log import JsonLog
 from rse_pf.backend.metrics import merge, merge_isolation, render
@@ -132,6 +133,7 @@ class _Supervisor:
             "settings": settings.to_dict(), "server": server_id, "services": services, "workers": count,
             "keys": keys.to_json() if keys is not None and settings.auth.required else None,
             "conformance_echo": conformance_echo, "supervisor": os.getpid(),
+            "job_slots": make_pipe(settings.serving.jobs),
         }  # fmt: skip
         self._configs = [{**config, "index": index} for index in range(count)]
         self._workers: list[WorkerProcess] = []

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import asyncio
 import gc
-import importlib
 import json
 import os
 import secrets
@@ -17,7 +16,7 @@ import signal
 import socket
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +25,12 @@ from rse_pf.backend.core import Core
 from rse_pf.backend.door import Door
 from rse_pf.backend.environments import Environments
 from rse_pf.backend.hand_over import HandOver
+from rse_pf.backend.job_run import Context
+from rse_pf.backend.job_slots import Slots
+from rse_pf.backend.job_spawn import spawner
+from rse_pf.backend.job_store import open_job_store
+from rse_pf.backend.jobs import Jobs
+from rse_pf.backend.load_services import load_services
 from rse_pf.backend.log import JsonLog
 from rse_pf.backend.processes import die_with_parent
 from rse_pf.backend.revocation import Standing
@@ -33,13 +38,12 @@ from rse_pf.backend.seams import Clocks
 from rse_pf.backend.server import RobotSockets
 from rse_pf.backend.worker_process import NUMBER_BYTES
 from rse_pf.control import key_set_of
-from rse_pf.errors import ConfigurationError, MissingExtra
+from rse_pf.errors import MissingExtra
 from rse_pf.objects import open_store
-from rse_pf.service import Registry
 from rse_pf.services.installed import installed_services, published_services
 from rse_pf.settings import PlatformSettings
 
-__all__ = ["load_services", "main"]
+__all__ = ["main"]
 
 _POLL_S = 0.01
 _MOST_LINE_BYTES = 1 << 26
@@ -63,18 +67,6 @@ def main(arguments: list[str]) -> None:
     loop = uvloop.new_event_loop()
     asyncio.set_event_loop(loop)
     loop.run_until_complete(_Worker(config, data, control, loop).run())
-
-
-def load_services(name: str, settings: PlatformSettings) -> Registry:
-    """Return the registry that ``module:function`` makes of *settings*; raises ConfigurationError."""
-    module, _, function = name.partition(":")
-    try:
-        make: Callable[[PlatformSettings], Registry] = getattr(importlib.import_module(module), function)
-    except (ImportError, AttributeError) as error:
-        raise ConfigurationError(
-            f"no services at {name!r}: {error}", hint="name them as module:function"
-        ) from error
-    return make(settings)
 
 
 class _Worker:
@@ -105,6 +97,8 @@ class _Worker:
         )
         if settings.services.folder or settings.services.published:
             self._core.environments = self._environments(settings, config["server"], config["workers"])
+        if settings.serving.jobs:
+            self._core.jobs = self._jobs(settings, config)
         self._hand_over = HandOver(
             self._core.connections, timers=loop, now=time.monotonic, choose=secrets.choice
         )
@@ -141,6 +135,24 @@ class _Worker:
             log=self._log,
             answer=self._core.answer_isolated,
         )
+
+    def _jobs(self, settings: PlatformSettings, config: Mapping[str, Any]) -> Jobs:
+        session = settings.session
+        read, write = config["job_slots"]
+        context = Context(
+            store=open_job_store(settings),
+            slots=Slots((read, write)),
+            settings=settings.serving,
+            most_bytes=settings.data.max_object_bytes,
+            inline_bytes=session.max_message_bytes // 2,
+            server_id=config["server"],
+            start=spawner(config["services"], settings),
+            clock=time.monotonic,
+        )
+        return Jobs(
+            context, settings=settings, loop=self._loop, log=self._log, answer=self._core.answer_isolated,
+            progress=self._core.progress, new_owner=lambda: f"{config['server']}-{secrets.token_hex(8)}",
+        )  # fmt: skip
 
     async def run(self) -> None:
         reader, self._writer = await asyncio.open_unix_connection(sock=self._control, limit=_MOST_LINE_BYTES)

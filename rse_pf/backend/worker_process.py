@@ -41,7 +41,7 @@ class WorkerProcess:
         with data, control:
             self._process = subprocess.Popen(
                 [sys.executable, "-m", "rse_pf.backend.worker", str(data.fileno()), str(control.fileno())],
-                pass_fds=(data.fileno(), control.fileno()),
+                pass_fds=(data.fileno(), control.fileno(), *config["job_slots"]),
                 stdin=subprocess.DEVNULL,
             )
         self._control.sendall(json.dumps(config).encode() + b"\n")

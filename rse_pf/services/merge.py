@@ -74,9 +74,9 @@ def register(registry: Registry, settings: ServiceSettings) -> None:
     """Add ``merge`` to *registry*."""
 
     @registry.service("merge", kind="long")
-    def merge(request: MergeRequest) -> MergeReply:
+    def merge(request: MergeRequest, *, report: Report = silent) -> MergeReply:
         """Make one map of several robots' maps, or close the loops of one."""
-        return merge_maps(request, settings)
+        return merge_maps(request, settings, report=report)
 
 
 def _reply(merged: Merged) -> MergeReply:

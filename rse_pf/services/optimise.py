@@ -146,7 +146,7 @@ def register(registry: Registry, settings: ServiceSettings) -> None:
     """Add ``optimise`` to *registry*."""
 
     @registry.service("optimise", kind="long")
-    def optimise(request: OptimiseRequest) -> OptimiseReply:
+    def optimise(request: OptimiseRequest, *, report: Report = silent) -> OptimiseReply:
         """Fit the poses of a pose graph to its edges."""
         graph = read_g2o(request.g2o)
         if len(graph.a) > settings.max_graph_edges:
@@ -154,7 +154,7 @@ def register(registry: Registry, settings: ServiceSettings) -> None:
                 f"{len(graph.a)} edges are above {settings.max_graph_edges}", hint="send a part of the graph"
             )
         options = request.options or OptimiseOptions()
-        found = optimise_graph(graph, options)
+        found = optimise_graph(graph, options, report=report)
         squares = graph.squared_residuals(found.T_world_pose)
         wrong = np.flatnonzero(graph.robust & (squares > 9.0 * max(options.cauchy, 3.0) ** 2))
         return OptimiseReply(

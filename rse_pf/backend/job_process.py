@@ -1,0 +1,131 @@
+"""The inside of one job: a process of its own that steps back behind everything else, works once and ends.
+
+It talks with its worker over one socket: an order in; progress, then one answer out.  Promises to run at
+the lowest priority there is, to stay within its memory, and not to outlive its worker.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import resource
+import select
+import socket
+import sys
+import time
+import traceback
+from collections.abc import Callable
+from typing import Any
+
+import msgspec
+
+from rse_pf.backend.environment_process import HEADER, decoded, encoded
+from rse_pf.backend.load_services import load_services
+from rse_pf.backend.processes import die_with_parent
+from rse_pf.errors import Cancelled, Crashed, RsePfError
+from rse_pf.service import dispatch, failure_of
+from rse_pf.settings import PlatformSettings
+from rse_pf.wire import Command, Failure, Result
+from rse_pf.wire.arrays import binary_encode_hook
+
+__all__ = ["main", "receive"]
+
+_REPORT_PAUSE_S = 0.5
+_LOWEST = 19
+
+
+def main(arguments: list[str]) -> None:
+    """Do the one job that the worker orders over the socket with this number."""
+    with socket.socket(fileno=int(arguments[0])) as worker:
+        order = receive(worker)
+        if order is None or not die_with_parent(order["worker"]):
+            return
+        _step_back()
+        resource.setrlimit(resource.RLIMIT_DATA, (order["memory_bytes"],) * 2)
+        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+        with contextlib.suppress(OSError):  # a worker that does not wait any longer is no defect
+            worker.sendall(encoded(_work(order, _Reporter(worker, time.monotonic))))
+
+
+def receive(connection: socket.socket) -> Any:
+    """Return the next message on a blocking socket, None at its end."""
+    header = _exactly(connection, HEADER.size)
+    if header is None:
+        return None
+    body = _exactly(connection, *HEADER.unpack(header))
+    return None if body is None else decoded(body)
+
+
+class _Reporter:
+    """Tells the worker how far the job is, and hears from it that nobody wants it any longer."""
+
+    def __init__(self, worker: socket.socket, clock: Callable[[], float]) -> None:
+        self._worker = worker
+        self._clock = clock
+        self._told_s = float("-inf")
+
+    def __call__(self, done: float, what: str) -> None:
+        if select.select([self._worker], [], [], 0)[0]:
+            raise Cancelled("the robot took the command back")
+        now = self._clock()
+        if now - self._told_s >= _REPORT_PAUSE_S:
+            self._told_s = now
+            self._worker.sendall(encoded(["progress", float(done), str(what)[:200]]))
+
+
+def _work(order: dict[str, Any], report: Callable[[float, str], None]) -> list[Any]:
+    command = Command(id=0, service=order["service"], payload=order["payload"])
+    out_of_memory = False
+
+    def on_defect(_: Command, error: Exception) -> None:
+        nonlocal out_of_memory
+        out_of_memory = isinstance(error, MemoryError)
+        traceback.print_exception(error)
+
+    try:
+        settings = PlatformSettings.from_dict(order["settings"])
+        registry = load_services(order["services"], settings)
+        answer = dispatch(registry, command, time.monotonic, on_defect=on_defect, report=report)
+    except RsePfError as error:
+        answer = failure_of(error)
+    except MemoryError:
+        out_of_memory = True
+    if out_of_memory:
+        megabytes = order["memory_bytes"] / 1e6
+        answer = failure_of(
+            Crashed(f"the job needs more than {megabytes:.0f} MB of memory", hint="send less at once")
+        )
+    return _told(answer)
+
+
+def _told(answer: Result | Failure) -> list[Any]:
+    if isinstance(answer, Failure):
+        return ["failed", answer.code, answer.message, answer.hint]
+    try:
+        reply = msgspec.msgpack.encode(answer.reply, enc_hook=binary_encode_hook)
+    except (TypeError, ValueError, OverflowError) as error:
+        return ["failed", "internal", f"the reply does not travel: {str(error)[:150]}", ""]
+    return ["done", answer.compute_ms, reply]
+
+
+def _step_back() -> None:
+    """Run only when nothing else wants to; be the first to go when memory is short."""
+    os.nice(_LOWEST)
+    with contextlib.suppress(OSError):
+        os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
+    with contextlib.suppress(OSError), open("/proc/self/oom_score_adj", "w", encoding="ascii") as file:
+        file.write("1000")
+
+
+def _exactly(connection: socket.socket, count: int) -> bytes | None:
+    data = bytearray()
+    while len(data) < count:
+        piece = connection.recv(count - len(data))
+        if not piece:
+            return None
+        data += piece
+    return bytes(data)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
