@@ -42,7 +42,7 @@ from rse_pf.wire.robot_session import (
     RobotSession,
     Welcomed,
 )
-from rse_pf.wire.session import CLOSE_REPLACED
+from rse_pf.wire.session import CLOSE_RATE, CLOSE_REPLACED
 
 __all__ = ["Connection", "OnChange", "Token", "websocket_options"]
 
@@ -335,6 +335,8 @@ class Connection:
                 self.bytes_in += len(data)
                 self._hear(socket, data)
         except (ConnectionClosed, OSError):
+            if socket.websocket.close_code == CLOSE_RATE:
+                self.last_error = "the server cut this robot off: it sends more than its rate"
             replaced = socket.websocket.close_code == CLOSE_REPLACED
             if replaced and self._session.current is socket.link and self._move_asked is None:
                 self._end(
@@ -454,7 +456,7 @@ class Connection:
             told = f"{self._address} forbids this robot to connect"
             return _Refused(Forbidden(told, hint="ask the operator"), for_good=True)
         error = ConnectError(f"{self._address} answers {status}", hint="it is full or not ready; try later")
-        if 400 <= status < 500:
+        if 400 <= status < 500 and status != 429:
             error.hint = "check the URL: it ends with the path of the servers, /ws"
         after_s = float(retry_after) if retry_after.isdecimal() else 0.0
         is_wrong = status in (400, 404)

@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 from typing import Generic, TypeVar
 
 from rse_pf.settings import ServingSettings, SessionSettings
+from rse_pf.wire.pace import Bucket
 
 __all__ = ["Bucket", "CutOff", "RobotRates", "SourceRates", "TooFast", "WaitingRoom"]
 
@@ -22,42 +23,6 @@ _SHORTEST_RETRY_MS = 1.0
 
 Key = TypeVar("Key", bound=Hashable)
 Value = TypeVar("Value")
-
-
-@dataclass(slots=True)
-class Bucket:
-    """A token bucket: *burst* at once, *rate* a second; starts full.
-
-    Source:
-        Turner 1986, "New directions in communications".
-    """
-
-    rate: float
-    burst: float
-    left: float = field(init=False)
-    at: float = field(init=False, default=-math.inf)
-
-    def __post_init__(self) -> None:
-        """Fill it."""
-        self.left = self.burst
-
-    def take(self, now: float) -> float:
-        """Take one token at *now* (s) and return 0, or the seconds until there is one again."""
-        self._fill(now)
-        if self.left >= 1.0:
-            self.left -= 1.0
-            return 0.0
-        return (1.0 - self.left) / self.rate
-
-    def is_full(self, now: float) -> bool:
-        """Whether nothing was taken that time has not given back."""
-        self._fill(now)
-        return self.left >= self.burst
-
-    def _fill(self, now: float) -> None:
-        if now > self.at:
-            self.left = min(self.burst, self.left + (now - self.at) * self.rate)
-            self.at = now
 
 
 @dataclass(frozen=True, slots=True)

@@ -45,11 +45,13 @@ class _Message(msgspec.Struct, frozen=True, kw_only=True, tag_field="type", omit
     """Unknown fields are ignored, so that a newer side may say more."""
 
 
-class Limits(msgspec.Struct, frozen=True, kw_only=True):
-    """What the server accepts from this robot."""
+class Limits(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """What the server accepts from this robot; a rate of 0 is none."""
 
     max_message_bytes: int
     max_in_flight: int
+    max_commands_per_s: float = 0.0
+    command_burst: int = 0
 
 
 class Hello(_Message, frozen=True, kw_only=True, tag="hello"):

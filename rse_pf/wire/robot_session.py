@@ -32,6 +32,7 @@ from rse_pf.wire.messages import (
     Result,
     Welcome,
 )
+from rse_pf.wire.pace import Pace
 from rse_pf.wire.prepared import encode_command
 from rse_pf.wire.renewal import Lease
 from rse_pf.wire.session import PROGRESS
@@ -139,6 +140,7 @@ class Link:
     clock_offset: ClockOffset = field(default_factory=ClockOffset)
     last_exchange: Exchange | None = None
     outgoing: list[bytes] = field(default_factory=list)
+    pace: Pace = field(default_factory=Pace)
     lease: Lease = field(default_factory=Lease)
 
     @property
@@ -205,7 +207,7 @@ class RobotSession:
         self._sequence[stream] = command.seq
         self._pending[command.id] = pending
         self._retry_tokens = min(_RETRY_BURST, self._retry_tokens + self.settings.retry_percent / 100)
-        if self.current is not None and self._room(self.current) > 0:
+        if self.current is not None and self._room(self.current, now) > 0:
             self._write(pending, self.current, now, data)
         return command.id
 
@@ -261,7 +263,7 @@ class RobotSession:
         if isinstance(message, Welcome):
             if link.welcome is not None:
                 return []
-            link.welcome = message
+            link.welcome, link.pace = message, Pace(message.limits)
             if message.token_s is not None:
                 link.lease.lasts(message.token_s, now)
             return [Welcomed(message)]
@@ -335,6 +337,7 @@ class RobotSession:
             link.ping_sent = now if link.ping_sent is None else link.ping_sent
             link.last_ping = now
             link.outgoing.append(self.codec.encode(Ping(sent_s=now)))
+            link.pace.spend(now)
         return [RenewalDue()] if not link.leaving and link.lease.is_due(now) else []
 
     def next_due(self, now: float) -> float:
@@ -342,6 +345,8 @@ class RobotSession:
         times = [now + self.settings.silence_s / _PINGS_PER_SILENCE]
         times += [pending.deadline for pending in self._pending.values()]
         times += [p.not_before for p in self._pending.values() if p.link is None and p.not_before > now]
+        if self.current is not None and not self.current.pace.room(now):
+            times.append(self.current.pace.next_s(now))
         return max(now, min(times))
 
     def _flush(self, now: float) -> list[Event]:
@@ -350,7 +355,7 @@ class RobotSession:
         if link is None:
             return []
         events: list[Event] = []
-        room = self._room(link)
+        room = self._room(link, now)
         for identity, pending in list(self._pending.items()):
             if pending.link is not None or now < pending.not_before:
                 continue
@@ -362,9 +367,10 @@ class RobotSession:
                 self._write(pending, link, now)
         return events
 
-    def _room(self, link: Link) -> int:
+    def _room(self, link: Link, now: float) -> int:
         most = link.welcome.limits.max_in_flight if link.welcome else self.settings.max_in_flight
-        return max(1, most) - sum(pending.link is link for pending in self._pending.values())
+        free = max(1, most) - sum(pending.link is link for pending in self._pending.values())
+        return min(free, link.pace.room(now))
 
     def _check_size(self, data: bytes) -> None:
         most = self.settings.max_message_bytes
@@ -379,6 +385,7 @@ class RobotSession:
     def _write(self, pending: _Pending, link: Link, now: float, data: bytes | None = None) -> None:
         self.resent += pending.sent_at is not None
         pending.link, pending.sent_at = link, now
+        link.pace.spend(now)
         link.outgoing.append(
             encode_command(self.codec, _with_deadline(pending.command, pending.deadline - now))
             if data is None

@@ -233,6 +233,8 @@ class ServerSession:
             limits=Limits(
                 max_message_bytes=self._limits.max_message_bytes,
                 max_in_flight=self._limits.max_in_flight,
+                max_commands_per_s=self._limits.max_commands_per_s,
+                command_burst=self._limits.command_burst if self._limits.max_commands_per_s else 0,
             ),
             clock_s=now,
             token_s=None if self.ends_s is None else max(0.0, self.ends_s - now),
