@@ -20,7 +20,9 @@ from typing import Any
 import msgspec
 
 from rse_pf.backend.environment_process import HEADER, decoded, encoded
+from rse_pf.backend.job_store import open_job_store
 from rse_pf.backend.load_services import load_services
+from rse_pf.backend.objects_in import named_in, resolve
 from rse_pf.backend.processes import die_with_parent
 from rse_pf.errors import Cancelled, Crashed, RsePfError
 from rse_pf.service import dispatch, failure_of
@@ -85,6 +87,8 @@ def _work(order: dict[str, Any], report: Callable[[float, str], None]) -> list[A
     try:
         settings = PlatformSettings.from_dict(order["settings"])
         registry = load_services(order["services"], settings)
+        payload = _resolved(command.payload, registry.get(command.service).request_type, order, settings)
+        command = msgspec.structs.replace(command, payload=payload)
         answer = dispatch(registry, command, time.monotonic, on_defect=on_defect, report=report)
     except RsePfError as error:
         answer = failure_of(error)
@@ -96,6 +100,16 @@ def _work(order: dict[str, Any], report: Callable[[float, str], None]) -> list[A
             Crashed(f"the job needs more than {megabytes:.0f} MB of memory", hint="send less at once")
         )
     return _told(answer)
+
+
+def _resolved(
+    payload: Any, request_type: type[Any], order: dict[str, Any], settings: PlatformSettings
+) -> Any:
+    """Return the payload with the robot's own objects in the place of their names."""
+    if not named_in(request_type, payload):
+        return payload
+    store = open_job_store(settings)
+    return resolve(request_type, payload, order["tenant"], order["robot"], store, settings=settings.serving)
 
 
 def _told(answer: Result | Failure) -> list[Any]:

@@ -7,6 +7,7 @@ outlives the connection which asked for it.
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import json
 import threading
@@ -39,11 +40,15 @@ class Loop(Protocol):
     def call_soon_threadsafe(self, callback: Callable[..., object], *args: Any) -> object:
         """Call *callback* in the loop's thread."""
 
+    def call_later(self, delay: float, callback: Callable[[], object]) -> object:
+        """Call *callback* in *delay* seconds."""
+
 
 @dataclass(eq=False, slots=True)
 class _Waiter:
     job: Job
     told_s: float = float("-inf")
+    is_told_later: bool = False
 
 
 @dataclass(eq=False, slots=True)
@@ -200,14 +205,24 @@ class Jobs:
     def _tell(self, entry: _Entry) -> None:
         now = self._context.clock()
         for waiter in entry.waiters:
-            if now - waiter.told_s >= _PROGRESS_PAUSE_S:
+            pause_s = waiter.told_s + _PROGRESS_PAUSE_S - now
+            if pause_s <= 0:
                 waiter.told_s = now
                 progress = Progress(id=waiter.job.command.id, done=entry.share, what=entry.what)
                 self._progress(waiter.job.owner, progress)
+            elif not waiter.is_told_later:
+                waiter.is_told_later = True
+                self._loop.call_later(pause_s, functools.partial(self._tell_later, entry, waiter))
+
+    def _tell_later(self, entry: _Entry, waiter: _Waiter) -> None:
+        waiter.is_told_later = False
+        if waiter in entry.waiters:
+            self._tell(entry)
 
     def _ended(self, entry: _Entry, outcome: Outcome) -> None:
         wanted = entry.wanted
         del self._entries[wanted.tenant, wanted.robot, wanted.key]
+        waiters, entry.waiters = entry.waiters, []
         entry.signals.close()
         code = "given-up" if outcome.is_given_up else "ok" if outcome.error is None else outcome.error.code
         self._log.info(
@@ -219,7 +234,7 @@ class Jobs:
         reply = None
         if outcome.reply is not None:
             reply = msgspec.msgpack.decode(outcome.reply, ext_hook=extension_hook)
-        for waiter in entry.waiters:
+        for waiter in waiters:
             if outcome.error is not None:
                 self._fail(waiter.job, outcome.error)
                 continue
