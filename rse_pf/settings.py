@@ -249,6 +249,7 @@ class LocalSettings:
     start_timeout_s: float = setting(20.0, unit="s", doc="a server that is not ready by then failed", low=1)
     stop_timeout_s: float = setting(10.0, unit="s", doc="a process that does not leave by then is killed", low=0.5)
     restarts_per_minute: int = setting(5, unit="servers", doc="replacements of servers that died young, in any minute", low=1)
+    max_connections: int = setting(12000, unit="sockets", doc="connections of the front door, robots and others; more are closed", low=16)
     young_s: float = setting(10.0, unit="s", doc="a server that ends this soon after it became healthy died young", low=0)
 
 

@@ -47,7 +47,7 @@ async def adopt(
     now_s = time.monotonic()
     balancer = state.load_balancer
     kept = balancer is not None and is_alive(balancer)
-    load_balancer.adopt(balancer if kept else None, port=state.port, admin_port=state.admin_port)
+    load_balancer.adopt(balancer if kept else None, port=state.port)
     fleet.launched = state.launched
     members = []
     for server in state.servers:

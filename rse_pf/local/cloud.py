@@ -219,7 +219,6 @@ class LocalCloud:
             "balancer": {
                 "pid": None if mark is None else mark.pid,
                 "port": self.load_balancer.port,
-                "admin_port": self.load_balancer.admin_port,
                 "running": self.load_balancer.is_running(),
             },
             "servers": [{**read.get(str(each["name"]), {}), **each} for each in servers],
@@ -388,7 +387,6 @@ class LocalCloud:
             ),
             load_balancer=self.load_balancer.mark,
             port=self.load_balancer.port,
-            admin_port=self.load_balancer.admin_port,
             status_port=0 if self._status is None else self._status.sockets[0].getsockname()[1],
             launched=self._fleet.launched,
         ).write(self.state)

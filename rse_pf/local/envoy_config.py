@@ -13,14 +13,15 @@ from typing import Any
 
 from rse_pf.settings import PlatformSettings
 
-__all__ = ["CLUSTER", "Target", "endpoints", "envoy_config"]
+__all__ = ["ADMIN_SOCKET", "CLUSTER", "Target", "endpoints", "envoy_config"]
 
 CLUSTER = "backend-servers"
+ADMIN_SOCKET = "admin.sock"
+"""In the balancer's folder: whoever reaches the admin page can end the balancer, so no port leads there."""
 _TYPES = "type.googleapis.com/envoy"
 _LOOPBACK = "127.0.0.1"
 _NO_LIMIT = 1_000_000
 """A server counts its robots itself (``serving.max_robots``); Envoy's breakers must not act before."""
-_MOST_HEADER_KIB = 16
 _MOST_HEADERS = 64
 
 
@@ -43,7 +44,8 @@ def envoy_config(settings: PlatformSettings, *, port: int, endpoints_file: Path)
     """
     return {
         "node": {"id": "front-door", "cluster": "rse-pf"},  # endpoint files are refused without
-        "admin": {"address": _address(_LOOPBACK, 0)},
+        "admin": {"address": {"pipe": {"path": ADMIN_SOCKET, "mode": 0o600}}},
+        "overload_manager": _most_connections(settings.local.max_connections),
         "static_resources": {
             "listeners": [_front_door(settings, port)],
             "clusters": [_cluster(settings, endpoints_file)],
@@ -83,15 +85,21 @@ def _front_door(settings: PlatformSettings, port: int) -> dict[str, Any]:
         "stream_idle_timeout": "0s",
         "request_timeout": "0s",
         "common_http_protocol_options": {
-            "idle_timeout": "0s",
+            # Without a request: silent ones end like slow handshakes.  An open WebSocket is a request.
+            "idle_timeout": _seconds(settings.serving.handshake_timeout_s),
             "max_headers_count": _MOST_HEADERS,
             "headers_with_underscores_action": "REJECT_REQUEST",
         },
         # The default of 1 s makes every close take a second, and hides a dead server from its robots.
         "delayed_close_timeout": "0s",
         "request_headers_timeout": _seconds(settings.serving.handshake_timeout_s),
-        "max_request_headers_kb": _MOST_HEADER_KIB,
+        "max_request_headers_kb": settings.serving.max_handshake_bytes // 1024,
+        # Whatever a robot says of its own address is dropped; servers read what stands here instead.
         "use_remote_address": True,
+        "xff_num_trusted_hops": 0,
+        "normalize_path": True,
+        "merge_slashes": True,
+        "path_with_escaped_slashes_action": "REJECT_REQUEST",
         "upgrade_configs": [{"upgrade_type": "websocket"}],
         "route_config": {"virtual_hosts": [_virtual_host(settings)]},
         "http_filters": [
@@ -106,7 +114,19 @@ def _front_door(settings: PlatformSettings, port: int) -> dict[str, Any]:
         "address": _address(settings.serving.host, port),
         # With the default a second Envoy would share a taken port in silence.
         "enable_reuse_port": False,
+        # Behind a slow reader no more is kept here than a server would keep itself.
+        "per_connection_buffer_limit_bytes": settings.serving.write_buffer_bytes,
         "filter_chains": [{"filters": [{"name": "http", "typed_config": manager}]}],
+    }
+
+
+def _most_connections(most: int) -> dict[str, Any]:
+    name = "envoy.resource_monitors.global_downstream_max_connections"
+    kind = f"{_TYPES}.extensions.resource_monitors.downstream_connections.v3.DownstreamConnectionsConfig"
+    return {
+        "resource_monitors": [
+            {"name": name, "typed_config": {"@type": kind, "max_active_downstream_connections": str(most)}}
+        ]
     }
 
 
@@ -159,6 +179,7 @@ def _cluster(settings: PlatformSettings, endpoints_file: Path) -> dict[str, Any]
         # A server that leaves the file gets nothing new, and keeps its open sockets.
         "ignore_health_on_host_removal": True,
         "connect_timeout": "0.5s",
+        "per_connection_buffer_limit_bytes": settings.serving.write_buffer_bytes,
         "circuit_breakers": {"thresholds": [dict.fromkeys(limits, _NO_LIMIT)]},
         "health_checks": [
             {

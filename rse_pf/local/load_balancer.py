@@ -9,7 +9,9 @@ from __future__ import annotations
 import asyncio
 import http.client
 import json
+import os
 import signal
+import socket
 import subprocess
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -18,13 +20,12 @@ from pathlib import Path
 from typing import Any
 
 from rse_pf.errors import ConfigurationError, MissingExtra
-from rse_pf.local.envoy_config import CLUSTER, Target, endpoints, envoy_config
+from rse_pf.local.envoy_config import ADMIN_SOCKET, CLUSTER, Target, endpoints, envoy_config
 from rse_pf.local.processes import ProcessMark, ended, is_alive, last_line, mark_of, send_signal, spawn
 from rse_pf.settings import PlatformSettings
 
 __all__ = ["LoadBalancer", "TargetStats", "envoy_binary"]
 
-_LOOPBACK = "127.0.0.1"
 _ASK_S = 1.0
 _LOOK_AGAIN_S = 0.01
 
@@ -47,13 +48,12 @@ def envoy_binary() -> str:
 
 
 class LoadBalancer:
-    """One Envoy.  ``port`` and ``admin_port`` are 0 before `start`."""
+    """One Envoy.  ``port`` is 0 before `wait_live`; its admin page is a socket file that only we may open."""
 
     def __init__(
         self, settings: PlatformSettings, *, folder: Path, port: int, dies_with_parent: bool = True
     ) -> None:
         self.port = 0
-        self.admin_port = 0
         self.mark: ProcessMark | None = None
         self.log = folder / "load-balancer.log"
         self._settings = settings
@@ -74,35 +74,30 @@ class LoadBalancer:
             self.set_targets(())
         self.kill()  # reaps one that ended by itself
         self._wanted_port = self.port or self._wanted_port
-        self.admin_port = 0
         config = self._folder / "envoy.json"
-        admin = self._folder / "admin-address"
-        admin.unlink(missing_ok=True)
+        (self._folder / ADMIN_SOCKET).unlink(missing_ok=True)
         made = envoy_config(self._settings, port=self._wanted_port, endpoints_file=self._endpoints)
         config.write_text(json.dumps(made, indent=1), encoding="utf-8")
-        command = [binary, "-c", str(config), "--admin-address-path", str(admin), "--concurrency", "1"]
+        command = [binary, "-c", str(config), "--concurrency", "1"]
         command += ["-l", "warning", "--disable-hot-restart"]
         self._process = spawn(
             command, log=self.log, folder=self._folder, dies_with_parent=self._dies_with_parent
         )
         self.mark = mark_of(self._process.pid)
 
-    def adopt(self, mark: ProcessMark | None, *, port: int, admin_port: int) -> None:
+    def adopt(self, mark: ProcessMark | None, *, port: int) -> None:
         """Know the balancer of an earlier control plane, which may be gone; its port stays its port."""
-        self.mark, self.port, self.admin_port = mark, port, admin_port
+        self.mark, self.port = mark, port
 
     async def wait_live(self, timeout_s: float) -> None:
-        """Wait until the front door is open; sets ``port`` and ``admin_port``.
+        """Wait until the front door is open; sets ``port``.
 
         Raises:
             ConfigurationError: Envoy ended, or did not open the door in time.
         """
-        admin = self._folder / "admin-address"
 
         async def live() -> bool:
-            if admin.exists():
-                self.admin_port = int(admin.read_text(encoding="ascii").rpartition(":")[2] or 0)
-            if not self.admin_port or await self._get("/ready") != b"LIVE\n":
+            if await self._get("/ready") != b"LIVE\n":
                 return False
             page = json.loads(await self._get("/listeners?format=json") or b"{}")
             listeners = page.get("listener_statuses", [])
@@ -201,12 +196,30 @@ class LoadBalancer:
         return False
 
     async def _get(self, path: str) -> bytes:
-        return await asyncio.to_thread(_ask, self.admin_port, path)
+        return await asyncio.to_thread(_ask, self._folder, path)
 
 
-def _ask(port: int, path: str) -> bytes:
+class _Admin(http.client.HTTPConnection):
+    """HTTP over the socket file in *folder*."""
+
+    def __init__(self, folder: Path) -> None:
+        super().__init__("admin", timeout=_ASK_S)
+        self._folder = folder
+
+    def connect(self) -> None:
+        """Connect by the folder's descriptor: an address of a socket file has at most 107 bytes."""
+        self.sock = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        self.sock.settimeout(_ASK_S)
+        folder = os.open(self._folder, os.O_PATH | os.O_DIRECTORY)
+        try:
+            self.sock.connect(f"/proc/self/fd/{folder}/{ADMIN_SOCKET}")
+        finally:
+            os.close(folder)
+
+
+def _ask(folder: Path, path: str) -> bytes:
     """Return what Envoy's admin page answers; nothing when it does not."""
-    connection = http.client.HTTPConnection(_LOOPBACK, port, timeout=_ASK_S)
+    connection = _Admin(folder)
     try:
         connection.request("GET", path)
         return connection.getresponse().read()

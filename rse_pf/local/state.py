@@ -61,7 +61,6 @@ class PlatformState:
     servers: tuple[ServerState, ...] = ()
     load_balancer: ProcessMark | None = None
     port: int = 0
-    admin_port: int = 0
     status_port: int = 0
     launched: int = 0
 

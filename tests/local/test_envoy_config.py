@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from rse_pf.local.envoy_config import CLUSTER, Target, endpoints, envoy_config
+from rse_pf.local.envoy_config import ADMIN_SOCKET, CLUSTER, Target, endpoints, envoy_config
 from rse_pf.settings import PlatformSettings
 
 ENDPOINTS = Path("/somewhere/endpoints.json")
@@ -43,7 +43,6 @@ def test_no_clock_of_the_balancer_ends_an_open_socket() -> None:
 
     assert manager(made)["stream_idle_timeout"] == "0s"
     assert manager(made)["request_timeout"] == "0s"
-    assert manager(made)["common_http_protocol_options"]["idle_timeout"] == "0s"
     assert only_route(made)["route"]["timeout"] == "0s"
     assert only_route(made)["route"]["idle_timeout"] == "0s"
 
@@ -74,11 +73,11 @@ def test_health_checks_follow_the_settings() -> None:
     assert check["http_health_check"] == {"path": "/ok"}
 
 
-def test_the_door_and_the_admin_page_listen_on_loopback() -> None:
+def test_the_door_is_on_loopback_and_the_admin_page_on_no_port() -> None:
     made = config()
 
-    for place in (listener(made)["address"], made["admin"]["address"]):
-        assert place["socket_address"]["address"] == "127.0.0.1"
+    assert listener(made)["address"]["socket_address"]["address"] == "127.0.0.1"
+    assert made["admin"]["address"] == {"pipe": {"path": ADMIN_SOCKET, "mode": 0o600}}
 
 
 def test_only_the_path_of_the_robots_leads_to_a_server() -> None:
@@ -86,11 +85,26 @@ def test_only_the_path_of_the_robots_leads_to_a_server() -> None:
 
 
 def test_headers_are_bounded_in_number_size_and_time() -> None:
-    made = manager(config(serving={"handshake_timeout_s": 1.5}))
+    made = manager(config(serving={"handshake_timeout_s": 1.5, "max_handshake_bytes": 4096}))
 
     assert made["request_headers_timeout"] == "1.5s"
-    assert made["max_request_headers_kb"] <= 60
+    assert made["common_http_protocol_options"]["idle_timeout"] == "1.5s"
+    assert made["max_request_headers_kb"] == 4
     assert made["common_http_protocol_options"]["max_headers_count"] <= 100
+
+
+def test_connections_and_buffers_are_bounded() -> None:
+    made = config(local={"max_connections": 500}, serving={"write_buffer_bytes": 65536})
+    (monitor,) = made["overload_manager"]["resource_monitors"]
+
+    assert monitor["typed_config"]["max_active_downstream_connections"] == "500"
+    assert listener(made)["per_connection_buffer_limit_bytes"] == 65536
+    assert cluster(made)["per_connection_buffer_limit_bytes"] == 65536
+
+
+def test_what_a_robot_says_of_its_address_is_not_believed() -> None:
+    assert manager(config())["use_remote_address"] is True
+    assert manager(config())["xff_num_trusted_hops"] == 0
 
 
 def test_the_endpoint_file_sends_robots_and_checks_to_different_ports() -> None:

@@ -33,7 +33,6 @@ STATE = PlatformState(
     servers=(ServerState(name="server-1", process=mark(2), port=10, control_port=11),),
     load_balancer=mark(3),
     port=12,
-    admin_port=13,
 )
 
 
