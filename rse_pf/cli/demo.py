@@ -45,7 +45,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--out", type=Path, default=Path("out"), metavar="DIR", help="results (default: out)")
     parser.add_argument(
-        "--frames", type=int, help="frames of each robot in the rendered world (default: 80, to merge: 170)"
+        "--frames", type=int, help="frames of each robot in the rendered world (default: 80, to merge: 150)"
     )
     parser.add_argument("--seed", type=int, default=0, help="another rendered world (default: 0)")
     parser.add_argument(

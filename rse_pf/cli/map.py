@@ -38,6 +38,7 @@ from rse_pf.settings import PlatformSettings
 __all__ = ["add_arguments", "run"]
 
 _SHORT = 12
+_LONGEST_VALUE = 80
 _ACTIONS = {
     "list": ("list the maps", "list"),
     "show": ("show a version: what is in it, and where it came from", "show kitchen --png kitchen.png"),
@@ -179,7 +180,7 @@ def _show(args: argparse.Namespace, maps: MapRegistry) -> None:
         print(f"points      {record.points}")
         print(f"size        {record.size} bytes, sha256 {record.digest}")
         for key in sorted(version.provenance):
-            print(f"provenance  {key} = {version.provenance[key]}")
+            print(f"provenance  {key} = {_shortened(str(version.provenance[key]))}")
     if args.png is not None:
         _draw(args, maps, record)
 
@@ -273,6 +274,10 @@ def _fields(record: MapRecord) -> dict[str, Any]:
 
 def _counts(counted: Counter[str]) -> str:
     return ", ".join(f"{name} {counted[name]}" for name in sorted(counted)) or "none"
+
+
+def _shortened(text: str) -> str:
+    return text if len(text) <= _LONGEST_VALUE else f"{text[:_LONGEST_VALUE]} ... (whole with --json)"
 
 
 def _when(created_s: float) -> str:

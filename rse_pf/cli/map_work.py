@@ -69,7 +69,8 @@ def merge_into(args: argparse.Namespace, maps: MapRegistry, settings: ServiceSet
     for name, reason in left_out:
         print(f"not joined  {name}: {reason}")
     for each in refused:
-        print(f"refused     {each['count']:>4}  {each['reason']:<17} {each['between']}")
+        told = ", ".join(f"{count} {reason}" for reason, count in each["reasons"].items())
+        print(f"refused     {each['between']}: {told}")
     return 1 if left_out else 0
 
 
@@ -178,7 +179,7 @@ def _found(label: str, location: Location) -> dict[str, Any]:
     return {
         "frame": label, "verdict": location.verdict, "reason": location.reason, "inliers": location.inliers,
         "rmse_px": round(location.rmse_px, 3), "keyframes": list(location.keyframes),
-        "position_m": None if T is None else [round(float(x), 4) for x in T[:3, 3]],
+        "position_m": None if T is None else [round(float(x), 4) + 0.0 for x in T[:3, 3]],
         "quaternion_xyzw": None if T is None else [round(float(x), 6) for x in to_quaternion(T[:3, :3])],
         "turned_deg": None if T is None else round(rotation_angle_deg(T[:3, :3]), 2),
     }  # fmt: skip
@@ -198,13 +199,14 @@ def _line(found: dict[str, Any]) -> str:
 
 
 def _refused(names: Sequence[str], reply: MergeReply) -> list[dict[str, Any]]:
-    return [
-        {
-            "between": " and ".join(dict.fromkeys(names[row] for row in each.maps)),
-            "reason": each.reason, "count": each.count,
-        }
-        for each in reply.refused
-    ]  # fmt: skip
+    """Return which pairs of keyframes made no link, by the maps that they are from."""
+    pairs: dict[str, dict[str, int]] = {}
+    for each in reply.refused:
+        between = " and ".join(dict.fromkeys(names[row] for row in each.maps))
+        if len(set(each.maps)) == 1:
+            between = f"within {between}"
+        pairs.setdefault(between, {})[each.reason] = each.count
+    return [{"between": between, "reasons": reasons} for between, reasons in pairs.items()]
 
 
 def _head(maps: MapRegistry, name: str) -> str | None:

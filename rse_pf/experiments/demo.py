@@ -42,7 +42,7 @@ from rse_pf.settings import PlatformSettings
 __all__ = ["DemoOptions", "run_demo"]
 
 _DEFAULT_FRAMES = 80
-_MERGE_FRAMES = 170
+_MERGE_FRAMES = 150
 """So far that each of three robots comes to see what the next one saw at its start."""
 _LOST_AFTER_S = 5.0
 _START_TIMEOUT_S = 120.0

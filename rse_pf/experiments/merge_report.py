@@ -162,10 +162,18 @@ def merged_rows(section: Mapping[str, Any] | None) -> list[str]:
         ("ATE cm of the maps laid beside each other, not bent", _two(section["ate_stiff_cm"])),
         *((f"origin of {e['robot']} off", f"{e['cm']:.1f} cm, {e['deg']:.2f} deg")
           for e in section["origins"]),
-        *((f"refused between {' and '.join(dict.fromkeys(e['robots']))}, {e['reason']}", e["count"])
-          for e in section["refused"]),
+        *(("refused " + between, reasons) for between, reasons in _refused_by_pair(section).items()),
     ]  # fmt: skip
     return ["| merged map | |", "|---|---|", *(f"| {what} | {value} |" for what, value in rows), ""]
+
+
+def _refused_by_pair(section: Mapping[str, Any]) -> dict[str, str]:
+    pairs: dict[str, list[str]] = {}
+    for each in section["refused"]:
+        one, other = each["robots"]
+        between = f"within {one}" if one == other else f"between {one} and {other}"
+        pairs.setdefault(between, []).append(f"{each['count']} {each['reason']}")
+    return {between: ", ".join(told) for between, told in pairs.items()}
 
 
 def _two(value: float | None) -> str:

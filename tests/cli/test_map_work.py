@@ -1,0 +1,216 @@
+"""rse-pf map merge, localise and view: what is written, what is said, and what is refused."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rse_pf.cli.main import main
+from rse_pf.data_server.maps import MapRegistry
+from rse_pf.geometry import pose_difference
+from rse_pf.maps import Keyframe, MapVersion, encode_map
+from rse_pf.objects import DirectoryStore
+from rse_pf.services.map_problems import make_world
+
+for package in ("faiss", "gtsam", "PIL", "cv2"):
+    pytest.importorskip(package, reason="the extras maps, local and vision are needed")
+
+WORLD = make_world(1)
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> Path:
+    """A store with maps a and b of one hall, and c of another."""
+    maps = MapRegistry(DirectoryStore(tmp_path / "store"))
+    walks = {
+        "a": WORLD.walk("robot-a", np.linspace(0.0, 0.5, 13), seed=1)[0],
+        "b": WORLD.walk("robot-b", np.linspace(0.3, 0.8, 13), seed=2)[0],
+        "c": make_world(2).walk("robot-c", np.linspace(0.0, 0.3, 8), seed=3)[0],
+    }
+    for name, version in walks.items():
+        maps.commit(name, encode_map(version), parent=None, author=name, created_s=1e9)
+    return tmp_path / "store"
+
+
+def run(store: Path, *words: str) -> int:
+    return main(["map", *words, "--store", f"dir:{store}"])
+
+
+def test_merge_makes_one_map_and_says_what_was_joined(
+    store: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(store, "merge", "a", "b", "--into", "hall") == 0
+
+    said = capsys.readouterr().out
+    assert "hall is now version 1" in said
+    assert "joined      a, b\n" in said
+    version = MapRegistry(DirectoryStore(store)).load("hall")
+    assert len(version.keyframes) == 26
+    assert any(edge.kind == "merge" for edge in version.edges)
+
+
+def test_merging_into_a_map_that_exists_follows_its_head(
+    store: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(store, "merge", "a", "b", "--into", "a") == 0
+
+    records = MapRegistry(DirectoryStore(store)).versions("a")
+    assert [each.number for each in records] == [1, 2]
+    assert records[1].parent == records[0].id
+    assert records[1].note == "merged a, b"
+
+
+def test_what_was_not_joined_is_named_and_ends_in_one(
+    store: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(store, "merge", "a", "b", "c", "--into", "hall", "--json") == 1
+
+    made = json.loads(capsys.readouterr().out)
+    assert made["joined"] == ["a", "b"]
+    assert [each["map"] for each in made["not_joined"]] == ["c"]
+    assert made["not_joined"][0]["reason"]
+
+
+def test_maps_that_cannot_be_joined_write_nothing(store: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(store, "merge", "a", "c", "--into", "hall") == 1
+
+    said = capsys.readouterr().err
+    assert "nothing was written" in said
+    assert "hint:" in said
+    assert "hall" not in MapRegistry(DirectoryStore(store)).names()
+
+
+def test_an_older_version_can_be_merged(store: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    maps = MapRegistry(DirectoryStore(store))
+    first = maps.head("a")
+    strange = make_world(2).walk("robot-a", np.linspace(0.0, 0.3, 8), seed=3)[0]
+    maps.commit("a", encode_map(strange), parent=first.id, author="a", created_s=2e9)
+
+    assert run(store, "merge", f"a@{first.id[:8]}", "b", "--into", "hall") == 0
+
+
+def test_view_draws_the_map_there(store: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = store.parent / "a.png"
+
+    assert run(store, "view", "a", "--out", str(out)) == 0
+
+    assert out.read_bytes().startswith(b"\x89PNG")
+    assert str(out) in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    "action", ["list", "show", "view", "merge", "localise", "diff", "rollback", "export"]
+)
+def test_each_action_has_an_example(capsys: pytest.CaptureFixture[str], action: str) -> None:
+    assert main(["map", action, "--help"]) == 0
+
+    assert f"example:\n  rse-pf map {action}" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "told"),
+    [
+        (["merge", "a", "nowhere", "--into", "hall"], 1, "no map 'nowhere'"),
+        (["merge", "a", "b", "--into", "No Name"], 1, "no name of a map"),
+        (["localise", "a", "nowhere.png"], 2, "no image or recording nowhere.png"),
+        (["localise", "a", "x.png", "--every", "0"], 2, "--every 0"),
+        (["view", "a", "--out", "/nowhere/x.png"], 2, "no folder /nowhere"),
+        (["view", "nowhere"], 1, "no map 'nowhere'"),
+        (["view", "a", "--browser", "--port", "0"], 2, "port 0"),
+    ],
+)
+def test_bad_input_is_one_sentence_and_a_hint(
+    store: Path, capsys: pytest.CaptureFixture[str], words: list[str], code: int, told: str
+) -> None:
+    assert run(store, *words) == code
+
+    said = capsys.readouterr().err
+    assert told in said
+    assert said.count("\n") == 2
+    assert "\n  hint: " in said
+
+
+@pytest.fixture(scope="module")
+def rendered(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, np.ndarray, Path]:
+    """A store whose map "room" has two rendered frames; an image between them, and its true pose."""
+    from PIL import Image
+
+    from client_sdk.frontend import FrontEndOptions, extract
+    from client_sdk.simulate import render_frames, true_trajectory
+
+    folder = tmp_path_factory.mktemp("rendered")
+    truth = true_trajectory(0, 1, 3, 0).T_world_camera
+    frames = list(render_frames(0, 1, 3, 0))
+    keyframes = []
+    for row in (0, 2):
+        found = extract(frames[row], FrontEndOptions())
+        keyframes.append(
+            Keyframe(
+                id=row, robot="robot-1", timestamp_s=float(row), T_world_camera=truth[row],
+                camera=frames[row].camera, pixels=found.pixels.astype(np.float32),
+                descriptors=found.descriptors, points_camera=found.points_camera.astype(np.float32),
+            )
+        )  # fmt: skip
+    maps = MapRegistry(DirectoryStore(folder / "store"))
+    maps.commit(
+        "room", encode_map(MapVersion(keyframes=tuple(keyframes))), parent=None, author="a", created_s=1e9
+    )
+    Image.fromarray(frames[1].rgb).save(folder / "frame.png")
+    return folder / "store", truth[1], folder / "frame.png"
+
+
+def test_localise_finds_an_image_by_the_maps_own_camera(
+    rendered: tuple[Path, np.ndarray, Path], capsys: pytest.CaptureFixture[str]
+) -> None:
+    store, truth, image = rendered
+
+    assert run(store, "localise", "room", str(image), "--json") == 0
+
+    (found,) = json.loads(capsys.readouterr().out)
+    assert found["verdict"] == "ok"
+    assert found["inliers"] >= 30
+    assert found["keyframes"]
+    estimate = np.eye(4)
+    estimate[:3, 3] = found["position_m"]
+    assert pose_difference(estimate, truth)[0] <= 0.03
+
+
+def test_localise_prints_a_line_for_each_frame_and_ends_in_one_if_none_was_found(
+    rendered: tuple[Path, np.ndarray, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from PIL import Image
+
+    store, _, image = rendered
+    noise = np.random.default_rng(0).integers(0, 256, (480, 640, 3), dtype=np.uint8)
+    Image.fromarray(noise).save(tmp_path / "noise.png")
+
+    assert run(store, "localise", "room", str(image), str(tmp_path / "noise.png")) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert "ok" in lines[0]
+    assert "inliers" in lines[0]
+    assert "lost" in lines[1]
+    assert lines[2] == "1 of 2 found"
+
+    assert run(store, "localise", "room", str(tmp_path / "noise.png")) == 1
+
+
+def test_an_image_of_another_size_needs_its_camera(
+    rendered: tuple[Path, np.ndarray, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from PIL import Image
+
+    store, _, image = rendered
+    with Image.open(image) as whole:
+        whole.resize((320, 240)).save(tmp_path / "small.png")
+
+    assert run(store, "localise", "room", str(tmp_path / "small.png")) == 2
+    assert "--camera fx,fy,cx,cy" in capsys.readouterr().err
+    assert run(store, "localise", "room", str(tmp_path / "small.png"), "--camera", "1,2,x") == 2
+
+    assert (
+        run(store, "localise", "room", str(tmp_path / "small.png"), "--camera", "262.5,262.5,159.5,119.5")
+        == 0
+    )
