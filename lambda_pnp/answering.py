@@ -17,7 +17,8 @@ from typing import Any
 
 from lambda_pnp.keys import KeyCache, read_object
 from rse_pf.auth import verify_token
-from rse_pf.errors import BadMessage, Expired, RsePfError, Unauthorized, UnsupportedProtocol
+from rse_pf.enrolment import holds
+from rse_pf.errors import BadMessage, Expired, Forbidden, RsePfError, Unauthorized, UnsupportedProtocol
 from rse_pf.service import Registry, dispatch, failure_of
 from rse_pf.services import pnp
 from rse_pf.settings import PlatformSettings, load_settings
@@ -27,6 +28,8 @@ __all__ = ["Answered", "Answering", "load_answering"]
 
 _ROOT = Path(__file__).resolve().parents[1]
 _SERVER = "lambda"
+_MOST_STALE_S = 30.0
+"""So long a revoked token may still be answered here; there is no socket that could be closed."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -69,7 +72,7 @@ class Answering:
         headers = {str(name).lower(): str(each) for name, each in (event.get("headers") or {}).items()}
         try:
             kind, _, token = headers.get("authorization", "").partition(" ")
-            verify_token(
+            who = verify_token(
                 token.strip() if kind.lower() == "bearer" else "",
                 keys=self._keys.at(arrived), now=now_s, settings=self._settings.auth,
             )  # fmt: skip
@@ -86,6 +89,11 @@ class Answering:
         allowed_ms = min(left_ms, allowed_ms if message.deadline_ms is None else message.deadline_ms)
         if (clock() - arrived) * 1e3 >= allowed_ms:
             return self._said(codec, self._late(message))
+        if not holds(who.scopes, f"services:{message.service}"):
+            forbidden = Forbidden(
+                f"this token does not hold the scope services:{message.service}", hint="issue one that does"
+            )
+            return self._said(codec, failure_of(forbidden, message, server=_SERVER))
         answer = dispatch(self._registry, message, clock, server=_SERVER)
         late = (clock() - arrived) * 1e3 > allowed_ms
         return self._said(codec, self._late(message) if late else answer)
@@ -135,4 +143,8 @@ def load_answering() -> Answering:
     def read() -> str:
         return read_object(os.environ, datetime.now(timezone.utc))
 
-    return Answering(settings, KeyCache(read, settings.scaling.period_s))
+    def read_control(name: str) -> str:
+        return read_object(os.environ, datetime.now(timezone.utc), name)
+
+    period_s = min(_MOST_STALE_S, settings.scaling.period_s)
+    return Answering(settings, KeyCache(read, period_s, read_control=read_control))

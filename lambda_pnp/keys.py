@@ -1,8 +1,8 @@
-"""Read the public keys from the artifact bucket with the standard library alone.
+"""Read the public keys and the control room from the artifact bucket with the standard library alone.
 
 The package stays small and imports fast without an AWS SDK.  A function may live for hours, so the keys are
-fetched again once in a period: a new key is learned, a retired one forgotten.  Promises one signed GET at a
-time and no retry within it; a fetch that fails leaves the keys as they were.
+fetched again once in a period: a new key is learned, a retired one forgotten, a revoked token refused.
+Promises one signed GET at a time and no retry within it; a fetch that fails leaves everything as it was.
 """
 
 from __future__ import annotations
@@ -10,33 +10,51 @@ from __future__ import annotations
 import hashlib
 import hmac
 import sys
+import urllib.error
 import urllib.request
 from collections.abc import Callable, Mapping
 from datetime import datetime
+from typing import TypeVar
 
 from rse_pf.auth import KeySet
-from rse_pf.errors import RsePfError
+from rse_pf.enrolment import DenyList, Roster, from_json
+from rse_pf.errors import NotFound, RsePfError
 
 __all__ = ["KeyCache", "read_object", "signed_request"]
 
 _TIMEOUT_S = 3.0
 _AGAIN_S = 5.0
+_NOT_FOUND = 404
+_T = TypeVar("_T", Roster, DenyList)
 
 
 class KeyCache:
     """The public keys, as old as a period at most while S3 answers."""
 
-    def __init__(self, read: Callable[[], str], period_s: float) -> None:
+    def __init__(
+        self, read: Callable[[], str], period_s: float, *, read_control: Callable[[str], str] | None = None
+    ) -> None:
+        """Know nothing yet.
+
+        Args:
+            read: Returns the JWKS.
+            period_s: So old may everything become.
+            read_control: Returns ``robots.json`` or ``deny.json`` of the control room; raises NotFound.
+        """
         self._read = read
+        self._read_control = read_control
         self._period_s = period_s
         self._keys = KeySet({})
+        self._found: set[str] = set()
         self._due_s: float | None = None
 
     def at(self, clock_s: float) -> KeySet:
         """Return the keys at *clock_s*, in monotonic seconds; empty if none could ever be fetched."""
         if self._due_s is None or clock_s >= self._due_s:
             try:
-                self._keys = KeySet.from_json(self._read())
+                self._keys = KeySet.from_json(self._read()).governed_by(
+                    self._governor("robots.json", Roster), self._governor("deny.json", DenyList)
+                )
                 self._due_s = clock_s + self._period_s
             except (OSError, RsePfError) as error:
                 self._due_s = clock_s + min(_AGAIN_S, self._period_s)
@@ -45,17 +63,45 @@ class KeyCache:
                 )
         return self._keys
 
+    def _governor(self, name: str, kind: type[_T]) -> _T:
+        """Return what the control room says; nothing only where nothing was ever written."""
+        if self._read_control is None:
+            return kind()
+        try:
+            found = from_json(self._read_control(name), kind)
+        except NotFound:
+            if name in self._found:
+                raise
+            return kind()
+        self._found.add(name)
+        return found
 
-def read_object(environment: Mapping[str, str], now: datetime) -> str:
-    """Return the object that ``RSE_PF_KEYS`` (``BUCKET/NAME``) names."""
-    with urllib.request.urlopen(signed_request(environment, now), timeout=_TIMEOUT_S) as answer:
-        text: bytes = answer.read()
+
+def read_object(environment: Mapping[str, str], now: datetime, control: str = "") -> str:
+    """Return the object that ``RSE_PF_KEYS`` (``BUCKET/NAME``) names, or *control* of the room beside it.
+
+    Raises:
+        NotFound: There is no such object.
+        OSError: Anything else.
+    """
+    try:
+        with urllib.request.urlopen(signed_request(environment, now, control), timeout=_TIMEOUT_S) as answer:
+            text: bytes = answer.read()
+    except urllib.error.HTTPError as error:
+        with error:
+            if error.code == _NOT_FOUND:
+                raise NotFound(f"there is no {control or 'key set'} in the bucket") from error
+            raise
     return text.decode()
 
 
-def signed_request(environment: Mapping[str, str], now: datetime) -> urllib.request.Request:
+def signed_request(
+    environment: Mapping[str, str], now: datetime, control: str = ""
+) -> urllib.request.Request:
     """Return the GET with AWS Signature Version 4, from Lambda's own variables and the time in UTC."""
     bucket, _, name = environment["RSE_PF_KEYS"].partition("/")
+    if control:
+        name = f"{name.rpartition('/')[0]}/control/{control}".lstrip("/")
     region = environment["AWS_REGION"]
     host, stamp = f"{bucket}.s3.{region}.amazonaws.com", now.strftime("%Y%m%dT%H%M%SZ")
     empty = hashlib.sha256(b"").hexdigest()

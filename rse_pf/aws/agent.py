@@ -1,9 +1,10 @@
-"""Stand beside a backend server on its instance: publish its numbers, fetch the keys, drain it at the end.
+"""Stand beside a backend server on its instance: numbers out; keys, roster and deny-list in; the drain.
 
     python -m rse_pf.aws.agent --settings FILE --bucket B --keys-file FILE --group G --hook H
 
 Without it the idle alarm never fires and a scale-in cuts robots off.  Each duty fails by itself, with one
-line in the log, and is tried again.  Promises to write one file, the public keys, and never a secret.
+line in the log, and is tried again.  Promises to write the public keys and the control room beside them, and
+never a secret.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ import argparse
 import json
 import os
 import sys
+import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -24,6 +26,8 @@ from rse_pf.aws.drain_hook import leave_group
 from rse_pf.aws.instance import Instance, Machine
 from rse_pf.aws.metrics import Reading, datums, read_page
 from rse_pf.aws.s3_store import open_bucket
+from rse_pf.control import DENY_NAME, ROBOTS_NAME
+from rse_pf.enrolment import DenyList, Roster, from_json
 from rse_pf.errors import NotFound, RsePfError
 from rse_pf.objects import ObjectStore
 from rse_pf.scaling.alarms import NAMESPACE
@@ -99,6 +103,27 @@ class Agent:
         self._replace(file, fresh)
         self._log("keys", bytes=len(fresh))
 
+    def fetch_control(self) -> None:
+        """Write what the bucket's control room says; what is nonsense or gone changes nothing."""
+        for name, kind in ((ROBOTS_NAME, Roster), (DENY_NAME, DenyList)):
+            file = self._post.keys_file.parent / name
+            try:
+                fresh = self._artifacts.get(name)
+            except NotFound:
+                continue  # nobody was ever enrolled or denied, or somebody deleted what servers still know
+            if file.exists() and file.read_bytes() == fresh:
+                continue
+            from_json(fresh, kind)
+            file.parent.mkdir(exist_ok=True)
+            self._replace(file, fresh)
+            self._log("control", name=name, bytes=len(fresh))
+
+    def watch_control(self, rest: Callable[[float], None] = time.sleep) -> None:
+        """Fetch it again and again, for ever; in a thread, since a drain holds `step` up."""
+        while True:
+            self._try("control", self.fetch_control)
+            rest(self._settings.auth.deny_list_refresh_s)
+
     def _look_at_lifecycle(self) -> None:
         if self._machine.is_leaving():
             self._log("leaving", group=self._post.group)
@@ -149,10 +174,12 @@ def main(arguments: list[str] | None = None) -> int:
         )  # fmt: skip
         if args.once:
             agent.fetch_keys()
+            agent.fetch_control()
             return 0
     except RsePfError as error:
         sys.stderr.write(f"{error.report()}\n")
         return 2
+    threading.Thread(target=agent.watch_control, daemon=True).start()
     while True:
         agent.step()
         time.sleep(settings.cloud.poll_s)

@@ -14,6 +14,7 @@ from rse_pf.auth import KeySet, SigningKey
 from rse_pf.aws.account import Account
 from rse_pf.aws.s3_store import S3Store
 from rse_pf.aws.secrets import read_secret, write_secret
+from rse_pf.control import ControlRoom
 from rse_pf.errors import ConfigurationError, NotFound, UsageError
 from rse_pf.settings import PlatformSettings
 
@@ -125,8 +126,13 @@ class KeyStore:
         write_secret(self._secrets, self._secret, ring.to_json())
         self.publish(ring)
 
+    def control_room(self) -> ControlRoom:
+        """Return the room beside the public keys, which servers look into every few hundred milliseconds."""
+        return ControlRoom(self._bucket)
+
     def publish(self, ring: KeyRing) -> None:
-        """Write the public half, which servers fetch within `spread_s`."""
+        """Write the public half, which servers fetch within `spread_s`, and furnish the control room."""
+        self.control_room().furnish()
         self._bucket.put(KEYS_NAME, ring.key_set().to_json().encode())
 
 

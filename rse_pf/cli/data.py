@@ -30,7 +30,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         parser.add_argument(
             f"--{name}", type=kind, help=f"{rows[name].doc} (data.{name}, default {rows[name].default})"
         )
-    parser.add_argument("--keys", type=Path, metavar="FILE", help="public keys of the tokens, a JWKS")
+    parser.add_argument(
+        "--keys", type=Path, metavar="FILE",
+        help="public keys of the tokens, a JWKS; roster and deny-list lie beside it in control/",
+    )  # fmt: skip
     parser.add_argument(
         "--openapi", action="store_true", help="print the OpenAPI document and do nothing else"
     )
@@ -57,7 +60,8 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
     store = open_any_store(chosen)
     from rse_pf.data_server.server import KeysFile, serve_data
 
-    return serve_data(chosen, store, keys=KeysFile(args.keys), announce=args.announce)
+    keys = KeysFile(args.keys, chosen.auth.deny_list_refresh_s)
+    return serve_data(chosen, store, keys=keys, announce=args.announce)
 
 
 def open_any_store(settings: PlatformSettings) -> ObjectStore:

@@ -28,6 +28,7 @@ VERBS = {
     "local": "run the platform on this machine: load balancer and backend servers",
     "swarm": "load a platform with many robots, and measure what they see",
     "token": "issue a robot's token, or look into one",
+    "robot": "enrol robots with keys of their own, and shut them out",
     "service": "write, test, run and install a service of your own: Python, C/C++ or Lua",
     "serve": "run one backend server, as EC2 runs it",
     "data": "run the data service: images, keyframes, clouds and maps by HTTP",

@@ -1,14 +1,20 @@
-"""Issue a token for a robot, or look into one; make and change the keys of a cloud.
+"""Issue a token for a robot, look into one, revoke it; make and change the keys that sign.
 
 A token is signed with the key of a platform that rse-pf local made, with --key FILE, or with --cloud by the
 key in the deployment's secret.  inspect needs no secret: it shows what the token says, and whether the
-platform's public keys vouch for it.  init, rotate and retire are for --cloud: the first key, one more that
-takes over when every server knows it, and the end of the one before.
+platform's public keys vouch for it and nobody revoked it.  revoke ends one token, or with --all-of every
+token that a robot was given until now; live connections end within 2 s.  rotate-keys makes a new key;
+tokens of the one before stay good until their end.  init, rotate and retire are for --cloud: the first key,
+one more that takes over when every server knows it, and the end of the one before.
 
 examples:
   rse-pf token issue robot-1
   rse-pf token issue robot-1 --life 60
+  rse-pf token issue robot-1 --scope services:pnp --scope maps:read
   rse-pf token inspect "$TOKEN"
+  rse-pf token revoke "$TOKEN"
+  rse-pf token revoke --all-of robot-1
+  rse-pf token rotate-keys
   rse-pf token init --cloud
   rse-pf token issue robot-1 --cloud
 """
@@ -25,7 +31,10 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rse_pf.auth import SigningKey
+from rse_pf.auth import KeySet, SigningKey
+from rse_pf.cli.robot import add_place, control_room, longest_s
+from rse_pf.control import ControlRoom
+from rse_pf.enrolment import check_robot, check_tenant
 from rse_pf.errors import ConfigurationError, Unauthorized, UsageError
 from rse_pf.settings import PlatformSettings, load_settings
 
@@ -34,21 +43,25 @@ if TYPE_CHECKING:
 
 __all__ = ["add_arguments", "run"]
 
-_NAME = "default"
 _LAST_TIME = 1e11
-_KEY_ACTIONS = ("init", "rotate", "retire")
+_CLOUD_ACTIONS = ("init", "rotate", "retire")
+_KEY_ACTIONS = (*_CLOUD_ACTIONS, "rotate-keys")
 _SEED_BYTES = 32
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     life_s = PlatformSettings().auth.token_life_s
-    parser.add_argument("action", choices=("issue", "inspect", *_KEY_ACTIONS), help="what to do")
+    parser.add_argument("action", choices=("issue", "inspect", "revoke", *_KEY_ACTIONS), help="what to do")
     parser.add_argument(
         "subject", nargs="?", metavar="ROBOT|TOKEN", help="name of the robot; or the token, - reads it"
     )
-    parser.add_argument("--cloud", action="store_true", help="the deployment on AWS in cloud.region")
-    parser.add_argument("--name", default=_NAME, help=f"which local platform (default: {_NAME})")
+    add_place(parser)
+    parser.add_argument(
+        "--scope", action="append", default=[], metavar="SCOPE",
+        help="issue: allow this alone, as services:pnp or maps:read; again for more (default: everything)",
+    )  # fmt: skip
+    parser.add_argument("--all-of", metavar="ROBOT", help="revoke: every token of this robot until now")
     parser.add_argument("--key", type=Path, metavar="FILE", help="issue: sign with this key")
     parser.add_argument(
         "--life",
@@ -63,6 +76,10 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
     """Do one action, by the settings that the platform was started with unless told otherwise."""
     if args.action in _KEY_ACTIONS:
         return _change_keys(args, settings)
+    if args.action == "revoke":
+        return _revoke(args, settings)
+    if args.all_of is not None or (args.scope and args.action != "issue"):
+        raise UsageError("--all-of is for revoke and --scope for issue", hint="see rse-pf token --help")
     if args.subject is None:
         what = "the name of a robot" if args.action == "issue" else "a token"
         raise UsageError(f"rse-pf token {args.action} needs {what}", hint="see rse-pf token --help")
@@ -87,9 +104,49 @@ def _issue(args: argparse.Namespace, settings: PlatformSettings) -> int:
         token_id=secrets.token_hex(8),
         settings=settings.auth,
         life_s=args.life,
+        scopes=tuple(args.scope),
+        tenant=check_tenant(args.tenant),
     )
     print(token)
     return 0
+
+
+def _revoke(args: argparse.Namespace, settings: PlatformSettings) -> int:
+    if (args.subject is None) == (args.all_of is None):
+        raise UsageError(
+            "rse-pf token revoke needs a token, or --all-of ROBOT", hint="a token or - comes last"
+        )
+    now, longest = time.time(), longest_s(settings)
+    if args.all_of is not None:
+        robot, tenant = check_robot(args.all_of), check_tenant(args.tenant)
+        from_s = float(int(now) + 1)  # a token says when it was issued in whole seconds, rounded down
+        control_room(args, settings).change_denied(
+            lambda denied: denied.pruned(now=now, longest_s=longest).with_all_tokens(tenant, robot, from_s)
+        )
+        print(f"every token of {robot!r} until now is revoked; one issued in a second is good again")
+        return 0
+    header, claims = _parts(_token(args.subject))
+    name, token_id, over = claims.get("sub"), claims.get("jti"), claims.get("exp")
+    if not isinstance(name, str) or not isinstance(token_id, str) or not isinstance(over, (int, float)):
+        raise UsageError(
+            "this token lacks sub, jti or exp: no server takes it", hint="there is nothing to do"
+        )
+    if over + settings.auth.leeway_s < now:
+        raise UsageError("this token is over already", hint="there is nothing to do")
+    room = control_room(args, settings)
+    tenant = _tenant_of(room, header, claims)
+    until_s = min(float(over), now + longest)
+    room.change_denied(
+        lambda denied: denied.pruned(now=now, longest_s=longest).with_token(tenant, name, token_id, until_s)
+    )
+    print(f"token {token_id} of {name!r} is revoked: its connections end within 2 s")
+    return 0
+
+
+def _tenant_of(room: ControlRoom, header: dict[str, Any], claims: dict[str, Any]) -> str:
+    """Return whose robot a token names; for one that its robot signed, the roster knows."""
+    enrolled = [each for each in room.roster().robots if each.key_id == header.get("kid")]
+    return enrolled[0].tenant if enrolled else str(claims.get("tenant", "default"))
 
 
 def _signing_key(args: argparse.Namespace, settings: PlatformSettings, now: float) -> SigningKey:
@@ -103,6 +160,8 @@ def _signing_key(args: argparse.Namespace, settings: PlatformSettings, now: floa
 def _change_keys(args: argparse.Namespace, settings: PlatformSettings) -> int:
     from rse_pf.aws.key_store import KeyRing, spread_s
 
+    if args.action == "rotate-keys" and args.subject is None and not args.cloud:
+        return _rotate_local(_folder(args.name))
     if not args.cloud or args.subject is not None:
         raise UsageError(
             f"rse-pf token {args.action} is for a cloud, and names no robot",
@@ -110,7 +169,7 @@ def _change_keys(args: argparse.Namespace, settings: PlatformSettings) -> int:
         )
     store, now = _key_store(settings), time.time()
     new = SigningKey.from_seed(secrets.token_bytes(_SEED_BYTES), secrets.token_hex(8))
-    if args.action == "rotate":
+    if args.action in ("rotate", "rotate-keys"):
         ring = store.ring().rotated(new, now=now, settings=settings)
         store.write(ring)
         print(f"key {new.key_id} is published, and signs in {spread_s(settings):g} s")
@@ -130,6 +189,28 @@ def _change_keys(args: argparse.Namespace, settings: PlatformSettings) -> int:
     return 0
 
 
+def _rotate_local(folder: Path) -> int:
+    """Publish a new key beside the one that signs now, then sign with it."""
+    from rse_pf.local.firewall import key_file, key_set_file, read_key
+
+    old = read_key(key_file(folder))
+    new = SigningKey.from_seed(secrets.token_bytes(_SEED_BYTES), secrets.token_hex(8))
+    halves = {key.key_id: key.key_set().get(key.key_id) for key in (new, old)}
+    public = KeySet({name: half for name, half in halves.items() if half is not None})
+    _replace(key_set_file(folder), public.to_json(), 0o644)
+    _replace(key_file(folder), new.to_json(), 0o600)
+    print(f"key {new.key_id} signs from now on; tokens of {old.key_id} are good until their end")
+    return 0
+
+
+def _replace(file: Path, text: str, mode: int) -> None:
+    temporary = file.with_name(f".{file.name}.new")
+    temporary.unlink(missing_ok=True)
+    with open(os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode), "w") as out:
+        out.write(text)
+    temporary.replace(file)
+
+
 def _key_store(settings: PlatformSettings) -> KeyStore:
     from rse_pf.aws.account import open_account
     from rse_pf.aws.key_store import open_key_store
@@ -138,13 +219,17 @@ def _key_store(settings: PlatformSettings) -> KeyStore:
 
 
 def _inspect(args: argparse.Namespace, settings: PlatformSettings) -> int:
-    token = sys.stdin.readline().strip() if args.subject == "-" else args.subject.strip()
+    token = _token(args.subject)
     header, claims = _parts(token)
     now = time.time()
     verdict, code = _verdict(token, _keys(args, settings), now, settings)
     told = {"header": header, "claims": claims, "seconds_left": _left(claims, now), "verified": verdict}
     print(json.dumps(told, indent=2))
     return code
+
+
+def _token(subject: str) -> str:
+    return sys.stdin.readline().strip() if subject == "-" else str(subject).strip()
 
 
 def _left(claims: dict[str, Any], now: float) -> int | None:
@@ -179,21 +264,27 @@ def _verdict(token: str, keys: Any, now: float, settings: PlatformSettings) -> t
 
 
 def _keys(args: argparse.Namespace, settings: PlatformSettings) -> Any:
-    """Return the public keys that were named, or the platform's; None if it has none."""
-    from rse_pf.auth import KeySet
+    """Return the public keys that were named, or the platform's, under its control room; None if none."""
     from rse_pf.local.firewall import key_set_file
+    from rse_pf.objects import DirectoryStore
 
     if args.cloud:
-        return _key_store(settings).ring().key_set()
+        store = _key_store(settings)
+        return _governed(store.ring().key_set(), store.control_room())
     path = args.keys if args.keys is not None else key_set_file(_folder(args.name))
     try:
-        return KeySet.from_json(path.read_text(encoding="utf-8"))
+        keys = KeySet.from_json(path.read_text(encoding="utf-8"))
+        return _governed(keys, ControlRoom(DirectoryStore(path.absolute().parent)))
     except FileNotFoundError as error:
         if args.keys is None:
             return None
         raise UsageError(f"there is no file {path}", hint="name a JWKS with --keys") from error
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigurationError(f"cannot read {path}", hint="name a JWKS with --keys") from error
+
+
+def _governed(keys: KeySet, room: ControlRoom) -> KeySet:
+    return keys.governed_by(room.roster(), room.denied())
 
 
 def _of_platform(name: str) -> PlatformSettings | None:

@@ -17,6 +17,7 @@ from rse_pf.auth import Claims, KeySet, token_problem, verify_token
 from rse_pf.data_server.handlers import Handler, Handlers
 from rse_pf.data_server.http import MethodNotAllowed, Receive, Reply, Request, Send, failure_reply
 from rse_pf.data_server.routes import ROUTES, Route
+from rse_pf.enrolment import holds
 from rse_pf.errors import (
     BadRequest,
     Busy,
@@ -122,7 +123,7 @@ class DataServer:
     async def _handled(self, request: Request, said: dict[str, Any]) -> Reply:
         route, handler, path = self._find(request)
         said["operation"] = route.operation
-        who = _NOBODY if route.scope is None else self._who(request, route.scope, said)
+        who = _NOBODY if route.scope is None else self._who(request, route.scope, path.get("name", ""), said)
         if route.body is None:
             return await handler(request, who, path)
         if self._bodies >= self._settings.data.most_uploads:
@@ -147,7 +148,7 @@ class DataServer:
             raise refused
         raise NotFound("there is nothing here", hint="see /data/openapi.json")
 
-    def _who(self, request: Request, scope: str, said: dict[str, Any]) -> Claims:
+    def _who(self, request: Request, scope: str, name: str, said: dict[str, Any]) -> Claims:
         kind, _, token = request.headers.get("authorization", "").partition(" ")
         keys = self._keys()
         if keys is None:
@@ -161,7 +162,7 @@ class DataServer:
             said["reason"] = token_problem(error)
             raise
         said["robot"] = who.robot
-        if who.scopes and scope not in who.scopes:
+        if not holds(who.scopes, scope, name):
             raise Forbidden(f"this token does not hold the scope {scope}", hint="issue one that does")
         return who
 

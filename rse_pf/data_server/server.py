@@ -20,8 +20,9 @@ from typing import Any
 import msgspec
 
 from rse_pf.auth import KeySet
+from rse_pf.control import Trust
 from rse_pf.data_server.app import DataServer
-from rse_pf.errors import ConfigurationError, MissingExtra, StoreError, UsageError
+from rse_pf.errors import ConfigurationError, MissingExtra, StoreError
 from rse_pf.objects import DirectoryStore, ObjectStore
 from rse_pf.settings import PlatformSettings
 
@@ -29,33 +30,23 @@ __all__ = ["KeysFile", "serve_data"]
 
 _SWEEP_S = 3600.0
 _BACKLOG = 1024
-_LOOK_AGAIN_S = 1.0
 
 
 class KeysFile:
-    """The public keys in a file, read again when it changes; a broken file keeps the last good keys."""
+    """The public keys in a file and the control room beside it, read again and again; see `control.Trust`."""
 
-    def __init__(self, path: Path, clock: Callable[[], float] = time.monotonic) -> None:
-        self._path = path
+    def __init__(self, path: Path, pause_s: float, clock: Callable[[], float] = time.monotonic) -> None:
+        self._trust = Trust(path)
+        self._pause_s = pause_s
         self._clock = clock
         self._looked = float("-inf")
-        self._stamp: tuple[int, int] | None = None
-        self._keys: KeySet | None = None
 
     def __call__(self) -> KeySet | None:
         """Return the keys; None while there are none."""
-        if self._clock() - self._looked < _LOOK_AGAIN_S:
-            return self._keys
-        self._looked = self._clock()
-        try:
-            found = self._path.stat()
-            stamp = (found.st_mtime_ns, found.st_ino)
-            if stamp != self._stamp:
-                self._keys = KeySet.from_json(self._path.read_text(encoding="utf-8"))
-                self._stamp = stamp
-        except (OSError, UnicodeDecodeError, UsageError):
-            pass  # it comes later, or is being replaced
-        return self._keys
+        if self._clock() - self._looked >= self._pause_s:
+            self._looked = self._clock()
+            self._trust.look()
+        return self._trust.keys
 
 
 def serve_data(

@@ -254,10 +254,11 @@ class Objects:
             counted_at, used = self._usage.get(key, (float("-inf"), 0))
             if self._clock() - counted_at > _COUNT_AGAIN_S:
                 used, counted_at = self._count(key), self._clock()
-            if used + size > self._settings.quota_bytes:
+            quota = who.quota("data_bytes") or self._settings.quota_bytes
+            if used + size > quota:
                 self._usage[key] = counted_at, used
                 raise QuotaExceeded(
-                    f"{used} + {size} bytes are more than the quota of {self._settings.quota_bytes}",
+                    f"{used} + {size} bytes are more than the quota of {quota:.0f}",
                     hint="delete objects, or raise data.quota_bytes",
                 )
             self._usage[key] = counted_at, used + size

@@ -14,8 +14,8 @@ from rse_pf.cli.main import VERBS, main
 from rse_pf.settings import PlatformSettings, settings_page
 
 EMPTY = [
-    "demo", "experiment", "local", "swarm", "token", "service", "serve", "data", "map", "cloud", "settings",
-    "doctor",
+    "demo", "experiment", "local", "swarm", "token", "robot", "service", "serve", "data",
+    "map", "cloud", "settings", "doctor",
 ]  # fmt: skip
 HELP_S = 0.3
 

@@ -9,7 +9,7 @@ from collections.abc import Iterator, Mapping
 import pytest
 
 GROUND = {"errors", "settings"}
-FIRST = {"geometry", "wire", "scaling", "auth", "enrolment", "control", "service", "objects", "maps"}
+FIRST = {"geometry", "wire", "scaling", "auth", "enrolment", "control", "robot_key", "service", "objects", "maps"}
 SECOND = {"pnp", "services", "aws"}
 LEAVES = {"backend", "data_server", "local", "client_sdk", "lambda_pnp", "stacks"}
 BELOW_LEAVES = GROUND | FIRST | SECOND
@@ -25,6 +25,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "enrolment": GROUND,
     "auth": GROUND | {"enrolment"},
     "objects": GROUND,
+    "robot_key": GROUND | {"auth"},
     "control": GROUND | {"enrolment", "auth", "objects"},
     "service": GROUND | {"wire", "geometry"},
     "pnp": GROUND | FIRST,
