@@ -14,7 +14,7 @@ from typing import Any, Literal
 
 import msgspec
 
-from rse_pf.errors import BadRequest, Conflict, NotFound, StoreError
+from rse_pf.errors import BadMessage, BadRequest, Conflict, NotFound, StoreError
 from rse_pf.objects import ObjectStore, name_segment
 from rse_pf.wire.arrays import binary_encode_hook
 
@@ -61,7 +61,7 @@ def job_key(service: str, payload: Any, settings: str) -> str:
         plain = msgspec.msgpack.encode(
             [service, settings, payload], enc_hook=binary_encode_hook, order="deterministic"
         )
-    except (TypeError, ValueError, OverflowError, RecursionError) as error:
+    except (BadMessage, TypeError, ValueError, OverflowError, RecursionError) as error:
         raise BadRequest("the request cannot be encoded", hint="send numbers, strings and lists") from error
     return hashlib.sha256(plain).hexdigest()
 

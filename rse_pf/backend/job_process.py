@@ -24,7 +24,7 @@ from rse_pf.backend.job_store import open_job_store
 from rse_pf.backend.load_services import load_services
 from rse_pf.backend.objects_in import named_in, resolve
 from rse_pf.backend.processes import die_with_parent
-from rse_pf.errors import Cancelled, Crashed, RsePfError
+from rse_pf.errors import BadMessage, Cancelled, Crashed, RsePfError
 from rse_pf.service import dispatch, failure_of
 from rse_pf.settings import PlatformSettings
 from rse_pf.wire import Command, Failure, Result
@@ -117,7 +117,7 @@ def _told(answer: Result | Failure) -> list[Any]:
         return ["failed", answer.code, answer.message, answer.hint]
     try:
         reply = msgspec.msgpack.encode(answer.reply, enc_hook=binary_encode_hook)
-    except (TypeError, ValueError, OverflowError) as error:
+    except (BadMessage, TypeError, ValueError, OverflowError) as error:
         return ["failed", "internal", f"the reply does not travel: {str(error)[:150]}", ""]
     return ["done", answer.compute_ms, reply]
 

@@ -183,6 +183,7 @@ async def test_a_job_runs_behind_everything_else_and_its_result_is_kept(platform
     assert client_sdk.decode_reply(kept, dict) == first.reply
 
 
+@pytest.mark.slow
 @in_a_loop
 async def test_a_reply_that_is_too_large_for_a_message_is_named(platform, tmp_path):
     server = platform()
@@ -214,6 +215,7 @@ async def test_a_job_ends_on_the_other_server_when_its_own_is_killed(platform, r
     assert len(runs()) == 2
 
 
+@pytest.mark.slow
 @in_a_loop
 async def test_after_a_cut_the_robot_waits_for_the_same_run(platform, runs, tmp_path):
     server, heard = platform(), Heard()
@@ -231,6 +233,7 @@ async def test_after_a_cut_the_robot_waits_for_the_same_run(platform, runs, tmp_
     assert len(runs()) == 1
 
 
+@pytest.mark.slow
 @in_a_loop
 async def test_a_drained_server_gives_its_jobs_up_at_once(platform, runs, tmp_path):
     first, second, heard = platform(job_lease_s=600.0), platform(job_lease_s=600.0), Heard()
@@ -250,7 +253,9 @@ async def test_a_drained_server_gives_its_jobs_up_at_once(platform, runs, tmp_pa
     assert len(runs()) == 2
 
 
-@pytest.mark.parametrize("deaf", [False, True], ids=["listens", "is deaf"])
+@pytest.mark.parametrize(
+    "deaf", [False, pytest.param(True, marks=pytest.mark.slow)], ids=["listens", "is deaf"]
+)
 @in_a_loop
 async def test_a_robot_that_takes_its_job_back_ends_it_within_a_second(platform, runs, gone, deaf):
     server, heard = platform(), Heard()
@@ -266,6 +271,7 @@ async def test_a_robot_that_takes_its_job_back_ends_it_within_a_second(platform,
             await robot.call("long", {"deaf": deaf}, deadline_s=0.2)
 
 
+@pytest.mark.slow
 @in_a_loop
 async def test_taking_back_on_another_server_ends_the_job_where_it_runs(platform, runs, gone):
     first, second, heard = platform(), platform(), Heard()
@@ -286,7 +292,7 @@ async def test_taking_back_on_another_server_ends_the_job_where_it_runs(platform
     assert len(runs()) == 1
 
 
-@pytest.mark.parametrize("fate", ["crash", "memory"])
+@pytest.mark.parametrize("fate", ["crash", pytest.param("memory", marks=pytest.mark.slow)])
 @in_a_loop
 async def test_a_job_that_crashes_is_a_typed_failure_and_the_server_lives(platform, fate):
     server = platform()
@@ -296,6 +302,7 @@ async def test_a_job_that_crashes_is_a_typed_failure_and_the_server_lives(platfo
         assert (await robot.call("echo", {"value": 1})).reply == {"value": 1}
 
 
+@pytest.mark.slow
 @in_a_loop
 async def test_one_job_runs_at_a_time_some_wait_and_more_are_refused(platform, runs, tmp_path):
     server, heard = platform(jobs_waiting=1), Heard()
@@ -315,6 +322,7 @@ async def test_one_job_runs_at_a_time_some_wait_and_more_are_refused(platform, r
     assert len(runs()) == 2
 
 
+@pytest.mark.slow
 @in_a_loop
 async def test_progress_comes_at_most_twice_a_second(platform, tmp_path):
     server, heard = platform(), Heard()
