@@ -9,7 +9,21 @@ from collections.abc import Iterator, Mapping
 import pytest
 
 GROUND = {"errors", "settings"}
-FIRST = {"geometry", "wire", "scaling", "auth", "enrolment", "control", "robot_key", "service", "objects", "maps"}
+FIRST = {
+    "geometry",
+    "wire",
+    "scaling",
+    "auth",
+    "enrolment",
+    "control",
+    "robot_key",
+    "service",
+    "objects",
+    "maps",
+    "audit",
+    "audit_log",
+    "audit_check",
+}
 SECOND = {"pnp", "services", "aws"}
 LEAVES = {"backend", "data_server", "local", "client_sdk", "lambda_pnp", "stacks"}
 BELOW_LEAVES = GROUND | FIRST | SECOND
@@ -25,6 +39,9 @@ MAY_IMPORT: dict[str, set[str]] = {
     "enrolment": GROUND,
     "auth": GROUND | {"enrolment"},
     "objects": GROUND,
+    "audit": GROUND,
+    "audit_log": GROUND | {"audit"},
+    "audit_check": GROUND | {"audit", "audit_log"},
     "robot_key": GROUND | {"auth"},
     "control": GROUND | {"enrolment", "auth", "objects"},
     "service": GROUND | {"wire", "geometry"},
@@ -33,7 +50,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "aws": GROUND | FIRST | {"pnp", "services"},
     "backend": BELOW_LEAVES - {"scaling"},
     "data_server": BELOW_LEAVES,
-    "local": {"settings", "scaling", "errors", "auth", "objects"},
+    "local": {"settings", "scaling", "errors", "auth", "objects", "audit", "audit_log"},
     "client_sdk": {"settings", "errors", "geometry", "maps", "wire", "service", "services", "pnp"},
     "lambda_pnp": BELOW_LEAVES - {"scaling", "aws"},
     "stacks": {"settings", "scaling", "errors"},
@@ -76,7 +93,7 @@ PACKAGES: dict[str, tuple[str, ...]] = {
 BASE = {"numpy", "msgspec", "websockets"}
 BASE_ROOMS = MAY_IMPORT["client_sdk"] | {"client_sdk", "setting_checks", "auth", "scaling", "objects"}
 
-PURE = ("rse_pf/wire/", "rse_pf/scaling/", "rse_pf/auth.py", "client_sdk/offload.py")
+PURE = ("rse_pf/wire/", "rse_pf/scaling/", "rse_pf/auth.py", "rse_pf/audit.py", "client_sdk/offload.py")
 IMPURE = {
     "time", "datetime", "sched", "socket", "socketserver", "select", "selectors", "ssl", "threading",
     "_thread", "concurrent", "multiprocessing", "subprocess", "random", "secrets", "uuid", "os",

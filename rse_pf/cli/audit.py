@@ -1,0 +1,158 @@
+"""Read the audit log of a platform, or check that nobody changed it.
+
+Servers, the control plane, the data service and operators' commands write one chain each: who came in or
+was refused, who was revoked, what was started and stopped, how maps changed.  verify prints a line for each
+chain, and exits with 1 if an entry was changed, moved, added or lost.  A head that you keep elsewhere also
+betrays an end that was cut off: give it back with --head.
+
+examples:
+  rse-pf audit verify
+  rse-pf audit show --last 20
+  rse-pf audit show --action revoke --json
+  rse-pf audit verify --head control-plane=17:e3b0c442...
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import re
+import time
+from collections import deque
+from collections.abc import Iterable, Sequence
+from datetime import datetime, timezone
+from pathlib import Path
+
+from rse_pf.audit import Entry, Head, head_word
+from rse_pf.audit_check import Verdict, check_chain, check_folder, entries_of
+from rse_pf.audit_log import audit_folder, files_of, names_in
+from rse_pf.errors import UsageError
+from rse_pf.settings import PlatformSettings
+
+__all__ = ["add_arguments", "run"]
+
+_NAME = "default"
+_TRIES, _AGAIN_S = 5, 0.2
+_PLAIN = re.compile(r"[!-~]+")
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    parser.add_argument("action", choices=("show", "verify"), help="what to do")
+    parser.add_argument(
+        "files", nargs="*", type=Path, metavar="FILE", help="files of one chain, oldest first; or a folder"
+    )
+    parser.add_argument("--name", default=_NAME, help=f"which local platform (default: {_NAME})")
+    parser.add_argument("--last", type=int, metavar="N", help="show: only the newest N entries")
+    parser.add_argument("--only", metavar="WORD", help="show: only actions with this word in them")
+    parser.add_argument("--json", action="store_true", help="show: one JSON object for each entry")
+    parser.add_argument(
+        "--head", action="append", default=[], metavar="WHO=SEQ:HASH",
+        help="verify: this head, kept elsewhere, must be in the chain of WHO",
+    )  # fmt: skip
+
+
+def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
+    """Show or verify; the exit code is 1 if a chain is broken."""
+    is_folder = not args.files or (len(args.files) == 1 and args.files[0].is_dir())
+    folder = _folder(args) if is_folder else None
+    for path in args.files:
+        if not path.exists():
+            raise UsageError(f"there is no {path}", hint="name the files of one chain, or a folder")
+    if args.action == "show":
+        return _show(args, folder)
+    if args.last is not None or args.only is not None or args.json:
+        raise UsageError("--last, --only and --json are for show", hint="see rse-pf audit --help")
+    return _verify(args, folder)
+
+
+def _show(args: argparse.Namespace, folder: Path | None) -> int:
+    if args.head:
+        raise UsageError("--head is for verify", hint="see rse-pf audit --help")
+    if args.last is not None and args.last < 1:
+        raise UsageError(f"--last {args.last} shows nothing", hint="give 1 or more")
+    chains = [args.files] if folder is None else [files_of(folder, who) for who in names_in(folder)]
+    found = ((path[-1].name.partition(".")[0], entry) for path in chains for entry in entries_of(path))
+    wanted = ((who, entry) for who, entry in found if args.only is None or args.only in entry.action)
+    shown = sorted(wanted, key=lambda each: (each[1].time, each[0], each[1].seq))
+    for who, entry in deque(shown, args.last):
+        print(_json_line(who, entry) if args.json else _line(who, entry))
+    return 0
+
+
+def _verify(args: argparse.Namespace, folder: Path | None) -> int:
+    known = _heads(args.head)
+    if folder is None:
+        if known:
+            raise UsageError("--head needs all chains of a folder", hint="name the folder, not files")
+        first = args.files[0]
+        verdicts = [check_chain(first.name.partition(".")[0], args.files, from_genesis=False)]
+    else:
+        verdicts = _settled(folder, known)
+    for verdict in verdicts:
+        _tell(verdict)
+    return int(any(verdict.problem for verdict in verdicts))
+
+
+def _settled(folder: Path, known: dict[str, Head]) -> list[Verdict]:
+    """Check while writers go on: a line that is being written, a file that moves, are looked at again."""
+    for attempt in range(_TRIES):
+        try:
+            verdicts = check_folder(folder, known=known)
+        except FileNotFoundError:
+            if attempt + 1 == _TRIES:
+                raise
+        else:
+            if not any(verdict.problem for verdict in verdicts) or attempt + 1 == _TRIES:
+                break
+        time.sleep(_AGAIN_S)
+    return verdicts
+
+
+def _tell(verdict: Verdict) -> None:
+    if verdict.problem:
+        print(f"{verdict.who}: BROKEN in {verdict.file}: {verdict.problem}")
+        return
+    notes = "".join(f"; {note}" for note in verdict.notes)
+    print(f"{verdict.who}: {verdict.entries} entries good, head {verdict.head}{notes}")
+
+
+def _heads(words: Sequence[str]) -> dict[str, Head]:
+    heads = {}
+    for word in words:
+        who, _, rest = word.partition("=")
+        head = head_word(rest)
+        if head is None or not who:
+            raise UsageError(f"{word[:80]!r} is no head", hint="copy it from a line of rse-pf audit verify")
+        heads[who] = head
+    return heads
+
+
+def _folder(args: argparse.Namespace) -> Path:
+    from rse_pf.local.state import state_folder
+
+    folder: Path = args.files[0] if args.files else audit_folder(state_folder(args.name, os.environ))
+    if not folder.is_dir() or not names_in(folder):
+        raise UsageError(
+            f"there is no audit log in {folder}", hint="start rse-pf local, or name a folder or files"
+        )
+    return folder
+
+
+def _json_line(who: str, entry: Entry) -> str:
+    fields: dict[str, object] = {name: getattr(entry, name) for name in entry.__struct_fields__}
+    return json.dumps({"log": who, **fields})
+
+
+def _line(who: str, entry: Entry) -> str:
+    when = datetime.fromtimestamp(entry.time, timezone.utc).strftime("%Y-%m-%d %H:%M:%S")
+    actor = [] if entry.actor == who else [f"by {_word(entry.actor)}"]
+    words: Iterable[str] = (f"{_word(key)}={_word(value)}" for key, value in entry.detail.items())
+    subject = [_word(entry.subject)] if entry.subject else []
+    return " ".join([when, f"{who}#{entry.seq}", _word(entry.action), *subject, *actor, *words])
+
+
+def _word(value: object) -> str:
+    text = str(value)
+    return text if _PLAIN.fullmatch(text) else json.dumps(text)
