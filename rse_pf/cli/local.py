@@ -61,6 +61,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help=f"front door; 0 takes a free one (local.port, default {defaults.port})",
     )  # fmt: skip
     parser.add_argument(
+        "--no-data", action="store_true", help="do without the data service (large data by HTTP under /data/)"
+    )
+    parser.add_argument(
         "--services", metavar="DIR", help="also run the services installed there (rse-pf service install)"
     )
     parser.add_argument(
@@ -84,7 +87,8 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
         return _on_running(args, folder)
     wanted = {"servers": args.servers, "port": args.port}
     chosen = settings.replace(local={name: value for name, value in wanted.items() if value is not None})
-    return asyncio.run(_foreground(args.name, folder, _with_services(chosen, args)))
+    work = _foreground(args.name, folder, _with_services(chosen, args), data=not args.no_data)
+    return asyncio.run(work)
 
 
 def _with_services(settings: PlatformSettings, args: argparse.Namespace) -> PlatformSettings:
@@ -168,7 +172,7 @@ class _Patience:
         return signal.sigtimedwait(_STOPPERS, left_s) is not None or time.monotonic() >= self._end
 
 
-async def _foreground(name: str, folder: Any, settings: PlatformSettings) -> int:
+async def _foreground(name: str, folder: Any, settings: PlatformSettings, *, data: bool) -> int:
     from rse_pf.local.cloud import LocalCloud
 
     stopped = asyncio.Event()
@@ -185,7 +189,9 @@ async def _foreground(name: str, folder: Any, settings: PlatformSettings) -> int
     ready = False
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         loop.add_signal_handler(number, leave)
-    cloud = LocalCloud(settings, state=folder, name=name, adoptable=True, elastic=True, on_event=_show)
+    cloud = LocalCloud(
+        settings, state=folder, name=name, adoptable=True, elastic=True, data=data, on_event=_show
+    )
     try:
         async with cloud:
             ready = True
@@ -199,9 +205,12 @@ async def _foreground(name: str, folder: Any, settings: PlatformSettings) -> int
 
 
 def _welcome(cloud: Any, name: str) -> None:
+    from rse_pf.local.status import data_url
+
     which = "" if name == DEFAULT_NAME else f" --name {name}"
+    large = f"large data goes to {data_url(cloud.url)}\n" if cloud.data_servers.is_running() else ""
     print(
-        f"\nrobots connect to  {cloud.url}\n"
+        f"\nrobots connect to  {cloud.url}\n{large}"
         f"a robot's token    rse-pf token issue robot-1{which}\n"
         f"to stop            Ctrl-C, or rse-pf local stop{which}\n"
         f"logs and state     {cloud.state}\n",
@@ -233,6 +242,8 @@ _WORDS = {
     "balancer-gone": "the load balancer is gone: {reason}",
     "crash-loop": "servers die young: the next one starts in {wait_s} s",
     "data-server-down": "data server {name} ended ({code})",
+    "data-server-failed": "data server {name} does not start: {error}",
+    "data-server-silent": "data server {name} answers nobody and is ended",
     "data-server-up": "data server {name} is ready (pid {pid})",
     "drain-over": "{server} has left after {seconds} s",
     "drain-start": "{server} leaves ({reason}); its robots move",

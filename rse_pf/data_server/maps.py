@@ -12,14 +12,16 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import msgspec
-import numpy as np
 
 from rse_pf.errors import BadRequest, Conflict, NotFound, StoreError
-from rse_pf.geometry import Array, pose_difference
-from rse_pf.maps import MapVersion, decode_map
 from rse_pf.objects import ObjectStore, digest_of, name_segment
+
+if TYPE_CHECKING:  # numpy is a third of a data server's start, and only maps need it
+    from rse_pf.geometry import Array
+    from rse_pf.maps import MapVersion
 
 __all__ = ["MapDiff", "MapRecord", "MapRegistry", "difference"]
 
@@ -96,6 +98,8 @@ class MapRegistry:
             Conflict: The head is not *parent*; read it, merge, commit again.
             StoreError: The head is as it was.
         """
+        from rse_pf.maps import decode_map
+
         base = self._base(name)
         decoded = decode_map(data, self._most_bytes)
         before = self.record(name, parent) if parent is not None else None
@@ -161,6 +165,8 @@ class MapRegistry:
 
     def load(self, name: str, version: str = "head") -> MapVersion:
         """Return a version as a value."""
+        from rse_pf.maps import decode_map
+
         return decode_map(self.data(name, version), self._most_bytes)
 
     def move_head(self, name: str, version: str, *, expected: str) -> MapRecord:
@@ -227,6 +233,10 @@ def difference(before: MapVersion, after: MapVersion) -> MapDiff:
 
 
 def _move(before: Array, after: Array) -> tuple[float, float]:
+    import numpy as np
+
+    from rse_pf.geometry import pose_difference
+
     metres, degrees = pose_difference(before, after)
     return float(np.asarray(metres)), float(np.asarray(degrees))
 

@@ -7,18 +7,20 @@ to restart nothing that runs, and that the front door stays where it was.
 from __future__ import annotations
 
 import asyncio
+import signal
 import time
 from collections.abc import Callable
 
 from rse_pf.errors import ConfigurationError
 from rse_pf.local.backend_servers import BackendServers
 from rse_pf.local.control_port import ControlPort
+from rse_pf.local.data_servers import DataServers
 from rse_pf.local.fleet import Fleet, Member
 from rse_pf.local.load_balancer import LoadBalancer
-from rse_pf.local.processes import is_alive
+from rse_pf.local.processes import is_alive, send_signal
 from rse_pf.local.state import PlatformState
 
-__all__ = ["adopt"]
+__all__ = ["adopt", "adopt_data"]
 
 _ASK_S = 1.0
 
@@ -70,6 +72,31 @@ async def adopt(
     for member in members:
         fleet.start(member)
     await _until_one_is_healthy(members, end)
+
+
+async def adopt_data(
+    state: PlatformState, data_servers: DataServers, load_balancer: LoadBalancer, *, wanted: bool
+) -> None:
+    """Adopt the data server of *state* if it runs; start one if there is none and it is *wanted*.
+
+    Args:
+        state: What the earlier control plane wrote.
+        data_servers: Not started.
+        load_balancer: Told where the data server is.
+        wanted: Whether a missing one is started, on its old port if that is free.
+
+    Raises:
+        ConfigurationError: It does not start.
+    """
+    left = state.data_server
+    if left is not None and is_alive(left.process) and left.port:
+        data_servers.adopt(left.process, left.port)
+        load_balancer.set_data_targets([data_servers.target])
+        return
+    if left is not None:
+        send_signal(left.process, signal.SIGKILL)  # it had not announced itself, and nobody knows its port
+    if wanted:
+        await data_servers.start(0 if left is None else left.port)
 
 
 async def _until_one_is_healthy(members: list[Member], end: float) -> None:

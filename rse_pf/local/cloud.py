@@ -22,9 +22,10 @@ from typing import Any
 
 from rse_pf.auth import SigningKey
 from rse_pf.errors import ConfigurationError, UsageError
-from rse_pf.local.adoption import adopt
+from rse_pf.local.adoption import adopt, adopt_data
 from rse_pf.local.backend_servers import RSE_PF, BackendServer, BackendServers
 from rse_pf.local.control_plane import ControlPlane
+from rse_pf.local.data_servers import DataServers
 from rse_pf.local.firewall import check_front_door, ensure_key, key_file, key_set_file
 from rse_pf.local.fleet import Fleet
 from rse_pf.local.load_balancer import LoadBalancer
@@ -65,6 +66,7 @@ class LocalCloud:
         elastic: bool = False,
         compress: float = 1.0,
         rebalance: bool = True,
+        data: bool | None = None,
         on_reading: Callable[[Mapping[str, Any]], None] | None = None,
     ) -> None:
         """Describe a platform; nothing is started.
@@ -83,6 +85,7 @@ class LocalCloud:
             elastic: Whether monitor and scale modifier run, and what breaks is replaced.
             compress: Periods, idle time, warm-up and grace are shorter by this factor; for experiments.
             rebalance: Whether crowded servers hand robots over, if *elastic*.
+            data: Whether robots get the data service under ``/data/``; None means ``data.enabled``.
             on_reading: Called with each reading of the monitor, which runs then even if not *elastic*.
         """
         self.events: list[Event] = []
@@ -110,6 +113,18 @@ class LocalCloud:
         )
         self.load_balancer = LoadBalancer(
             self.settings, folder=self.state, port=self._wanted_port, dies_with_parent=not adoptable
+        )
+        self._has_data = settings.data.enabled if data is None else data
+        self.data_servers = DataServers(
+            self._server_settings,
+            folder=self.state,
+            settings_file=self._settings_file,
+            keys_file=key_set_file(self.state),
+            store=self._server_settings.data.store,
+            dies_with_parent=not adoptable,
+            replaces=elastic,
+            program=program,
+            tell=self._data_changed,
         )
         self._fleet = Fleet(
             self.backend_servers,
@@ -222,6 +237,7 @@ class LocalCloud:
                 "running": self.load_balancer.is_running(),
             },
             "servers": [{**read.get(str(each["name"]), {}), **each} for each in servers],
+            "data_servers": self.data_servers.document(),
             "reading": reading,
             "policy": self._control.document(),
             "events": [dict(event) for event in self.events[-_LAST_EVENTS:]],
@@ -355,7 +371,10 @@ class LocalCloud:
         if left is None:
             await self._begin(end)
         else:
-            await adopt(left, self._fleet, self.backend_servers, self.load_balancer, self._tell, end)
+            await _all(
+                adopt(left, self._fleet, self.backend_servers, self.load_balancer, self._tell, end),
+                adopt_data(left, self.data_servers, self.load_balancer, wanted=self._has_data),
+            )
         serving = self.settings.serving
         host = f"[{serving.host}]" if ":" in serving.host else serving.host
         self.url = f"ws://{host}:{self.port}{serving.path}"
@@ -370,6 +389,7 @@ class LocalCloud:
         await _all(
             self.load_balancer.wait_live(end - time.monotonic()),
             *(self._fleet.bring_up(member, end - time.monotonic()) for member in members),
+            *((self.data_servers.start(),) if self._has_data else ()),
         )
 
     def _write_state(self) -> None:
@@ -385,11 +405,18 @@ class LocalCloud:
             servers=tuple(
                 self._server_state(name, mark) for name, mark in self.backend_servers.marks.items()
             ),
+            data_server=self.data_servers.state,
             load_balancer=self.load_balancer.mark,
             port=self.load_balancer.port,
             status_port=0 if self._status is None else self._status.sockets[0].getsockname()[1],
             launched=self._fleet.launched,
         ).write(self.state)
+
+    def _data_changed(self, event: str, **details: Any) -> None:
+        self._tell(event, **details)
+        if event == "data-server-up":
+            self.load_balancer.set_data_targets([self.data_servers.target])
+        self._write_state()
 
     def _server_state(self, name: str, mark: ProcessMark) -> ServerState:
         member = self._fleet.members.get(name)
@@ -408,10 +435,11 @@ class LocalCloud:
             await self._fleet.close()
             if self._status is not None:
                 self._status.close()
-            await self.backend_servers.stop(timeout_s)
+            await asyncio.gather(self.backend_servers.stop(timeout_s), self.data_servers.stop(timeout_s))
             await self.load_balancer.stop(timeout_s)
         finally:
             self.backend_servers.kill_all()
+            self.data_servers.kill_all()
             self.load_balancer.kill()
             self._fleet.members.clear()
             with contextlib.suppress(OSError):  # the folder may have been removed under our feet

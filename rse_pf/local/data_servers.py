@@ -1,7 +1,8 @@
 """The data servers box on one machine: an ``rse-pf data`` process, started, watched and replaced.
 
 A replacement takes the port of the one before, so the load balancer's configuration never changes.
-Promises to keep no state of its own: objects are in the store, tokens' keys in a file.
+Promises to keep no state of its own (objects are in the store, tokens' keys in a file), and that one which
+answers nobody any more is ended and replaced like one that died.
 """
 
 from __future__ import annotations
@@ -20,7 +21,9 @@ from pathlib import Path
 from typing import Any
 
 from rse_pf.errors import ConfigurationError
-from rse_pf.local.processes import ProcessMark, ended, last_line, mark_of, send_signal, spawn
+from rse_pf.local.envoy_config import Target
+from rse_pf.local.processes import ProcessMark, ended, is_alive, last_line, mark_of, send_signal, spawn
+from rse_pf.local.state import ServerState
 from rse_pf.settings import PlatformSettings
 
 __all__ = ["DataServer", "DataServers"]
@@ -29,6 +32,7 @@ _RSE_PF = (sys.executable, "-m", "rse_pf.cli.main")
 _LOOPBACK = "127.0.0.1"
 _LOOK_AGAIN_S = 0.01
 _ASK_S = 1.0
+_READY, _ALIVE = "/data/readyz", "/data/healthz"
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.1, 5.0
 
 
@@ -56,6 +60,7 @@ class DataServers:
         store: str | None = None,
         name: str = "data-1",
         dies_with_parent: bool = True,
+        replaces: bool = True,
         program: Sequence[str] = _RSE_PF,
         tell: Callable[..., None] = lambda event, **details: None,
     ) -> None:
@@ -69,13 +74,16 @@ class DataServers:
             store: Overrides ``data.store``; a platform whose store is ``memory:`` names a folder here.
             name: Of the process, in log and events.
             dies_with_parent: Whether the process ends when this one does.
+            replaces: Whether one that ends or hangs gets a successor; else its end is told, and that is all.
             program: What to run; ``data`` and its options follow.
-            tell: Gets ``data-server-up`` and ``data-server-down``, with name, pid and, when down, code.
+            tell: Gets ``data-server-start`` with name and pid, ``data-server-up`` with port, too,
+                ``data-server-down`` with name and code, ``data-server-silent`` and ``data-server-failed``.
         """
         self._settings = settings
         self._folder = folder
         self._name = name
         self._dies_with_parent = dies_with_parent
+        self._replaces = replaces
         self._tell = tell
         self._port = 0
         self._process: subprocess.Popen[bytes] | None = None
@@ -88,6 +96,11 @@ class DataServers:
         ]  # fmt: skip
 
     @property
+    def name(self) -> str:
+        """What people call it."""
+        return self._name
+
+    @property
     def mark(self) -> ProcessMark | None:
         """The process that runs now."""
         return self._mark
@@ -97,13 +110,41 @@ class DataServers:
         """Where it listens, and its successors will; 0 before the first start."""
         return self._port
 
-    async def start(self) -> DataServer:
-        """Start the process, wait until it answers, and replace it whenever it ends.
+    @property
+    def target(self) -> Target:
+        """The service as the load balancer sees it."""
+        return Target(name=self._name, port=self._port, control_port=self._port)
+
+    @property
+    def state(self) -> ServerState | None:
+        """What the state file says of it; None if there is none."""
+        mark = self._mark
+        return None if mark is None else ServerState(name=self._name, process=mark, port=self._port)
+
+    def document(self) -> list[dict[str, Any]]:
+        """Return what is known of it, as plain JSON values."""
+        if self._mark is None:
+            return []
+        return [{"name": self._name, "pid": self._mark.pid, "port": self._port, "running": self.is_running()}]
+
+    def is_running(self) -> bool:
+        """Return whether the process is there."""
+        return self._mark is not None and is_alive(self._mark)
+
+    async def start(self, port: int = 0) -> DataServer:
+        """Start the process at *port* (0: a free one), wait until it answers, and watch it from then on.
 
         Raises:
             ConfigurationError: It ended or was not ready within ``local.start_timeout_s``.
         """
-        server = await self._launch()
+        self._port = port
+        try:
+            server = await self._launch()
+        except ConfigurationError:
+            if not port:
+                raise
+            self._port = 0  # somebody took it meanwhile
+            server = await self._launch()
         self._watching = asyncio.create_task(self._watch())
         return server
 
@@ -114,7 +155,7 @@ class DataServers:
 
     async def is_ready(self) -> bool:
         """Return whether the service answers and its store does."""
-        return self._port > 0 and await asyncio.to_thread(_ask_ready, self._port)
+        return self._port > 0 and await asyncio.to_thread(_ask, self._port, _READY)
 
     def send(self, number: signal.Signals) -> bool:
         """Signal the process; return False if it is gone."""
@@ -148,9 +189,11 @@ class DataServers:
         pause_s = _FIRST_PAUSE_S
         while True:
             if self._mark is not None:
-                await ended(self._mark)
+                await self._until_over(self._mark)
             code = None if self._process is None else self._process.wait()
             self._tell("data-server-down", name=self._name, code=code)
+            if not self._replaces:
+                return
             try:
                 await self._launch()
                 pause_s = _FIRST_PAUSE_S
@@ -158,6 +201,21 @@ class DataServers:
                 self._tell("data-server-failed", name=self._name, error=str(error))
                 await asyncio.sleep(pause_s)
                 pause_s = min(2 * pause_s, _LONGEST_PAUSE_S)
+                self._port = 0  # whatever holds the old one may hold it for ever
+
+    async def _until_over(self, mark: ProcessMark) -> None:
+        """Wait until the process has ended; end it when it leaves too many questions unanswered."""
+        over = asyncio.ensure_future(ended(mark))
+        silent = 0
+        try:
+            while not over.done():
+                await asyncio.wait({over}, timeout=_ASK_S)
+                silent = 0 if await asyncio.to_thread(_ask, self._port, _ALIVE) else silent + 1
+                if silent > self._settings.health.unhealthy_checks and self._replaces and not over.done():
+                    self._tell("data-server-silent", name=self._name, pid=mark.pid)
+                    send_signal(mark, signal.SIGKILL)
+        finally:
+            over.cancel()
 
     async def _launch(self) -> DataServer:
         self._announce.unlink(missing_ok=True)
@@ -166,6 +224,7 @@ class DataServers:
             log=self._log, folder=self._folder, dies_with_parent=self._dies_with_parent,
         )  # fmt: skip
         self._process, self._mark = process, mark_of(process.pid)
+        self._tell("data-server-start", name=self._name, pid=process.pid)
         try:
             server = await self._announced(process)
         except (ConfigurationError, asyncio.CancelledError):
@@ -173,7 +232,7 @@ class DataServers:
             process.wait()
             raise
         self._port = server.port
-        self._tell("data-server-up", name=self._name, pid=server.pid)
+        self._tell("data-server-up", name=self._name, pid=server.pid, port=server.port)
         return server
 
     async def _announced(self, process: subprocess.Popen[bytes]) -> DataServer:
@@ -208,11 +267,11 @@ class DataServers:
         )
 
 
-def _ask_ready(port: int) -> bool:
+def _ask(port: int, path: str) -> bool:
     connection = http.client.HTTPConnection(_LOOPBACK, port, timeout=_ASK_S)
     with contextlib.closing(connection):
         try:
-            connection.request("GET", "/data/readyz")
+            connection.request("GET", path)
             return connection.getresponse().status == 200
         except (OSError, http.client.HTTPException):
             return False

@@ -1,4 +1,4 @@
-"""Write down what Envoy is told: one front door, one cluster, an endpoint file that changes alone.
+"""Write down what Envoy is told: one front door, two clusters, endpoint files that change alone.
 
 Pure.  Promises that every value which differs from Envoy's default has its reason beside it; most were
 found by measuring what robots notice when servers come, go, stall and die.
@@ -13,11 +13,14 @@ from typing import Any
 
 from rse_pf.settings import PlatformSettings
 
-__all__ = ["ADMIN_SOCKET", "CLUSTER", "Target", "endpoints", "envoy_config"]
+__all__ = ["ADMIN_SOCKET", "CLUSTER", "DATA_CLUSTER", "Target", "endpoints", "envoy_config"]
 
 CLUSTER = "backend-servers"
 ADMIN_SOCKET = "admin.sock"
 """In the balancer's folder: whoever reaches the admin page can end the balancer, so no port leads there."""
+DATA_CLUSTER = "data-servers"
+_DATA_PATH = "/data/"
+_DATA_READY = "/data/readyz"
 _TYPES = "type.googleapis.com/envoy"
 _LOOPBACK = "127.0.0.1"
 _NO_LIMIT = 1_000_000
@@ -34,27 +37,35 @@ class Target:
     control_port: int
 
 
-def envoy_config(settings: PlatformSettings, *, port: int, endpoints_file: Path) -> dict[str, Any]:
+def envoy_config(
+    settings: PlatformSettings, *, port: int, endpoints_file: Path, data_endpoints_file: Path
+) -> dict[str, Any]:
     """Return the static configuration.
 
     Args:
         settings: Front door address and path, health checks, handshake limit.
         port: Of the front door; 0 takes a free one.
         endpoints_file: What `endpoints` returned, as JSON; replaced by rename, never written in place.
+        data_endpoints_file: The same for the data servers; without targets ``/data/`` is answered with 503.
     """
+    health = settings.health
     return {
         "node": {"id": "front-door", "cluster": "rse-pf"},  # endpoint files are refused without
         "admin": {"address": {"pipe": {"path": ADMIN_SOCKET, "mode": 0o600}}},
         "overload_manager": _most_connections(settings.local.max_connections),
         "static_resources": {
             "listeners": [_front_door(settings, port)],
-            "clusters": [_cluster(settings, endpoints_file)],
+            "clusters": [
+                _cluster(settings, CLUSTER, endpoints_file, health.path, panic_percent=0),
+                # One data server, and its successor on the same port: better asked in vain than not asked.
+                _cluster(settings, DATA_CLUSTER, data_endpoints_file, _DATA_READY, panic_percent=100),
+            ],
         },
     }
 
 
-def endpoints(targets: Sequence[Target]) -> dict[str, Any]:
-    """Return the endpoint file: robots go to ``port``, health checks to ``control_port``."""
+def endpoints(targets: Sequence[Target], cluster: str = CLUSTER) -> dict[str, Any]:
+    """Return the endpoint file of *cluster*: robots go to ``port``, health checks to ``control_port``."""
     members = [
         {
             "endpoint": {
@@ -69,7 +80,7 @@ def endpoints(targets: Sequence[Target]) -> dict[str, Any]:
         "resources": [
             {
                 "@type": f"{_TYPES}.config.endpoint.v3.ClusterLoadAssignment",
-                "cluster_name": CLUSTER,
+                "cluster_name": cluster,
                 "endpoints": [{"lb_endpoints": members}],
             }
         ]
@@ -148,18 +159,27 @@ def _virtual_host(settings: PlatformSettings) -> dict[str, Any]:
         "host_selection_retry_max_attempts": "8",
     }
     route = {"cluster": CLUSTER, "timeout": "0s", "idle_timeout": "0s", "retry_policy": retry}
+    # A large upload takes as long as it takes, unless nobody says anything; the data server is stricter.
+    # No retries: the robot knows whether a part arrived, and goes on from there.
+    idle = _seconds(3 * settings.data.body_timeout_s)
+    data_route = {"cluster": DATA_CLUSTER, "timeout": "0s", "idle_timeout": idle}
     return {
         "name": "platform",
         "domains": ["*"],
-        "routes": [{"match": {"path": settings.serving.path}, "route": route}],
+        "routes": [
+            {"match": {"path": settings.serving.path}, "route": route},
+            {"match": {"prefix": _DATA_PATH}, "route": data_route},
+        ],
     }
 
 
-def _cluster(settings: PlatformSettings, endpoints_file: Path) -> dict[str, Any]:
+def _cluster(
+    settings: PlatformSettings, name: str, endpoints_file: Path, ready: str, *, panic_percent: int
+) -> dict[str, Any]:
     health = settings.health
     limits = ("max_connections", "max_requests", "max_pending_requests", "max_retries")
     return {
-        "name": CLUSTER,
+        "name": name,
         "type": "EDS",
         "eds_cluster_config": {
             "eds_config": {
@@ -173,8 +193,8 @@ def _cluster(settings: PlatformSettings, endpoints_file: Path) -> dict[str, Any]
         "common_lb_config": {
             # The default of 1 s holds a new server back for a second although it is healthy.
             "update_merge_window": "0s",
-            # No traffic to servers that failed their checks, however many they are.
-            "healthy_panic_threshold": {"value": 0},
+            # 0: no traffic to servers that failed their checks, however many they are.
+            "healthy_panic_threshold": {"value": panic_percent},
         },
         # A server that leaves the file gets nothing new, and keeps its open sockets.
         "ignore_health_on_host_removal": True,
@@ -189,7 +209,7 @@ def _cluster(settings: PlatformSettings, endpoints_file: Path) -> dict[str, Any]
                 "timeout": _seconds(health.local_timeout_s),
                 "unhealthy_threshold": health.unhealthy_checks,
                 "healthy_threshold": health.healthy_checks,
-                "http_health_check": {"path": health.path},
+                "http_health_check": {"path": ready},
             }
         ],
     }

@@ -29,7 +29,8 @@ _KERNEL = "the kernel needs nf_tables, and nft 1.0 or later"
 
 def find_server(state: PlatformState, name: str) -> ServerState:
     """Return the running server called *name*; raises UsageError, which names those that run."""
-    alive = [server for server in state.servers if is_alive(server.process)]
+    known = state.servers if state.data_server is None else (*state.servers, state.data_server)
+    alive = [server for server in known if is_alive(server.process)]
     for server in alive:
         if server.name == name:
             return server

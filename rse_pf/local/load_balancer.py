@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from rse_pf.errors import ConfigurationError, MissingExtra
-from rse_pf.local.envoy_config import ADMIN_SOCKET, CLUSTER, Target, endpoints, envoy_config
+from rse_pf.local.envoy_config import ADMIN_SOCKET, CLUSTER, DATA_CLUSTER, Target, endpoints, envoy_config
 from rse_pf.local.processes import ProcessMark, ended, is_alive, last_line, mark_of, send_signal, spawn
 from rse_pf.settings import PlatformSettings
 
@@ -61,6 +61,7 @@ class LoadBalancer:
         self._wanted_port = port
         self._dies_with_parent = dies_with_parent
         self._endpoints = folder / "endpoints.json"
+        self._data_endpoints = folder / "data-endpoints.json"
         self._process: subprocess.Popen[bytes] | None = None
         self._names: dict[int, str] = {}
 
@@ -72,11 +73,15 @@ class LoadBalancer:
         binary = envoy_binary()
         if self.mark is None:
             self.set_targets(())
+            self.set_data_targets(())
         self.kill()  # reaps one that ended by itself
         self._wanted_port = self.port or self._wanted_port
         config = self._folder / "envoy.json"
         (self._folder / ADMIN_SOCKET).unlink(missing_ok=True)
-        made = envoy_config(self._settings, port=self._wanted_port, endpoints_file=self._endpoints)
+        made = envoy_config(
+            self._settings, port=self._wanted_port, endpoints_file=self._endpoints,
+            data_endpoints_file=self._data_endpoints,
+        )  # fmt: skip
         config.write_text(json.dumps(made, indent=1), encoding="utf-8")
         command = [binary, "-c", str(config), "--concurrency", "1"]
         command += ["-l", "warning", "--disable-hot-restart"]
@@ -115,9 +120,11 @@ class LoadBalancer:
     def set_targets(self, targets: Sequence[Target]) -> None:
         """Let new sockets go to *targets* and nowhere else; open sockets stay where they are."""
         self._names.update({target.port: target.name for target in targets})
-        temporary = self._endpoints.with_name(f".{self._endpoints.name}")
-        temporary.write_text(json.dumps(endpoints(targets)), encoding="utf-8")
-        temporary.replace(self._endpoints)
+        _replace(self._endpoints, endpoints(targets))
+
+    def set_data_targets(self, targets: Sequence[Target]) -> None:
+        """Let what is asked under ``/data/`` go to *targets*."""
+        _replace(self._data_endpoints, endpoints(targets, DATA_CLUSTER))
 
     async def stats(self) -> Mapping[str, TargetStats]:
         """Return the targets that Envoy has now, by server name; empty when it does not answer."""
@@ -227,3 +234,9 @@ def _ask(folder: Path, path: str) -> bytes:
         return b""
     finally:
         connection.close()
+
+
+def _replace(path: Path, value: Mapping[str, Any]) -> None:
+    temporary = path.with_name(f".{path.name}")
+    temporary.write_text(json.dumps(value), encoding="utf-8")
+    temporary.replace(path)

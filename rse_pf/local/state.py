@@ -59,6 +59,7 @@ class PlatformState:
     settings_file: str
     key_file: str
     servers: tuple[ServerState, ...] = ()
+    data_server: ServerState | None = None
     load_balancer: ProcessMark | None = None
     port: int = 0
     status_port: int = 0
@@ -67,7 +68,8 @@ class PlatformState:
     def processes(self) -> tuple[ProcessMark, ...]:
         """Return the data path: everything but the control plane."""
         balancer = () if self.load_balancer is None else (self.load_balancer,)
-        return (*(server.process for server in self.servers), *balancer)
+        data = () if self.data_server is None else (self.data_server.process,)
+        return (*(server.process for server in self.servers), *data, *balancer)
 
     def write(self, folder: Path) -> None:
         """Replace the file in *folder* in one step."""
@@ -150,12 +152,15 @@ def _state(document: Any) -> PlatformState:
     if not isinstance(document, dict):
         raise TypeError("it is not an object")
     balancer = document.pop("load_balancer")
-    servers = tuple(
-        ServerState(**{**server, "process": ProcessMark(**server["process"])})
-        for server in document.pop("servers")
-    )
+    servers = tuple(map(_server, document.pop("servers")))
+    data = document.pop("data_server", None)
     return PlatformState(
         **{**document, "control_plane": ProcessMark(**document["control_plane"])},
         servers=servers,
+        data_server=None if data is None else _server(data),
         load_balancer=None if balancer is None else ProcessMark(**balancer),
     )
+
+
+def _server(document: dict[str, Any]) -> ServerState:
+    return ServerState(**{**document, "process": ProcessMark(**document["process"])})

@@ -11,12 +11,13 @@ import time
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlsplit
 
 from rse_pf.local.control_port import ControlPort
 from rse_pf.local.processes import is_alive
 from rse_pf.local.state import PlatformState, ServerState
 
-__all__ = ["platform_status", "status_table"]
+__all__ = ["data_url", "platform_status", "status_table"]
 
 _PATIENCE_S = 0.5
 _COLUMNS = ("server", "pid", "state", "robots", "CPU %", "requests/s", "queue")
@@ -24,7 +25,11 @@ _COLUMNS = ("server", "pid", "state", "robots", "CPU %", "requests/s", "queue")
 
 async def platform_status(state: PlatformState, *, sample_s: float) -> dict[str, Any]:
     """Return what runs; CPU (% of the server's size) and requests are those of *sample_s* seconds."""
-    servers = await asyncio.gather(*(_server(server, sample_s) for server in state.servers))
+    data = () if state.data_server is None else (state.data_server,)
+    servers, data_servers = await asyncio.gather(
+        asyncio.gather(*(_server(server, sample_s) for server in state.servers)),
+        asyncio.gather(*map(_data_server, data)),
+    )
     balancer = state.load_balancer
     return {
         "platform": state.name,
@@ -36,6 +41,7 @@ async def platform_status(state: PlatformState, *, sample_s: float) -> dict[str,
             "running": balancer is not None and is_alive(balancer) and not _is_stopped(balancer.pid),
         },
         "servers": list(servers),
+        "data_servers": list(data_servers),
     }
 
 
@@ -50,10 +56,38 @@ def status_table(status: Mapping[str, Any]) -> str:
         ).rstrip()
         for row in rows
     ]
+    for told in status["data_servers"]:
+        lines.append(f"data server  {told['name']} is {told['state']} (pid {told['pid']})")
     for what, told in (("load balancer", status["balancer"]), ("control plane", status["control_plane"])):
         lines.append(f"{what}  {'runs' if told['running'] else 'does not run'} (pid {told['pid']})")
     lines.append(f"robots connect to  {status['url'] or 'nothing yet'}")
+    if status["data_servers"] and status["url"]:
+        lines.append(f"large data goes to  {data_url(status['url'])}")
     return "\n".join(lines)
+
+
+def data_url(url: str) -> str:
+    """Return where the data service answers, by the address *url* of the robots' door."""
+    parts = urlsplit(url)
+    return f"{'https' if parts.scheme == 'wss' else 'http'}://{parts.netloc}/data/"
+
+
+async def _data_server(server: ServerState) -> dict[str, Any]:
+    known: dict[str, Any] = {"name": server.name, "pid": server.process.pid, "port": server.port}
+    if not is_alive(server.process):
+        return {**known, "state": "gone"}
+    if _is_stopped(server.process.pid):
+        return {**known, "state": "stopped"}
+    if not server.port:
+        return {**known, "state": "starting"}
+    port = ControlPort(server.port)
+    try:
+        reply = await port.ask("/data/readyz", timeout_s=_PATIENCE_S)
+    except ConnectionError:
+        return {**known, "state": "silent"}
+    finally:
+        port.close()
+    return {**known, "state": "ready" if reply.status == 200 else "not ready"}
 
 
 async def _server(server: ServerState, sample_s: float) -> dict[str, Any]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -27,22 +28,28 @@ os.replace(temporary, args["--announce"])
 signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
 signal.pause()
 """
+"""Answers no question, so it must not live long where hanging servers are ended."""
+PATIENT: dict[str, Any] = {"unhealthy_checks": 10}
 
 
 class Box:
     """Data servers that run a program of the test, and what they told."""
 
-    def __init__(self, folder: Path, program: str) -> None:
+    def __init__(
+        self, folder: Path, program: str, *, health: dict[str, Any] = PATIENT, replaces: bool = True
+    ) -> None:
         self.told: asyncio.Queue[str] = asyncio.Queue()
         self.servers = DataServers(
-            PlatformSettings().replace(local={"start_timeout_s": 15.0}),
+            PlatformSettings().replace(local={"start_timeout_s": 15.0}, health=health),
             folder=folder, settings_file=folder / "s", keys_file=folder / "k", store="dir:objects",
-            program=(sys.executable, "-W", "ignore", "-c", program),
+            replaces=replaces, program=(sys.executable, "-W", "ignore", "-c", program),
             tell=lambda event, **_: self.told.put_nowait(event),
         )  # fmt: skip
 
     async def next(self) -> str:
-        return await asyncio.wait_for(self.told.get(), 15)
+        while (event := await asyncio.wait_for(self.told.get(), 15)) == "data-server-start":
+            pass
+        return event
 
 
 def test_a_server_that_dies_is_replaced_on_its_port(tmp_path: Path) -> None:
@@ -80,7 +87,52 @@ def test_the_server_of_an_earlier_control_plane_is_adopted_and_replaced(tmp_path
         earlier.servers.kill_all()  # reaps its child
 
         assert later.servers.port == server.port
-        assert earlier.told.qsize() == 1
+        assert earlier.told.qsize() == 2, "its start and its being up"
+
+    asyncio.run(run())
+
+
+def test_a_server_that_answers_nobody_is_ended_and_replaced(tmp_path: Path) -> None:
+    async def run() -> None:
+        box = Box(tmp_path, _PROGRAM, health={"unhealthy_checks": 2})
+        first = await box.servers.start()
+        assert await box.next() == "data-server-up"
+
+        told = [await box.next(), await box.next(), await box.next()]
+        assert told == ["data-server-silent", "data-server-down", "data-server-up"]
+        assert not is_alive(first.mark)
+        await box.servers.stop(10.0)
+
+    asyncio.run(run())
+
+
+def test_a_platform_that_heals_nothing_only_tells_of_the_end(tmp_path: Path) -> None:
+    async def run() -> None:
+        box = Box(tmp_path, _PROGRAM, replaces=False)
+        await box.servers.start()
+        assert await box.next() == "data-server-up"
+
+        assert box.servers.send(9)  # type: ignore[arg-type]
+        assert await box.next() == "data-server-down"
+        assert not box.servers.is_running()
+        await box.servers.stop(10.0)
+        assert (tmp_path / "starts").read_text().count("\n") == 1
+
+    asyncio.run(run())
+
+
+def test_a_port_that_somebody_took_meanwhile_is_given_up(tmp_path: Path) -> None:
+    async def run() -> None:
+        box = Box(
+            tmp_path, _PROGRAM.replace("port = ", "args['--port'] == '0' or sys.exit('taken')\nport = ")
+        )
+
+        server = await box.servers.start(port=40002)
+
+        assert server.port == box.servers.port == 40001
+        assert box.servers.state is not None
+        assert box.servers.state.port == 40001
+        await box.servers.stop(10.0)
 
     asyncio.run(run())
 

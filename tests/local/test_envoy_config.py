@@ -8,14 +8,17 @@ from typing import Any
 
 import pytest
 
-from rse_pf.local.envoy_config import ADMIN_SOCKET, CLUSTER, Target, endpoints, envoy_config
+from rse_pf.local.envoy_config import ADMIN_SOCKET, CLUSTER, DATA_CLUSTER, Target, endpoints, envoy_config
 from rse_pf.settings import PlatformSettings
 
 ENDPOINTS = Path("/somewhere/endpoints.json")
+DATA = Path("/somewhere/data-endpoints.json")
 
 
 def config(**groups: dict[str, Any]) -> dict[str, Any]:
-    return envoy_config(PlatformSettings().replace(**groups), port=0, endpoints_file=ENDPOINTS)
+    return envoy_config(
+        PlatformSettings().replace(**groups), port=0, endpoints_file=ENDPOINTS, data_endpoints_file=DATA
+    )
 
 
 def listener(made: dict[str, Any]) -> dict[str, Any]:
@@ -27,14 +30,19 @@ def manager(made: dict[str, Any]) -> dict[str, Any]:
     return listener(made)["filter_chains"][0]["filters"][0]["typed_config"]
 
 
-def cluster(made: dict[str, Any]) -> dict[str, Any]:
-    (only,) = made["static_resources"]["clusters"]
+def cluster(made: dict[str, Any], name: str = CLUSTER) -> dict[str, Any]:
+    (only,) = [each for each in made["static_resources"]["clusters"] if each["name"] == name]
     return only
 
 
-def only_route(made: dict[str, Any]) -> dict[str, Any]:
+def routes(made: dict[str, Any]) -> list[dict[str, Any]]:
     (host,) = manager(made)["route_config"]["virtual_hosts"]
-    (route,) = host["routes"]
+    return host["routes"]
+
+
+def only_route(made: dict[str, Any]) -> dict[str, Any]:
+    """Return the only one that leads to backend servers."""
+    (route,) = [each for each in routes(made) if each["route"]["cluster"] == CLUSTER]
     return route
 
 
@@ -91,6 +99,24 @@ def test_headers_are_bounded_in_number_size_and_time() -> None:
     assert made["common_http_protocol_options"]["idle_timeout"] == "1.5s"
     assert made["max_request_headers_kb"] == 4
     assert made["common_http_protocol_options"]["max_headers_count"] <= 100
+
+
+def test_large_data_has_a_way_of_its_own_that_is_never_repeated_by_the_balancer() -> None:
+    made = config(data={"body_timeout_s": 4.0})
+    (data,) = [each for each in routes(made) if each["route"]["cluster"] == DATA_CLUSTER]
+
+    assert data["match"] == {"prefix": "/data/"}
+    assert data["route"]["timeout"] == "0s", "an upload takes as long as it takes"
+    assert data["route"]["idle_timeout"] == "12s"
+    assert "retry_policy" not in data["route"], "a part may have arrived: only the robot knows"
+    assert cluster(made, DATA_CLUSTER)["health_checks"][0]["http_health_check"] == {"path": "/data/readyz"}
+    assert endpoints([], DATA_CLUSTER)["resources"][0]["cluster_name"] == DATA_CLUSTER
+    files = [
+        cluster(made, name)["eds_cluster_config"]["eds_config"]["path_config_source"]["path"]
+        for name in (CLUSTER, DATA_CLUSTER)
+    ]
+    assert files == [str(ENDPOINTS), str(DATA)]
+    assert [each["match"] for each in routes(made)] == [{"path": "/ws"}, {"prefix": "/data/"}]
 
 
 def test_connections_and_buffers_are_bounded() -> None:

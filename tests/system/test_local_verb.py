@@ -166,6 +166,7 @@ def test_without_a_control_plane_robots_are_served_status_works_and_stop_cleans_
     assert not seen["control_plane"]["running"]
     assert seen["balancer"]["running"]
     assert [(each["name"], each["state"]) for each in seen["servers"]] == [("server-1", "ready")]
+    assert [(each["name"], each["state"]) for each in seen["data_servers"]] == [("data-1", "ready")]
 
     told = terminal.run("local", "stop")
     assert told.stdout == "platform 'default' is stopped\n"
@@ -235,7 +236,27 @@ def test_a_new_control_plane_takes_over_what_runs(terminal: Terminal) -> None:
 
     assert "took over what an earlier control plane left: server-1" in said
     assert after.processes() == before.processes()
+    assert after.data_server == before.data_server is not None
     assert (after.url, after.key_file) == (before.url, before.key_file)
+
+
+def test_a_data_server_that_died_without_a_control_plane_is_started_by_the_next_one(
+    terminal: Terminal,
+) -> None:
+    process, before, said = terminal.platform()
+    assert "large data goes to http://127.0.0.1:" in said
+    process.kill()
+    process.wait(SOON_S)
+    assert before.data_server is not None
+    told = terminal.run("local", "kill", "data-1")
+    assert told.stdout == f"killed: data-1 (pid {before.data_server.process.pid}, 1 processes)\n"
+
+    _, after, said = terminal.platform()
+
+    assert "data server data-1 is ready" in said
+    assert after.data_server is not None
+    assert after.data_server.port == before.data_server.port
+    assert after.data_server.process != before.data_server.process
 
 
 def test_a_killed_balancer_comes_back_on_the_same_port(terminal: Terminal) -> None:

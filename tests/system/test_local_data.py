@@ -1,0 +1,121 @@
+"""The data service of the local platform: through the balancer, killed, stopped, and gone at the end."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import random
+import signal
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from client_sdk.data import DataClient, DataOptions
+from rse_pf.backend.objects_in import resolve
+from rse_pf.errors import ConnectError
+from rse_pf.local import faults
+from rse_pf.local.cloud import LocalCloud
+from rse_pf.local.state import read_state
+from rse_pf.local.status import data_url, platform_status, status_table
+from rse_pf.objects import DirectoryStore
+from rse_pf.services.localise import LocaliseRequest
+from rse_pf.settings import PlatformSettings
+
+pytestmark = pytest.mark.system
+
+SOON_S = 60.0
+SETTINGS = PlatformSettings().replace(local={"workers": 1})
+MIB = 1 << 20
+
+
+class Events:
+    """What the platform told, to be waited for."""
+
+    def __init__(self) -> None:
+        self._heard: asyncio.Queue[Any] = asyncio.Queue()
+
+    def __call__(self, event: Any) -> None:
+        self._heard.put_nowait((time.monotonic(), dict(event)))
+
+    async def next(self, name: str) -> tuple[float, dict[str, Any]]:
+        async def wait() -> tuple[float, dict[str, Any]]:
+            while (told := await self._heard.get())[1]["event"] != name:
+                pass
+            return told
+
+        found: tuple[float, dict[str, Any]] = await asyncio.wait_for(wait(), SOON_S)
+        return found
+
+
+def client(cloud: LocalCloud, robot: str = "robot-1", **options: Any) -> DataClient:
+    chosen = DataOptions(part_bytes=MIB // 4, first_pause_s=0.02, random=random.Random(1), **options)
+    return DataClient(cloud.url, lambda: cloud.issue_token(robot), chosen)
+
+
+def test_a_robot_stores_through_the_front_door_what_its_services_can_read(
+    tmp_path: Path, gone: Callable[[int], None]
+) -> None:
+    data = random.Random(7).randbytes(2 * MIB)
+    events = Events()
+
+    async def run() -> list[int]:
+        cloud = LocalCloud(
+            SETTINGS, servers=1, port=0, state=tmp_path / "a", data=True, elastic=True, on_event=events
+        )
+        async with cloud:
+            robot = client(cloud)
+            digest = await asyncio.to_thread(robot.upload, data)
+            assert await asyncio.to_thread(robot.download, digest) == data
+            store = DirectoryStore(tmp_path / "a" / "objects")
+            payload = resolve(
+                LocaliseRequest, {"map": {"object": digest}}, "default", "robot-1", store,
+                settings=SETTINGS.serving,
+            )  # fmt: skip
+            assert payload == {"map": data}
+
+            state = read_state(cloud.state)
+            assert state is not None
+            assert state.data_server is not None
+            (first,) = cloud.status_document()["data_servers"]
+            assert first["pid"] == state.data_server.process.pid
+            assert first["running"] is True
+            status = await platform_status(state, sample_s=0.0)
+            assert status["data_servers"][0]["state"] == "ready"
+            assert f"large data goes to  {data_url(cloud.url)}" in status_table(status)
+
+            server = faults.find_server(state, "data-1")
+            killed_s = time.monotonic()
+            faults.signal_tree(server.process, signal.SIGKILL)
+            await events.next("data-server-down")
+            back_s, told = await events.next("data-server-up")
+            print(f"back after {back_s - killed_s:.2f} s, load {os.getloadavg()[0]:.1f}")
+            assert told["port"] == first["port"]
+            assert await asyncio.to_thread(robot.download, digest) == data
+
+            faults.signal_tree(cloud.data_servers.state.process, signal.SIGSTOP)  # type: ignore[union-attr]
+            await events.next("data-server-silent")
+            await events.next("data-server-up")
+            assert await asyncio.to_thread(robot.download, digest) == data
+            robot.close()
+            return [first["pid"], told["pid"], cloud.data_servers.document()[0]["pid"]]
+
+    pids = asyncio.run(run())
+    assert len(set(pids)) == 3
+    for pid in pids:
+        gone(pid)
+
+
+def test_without_a_data_service_the_door_says_come_again(tmp_path: Path) -> None:
+    async def run() -> None:
+        async with LocalCloud(SETTINGS, servers=1, port=0, state=tmp_path / "a") as cloud:
+            assert cloud.status_document()["data_servers"] == []
+            robot = client(cloud, deadline_s=0.1)
+            with pytest.raises(Exception, match="503") as refused:
+                await asyncio.to_thread(robot.upload, b"data")
+            assert not isinstance(refused.value, ConnectError)
+            robot.close()
+
+    asyncio.run(run())
