@@ -9,10 +9,10 @@ SETUP := PYTHON=$(PYTHON) sh scripts/setup.sh
 PYTEST := $(BIN)/python -m pytest
 
 .DEFAULT_GOAL := help
-.PHONY: help setup assets synth demo test quick slow lint types bench docs lock clean
+.PHONY: help setup assets synth demo test quick slow lint types bench docs lock fuzz sbom audit-deps clean
 
 help: ## show these verbs
-	@awk -F':.*## ' '/^[a-z-]+:.*## /{printf "  make %-8s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
+	@awk -F':.*## ' '/^[a-z-]+:.*## /{printf "  make %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
 
 setup: ## install everything a developer needs: Node, the CDK, the cloud's packages
 	@$(SETUP) dev infra
@@ -66,6 +66,25 @@ docs: ## write the generated pages anew
 	@$(BIN)/rse-pf settings --markdown > docs/settings.md
 	@$(BIN)/rse-pf data --openapi > docs/openapi.json
 	@$(BIN)/python scripts/asyncapi.py
+
+fuzz: ## strangers' bytes for FUZZ_S seconds a target (600), guided by coverage where atheris runs
+	@$(SETUP) dev
+	@engine=mutations; $(BIN)/python -c 'import atheris' 2>/dev/null && engine=atheris; \
+	for each in codec frames stream geometry; do echo "== $$each ($$engine)"; \
+	  $(BIN)/python -m fuzz $$each --engine $$engine --seconds $${FUZZ_S:-600} || exit 1; done
+
+sbom: ## what is installed with the product, as CycloneDX, from the locks: build/sbom.json
+	@$(SETUP) dev
+	@mkdir -p build
+	@$(BIN)/python -m cyclonedx_py requirements locks/demo.txt --pyproject pyproject.toml --mc-type application \
+	  --output-reproducible --of JSON -o build/sbom.json
+	@$(BIN)/python -m cyclonedx_py requirements locks/boot.txt --pyproject pyproject.toml --mc-type application \
+	  --output-reproducible --of JSON -o build/sbom-boot.json
+	@echo "build/sbom.json: a robot and the local platform; build/sbom-boot.json: a cloud server"
+
+audit-deps: ## look the locked versions up among known weaknesses; needs the network
+	@$(SETUP) dev
+	@$(BIN)/pip-audit --disable-pip --require-hashes -r locks/demo.txt -r locks/boot.txt -r locks/lambda.txt
 
 lock: ## choose the newest versions and write the hashes into locks/
 	@$(SETUP) dev

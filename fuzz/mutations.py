@@ -13,7 +13,8 @@ __all__ = ["mutations"]
 _TOKENS = (
     b"[", b"]", b"{", b"}", b'"', b"\\", b"\\u0000", b"\\ud800", b",", b":", b"null", b"true", b"1e308",
     b"-0.0", b"1e999", b"NaN", b"9007199254740992", b"18446744073709551616", b'"type":', b'"command"',
-    b'"payload":', b'"hello"', b'"cancel"', b'"id":', b'{"a":', b"[[[[[[[[[[[[[[[[[[", b"9" * 400, b"\xef\xbb\xbf", b"\xff",
+    b'"payload":', b'"hello"', b'"cancel"', b'"id":', b'{"a":', b"[[[[[[[[[[[[[[[[[[", b"9" * 400,
+    b"\xef\xbb\xbf", b"\xff",
     b"\xc0\x80", b"\xed\xa0\x80", b"\x00", b"\x90", b"\x80", b"\xc0", b"\xc1", b"\xcb\x7f\xf8\0\0\0\0\0\0",
     b"\xca\x7f\x80\0\0", b"\xdc\xff\xff", b"\xdd\xff\xff\xff\xff", b"\xdd\x00\x03\xff\x00", b"\xde\xff\xff",
     b"\xdf\x7f\xff\xff\xff", b"\xdb\xff\xff\xff\xff", b"\xc6\xff\xff\xff\xff", b"\xc9\xff\xff\xff\xff\x01",

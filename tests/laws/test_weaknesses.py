@@ -1,0 +1,119 @@
+"""bandit and detect-secrets find nothing that nobody has judged; what was judged is listed, with why."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+
+import pytest
+from detect_secrets.core.secrets_collection import SecretsCollection
+from detect_secrets.settings import transient_settings
+
+SOURCES = ("rse_pf", "client_sdk", "lambda_pnp", "stacks", "scripts", "app.py")
+
+HARMLESS: Mapping[tuple[str, str], str] = {
+    ("lambda_pnp/keys.py", "B310"): "the address of the bucket, from the stack, always https",
+    ("rse_pf/aws/instance.py", "B105"): "seconds that a metadata token lives",
+    ("rse_pf/aws/instance.py", "B310"): "the instance's own metadata, a literal address",
+    ("rse_pf/aws/leftovers.py", "B105"): "a sentence about the secret, not the secret",
+    ("rse_pf/backend/walls.py", "B108"): "what an environment does not see; its own scratch folder",
+    ("rse_pf/cli/main.py", "B105"): "help of the verb named token",
+    ("rse_pf/data_server/app.py", "B106"): "an empty default",
+    ("stacks/boot/first_boot.py", "B310"): "the bucket and the instance's own metadata",
+}
+"""File and rule of bandit to why it is no weakness."""
+
+NO_SECRETS: Mapping[tuple[str, str], str] = {
+    ("docs/protocol.md", "JSON Web Token"): "the page's example; its signature says 'signature'",
+    ("docs/protocol.md", "Base64 High Entropy String"): "the same",
+    ("rse_pf/aws/leftovers.py", "Secret Keyword"): "a sentence about the secret, not the secret",
+    ("tests/aws/test_leftovers.py", "Secret Keyword"): "a name",
+    ("tests/aws/test_secrets.py", "Secret Keyword"): "made for moto",
+    ("tests/cli/test_token.py", "Secret Keyword"): "made for moto",
+    ("tests/lambda_pnp/test_keys.py", "Secret Keyword"): "made for moto",
+    ("tests/stacks/test_first_boot.py", "Secret Keyword"): "made for moto",
+    ("tests/system/boot/imds.py", "Secret Keyword"): "made for moto",
+    ("tests/test_objects.py", "Hex High Entropy String"): "the sha256 of 'abc'",
+}
+"""File and kind of detect-secrets to why it is none."""
+
+_QUICK = ("AWSKeyDetector", "PrivateKeyDetector", "JwtTokenDetector", "BasicAuthDetector")
+"""Each plugin costs half a second a hundred files; all of them run with the slow tests."""
+
+
+def weaknesses(repository: Path, files: Iterable[str]) -> set[tuple[str, str]]:
+    """Return file and rule of what bandit finds in *files*, with the configuration of pyproject.toml."""
+    settings = ["-c", str(repository / "pyproject.toml"), "-f", "json", "-q"]
+    command = [sys.executable, "-m", "bandit", *settings, "-r", *files]
+    done = subprocess.run(command, cwd=repository, capture_output=True, text=True, check=False)
+    report = json.loads(done.stdout)
+    assert report["errors"] == []
+    return {(each["filename"].removeprefix("./"), each["test_id"]) for each in report["results"]}
+
+
+def secrets(repository: Path, files: Iterable[str], *plugins: str) -> set[tuple[str, str]]:
+    """Return file and kind of what detect-secrets finds in *files*: with *plugins*, or all it has."""
+    configuration = json.loads((repository / ".secrets.baseline").read_text(encoding="utf-8"))
+    if plugins:
+        configuration["plugins_used"] = [{"name": name} for name in plugins]
+    found = set()
+    with transient_settings(configuration):
+        collection = SecretsCollection(root=str(repository))
+        for file in files:
+            collection.scan_file(file)
+        for file, secret in collection:
+            found.add((file, secret.type))
+    return found
+
+
+def text_files(repository: Path) -> list[str]:
+    """Return what git tracks, but locks (hashes), golden messages and generated pages."""
+    listed = subprocess.run(["git", "ls-files"], cwd=repository, capture_output=True, text=True, check=False)
+    generated = ("locks/", "tests/wire/golden/", "docs/images/", "docs/results/", "fuzz/corpus/")
+    return [
+        file
+        for file in listed.stdout.splitlines()
+        if not file.startswith(generated) and not (file.startswith("docs/") and file.endswith(".json"))
+    ]
+
+
+def test_bandit_finds_nothing_that_nobody_has_judged(repository: Path) -> None:
+    assert weaknesses(repository, SOURCES) <= HARMLESS.keys()
+
+
+def test_bandit_sees_a_shell_and_an_eval(repository: Path, tmp_path: Path) -> None:
+    file = tmp_path / "bad.py"
+    file.write_text("import subprocess\nsubprocess.run(input(), shell=True)\neval(input())\n")
+
+    assert {rule for _, rule in weaknesses(repository, [str(file)])} == {"B602", "B307"}
+
+
+def test_no_key_lies_in_the_product_or_its_pages(repository: Path) -> None:
+    files = [file for file in text_files(repository) if not file.startswith(("tests/", "benchmarks/"))]
+    if not files:
+        pytest.skip("not a git checkout, so nobody knows which files belong to it")
+
+    assert secrets(repository, files, *_QUICK) <= NO_SECRETS.keys()
+
+
+@pytest.mark.slow
+def test_no_secret_lies_anywhere_in_the_checkout(repository: Path) -> None:
+    files = text_files(repository)
+    if not files:
+        pytest.skip("not a git checkout, so nobody knows which files belong to it")
+
+    assert secrets(repository, files) <= NO_SECRETS.keys()
+
+
+def test_a_key_would_be_seen(repository: Path, tmp_path: Path) -> None:
+    file = tmp_path / "keys.py"
+    file.write_text(
+        "key = '" + "AKIA" + "Q3EGRWLEX5J2YEXW" + "'\n" + "-----BEGIN RSA " + "PRIVATE KEY-----\n"
+    )
+
+    for plugins in ((), _QUICK):
+        found = {kind for _, kind in secrets(repository, [str(file)], *plugins)}
+        assert found >= {"AWS Access Key", "Private Key"}
