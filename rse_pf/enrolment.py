@@ -36,7 +36,7 @@ __all__ = [
 
 ROBOT_KEY = "robot:"
 """Key ids of robots' own keys begin so; no platform key may."""
-QUOTAS = ("data_bytes", "commands_per_s")
+QUOTAS = ("data_bytes",)
 """What an operator may limit for one robot; the settings hold for whoever has no quota."""
 
 _SCOPE = re.compile(

@@ -63,7 +63,7 @@ def test_an_enrolled_robot_signs_for_itself_and_the_roster_says_what_it_may():
 
     assert (claims.robot, claims.tenant, claims.scopes) == ("robot-1", "lab", ("services:pnp",))
     assert claims.quota("data_bytes") == 10.0
-    assert claims.quota("commands_per_s") is None
+    assert verified(token(PLATFORM), trusted()).quota("data_bytes") is None
 
 
 def test_a_robots_key_signs_for_no_other_robot():

@@ -54,7 +54,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     parser.add_argument(
         "--quota", action="append", default=[], metavar="NAME=N",
-        help="enrol: data_bytes or commands_per_s of this robot (default: the settings)",
+        help="enrol: data_bytes, all that it may store (default: data.quota_bytes)",
     )  # fmt: skip
     parser.add_argument("--json", action="store_true", help="list: as JSON")
     add_place(parser)
