@@ -12,15 +12,17 @@ examples:
 from __future__ import annotations
 
 import argparse
+import importlib.util
 import math
 from pathlib import Path
 
-from rse_pf.errors import UsageError
+from rse_pf.errors import MissingExtra, UsageError
 from rse_pf.settings import PlatformSettings
 
 __all__ = ["add_arguments", "run"]
 
 _MOST_ROBOTS = 32
+_MERGE_NEEDS = {"gtsam": "maps", "faiss": "maps", "uvicorn": "data"}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -73,6 +75,10 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
         raise UsageError(f"--frames {args.frames} is not within 2..2000", hint="80 is a path of 5.5 m")
     if args.seed < 0:
         raise UsageError(f"--seed {args.seed} is below 0", hint="choose 0 or more")
+    if args.merge:
+        for package, extra in _MERGE_NEEDS.items():
+            if importlib.util.find_spec(package) is None:  # better now than after the drive
+                raise MissingExtra(package, extra)
     from rse_pf.experiments.demo import DemoOptions, run_demo
 
     if args.data is not None:

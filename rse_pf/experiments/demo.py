@@ -24,7 +24,8 @@ from client_sdk.frontend import FrontEndOptions
 from client_sdk.mapping import read_ply
 from rse_pf.errors import CommandFailed, UsageError
 from rse_pf.experiments import demo_report
-from rse_pf.experiments.demo_merge import MERGED_MAP, merge_here, write_merged
+from rse_pf.experiments.demo_merge import MERGED_MAP, write_merged
+from rse_pf.experiments.demo_platform_merge import merge_there
 from rse_pf.experiments.demo_robot import (
     Failed,
     Finished,
@@ -100,7 +101,7 @@ async def _run(
     with _screen(options) as screen:
         screen.say("starting the platform: Envoy and two servers")
         async with LocalCloud(
-            settings, port=0, state=folder / "platform", name="demo", on_event=tell
+            settings, port=0, state=folder / "platform", name="demo", on_event=tell, data=options.merge
         ) as cloud:
             pids = ", ".join(f"{server.name} {server.pid}" for server in cloud.servers)
             screen.say(f"running at {cloud.url}: {pids} (kill -9 one, and watch the robots go on)")
@@ -121,7 +122,7 @@ async def _run(
             merged = None
             if options.merge:
                 screen.say("merging the maps")
-                merged = await asyncio.to_thread(_merge, settings, folder, finished)
+                merged = await asyncio.to_thread(_merge, settings, folder, finished, cloud)
                 events.write(now(), "merged", joined=merged["joined"])
     for secret in ("key.json", "keys.json"):
         (folder / "platform" / secret).unlink(missing_ok=True)
@@ -150,6 +151,7 @@ def _start(
         frontend=frontend,
         session=settings.session,
         merge=options.merge,
+        data_settings=settings.data if options.merge else None,
     )
     context = multiprocessing.get_context("spawn")
     mine, theirs = context.Pipe()
@@ -212,7 +214,8 @@ async def _messages(pipe: Connection) -> AsyncIterator[Any]:
     """Yield what comes through *pipe* until the other side closes it."""
     loop = asyncio.get_running_loop()
     readable = asyncio.Event()
-    loop.add_reader(pipe.fileno(), readable.set)
+    number = pipe.fileno()  # a pipe that was closed while we waited does not tell it any more
+    loop.add_reader(number, readable.set)
     try:
         while True:
             while pipe.poll():
@@ -225,7 +228,7 @@ async def _messages(pipe: Connection) -> AsyncIterator[Any]:
             if not pipe.poll():
                 await readable.wait()
     finally:
-        loop.remove_reader(pipe.fileno())
+        loop.remove_reader(number)
 
 
 async def _sample(cloud: LocalCloud, path: Path, now: Callable[[], float]) -> None:
@@ -252,14 +255,21 @@ def _end(robots: list[_Robot]) -> None:
         robot.pipe.close()
 
 
-def _merge(settings: PlatformSettings, folder: Path, finished: list[Finished]) -> dict[str, Any]:
-    return write_merged(
+def _merge(
+    settings: PlatformSettings, folder: Path, finished: list[Finished], cloud: LocalCloud
+) -> dict[str, Any]:
+    """Merge on the platform the maps that the robots have committed."""
+    names = [_name(number) for number in range(len(finished))]
+    url, token = cloud.url, cloud.issue_token("operator")
+    section = write_merged(
         folder,
-        [_name(number) for number in range(len(finished))],
+        names,
         [robot.trajectory for robot in finished],
         [robot.truth for robot in finished],
-        lambda request: merge_here(request, settings.services, lambda done, what: None),
+        lambda _: merge_there(url, token, names, settings.session, lambda done, what: None),
     )
+    section["keyframes_uploaded"] = sum(robot.stats["keyframes_uploaded"] for robot in finished)
+    return section
 
 
 def _name(number: int) -> str:

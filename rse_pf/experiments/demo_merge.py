@@ -5,7 +5,6 @@ Promises that the robots' own maps stay as they were, and that a map which was n
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -16,24 +15,14 @@ from rse_pf.experiments.demo_keyframes import MAP_FILE
 from rse_pf.experiments.map_picture import PathOfRobot, draw_map
 from rse_pf.experiments.merge_report import JoinedRobot, joined_robots, merge_section
 from rse_pf.maps import MapVersion, decode_map
-from rse_pf.services.merge import MergeReply, MergeRequest, merge_maps
-from rse_pf.settings import ServiceSettings
+from rse_pf.services.merge import MergeReply
 
-__all__ = ["MERGED_MAP", "Merging", "merge_here", "write_merged"]
+__all__ = ["MERGED_MAP", "Merging", "write_merged"]
 
 MERGED_MAP = "merged.rsemap"
 
-Merging = Callable[[MergeRequest], tuple[MergeReply, dict[str, Any]]]
-"""Asks the merge service, wherever it is; returns its reply, and what the report says of the asking."""
-
-
-def merge_here(
-    request: MergeRequest, settings: ServiceSettings, progress: Callable[[float, str], None]
-) -> tuple[MergeReply, dict[str, Any]]:
-    """Merge in this process: what a server would do with the same request."""
-    began = time.perf_counter()
-    reply = merge_maps(request, settings, report=progress)
-    return reply, {"merged_by": "this process", "merge_s": round(time.perf_counter() - began, 3)}
+Merging = Callable[[Sequence[bytes]], tuple[MergeReply, dict[str, Any]]]
+"""Merges encoded maps, wherever; returns the reply of ``merge``, and what the report says of the asking."""
 
 
 def write_merged(
@@ -66,7 +55,7 @@ def write_merged(
         raise CommandFailed(
             f"{empty[0]} made no keyframe, so there is nothing to merge", hint="give it more frames"
         )
-    reply, how = ask(MergeRequest(maps=encoded))
+    reply, how = ask(encoded)
     merged = decode_map(reply.map)
     robots = joined_robots(names, paths, truths, versions, reply, merged)
     (folder / MERGED_MAP).write_bytes(reply.map)

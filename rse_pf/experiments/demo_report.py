@@ -109,6 +109,7 @@ def closing_lines(report: Mapping[str, Any], folder: Path) -> str:
     if "merged" in report:
         third = merged_lines(report["merged"])
         pictures = f"{shown}/map_merged.png, {shown}/merged.ply and "
+        third += f"look at it again: rse-pf map show merged --store dir:{shown}/platform/objects\n"
     return (
         f"{first}\n{second}{third}wrote {pictures}{shown}/robot-*/{{map.ply,map.png,trajectory.txt}}, "
         f"{shown}/report.md, report.json, commands.csv, events.jsonl, samples.csv"

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -19,11 +19,11 @@ import numpy as np
 from client_sdk.frontend import Frame, FrontEndOptions, PoseQuery, TrackedFrame, Tracker
 from client_sdk.mapping import MapOptions, PointMap, Trajectory, write_ply, write_trajectory
 from rse_pf.errors import RsePfError
-from rse_pf.experiments.demo_keyframes import MAP_FILE, KeyframeKeeper
+from rse_pf.experiments.demo_keyframes import MAP_FILE, KeyframeKeeper, KeyframeUploads
 from rse_pf.experiments.report import CommandRecord
 from rse_pf.geometry import Array
 from rse_pf.pnp import PnpOptions
-from rse_pf.settings import SessionSettings
+from rse_pf.settings import DataSettings, SessionSettings
 
 __all__ = ["Failed", "Finished", "Progress", "Ready", "RobotSpec", "TokenWanted", "run_robot"]
 
@@ -49,6 +49,8 @@ class RobotSpec:
     session: SessionSettings
     merge: bool = False
     """Whether it keeps its keyframes and starts in a world of its own, not at its true pose."""
+    data_settings: DataSettings | None = None
+    """How it uploads keyframes and map to the data service; None if the platform has none."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,6 +106,8 @@ class _Diary:
     commands: list[CommandRecord] = field(default_factory=list)
     tracked: list[TrackedFrame] = field(default_factory=list)
     weak_poses: int = 0
+    asking: bool = False
+    """Whether a live pose is on its way: keyframes wait."""
 
 
 def run_robot(spec: RobotSpec, pipe: Connection) -> None:
@@ -137,8 +141,8 @@ async def _run(spec: RobotSpec, pipe: Connection) -> None:
         start = np.eye(4) if truth is None or spec.merge else truth.T_world_camera[0]
         tracker = Tracker(spec.frontend, T_world_start=start)
         point_map = PointMap(MapOptions())
-        keeper = KeyframeKeeper(spec.name, spec.frontend) if spec.merge else None
         diary = _Diary()
+        keeper = _keeper(spec, lambda: diary.asking)
         first_s = time.monotonic()
         for row, frame in enumerate(frames):
             planned = began + (row + spec.number / spec.robots) / spec.rate_hz
@@ -167,7 +171,11 @@ async def _run(spec: RobotSpec, pipe: Connection) -> None:
                 trajectory=trajectory,
                 truth=truth,
                 truth_kind=truth_kind,
-                stats={"reconnects": robot.stats.reconnects, "resent": robot.stats.resent},
+                stats={
+                    "reconnects": robot.stats.reconnects,
+                    "resent": robot.stats.resent,
+                    "keyframes_uploaded": 0 if keeper is None else keeper.uploaded,
+                },
             )
         )
 
@@ -203,6 +211,7 @@ async def _solve(
         server="",
         code="",
     )
+    diary.asking = True
     try:
         answer = await robot.solve_pnp(
             query.correspondences.points_world,
@@ -215,6 +224,8 @@ async def _solve(
     except RsePfError as error:
         diary.commands.append(replace(record, answered=_since(began), code=error.code))
         return None, 0
+    finally:
+        diary.asking = False
     diary.commands.append(
         replace(
             record,
@@ -264,9 +275,20 @@ def _trajectory(tracked: Iterable[TrackedFrame]) -> Trajectory:
     )
 
 
+def _keeper(spec: RobotSpec, is_busy: Callable[[], bool]) -> KeyframeKeeper | None:
+    if not spec.merge:
+        return None
+    if spec.data_settings is None:
+        return KeyframeKeeper(spec.name, spec.frontend)
+    uploads = KeyframeUploads(spec.url, spec.token, spec.folder / "spool", spec.data_settings, is_busy)
+    return KeyframeKeeper(spec.name, spec.frontend, uploads)
+
+
 def _write(folder: Path, point_map: PointMap, trajectory: Trajectory, keeper: KeyframeKeeper | None) -> None:
     points, colours = point_map.points(min_readings=_PRUNE_READINGS)
     write_ply(folder / "map.ply", points, colours)
     write_trajectory(folder / "trajectory.txt", trajectory)
     if keeper is not None:
-        (folder / MAP_FILE).write_bytes(keeper.encoded_map(points, colours))
+        data = keeper.encoded_map(points, colours)
+        (folder / MAP_FILE).write_bytes(data)
+        keeper.share(data)

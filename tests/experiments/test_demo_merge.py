@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,10 +13,11 @@ from client_sdk.frontend import Frame, FrontEndOptions, TrackedFrame
 from client_sdk.mapping import Trajectory, read_ply, read_trajectory
 from rse_pf.errors import CommandFailed
 from rse_pf.experiments.demo_keyframes import MAP_FILE, KeyframeKeeper
-from rse_pf.experiments.demo_merge import MERGED_MAP, merge_here, write_merged
+from rse_pf.experiments.demo_merge import MERGED_MAP, write_merged
 from rse_pf.geometry import Camera
 from rse_pf.maps import MapVersion, decode_map, encode_map
 from rse_pf.services.map_problems import make_world
+from rse_pf.services.merge import MergeReply, MergeRequest, merge_maps
 from rse_pf.settings import ServiceSettings
 
 for package in ("faiss", "gtsam", "PIL", "cv2"):
@@ -46,15 +49,13 @@ def demo_folder(folder: Path, maps: list[MapVersion]) -> list[Trajectory]:
     return paths
 
 
-def merge(folder: Path, paths: list[Trajectory], truths: list[Trajectory | None]) -> dict[str, object]:
+def merge_here(maps: Sequence[bytes]) -> tuple[MergeReply, dict[str, Any]]:
+    return merge_maps(MergeRequest(maps=list(maps)), ServiceSettings()), {"merged_by": "this test"}
+
+
+def merge(folder: Path, paths: list[Trajectory], truths: list[Trajectory | None]) -> dict[str, Any]:
     names = [f"robot-{number + 1}" for number in range(len(paths))]
-    return write_merged(
-        folder,
-        names,
-        paths,
-        truths,
-        lambda request: merge_here(request, ServiceSettings(), lambda done, what: None),
-    )
+    return write_merged(folder, names, paths, truths, merge_here)
 
 
 def test_robots_that_share_views_end_in_one_map_and_strangers_stay_out(tmp_path: Path) -> None:
@@ -67,11 +68,11 @@ def test_robots_that_share_views_end_in_one_map_and_strangers_stay_out(tmp_path:
     section = merge(tmp_path, paths, list(truths))
 
     assert section["joined"] == ["robot-1", "robot-2"]
-    (left_out,) = section["not_joined"]  # type: ignore[misc]
+    (left_out,) = section["not_joined"]
     assert left_out["robot"] == "robot-3"
     assert left_out["reason"]
-    assert section["ate_cm"] < 5.0  # type: ignore[operator]
-    assert section["links_between_robots"] >= 3  # type: ignore[operator]
+    assert section["ate_cm"] < 5.0
+    assert section["links_between_robots"] >= 3
     merged = decode_map((tmp_path / MERGED_MAP).read_bytes())
     assert {each.robot for each in merged.keyframes} == {"robot-1", "robot-2"}
     points, colours = read_ply(tmp_path / "merged.ply")
@@ -98,18 +99,38 @@ def tracked(*, keyframe: bool, seed: int = 0) -> TrackedFrame:
     return TrackedFrame(frame=frame, T_world_camera=np.eye(4), keyframe=keyframe, inliers=9, matches=9)
 
 
+class Listener:
+    """Stands in for the data service."""
+
+    def __init__(self) -> None:
+        self.handed: list[bytes] = []
+        self.maps: dict[str, bytes] = {}
+
+    def keyframe(self, data: bytes) -> None:
+        self.handed.append(data)
+
+    def finish(self, robot: str, data: bytes) -> int:
+        self.maps[robot] = data
+        return len(self.handed)
+
+
 def test_a_robot_keeps_its_keyframes_and_hands_each_over_once() -> None:
-    handed: list[bytes] = []
-    keeper = KeyframeKeeper("robot-1", FrontEndOptions(), handed.append)
+    others = Listener()
+    keeper = KeyframeKeeper("robot-1", FrontEndOptions(), others)
 
     for step in (tracked(keyframe=True), tracked(keyframe=False, seed=1), tracked(keyframe=True, seed=2)):
         keeper.see(step)
 
-    assert len(keeper) == len(handed) == 2
+    assert len(keeper) == len(others.handed) == 2
     version = decode_map(keeper.encoded_map(np.zeros((1, 3), np.float32), np.zeros((1, 3), np.uint8)))
     assert [each.id for each in version.keyframes] == [0, 1]
     assert version.provenance["robot"] == "robot-1"
-    (sent,) = decode_map(handed[1]).keyframes
+    (sent,) = decode_map(others.handed[1]).keyframes
     assert len(sent.pixels) > 50
     np.testing.assert_array_equal(sent.descriptors, version.keyframes[1].descriptors)
     np.testing.assert_allclose(sent.points_camera[:, 2], 2.0, atol=1e-4)
+
+    whole = encode_map(version)
+    keeper.share(whole)
+    assert others.maps == {"robot-1": whole}
+    assert keeper.uploaded == 2

@@ -1,0 +1,68 @@
+"""demo --merge through the whole platform: keyframes and maps by HTTP, the merge as a job, one map at the end."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from client_sdk.mapping import read_ply, read_trajectory
+from rse_pf.data_server.maps import MapRegistry
+from rse_pf.objects import DirectoryStore
+
+pytestmark = pytest.mark.system
+
+for package in ("faiss", "gtsam", "PIL", "cv2", "uvicorn"):
+    pytest.importorskip(package, reason="the extras maps, demo and data are needed")
+
+
+def demo(out: Path, *options: str, within_s: float) -> tuple[dict[str, Any], str]:
+    command = [sys.executable, "-m", "rse_pf.cli.main", "demo", "--merge", "--quiet", "--out", str(out)]
+    done = subprocess.run([*command, *options], capture_output=True, text=True, timeout=within_s, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return json.loads((out / "report.json").read_text())["merged"], done.stdout
+
+
+@pytest.mark.timeout(110)
+def test_robots_that_share_no_view_are_not_joined_and_the_reason_is_told(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+
+    merged, said = demo(out, "--robots", "2", "--frames", "8", "--rate", "10", within_s=100)
+
+    assert merged["joined"] == ["robot-1"]
+    (left_out,) = merged["not_joined"]
+    assert left_out["robot"] == "robot-2"
+    assert f"robot-2 not joined: {left_out['reason']}" in said
+    assert merged["merged_by"] in ("server-1", "server-2")
+    maps = MapRegistry(DirectoryStore(out / "platform" / "objects"))
+    assert maps.names() == ["merged", "robot-1", "robot-2"]
+    robots = [maps.load(name) for name in ("robot-1", "robot-2")]
+    assert merged["keyframes_uploaded"] == sum(len(version.keyframes) for version in robots)
+    assert maps.head("merged").id == merged["map"]["version"]
+    assert {each.robot for each in maps.load("merged").keyframes} == {"robot-1"}
+    assert (out / "map_merged.png").read_bytes().startswith(b"\x89PNG")
+    assert not (out / "robot-2" / "merged_trajectory.txt").exists()
+
+
+@pytest.mark.slow
+@pytest.mark.data
+@pytest.mark.timeout(400)
+def test_three_robots_in_the_red_kitchen_end_in_one_map_within_the_bars(tmp_path: Path) -> None:
+    recording = Path(__file__).parents[2].parent / "shared" / "data" / "7scenes_redkitchen"
+    if not recording.is_dir():
+        pytest.skip(f"there is no recording {recording}")
+    out = tmp_path / "out"
+
+    merged, said = demo(out, "--recording", str(recording), "--rate", "10", "--robots", "3", within_s=380)
+
+    assert merged["joined"] == ["robot-1", "robot-2", "robot-3"]
+    assert merged["ate_cm"] <= 4.5
+    assert all(each["cm"] <= 7.0 and each["deg"] <= 2.5 for each in merged["origins"])
+    assert f"{merged['links_between_robots']} links between them" in said
+    assert len(read_ply(out / "merged.ply")[0]) == merged["points"] > 100_000
+    paths = [read_trajectory(out / name / "merged_trajectory.txt") for name in merged["joined"]]
+    assert sum(len(path) for path in paths) == merged["frames"] == 250
