@@ -20,10 +20,12 @@ from stacks.load_balancer import LoadBalancer
 from stacks.network_stack import NetworkStack
 from stacks.scale_modifier import ScaleModifier
 
-__all__ = ["KEY_SET", "BackendStack"]
+__all__ = ["KEY_SET", "TRUSTED", "BackendStack"]
 
 KEY_SET = "keys.json"
 """Name of the public key set in the artifact bucket."""
+TRUSTED = (KEY_SET, "control/robots.json", "control/deny.json")
+"""What says who may come in: keys, enrolled robots, revoked tokens."""
 
 
 class BackendStack(cdk.Stack):
@@ -63,7 +65,9 @@ class BackendStack(cdk.Stack):
             settings=settings, artifacts=data.artifacts, key_set=KEY_SET,
         )  # fmt: skip
         self.servers.role.add_to_policy(
-            iam.PolicyStatement(actions=["s3:GetObject"], resources=[data.artifacts.arn_for_objects(KEY_SET)])
+            iam.PolicyStatement(
+                actions=["s3:GetObject"], resources=[data.artifacts.arn_for_objects(name) for name in TRUSTED]
+            )
         )
         group = self.servers.group
         # By name, not by reference: a reference would make a cycle with the group.

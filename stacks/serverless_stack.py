@@ -14,7 +14,7 @@ from constructs import Construct
 
 from rse_pf.settings import PlatformSettings
 from stacks.assets import staged
-from stacks.backend_stack import KEY_SET
+from stacks.backend_stack import KEY_SET, TRUSTED
 from stacks.data_stack import DataStack
 from stacks.findings import acknowledge
 
@@ -39,7 +39,9 @@ class ServerlessStack(cdk.Stack):
         cast("logs.CfnLogGroup", log.node.default_child).retention_in_days = settings.cloud.log_days
         role = iam.Role(self, "Role", assumed_by=iam.ServicePrincipal("lambda.amazonaws.com"))
         role.add_to_policy(
-            iam.PolicyStatement(actions=["s3:GetObject"], resources=[data.artifacts.arn_for_objects(KEY_SET)])
+            iam.PolicyStatement(
+                actions=["s3:GetObject"], resources=[data.artifacts.arn_for_objects(name) for name in TRUSTED]
+            )
         )
         log.grant_write(role)
         with tempfile.TemporaryDirectory() as folder:

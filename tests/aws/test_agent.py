@@ -12,6 +12,7 @@ from aws.fake_machine import FakeMachine, FakeScaling
 from rse_pf.auth import SigningKey
 from rse_pf.aws.agent import Agent, Post, main
 from rse_pf.aws.clients import make_client
+from rse_pf.control import DENY_NAME, ControlRoom
 from rse_pf.objects import MemoryStore
 from rse_pf.scaling.alarms import NAMESPACE
 from rse_pf.settings import PlatformSettings
@@ -179,3 +180,39 @@ def test_a_missing_settings_file_is_two_lines(tmp_path: Path, capsys: pytest.Cap
 
     assert main(["--settings", str(tmp_path / "none.json"), *place]) == 2
     assert len(capsys.readouterr().err.splitlines()) == 2
+
+
+def test_the_control_room_is_fetched_beside_the_keys_when_it_changes(stand: Stand) -> None:
+    room = ControlRoom(stand.artifacts)
+    stand.agent.fetch_control()
+    assert not (stand.file.parent / DENY_NAME).exists()
+
+    room.change_denied(lambda denied: denied.with_robot("default", "r", 1.0))
+    stand.agent.fetch_control()
+    stand.agent.fetch_control()
+
+    assert (stand.file.parent / DENY_NAME).read_bytes() == stand.artifacts.get(DENY_NAME)
+    assert stand.events() == ["control"]
+
+
+@pytest.mark.parametrize("harm", ["nonsense", "gone"])
+def test_a_control_room_that_was_spoilt_changes_nothing_on_the_machine(stand: Stand, harm: str) -> None:
+    ControlRoom(stand.artifacts).change_denied(lambda denied: denied.with_robot("default", "r", 1.0))
+    stand.agent.fetch_control()
+    good = (stand.file.parent / DENY_NAME).read_bytes()
+    if harm == "gone":
+        stand.artifacts.delete(DENY_NAME)
+    else:
+        stand.artifacts.put(DENY_NAME, b"nonsense")
+
+    class Enough(Exception):
+        pass
+
+    def stop(_: float) -> None:
+        raise Enough
+
+    with pytest.raises(Enough):
+        stand.agent.watch_control(stop)
+
+    assert (stand.file.parent / DENY_NAME).read_bytes() == good
+    assert stand.events() == ["control"] + ["failed"] * (harm == "nonsense")

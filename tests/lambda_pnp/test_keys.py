@@ -7,7 +7,9 @@ from datetime import datetime, timezone
 import pytest
 
 from lambda_pnp.keys import KeyCache, signed_request
-from rse_pf.auth import SigningKey
+from rse_pf.auth import Claims, SigningKey
+from rse_pf.enrolment import DenyList, EnrolledRobot, Roster, public_key_of, to_json
+from rse_pf.errors import NotFound
 
 ENVIRONMENT = {
     "RSE_PF_KEYS": "artifacts/keys.json", "AWS_REGION": "ap-northeast-2", "AWS_ACCESS_KEY_ID": "AKIDEXAMPLE",
@@ -93,3 +95,68 @@ def test_before_the_first_key_nobody_is_trusted_and_nothing_falls_over(
 ) -> None:
     assert KeyCache(Bucket().read, 60.0).at(0.0).get("a") is None
     assert "rse-pf token init --cloud" in capsys.readouterr().err
+
+
+class Room:
+    """A control room whose objects may be there, missing, or out of reach."""
+
+    def __init__(self) -> None:
+        self.objects: dict[str, str] = {}
+        self.error: Exception | None = None
+
+    def read(self, name: str) -> str:
+        if self.error is not None:
+            raise self.error
+        if name not in self.objects:
+            raise NotFound(f"no {name}")
+        return self.objects[name]
+
+
+CLAIMS = Claims(robot="r", token_id="t", issued_s=0.0, expires_s=900.0, key_id="a")
+DISABLED = to_json(DenyList().with_robot("default", "r", 1.0)).decode()
+
+
+def test_a_robot_that_was_disabled_is_refused_within_a_period() -> None:
+    bucket, room = Bucket("a"), Room()
+    cache = KeyCache(bucket.read, 30.0, read_control=room.read)
+    assert cache.at(0.0).denies(CLAIMS) == ""
+
+    room.objects["deny.json"] = DISABLED
+
+    assert cache.at(29.9).denies(CLAIMS) == ""
+    assert cache.at(30.0).denies(CLAIMS) == "disabled"
+
+
+@pytest.mark.parametrize("harm", [OSError("HTTP Error 403: Forbidden"), NotFound("gone"), None])
+def test_a_deny_list_out_of_reach_stays_as_it_was_known(harm: Exception | None) -> None:
+    bucket, room = Bucket("a"), Room()
+    room.objects["deny.json"] = DISABLED
+    cache = KeyCache(bucket.read, 30.0, read_control=room.read)
+    cache.at(0.0)
+    room.error = harm
+    room.objects["deny.json"] = "nonsense"
+
+    assert cache.at(31.0).denies(CLAIMS) == "disabled"
+    assert cache.at(31.0).get("a") is not None
+
+
+def test_nobody_is_let_in_while_the_deny_list_was_never_read() -> None:
+    room = Room()
+    room.error = OSError("HTTP Error 403: Forbidden")
+
+    assert KeyCache(Bucket("a").read, 30.0, read_control=room.read).at(0.0).get("a") is None
+
+
+def test_an_enrolled_robots_key_is_known() -> None:
+    key = SigningKey.of_robot(b"r" * 32)
+    robot = EnrolledRobot(robot="r", x=public_key_of(key.public_json()))
+    room = Room()
+    room.objects["robots.json"] = to_json(Roster(robots=(robot,))).decode()
+
+    assert KeyCache(Bucket("a").read, 30.0, read_control=room.read).at(0.0).robot_of(key.key_id) == robot
+
+
+def test_the_control_room_lies_beside_the_keys() -> None:
+    request = signed_request(ENVIRONMENT, NOW, "deny.json")
+
+    assert request.full_url == "https://artifacts.s3.ap-northeast-2.amazonaws.com/control/deny.json"

@@ -116,9 +116,11 @@ def test_what_the_commands_look_for_is_what_the_stacks_call_it(assembly: Assembl
     from rse_pf.aws.costs import interface_endpoints
     from rse_pf.aws.fleet import GROUP
     from rse_pf.aws.key_store import DATA_STACK, KEYS_NAME
+    from rse_pf.control import DENY_NAME, ROBOTS_NAME
     from stacks import backend_servers, backend_stack
 
     assert (GROUP, KEYS_NAME) == (backend_servers.GROUP, backend_stack.KEY_SET)
+    assert {KEYS_NAME, ROBOTS_NAME, DENY_NAME} == set(backend_stack.TRUSTED)
     resources = assembly.templates[DATA_STACK]["Resources"]
     for word, kind in (("SigningKey", "AWS::SecretsManager::Secret"), ("Artifacts", "AWS::S3::Bucket")):
         assert [each["Type"] for name, each in resources.items() if name.startswith(word)].count(kind) == 1
