@@ -60,7 +60,7 @@ class AuditLog:
         self._wall_clock = wall_clock
         self._most_bytes = most_bytes
         self._sync_s = sync_s
-        self._on_problem = on_problem
+        self.on_problem = on_problem
         self._failed = False
         self._held: list[Note] = []
         self._guard, self._writing = threading.Lock(), threading.Lock()
@@ -141,7 +141,7 @@ class AuditLog:
                     del self._held[_MOST_HELD:]
                 if not self._failed:
                     self._failed = True
-                    self._on_problem(f"the audit log of {self.who} cannot be written: {error.strerror}")
+                    self.on_problem(f"the audit log of {self.who} cannot be written: {error.strerror}")
 
     def close(self) -> None:
         """Write what is held, and let go of the log."""

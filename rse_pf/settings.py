@@ -213,6 +213,11 @@ class AuthSettings:
     max_token_bytes: int = setting(4096, unit="bytes", doc="a longer token is refused unread", low=512)
     required: bool = setting(True, doc="robots without a token are refused")
     deny_list_refresh_s: float = setting(0.5, unit="s", doc="time between two looks of a server at revoked tokens, disabled and enrolled robots", source="live sockets end within 2 s", low=0.05, high=30)
+    audit_sync_ms: float = setting(100.0, unit="ms", doc="an entry of the audit log is on the disk after this", low=1, high=10000)
+    audit_file_bytes: int = setting(16777216, unit="bytes", doc="a file of the audit log that has grown longer is set aside, and the chain goes on in the next", low=65536)
+    audit_refused_per_s: float = setting(2.0, unit="1/s", doc="refused tokens that a worker records one by one, in the long run; the rest are counted", low=0)
+    audit_refused_burst: int = setting(50, unit="entries", doc="refused tokens that it records at once", low=1)
+    audit_heads_s: float = setting(60.0, unit="s", doc="time between two looks of the control plane at the heads of the other audit logs", low=0.1)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

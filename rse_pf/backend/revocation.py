@@ -18,6 +18,7 @@ from rse_pf.backend.door import Door
 from rse_pf.backend.log import JsonLog
 from rse_pf.backend.presence import Orderly
 from rse_pf.backend.seams import Handle, Loop
+from rse_pf.backend.witness import Witness
 from rse_pf.control import Trust
 from rse_pf.wire.session import CLOSE_REPLACED, CLOSE_REVOKED, CLOSE_TOKEN_OVER
 
@@ -28,7 +29,7 @@ class Standing:
     """The claims of one worker's connections; the core tells who comes and goes."""
 
     def __init__(
-        self, core: Core, door: Door, *, loop: Loop, log: JsonLog, tell: Callable[..., None]
+        self, core: Core, door: Door, *, loop: Loop, log: JsonLog, tell: Callable[..., None], witness: Witness
     ) -> None:
         """Serve *core*.
 
@@ -38,12 +39,14 @@ class Standing:
             loop: For the ends of tokens.
             log: One line for each socket that is ended.
             tell: Says something to the supervisor.
+            witness: Records fresh tokens, and sockets that lose their standing.
         """
         self._core = core
         self._door = door
         self._loop = loop
         self._log = log
         self._tell = tell
+        self._witness = witness
         self._of_number: dict[int, Connection] = {}
         self._ends: dict[Connection, Handle] = {}
 
@@ -54,6 +57,8 @@ class Standing:
             problem = "" if connection.claims is None else standing_problem(connection.claims, keys)
             if problem and not connection.assembler.closed:
                 self._log.info("revoked", robot=connection.robot, reason=problem)
+                if connection.claims is not None:
+                    self._witness.cut_off(connection.claims, problem)
                 connection.close(CLOSE_REVOKED, "revoked")
 
     def connected(self, connection: Connection) -> None:
@@ -93,6 +98,7 @@ class Standing:
         claims = self._door.renewed(token, wall_s)
         if isinstance(claims, Claims) and before is not None and _is_same_robot(before, claims):
             connection.claims = claims
+            self._witness.renewed(before, claims)
             token_s = self._door.ends_s(claims, wall_s) - wall_s
             connection.expires_s = now + token_s
             self._end_in_time(connection)
@@ -102,6 +108,7 @@ class Standing:
             core.metrics.handshakes["renewal-refused"] += 1
             reason = claims if isinstance(claims, str) else "wrong-robot"
             self._log.info("renewal-refused", robot=connection.robot, reason=reason)
+            self._witness.renewal_refused(before, reason)
         if connection.session is not None:
             connection.apply(connection.session.renewed(token_s), now)
 

@@ -10,7 +10,7 @@ import asyncio
 import socket
 from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import Any, Protocol
 
 from rse_pf.backend.connection import Connection
 from rse_pf.backend.core import Core
@@ -30,6 +30,13 @@ _LINGER_S = 2.0
 """Time a robot has to read our CLOSE and to end its side; then the connection is cut."""
 
 
+class Judged(Protocol):
+    """Gets every verdict of the door."""
+
+    def __call__(self, verdict: Admitted | TurnedAway, source: str, authorization: str) -> None:
+        """Take one verdict, of the address *source*."""
+
+
 class _Quiet:
     """The logger picows gets: it would make one logger object for each socket otherwise."""
 
@@ -44,10 +51,10 @@ class _Quiet:
 class _Arrival:
     """A socket until its handshake is judged."""
 
-    __slots__ = ("_is_cut", "_transport", "number", "peer", "room")
+    __slots__ = ("_is_cut", "_transport", "number", "peer", "room", "source")
 
     def __init__(self, peer: str, room: int, number: int = 0) -> None:
-        self.peer = peer
+        self.peer = self.source = peer
         self.number = number
         self.room = room
         """Bytes that the head of its handshake may still have."""
@@ -90,6 +97,7 @@ class RobotSockets:
         most_robots: int,
         workers: int,
         new_name: Callable[[], str],
+        judged: Judged,
         log: JsonLog,
         loop: asyncio.AbstractEventLoop,
     ) -> None:
@@ -102,6 +110,7 @@ class RobotSockets:
             -(-serving.max_unauthenticated // workers), -(-per_source // workers)
         )
         self._new_name = new_name
+        self._judged = judged
         self._log = log
         self._loop = loop
         self._serving = serving
@@ -151,6 +160,7 @@ class RobotSockets:
         self._waiting.leave(arrival)
         try:
             verdict = self._verdict(arrival, request)
+            self._judged(verdict, arrival.source, request.headers.get("Authorization", ""))
         except Exception as error:  # noqa: BLE001  see above
             self._log.error("defect", at="door", traceback=repr(error))
             verdict = self._door.defect
@@ -170,7 +180,9 @@ class RobotSockets:
 
     def _verdict(self, arrival: _Arrival, request: Any) -> Admitted | TurnedAway:
         headers, now = request.headers, self._core.clocks.monotonic()
-        source = self._sources.source(arrival.peer, ",".join(headers.getall("X-Forwarded-For", [])))
+        source = arrival.source = self._sources.source(
+            arrival.peer, ",".join(headers.getall("X-Forwarded-For", []))
+        )
         if self._sources.wait_s(source, now) > 0:
             return self._door.too_fast
         connection = [word.strip().lower() for word in ",".join(headers.getall("Connection", [])).split(",")]

@@ -31,6 +31,7 @@ from rse_pf.backend.metrics import merge, merge_isolation, render
 from rse_pf.backend.presence import Presence
 from rse_pf.backend.processes import cpu_seconds, raise_descriptor_limit, resident_bytes
 from rse_pf.backend.revocation import Watch, first_order
+from rse_pf.backend.witness import Records, open_records
 from rse_pf.backend.worker_process import WorkerProcess
 from rse_pf.control import Trust
 from rse_pf.errors import ConfigurationError
@@ -61,6 +62,7 @@ def serve(
     conformance_echo: bool = False,
     services: str = _BUILTIN,
     settings_digest: str = "",
+    audit: Path | None = None,
 ) -> int:
     """Serve robots until a drain or a signal ends it; call it in the main thread of a process.
 
@@ -74,6 +76,7 @@ def serve(
         services: ``module:function`` that makes the registry of a worker from the settings.
         settings_digest: What /healthz says; empty means that of *settings*.  Whoever lays an address of this
             machine over shared settings names the digest of the shared ones.
+        audit: Folder of the audit log; None records nothing.
 
     Returns:
         0 after a drain or a signal, 1 when a worker was lost.
@@ -87,11 +90,11 @@ def serve(
     check_open_door(settings, keys, conformance_echo)
     raise_descriptor_limit()
     listener = bound(settings.serving.host, settings.serving.port)
-    with listener:
+    with listener, open_records(audit, server_id, settings.auth) as records:
         supervisor = _Supervisor(
             settings, keys=keys, trust=trust, server_id=server_id, announce=announce,
             conformance_echo=conformance_echo, services=services, listener=listener,
-            digest=settings_digest or settings.digest(),
+            digest=settings_digest or settings.digest(), records=records,
         )  # fmt: skip
         return asyncio.run(supervisor.run())
 
@@ -109,10 +112,12 @@ class _Supervisor:
         services: str,
         listener: socket.socket,
         digest: str,
+        records: Records,
     ) -> None:
         self._settings = settings
         self._digest = digest
         self._server_id = server_id
+        self._records = records
         self._announce = announce
         self._listener = listener
         self._state = "starting"
@@ -128,12 +133,13 @@ class _Supervisor:
         self._accepts = Bucket(settings.serving.accepts_per_s, float(settings.serving.handshake_burst))
         self._accept_pauses = 0
         self._log = JsonLog(level=settings.serving.log_level, server=server_id, wall_clock=time.time)
+        records.complain_to(lambda problem: self._log.error("audit", reason=problem))
         count = settings.serving.workers or len(os.sched_getaffinity(0))
         config = {
             "settings": settings.to_dict(), "server": server_id, "services": services, "workers": count,
             "keys": keys.to_json() if keys is not None and settings.auth.required else None,
             "conformance_echo": conformance_echo, "supervisor": os.getpid(),
-            "job_slots": make_pipe(settings.serving.jobs),
+            "job_slots": make_pipe(settings.serving.jobs), "audit": records.is_on,
         }  # fmt: skip
         self._configs = [{**config, "index": index} for index in range(count)]
         self._workers: list[WorkerProcess] = []
@@ -145,7 +151,7 @@ class _Supervisor:
             loop.add_signal_handler(number, self._on_signal, number)
         control = await self._open_control()
         try:
-            hear = Presence().hear
+            hear = self._records.heard(Presence().hear)
             self._workers = [WorkerProcess(config, self._on_lost, hear) for config in self._configs]
             await self._start(loop)
             return await self._over
@@ -156,7 +162,9 @@ class _Supervisor:
                 worker.kill()
             if self._announce is not None:
                 self._announce.unlink(missing_ok=True)
-            self._log.info("server-over", exit_code=self._over.result() if self._over.done() else None)
+            code = self._over.result() if self._over.done() else None
+            self._log.info("server-over", exit_code=code)
+            self._records.note("server.over", exit_code=code)
             self._log.close()
 
     async def _open_control(self) -> asyncio.Server:
@@ -196,6 +204,7 @@ class _Supervisor:
             watch = Watch(self._trust, workers=lambda: self._workers, log=self._log, pause_s=pause_s)
             self._keep(watch.run())
         self._log.info("server-ready", **self._identity(), settings=self._digest)
+        self._records.note("server.ready", settings=self._digest)
 
     def _identity(self) -> dict[str, Any]:
         return {
@@ -259,6 +268,7 @@ class _Supervisor:
         """Not ready but accepting, then Move to all, finish what is held, leave."""
         self._state = "draining"
         self._log.info("drain", wait_s=wait_s)
+        self._records.note("server.drain", wait_s=wait_s)
         await asyncio.sleep(wait_s)
         within_ms = self._settings.serving.drain_within_ms
         for worker in self._workers:
@@ -421,6 +431,7 @@ class _Supervisor:
                 within_ms = self._settings.serving.drain_within_ms
                 worker.order(do="hand-over", delays_s=delays_s, within_ms=within_ms)
         self._log.info("hand-over", robots=asked, spread_s=round(last_s, 3))
+        self._records.note("server.move", robots=asked, spread_s=round(last_s, 3))
         return _json({"robots": asked, "spread_s": round(last_s, 3), "under_way": False}, status=202)
 
     def _identity_while_open(self) -> dict[str, Any]:

@@ -36,6 +36,7 @@ from rse_pf.backend.processes import die_with_parent
 from rse_pf.backend.revocation import Standing
 from rse_pf.backend.seams import Clocks
 from rse_pf.backend.server import RobotSockets
+from rse_pf.backend.witness import Witness
 from rse_pf.backend.worker_process import NUMBER_BYTES
 from rse_pf.control import key_set_of
 from rse_pf.errors import MissingExtra
@@ -105,8 +106,11 @@ class _Worker:
         keys = None if config["keys"] is None else KeySet.from_json(config["keys"])
         self._index, self._workers, self._named = config["index"], config["workers"], 0
         door = Door(settings, keys, conformance_echo=config["conformance_echo"])
+        self._witness = Witness(
+            settings.auth, self._core.clocks, loop=loop, tell=self._say if config["audit"] else None
+        )
         self._standing = self._core.standing = Standing(
-            self._core, door, loop=loop, log=self._log, tell=self._say
+            self._core, door, loop=loop, log=self._log, tell=self._say, witness=self._witness
         )
         self._sockets = RobotSockets(
             core=self._core,
@@ -116,6 +120,7 @@ class _Worker:
             most_robots=-(-settings.serving.max_robots // self._workers),
             workers=self._workers,
             new_name=self._new_name,
+            judged=self._witness.judged,
             log=self._log,
             loop=loop,
         )
@@ -178,6 +183,7 @@ class _Worker:
             elif order["do"] == "leave":
                 await self._leave(order["held_s"])
                 break
+        self._witness.flush()
         self._log.close()
         os._exit(0)  # sockets and threads of a worker that has no supervisor are nobody's
 

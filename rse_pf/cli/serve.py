@@ -48,6 +48,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--announce", type=Path, metavar="FILE", help="write pids and ports there when all is ready"
     )
+    parser.add_argument(
+        "--audit", type=Path, metavar="DIR", help="record there who came in and who was refused"
+    )
     parser.add_argument("--store", metavar="PLACE", help="where objects live (data.store)")
     parser.add_argument(
         "--services", type=Path, metavar="DIR", help="run the services installed there (services.folder)"
@@ -91,6 +94,7 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
         announce=args.announce,
         conformance_echo=args.conformance_echo,
         settings_digest=settings.digest(),
+        audit=args.audit,
     )
 
 

@@ -18,6 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from rse_pf.audit_log import audit_folder
 from rse_pf.errors import ConfigurationError
 from rse_pf.local.envoy_config import Target
 from rse_pf.local.processes import ProcessMark, ended, is_alive, last_line, mark_of, send_signal, spawn
@@ -89,6 +90,7 @@ class BackendServers:
         command += ["--control-host", serving.control_host, "--control-port", str(serving.control_port)]
         command += ["--store", self._settings.data.store]
         command += ["--keys", str(self._keys_file), "--announce", str(self._announce(name))]
+        command += ["--audit", str(audit_folder(self._folder))]
         process = spawn(
             command, log=self._log(name), folder=self._folder, dies_with_parent=self._dies_with_parent
         )

@@ -24,6 +24,7 @@ from rse_pf.auth import SigningKey
 from rse_pf.errors import ConfigurationError, UsageError
 from rse_pf.local.adoption import adopt, adopt_data
 from rse_pf.local.backend_servers import RSE_PF, BackendServer, BackendServers
+from rse_pf.local.chronicle import Chronicle
 from rse_pf.local.control_plane import ControlPlane
 from rse_pf.local.data_servers import DataServers
 from rse_pf.local.firewall import check_front_door, ensure_key, key_file, key_set_file
@@ -98,6 +99,7 @@ class LocalCloud:
         self._adoptable = adoptable
         self._on_event = on_event
         self._lock = PlatformLock(self.state)
+        self._chronicle = Chronicle(self.state, settings.auth)
         self._key: SigningKey | None = None
         self._wanted_port = settings.local.port if port is None else port
         self._settings_file = settings_file(self.state)
@@ -179,6 +181,7 @@ class LocalCloud:
             left = self._leftovers()
             if left is None:
                 check_front_door(self.settings.serving.host, self._wanted_port)
+            self._chronicle.open()
         except ConfigurationError:
             self._lock.release()
             raise
@@ -379,6 +382,7 @@ class LocalCloud:
         host = f"[{serving.host}]" if ":" in serving.host else serving.host
         self.url = f"ws://{host}:{self.port}{serving.path}"
         self._status = await serve_status(self.status_document)
+        self._fleet.keep(self._chronicle.watch())
         if self._monitored:
             self._control.start()
         self._write_state()
@@ -446,12 +450,14 @@ class LocalCloud:
                 remove_state(self.state)
                 if not self._adoptable:  # nobody can come back to this platform: nor may its tokens
                     key_file(self.state).unlink(missing_ok=True)
+            self._chronicle.close()
             self._lock.release()
         self._tell("platform-gone")
 
     def _tell(self, event: str, **details: Any) -> None:
         told = {"event": event, **details}
         self.events.append(told)
+        self._chronicle.take(told)
         if self._on_event is not None:
             self._on_event(told)
 
