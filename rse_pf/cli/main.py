@@ -32,7 +32,7 @@ VERBS = {
     "service": "write, test, run and install a service of your own: Python, C/C++ or Lua",
     "serve": "run one backend server, as EC2 runs it",
     "data": "run the data service: images, keyframes, clouds and maps by HTTP",
-    "map": "list, show, compare, roll back and export the maps that robots share",
+    "map": "look at, merge, localise in, roll back and export the maps that robots share",
     "audit": "show who came in, what was changed, and check that nobody changed that log",
     "cloud": "look after the platform on AWS: doctor, cost, status, leftovers",
     "settings": "show every setting: value, default, unit, source",

@@ -10,7 +10,7 @@ import pytest
 
 from rse_pf.cli.main import main
 from rse_pf.data_server.maps import MapRegistry
-from rse_pf.geometry import pose_difference
+from rse_pf.geometry import Camera, pose_difference
 from rse_pf.maps import Keyframe, MapVersion, encode_map
 from rse_pf.objects import DirectoryStore
 from rse_pf.services.map_problems import make_world
@@ -19,6 +19,7 @@ for package in ("faiss", "gtsam", "PIL", "cv2"):
     pytest.importorskip(package, reason="the extras maps, local and vision are needed")
 
 WORLD = make_world(1)
+WALL_M = 2.0
 
 
 @pytest.fixture
@@ -133,33 +134,37 @@ def test_bad_input_is_one_sentence_and_a_hint(
     assert "\n  hint: " in said
 
 
+SHIFT_PX = 16
+"""The camera moves to the right by so many pixels, in front of a wall."""
+
+
 @pytest.fixture(scope="module")
 def rendered(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, np.ndarray, Path]:
-    """A store whose map "room" has two rendered frames; an image between them, and its true pose."""
+    """A store whose map "room" is one view of a wall; an image from further right, and its true pose."""
     from PIL import Image
 
-    from client_sdk.frontend import FrontEndOptions, extract
-    from client_sdk.simulate import render_frames, true_trajectory
+    from client_sdk.frontend import Frame, FrontEndOptions, extract
 
     folder = tmp_path_factory.mktemp("rendered")
-    truth = true_trajectory(0, 1, 3, 0).T_world_camera
-    frames = list(render_frames(0, 1, 3, 0))
-    keyframes = []
-    for row in (0, 2):
-        found = extract(frames[row], FrontEndOptions())
-        keyframes.append(
-            Keyframe(
-                id=row, robot="robot-1", timestamp_s=float(row), T_world_camera=truth[row],
-                camera=frames[row].camera, pixels=found.pixels.astype(np.float32),
-                descriptors=found.descriptors, points_camera=found.points_camera.astype(np.float32),
-            )
-        )  # fmt: skip
-    maps = MapRegistry(DirectoryStore(folder / "store"))
-    maps.commit(
-        "room", encode_map(MapVersion(keyframes=tuple(keyframes))), parent=None, author="a", created_s=1e9
+    camera = Camera(fx=525.0, fy=525.0, cx=319.5, cy=239.5, width=640, height=480)
+    blocks = np.random.default_rng(1).integers(0, 256, (60, 90, 3), dtype=np.uint8)
+    wall = np.kron(blocks, np.ones((8, 8, 1), dtype=np.uint8))
+    truth = np.eye(4)
+    truth[0, 3] = SHIFT_PX * WALL_M / camera.fx
+    depth_m = np.full((480, 640), WALL_M, dtype=np.float32)
+    found = extract(
+        Frame(timestamp_s=0.0, rgb=wall[:, :640], depth_m=depth_m, camera=camera), FrontEndOptions()
     )
-    Image.fromarray(frames[1].rgb).save(folder / "frame.png")
-    return folder / "store", truth[1], folder / "frame.png"
+    keyframe = Keyframe(
+        id=7, robot="robot-1", timestamp_s=0.0, T_world_camera=np.eye(4), camera=camera,
+        pixels=found.pixels.astype(np.float32), descriptors=found.descriptors,
+        points_camera=found.points_camera.astype(np.float32),
+    )  # fmt: skip
+    maps = MapRegistry(DirectoryStore(folder / "store"))
+    data = encode_map(MapVersion(keyframes=(keyframe,)))
+    maps.commit("room", data, parent=None, author="a", created_s=1e9)
+    Image.fromarray(wall[:, SHIFT_PX : SHIFT_PX + 640]).save(folder / "frame.png")
+    return folder / "store", truth, folder / "frame.png"
 
 
 def test_localise_finds_an_image_by_the_maps_own_camera(
@@ -172,10 +177,10 @@ def test_localise_finds_an_image_by_the_maps_own_camera(
     (found,) = json.loads(capsys.readouterr().out)
     assert found["verdict"] == "ok"
     assert found["inliers"] >= 30
-    assert found["keyframes"]
+    assert found["keyframes"] == [7]
     estimate = np.eye(4)
     estimate[:3, 3] = found["position_m"]
-    assert pose_difference(estimate, truth)[0] <= 0.03
+    assert pose_difference(estimate, truth)[0] <= 0.01
 
 
 def test_localise_prints_a_line_for_each_frame_and_ends_in_one_if_none_was_found(

@@ -1,4 +1,4 @@
-"""demo --merge through the whole platform: keyframes and maps by HTTP, the merge as a job, one map at the end."""
+"""demo --merge through the whole platform: data by HTTP, the merge as a job, one map at the end."""
 
 from __future__ import annotations
 
