@@ -22,10 +22,11 @@ from rse_pf.backend.executors import Executor, SolverThreads
 from rse_pf.backend.limits import CutOff, RobotRates, TooFast
 from rse_pf.backend.log import JsonLog
 from rse_pf.backend.metrics import LongestRecently, Metrics
+from rse_pf.backend.objects_in import ObjectsIn
 from rse_pf.backend.scheduler import BEHIND, BEHIND_HINT, Job, Refusal, Scheduler
 from rse_pf.backend.seams import Clocks, Handle, Loop, Wire
 from rse_pf.backend.size_gate import SizeGate
-from rse_pf.errors import Busy, Forbidden, InternalError, LimitExceeded, UnknownService
+from rse_pf.errors import Busy, Forbidden, InternalError, LimitExceeded, RsePfError, UnknownService
 from rse_pf.service import Kind, Registry, Service, dispatch, failure_of
 from rse_pf.settings import PlatformSettings
 from rse_pf.wire import CODECS, Codec, Command, Failure, Progress, Result, make_codec
@@ -104,6 +105,8 @@ class Core:
         """For long services; set by whoever can make processes."""
         self.standing: Standing | None = None
         """What the connections' tokens are worth; set by whoever can hear of it."""
+        self.objects = ObjectsIn(None, settings.serving)
+        """What payloads may name; set by whoever opens the store."""
         self._gate_timer: Handle | None = None
         self._ran_inline = False
         self._sweep_timer: Handle | None = None
@@ -339,7 +342,8 @@ class Core:
         """
         service = self._registry.get(job.command.service)
         inline_bytes = self.settings.serving.inline_bytes
-        if service.kind == "stateless" and self._scheduler.runs_inline(
+        may_run_here = service.kind == "stateless" and not self.objects.named_by(job.command, service)
+        if may_run_here and self._scheduler.runs_inline(
             cheap=service.cheap, size_bytes=job.size_bytes, inline_bytes=inline_bytes
         ):
             self._ran_inline = True
@@ -352,6 +356,10 @@ class Core:
         """Solve and encode; runs in the loop or in a thread, so it touches nothing shared."""
         monotonic, command = self.clocks.monotonic, job.command
         started = monotonic()
+        try:
+            command = self.objects.put_in(command, self._registry, job.owner)
+        except RsePfError as error:
+            return self._encoded(job, failure_of(error, command, server=self._server_id))
         answer = dispatch(
             self._registry, command, monotonic, server=self._server_id, on_defect=self._log_defect
         )
@@ -362,7 +370,9 @@ class Core:
                 received_s=job.received_s,
                 sent_s=monotonic(),
             )
-        return self._encoded(job, answer)
+        outcome = self._encoded(job, answer)
+        kept = self.objects.kept(answer, outcome.answer, job.owner)
+        return outcome if kept is outcome.answer else self._encoded(job, kept)
 
     def _encoded(self, job: Job, answer: Result | Failure) -> _Outcome:
         codec, command = job.owner.session.codec, job.command

@@ -12,13 +12,16 @@ import functools
 import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import msgspec
 
 from rse_pf.errors import BadRequest, LimitExceeded, NotFound, StoreError
 from rse_pf.objects import ObjectStore, digest_of, object_name
+from rse_pf.service import Registry, Service
 from rse_pf.settings import ServingSettings
+from rse_pf.wire import Command, Failure, Result
+from rse_pf.wire.arrays import binary_encode_hook
 
 __all__ = ["ObjectsIn", "named_in", "resolve", "takes_objects"]
 
@@ -97,23 +100,55 @@ def resolve(
     return _walk(_shape(request_type), payload, held.__getitem__)
 
 
+class Owner(Protocol):
+    """Whose objects."""
+
+    robot: str
+    tenant: str
+
+
 @dataclass(frozen=True, slots=True)
 class ObjectsIn:
-    """One worker's store and limits, as the command path uses them."""
+    """One worker's store and limits, as the command path uses them; without a store nothing is a name."""
 
-    store: ObjectStore
+    store: ObjectStore | None
     settings: ServingSettings
 
-    def may_name(self, request_type: type[Any], payload: Any) -> bool:
-        """Return whether the store may have to be asked; cheap for services that take no ``bytes``."""
-        shape = _shape(request_type)
-        return shape is not None and any(True for _ in _names(shape, payload))
+    def named_by(self, command: Command, service: Service) -> bool:
+        """Return whether the store would have to be asked; cheap for services that take no ``bytes``."""
+        shape = None if self.store is None else _shape(service.request_type)
+        return shape is not None and any(True for _ in _names(shape, command.payload))
 
-    def resolved(self, request_type: type[Any], payload: Any, tenant: str, robot: str) -> Any:
-        """Return what `resolve` returns."""
-        if not takes_objects(request_type):
-            return payload
-        return resolve(request_type, payload, tenant, robot, self.store, settings=self.settings)
+    def put_in(self, command: Command, registry: Registry, who: Owner) -> Command:
+        """Return *command* with what it names in its payload; blocks for the store.
+
+        Raises:
+            UnknownService: The registry does not know the service.
+            RsePfError: As `resolve` says.
+        """
+        service = registry.get(command.service)
+        if self.store is None or not self.named_by(command, service):
+            return command
+        payload = resolve(
+            service.request_type, command.payload, who.tenant, who.robot, self.store, settings=self.settings
+        )
+        return msgspec.structs.replace(command, payload=payload)
+
+    def kept(self, answer: Result | Failure, sent: Result | Failure, who: Owner) -> Result | Failure:
+        """Return *answer* with its reply named where it was too large and *sent* says so; blocks."""
+        if self.store is None or not isinstance(answer, Result) or not isinstance(sent, Failure):
+            return sent
+        if sent.code != LimitExceeded.code:
+            return sent
+        reply = msgspec.msgpack.encode(answer.reply, enc_hook=binary_encode_hook)
+        if len(reply) > self.settings.object_bytes_per_command:
+            return sent
+        digest = digest_of(reply)
+        try:
+            self.store.put(object_name(who.tenant, who.robot, digest), reply)
+        except StoreError:
+            return sent  # true, too, and says what to do
+        return msgspec.structs.replace(answer, reply=None, object=digest)
 
 
 # --- where names may stand -----------------------------------------------------------------------

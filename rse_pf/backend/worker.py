@@ -32,6 +32,7 @@ from rse_pf.backend.job_store import open_job_store
 from rse_pf.backend.jobs import Jobs
 from rse_pf.backend.load_services import load_services
 from rse_pf.backend.log import JsonLog
+from rse_pf.backend.objects_in import ObjectsIn
 from rse_pf.backend.processes import die_with_parent
 from rse_pf.backend.revocation import Standing
 from rse_pf.backend.seams import Clocks
@@ -96,6 +97,7 @@ class _Worker:
             new_session_id=lambda: secrets.token_hex(8),
             rest=time.sleep,
         )
+        self._core.objects = ObjectsIn(open_job_store(settings), settings.serving)
         if settings.services.folder or settings.services.published:
             self._core.environments = self._environments(settings, config["server"], config["workers"])
         if settings.serving.jobs:

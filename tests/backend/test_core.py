@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import heapq
 import os
+import threading
 from collections.abc import Callable
 from typing import Any
 
@@ -13,14 +14,18 @@ import pytest
 from rse_pf.backend.core import Core
 from rse_pf.backend.door import Admitted
 from rse_pf.backend.log import JsonLog
+from rse_pf.backend.objects_in import ObjectsIn
+from rse_pf.backend.scheduler import Job
 from rse_pf.backend.seams import Clocks
 from rse_pf.backend.size_gate import SizeGate
+from rse_pf.objects import MemoryStore, digest_of, object_name
 from rse_pf.service import Registry
 from rse_pf.services import echo
 from rse_pf.settings import PlatformSettings
 from rse_pf.wire import Command, Failure, Hello, Move, Ping, Pong, Result, Welcome, make_codec
 
 CODEC = make_codec("bin")
+SETTINGS = PlatformSettings()
 BINARY = 2
 
 
@@ -63,6 +68,10 @@ class FakeWire:
         self.closed = (code, reason)
 
 
+class Large(msgspec.Struct, frozen=True, kw_only=True):
+    data: bytes = b""
+
+
 class Odd(msgspec.Struct, frozen=True, kw_only=True):
     value: Any = None
 
@@ -81,6 +90,10 @@ def made():
     @registry.service("odd", cheap=True)
     def odd(request: Odd) -> Odd:
         return Odd(value=object())
+
+    @registry.service("large", cheap=True)
+    def large(request: Large) -> Large:
+        return request
 
     @registry.service("kept", kind="per_robot_state")
     def kept(request: Odd) -> Odd:
@@ -130,6 +143,46 @@ def test_a_reply_that_cannot_be_encoded_is_an_internal_failure(made):
 
     assert isinstance(wire.sent[-1], Failure)
     assert (wire.sent[-1].id, wire.sent[-1].code) == (3, "internal")
+
+
+def test_a_named_object_is_put_in_by_a_thread_and_a_large_reply_is_named_in_turn(made):
+    core, loop = made
+    connection, wire = join(core)
+    store, data = MemoryStore(), bytes(2 * SETTINGS.session.max_message_bytes)
+    core.objects = ObjectsIn(store, SETTINGS.serving)
+    store.put(object_name("default", "r", digest_of(data)), data)
+    threads: list[str] = []
+    answered = threading.Event()
+    get = store.get
+    store.get = lambda name: threads.append(threading.current_thread().name) or get(name)
+    loop.call_soon_threadsafe = lambda callback, *args: (callback(*args), answered.set())
+
+    say(connection, Command(id=3, service="large", payload={"data": {"object": digest_of(data)}}))
+
+    assert answered.wait(10)
+    (result,) = [message for message in wire.sent if isinstance(message, Result)]
+    assert (result.id, result.reply) == (3, None)
+    reply = msgspec.msgpack.decode(get(object_name("default", "r", result.object)), type=Large)
+    assert reply.data == data
+    assert set(threads) == {"solver-0"}, "the event loop never waits for the store"
+
+
+def test_an_object_of_another_robot_is_not_found_and_too_much_is_too_large_without_a_store(made):
+    core, _ = made
+    connection, _ = join(core)
+    foreign, long = digest_of(b"x"), bytes(SETTINGS.session.max_message_bytes - 100)
+
+    store = MemoryStore()
+    store.put(object_name("default", "other", foreign), b"x")
+    core.objects = ObjectsIn(store, SETTINGS.serving)
+    named = Command(id=4, service="large", payload={"data": {"object": foreign}})
+    missing = core._compute(Job(connection, "r", named, 9, 0.0, 1.0)).answer
+    core.objects = ObjectsIn(None, SETTINGS.serving)
+    inline = Command(id=5, service="large", payload={"data": long + long})
+    large = core._compute(Job(connection, "r", inline, 9, 0.0, 1.0)).answer
+
+    assert (missing.id, missing.code) == (4, "not-found")
+    assert (large.id, large.code) == (5, "too-large")
 
 
 def test_a_kind_of_service_that_has_no_executor_is_refused(made):

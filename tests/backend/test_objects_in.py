@@ -10,10 +10,12 @@ import pytest
 from rse_pf.backend.objects_in import ObjectsIn, named_in, resolve, takes_objects
 from rse_pf.errors import BadRequest, LimitExceeded, NotFound, RsePfError, StoreError
 from rse_pf.objects import MemoryStore, ObjectInfo, digest_of, object_name
+from rse_pf.service import Registry
 from rse_pf.services.localise import LocaliseRequest
 from rse_pf.services.merge import MergeRequest
 from rse_pf.services.pnp import PnpRequest
 from rse_pf.settings import PlatformSettings
+from rse_pf.wire import Command
 
 SERVING = PlatformSettings().serving
 MAP, OTHER = b"a map" * 400, b"another"
@@ -165,11 +167,18 @@ def test_the_services_for_maps_take_objects_and_pnp_is_not_even_looked_at(store:
 
 
 def test_a_payload_of_nonsense_is_left_to_the_service_to_refuse(store: Counting) -> None:
-    gate = ObjectsIn(store, SERVING)
+    gate, registry = ObjectsIn(store, SERVING), Registry()
+
+    @registry.service("asked")
+    def asked(request: Asked) -> Asked:
+        return request
+
+    def looks_into_the_store(payload: Any) -> bool:
+        return gate.named_by(Command(id=1, service="asked", payload=payload), registry.get("asked"))
 
     wrong: list[Any] = [None, 7, [], {"one": [name(MAP)]}, {"many": name(MAP)}, {"part": [1]}]
 
     for nonsense in wrong:
-        assert not gate.may_name(Asked, nonsense)
-        assert gate.resolved(Asked, nonsense, "lab", "robot-1") == nonsense
-    assert gate.may_name(Asked, {"many": [b"", name(MAP)]})
+        assert not looks_into_the_store(nonsense)
+        assert resolved(nonsense, store) == nonsense
+    assert looks_into_the_store({"many": [b"", name(MAP)]})
