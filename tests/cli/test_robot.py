@@ -1,0 +1,228 @@
+"""Robots on the command line: keys that stay on the robot, a roster, and doors that close and open again."""
+
+from __future__ import annotations
+
+import asyncio
+import base64
+import io
+import json
+import stat
+import time
+from pathlib import Path
+
+import pytest
+
+from rse_pf.auth import KeySet, token_problem, verify_token
+from rse_pf.cli.main import main
+from rse_pf.control import ControlRoom
+from rse_pf.errors import Unauthorized, UsageError
+from rse_pf.local.firewall import ensure_key, key_file, key_set_file
+from rse_pf.objects import DirectoryStore
+from rse_pf.robot_key import RobotKey
+from rse_pf.settings import AuthSettings
+
+Capture = pytest.CaptureFixture[str]
+SETTINGS = AuthSettings()
+
+
+@pytest.fixture
+def platform(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The folder of a platform that has run once; the working folder is a robot's."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+    folder = tmp_path / "rse-pf" / "default"
+    folder.mkdir(parents=True)
+    ensure_key(folder, seed=b"s" * 32, key_id="k")
+    return folder
+
+
+def said(capsys: Capture, *words: str) -> str:
+    """Return what a command printed that went well."""
+    assert main(list(words)) == 0
+    return capsys.readouterr().out
+
+
+def refused(capsys: Capture, *words: str) -> list[str]:
+    """Return the two lines of a command that was called wrongly."""
+    assert main(list(words)) == 2
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 2
+    assert "hint" in lines[1]
+    return lines
+
+
+def enrolled(capsys: Capture, name: str = "robot-1", *options: str) -> RobotKey:
+    """Make a key and enrol a robot with it."""
+    public = said(capsys, "robot", "keygen", "--out", f"{name}.key")
+    Path(f"{name}.json").write_text(public)
+    said(capsys, "robot", "enrol", name, "--public-key", f"{name}.json", *options)
+    return RobotKey(f"{name}.key", name)
+
+
+def trusted(folder: Path) -> KeySet:
+    """Return what a server of the platform would trust."""
+    room = ControlRoom(DirectoryStore(folder))
+    keys = KeySet.from_json(key_set_file(folder).read_text())
+    return keys.governed_by(room.roster(), room.denied())
+
+
+def problem(folder: Path, token: str) -> str:
+    """Return why a server of the platform refuses *token*; empty if it does not."""
+    try:
+        verify_token(token, keys=trusted(folder), now=time.time(), settings=SETTINGS)
+    except Unauthorized as error:
+        return token_problem(error)
+    return ""
+
+
+def issued(capsys: Capture, name: str = "robot-1", *options: str) -> str:
+    return said(capsys, "token", "issue", name, *options).strip()
+
+
+def test_a_key_is_its_owners_alone_and_only_its_public_half_is_printed(
+    capsys: Capture, platform: Path
+) -> None:
+    public = json.loads(said(capsys, "robot", "keygen", "--out", "robot.key"))
+
+    private = json.loads(Path("robot.key").read_text())
+    assert stat.S_IMODE(Path("robot.key").stat().st_mode) == 0o600
+    assert "d" in private
+    assert public == {name: value for name, value in private.items() if name != "d"}
+    assert "already" in refused(capsys, "robot", "keygen", "--out", "robot.key")[0]
+
+
+def test_an_enrolled_robot_comes_in_with_tokens_that_it_made_itself(capsys: Capture, platform: Path) -> None:
+    key = enrolled(capsys, "robot-1", "--scope", "services:pnp", "--scope", "maps:read", "--tenant", "lab")
+    token = asyncio.run(key.token())
+
+    claims = verify_token(token, keys=trusted(platform), now=_issued_s(token), settings=SETTINGS)
+
+    assert (claims.robot, claims.tenant, claims.scopes) == ("robot-1", "lab", ("services:pnp", "maps:read"))
+    assert json.loads(said(capsys, "token", "inspect", token))["verified"] == "yes"
+
+
+def _issued_s(token: str) -> float:
+    body = token.split(".")[1]
+    return float(json.loads(base64.urlsafe_b64decode(body + "=" * (-len(body) % 4)))["iat"])
+
+
+def test_a_key_that_others_may_read_signs_nothing(capsys: Capture, platform: Path) -> None:
+    key = enrolled(capsys)
+    Path("robot-1.key").chmod(0o640)
+
+    with pytest.raises(UsageError, match="others may read"):
+        asyncio.run(key.token())
+
+
+def test_a_disabled_robot_is_refused_whoever_signed_and_an_enabled_one_needs_a_fresh_token(
+    capsys: Capture, platform: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    key = enrolled(capsys)
+    before = [asyncio.run(key.token()), issued(capsys)]
+    assert [problem(platform, token) for token in before] == ["", ""]
+
+    said(capsys, "robot", "disable", "robot-1")
+    assert [problem(platform, token) for token in before] == ["disabled", "disabled"]
+    assert "robot-1  disabled" in said(capsys, "robot", "list")
+    monkeypatch.setattr("rse_pf.cli.robot.time.time", lambda: _issued_s(before[0]) + 5.0)
+    said(capsys, "robot", "enable", "robot-1")
+
+    assert [problem(platform, token) for token in before] == ["issued-too-early"] * 2
+    assert json.loads(said(capsys, "robot", "list", "--json"))[0]["state"] == "enrolled"
+
+
+def test_a_robot_without_a_key_of_its_own_can_be_disabled_too(capsys: Capture, platform: Path) -> None:
+    said(capsys, "robot", "disable", "other")
+
+    assert "other  disabled  no key of its own" in said(capsys, "robot", "list")
+    assert problem(platform, issued(capsys, "other")) == "disabled"
+
+
+def test_one_token_is_revoked_and_the_next_one_is_good(
+    capsys: Capture, platform: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first, second = issued(capsys), issued(capsys)
+    monkeypatch.setattr("sys.stdin", io.StringIO(first + "\n"))
+
+    told = said(capsys, "token", "revoke", "-")
+
+    assert "revoked" in told
+    assert first not in told
+    assert (problem(platform, first), problem(platform, second)) == ("revoked", "")
+    assert main(["token", "inspect", first]) == 1
+    assert "no: revoked" in capsys.readouterr().out
+
+
+def test_a_token_that_a_robot_signed_is_revoked_in_the_tenant_of_the_roster(
+    capsys: Capture, platform: Path
+) -> None:
+    token = asyncio.run(enrolled(capsys, "robot-1", "--tenant", "lab").token())
+
+    said(capsys, "token", "revoke", token)
+
+    assert problem(platform, token) == "revoked"
+
+
+def test_all_tokens_of_a_robot_until_now_are_revoked(capsys: Capture, platform: Path) -> None:
+    mine, others = issued(capsys), issued(capsys, "robot-2")
+
+    said(capsys, "token", "revoke", "--all-of", "robot-1")
+
+    assert (problem(platform, mine), problem(platform, others)) == ("issued-too-early", "")
+
+
+def test_after_a_rotation_both_keys_are_trusted_and_after_two_the_first_is_not(
+    capsys: Capture, platform: Path
+) -> None:
+    first = issued(capsys)
+    said(capsys, "token", "rotate-keys")
+    second = issued(capsys)
+
+    assert [problem(platform, token) for token in (first, second)] == ["", ""]
+    assert stat.S_IMODE(key_file(platform).stat().st_mode) == 0o600
+    said(capsys, "token", "rotate-keys")
+    assert [problem(platform, token) for token in (first, second, issued(capsys))] == ["unknown-key", "", ""]
+
+
+def test_a_token_is_issued_with_scopes_and_tenant(capsys: Capture, platform: Path) -> None:
+    token = issued(capsys, "robot-1", "--scope", "services:pnp", "--tenant", "lab")
+
+    claims = json.loads(said(capsys, "token", "inspect", token))["claims"]
+
+    assert (claims["scope"], claims["tenant"]) == ("services:pnp", "lab")
+
+
+def test_a_roster_that_is_empty_says_so(capsys: Capture, platform: Path) -> None:
+    assert "no robot is enrolled" in said(capsys, "robot", "list")
+
+
+@pytest.mark.parametrize(
+    ("words", "first"),
+    [
+        ("robot enrol robot-1", "--public-key"),
+        ("robot enrol --public-key x.json", "needs the name"),
+        ("robot enrol robot-1 --public-key missing.json", "cannot read"),
+        ("robot enrol robot-1 --public-key private.json", "private key"),
+        ("robot enrol robot-1 --public-key public.json --scope pnp", "is no scope"),
+        ("robot enrol robot-1 --public-key public.json --quota x=1", "is no quota"),
+        ("robot enrol robot-1 --public-key public.json --quota data_bytes", "is no quota"),
+        ("robot disable", "needs the name"),
+        ("robot disable robot-1 --scope services:pnp", "--scope"),
+        ("robot enable robot-1", "is not disabled"),
+        ("robot list robot-1", "names no robot"),
+        ("robot list --name nowhere", "no platform"),
+        ("robot keygen", "--out"),
+        ("robot keygen --out nowhere/robot.key", "cannot write"),
+        ("token revoke", "needs a token"),
+        ("token revoke x.y.z", "no token"),
+        ("token revoke x --all-of robot-1", "needs a token"),
+        ("token issue robot-1 --scope pnp", "is no scope"),
+        ("token issue robot-1 --all-of robot-1", "--all-of"),
+        ("token rotate-keys robot-1", "names no robot"),
+    ],
+)
+def test_bad_input_is_one_line_and_a_hint(capsys: Capture, platform: Path, words: str, first: str) -> None:
+    public = said(capsys, "robot", "keygen", "--out", "private.json")
+    Path("public.json").write_text(public)
+
+    assert first in refused(capsys, *words.split())[0]
