@@ -133,10 +133,11 @@ def test_the_owner_hears_that_a_follower_takes_the_job_back(store, clock):
 
 
 def test_a_job_is_named_by_what_is_asked(store):
-    key = job_key("merge", {"a": 1, "b": [1.5]}, "s")
+    asked = {"a": 1, "b": [1.5]}
+    key = job_key("merge", asked, "s")
 
     assert key == job_key("merge", {"b": [1.5], "a": 1}, "s")
-    others = [("optimise", {"a": 1, "b": [1.5]}, "s"), ("merge", {"a": 2}, "s"), ("merge", {"a": 1}, "t")]
+    others = [("optimise", asked, "s"), ("merge", {"a": 2, "b": [1.5]}, "s"), ("merge", asked, "t")]
     assert len({key, *(job_key(*other) for other in others)}) == 4
     arrays = [job_key("merge", {"a": np.array([value])}, "s") for value in (0.5, 0.5, 0.25)]
     assert arrays[0] == arrays[1] != arrays[2]

@@ -118,3 +118,19 @@ def test_waiting_for_a_long_command_is_no_silence():
 
     assert session.tend(link, 0.1 + SETTINGS.ping_interval_s / 2) == []
     assert sent(link) == []
+
+
+def test_a_long_command_whose_caller_leaves_is_taken_back_once():
+    session = make_session()
+    link = open_link(session)
+    identity = session.submit("merge", None, now=0.0)
+    tell(session, link, Progress(id=identity, done=0.0), 0.1)
+    sent(link)
+
+    session.cancel(identity)
+    session.cancel(identity)
+
+    assert sent(link) == [Cancel(id=identity)]
+    cancelled = Failure(id=identity, code="cancelled", message="taken back")
+    assert tell(session, link, cancelled, 0.2) == []
+    assert session.unanswered == 0
