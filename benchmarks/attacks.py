@@ -27,7 +27,7 @@ __all__ = ["ATTACKS", "Door", "Outcome", "Socket", "frame"]
 
 CONTINUATION, BINARY, CLOSE, PING, PONG = 0, 2, 8, 9, 10
 FIN, MASKED = 0x80, 0x80
-LONG_S = 20.0
+LONG_S = 25.0
 
 
 def frame(payload: bytes, opcode: int = BINARY, *, fin: bool = True) -> bytes:

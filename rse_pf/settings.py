@@ -114,6 +114,7 @@ class SessionSettings:
     max_json_lists: int = setting(10000, doc="lists and objects of a message, at any depth", low=16)
     max_json_values: int = setting(50000, doc="values of a robot's message outside of raw arrays; a list counts as three, an object as six", low=64)
     max_bad_messages: int = setting(10, unit="messages", doc="undecodable messages of one socket before it is closed", low=0)
+    bad_message_pause_s: float = setting(0.1, unit="s", doc="after an undecodable message its socket is not read for this, times their number", low=0)
     max_control_per_s: float = setting(10.0, unit="frames/s", doc="control frames of one socket", low=1)
     max_in_flight: int = setting(8, unit="commands", doc="unanswered commands of one robot", low=1)
     max_commands_per_s: float = setting(20.0, unit="commands/s", doc="messages of one robot; more are refused; 0 is off", source="AWS IoT and Discord limit so", low=0)

@@ -121,7 +121,11 @@ class Connection:
             return
         if session.state == "open" and self._core.refuses_unread(self, session.codec, received.data, now):
             return
-        was_opening = session.state == "opening"
+        was_opening, bad = session.state == "opening", session.bad_messages
         self.apply(session.receive(received.data, now), now, len(received.data))
+        if session.bad_messages > bad and not self.assembler.closed:
+            # To refuse costs as much as to read: who sends garbage is read more and more rarely.
+            self._core.metrics.shed["bad-message"] += 1
+            self._wire.pause(session.bad_messages * self._core.settings.session.bad_message_pause_s)
         if was_opening and session.state == "open":
             self._core.welcomed(self, now)

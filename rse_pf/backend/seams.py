@@ -21,6 +21,9 @@ class Wire(Protocol):
     def send_pong(self, data: bytes) -> None:
         """Write one pong frame."""
 
+    def pause(self, seconds: float) -> None:
+        """Read nothing more for so long."""
+
     def close(self, code: int, reason: str) -> None:
         """Write a close frame and end the connection."""
 

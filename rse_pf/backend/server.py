@@ -129,6 +129,8 @@ class RobotSockets:
         """Serve the accepted socket *fd*, the server's *number*-th; *ended* is called once, at its end."""
         accepted = socket.socket(fileno=fd)
         accepted.setblocking(False)
+        # The kernel would keep megabytes for a reader who is slow, and tell nobody.
+        accepted.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, self._serving.write_buffer_bytes)
         arrival = _Arrival(_peer(accepted), self._serving.max_handshake_bytes, number)
         leaving = self._waiting.enter(arrival, arrival.peer)
         if leaving is not None:
@@ -305,6 +307,14 @@ def _listener_type(picows: Any, loop: asyncio.AbstractEventLoop, serving: Servin
 
         def send_pong(self, data: bytes) -> None:
             self._transport.send_pong(data)
+
+        def pause(self, seconds: float) -> None:
+            self._transport.underlying_transport.pause_reading()
+            loop.call_later(seconds, self._read_on)
+
+        def _read_on(self) -> None:
+            if self._connection is not None:
+                self._transport.underlying_transport.resume_reading()
 
         def close(self, code: int, reason: str) -> None:
             self._transport.send_close(code, reason.encode()[:_MOST_CLOSE_REASON_BYTES])

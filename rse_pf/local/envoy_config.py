@@ -26,6 +26,8 @@ _LOOPBACK = "127.0.0.1"
 _NO_LIMIT = 1_000_000
 """A server counts its robots itself (``serving.max_robots``); Envoy's breakers must not act before."""
 _MOST_HEADERS = 64
+_SOL_SOCKET, _SO_SNDBUF, _SO_RCVBUF, _IPPROTO_TCP, _TCP_USER_TIMEOUT = 1, 7, 8, 6, 18
+"""Of Linux."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -125,10 +127,23 @@ def _front_door(settings: PlatformSettings, port: int) -> dict[str, Any]:
         "address": _address(settings.serving.host, port),
         # With the default a second Envoy would share a taken port in silence.
         "enable_reuse_port": False,
-        # Behind a slow reader no more is kept here than a server would keep itself.
+        # Behind a slow reader no more is kept, here and in the kernel, than a server would keep itself.
         "per_connection_buffer_limit_bytes": settings.serving.write_buffer_bytes,
+        "socket_options": [_kernel_buffer(_SO_SNDBUF, settings), _unread_timeout(settings)],
         "filter_chains": [{"filters": [{"name": "http", "typed_config": manager}]}],
     }
+
+
+def _kernel_buffer(name: int, settings: PlatformSettings) -> dict[str, Any]:
+    value = settings.serving.write_buffer_bytes
+    return {"level": _SOL_SOCKET, "name": name, "int_value": value, "state": "STATE_PREBIND"}
+
+
+def _unread_timeout(settings: PlatformSettings) -> dict[str, Any]:
+    """End a connection whose robot takes nothing: with what it did not read, Envoy would keep it for ever."""
+    session = settings.session
+    most_ms = int(2e3 * (session.ping_interval_s + session.ping_patience_s))
+    return {"level": _IPPROTO_TCP, "name": _TCP_USER_TIMEOUT, "int_value": most_ms, "state": "STATE_PREBIND"}
 
 
 def _most_connections(most: int) -> dict[str, Any]:
@@ -199,6 +214,7 @@ def _cluster(
         # A server that leaves the file gets nothing new, and keeps its open sockets.
         "ignore_health_on_host_removal": True,
         "connect_timeout": "0.5s",
+        "upstream_bind_config": {"socket_options": [_kernel_buffer(_SO_RCVBUF, settings)]},
         "per_connection_buffer_limit_bytes": settings.serving.write_buffer_bytes,
         "circuit_breakers": {"thresholds": [dict.fromkeys(limits, _NO_LIMIT)]},
         "health_checks": [

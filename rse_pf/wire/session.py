@@ -133,6 +133,11 @@ class ServerSession:
         self._bad_messages = 0
         self._next_renewal_s = float("-inf")
 
+    @property
+    def bad_messages(self) -> int:
+        """How many messages could not be read."""
+        return self._bad_messages
+
     def receive(self, data: bytes, now: float) -> list[Decision]:
         """Return what to do about one WebSocket message that arrived at *now* (server clock, s)."""
         if self.state == "closed":

@@ -57,12 +57,16 @@ class FakeWire:
     def __init__(self) -> None:
         self.sent: list[Any] = []
         self.closed: tuple[int, str] | None = None
+        self.pauses: list[float] = []
 
     def send(self, data: bytes, is_text: bool) -> None:
         self.sent.append(CODEC.decode_from_server(data))
 
     def send_pong(self, data: bytes) -> None:
         self.sent.append(data)
+
+    def pause(self, seconds: float) -> None:
+        self.pauses.append(seconds)
 
     def close(self, code: int, reason: str) -> None:
         self.closed = (code, reason)
@@ -333,3 +337,43 @@ def test_a_small_server_out_of_budget_rests_a_moment_only_while_it_is_behind(mad
 
     assert rests == rested
     assert len(wire.sent) == 1, "only the welcome: the budget is used up"
+
+
+def test_who_sends_garbage_is_read_more_and_more_rarely(made):
+    core, _ = made
+    connection, wire = join(core)
+
+    for _ in range(3):
+        connection.frame(BINARY, True, False, b"garbage")
+
+    assert wire.pauses == pytest.approx([0.1, 0.2, 0.3])
+    assert [message.code for message in wire.sent[1:]] == ["bad-message"] * 3
+
+
+def test_a_flood_is_refused_by_name_and_then_cut_off(made):
+    core, loop = made
+    connection, wire = join(core)
+
+    for number in range(200):
+        say(connection, Command(id=number, service="echo", payload={"value": 1}))
+        if wire.closed:
+            break
+
+    told = [each for each in wire.sent if isinstance(each, Failure) and "rate" in each.message]
+    assert number == 40 + 120 - 1
+    assert [each.id for each in told] == list(range(40, 159))
+    assert all(each.code == "busy" and each.retry_after_ms > 0 for each in told)
+    assert wire.closed == (4429, "rate")
+    assert core.rates.rests_s("r", loop.now) > 0
+    assert core.metrics.shed["rate"] == 120
+
+
+def test_what_cannot_be_named_is_refused_without_a_name(made):
+    core, _ = made
+    connection, wire = join(core)
+
+    for _ in range(41):
+        say(connection, Ping(sent_s=1.0))
+
+    assert isinstance(wire.sent[-1], Failure)
+    assert (wire.sent[-1].code, wire.sent[-1].id) == ("busy", None)

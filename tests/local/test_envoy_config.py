@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import socket
 from pathlib import Path
 from typing import Any
 
@@ -126,6 +127,20 @@ def test_connections_and_buffers_are_bounded() -> None:
     assert monitor["typed_config"]["max_active_downstream_connections"] == "500"
     assert listener(made)["per_connection_buffer_limit_bytes"] == 65536
     assert cluster(made)["per_connection_buffer_limit_bytes"] == 65536
+
+
+def test_a_robot_that_takes_nothing_is_ended_by_the_kernel() -> None:
+    made = config(
+        serving={"write_buffer_bytes": 65536}, session={"ping_interval_s": 2.0, "ping_patience_s": 1.0}
+    )
+    options = {(each["level"], each["name"]): each["int_value"] for each in listener(made)["socket_options"]}
+    (upstream,) = cluster(made)["upstream_bind_config"]["socket_options"]
+
+    assert options == {
+        (socket.SOL_SOCKET, socket.SO_SNDBUF): 65536,
+        (socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT): 6000,
+    }
+    assert (upstream["name"], upstream["int_value"]) == (socket.SO_RCVBUF, 65536)
 
 
 def test_what_a_robot_says_of_its_address_is_not_believed() -> None:

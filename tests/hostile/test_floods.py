@@ -1,0 +1,156 @@
+"""Floods against a real server: refused or cut off at the limit, counted, and others are served meanwhile."""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+import json
+import os
+import re
+import time
+import urllib.request
+from collections.abc import Awaitable, Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from guarded_server import GuardedServer
+
+from benchmarks import attacks
+from benchmarks.attacks import Door, Outcome
+from client_sdk import connect
+
+pytestmark = pytest.mark.system
+
+ONE_S = 1.0
+SOON_S = 10.0
+_NUMBERS = itertools.count()
+"""Every attacker is a robot of its own: one that was cut off rests."""
+
+
+@pytest.fixture(scope="module")
+def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[GuardedServer]:
+    """One worker with short patience, where sockets come directly and from one address."""
+    groups: dict[str, dict[str, Any]] = {
+        "serving": {
+            "handshake_timeout_s": ONE_S, "slow_reader_s": 0.3, "write_buffer_bytes": 65536,
+            "trusted_proxies": 0, "max_unauthenticated_per_source": 20, "max_unauthenticated": 40,
+            "handshakes_per_source_per_s": 0.0, "accepts_per_s": 0.0,
+        },
+    }  # fmt: skip
+    with GuardedServer(tmp_path_factory.mktemp("floods"), workers=1, **groups) as made:
+        yield made
+
+
+def announced(server: GuardedServer) -> dict[str, Any]:
+    told: dict[str, Any] = json.loads((server.folder / "announce.json").read_text())
+    return told
+
+
+def resident_mib(server: GuardedServer) -> float:
+    told = announced(server)
+    pages = [
+        int(Path(f"/proc/{pid}/statm").read_text().split()[1]) for pid in (told["pid"], *told["workers"])
+    ]
+    return sum(pages) * os.sysconf("SC_PAGE_SIZE") / 2**20
+
+
+def counted(server: GuardedServer, name: str, label: str, at_least: float) -> bool:
+    """Return whether a counter of /metrics, which is renewed four times a second, comes to *at_least*."""
+    url, end = f"http://127.0.0.1:{announced(server)['control_port']}/metrics", time.monotonic() + SOON_S
+    while time.monotonic() < end:
+        with urllib.request.urlopen(url, timeout=SOON_S) as answer:
+            text = answer.read().decode()
+        found = re.search(rf'rse_pf_{name}_total{{[a-z]+="{label}"}} ([0-9.e+]+)', text)
+        if found and float(found[1]) >= at_least:
+            return True
+    return False
+
+
+def attacked(
+    server: GuardedServer, attack: Callable[[Door], Awaitable[Outcome]], *, robots: int = 1
+) -> tuple[Outcome, int]:
+    """Return what came of *attack*, and how many calls of a robot beside it were answered, of 5."""
+    tokens = tuple(server.token(f"hostile-{next(_NUMBERS)}") for _ in range(robots))
+
+    async def run() -> tuple[Outcome, int]:
+        door, answered = Door(server.url, tokens), 0
+        async with connect(server.url, token=server.token("calm")) as calm:
+            attacking = asyncio.ensure_future(attack(door))
+            for _ in range(5):
+                answer = await calm.call("echo", {"value": 1}, deadline_s=20.0)
+                answered += answer.reply["value"] == 1
+                await asyncio.wait({attacking}, timeout=0.1)
+            outcome = await attacking
+            assert calm.stats.reconnects == 0
+        return outcome, answered
+
+    return asyncio.run(run())
+
+
+@pytest.mark.parametrize(("attack", "code"), [("empty-fragments", "1009"), ("ping-flood", "1008")])
+def test_endless_frames_are_cut_off_at_the_limit(server, attack, code):
+    outcome, answered = attacked(server, attacks.ATTACKS[attack])
+
+    assert outcome.ends == {code: 1}
+    assert answered == 5
+    assert counted(server, "closed", f"frames-{code}", 1)
+
+
+def test_a_robot_at_a_hundred_times_its_rate_is_told_cut_off_and_kept_out(server):
+    async def attack(door: Door) -> Outcome:
+        return await attacks.rate_flood(door, 2000.0, 1.5)
+
+    outcome, answered = attacked(server, attack)
+
+    assert outcome.ends["4429"] == 1
+    assert outcome.ends["429"] >= 1, "it came back at once"
+    assert outcome.refused > 50
+    assert answered == 5
+    assert counted(server, "shed", "rate", 100)
+    assert counted(server, "handshakes", "quota", 1)
+
+
+def test_every_bomb_is_refused_and_memory_stays(server):
+    async def attack(door: Door) -> Outcome:
+        return await attacks.zip_bombs(door, 100)
+
+    before = resident_mib(server)
+    outcome, answered = attacked(server, attack, robots=10)
+
+    assert (outcome.tried, outcome.refused) == (100, 100)
+    assert answered == 5
+    assert resident_mib(server) - before < 64
+
+
+def test_silent_connections_leave_for_newer_ones_and_after_their_time(server):
+    async def attack(door: Door) -> Outcome:
+        return await attacks.silent_connects(door, 100)
+
+    outcome, answered = attacked(server, attack)
+
+    assert outcome.refused == 100
+    assert answered == 5
+    assert counted(server, "closed", "unauthenticated", 80)
+
+
+def test_slow_heads_are_cut_after_the_time_of_a_handshake(server):
+    async def attack(door: Door) -> Outcome:
+        return await attacks.slow_headers(door, 20, pause_s=0.2)
+
+    outcome, answered = attacked(server, attack)
+
+    assert outcome.refused == 20
+    assert outcome.slowest_s < 10 * ONE_S
+    assert answered == 5
+
+
+def test_a_long_head_is_answered_with_431(server):
+    async def knock() -> bytes:
+        reader, writer = await Door(server.url).knock()
+        writer.write(b"GET /ws HTTP/1.1\r\nHost: a\r\nX-Long: " + b"x" * 9000)
+        answer = await asyncio.wait_for(reader.read(), 10)
+        writer.close()
+        return answer
+
+    assert asyncio.run(knock()).startswith(b"HTTP/1.1 431 ")
