@@ -11,6 +11,7 @@ import asyncio
 import contextlib
 import http.client
 import json
+import os
 import signal
 import subprocess
 import sys
@@ -20,6 +21,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from rse_pf.audit_log import audit_folder
 from rse_pf.errors import ConfigurationError
 from rse_pf.local.envoy_config import Target
 from rse_pf.local.processes import ProcessMark, ended, is_alive, last_line, mark_of, send_signal, spawn
@@ -91,7 +93,7 @@ class DataServers:
         self._watching: asyncio.Task[None] | None = None
         self._command = [
             *program, "data", "--settings", str(settings_file), "--keys", str(keys_file),
-            "--host", _LOOPBACK, "--announce", str(self._announce),
+            "--host", _LOOPBACK, "--announce", str(self._announce), "--audit", str(audit_folder(folder)),
             *(() if store is None else ("--store", store)),
         ]  # fmt: skip
 
@@ -223,6 +225,7 @@ class DataServers:
             [*self._command, "--port", str(self._port)],
             log=self._log, folder=self._folder, dies_with_parent=self._dies_with_parent,
         )  # fmt: skip
+        _step_back(process.pid, self._settings.local.data_nice)
         self._process, self._mark = process, mark_of(process.pid)
         self._tell("data-server-start", name=self._name, pid=process.pid)
         try:
@@ -265,6 +268,12 @@ class DataServers:
         return ConfigurationError(
             f"{self._name} {what}{': ' if last else ''}{last}", hint=f"its log is {self._log}"
         )
+
+
+def _step_back(pid: int, nice: int) -> None:
+    """Let poses go first where both share a machine; threads that the process starts later do the same."""
+    with contextlib.suppress(OSError):
+        os.setpriority(os.PRIO_PROCESS, pid, max(nice, os.getpriority(os.PRIO_PROCESS, 0)))
 
 
 def _ask(port: int, path: str) -> bool:

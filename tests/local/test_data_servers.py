@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import os
 import sys
 from pathlib import Path
 from typing import Any
@@ -88,6 +89,19 @@ def test_the_server_of_an_earlier_control_plane_is_adopted_and_replaced(tmp_path
 
         assert later.servers.port == server.port
         assert earlier.told.qsize() == 2, "its start and its being up"
+
+    asyncio.run(run())
+
+
+def test_a_server_steps_back_behind_the_poses(tmp_path: Path) -> None:
+    async def run() -> None:
+        box = Box(tmp_path, _PROGRAM)
+        server = await box.servers.start()
+
+        ours, its = os.getpriority(os.PRIO_PROCESS, 0), os.getpriority(os.PRIO_PROCESS, server.pid)
+        await box.servers.stop(10.0)
+
+        assert its == max(ours, PlatformSettings().local.data_nice) > 0
 
     asyncio.run(run())
 
