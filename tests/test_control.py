@@ -40,12 +40,14 @@ class Racing(MemoryStore):
         super().__init__()
         self.races = races
 
-    def compare_and_swap(self, name: str, expected: bytes | None, data: bytes) -> None:
-        if self.races:
-            self.races -= 1
-            other = ControlRoom(_Quiet(self))
-            other.change_denied(lambda denied: denied.with_robot("default", f"other-{self.races}", 1.0))
-        super().compare_and_swap(name, expected, data)
+    def get(self, name: str) -> bytes:
+        try:
+            return super().get(name)
+        finally:
+            if self.races:
+                self.races -= 1
+                other = ControlRoom(_Quiet(self))
+                other.change_denied(lambda denied: denied.with_robot("default", f"other-{self.races}", 1.0))
 
 
 class _Quiet:
@@ -55,7 +57,7 @@ class _Quiet:
         self._store = store
 
     def get(self, name: str) -> bytes:
-        return self._store.get(name)
+        return MemoryStore.get(self._store, name)
 
     def compare_and_swap(self, name: str, expected: bytes | None, data: bytes) -> None:
         MemoryStore.compare_and_swap(self._store, name, expected, data)
