@@ -19,6 +19,7 @@ from guarded_server import GuardedServer
 from benchmarks import attacks
 from benchmarks.attacks import Door, Outcome
 from client_sdk import connect
+from rse_pf.wire import Command, Result
 
 pytestmark = pytest.mark.system
 
@@ -154,3 +155,28 @@ def test_a_long_head_is_answered_with_431(server):
         return answer
 
     assert asyncio.run(knock()).startswith(b"HTTP/1.1 431 ")
+
+
+def test_equal_ids_and_streams_of_many_robots_never_meet(server):
+    async def run() -> list[tuple[int, object]]:
+        door = Door(server.url)
+        robots = [await door.enter(server.token(f"twin-{n}"), "bin") for n in range(20)]
+        heard: list[tuple[int, object]] = []
+        for number, robot in enumerate(robots):
+            for identity in (1, 2):
+                command = Command(
+                    id=identity, service="echo", payload={"value": number}, stream="s", keep=True
+                )
+                robot.say(command)
+        for number, robot in enumerate(robots):
+            for _ in (1, 2):
+                answer = await asyncio.wait_for(robot.hear(), SOON_S)
+                assert isinstance(answer, Result), answer
+                heard.append((number, answer.reply["value"]))
+            robot.end()
+        return heard
+
+    heard = asyncio.run(run())
+
+    assert len(heard) == 40
+    assert all(number == value for number, value in heard)
