@@ -197,7 +197,7 @@ async def test_a_reply_that_is_too_large_for_a_message_is_named(platform, tmp_pa
 
 
 @in_a_loop
-async def test_a_job_ends_on_the_other_server_when_its_own_is_killed(platform, runs, tmp_path):
+async def test_a_job_ends_on_the_other_server_when_its_own_is_killed(platform, runs, gone, tmp_path):
     first, second, heard = platform(), platform(), Heard()
     async with Door() as door:
         door.target = first.port
@@ -206,6 +206,7 @@ async def test_a_job_ends_on_the_other_server_when_its_own_is_killed(platform, r
             await heard.until("half")
             door.target = second.port
             first.process.send_signal(signal.SIGKILL)
+            await asyncio.to_thread(gone, runs()[0])
             while len(runs()) < 2:
                 await heard.until("half")
             (tmp_path / "job").touch()
