@@ -80,6 +80,12 @@ def check_contradictions(s: PlatformSettings) -> None:
                 f"{group}.{large} = {high:g} is less than {group}.{small} = {low:g}",
                 hint=f"raise {group}.{large} or lower {group}.{small} {where}",
             )
+    if bool(s.local.certificate) != bool(s.local.private_key):
+        raise SettingsError(
+            f"local.certificate = {s.local.certificate!r} without its fellow, local.private_key = "
+            f"{s.local.private_key!r}",
+            hint=f"name both files, or none of them {where}",
+        )
     if s.scaling.idle_s % s.scaling.period_s:
         raise SettingsError(
             f"scaling.idle_s = {s.scaling.idle_s} is no multiple of scaling.period_s = {s.scaling.period_s}",

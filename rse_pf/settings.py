@@ -258,6 +258,8 @@ class LocalSettings:
     restarts_per_minute: int = setting(5, unit="servers", doc="replacements of servers that died young, in any minute", low=1)
     max_connections: int = setting(12000, unit="sockets", doc="connections of the front door, robots and others; more are closed", low=16)
     young_s: float = setting(10.0, unit="s", doc="a server that ends this soon after it became healthy died young", low=0)
+    certificate: str = setting("", doc="file of the front door's certificate chain (PEM); with it robots dial wss://")
+    private_key: str = setting("", doc="file of the private key of local.certificate (PEM)")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

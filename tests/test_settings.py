@@ -114,6 +114,8 @@ def test_the_digest_changes_with_every_setting(row: SettingRow) -> None:
         "step": {"big_step": 2},
         "max_servers": {"max_servers": 11},
         "lab": {"certificate_arn": "arn", "domain_name": "door.example"},
+        "certificate": {"private_key": "key.pem"},
+        "private_key": {"certificate": "door.pem"},
     }
     values = {row.name: other(row), **companions.get(row.name, {})}
 

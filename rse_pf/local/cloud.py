@@ -380,7 +380,8 @@ class LocalCloud:
             )
         serving = self.settings.serving
         host = f"[{serving.host}]" if ":" in serving.host else serving.host
-        self.url = f"ws://{host}:{self.port}{serving.path}"
+        scheme = "wss" if self.settings.local.certificate else "ws"
+        self.url = f"{scheme}://{host}:{self.port}{serving.path}"
         self._status = await serve_status(self.status_document)
         self._fleet.keep(self._chronicle.watch())
         if self._monitored:

@@ -1,0 +1,188 @@
+"""TLS at the local platform's front door: old versions, weak ciphers and plain text have no answer (T19)."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import datetime
+import ipaddress
+import socket
+import ssl
+import subprocess
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from cryptography import x509
+from cryptography.hazmat.primitives import hashes, serialization
+from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.x509.oid import NameOID
+
+from client_sdk import connect
+from rse_pf.errors import RsePfError, SettingsError
+from rse_pf.local.cloud import LocalCloud
+from rse_pf.settings import PlatformSettings
+
+SOON_S = 20.0
+
+
+def write_certificate(folder: Path) -> tuple[Path, Path]:
+    """Write a certificate for 127.0.0.1 and its key; return both files."""
+    key = ec.generate_private_key(ec.SECP256R1())
+    name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, "rse-pf of a test")])
+    now = datetime.datetime.now(datetime.timezone.utc)
+    address = x509.IPAddress(ipaddress.ip_address("127.0.0.1"))
+    certificate = (
+        x509.CertificateBuilder()
+        .subject_name(name)
+        .issuer_name(name)
+        .public_key(key.public_key())
+        .serial_number(1)
+        .not_valid_before(now - datetime.timedelta(hours=1))
+        .not_valid_after(now + datetime.timedelta(hours=1))
+        .add_extension(x509.SubjectAlternativeName([address]), critical=False)
+        .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
+        .sign(key, hashes.SHA256())
+    )
+    files = folder / "certificate.pem", folder / "key.pem"
+    files[0].write_bytes(certificate.public_bytes(serialization.Encoding.PEM))
+    files[1].write_bytes(
+        key.private_bytes(
+            serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
+        )
+    )
+    return files
+
+
+class Door:
+    """A platform behind TLS, run in a loop of its own so that a test may block."""
+
+    def __init__(self, folder: Path) -> None:
+        self.certificate, key = write_certificate(folder)
+        settings = PlatformSettings().replace(
+            local={"certificate": str(self.certificate), "private_key": str(key)}
+        )
+        self._loop = asyncio.new_event_loop()
+        self._cloud = LocalCloud(settings, servers=1, port=0, state=folder / "platform")
+        self._loop.run_until_complete(self._cloud.__aenter__())
+        self.url = self._cloud.url
+        self.port = self._cloud.port
+
+    def close(self) -> None:
+        self._loop.run_until_complete(self._cloud.__aexit__(None, None, None))
+        self._loop.close()
+
+    def token(self) -> str:
+        return self._cloud.issue_token("robot-1")
+
+    def shake_hands(self, context: ssl.SSLContext) -> tuple[str, str] | None:
+        """Return version and cipher that the door agrees to, None if it agrees to nothing."""
+        with socket.create_connection(("127.0.0.1", self.port), timeout=SOON_S) as plain:
+            try:
+                with context.wrap_socket(plain, server_hostname="127.0.0.1") as secured:
+                    cipher = secured.cipher()
+                    assert cipher is not None
+                    return secured.version() or "", cipher[0]
+            except (ssl.SSLError, ConnectionError):
+                return None
+
+
+@pytest.fixture(scope="module")
+def door(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Door]:
+    opened = Door(tmp_path_factory.mktemp("tls"))
+    yield opened
+    opened.close()
+
+
+def speaking(version: ssl.TLSVersion, ciphers: str = "ALL:@SECLEVEL=0") -> ssl.SSLContext:
+    """Return a client that speaks one version only, and takes any certificate."""
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+    context.check_hostname, context.verify_mode = False, ssl.CERT_NONE
+    context.set_ciphers(ciphers)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)
+        context.maximum_version = version
+        context.minimum_version = version
+    return context
+
+
+@pytest.mark.system
+@pytest.mark.parametrize("version", ["TLSv1_2", "TLSv1_3"])
+def test_today_s_versions_are_spoken_with_ciphers_that_authenticate(door: Door, version: str) -> None:
+    agreed = door.shake_hands(speaking(ssl.TLSVersion[version]))
+
+    assert agreed is not None
+    assert agreed[0] == version.replace("_", ".")
+    assert "GCM" in agreed[1] or "POLY1305" in agreed[1]
+
+
+@pytest.mark.system
+@pytest.mark.parametrize("version", ["TLSv1", "TLSv1_1"])
+def test_old_versions_get_no_handshake(door: Door, version: str) -> None:
+    assert door.shake_hands(speaking(ssl.TLSVersion[version])) is None
+
+
+@pytest.mark.system
+def test_of_all_ciphers_that_this_machine_can_offer_only_those_with_authentication_pass(door: Door) -> None:
+    offered = [
+        each["name"]
+        for each in speaking(ssl.TLSVersion.TLSv1_2).get_ciphers()
+        if each["protocol"] != "TLSv1.3"
+    ]
+    passed = []
+    for name in offered:
+        agreed = door.shake_hands(speaking(ssl.TLSVersion.TLSv1_2, f"{name}:@SECLEVEL=0"))
+        if agreed is not None:
+            passed.append(agreed[1])
+
+    assert len(offered) > 20, "this machine offers nothing weak, so nothing was tested"
+    assert passed
+    assert all(name.startswith("ECDHE") and ("GCM" in name or "POLY1305" in name) for name in passed), passed
+
+
+@pytest.mark.system
+def test_plain_text_gets_no_answer(door: Door) -> None:
+    with socket.create_connection(("127.0.0.1", door.port), timeout=SOON_S) as plain:
+        plain.sendall(b"GET /ws HTTP/1.1\r\nHost: a\r\n\r\n")
+        answer = b""
+        with contextlib.suppress(ConnectionError):
+            answer = plain.recv(1024)
+
+    assert not answer.startswith(b"HTTP")
+
+
+@pytest.mark.system
+def test_a_robot_dials_wss_and_refuses_a_certificate_that_nobody_signed(
+    door: Door, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async def echoed() -> object:
+        async with connect(url=door.url, token=door.token()) as robot:
+            return await robot.call("echo", {"value": 5})
+
+    assert door.url.startswith("wss://")
+    with pytest.raises(RsePfError):
+        asyncio.run(asyncio.wait_for(echoed(), SOON_S))
+    monkeypatch.setenv("SSL_CERT_FILE", str(door.certificate))
+    assert asyncio.run(asyncio.wait_for(echoed(), SOON_S))
+
+
+@pytest.mark.system
+def test_sslscan_sees_neither_old_versions_nor_weak_ciphers(door: Door) -> None:
+    try:
+        done = subprocess.run(
+            ["sslscan", "--no-colour", f"127.0.0.1:{door.port}"], capture_output=True, text=True, check=False
+        )
+    except FileNotFoundError:
+        pytest.skip("sslscan is not installed: apt install sslscan")
+    for line in done.stdout.splitlines():
+        if line.startswith(("SSLv", "TLSv1.0", "TLSv1.1")) and "abled" in line:
+            assert line.split()[-1] == "disabled", line
+        if line.startswith(("Accepted", "Preferred")):
+            assert "GCM" in line or "POLY1305" in line, line
+    assert "TLSv1.3   enabled" in done.stdout
+
+
+def test_a_certificate_without_its_key_is_refused_at_once() -> None:
+    with pytest.raises(SettingsError, match="private_key"):
+        PlatformSettings().replace(local={"certificate": "door.pem"})
