@@ -25,6 +25,7 @@ from client_sdk.mapping import read_ply
 from rse_pf.errors import CommandFailed, UsageError
 from rse_pf.experiments import demo_report
 from rse_pf.experiments.demo_merge import MERGED_MAP, write_merged
+from rse_pf.experiments.demo_pipe import TokenWanted
 from rse_pf.experiments.demo_platform_merge import merge_there
 from rse_pf.experiments.demo_robot import (
     Failed,
@@ -32,7 +33,6 @@ from rse_pf.experiments.demo_robot import (
     Progress,
     Ready,
     RobotSpec,
-    TokenWanted,
     run_robot,
 )
 from rse_pf.experiments.map_picture import PathOfRobot, draw_map
@@ -106,7 +106,9 @@ async def _run(
             pids = ", ".join(f"{server.name} {server.pid}" for server in cloud.servers)
             screen.say(f"running at {cloud.url}: {pids} (kill -9 one, and watch the robots go on)")
             samples = asyncio.create_task(_sample(cloud, folder / "samples.csv", now))
-            robots = [_start(options, settings, folder, cloud, number) for number in range(options.robots)]
+            robots = [
+                _start(options, settings, folder, cloud.url, number) for number in range(options.robots)
+            ]
             try:
                 await _play(robots, cloud, screen, events, now)
             finally:
@@ -130,9 +132,7 @@ async def _run(
     return _judge(options, folder, finished, before, merged)
 
 
-def _start(
-    options: DemoOptions, settings: PlatformSettings, folder: Path, cloud: LocalCloud, number: int
-) -> _Robot:
+def _start(options: DemoOptions, settings: PlatformSettings, folder: Path, url: str, number: int) -> _Robot:
     name = _name(number)
     (folder / name).mkdir()
     frontend = FrontEndOptions.wide_baseline() if options.frontend == "wide-baseline" else FrontEndOptions()
@@ -140,8 +140,7 @@ def _start(
         name=name,
         number=number,
         robots=options.robots,
-        url=cloud.url,
-        token=cloud.issue_token(name),
+        url=url,
         codec=options.codec,
         rate_hz=options.rate_hz,
         folder=folder / name,

@@ -43,7 +43,12 @@ class KeyframeUploads:
     """The way to the data service: keyframes in the background, the map at the end."""
 
     def __init__(
-        self, url: str, token: str, spool: Path, settings: DataSettings, is_busy: Callable[[], bool]
+        self,
+        url: str,
+        token: Callable[[], str],
+        spool: Path,
+        settings: DataSettings,
+        is_busy: Callable[[], bool],
     ) -> None:
         """Begin to send; *is_busy* says that a live pose is on its way and keyframes have to wait."""
         self._client = DataClient(url, token)

@@ -20,12 +20,13 @@ from client_sdk.frontend import Frame, FrontEndOptions, PoseQuery, TrackedFrame,
 from client_sdk.mapping import MapOptions, PointMap, Trajectory, write_ply, write_trajectory
 from rse_pf.errors import RsePfError
 from rse_pf.experiments.demo_keyframes import MAP_FILE, KeyframeKeeper, KeyframeUploads
+from rse_pf.experiments.demo_pipe import ParentPipe
 from rse_pf.experiments.report import CommandRecord
 from rse_pf.geometry import Array
 from rse_pf.pnp import PnpOptions
 from rse_pf.settings import DataSettings, SessionSettings
 
-__all__ = ["Failed", "Finished", "Progress", "Ready", "RobotSpec", "TokenWanted", "run_robot"]
+__all__ = ["Failed", "Finished", "Progress", "Ready", "RobotSpec", "run_robot"]
 
 _PRUNE_READINGS = 2
 
@@ -38,7 +39,6 @@ class RobotSpec:
     number: int
     robots: int
     url: str
-    token: str
     codec: str
     rate_hz: float
     folder: Path
@@ -66,11 +66,6 @@ class Progress:
 
     frames: int
     lost: bool = False
-
-
-@dataclass(frozen=True, slots=True)
-class TokenWanted:
-    """The robot's token is over; the parent answers with a new one."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,37 +107,32 @@ class _Diary:
 
 def run_robot(spec: RobotSpec, pipe: Connection) -> None:
     """Load the frames, connect, wait for the start, play; the entry point of the process."""
+    parent = ParentPipe(pipe)
+    parent.listen()
     try:
-        asyncio.run(_run(spec, pipe))
+        asyncio.run(_run(spec, parent))
     except RsePfError as error:
-        pipe.send(Failed(error.report()))
+        parent.send(Failed(error.report()))
     except KeyboardInterrupt:
         pass
-    finally:
-        pipe.close()
 
 
-async def _run(spec: RobotSpec, pipe: Connection) -> None:
+async def _run(spec: RobotSpec, pipe: ParentPipe) -> None:
     from client_sdk import connect
 
     frames, truth, truth_kind = await asyncio.to_thread(_load, spec, pipe)
-    first_token = [spec.token]
 
     async def token() -> str:
-        if first_token:
-            return first_token.pop()
-        pipe.send(TokenWanted())
-        fresh: str = await asyncio.to_thread(pipe.recv)
-        return fresh
+        return await asyncio.to_thread(pipe.fresh_token)
 
     async with connect(spec.url, token=token, codec=spec.codec, settings=spec.session) as robot:
         pipe.send(Ready(len(frames)))
-        began: float = await asyncio.to_thread(pipe.recv)
+        began = await asyncio.to_thread(pipe.wait_start)
         start = np.eye(4) if truth is None or spec.merge else truth.T_world_camera[0]
         tracker = Tracker(spec.frontend, T_world_start=start)
         point_map = PointMap(MapOptions())
         diary = _Diary()
-        keeper = _keeper(spec, lambda: diary.asking)
+        keeper = _keeper(spec, pipe.token, lambda: diary.asking)
         first_s = time.monotonic()
         for row, frame in enumerate(frames):
             planned = began + (row + spec.number / spec.robots) / spec.rate_hz
@@ -249,7 +239,7 @@ def _since(began: float) -> float:
     return round(time.monotonic() - began, 6)
 
 
-def _load(spec: RobotSpec, pipe: Connection) -> tuple[Any, Trajectory | None, str]:
+def _load(spec: RobotSpec, pipe: ParentPipe) -> tuple[Any, Trajectory | None, str]:
     """Return frames, truth and what kind of truth it is; rendered frames are made beforehand."""
     if spec.data is not None:
         from client_sdk.datasets import open_dataset
@@ -275,12 +265,12 @@ def _trajectory(tracked: Iterable[TrackedFrame]) -> Trajectory:
     )
 
 
-def _keeper(spec: RobotSpec, is_busy: Callable[[], bool]) -> KeyframeKeeper | None:
+def _keeper(spec: RobotSpec, token: Callable[[], str], is_busy: Callable[[], bool]) -> KeyframeKeeper | None:
     if not spec.merge:
         return None
     if spec.data_settings is None:
         return KeyframeKeeper(spec.name, spec.frontend)
-    uploads = KeyframeUploads(spec.url, spec.token, spec.folder / "spool", spec.data_settings, is_busy)
+    uploads = KeyframeUploads(spec.url, token, spec.folder / "spool", spec.data_settings, is_busy)
     return KeyframeKeeper(spec.name, spec.frontend, uploads)
 
 
