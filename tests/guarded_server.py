@@ -75,6 +75,7 @@ class GuardedServer:
                     str(self.folder / "settings.json"), "--keys", str(self.folder / "keys.json"),
                     "--port", "0", "--control-port", "0", "--workers", str(self._workers),
                     "--server-id", "guarded", "--announce", str(announce),
+                    "--audit", str(self.folder / "audit"),
                 ],
                 stdout=subprocess.DEVNULL, stderr=log, cwd=self.folder,
             )  # fmt: skip

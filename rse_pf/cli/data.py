@@ -35,6 +35,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="public keys of the tokens, a JWKS; roster and deny-list lie beside it in control/",
     )  # fmt: skip
     parser.add_argument(
+        "--audit", type=Path, metavar="DIR", help="record there how maps change, and who was refused"
+    )
+    parser.add_argument(
         "--openapi", action="store_true", help="print the OpenAPI document and do nothing else"
     )
     parser.add_argument(
@@ -61,7 +64,7 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
     from rse_pf.data_server.server import KeysFile, serve_data
 
     keys = KeysFile(args.keys, chosen.auth.deny_list_refresh_s)
-    return serve_data(chosen, store, keys=keys, announce=args.announce)
+    return serve_data(chosen, store, keys=keys, announce=args.announce, audit=args.audit)
 
 
 def open_any_store(settings: PlatformSettings) -> ObjectStore:

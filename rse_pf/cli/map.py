@@ -30,6 +30,7 @@ import msgspec
 import numpy as np
 
 from rse_pf.cli.data import open_any_store
+from rse_pf.cli.recorded import record_map_change
 from rse_pf.data_server.map_files import FORMATS, export_map
 from rse_pf.data_server.maps import MapRecord, MapRegistry, difference
 from rse_pf.errors import NotFound, UsageError
@@ -116,7 +117,12 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
     chosen = settings if args.store is None else settings.replace(data={"store": args.store})
     if chosen.data.store == "memory:":
         raise UsageError("maps in memory belong to another process", hint="name --store dir:PATH")
-    maps = MapRegistry(open_any_store(chosen), args.tenant, most_bytes=4 * chosen.data.max_object_bytes)
+
+    def told(action: str, name: str, record: MapRecord) -> None:
+        record_map_change(chosen, action, name, version=record.id, number=record.number)
+
+    most_bytes = 4 * chosen.data.max_object_bytes
+    maps = MapRegistry(open_any_store(chosen), args.tenant, most_bytes=most_bytes, told=told)
     if args.action in ("merge", "localise"):
         return _work(args, maps, chosen)
     actions = {

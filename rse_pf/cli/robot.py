@@ -21,6 +21,8 @@ import time
 from pathlib import Path
 from typing import Any
 
+from rse_pf.audit import Value
+from rse_pf.cli.recorded import record
 from rse_pf.control import ControlRoom
 from rse_pf.enrolment import (
     DenyList,
@@ -34,7 +36,7 @@ from rse_pf.enrolment import (
 from rse_pf.errors import UsageError
 from rse_pf.settings import PlatformSettings
 
-__all__ = ["add_arguments", "add_place", "control_room", "longest_s", "run"]
+__all__ = ["add_arguments", "add_place", "control_room", "longest_s", "note", "run"]
 
 _DEFAULT = "default"
 _ACTIONS = ("keygen", "enrol", "list", "disable", "enable")
@@ -81,11 +83,12 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
     robot, tenant = check_robot(args.robot), check_tenant(args.tenant)
     longest = longest_s(settings)
     if args.action == "enrol":
-        return _enrol(args, room, now)
+        return _enrol(args, room, now, settings)
     if args.action == "disable":
         room.change_denied(
             lambda denied: denied.pruned(now=now, longest_s=longest).with_robot(tenant, robot, now)
         )
+        note(args, settings, "robot.disabled", robot, tenant=tenant)
         print(f"robot {robot!r} is disabled: its connections end within 2 s, and no token of it is taken")
         return 0
     if not room.denied().is_disabled(tenant, robot):
@@ -96,6 +99,7 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
         return kept.with_all_tokens(tenant, robot, float(int(now)))
 
     room.change_denied(enabled)
+    note(args, settings, "robot.enabled", robot, tenant=tenant)
     print(f"robot {robot!r} may come in again, with tokens that are made from now on")
     return 0
 
@@ -115,6 +119,16 @@ def control_room(args: argparse.Namespace, settings: PlatformSettings) -> Contro
     if not key_set_file(folder).exists():
         raise UsageError(f"there is no platform {args.name!r}", hint="start one with rse-pf local")
     return ControlRoom(DirectoryStore(folder))
+
+
+def note(
+    args: argparse.Namespace, settings: PlatformSettings, action: str, subject: str, **detail: Value
+) -> None:
+    """Record what was done in the audit log of a local platform; a cloud's own trail has it there."""
+    if not args.cloud:
+        from rse_pf.local.state import state_folder
+
+        record(state_folder(args.name, os.environ), settings.auth, action, subject, **detail)
 
 
 def longest_s(settings: PlatformSettings) -> float:
@@ -138,7 +152,7 @@ def _check(args: argparse.Namespace) -> None:
         raise UsageError("--scope and --quota are for enrol", hint="enrol the robot again to change them")
 
 
-def _enrol(args: argparse.Namespace, room: ControlRoom, now: float) -> int:
+def _enrol(args: argparse.Namespace, room: ControlRoom, now: float, settings: PlatformSettings) -> int:
     robot = EnrolledRobot(
         robot=args.robot,
         tenant=args.tenant,
@@ -149,6 +163,7 @@ def _enrol(args: argparse.Namespace, room: ControlRoom, now: float) -> int:
     )
     room.change_roster(lambda roster: roster.enrolled(robot))
     allowed = " ".join(robot.scopes) or "everything"
+    note(args, settings, "robot.enrolled", robot.robot, tenant=robot.tenant, key=robot.key_id, scopes=allowed)
     print(f"robot {robot.robot!r} is enrolled with {robot.key_id}; it may use {allowed}")
     return 0
 

@@ -32,7 +32,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rse_pf.auth import KeySet, SigningKey
-from rse_pf.cli.robot import add_place, control_room, longest_s
+from rse_pf.cli.robot import add_place, control_room, longest_s, note
 from rse_pf.control import ControlRoom
 from rse_pf.enrolment import check_robot, check_tenant
 from rse_pf.errors import ConfigurationError, Unauthorized, UsageError
@@ -97,16 +97,18 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
 
 
 def _issue(args: argparse.Namespace, settings: PlatformSettings) -> int:
-    now = time.time()
+    now, token_id = time.time(), secrets.token_hex(8)
     token = _signing_key(args, settings, now).issue(
         args.subject,
         now=now,
-        token_id=secrets.token_hex(8),
+        token_id=token_id,
         settings=settings.auth,
         life_s=args.life,
         scopes=tuple(args.scope),
         tenant=check_tenant(args.tenant),
     )
+    if args.key is None:
+        note(args, settings, "token.issued", args.subject, tenant=args.tenant, token=token_id)
     print(token)
     return 0
 
@@ -123,6 +125,7 @@ def _revoke(args: argparse.Namespace, settings: PlatformSettings) -> int:
         control_room(args, settings).change_denied(
             lambda denied: denied.pruned(now=now, longest_s=longest).with_all_tokens(tenant, robot, from_s)
         )
+        note(args, settings, "token.revoked-all", robot, tenant=tenant)
         print(f"every token of {robot!r} until now is revoked; one issued in a second is good again")
         return 0
     header, claims = _parts(_token(args.subject))
@@ -139,6 +142,7 @@ def _revoke(args: argparse.Namespace, settings: PlatformSettings) -> int:
     room.change_denied(
         lambda denied: denied.pruned(now=now, longest_s=longest).with_token(tenant, name, token_id, until_s)
     )
+    note(args, settings, "token.revoked", name, tenant=tenant, token=token_id)
     print(f"token {token_id} of {name!r} is revoked: its connections end within 2 s")
     return 0
 
@@ -161,7 +165,7 @@ def _change_keys(args: argparse.Namespace, settings: PlatformSettings) -> int:
     from rse_pf.aws.key_store import KeyRing, spread_s
 
     if args.action == "rotate-keys" and args.subject is None and not args.cloud:
-        return _rotate_local(_folder(args.name))
+        return _rotate_local(args, settings)
     if not args.cloud or args.subject is not None:
         raise UsageError(
             f"rse-pf token {args.action} is for a cloud, and names no robot",
@@ -189,16 +193,18 @@ def _change_keys(args: argparse.Namespace, settings: PlatformSettings) -> int:
     return 0
 
 
-def _rotate_local(folder: Path) -> int:
+def _rotate_local(args: argparse.Namespace, settings: PlatformSettings) -> int:
     """Publish a new key beside the one that signs now, then sign with it."""
     from rse_pf.local.firewall import key_file, key_set_file, read_key
 
+    folder = _folder(args.name)
     old = read_key(key_file(folder))
     new = SigningKey.from_seed(secrets.token_bytes(_SEED_BYTES), secrets.token_hex(8))
     halves = {key.key_id: key.key_set().get(key.key_id) for key in (new, old)}
     public = KeySet({name: half for name, half in halves.items() if half is not None})
     _replace(key_set_file(folder), public.to_json(), 0o644)
     _replace(key_file(folder), new.to_json(), 0o600)
+    note(args, settings, "key.rotated", new.key_id, before=old.key_id)
     print(f"key {new.key_id} signs from now on; tokens of {old.key_id} are good until their end")
     return 0
 

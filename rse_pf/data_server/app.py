@@ -13,6 +13,8 @@ import uuid
 from collections.abc import AsyncIterator, Callable, Mapping
 from typing import Any
 
+from rse_pf.audit import Note, Refusals
+from rse_pf.audit_log import AuditLog
 from rse_pf.auth import Claims, KeySet, token_problem, verify_token
 from rse_pf.data_server.handlers import Handler, Handlers
 from rse_pf.data_server.http import MethodNotAllowed, Receive, Reply, Request, Send, failure_reply
@@ -51,6 +53,7 @@ class DataServer:
         log: Callable[[dict[str, Any]], None],
         clock: Callable[[], float] = time.monotonic,
         wall_clock: Callable[[], float] = time.time,
+        audit: AuditLog | None = None,
     ) -> None:
         """Make the application.
 
@@ -61,14 +64,17 @@ class DataServer:
             log: Gets one line for each request.
             clock: Monotonic seconds.
             wall_clock: Unix seconds.
+            audit: Gets refused tokens and changes of maps; None records nothing.
         """
+        self._audit = audit
+        self._refusals = Refusals(settings.auth.audit_refused_per_s, settings.auth.audit_refused_burst)
         self._settings = settings
         self._keys = keys
         self._log = log
         self._clock = clock
         self._wall_clock = wall_clock
         self._bodies = 0
-        self.handlers = Handlers(store, settings.data, clock=clock, wall_clock=wall_clock)
+        self.handlers = Handlers(store, settings.data, clock=clock, wall_clock=wall_clock, audit=audit)
         self._routes = [(route.pattern, route, _handler(self.handlers, route)) for route in ROUTES]
 
     async def __call__(self, scope: Mapping[str, Any], receive: Receive, send: Send) -> None:
@@ -160,11 +166,24 @@ class DataServer:
             )  # fmt: skip
         except Unauthorized as error:
             said["reason"] = token_problem(error)
+            self._record_refusal(said["reason"])
             raise
         said["robot"] = who.robot
         if not holds(who.scopes, scope, name):
             raise Forbidden(f"this token does not hold the scope {scope}", hint="issue one that does")
         return who
+
+    def record_counted(self) -> None:
+        """Record how many refusals were only counted since the last that was recorded."""
+        counted = self._refusals.summary()
+        if self._audit is not None and counted:
+            now, who = self._wall_clock(), self._audit.who
+            self._audit.add([Note(time=now, actor=who, action="auth.refused-many", detail=counted)])
+
+    def _record_refusal(self, reason: str) -> None:
+        if self._audit is not None and self._refusals.take(reason, self._clock()):
+            self.record_counted()
+            self._audit.record("auth.refused", reason=reason)
 
 
 def _handler(handlers: Handlers, route: Route) -> Handler:

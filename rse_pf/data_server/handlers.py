@@ -14,6 +14,7 @@ from typing import Any, TypeVar
 
 import msgspec
 
+from rse_pf.audit_log import AuditLog
 from rse_pf.auth import Claims
 from rse_pf.data_server.http import Reply, Request, failure_reply, json_reply, wanted_range
 from rse_pf.data_server.maps import MapRecord, MapRegistry
@@ -58,8 +59,10 @@ class Handlers:
         *,
         clock: Callable[[], float] = time.monotonic,
         wall_clock: Callable[[], float] = time.time,
+        audit: AuditLog | None = None,
     ) -> None:
         self._store = store
+        self._audit = audit
         self._settings = settings
         self._wall_clock = wall_clock
         self.objects = Objects(store, settings, clock, wall_clock)
@@ -191,7 +194,13 @@ class Handlers:
         return _version(200, await asyncio.to_thread(work))
 
     def _maps(self, who: Claims) -> MapRegistry:
-        return MapRegistry(self._store, who.tenant, most_bytes=4 * self._settings.max_object_bytes)
+        def told(action: str, name: str, record: MapRecord) -> None:
+            if self._audit is not None:
+                subject = name if who.tenant == "default" else f"{who.tenant}/{name}"
+                self._audit.record(action, subject, actor=who.robot, version=record.id, number=record.number)
+
+        most_bytes = 4 * self._settings.max_object_bytes
+        return MapRegistry(self._store, who.tenant, most_bytes=most_bytes, told=told)
 
     def _content(self, request: Request, name: str, size: int, digest: str) -> Reply:
         try:

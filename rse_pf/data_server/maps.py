@@ -10,7 +10,7 @@ Layout: ``maps/TENANT/NAME/blobs/DIGEST``, ``.../versions/ID`` (ID is the sha256
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -71,8 +71,17 @@ class MapDiff:
 class MapRegistry:
     """The maps of one tenant in one store.  Blocking."""
 
-    def __init__(self, store: ObjectStore, tenant: str = "default", *, most_bytes: int = 1 << 30) -> None:
+    def __init__(
+        self,
+        store: ObjectStore,
+        tenant: str = "default",
+        *,
+        most_bytes: int = 1 << 30,
+        told: Callable[[str, str, MapRecord], None] = lambda action, name, record: None,
+    ) -> None:
+        """Look after the maps of *tenant*; *told* gets ``map.commit`` or ``map.head``, map and version."""
         self._store = store
+        self._told = told
         self._prefix = f"maps/{name_segment(tenant)}/"
         self._most_bytes = most_bytes
 
@@ -114,6 +123,7 @@ class MapRegistry:
         self._store.put(f"{base}blobs/{record.digest}", data)
         self._store.put(f"{base}versions/{record.id}", msgspec.json.encode(record))
         self._swap(name, parent, record.id)
+        self._told("map.commit", name, record)
         return record
 
     def head(self, name: str) -> MapRecord:
@@ -178,6 +188,7 @@ class MapRegistry:
         """
         record = self.record(name, version)
         self._swap(name, self.record(name, expected).id, record.id)
+        self._told("map.head", name, record)
         return record
 
     def _base(self, name: str) -> str:

@@ -19,6 +19,7 @@ from typing import Any
 
 import msgspec
 
+from rse_pf.audit_log import AuditLog
 from rse_pf.auth import KeySet
 from rse_pf.control import Trust
 from rse_pf.data_server.app import DataServer
@@ -55,6 +56,7 @@ def serve_data(
     *,
     keys: Callable[[], KeySet | None],
     announce: Path | None,
+    audit: Path | None = None,
 ) -> int:
     """Serve until a signal comes; return the exit code.
 
@@ -63,16 +65,18 @@ def serve_data(
         store: Where objects and maps live.
         keys: Who may sign tokens, asked for each request.
         announce: Gets pid and port as JSON, by rename, when requests are answered.
+        audit: Folder of the audit log; None records nothing.
 
     Raises:
-        ConfigurationError: The address is taken.
+        ConfigurationError: The address is taken, or the audit log cannot be written.
         MissingExtra: uvicorn is not installed.
     """
     try:
         import uvicorn
     except ImportError as error:
         raise MissingExtra("uvicorn", "data") from error
-    app = DataServer(settings, store, keys=keys, log=_write_line)
+    log = None if audit is None else _audit_log(audit, settings)
+    app = DataServer(settings, store, keys=keys, log=_write_line, audit=log)
     listening = _listen(settings)
     config = uvicorn.Config(
         app, http="h11", ws="none", lifespan="off", access_log=False, log_level="warning", backlog=_BACKLOG,
@@ -81,8 +85,26 @@ def serve_data(
     )  # fmt: skip
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, _stay)  # uvicorn sends itself the signal again when it is done
-    asyncio.run(_run(uvicorn.Server(config), app, store, listening, settings, announce))
+    try:
+        asyncio.run(_run(uvicorn.Server(config), app, store, listening, settings, announce))
+    finally:
+        app.record_counted()
+        if log is not None:
+            log.close()
     return 0
+
+
+def _audit_log(folder: Path, settings: PlatformSettings) -> AuditLog:
+    log = AuditLog(
+        folder, "data", wall_clock=time.time, most_bytes=settings.auth.audit_file_bytes,
+        sync_s=settings.auth.audit_sync_ms / 1e3, on_problem=_say_problem,
+    ).open()  # fmt: skip
+    log.start()
+    return log
+
+
+def _say_problem(problem: str) -> None:
+    _write_line({"event": "audit", "error": problem})
 
 
 def _stay(number: int, frame: object) -> None:

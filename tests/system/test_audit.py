@@ -1,0 +1,139 @@
+"""The audit log of real processes: servers, the control plane, an operator's commands; kill -9 too."""
+
+from __future__ import annotations
+
+import asyncio
+import functools
+import json
+import time
+from collections.abc import Callable, Coroutine
+from pathlib import Path
+from typing import Any
+
+import pytest
+from guarded_server import GuardedServer
+
+from rse_pf.audit import Entry
+from rse_pf.audit_check import check_folder, entries_of
+from rse_pf.audit_log import audit_folder, files_of, names_in
+from rse_pf.cli.main import main
+from rse_pf.local.cloud import LocalCloud
+from rse_pf.settings import PlatformSettings
+
+pytestmark = pytest.mark.system
+
+SOON_S = 20.0
+PAUSE_S = 0.02
+
+
+def awaited(test: Callable[..., Coroutine[Any, Any, None]]) -> Callable[..., None]:
+    """Return a test that runs the coroutine *test*, with its fixtures."""
+
+    @functools.wraps(test)
+    def run(**fixtures: Any) -> None:
+        asyncio.run(test(**fixtures))
+
+    return run
+
+
+def entries(folder: Path, who: str) -> list[Entry]:
+    return list(entries_of(files_of(folder, who)))
+
+
+async def until(found: Callable[[], bool], what: Callable[[], object]) -> None:
+    """Wait until *found*, which files tell and no event does."""
+    end = time.monotonic() + SOON_S
+    while not found():
+        assert time.monotonic() < end, what()
+        await asyncio.sleep(PAUSE_S)
+
+
+@awaited
+async def test_a_server_records_who_came_in_and_who_was_refused_and_no_token(tmp_path: Path):
+    with GuardedServer(tmp_path) as server:
+        audit, good = tmp_path / "audit", server.token("robot-1")
+        assert (await server.handshake(b"Bearer " + good.encode()))[0] == 101
+        assert (await server.handshake(b"Bearer " + good[:-4].encode() + b"AAAA"))[0] == 401
+        server.room.change_denied(lambda denied: denied.with_robot("default", "robot-1", time.time()))
+
+        def tokens() -> list[str]:
+            return [entry.action for entry in entries(audit, "guarded") if entry.action.startswith("auth")]
+
+        await until(lambda: len(tokens()) >= 2, tokens)
+        text = (audit / "guarded.jsonl").read_text()
+
+    ready, accepted, refused = entries(audit, "guarded")[:3]
+    assert ready.action == "server.ready"
+    assert (accepted.action, accepted.subject, accepted.detail["token"]) == (
+        "auth.accepted",
+        "robot-1",
+        "t-1",
+    )
+    assert accepted.detail["source"] == "127.0.0.1"
+    assert (refused.action, refused.detail["claimed_robot"]) == ("auth.refused", "robot-1")
+    assert good not in text
+    assert good.split(".")[1] not in text
+
+
+@awaited
+async def test_the_chain_of_a_server_goes_on_over_kills(tmp_path: Path):
+    with GuardedServer(tmp_path) as server:
+        for number in range(2):
+            if number:
+                server.restart()
+            authorization = b"Bearer " + server.token(f"robot-{number}").encode()
+            assert (await server.handshake(authorization))[0] == 101
+            await until(
+                lambda wanted=number + 1: sum(  # type: ignore[misc]
+                    entry.action == "auth.accepted" for entry in entries(tmp_path / "audit", "guarded")
+                ) >= wanted,
+                lambda: entries(tmp_path / "audit", "guarded"),
+            )  # fmt: skip
+
+    (verdict,) = check_folder(tmp_path / "audit")
+    assert verdict.problem == ""
+    assert verdict.entries >= 4
+
+
+@awaited
+async def test_a_platform_records_its_deeds_its_robots_its_operator_and_the_heads_of_all(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+    state = tmp_path / "rse-pf" / "audited"
+    settings = PlatformSettings.from_dict({"auth": {"audit_heads_s": 0.1}})
+    audit = audit_folder(state)
+    async with LocalCloud(settings, state=state, servers=1, port=0, data=True) as cloud:
+        from client_sdk import connect
+
+        async with connect(cloud.url, token=cloud.issue_token("robot-1")):
+            pass
+        assert await asyncio.to_thread(main, ["robot", "disable", "robot-7", "--name", "audited"]) == 0
+        (server,) = [who for who in names_in(audit) if who.startswith("server-")]
+
+        def heads() -> set[str]:
+            told = [entry.detail for entry in entries(audit, "control-plane") if entry.action == "log.heads"]
+            return {name for detail in told for name in detail}
+
+        await until(lambda: {server, "operator"} <= heads(), heads)
+        assert main(["audit", "verify", "--name", "audited"]) == 0
+
+    assert {entry.subject for entry in entries(audit, server) if entry.action == "auth.accepted"} == {
+        "robot-1"
+    }
+    assert [(entry.action, entry.subject) for entry in entries(audit, "operator")] == [
+        ("robot.disabled", "robot-7")
+    ]
+    deeds = {entry.action for entry in entries(audit, "control-plane")}
+    assert {"platform.platform-ready", "platform.server-ready", "platform.over"} <= deeds
+    assert {verdict.problem for verdict in check_folder(audit)} == {""}
+
+    path = audit / f"{server}.jsonl"
+    path.write_bytes(b"".join(path.read_bytes().splitlines(keepends=True)[:-1]))
+    capsys.readouterr()
+    assert main(["audit", "verify", "--name", "audited"]) == 1
+    (broken,) = [line for line in capsys.readouterr().out.splitlines() if "BROKEN" in line]
+    assert broken.startswith(f"{server}: BROKEN in {server}.jsonl: entry ")
+    assert "is missing: entry " in broken
+    assert main(["audit", "show", "--name", "audited", "--only", "robot.disabled", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["subject"] == "robot-7"
