@@ -26,7 +26,10 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--engine", choices=["mutations", "atheris"], default="mutations")
     parser.add_argument("--found", type=Path, default=Path("out/fuzz"), help="where findings are written")
+    parser.add_argument("--replay", type=Path, help="try this one input, and say what it cost")
     options = parser.parse_args(arguments)
+    if options.replay:
+        return _replayed(options)
     if options.engine == "atheris":
         _with_atheris(options)
     return _with_mutations(options)
@@ -59,6 +62,15 @@ def _with_mutations(options: argparse.Namespace) -> int:
         print(f"  above the bars of {MOST_MS:g} ms and {MOST_MIB:g} MiB: {json.dumps(missed)}")
         for data in (meter.slowest, meter.largest):
             print(f"  {_kept(options.found, data)}")
+    return 0
+
+
+def _replayed(options: argparse.Namespace) -> int:
+    from fuzz.targets import TARGETS
+
+    meter = Meter()
+    TARGETS[options.target](options.replay.read_bytes(), meter)
+    print(meter.line())
     return 0
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import subprocess
 import sys
 from collections.abc import Iterable, Mapping
@@ -117,3 +118,19 @@ def test_a_key_would_be_seen(repository: Path, tmp_path: Path) -> None:
     for plugins in ((), _QUICK):
         found = {kind for _, kind in secrets(repository, [str(file)], *plugins)}
         assert found >= {"AWS Access Key", "Private Key"}
+
+
+def unhashed(lock: str) -> list[str]:
+    """Return the packages of a lock that are named without a hash."""
+    entries = re.split(r"^(?=[a-zA-Z0-9])", lock, flags=re.M)
+    return [each.split("==")[0] for each in entries if "==" in each and "--hash=sha256:" not in each]
+
+
+def test_every_locked_package_has_a_hash(repository: Path) -> None:
+    locks = [file for file in (repository / "locks").glob("*.txt") if file.name != "constraints.txt"]
+
+    assert {file.name: unhashed(file.read_text(encoding="utf-8")) for file in locks} == {
+        name: [] for name in ("boot.txt", "demo.txt", "dev.txt", "infra.txt", "lambda.txt")
+    }
+    assert "--require-hashes" in (repository / "scripts/setup.sh").read_text(encoding="utf-8")
+    assert unhashed("a==1 \\\n    --hash=sha256:0\nb==2 ; python_version > '3'\n") == ["b"]
