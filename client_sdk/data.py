@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any, BinaryIO
 from urllib.parse import urlsplit
 
+from client_sdk.direct import fetch_direct, is_allowed, put_direct
 from rse_pf.errors import (
     BadRequest,
     CommandFailed,
@@ -39,6 +40,8 @@ Progress = Callable[[int, int], None]
 
 _SMALL_BYTES = 262_144
 _PIECE_BYTES = 1 << 20
+_DIRECT_TRIES = 3
+_REDIRECTED = 307
 _BUSY = {408, 429, 500, 502, 503, 504}
 
 
@@ -165,7 +168,7 @@ class DataClient:
     def _upload_parts(self, opened: _Source, digest: str, progress: Progress | None) -> None:
         path, size = f"/data/v1/uploads/{digest}", opened.size
         begin = json.dumps({"size": size}).encode()
-        state = self._json("PUT", path, begin)
+        state = self._begin(path, begin, opened, progress)
         part_bytes = min(int(state["part_bytes"]), self._options.part_bytes)
         offset = int(state["offset"])
         _tell(progress, offset, size)
@@ -178,14 +181,50 @@ class DataClient:
             offset = int(state["offset"])
             _tell(progress, offset, size)
 
+    def _begin(self, path: str, begin: bytes, opened: _Source, progress: Progress | None) -> Any:
+        """Open an upload, and send all straight to the bucket if the service offers that and it works."""
+        tries, pause = _DIRECT_TRIES, self._options.first_pause_s
+        while True:
+            state = self._json("PUT", path, begin)
+            direct = state.get("direct")
+            if direct is None or not tries or not is_allowed(direct["url"], secure=self._secure):
+                return state
+            tries -= 1
+            body = opened.pieces(progress)
+            if put_direct(direct["url"], direct["headers"], body, timeout_s=self._options.timeout_s):
+                continue  # asking again tells whether it is there
+            self._options.sleep(pause)
+            pause *= 2
+
+    def _piece(
+        self, path: str, headers: dict[str, str], way: _Way
+    ) -> tuple[int, http.client.HTTPMessage, bytes]:
+        """Fetch a range straight from the bucket if the service offers that, else from the service."""
+        options = self._options
+        while way.tries:
+            if not way.url:
+                asking = {**headers, "X-Accept-Direct": "1"}
+                status, answer, piece = self._patiently("GET", path, None, asking, also=(416,))
+                way.url = answer.get("Location", "") if status == _REDIRECTED else ""
+                if status != _REDIRECTED:
+                    return status, answer, piece
+            found = None
+            if is_allowed(way.url, secure=self._secure):
+                found = fetch_direct(way.url, headers, timeout_s=options.timeout_s)
+            if found is not None:
+                return found
+            way.url, way.tries = "", way.tries - 1  # it has expired, or the bucket is out of reach
+            options.sleep(options.first_pause_s)
+        return self._patiently("GET", path, None, headers, also=(416,))
+
     def _download(self, path: str, digest: str, to: Path | None, progress: Progress | None) -> bytes:
         partial = None if to is None else to.with_name(f".{to.name}.{digest[:16]}.part")
         held = bytearray() if partial is None else bytearray(_bytes_of(partial))
-        size = -1
+        size, way = -1, _Way()
         while size != len(held):
             end = len(held) + _PIECE_BYTES - 1
             headers = {"Range": f"bytes={len(held)}-{end}"}
-            status, answer, piece = self._patiently("GET", path, None, headers, also=(416,))
+            status, answer, piece = self._piece(path, headers, way)
             told = answer.get("Content-Range", "")
             size = int(told.rpartition("/")[2]) if told else len(piece)
             if status == 200:
@@ -258,6 +297,14 @@ class DataClient:
         return answer.status, answer.headers, content
 
 
+@dataclass(slots=True)
+class _Way:
+    """How a download goes: straight from *url*, which ends soon, or through the service without tries."""
+
+    url: str = ""
+    tries: int = _DIRECT_TRIES
+
+
 class _Source:
     """Bytes or a file, read by position."""
 
@@ -276,6 +323,11 @@ class _Source:
         for offset in range(0, self.size, _PIECE_BYTES):
             made.update(self.read(offset, _PIECE_BYTES))
         return made.hexdigest()
+
+    def pieces(self, progress: Progress | None) -> Iterator[bytes]:
+        for offset in range(0, self.size, _PIECE_BYTES):
+            yield self.read(offset, _PIECE_BYTES)
+            _tell(progress, min(offset + _PIECE_BYTES, self.size), self.size)
 
     def read(self, offset: int, length: int) -> bytes:
         if self._file is None:

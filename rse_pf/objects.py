@@ -26,6 +26,7 @@ __all__ = [
     "MemoryStore",
     "ObjectInfo",
     "ObjectStore",
+    "PresigningStore",
     "RangedStore",
     "check_name",
     "digest_of",
@@ -76,6 +77,17 @@ class RangedStore(Protocol):
 
     def get_range(self, name: str, start: int, length: int) -> bytes:
         """Return at most *length* bytes from *start* on; raises NotFound."""
+
+
+@runtime_checkable
+class PresigningStore(Protocol):
+    """A store that others may be let into, for one object and a short time; the network is not asked."""
+
+    def presigned_put(self, name: str, *, size: int, sha256: str, life_s: int) -> tuple[str, dict[str, str]]:
+        """Return an address and the headers with which exactly these bytes may be PUT there."""
+
+    def presigned_get(self, name: str, *, life_s: int) -> str:
+        """Return an address from which the object may be read."""
 
 
 def read_range(store: ObjectStore, name: str, start: int, length: int) -> bytes:

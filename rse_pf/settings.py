@@ -197,6 +197,7 @@ class DataSettings:
     body_timeout_s: float = setting(10.0, unit="s", doc="longest silence within a body", low=0.1)
     body_grace_s: float = setting(5.0, unit="s", doc="then the lowest body rate applies", low=0.1)
     min_body_bytes_per_s: int = setting(1024, unit="bytes/s", doc="a slower body is refused", low=1)
+    direct_life_s: int = setting(300, unit="s", doc="a signed address of the bucket is good for so long", low=10, high=300)
     background_bytes_per_s: int = setting(262144, unit="bytes/s", doc="keyframes a robot sends beside its live poses", low=1024)
     spool_bytes: int = setting(1073741824, unit="bytes", doc="keyframes a robot keeps on its disk while offline", low=1024)
     infrequent_after_days: int = setting(30, unit="days", doc="maps move to infrequent access", low=30)

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import json
+import threading
 from collections.abc import Iterable, Mapping
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
 
 from rse_pf.auth import SigningKey
@@ -93,6 +95,45 @@ class Service:
             {name.decode(): value.decode() for name, value in sent[0]["headers"]},
             b"".join(message.get("body", b"") for message in sent[1:]),
         )
+
+
+class Door:
+    """The service on a port of this machine, for clients that speak HTTP; one request at a time."""
+
+    def __init__(self, service: Service) -> None:
+        lock = threading.Lock()
+
+        class Handler(BaseHTTPRequestHandler):
+            protocol_version = "HTTP/1.1"
+
+            def answer(self) -> None:
+                body = self.rfile.read(int(self.headers.get("Content-Length", 0)))
+                path, _, query = self.path.partition("?")
+                headers = {name: value for name, value in self.headers.items() if name != "Authorization"}
+                token = self.headers.get("Authorization", "").removeprefix("Bearer ")
+                with lock:
+                    made = service.ask(self.command, path, body, token=token, headers=headers, query=query)
+                self.send_response(made.status)
+                for name, value in {**made.headers, "content-length": str(len(made.body))}.items():
+                    self.send_header(name, value)
+                self.end_headers()
+                self.wfile.write(made.body)
+
+            do_GET = do_PUT = do_PATCH = do_DELETE = do_POST = answer
+
+            def log_message(self, *_: object) -> None:
+                """Stay silent."""
+
+        self._server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
+        self._server.daemon_threads = True
+        self._thread = threading.Thread(target=self._server.serve_forever, args=(0.01,), daemon=True)
+        self._thread.start()
+        self.url = f"http://127.0.0.1:{self._server.server_address[1]}"
+
+    def close(self) -> None:
+        self._server.shutdown()
+        self._server.server_close()
+        self._thread.join(10)
 
 
 def small_settings(**data: Any) -> PlatformSettings:

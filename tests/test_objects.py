@@ -24,9 +24,11 @@ from rse_pf.objects import (
     MemoryStore,
     ObjectInfo,
     ObjectStore,
+    RangedStore,
     check_name,
     digest_of,
     open_store,
+    read_range,
 )
 
 STORES: dict[str, Callable[[Path], ObjectStore]] = {
@@ -67,6 +69,17 @@ def test_what_was_put_is_there_whole(store: ObjectStore) -> None:
 
     assert store.get("maps/lab/cloud.bin") == data
     assert store.head("maps/lab/cloud.bin") == ObjectInfo(name="maps/lab/cloud.bin", size=len(data))
+
+
+def test_a_piece_is_read_where_it_lies_and_ends_where_the_object_does(store: ObjectStore) -> None:
+    store.put("a", b"0123456789")
+
+    pieces = [read_range(store, "a", start, length) for start, length in [(0, 4), (8, 4), (10, 4), (3, 0)]]
+
+    assert pieces == [b"0123", b"89", b"", b""]
+    assert isinstance(store, RangedStore), "pieces of a large object must not cost the whole"
+    with pytest.raises(NotFound):
+        read_range(store, "b", 0, 1)
 
 
 def test_an_empty_object_is_an_object(store: ObjectStore) -> None:

@@ -18,7 +18,7 @@ from rse_pf.objects import ObjectInfo, check_name
 
 __all__ = ["S3Store", "open_bucket"]
 
-_MISSING, _CHANGED, _RACED = 404, 412, 409
+_MISSING, _CHANGED, _RACED, _OUTSIDE = 404, 412, 409, 416
 _FULL = {"QuotaExceeded", "EntityTooLarge", "InsufficientStorage"}
 
 
@@ -37,6 +37,27 @@ class S3Store:
     def get(self, name: str) -> bytes:
         """Return the object; raises NotFound."""
         return self._read(name)[0]
+
+    def get_range(self, name: str, start: int, length: int) -> bytes:
+        """Return at most *length* bytes from *start* on; raises NotFound."""
+        from botocore.exceptions import ClientError
+
+        if length <= 0:
+            return b""
+
+        def piece() -> bytes:
+            wanted = f"bytes={start}-{start + length - 1}"
+            found = self._client.get_object(Bucket=self._bucket, Key=check_name(name), Range=wanted)
+            data: bytes = found["Body"].read()
+            return data
+
+        with _as_store_errors(name):
+            try:
+                return patiently(piece)
+            except ClientError as error:
+                if status_of(error) == _OUTSIDE:
+                    return b""
+                raise
 
     def put(self, name: str, data: bytes) -> None:
         """Store the object durably; raises StoreFull."""

@@ -23,6 +23,7 @@ from rse_pf.data_server.routes import (
     BYTES,
     Begin,
     Commit,
+    Direct,
     Health,
     MapName,
     MapPage,
@@ -34,7 +35,7 @@ from rse_pf.data_server.routes import (
 )
 from rse_pf.data_server.uploads import Objects, UploadState
 from rse_pf.errors import BadRequest, NotFound
-from rse_pf.objects import ObjectStore, read_range
+from rse_pf.objects import ObjectStore, PresigningStore, read_range
 from rse_pf.settings import DataSettings
 
 __all__ = ["Handler", "Handlers"]
@@ -95,7 +96,7 @@ class Handlers:
     async def get_object(self, request: Request, who: Claims, path: dict[str, str]) -> Reply:
         """Send an object or a range."""
         info = await asyncio.to_thread(self.objects.head, who, path["digest"])
-        return self._content(request, info.name, info.size, path["digest"])
+        return await self._content(request, info.name, info.size, path["digest"])
 
     async def head_object(self, request: Request, who: Claims, path: dict[str, str]) -> Reply:
         """Send the size alone."""
@@ -120,7 +121,17 @@ class Handlers:
         begin = await _json_body(request, Begin)
         if begin.size < 1:
             raise BadRequest(f"a size of {begin.size} bytes needs no upload", hint="PUT the object")
-        return _upload(200, await asyncio.to_thread(self.objects.begin, who, path["digest"], begin.size))
+        state = await asyncio.to_thread(self.objects.begin, who, path["digest"], begin.size)
+        return _upload(200, state, await asyncio.to_thread(self._direct, who, state))
+
+    def _direct(self, who: Claims, state: UploadState) -> Direct | None:
+        """Return where all bytes may go at once; None if some are here, or the store has no such place."""
+        store, life_s = self._store, self._settings.direct_life_s
+        if state.offset or not isinstance(store, PresigningStore):
+            return None
+        name = self.objects.name(who, state.digest)
+        url, headers = store.presigned_put(name, size=state.size, sha256=state.digest, life_s=life_s)
+        return Direct(url=url, headers=headers, life_s=life_s)
 
     async def get_upload(self, request: Request, who: Claims, path: dict[str, str]) -> Reply:
         """Tell how far an upload has come."""
@@ -182,7 +193,7 @@ class Handlers:
         """Send the bytes of a version or a range of them."""
         maps = self._maps(who)
         record = await asyncio.to_thread(maps.record, path["name"], path["version"])
-        return self._content(request, maps.blob_name(path["name"], record), record.size, record.digest)
+        return await self._content(request, maps.blob_name(path["name"], record), record.size, record.digest)
 
     async def move_head(self, request: Request, who: Claims, path: dict[str, str]) -> Reply:
         """Move a head."""
@@ -202,7 +213,11 @@ class Handlers:
         most_bytes = 4 * self._settings.max_object_bytes
         return MapRegistry(self._store, who.tenant, most_bytes=most_bytes, told=told)
 
-    def _content(self, request: Request, name: str, size: int, digest: str) -> Reply:
+    async def _content(self, request: Request, name: str, size: int, digest: str) -> Reply:
+        store, life_s = self._store, self._settings.direct_life_s
+        if request.headers.get("x-accept-direct") == "1" and isinstance(store, PresigningStore):
+            url = await asyncio.to_thread(store.presigned_get, name, life_s=life_s)
+            return Reply(status=307, headers={"Location": url, **_content_headers(digest)})
         try:
             wanted = wanted_range(request.headers.get("range"), size)
         except BadRequest as error:
@@ -235,8 +250,8 @@ def _content_headers(digest: str) -> dict[str, str]:
     }  # fmt: skip
 
 
-def _upload(status: int, state: UploadState) -> Reply:
-    return json_reply(status, Upload(**asdict(state)), Upload_Offset=str(state.offset))
+def _upload(status: int, state: UploadState, direct: Direct | None = None) -> Reply:
+    return json_reply(status, Upload(**asdict(state), direct=direct), Upload_Offset=str(state.offset))
 
 
 def _version(status: int, record: MapRecord) -> Reply:

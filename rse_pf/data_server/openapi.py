@@ -25,6 +25,7 @@ _PATH_SCHEMAS: dict[str, dict[str, Any]] = {
 }
 _JSON = "application/json"
 _WORDS = {
+    307: "It is at the signed address in Location; ask there without the token",
     200: "Done", 201: "Stored durably", 204: "Done, nothing to say", 206: "A range", 400: "Not understood",
     401: "No valid token", 403: "The token's scopes do not allow this", 404: "Not there, or not yours",
     408: "The body was too slow", 409: "Changed meanwhile", 413: "Larger than a limit or the quota",

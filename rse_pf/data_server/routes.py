@@ -54,13 +54,25 @@ class Begin(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     size: int
 
 
-class Upload(msgspec.Struct, frozen=True, kw_only=True):
-    """An upload: it is done, and durable, when *offset* is *size*."""
+class Direct(msgspec.Struct, frozen=True, kw_only=True):
+    """Where all bytes may be PUT at once, with exactly these headers and no token, for a short time."""
+
+    url: str
+    headers: dict[str, str]
+    life_s: int
+
+
+class Upload(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """An upload: it is done, and durable, when *offset* is *size*.
+
+    Where *direct* is given the bytes may go straight to the bucket; begin the upload again afterwards.
+    """
 
     digest: str
     size: int
     offset: int
     part_bytes: int
+    direct: Direct | None = None
 
 
 class MapName(msgspec.Struct, frozen=True, kw_only=True):
@@ -142,6 +154,10 @@ _RANGE = Field(name="Range", place="header", doc="one range of bytes, as bytes=S
 _OFFSET = Field(
     name="Upload-Offset", place="header", doc="where this part begins", whole_number=True, required=True
 )
+_DIRECT = Field(
+    name="X-Accept-Direct", place="header",
+    doc="1: 307 with a signed address in Location will do, if the store has such", whole_number=True,
+)  # fmt: skip
 _AFTER = Field(name="after", place="query", doc="only objects behind this digest")
 _LIMIT = Field(name="limit", place="query", doc="at most so many", whole_number=True, most=1000)
 
@@ -168,9 +184,9 @@ ROUTES: tuple[Route, ...] = (
         doc="List this robot's objects", fields=(_AFTER, _LIMIT), replies={200: ObjectPage, **_BAD},
     ),
     Route(
-        operation="get_object", method="GET", path=_OBJECT, scope="data:read", fields=(_RANGE,),
+        operation="get_object", method="GET", path=_OBJECT, scope="data:read", fields=(_RANGE, _DIRECT),
         doc="Return an object or one range of it",
-        replies={200: bytes, 206: bytes, 416: Failure, **_NOT_FOUND},
+        replies={200: bytes, 206: bytes, 307: None, 416: Failure, **_NOT_FOUND},
     ),
     Route(
         operation="head_object", method="HEAD", path=_OBJECT, scope="data:read",
@@ -229,8 +245,8 @@ ROUTES: tuple[Route, ...] = (
     ),
     Route(
         operation="get_version", method="GET", path=_VERSION + "/content", scope="maps:read",
-        fields=(_RANGE,), doc="Return the bytes of a version",
-        replies={200: bytes, 206: bytes, 416: Failure, **_BAD, **_NOT_FOUND},
+        fields=(_RANGE, _DIRECT), doc="Return the bytes of a version",
+        replies={200: bytes, 206: bytes, 307: None, 416: Failure, **_BAD, **_NOT_FOUND},
     ),
     Route(
         operation="move_head", method="PUT", path="/data/v1/maps/{name}/head", scope="maps:write",

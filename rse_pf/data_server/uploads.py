@@ -104,6 +104,10 @@ class Objects:
                 hint="split it, or raise data.max_object_bytes",
             )
         if self._exists(name):
+            with self._lock_of(name):
+                if self._opened(who, digest) is not None:  # the robot sent it straight to the bucket
+                    self._drop_parts(who, digest)
+                    self._forget_usage(who)
             return self._state(digest, size, size)
         with self._lock_of(name):
             opened = self._opened(who, digest)
