@@ -26,6 +26,8 @@ __all__ = ["RobotSockets"]
 
 _MOST_CLOSE_REASON_BYTES = 123
 _TOO_LONG = b"HTTP/1.1 431 Request Header Fields Too Large\r\nConnection: close\r\nContent-Length: 0\r\n\r\n"
+_MOST_READ_BYTES = 16384
+"""At once: of the smallest frames this holds thousands, and the other robots wait while they are walked."""
 _LINGER_S = 2.0
 """Time a robot has to read our CLOSE and to end its side; then the connection is cut."""
 
@@ -240,14 +242,16 @@ def _protocol_type(picows: Any) -> Any:
             self._arrival.made(transport)
 
         def get_buffer(self, hint: int) -> memoryview:
-            self._room = get_buffer(self, hint)
+            self._room = get_buffer(self, hint)[:_MOST_READ_BYTES]
             return self._room
 
         def buffer_updated(self, n: int) -> None:
             if not self._border.is_upgraded and self._arrival.is_too_long(n):
                 return
+            if self.transport is not None and self.transport.is_close_frame_sent:
+                return
             wanted = self._border.wanted(self._room[:n])
-            if wanted and (self.transport is None or not self.transport.is_close_frame_sent):
+            if wanted:
                 buffer_updated(self, wanted)
 
         def connection_lost(self, error: Exception | None) -> None:
