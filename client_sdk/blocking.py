@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from client_sdk.answers import Answer, PoseAnswer
 from client_sdk.connection import OnChange, Token
 from client_sdk.offload import CloudFirst
-from client_sdk.robot import Robot, connect
+from client_sdk.robot import OnProgress, Robot, connect
 from client_sdk.stats import Stats
 from rse_pf.errors import Disconnected
 from rse_pf.settings import SessionSettings
@@ -121,11 +121,15 @@ class BlockingRobot:
         deadline_s: float | None = None,
         stream: str = "",
         keep: bool = False,
+        on_progress: OnProgress | None = None,
     ) -> Answer:
-        """Ask a service; see `Robot.call`."""
+        """Ask a service; see `Robot.call`.  *on_progress* is called in another thread."""
         return self._wait(
-            self._robot.call(service, request, reply_type, deadline_s=deadline_s, stream=stream, keep=keep)
-        )
+            self._robot.call(
+                service, request, reply_type, deadline_s=deadline_s, stream=stream, keep=keep,
+                on_progress=on_progress,
+            )
+        )  # fmt: skip
 
     @property
     def stats(self) -> Stats:
