@@ -11,17 +11,17 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
+import client_sdk
 from client_sdk.data import DataClient, DataOptions
-from rse_pf.backend.objects_in import resolve
-from rse_pf.errors import ConnectError
+from rse_pf.errors import ConnectError, RsePfError
 from rse_pf.local import faults
 from rse_pf.local.cloud import LocalCloud
 from rse_pf.local.state import read_state
 from rse_pf.local.status import data_url, platform_status, status_table
-from rse_pf.objects import DirectoryStore
-from rse_pf.services.localise import LocaliseRequest
+from rse_pf.objects import DirectoryStore, object_name
 from rse_pf.settings import PlatformSettings
 
 pytestmark = pytest.mark.system
@@ -55,6 +55,19 @@ def client(cloud: LocalCloud, robot: str = "robot-1", **options: Any) -> DataCli
     return DataClient(cloud.url, lambda: cloud.issue_token(robot), chosen)
 
 
+async def localise_in(cloud: LocalCloud, name: str, digest: str) -> str:
+    """Return with which code robot *name* is refused that asks where it is in a map which is none."""
+    camera = {"fx": 500.0, "fy": 500.0, "cx": 320.0, "cy": 240.0, "width": 640, "height": 480}
+    request = {
+        "map": {"object": digest}, "camera": camera, "pixels": np.zeros((40, 2)),
+        "descriptors": bytes(32 * 40),
+    }  # fmt: skip
+    async with client_sdk.connect(cloud.url, token=cloud.issue_token(name)) as robot:
+        with pytest.raises(RsePfError) as refused:
+            await robot.call("localise", request)
+    return refused.value.code
+
+
 def test_a_robot_stores_through_the_front_door_what_its_services_can_read(
     tmp_path: Path, gone: Callable[[int], None]
 ) -> None:
@@ -70,11 +83,11 @@ def test_a_robot_stores_through_the_front_door_what_its_services_can_read(
             digest = await asyncio.to_thread(robot.upload, data)
             assert await asyncio.to_thread(robot.download, digest) == data
             store = DirectoryStore(tmp_path / "a" / "objects")
-            payload = resolve(
-                LocaliseRequest, {"map": {"object": digest}}, "default", "robot-1", store,
-                settings=SETTINGS.serving,
-            )  # fmt: skip
-            assert payload == {"map": data}
+            assert store.get(object_name("default", "robot-1", digest)) == data
+            assert await localise_in(cloud, "robot-1", digest) == "bad-request", (
+                "read, and found to be no map"
+            )
+            assert await localise_in(cloud, "robot-2", digest) == "not-found"
 
             state = read_state(cloud.state)
             assert state is not None
