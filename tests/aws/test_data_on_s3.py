@@ -17,7 +17,7 @@ from rse_pf.objects import digest_of, object_name
 
 BUCKET = "objects"
 FAILING_SHARE = 0.3
-UPLOADS = 40
+UPLOADS = 24
 LARGE = random.Random(5).randbytes(700_000)
 
 
@@ -66,42 +66,62 @@ def test_large_objects_go_straight_to_the_bucket_and_come_straight_back(s3_serve
     door.close()
 
 
+@pytest.mark.parametrize(
+    ("tries", "largest"), [(1, 3000), pytest.param(clients.MOST_TRIES, 300_000, marks=pytest.mark.slow)]
+)
 def test_an_s3_that_fails_three_times_in_ten_loses_nothing_that_was_acknowledged(
-    region: str, monkeypatch: pytest.MonkeyPatch
+    region: str, monkeypatch: pytest.MonkeyPatch, tries: int, largest: int
 ) -> None:
+    """With one try of the service every failure reaches the robot; with as many as it makes, few do."""
     from botocore.awsrequest import AWSResponse
 
     monkeypatch.setattr(clients, "_FIRST_PAUSE_S", 0.001)
+    monkeypatch.setattr(clients, "MOST_TRIES", tries)
     chance, lock = random.Random(11), threading.Lock()
     asked = failed = 0
 
-    def fail_sometimes(request: Any, **_: Any) -> AWSResponse | None:
-        nonlocal asked, failed
+    def fails(share: float) -> bool:
+        nonlocal failed
         with lock:
-            asked += 1
-            if chance.random() >= FAILING_SHARE:
-                return None
-            failed += 1
-        body = b"<Error><Code>InternalError</Code><Message>no</Message></Error>"
+            unlucky = chance.random() < share
+            failed += unlucky
+            return unlucky
+
+    def refuse(**_: Any) -> tuple[Any, dict[str, Any]] | None:
+        """Nothing is done."""
+        nonlocal asked
+        asked += 1
+        if not fails(FAILING_SHARE / 2):
+            return None
+        told = {"Error": {"Code": "InternalError"}, "ResponseMetadata": {"HTTPStatusCode": 500}}
+        return AWSResponse("", 500, {}, None), told
+
+    def lose_the_answer(request: Any, **_: Any) -> AWSResponse | None:
+        """The emulator does what it was asked, too."""
+        if not fails(FAILING_SHARE / 2 / (1 - FAILING_SHARE / 2)):
+            return None
         answer = AWSResponse(request.url, 500, {"content-type": "application/xml"}, None)
-        answer._content = body
+        answer._content = b"<Error><Code>InternalError</Code><Message>no</Message></Error>"
         return answer
 
-    plain = bucket_in(region)
+    plain = bucket_in(region)  # its client does not fail
     store = open_bucket(BUCKET, region)
-    store._client.meta.events.register_first("before-send.s3", fail_sometimes)
+    store._client.meta.events.register_first("before-call.s3", refuse)
+    store._client.meta.events.register_first("before-send.s3", lose_the_answer)
     settings = small_settings(part_bytes=65536, max_object_bytes=1_000_000, quota_bytes=100_000_000)
     service = Service(settings, store)
     # Without signed addresses: every byte goes through the service and its failing store.
     monkeypatch.setattr(type(service.app.handlers), "_direct", lambda *_: None)
     door = Door(service)
     robot = client_of(door, service)
-    contents = [random.Random(number).randbytes(3000) for number in range(UPLOADS)] + [LARGE[:300_000]]
+    contents = [random.Random(number).randbytes(3000) for number in range(UPLOADS)] + [LARGE[:largest]]
 
     acknowledged = [robot.upload(content) for content in contents]
 
     assert failed > 0.2 * asked > 10
     assert acknowledged == [digest_of(content) for content in contents]
+    refused = sum(line["status"] >= 500 for line in service.lines)
+    assert refused > UPLOADS / 4 or tries > 1, "the robot must have heard of failures"
     for digest, content in zip(acknowledged, contents, strict=True):
         assert plain.get(object_name("default", "robot-1", digest)) == content
     names = {object_name("default", "robot-1", digest) for digest in acknowledged}
