@@ -58,7 +58,7 @@ def test_shows_the_cloud_and_a_camera_for_each_keyframe_and_ends() -> None:
     (cloud,) = [options for name, _, options in page.calls if name == "add_point_cloud"]
     assert len(cloud["points"]) == 5
     assert page.host == "127.0.0.1"
-    assert said == ["http://127.0.0.1:8080"]
+    assert said == [f"http://{page.host}:{page.port}"]
     assert page.stopped
 
 
