@@ -17,8 +17,8 @@ __all__ = ["MOST_MIB", "MOST_MS", "Meter"]
 MOST_MS = 10.0
 MOST_MIB = 2.0
 
-_TRACED_FROM_MS = 0.2
-"""Nothing takes a MiB in less."""
+_TRACED_FROM_MS = 0.5
+"""Nothing takes two MiB in less."""
 _TRIES = 3
 
 

@@ -28,10 +28,10 @@ def fuzzed(target: str, *, seed: int, inputs: int) -> Meter:
 
 
 def test_thousands_of_damaged_messages_give_a_message_or_a_protocol_error() -> None:
-    meter = fuzzed("codec", seed=7, inputs=4000)
+    meter = fuzzed("codec", seed=7, inputs=1500)
 
     assert meter.refusals.keys() <= {"bad-message", "too-large"}
-    assert meter.refusals["bad-message"] > 1000, "the damage did no damage"
+    assert meter.refusals["bad-message"] > 500, "the damage did no damage"
     assert meter.worst_ms < _SLOW_MACHINE * MOST_MS, meter.line()
     assert meter.worst_mib < MOST_MIB, meter.line()
 
@@ -49,7 +49,7 @@ def test_a_decoder_that_lets_a_foreign_error_out_is_found(monkeypatch: pytest.Mo
     monkeypatch.setattr(codec, "_guarded", lambda decode, data: decode(data))
 
     with pytest.raises(msgspec.DecodeError):
-        fuzzed("codec", seed=7, inputs=4000)
+        fuzzed("codec", seed=7, inputs=1500)
 
 
 def test_every_target_keeps_a_corpus() -> None:

@@ -213,7 +213,7 @@ class Platform(RuleBasedStateMachine):
 
 
 TestPlatform = Platform.TestCase
-TestPlatform.settings = hypothesis_settings(max_examples=60, stateful_step_count=30, deadline=None)
+TestPlatform.settings = hypothesis_settings(max_examples=30, stateful_step_count=30, deadline=None)
 
 
 @pytest.mark.slow

@@ -101,6 +101,7 @@ def test_no_key_lies_in_the_product_or_its_pages(repository: Path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(600)
 def test_no_secret_lies_anywhere_in_the_checkout(repository: Path) -> None:
     files = text_files(repository)
     if not files:
