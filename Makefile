@@ -36,11 +36,12 @@ test: ## the tests that CI runs, under ten minutes on two cores
 	@$(SETUP) dev infra
 	@$(BIN)/ruff check . && $(BIN)/ruff format --check .
 	@$(BIN)/mypy
-	@$(PYTEST) -m "not slow" $(ARGS)
+	@$(PYTEST) -m "not slow and not system" -n 2 --dist loadfile $(ARGS) || [ $$? -eq 5 ]
+	@$(PYTEST) -m "not slow and system" $(ARGS) || [ $$? -eq 5 ]
 
 quick: ## pure tests only, in seconds
 	@$(SETUP) dev
-	@$(PYTEST) -q -m "not slow and not system" $(ARGS)
+	@$(PYTEST) -q -m "not slow and not system" -n 2 --dist loadfile $(ARGS)
 
 slow: ## conformance suites, recordings, a bare Debian: what make test leaves out
 	@$(SETUP) dev infra

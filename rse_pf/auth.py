@@ -340,7 +340,7 @@ def _ed25519() -> Any:
     try:
         from cryptography.hazmat.primitives.asymmetric import ed25519
     except ImportError as error:
-        raise MissingExtra("cryptography", "backend") from error
+        raise MissingExtra("cryptography", "keys") from error
     return ed25519
 
 
@@ -348,5 +348,5 @@ def _jwt() -> Any:
     try:
         import jwt
     except ImportError as error:
-        raise MissingExtra("pyjwt", "backend") from error
+        raise MissingExtra("pyjwt", "keys") from error
     return jwt

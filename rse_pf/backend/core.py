@@ -240,7 +240,7 @@ class Core:
 
     def refuses_unread(self, connection: Connection, codec: Codec, data: bytes, now: float) -> bool:
         """Refuse the command in *data* for a fraction of what reading it costs; False if it must be read."""
-        verdict = self.rates.judge(connection.robot, now)
+        verdict = self.rates.judge((connection.tenant, connection.robot), now)
         if verdict is not None:
             self._too_fast(connection, codec, data, verdict)
             return True

@@ -54,15 +54,15 @@ class RobotRates:
 
     def __init__(self, limits: SessionSettings) -> None:
         self._limits = limits
-        self._robots: dict[str, _Robot] = {}
+        self._robots: dict[tuple[str, str], _Robot] = {}
 
     @property
     def is_on(self) -> bool:
         """Whether there is a limit at all."""
         return self._limits.max_commands_per_s > 0
 
-    def judge(self, robot: str, now: float) -> TooFast | CutOff | None:
-        """Return what to do with one more message of *robot* at *now* (s); None: take it."""
+    def judge(self, robot: tuple[str, str], now: float) -> TooFast | CutOff | None:
+        """Return what to do with one more message of *robot* (tenant, name) at *now* (s); None: take it."""
         if not self.is_on:
             return None
         known = self._robots.get(robot)
@@ -77,7 +77,7 @@ class RobotRates:
             return CutOff()
         return TooFast(max(_SHORTEST_RETRY_MS, wait_s * 1e3))
 
-    def rests_s(self, robot: str, now: float) -> float:
+    def rests_s(self, robot: tuple[str, str], now: float) -> float:
         """Return for how many seconds more *robot*, cut off before, is not let in."""
         known = self._robots.get(robot)
         return 0.0 if known is None else max(0.0, known.rests_until - now)

@@ -201,7 +201,7 @@ class RobotSockets:
             anonymous=self._new_name(),
             now_s=self._core.clocks.wall(),
         )
-        if isinstance(verdict, Admitted) and self._core.rates.rests_s(verdict.robot, now) > 0:
+        if isinstance(verdict, Admitted) and self._core.rates.rests_s((verdict.tenant, verdict.robot), now) > 0:
             return self._door.too_fast
         return verdict
 

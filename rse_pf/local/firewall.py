@@ -12,7 +12,7 @@ import socket
 import stat
 from pathlib import Path
 
-from rse_pf.auth import SigningKey
+from rse_pf.auth import KeySet, SigningKey
 from rse_pf.errors import ConfigurationError, UsageError
 
 __all__ = ["check_front_door", "ensure_key", "key_file", "key_set_file", "read_key"]
@@ -54,7 +54,8 @@ def check_front_door(host: str, port: int) -> None:
 def ensure_key(folder: Path, *, seed: bytes, key_id: str) -> SigningKey:
     """Return the key of *folder*; make it from *seed* (32 secret random bytes) if there is none.
 
-    A platform that starts again keeps its key, so that robots keep their tokens.
+    A platform that starts again keeps its keys, so that robots keep their tokens: a set that a rotation wrote
+    and that holds the newest key stays as it is.
     """
     path = key_file(folder)
     if not path.exists():
@@ -65,10 +66,22 @@ def ensure_key(folder: Path, *, seed: bytes, key_id: str) -> SigningKey:
         temporary.replace(path)
     key = read_key(path)
     public = key_set_file(folder)
+    if _holds(public, key):
+        return key
     temporary = public.with_name(f".{public.name}")
     temporary.write_text(key.key_set().to_json(), encoding="utf-8")
     temporary.replace(public)
     return key
+
+
+def _holds(public: Path, key: SigningKey) -> bool:
+    """Whether the set in the file *public* holds *key*, perhaps beside others."""
+    try:
+        known = KeySet.from_json(public.read_text(encoding="utf-8")).get(key.key_id)
+    except (OSError, UsageError):
+        return False
+    own = key.key_set().get(key.key_id)
+    return known is not None and own is not None and known.public_bytes_raw() == own.public_bytes_raw()
 
 
 def read_key(path: Path) -> SigningKey:

@@ -10,12 +10,13 @@ from rse_pf.backend import limits
 from rse_pf.backend.limits import Bucket, CutOff, RobotRates, SourceRates, TooFast, WaitingRoom
 from rse_pf.settings import ServingSettings, SessionSettings
 
+ROBOT = ("default", "r")
 LIMITS = SessionSettings(
     max_commands_per_s=20.0, command_burst=40, rate_strikes=3, rate_window_s=10.0, rate_rest_s=5.0
 )
 
 
-def judged(rates: RobotRates, per_s: float, seconds: float, robot: str = "r") -> list[object]:
+def judged(rates: RobotRates, per_s: float, seconds: float, robot: tuple[str, str] = ROBOT) -> list[object]:
     return [rates.judge(robot, 100.0 + k / per_s) for k in range(int(per_s * seconds))]
 
 
@@ -68,7 +69,7 @@ def test_five_frames_a_second_with_the_catch_up_of_a_long_cut_are_never_refused(
     live = [100.0 + k / 5 for k in range(300)]
     caught_up = [130.0] * 16  # what was unanswered when the link came back, and eight pings
 
-    assert all(rates.judge("r", now) is None for now in sorted(live + caught_up))
+    assert all(rates.judge(ROBOT, now) is None for now in sorted(live + caught_up))
 
 
 def test_ten_hertz_is_never_refused():
@@ -90,16 +91,17 @@ def test_a_robot_at_a_hundred_times_its_rate_is_cut_off_within_half_a_second_and
     cut_off = verdicts.index(CutOff())
 
     assert 40 + 3 * 40 <= cut_off <= 180
-    assert rates.rests_s("r", 100.0 + cut_off / 500) == pytest.approx(5.0)
-    assert rates.rests_s("r", 106.0) == 0.0
-    assert rates.rests_s("another", 100.5) == 0.0
+    assert rates.rests_s(ROBOT, 100.0 + cut_off / 500) == pytest.approx(5.0)
+    assert rates.rests_s(ROBOT, 106.0) == 0.0
+    assert rates.rests_s(("default", "another"), 100.5) == 0.0
 
 
 def test_robots_have_buckets_of_their_own():
     rates = RobotRates(LIMITS)
-    judged(rates, per_s=500.0, seconds=0.5, robot="flood")
+    judged(rates, per_s=500.0, seconds=0.5, robot=("a", "flood"))
 
-    assert rates.judge("calm", 100.5) is None
+    assert rates.judge(("a", "calm"), 100.5) is None
+    assert rates.judge(("b", "flood"), 100.5) is None, "a name belongs to its tenant"
 
 
 def test_zero_turns_the_rate_off():

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from rse_pf.auth import KeySet, verify_token
+from rse_pf.auth import KeySet, SigningKey, verify_token
 from rse_pf.errors import ConfigurationError, UsageError
 from rse_pf.local.firewall import check_front_door, ensure_key, key_file, key_set_file, read_key
 from rse_pf.settings import AuthSettings
@@ -45,6 +45,26 @@ def test_a_platform_that_starts_again_keeps_its_key(tmp_path: Path) -> None:
     first = ensure_key(tmp_path, seed=SEED, key_id="k").to_json()
 
     assert ensure_key(tmp_path, seed=b"t" * 32, key_id="l").to_json() == first
+
+
+def test_a_platform_that_starts_again_keeps_the_keys_of_a_rotation(tmp_path: Path) -> None:
+    key = ensure_key(tmp_path, seed=SEED, key_id="new")
+    old = SigningKey.from_seed(b"o" * 32, "old")
+    both = {each.key_id: each.key_set().get(each.key_id) for each in (key, old)}
+    key_set_file(tmp_path).write_text(KeySet({kid: half for kid, half in both.items() if half}).to_json())
+
+    ensure_key(tmp_path, seed=SEED, key_id="new")
+
+    assert KeySet.from_json(key_set_file(tmp_path).read_text()).get("old") is not None
+
+
+def test_a_set_without_the_platforms_key_is_written_anew(tmp_path: Path) -> None:
+    ensure_key(tmp_path, seed=SEED, key_id="new")
+    key_set_file(tmp_path).write_text(SigningKey.from_seed(b"o" * 32, "new").key_set().to_json())
+
+    key = ensure_key(tmp_path, seed=SEED, key_id="new")
+
+    assert key_set_file(tmp_path).read_text() == key.key_set().to_json()
 
 
 def test_a_key_that_others_may_read_is_refused(tmp_path: Path) -> None:
