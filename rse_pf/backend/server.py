@@ -201,9 +201,10 @@ class RobotSockets:
             anonymous=self._new_name(),
             now_s=self._core.clocks.wall(),
         )
-        if isinstance(verdict, Admitted) and self._core.rates.rests_s((verdict.tenant, verdict.robot), now) > 0:
-            return self._door.too_fast
-        return verdict
+        if not isinstance(verdict, Admitted):
+            return verdict
+        rests_s = self._core.rates.rests_s((verdict.tenant, verdict.robot), now)
+        return self._door.too_fast if rests_s > 0 else verdict
 
 
 def _peer(accepted: socket.socket) -> str:

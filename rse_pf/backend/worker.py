@@ -41,7 +41,6 @@ from rse_pf.backend.witness import Witness
 from rse_pf.backend.worker_process import NUMBER_BYTES
 from rse_pf.control import key_set_of
 from rse_pf.errors import MissingExtra
-from rse_pf.objects import open_store
 from rse_pf.services.installed import installed_services, published_services
 from rse_pf.settings import PlatformSettings
 
@@ -136,7 +135,7 @@ class _Worker:
             settings=settings,
             most=-(-settings.services.max_environments // workers),
             server_id=server,
-            store=open_store(settings.data.store),
+            store=open_job_store(settings),
             monotonic=time.monotonic,
             loop=self._loop,
             log=self._log,
