@@ -22,7 +22,6 @@ _MOST_NAMES = 20000
 _SHORTEST_RETRY_MS = 1.0
 
 Key = TypeVar("Key", bound=Hashable)
-Name = TypeVar("Name")
 Value = TypeVar("Value")
 
 
@@ -178,6 +177,6 @@ class WaitingRoom(Generic[Key]):
             del self._of_source[source]
 
 
-def _half(names: dict[Name, Value]) -> dict[Name, Value]:
+def _half(names: dict[Key, Value]) -> dict[Key, Value]:
     """Return the younger ones, at most half of the names that are kept: to forget must stay rare."""
     return dict(list(names.items())[-_MOST_NAMES // 2 :])
