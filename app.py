@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 import sys
-import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -68,11 +67,19 @@ def main() -> int:
         build(app, settings, root / "build")
     except RsePfError as error:
         return _complain(error)
-    except (OSError, zipfile.BadZipFile) as error:
+    except OSError as error:
         return _complain(
             ConfigurationError(f"cannot read the packages in build: {error}", hint="run make assets")
         )
-    app.synth()
+    try:
+        app.synth()
+    except (RuntimeError, OSError) as error:
+        told = str(error).strip().splitlines() or ["no reason given"]
+        return _complain(
+            ConfigurationError(
+                f"synthesis failed: {told[0]}", hint="look at cdk.json, and at the output folder"
+            )
+        )
     return 0
 
 

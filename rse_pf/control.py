@@ -15,12 +15,11 @@ from typing import TypeVar
 from rse_pf.auth import KeySet
 from rse_pf.enrolment import DenyList, Roster, from_json, to_json
 from rse_pf.errors import ConfigurationError, Conflict, NotFound, RsePfError
+from rse_pf.names import DENY_NAME, ROBOTS_NAME
 from rse_pf.objects import DirectoryStore, ObjectStore
 
 __all__ = ["DENY_NAME", "ROBOTS_NAME", "ControlRoom", "Trust", "key_set_of"]
 
-DENY_NAME = "control/deny.json"
-ROBOTS_NAME = "control/robots.json"
 _TRIES = 20
 
 _T = TypeVar("_T", Roster, DenyList)

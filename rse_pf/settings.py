@@ -39,7 +39,7 @@ __all__ = [
 ]
 
 _OURS = "ours"
-_LIST = "AWS list prices, as dated"
+_LIST = "AWS list prices as remembered on that date; checked against no page"
 
 
 def setting(
@@ -291,9 +291,11 @@ class PriceSettings:
     """What AWS asks for, for `rse-pf cloud cost`: one dated table for one region, without taxes. Lay your own over it."""
 
     as_of: str = setting("2025-06, Seoul, from memory", doc="when and where these prices held, and who read them", source=_LIST)
-    server_hour_usd: float = setting(0.1008, unit="USD/h", doc="one cloud.instance_type, on demand (c7i.large)", source=_LIST, low=0)
-    server_vcpus: int = setting(2, doc="vCPUs of one cloud.instance_type", source=_LIST, low=1)
-    server_month_usd: float = setting(2.83, unit="USD/month", doc="beside the hours of a server: 8 GB of gp3, seven detailed metrics", source=_LIST, low=0)
+    region: str = setting("ap-northeast-2", doc="region for which these prices held")
+    instance_type: str = setting("c7i.large", doc="type of server for which they held")
+    server_hour_usd: float = setting(0.1008, unit="USD/h", doc="one prices.instance_type, on demand", source=_LIST, low=0)
+    server_vcpus: int = setting(2, doc="vCPUs of one prices.instance_type", source=_LIST, low=1)
+    server_month_usd: float = setting(3.13, unit="USD/month", doc="beside the hours of a server: 8 GB of gp3, seven detailed metrics, one of ours", source=_LIST, low=0)
     balancer_hour_usd: float = setting(0.0325, unit="USD/h", doc="the load balancer with two public addresses", source=_LIST, low=0)
     balancer_unit_hour_usd: float = setting(0.008, unit="USD/h", doc="one capacity unit: 3000 sockets, or 1 GB an hour", source=_LIST, low=0)
     endpoint_hour_usd: float = setting(0.013, unit="USD/h", doc="one interface endpoint in one zone", source=_LIST, low=0)

@@ -9,6 +9,7 @@ import hashlib
 import json
 import shutil
 import zipfile
+import zlib
 from pathlib import Path
 
 from rse_pf.errors import ConfigurationError
@@ -63,8 +64,7 @@ def _check_fresh(packages: Path) -> None:
         file.relative_to(packages).as_posix(): file.read_bytes() for file in (packages / _OURS).rglob("*.py")
     }
     for wheel in packages.glob(f"{_OURS}-*.whl"):
-        with zipfile.ZipFile(wheel) as archive:
-            built.update({each: archive.read(each) for each in archive.namelist() if _is_ours(each)})
+        built.update(_inside(wheel))
     if not built:
         return
     sources = {file.relative_to(_ROOT).as_posix(): file for file in (_ROOT / _OURS).rglob("*.py")}
@@ -72,6 +72,15 @@ def _check_fresh(packages: Path) -> None:
         raise ConfigurationError(
             f"the packages in {packages} were built of other sources", hint="run make assets"
         )
+
+
+def _inside(wheel: Path) -> dict[str, bytes]:
+    """Return our sources in *wheel*."""
+    try:
+        with zipfile.ZipFile(wheel) as archive:
+            return {each: archive.read(each) for each in archive.namelist() if _is_ours(each)}
+    except (OSError, EOFError, NotImplementedError, zipfile.BadZipFile, zlib.error) as error:
+        raise ConfigurationError(f"{wheel} cannot be read: {error}", hint="run make assets") from error
 
 
 def _is_ours(name: str) -> bool:

@@ -20,18 +20,15 @@ from aws_cdk import aws_s3_assets as s3_assets
 from aws_cdk import aws_sns as sns
 from constructs import Construct
 
+from rse_pf.names import GROUP, HOOK
 from rse_pf.scaling.alarms import NAMESPACE
 from rse_pf.settings import PlatformSettings
 from stacks.findings import acknowledge
 
-__all__ = ["GROUP", "HOOK", "BackendServers"]
-
-GROUP = "rse-pf"
-"""Name of the Auto Scaling group; fixed, so that an instance knows it before the group exists."""
-HOOK = "rse-pf-drain"
-"""Name of the hook that an instance completes when its robots are gone."""
+__all__ = ["BackendServers"]
 
 _BOOT = Path(__file__).parent / "boot" / "first_boot.py"
+_MAPS_FINDING = "IAM5[Resource::RsePf-Data:ExportsOutputFnGetAttMaps9A995C1AArn072BF5B2/*]"
 _GIB = 8
 _START_S = 300
 
@@ -51,12 +48,15 @@ class BackendServers(Construct):
         topic: sns.ITopic,
         targets: Sequence[elbv2.IApplicationTargetGroup],
         artifacts: s3.IBucket,
+        maps: s3.IBucket,
         key_set: str,
         settings: PlatformSettings,
     ) -> None:
         super().__init__(scope, construct_id)
         scaling = settings.scaling
         self.role = self._role(package, artifacts)
+        if settings.data.enabled:
+            self._let_in(maps)
         self.group = autoscaling.AutoScalingGroup(
             self, "Group", auto_scaling_group_name=GROUP, vpc=vpc,
             min_capacity=scaling.min_servers, max_capacity=scaling.max_servers,
@@ -66,6 +66,7 @@ class BackendServers(Construct):
                 {
                     "package": package.s3_object_url, "sha256": package_sums, "region": settings.cloud.region,
                     "bucket": artifacts.bucket_name, "keys": key_set, "group": GROUP, "hook": HOOK,
+                    "store": f"s3:{maps.bucket_name}" if settings.data.enabled else settings.data.store,
                 },
             ),
             health_checks=autoscaling.HealthChecks.with_additional_checks(
@@ -109,6 +110,14 @@ class BackendServers(Construct):
             role, "PutMetricData knows no resources; the condition allows one namespace", "IAM5[Resource::*]"
         )
         return role
+
+    def _let_in(self, maps: s3.IBucket) -> None:
+        """Robots' objects and maps, read and written by the servers and by the data service beside them."""
+        objects = maps.arn_for_objects("*")
+        actions = ["s3:GetObject", "s3:PutObject", "s3:DeleteObject"]
+        self.role.add_to_policy(iam.PolicyStatement(actions=actions, resources=[objects]))
+        self.role.add_to_policy(iam.PolicyStatement(actions=["s3:ListBucket"], resources=[maps.bucket_arn]))
+        acknowledge(self.role, "names of objects are digests, which nobody knows beforehand", _MAPS_FINDING)
 
     def _template(
         self,

@@ -11,9 +11,10 @@ from aws_cdk import aws_s3_assets as s3_assets
 from aws_cdk import aws_sns as sns
 from constructs import Construct
 
+from rse_pf.names import DENY_NAME, GROUP, KEYS_NAME, ROBOTS_NAME
 from rse_pf.settings import PlatformSettings
 from stacks.assets import WHEELHOUSE, staged, sums_digest
-from stacks.backend_servers import GROUP, BackendServers
+from stacks.backend_servers import BackendServers
 from stacks.data_stack import DataStack
 from stacks.findings import acknowledge
 from stacks.load_balancer import LoadBalancer
@@ -22,9 +23,8 @@ from stacks.scale_modifier import ScaleModifier
 
 __all__ = ["KEY_SET", "TRUSTED", "BackendStack"]
 
-KEY_SET = "keys.json"
-"""Name of the public key set in the artifact bucket."""
-TRUSTED = (KEY_SET, "control/robots.json", "control/deny.json")
+KEY_SET = KEYS_NAME
+TRUSTED = (KEYS_NAME, ROBOTS_NAME, DENY_NAME)
 """What says who may come in: keys, enrolled robots, revoked tokens."""
 
 
@@ -62,7 +62,7 @@ class BackendStack(cdk.Stack):
         self.servers = BackendServers(
             self, "Servers", vpc=network.vpc, firewall_group=network.firewall.servers, package=package,
             package_sums=sums, topic=self.topic, targets=list(self.balancer.targets.values()),
-            settings=settings, artifacts=data.artifacts, key_set=KEY_SET,
+            settings=settings, artifacts=data.artifacts, maps=data.maps, key_set=KEY_SET,
         )  # fmt: skip
         self.servers.role.add_to_policy(
             iam.PolicyStatement(

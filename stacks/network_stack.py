@@ -55,7 +55,8 @@ class NetworkStack(cdk.Stack):
         self.s3 = self.vpc.add_gateway_endpoint("S3", service=ec2.GatewayVpcEndpointAwsService.S3)
         self.s3.add_to_policy(
             iam.PolicyStatement(
-                principals=[iam.AnyPrincipal()], actions=["s3:GetObject", "s3:PutObject", "s3:ListBucket"],
+                principals=[iam.AnyPrincipal()],
+                actions=["s3:GetObject", "s3:PutObject", "s3:DeleteObject", "s3:ListBucket"],
                 resources=["*"], conditions={"StringEquals": {"aws:ResourceAccount": self.account}},
             )
         )  # fmt: skip

@@ -138,7 +138,7 @@ class Agent:
         now = read_page(self._machine.page())
         if self._before is None:
             self._before = now  # what was before this agent began is not this period's
-        data = datums(self._before, now, self._post.group)
+        data = datums(self._before, now, self._post.group, self._machine.instance_id())
         ask(self._cloudwatch, "put_metric_data", Namespace=NAMESPACE, MetricData=data)
         self._before = now
 

@@ -19,6 +19,16 @@ MOST_S = 10.0
 _CONNECT_S, _READ_S = 1.0, 3.5
 _FIRST_PAUSE_S = 0.1
 _THROTTLED = 429
+_LATER = frozenset(
+    {
+        "Throttling", "ThrottlingException", "ThrottledException", "RequestThrottled",
+        "EC2ThrottledException", "RequestThrottledException", "TooManyRequestsException",
+        "RequestLimitExceeded", "SlowDown", "BandwidthLimitExceeded",
+        "ProvisionedThroughputExceededException", "PriorRequestNotComplete",
+        "TransactionInProgressException", "RequestTimeout", "RequestTimeoutException",
+    }
+)  # fmt: skip
+"""What services of AWS call "come again", most of them with status 400."""
 
 T = TypeVar("T")
 
@@ -92,4 +102,4 @@ def status_of(error: Any) -> int:
 
 def _may_pass(error: Any) -> bool:
     code = error.response.get("Error", {}).get("Code", "")
-    return status_of(error) >= 500 or status_of(error) == _THROTTLED or code in ("Throttling", "SlowDown")
+    return status_of(error) >= 500 or status_of(error) == _THROTTLED or code in _LATER

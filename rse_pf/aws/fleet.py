@@ -5,22 +5,20 @@ Promises to change nothing, and to say when nobody told a number instead of call
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from datetime import datetime, timedelta
-from typing import Any
 
 from rse_pf.aws.account import Account
+from rse_pf.aws.metrics import ROBOTS, dimensions_of
 from rse_pf.errors import ConfigurationError
+from rse_pf.names import GROUP
 from rse_pf.scaling.alarms import NAMESPACE
 from rse_pf.settings import PlatformSettings
 
 __all__ = ["GROUP", "Fleet", "Server", "look_at"]
 
-GROUP = "rse-pf"
-"""Name of the Auto Scaling group."""
 _ALARMS = "rse-pf-"
 _PERIODS = 3
-_STATISTICS = ("Sum", "Minimum", "Maximum", "SampleCount")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -36,17 +34,18 @@ class Server:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Fleet:
-    """Everything `rse-pf cloud status` shows.
-
-    ``robots`` maps Sum, Minimum, Maximum and SampleCount, over the servers, of the last period that has any.
-    """
+    """Everything `rse-pf cloud status` shows."""
 
     least: int
     wanted: int
     most: int
     servers: tuple[Server, ...]
     alarms: dict[str, str]
-    robots: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def robots(self) -> tuple[float, ...]:
+        """How many robots each server has that told it."""
+        return tuple(each.robots for each in self.servers if each.robots is not None)
 
     @property
     def is_well(self) -> bool:
@@ -93,7 +92,6 @@ def look_at(account: Account, settings: PlatformSettings, *, now: datetime) -> F
             for each in sorted(group["Instances"], key=lambda one: str(one["InstanceId"]))
         ),
         alarms={each["AlarmName"].removeprefix(_ALARMS): each["StateValue"] for each in alarms},
-        robots={name: told[name] for name in _STATISTICS if name in told},
     )
 
 
@@ -108,29 +106,33 @@ def _health(account: Account, target_groups: list[str]) -> list[dict[str, str]]:
 
 
 def _robots(account: Account, servers: list[str], period_s: int, now: datetime) -> dict[str, float]:
-    """Return the newest values of the metric Robots, by statistic and by server; absent is absent."""
-    asked: list[tuple[str, str, dict[str, str]]] = [(each, each, {}) for each in _STATISTICS]
-    asked += [(each, "Average", {"InstanceId": each}) for each in servers]
+    """Return the newest value of each server in the last periods that are over; absent is absent.
+
+    The period that runs is left out: half of the servers may not have told theirs yet.
+    """
+    end = datetime.fromtimestamp(now.timestamp() // period_s * period_s, now.tzinfo)
     queries = [
         {
             "Id": f"q{at}",
-            "MetricStat": {"Metric": _metric(more), "Period": period_s, "Stat": statistic},
+            "MetricStat": {
+                "Metric": {
+                    "Namespace": NAMESPACE, "MetricName": ROBOTS, "Dimensions": dimensions_of(GROUP, server),
+                },
+                "Period": period_s,
+                "Stat": "Maximum",
+            },
         }
-        for at, (_, statistic, more) in enumerate(asked)
-    ]
+        for at, server in enumerate(servers)
+    ]  # fmt: skip
+    if not queries:
+        return {}
     found = account.pages(
         "cloudwatch", "get_metric_data", "MetricDataResults",
         MetricDataQueries=queries, ScanBy="TimestampDescending",
-        StartTime=now - timedelta(seconds=_PERIODS * period_s), EndTime=now,
+        StartTime=end - timedelta(seconds=_PERIODS * period_s), EndTime=end,
     )  # fmt: skip
-    newest = {row["Id"]: row["Values"][0] for row in found if row["Values"]}
-    return {name: newest[f"q{at}"] for at, (name, _, _) in enumerate(asked) if f"q{at}" in newest}
-
-
-def _metric(more: dict[str, str]) -> dict[str, Any]:
-    dimensions = {"AutoScalingGroupName": GROUP, **more}
-    return {
-        "Namespace": NAMESPACE,
-        "MetricName": "Robots",
-        "Dimensions": [{"Name": name, "Value": value} for name, value in dimensions.items()],
-    }
+    newest: dict[str, float] = {}
+    for row in found:
+        if row["Values"]:
+            newest.setdefault(servers[int(row["Id"].removeprefix("q"))], row["Values"][0])
+    return newest

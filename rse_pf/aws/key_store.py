@@ -16,13 +16,11 @@ from rse_pf.aws.s3_store import S3Store
 from rse_pf.aws.secrets import read_secret, write_secret
 from rse_pf.control import ControlRoom
 from rse_pf.errors import ConfigurationError, NotFound, UsageError
+from rse_pf.names import DATA_STACK, KEYS_NAME
 from rse_pf.settings import PlatformSettings
 
 __all__ = ["DATA_STACK", "KEYS_NAME", "KeyRing", "KeyStore", "open_key_store", "spread_s"]
 
-DATA_STACK = "RsePf-Data"
-KEYS_NAME = "keys.json"
-"""Name of the public key set in the artifact bucket."""
 _SECRET, _BUCKET = "SigningKey", "Artifacts"
 _MAKE_ONE = "make one with rse-pf token init --cloud"
 
@@ -84,11 +82,12 @@ class KeyRing:
             )
         return KeyRing(keys=(self.keys[-1], (key, now + spread_s(settings))))
 
-    def retired(self, *, now: float) -> KeyRing:
+    def retired(self, *, now: float, force: bool = False) -> KeyRing:
         """Return the newest key alone, signing from *now*: the others are trusted no longer.
 
         Raises:
-            ConfigurationError: There is no other key.
+            ConfigurationError: There is no other key; or not every server knows the newest yet and *force* is
+                not given: robots with good tokens would be refused.
         """
         if len(self.keys) == 1:
             raise ConfigurationError(
@@ -96,6 +95,11 @@ class KeyRing:
                 hint="add another with rse-pf token rotate --cloud first",
             )
         key, from_s = self.keys[-1]
+        if now < from_s and not force:
+            raise ConfigurationError(
+                f"for {from_s - now:.0f} s more servers may not know key {key.key_id} and refuse robots",
+                hint="wait; if the key before was stolen, add --force",
+            )
         return KeyRing(keys=((key, min(from_s, now)),))
 
 

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from rse_pf.aws.account import Account
+from rse_pf.errors import ConfigurationError
 
 __all__ = ["Leftover", "find_leftovers", "living_stacks"]
 
@@ -26,12 +27,13 @@ _KEPT = {
 
 @dataclass(frozen=True, slots=True, kw_only=True, order=True)
 class Leftover:
-    """One thing that is still there; ``remove`` is a command."""
+    """One thing that is still there; ``remove`` is a command.  ``unread``: perhaps it is not ours."""
 
     kind: str
     name: str
     why: str
     remove: str
+    unread: bool = False
 
 
 def living_stacks(account: Account) -> list[str]:
@@ -50,17 +52,26 @@ def find_leftovers(account: Account) -> list[Leftover]:
             "cloudformation", "list_stack_resources", "StackResourceSummaries", StackName=stack
         )
     }
-    found = {(kind, name) for kind, name, alias in _all_of_ours(account) if not owned & {name, alias}}
+    unread: dict[str, str] = {}
+    found = {(kind, name) for kind, name, alias in _all_of_ours(account, unread) if not owned & {name, alias}}
     return sorted(
-        Leftover(kind=kind, name=name, why=_KEPT.get(kind, "forgotten"), remove=_remove(kind, name))
+        Leftover(
+            kind=kind, name=name, remove=_remove(kind, name), unread=name in unread,
+            why=unread.get(name) or _KEPT.get(kind, "forgotten"),
+        )
         for kind, name in found
-    )
+    )  # fmt: skip
 
 
-def _all_of_ours(account: Account) -> Iterator[tuple[str, str, str]]:
-    """Yield kind, name, and the other name that CloudFormation may know it by."""
+def _all_of_ours(account: Account, unread: dict[str, str]) -> Iterator[tuple[str, str, str]]:
+    """Yield kind, name, and the other name that CloudFormation may know it by; fill *unread* with reasons."""
     for row in account.pages("s3", "list_buckets", "Buckets"):
-        if _is_tagged(account, row["Name"]):
+        try:
+            is_ours = _is_tagged(account, row["Name"])
+        except ConfigurationError as error:
+            unread[row["Name"]] = f"perhaps not ours, it cannot be looked into: {error}"
+            is_ours = True
+        if is_ours:
             yield "bucket", row["Name"], ""
     for row in account.pages("secretsmanager", "list_secrets", "SecretList"):
         if any(tag["Key"] == _TAG for tag in row.get("Tags", ())):

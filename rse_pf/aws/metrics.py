@@ -1,7 +1,7 @@
 """Turn a server's own metrics page into what CloudWatch's alarms and dashboard read.
 
 Pure: text in, data out.  A counter that fell was reset by a restart, and counts from zero again.  Promises
-the names of `rse_pf.scaling.alarms`, one dimension (the group), and no robot's name.
+the names of `rse_pf.scaling.alarms`, the dimensions of `dimensions_of`, and no robot's name.
 """
 
 from __future__ import annotations
@@ -12,7 +12,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-__all__ = ["Reading", "datums", "read_page"]
+__all__ = ["ROBOTS", "Reading", "datums", "dimensions_of", "read_page"]
+
+ROBOTS = "Robots"
+"""The one metric that is told for each server, too."""
 
 _LINE = re.compile(r"^rse_pf_(\w+?)(?:\{(.*)\})? (\S+)$", flags=re.M)
 _LABEL = re.compile(r'(\w+)="([^"]*)"')
@@ -64,21 +67,29 @@ def read_page(text: str) -> Reading:
     )
 
 
-def datums(before: Reading, now: Reading, group: str) -> list[dict[str, Any]]:
-    """Return the MetricData of one period between two looks, for PutMetricData."""
+def dimensions_of(group: str, server: str = "") -> list[dict[str, str]]:
+    """Return the dimensions of what is told for a group or, where *server* is an instance, for it alone."""
+    named = {"AutoScalingGroupName": group, **({"InstanceId": server} if server else {})}
+    return [{"Name": name, "Value": value} for name, value in named.items()]
+
+
+def datums(before: Reading, now: Reading, group: str, server: str) -> list[dict[str, Any]]:
+    """Return the MetricData of one period between two looks of the instance *server*, for PutMetricData."""
     values = {
-        "Robots": (now.robots, "Count"),
+        ROBOTS: (now.robots, "Count"),
         "InFlight": (now.in_flight, "Count"),
         "QueueMs": (now.queue_ms, "Milliseconds"),
         "Requests": (_since(before.requests, now.requests), "Count"),
         "BytesIn": (_since(before.bytes_in, now.bytes_in), "Bytes"),
         "BytesOut": (_since(before.bytes_out, now.bytes_out), "Bytes"),
     }
-    dimensions = [{"Name": "AutoScalingGroupName", "Value": group}]
+    dimensions = dimensions_of(group)
     made: list[dict[str, Any]] = [
         {"MetricName": name, "Dimensions": dimensions, "Value": value, "Unit": unit}
         for name, (value, unit) in values.items()
     ]
+    of_server = dimensions_of(group, server)
+    made.append({"MetricName": ROBOTS, "Dimensions": of_server, "Value": now.robots, "Unit": "Count"})
     slots = _answers_between(before.answers, now.answers)
     if slots:
         made.append(

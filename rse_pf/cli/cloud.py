@@ -177,7 +177,14 @@ def _cost(args: argparse.Namespace, settings: PlatformSettings) -> int:
     )
     if costs.servers > most or costs.at_once > at_once:
         print("more than scaling.max_servers or cloud.lambda_concurrency allows: robots would be refused")
-    print(f"\nprices: {settings.prices.as_of} (settings, group prices); a month has {HOURS:g} h")
+    prices, cloud = settings.prices, settings.cloud
+    print(f"\nprices: {prices.as_of} (settings, group prices); a month has {HOURS:g} h")
+    for what, of, wanted in (
+        ("cloud.region", prices.region, cloud.region),
+        ("cloud.instance_type", prices.instance_type, cloud.instance_type),
+    ):
+        if of != wanted:
+            print(f"WRONG PRICES: they are for {of}, and {what} is {wanted}: lay your own over group prices")
     print(f"not included: {NOT_INCLUDED}")
     return 0
 
@@ -194,11 +201,9 @@ def _status(args: argparse.Namespace, settings: PlatformSettings) -> int:
         robots = "robots: not told" if each.robots is None else f"{each.robots:g} robots"
         print(f"  {each.name}  {each.zone}  {each.state:<12}  {health:<20}  {robots}")
     if fleet.robots:
-        told = {name: f"{value:g}" for name, value in fleet.robots.items()}
-        print(
-            f"{told['Sum']} robots on {told['SampleCount']} servers, "
-            f"{told['Minimum']} to {told['Maximum']} on each"
-        )
+        told = fleet.robots
+        of = f" of {len(fleet.servers)}" if len(told) < len(fleet.servers) else ""
+        print(f"{sum(told):g} robots on {len(told)}{of} servers, {min(told):g} to {max(told):g} on each")
     else:
         print("robots: no server told how many it has")
     for name, state in sorted(fleet.alarms.items()):
@@ -218,5 +223,6 @@ def _leftovers(args: argparse.Namespace, settings: PlatformSettings) -> int:
     found = find_leftovers(account)
     for each in found:
         print(f"{each.kind}  {each.name}\n  {each.why}\n  remove: {each.remove}")
-    print(f"{len(found)} left over")
+    unread = sum(each.unread for each in found)
+    print(f"{len(found) - unread} left over" + (f", {unread} could not be looked into" if unread else ""))
     return 1 if found else 0

@@ -124,7 +124,7 @@ def control_room(args: argparse.Namespace, settings: PlatformSettings) -> Contro
 def note(
     args: argparse.Namespace, settings: PlatformSettings, action: str, subject: str, **detail: Value
 ) -> None:
-    """Record what was done in the audit log of a local platform; a cloud's own trail has it there."""
+    """Record what was done in the audit log of a local platform; in a cloud the bucket keeps all versions."""
     if not args.cloud:
         from rse_pf.local.state import state_folder
 

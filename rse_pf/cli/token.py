@@ -70,10 +70,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help=f"issue: life in seconds (auth.token_life_s, default {life_s})",
     )
     parser.add_argument("--keys", type=Path, metavar="FILE", help="inspect: verify with this JWKS")
+    parser.add_argument(
+        "--force", action="store_true", help="retire: even if servers do not know the new key yet"
+    )
 
 
 def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
     """Do one action, by the settings that the platform was started with unless told otherwise."""
+    if args.force and args.action != "retire":
+        raise UsageError("--force is for retire", hint="see rse-pf token --help")
     if args.action in _KEY_ACTIONS:
         return _change_keys(args, settings)
     if args.action == "revoke":
@@ -179,7 +184,7 @@ def _change_keys(args: argparse.Namespace, settings: PlatformSettings) -> int:
         print(f"key {new.key_id} is published, and signs in {spread_s(settings):g} s")
         return 0
     if args.action == "retire":
-        ring = store.ring().retired(now=now)
+        ring = store.ring().retired(now=now, force=args.force)
         store.write(ring)
         print(f"key {ring.keys[0][0].key_id} alone is trusted; servers know it in {spread_s(settings):g} s")
         return 0

@@ -32,9 +32,12 @@ def units_of(settings):
 def environment_file(facts):
     """Return what the units read: where this server stands.
 
-    *facts* holds ``server``, ``bucket``, ``keys``, ``group`` and ``hook``.
+    *facts* holds ``server``, ``bucket``, ``keys``, ``group``, ``hook`` and ``store``.
     """
-    names = {"SERVER_ID": "server", "BUCKET": "bucket", "KEYS_NAME": "keys", "GROUP": "group", "HOOK": "hook"}
+    names = {
+        "SERVER_ID": "server", "BUCKET": "bucket", "KEYS_NAME": "keys", "GROUP": "group", "HOOK": "hook",
+        "STORE": "store",
+    }  # fmt: skip
     for name in names.values():
         if not facts[name] or any(sign in facts[name] for sign in "\n\r\"'\\ $"):
             raise SystemExit(f"install: {name} = {facts[name]!r} is no plain word")

@@ -4,13 +4,20 @@ from __future__ import annotations
 
 import dataclasses
 from datetime import datetime, timedelta, timezone
+from pathlib import Path
 from typing import Any
 
 import pytest
+from aws.fake_machine import FakeMachine, FakeScaling
 
 from rse_pf.aws.account import open_account
+from rse_pf.aws.agent import Agent, Post
+from rse_pf.aws.clients import make_client
 from rse_pf.aws.fleet import GROUP, Fleet, Server, look_at
+from rse_pf.aws.metrics import Reading, datums
 from rse_pf.errors import ConfigurationError
+from rse_pf.objects import MemoryStore
+from rse_pf.scaling.alarms import NAMESPACE
 from rse_pf.settings import PlatformSettings
 
 SETTINGS = PlatformSettings()
@@ -42,13 +49,12 @@ def servers(region: str) -> list[str]:
     return sorted(each["InstanceId"] for each in group["Instances"])
 
 
-def tell(region: str, value: float, minutes_ago: float, **more: str) -> None:
-    dimensions = [{"Name": k, "Value": v} for k, v in {"AutoScalingGroupName": GROUP, **more}.items()]
-    datum = {
-        "MetricName": "Robots", "Dimensions": dimensions, "Value": value, "Unit": "Count",
-        "Timestamp": NOW - timedelta(minutes=minutes_ago),
-    }  # fmt: skip
-    open_account(region).client("cloudwatch").put_metric_data(Namespace="RsePf", MetricData=[datum])
+def tell(region: str, server: str, robots: int, minutes_ago: float) -> None:
+    """Publish what an agent publishes, as of some minutes ago."""
+    reading = Reading(robots=robots)
+    when = NOW - timedelta(minutes=minutes_ago)
+    data = [{**datum, "Timestamp": when} for datum in datums(reading, reading, GROUP, server)]
+    open_account(region).client("cloudwatch").put_metric_data(Namespace=NAMESPACE, MetricData=data)
 
 
 def test_servers_and_alarms_are_shown_and_untold_robots_are_not_zero(region: str, servers: list[str]) -> None:
@@ -57,27 +63,56 @@ def test_servers_and_alarms_are_shown_and_untold_robots_are_not_zero(region: str
     assert (fleet.least, fleet.wanted, fleet.most) == (2, 2, 4)
     assert [each.name for each in fleet.servers] == servers
     assert [each.robots for each in fleet.servers] == [None, None]
-    assert fleet.robots == {}
+    assert fleet.robots == ()
     assert list(fleet.alarms) == ["busy"]
     assert all(len(each.targets) == 1 for each in fleet.servers)
 
 
-def test_the_newest_period_counts_over_all_servers_and_by_server(region: str, servers: list[str]) -> None:
-    tell(region, 99, 2.5)
-    tell(region, 12, 1)
-    tell(region, 30, 1)
-    tell(region, 12, 1, InstanceId=servers[0])
+def test_each_server_has_the_robots_that_its_agent_published_last(region: str, servers: list[str]) -> None:
+    tell(region, servers[0], 99, 2.5)
+    tell(region, servers[0], 12, 1)
+    tell(region, servers[1], 30, 1)
 
     fleet = look_at(open_account(region), SETTINGS, now=NOW)
 
-    assert fleet.robots == {"Sum": 42, "Minimum": 12, "Maximum": 30, "SampleCount": 2}
-    assert [each.robots for each in fleet.servers] == [12, None]
+    assert [each.robots for each in fleet.servers] == [12, 30]
+    assert fleet.robots == (12, 30)
+
+
+def test_what_a_running_agent_publishes_is_what_the_status_shows(
+    region: str, servers: list[str], tmp_path: Path
+) -> None:
+    machine = FakeMachine()
+    machine.instance_id = lambda: servers[0]  # type: ignore[method-assign]
+    machine.text = "rse_pf_robots 7\n"
+    post = Post(group=GROUP, hook="h", keys_name="k", keys_file=tmp_path / "keys.json")
+    Agent(
+        machine, cloudwatch=make_client("cloudwatch", region), autoscaling=FakeScaling(machine), post=post,
+        artifacts=MemoryStore(), settings=SETTINGS, log=lambda event, **fields: None, clock=machine.clock,
+        rest=machine.rest,
+    ).step()  # fmt: skip
+
+    fleet = look_at(open_account(region), SETTINGS, now=datetime.now(timezone.utc) + timedelta(minutes=1))
+
+    assert [each.robots for each in fleet.servers] == [7, None]
+
+
+def test_the_period_that_runs_is_left_out_so_that_no_server_is_missing_from_the_sum(
+    region: str, servers: list[str]
+) -> None:
+    for server, robots in zip(servers, (12, 30), strict=True):
+        tell(region, server, robots, 1)
+    tell(region, servers[0], 13, 0)  # the other's agent comes later in this minute
+
+    fleet = look_at(open_account(region), SETTINGS, now=NOW + timedelta(seconds=20))
+
+    assert fleet.robots == (12, 30)
 
 
 def test_a_number_that_is_older_than_three_periods_is_not_told(region: str, servers: list[str]) -> None:
-    tell(region, 99, 5)
+    tell(region, servers[0], 99, 5)
 
-    assert look_at(open_account(region), SETTINGS, now=NOW).robots == {}
+    assert look_at(open_account(region), SETTINGS, now=NOW).robots == ()
 
 
 def test_without_a_platform_the_hint_says_to_deploy(region: str) -> None:

@@ -106,10 +106,21 @@ def test_a_retired_key_is_trusted_no_longer_and_the_other_signs_at_once() -> Non
     rotated = ring("a").rotated(key("b"), now=BORN_S, settings=SETTINGS)
     stolen = key("a").issue("robot-1", now=BORN_S, token_id="t", settings=AUTH)
 
-    retired = rotated.retired(now=BORN_S + 1)
+    retired = rotated.retired(now=BORN_S + 1, force=True)
 
     assert not is_trusted(stolen, retired, BORN_S + 1)
     assert retired.signer(BORN_S + 1).key_id == "b"
+
+
+def test_a_key_is_not_retired_while_servers_may_not_know_the_next() -> None:
+    rotated = ring("a").rotated(key("b"), now=BORN_S, settings=SETTINGS)
+
+    with pytest.raises(ConfigurationError) as told:
+        rotated.retired(now=BORN_S + spread_s(SETTINGS) - 5)
+
+    assert told.value.message.startswith("for 5 s more servers may not know key b")
+    assert "--force" in told.value.hint
+    assert rotated.retired(now=BORN_S + spread_s(SETTINGS)).keys[0][0].key_id == "b"
 
 
 def test_the_only_key_is_not_retired() -> None:

@@ -8,6 +8,7 @@ import pytest
 
 from rse_pf.aws.account import Account, open_account
 from rse_pf.aws.leftovers import find_leftovers, living_stacks
+from rse_pf.errors import ConfigurationError
 
 TAG = {"Key": "rse-pf", "Value": "digest"}
 STACK = """{"Resources": {"Maps": {"Type": "AWS::S3::Bucket", "Properties": {
@@ -56,6 +57,27 @@ def test_each_kind_of_ours_is_found_and_nothing_of_others(region: str) -> None:
     for each in found:
         assert each.name in each.remove, "the command names it"
         assert each.why.startswith("kept on purpose") == (each.kind in ("bucket", "secret"))
+
+
+def test_a_bucket_that_cannot_be_looked_into_is_told_and_ends_nothing(
+    region: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    account = open_account(region)
+    ours = fill(account, region)
+    real = account.find
+
+    def find(service: str, method: str, **arguments: Any) -> dict[str, Any] | None:
+        if method == "get_bucket_tagging" and arguments["Bucket"] == "maps-theirs":
+            raise ConfigurationError("AWS refuses s3 get_bucket_tagging: AccessDenied")
+        return real(service, method, **arguments)
+
+    monkeypatch.setattr(account, "find", find)
+    found = find_leftovers(account)
+
+    (unread,) = [each for each in found if each.unread]
+    assert (unread.kind, unread.name) == ("bucket", "maps-theirs")
+    assert "AccessDenied" in unread.why
+    assert {each.kind: each.name for each in found if not each.unread} == ours
 
 
 def test_an_empty_account_has_none(region: str) -> None:

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from rse_pf.aws.metrics import Reading, datums, read_page
+from rse_pf.aws.metrics import Reading, datums, dimensions_of, read_page
 from rse_pf.scaling.alarms import NAMESPACE, alarms_of
 from rse_pf.settings import PlatformSettings
 
@@ -42,7 +42,7 @@ def test_counters_are_told_as_what_came_since_the_last_look() -> None:
     before = Reading(requests=100, bytes_in=10, answers={1.0: 90, 2.0: 100})
     now = Reading(requests=130, bytes_in=15, robots=4, answers={1.0: 95, 2.0: 130})
 
-    told = named(datums(before, now, "group"))
+    told = named(datums(before, now, "group", "i-1"))
 
     assert told["Requests"]["Value"] == 30
     assert told["BytesIn"]["Value"] == 5
@@ -52,7 +52,9 @@ def test_counters_are_told_as_what_came_since_the_last_look() -> None:
 
 def test_a_restarted_server_counts_from_zero_again() -> None:
     told = named(
-        datums(Reading(requests=100, answers={1.0: 100}), Reading(requests=7, answers={1.0: 7}), "group")
+        datums(
+            Reading(requests=100, answers={1.0: 100}), Reading(requests=7, answers={1.0: 7}), "group", "i-1"
+        )
     )
 
     assert told["Requests"]["Value"] == 7
@@ -60,7 +62,7 @@ def test_a_restarted_server_counts_from_zero_again() -> None:
 
 
 def test_no_answers_are_no_answer_times() -> None:
-    assert "AnswerMs" not in named(datums(Reading(), Reading(), "group"))
+    assert "AnswerMs" not in named(datums(Reading(), Reading(), "group", "i-1"))
 
 
 def test_every_series_that_an_alarm_reads_is_published_with_the_groups_name() -> None:
@@ -71,9 +73,12 @@ def test_every_series_that_an_alarm_reads_is_published_with_the_groups_name() ->
         for metric in alarm.metrics
         if metric.namespace == NAMESPACE
     }
-    told = datums(Reading(), Reading(), "rse-pf")
+    told = datums(Reading(), Reading(), "rse-pf", "i-1")
 
     assert wanted == {"Requests", "Robots", "QueueMs"}
     assert wanted <= set(named(told))
-    for each in told:
+    *of_group, of_server = told
+    for each in of_group:
         assert each["Dimensions"] == [{"Name": "AutoScalingGroupName", "Value": "rse-pf"}]
+    assert (of_server["MetricName"], of_server["Dimensions"]) == ("Robots", dimensions_of("rse-pf", "i-1"))
+    assert dimensions_of("rse-pf", "i-1")[1:] == [{"Name": "InstanceId", "Value": "i-1"}]

@@ -60,7 +60,16 @@ def test_a_service_that_fails_is_asked_three_times_within_ten_seconds(takes_s: f
 
 @pytest.mark.parametrize(
     ("code", "status", "tries"),
-    [("InternalError", 500, 3), ("SlowDown", 503, 3), ("Throttling", 400, 3), ("AccessDenied", 403, 1)],
+    [
+        ("InternalError", 500, 3),
+        ("SlowDown", 503, 3),
+        ("Throttling", 400, 3),
+        ("AccessDenied", 403, 1),
+        ("ThrottlingException", 400, 3),
+        ("RequestLimitExceeded", 400, 3),
+        ("TooManyRequestsException", 400, 3),
+        ("LimitExceededException", 400, 1),
+    ],
 )
 def test_only_what_may_pass_is_tried_again(code: str, status: int, tries: int) -> None:
     clock = Clock()

@@ -72,6 +72,28 @@ def test_the_prices_follow_the_settings(capsys: pytest.CaptureFixture[str], tmp_
     assert f"{730 * 3600}." in page, "a dollar for each command"
 
 
+@pytest.mark.parametrize(
+    ("cloud", "said"),
+    [
+        ({"region": "eu-central-1"}, "they are for ap-northeast-2, and cloud.region is eu-central-1"),
+        ({"instance_type": "c7i.xlarge"}, "they are for c7i.large, and cloud.instance_type is c7i.xlarge"),
+        ({}, ""),
+    ],
+)
+def test_prices_of_another_region_or_type_are_called_wrong(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, cloud: dict[str, str], said: str
+) -> None:
+    (tmp_path / "mine.json").write_text(
+        json.dumps({"context": {"rse-pf": {"cloud": cloud}}}), encoding="utf-8"
+    )
+
+    assert main(["cloud", "--settings", str(tmp_path / "mine.json"), "cost"]) == 0
+
+    page = capsys.readouterr().out
+    assert said in page
+    assert ("WRONG PRICES" in page) == bool(said)
+
+
 def test_a_load_beyond_the_settings_is_said(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["cloud", "cost", "--robots", "10000", "--fps", "30"]) == 0
 
@@ -211,9 +233,7 @@ def server(name: str, **changes: Any) -> Server:
 def test_the_status_of_a_well_fleet(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    told = {"Sum": 7.0, "Minimum": 7.0, "Maximum": 7.0, "SampleCount": 1.0}
-    fleet = Fleet(least=1, wanted=1, most=4, servers=(server("i-1"),), alarms={"idle": "OK"}, robots=told)
-    show(monkeypatch, fleet)
+    show(monkeypatch, Fleet(least=1, wanted=1, most=4, servers=(server("i-1"),), alarms={"idle": "OK"}))
 
     assert main(["cloud", "status"]) == 0
 
@@ -221,6 +241,17 @@ def test_the_status_of_a_well_fleet(
     assert "1 servers, wanted 1 of 1 to 4" in page
     assert "7 robots on 1 servers, 7 to 7 on each" in page
     assert "alarm idle         OK\n" in page
+
+
+def test_servers_that_told_no_robots_are_not_counted_as_empty(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    both = (server("i-1"), server("i-2", robots=None))
+    show(monkeypatch, Fleet(least=1, wanted=2, most=4, servers=both, alarms={}))
+
+    assert main(["cloud", "status"]) == 0
+
+    assert "7 robots on 1 of 2 servers, 7 to 7 on each" in capsys.readouterr().out
 
 
 def test_the_status_of_an_ill_fleet_leads_to_the_runbook(

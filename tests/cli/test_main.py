@@ -15,7 +15,7 @@ from rse_pf.settings import PlatformSettings, settings_page
 
 EMPTY = [
     "demo", "experiment", "local", "swarm", "token", "robot", "service", "serve", "data",
-    "map", "cloud", "settings", "doctor",
+    "map", "audit", "cloud", "settings", "doctor",
 ]  # fmt: skip
 HELP_S = 0.3
 

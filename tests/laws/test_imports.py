@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping
 
 import pytest
 
-GROUND = {"errors", "settings"}
+GROUND = {"errors", "settings", "names"}
 FIRST = {
     "geometry",
     "wire",
@@ -30,6 +30,7 @@ BELOW_LEAVES = GROUND | FIRST | SECOND
 
 MAY_IMPORT: dict[str, set[str]] = {
     "errors": set(),
+    "names": set(),
     "settings": {"errors", "setting_checks"},
     "setting_checks": {"errors"},
     "geometry": GROUND,
@@ -53,7 +54,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "local": {"settings", "scaling", "errors", "auth", "objects", "audit", "audit_log"},
     "client_sdk": {"settings", "errors", "geometry", "maps", "wire", "service", "services", "pnp"},
     "lambda_pnp": BELOW_LEAVES - {"scaling", "aws"},
-    "stacks": {"settings", "scaling", "errors"},
+    "stacks": {"settings", "scaling", "errors", "names"},
     "experiments": BELOW_LEAVES | LEAVES - {"stacks"},
     "cli": BELOW_LEAVES | LEAVES - {"stacks"} | {"experiments"},
     "app": {"settings", "errors", "stacks"},

@@ -8,6 +8,7 @@ import os
 import shutil
 import subprocess
 import sys
+import zipfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -81,6 +82,16 @@ def torn(checkout: Checkout) -> None:
     (wheelhouse(checkout) / "rse_pf-0.1.0-py3-none-any.whl").write_bytes(b"half a wheel")
 
 
+def rotten(checkout: Checkout) -> None:
+    """A wheel whose table of contents is whole, and what it holds is not."""
+    wheel = wheelhouse(checkout) / "rse_pf-0.1.0-py3-none-any.whl"
+    with zipfile.ZipFile(wheel, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("rse_pf/errors.py", "x = 1\n" * 500)
+    data = bytearray(wheel.read_bytes())
+    data[50:60] = bytes(10)
+    wheel.write_bytes(data)
+
+
 def settings(**groups: dict[str, Any]) -> Callable[[Checkout], None]:
     return lambda checkout: checkout.overrides(groups)
 
@@ -108,7 +119,8 @@ def surroundings(repository: Path) -> dict[str, str]:
         (lost, "no packages in"),
         (a_file, "no packages in"),
         (stale, "were built of other sources"),
-        (torn, "cannot read the packages in build"),
+        (torn, "rse_pf-0.1.0-py3-none-any.whl cannot be read: "),
+        (rotten, "rse_pf-0.1.0-py3-none-any.whl cannot be read: "),
     ],
 )
 def test_bad_input_is_one_line_and_a_hint(
@@ -122,6 +134,21 @@ def test_bad_input_is_one_line_and_a_hint(
     assert words in first
     assert second.startswith("  hint: ")
     assert not (checkout.folder / "cdk.out").exists()
+
+
+def test_a_synthesis_that_fails_is_one_line_and_a_hint(
+    capsys: pytest.CaptureFixture[str], checkout: Checkout, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def failing(app: object) -> None:
+        raise RuntimeError("EROFS: read-only file system\n    at writeFileSync (node:fs)")
+
+    monkeypatch.setattr("aws_cdk.App.synth", failing)
+
+    assert checkout.run() == 2
+
+    first, second = capsys.readouterr().err.splitlines()[-2:]
+    assert first.endswith("synthesis failed: EROFS: read-only file system")
+    assert second.startswith("  hint: ")
 
 
 @pytest.mark.parametrize("context", [{"max_servers": 4}, {"rse-pf": {"scaling": {"max_servers": 4}}}])

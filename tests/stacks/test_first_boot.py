@@ -21,7 +21,10 @@ from stacks.boot.install import environment_file, units_of
 
 NOW = datetime(2026, 11, 21, 6, 0, 0, tzinfo=timezone.utc)
 USER_DATA_BYTES = 16384
-FACTS = {"server": "i-0abc", "bucket": "artifacts", "keys": "keys.json", "group": "rse-pf", "hook": "drain"}
+FACTS = {
+    "server": "i-0abc", "bucket": "artifacts", "keys": "keys.json", "group": "rse-pf", "hook": "drain",
+    "store": "s3:maps",
+}  # fmt: skip
 
 
 def test_the_boot_script_signs_as_the_function_does() -> None:
@@ -124,6 +127,16 @@ def test_every_service_has_its_own_user_and_walls_and_comes_back(repository: Pat
     assert unit(repository, name)["Unit"]["StartLimitIntervalSec"] == "0", "a unit that gives up stays down"
 
 
+@pytest.mark.parametrize("name", ["rse-pf.service", "rse-pf-data.service"])
+def test_the_server_and_the_data_service_share_a_store_and_keep_an_audit_log(
+    repository: Path, name: str
+) -> None:
+    started = unit(repository, name)["Service"]["ExecStart"]
+
+    assert " --store ${STORE} " in f"{started} "
+    assert " --audit /var/lib/rse-pf/audit" in started
+
+
 def test_a_server_that_was_drained_stays_down(repository: Path) -> None:
     assert unit(repository, "rse-pf.service")["Service"]["Restart"] == "on-failure"
 
@@ -139,6 +152,7 @@ def test_a_data_group_is_attached_exactly_when_the_data_unit_starts(assembly: An
 def test_the_environment_file_holds_plain_words_only() -> None:
     assert environment_file(FACTS).splitlines() == [
         "SERVER_ID=i-0abc", "BUCKET=artifacts", "KEYS_NAME=keys.json", "GROUP=rse-pf", "HOOK=drain",
+        "STORE=s3:maps",
     ]  # fmt: skip
     for bad in ("", "a\nUser=root", "a b", '"', "$HOME"):
         with pytest.raises(SystemExit, match="no plain word"):

@@ -26,7 +26,7 @@ RUN_HERE = {
     "rse-pf token issue robot-1 --cloud": 0,
     "rse-pf cloud status": 2,
     "rse-pf token rotate --cloud": 0,
-    "rse-pf token retire --cloud": 0,
+    "rse-pf token retire --cloud --force": 0,
     "rse-pf cloud leftovers": 1,
 }
 """Each with its exit code on an account that has the Data stack and nothing else."""

@@ -117,9 +117,10 @@ def test_what_the_commands_look_for_is_what_the_stacks_call_it(assembly: Assembl
     from rse_pf.aws.fleet import GROUP
     from rse_pf.aws.key_store import DATA_STACK, KEYS_NAME
     from rse_pf.control import DENY_NAME, ROBOTS_NAME
-    from stacks import backend_servers, backend_stack
+    from stacks import backend_stack
 
-    assert (GROUP, KEYS_NAME) == (backend_servers.GROUP, backend_stack.KEY_SET)
+    (group,) = assembly.all("AWS::AutoScaling::AutoScalingGroup")
+    assert group["AutoScalingGroupName"] == GROUP
     assert {KEYS_NAME, ROBOTS_NAME, DENY_NAME} == set(backend_stack.TRUSTED)
     resources = assembly.templates[DATA_STACK]["Resources"]
     for word, kind in (("SigningKey", "AWS::SecretsManager::Secret"), ("Artifacts", "AWS::S3::Bucket")):
@@ -128,6 +129,34 @@ def test_what_the_commands_look_for_is_what_the_stacks_call_it(assembly: Assembl
         each for each in assembly.all("AWS::EC2::VPCEndpoint") if each["VpcEndpointType"] == "Interface"
     ]
     assert sum(len(each["SubnetIds"]) for each in interfaces) == interface_endpoints(assembly.settings)
+
+
+def test_servers_reach_the_map_bucket_exactly_when_the_data_service_runs(assembly: Assembly) -> None:
+    statements = [
+        statement
+        for policy in assembly.all("AWS::IAM::Policy")
+        for statement in policy["PolicyDocument"]["Statement"]
+        if "s3:DeleteObject" in _listed(statement["Action"])
+    ]
+    script = json.dumps(assembly.one("AWS::EC2::LaunchTemplate")["LaunchTemplateData"]["UserData"])
+    named = [word for word in ("store", "Maps") if f"{word}" in script]
+
+    if not assembly.settings.data.enabled:
+        assert statements == []
+        assert "s3:" not in script.partition("store")[2][:12]
+        assert "Maps" not in script
+        return
+    (statement,) = statements
+    assert sorted(_listed(statement["Action"])) == ["s3:DeleteObject", "s3:GetObject", "s3:PutObject"]
+    assert "Maps" in json.dumps(statement["Resource"])
+    assert named == ["store", "Maps"]
+    (gate,) = [
+        each["PolicyDocument"]["Statement"]
+        for each in assembly.all("AWS::EC2::VPCEndpoint")
+        if each["VpcEndpointType"] == "Gateway"
+    ]
+    let_through = {action for one in gate for action in _listed(one["Action"])}
+    assert {"s3:DeleteObject", "s3:GetObject", "s3:PutObject", "s3:ListBucket"} <= let_through
 
 
 def test_no_target_group_belongs_to_a_service_that_does_not_run(assembly: Assembly) -> None:

@@ -89,7 +89,7 @@ class World:
         self.inside("fill", str(archive))
         facts = {
             "package": "s3://assets/package.zip", "sha256": digest, "region": REGION, "bucket": "artifacts",
-            "keys": "keys.json", "group": "rse-pf", "hook": "rse-pf-drain",
+            "keys": "keys.json", "group": "rse-pf", "hook": "rse-pf-drain", "store": "memory:",
         }  # fmt: skip
         script = (HERE.parents[2] / "stacks/boot/first_boot.py").read_text()
         (self.root / "boot-test/user-data").write_text(f"{script}\nmain({json.dumps(facts)})\n")

@@ -1,0 +1,93 @@
+"""What the data service records: how maps change and by whom, and refused tokens within bounds."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from fake_data_service import KEY, Service, small_settings
+
+from rse_pf.audit import Entry
+from rse_pf.audit_check import check_folder, entries_of
+from rse_pf.audit_log import AuditLog, files_of
+from rse_pf.data_server.app import DataServer
+from rse_pf.maps import MapVersion, encode_map
+from rse_pf.objects import MemoryStore, digest_of
+
+MAPS = "/data/v1/maps/kitchen"
+
+
+class Recorded(Service):
+    """A service with an audit log."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.log = AuditLog(folder, "data", wall_clock=lambda: 1e9, most_bytes=1 << 20, sync_s=0.1).open()
+        super().__init__(small_settings(), MemoryStore())
+
+    def restart(self) -> None:
+        self.app = DataServer(
+            self.settings, self.store, keys=KEY.key_set, log=self.lines.append, clock=lambda: self.now,
+            wall_clock=lambda: self.wall, audit=self.log,
+        )  # fmt: skip
+
+    def entries(self) -> list[Entry]:
+        self.app.record_counted()
+        self.log.flush()
+        assert check_folder(self.folder)[0].problem == ""
+        return list(entries_of(files_of(self.folder, "data")))
+
+    def commit(self, seed: int, parent: str | None, *, robot: str, tenant: str = "default") -> str:
+        data = encode_map(MapVersion(keyframes=(), provenance={"seed": seed}))
+        self.ask("PUT", f"/data/v1/objects/{digest_of(data)}", data, robot=robot, tenant=tenant)
+        body = json.dumps({"digest": digest_of(data), "parent": parent, "note": "n"}).encode()
+        return str(self.ask("POST", f"{MAPS}/versions", body, robot=robot, tenant=tenant).json["id"])
+
+
+@pytest.fixture
+def recorded(tmp_path: Path) -> Iterator[Recorded]:
+    service = Recorded(tmp_path)
+    yield service
+    service.log.close()
+
+
+def test_commits_and_rollbacks_are_recorded_with_robot_map_and_version(recorded: Recorded) -> None:
+    first = recorded.commit(1, None, robot="robot-1")
+    second = recorded.commit(2, first, robot="robot-2")
+    body = json.dumps({"version": first, "expected": second}).encode()
+    assert recorded.ask("PUT", f"{MAPS}/head", body, robot="robot-3").status == 200
+
+    assert [(e.action, e.actor, e.subject, e.detail["version"]) for e in recorded.entries()] == [
+        ("map.commit", "robot-1", "kitchen", first),
+        ("map.commit", "robot-2", "kitchen", second),
+        ("map.head", "robot-3", "kitchen", first),
+    ]
+
+
+def test_the_map_of_another_tenant_is_named_with_it(recorded: Recorded) -> None:
+    recorded.commit(1, None, robot="robot-1", tenant="acme")
+
+    assert [entry.subject for entry in recorded.entries()] == ["acme/kitchen"]
+
+
+def test_what_changed_nothing_is_not_recorded(recorded: Recorded) -> None:
+    first = recorded.commit(1, None, robot="robot-1")
+    body = json.dumps({"version": first, "expected": "0" * 64}).encode()
+    assert recorded.ask("PUT", f"{MAPS}/head", body).status >= 400
+    recorded.ask("GET", f"{MAPS}/versions")
+
+    assert [entry.action for entry in recorded.entries()] == ["map.commit"]
+
+
+def test_refused_tokens_are_recorded_and_a_flood_of_them_is_counted(recorded: Recorded) -> None:
+    burst = recorded.settings.auth.audit_refused_burst
+    for _ in range(burst + 30):
+        assert recorded.ask("GET", "/data/v1/maps", token="nonsense").status == 401
+
+    entries = recorded.entries()
+
+    assert [entry.action for entry in entries] == ["auth.refused"] * burst + ["auth.refused-many"]
+    assert sum(int(str(count)) for count in entries[-1].detail.values()) == 30
+    assert entries[0].detail["reason"] != ""
