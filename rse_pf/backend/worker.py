@@ -47,6 +47,8 @@ from rse_pf.settings import PlatformSettings
 __all__ = ["main"]
 
 _POLL_S = 0.01
+_OURS_ALONE = "memory:"
+"""A store that no robot and no data server reaches, so that names in it are worth nothing."""
 _MOST_LINE_BYTES = 1 << 26
 """An order may name every robot that is enrolled."""
 _CLOSING_S = 1.0
@@ -96,7 +98,8 @@ class _Worker:
             new_session_id=lambda: secrets.token_hex(8),
             rest=time.sleep,
         )
-        self._core.objects = ObjectsIn(open_job_store(settings), settings.serving)
+        if settings.data.store != _OURS_ALONE:
+            self._core.objects = ObjectsIn(open_job_store(settings), settings.serving)
         if settings.services.folder or settings.services.published:
             self._core.environments = self._environments(settings, config["server"], config["workers"])
         if settings.serving.jobs:
