@@ -364,7 +364,7 @@ def test_a_flood_is_refused_by_name_and_then_cut_off(made):
     assert [each.id for each in told] == list(range(40, 159))
     assert all(each.code == "busy" and each.retry_after_ms > 0 for each in told)
     assert wire.closed == (4429, "rate")
-    assert core.rates.rests_s("r", loop.now) > 0
+    assert core.rates.rests_s(("default", "r"), loop.now) > 0
     assert core.metrics.shed["rate"] == 120
 
 

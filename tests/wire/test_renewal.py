@@ -18,7 +18,7 @@ CODEC = make_codec("json", SETTINGS)
 
 def server_session(token_s: float | None = 100.0) -> tuple[ServerSession, Welcome]:
     session = ServerSession(codec=CODEC, robot="r", server="s", session="x", limits=SETTINGS)
-    session.token_s = token_s
+    session.ends_s = token_s  # the session hears Hello at 0
     (send,) = session.receive(CODEC.encode(Hello()), 0.0)
     assert isinstance(send, Send)
     welcome = CODEC.decode_from_server(send.data)
