@@ -56,11 +56,11 @@ def dial(url: str, token: str) -> Any:
 
 
 @contextlib.asynccontextmanager
-async def robots(cloud: LocalCloud, count: int) -> AsyncIterator[list[Robot]]:
-    """Open *count* sockets one after another; each knows which server welcomed it."""
+async def robots(cloud: LocalCloud, count: int, first: int = 0) -> AsyncIterator[list[Robot]]:
+    """Open *count* sockets of robots *first* and on, one after another; each knows which server welcomed it."""
     async with contextlib.AsyncExitStack() as stack:
         opened = []
-        for number in range(count):
+        for number in range(first, first + count):
             robot = Robot(
                 await stack.enter_async_context(dial(cloud.url, cloud.issue_token(f"robot-{number}")))
             )
@@ -144,7 +144,7 @@ def test_targets_change_without_cutting_open_sockets(tmp_path: Path) -> None:
                 for _ in range(3):
                     balancer.set_targets([first.target])
                     assert await balancer.wait_gone(second.name, SOON_S)
-                    async with robots(cloud, 4) as late:
+                    async with robots(cloud, 4, first=8) as late:
                         assert {robot.server for robot in late} == {first.name}
                     balancer.set_targets([first.target, second.target])
                     assert await balancer.wait_healthy([first.name, second.name], SOON_S)
