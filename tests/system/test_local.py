@@ -57,7 +57,7 @@ def dial(url: str, token: str) -> Any:
 
 @contextlib.asynccontextmanager
 async def robots(cloud: LocalCloud, count: int, first: int = 0) -> AsyncIterator[list[Robot]]:
-    """Open *count* sockets of robots *first* and on, one after another; each knows which server welcomed it."""
+    """Open *count* sockets, of robot *first* and on, in turn; each knows which server welcomed it."""
     async with contextlib.AsyncExitStack() as stack:
         opened = []
         for number in range(first, first + count):
