@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import settings
@@ -46,12 +47,23 @@ _LEFT_OUT: dict[str, int] = {}
 
 
 def pytest_deselected(items: list[pytest.Item]) -> None:
-    """Remember what the marker left out; system tests run apart, the others two at a time."""
+    """Remember what the marker left out."""
     for item in items:
-        if item.get_closest_marker("slow") is None:
-            continue
         file = item.path.relative_to(_REPOSITORY).as_posix()
         _LEFT_OUT[file] = _LEFT_OUT.get(file, 0) + 1
+
+
+def pytest_sessionfinish(session: pytest.Session) -> None:
+    """Tell the process that prints, where tests run in several."""
+    told = getattr(session.config, "workeroutput", None)
+    if told is not None:
+        told["left_out"] = dict(_LEFT_OUT)
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_testnodedown(node: Any, error: Any) -> None:
+    """Take what a process left out; every one of them saw all tests."""
+    _LEFT_OUT.update(getattr(node, "workeroutput", {}).get("left_out", {}))
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
