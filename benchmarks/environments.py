@@ -86,6 +86,7 @@ class Server:
         chosen = {"folder": str(folder / "services"), "accept_weak_isolation": True, **services}
         settings = {
             "serving": {"port": 0, "control_port": 0, "workers": 1},
+            "session": {"max_commands_per_s": 0.0},  # calls follow one another at once
             "services": chosen,
             "data": {"store": f"dir:{folder / 'store'}"},
         }
