@@ -28,6 +28,7 @@ class Ask:
     path: str
     query: Mapping[str, str]
     is_local: bool
+    authorization: str = field(default="", repr=False)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -85,6 +86,7 @@ async def _exchange(
         path=url.path,
         query=dict(parse_qsl(url.query)),
         is_local=ipaddress.ip_address(peer.partition("%")[0]).is_loopback and "origin" not in headers,
+        authorization=headers.get("authorization", ""),
     )
     keep = version == "HTTP/1.1" and headers.get("connection", "").lower() != "close"
     _write(writer, method, await answer(ask), keep=keep)

@@ -34,6 +34,7 @@ from rse_pf.backend.revocation import Watch, first_order
 from rse_pf.backend.witness import Records, open_records
 from rse_pf.backend.worker_process import WorkerProcess
 from rse_pf.control import Trust
+from rse_pf.control_token import is_carried
 from rse_pf.errors import ConfigurationError
 from rse_pf.settings import PlatformSettings
 
@@ -50,6 +51,8 @@ _AT_ONCE_S = 0.0
 _MOST_MOVES = 10000
 _LONGEST_SPREAD_S = 3600.0
 _EXIT_OK, _EXIT_LOST = 0, 1
+_PAGES_OF_ALL = ("/healthz", "/readyz")
+"""A load balancer asks them, and carries no token."""
 
 
 def serve(
@@ -63,6 +66,7 @@ def serve(
     services: str = _BUILTIN,
     settings_digest: str = "",
     audit: Path | None = None,
+    control_token: str | None = None,
 ) -> int:
     """Serve robots until a drain or a signal ends it; call it in the main thread of a process.
 
@@ -77,6 +81,7 @@ def serve(
         settings_digest: What /healthz says; empty means that of *settings*.  Whoever lays an address of this
             machine over shared settings names the digest of the shared ones.
         audit: Folder of the audit log; None records nothing.
+        control_token: What must be carried to the control port, but to its two health pages; None: nothing.
 
     Returns:
         0 after a drain or a signal, 1 when a worker was lost.
@@ -95,6 +100,7 @@ def serve(
             settings, keys=keys, trust=trust, server_id=server_id, announce=announce,
             conformance_echo=conformance_echo, services=services, listener=listener,
             digest=settings_digest or settings.digest(), records=records,
+            control_token=control_token,
         )  # fmt: skip
         return asyncio.run(supervisor.run())
 
@@ -113,6 +119,7 @@ class _Supervisor:
         listener: socket.socket,
         digest: str,
         records: Records,
+        control_token: str | None,
     ) -> None:
         self._settings = settings
         self._digest = digest
@@ -131,7 +138,8 @@ class _Supervisor:
         self._accepted = self._refused_full = 0
         self._trust = trust if settings.auth.required else None
         self._accepts = Bucket(settings.serving.accepts_per_s, float(settings.serving.handshake_burst))
-        self._accept_pauses = 0
+        self._accept_pauses = self._control_refused = 0
+        self._control_token = control_token
         self._log = JsonLog(level=settings.serving.log_level, server=server_id, wall_clock=time.time)
         records.complain_to(lambda problem: self._log.error("audit", reason=problem))
         count = settings.serving.workers or len(os.sched_getaffinity(0))
@@ -317,6 +325,10 @@ class _Supervisor:
             ("POST", "/drain"): self._post_drain,
             ("POST", "/move"): self._post_move,
         }
+        token = self._control_token
+        if token is not None and ask.path not in _PAGES_OF_ALL and not is_carried(ask.authorization, token):
+            self._control_refused += 1
+            return _json({"code": "unauthorized"}, status=401, headers={"WWW-Authenticate": "Bearer"})
         page = pages.get((ask.method, ask.path))
         if page is not None:
             return await page(ask)
@@ -351,6 +363,7 @@ class _Supervisor:
                 "resident_bytes": float(sum(map(resident_bytes, self._pids()))),
                 "ready": float(self._state == "ready"),
                 "accept_pauses": float(self._accept_pauses),
+                "control_refused": float(self._control_refused),
             }
         )
         return Answer(body=render(merged), content_type="text/plain; version=0.0.4; charset=utf-8")

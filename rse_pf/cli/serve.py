@@ -1,6 +1,7 @@
 """Run one backend server: a supervisor, its worker processes, and a control port.
 
-The control port answers /healthz, /readyz, /metrics and /status.  SIGTERM drains: robots are moved and
+The control port answers /healthz, /readyz, /metrics and /status; with --control-token the first two to
+everybody, the rest to who carries it.  SIGTERM drains: robots are moved and
 nothing is lost.  Ctrl-C leaves at once.  To run a whole platform, use rse-pf local.
 
 example:
@@ -17,6 +18,7 @@ from pathlib import Path
 
 from rse_pf.auth import KeySet
 from rse_pf.control import Trust
+from rse_pf.control_token import read_control_token
 from rse_pf.errors import UsageError
 from rse_pf.settings import PlatformSettings, setting_rows
 
@@ -43,6 +45,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--keys", type=Path, metavar="FILE",
         help="public keys of the tokens, a JWKS; roster and deny-list lie beside it in control/",
+    )  # fmt: skip
+    parser.add_argument(
+        "--control-token", type=Path, metavar="FILE",
+        help="whoever asks the control port for more than its health must carry what stands there",
     )  # fmt: skip
     parser.add_argument("--server-id", metavar="NAME", help="name of this server (default: server-PID)")
     parser.add_argument(
@@ -78,6 +84,7 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
     if not 0 < len(server_id) <= 64 or not server_id.isprintable():
         raise UsageError(f"{server_id[:80]!r} is no name for a server", hint="use 1 to 64 printable letters")
     keys = None if args.keys is None else _keys(args.keys)
+    token = None if args.control_token is None else read_control_token(args.control_token)
     if args.announce is not None and not args.announce.absolute().parent.is_dir():
         raise UsageError(
             f"there is no folder {args.announce.absolute().parent}",
@@ -95,6 +102,7 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
         conformance_echo=args.conformance_echo,
         settings_digest=settings.digest(),
         audit=args.audit,
+        control_token=token,
     )
 
 

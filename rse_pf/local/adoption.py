@@ -56,7 +56,11 @@ async def adopt(
         if is_alive(server.process):
             backend_servers.adopt(server.name, server.process)
             members.append(fleet.adopt(server.name, now_s=now_s, is_target=bool(server.port)))
-    digests = {server.name: await _digest(server.control_port) for server in state.servers if server.port}
+    digests = {
+        server.name: await _digest(backend_servers.control(server.control_port))
+        for server in state.servers
+        if server.port
+    }
     tell(
         "adopted",
         servers=[member.name for member in members],
@@ -115,9 +119,8 @@ async def _until_one_is_healthy(members: list[Member], end: float) -> None:
         )
 
 
-async def _digest(control_port: int) -> str | None:
+async def _digest(port: ControlPort) -> str | None:
     """Return which settings the server runs with; None if it does not answer."""
-    port = ControlPort(control_port)
     try:
         told = (await port.ask("/status", timeout_s=_ASK_S)).document()
     except ConnectionError:

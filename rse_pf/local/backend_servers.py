@@ -19,7 +19,9 @@ from pathlib import Path
 from typing import Any
 
 from rse_pf.audit_log import audit_folder
+from rse_pf.control_token import bearer, read_control_token
 from rse_pf.errors import ConfigurationError
+from rse_pf.local.control_port import ControlPort
 from rse_pf.local.envoy_config import Target
 from rse_pf.local.processes import ProcessMark, ended, is_alive, last_line, mark_of, send_signal, spawn
 from rse_pf.settings import PlatformSettings
@@ -63,6 +65,7 @@ class BackendServers:
         folder: Path,
         settings_file: Path,
         keys_file: Path,
+        control_token_file: Path | None = None,
         dies_with_parent: bool = True,
         program: Sequence[str] = RSE_PF,
     ) -> None:
@@ -70,6 +73,8 @@ class BackendServers:
         self._folder = folder
         self._settings_file = settings_file
         self._keys_file = keys_file
+        self._control_token_file = control_token_file
+        self._control_token: str | None = None
         self._dies_with_parent = dies_with_parent
         self._program = tuple(program)
         self._processes: dict[str, subprocess.Popen[bytes]] = {}
@@ -91,6 +96,8 @@ class BackendServers:
         command += ["--store", self._settings.data.store]
         command += ["--keys", str(self._keys_file), "--announce", str(self._announce(name))]
         command += ["--audit", str(audit_folder(self._folder))]
+        if self._control_token_file is not None:
+            command += ["--control-token", str(self._control_token_file)]
         process = spawn(
             command, log=self._log(name), folder=self._folder, dies_with_parent=self._dies_with_parent
         )
@@ -130,9 +137,17 @@ class BackendServers:
             worker_marks=tuple(worker for worker in worker_marks if worker is not None),
         )  # fmt: skip
 
+    def control(self, port: int) -> ControlPort:
+        """Return the control port *port* of one of these servers, with what must be carried to it.
+
+        Raises:
+            UsageError: The token's file is gone, or is none.
+        """
+        return ControlPort(port, self._token())
+
     async def status(self, server: BackendServer) -> dict[str, Any] | None:
         """Return what the server says of itself on its control port; None when it does not answer."""
-        return await asyncio.to_thread(_ask_status, server.control_port)
+        return await asyncio.to_thread(_ask_status, server.control_port, self._token())
 
     async def wait_over(self, name: str) -> int | None:
         """Wait until the process of *name* has ended; return its exit code, negative for a signal.
@@ -174,6 +189,11 @@ class BackendServers:
         for name in {**self._marks, **self._processes}:
             self.forget(name)
 
+    def _token(self) -> str | None:
+        if self._control_token is None and self._control_token_file is not None:
+            self._control_token = read_control_token(self._control_token_file)
+        return self._control_token
+
     def _runs(self, name: str) -> bool:
         process, mark = self._processes.get(name), self._marks.get(name)
         if process is not None:
@@ -193,10 +213,11 @@ class BackendServers:
         )
 
 
-def _ask_status(port: int) -> dict[str, Any] | None:
+def _ask_status(port: int, token: str | None) -> dict[str, Any] | None:
+    headers = {} if token is None else {"Authorization": bearer(token)}
     connection = http.client.HTTPConnection(_LOOPBACK, port, timeout=_ASK_S)
     try:
-        connection.request("GET", "/status")
+        connection.request("GET", "/status", headers=headers)
         answer = connection.getresponse()
         status: dict[str, Any] | None = json.loads(answer.read()) if answer.status == 200 else None
     except (OSError, ValueError, http.client.HTTPException):

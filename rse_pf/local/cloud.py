@@ -21,6 +21,7 @@ from types import TracebackType
 from typing import Any
 
 from rse_pf.auth import SigningKey
+from rse_pf.control_token import ensure_control_token
 from rse_pf.errors import ConfigurationError, UsageError
 from rse_pf.local.adoption import adopt, adopt_data
 from rse_pf.local.backend_servers import RSE_PF, BackendServer, BackendServers
@@ -35,6 +36,7 @@ from rse_pf.local.state import (
     PlatformLock,
     PlatformState,
     ServerState,
+    control_token_file,
     read_state,
     remove_state,
     settings_file,
@@ -110,6 +112,7 @@ class LocalCloud:
             folder=self.state,
             settings_file=self._settings_file,
             keys_file=key_set_file(self.state),
+            control_token_file=control_token_file(self.state),
             dies_with_parent=not adoptable,
             program=program,
         )
@@ -367,6 +370,7 @@ class LocalCloud:
 
     async def _start(self, left: PlatformState | None, end: float) -> None:
         self._key = ensure_key(self.state, seed=secrets.token_bytes(32), key_id=secrets.token_hex(4))
+        token = ensure_control_token(control_token_file(self.state), seed=secrets.token_bytes(32))
         document = {"context": {"rse-pf": self.settings.to_dict()}}
         self._settings_file.write_text(json.dumps(document, indent=1), encoding="utf-8")
         if self._monitored:
@@ -382,7 +386,7 @@ class LocalCloud:
         host = f"[{serving.host}]" if ":" in serving.host else serving.host
         scheme = "wss" if self.settings.local.certificate else "ws"
         self.url = f"{scheme}://{host}:{self.port}{serving.path}"
-        self._status = await serve_status(self.status_document)
+        self._status = await serve_status(self.status_document, token)
         self._fleet.keep(self._chronicle.watch())
         if self._monitored:
             self._control.start()
@@ -407,6 +411,7 @@ class LocalCloud:
             settings_digest=self.settings.digest(),
             settings_file=str(self._settings_file),
             key_file=str(key_file(self.state)),
+            control_token_file=str(control_token_file(self.state)),
             servers=tuple(
                 self._server_state(name, mark) for name, mark in self.backend_servers.marks.items()
             ),
@@ -451,6 +456,7 @@ class LocalCloud:
                 remove_state(self.state)
                 if not self._adoptable:  # nobody can come back to this platform: nor may its tokens
                     key_file(self.state).unlink(missing_ok=True)
+                    control_token_file(self.state).unlink(missing_ok=True)
             self._chronicle.close()
             self._lock.release()
         self._tell("platform-gone")

@@ -121,7 +121,7 @@ class ControlPlane:
     async def _check_on(self, member: Member) -> None:
         """Ask */readyz* of one server again and again, as the balancer does."""
         assert member.server is not None
-        port, health = ControlPort(member.server.control_port), self._settings.health
+        port, health = self._fleet.control(member.server), self._settings.health
         try:
             while not (member.over.is_set() or member.leaving or member.out):
                 began_s = time.monotonic()
@@ -191,7 +191,9 @@ class ControlPlane:
         server = member.server
         observed = None
         if server is not None:
-            port = self._ports.setdefault(member.name, ControlPort(server.control_port))
+            if member.name not in self._ports:
+                self._ports[member.name] = self._fleet.control(server)
+            port = self._ports[member.name]
             try:
                 reply = await port.ask("/status", timeout_s=_STATUS_SHARE * self._every_s)
                 told = reply.document()
@@ -237,7 +239,7 @@ class ControlPlane:
         member = self._fleet.members.get(order.server)
         if member is None or member.server is None:
             return
-        port = ControlPort(member.server.control_port)
+        port = self._fleet.control(member.server)
         try:
             target = f"/move?robots={order.robots}&spread_s={order.spread_s:g}"
             reply = await port.ask(target, timeout_s=_ASK_S, method="POST")

@@ -11,6 +11,8 @@ import json
 from dataclasses import dataclass
 from typing import Any
 
+from rse_pf.control_token import bearer
+
 __all__ = ["ControlPort", "Reply"]
 
 _LOOPBACK = "127.0.0.1"
@@ -35,10 +37,16 @@ class Reply:
 
 
 class ControlPort:
-    """One control port on this machine; connects with the first question, and anew after a failure."""
+    """One control port on this machine; connects with the first question, and anew after a failure.
 
-    def __init__(self, port: int) -> None:
+    Each question carries *token*, if the port has one.
+    """
+
+    def __init__(self, port: int, token: str | None = None) -> None:
         self._port = port
+        self._headers = f"Host: {_LOOPBACK}\r\nContent-Length: 0\r\n"
+        if token is not None:
+            self._headers += f"Authorization: {bearer(token)}\r\n"
         self._reader: asyncio.StreamReader | None = None
         self._writer: asyncio.StreamWriter | None = None
         self._turn = asyncio.Lock()
@@ -73,7 +81,7 @@ class ControlPort:
                 _LOOPBACK, self._port, limit=_MOST_HEAD_BYTES
             )
         reader, writer = self._reader, self._writer
-        writer.write(f"{method} {target} HTTP/1.1\r\nHost: {_LOOPBACK}\r\nContent-Length: 0\r\n\r\n".encode())
+        writer.write(f"{method} {target} HTTP/1.1\r\n{self._headers}\r\n".encode())
         head = (await reader.readuntil(b"\r\n\r\n")).decode("latin-1").split("\r\n")
         headers = dict(line.lower().split(": ", 1) for line in head[1:] if ": " in line)
         length = int(headers["content-length"]) if "content-length" in headers else -1

@@ -110,6 +110,10 @@ class Fleet:
             raise UsageError(f"no server named {name!r} is running", hint=f"running are {running}")
         return self.members[name]
 
+    def control(self, server: BackendServer) -> ControlPort:
+        """Return the control port of *server*, with what must be carried to it."""
+        return self._backend_servers.control(server.control_port)
+
     def is_warming(self, member: Member, now_s: float) -> bool:
         """Return whether the CPU of *member* does not count yet: it counts some time after it took robots."""
         if member.adopted:
@@ -264,7 +268,7 @@ class Fleet:
         server = member.server
         asked = False
         if server is not None:
-            port = ControlPort(server.control_port)
+            port = self.control(server)
             with contextlib.suppress(ConnectionError):
                 asked = (await port.ask("/drain?wait=0", timeout_s=_ASK_S, method="POST")).status == 202
             port.close()

@@ -1,7 +1,7 @@
 """Where a local platform keeps its files, and what it tells other commands about itself.
 
 One folder per platform name under ``$XDG_STATE_HOME/rse-pf``; ``platform.json`` appears with the first
-process and goes with the last.  Promises to hold no secret (the key has a file of its own) and that
+process and goes with the last.  Promises to hold no secret (key and token have files of their own) and that
 every write is whole.
 """
 
@@ -23,6 +23,7 @@ __all__ = [
     "PlatformLock",
     "PlatformState",
     "ServerState",
+    "control_token_file",
     "read_state",
     "remove_state",
     "settings_file",
@@ -49,7 +50,7 @@ class PlatformState:
     """A platform that runs; ``url`` is empty until the front door is open.
 
     ``status_port`` is where the control plane answers ``GET /status``, ``launched`` the highest number that
-    a server's name ever had.
+    a server's name ever had; ``control_token_file`` is empty if the control ports ask for no token.
     """
 
     name: str
@@ -58,6 +59,7 @@ class PlatformState:
     settings_digest: str
     settings_file: str
     key_file: str
+    control_token_file: str = ""
     servers: tuple[ServerState, ...] = ()
     data_server: ServerState | None = None
     load_balancer: ProcessMark | None = None
@@ -119,6 +121,11 @@ def state_folder(name: str, environment: Mapping[str, str]) -> Path:
     if not base.is_absolute():
         base = Path(environment.get("HOME") or "~").expanduser() / ".local" / "state"
     return base / "rse-pf" / name
+
+
+def control_token_file(folder: Path) -> Path:
+    """Return where the platform in *folder* keeps the token of its control ports."""
+    return folder / "control.token"
 
 
 def settings_file(folder: Path) -> Path:

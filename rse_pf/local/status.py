@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
+from rse_pf.control_token import read_control_token
 from rse_pf.local.control_port import ControlPort
 from rse_pf.local.processes import is_alive
 from rse_pf.local.state import PlatformState, ServerState
@@ -24,10 +25,16 @@ _COLUMNS = ("server", "pid", "state", "robots", "CPU %", "requests/s", "queue")
 
 
 async def platform_status(state: PlatformState, *, sample_s: float) -> dict[str, Any]:
-    """Return what runs; CPU (% of the server's size) and requests are those of *sample_s* seconds."""
+    """Return what runs; CPU (% of the server's size) and requests are those of *sample_s* seconds.
+
+    Raises:
+        UsageError: The control ports ask for a token, and its file is gone or not for us to read.
+    """
+    file = state.control_token_file
+    token = read_control_token(Path(file)) if file else None
     data = () if state.data_server is None else (state.data_server,)
     servers, data_servers = await asyncio.gather(
-        asyncio.gather(*(_server(server, sample_s) for server in state.servers)),
+        asyncio.gather(*(_server(server, token, sample_s) for server in state.servers)),
         asyncio.gather(*map(_data_server, data)),
     )
     balancer = state.load_balancer
@@ -90,7 +97,7 @@ async def _data_server(server: ServerState) -> dict[str, Any]:
     return {**known, "state": "ready" if reply.status == 200 else "not ready"}
 
 
-async def _server(server: ServerState, sample_s: float) -> dict[str, Any]:
+async def _server(server: ServerState, token: str | None, sample_s: float) -> dict[str, Any]:
     known: dict[str, Any] = {"name": server.name, "pid": server.process.pid}
     if not is_alive(server.process):
         return {**known, "state": "gone"}
@@ -98,7 +105,7 @@ async def _server(server: ServerState, sample_s: float) -> dict[str, Any]:
         return {**known, "state": "stopped"}
     if not server.control_port:
         return {**known, "state": "starting"}
-    port = ControlPort(server.control_port)
+    port = ControlPort(server.control_port, token)
     try:
         first, began = await _ask(port), time.monotonic()
         await asyncio.sleep(sample_s)

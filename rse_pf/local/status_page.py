@@ -1,7 +1,7 @@
 """What the control plane knows, as JSON at ``GET /status`` on a loopback port, for people and scripts.
 
-Promises to change nothing, to name no secret, to answer a browser's page of another origin with nothing, and
-that a slow or broken asker costs at most its own connection.
+Promises to change nothing, to name no secret, to answer who does not carry the token or is a browser's page
+of another origin with nothing, and that a slow or broken asker costs at most its own connection.
 """
 
 from __future__ import annotations
@@ -11,6 +11,8 @@ import json
 from collections.abc import Callable, Mapping
 from typing import Any
 
+from rse_pf.control_token import is_carried
+
 __all__ = ["serve_status"]
 
 _LOOPBACK = "127.0.0.1"
@@ -18,13 +20,13 @@ _PATIENCE_S = 5.0
 _MOST_HEAD_BYTES = 16384
 
 
-async def serve_status(document: Callable[[], Mapping[str, Any]]) -> asyncio.Server:
-    """Listen on a free port; each question is answered with what *document* returns then."""
+async def serve_status(document: Callable[[], Mapping[str, Any]], token: str) -> asyncio.Server:
+    """Listen on a free port; who carries *token* is answered with what *document* returns then."""
 
     async def talk(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         try:
             head = await asyncio.wait_for(reader.readuntil(b"\r\n\r\n"), _PATIENCE_S)
-            writer.write(_answer(head.decode("latin-1"), document))
+            writer.write(_answer(head.decode("latin-1"), document, token))
             await asyncio.wait_for(writer.drain(), _PATIENCE_S)
         except (OSError, ValueError, EOFError, asyncio.LimitOverrunError, asyncio.TimeoutError):
             pass  # a stranger's broken request ends its own connection, and only that
@@ -34,10 +36,15 @@ async def serve_status(document: Callable[[], Mapping[str, Any]]) -> asyncio.Ser
     return await asyncio.start_server(talk, _LOOPBACK, 0, limit=_MOST_HEAD_BYTES)
 
 
-def _answer(head: str, document: Callable[[], Mapping[str, Any]]) -> bytes:
-    request, _, headers = head.partition("\r\n")
+def _answer(head: str, document: Callable[[], Mapping[str, Any]], token: str) -> bytes:
+    request, *lines = head.split("\r\n")
     method, target, _ = request.split(" ")
-    if "\norigin:" in f"\n{headers.lower()}":
+    headers = {
+        name.strip().lower(): value.strip() for name, _, value in (line.partition(":") for line in lines)
+    }
+    if not is_carried(headers.get("authorization", ""), token):
+        return _page("401 Unauthorized\r\nWWW-Authenticate: Bearer", {"code": "unauthorized"})
+    if "origin" in headers:
         return _page("403 Forbidden", {"code": "forbidden"})
     if target != "/status":
         return _page("404 Not Found", {"code": "not-found"})

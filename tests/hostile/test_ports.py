@@ -7,9 +7,11 @@ import stat
 import urllib.error
 import urllib.request
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+from rse_pf.control_token import bearer, read_control_token
 from rse_pf.local.cloud import LocalCloud
 from rse_pf.local.envoy_config import ADMIN_SOCKET
 from rse_pf.settings import PlatformSettings
@@ -21,18 +23,28 @@ OURS_AND_NOT_PUBLIC = (
     "/config_dump", "/quitquitquit", "/stats", "/ws/", "/ws/..", "/ws/../metrics", "//metrics",
     "/ws%2f..%2fmetrics", "/%2e%2e/metrics", "/datax", "/.env", "/server-status", "/admin",
 )  # fmt: skip
+HEALTH_PAGES = (("GET", "/healthz"), ("GET", "/readyz"))
+PAGES_WITH_TOKEN = (
+    ("GET", "/metrics"), ("GET", "/status"), ("POST", "/drain?wait=0"), ("POST", "/move?robots=1"),
+    ("GET", "/drain"), ("HEAD", "/metrics"), ("GET", "//metrics"), ("GET", "/readyz/../status"), ("GET", "/elsewhere"),
+)  # fmt: skip
 LISTENING = "0A"
 LOOPBACK = ("0100007F", "00000000000000000000000001000000")
 
 
-def status_of(port: int, path: str, method: str = "GET") -> int:
-    request = urllib.request.Request(f"http://127.0.0.1:{port}{path}", method=method)
+def asked(port: int, path: str, method: str = "GET", authorization: str = "") -> tuple[int, bytes]:
+    headers = {"Authorization": authorization} if authorization else {}
+    request = urllib.request.Request(f"http://127.0.0.1:{port}{path}", method=method, headers=headers)
     try:
         with urllib.request.urlopen(request, timeout=10) as answer:
-            return answer.status
+            return answer.status, answer.read()
     except urllib.error.HTTPError as error:
         with error:
-            return error.code
+            return error.code, error.read()
+
+
+def status_of(port: int, path: str, method: str = "GET", authorization: str = "") -> int:
+    return asked(port, path, method, authorization)[0]
 
 
 def listening(pids: list[int]) -> list[str]:
@@ -74,3 +86,38 @@ def test_the_door_knows_two_paths_and_nothing_else_listens_to_the_world(tmp_path
     assert len(addresses) >= 3
     assert all(address in LOOPBACK for address in addresses)
     assert mode == 0o600
+
+
+def test_a_control_port_tells_its_health_to_all_and_the_rest_to_who_carries_its_token(tmp_path: Path) -> None:
+    folder = tmp_path / "p"
+
+    def knock(port: int) -> tuple[list[int], list[int], set[bytes], list[int], bytes]:
+        token = read_control_token(folder / "control.token")
+        wrong = ("", "Bearer", token, f"Basic {token}", bearer(token[:-1]), bearer("0" * 64))
+        told = [asked(port, path, method, each) for method, path in PAGES_WITH_TOKEN for each in wrong]
+        bodies = {body for status, body in told if body}
+        health = [status_of(port, path, method) for method, path in HEALTH_PAGES]
+        carried = [status_of(port, path, "GET", bearer(token)) for path in ("/metrics", "/status")]
+        carried.append(status_of(port, "/move?robots=1", "POST", bearer(token)))
+        page = asked(port, "/metrics", "GET", bearer(token))[1]
+        carried.append(status_of(port, "/drain?wait=60", "POST", bearer(token)))
+        return [status for status, _ in told], health, bodies, carried, page
+
+    async def scan() -> tuple[Any, int, int]:
+        async with LocalCloud(PlatformSettings(), state=folder, port=0, servers=1) as cloud:
+            (server,) = cloud.servers
+            status_port = cloud._status.sockets[0].getsockname()[1] if cloud._status else 0
+            unasked = await asyncio.to_thread(status_of, status_port, "/status")
+            mode = stat.S_IMODE((folder / "control.token").stat().st_mode)
+            return await asyncio.to_thread(knock, server.control_port), unasked, mode
+
+    (refused, health, bodies, carried, page), unasked, mode = asyncio.run(scan())
+
+    assert set(refused) == {401}
+    assert bodies == {b'{"code": "unauthorized"}\n'}
+    assert health == [200, 200]
+    assert carried == [200, 200, 202, 202]
+    assert f"control_refused {len(refused)}".encode() in page.replace(b".0", b"")
+    assert unasked == 401
+    assert mode == 0o600
+    assert not (folder / "control.token").exists(), "the token goes with the platform"

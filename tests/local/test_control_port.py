@@ -16,10 +16,12 @@ AT_ONCE_S = 0.05
 Talk = Callable[[asyncio.StreamReader, asyncio.StreamWriter], Awaitable[None]]
 
 
-def with_server(talk: Talk, work: Callable[[ControlPort], Coroutine[Any, Any, Any]]) -> Any:
+def with_server(
+    talk: Talk, work: Callable[[ControlPort], Coroutine[Any, Any, Any]], token: str | None = None
+) -> Any:
     async def run() -> Any:
         server = await asyncio.start_server(talk, "127.0.0.1", 0)
-        port = ControlPort(server.sockets[0].getsockname()[1])
+        port = ControlPort(server.sockets[0].getsockname()[1], token)
         try:
             return await work(port)
         finally:
@@ -46,6 +48,27 @@ def test_questions_share_one_connection() -> None:
 
     assert with_server(_quietly(talk), work) == [{"asked": "/a"}, {"asked": "/b"}]
     assert len(connections) == 1
+
+
+@pytest.mark.parametrize(
+    ("token", "carried"), [(None, []), ("ab" * 16, [f"authorization: bearer {'ab' * 16}"])]
+)
+def test_every_question_carries_the_token(token: str | None, carried: list[str]) -> None:
+    heads: list[str] = []
+
+    async def talk(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        while head := await reader.readuntil(b"\r\n\r\n"):
+            heads.append(head.decode().lower())
+            writer.write(page(b"{}"))
+
+    async def work(port: ControlPort) -> None:
+        for target in ("/a", "/b"):
+            await port.ask(target, timeout_s=SOON_S)
+
+    with_server(_quietly(talk), work, token)
+
+    told = [[line for line in head.split("\r\n") if line.startswith("authorization")] for head in heads]
+    assert told == [carried, carried]
 
 
 def test_an_answer_that_comes_too_late_is_not_taken_for_the_next_one() -> None:

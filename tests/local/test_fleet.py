@@ -12,6 +12,7 @@ import pytest
 
 from rse_pf.errors import ConfigurationError
 from rse_pf.local.backend_servers import BackendServer
+from rse_pf.local.control_port import ControlPort
 from rse_pf.local.envoy_config import Target
 from rse_pf.local.fleet import Fleet, Member
 from rse_pf.local.processes import ProcessMark
@@ -47,6 +48,9 @@ class FakeServers:
             log=Path(name),
             mark=mark,
         )
+
+    def control(self, port: int) -> ControlPort:
+        return ControlPort(port)
 
     def send(self, name: str, number: signal.Signals) -> bool:
         self.signals.append((name, number))

@@ -10,11 +10,13 @@ import pytest
 from rse_pf.local.status_page import serve_status
 
 SOON_S = 10.0
+TOKEN = "0123456789abcdef" * 4
+CARRIED = b"Authorization: Bearer %s\r\n" % TOKEN.encode()
 
 
 def answer(request: bytes) -> bytes:
     async def run() -> bytes:
-        server = await serve_status(lambda: {"platform": "a"})
+        server = await serve_status(lambda: {"platform": "a"}, TOKEN)
         reader, writer = await asyncio.open_connection(*server.sockets[0].getsockname())
         try:
             writer.write(request)
@@ -28,7 +30,7 @@ def answer(request: bytes) -> bytes:
 
 
 def test_the_document_is_told() -> None:
-    head, _, body = answer(b"GET /status HTTP/1.1\r\nHost: x\r\n\r\n").partition(b"\r\n\r\n")
+    head, _, body = answer(b"GET /status HTTP/1.1\r\nHost: x\r\n%s\r\n" % CARRIED).partition(b"\r\n\r\n")
 
     assert head.startswith(b"HTTP/1.1 200 OK\r\n")
     assert json.loads(body) == {"platform": "a"}
@@ -37,9 +39,11 @@ def test_the_document_is_told() -> None:
 @pytest.mark.parametrize(
     ("request_", "status"),
     [
-        (b"GET /elsewhere HTTP/1.1\r\n\r\n", b"404"),
-        (b"POST /status HTTP/1.1\r\n\r\n", b"405"),
-        (b"GET /status HTTP/1.1\r\nOrigin: http://example.org\r\n\r\n", b"403"),
+        (b"GET /elsewhere HTTP/1.1\r\n%s\r\n" % CARRIED, b"404"),
+        (b"POST /status HTTP/1.1\r\n%s\r\n" % CARRIED, b"405"),
+        (b"GET /status HTTP/1.1\r\nOrigin: http://example.org\r\n%s\r\n" % CARRIED, b"403"),
+        (b"GET /status HTTP/1.1\r\nHost: x\r\n\r\n", b"401"),
+        (b"GET /status HTTP/1.1\r\nAuthorization: Bearer %s\r\n\r\n" % TOKEN[:-1].encode(), b"401"),
     ],
 )
 def test_everything_else_is_refused(request_: bytes, status: bytes) -> None:

@@ -19,6 +19,7 @@ from typing import Any
 import pytest
 
 from client_sdk import connect
+from rse_pf.control_token import bearer, read_control_token
 from rse_pf.errors import ConfigurationError, UsageError
 from rse_pf.local.cloud import LocalCloud
 from rse_pf.local.processes import is_alive, mark_of, send_signal, wait_ended
@@ -343,12 +344,14 @@ def test_a_new_control_plane_adopts_what_a_killed_one_left_and_robots_notice_not
                 new = await news.heard("replace", server="server-1")
                 assert new["by"] == "server-3"
                 await news.heard("server-healthy", server="server-3")
-                await asyncio.to_thread(page, after.status_port)
+                await asyncio.to_thread(page, after.status_port, after.control_token_file)
         for mark in before.processes():
             assert wait_ended(mark, SOON_S)
 
-    def page(port: int) -> None:
-        with urllib.request.urlopen(f"http://127.0.0.1:{port}/status", timeout=SOON_S) as answer:
+    def page(port: int, token_file: str) -> None:
+        headers = {"Authorization": bearer(read_control_token(Path(token_file)))}
+        request = urllib.request.Request(f"http://127.0.0.1:{port}/status", headers=headers)
+        with urllib.request.urlopen(request, timeout=SOON_S) as answer:
             told = json.load(answer)
         assert [server["name"] for server in told["servers"]] == ["server-2", "server-3"]
         assert told["policy"]["max_servers"] == 7
