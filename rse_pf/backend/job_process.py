@@ -7,7 +7,6 @@ the lowest priority there is, to stay within its memory, and not to outlive its 
 from __future__ import annotations
 
 import contextlib
-import os
 import resource
 import select
 import socket
@@ -23,7 +22,7 @@ from rse_pf.backend.environment_process import HEADER, decoded, encoded
 from rse_pf.backend.job_store import open_job_store
 from rse_pf.backend.load_services import load_services
 from rse_pf.backend.objects_in import named_in, resolve
-from rse_pf.backend.processes import die_with_parent
+from rse_pf.backend.processes import die_with_parent, step_back
 from rse_pf.errors import BadMessage, Cancelled, Crashed, RsePfError
 from rse_pf.service import dispatch, failure_of
 from rse_pf.settings import PlatformSettings
@@ -33,7 +32,6 @@ from rse_pf.wire.arrays import binary_encode_hook
 __all__ = ["main", "receive"]
 
 _REPORT_PAUSE_S = 0.5
-_LOWEST = 19
 
 
 def main(arguments: list[str]) -> None:
@@ -124,9 +122,7 @@ def _told(answer: Result | Failure) -> list[Any]:
 
 def _step_back() -> None:
     """Run only when nothing else wants to; be the first to go when memory is short."""
-    os.nice(_LOWEST)
-    with contextlib.suppress(OSError):
-        os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
+    step_back(0)
     with contextlib.suppress(OSError), open("/proc/self/oom_score_adj", "w", encoding="ascii") as file:
         file.write("1000")
 

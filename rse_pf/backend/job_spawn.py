@@ -15,6 +15,7 @@ from typing import Any
 
 from rse_pf.backend.environment_process import encoded
 from rse_pf.backend.job_run import Wanted
+from rse_pf.backend.processes import step_back
 from rse_pf.settings import PlatformSettings
 
 __all__ = ["JobProcess", "spawner"]
@@ -32,6 +33,7 @@ class JobProcess:
                 [sys.executable, "-m", "rse_pf.backend.job_process", str(theirs.fileno())],
                 pass_fds=(theirs.fileno(),), stdin=subprocess.DEVNULL, env={**os.environ, **_ONE_THREAD},
             )  # fmt: skip
+        step_back(self._process.pid)
         try:
             self.connection.sendall(encoded(order))
         except OSError:
