@@ -4,7 +4,7 @@
 
 Without it the idle alarm never fires and a scale-in cuts robots off.  Each duty fails by itself, with one
 line in the log, and is tried again.  Promises to write the public keys and the control room beside them, and
-never a secret.
+no secret but the token of the control port, which never leaves the machine.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import secrets
 import sys
 import threading
 import time
@@ -27,6 +28,7 @@ from rse_pf.aws.instance import Instance, Machine
 from rse_pf.aws.metrics import Reading, datums, read_page
 from rse_pf.aws.s3_store import open_bucket
 from rse_pf.control import DENY_NAME, ROBOTS_NAME
+from rse_pf.control_token import ensure_control_token
 from rse_pf.enrolment import DenyList, Roster, from_json
 from rse_pf.errors import NotFound, RsePfError
 from rse_pf.objects import ObjectStore
@@ -155,20 +157,26 @@ class Agent:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Stand at the post until a signal ends it; ``--once`` only fetches the keys."""
+    """Stand at the post until a signal ends it; ``--once`` only makes the token and fetches the keys."""
     parser = argparse.ArgumentParser(prog="rse-pf-agent", description="the agent of a backend server on AWS")
     parser.add_argument("--settings", type=Path, required=True, metavar="FILE")
     for name in ("bucket", "keys-name", "group", "hook"):
         parser.add_argument(f"--{name}", required=True)
     parser.add_argument("--keys-file", type=Path, required=True, metavar="FILE")
+    parser.add_argument(
+        "--control-token", type=Path, metavar="FILE", help="the token of the control port; --once makes it"
+    )
     parser.add_argument("--once", action="store_true", help="fetch the keys and leave")
     args = parser.parse_args(arguments)
     try:
         settings = load_settings(args.settings)
+        if args.once and args.control_token is not None:
+            ensure_control_token(args.control_token, seed=secrets.token_bytes(32))
         region = settings.cloud.region
         post = Post(group=args.group, hook=args.hook, keys_name=args.keys_name, keys_file=args.keys_file)
         agent = Agent(
-            Instance(settings.serving.control_port), cloudwatch=make_client("cloudwatch", region),
+            Instance(settings.serving.control_port, args.control_token),
+            cloudwatch=make_client("cloudwatch", region),
             autoscaling=make_client("autoscaling", region), artifacts=open_bucket(args.bucket, region),
             post=post, settings=settings, log=_log,
         )  # fmt: skip

@@ -8,9 +8,11 @@ from __future__ import annotations
 import http.client
 import urllib.error
 import urllib.request
+from pathlib import Path
 from typing import Protocol
 
-from rse_pf.errors import Disconnected
+from rse_pf.control_token import bearer, read_control_token
+from rse_pf.errors import Disconnected, UsageError
 
 __all__ = ["Instance", "Machine", "ServerControl"]
 
@@ -37,18 +39,28 @@ class Machine(Protocol):
 
 
 class ServerControl:
-    """The control port of the backend server on this machine."""
+    """The control port of the backend server on this machine; questions carry what is in *token_file*."""
 
-    def __init__(self, port: int) -> None:
+    def __init__(self, port: int, token_file: Path | None = None) -> None:
         self._base = f"http://127.0.0.1:{port}"
+        self._token_file = token_file
 
     def page(self) -> str:
         """Return /metrics; raises Disconnected."""
-        return _asked(urllib.request.Request(f"{self._base}/metrics"))
+        return self._ask("/metrics", "GET")
 
     def drain(self, wait_s: float) -> None:
         """Order the drain; raises Disconnected."""
-        _asked(urllib.request.Request(f"{self._base}/drain?wait={wait_s:g}", method="POST"))
+        self._ask(f"/drain?wait={wait_s:g}", "POST")
+
+    def _ask(self, target: str, method: str) -> str:
+        headers = {}
+        if self._token_file is not None:
+            try:
+                headers["Authorization"] = bearer(read_control_token(self._token_file))
+            except UsageError as error:  # it is made before the server starts: no server runs
+                raise Disconnected(str(error)) from error
+        return _asked(urllib.request.Request(f"{self._base}{target}", method=method, headers=headers))
 
 
 class Instance(ServerControl):

@@ -26,7 +26,8 @@ OURS_AND_NOT_PUBLIC = (
 HEALTH_PAGES = (("GET", "/healthz"), ("GET", "/readyz"))
 PAGES_WITH_TOKEN = (
     ("GET", "/metrics"), ("GET", "/status"), ("POST", "/drain?wait=0"), ("POST", "/move?robots=1"),
-    ("GET", "/drain"), ("HEAD", "/metrics"), ("GET", "//metrics"), ("GET", "/readyz/../status"), ("GET", "/elsewhere"),
+    ("GET", "/drain"), ("HEAD", "/metrics"), ("GET", "//metrics"),
+    ("GET", "/readyz/../status"), ("GET", "/elsewhere"),
 )  # fmt: skip
 LISTENING = "0A"
 LOOPBACK = ("0100007F", "00000000000000000000000001000000")

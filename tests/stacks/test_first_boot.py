@@ -137,6 +137,15 @@ def test_the_server_and_the_data_service_share_a_store_and_keep_an_audit_log(
     assert " --audit /var/lib/rse-pf/audit" in started
 
 
+def test_the_agent_makes_and_carries_the_token_that_the_server_asks_for(repository: Path) -> None:
+    server, agent = (unit(repository, name)["Service"] for name in ("rse-pf.service", "rse-pf-agent.service"))
+    wanted = " --control-token /var/lib/rse-pf/control.token"
+
+    assert all(wanted in line for line in (server["ExecStart"], server["ExecStartPre"], agent["ExecStart"]))
+    assert server["ExecStartPre"].endswith(" --once"), "that is what makes it"
+    assert server["User"] == agent["User"]
+
+
 def test_a_server_that_was_drained_stays_down(repository: Path) -> None:
     assert unit(repository, "rse-pf.service")["Service"]["Restart"] == "on-failure"
 
