@@ -8,7 +8,7 @@ betrays an end that was cut off: give it back with --head.
 examples:
   rse-pf audit verify
   rse-pf audit show --last 20
-  rse-pf audit show --action revoke --json
+  rse-pf audit show --only revoke --json
   rse-pf audit verify --head control-plane=17:e3b0c442...
 """
 
