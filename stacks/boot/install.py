@@ -19,8 +19,7 @@ HOME = PACKAGE.parent
 USER = "rse-pf"
 UNITS = pathlib.Path("/etc/systemd/system")
 CONFIGURATION = pathlib.Path("/etc/rse-pf")
-ALWAYS = ("rse-pf.service", "rse-pf-agent.service", "rse-pf-keys.path")
-ON_DEMAND = ("rse-pf-keys.service",)
+ALWAYS = ("rse-pf.service", "rse-pf-agent.service")
 DATA = "rse-pf-data.service"
 
 
@@ -60,7 +59,7 @@ def main(facts):
     CONFIGURATION.mkdir(exist_ok=True)
     (CONFIGURATION / "server.env").write_text(environment_file(facts), encoding="utf-8")
     started = units_of(settings)
-    for unit in (*started, *ON_DEMAND):
+    for unit in started:
         shutil.copyfile(PACKAGE / unit, UNITS / unit)
     run("/usr/bin/systemctl", "daemon-reload")
     run("/usr/bin/systemctl", "enable", "--now", *started)

@@ -52,7 +52,7 @@ def test_the_boot_files_travel_with_the_wheels_and_the_script_of_the_user_data_d
 ) -> None:
     names = {file.name for file in staged(assets, WHEELHOUSE, PlatformSettings(), tmp_path / "out").iterdir()}
 
-    assert {"install.py", "rse-pf.service", "rse-pf-agent.service", "rse-pf-keys.path"} <= names
+    assert {"install.py", "rse-pf.service", "rse-pf-agent.service", "rse-pf-data.service"} <= names
     assert "first_boot.py" not in names
 
 

@@ -90,7 +90,7 @@ def main():
     began = time.monotonic()
     code = subprocess.run(["/usr/bin/python3", "/boot-test/user-data"]).returncode
     say("user-data ended with", code, f"after {time.monotonic() - began:.1f} s")
-    services, watched, done = {}, {}, 0
+    services, done = {}, 0
     while True:
         orders = ORDERS.read_text().splitlines()
         for order in orders[done:]:
@@ -99,21 +99,10 @@ def main():
             for name in names:
                 if verb == "enable" and name.endswith(".service"):
                     services[name] = Service(name)
-                elif verb == "enable" and name.endswith(".path"):
-                    watched[name] = pathlib.Path(entries(name)["PathChanged"])
-                elif verb == "try-restart" and services[name].process:
-                    services[name].stop()
-                    services[name].process = None
         done = len(orders)
         for service in services.values():
             service.look()
-        for name, path in watched.items():
-            stamp = path.stat().st_mtime_ns if path.exists() else None
-            if stamp != seen.setdefault(name, stamp):
-                seen[name] = stamp
-                subprocess.run(shlex.split(entries(name.replace(".path", ".service"))["ExecStart"]))
         time.sleep(LOOK_S)
 
 
-seen = {}
 main()
