@@ -58,7 +58,7 @@ types: ## mypy --strict
 bench: ## every benchmark, short; tables on the screen, JSON in out/bench
 	@$(SETUP) dev
 	@mkdir -p out/bench
-	@for each in benchmarks/*.py; do \
+	@for each in $$(grep -l -- '"--out"' benchmarks/*.py); do \
 	  echo "== $$each"; $(BIN)/python $$each --out out/bench/$$(basename $$each .py).json || exit 1; done
 
 docs: ## write the generated pages anew

@@ -31,11 +31,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from windows import poses
 
 from client_sdk.background import Pace
 from client_sdk.data import DataClient, DataOptions
 from rse_pf.errors import RsePfError
-from rse_pf.experiments.report import CommandRecord
 from rse_pf.experiments.swarm import Swarm, SwarmOptions
 from rse_pf.local.cloud import LocalCloud
 from rse_pf.objects import DirectoryStore, digest_of
@@ -127,18 +127,6 @@ class Uploads:
         self._process.terminate()
         self._process.join()
         self._pipe.close()
-
-
-def poses(commands: list[CommandRecord], begin_s: float, end_s: float) -> dict[str, Any]:
-    """Return how long poses took whose frame was planned from *begin_s* to *end_s*, and what got none."""
-    chosen = [each for each in commands if begin_s <= each.planned < end_s]
-    took = [
-        (each.answered - each.planned) * 1e3
-        for each in chosen
-        if each.answered is not None and each.code == "ok"
-    ]
-    p50, p99 = np.percentile(took, [50, 99]) if took else (float("nan"),) * 2
-    return {"n": len(chosen), "unanswered": len(chosen) - len(took), "p50_ms": p50, "p99_ms": p99}
 
 
 async def kill_on_the_way(cloud: LocalCloud, uploads: Uploads, args: argparse.Namespace) -> list[float]:

@@ -26,13 +26,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from windows import poses
 
 import client_sdk
 from client_sdk.datasets import open_dataset
 from client_sdk.frontend import Frame, FrontEndOptions, extract
 from client_sdk.simulate import render_frames, true_trajectory
 from rse_pf.errors import RsePfError
-from rse_pf.experiments.report import CommandRecord
 from rse_pf.experiments.swarm import Swarm, SwarmOptions
 from rse_pf.geometry import Array, inverse
 from rse_pf.local.cloud import LocalCloud
@@ -83,18 +83,6 @@ def two_maps(recordings: Path | None, count: int) -> list[bytes]:
             )
         )  # fmt: skip
     return [encode_map(MapVersion(keyframes=tuple(each))) for each in kept]
-
-
-def p99_ms(commands: list[CommandRecord], begin_s: float, end_s: float) -> dict[str, Any]:
-    """Return how long poses took whose frame was planned from *begin_s* to *end_s*, and what got none."""
-    chosen = [each for each in commands if begin_s <= each.planned < end_s]
-    took = [
-        (each.answered - each.planned) * 1e3
-        for each in chosen
-        if each.answered is not None and each.code == "ok"
-    ]
-    p50, p99 = np.percentile(took, [50, 99]) if took else (float("nan"),) * 2
-    return {"n": len(chosen), "unanswered": len(chosen) - len(took), "p50_ms": p50, "p99_ms": p99}
 
 
 class Bench:
@@ -187,7 +175,7 @@ async def run(args: argparse.Namespace) -> dict[str, Any]:
                 reference, reply, alone_s = await bench.undisturbed()
                 death = await bench.killed()
                 result = await swarm.finish()
-    kept = [p99_ms(result.commands, before, during), p99_ms(result.commands, during, after)]
+    kept = [poses(result.commands, before, during), poses(result.commands, during, after)]
     return {
         "keyframes": args.keyframes, "map_bytes": [len(data) for data in maps], "merges_s": took,
         "merge_alone_s": alone_s, "joined": _joined(reply), "before": kept[0], "during": kept[1],

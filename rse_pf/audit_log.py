@@ -167,7 +167,7 @@ class AuditLog:
                         f"another process writes the audit log {self.who} in {self._folder}",
                         hint="give each server a name or a folder of its own",
                     ) from error
-            time.sleep(_LOOK_AGAIN_S)
+            time.sleep(_LOOK_AGAIN_S)  # a lock with a time limit: flock has none of its own
 
     def _continue(self) -> None:
         """Find the head, and set aside a file that a crash left in the middle of a line."""

@@ -190,7 +190,7 @@ def main(arguments: list[str] | None = None) -> int:
     threading.Thread(target=agent.watch_control, daemon=True).start()
     while True:
         agent.step()
-        time.sleep(settings.cloud.poll_s)
+        time.sleep(settings.cloud.poll_s)  # it polls, because nobody calls an instance
 
 
 def _log(event: str, **fields: Any) -> None:

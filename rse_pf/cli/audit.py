@@ -106,7 +106,7 @@ def _settled(folder: Path, known: dict[str, Head]) -> list[Verdict]:
         else:
             if not any(verdict.problem for verdict in verdicts) or attempt + 1 == _TRIES:
                 break
-        time.sleep(_AGAIN_S)
+        time.sleep(_AGAIN_S)  # a writer is in the middle of a line, and does not say when it is over
     return verdicts
 
 

@@ -16,24 +16,13 @@ from rse_pf.auth import KeySet, token_problem, verify_token
 from rse_pf.cli.main import main
 from rse_pf.control import ControlRoom
 from rse_pf.errors import Unauthorized, UsageError
-from rse_pf.local.firewall import ensure_key, key_file, key_set_file
+from rse_pf.local.firewall import key_file, key_set_file
 from rse_pf.objects import DirectoryStore
 from rse_pf.robot_key import RobotKey
 from rse_pf.settings import AuthSettings
 
 Capture = pytest.CaptureFixture[str]
 SETTINGS = AuthSettings()
-
-
-@pytest.fixture
-def platform(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The folder of a platform that has run once; the working folder is a robot's."""
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
-    folder = tmp_path / "rse-pf" / "default"
-    folder.mkdir(parents=True)
-    ensure_key(folder, seed=b"s" * 32, key_id="k")
-    return folder
 
 
 def said(capsys: Capture, *words: str) -> str:

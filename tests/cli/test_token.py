@@ -18,17 +18,6 @@ from rse_pf.local.firewall import ensure_key, key_file, key_set_file
 from rse_pf.local.state import settings_file
 
 
-@pytest.fixture
-def platform(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The folder of a platform that has run once."""
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
-    folder = tmp_path / "rse-pf" / "default"
-    folder.mkdir(parents=True)
-    ensure_key(folder, seed=b"s" * 32, key_id="k")
-    return folder
-
-
 def issued(capsys: pytest.CaptureFixture[str], *options: str) -> str:
     assert main(["token", "issue", "robot-1", *options]) == 0
     (token,) = capsys.readouterr().out.splitlines()

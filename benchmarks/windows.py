@@ -1,0 +1,21 @@
+"""What robots noticed in a window of time: shared by the benchmarks that load a platform and disturb it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from rse_pf.experiments.report import CommandRecord
+
+
+def poses(commands: list[CommandRecord], begin_s: float, end_s: float) -> dict[str, Any]:
+    """Return how long poses took whose frame was planned from *begin_s* to *end_s*, and what got none."""
+    chosen = [each for each in commands if begin_s <= each.planned < end_s]
+    took = [
+        (each.answered - each.planned) * 1e3
+        for each in chosen
+        if each.answered is not None and each.code == "ok"
+    ]
+    p50, p99 = np.percentile(took, [50, 99]) if took else (float("nan"),) * 2
+    return {"n": len(chosen), "unanswered": len(chosen) - len(took), "p50_ms": p50, "p99_ms": p99}
