@@ -1,7 +1,8 @@
 """Enrol robots that hold keys of their own, and shut robots out or let them in again.
 
 A robot makes its key itself and keeps it; what it gives away is the public half.  Enrolled, it signs its own
-short tokens.  Every server of the platform knows within 2 s; --cloud means the deployment on AWS.
+short tokens.  Every server of the platform knows within 2 s; --cloud means the deployment on AWS.  remove
+forgets its key, so nothing that the robot signs is good; disable also refuses what rse-pf token issue made.
 
 examples:
   rse-pf robot keygen --out robot.key > robot.json
@@ -9,6 +10,7 @@ examples:
   rse-pf robot list
   rse-pf robot disable robot-1
   rse-pf robot enable robot-1
+  rse-pf robot remove robot-1
 """
 
 from __future__ import annotations
@@ -27,6 +29,7 @@ from rse_pf.control import ControlRoom
 from rse_pf.enrolment import (
     DenyList,
     EnrolledRobot,
+    Roster,
     check_quotas,
     check_robot,
     check_scopes,
@@ -39,7 +42,7 @@ from rse_pf.settings import PlatformSettings
 __all__ = ["add_arguments", "add_place", "control_room", "longest_s", "note", "run"]
 
 _DEFAULT = "default"
-_ACTIONS = ("keygen", "enrol", "list", "disable", "enable")
+_ACTIONS = ("keygen", "enrol", "list", "disable", "enable", "remove")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -84,6 +87,8 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
     longest = longest_s(settings)
     if args.action == "enrol":
         return _enrol(args, room, now, settings)
+    if args.action == "remove":
+        return _remove(args, room, settings)
     if args.action == "disable":
         room.change_denied(
             lambda denied: denied.pruned(now=now, longest_s=longest).with_robot(tenant, robot, now)
@@ -138,7 +143,7 @@ def longest_s(settings: PlatformSettings) -> float:
 
 def _check(args: argparse.Namespace) -> None:
     """Refuse words that the action does not take."""
-    named = args.action in ("enrol", "disable", "enable")
+    named = args.action in ("enrol", "disable", "enable", "remove")
     if named != (args.robot is not None):
         what = "needs the name of a robot" if named else "names no robot"
         raise UsageError(f"rse-pf robot {args.action} {what}", hint="see rse-pf robot --help")
@@ -165,6 +170,20 @@ def _enrol(args: argparse.Namespace, room: ControlRoom, now: float, settings: Pl
     allowed = " ".join(robot.scopes) or "everything"
     note(args, settings, "robot.enrolled", robot.robot, tenant=robot.tenant, key=robot.key_id, scopes=allowed)
     print(f"robot {robot.robot!r} is enrolled with {robot.key_id}; it may use {allowed}")
+    return 0
+
+
+def _remove(args: argparse.Namespace, room: ControlRoom, settings: PlatformSettings) -> int:
+    found = room.roster().find(args.tenant, args.robot)
+    if found is None:
+        raise UsageError(f"robot {args.robot!r} is not enrolled", hint="rse-pf robot list shows who is")
+
+    def without(roster: Roster) -> Roster:
+        return Roster(robots=tuple(each for each in roster.robots if each.x != found.x))
+
+    room.change_roster(without)
+    note(args, settings, "robot.removed", args.robot, tenant=args.tenant, key=found.key_id)
+    print(f"robot {args.robot!r} is enrolled no more: what {found.key_id} signed is refused within 2 s")
     return 0
 
 

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+from rse_pf.aws.account import Account
+from rse_pf.aws.clients import make_client
 from rse_pf.local.firewall import ensure_key
 
 
@@ -18,3 +22,39 @@ def platform(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     folder.mkdir(parents=True)
     ensure_key(folder, seed=b"s" * 32, key_id="k")
     return folder
+
+
+REGION = "ap-northeast-2"
+ROWS = (
+    ("SigningKey8FF1", "AWS::SecretsManager::Secret", "signing-key"),
+    ("Artifacts1F2E", "AWS::S3::Bucket", "artifacts"),
+)
+
+
+class Formation:
+    """The stack RsePf-Data, as far as its secret and its bucket; moto does not make secrets."""
+
+    def can_paginate(self, method: str) -> bool:
+        return False
+
+    def list_stack_resources(self, *, StackName: str) -> dict[str, Any]:
+        names = ("LogicalResourceId", "ResourceType", "PhysicalResourceId")
+        return {"StackResourceSummaries": [dict(zip(names, row, strict=True)) for row in ROWS]}
+
+
+@pytest.fixture
+def cloud(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
+    """A deployment without keys; the S3 client that sees its bucket."""
+    moto = pytest.importorskip("moto", reason="the dev extra is not installed")
+    monkeypatch.chdir(tmp_path)
+    for name in ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY"):
+        monkeypatch.setenv(name, "testing")
+    with moto.mock_aws():
+        s3 = make_client("s3", REGION)
+        s3.create_bucket(Bucket="artifacts", CreateBucketConfiguration={"LocationConstraint": REGION})
+        make_client("secretsmanager", REGION).create_secret(Name="signing-key", SecretString="k]:vE{")
+        account = Account(
+            REGION, lambda name, at: Formation() if name == "cloudformation" else make_client(name, at)
+        )
+        monkeypatch.setattr("rse_pf.aws.account.open_account", lambda region: account)
+        yield s3

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import io
 import json
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from rse_pf.auth import KeySet
-from rse_pf.aws.account import Account
 from rse_pf.aws.clients import make_client
 from rse_pf.cli.main import main
 from rse_pf.local.firewall import ensure_key, key_file, key_set_file
@@ -104,42 +102,6 @@ def test_a_longer_life_than_the_settings_allow_is_refused(
     assert "901 s is not within 900 s" in capsys.readouterr().err
 
 
-REGION = "ap-northeast-2"
-ROWS = (
-    ("SigningKey8FF1", "AWS::SecretsManager::Secret", "signing-key"),
-    ("Artifacts1F2E", "AWS::S3::Bucket", "artifacts"),
-)
-
-
-class Formation:
-    """The stack RsePf-Data, as far as its secret and its bucket; moto does not make secrets."""
-
-    def can_paginate(self, method: str) -> bool:
-        return False
-
-    def list_stack_resources(self, *, StackName: str) -> dict[str, Any]:
-        names = ("LogicalResourceId", "ResourceType", "PhysicalResourceId")
-        return {"StackResourceSummaries": [dict(zip(names, row, strict=True)) for row in ROWS]}
-
-
-@pytest.fixture
-def cloud(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
-    """A deployment without keys; the S3 client that sees its bucket."""
-    moto = pytest.importorskip("moto", reason="the dev extra is not installed")
-    monkeypatch.chdir(tmp_path)
-    for name in ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY"):
-        monkeypatch.setenv(name, "testing")
-    with moto.mock_aws():
-        s3 = make_client("s3", REGION)
-        s3.create_bucket(Bucket="artifacts", CreateBucketConfiguration={"LocationConstraint": REGION})
-        make_client("secretsmanager", REGION).create_secret(Name="signing-key", SecretString="k]:vE{")
-        account = Account(
-            REGION, lambda name, at: Formation() if name == "cloudformation" else make_client(name, at)
-        )
-        monkeypatch.setattr("rse_pf.aws.account.open_account", lambda region: account)
-        yield s3
-
-
 def published(s3: Any) -> list[str]:
     text = s3.get_object(Bucket="artifacts", Key="keys.json")["Body"].read().decode()
     KeySet.from_json(text)
@@ -151,7 +113,9 @@ def test_a_clouds_token_is_good_for_its_servers_and_the_private_half_is_never_pr
 ) -> None:
     assert main(["token", "init", "--cloud"]) == 0
     (key_id,) = published(cloud)
-    secret = make_client("secretsmanager", REGION).get_secret_value(SecretId="signing-key")["SecretString"]
+    secret = make_client("secretsmanager", "ap-northeast-2").get_secret_value(SecretId="signing-key")[
+        "SecretString"
+    ]
     told = capsys.readouterr()
 
     assert key_id in told.out
