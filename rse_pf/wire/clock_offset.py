@@ -76,6 +76,21 @@ class ClockOffset:
         down = exchange.returned_s - (exchange.answered_s - offset)
         return up, down
 
+    def split_s(
+        self, sent_s: float, received_s: float, answered_s: float, returned_s: float
+    ) -> tuple[float, float] | tuple[None, None]:
+        """Return how long a command and its answer were on their ways, by the best offset.
+
+        What the offset's uncertainty makes negative counts as nothing; without an offset or the server's
+        stamps nothing is known.
+        """
+        offset = self.offset_s
+        if offset is None or not 0.0 < received_s <= answered_s:
+            return None, None
+        network = max(0.0, (returned_s - sent_s) - (answered_s - received_s))
+        up = min(network, max(0.0, received_s - offset - sent_s))
+        return up, network - up
+
     @property
     def _best(self) -> Exchange:
         return min(self._window, key=lambda exchange: exchange.round_trip_s)

@@ -212,15 +212,18 @@ class RobotSession:
         return command.id
 
     def cancel(self, identity: int) -> None:
-        """Forget a command whose caller went away; its answer, if one comes, is dropped."""
+        """Forget a command whose caller went away; its answer, if one comes, is dropped.
+
+        A long one is asked for once more on the next link, to be taken back there, if this one does not last.
+        """
         pending = self._pending.get(identity)
-        if pending is None:
+        if pending is None or pending.cancelled:
             return
-        if pending.link is None:
-            del self._pending[identity]
-        elif pending.is_long and not pending.cancelled:
-            self._take_back(pending.link, identity)
         pending.cancelled = True
+        if pending.is_long:
+            self._take_back(pending)
+        elif pending.link is None:
+            del self._pending[identity]
 
     def open_link(self, now: float) -> Link:
         """Return a new link with a Hello to send; call when a socket is open."""
@@ -236,7 +239,7 @@ class RobotSession:
         for identity, pending in list(self._pending.items()):
             if pending.link is link:
                 pending.link = None
-                if pending.cancelled:
+                if pending.cancelled and not pending.is_long:
                     del self._pending[identity]
 
     def unanswered_on(self, link: Link) -> int:
@@ -292,9 +295,10 @@ class RobotSession:
             if now >= pending.deadline:
                 waited = now - pending.submitted
                 failure = _failure(pending.command, "expired", f"no answer within {waited:.3f} s")
-                if pending.is_long and pending.link is not None and not pending.cancelled:
-                    self._take_back(pending.link, identity)
                 events += self._end(identity, failure)
+                if pending.is_long:
+                    self._pending[identity] = pending
+                    self._take_back(pending)
         return events + self._flush(now)
 
     def abandon(self, code: str, message: str, hint: str = "") -> list[Event]:
@@ -365,6 +369,8 @@ class RobotSession:
             elif room > 0:
                 room -= 1
                 self._write(pending, link, now)
+                if pending.cancelled:
+                    self._take_back(pending)
         return events
 
     def _room(self, link: Link, now: float) -> int:
@@ -411,7 +417,9 @@ class RobotSession:
             return self._end(command.id, stale) + self._flush(now)
         if not pending.cancelled:
             self._delivered[command.stream] = max(last, command.seq)
-        up_s, down_s = (None, None) if elsewhere else _delays(link, answer, pending.sent_at, now)
+        up_s, down_s = None, None
+        if not elsewhere and pending.sent_at is not None:
+            up_s, down_s = link.clock_offset.split_s(pending.sent_at, answer.received_s, answer.sent_s, now)
         return self._end(command.id, answer, up_s, down_s) + self._flush(now)
 
     def _try_again(self, pending: _Pending, failure: Failure, now: float) -> bool:
@@ -436,8 +444,8 @@ class RobotSession:
             return []
         if pending.cancelled:
             if not pending.is_long:
-                self._take_back(link, progress.id)
-            pending.is_long = True
+                pending.is_long = True
+                self._take_back(pending)
             return []
         pending.is_long = True
         if pending.is_open_ended:
@@ -445,8 +453,10 @@ class RobotSession:
         share = min(1.0, max(0.0, progress.done)) if math.isfinite(progress.done) else 0.0
         return [Progressed(progress.id, share, progress.what)]
 
-    def _take_back(self, link: Link, identity: int) -> None:
-        link.outgoing.append(self.codec.encode(Cancel(id=identity)))
+    def _take_back(self, pending: _Pending) -> None:
+        pending.cancelled, pending.deadline = True, math.inf
+        if pending.link is not None:
+            pending.link.outgoing.append(self.codec.encode(Cancel(id=pending.command.id)))
 
     def _pong(self, link: Link, pong: Pong, now: float) -> list[Event]:
         link.ping_sent = None
@@ -481,15 +491,3 @@ def _with_deadline(command: Command, remaining_s: float) -> Command:
 
 def _failure(command: Command, code: str, message: str) -> Failure:
     return Failure(id=command.id, code=code, message=message, trace=command.trace)
-
-
-def _delays(
-    link: Link, result: Result, sent_at: float | None, now: float
-) -> tuple[float, float] | tuple[None, None]:
-    """Return the two one-way delays; what the offset's uncertainty makes negative counts as nothing."""
-    offset = link.clock_offset.offset_s
-    if offset is None or sent_at is None or not 0.0 < result.received_s <= result.sent_s:
-        return None, None
-    network = max(0.0, (now - sent_at) - (result.sent_s - result.received_s))
-    up_s = min(network, max(0.0, result.received_s - offset - sent_at))
-    return up_s, network - up_s

@@ -134,3 +134,48 @@ def test_a_long_command_whose_caller_leaves_is_taken_back_once():
     cancelled = Failure(id=identity, code="cancelled", message="taken back")
     assert tell(session, link, cancelled, 0.2) == []
     assert session.unanswered == 0
+
+
+def test_a_command_that_is_taken_back_while_there_is_no_link_is_taken_back_on_the_next():
+    session = make_session()
+    first = open_link(session)
+    identity = session.submit("merge", None, now=0.0, patient=True)
+    tell(session, first, Progress(id=identity, done=0.1), 1.0)
+    session.close_link(first)
+    session.cancel(identity)
+    session.due(1e6)
+
+    second = open_link(session, now=1e6, server="b")
+
+    asked = [message for message in sent(second) if isinstance(message, Command | Cancel)]
+    assert [type(message) for message in asked] == [Command, Cancel]
+    assert {message.id for message in asked} == {identity}
+    taken_back = Failure(id=identity, code="cancelled", message="taken back")
+    assert tell(session, second, taken_back, 1e6 + 1) == []
+    session.close_link(second)
+    assert commands(open_link(session, now=1e6 + 9, server="c")) == []
+
+
+def test_a_cancel_that_was_lost_with_its_link_is_sent_again():
+    session = make_session()
+    first = open_link(session)
+    identity = session.submit("merge", None, now=0.0, deadline_s=10.0)
+    tell(session, first, Progress(id=identity, done=0.1), 1.0)
+    assert codes(session.due(10.0)) == {identity: "expired"}
+    assert session.unanswered == 0
+    session.close_link(first)
+
+    second = open_link(session, now=20.0, server="b")
+
+    assert [message.id for message in sent(second) if isinstance(message, Cancel)] == [identity]
+    assert session.due(3600.0) == []
+
+
+def test_a_short_command_whose_caller_left_is_not_asked_again():
+    session = make_session()
+    first = open_link(session)
+    identity = session.submit("pnp", None, now=0.0)
+    session.close_link(first)
+    session.cancel(identity)
+
+    assert commands(open_link(session, now=1.0, server="b")) == []
