@@ -32,7 +32,8 @@ from rse_pf.backend.presence import Presence
 from rse_pf.backend.processes import cpu_seconds, raise_descriptor_limit, resident_bytes
 from rse_pf.backend.revocation import Watch, first_order
 from rse_pf.backend.witness import Records, open_records
-from rse_pf.backend.worker_process import WorkerProcess
+from rse_pf.backend.worker import WorkerPlan
+from rse_pf.backend.worker_process import WorkerProcess, fork_workers
 from rse_pf.control import Trust
 from rse_pf.control_token import is_carried
 from rse_pf.errors import ConfigurationError
@@ -94,15 +95,29 @@ def serve(
         keys = trust.keys
     check_open_door(settings, keys, conformance_echo)
     raise_descriptor_limit()
-    listener = bound(settings.serving.host, settings.serving.port)
-    with listener, open_records(audit, server_id, settings.auth) as records:
-        supervisor = _Supervisor(
-            settings, keys=keys, trust=trust, server_id=server_id, announce=announce,
-            conformance_echo=conformance_echo, services=services, listener=listener,
-            digest=settings_digest or settings.digest(), records=records,
-            control_token=control_token,
-        )  # fmt: skip
-        return asyncio.run(supervisor.run())
+    count = settings.serving.workers or len(os.sched_getaffinity(0))
+    slots = make_pipe(settings.serving.jobs)
+    plans = [
+        WorkerPlan(
+            settings=settings, keys=keys if settings.auth.required else None, server_id=server_id,
+            services=services, workers=count, index=index, job_slots=slots, supervisor=os.getpid(),
+            conformance_echo=conformance_echo, audit=audit is not None,
+        )
+        for index in range(count)
+    ]  # fmt: skip
+    with bound(settings.serving.host, settings.serving.port) as listener:
+        workers = fork_workers(plans, listener=listener)
+        try:
+            with open_records(audit, server_id, settings.auth) as records:
+                supervisor = _Supervisor(
+                    settings, workers=workers, trust=trust, server_id=server_id, announce=announce,
+                    listener=listener, digest=settings_digest or settings.digest(), records=records,
+                    control_token=control_token,
+                )  # fmt: skip
+                return asyncio.run(supervisor.run())
+        finally:
+            for worker in workers:
+                worker.kill()
 
 
 class _Supervisor:
@@ -110,12 +125,10 @@ class _Supervisor:
         self,
         settings: PlatformSettings,
         *,
-        keys: KeySet | None,
+        workers: list[WorkerProcess],
         trust: Trust | None,
         server_id: str,
         announce: Path | None,
-        conformance_echo: bool,
-        services: str,
         listener: socket.socket,
         digest: str,
         records: Records,
@@ -142,15 +155,7 @@ class _Supervisor:
         self._control_token = control_token
         self._log = JsonLog(level=settings.serving.log_level, server=server_id, wall_clock=time.time)
         records.complain_to(lambda problem: self._log.error("audit", reason=problem))
-        count = settings.serving.workers or len(os.sched_getaffinity(0))
-        config = {
-            "settings": settings.to_dict(), "server": server_id, "services": services, "workers": count,
-            "keys": keys.to_json() if keys is not None and settings.auth.required else None,
-            "conformance_echo": conformance_echo, "supervisor": os.getpid(),
-            "job_slots": make_pipe(settings.serving.jobs), "audit": records.is_on,
-        }  # fmt: skip
-        self._configs = [{**config, "index": index} for index in range(count)]
-        self._workers: list[WorkerProcess] = []
+        self._workers = workers
 
     async def run(self) -> int:
         loop = asyncio.get_running_loop()
@@ -159,8 +164,6 @@ class _Supervisor:
             loop.add_signal_handler(number, self._on_signal, number)
         control = await self._open_control()
         try:
-            hear = self._records.heard(Presence().hear)
-            self._workers = [WorkerProcess(config, self._on_lost, hear) for config in self._configs]
             await self._start(loop)
             return await self._over
         finally:
@@ -188,7 +191,11 @@ class _Supervisor:
         return control
 
     async def _start(self, loop: asyncio.AbstractEventLoop) -> None:
-        readiness = [loop.create_task(worker.connect(first_order(self._trust))) for worker in self._workers]
+        hear, order = self._records.heard(Presence().hear), first_order(self._trust)
+        readiness = [
+            loop.create_task(worker.connect(order, on_lost=self._on_lost, on_robot=hear))
+            for worker in self._workers
+        ]
         everything = asyncio.gather(*readiness)
         either: list[asyncio.Future[Any]] = [self._over, everything]
         await asyncio.wait(

@@ -1,4 +1,4 @@
-"""One worker process: `python -m rse_pf.backend.worker DATA_FD CONTROL_FD`, started by the supervisor.
+"""One worker process, forked by the supervisor (`worker_process`).
 
 Accepted sockets arrive as descriptors on the data channel, orders as JSON lines on the control
 channel.  Promises to die with its supervisor (parent-death signal, and the end of either channel),
@@ -14,9 +14,9 @@ import os
 import secrets
 import signal
 import socket
-import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -33,19 +33,20 @@ from rse_pf.backend.jobs import Jobs
 from rse_pf.backend.load_services import load_services
 from rse_pf.backend.log import JsonLog
 from rse_pf.backend.objects_in import ObjectsIn
-from rse_pf.backend.processes import die_with_parent
+from rse_pf.backend.processes import call_this_process, die_with_parent
 from rse_pf.backend.revocation import Standing
 from rse_pf.backend.seams import Clocks
 from rse_pf.backend.server import RobotSockets
 from rse_pf.backend.witness import Witness
-from rse_pf.backend.worker_process import NUMBER_BYTES
 from rse_pf.control import key_set_of
 from rse_pf.errors import MissingExtra
 from rse_pf.services.installed import installed_services, published_services
 from rse_pf.settings import PlatformSettings
 
-__all__ = ["main"]
+__all__ = ["NUMBER_BYTES", "WorkerPlan", "event_loop_maker", "run_worker"]
 
+NUMBER_BYTES = 8
+"""Length of a socket's number, which travels with its descriptor."""
 _POLL_S = 0.01
 _OURS_ALONE = "memory:"
 """A store that no robot and no data server reaches, so that names in it are worth nothing."""
@@ -54,44 +55,64 @@ _MOST_LINE_BYTES = 1 << 26
 _CLOSING_S = 1.0
 
 
-def main(arguments: list[str]) -> None:
-    """Run the worker until it is told to leave or its supervisor is gone."""
-    data, control = (socket.socket(fileno=int(fd)) for fd in arguments)
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    signal.signal(signal.SIGTERM, signal.SIG_IGN)
-    with control.makefile("rb", buffering=0) as orders:
-        config = json.loads(orders.readline() or b"null")
-    if config is None or not die_with_parent(config["supervisor"]):
-        return
+@dataclass(frozen=True)
+class WorkerPlan:
+    """What a worker is told before it is forked."""
+
+    settings: PlatformSettings
+    keys: KeySet | None
+    server_id: str
+    services: str
+    workers: int
+    index: int
+    job_slots: tuple[int, int]
+    supervisor: int
+    conformance_echo: bool = False
+    audit: bool = False
+
+
+def event_loop_maker() -> Callable[[], asyncio.AbstractEventLoop]:
+    """Return what makes the event loop of a worker; raises MissingExtra."""
     try:
         import uvloop
     except ImportError as error:
         raise MissingExtra("uvloop", "backend") from error
-    loop = uvloop.new_event_loop()
+    make: Callable[[], asyncio.AbstractEventLoop] = uvloop.new_event_loop
+    return make
+
+
+def run_worker(plan: WorkerPlan, data: socket.socket, control: socket.socket) -> None:
+    """Serve robots until the worker is told to leave or its supervisor is gone."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    if not die_with_parent(plan.supervisor):
+        return
+    call_this_process("rse-pf worker")
+    loop = event_loop_maker()()
     asyncio.set_event_loop(loop)
-    loop.run_until_complete(_Worker(config, data, control, loop).run())
+    loop.run_until_complete(_Worker(plan, data, control, loop).run())
 
 
 class _Worker:
     def __init__(
         self,
-        config: Mapping[str, Any],
+        plan: WorkerPlan,
         data: socket.socket,
         control: socket.socket,
         loop: asyncio.AbstractEventLoop,
     ) -> None:
-        settings = PlatformSettings.from_dict(config["settings"])
+        settings = plan.settings
         self._data = data
         self._control = control
         self._loop = loop
         self._ended = 0
         self._flushing = False
         self._tasks: set[asyncio.Task[None]] = set()
-        self._log = JsonLog(level=settings.serving.log_level, server=config["server"], wall_clock=time.time)
+        self._log = JsonLog(level=settings.serving.log_level, server=plan.server_id, wall_clock=time.time)
         self._core = Core(
             settings=settings,
-            registry=load_services(config["services"], settings),
-            server_id=config["server"],
+            registry=load_services(plan.services, settings),
+            server_id=plan.server_id,
             clocks=Clocks(monotonic=time.monotonic, wall=time.time, cpu=time.process_time),
             loop=loop,
             log=self._log,
@@ -101,17 +122,16 @@ class _Worker:
         if settings.data.store != _OURS_ALONE:
             self._core.objects = ObjectsIn(open_job_store(settings), settings.serving)
         if settings.services.folder or settings.services.published:
-            self._core.environments = self._environments(settings, config["server"], config["workers"])
+            self._core.environments = self._environments(settings, plan.server_id, plan.workers)
         if settings.serving.jobs:
-            self._core.jobs = self._jobs(settings, config)
+            self._core.jobs = self._jobs(settings, plan)
         self._hand_over = HandOver(
             self._core.connections, timers=loop, now=time.monotonic, choose=secrets.choice
         )
-        keys = None if config["keys"] is None else KeySet.from_json(config["keys"])
-        self._index, self._workers, self._named = config["index"], config["workers"], 0
-        door = Door(settings, keys, conformance_echo=config["conformance_echo"])
+        self._index, self._workers, self._named = plan.index, plan.workers, 0
+        door = Door(settings, plan.keys, conformance_echo=plan.conformance_echo)
         self._witness = Witness(
-            settings.auth, self._core.clocks, loop=loop, tell=self._say if config["audit"] else None
+            settings.auth, self._core.clocks, loop=loop, tell=self._say if plan.audit else None
         )
         self._standing = self._core.standing = Standing(
             self._core, door, loop=loop, log=self._log, tell=self._say, witness=self._witness
@@ -145,22 +165,22 @@ class _Worker:
             answer=self._core.answer_isolated,
         )
 
-    def _jobs(self, settings: PlatformSettings, config: Mapping[str, Any]) -> Jobs:
+    def _jobs(self, settings: PlatformSettings, plan: WorkerPlan) -> Jobs:
         session = settings.session
-        read, write = config["job_slots"]
+        read, write = plan.job_slots
         context = Context(
             store=open_job_store(settings),
             slots=Slots((read, write)),
             settings=settings.serving,
             most_bytes=settings.data.max_object_bytes,
             inline_bytes=session.max_message_bytes // 2,
-            server_id=config["server"],
-            start=spawner(config["services"], settings),
+            server_id=plan.server_id,
+            start=spawner(plan.services, settings),
             clock=time.monotonic,
         )
         return Jobs(
             context, settings=settings, loop=self._loop, log=self._log, answer=self._core.answer_isolated,
-            progress=self._core.progress, new_owner=lambda: f"{config['server']}-{secrets.token_hex(8)}",
+            progress=self._core.progress, new_owner=lambda: f"{plan.server_id}-{secrets.token_hex(8)}",
         )  # fmt: skip
 
     async def run(self) -> None:
@@ -254,7 +274,3 @@ class _Worker:
         task = self._loop.create_task(work)
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
-
-
-if __name__ == "__main__":
-    main(sys.argv[1:])

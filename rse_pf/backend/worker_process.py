@@ -1,68 +1,105 @@
 """A worker as its supervisor sees it: a process, its load, and two channels.
 
-Promises never to block the supervisor: a full channel is a refusal, a silent worker a time-out.
+Workers are forked from the supervisor after its imports, which most of a server's start is spent on, and
+before its event loop and its threads.  Promises that a worker holds no channel of another worker nor the
+listener, and never to block the supervisor: a full channel is a refusal, a silent worker a time-out.
 """
 
 from __future__ import annotations
 
 import asyncio
+import gc
 import json
+import os
+import signal
 import socket
-import subprocess
 import sys
-from collections.abc import Callable, Mapping
-from typing import Any
+import traceback
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from typing import Any, NoReturn
 
-__all__ = ["NUMBER_BYTES", "WorkerProcess"]
+from rse_pf.backend.load_services import load_services
+from rse_pf.backend.worker import NUMBER_BYTES, WorkerPlan, event_loop_maker, run_worker
+
+__all__ = ["WorkerProcess", "fork_workers"]
 
 _MOST_LINE_BYTES = 1 << 20
 _READ_BYTES = 4096
-NUMBER_BYTES = 8
-"""Length of a socket's number, which travels with its descriptor."""
+
+
+def fork_workers(plans: Sequence[WorkerPlan], *, listener: socket.socket) -> list[WorkerProcess]:
+    """Import what every worker needs, then fork one for each plan; call it before any thread or event loop.
+
+    Raises:
+        ConfigurationError: There are no such services.
+        MissingExtra: The extra ``backend`` is not installed.
+    """
+    event_loop_maker()
+    for plan in plans[:1]:
+        load_services(plan.services, plan.settings)
+    gc.collect()
+    gc.freeze()  # or the first collection of a worker would copy every page that it shares
+    workers: list[WorkerProcess] = []
+    try:
+        for plan in plans:
+            workers.append(
+                WorkerProcess(plan, strangers=[listener, *(end for each in workers for end in each.ends())])
+            )
+    except OSError:
+        for worker in workers:
+            worker.kill()
+        raise
+    return workers
 
 
 class WorkerProcess:
-    """One worker process, started at once; `connect` waits until it is ready."""
+    """One worker process, forked at once; `connect` waits until it is ready."""
 
-    def __init__(
-        self,
-        config: Mapping[str, Any],
-        on_lost: Callable[[WorkerProcess], None],
-        on_robot: Callable[[WorkerProcess, dict[str, Any]], None],
-    ) -> None:
+    def __init__(self, plan: WorkerPlan, *, strangers: Sequence[socket.socket]) -> None:
+        """Fork.  The child closes *strangers*, sockets of its parent that are none of its business."""
         self.load = 0
         self.report: dict[str, Any] | None = None
         self.empty = asyncio.Event()
         self.gone = asyncio.Event()
-        self._on_lost = on_lost
-        self._on_robot = on_robot
         self._data, data = socket.socketpair()
         self._control, control = socket.socketpair()
+        self._exit_code: int | None = None
         with data, control:
-            self._process = subprocess.Popen(
-                [sys.executable, "-m", "rse_pf.backend.worker", str(data.fileno()), str(control.fileno())],
-                pass_fds=(data.fileno(), control.fileno(), *config["job_slots"]),
-                stdin=subprocess.DEVNULL,
-            )
-        self._control.sendall(json.dumps(config).encode() + b"\n")
+            self._pid = os.fork()
+            if self._pid == 0:
+                _be_worker(plan, data, control, [*strangers, *self.ends()])
         self._data.setblocking(False)
+        self._loop: asyncio.AbstractEventLoop | None = None
         self._writer: asyncio.StreamWriter | None = None
         self._reading: asyncio.Task[None] | None = None
         self._reported: asyncio.Future[None] | None = None
 
+    def ends(self) -> tuple[socket.socket, socket.socket]:
+        """Return the supervisor's ends of both channels."""
+        return self._data, self._control
+
     @property
     def pid(self) -> int:
         """Process id."""
-        return self._process.pid
+        return self._pid
 
     def exit_code(self) -> int | None:
-        """Return how the process ended, None while it runs or is not reaped."""
-        return self._process.poll()
+        """Return how the process ended (negative: by which signal), None while it runs."""
+        self._reap(os.WNOHANG)
+        return self._exit_code
 
-    async def connect(self, first_order: Mapping[str, Any]) -> None:
-        """Wait until the worker takes sockets; `on_lost` is called if it never does."""
+    async def connect(
+        self,
+        first_order: Mapping[str, Any],
+        *,
+        on_lost: Callable[[WorkerProcess], None],
+        on_robot: Callable[[WorkerProcess, dict[str, Any]], None],
+    ) -> None:
+        """Wait until the worker takes sockets; *on_lost* is called if it never does, or ends later."""
+        self._on_lost, self._on_robot = on_lost, on_robot
         reader, self._writer = await asyncio.open_unix_connection(sock=self._control, limit=_MOST_LINE_BYTES)
-        loop = asyncio.get_running_loop()
+        self._loop = loop = asyncio.get_running_loop()
         self.order(**first_order)
         ready = asyncio.Event()
         self._reading = loop.create_task(self._listen(reader, ready))
@@ -90,18 +127,30 @@ class WorkerProcess:
         await asyncio.wait([self._reported], timeout=timeout_s)
 
     def kill(self) -> None:
-        """End the process, whatever it does, and close the channels."""
-        if self._reading is not None:
+        """End the process, whatever it does, and close the channels; a second call does nothing."""
+        if self._data.fileno() < 0:
+            return
+        if self._loop is not None and self._reading is not None:
             self._reading.cancel()
-        if self._data.fileno() >= 0:
-            asyncio.get_running_loop().remove_reader(self._data.fileno())
-        self._process.kill()
-        self._process.wait()
+            self._loop.remove_reader(self._data.fileno())
+        if self.exit_code() is None:
+            with suppress(ProcessLookupError):
+                os.kill(self._pid, signal.SIGKILL)
+            self._reap(0)
         self._data.close()
         if self._writer is not None:
             self._writer.close()
         else:
             self._control.close()
+
+    def _reap(self, how: int) -> None:
+        if self._exit_code is None:
+            try:
+                pid, status = os.waitpid(self._pid, how)
+            except ChildProcessError:
+                pid, status = self._pid, 0  # somebody else reaped it
+            if pid:
+                self._exit_code = os.waitstatus_to_exitcode(status)
 
     async def _listen(self, reader: asyncio.StreamReader, ready: asyncio.Event) -> None:
         try:
@@ -134,3 +183,22 @@ class WorkerProcess:
             self.load -= len(ended)
         else:
             asyncio.get_running_loop().remove_reader(self._data.fileno())
+
+
+def _be_worker(
+    plan: WorkerPlan, data: socket.socket, control: socket.socket, strangers: Sequence[socket.socket]
+) -> NoReturn:
+    """The child's whole life: whatever happens, it does not return into the supervisor's code."""
+    try:
+        for stranger in strangers:
+            stranger.close()
+        nothing = os.open(os.devnull, os.O_RDONLY)
+        os.dup2(nothing, 0)
+        os.close(nothing)
+        run_worker(plan, data, control)
+        os._exit(0)
+    except BaseException:  # noqa: BLE001  it must not come back to life as a second supervisor
+        traceback.print_exc()
+        sys.stderr.flush()
+    finally:
+        os._exit(1)
