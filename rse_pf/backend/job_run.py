@@ -183,7 +183,7 @@ def _pursue(wanted: Wanted, context: Context, signals: Signals, tell: Tell, leas
             if stored is not None:
                 return stored
         tell(0.0, WAITS)
-        if not context.slots.acquire(signals.rest):
+        if not context.slots.acquire((wanted.tenant, wanted.robot), signals.rest):
             continue
         try:
             if lease.take():

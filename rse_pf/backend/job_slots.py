@@ -1,7 +1,7 @@
 """Turns to run a job, shared by all workers of a server: a pipe with one byte for each turn.
 
-Within a worker turns are given in the order of asking.  Promises that a turn which was taken comes back only
-by `release`, or with the end of the server.
+Within a worker robots take turns (`job_turns`).  Promises that a turn which was taken comes back only by
+`release`, or with the end of the server.
 
 Source:
     The jobserver of GNU make.
@@ -10,8 +10,10 @@ Source:
 from __future__ import annotations
 
 import os
-from collections import deque
+import threading
 from collections.abc import Callable
+
+from rse_pf.backend.job_turns import Line, Who
 
 __all__ = ["Slots", "make_pipe"]
 
@@ -31,26 +33,35 @@ class Slots:
 
     def __init__(self, pipe: tuple[int, int]) -> None:
         self._read, self._write = pipe
-        self._line: deque[object] = deque()
+        self._line = Line()
+        self._lock = threading.Lock()
 
-    def acquire(self, rest: Callable[[float], bool]) -> bool:
-        """Wait for a turn; False if *rest*, which waits for so many seconds, says that it is off."""
+    def acquire(self, who: Who, rest: Callable[[float], bool]) -> bool:
+        """Wait for a turn of *who*; False if *rest*, which waits so many seconds, says that it is off."""
         ticket = object()
-        self._line.append(ticket)
+        with self._lock:
+            self._line.join(ticket, who)
         try:
-            while not (self._line[0] is ticket and self._take()):
+            while not self._take(ticket):
                 if not rest(_LOOK_AGAIN_S):
                     return False
             return True
         finally:
-            self._line.remove(ticket)
+            with self._lock:
+                self._line.leave(ticket)
 
     def release(self) -> None:
         """Give a turn back."""
         os.write(self._write, b"j")
 
-    def _take(self) -> bool:
-        try:
-            return bool(os.read(self._read, 1))
-        except BlockingIOError:
-            return False
+    def _take(self, ticket: object) -> bool:
+        with self._lock:
+            if self._line.first() is not ticket:
+                return False
+            try:
+                taken = bool(os.read(self._read, 1))
+            except BlockingIOError:
+                return False
+            if taken:
+                self._line.served(ticket)
+            return taken

@@ -19,6 +19,7 @@ import msgspec
 
 from rse_pf.backend.job_lease import job_key
 from rse_pf.backend.job_run import WAITS, Context, Outcome, Signals, Wanted, run_job
+from rse_pf.backend.job_turns import who_makes_room
 from rse_pf.backend.scheduler import Job
 from rse_pf.backend.template import EventLog
 from rse_pf.errors import BadRequest, Busy, Cancelled, RsePfError
@@ -57,7 +58,7 @@ class _Entry:
     signals: Signals
     waiters: list[_Waiter] = field(default_factory=list)
     again: list[Job] = field(default_factory=list)
-    """Asked while the same job was being cancelled."""
+    """Asked while the same job was being cancelled, or made room for another robot's."""
     share: float = 0.0
     what: str = WAITS
     thread: threading.Thread | None = None
@@ -121,13 +122,12 @@ class Jobs:
             return
         name = (wanted.tenant, wanted.robot, wanted.key)
         entry = self._entries.get(name)
-        if entry is not None and entry.signals.cancelled:
+        if entry is not None and (entry.signals.cancelled or entry.signals.giving_up):
             entry.again.append(job)
             return
         if entry is None:
-            if len(self._entries) >= self._serving.jobs + self._serving.jobs_waiting:
-                busy = Busy("too many jobs wait", hint="try again later", retry_after_ms=_BUSY_RETRY_MS)
-                self._fail(job, busy)
+            if not self._has_room(wanted):
+                self._fail(job, _too_many())
                 return
             entry = self._entries[name] = _Entry(wanted, Signals())
             entry.waiters.append(_Waiter(job))
@@ -167,6 +167,21 @@ class Jobs:
         for entry in list(self._entries.values()):
             if entry.thread is not None:
                 entry.thread.join(max(0.0, until - self._context.clock()))
+
+    def _has_room(self, wanted: Wanted) -> bool:
+        """Return whether one more job may wait; another robot's newest may have to come again for it."""
+        here = [entry for entry in self._entries.values() if not entry.signals.giving_up]
+        if len(here) < self._serving.jobs + self._serving.jobs_waiting:
+            return True
+        jobs = [((entry.wanted.tenant, entry.wanted.robot), entry.what == WAITS) for entry in here]
+        row = who_makes_room(jobs, (wanted.tenant, wanted.robot))
+        if row is None:
+            return False
+        here[row].signals.give_up()
+        waiters, here[row].waiters = here[row].waiters, []
+        for waiter in waiters:
+            self._fail(waiter.job, _too_many())
+        return True
 
     def _wanted(self, job: Job) -> Wanted:
         command = job.command
@@ -229,12 +244,10 @@ class Jobs:
             "job", robot=wanted.robot, service=wanted.service, job=wanted.key[:16], code=code,
             object=outcome.object[:16], compute_ms=round(outcome.compute_ms, 3),
         )  # fmt: skip
-        if outcome.is_given_up:
-            return
         reply = None
         if outcome.reply is not None:
             reply = msgspec.msgpack.decode(outcome.reply, ext_hook=extension_hook)
-        for waiter in waiters:
+        for waiter in () if outcome.is_given_up else waiters:
             if outcome.error is not None:
                 self._fail(waiter.job, outcome.error)
                 continue
@@ -248,3 +261,7 @@ class Jobs:
 
     def _fail(self, job: Job, error: RsePfError) -> None:
         self._answer(job, failure_of(error, job.command, server=self._context.server_id))
+
+
+def _too_many() -> Busy:
+    return Busy("too many jobs wait", hint="try again later", retry_after_ms=_BUSY_RETRY_MS)

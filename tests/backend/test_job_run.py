@@ -21,6 +21,7 @@ from rse_pf.settings import ServingSettings
 
 SETTINGS = ServingSettings(job_beat_s=0.05, job_lease_s=0.2)
 WANTED = Wanted(service="long", payload={}, tenant="default", robot="robot-1", key="ab" * 32)
+WHO = ("default", "robot-1")
 NAME = record_name("default", "robot-1", WANTED.key)
 REPLY = msgspec.msgpack.encode({"value": 1})
 DONE = ["done", 12.5, REPLY]
@@ -286,11 +287,11 @@ def test_a_store_that_fails_is_a_typed_failure(bench):
 
 def test_turns_are_given_in_order_and_come_back(bench):
     slots = Slots(bench.pipe)
-    assert slots.acquire(lambda seconds: pytest.fail("there is a turn"))
+    assert slots.acquire(WHO, lambda seconds: pytest.fail("there is a turn"))
     rests: list[float] = []
-    assert not slots.acquire(lambda seconds: bool(rests.append(seconds)))
+    assert not slots.acquire(WHO, lambda seconds: bool(rests.append(seconds)))
     slots.release()
-    assert slots.acquire(lambda seconds: pytest.fail("there is a turn"))
+    assert slots.acquire(WHO, lambda seconds: pytest.fail("there is a turn"))
     assert len(rests) == 1
 
 

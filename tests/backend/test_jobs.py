@@ -166,6 +166,28 @@ def test_more_jobs_than_may_wait_are_refused_with_when_to_come_again(make):
     assert bench.jobs.known == 2
 
 
+def test_a_robot_that_fills_the_line_makes_room_for_another_and_asks_again(make):
+    bench, greedy, modest = make(jobs_waiting=3), robot("greedy"), robot("modest")
+    ask(bench, greedy, 0, value=0)
+    bench.process()
+    bench.turn(lambda: bench.advance(0.5) or any(what == "starts" for _, _, what in bench.progress))
+    for identity in range(1, 4):
+        ask(bench, greedy, identity, value=identity)
+
+    ask(bench, modest, 10, value=10)
+
+    assert code(bench.answers[3]) == "busy"
+    assert bench.answers[3].retry_after_ms == 5000.0
+    ask(bench, modest, 11, value=11)
+    assert code(bench.answers[2]) == "busy"
+    ask(bench, modest, 12, value=12)
+    assert code(bench.answers[12]) == "busy"
+    ask(bench, greedy, 4, value=3)
+    bench.turn(lambda: 4 in bench.answers)
+    assert code(bench.answers[4]) == "busy"
+    assert set(bench.answers) == {2, 3, 4, 12}
+
+
 def test_the_robot_is_told_at_once_then_at_most_twice_a_second_and_never_something_old(make):
     bench, owner = make(), robot()
     ask(bench, owner, 1)
