@@ -35,6 +35,16 @@ from rse_pf.wire.messages import (
 from rse_pf.wire.pace import Pace
 from rse_pf.wire.prepared import encode_command
 from rse_pf.wire.renewal import Lease
+from rse_pf.wire.robot_events import (
+    Answered,
+    Event,
+    LinkLost,
+    MoveAsked,
+    Notice,
+    Progressed,
+    RenewalDue,
+    Welcomed,
+)
 from rse_pf.wire.session import PROGRESS
 
 __all__ = [
@@ -46,68 +56,6 @@ _MAX_TRIES_AFTER_LOSS = 2
 _RETRY_BURST = 5.0
 _PINGS_PER_SILENCE = 3.0
 _LONGEST_MS = 3.6e6
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Answered:
-    """A command came to its end.
-
-    ``sent_s`` is when the robot took it (its clock); ``up_s`` and ``down_s`` are the paper's two
-    one-way delays, None where no clock offset is known; ``wire_bytes`` is what it weighed.
-    """
-
-    id: int
-    answer: Result | Failure
-    sent_s: float
-    wire_bytes: int = 0
-    up_s: float | None = None
-    down_s: float | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class Welcomed:
-    """The link is open; the session sends on it from now on."""
-
-    welcome: Welcome
-
-
-@dataclass(frozen=True, slots=True)
-class MoveAsked:
-    """The server wants the robot elsewhere."""
-
-    reason: str
-    within_s: float
-
-
-@dataclass(frozen=True, slots=True)
-class LinkLost:
-    """The link is dead although its socket may look alive."""
-
-    reason: str
-
-
-@dataclass(frozen=True, slots=True)
-class Notice:
-    """The server complains about a message or the session, not about one command."""
-
-    failure: Failure
-
-
-@dataclass(frozen=True, slots=True)
-class Progressed:
-    """A long command is so far: the share *done* (0..1), and *what* was done last."""
-
-    id: int
-    done: float
-    what: str
-
-
-@dataclass(frozen=True, slots=True)
-class RenewalDue:
-    """The link ends soon unless a fresh token is shown: see `RobotSession.renew`."""
-
-
-Event = RenewalDue | Answered | Welcomed | MoveAsked | LinkLost | Notice | Progressed
 
 
 @dataclass(slots=True, kw_only=True)
