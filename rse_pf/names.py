@@ -5,7 +5,7 @@ Promises to import nothing, and to hold no setting: a name here is the same in e
 
 from __future__ import annotations
 
-__all__ = ["DATA_STACK", "DENY_NAME", "GROUP", "HOOK", "KEYS_NAME", "ROBOTS_NAME"]
+__all__ = ["AUDIT_PREFIX", "DATA_STACK", "DENY_NAME", "GROUP", "HOOK", "KEYS_NAME", "ROBOTS_NAME"]
 
 GROUP = "rse-pf"
 """Of the Auto Scaling group; fixed, so that an instance knows it before the group exists."""
@@ -18,3 +18,5 @@ ROBOTS_NAME = "control/robots.json"
 """Of the roster beside it: who is enrolled."""
 DENY_NAME = "control/deny.json"
 """Of the deny-list beside it: who is refused."""
+AUDIT_PREFIX = "audit"
+"""Of the pieces of audit logs in their bucket."""

@@ -97,6 +97,7 @@ class ServingSettings:
     job_beat_s: float = setting(1.0, unit="s", doc="time between two renewals of a job's lease", low=0.05)
     job_lease_s: float = setting(5.0, unit="s", doc="a job whose lease is not renewed for so long is taken over by another server", low=0.1)
     job_longest_s: float = setting(3600.0, unit="s", doc="a job that takes longer is ended", low=1)
+    job_record_s: float = setting(604800.0, unit="s", doc="the record of a job that nobody touched for so long is forgotten; asked again, the job is done again", low=60)
     drain_wait_s: float = setting(1.0, unit="s", doc="not ready, but still accepting, before robots are moved", low=0)
     drain_within_ms: float = setting(5000.0, unit="ms", doc="time robots get to move to another server", low=100)
     log_level: str = setting("info", doc="lines below this level are not written", choices=("debug", "info", "warning", "error"))
@@ -284,6 +285,8 @@ class CloudSettings:
     lambda_concurrency: int = setting(20, doc="executions of the serverless PnP at a time", low=1)
     lambda_timeout_s: int = setting(10, unit="s", doc="longest execution of the serverless PnP", low=1, high=900)
     log_days: int = setting(30, unit="days", doc="logs are kept this long", low=1)
+    audit_ship_s: int = setting(60, unit="s", doc="time between two pieces of a server's audit log on their way to the bucket; a machine that dies at once loses so much", low=5, high=3600)
+    audit_days: int = setting(365, unit="days", doc="nobody can change or delete an audit log in the bucket for so long; then it goes by itself", low=1)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

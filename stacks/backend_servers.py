@@ -20,7 +20,7 @@ from aws_cdk import aws_s3_assets as s3_assets
 from aws_cdk import aws_sns as sns
 from constructs import Construct
 
-from rse_pf.names import GROUP, HOOK
+from rse_pf.names import AUDIT_PREFIX, GROUP, HOOK
 from rse_pf.scaling.alarms import NAMESPACE
 from rse_pf.settings import PlatformSettings
 from stacks.findings import acknowledge
@@ -29,6 +29,9 @@ __all__ = ["BackendServers"]
 
 _BOOT = Path(__file__).parent / "boot" / "first_boot.py"
 _MAPS_FINDING = "IAM5[Resource::RsePf-Data:ExportsOutputFnGetAttMaps9A995C1AArn072BF5B2/*]"
+_AUDIT_FINDING = (
+    f"IAM5[Resource::RsePf-Data:ExportsOutputFnGetAttAuditLogsB945E340Arn0187FED2/{AUDIT_PREFIX}/*]"
+)
 _GIB = 8
 _START_S = 300
 
@@ -49,6 +52,7 @@ class BackendServers(Construct):
         targets: Sequence[elbv2.IApplicationTargetGroup],
         artifacts: s3.IBucket,
         maps: s3.IBucket,
+        audit_logs: s3.IBucket,
         key_set: str,
         settings: PlatformSettings,
     ) -> None:
@@ -57,6 +61,7 @@ class BackendServers(Construct):
         self.role = self._role(package, artifacts)
         if settings.data.enabled:
             self._let_in(maps)
+        self._let_write(audit_logs)
         self.group = autoscaling.AutoScalingGroup(
             self, "Group", auto_scaling_group_name=GROUP, vpc=vpc,
             min_capacity=scaling.min_servers, max_capacity=scaling.max_servers,
@@ -67,6 +72,7 @@ class BackendServers(Construct):
                     "package": package.s3_object_url, "sha256": package_sums, "region": settings.cloud.region,
                     "bucket": artifacts.bucket_name, "keys": key_set, "group": GROUP, "hook": HOOK,
                     "store": f"s3:{maps.bucket_name}" if settings.data.enabled else settings.data.store,
+                    "audit": audit_logs.bucket_name,
                 },
             ),
             health_checks=autoscaling.HealthChecks.with_additional_checks(
@@ -118,6 +124,16 @@ class BackendServers(Construct):
         self.role.add_to_policy(iam.PolicyStatement(actions=actions, resources=[objects]))
         self.role.add_to_policy(iam.PolicyStatement(actions=["s3:ListBucket"], resources=[maps.bucket_arn]))
         acknowledge(self.role, "names of objects are digests, which nobody knows beforehand", _MAPS_FINDING)
+
+    def _let_write(self, audit_logs: s3.IBucket) -> None:
+        """Pieces of the audit log under names that are not there yet; no reading, listing or deleting."""
+        self.role.add_to_policy(
+            iam.PolicyStatement(
+                actions=["s3:PutObject"], resources=[audit_logs.arn_for_objects(f"{AUDIT_PREFIX}/*")],
+                conditions={"Null": {"s3:if-none-match": "false"}},
+            )
+        )  # fmt: skip
+        acknowledge(self.role, "names hold the instance's id and a digest; no name twice", _AUDIT_FINDING)
 
     def _template(
         self,

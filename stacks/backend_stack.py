@@ -62,7 +62,8 @@ class BackendStack(cdk.Stack):
         self.servers = BackendServers(
             self, "Servers", vpc=network.vpc, firewall_group=network.firewall.servers, package=package,
             package_sums=sums, topic=self.topic, targets=list(self.balancer.targets.values()),
-            settings=settings, artifacts=data.artifacts, maps=data.maps, key_set=KEY_SET,
+            settings=settings, artifacts=data.artifacts, maps=data.maps,
+            audit_logs=data.audit_logs, key_set=KEY_SET,
         )  # fmt: skip
         self.servers.role.add_to_policy(
             iam.PolicyStatement(

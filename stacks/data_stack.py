@@ -1,6 +1,7 @@
 """The data servers' ground: buckets and the signing key; kept when the stack goes, and hard to delete.
 
 Whoever wants the data gone turns two keys: termination protection off, then the buckets emptied by hand.
+Audit logs take a third: a role that may bypass their retention.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ __all__ = ["DataStack"]
 
 
 class DataStack(cdk.Stack):
-    """Map, artifact and access-log buckets; the secret of the signing key."""
+    """Map, artifact, audit-log and access-log buckets; the secret of the signing key."""
 
     def __init__(
         self, scope: Construct, construct_id: str, *, settings: PlatformSettings, env: cdk.Environment
@@ -36,16 +37,25 @@ class DataStack(cdk.Stack):
             ]
         )
         self.artifacts = self._bucket("Artifacts", self.access_logs)
+        self.audit_logs = self._bucket(
+            "AuditLogs", self.access_logs, cdk.Duration.days(settings.cloud.audit_days)
+        )
+        self.audit_logs.add_lifecycle_rule(
+            expiration=cdk.Duration.days(settings.cloud.audit_days + 1),
+            noncurrent_version_expiration=cdk.Duration.days(1),
+        )
         self.signing_key = secretsmanager.Secret(
             self, "SigningKey", description="private half of the robots' tokens; rse-pf token init --cloud",
             removal_policy=cdk.RemovalPolicy.RETAIN,
         )  # fmt: skip
         acknowledge(self.signing_key, "rotated by two overlapping keys, see docs/operations.md", "SMG4")
 
-    def _bucket(self, name: str, logs: s3.Bucket | None) -> s3.Bucket:
+    def _bucket(self, name: str, logs: s3.Bucket | None, locked_for: cdk.Duration | None = None) -> s3.Bucket:
+        lock = None if locked_for is None else s3.ObjectLockRetention.governance(locked_for)
         return s3.Bucket(
             self, name, versioned=True, encryption=s3.BucketEncryption.S3_MANAGED, enforce_ssl=True,
             block_public_access=s3.BlockPublicAccess.BLOCK_ALL, removal_policy=cdk.RemovalPolicy.RETAIN,
             object_ownership=s3.ObjectOwnership.BUCKET_OWNER_ENFORCED,
+            object_lock_enabled=None if lock is None else True, object_lock_default_retention=lock,
             server_access_logs_bucket=logs, server_access_logs_prefix=f"{name.lower()}/" if logs else None,
         )  # fmt: skip

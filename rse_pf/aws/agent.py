@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import Any
 
 from rse_pf.auth import KeySet
+from rse_pf.aws.audit_ship import Shipper
 from rse_pf.aws.clients import ask, make_client
 from rse_pf.aws.drain_hook import leave_group
 from rse_pf.aws.instance import Instance, Machine
@@ -63,6 +64,7 @@ class Agent:
         post: Post,
         settings: PlatformSettings,
         log: Callable[..., None],
+        shipper: Shipper | None = None,
         clock: Callable[[], float] = time.monotonic,
         rest: Callable[[float], None] = time.sleep,
     ) -> None:
@@ -73,14 +75,15 @@ class Agent:
         self._post = post
         self._settings = settings
         self._log = log
+        self._shipper = shipper
         self._clock = clock
         self._rest = rest
         self._before: Reading | None = None
-        self._due_s = 0.0
+        self._due_s = self._ship_due_s = 0.0
         self.has_left = False
 
     def step(self) -> None:
-        """Look at the lifecycle; once in a period, fetch keys and publish numbers."""
+        """Look at the lifecycle; each in its period, fetch keys, publish numbers, ship the audit log."""
         if not self.has_left:
             self._try("lifecycle", self._look_at_lifecycle)
         if self._clock() >= self._due_s:
@@ -88,6 +91,9 @@ class Agent:
             self._try("keys", self.fetch_keys)
             if not self.has_left:
                 self._try("metrics", self._publish)
+        if self._clock() >= self._ship_due_s:
+            self._ship_due_s = self._clock() + self._settings.cloud.audit_ship_s
+            self._try("audit", self._ship)
 
     def fetch_keys(self) -> None:
         """Write the public keys if they changed; what is no key set is refused and the old one stays."""
@@ -129,12 +135,22 @@ class Agent:
     def _look_at_lifecycle(self) -> None:
         if self._machine.is_leaving():
             self._log("leaving", group=self._post.group)
+            self._try("audit", self._ship)  # most of it goes before the time is short
             drained = leave_group(
                 self._machine, self._autoscaling, group=self._post.group, hook=self._post.hook,
-                settings=self._settings, clock=self._clock, rest=self._rest,
+                settings=self._settings, clock=self._clock, rest=self._rest, before_end=self._ship_the_rest,
             )  # fmt: skip
             self.has_left = True
             self._log("left", drained=drained)
+
+    def _ship_the_rest(self) -> None:
+        self._rest(2e-3 * self._settings.auth.audit_sync_ms)  # a server that has left is still writing
+        self._try("audit", self._ship)
+
+    def _ship(self) -> None:
+        count = 0 if self._shipper is None else self._shipper.ship()
+        if count:
+            self._log("shipped", pieces=count)
 
     def _publish(self) -> None:
         now = read_page(self._machine.page())
@@ -166,6 +182,8 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument(
         "--control-token", type=Path, metavar="FILE", help="the token of the control port; --once makes it"
     )
+    parser.add_argument("--audit", type=Path, metavar="FOLDER", help="where servers write their audit logs")
+    parser.add_argument("--audit-bucket", metavar="B", help="where the audit logs go")
     parser.add_argument("--once", action="store_true", help="fetch the keys and leave")
     args = parser.parse_args(arguments)
     try:
@@ -174,11 +192,12 @@ def main(arguments: list[str] | None = None) -> int:
             ensure_control_token(args.control_token, seed=secrets.token_bytes(32))
         region = settings.cloud.region
         post = Post(group=args.group, hook=args.hook, keys_name=args.keys_name, keys_file=args.keys_file)
+        machine = Instance(settings.serving.control_port, args.control_token)
         agent = Agent(
-            Instance(settings.serving.control_port, args.control_token),
+            machine,
             cloudwatch=make_client("cloudwatch", region),
             autoscaling=make_client("autoscaling", region), artifacts=open_bucket(args.bucket, region),
-            post=post, settings=settings, log=_log,
+            post=post, settings=settings, log=_log, shipper=_shipper(args, region, machine),
         )  # fmt: skip
         if args.once:
             agent.fetch_keys()
@@ -191,6 +210,16 @@ def main(arguments: list[str] | None = None) -> int:
     while True:
         agent.step()
         time.sleep(settings.cloud.poll_s)  # it polls, because nobody calls an instance
+
+
+def _shipper(args: argparse.Namespace, region: str, machine: Machine) -> Shipper | None:
+    if args.audit is None or args.audit_bucket is None:
+        return None
+    return Shipper(
+        args.audit, open_bucket(args.audit_bucket, region), instance=machine.instance_id,
+        marks_file=args.audit.with_name(f"{args.audit.name}-shipped.json"),
+        on_broken=lambda who, why: _log("audit-broken", who=who, why=why[:200]),
+    )  # fmt: skip
 
 
 def _log(event: str, **fields: Any) -> None:

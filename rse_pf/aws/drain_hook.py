@@ -36,8 +36,12 @@ def leave_group(
     settings: PlatformSettings,
     clock: Callable[[], float],
     rest: Callable[[float], None],
+    before_end: Callable[[], None] = lambda: None,
 ) -> bool:
-    """Drain the server, complete *hook* of *group*; return whether the server left in time."""
+    """Drain the server, complete *hook* of *group*; return whether the server left in time.
+
+    *before_end* is called when the server is gone and raises nothing; the instance ends after the hook.
+    """
     until = clock() + settings.cloud.drain_s - _SPARE_S
     gone = False
     try:
@@ -47,6 +51,7 @@ def leave_group(
             rest(_LOOK_S)
     except Disconnected:
         gone = True
+    before_end()
     ask(
         autoscaling, "complete_lifecycle_action", AutoScalingGroupName=group, LifecycleHookName=hook,
         InstanceId=machine.instance_id(), LifecycleActionResult="CONTINUE",

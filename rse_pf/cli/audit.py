@@ -3,13 +3,16 @@
 Servers, the control plane, the data service and operators' commands write one chain each: who came in or
 was refused, who was revoked, what was started and stopped, how maps changed.  verify prints a line for each
 chain, and exits with 1 if an entry was changed, moved, added or lost.  A head that you keep elsewhere also
-betrays an end that was cut off: give it back with --head.
+betrays an end that was cut off: give it back with --head.  --cloud reads what the servers of the deployment
+on AWS have sent to its bucket; --out keeps the files, to be shown again without asking AWS.
 
 examples:
   rse-pf audit verify
   rse-pf audit show --last 20
   rse-pf audit show --only revoke --json
   rse-pf audit verify --head control-plane=17:e3b0c442...
+  rse-pf audit verify --cloud
+  rse-pf audit show --cloud --only revoke --out logs
 """
 
 from __future__ import annotations
@@ -18,6 +21,8 @@ import argparse
 import json
 import os
 import re
+import sys
+import tempfile
 import time
 from collections import deque
 from collections.abc import Iterable, Sequence
@@ -44,6 +49,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "files", nargs="*", type=Path, metavar="FILE", help="files of one chain, oldest first; or a folder"
     )
     parser.add_argument("--name", default=_NAME, help=f"which local platform (default: {_NAME})")
+    parser.add_argument("--cloud", action="store_true", help="the deployment on AWS in cloud.region")
+    parser.add_argument("--out", type=Path, metavar="FOLDER", help="with --cloud: keep the files here")
     parser.add_argument("--last", type=int, metavar="N", help="show: only the newest N entries")
     parser.add_argument("--only", metavar="WORD", help="show: only actions with this word in them")
     parser.add_argument("--json", action="store_true", help="show: one JSON object for each entry")
@@ -55,16 +62,47 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
     """Show or verify; the exit code is 1 if a chain is broken."""
+    if args.cloud:
+        return _run_in_cloud(args, settings)
+    if args.out is not None:
+        raise UsageError("--out is for --cloud", hint="the files of a local platform are in its folder")
+    return _run_on(args, [])
+
+
+def _run_in_cloud(args: argparse.Namespace, settings: PlatformSettings) -> int:
+    """Fetch what the bucket holds, and go on as with any folder."""
+    from rse_pf.aws.account import open_account
+    from rse_pf.aws.audit_archive import fetch_audit, open_audit_archive
+
+    if args.files:
+        raise UsageError("--cloud and files are two places", hint="leave one of them out")
+    if args.out is not None and args.out.exists() and any(args.out.iterdir()):
+        raise UsageError(f"{args.out} is not empty", hint="name a new folder")
+    archive = open_audit_archive(open_account(settings.cloud.region))
+    with tempfile.TemporaryDirectory() as temporary:
+        args.files = [args.out or Path(temporary)]
+        problems = fetch_audit(archive, args.files[0])
+        if not names_in(args.files[0]) and not problems:
+            raise UsageError(
+                "the bucket holds no audit log yet", hint="servers send the first within cloud.audit_ship_s"
+            )
+        return _run_on(args, problems)
+
+
+def _run_on(args: argparse.Namespace, problems: Sequence[str]) -> int:
+    """Show or verify what lies on this machine; *problems* were found on the way to it."""
+    for problem in problems:
+        print(f"BROKEN: {problem}", file=sys.stderr if args.action == "show" else None)
     is_folder = not args.files or (len(args.files) == 1 and args.files[0].is_dir())
     folder = _folder(args) if is_folder else None
     for path in args.files:
         if not path.exists():
             raise UsageError(f"there is no {path}", hint="name the files of one chain, or a folder")
     if args.action == "show":
-        return _show(args, folder)
+        return _show(args, folder) or int(bool(problems))
     if args.last is not None or args.only is not None or args.json:
         raise UsageError("--last, --only and --json are for show", hint="see rse-pf audit --help")
-    return _verify(args, folder)
+    return _verify(args, folder) or int(bool(problems))
 
 
 def _show(args: argparse.Namespace, folder: Path | None) -> int:

@@ -31,11 +31,11 @@ def units_of(settings):
 def environment_file(facts):
     """Return what the units read: where this server stands.
 
-    *facts* holds ``server``, ``bucket``, ``keys``, ``group``, ``hook`` and ``store``.
+    *facts* holds ``server``, ``bucket``, ``keys``, ``group``, ``hook``, ``store`` and ``audit``.
     """
     names = {
         "SERVER_ID": "server", "BUCKET": "bucket", "KEYS_NAME": "keys", "GROUP": "group", "HOOK": "hook",
-        "STORE": "store",
+        "STORE": "store", "AUDIT_BUCKET": "audit",
     }  # fmt: skip
     for name in names.values():
         if not facts[name] or any(sign in facts[name] for sign in "\n\r\"'\\ $"):

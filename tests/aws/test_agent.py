@@ -9,10 +9,15 @@ from typing import Any
 import pytest
 from aws.fake_machine import FakeMachine, FakeScaling
 
+from rse_pf.audit_check import check_folder
+from rse_pf.audit_log import record_once
 from rse_pf.auth import SigningKey
 from rse_pf.aws.agent import Agent, Post, main
+from rse_pf.aws.audit_archive import fetch_audit
+from rse_pf.aws.audit_ship import Shipper
 from rse_pf.aws.clients import make_client
 from rse_pf.control import DENY_NAME, ControlRoom
+from rse_pf.errors import StoreError
 from rse_pf.objects import MemoryStore
 from rse_pf.scaling.alarms import NAMESPACE
 from rse_pf.settings import PlatformSettings
@@ -30,12 +35,31 @@ class Stand:
         self.artifacts = MemoryStore()
         self.file = folder / "keys.json"
         self.log: list[tuple[str, dict[str, Any]]] = []
+        self.audit, self.archive = folder / "audit", MemoryStore()
+        shipper = Shipper(
+            self.audit, self.archive, marks_file=folder / "shipped.json", instance=self.machine.instance_id,
+            on_broken=lambda who, why: self.log.append(("broken", {"who": who})),
+        )  # fmt: skip
         self.agent = Agent(
             self.machine, cloudwatch=cloudwatch, autoscaling=self.scaling, artifacts=self.artifacts,
             post=Post(group="rse-pf", hook="drain", keys_name="keys.json", keys_file=self.file),
             settings=PlatformSettings(), clock=self.machine.clock, rest=self.machine.rest,
-            log=lambda event, **fields: self.log.append((event, fields)),
+            log=lambda event, **fields: self.log.append((event, fields)), shipper=shipper,
         )  # fmt: skip
+
+    def note(self, action: str) -> None:
+        """Have the server write an entry."""
+        record_once(
+            self.audit, self.machine.instance_id(), action, wall_clock=lambda: 1e9, most_bytes=1 << 20
+        )
+
+    def archived(self) -> int:
+        """Return the number of entries that are safe in the bucket, in whole chains."""
+        folder = self.audit.with_name(f"fetched-{len(list(self.audit.parent.iterdir()))}")
+        assert fetch_audit(self.archive, folder) == []
+        verdicts = check_folder(folder)
+        assert [each.problem for each in verdicts] == [""] * len(verdicts)
+        return sum(each.entries for each in verdicts)
 
     def events(self) -> list[str]:
         return [event for event, _ in self.log]
@@ -216,3 +240,57 @@ def test_a_control_room_that_was_spoilt_changes_nothing_on_the_machine(stand: St
 
     assert (stand.file.parent / DENY_NAME).read_bytes() == good
     assert stand.events() == ["control"] + ["failed"] * (harm == "nonsense")
+
+
+def test_the_audit_log_is_sent_in_its_own_period_and_only_when_something_is_new(stand: Stand) -> None:
+    stand.note("first")
+    stand.agent.step()
+    assert stand.archived() == 1
+    stand.note("second")
+    stand.agent.step()
+    assert stand.archived() == 1, "not before its time"
+    stand.machine.rest(60.0)
+    stand.agent.step()
+    stand.machine.rest(60.0)
+    stand.agent.step()
+
+    assert stand.archived() == 2
+    assert stand.events().count("shipped") == 2
+
+
+def test_what_a_server_writes_while_it_leaves_is_sent_before_the_hook_is_completed(tmp_path: Path) -> None:
+    stand = Stand(tmp_path, Counting())
+    stand.note("lived")
+    stand.machine.leaving = True
+    drain, complete = stand.machine.drain, stand.scaling.complete_lifecycle_action
+    safe: list[int] = []
+
+    def drained(wait_s: float) -> None:
+        stand.note("drained")
+        drain(wait_s)
+
+    def completed(**arguments: Any) -> dict[str, Any]:
+        safe.append(stand.archived())
+        return complete(**arguments)
+
+    stand.machine.drain = drained  # type: ignore[method-assign]
+    stand.scaling.complete_lifecycle_action = completed  # type: ignore[method-assign]
+    stand.agent.step()
+
+    assert safe == [2]
+    assert stand.agent.has_left
+
+
+def test_a_bucket_that_is_away_keeps_no_instance_from_leaving(
+    stand: Stand, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def away(*_: Any) -> None:
+        raise StoreError("AWS does not answer")
+
+    monkeypatch.setattr(stand.archive, "compare_and_swap", away)
+    stand.note("lived")
+    stand.machine.leaving = True
+    stand.agent.step()
+
+    assert len(stand.scaling.completed) == 1
+    assert [fields["duty"] for event, fields in stand.log if event == "failed"].count("audit") == 3

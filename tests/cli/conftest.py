@@ -28,11 +28,12 @@ REGION = "ap-northeast-2"
 ROWS = (
     ("SigningKey8FF1", "AWS::SecretsManager::Secret", "signing-key"),
     ("Artifacts1F2E", "AWS::S3::Bucket", "artifacts"),
+    ("AuditLogs3C4D", "AWS::S3::Bucket", "audit-logs"),
 )
 
 
 class Formation:
-    """The stack RsePf-Data, as far as its secret and its bucket; moto does not make secrets."""
+    """The stack RsePf-Data, as far as its secret and its buckets; moto does not make secrets."""
 
     def can_paginate(self, method: str) -> bool:
         return False
@@ -44,14 +45,15 @@ class Formation:
 
 @pytest.fixture
 def cloud(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
-    """A deployment without keys; the S3 client that sees its bucket."""
+    """A deployment without keys; the S3 client that sees its buckets."""
     moto = pytest.importorskip("moto", reason="the dev extra is not installed")
     monkeypatch.chdir(tmp_path)
     for name in ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY"):
         monkeypatch.setenv(name, "testing")
     with moto.mock_aws():
         s3 = make_client("s3", REGION)
-        s3.create_bucket(Bucket="artifacts", CreateBucketConfiguration={"LocationConstraint": REGION})
+        for name in ("artifacts", "audit-logs"):
+            s3.create_bucket(Bucket=name, CreateBucketConfiguration={"LocationConstraint": REGION})
         make_client("secretsmanager", REGION).create_secret(Name="signing-key", SecretString="k]:vE{")
         account = Account(
             REGION, lambda name, at: Formation() if name == "cloudformation" else make_client(name, at)

@@ -36,7 +36,7 @@ NO_SECRETS: Mapping[tuple[str, str], str] = {
     ("tests/test_audit.py", "JSON Web Token"): "made up, to be looked for in the audit log",
     ("tests/test_settings.py", "Secret Keyword"): "the name of a file",
     ("tests/aws/test_secrets.py", "Secret Keyword"): "made for moto",
-    ("tests/cli/test_token.py", "Secret Keyword"): "made for moto",
+    ("tests/cli/conftest.py", "Secret Keyword"): "made for moto",
     ("tests/lambda_pnp/test_keys.py", "Secret Keyword"): "made for moto",
     ("tests/stacks/test_first_boot.py", "Secret Keyword"): "made for moto",
     ("tests/system/boot/imds.py", "Secret Keyword"): "made for moto",

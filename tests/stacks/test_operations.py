@@ -27,6 +27,8 @@ RUN_HERE = {
     "rse-pf cloud status": 2,
     "rse-pf token rotate --cloud": 0,
     "rse-pf token retire --cloud --force": 0,
+    "rse-pf audit verify --cloud": 2,
+    "rse-pf audit show --cloud --only refused --out logs": 2,
     "rse-pf cloud leftovers": 1,
 }
 """Each with its exit code on an account that has the Data stack and nothing else."""
@@ -79,7 +81,8 @@ class Formation:
         return {"Stacks": []}
 
     def list_stack_resources(self, *, StackName: str) -> dict[str, Any]:
-        kinds = {"SigningKey": "AWS::SecretsManager::Secret", "Artifacts": "AWS::S3::Bucket"}
+        bucket = "AWS::S3::Bucket"
+        kinds = {"SigningKey": "AWS::SecretsManager::Secret", "Artifacts": bucket, "AuditLogs": bucket}
         rows = [
             {"LogicalResourceId": name, "ResourceType": kind, "PhysicalResourceId": name.lower()}
             for name, kind in kinds.items()
@@ -105,7 +108,8 @@ def account(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[None]:
     made = Account(REGION, lambda name, at: own.get(name) or make_client(name, at))
     with moto.mock_aws():
         s3 = make_client("s3", REGION)
-        s3.create_bucket(Bucket="artifacts", CreateBucketConfiguration={"LocationConstraint": REGION})
+        for name in ("artifacts", "auditlogs"):
+            s3.create_bucket(Bucket=name, CreateBucketConfiguration={"LocationConstraint": REGION})
         tag = [{"Key": "rse-pf", "Value": "digest"}]
         make_client("secretsmanager", REGION).create_secret(Name="signingkey", SecretString="x", Tags=tag)
         monkeypatch.setattr("rse_pf.aws.account.open_account", lambda region: made)

@@ -123,7 +123,10 @@ def test_what_the_commands_look_for_is_what_the_stacks_call_it(assembly: Assembl
     assert group["AutoScalingGroupName"] == GROUP
     assert {KEYS_NAME, ROBOTS_NAME, DENY_NAME} == set(backend_stack.TRUSTED)
     resources = assembly.templates[DATA_STACK]["Resources"]
-    for word, kind in (("SigningKey", "AWS::SecretsManager::Secret"), ("Artifacts", "AWS::S3::Bucket")):
+    for word, kind in (
+        ("SigningKey", "AWS::SecretsManager::Secret"), ("Artifacts", "AWS::S3::Bucket"),
+        ("AuditLogs", "AWS::S3::Bucket"),
+    ):  # fmt: skip
         assert [each["Type"] for name, each in resources.items() if name.startswith(word)].count(kind) == 1
     interfaces = [
         each for each in assembly.all("AWS::EC2::VPCEndpoint") if each["VpcEndpointType"] == "Interface"
@@ -232,12 +235,33 @@ def test_every_bucket_is_private_versioned_encrypted_and_kept(assembly: Assembly
         if each["Type"] == "AWS::S3::Bucket"
     ]
 
-    assert len(buckets) == 3
+    assert len(buckets) == 4
     for bucket in buckets:
         assert bucket["DeletionPolicy"] == "Retain"
         assert set(bucket["Properties"]["PublicAccessBlockConfiguration"].values()) == {True}
         assert bucket["Properties"]["VersioningConfiguration"] == {"Status": "Enabled"}
         assert "BucketEncryption" in bucket["Properties"]
+
+
+def test_audit_logs_are_written_once_and_read_changed_or_deleted_by_no_server(assembly: Assembly) -> None:
+    lock = {"Mode": "GOVERNANCE", "Days": assembly.settings.cloud.audit_days}
+    (bucket,) = [each for each in assembly.all("AWS::S3::Bucket") if each.get("ObjectLockEnabled")]
+    statements = [
+        statement
+        for policy in assembly.all("AWS::IAM::Policy")
+        for statement in policy["PolicyDocument"]["Statement"]
+        if "AuditLogs" in json.dumps(statement["Resource"])
+    ]
+
+    assert bucket["ObjectLockConfiguration"]["Rule"]["DefaultRetention"] == lock
+    assert (
+        min(rule["ExpirationInDays"] for rule in bucket["LifecycleConfiguration"]["Rules"])
+        > assembly.settings.cloud.audit_days
+    ), "what is locked cannot expire"
+    (statement,) = statements
+    assert (statement["Effect"], statement["Action"]) == ("Allow", "s3:PutObject")
+    assert statement["Condition"] == {"Null": {"s3:if-none-match": "false"}}
+    assert statement["Resource"]["Fn::Join"][1][-1] == "/audit/*"
 
 
 def test_packages_carry_the_merged_settings_and_one_digest(assembly: Assembly) -> None:
