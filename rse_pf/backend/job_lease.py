@@ -18,12 +18,15 @@ from rse_pf.errors import BadMessage, BadRequest, Conflict, NotFound, StoreError
 from rse_pf.objects import ObjectStore, name_segment
 from rse_pf.wire.arrays import binary_encode_hook
 
-__all__ = ["MOST_TRIES", "JobRecord", "Lease", "Verdict", "job_key", "record_name", "verdict_on"]
+__all__ = [
+    "MOST_TRIES", "JobRecord", "Lease", "Verdict", "decode_record", "encode_record", "is_over", "job_key",
+    "marked", "record_name", "tombstone", "verdict_on",
+]  # fmt: skip
 
 MOST_TRIES = 3
 """A job whose servers died so often is not tried again: it may have been the cause."""
 
-State = Literal["running", "given-up", "done", "failed"]
+State = Literal["running", "given-up", "done", "failed", "swept"]
 Verdict = Literal["take", "follow", "done", "failed", "poison"]
 
 
@@ -45,10 +48,35 @@ class JobRecord(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     code: str = ""
     message: str = ""
     hint: str = ""
+    marked_s: float = 0.0
+    """Unix time when a sweep first saw the record as it is; 0 if none did since its owner last wrote."""
 
 
-_encode = msgspec.json.Encoder().encode
+encode_record = msgspec.json.Encoder().encode
 _decode = msgspec.json.Decoder(JobRecord).decode
+
+
+def decode_record(name: str, data: bytes) -> JobRecord:
+    """Return the record in *data*, the object *name*; raises StoreError."""
+    try:
+        return _decode(data)
+    except msgspec.DecodeError as error:
+        raise StoreError(f"{name!r} is no record of a job", hint="delete it") from error
+
+
+def marked(record: JobRecord, now: float) -> JobRecord:
+    """Return *record* as a sweep leaves it when it sees it first; *now* is Unix time."""
+    return msgspec.structs.replace(record, marked_s=now)
+
+
+def is_over(record: JobRecord, now: float, life_s: float) -> bool:
+    """Return whether nobody has touched *record* for *life_s* since a sweep marked it."""
+    return record.marked_s > 0 and now - record.marked_s >= life_s
+
+
+def tombstone(now: float) -> JobRecord:
+    """Return what stands in the place of a record that is about to go."""
+    return JobRecord(state="swept", owner="", marked_s=now)
 
 
 def job_key(service: str, payload: Any, settings: str) -> str:
@@ -88,7 +116,9 @@ def verdict_on(record: JobRecord | None, *, unchanged_s: float, lease_s: float, 
     if record.state == "failed":
         return "failed" if is_watched else "take"
     if unchanged_s < lease_s:
-        return "follow"
+        return "follow"  # who sweeps is about to remove the record, or who works renews it
+    if record.state == "swept":
+        return "take"
     return "take" if record.tries < MOST_TRIES else "poison"
 
 
@@ -151,7 +181,9 @@ class Lease:
     def renew(self, share: float, what: str) -> bool:
         """Say that the owner lives and how far it is; False if the job was taken or cancelled meanwhile."""
         assert self.record is not None
-        beat = msgspec.structs.replace(self.record, beat=self.record.beat + 1, share=share, what=what)
+        beat = msgspec.structs.replace(
+            self.record, beat=self.record.beat + 1, share=share, what=what, marked_s=0.0
+        )
         return self._swap(beat) and not beat.cancel
 
     def end(self, record: JobRecord) -> bool:
@@ -168,7 +200,7 @@ class Lease:
                 return
 
     def _swap(self, record: JobRecord) -> bool:
-        data = _encode(record)
+        data = encode_record(record)
         try:
             self._store.compare_and_swap(self._name, self._seen.data, data)
         except Conflict:
@@ -180,7 +212,4 @@ class Lease:
     def _note(self, data: bytes | None) -> None:
         if data != self._seen.data:
             self._seen = _Seen(data, self._clock())
-        try:
-            self.record = None if data is None else _decode(data)
-        except msgspec.DecodeError as error:
-            raise StoreError(f"{self._name!r} is no record of a job", hint="delete it") from error
+        self.record = None if data is None else decode_record(self._name, data)

@@ -11,6 +11,7 @@ import functools
 import hashlib
 import json
 import threading
+import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, Protocol
@@ -19,6 +20,7 @@ import msgspec
 
 from rse_pf.backend.job_lease import job_key
 from rse_pf.backend.job_run import WAITS, Context, Outcome, Signals, Wanted, run_job
+from rse_pf.backend.job_sweep import RecordSweep
 from rse_pf.backend.job_turns import who_makes_room
 from rse_pf.backend.scheduler import Job
 from rse_pf.backend.template import EventLog
@@ -77,6 +79,7 @@ class Jobs:
         answer: Callable[[Job, Result | Failure], None],
         progress: Callable[[Any, Progress], None],
         new_owner: Callable[[], str],
+        wall_clock: Callable[[], float] = time.time,
     ) -> None:
         """Start nothing yet.
 
@@ -89,6 +92,7 @@ class Jobs:
                 leaves before the job's end.
             progress: Called with the connection of a command, and how far it is.
             new_owner: Makes names that are unique among all servers.
+            wall_clock: Unix seconds.
         """
         self._context = context
         self._serving = settings.serving
@@ -99,6 +103,9 @@ class Jobs:
         self._new_owner = new_owner
         self._entries: dict[tuple[str, str, str], _Entry] = {}
         self._leaving = False
+        self._sweep = RecordSweep(
+            context.store, life_s=settings.serving.job_record_s, clock=context.clock, wall_clock=wall_clock
+        )
         plain = settings.to_dict()
         chosen = json.dumps([plain["services"], plain["pnp"]], sort_keys=True)
         self._settings_digest = hashlib.sha256(chosen.encode()).hexdigest()
@@ -209,6 +216,8 @@ class Jobs:
                 self._log.error("job-defect", service=entry.wanted.service, reason=repr(error))
                 outcome = Outcome(error=RsePfError("the job failed", hint="the server's log has it"))
             told(self._ended, entry, outcome)
+            if not outcome.is_given_up:
+                self._sweep.turn()
 
         entry.thread = threading.Thread(target=work, name=f"job-{entry.wanted.key[:8]}", daemon=True)
         entry.thread.start()

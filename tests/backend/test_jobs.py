@@ -6,6 +6,7 @@ import heapq
 import os
 import queue
 import socket
+import threading
 import time
 from collections.abc import Callable
 from types import SimpleNamespace
@@ -15,6 +16,7 @@ import msgspec
 import pytest
 
 from rse_pf.backend.environment_process import encoded
+from rse_pf.backend.job_lease import JobRecord, encode_record
 from rse_pf.backend.job_run import Context, Wanted
 from rse_pf.backend.job_slots import Slots, make_pipe
 from rse_pf.backend.jobs import Jobs
@@ -61,8 +63,9 @@ class Bench:
         self._timers: list[tuple[float, int, Callable[[], object]]] = []
         self._fd = os.open(os.devnull, os.O_WRONLY)
         self.log = JsonLog(level="error", server="s", wall_clock=lambda: 0.0, fd=self._fd)
+        self.store = MemoryStore()
         context = Context(
-            store=MemoryStore(), slots=Slots(make_pipe(self.settings.serving.jobs)), server_id="s",
+            store=self.store, slots=Slots(make_pipe(self.settings.serving.jobs)), server_id="s",
             settings=self.settings.serving, most_bytes=1000, inline_bytes=100, start=self.start,
             clock=lambda: self.now,
         )  # fmt: skip
@@ -275,3 +278,20 @@ def test_a_leaving_server_answers_nothing_for_the_robot_asks_elsewhere(make):
 
     assert bench.answers == {}
     assert bench.jobs.known == 0
+
+
+def test_the_end_of_a_job_is_when_old_records_go(make):
+    bench, owner = make(job_record_s=60.0), robot()
+    old = "jobs/default/robot-9/" + "0" * 64
+    bench.store.put(old, encode_record(JobRecord(state="done", owner="", marked_s=1.0)))
+    ask(bench, owner, 1)
+
+    bench.process().done()
+    bench.turn(lambda: 1 in bench.answers)
+    for thread in threading.enumerate():
+        if thread.name.startswith("job-"):
+            thread.join(WAIT_S)
+
+    names = [info.name for info in bench.store.list("jobs/")]
+    assert len(names) == 1
+    assert old not in names
