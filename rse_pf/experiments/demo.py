@@ -26,7 +26,7 @@ from rse_pf.errors import CommandFailed, UsageError
 from rse_pf.experiments import demo_report
 from rse_pf.experiments.demo_merge import MERGED_MAP, write_merged
 from rse_pf.experiments.demo_pipe import TokenWanted
-from rse_pf.experiments.demo_platform_merge import merge_there
+from rse_pf.experiments.demo_platform_merge import merge_there, tenths
 from rse_pf.experiments.demo_robot import (
     Failed,
     Finished,
@@ -124,7 +124,7 @@ async def _run(
             merged = None
             if options.merge:
                 screen.say("merging the maps")
-                merged = await asyncio.to_thread(_merge, settings, folder, finished, cloud)
+                merged = await asyncio.to_thread(_merge, settings, folder, finished, cloud, screen)
                 events.write(now(), "merged", joined=merged["joined"])
     for secret in ("key.json", "keys.json"):
         (folder / "platform" / secret).unlink(missing_ok=True)
@@ -255,7 +255,7 @@ def _end(robots: list[_Robot]) -> None:
 
 
 def _merge(
-    settings: PlatformSettings, folder: Path, finished: list[Finished], cloud: LocalCloud
+    settings: PlatformSettings, folder: Path, finished: list[Finished], cloud: LocalCloud, screen: _Screen
 ) -> dict[str, Any]:
     """Merge on the platform the maps that the robots have committed."""
     names = [_name(number) for number in range(len(finished))]
@@ -265,7 +265,7 @@ def _merge(
         names,
         [robot.trajectory for robot in finished],
         [robot.truth for robot in finished],
-        lambda _: merge_there(url, token, names, settings.session, lambda done, what: None),
+        lambda _: merge_there(url, token, names, settings.session, tenths(screen.say)),
     )
     section["keyframes_uploaded"] = sum(robot.stats["keyframes_uploaded"] for robot in finished)
     return section

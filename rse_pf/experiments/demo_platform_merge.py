@@ -18,7 +18,7 @@ from rse_pf.errors import NotFound
 from rse_pf.services.merge import MergeReply
 from rse_pf.settings import SessionSettings
 
-__all__ = ["MERGED_NAME", "commit", "merge_there"]
+__all__ = ["MERGED_NAME", "commit", "merge_there", "tenths"]
 
 MERGED_NAME = "merged"
 
@@ -69,6 +69,22 @@ def commit(data: DataClient, name: str, encoded: bytes, note: str) -> str:
     except NotFound:
         parent = None
     return data.commit_map(name, encoded, parent=parent, note=note)
+
+
+def tenths(say: Callable[[str], None]) -> Callable[[float, str], None]:
+    """Return a progress callback that says a line when the next tenth is reached, and never goes back.
+
+    A job that another server begins anew is silent until it is where the first one was.
+    """
+    reached = -1
+
+    def tell(done: float, what: str) -> None:
+        nonlocal reached
+        if int(10 * done) > reached:
+            reached = int(10 * done)
+            say(f"merging the maps: {10 * reached} %, {what}")
+
+    return tell
 
 
 async def _ask(
