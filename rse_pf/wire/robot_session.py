@@ -18,6 +18,7 @@ from rse_pf.errors import LimitExceeded
 from rse_pf.settings import SessionSettings
 from rse_pf.wire.clock_offset import ClockOffset, Exchange
 from rse_pf.wire.codec import Codec
+from rse_pf.wire.comeback import Comeback, turn
 from rse_pf.wire.messages import (
     Cancel,
     Command,
@@ -90,6 +91,7 @@ class Link:
     outgoing: list[bytes] = field(default_factory=list)
     pace: Pace = field(default_factory=Pace)
     lease: Lease = field(default_factory=Lease)
+    comeback: Comeback | None = None
 
     @property
     def server(self) -> str:
@@ -155,7 +157,7 @@ class RobotSession:
         self._sequence[stream] = command.seq
         self._pending[command.id] = pending
         self._retry_tokens = min(_RETRY_BURST, self._retry_tokens + self.settings.retry_percent / 100)
-        if self.current is not None and self._room(self.current, now) > 0:
+        if self.current is not None and self._may_go(command, self.current, self._room(self.current, now)):
             self._write(pending, self.current, now, data)
         return command.id
 
@@ -197,7 +199,8 @@ class RobotSession:
     def adopt(self, link: Link, now: float) -> list[Event]:
         """Make a welcomed *link* the current one and send on it what has no link.
 
-        Of a latest-wins stream only the newest frame is sent again: no catch-up burst.
+        Of a latest-wins stream only the newest frame is sent again: no catch-up burst.  Frames that waited
+        for want of a link go as `rse_pf.wire.comeback` says.
         """
         before, self.current = self.current, link
         if before is not None and before is not link:
@@ -205,6 +208,9 @@ class RobotSession:
             for pending in self._pending.values():
                 if pending.link is before and pending.is_long and not pending.cancelled:
                     pending.link = None  # it goes on elsewhere: ask there, and do not hold the old server up
+        frames = [each.command.id for each in self._pending.values() if _is_frame(each) and each.link is None]
+        if before is None and len(frames) > 1:
+            link.comeback = Comeback(newest=frames[-1])
         return self._flush(now)
 
     def receive(self, link: Link, data: bytes, now: float) -> list[Event]:
@@ -308,18 +314,30 @@ class RobotSession:
             return []
         events: list[Event] = []
         room = self._room(link, now)
-        for identity, pending in list(self._pending.items()):
-            if pending.link is not None or now < pending.not_before:
+        waiting = [each for each in self._pending.items() if each[1].link is None]
+        newest = 0 if link.comeback is None else link.comeback.newest
+        if not any(identity <= newest and _is_frame(pending) for identity, pending in waiting):
+            link.comeback = None
+        else:
+            waiting.sort(key=lambda each: turn(each[0], each[1].command.stream))
+        for identity, pending in waiting:
+            if now < pending.not_before:
                 continue
             command = pending.command
             if command.stream and not command.keep and command.seq < self._sequence[command.stream]:
                 events += self._end(identity, _failure(command, "stale", "a newer frame took its place"))
-            elif room > 0:
+            elif self._may_go(command, link, room):
                 room -= 1
                 self._write(pending, link, now)
                 if pending.cancelled:
                     self._take_back(pending)
         return events
+
+    def _may_go(self, command: Command, link: Link, room: int) -> bool:
+        if room <= 0 or not command.stream or link.comeback is None:
+            return room > 0
+        under_way = sum(_is_frame(each) and each.link is link for each in self._pending.values())
+        return under_way < link.comeback.room
 
     def _room(self, link: Link, now: float) -> int:
         most = link.welcome.limits.max_in_flight if link.welcome else self.settings.max_in_flight
@@ -352,6 +370,8 @@ class RobotSession:
         if pending is None or (elsewhere and isinstance(answer, Failure)):
             self.dropped_answers += 1
             return []
+        if link.comeback is not None:
+            link.comeback.heard(answer.queue_ms if isinstance(answer, Result) else math.inf)
         if isinstance(answer, Failure):
             again = self._try_again(pending, answer, now)
             return self._flush(now) if again else self._end(pending.command.id, answer) + self._flush(now)
@@ -435,6 +455,11 @@ class RobotSession:
 
 def _with_deadline(command: Command, remaining_s: float) -> Command:
     return msgspec.structs.replace(command, deadline_ms=min(_LONGEST_MS, max(0.0, remaining_s * 1e3)))
+
+
+def _is_frame(pending: _Pending) -> bool:
+    """Whether it loses its worth with time: of a stream, and not without an end."""
+    return bool(pending.command.stream) and math.isfinite(pending.deadline)
 
 
 def _failure(command: Command, code: str, message: str) -> Failure:
