@@ -87,7 +87,10 @@ async def ended(mark: ProcessMark, timeout_s: float | None = None) -> bool:
 def spawn(
     command: Sequence[str], *, log: Path, folder: Path, dies_with_parent: bool
 ) -> subprocess.Popen[bytes]:
-    """Start *command* in a session of its own, so that a terminal's Ctrl-C does not reach it.
+    """Start *command* in a process group of its own, so that a terminal's Ctrl-C does not reach it.
+
+    Not in a session of its own: where Linux groups by session (autogroup, a default of desktops), every
+    session gets the same share of the processor, whatever the niceness of what runs in it.
 
     Args:
         command: Program and arguments.
@@ -102,8 +105,7 @@ def spawn(
             stdin=subprocess.DEVNULL,
             stdout=output,
             stderr=subprocess.STDOUT,
-            start_new_session=True,
-            preexec_fn=_killed_with_parent(os.getpid()) if dies_with_parent else None,
+            preexec_fn=_apart(os.getpid() if dies_with_parent else None),
         )
     _, most = resource.getrlimit(resource.RLIMIT_NOFILE)
     with contextlib.suppress(OSError):  # each robot needs two descriptors; the process may be gone already
@@ -124,15 +126,18 @@ def last_line(log: Path) -> str:
     return (told or lines or [""])[-1][:300]
 
 
-def _killed_with_parent(parent: int) -> Callable[[], None]:
+def _apart(parent: int | None) -> Callable[[], None]:
+    """Return what a child does before its program: leave the group, and be killed with *parent*, if any."""
     prctl = ctypes.CDLL(None).prctl  # looked up before the fork: the child may not take locks
 
-    def ask() -> None:
-        prctl(_PR_SET_PDEATHSIG, int(signal.SIGKILL), 0, 0, 0)
-        if os.getppid() != parent:
-            os._exit(1)
+    def leave() -> None:
+        os.setpgid(0, 0)
+        if parent is not None:
+            prctl(_PR_SET_PDEATHSIG, int(signal.SIGKILL), 0, 0, 0)
+            if os.getppid() != parent:
+                os._exit(1)
 
-    return ask
+    return leave
 
 
 @contextlib.contextmanager

@@ -98,6 +98,16 @@ def test_a_spawned_process_reads_nothing_and_writes_its_log(tmp_path: Path) -> N
     assert log.read_text().splitlines() == [str(tmp_path), "last"]
 
 
+@pytest.mark.parametrize("dies", [True, False])
+def test_ctrl_c_does_not_reach_a_spawned_process_and_its_niceness_counts(tmp_path: Path, dies: bool) -> None:
+    """A group of its own for the first, our session for the second: Linux may share time out by session."""
+    log = tmp_path / "log"
+    told = "import os; print(os.getpgid(0) == os.getpid(), os.getsid(0), flush=True)"
+    spawn([sys.executable, "-c", told], log=log, folder=tmp_path, dies_with_parent=dies).wait()
+
+    assert log.read_text().split() == ["True", str(os.getsid(0))]
+
+
 def test_a_spawned_process_may_open_as_many_files_as_the_system_allows(tmp_path: Path) -> None:
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     resource.setrlimit(resource.RLIMIT_NOFILE, (min(soft, 512), hard))
