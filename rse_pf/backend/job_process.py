@@ -1,7 +1,8 @@
 """The inside of one job: a process of its own that steps back behind everything else, works once and ends.
 
 It talks with its worker over one socket: an order in; progress, then one answer out.  Promises to run at
-the lowest priority there is, to stay within its memory, and not to outlive its worker.
+the lowest priority there is, to stay within its memory, and not to outlive its worker.  It reads its inputs
+and stores its reply itself: a worker has robots to answer.
 """
 
 from __future__ import annotations
@@ -19,19 +20,22 @@ from typing import Any
 import msgspec
 
 from rse_pf.backend.environment_process import HEADER, decoded, encoded
-from rse_pf.backend.job_store import open_job_store
+from rse_pf.backend.job_store import is_shared, open_job_store
 from rse_pf.backend.load_services import load_services
 from rse_pf.backend.objects_in import named_in, resolve
 from rse_pf.backend.processes import die_with_parent, step_back
-from rse_pf.errors import BadMessage, Cancelled, Crashed, RsePfError
+from rse_pf.backend.room import check_room, store_within
+from rse_pf.errors import BadMessage, Cancelled, Crashed, LimitExceeded, RsePfError, StoreError
+from rse_pf.objects import ObjectStore
 from rse_pf.service import dispatch, failure_of
 from rse_pf.settings import PlatformSettings
 from rse_pf.wire import Command, Failure, Result
 from rse_pf.wire.arrays import binary_encode_hook
 
-__all__ = ["main", "receive"]
+__all__ = ["kept", "main", "receive"]
 
 _REPORT_PAUSE_S = 0.5
+_STORE_TRIES = 3
 
 
 def main(arguments: list[str]) -> None:
@@ -44,7 +48,7 @@ def main(arguments: list[str]) -> None:
         resource.setrlimit(resource.RLIMIT_DATA, (order["memory_bytes"],) * 2)
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
         with contextlib.suppress(OSError):  # a worker that does not wait any longer is no defect
-            worker.sendall(encoded(_work(order, _Reporter(worker, time.monotonic))))
+            worker.sendall(encoded(kept(_work(order, _Reporter(worker, time.monotonic)), order)))
 
 
 def receive(connection: socket.socket) -> Any:
@@ -85,6 +89,7 @@ def _work(order: dict[str, Any], report: Callable[[float, str], None]) -> list[A
     try:
         settings = PlatformSettings.from_dict(order["settings"])
         registry = load_services(order["services"], settings)
+        _look_for_room(order, settings)
         payload = _resolved(command.payload, registry.get(command.service).request_type, order, settings)
         command = msgspec.structs.replace(command, payload=payload)
         answer = dispatch(registry, command, time.monotonic, on_defect=on_defect, report=report)
@@ -108,6 +113,36 @@ def _resolved(
         return payload
     store = open_job_store(settings)
     return resolve(request_type, payload, order["tenant"], order["robot"], store, settings=settings.serving)
+
+
+def _look_for_room(order: dict[str, Any], settings: PlatformSettings) -> None:
+    """Raise QuotaExceeded before the work, not after it, where its result has no place."""
+    if is_shared(settings):
+        store = open_job_store(settings)
+        with contextlib.suppress(StoreError):  # whether it can keep the result shows when there is one
+            check_room(store, order["tenant"], order["robot"], 1, order["quota_bytes"])
+
+
+def kept(told: list[Any], order: dict[str, Any]) -> list[Any]:
+    """Store the reply here, where it disturbs nobody, and tell its name; small ones go along."""
+    settings = PlatformSettings.from_dict(order["settings"])
+    if told[0] != "done" or not is_shared(settings):
+        return told
+    _, compute_ms, reply = told
+    try:
+        if len(reply) > settings.data.max_object_bytes:
+            raise LimitExceeded(f"a reply of {len(reply)} bytes is too large", hint="ask for less")
+        digest = _stored(reply, order, open_job_store(settings))
+    except RsePfError as error:
+        return _told(failure_of(error))
+    return ["stored", compute_ms, digest, len(reply), reply if len(reply) <= order["inline_bytes"] else None]
+
+
+def _stored(reply: bytes, order: dict[str, Any], store: ObjectStore) -> str:
+    for _ in range(_STORE_TRIES - 1):
+        with contextlib.suppress(StoreError):
+            return store_within(store, order["tenant"], order["robot"], reply, order["quota_bytes"])
+    return store_within(store, order["tenant"], order["robot"], reply, order["quota_bytes"])
 
 
 def _told(answer: Result | Failure) -> list[Any]:

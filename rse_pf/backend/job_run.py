@@ -19,12 +19,14 @@ from typing import Any, Literal, Protocol
 from rse_pf.backend.environment_process import HEADER, decoded, encoded
 from rse_pf.backend.job_lease import MOST_TRIES, JobRecord, Lease, record_name, verdict_on
 from rse_pf.backend.job_slots import Slots
+from rse_pf.backend.room import store_within
 from rse_pf.errors import (
     Cancelled,
     Crashed,
     Expired,
     NotFound,
     Poison,
+    QuotaExceeded,
     RsePfError,
     StoreError,
     error_from_code,
@@ -64,6 +66,8 @@ class Wanted:
     tenant: str
     robot: str
     key: str
+    quota_bytes: float
+    """Of all that the robot stores, its results among it."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -73,6 +77,8 @@ class Context:
     store: ObjectStore
     slots: Slots
     settings: ServingSettings
+    quota_bytes: float
+    """Of a robot whose token says nothing of it."""
     most_bytes: int
     """Of a reply."""
     inline_bytes: int
@@ -245,6 +251,8 @@ class _Run:
         code = process.wait()
         if self._end is None:
             return self._failed(_crashed(code))
+        if self._end[0] == "stored":
+            return self._stored(*self._end[1:])
         if self._end[0] == "done":
             return self._done(*self._end[1:])
         return self._failed(error_from_code(str(self._end[1]), str(self._end[2]), hint=str(self._end[3])))
@@ -313,19 +321,26 @@ class _Run:
                 self._end, self._is_over = message, True
 
     def _done(self, compute_ms: float, reply: bytes) -> Outcome:
-        """Make the reply durable before anybody hears of it."""
-        context, digest = self._context, digest_of(reply)
-        self._patiently(
-            lambda: context.store.put(object_name(self._wanted.tenant, self._wanted.robot, digest), reply)
-        )
+        """Make the reply durable before anybody hears of it, as the process could not."""
+        context, wanted, digest = self._context, self._wanted, digest_of(reply)
+        try:
+            self._patiently(
+                lambda: store_within(context.store, wanted.tenant, wanted.robot, reply, wanted.quota_bytes)
+            )
+        except QuotaExceeded as error:
+            return self._failed(error)
+        inline = reply if len(reply) <= context.inline_bytes else None
+        return self._stored(compute_ms, digest, len(reply), inline)
+
+    def _stored(self, compute_ms: float, digest: str, size: int, reply: bytes | None) -> Outcome:
+        """Tell everybody where the durable reply is; *reply* itself if it is small."""
         self._leave(
             JobRecord(
-                state="done", owner="", reply=digest, reply_bytes=len(reply), compute_ms=compute_ms,
-                server=context.server_id,
+                state="done", owner="", reply=digest, reply_bytes=size, compute_ms=compute_ms,
+                server=self._context.server_id,
             )
         )  # fmt: skip
-        inline = reply if len(reply) <= context.inline_bytes else None
-        return Outcome(object=digest, reply=inline, compute_ms=compute_ms)
+        return Outcome(object=digest, reply=reply, compute_ms=compute_ms)
 
     def _failed(self, error: RsePfError) -> Outcome:
         self._leave(

@@ -8,7 +8,14 @@ from __future__ import annotations
 from rse_pf.objects import ObjectStore, open_store
 from rse_pf.settings import PlatformSettings
 
-__all__ = ["open_job_store"]
+__all__ = ["is_shared", "open_job_store"]
+
+_OURS_ALONE = "memory:"
+
+
+def is_shared(settings: PlatformSettings) -> bool:
+    """Return whether what one process stores is there for another."""
+    return settings.data.store != _OURS_ALONE
 
 
 def open_job_store(settings: PlatformSettings) -> ObjectStore:

@@ -22,6 +22,7 @@ from rse_pf.backend.job_lease import job_key
 from rse_pf.backend.job_run import WAITS, Context, Outcome, Signals, Wanted, run_job
 from rse_pf.backend.job_sweep import RecordSweep
 from rse_pf.backend.job_turns import who_makes_room
+from rse_pf.backend.room import quota_bytes
 from rse_pf.backend.scheduler import Job
 from rse_pf.backend.template import EventLog
 from rse_pf.errors import BadRequest, Busy, Cancelled, RsePfError
@@ -199,6 +200,7 @@ class Jobs:
             tenant=job.owner.tenant,
             robot=job.robot,
             key=key,
+            quota_bytes=quota_bytes(job.owner.claims, self._context.quota_bytes),
         )
 
     def _begin(self, entry: _Entry) -> None:

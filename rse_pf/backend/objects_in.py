@@ -9,6 +9,7 @@ bytes whose digest is right.
 from __future__ import annotations
 
 import functools
+import math
 import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -16,7 +17,9 @@ from typing import Any, Protocol
 
 import msgspec
 
-from rse_pf.errors import BadRequest, LimitExceeded, NotFound, StoreError
+from rse_pf.auth import Claims
+from rse_pf.backend.room import quota_bytes, store_within
+from rse_pf.errors import BadRequest, LimitExceeded, NotFound, QuotaExceeded, StoreError
 from rse_pf.objects import ObjectStore, digest_of, object_name
 from rse_pf.service import Registry, Service
 from rse_pf.settings import ServingSettings
@@ -105,6 +108,7 @@ class Owner(Protocol):
 
     robot: str
     tenant: str
+    claims: Claims | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,6 +117,8 @@ class ObjectsIn:
 
     store: ObjectStore | None
     settings: ServingSettings
+    quota_bytes: float = math.inf
+    """Of a robot whose token says nothing of it."""
 
     def named_by(self, command: Command, service: Service) -> bool:
         """Return whether the store would have to be asked; cheap for services that take no ``bytes``."""
@@ -135,7 +141,10 @@ class ObjectsIn:
         return msgspec.structs.replace(command, payload=payload)
 
     def kept(self, answer: Result | Failure, sent: Result | Failure, who: Owner) -> Result | Failure:
-        """Return *answer* with its reply named where it was too large and *sent* says so; blocks."""
+        """Return *answer* with its reply named where it was too large and *sent* says so; blocks.
+
+        Of a robot that has no room left, the failure that says so.
+        """
         if self.store is None or not isinstance(answer, Result) or not isinstance(sent, Failure):
             return sent
         if sent.code != LimitExceeded.code:
@@ -143,9 +152,11 @@ class ObjectsIn:
         reply = msgspec.msgpack.encode(answer.reply, enc_hook=binary_encode_hook)
         if len(reply) > self.settings.object_bytes_per_command:
             return sent
-        digest = digest_of(reply)
+        most_bytes = quota_bytes(who.claims, self.quota_bytes)
         try:
-            self.store.put(object_name(who.tenant, who.robot, digest), reply)
+            digest = store_within(self.store, who.tenant, who.robot, reply, most_bytes)
+        except QuotaExceeded as error:
+            return msgspec.structs.replace(sent, code=error.code, message=error.message, hint=error.hint)
         except StoreError:
             return sent  # true, too, and says what to do
         return msgspec.structs.replace(answer, reply=None, object=digest)

@@ -120,7 +120,9 @@ class _Worker:
             rest=time.sleep,
         )
         if settings.data.store != _OURS_ALONE:
-            self._core.objects = ObjectsIn(open_job_store(settings), settings.serving)
+            self._core.objects = ObjectsIn(
+                open_job_store(settings), settings.serving, settings.data.quota_bytes
+            )
         if settings.services.folder or settings.services.published:
             self._core.environments = self._environments(settings, plan.server_id, plan.workers)
         if settings.serving.jobs:
@@ -172,6 +174,7 @@ class _Worker:
             store=open_job_store(settings),
             slots=Slots((read, write)),
             settings=settings.serving,
+            quota_bytes=settings.data.quota_bytes,
             most_bytes=settings.data.max_object_bytes,
             inline_bytes=session.max_message_bytes // 2,
             server_id=plan.server_id,

@@ -153,7 +153,7 @@ def test_a_named_object_is_put_in_by_a_thread_and_a_large_reply_is_named_in_turn
     core, loop = made
     connection, wire = join(core)
     store, data = MemoryStore(), bytes(2 * SETTINGS.session.max_message_bytes)
-    core.objects = ObjectsIn(store, SETTINGS.serving)
+    core.objects = ObjectsIn(store, SETTINGS.serving, SETTINGS.data.quota_bytes)
     store.put(object_name("default", "r", digest_of(data)), data)
     threads: list[str] = []
     answered = threading.Event()
@@ -178,10 +178,10 @@ def test_an_object_of_another_robot_is_not_found_and_too_much_is_too_large_witho
 
     store = MemoryStore()
     store.put(object_name("default", "other", foreign), b"x")
-    core.objects = ObjectsIn(store, SETTINGS.serving)
+    core.objects = ObjectsIn(store, SETTINGS.serving, SETTINGS.data.quota_bytes)
     named = Command(id=4, service="large", payload={"data": {"object": foreign}})
     missing = core._compute(Job(connection, "r", named, 9, 0.0, 1.0)).answer
-    core.objects = ObjectsIn(None, SETTINGS.serving)
+    core.objects = ObjectsIn(None, SETTINGS.serving, SETTINGS.data.quota_bytes)
     inline = Command(id=5, service="large", payload={"data": long + long})
     large = core._compute(Job(connection, "r", inline, 9, 0.0, 1.0)).answer
 

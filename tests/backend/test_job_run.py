@@ -20,7 +20,7 @@ from rse_pf.objects import MemoryStore, digest_of, object_name
 from rse_pf.settings import ServingSettings
 
 SETTINGS = ServingSettings(job_beat_s=0.05, job_lease_s=0.2)
-WANTED = Wanted(service="long", payload={}, tenant="default", robot="robot-1", key="ab" * 32)
+WANTED = Wanted(service="long", payload={}, tenant="default", robot="robot-1", key="ab" * 32, quota_bytes=1e6)
 WHO = ("default", "robot-1")
 NAME = record_name("default", "robot-1", WANTED.key)
 REPLY = msgspec.msgpack.encode({"value": 1})
@@ -74,8 +74,8 @@ class Bench:
     def run(self, *scripts: Callable[[], FakeProcess], most_bytes: int = 1000, inline: int = 100) -> Outcome:
         self.scripts += scripts
         context = Context(
-            store=self.store, slots=Slots(self.pipe), settings=SETTINGS, most_bytes=most_bytes,
-            inline_bytes=inline, server_id="s", start=self.start, clock=Clock(),
+            store=self.store, slots=Slots(self.pipe), settings=SETTINGS, quota_bytes=1e6,
+            most_bytes=most_bytes, inline_bytes=inline, server_id="s", start=self.start, clock=Clock(),
         )  # fmt: skip
 
         def tell(share: float, what: str) -> None:
@@ -309,3 +309,19 @@ def test_a_conflict_is_no_reason_to_forget_the_end(bench):
 
     assert code(bench.run(lambda: FakeProcess([DONE]))) == "ok"
     assert bench.record.state == "done"
+
+
+def test_a_reply_that_the_process_stored_is_passed_on_under_its_name(bench):
+    outcome = bench.run(lambda: FakeProcess([["stored", 12.5, "ab" * 32, 10**6, None]]))
+
+    assert outcome == Outcome(object="ab" * 32, reply=None, compute_ms=12.5)
+    assert (bench.record.state, bench.record.reply, bench.record.reply_bytes) == ("done", "ab" * 32, 10**6)
+    assert [info.name for info in bench.store.list("objects/")] == []
+
+
+def test_a_reply_that_does_not_fit_the_robots_quota_is_a_typed_failure_and_not_stored(bench):
+    bench.store.put(object_name("default", "robot-1", "full"), bytes(10**6 - 1))
+
+    assert code(bench.run(lambda: FakeProcess([DONE]))) == "quota"
+    assert bench.record.code == "quota"
+    assert len(list(bench.store.list("objects/"))) == 1

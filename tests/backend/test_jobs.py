@@ -66,8 +66,8 @@ class Bench:
         self.store = MemoryStore()
         context = Context(
             store=self.store, slots=Slots(make_pipe(self.settings.serving.jobs)), server_id="s",
-            settings=self.settings.serving, most_bytes=1000, inline_bytes=100, start=self.start,
-            clock=lambda: self.now,
+            settings=self.settings.serving, quota_bytes=1e6, most_bytes=1000, inline_bytes=100,
+            start=self.start, clock=lambda: self.now,
         )  # fmt: skip
         self.jobs = Jobs(
             context, settings=self.settings, loop=self, log=self.log, new_owner=lambda: os.urandom(4).hex(),
@@ -122,7 +122,7 @@ def make():
 
 
 def robot(name: str = "robot-1", tenant: str = "default") -> Any:
-    return SimpleNamespace(robot=name, tenant=tenant)
+    return SimpleNamespace(robot=name, tenant=tenant, claims=None)
 
 
 def ask(bench: Bench, owner: Any, identity: int, value: int = 1) -> None:

@@ -167,7 +167,7 @@ def test_the_services_for_maps_take_objects_and_pnp_is_not_even_looked_at(store:
 
 
 def test_a_payload_of_nonsense_is_left_to_the_service_to_refuse(store: Counting) -> None:
-    gate, registry = ObjectsIn(store, SERVING), Registry()
+    gate, registry = ObjectsIn(store, SERVING, 1e9), Registry()
 
     @registry.service("asked")
     def asked(request: Asked) -> Asked:
