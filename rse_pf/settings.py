@@ -84,6 +84,7 @@ class ServingSettings:
     write_buffer_bytes: int = setting(262144, unit="bytes", doc="unsent bytes at which a reader counts as slow", low=4096)
     slow_reader_s: float = setting(1.0, unit="s", doc="a reader that stays slow this long is cut off", low=0.05)
     inline_bytes: int = setting(16384, unit="bytes", doc="a command up to this size is solved in the event loop when nothing waits", low=0)
+    unread_bytes: int = setting(16777216, unit="bytes", doc="messages of more than inline_bytes that wait to be read in one worker; more are refused", low=262144)
     queue_target_ms: float = setting(50.0, unit="ms", doc="waiting time above which the server counts as behind", source="CoDel, Nichols and Jacobson 2012", low=1)
     queue_interval_ms: float = setting(100.0, unit="ms", doc="behind for this long, the server sheds", source="CoDel, Nichols and Jacobson 2012", low=1)
     queue_per_robot: int = setting(8, unit="commands", doc="commands of one robot that wait; more are refused", low=1)

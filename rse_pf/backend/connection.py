@@ -6,9 +6,11 @@ more.
 
 from __future__ import annotations
 
+from collections import deque
 from typing import TYPE_CHECKING
 
 from rse_pf.backend.frames import CloseSocket, FrameAssembler, Received, SendPong
+from rse_pf.backend.reading import Reading, refusal_unread
 from rse_pf.backend.seams import Wire
 from rse_pf.enrolment import holds
 from rse_pf.wire.session import Decision, Renewal, Send, ServerSession, Submit, Withdraw
@@ -16,6 +18,8 @@ from rse_pf.wire.session import Decision, Renewal, Send, ServerSession, Submit, 
 if TYPE_CHECKING:
     from rse_pf.auth import Claims
     from rse_pf.backend.core import Core
+    from rse_pf.errors import ProtocolError
+    from rse_pf.wire.messages import FromRobot
 
 __all__ = ["Connection"]
 
@@ -24,8 +28,8 @@ class Connection:
     """One robot's socket between its handshake and its end."""
 
     __slots__ = (
-        "_core", "_wire", "allowed_s", "assembler", "claims", "expires_s", "last_heard_s", "moving_until_s",
-        "number", "opened_s", "robot", "session", "tenant",
+        "_behind", "_core", "_wire", "allowed_s", "assembler", "claims", "expires_s", "last_heard_s",
+        "moving_until_s", "number", "opened_s", "robot", "session", "tenant",
     )  # fmt: skip
 
     def __init__(
@@ -52,6 +56,8 @@ class Connection:
         self.moving_until_s = float("-inf")
         self._core = core
         self._wire = wire
+        self._behind: deque[tuple[Received, float]] | None = None
+        """What arrived while a long message is read elsewhere; None: nothing is."""
 
     def frame(self, opcode: int, fin: bool, rsv: bool, payload: bytes) -> None:
         """Take one unmasked frame."""
@@ -113,6 +119,9 @@ class Connection:
 
     def _message(self, received: Received, now: float) -> None:
         self.last_heard_s = now
+        if self._behind is not None:
+            self._behind.append((received, now))
+            return
         self._core.metrics.bytes_in += len(received.data)
         session = self.session
         if session is None:
@@ -121,11 +130,44 @@ class Connection:
             return
         if session.state == "open" and self._core.refuses_unread(self, session.codec, received.data, now):
             return
-        was_opening, bad = session.state == "opening", session.bad_messages
-        self.apply(session.receive(received.data, now), now, len(received.data))
-        if session.bad_messages > bad and not self.assembler.closed:
+        reading, was, bad = self._core.reading, session.state, session.bad_messages
+        if reading is None:
+            self._received(session.receive(received.data, now), len(received.data), now, was, bad)
+            return
+        if len(received.data) <= reading.short_bytes:
+            decisions = session.receive_short(received.data, now, reading.short_inflated_bytes)
+            if decisions is not None:
+                self._received(decisions, len(received.data), now, was, bad)
+                return
+        self._read_elsewhere(reading, session, received.data, now)
+
+    def _read_elsewhere(self, reading: Reading, session: ServerSession, data: bytes, now: float) -> None:
+        was, bad = session.state, session.bad_messages
+
+        def done(read: FromRobot | ProtocolError) -> None:
+            behind, self._behind = self._behind, None
+            if not self.assembler.closed and self in self._core.connections:
+                self._received(session.take(read, now), len(data), now, was, bad)
+            for each, arrived in behind or ():
+                if not self.assembler.closed:
+                    self._message(each, arrived)
+            self._wire.read_on()
+
+        if not reading.begin(session.codec, data, suspicion=bad, done=done):
+            self._core.metrics.shed["unread"] += 1
+            self.write(refusal_unread(session.codec, data, self._core.server_id))
+            return
+        self._behind = deque()
+        self._wire.hold()
+
+    def _received(self, decisions: list[Decision], size_bytes: int, now: float, was: str, bad: int) -> None:
+        session = self.session
+        self.apply(decisions, now, size_bytes)
+        if session is None or self.assembler.closed:
+            return
+        if session.bad_messages > bad:
             # To refuse costs as much as to read: who sends garbage is read more and more rarely.
             self._core.metrics.shed["bad-message"] += 1
             self._wire.pause(session.bad_messages * self._core.settings.session.bad_message_pause_s)
-        if was_opening and session.state == "open":
+        if was == "opening" and session.state == "open":
             self._core.welcomed(self, now)

@@ -41,6 +41,7 @@ from rse_pf.wire.session import (
 
 if TYPE_CHECKING:
     from rse_pf.backend.jobs import Jobs
+    from rse_pf.backend.reading import Reading
     from rse_pf.backend.revocation import Standing
 
 __all__ = ["Core"]
@@ -84,7 +85,7 @@ class Core:
         self.connections: set[Connection] = set()
         self.rates = RobotRates(settings.session)
         self._registry = registry
-        self._server_id = server_id
+        self.server_id = server_id
         self._loop = loop
         self._log = log
         self._new_session_id = new_session_id
@@ -107,6 +108,8 @@ class Core:
         """What the connections' tokens are worth; set by whoever can hear of it."""
         self.objects = ObjectsIn(None, settings.serving)
         """What payloads may name; set by whoever opens the store."""
+        self.reading: Reading | None = None
+        """Of long messages; set by whoever has a loop that threads can call."""
         self._gate_timer: Handle | None = None
         self._ran_inline = False
         self._sweep_timer: Handle | None = None
@@ -130,7 +133,7 @@ class Core:
             session = ServerSession(
                 codec=self._codecs[admitted.codec],
                 robot=admitted.robot,
-                server=self._server_id,
+                server=self.server_id,
                 session=self._new_session_id(),
                 limits=self.settings.session,
             )
@@ -252,7 +255,7 @@ class Core:
             return False
         failure = Failure(
             id=envelope.id, code=Busy.code, message=BEHIND, hint=BEHIND_HINT,
-            retry_after_ms=retry_after_ms, server=self._server_id,
+            retry_after_ms=retry_after_ms, server=self.server_id,
         )  # fmt: skip
         refusal = encode_refusal(codec, failure)
         self.metrics.shed["unread"] += 1
@@ -275,7 +278,7 @@ class Core:
         envelope = peek(codec, data)
         failure = Failure(
             id=None if envelope is None else envelope.id, code=Busy.code, message=_TOO_FAST,
-            hint=_TOO_FAST_HINT, retry_after_ms=verdict.retry_after_ms, server=self._server_id,
+            hint=_TOO_FAST_HINT, retry_after_ms=verdict.retry_after_ms, server=self.server_id,
         )  # fmt: skip
         connection.write(encode_refusal(codec, failure))
         if envelope is not None:
@@ -359,9 +362,9 @@ class Core:
         try:
             command = self.objects.put_in(command, self._registry, job.owner)
         except RsePfError as error:
-            return self._encoded(job, failure_of(error, command, server=self._server_id))
+            return self._encoded(job, failure_of(error, command, server=self.server_id))
         answer = dispatch(
-            self._registry, command, monotonic, server=self._server_id, on_defect=self._log_defect
+            self._registry, command, monotonic, server=self.server_id, on_defect=self._log_defect
         )
         if isinstance(answer, Result):
             answer = msgspec.structs.replace(
@@ -383,7 +386,7 @@ class Core:
             answer = failure_of(
                 InternalError(f"the reply of {command.service!r} cannot be encoded"),
                 command,
-                server=self._server_id,
+                server=self.server_id,
             )
             return _Outcome(job, answer, codec.encode(answer))
         most = self.settings.session.max_message_bytes
@@ -391,7 +394,7 @@ class Core:
             return self._encoded(job, msgspec.structs.replace(answer, reply=None))
         if len(data) > most:
             too_large = LimitExceeded(f"the reply has {len(data)} bytes, above {most}", hint="ask for less")
-            answer = failure_of(too_large, command, server=self._server_id)
+            answer = failure_of(too_large, command, server=self.server_id)
             data = codec.encode(answer)
         return _Outcome(job, answer, data)
 
@@ -411,7 +414,7 @@ class Core:
         for refusal in refusals:
             self.metrics.shed[refusal.reason] += 1
             job = refusal.job
-            failure = failure_of(refusal.error, job.command, server=self._server_id)
+            failure = failure_of(refusal.error, job.command, server=self.server_id)
             self._answer(_Outcome(job, failure, job.owner.session.codec.encode(failure)), now)
 
     def _answer(self, outcome: _Outcome, now: float) -> None:

@@ -24,6 +24,12 @@ class Wire(Protocol):
     def pause(self, seconds: float) -> None:
         """Read nothing more for so long."""
 
+    def hold(self) -> None:
+        """Read nothing more until as many `read_on` have come."""
+
+    def read_on(self) -> None:
+        """Take one `hold` back."""
+
     def close(self, code: int, reason: str) -> None:
         """Write a close frame and end the connection."""
 

@@ -18,6 +18,7 @@ from rse_pf.backend.door import Admitted, Door, TurnedAway
 from rse_pf.backend.frames import CloseBorder
 from rse_pf.backend.limits import SourceRates, WaitingRoom
 from rse_pf.backend.log import JsonLog
+from rse_pf.backend.reading import Reading
 from rse_pf.backend.seams import Handle
 from rse_pf.errors import MissingExtra
 from rse_pf.settings import ServingSettings, SessionSettings
@@ -104,6 +105,7 @@ class RobotSockets:
         loop: asyncio.AbstractEventLoop,
     ) -> None:
         self._core = core
+        core.reading = Reading(serving, call_soon_threadsafe=loop.call_soon_threadsafe)
         self._door = door
         self._most_robots = most_robots
         self._sources = SourceRates(serving)
@@ -277,6 +279,7 @@ def _listener_type(picows: Any, loop: asyncio.AbstractEventLoop, serving: Servin
             self._transport: Any = None
             self._connection: Connection | None = None
             self._cut: Handle | None = None
+            self._holds = 0
 
         def on_ws_connected(self, transport: Any) -> None:
             self._transport = transport
@@ -300,11 +303,14 @@ def _listener_type(picows: Any, loop: asyncio.AbstractEventLoop, serving: Servin
         def pause_writing(self) -> None:
             if self._cut is None:
                 self._cut = loop.call_later(serving.slow_reader_s, self._cut_off)
+                # Who does not read its answers is not heard: they would be made for nobody.
+                self.hold()
 
         def resume_writing(self) -> None:
             if self._cut is not None:
                 self._cut.cancel()
                 self._cut = None
+                self.read_on()
 
         def send(self, data: bytes, is_text: bool) -> None:
             if self._connection is not None:
@@ -314,11 +320,16 @@ def _listener_type(picows: Any, loop: asyncio.AbstractEventLoop, serving: Servin
             self._transport.send_pong(data)
 
         def pause(self, seconds: float) -> None:
-            self._transport.underlying_transport.pause_reading()
-            loop.call_later(seconds, self._read_on)
+            self.hold()
+            loop.call_later(seconds, self.read_on)
 
-        def _read_on(self) -> None:
-            if self._connection is not None:
+        def hold(self) -> None:
+            self._holds += 1
+            self._transport.underlying_transport.pause_reading()
+
+        def read_on(self) -> None:
+            self._holds -= 1
+            if self._connection is not None and not self._holds:
                 self._transport.underlying_transport.resume_reading()
 
         def close(self, code: int, reason: str) -> None:

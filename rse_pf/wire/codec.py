@@ -58,6 +58,9 @@ class Codec(Protocol):
     def decode_from_robot(self, data: bytes) -> FromRobot:
         """Return what a robot sent; raises BadMessage or LimitExceeded."""
 
+    def decode_short_from_robot(self, data: bytes, most: int) -> FromRobot | None:
+        """Return what a robot sent, None if it is longer than *most* bytes, inflated; raises the same."""
+
     def decode_from_server(self, data: bytes) -> FromServer:
         """Return what a server sent; raises BadMessage or LimitExceeded."""
 
@@ -108,20 +111,27 @@ class _JsonCodec:
         return stream.compress(data) + stream.flush()
 
     def decode_from_robot(self, data: bytes) -> FromRobot:
+        return self._read(self._open(data))
+
+    def decode_short_from_robot(self, data: bytes, most: int) -> FromRobot | None:
+        text = _inflate_short(data, most) if self._compressed else data
+        return None if text is None or len(text) > most else self._read(text)
+
+    def decode_from_server(self, data: bytes) -> FromServer:
         text = self._open(data)
+        _check_boxes(text, self._limits)
+        message: FromServer = _guarded(self._from_server, text)
+        return message
+
+    def _read(self, text: bytes) -> FromRobot:
+        _check_boxes(text, self._limits)
         _check_values(text, self._limits.max_json_values)
         message: FromRobot = _guarded(self._from_robot, text)
         return message
 
-    def decode_from_server(self, data: bytes) -> FromServer:
-        message: FromServer = _guarded(self._from_server, self._open(data))
-        return message
-
     def _open(self, data: bytes) -> bytes:
         _check_size(data, self._limits)
-        text = _inflate(data, self._limits) if self._compressed else data
-        _check_boxes(text, self._limits)
-        return text
+        return _inflate(data, self._limits) if self._compressed else data
 
 
 class _BinaryCodec:
@@ -143,6 +153,9 @@ class _BinaryCodec:
         message: FromRobot = _guarded(self._from_robot, data)
         _check_nesting(getattr(message, "payload", None), self._limits.max_json_depth)
         return message
+
+    def decode_short_from_robot(self, data: bytes, most: int) -> FromRobot | None:
+        return None if len(data) > most else self.decode_from_robot(data)
 
     def decode_from_server(self, data: bytes) -> FromServer:
         _check_size(data, self._limits)
@@ -201,12 +214,33 @@ def _inflate(data: bytes, limits: SessionSettings) -> bytes:
         if len(data) > first:
             text += stream.decompress(stream.unconsumed_tail + data[first:], most + 1 - len(text))
     except zlib.error as error:
-        raise BadMessage("not a zlib stream", hint="is this the sub-protocol that was agreed?") from error
+        raise _no_stream() from error
     if len(text) > most:
         raise _bomb(data, most)
     if not stream.eof or stream.unused_data:
-        raise BadMessage("the zlib stream does not end with the message", hint="one stream for each message")
+        raise _no_end()
     return text
+
+
+def _inflate_short(data: bytes, most: int) -> bytes | None:
+    stream = zlib.decompressobj()
+    try:
+        text = stream.decompress(data, most + 1)
+    except zlib.error as error:
+        raise _no_stream() from error
+    if len(text) > most:
+        return None
+    if not stream.eof or stream.unused_data:
+        raise _no_end()
+    return text
+
+
+def _no_stream() -> BadMessage:
+    return BadMessage("not a zlib stream", hint="is this the sub-protocol that was agreed?")
+
+
+def _no_end() -> BadMessage:
+    return BadMessage("the zlib stream does not end with the message", hint="one stream for each message")
 
 
 def _bomb(data: bytes, most: int) -> LimitExceeded:

@@ -25,6 +25,7 @@ from rse_pf.wire.messages import (
     Cancel,
     Command,
     Failure,
+    FromRobot,
     FromServer,
     Hello,
     Limits,
@@ -142,10 +143,29 @@ class ServerSession:
         """Return what to do about one WebSocket message that arrived at *now* (server clock, s)."""
         if self.state == "closed":
             return []
+        message: FromRobot | ProtocolError
         try:
             message = self.codec.decode_from_robot(data)
         except ProtocolError as error:
-            return self._refuse(error)
+            message = error
+        return self.take(message, now)
+
+    def receive_short(self, data: bytes, now: float, most: int) -> list[Decision] | None:
+        """Return the same as `receive`, but None if the message is longer than *most* bytes, inflated."""
+        if self.state == "closed":
+            return []
+        try:
+            message = self.codec.decode_short_from_robot(data, most)
+        except ProtocolError as error:
+            return self.take(error, now)
+        return None if message is None else self.take(message, now)
+
+    def take(self, message: FromRobot | ProtocolError, now: float) -> list[Decision]:
+        """Return what to do about one message that was read elsewhere, or could not be."""
+        if self.state == "closed":
+            return []
+        if isinstance(message, ProtocolError):
+            return self._refuse(message)
         if isinstance(message, Hello):
             return self._hello(message, now)
         if self.state == "opening":
