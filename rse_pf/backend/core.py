@@ -23,6 +23,7 @@ from rse_pf.backend.limits import CutOff, RobotRates, TooFast
 from rse_pf.backend.log import JsonLog
 from rse_pf.backend.metrics import LongestRecently, Metrics
 from rse_pf.backend.objects_in import ObjectsIn
+from rse_pf.backend.patience import Patience
 from rse_pf.backend.scheduler import BEHIND, BEHIND_HINT, Job, Refusal, Scheduler
 from rse_pf.backend.seams import Clocks, Handle, Loop, Wire
 from rse_pf.backend.size_gate import SizeGate
@@ -31,13 +32,7 @@ from rse_pf.service import Kind, Registry, Service, dispatch, failure_of
 from rse_pf.settings import PlatformSettings
 from rse_pf.wire import CODECS, Codec, Command, Failure, Progress, Result, make_codec
 from rse_pf.wire.envelope import encode_refusal, peek
-from rse_pf.wire.session import (
-    CLOSE_GOING_AWAY,
-    CLOSE_PROTOCOL,
-    CLOSE_RATE,
-    CLOSE_TOKEN_OVER,
-    ServerSession,
-)
+from rse_pf.wire.session import CLOSE_GOING_AWAY, CLOSE_RATE, ServerSession
 
 if TYPE_CHECKING:
     from rse_pf.backend.jobs import Jobs
@@ -46,9 +41,6 @@ if TYPE_CHECKING:
 
 __all__ = ["Core"]
 
-_SILENCE_MARGIN_S = 0.0
-_SLOWEST_TICK_S = 1.0
-_TICKS_PER_LIMIT = 4
 _UNKNOWN = "unknown"
 _BATCH_S = 0.01
 """Behind and out of budget, a small server refuses in batches: alone, a refusal costs three times as much."""
@@ -114,10 +106,9 @@ class Core:
         self._ran_inline = False
         self._sweep_timer: Handle | None = None
         self._move: tuple[str, float] | None = None
-        self._tick_s = _tick_s(settings)
-        self._next_tick_s = clocks.monotonic() + self._tick_s
+        self._patience = Patience(settings.session, clocks.monotonic())
         self._lag_s = 0.0
-        loop.call_later(self._tick_s, self._tick)
+        loop.call_later(self._patience.left_s(clocks.monotonic()), self._tick)
 
     @property
     def held(self) -> int:
@@ -473,28 +464,6 @@ class Core:
 
     def _tick(self) -> None:
         now = self.clocks.monotonic()
-        self._lag_s = max(self._lag_s, now - self._next_tick_s)
-        for connection in list(self.connections):
-            self._check(connection, now)
-        self._next_tick_s = now + self._tick_s
-        self._loop.call_later(self._tick_s, self._tick)
-
-    def _check(self, connection: Connection, now: float) -> None:
-        limits, session = self.settings.session, connection.session
-        if session is None or connection.assembler.closed:
-            return
-        if connection.expires_s is not None and now >= connection.expires_s:
-            connection.close(CLOSE_TOKEN_OVER, "token-over")
-        elif session.state == "opening":
-            if now - connection.opened_s >= limits.hello_timeout_s:
-                connection.close(CLOSE_PROTOCOL, "no-hello")
-        elif now - connection.last_heard_s >= _longest_silence_s(self.settings):
-            connection.close(CLOSE_GOING_AWAY, "silent")
-
-
-def _longest_silence_s(settings: PlatformSettings) -> float:
-    return settings.session.ping_interval_s + settings.session.ping_patience_s + _SILENCE_MARGIN_S
-
-
-def _tick_s(settings: PlatformSettings) -> float:
-    return min(_SLOWEST_TICK_S, settings.session.hello_timeout_s / _TICKS_PER_LIMIT)
+        self._lag_s = max(self._lag_s, -self._patience.left_s(now))
+        self._patience.look(self.connections, now)
+        self._loop.call_later(self._patience.left_s(now), self._tick)
