@@ -34,6 +34,7 @@ class LoadBalancer(Construct):
         self.alb = elbv2.ApplicationLoadBalancer(
             self, "Alb", vpc=vpc, internet_facing=True, security_group=group, drop_invalid_header_fields=True,
             idle_timeout=cdk.Duration.seconds(settings.cloud.idle_timeout_s),
+            desync_mitigation_mode=elbv2.DesyncMitigationMode.STRICTEST,
         )  # fmt: skip
         self.alb.log_access_logs(logs, "alb")
         self.targets = {"robots": self._targets("Robots", vpc, settings.serving.port, settings)}

@@ -73,15 +73,17 @@ def serve_data(
     """
     try:
         import uvicorn
+
+        from rse_pf.data_server.one_request import OneRequestProtocol
     except ImportError as error:
         raise MissingExtra("uvicorn", "data") from error
     log = None if audit is None else _audit_log(audit, settings)
     app = DataServer(settings, store, keys=keys, log=_write_line, audit=log)
     listening = _listen(settings)
     config = uvicorn.Config(
-        app, http="h11", ws="none", lifespan="off", access_log=False, log_level="warning", backlog=_BACKLOG,
-        server_header=False, date_header=False, proxy_headers=False, timeout_keep_alive=30,
-        timeout_graceful_shutdown=int(settings.local.stop_timeout_s),
+        app, http=OneRequestProtocol, ws="none", lifespan="off", access_log=False, log_level="warning",
+        backlog=_BACKLOG, server_header=False, date_header=False, proxy_headers=False,
+        timeout_keep_alive=30, timeout_graceful_shutdown=int(settings.local.stop_timeout_s),
     )  # fmt: skip
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, _stay)  # uvicorn sends itself the signal again when it is done

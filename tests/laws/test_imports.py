@@ -74,7 +74,7 @@ PACKAGES: dict[str, tuple[str, ...]] = {
     "aiofastnet": ("rse_pf/backend/",),
     "uvloop": ("rse_pf/backend/",),
     "prometheus_client": ("rse_pf/backend/", "rse_pf/data_server/"),
-    "uvicorn": ("rse_pf/data_server/server.py",),
+    "uvicorn": ("rse_pf/data_server/server.py", "rse_pf/data_server/one_request.py"),
     "jwt": ("rse_pf/auth.py",),
     "cryptography": ("rse_pf/auth.py",),
     "boto3": ("rse_pf/aws/",),

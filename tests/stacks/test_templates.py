@@ -199,6 +199,14 @@ def test_the_front_door_speaks_tls_unless_it_is_a_lab(assembly: Assembly) -> Non
         assert url == f"wss://robots.example.org{assembly.settings.serving.path}"
 
 
+def test_the_load_balancer_refuses_what_two_readers_may_understand_differently(assembly: Assembly) -> None:
+    balancer = assembly.one("AWS::ElasticLoadBalancingV2::LoadBalancer")
+    chosen = {each["Key"]: each["Value"] for each in balancer["LoadBalancerAttributes"]}
+
+    assert chosen["routing.http.desync_mitigation_mode"] == "strictest"
+    assert chosen["routing.http.drop_invalid_header_fields.enabled"] == "true"
+
+
 def test_only_the_front_door_is_open_to_the_world(assembly: Assembly) -> None:
     inline = [
         rule
