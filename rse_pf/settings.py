@@ -128,6 +128,7 @@ class SessionSettings:
     ping_patience_s: float = setting(3.0, unit="s", doc="silence after a ping that counts as a lost link", low=0.1)
     hello_timeout_s: float = setting(5.0, unit="s", doc="a socket without a Hello is closed", low=0.1)
     connect_timeout_s: float = setting(2.0, unit="s", doc="one try to connect", low=0.1)
+    dial_again_s: float = setting(0.5, unit="s", doc="a dial that is not through after this gets a second one beside it; 0 is off", source="RFC 8305 has 0.25 s, for other addresses", low=0)
     reconnect_base_s: float = setting(0.1, unit="s", doc="first back-off; full jitter", source="AWS Architecture Blog, 2015", low=0.001)
     reconnect_max_s: float = setting(1.0, unit="s", doc="longest back-off", low=0.01)
     answer_timeout_s: float = setting(5.0, unit="s", doc="deadline of a command that names none", low=0.05)
@@ -261,6 +262,7 @@ class LocalSettings:
     restarts_per_minute: int = setting(5, unit="servers", doc="replacements of servers that died young, in any minute", low=1)
     max_connections: int = setting(12000, unit="sockets", doc="connections of the front door, robots and others; more are closed", low=16)
     young_s: float = setting(10.0, unit="s", doc="a server that ends this soon after it became healthy died young", low=0)
+    log_file_bytes: int = setting(67108864, unit="bytes", doc="a log that has grown longer is set aside, in place of the one set aside before, and begins anew", low=65536)
     certificate: str = setting("", doc="file of the front door's certificate chain (PEM); with it robots dial wss://")
     private_key: str = setting("", doc="file of the private key of local.certificate (PEM)")
 

@@ -417,9 +417,10 @@ class Core:
         if connection in self.connections and connection.session is not None:
             connection.session.in_flight -= 1
             connection.write(outcome.data)
-        if self._log.writes("info"):
+        level, tell = ("debug", self._log.debug) if code == "ok" else ("info", self._log.info)
+        if self._log.writes(level):
             compute_ms = answer.compute_ms if isinstance(answer, Result) else 0.0
-            self._log.info(
+            tell(
                 "command", robot=job.robot, service=service, id=job.command.id, trace=job.command.trace,
                 code=code, queue_ms=round((job.started_s or now) * 1e3 - job.received_s * 1e3, 3),
                 compute_ms=round(compute_ms, 3),

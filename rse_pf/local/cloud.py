@@ -28,9 +28,10 @@ from rse_pf.local.backend_servers import RSE_PF, BackendServer, BackendServers
 from rse_pf.local.chronicle import Chronicle
 from rse_pf.local.control_plane import ControlPlane
 from rse_pf.local.data_servers import DataServers
-from rse_pf.local.firewall import check_front_door, ensure_key, key_file, key_set_file
+from rse_pf.local.firewall import check_front_door, ensure_key, front_door_url, key_file, key_set_file
 from rse_pf.local.fleet import Fleet
 from rse_pf.local.load_balancer import LoadBalancer
+from rse_pf.local.log_files import keep_short
 from rse_pf.local.processes import ProcessMark, is_alive, mark_of, send_signal
 from rse_pf.local.state import (
     PlatformLock,
@@ -382,12 +383,10 @@ class LocalCloud:
                 adopt(left, self._fleet, self.backend_servers, self.load_balancer, self._tell, end),
                 adopt_data(left, self.data_servers, self.load_balancer, wanted=self._has_data),
             )
-        serving = self.settings.serving
-        host = f"[{serving.host}]" if ":" in serving.host else serving.host
-        scheme = "wss" if self.settings.local.certificate else "ws"
-        self.url = f"{scheme}://{host}:{self.port}{serving.path}"
+        self.url = front_door_url(self.settings, self.port)
         self._status = await serve_status(self.status_document, token)
         self._fleet.keep(self._chronicle.watch())
+        self._fleet.keep(keep_short(self.state, self.settings.local.log_file_bytes))
         if self._monitored:
             self._control.start()
         self._write_state()

@@ -14,8 +14,9 @@ from pathlib import Path
 
 from rse_pf.auth import KeySet, SigningKey
 from rse_pf.errors import ConfigurationError, UsageError
+from rse_pf.settings import PlatformSettings
 
-__all__ = ["check_front_door", "ensure_key", "key_file", "key_set_file", "read_key"]
+__all__ = ["check_front_door", "ensure_key", "front_door_url", "key_file", "key_set_file", "read_key"]
 
 
 def key_file(folder: Path) -> Path:
@@ -26,6 +27,13 @@ def key_file(folder: Path) -> Path:
 def key_set_file(folder: Path) -> Path:
     """Return where its servers find the public half, a JWKS."""
     return folder / "keys.json"
+
+
+def front_door_url(settings: PlatformSettings, port: int) -> str:
+    """Return the address that robots dial, ``ws://`` or with a certificate ``wss://``."""
+    host = f"[{settings.serving.host}]" if ":" in settings.serving.host else settings.serving.host
+    scheme = "wss" if settings.local.certificate else "ws"
+    return f"{scheme}://{host}:{port}{settings.serving.path}"
 
 
 def check_front_door(host: str, port: int) -> None:

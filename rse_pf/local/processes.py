@@ -98,7 +98,8 @@ def spawn(
         folder: Its working directory.
         dies_with_parent: Whether Linux kills it when the calling thread ends, however that ends.
     """
-    with log.open("wb") as output:
+    log.unlink(missing_ok=True)
+    with log.open("ab") as output:  # it appends, so that the log may be cut short under it
         process = subprocess.Popen(
             command,
             cwd=folder,

@@ -184,7 +184,7 @@ def test_a_reply_above_the_limit_is_a_typed_failure(start_server):
 
 
 def test_one_line_is_logged_for_a_command_and_no_secret(start_server):
-    server = start_server(keys=True)
+    server = start_server(keys=True, serving={"log_level": "debug"})
     token = server.token()
 
     async def run():
@@ -200,6 +200,20 @@ def test_one_line_is_logged_for_a_command_and_no_secret(start_server):
     assert "\x1b" not in server.text
     assert "private-payload" not in server.text
     assert token not in server.text
+
+
+def test_what_went_well_is_told_by_numbers_and_logged_for_developers_only(start_server):
+    server = start_server()
+
+    async def run():
+        async with server.robot() as robot:
+            await robot.ask(5, "echo", {"value": 1})
+            await robot.ask(6, "no-such-service")
+
+    asyncio.run(run())
+    line = server.wait_for_log("command")
+    assert (line["id"], line["code"], line["level"]) == (6, "unknown-service", "info")
+    assert server.status()["results"]["ok"] == 1
 
 
 def test_the_control_port_tells_health_and_numbers(start_server):
