@@ -1,8 +1,7 @@
 """Sockets of a robot: dial, read, write, ping, reconnect, move; the rules are in `RobotSession`.
 
 Promises to be the only file that knows the WebSocket library, to keep one current socket (two
-during a move), to dial with full jitter and one dial at a time, and that no command is lost
-because a socket was.
+during a move), to dial with full jitter, and that no command is lost because a socket was.
 """
 
 from __future__ import annotations
@@ -11,22 +10,20 @@ import asyncio
 import random as random_module
 from collections.abc import Awaitable, Callable, Coroutine
 from typing import Any
-from urllib.parse import urlsplit
 
 from websockets.asyncio.client import ClientConnection
 from websockets.asyncio.client import connect as websocket_connect
 from websockets.exceptions import ConnectionClosed, InvalidStatus, WebSocketException
 from websockets.typing import Subprotocol
 
+from client_sdk.dialling import Refused, again_after_s, dial_beside, refusal, shown_address
 from rse_pf.errors import (
     Conflict,
     ConnectError,
-    Forbidden,
     ProtocolError,
     RsePfError,
     Unauthorized,
     UnsupportedProtocol,
-    UsageError,
 )
 from rse_pf.settings import SessionSettings
 from rse_pf.wire import SUBPROTOCOLS
@@ -53,7 +50,6 @@ OnChange = Callable[[str, str], None] | None
 """Is told ``link-lost`` with a reason, and ``link-back`` or ``moved`` with the server's name."""
 
 _FIRST_TRIES = 4
-_LONGEST_RETRY_AFTER_S = 30.0
 _SHORTEST_TICK_S = 0.001
 _IS_IT_RUNNING = "is the platform running? start it with rse-pf local start"
 
@@ -68,19 +64,6 @@ def websocket_options(settings: SessionSettings) -> dict[str, Any]:
         "close_timeout": settings.silence_s,
         "proxy": None,
     }
-
-
-class _Refused(Exception):
-    """A dial that failed: why, how long to wait, and whether trying again is of any use."""
-
-    def __init__(
-        self, error: RsePfError, *, after_s: float = 0.0, wrong_address: bool = False, for_good: bool = False
-    ) -> None:
-        super().__init__(error.message)
-        self.error = error
-        self.after_s = after_s
-        self.wrong_address = wrong_address
-        self.for_good = for_good
 
 
 class _Socket:
@@ -118,7 +101,7 @@ class Connection:
         self.bytes_out = 0
         self.last_error = ""
         self.fatal: RsePfError | None = None
-        self._address = _checked(url)
+        self._address = shown_address(url)
         self._token = token
         self._session = session
         self._settings = session.settings
@@ -149,7 +132,7 @@ class Connection:
             try:
                 self._adopt(await self._dial())
                 break
-            except _Refused as refused:
+            except Refused as refused:
                 if attempt == _FIRST_TRIES or refused.for_good or refused.wrong_address:
                     raise refused.error from None
                 await asyncio.sleep(self._pause_s(refused.after_s))
@@ -219,7 +202,7 @@ class Connection:
             began = self._clock()
             try:
                 socket = await self._dial()
-            except _Refused as refused:
+            except Refused as refused:
                 after_s, spent_s = refused.after_s, self._clock() - began
                 if refused.for_good:
                     self._end(refused.error)
@@ -237,7 +220,7 @@ class Connection:
             after_s = 0.0
             try:
                 fresh = await self._dial()
-            except _Refused as refused:
+            except Refused as refused:
                 after_s = refused.after_s
             else:
                 if self._session.current is not old.link:
@@ -260,7 +243,7 @@ class Connection:
         """Open a socket through the load balancer and wait for its Welcome."""
         try:
             websocket = await self._handshake()
-        except _Refused as refused:
+        except Refused as refused:
             if not callable(self._token) or not isinstance(refused.error, Unauthorized):
                 self.last_error = refused.error.message
                 raise
@@ -273,7 +256,7 @@ class Connection:
             done, _ = await asyncio.wait({socket.welcome}, timeout=self._settings.connect_timeout_s)
             if not done:
                 mute = ConnectError(f"{self._address} does not say welcome", hint="is it an RSE-PF server?")
-                raise _Refused(mute)
+                raise Refused(mute)
             socket.welcome.result()
         except BaseException:
             self._abort(socket)
@@ -283,27 +266,34 @@ class Connection:
     async def _handshake(self) -> ClientConnection:
         wanted = SUBPROTOCOLS[self._session.codec.name]
         token = await self._read_token()
-        try:
-            websocket = await websocket_connect(
+
+        async def open_one() -> ClientConnection:
+            return await websocket_connect(
                 self.url,
                 subprotocols=[Subprotocol(wanted)],
                 additional_headers={} if token is None else {"Authorization": f"Bearer {token}"},
                 **websocket_options(self._settings),
             )
+
+        try:
+            again_s = again_after_s(self._settings.dial_again_s, self._random)
+            pause = asyncio.sleep(again_s) if again_s else asyncio.get_running_loop().create_future()
+            websocket = await dial_beside(open_one, _drop, pause)
         except InvalidStatus as error:
             response = error.response
-            raise self._refusal(response.status_code, response.headers.get("Retry-After", "")) from error
+            told = refusal(self._address, response.status_code, response.headers.get("Retry-After", ""))
+            raise told from error
         except (OSError, asyncio.TimeoutError, WebSocketException, EOFError) as error:
             cause = getattr(error, "strerror", None) or str(error) or type(error).__name__
-            raise _Refused(
+            raise Refused(
                 ConnectError(f"cannot connect to {self._address}: {cause}", hint=_IS_IT_RUNNING)
             ) from error
         if websocket.subprotocol != wanted:
-            websocket.transport.abort()
+            _drop(websocket)
             unsupported = UnsupportedProtocol(
                 f"{self._address} does not speak {wanted}", hint="is it an RSE-PF server?"
             )
-            raise _Refused(unsupported, wrong_address=True)
+            raise Refused(unsupported, wrong_address=True)
         return websocket
 
     async def _read_token(self) -> str | None:
@@ -315,13 +305,13 @@ class Connection:
             told = ConnectError(
                 f"no token: the token callable raised {type(error).__name__}", hint="mend the token callable"
             )
-            raise _Refused(told) from error
+            raise Refused(told) from error
 
     async def _renew(self, socket: _Socket) -> None:
         """Show a fresh token on a live socket; without one its end brings a new dial, with a new try."""
         try:
             token = await self._read_token()
-        except _Refused as refused:
+        except Refused as refused:
             self.last_error = refused.error.message
             return
         if token and not socket.ended.is_set() and not socket.is_closing:
@@ -396,7 +386,7 @@ class Connection:
             self.last_error = failure.message
             if not socket.welcome.done():
                 unsupported = UnsupportedProtocol(failure.message, hint=failure.hint)
-                socket.welcome.set_exception(_Refused(unsupported, for_good=failure.code == unsupported.code))
+                socket.welcome.set_exception(Refused(unsupported, for_good=failure.code == unsupported.code))
         elif isinstance(event, MoveAsked) and socket.link is self._session.current and not self._move_asked:
             self._move_asked = (socket, self._clock() + event.within_s)
             self._changed.set()
@@ -436,7 +426,7 @@ class Connection:
                 task.cancel()
         if not socket.welcome.done():
             cut = ConnectError(f"{self._address} closed without a welcome", hint=_IS_IT_RUNNING)
-            socket.welcome.set_exception(_Refused(cut))
+            socket.welcome.set_exception(Refused(cut))
             socket.welcome.exception()
         self._changed.set()
         self._wake.set()
@@ -447,20 +437,6 @@ class Connection:
         self.last_error = error.message
         self._take(None, self._session.abandon(error.code, error.message, error.hint))
         self._changed.set()
-
-    def _refusal(self, status: int, retry_after: str) -> _Refused:
-        if status == 401:
-            told = "the token is missing, wrong or over"
-            return _Refused(Unauthorized(told, hint="issue one: rse-pf token issue ROBOT"), for_good=True)
-        if status == 403:
-            told = f"{self._address} forbids this robot to connect"
-            return _Refused(Forbidden(told, hint="ask the operator"), for_good=True)
-        error = ConnectError(f"{self._address} answers {status}", hint="it is full or not ready; try later")
-        if 400 <= status < 500 and status != 429:
-            error.hint = "check the URL: it ends with the path of the servers, /ws"
-        after_s = float(retry_after) if retry_after.isdecimal() else 0.0
-        is_wrong = status in (400, 404)
-        return _Refused(error, after_s=min(after_s, _LONGEST_RETRY_AFTER_S), wrong_address=is_wrong)
 
     def _pause_s(self, after_s: float) -> float:
         """Return the next back-off, with full jitter on top of what the server asked for."""
@@ -476,6 +452,10 @@ class Connection:
         return task
 
 
+def _drop(websocket: ClientConnection) -> None:
+    websocket.transport.abort()
+
+
 async def _either(event: asyncio.Event, timeout_s: float) -> None:
     """Wait for *event*, at most *timeout_s*; unlike ``wait_for``, never swallow a cancellation."""
     waiting = asyncio.ensure_future(event.wait())
@@ -483,17 +463,3 @@ async def _either(event: asyncio.Event, timeout_s: float) -> None:
         await asyncio.wait({waiting}, timeout=timeout_s)
     finally:
         waiting.cancel()
-
-
-def _checked(url: str) -> str:
-    """Return *url* as it may be shown, or raise UsageError."""
-    parts = urlsplit(url)
-    try:
-        port = parts.port
-    except ValueError:
-        port = -1
-    if parts.scheme not in ("ws", "wss") or not parts.hostname or port == -1:
-        raise UsageError(
-            f"{url!r} is not a WebSocket address", hint="write ws://HOST:PORT/ws or wss://HOST/ws"
-        )
-    return f"{parts.scheme}://{parts.netloc.rpartition('@')[2]}{parts.path}"

@@ -28,7 +28,7 @@ pytestmark = pytest.mark.system
 
 QUICK = SessionSettings(
     connect_timeout_s=0.5, silence_s=0.3, ping_interval_s=0.1, ping_patience_s=0.5, reconnect_base_s=0.01,
-    reconnect_max_s=0.05, hello_timeout_s=1.0,
+    reconnect_max_s=0.05, hello_timeout_s=1.0, dial_again_s=0.0,
 )  # fmt: skip
 
 
@@ -402,7 +402,9 @@ def test_reconnects_spread_over_the_whole_back_off():
         async with FakePlatform() as platform:
             robots = [
                 client_sdk.connect(
-                    platform.url, settings=SessionSettings(reconnect_base_s=0.4), random=random.Random(seed)
+                    platform.url,
+                    settings=SessionSettings(reconnect_base_s=0.4, dial_again_s=0.0),
+                    random=random.Random(seed),
                 )
                 for seed in range(30)
             ]
