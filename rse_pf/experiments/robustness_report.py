@@ -184,7 +184,8 @@ def _cut(records: Records, faults: Sequence[Event]) -> dict[str, Any]:
     shown = {name: {key: value[key] for key in ("n", "p50", "p99", "max")} for name, value in figures.items()}
     return {
         "noticed_s": shown["noticed"],
-        "server_noticed_s": _emptied_s(records.readings, faults),
+        "server_noticed_s": _after(records.events, "fault", "servers-empty")
+        or _emptied_s(records.readings, faults),
         "first_answer_after_heal_s": shown["first"],
         "stale_as_fresh": stale,
     }

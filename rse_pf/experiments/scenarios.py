@@ -6,6 +6,7 @@ over or its patience is.  Promises to judge nothing: that is `rse_pf.experiments
 
 from __future__ import annotations
 
+import asyncio
 import os
 import random
 from collections.abc import Awaitable, Callable
@@ -20,6 +21,7 @@ __all__ = ["SCENARIOS", "Scenario"]
 _PATIENCE_S = 30.0
 _AFTER_S = 6.0
 _RANDOM_EVERY_S = 3.0
+_LOOK_S = 0.1
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -88,10 +90,25 @@ async def _wifi(stage: Stage, seconds: float, seed: int) -> None:
     link: Any = stage.link
     stage.tell("fault", fault="link cut", seconds=seconds, watch_s=seconds + 10.0)
     await link.cut()
-    await watch(stage, seconds)
+    looking = asyncio.ensure_future(_tell_when_empty(stage))
+    try:
+        await watch(stage, seconds)
+    finally:
+        looking.cancel()
+        await asyncio.gather(looking, return_exceptions=True)
     await link.heal()
     stage.tell("healed")
     await watch(stage, _AFTER_S)
+
+
+async def _tell_when_empty(stage: Stage) -> None:
+    """Log when no server has a robot any more; a reading a second would be too coarse for that."""
+    while True:
+        told = await stage.cloud.status()
+        if len(told) == len(stage.cloud.servers) and not any(status["robots"] for status in told):
+            stage.tell("servers-empty")
+            return
+        await asyncio.sleep(_LOOK_S)
 
 
 async def _random(stage: Stage, seconds: float, seed: int) -> None:

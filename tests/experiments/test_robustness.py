@@ -141,6 +141,9 @@ def test_a_cut_is_judged_on_both_sides_and_by_the_first_answers_after_it():
     assert judged["stale_as_fresh"] == 1
     assert not judged["bars"]["stale_as_fresh"]["held"]
 
+    looked = run("wifi", [*events[:2], event(9.02, "servers-empty"), events[2]], commands, readings)
+    assert judge_scenario(looked)["server_noticed_s"] == pytest.approx(5.02)
+
 
 def robots(time_s, *counts):
     servers = tuple(
