@@ -28,8 +28,8 @@ _TRY_AGAIN_S = 5.0
 class Uploads(Protocol):
     """What sends one object; `client_sdk.data.DataClient` does."""
 
-    def upload(self, source: Path) -> str:
-        """Store a file and return its digest."""
+    def upload(self, source: Path, progress: Callable[[int, int], None] | None = None) -> str:
+        """Store a file and return its digest; tell bytes done and in all after each part."""
 
     def close(self) -> None:
         """Close the connection."""
@@ -68,7 +68,7 @@ class BackgroundUploader:
             folder: The spool; made by `start`, and read first if it holds keyframes of an earlier run.
             settings: ``background_bytes_per_s``, ``spool_bytes``.
             clock: Monotonic seconds.
-            is_busy: Says that live poses wait for the link; nothing is begun while they do.
+            is_busy: Says that live poses wait for the link; no keyframe and no part is begun while they do.
         """
         self.sent = 0
         self.dropped = 0
@@ -158,7 +158,7 @@ class BackgroundUploader:
     def _send(self, name: str) -> bool:
         path = self._folder / name
         try:
-            self._uploads.upload(path)
+            self._uploads.upload(path, self._between_parts)
         except (BadRequest, LimitExceeded, UsageError) as error:  # it will never be taken, or is gone
             self.dropped += 1
             self.last_error = str(error)
@@ -173,6 +173,10 @@ class BackgroundUploader:
             self._held.pop(name, None)
             self._condition.notify_all()
         return True
+
+    def _between_parts(self, done: int, size: int) -> None:
+        if done < size:
+            self._wait_for_quiet()
 
     def _wait_for_quiet(self) -> bool:
         while self._is_busy():

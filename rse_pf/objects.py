@@ -28,11 +28,13 @@ __all__ = [
     "ObjectStore",
     "PresigningStore",
     "RangedStore",
+    "ScratchStore",
     "check_name",
     "digest_of",
     "name_segment",
     "object_name",
     "open_store",
+    "put_scratch",
     "read_range",
 ]
 
@@ -80,6 +82,14 @@ class RangedStore(Protocol):
 
 
 @runtime_checkable
+class ScratchStore(Protocol):
+    """A store that need not wait for the disk where nothing is lost but time."""
+
+    def put_scratch(self, name: str, data: bytes) -> None:
+        """Store what outlives this process, but may be lost or cut short when the machine crashes."""
+
+
+@runtime_checkable
 class PresigningStore(Protocol):
     """A store that others may be let into, for one object and a short time; the network is not asked."""
 
@@ -95,6 +105,14 @@ def read_range(store: ObjectStore, name: str, start: int, length: int) -> bytes:
     if isinstance(store, RangedStore):
         return store.get_range(name, start, length)
     return store.get(name)[start : start + length]
+
+
+def put_scratch(store: ObjectStore, name: str, data: bytes) -> None:
+    """Store what a crash of the machine may lose or cut short, by the cheapest way of *store*."""
+    if isinstance(store, ScratchStore):
+        store.put_scratch(name, data)
+    else:
+        store.put(name, data)
 
 
 def name_segment(text: str) -> str:
@@ -216,6 +234,13 @@ class DirectoryStore:
             _make_folder(path.parent)
             self._write(path, data)
 
+    def put_scratch(self, name: str, data: bytes) -> None:
+        """Store the object, whole, without waiting for the disk."""
+        path = self._path(name)
+        with _as_store_errors(name):
+            _make_folder(path.parent)
+            self._write(path, data, is_durable=False)
+
     def head(self, name: str) -> ObjectInfo:
         """Return size and name."""
         with _as_store_errors(name):
@@ -275,19 +300,21 @@ class DirectoryStore:
         return self._folder / check_name(name)
 
     @staticmethod
-    def _write(path: Path, data: bytes) -> None:
+    def _write(path: Path, data: bytes, *, is_durable: bool = True) -> None:
         handle, temporary = tempfile.mkstemp(prefix=".part-", dir=path.parent)
         try:
             with os.fdopen(handle, "wb") as file:
                 file.write(data)
                 file.flush()
-                os.fsync(file.fileno())
+                if is_durable:
+                    os.fsync(file.fileno())
             os.replace(temporary, path)
         except BaseException:
             with contextlib.suppress(FileNotFoundError):
                 os.unlink(temporary)
             raise
-        _sync_folder(path.parent)
+        if is_durable:
+            _sync_folder(path.parent)
 
 
 def _read(path: Path) -> bytes:

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 from rse_pf.auth import Claims
 from rse_pf.errors import BadRequest, Conflict, LimitExceeded, NotFound, QuotaExceeded
-from rse_pf.objects import ObjectInfo, ObjectStore, digest_of, name_segment, object_name
+from rse_pf.objects import ObjectInfo, ObjectStore, digest_of, name_segment, object_name, put_scratch
 from rse_pf.settings import DataSettings
 
 __all__ = ["Objects", "UploadState", "check_digest"]
@@ -132,7 +132,10 @@ class Objects:
             return self._resumed(who, digest, name, opened)
 
     def append(self, who: Claims, digest: str, offset: int, data: bytes) -> UploadState:
-        """Add a part durably; the last one makes the object.
+        """Add a part; the last one makes the object, durably.
+
+        Parts outlive this process.  What a crash of the machine loses of them is sent again, and what it
+        spoils is found by the digest: no part waits for the disk.
 
         Raises:
             NotFound: The upload was never begun, or is over.
@@ -154,7 +157,7 @@ class Objects:
             if offset + len(data) > size or (not data and size > offset):
                 raise BadRequest(f"{len(data)} bytes at {offset} do not fit {size}", hint="look at the sizes")
             if data:
-                self._store.put(f"{self._parts(who, digest)}part-{offset:015d}", data)
+                put_scratch(self._store, f"{self._parts(who, digest)}part-{offset:015d}", data)
             if offset + len(data) == size:
                 self._assemble(who, digest, name, size)
             return self._state(digest, size, offset + len(data))
@@ -215,13 +218,15 @@ class Objects:
             return None
 
     def _stored_parts(self, who: Claims, digest: str) -> Iterator[ObjectInfo]:
-        """Yield the parts from the beginning up to the first gap."""
+        """Yield the parts from the beginning up to the first gap; behind a part that was cut some overlap."""
         prefix, at = f"{self._parts(who, digest)}part-", 0
         for part in self._store.list(prefix):
-            if int(part.name.removeprefix(prefix)) != at:
+            begins = int(part.name.removeprefix(prefix))
+            if begins > at:
                 return
-            at += part.size
-            yield part
+            if begins == at:
+                at += part.size
+                yield part
 
     def _offset(self, who: Claims, digest: str) -> int:
         return sum(part.size for part in self._stored_parts(who, digest))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import queue
 import random
 import threading
 from collections.abc import Callable, Iterator
@@ -271,11 +272,16 @@ class FakeUploads:
     def __init__(self) -> None:
         self.taken: list[bytes] = []
         self.errors: list[Exception] = []
+        self.parts: queue.SimpleQueue[int] = queue.SimpleQueue()
 
-    def upload(self, source: Path) -> str:
+    def upload(self, source: Path, progress: Callable[[int, int], None]) -> str:
         if self.errors:
             raise self.errors.pop(0)
-        self.taken.append(source.read_bytes())
+        data = source.read_bytes()
+        for done in (0, len(data) // 2, len(data)):
+            self.parts.put(done)
+            progress(done, len(data))
+        self.taken.append(data)
         return ""
 
     def close(self) -> None:
@@ -348,6 +354,31 @@ def test_nothing_is_begun_while_live_poses_wait(tmp_path: Path) -> None:
     busy.clear()
     assert background.wait_sent(20)
     background.close()
+
+
+def test_no_part_is_begun_while_live_poses_wait(tmp_path: Path) -> None:
+    uploads, busy, asked = FakeUploads(), threading.Event(), threading.Event()
+
+    def is_busy() -> bool:
+        if not uploads.parts.empty():
+            busy.set()  # a pose comes while the first part is on its way
+            asked.set()
+        return busy.is_set() and not let.is_set()
+
+    let = threading.Event()
+    background = uploader(uploads, tmp_path / "spool", is_busy=is_busy)
+    background.start()
+    background.add(b"keyframe")
+    assert asked.wait(20)
+    assert uploads.parts.get(timeout=20) == 0
+    assert uploads.parts.empty()
+    assert uploads.taken == []
+
+    let.set()
+    assert background.wait_sent(20)
+    background.close()
+
+    assert [uploads.parts.get(timeout=20) for _ in range(2)] == [4, 8]
 
 
 def test_what_the_server_will_never_take_is_dropped_and_the_next_goes(tmp_path: Path) -> None:

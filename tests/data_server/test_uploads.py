@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
+import os
+from pathlib import Path
 
 import pytest
 from fake_data_service import Answer, Service, small_settings
 
-from rse_pf.objects import MemoryStore, digest_of
+from rse_pf.objects import DirectoryStore, MemoryStore, digest_of
 
 DATA = bytes(n % 251 for n in range(10_000))
 DIGEST = digest_of(DATA)
@@ -92,6 +94,42 @@ def test_more_than_was_announced_is_refused(service: Service) -> None:
 
     assert part(service, 0, 101).status == 400
     assert begin(service, 200).status == 409
+
+
+def test_parts_wait_for_no_disk_but_the_object_does(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    store, synced = DirectoryStore(tmp_path), []
+    fsync = os.fsync
+    monkeypatch.setattr(os, "fsync", lambda handle: synced.append(handle) or fsync(handle))
+    service = Service(small_settings(), store)
+    begin(service)
+    at_begin = len(synced)
+
+    part(service, 0, 4096)
+    part(service, 4096, 8192)
+    between = len(synced)
+    assert part(service, 8192, 10_000).status == 201
+
+    assert at_begin > 0, "that an upload was begun is promised"
+    assert between == at_begin
+    assert len(synced) > between
+    assert store.get(next(store.list("objects/")).name) == DATA
+
+
+def test_an_upload_goes_on_behind_a_part_that_a_crash_of_the_machine_cut(service: Service) -> None:
+    begin(service)
+    part(service, 0, 4096)
+    part(service, 4096, 8192)
+    first = next(
+        info.name for info in service.store.list("uploads/") if info.name.endswith("part-" + "0" * 15)
+    )
+    service.store.put(first, DATA[:1000])
+
+    assert begin(service).json["offset"] == 1000
+    assert part(service, 1000, 5000).json["offset"] == 5000
+    assert part(service, 5000, 9000).json["offset"] == 9000
+    assert part(service, 9000, 10_000).status == 201
+
+    assert service.ask("GET", OBJECT).body == DATA
 
 
 def test_an_upload_of_what_is_there_is_done_at_once(service: Service) -> None:
