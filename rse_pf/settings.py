@@ -68,6 +68,7 @@ class ServingSettings:
     control_host: str = setting("127.0.0.1", doc="address of the control port")
     control_port: int = setting(8766, doc="port of /healthz, /readyz, /metrics and drain; 0 takes a free one", low=0, high=65535)
     path: str = setting("/ws", doc="path of the robots' WebSocket")
+    health_path: str = setting("/healthz", doc="path at the robots' port that tells everybody that robots are served, and nothing else")
     workers: int = setting(0, doc="worker processes; 0 means one per core", low=0, high=256)
     solver_threads: int = setting(1, doc="solver threads of each worker", low=1, high=64)
     backlog: int = setting(4096, doc="connections that wait for accept", low=16, high=65535)

@@ -52,6 +52,12 @@ class LoadBalancer(Construct):
                 "DataRule", priority=10, conditions=[elbv2.ListenerCondition.path_patterns(["/data/*"])],
                 target_groups=[self.targets["data"]],
             )  # fmt: skip
+            # Each would ask the bucket; the balancer's own checks do not come through the listener.
+            listener.add_action(
+                "NotReady", priority=5,
+                conditions=[elbv2.ListenerCondition.path_patterns([f"/data{settings.health.path}"])],
+                action=elbv2.ListenerAction.fixed_response(404),
+            )  # fmt: skip
         self._waf(settings)
 
     def _targets(

@@ -16,7 +16,10 @@ from rse_pf.errors import Unauthorized
 from rse_pf.settings import PlatformSettings
 from rse_pf.wire import SUBPROTOCOLS, codec_for
 
-__all__ = ["Admitted", "Door", "TurnedAway"]
+__all__ = ["HEALTH", "Admitted", "Door", "TurnedAway"]
+
+HEALTH = "health"
+"""Result of who asked for no WebSocket, but whether robots are served."""
 
 _RETRY_AFTER_S = 2
 
@@ -46,9 +49,13 @@ class TurnedAway:
 
 def _refusal(status: int, code: str, message: str, hint: str, **headers: str) -> TurnedAway:
     body = json.dumps({"code": code, "message": message, "hint": hint}, separators=(",", ":")).encode()
+    return _answer(status, body, code, **headers)
+
+
+def _answer(status: int, body: bytes, result: str, **headers: str) -> TurnedAway:
     named = {name.replace("_", "-"): value for name, value in headers.items()}
     return TurnedAway(
-        status=status, body=body, result=code, headers={"Content-Type": "application/json", **named}
+        status=status, body=body, result=result, headers={"Content-Type": "application/json", **named}
     )
 
 
@@ -63,6 +70,8 @@ class Door:
         self._conformance_echo = conformance_echo
         path = settings.serving.path
         self._path = path.encode()
+        self._health_path = settings.serving.health_path.encode()
+        self._healthy = _answer(200, b'{"status":"ok"}', HEALTH)
         self.defect = _refusal(500, "internal", "the handshake failed", "try again")
         self._not_found = _refusal(404, "not-found", "nothing is served here", f"connect to {path}")
         self._full = _refusal(
@@ -105,6 +114,8 @@ class Door:
         """
         if self._conformance_echo:
             return Admitted(robot=anonymous, codec="", subprotocol="")
+        if path == self._health_path:
+            return self._healthy
         if path.split(b"?")[0] != self._path:
             return self._not_found
         if is_full:

@@ -14,7 +14,7 @@ from typing import Any, Protocol
 
 from rse_pf.backend.connection import Connection
 from rse_pf.backend.core import Core
-from rse_pf.backend.door import Admitted, Door, TurnedAway
+from rse_pf.backend.door import HEALTH, Admitted, Door, TurnedAway
 from rse_pf.backend.frames import CloseBorder
 from rse_pf.backend.limits import SourceRates, WaitingRoom
 from rse_pf.backend.log import JsonLog
@@ -172,10 +172,12 @@ class RobotSockets:
             verdict = self._door.defect
         if isinstance(verdict, TurnedAway):
             self._core.metrics.handshakes[verdict.result] += 1
-            self._log.info("refused", result=verdict.result, reason=verdict.reason)
-            response = self._picows.WSUpgradeResponse.create_error_response(
-                verdict.status, verdict.body, dict(verdict.headers)
-            )
+            kinds = self._picows.WSUpgradeResponse
+            if verdict.result == HEALTH:
+                response = kinds.create_ok_response(verdict.body, dict(verdict.headers))
+            else:
+                self._log.info("refused", result=verdict.result, reason=verdict.reason)
+                response = kinds.create_error_response(verdict.status, verdict.body, dict(verdict.headers))
             return self._picows.WSUpgradeResponseWithListener(response, None)
         self._core.metrics.handshakes["ok"] += 1
         chosen = {"Sec-WebSocket-Protocol": verdict.subprotocol} if verdict.subprotocol else None

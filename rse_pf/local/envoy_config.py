@@ -114,6 +114,8 @@ def _front_door(settings: PlatformSettings, port: int) -> dict[str, Any]:
         "max_request_headers_kb": settings.serving.max_handshake_bytes // 1024,
         # Whatever a robot says of its own address is dropped; servers read what stands here instead.
         "use_remote_address": True,
+        # Who knocks need not know what opens: no name of the software, no time that a server took.
+        "server_header_transformation": "PASS_THROUGH",
         "xff_num_trusted_hops": 0,
         "normalize_path": True,
         "merge_slashes": True,
@@ -123,7 +125,10 @@ def _front_door(settings: PlatformSettings, port: int) -> dict[str, Any]:
         "http_filters": [
             {
                 "name": "router",
-                "typed_config": {"@type": f"{_TYPES}.extensions.filters.http.router.v3.Router"},
+                "typed_config": {
+                    "@type": f"{_TYPES}.extensions.filters.http.router.v3.Router",
+                    "suppress_envoy_headers": True,
+                },
             }
         ],
     }
@@ -208,11 +213,15 @@ def _virtual_host(settings: PlatformSettings) -> dict[str, Any]:
     # No retries: the robot knows whether a part arrived, and goes on from there.
     idle = _seconds(3 * settings.data.body_timeout_s)
     data_route = {"cluster": DATA_CLUSTER, "timeout": "0s", "idle_timeout": idle}
+    patience = _seconds(settings.serving.handshake_timeout_s)
     return {
         "name": "platform",
         "domains": ["*"],
         "routes": [
             {"match": {"path": settings.serving.path}, "route": route},
+            {"match": {"path": settings.serving.health_path}, "route": {**route, "timeout": patience}},
+            # Each would ask the store; the balancer's own checks do not come through the door.
+            {"match": {"path": _DATA_READY}, "direct_response": {"status": 404}},
             {"match": {"prefix": _DATA_PATH}, "route": data_route},
         ],
     }

@@ -7,7 +7,7 @@ import json
 import pytest
 
 from rse_pf.auth import SigningKey
-from rse_pf.backend.door import Admitted, Door, TurnedAway
+from rse_pf.backend.door import HEALTH, Admitted, Door, TurnedAway
 from rse_pf.settings import PlatformSettings
 from rse_pf.wire import SUBPROTOCOLS
 
@@ -99,3 +99,14 @@ def test_conformance_echo_asks_for_nothing():
     assert judge(door, path=b"/", offered=[], authorization="") == Admitted(
         robot="anonymous-1", codec="", subprotocol=""
     )
+
+
+def test_the_page_of_health_says_one_thing_to_everybody_also_when_the_server_is_full():
+    answers = [
+        judge(path=b"/healthz", authorization=each, is_full=full) for each in ("", "x") for full in (0, 1)
+    ]
+
+    assert all(answer == answers[0] for answer in answers)
+    assert isinstance(answers[0], TurnedAway)
+    assert (answers[0].status, answers[0].body, answers[0].result) == (200, b'{"status":"ok"}', HEALTH)
+    assert judge(path=b"/healthz?x").status == 404

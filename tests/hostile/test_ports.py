@@ -19,7 +19,8 @@ from rse_pf.settings import PlatformSettings
 pytestmark = pytest.mark.system
 
 OURS_AND_NOT_PUBLIC = (
-    "/", "/healthz", "/readyz", "/metrics", "/status", "/drain", "/move", "/ready", "/listeners", "/clusters",
+    "/", "/readyz", "/data/readyz", "/data//readyz", "/healthz/",
+    "/healthz/../metrics", "/metrics", "/status", "/drain", "/move", "/ready", "/listeners", "/clusters",
     "/config_dump", "/quitquitquit", "/stats", "/ws/", "/ws/..", "/ws/../metrics", "//metrics",
     "/ws%2f..%2fmetrics", "/%2e%2e/metrics", "/datax", "/.env", "/server-status", "/admin",
 )  # fmt: skip
@@ -44,6 +45,22 @@ def asked(port: int, path: str, method: str = "GET", authorization: str = "") ->
             return error.code, error.read()
 
 
+def health_of(port: int) -> tuple[int, bytes, set[str], list[str]]:
+    """Return what the door says of its health, and what its other answers call their server."""
+    with urllib.request.urlopen(f"http://127.0.0.1:{port}/healthz", timeout=10) as answer:
+        found = answer.status, answer.read(), {name.lower() for name in answer.headers}
+    named = []
+    for path in ("/", "/ws", "/data/v1/objects", "/data/readyz"):
+        try:
+            urllib.request.urlopen(f"http://127.0.0.1:{port}{path}", timeout=10).close()
+        except urllib.error.HTTPError as error:
+            with error:
+                named += [
+                    name for name in error.headers if name.lower() == "server" or "envoy" in name.lower()
+                ]
+    return *found, named
+
+
 def status_of(port: int, path: str, method: str = "GET", authorization: str = "") -> int:
     return asked(port, path, method, authorization)[0]
 
@@ -65,8 +82,8 @@ def listening(pids: list[int]) -> list[str]:
     return found
 
 
-def test_the_door_knows_two_paths_and_nothing_else_listens_to_the_world(tmp_path: Path) -> None:
-    async def scan() -> tuple[dict[str, int], int, list[str], int]:
+def test_the_door_knows_three_paths_and_nothing_else_listens_to_the_world(tmp_path: Path) -> None:
+    async def scan() -> tuple[dict[str, int], int, list[str], int, Any]:
         async with LocalCloud(PlatformSettings(), state=tmp_path / "p", port=0, servers=1) as cloud:
             door = cloud.load_balancer.port
             statuses = {
@@ -78,15 +95,20 @@ def test_the_door_knows_two_paths_and_nothing_else_listens_to_the_world(tmp_path
             marks = [*cloud.backend_servers.marks.values(), cloud.load_balancer.mark]
             addresses = listening([mark.pid for mark in marks if mark is not None])
             mode = stat.S_IMODE(next((tmp_path / "p").rglob(ADMIN_SOCKET)).stat().st_mode)
-            return statuses, robots, addresses, mode
+            health = await asyncio.to_thread(health_of, door)
+            return statuses, robots, addresses, mode, health
 
-    statuses, robots, addresses, mode = asyncio.run(scan())
+    statuses, robots, addresses, mode, health = asyncio.run(scan())
 
     assert {path: status for path, status in statuses.items() if status not in (400, 404)} == {}
     assert robots in (400, 401, 403, 426), "the WebSocket's path is there, and wants a handshake"
     assert len(addresses) >= 3
     assert all(address in LOOPBACK for address in addresses)
     assert mode == 0o600
+    status, body, headers, named = health
+    assert (status, body) == (200, b'{"status":"ok"}')
+    assert headers <= {"content-type", "content-length", "date", "connection"}, "names nothing"
+    assert named == []
 
 
 def test_a_control_port_tells_its_health_to_all_and_the_rest_to_who_carries_its_token(tmp_path: Path) -> None:

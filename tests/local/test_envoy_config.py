@@ -42,8 +42,9 @@ def routes(made: dict[str, Any]) -> list[dict[str, Any]]:
 
 
 def only_route(made: dict[str, Any]) -> dict[str, Any]:
-    """Return the only one that leads to backend servers."""
-    (route,) = [each for each in routes(made) if each["route"]["cluster"] == CLUSTER]
+    """Return the only one that leads to backend servers, but for the page of health."""
+    leading = [each for each in routes(made) if each.get("route", {}).get("cluster") == CLUSTER]
+    (route,) = [each for each in leading if each["match"] != {"path": "/healthz"}]
     return route
 
 
@@ -104,7 +105,7 @@ def test_headers_are_bounded_in_number_size_and_time() -> None:
 
 def test_large_data_has_a_way_of_its_own_that_is_never_repeated_by_the_balancer() -> None:
     made = config(data={"body_timeout_s": 4.0})
-    (data,) = [each for each in routes(made) if each["route"]["cluster"] == DATA_CLUSTER]
+    (data,) = [each for each in routes(made) if each.get("route", {}).get("cluster") == DATA_CLUSTER]
 
     assert data["match"] == {"prefix": "/data/"}
     assert data["route"]["timeout"] == "0s", "an upload takes as long as it takes"
@@ -117,7 +118,8 @@ def test_large_data_has_a_way_of_its_own_that_is_never_repeated_by_the_balancer(
         for name in (CLUSTER, DATA_CLUSTER)
     ]
     assert files == [str(ENDPOINTS), str(DATA)]
-    assert [each["match"] for each in routes(made)] == [{"path": "/ws"}, {"prefix": "/data/"}]
+    matches = [each["match"] for each in routes(made)]
+    assert matches == [{"path": "/ws"}, {"path": "/healthz"}, {"path": "/data/readyz"}, {"prefix": "/data/"}]
 
 
 def test_connections_and_buffers_are_bounded() -> None:
@@ -165,3 +167,17 @@ def test_no_targets_are_an_empty_list_not_a_missing_one() -> None:
 @pytest.mark.parametrize("made", [config(), endpoints([Target(name="a", port=1, control_port=2)])])
 def test_everything_is_plain_json(made: dict[str, Any]) -> None:
     assert json.loads(json.dumps(made)) == made
+
+
+def test_the_door_tells_that_robots_are_served_and_nothing_of_itself() -> None:
+    made = config()
+    (health,) = [each for each in routes(made) if each["match"].get("path") == "/healthz"]
+    closed = [each for each in routes(made) if "direct_response" in each]
+
+    assert health["route"]["cluster"] == CLUSTER, "without a healthy server it is no 200"
+    assert health["route"]["timeout"] != "0s", "no WebSocket begins here"
+    assert [(each["match"], each["direct_response"]) for each in closed] == [
+        ({"path": "/data/readyz"}, {"status": 404})
+    ]
+    assert manager(made)["server_header_transformation"] == "PASS_THROUGH"
+    assert manager(made)["http_filters"][0]["typed_config"]["suppress_envoy_headers"] is True

@@ -207,6 +207,17 @@ def test_the_load_balancer_refuses_what_two_readers_may_understand_differently(a
     assert chosen["routing.http.drop_invalid_header_fields.enabled"] == "true"
 
 
+def test_nobody_outside_can_have_the_data_service_ask_its_store(assembly: Assembly) -> None:
+    rules = {rule["Priority"]: rule for rule in assembly.all("AWS::ElasticLoadBalancingV2::ListenerRule")}
+    if not assembly.settings.data.enabled:
+        assert rules == {}
+        return
+
+    assert sorted(rules) == [5, 10], "the first that fits decides"
+    assert rules[5]["Conditions"][0]["PathPatternConfig"]["Values"] == ["/data/readyz"]
+    assert rules[5]["Actions"] == [{"Type": "fixed-response", "FixedResponseConfig": {"StatusCode": "404"}}]
+
+
 def test_only_the_front_door_is_open_to_the_world(assembly: Assembly) -> None:
     inline = [
         rule
