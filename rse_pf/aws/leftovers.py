@@ -20,7 +20,7 @@ _STACKS = "RsePf-"
 _ALARMS = "rse-pf-"
 _GONE = ("DELETE_COMPLETE", "REVIEW_IN_PROGRESS")
 _KEPT = {
-    "bucket": "kept on purpose: holds maps, packages or access logs",
+    "bucket": "kept on purpose: holds maps, packages, access logs or audit logs",
     "secret": "kept on purpose: the signing key",
 }
 
