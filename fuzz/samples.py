@@ -94,7 +94,17 @@ def _array(item: bytes, count: int) -> bytes:
     return _binary(b"\xdd" + count.to_bytes(4, "big") + item * count)
 
 
-_COUNT = 24_900
+def _deflated(payload: bytes) -> tuple[str, bytes]:
+    return "zlib", zlib.compress(_json(payload), 9)
+
+
+def _text(size: int) -> bytes:
+    """Return letters that deflate well, but not so well that they are a bomb."""
+    return b"".join(b"%06d%s" % (k, b"a" * 100) for k in range(size // 106))
+
+
+_COUNT, _ALL, _VALUES = 24_900, 1_048_000, 29_900
+_PACKED_KEYS = b"".join(b"\xa5k%04x\1" % k for k in range(14_900))
 _KEYS = b",".join(b'"k%d":%d' % (i, i + 1000) for i in range(_COUNT))
 _NUMBERED = b"".join(b"\xcd%c%c\x90" % divmod(i, 256) for i in range(_COUNT))
 
@@ -119,6 +129,18 @@ DEAR: dict[str, tuple[str, bytes]] = {
     "deflated keys": ("zlib", zlib.compress(_json(b"{" + _KEYS + b"}"), 9)),
     "deflated small maps": ("zlib", zlib.compress(_json(b"[" + b'{"a":1},' * 9_900 + b"1]"), 9)),
     "deflated words": ("zlib", zlib.compress(_json(b"[" + b'"ab",' * 49_000 + b"1]"), 9)),
+    "keys that may be": _deflated(b"{" + b",".join(_KEYS.split(b",")[:14_900]) + b"}"),
+    "packed keys": ("bin", _binary(b"\xde" + (14_900).to_bytes(2, "big") + _PACKED_KEYS)),
+    "words that may be": _deflated(b"[" + b'"ab",' * _VALUES + b"1]"),
+    "numbered words": _deflated(b"[" + b",".join(b'"%030d"' % (k * k) for k in range(_VALUES)) + b"]"),
+    "words and numbers": _deflated(b"[" + b",".join(b'"%06d",%d.5' % (k, k) for k in range(14_900)) + b"]"),
+    "one text": _deflated(b'"' + _text(_ALL) + b'"'),
+    "half a text": _deflated(b'"' + _text(_ALL // 2) + b'"'),
+    "a text with one wide letter": _deflated(b'"' + _text(_ALL) + "\U0001f600".encode() + b'"'),
+    "a text with one escape": _deflated(b'"' + _text(_ALL) + b'\\ud83d\\ude00"'),
+    "a text with escaped quotes": _deflated(b'"\\"' + _text(_ALL) + b'\\ud83d\\ude00"'),
+    "a short text with one escape": _deflated(b'"' + _text(240_000) + b'\\ud83d\\ude00"'),
+    "json text with one escape": ("json", _json(b'"' + _text(260_000) + b'\\ud83d\\ude00"')),
     "bomb": ("zlib", zlib.compress(b"[" * 50_000_000, 9)),
 }  # fmt: skip
 """Name to codec and message."""

@@ -23,6 +23,7 @@ from rse_pf.wire.packed import LIST_VALUES, MAP_VALUES, check_packed, too_many_v
 __all__ = ["CODECS", "SUBPROTOCOLS", "Codec", "as_type", "codec_for", "make_codec"]
 
 T = TypeVar("T")
+Text = bytes | bytearray
 
 SUBPROTOCOLS = {
     "zlib": "rse-pf.v1.json+zlib",
@@ -40,6 +41,9 @@ _REPLY_LEVEL, _REPLY_WINDOW_BITS, _REPLY_MEMORY = 1, 12, 5
 """A server's messages are short: level 6 saves 5 of 794 bytes and costs a third more time."""
 
 _PIECE_BYTES = 65536
+_WORD_BYTES, _NUMBER_BYTES, _WIDE, _WORST_WEIGHT = 60, 32, 7, 8
+"""What a word, a number and a letter of a text with one wide letter in it take, and a byte at the worst."""
+_FEW_WORDS = 2000
 _NOT_BRACKETS = bytes(set(range(256)) - set(b"[]{}"))
 _BOXES = frozenset((dict, list, tuple))
 _NOT_BRACKETS_OR_QUOTES = bytes(set(range(256)) - set(b'[]{}"'))
@@ -123,13 +127,14 @@ class _JsonCodec:
         message: FromServer = _guarded(self._from_server, text)
         return message
 
-    def _read(self, text: bytes) -> FromRobot:
+    def _read(self, text: Text) -> FromRobot:
         _check_boxes(text, self._limits)
         _check_values(text, self._limits.max_json_values)
+        _check_weight(text, self._limits.max_json_memory_bytes)
         message: FromRobot = _guarded(self._from_robot, text)
         return message
 
-    def _open(self, data: bytes) -> bytes:
+    def _open(self, data: bytes) -> Text:
         _check_size(data, self._limits)
         return _inflate(data, self._limits) if self._compressed else data
 
@@ -200,7 +205,7 @@ def _check_size(data: bytes, limits: SessionSettings) -> None:
         )
 
 
-def _inflate(data: bytes, limits: SessionSettings) -> bytes:
+def _inflate(data: bytes, limits: SessionSettings) -> Text:
     # The ratio is for large results: what may be sent plain is no bomb, however small it was.
     plain = limits.max_message_bytes
     most = min(limits.max_inflated_bytes, max(plain, int(len(data) * limits.max_inflate_ratio)))
@@ -208,17 +213,27 @@ def _inflate(data: bytes, limits: SessionSettings) -> bytes:
     stream = zlib.decompressobj()
     try:
         # A bomb shows itself here, for a quarter of what it takes to inflate all that is allowed.
-        text = stream.decompress(data[:first], min(plain, most) + 1)
-        if len(text) > min(plain, most):
+        head = stream.decompress(data[:first], min(plain, most) + 1)
+        if len(head) > min(plain, most):
             raise _bomb(data, plain)
+        text: Text = head
         if len(data) > first:
-            text += stream.decompress(stream.unconsumed_tail + data[first:], most + 1 - len(text))
+            text = _rest(stream, head, stream.unconsumed_tail + data[first:], most)
     except zlib.error as error:
         raise _no_stream() from error
     if len(text) > most:
         raise _bomb(data, most)
     if not stream.eof or stream.unused_data:
         raise _no_end()
+    return text
+
+
+def _rest(stream: Any, head: bytes, data: bytes, most: int) -> bytearray:
+    """Inflate piece by piece: at once, zlib holds everything twice."""
+    text = bytearray(head)
+    while data and len(text) <= most:
+        text += stream.decompress(data, min(_PIECE_BYTES, most + 1 - len(text)))
+        data = stream.unconsumed_tail
     return text
 
 
@@ -247,7 +262,7 @@ def _bomb(data: bytes, most: int) -> LimitExceeded:
     return LimitExceeded(f"{len(data)} bytes inflate to more than {most}", hint="send smaller messages")
 
 
-def _check_boxes(text: bytes, limits: SessionSettings) -> None:
+def _check_boxes(text: Text, limits: SessionSettings) -> None:
     """Count brackets before any list is made; only where they look too many are strings told apart."""
     deepest, most = limits.max_json_depth, limits.max_json_lists
     count = text.count(b"[") + text.count(b"{")
@@ -262,7 +277,7 @@ def _check_boxes(text: bytes, limits: SessionSettings) -> None:
         raise LimitExceeded(f"JSON is nested deeper than {deepest}", hint="send flat lists")
 
 
-def _check_values(text: bytes, most: int) -> None:
+def _check_values(text: Text, most: int) -> None:
     """Count values before any is made; only where they look too many are strings told apart."""
     if _values(text) < most:
         return
@@ -270,17 +285,45 @@ def _check_values(text: bytes, most: int) -> None:
         raise too_many_values(most)
 
 
-def _values(text: bytes) -> int:
+def _check_weight(text: Text, most: int) -> None:
+    """Estimate what a message takes in memory before it does; where it looks like too much, look closer."""
+    if _WORST_WEIGHT * len(text) <= most:
+        return
+    words, width = text.count(b'"') // 2, 1 if text.isascii() and b"\\u" not in text else _WIDE
+    numbers = text.count(b",") + text.count(b":")
+    other = len(text) + _WORD_BYTES * words + _NUMBER_BYTES * max(0, numbers - words)
+    if other + width * len(text) <= most:
+        return
+    letters = len(text) if words > _FEW_WORDS or b'\\"' in text else _letters(text)
+    if other + width * letters > most:
+        raise LimitExceeded(
+            f"a message that would take more than {most} bytes of memory",
+            hint="send arrays of numbers, or large data to the data server",
+        )
+
+
+def _letters(text: Text) -> int:
+    """Count what stands between quotes; none of them is escaped."""
+    count, end = 0, -1
+    while (begin := text.find(b'"', end + 1)) >= 0:
+        end = text.find(b'"', begin + 1)
+        if end < 0:
+            return len(text)
+        count += end - begin
+    return count
+
+
+def _values(text: Text) -> int:
     boxes = LIST_VALUES * text.count(b"[") + MAP_VALUES * text.count(b"{")
     return text.count(b",") + text.count(b":") + boxes
 
 
-def _depth(brackets: bytes) -> int:
+def _depth(brackets: Text) -> int:
     opening = np.isin(np.frombuffer(brackets, np.uint8), np.frombuffer(b"[{", np.uint8))
     return int(np.cumsum(np.where(opening, np.int8(1), np.int8(-1)), dtype=np.int32).max(initial=0))
 
 
-def _without_strings(text: bytes, dropped: bytes) -> bytes:
+def _without_strings(text: Text, dropped: bytes) -> bytes:
     marks = text.replace(b"\\\\", b"").replace(b'\\"', b"").translate(None, dropped)
     kept, is_inside = [], False
     for begin in range(0, len(marks), _PIECE_BYTES):
