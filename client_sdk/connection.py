@@ -50,6 +50,8 @@ OnChange = Callable[[str, str], None] | None
 """Is told ``link-lost`` with a reason, and ``link-back`` or ``moved`` with the server's name."""
 
 _FIRST_TRIES = 4
+_DIALS_OF_A_ROW = 8
+"""Time-outs after which a robot that lost its link begins anew, with a fresh token."""
 _SHORTEST_TICK_S = 0.001
 _IS_IT_RUNNING = "is the platform running? start it with rse-pf local start"
 
@@ -201,7 +203,7 @@ class Connection:
             await asyncio.sleep(max(after_s, self._pause_s(after_s) - spent_s))
             began = self._clock()
             try:
-                socket = await self._dial()
+                socket = await self._dial(_DIALS_OF_A_ROW)
             except Refused as refused:
                 after_s, spent_s = refused.after_s, self._clock() - began
                 if refused.for_good:
@@ -239,15 +241,15 @@ class Connection:
 
     # --- one socket ------------------------------------------------------------------------------
 
-    async def _dial(self) -> _Socket:
+    async def _dial(self, most: int = 2) -> _Socket:
         """Open a socket through the load balancer and wait for its Welcome."""
         try:
-            websocket = await self._handshake()
+            websocket = await self._handshake(most)
         except Refused as refused:
             if not callable(self._token) or not isinstance(refused.error, Unauthorized):
                 self.last_error = refused.error.message
                 raise
-            websocket = await self._handshake()
+            websocket = await self._handshake(most)
         socket = _Socket(websocket, self._session.open_link(self._clock()))
         self._sockets.append(socket)
         socket.tasks = [self._spawn(self._read(socket)), self._spawn(self._write(socket))]
@@ -263,7 +265,11 @@ class Connection:
             raise
         return socket
 
-    async def _handshake(self) -> ClientConnection:
+    async def _before_next_dial(self) -> None:
+        again_s = self._settings.dial_again_s
+        await (asyncio.sleep(again_after_s(again_s, self._random)) if again_s else asyncio.Event().wait())
+
+    async def _handshake(self, most: int) -> ClientConnection:
         wanted = SUBPROTOCOLS[self._session.codec.name]
         token = await self._read_token()
 
@@ -276,9 +282,7 @@ class Connection:
             )
 
         try:
-            again_s = again_after_s(self._settings.dial_again_s, self._random)
-            pause = asyncio.sleep(again_s) if again_s else asyncio.get_running_loop().create_future()
-            websocket = await dial_beside(open_one, _drop, pause)
+            websocket = await dial_beside(open_one, _drop, self._before_next_dial, most=most)
         except InvalidStatus as error:
             response = error.response
             told = refusal(self._address, response.status_code, response.headers.get("Retry-After", ""))

@@ -25,6 +25,7 @@ Opened = TypeVar("Opened")
 
 _LONGEST_RETRY_AFTER_S = 30.0
 _SPREAD = 0.2
+_BESIDE = 2
 
 
 class Refused(Exception):
@@ -41,28 +42,41 @@ class Refused(Exception):
 
 
 async def dial_beside(
-    dial: Callable[[], Coroutine[Any, Any, Opened]], drop: Callable[[Opened], None], pause: Awaitable[object]
+    dial: Callable[[], Coroutine[Any, Any, Opened]],
+    drop: Callable[[Opened], None],
+    pause: Callable[[], Awaitable[object]],
+    *,
+    most: int = 2,
 ) -> Opened:
-    """Return what *dial* opens; a second one begins if the first is still at it after *pause*.
+    """Return what *dial* opens; where one takes longer than *pause*, a second one begins beside it.
 
-    The first to end decides for both, whether it opened something or failed: a server that refuses one
-    would refuse the other.
+    One that timed out says nothing of the other, which goes on, and gets a new one beside it.  Any other
+    failure decides for both: a server that refuses one would refuse the other.
 
     Args:
         dial: Opens one; cancelled, it leaves nothing open.
         drop: Is given what the other one opened in the same moment.
-        pause: Is over when the second may begin.
+        pause: Gives what is over when the next one may begin.
+        most: So many dials at all; the last failure is raised.
     """
-    dials = [asyncio.ensure_future(dial())]
-    waiting = asyncio.ensure_future(pause)
+    dials = {asyncio.ensure_future(dial())}
+    waiting, begun = asyncio.ensure_future(pause()), 1
     won: asyncio.Future[Opened] | None = None
     try:
-        await asyncio.wait({dials[0], waiting}, return_when=asyncio.FIRST_COMPLETED)
-        if not dials[0].done():
-            dials.append(asyncio.ensure_future(dial()))
-        done, _ = await asyncio.wait(dials, return_when=asyncio.FIRST_COMPLETED)
-        won = min(done, key=lambda each: each.exception() is not None)
-        return won.result()
+        while True:
+            is_next = len(dials) < _BESIDE and begun < most
+            ends: set[asyncio.Future[Any]] = {*dials, waiting} if is_next else {*dials}
+            await asyncio.wait(ends, return_when=asyncio.FIRST_COMPLETED)
+            done = sorted((each for each in dials if each.done()), key=_weight)
+            if done and (_weight(done[0]) != _TIMED_OUT or (len(done) == len(dials) and begun == most)):
+                won = done[0]
+                return won.result()
+            dials.difference_update(done)
+            if is_next and waiting.done():
+                dials.add(asyncio.ensure_future(dial()))
+                waiting, begun = asyncio.ensure_future(pause()), begun + 1
+            elif not dials:
+                return done[-1].result()
     finally:
         waiting.cancel()
         others = [each for each in dials if each is not won]
@@ -71,6 +85,17 @@ async def dial_beside(
         for left in await asyncio.gather(*others, return_exceptions=True):
             if not isinstance(left, BaseException):
                 drop(left)
+
+
+_OPENED, _REFUSED, _TIMED_OUT = range(3)
+
+
+def _weight(dial: asyncio.Future[Any]) -> int:
+    """Return what the end of a dial says, the most telling first."""
+    error = dial.exception()
+    if error is None:
+        return _OPENED
+    return _TIMED_OUT if isinstance(error, TimeoutError | asyncio.TimeoutError) else _REFUSED
 
 
 def again_after_s(dial_again_s: float, random: random_module.Random) -> float:

@@ -20,13 +20,18 @@ SOON_S = 10.0
 class Network:
     """Dials that end when the test says so."""
 
-    def __init__(self) -> None:
+    def __init__(self, most: int = 2) -> None:
         self.begun: list[asyncio.Future[str]] = []
         self.cancelled: list[int] = []
         self.dropped: list[str] = []
         self.pause: asyncio.Future[None] = asyncio.get_running_loop().create_future()
         self._news = asyncio.Event()
-        self.winner = asyncio.ensure_future(dial_beside(self.dial, self.dropped.append, self.pause))
+        work = dial_beside(self.dial, self.dropped.append, self.new_pause, most=most)
+        self.winner = asyncio.ensure_future(work)
+
+    def new_pause(self) -> asyncio.Future[None]:
+        self.pause = asyncio.get_running_loop().create_future()
+        return self.pause
 
     async def dial(self) -> str:
         number = len(self.begun)
@@ -45,11 +50,11 @@ class Network:
             await self._news.wait()
 
 
-def play(story):
+def play(story, most=2):
     """Run an async story against a fresh network, within a deadline."""
 
     async def run():
-        return await story(Network())
+        return await story(Network(most))
 
     return asyncio.run(asyncio.wait_for(run(), SOON_S))
 
@@ -112,6 +117,48 @@ def test_a_refusal_of_one_is_one_of_both(refused):
         return network.cancelled
 
     assert play(story) == [1 - refused]
+
+
+def test_one_that_timed_out_says_nothing_of_the_other():
+    async def story(network):
+        await network.until(1)
+        network.pause.set_result(None)
+        await network.until(2)
+        network.begun[0].set_exception(TimeoutError())
+        network.begun[1].set_result("second")
+        return await network.winner, network.cancelled
+
+    assert play(story) == ("second", [])
+
+
+def test_one_that_timed_out_gets_a_successor_until_there_were_enough():
+    async def story(network):
+        for number in range(5):
+            await network.until(number + 1)
+            if number:
+                network.begun[number - 1].set_exception(TimeoutError())
+            network.pause.set_result(None)
+        network.begun[4].set_exception(TimeoutError())
+        with pytest.raises(TimeoutError):
+            await network.winner
+        return len(network.begun), network.cancelled
+
+    assert play(story, most=5) == (5, [])
+
+
+def test_never_are_more_than_two_open():
+    async def story(network):
+        await network.until(1)
+        network.pause.set_result(None)
+        await network.until(2)
+        network.pause.set_result(None)
+        network.begun[0].set_exception(TimeoutError())
+        await network.until(3)
+        assert not network.winner.done()
+        network.begun[2].set_result("third")
+        return await network.winner, network.cancelled, len(network.begun)
+
+    assert play(story, most=8) == ("third", [1], 3)
 
 
 def test_one_that_is_through_counts_more_than_one_that_fails_with_it():
