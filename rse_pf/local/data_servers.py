@@ -271,9 +271,15 @@ class DataServers:
 
 
 def _step_back(pid: int, nice: int) -> None:
-    """Let poses go first where both share a machine; threads that the process starts later do the same."""
+    """Let poses go first where both share a machine; threads that the process starts later do the same.
+
+    As a batch process it never takes the processor from who is at work when a piece of a body arrives; its
+    niceness leaves it a share of a full machine, so that it answers its health checks there, too.
+    """
     with contextlib.suppress(OSError):
         os.setpriority(os.PRIO_PROCESS, pid, max(nice, os.getpriority(os.PRIO_PROCESS, 0)))
+        if os.sched_getscheduler(pid) == os.SCHED_OTHER:
+            os.sched_setscheduler(pid, os.SCHED_BATCH, os.sched_param(0))
 
 
 def _ask(port: int, path: str) -> bool:

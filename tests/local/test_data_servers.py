@@ -99,9 +99,11 @@ def test_a_server_steps_back_behind_the_poses(tmp_path: Path) -> None:
         server = await box.servers.start()
 
         ours, its = os.getpriority(os.PRIO_PROCESS, 0), os.getpriority(os.PRIO_PROCESS, server.pid)
+        mine, policy = os.sched_getscheduler(0), os.sched_getscheduler(server.pid)
         await box.servers.stop(10.0)
 
         assert its == max(ours, PlatformSettings().local.data_nice) > 0
+        assert policy == {os.SCHED_OTHER: os.SCHED_BATCH}.get(mine, mine)
 
     asyncio.run(run())
 
