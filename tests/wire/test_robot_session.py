@@ -130,21 +130,6 @@ def test_of_a_latest_wins_stream_only_the_newest_frame_is_sent_again():
     assert [command.id for command in commands(fresh)] == [new]
 
 
-def test_kept_frames_are_all_sent_again():
-    session = make_session()
-    link = open_link(session)
-    ids = [session.submit("pnp", None, now=0.0, stream="map", keep=True) for _ in range(4)]
-    session.close_link(link)
-    link = open_link(session, now=1.0)
-
-    again = []
-    while batch := commands(link):
-        again += [command.id for command in batch]
-        for command in batch:
-            tell(session, link, result(command), 1.1)
-    assert sorted(again) == ids
-
-
 def test_after_a_long_cut_there_is_no_catch_up_burst():
     session = make_session()
     link = open_link(session)
