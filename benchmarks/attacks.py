@@ -1,6 +1,9 @@
 """What a hostile robot or stranger does to a front door, each attack bounded in number and time.
 
-    python benchmarks/attacks.py NAME URL < TOKENS     one attack, its outcome as JSON; see hostile.py
+    python benchmarks/attacks.py NAME URL     one attack, its outcome as JSON; see hostile.py
+
+Reads the tokens (one line of JSON), says ``ready`` when all that costs an attacker time beforehand is
+done, and begins at the next line.
 
 `ATTACKS` names them.  Promises to speak raw frames (no library of ours stands between), and to end every
 socket that it opened.
@@ -19,6 +22,7 @@ import zlib
 from collections import Counter
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, field
+from functools import cache
 from urllib.parse import urlsplit
 
 from rse_pf.wire import SUBPROTOCOLS, Command, Failure, Hello, make_codec
@@ -138,24 +142,47 @@ class Outcome:
     took_s: float = 0.0
 
 
-async def zip_bombs(door: Door, count: int = 1000) -> Outcome:
-    """Send *count* messages of 255 KB that would inflate to 256 MiB, ten a robot, all robots at once."""
+@cache
+def bomb() -> bytes:
+    """Return a message of 255 KB that would inflate to 256 MiB; it takes a second to make."""
     packer = zlib.compressobj(9)
-    bomb = b"".join(packer.compress(bytes(1 << 20)) for _ in range(256)) + packer.flush()
-    message, each = frame(bomb[:262144]), 10
+    made = b"".join(packer.compress(bytes(1 << 20)) for _ in range(256)) + packer.flush()
+    return made[:262144]
+
+
+async def zip_bombs(door: Door, count: int = 1000, pause_s: float = 1.0) -> Outcome:
+    """Send *count* messages of 255 KB that would inflate to 256 MiB, ten a robot, all robots at once.
+
+    Who is thrown out comes back at once, and after *pause_s* if the door stays shut; each try counts.
+    """
+    message, each = frame(bomb()), 10
     outcome = Outcome()
 
     async def robot(token: str) -> None:
-        socket = await door.enter(token)
+        socket: Socket | None = None
         for _ in range(each):
             began = time.monotonic()
-            socket.send(message)
             outcome.tried += 1
+            if socket is None:
+                try:
+                    socket = await door.enter(token)
+                except ConnectionError as error:
+                    outcome.refused += 1
+                    outcome.ends[str(error)[9:12]] += 1
+                    await asyncio.sleep(pause_s)
+                    continue
+            socket.send(message)
             answer = await socket.hear()
-            outcome.refused += isinstance(answer, Failure) and answer.code in ("too-large", "busy")
+            is_refused = isinstance(answer, Failure) and answer.code in ("too-large", "busy")
+            outcome.refused += is_refused or socket.closed is not None
             outcome.slowest_s = max(outcome.slowest_s, time.monotonic() - began)
-        outcome.ends[str(socket.closed)] += 1
-        socket.end()
+            if socket.closed is not None:
+                outcome.ends[str(socket.closed)] += 1
+                socket.end()
+                socket = None
+        if socket is not None:
+            outcome.ends[str(socket.closed)] += 1
+            socket.end()
 
     await _all([robot(token) for token in door.tokens[: count // each]])
     return outcome
@@ -323,13 +350,24 @@ ATTACKS: dict[str, Callable[[Door], Awaitable[Outcome]]] = {
 }
 
 
-async def _attack(name: str, url: str) -> Outcome:
+async def _attack(name: str, door: Door) -> Outcome:
     began = time.monotonic()
-    outcome = await ATTACKS[name](Door(url, tuple(json.load(sys.stdin))))
+    outcome = await ATTACKS[name](door)
     outcome.took_s = time.monotonic() - began
     return outcome
 
 
-if __name__ == "__main__":
-    made = asyncio.run(_attack(sys.argv[1], sys.argv[2]))
+def main() -> None:
+    """Get ready, wait, attack, tell."""
+    name, url = sys.argv[1:]
+    door = Door(url, tuple(json.loads(sys.stdin.readline())))
+    if name == "zip-bombs":
+        bomb()
+    print("ready", flush=True)
+    sys.stdin.readline()
+    made = asyncio.run(_attack(name, door))
     print(json.dumps({name: getattr(made, name) for name in made.__slots__}))
+
+
+if __name__ == "__main__":
+    main()

@@ -5,7 +5,8 @@
 For each attack of benchmarks/attacks.py: a quiet window, the attack for as long as it takes (at least as
 long), a rest.  "Others" send 5 commands a second each, kept; latency counts from the planned time; goodput is
 the share of commands planned in the window that came back as a pose.  The quiet window before each attack is
-its own yardstick, so that a slower machine slows both.
+its own yardstick, so that a slower machine slows both.  Attackers have their own machines: this one starts,
+and makes its messages, before the quiet window.
 
 Defends (issue 7): memory of the servers < +64 MiB, every attacker refused or cut off, others' p99 < 2x
 of quiet (1.5x beside one robot at 100 times its rate, goodput >= 99 %), 0 robots dropped.
@@ -20,6 +21,7 @@ import os
 import sys
 import tempfile
 import time
+from asyncio.subprocess import Process
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -51,16 +53,25 @@ def resident_mib(pids: Sequence[int]) -> float:
     return total * os.sysconf("SC_PAGE_SIZE") / 2**20
 
 
-async def attack(name: str, cloud: LocalCloud) -> tuple[dict[str, Any], float]:
-    """Run one attack in a process of its own; return its outcome and by how many MiB the servers grew."""
-    servers = [mark.pid for mark in cloud.backend_servers.marks.values()]
-    before = most = resident_mib(servers)
+async def attacker(name: str, cloud: LocalCloud) -> Process:
+    """Start the process of one attack and wait until it is ready: it would have a machine of its own."""
     tokens = json.dumps([cloud.issue_token(f"hostile-{n}") for n in range(TOKENS)]).encode()
     process = await asyncio.create_subprocess_exec(
         sys.executable, str(Path(__file__).with_name("attacks.py")), name, cloud.url,
         stdin=asyncio.subprocess.PIPE, stdout=asyncio.subprocess.PIPE,
     )  # fmt: skip
-    talking = asyncio.create_task(process.communicate(tokens))
+    assert process.stdin is not None
+    assert process.stdout is not None
+    process.stdin.write(tokens + b"\n")
+    await process.stdout.readline()
+    return process
+
+
+async def attack(process: Process, cloud: LocalCloud) -> tuple[dict[str, Any], float]:
+    """Let one attack go; return its outcome and by how many MiB the servers grew."""
+    servers = [mark.pid for mark in cloud.backend_servers.marks.values()]
+    before = most = resident_mib(servers)
+    talking = asyncio.create_task(process.communicate(b"go\n"))
     while not talking.done():
         await asyncio.wait({talking}, timeout=0.1)
         most = max(most, resident_mib(servers))
@@ -106,16 +117,16 @@ async def run(names: Sequence[str], robots: int, seconds: float, folder: Path) -
         ) as swarm:  # fmt: skip
             await swarm.start()
             await swarm.wait_joined(60.0)
-            await asyncio.sleep(REST_S)
             for name in names:
+                ready = await attacker(name, cloud)
+                await asyncio.sleep(REST_S)
                 quiet = now()
                 await asyncio.sleep(seconds)
                 began = now()
-                outcome, grown = await attack(name, cloud)
+                outcome, grown = await attack(ready, cloud)
                 await asyncio.sleep(max(0.0, began + seconds - now()))
                 row = {"attack": name, "outcome": outcome, "grown_mib": grown, "load": os.getloadavg()[0]}
                 rows.append({**row, "quiet_s": quiet, "began_s": began, "ended_s": now()})
-                await asyncio.sleep(REST_S)
             result = await swarm.finish(GRACE_S)
     for row in rows:
         row["quiet"] = seen(result.commands, row["quiet_s"], row["began_s"])

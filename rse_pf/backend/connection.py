@@ -147,7 +147,7 @@ class Connection:
         def done(read: FromRobot | ProtocolError) -> None:
             behind, self._behind = self._behind, None
             if not self.assembler.closed and self in self._core.connections:
-                self._received(session.take(read, now), len(data), now, was, bad)
+                self._received(session.take(read, now, len(data)), len(data), now, was, bad)
             for each, arrived in behind or ():
                 if not self.assembler.closed:
                     self._message(each, arrived)
@@ -163,7 +163,11 @@ class Connection:
     def _received(self, decisions: list[Decision], size_bytes: int, now: float, was: str, bad: int) -> None:
         session = self.session
         self.apply(decisions, now, size_bytes)
-        if session is None or self.assembler.closed:
+        if session is None:
+            return
+        if session.bad_messages > self._core.settings.session.max_bad_messages:
+            self._core.rates.rest((self.tenant, self.robot), now)
+        if self.assembler.closed:
             return
         if session.bad_messages > bad:
             # To refuse costs as much as to read: who sends garbage is read more and more rarely.

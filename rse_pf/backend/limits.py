@@ -77,6 +77,13 @@ class RobotRates:
             return CutOff()
         return TooFast(max(_SHORTEST_RETRY_MS, wait_s * 1e3))
 
+    def rest(self, robot: tuple[str, str], now: float) -> None:
+        """Let *robot*, cut off at *now* (s), rest before it may come in again."""
+        known = self._robots.get(robot)
+        if known is None:
+            known = self._robots[robot] = self._new(now)
+        known.rests_until = now + self._limits.rate_rest_s
+
     def rests_s(self, robot: tuple[str, str], now: float) -> float:
         """Return for how many seconds more *robot*, cut off before, is not let in."""
         known = self._robots.get(robot)

@@ -136,7 +136,7 @@ class ServerSession:
 
     @property
     def bad_messages(self) -> int:
-        """How many messages could not be read."""
+        """How many messages could not be read; a long one counts for several."""
         return self._bad_messages
 
     def receive(self, data: bytes, now: float) -> list[Decision]:
@@ -148,7 +148,7 @@ class ServerSession:
             message = self.codec.decode_from_robot(data)
         except ProtocolError as error:
             message = error
-        return self.take(message, now)
+        return self.take(message, now, len(data))
 
     def receive_short(self, data: bytes, now: float, most: int) -> list[Decision] | None:
         """Return the same as `receive`, but None if the message is longer than *most* bytes, inflated."""
@@ -157,15 +157,15 @@ class ServerSession:
         try:
             message = self.codec.decode_short_from_robot(data, most)
         except ProtocolError as error:
-            return self.take(error, now)
+            return self.take(error, now, len(data))
         return None if message is None else self.take(message, now)
 
-    def take(self, message: FromRobot | ProtocolError, now: float) -> list[Decision]:
-        """Return what to do about one message that was read elsewhere, or could not be."""
+    def take(self, message: FromRobot | ProtocolError, now: float, size_bytes: int = 0) -> list[Decision]:
+        """Return what to do about one message of *size_bytes* that was read, or could not be."""
         if self.state == "closed":
             return []
         if isinstance(message, ProtocolError):
-            return self._refuse(message)
+            return self._refuse(message, size_bytes)
         if isinstance(message, Hello):
             return self._hello(message, now)
         if self.state == "opening":
@@ -285,8 +285,8 @@ class ServerSession:
         self.in_flight += 1
         return [Submit(command)]
 
-    def _refuse(self, error: ProtocolError) -> list[Decision]:
-        self._bad_messages += 1
+    def _refuse(self, error: ProtocolError, size_bytes: int) -> list[Decision]:
+        self._bad_messages += 1 + size_bytes // self._limits.bad_message_bytes
         failure = Failure(code=error.code, message=error.message, hint=error.hint, server=self._server)
         if self._bad_messages > self._limits.max_bad_messages:
             return [self._send(failure), *self._leave(CLOSE_PROTOCOL, "too many bad messages")]

@@ -13,6 +13,7 @@ from typing import Any
 import pytest
 
 from rse_pf.backend.connection import Connection
+from rse_pf.backend.limits import RobotRates
 from rse_pf.backend.reading import Reading, refusal_unread
 from rse_pf.errors import LimitExceeded
 from rse_pf.settings import PlatformSettings
@@ -45,6 +46,10 @@ class Wire:
         self.sent: list[Any] = []
         self.holds = 0
         self.pauses: list[float] = []
+        self.closed: tuple[int, str] | None = None
+
+    def close(self, code: int, reason: str) -> None:
+        self.closed = (code, reason)
 
     def send(self, data: bytes, is_text: bool) -> None:
         self.sent.append(CODEC.decode_from_server(data))
@@ -66,6 +71,7 @@ class Core:
         self.reading = reading
         self.settings = SETTINGS
         self.server_id = "s-1"
+        self.rates = RobotRates(SETTINGS.session)
         self.clocks = SimpleNamespace(monotonic=lambda: 50.0)
         self.metrics = SimpleNamespace(closed=Counter(), shed=Counter(), bytes_in=0, bytes_out=0)
         self.connections: set[Connection] = set()
@@ -147,6 +153,24 @@ def test_a_small_bomb_is_inflated_elsewhere_and_its_robot_is_read_more_rarely(lo
     assert answers_at_once == 1, "only the welcome"
     assert wire.sent[-1].code == "too-large"
     assert wire.pauses == [SETTINGS.session.bad_message_pause_s]
+
+
+def test_three_long_bombs_end_the_socket_and_the_robot_rests(loop, reading):
+    core, connection, wire = join(reading)
+    limits = SETTINGS.session
+    bomb = zlib.compress(bytes(300_000_000), 9)[: limits.max_message_bytes]
+    assert len(bomb) == limits.max_message_bytes
+
+    for _ in range(3):
+        assert wire.closed is None
+        assert core.rates.rests_s(("default", "r"), 50.0) == 0
+        say(connection, bomb)
+        loop.turn()
+
+    assert wire.closed == (4400, "too many bad messages")
+    assert wire.pauses == pytest.approx([5 * limits.bad_message_pause_s, 10 * limits.bad_message_pause_s])
+    assert core.rates.rests_s(("default", "r"), 50.0) == limits.rate_rest_s
+    assert core.rates.rests_s(("default", "r2"), 50.0) == 0
 
 
 def test_a_robot_that_left_meanwhile_submits_nothing(loop, reading):

@@ -116,6 +116,7 @@ def test_every_bomb_is_refused_and_memory_stays(server):
     async def attack(door: Door) -> Outcome:
         return await attacks.zip_bombs(door, 100)
 
+    attacks.bomb()  # takes a second, in which the robot beside it could not say a word
     before = resident_mib(server)
     outcome, answered = attacked(server, attack, robots=10)
 
