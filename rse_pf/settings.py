@@ -131,7 +131,7 @@ class SessionSettings:
     ping_patience_s: float = setting(3.0, unit="s", doc="silence after a ping that counts as a lost link", low=0.1)
     hello_timeout_s: float = setting(5.0, unit="s", doc="a socket without a Hello is closed", low=0.1)
     connect_timeout_s: float = setting(2.0, unit="s", doc="one try to connect", low=0.1)
-    dial_again_s: float = setting(0.5, unit="s", doc="a dial that is not through after this gets a second one beside it; 0 is off", source="RFC 8305 has 0.25 s, for other addresses", low=0)
+    dial_again_s: float = setting(0.0, unit="s", doc="a dial that is not through after this gets a second one beside it; 0 is off", source="RFC 8305; off, as slow machines are no dead links", low=0)
     reconnect_base_s: float = setting(0.1, unit="s", doc="first back-off; full jitter", source="AWS Architecture Blog, 2015", low=0.001)
     reconnect_max_s: float = setting(1.0, unit="s", doc="longest back-off", low=0.01)
     answer_timeout_s: float = setting(5.0, unit="s", doc="deadline of a command that names none", low=0.05)

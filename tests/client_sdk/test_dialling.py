@@ -152,6 +152,9 @@ def test_never_are_more_than_two_open():
         network.pause.set_result(None)
         await network.until(2)
         network.pause.set_result(None)
+        for _ in range(10):  # turns of the loop, in which a third could begin
+            await asyncio.sleep(0)
+        assert len(network.begun) == 2
         network.begun[0].set_exception(TimeoutError())
         await network.until(3)
         assert not network.winner.done()
