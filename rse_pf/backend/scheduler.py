@@ -23,6 +23,11 @@ __all__ = ["BEHIND", "BEHIND_HINT", "Job", "Refusal", "Scheduler"]
 BEHIND = "the server is behind with its work"
 BEHIND_HINT = "try again later; the server list may grow meanwhile"
 _SMOOTHING = 0.1
+_JUMP = 4.0
+"""One measurement counts for at most so many times the expected: a process that did not run for a moment is no
+slower afterwards, and one that is slower shows it again and again."""
+_EXPECTED_S = 0.005
+"""At least so much is expected of a command."""
 _LONGEST_RETRY_MS = 5000.0
 _AT_ONCE_S = 0.0005
 """A command that waited less found the server free."""
@@ -156,7 +161,7 @@ class Scheduler:
         """Note that the compute of *job* ended; its robot may take another turn."""
         self.running -= 1
         spent_s = now - job.started_s
-        self._service_s += _SMOOTHING * (spent_s - self._service_s) if self._service_s else spent_s
+        self._service_s = _averaged(self._service_s, spent_s) if self._service_s else spent_s
         robot = self._robots[job.robot]
         robot.running, robot.free_since = None, now
         if robot.waiting:
@@ -291,7 +296,7 @@ class Scheduler:
     def _measure_turn(self, waited_s: float, now: float) -> None:
         """Average the time between two starts while robots wait: threads and size gate included."""
         if waited_s > _AT_ONCE_S and self._last_start > float("-inf"):
-            self._turn_s += _SMOOTHING * (now - self._last_start - self._turn_s)
+            self._turn_s = _averaged(self._turn_s, now - self._last_start)
         self._last_start = now
 
     def _rewait(self, name: str, robot: _Robot, kept: deque[Job]) -> None:
@@ -308,6 +313,11 @@ class Scheduler:
         robot = self._robots.get(name)
         if robot is not None and robot.running is None and not robot.waiting:
             del self._robots[name]
+
+
+def _averaged(average_s: float, measured_s: float) -> float:
+    believed_s = min(measured_s, _JUMP * max(average_s, _EXPECTED_S))
+    return average_s + _SMOOTHING * (believed_s - average_s)
 
 
 def _patience_s(allowed_s: float, longest_s: float) -> float:

@@ -18,7 +18,7 @@ from rse_pf.errors import LimitExceeded
 from rse_pf.settings import SessionSettings
 from rse_pf.wire.clock_offset import ClockOffset, Exchange
 from rse_pf.wire.codec import Codec
-from rse_pf.wire.comeback import Comeback, turn
+from rse_pf.wire.comeback import Comeback, is_long, turn
 from rse_pf.wire.messages import (
     Cancel,
     Command,
@@ -200,7 +200,7 @@ class RobotSession:
         """Make a welcomed *link* the current one and send on it what has no link.
 
         Of a latest-wins stream only the newest frame is sent again: no catch-up burst.  Frames that waited
-        for want of a link go as `rse_pf.wire.comeback` says.
+        long for want of a link go as `rse_pf.wire.comeback` says.
         """
         before, self.current = self.current, link
         if before is not None and before is not link:
@@ -208,9 +208,9 @@ class RobotSession:
             for pending in self._pending.values():
                 if pending.link is before and pending.is_long and not pending.cancelled:
                     pending.link = None  # it goes on elsewhere: ask there, and do not hold the old server up
-        frames = [each.command.id for each in self._pending.values() if _is_frame(each) and each.link is None]
-        if before is None and len(frames) > 1:
-            link.comeback = Comeback(newest=frames[-1])
+        frames = [each for each in self._pending.values() if _is_frame(each) and each.link is None]
+        if before is None and len(frames) > 1 and is_long(frames[0].submitted, frames[0].deadline, now):
+            link.comeback = Comeback(newest=frames[-1].command.id)
         return self._flush(now)
 
     def receive(self, link: Link, data: bytes, now: float) -> list[Event]:

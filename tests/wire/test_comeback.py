@@ -6,7 +6,7 @@ import pytest
 
 from rse_pf.settings import SessionSettings
 from rse_pf.wire import Command, Failure, Limits, Result, Welcome, make_codec
-from rse_pf.wire.comeback import Comeback, turn
+from rse_pf.wire.comeback import Comeback, is_long, turn
 from rse_pf.wire.robot_session import Link, RobotSession
 
 CODEC = make_codec("json")
@@ -46,11 +46,18 @@ def frames(session: RobotSession, count: int, now: float = 0.0) -> list[int]:
     return [session.submit("pnp", None, now=now, stream="pose", keep=True) for _ in range(count)]
 
 
+def old_frames(session: RobotSession, count: int) -> list[int]:
+    """Frames whose time ends at 5 s, of which two thirds are over at 1 s."""
+    return [
+        session.submit("pnp", None, now=-7.0, deadline_s=12.0, stream="pose", keep=True) for _ in range(count)
+    ]
+
+
 def back_with(count: int) -> tuple[RobotSession, Link, list[int]]:
     """Return a session whose link came back after *count* frames had waited for one."""
     session = make_session()
     session.close_link(welcomed(session))
-    waited = frames(session, count)
+    waited = old_frames(session, count)
     return session, welcomed(session, 1.0), waited
 
 
@@ -127,7 +134,7 @@ def test_all_that_waited_is_sent_in_the_end_and_then_frames_go_as_they_come():
 def test_commands_without_a_stream_keep_their_order_and_wait_for_no_frame():
     session = make_session()
     session.close_link(welcomed(session))
-    old = frames(session, 5)
+    old = old_frames(session, 5)
     calls = [session.submit("merge", None, now=0.0) for _ in range(3)]
 
     assert commands(welcomed(session, 1.0)) == [*calls, old[-1]]
@@ -136,7 +143,7 @@ def test_commands_without_a_stream_keep_their_order_and_wait_for_no_frame():
 def test_a_command_without_an_end_is_no_reason_to_hold_frames_back():
     session = make_session()
     session.close_link(welcomed(session))
-    old = frames(session, 3)
+    old = old_frames(session, 3)
     endless = session.submit("map", None, now=0.0, stream="map", keep=True, patient=True)
 
     assert commands(welcomed(session, 1.0)) == [endless, old[-1]]
@@ -166,6 +173,18 @@ def commands_of(session: RobotSession, link: Link, count: int) -> int:
     return len(commands(link))
 
 
+@pytest.mark.parametrize(("outage_s", "at_once"), [(2.4, 6), (2.6, 1)])
+def test_after_a_short_outage_all_can_be_in_time_and_go_as_they_came(outage_s, at_once):
+    """A server that died is replaced by its neighbour within a second or two: its robots' frames are still young."""
+    session = make_session()
+    session.close_link(welcomed(session))
+    waited = [session.submit("pnp", None, now=0.0, deadline_s=5.0, stream="pose", keep=True) for _ in range(6)]
+
+    sent = commands(welcomed(session, outage_s))
+
+    assert sent == (waited if at_once > 1 else [waited[-1]])
+
+
 def test_a_move_to_another_server_is_no_outage():
     session = make_session()
     welcomed(session)
@@ -181,3 +200,4 @@ def test_the_turns_are_those_of_the_rule():
         (2, ""), (4, ""), (5, "pose"), (3, "map"), (1, "pose"),
     ]  # fmt: skip
     assert Comeback(newest=5).room == 1
+    assert [is_long(2.0, 6.0, now_s) for now_s in (2.0, 4.0, 4.1)] == [False, False, True]
