@@ -24,8 +24,8 @@ BEHIND = "the server is behind with its work"
 BEHIND_HINT = "try again later; the server list may grow meanwhile"
 _SMOOTHING = 0.1
 _JUMP = 4.0
-"""One measurement counts for at most so many times the expected: a process that did not run for a moment is no
-slower afterwards, and one that is slower shows it again and again."""
+"""One measurement counts for at most so many times the expected: who did not run for a moment is not slower
+afterwards, and who is slower shows it again."""
 _EXPECTED_S = 0.005
 """At least so much is expected of a command."""
 _LONGEST_RETRY_MS = 5000.0
@@ -132,7 +132,7 @@ class Scheduler:
             return None
         self._refused += 1
         self._judge(now)
-        return self._retry_after_ms(2e3 * ahead_s)
+        return self._retry_after_ms(1e3 * ahead_s)
 
     def start(self, now: float) -> tuple[Job | None, list[Refusal]]:
         """Return the job whose turn it is, now running, and the jobs given up on the way."""
@@ -241,9 +241,9 @@ class Scheduler:
         return None
 
     def _ahead_s(self, robot: _Robot | None) -> float:
-        """How long the next command of *robot* will wait: a round of all for each of its own before it."""
+        """How long the next command of *robot* will wait: a round for each of its own, at most for all."""
         rounds = 1 + (len(robot.waiting) if robot is not None else 0)
-        return rounds * len(self._round) * self._turn_s
+        return min(rounds * len(self._round), self.waiting + 1) * self._turn_s
 
     @property
     def _wanted_s(self) -> float:
@@ -267,7 +267,7 @@ class Scheduler:
         return Refusal(job, self._busy(_turn_wait(robot, job, now)), "behind")
 
     def _busy(self, delay_s: float) -> Busy:
-        return Busy(BEHIND, hint=BEHIND_HINT, retry_after_ms=self._retry_after_ms(2e3 * delay_s))
+        return Busy(BEHIND, hint=BEHIND_HINT, retry_after_ms=self._retry_after_ms(1e3 * delay_s))
 
     def _retry_after_ms(self, wanted_ms: float) -> float:
         return min(_LONGEST_RETRY_MS, max(self._interval_s * 1e3, wanted_ms))

@@ -2,10 +2,10 @@
 
 When a link heals, every robot has seconds of frames to send and the server gets them all at once.  Oldest
 first, they reach their turn when their time is over, and the fresh ones stand behind them.  So, once the
-oldest has used up half of its time, frames go newest first and one at a time, one more with every answer that
-found the server at leisure, until none of those that waited is left.  After a shorter outage, a server that
-died, all can be in time: they go as they came.  Commands without a stream are no frames: they keep their order
-and their room.  Promises to know no clock, and that a robot is never left without room.
+oldest has used up half of its time, frames go newest first and one at a time, one more with every answer
+that found the server at leisure, until none of those that waited is left.  After a shorter outage, a server
+that died, all can be in time: they go as they came.  Commands without a stream are no frames: they keep their
+order and their room.  Promises to know no clock, and that a robot is never left without room.
 
 Source:
     Maurer 2015, "Fail at Scale", ACM Queue 13(8): adaptive LIFO; Jacobson 1988: slow start.

@@ -374,14 +374,13 @@ def test_who_can_wait_is_let_in_where_who_cannot_is_refused():
 
 def test_a_robots_own_waiting_commands_count_as_rounds():
     scheduler = Scheduler(SETTINGS)
-    scheduler.is_behind, scheduler._turn_s, scheduler._judged_s = True, 0.01, 0.0
-    for i in range(60):
-        scheduler.submit(job(f"r{i}", within=5.0), 0.0)
+    scheduler.is_behind, scheduler._turn_s, scheduler._judged_s = True, 0.012, 0.0
+    for number in range(3):
+        for i in range(60):
+            scheduler.submit(job(f"r{i}", number, within=5.0), 0.0)
 
-    taken = 0
-    while not scheduler.submit(job("r0", taken + 1, within=5.0), 0.0):
-        taken += 1
-    assert taken == 2, "the fourth command of r0 would wait four rounds of 0.6 s"
+    assert scheduler.submit(job("r0", 3, within=5.0), 0.0), "it would wait for all, more than 0.4 of its time"
+    assert scheduler.submit(job("new", within=5.0), 0.0) == [], "it waits for one round"
 
 
 def test_behind_only_a_short_queue_lets_another_robot_in():
@@ -467,43 +466,3 @@ def test_a_lone_solver_thread_lends_its_work_to_the_loop_only_while_behind():
     assert not alone.runs_inline(cheap=False, size_bytes=1, inline_bytes=10)
     assert not pair.runs_inline(cheap=True, size_bytes=1, inline_bytes=10)
     assert small.runs_inline(cheap=True, size_bytes=1, inline_bytes=10)
-
-
-def test_a_process_that_did_not_run_for_a_moment_refuses_nobody_who_has_time():
-    """A second without the processor in the middle of a round of 50 robots, who have five seconds each."""
-    scheduler = Scheduler(SETTINGS)
-    now = 0.0
-
-    def serve(count: int) -> None:
-        nonlocal now
-        for _ in range(count):
-            started, refusals = scheduler.start(now)
-            assert started is not None
-            assert refusals == []
-            now += 0.002
-            scheduler.done(started, now)
-
-    for robot in range(50):
-        assert scheduler.submit(job(f"r{robot}", at=now, within=5.0), now) == []
-    serve(25)
-    now += 1.0
-    serve(1)
-    for robot in range(26):
-        assert scheduler.submit(job(f"r{robot}", at=now, within=5.0), now) == []
-    serve(50)
-
-
-@pytest.mark.parametrize("service_s", [0.05, 0.5])
-def test_a_service_that_became_slow_is_believed_within_a_few_commands(service_s):
-    scheduler = Scheduler(SETTINGS)
-    now, turns = 0.0, []
-    for number in range(40):
-        for robot in ("a", "b"):
-            scheduler.submit(job(f"{robot}{number}", at=now, within=1e3), now)
-        while (started := scheduler.start(now)[0]) is not None:
-            now += 0.002 if number < 10 else service_s
-            scheduler.done(started, now)
-            turns.append(scheduler._turn_s)
-
-    assert turns[18] < 0.01
-    assert turns[60] > 0.5 * service_s

@@ -175,10 +175,10 @@ def commands_of(session: RobotSession, link: Link, count: int) -> int:
 
 @pytest.mark.parametrize(("outage_s", "at_once"), [(2.4, 6), (2.6, 1)])
 def test_after_a_short_outage_all_can_be_in_time_and_go_as_they_came(outage_s, at_once):
-    """A server that died is replaced by its neighbour within a second or two: its robots' frames are still young."""
+    """A server that died is replaced by its neighbour within a second or two: the frames are still young."""
     session = make_session()
     session.close_link(welcomed(session))
-    waited = [session.submit("pnp", None, now=0.0, deadline_s=5.0, stream="pose", keep=True) for _ in range(6)]
+    waited = frames(session, 6)
 
     sent = commands(welcomed(session, outage_s))
 
