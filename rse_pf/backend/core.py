@@ -43,6 +43,8 @@ __all__ = ["Core"]
 
 _UNKNOWN = "unknown"
 _BATCH_S = 0.01
+_USUAL = ("ok", Busy.code, "stale")
+"""What happens hundreds of times a second: counted, and logged for developers only."""
 """Behind and out of budget, a small server refuses in batches: alone, a refusal costs three times as much."""
 _TOO_FAST = "this robot sends more than its rate"
 _TOO_FAST_HINT = "send fewer, or have the operator raise session.max_commands_per_s"
@@ -252,8 +254,8 @@ class Core:
         self.metrics.shed["unread"] += 1
         self.metrics.answered(envelope.service, Busy.code, 0.0)
         connection.write(refusal)
-        if self._log.writes("info"):
-            self._log.info(
+        if self._log.writes("debug"):
+            self._log.debug(
                 "command", robot=connection.robot, service=envelope.service, id=envelope.id, trace="",
                 code=Busy.code, queue_ms=0.0, compute_ms=0.0, bytes_in=len(data), bytes_out=len(refusal),
             )  # fmt: skip
@@ -417,7 +419,7 @@ class Core:
         if connection in self.connections and connection.session is not None:
             connection.session.in_flight -= 1
             connection.write(outcome.data)
-        level, tell = ("debug", self._log.debug) if code == "ok" else ("info", self._log.info)
+        level, tell = ("debug", self._log.debug) if code in _USUAL else ("info", self._log.info)
         if self._log.writes(level):
             compute_ms = answer.compute_ms if isinstance(answer, Result) else 0.0
             tell(

@@ -37,6 +37,8 @@ _PATIENCE = 4.0
 """What was let in before the server fell behind is served up to so many targets later."""
 _SHARE_OF_TIME = 0.4
 """Of a command's time may pass in the queue, even behind; the rest is for the work and the way."""
+_RESERVE_S = 1.5
+"""Enough for the work and the way of any command: who has more time may wait for longer than that share."""
 _CALM_SHARE = 0.1
 """A server that refuses a smaller share of its commands has caught up."""
 
@@ -253,7 +255,7 @@ class Scheduler:
     def _is_hopeless(self, robot: _Robot, job: Job, now: float, others: int) -> bool:
         """Serving the oldest first serves those that are about to be late; give those up instead."""
         allowed_s = job.deadline_s - job.received_s
-        patience_s = max(_PATIENCE * self._wanted_s, _SHARE_OF_TIME * allowed_s)
+        patience_s = max(_PATIENCE * self._wanted_s, _spare_s(allowed_s))
         patience_s = min(patience_s, _LAST_CHANCE * allowed_s)
         if others and self.is_behind and _turn_wait(robot, job, now) > patience_s:
             return True
@@ -323,10 +325,15 @@ def _averaged(average_s: float, measured_s: float) -> float:
 def _patience_s(allowed_s: float, longest_s: float) -> float:
     """How long a command may wait for its turn on a server that is behind.
 
-    *longest_s*, or a share of what it allows if that is more: who can wait is served, not refused, when a
-    server has the robots of another one for some seconds.  In any case at most half of its time.
+    *longest_s*, or what it can spare if that is more: who can wait is served, not refused, when a server has
+    the robots of another one for some seconds.  In any case at most half of its time, or what it can spare.
     """
-    return min(max(longest_s, _SHARE_OF_TIME * allowed_s), allowed_s / 2)
+    spare_s = _spare_s(allowed_s)
+    return min(max(longest_s, spare_s), max(allowed_s / 2, spare_s))
+
+
+def _spare_s(allowed_s: float) -> float:
+    return max(_SHARE_OF_TIME * allowed_s, allowed_s - _RESERVE_S)
 
 
 def _turn_wait(robot: _Robot, job: Job, now: float) -> float:

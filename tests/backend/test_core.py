@@ -263,7 +263,7 @@ def test_a_server_that_is_behind_refuses_without_reading(made):
 
     refused = wire.sent[-1]
     assert (refused.id, refused.code) == (8, "busy")
-    assert refused.retry_after_ms >= 1000.0
+    assert refused.retry_after_ms >= 500.0
     assert connection.session.in_flight == 0
     assert core.metrics.shed["unread"] == 1
     assert core.metrics.requests["echo", "busy"] == 1
