@@ -261,6 +261,7 @@ class LocalSettings:
     workers: int = setting(1, doc="worker processes of each local server", low=1, high=64)
     start_timeout_s: float = setting(20.0, unit="s", doc="a server that is not ready by then failed", low=1)
     stop_timeout_s: float = setting(10.0, unit="s", doc="a process that does not leave by then is killed", low=0.5)
+    spare: bool = setting(True, doc="keep one more process warm, about 60 MB, that becomes the next server at once", source="warm pools of AWS Auto Scaling")
     data_nice: int = setting(10, doc="niceness of the data server: on one machine poses go first", low=0, high=19)
     restarts_per_minute: int = setting(5, unit="servers", doc="replacements of servers that died young, in any minute", low=1)
     max_connections: int = setting(12000, unit="sockets", doc="connections of the front door, robots and others; more are closed", low=16)

@@ -33,7 +33,7 @@ from rse_pf.backend.processes import cpu_seconds, raise_descriptor_limit, reside
 from rse_pf.backend.revocation import Watch, first_order
 from rse_pf.backend.witness import Records, open_records
 from rse_pf.backend.worker import WorkerPlan
-from rse_pf.backend.worker_process import WorkerProcess, fork_workers
+from rse_pf.backend.worker_process import BUILTIN, WorkerProcess, fork_workers
 from rse_pf.control import Trust
 from rse_pf.control_token import is_carried
 from rse_pf.errors import ConfigurationError
@@ -41,7 +41,6 @@ from rse_pf.settings import PlatformSettings
 
 __all__ = ["serve"]
 
-_BUILTIN = "rse_pf.services.builtin:builtin_services"
 _ACCEPTS_AT_ONCE = 64
 _ACCEPT_PAUSE_S = 0.1
 _SHORTEST_PAUSE_S = 0.01
@@ -64,7 +63,7 @@ def serve(
     server_id: str,
     announce: Path | None = None,
     conformance_echo: bool = False,
-    services: str = _BUILTIN,
+    services: str = BUILTIN,
     settings_digest: str = "",
     audit: Path | None = None,
     control_token: str | None = None,

@@ -21,11 +21,25 @@ from typing import Any, NoReturn
 
 from rse_pf.backend.load_services import load_services
 from rse_pf.backend.worker import NUMBER_BYTES, WorkerPlan, event_loop_maker, run_worker
+from rse_pf.settings import PlatformSettings
 
-__all__ = ["WorkerProcess", "fork_workers"]
+__all__ = ["BUILTIN", "WorkerProcess", "fork_workers", "warm_up"]
 
+BUILTIN = "rse_pf.services.builtin:builtin_services"
+"""The platform's own services."""
 _MOST_LINE_BYTES = 1 << 20
 _READ_BYTES = 4096
+
+
+def warm_up(services: str = BUILTIN, settings: PlatformSettings | None = None) -> None:
+    """Import what every worker needs, which most of a server's start is spent on.
+
+    Raises:
+        ConfigurationError: There are no such services.
+        MissingExtra: The extra ``backend`` is not installed.
+    """
+    event_loop_maker()
+    load_services(services, settings or PlatformSettings())
 
 
 def fork_workers(plans: Sequence[WorkerPlan], *, listener: socket.socket) -> list[WorkerProcess]:
@@ -35,9 +49,8 @@ def fork_workers(plans: Sequence[WorkerPlan], *, listener: socket.socket) -> lis
         ConfigurationError: There are no such services.
         MissingExtra: The extra ``backend`` is not installed.
     """
-    event_loop_maker()
     for plan in plans[:1]:
-        load_services(plan.services, plan.settings)
+        warm_up(plan.services, plan.settings)
     gc.collect()
     gc.freeze()  # or the first collection of a worker would copy every page that it shares
     workers: list[WorkerProcess] = []

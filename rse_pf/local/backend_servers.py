@@ -24,6 +24,7 @@ from rse_pf.errors import ConfigurationError
 from rse_pf.local.control_port import ControlPort
 from rse_pf.local.envoy_config import Target
 from rse_pf.local.processes import ProcessMark, ended, is_alive, last_line, mark_of, send_signal, spawn
+from rse_pf.local.spare import Spare
 from rse_pf.settings import PlatformSettings
 
 __all__ = ["RSE_PF", "BackendServer", "BackendServers"]
@@ -79,6 +80,9 @@ class BackendServers:
         self._program = tuple(program)
         self._processes: dict[str, subprocess.Popen[bytes]] = {}
         self._marks: dict[str, ProcessMark] = {}
+        self._spare: Spare | None = None
+        if self._program == RSE_PF and settings.local.spare:
+            self._spare = Spare(folder, dies_with_parent=dies_with_parent)
 
     @property
     def marks(self) -> dict[str, ProcessMark]:
@@ -89,7 +93,7 @@ class BackendServers:
         """Start the process of server *name*, and return before it listens."""
         self._announce(name).unlink(missing_ok=True)
         serving = self._settings.serving
-        command = [*self._program, "serve", "--settings", str(self._settings_file), "--server-id", name]
+        command = ["serve", "--settings", str(self._settings_file), "--server-id", name]
         # Where it runs is said beside the settings, whose digest is then the same on every machine.
         command += ["--host", serving.host, "--port", str(serving.port), "--workers", str(serving.workers)]
         command += ["--control-host", serving.control_host, "--control-port", str(serving.control_port)]
@@ -98,13 +102,24 @@ class BackendServers:
         command += ["--audit", str(audit_folder(self._folder))]
         if self._control_token_file is not None:
             command += ["--control-token", str(self._control_token_file)]
-        process = spawn(
-            command, log=self._log(name), folder=self._folder, dies_with_parent=self._dies_with_parent
-        )
+        log = self._log(name)
+        process = None if self._spare is None else self._spare.take(command, log)
+        if process is None:
+            command = [*self._program, *command]
+            process = spawn(command, log=log, folder=self._folder, dies_with_parent=self._dies_with_parent)
         self._processes[name] = process
         mark = mark_of(process.pid)
         if mark is not None:
             self._marks[name] = mark
+
+    def warm_spare(self) -> bool:
+        """Let one more process wait, warm, to become the next server; return whether one was started."""
+        return self._spare is not None and self._spare.warm()
+
+    @property
+    def spare_pid(self) -> int | None:
+        """Of the process that waits to become a server, if there is one."""
+        return None if self._spare is None else self._spare.pid
 
     def adopt(self, name: str, mark: ProcessMark) -> None:
         """Know a server that an earlier control plane launched as *name*, ready or not."""
@@ -184,6 +199,8 @@ class BackendServers:
 
     def kill_all(self) -> None:
         """End what is left, at once, and reap it."""
+        if self._spare is not None:
+            self._spare.close()
         for name in {**self._marks, **self._processes}:
             self.send(name, signal.SIGKILL)
         for name in {**self._marks, **self._processes}:

@@ -41,6 +41,7 @@ _LATE_SHARE = 0.5
 """A check whose deadline was noticed later than this share of it says more about us than about the server."""
 _LEAVING = frozenset({"draining", "leaving"})
 _LONGEST_PAUSE_S = 8.0
+_SPARE_EVERY_S = 1.0
 
 
 class ControlPlane:
@@ -96,7 +97,14 @@ class ControlPlane:
         if self._elastic:
             self._fleet.on_lost = self._soon
             self._fleet.keep(self._keep_balancer())
+            self._fleet.keep(self._keep_spare())
             self._soon()
+
+    async def _keep_spare(self) -> None:
+        """After every launch, once all is calm, prepare the next one."""
+        while self._elastic:
+            await asyncio.sleep(_SPARE_EVERY_S)
+            self._fleet.warm_spare()
 
     def stop(self) -> None:
         """Act no more, whatever was about to happen."""

@@ -32,6 +32,7 @@ _ASK_S = 2.0
 _LOOK_UP_S = 0.5
 _PAUSE_S = 0.02
 _CANCEL_AGAIN_S = 0.2
+_CALM_S = 3.0
 _PREFIX = "server-"
 
 
@@ -183,6 +184,13 @@ class Fleet:
                     f"the load balancer found {member.name} unhealthy", hint=f"its log is {server.log}"
                 )
             await asyncio.sleep(_PAUSE_S)  # the balancer itself may be gone, and come back
+
+    def warm_spare(self) -> None:
+        """Prepare for the next launch, unless a server started lately: its neighbours have enough to do."""
+        calm_since_s = time.monotonic() - _CALM_S
+        ready = (member.healthy_s for member in self.members.values())
+        if all(at is not None and at <= calm_since_s for at in ready) and self._backend_servers.warm_spare():
+            self._tell("spare-started", pid=self._backend_servers.spare_pid)
 
     def start(self, member: Member) -> None:
         """Bring *member* up in the background; its failure is an event and a loss."""

@@ -85,7 +85,12 @@ async def ended(mark: ProcessMark, timeout_s: float | None = None) -> bool:
 
 
 def spawn(
-    command: Sequence[str], *, log: Path, folder: Path, dies_with_parent: bool
+    command: Sequence[str],
+    *,
+    log: Path,
+    folder: Path,
+    dies_with_parent: bool,
+    stdin: int = subprocess.DEVNULL,
 ) -> subprocess.Popen[bytes]:
     """Start *command* in a process group of its own, so that a terminal's Ctrl-C does not reach it.
 
@@ -97,13 +102,14 @@ def spawn(
         log: Where both of its output streams go; an earlier file is replaced.
         folder: Its working directory.
         dies_with_parent: Whether Linux kills it when the calling thread ends, however that ends.
+        stdin: Nothing, or ``subprocess.PIPE``.
     """
     log.unlink(missing_ok=True)
     with log.open("ab") as output:  # it appends, so that the log may be cut short under it
         process = subprocess.Popen(
             command,
             cwd=folder,
-            stdin=subprocess.DEVNULL,
+            stdin=stdin,
             stdout=output,
             stderr=subprocess.STDOUT,
             preexec_fn=_apart(os.getpid() if dies_with_parent else None),

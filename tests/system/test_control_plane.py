@@ -157,6 +157,28 @@ def test_killed_and_stopped_servers_are_replaced_and_robots_lose_nothing(tmp_pat
     asyncio.run(run())
 
 
+def test_the_process_that_waits_warm_is_the_replacement_and_the_next_one_follows(tmp_path: Path) -> None:
+    async def run() -> None:
+        news = News()
+        async with platform(tmp_path / "a", news) as cloud:
+            spare = (await news.heard("spare-started"))["pid"]
+            async with asking(cloud) as tally:
+                cloud.kill("server-1")
+                await news.heard("server-healthy", server="server-3")
+                assert cloud.backend_servers.marks["server-3"].pid == spare
+                told = await news.heard("server-ready", server="server-3")
+                assert told["pid"] == spare
+            check(tally)
+            started = await news.until(
+                lambda: [told["pid"] for told in news.events if told["event"] == "spare-started"][1:]
+            )
+            mark = mark_of(started[0])
+        assert mark is not None
+        assert not is_alive(mark), "it goes with its platform"
+
+    asyncio.run(run())
+
+
 def test_a_killed_balancer_comes_back_on_its_port_with_its_targets(tmp_path: Path) -> None:
     async def run() -> None:
         news = News()
