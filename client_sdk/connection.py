@@ -53,6 +53,8 @@ _FIRST_TRIES = 4
 _DIALS_OF_A_ROW = 8
 """Time-outs after which a robot that lost its link begins anew, with a fresh token."""
 _SHORTEST_TICK_S = 0.001
+_GHOST_S = 60.0
+"""So long a dial that was given up may still be welcomed, by a server that was stopped meanwhile."""
 _IS_IT_RUNNING = "is the platform running? start it with rse-pf local start"
 
 
@@ -119,6 +121,7 @@ class Connection:
         self._attempt = 0
         self._adopted = 0.0
         self._move_asked: tuple[_Socket, float] | None = None
+        self._ghost_until = float("-inf")
         self._lasting: list[asyncio.Task[None]] = []
         self._closed = False
 
@@ -261,6 +264,7 @@ class Connection:
                 raise Refused(mute)
             socket.welcome.result()
         except BaseException:
+            self._ghost_until = self._clock() + _GHOST_S
             self._abort(socket)
             raise
         return socket
@@ -288,6 +292,7 @@ class Connection:
             told = refusal(self._address, response.status_code, response.headers.get("Retry-After", ""))
             raise told from error
         except (OSError, asyncio.TimeoutError, WebSocketException, EOFError) as error:
+            self._ghost_until = self._clock() + _GHOST_S
             cause = getattr(error, "strerror", None) or str(error) or type(error).__name__
             raise Refused(
                 ConnectError(f"cannot connect to {self._address}: {cause}", hint=_IS_IT_RUNNING)
@@ -332,7 +337,8 @@ class Connection:
             if socket.websocket.close_code == CLOSE_RATE:
                 self.last_error = "the server cut this robot off: it sends more than its rate"
             replaced = socket.websocket.close_code == CLOSE_REPLACED
-            if replaced and self._session.current is socket.link and self._move_asked is None:
+            by_ourselves = self._move_asked is not None or self._clock() < self._ghost_until
+            if replaced and self._session.current is socket.link and not by_ourselves:
                 self._end(
                     Conflict(
                         "another connection of this robot took its place",

@@ -387,6 +387,22 @@ def test_another_robot_with_the_same_token_is_told_and_not_fought():
     run(test())
 
 
+def test_a_robot_whose_own_given_up_dial_took_its_place_comes_back():
+    """A server that was stopped for a moment welcomes the dial late, and closes the robot's older socket."""
+
+    async def test():
+        async with FakePlatform() as platform, robot(platform.url) as a_robot:
+            platform.welcomes = False
+            await platform.sockets[0].move(within_ms=100.0)
+            await platform.until(lambda: len(platform.sockets) > 1 and not platform.sockets[1].is_open)
+            platform.welcomes = True
+            await platform.sockets[0].websocket.close(CLOSE_REPLACED, "replaced")
+
+            assert (await ask(a_robot, 1, deadline_s=5)).reply == {"value": 1}
+
+    run(test())
+
+
 def test_an_old_server_says_which_protocol_it_wants(monkeypatch):
     async def test():
         async with FakePlatform() as platform:
