@@ -1,27 +1,52 @@
 """A server that is not one yet: it has imported what `rse-pf serve` needs, and waits to be told which it is.
 
-Started by the local platform as ``python -m rse_pf.cli.spare``; one JSON line on its standard input names the
-arguments and the log.  Promises to listen nowhere and to hold no key before it is told, and to go when nobody
-is left who could tell it.
+Started by the local platform as ``python -m rse_pf.cli.spare``; it says a word when all is imported, and one
+JSON line on its standard input names the arguments and the log.  It imports slowly, a quarter of a core at
+most, because servers work beside it.  Promises to listen nowhere and to hold no key before it is told, not to
+dawdle once it is, and to go when nobody is left who could tell it.
 """
 
 from __future__ import annotations
 
 import importlib
+import importlib.abc
 import json
 import os
+import select
 import sys
-
-from rse_pf.backend import warm_up
-from rse_pf.cli import main as front
+import time
 
 __all__ = ["main"]
+
+_LONGEST_S = 0.01
+"""Of work without a rest, where one module does not take longer."""
+_REST = 3.0
+"""Rest so many times as long as was worked."""
+
+
+class _Rests(importlib.abc.MetaPathFinder):
+    """Finds no module; whoever looks for one is held back a little, until the order is there."""
+
+    def __init__(self) -> None:
+        self._worked_s = time.process_time()
+        self._is_wanted = False
+
+    def find_spec(self, fullname: str, path: object, target: object = None) -> None:
+        worked_s = time.process_time() - self._worked_s
+        if worked_s > _LONGEST_S and not self._is_wanted:
+            self._is_wanted = bool(select.select([0], [], [], _REST * worked_s)[0])
+            self._worked_s = time.process_time()
 
 
 def main() -> int:
     """Wait for the order, then be that server."""
+    rests = _Rests()
+    sys.meta_path.insert(0, rests)
+    front = importlib.import_module("rse_pf.cli.main")
     importlib.import_module("rse_pf.cli.serve")
-    warm_up()
+    importlib.import_module("rse_pf.backend").warm_up()
+    sys.meta_path.remove(rests)
+    print("warm", flush=True)
     line = sys.stdin.buffer.readline()
     if not line.endswith(b"\n"):
         return 0
@@ -32,7 +57,8 @@ def main() -> int:
         os.dup2(ours, standard)
     os.close(nothing)
     os.close(log)
-    return front.main(order["arguments"])
+    code: int = front.main(order["arguments"])
+    return code
 
 
 if __name__ == "__main__":

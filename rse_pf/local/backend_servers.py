@@ -121,6 +121,13 @@ class BackendServers:
         """Of the process that waits to become a server, if there is one."""
         return None if self._spare is None else self._spare.pid
 
+    async def wait_warm(self, timeout_s: float) -> None:
+        """Wait until a process waits warm, for a launch that is in no hurry; not where there is none."""
+        end = time.monotonic() + timeout_s
+        self.warm_spare()
+        while self._spare is not None and not self._spare.is_warm and time.monotonic() < end:
+            await asyncio.sleep(_LOOK_AGAIN_S)
+
     def adopt(self, name: str, mark: ProcessMark) -> None:
         """Know a server that an earlier control plane launched as *name*, ready or not."""
         self._marks[name] = mark

@@ -302,6 +302,7 @@ class LocalCloud:
         self._control.hold = True
         try:
             for old in [server.name for server in self.servers]:
+                await self.backend_servers.wait_warm(self.settings.local.start_timeout_s)
                 names = list(self._fleet.grow(1, "rolling replacement"))
                 await self._until_healthy(names)
                 if old in self._fleet.members:

@@ -38,13 +38,24 @@ class Spare:
         """Of the process that waits, if there is one."""
         return None if self._process is None or self._process.poll() is not None else self._process.pid
 
+    @property
+    def is_warm(self) -> bool:
+        """Whether the one that waits has said so."""
+        with contextlib.suppress(OSError):
+            return self.pid is not None and self._log.stat().st_size > 0
+        return False
+
+    @property
+    def _log(self) -> Path:
+        return self._folder / "spare.log"
+
     def warm(self) -> bool:
         """Start one, unless one waits already; return whether one was started."""
         waits = self.pid is not None
         if not waits:
             self.close()
             self._process = spawn(
-                self._program, log=self._folder / "spare.log", folder=self._folder,
+                self._program, log=self._log, folder=self._folder,
                 dies_with_parent=self._dies_with_parent, stdin=subprocess.PIPE,
             )  # fmt: skip
         return not waits

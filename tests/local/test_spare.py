@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import select
 import sys
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -65,6 +66,21 @@ def test_a_launch_goes_on_without_a_spare_that_died(tmp_path: Path) -> None:
     assert spare.pid is None
     assert spare.take(["serve"], tmp_path / "log") is None
     spare.close()
+
+
+def test_the_real_one_says_that_it_is_warm_and_is_a_server_once_told(tmp_path: Path) -> None:
+    real = Spare(tmp_path, dies_with_parent=True)
+    real.warm()
+    until = time.monotonic() + SOON_S
+    while not real.is_warm:
+        assert time.monotonic() < until
+        assert real.pid is not None, (tmp_path / "spare.log").read_text()
+
+    process = real.take(["serve", "--keys", str(tmp_path / "none.json")], tmp_path / "server-3.log")
+
+    assert process is not None
+    assert process.wait(SOON_S) == 2
+    assert "cannot read the keys" in (tmp_path / "server-3.log").read_text()
 
 
 def test_it_goes_with_its_platform_and_when_nobody_can_tell_it_any_more(tmp_path: Path) -> None:
