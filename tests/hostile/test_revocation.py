@@ -97,7 +97,8 @@ async def is_refused(server: GuardedServer, token: str) -> bool:
 
 @pytest.fixture(scope="module")
 def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[GuardedServer]:
-    with GuardedServer(tmp_path_factory.mktemp("guarded"), session={"max_commands_per_s": 0.0}) as server:
+    session = {"max_commands_per_s": 0.0, "ping_patience_s": 30.0}  # these robots send no pings
+    with GuardedServer(tmp_path_factory.mktemp("guarded"), session=session) as server:
         yield server
 
 
@@ -166,7 +167,7 @@ def test_a_socket_ends_with_its_token_to_the_second_and_not_before(server: Guard
 def test_a_fresh_token_moves_the_end_of_the_socket_and_a_bad_one_does_not(server: GuardedServer) -> None:
     async def run() -> None:
         names = ["renews", "renews-2", "renews-3"]
-        async with robots(server, [server.token(name, life_s=4.0) for name in names]) as (socket, *wrong):
+        async with robots(server, [server.token(name, life_s=3.0) for name in names]) as (socket, *wrong):
             assert socket.token_s is not None
             first_end = time.monotonic() + socket.token_s
             for other, token in zip(wrong, ("x", server.token("another")), strict=True):
