@@ -258,7 +258,7 @@ async def slow_reader(door: Door, count: int = 20) -> Outcome:
                 continue
             except OSError:
                 break
-            await asyncio.sleep(0.1)
+            await asyncio.sleep(0.1)  # a slow sender is slow
         is_over = writer.transport.is_closing()
         outcome.refused += is_over
         outcome.ends["cut" if is_over else "open"] += 1
@@ -277,7 +277,7 @@ async def rate_flood(door: Door, per_s: float = 500.0, seconds: float = 10.0) ->
             socket = await door.enter(door.tokens[0], "bin")
         except ConnectionError as error:
             outcome.ends[str(error)[9:12]] += 1
-            await asyncio.sleep(0.1)
+            await asyncio.sleep(0.1)  # thrown out, it comes back at this pace
             continue
         hearing = asyncio.create_task(_hear_all(socket, outcome))
         command = frame(socket.codec.encode(Command(id=1, service="echo", payload={"value": 1}, keep=True)))

@@ -92,7 +92,7 @@ class Server:
         while not announce.exists():
             if self._process.poll() is not None or time.monotonic() > end:
                 raise SystemExit((folder / "server.log").read_text()[-2000:])
-            time.sleep(0.05)
+            time.sleep(0.05)  # looks again, with a deadline: the file comes by rename
         self.port = int(json.loads(announce.read_text())["port"])
 
     def stop(self) -> None:

@@ -75,7 +75,7 @@ def upload_all(
         pace = Pace(bytes_per_s, time.monotonic()) if bytes_per_s else None
         for number in numbers[row::UPLOADERS]:
             if pace is not None:
-                time.sleep(pace.wait_s(size, time.monotonic()))
+                time.sleep(pace.wait_s(size, time.monotonic()))  # the pace is what is measured
             began = time.monotonic()
             digest = client.upload(content(number, size))
             with lock:
@@ -146,7 +146,7 @@ async def kill_on_the_way(cloud: LocalCloud, uploads: Uploads, args: argparse.Na
         while cloud.data_servers.mark == before or not await cloud.data_servers.is_ready():
             if time.monotonic() - began > PATIENCE_S:
                 raise TimeoutError("the data server does not come back")
-            await asyncio.sleep(0.01)
+            await asyncio.sleep(0.01)  # looks again, with a deadline
         back.append(time.monotonic() - began)
     return back
 

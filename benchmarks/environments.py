@@ -100,7 +100,7 @@ class Server:
         while not announce.exists():
             if time.monotonic() > end or self.process.poll() is not None:
                 raise SystemExit(f"the server did not start: {(folder / 'server.log').read_text()[-2000:]}")
-            time.sleep(0.02)
+            time.sleep(0.02)  # looks again, with a deadline
         self._identity = json.loads(announce.read_text())
         self.url = f"ws://127.0.0.1:{self._identity['port']}/ws"
 
@@ -320,7 +320,7 @@ async def gone(folder: Path, robots: int = 10) -> list[Row]:
         while (after := (len(server.processes()), server.descriptors())) != before:
             if time.monotonic() - began > 15:
                 break
-            await asyncio.sleep(0.1)
+            await asyncio.sleep(0.1)  # looks again, with a deadline
     return [{
         "row": f"{robots} robots leave", "processes_and_descriptors_before": before, "during": during,
         "after": after, "gone_after_s": time.monotonic() - began,
@@ -377,7 +377,7 @@ async def _count(robot: Any, times: int, counts: list[int], failures: list[str])
                 answer = await robot.call("hard", {}, deadline_s=3)
             except RsePfError as error:
                 failures.append(error.code)
-                await asyncio.sleep(0.1)
+                await asyncio.sleep(0.1)  # the robot's own pace after a failure
             else:
                 counts.append(answer.reply["count"])
                 holder = answer.server

@@ -222,7 +222,7 @@ async def probe(identity: dict[str, int], waits: dict[str, list[float]]) -> None
             writer.close()
             assert answer.startswith(b"HTTP/1.1 200"), answer[:50]
             waits[path].append(time.perf_counter() - began)
-        await asyncio.sleep(0.25)
+        await asyncio.sleep(0.25)  # the pace of the questions, four a second
 
 
 def judge(generator: Generator, borders: Any, first: int) -> list[dict[str, Any]]:

@@ -69,7 +69,7 @@ def start(folder: str, **serving: object) -> tuple[subprocess.Popen[bytes], dict
     while not announce.exists():
         if time.monotonic() > deadline or process.poll() is not None:
             raise SystemExit("the server did not start")
-        time.sleep(0.02)
+        time.sleep(0.02)  # looks again, with a deadline
     return process, json.loads(announce.read_text())
 
 
