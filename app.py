@@ -1,4 +1,4 @@
-"""Say which stacks there are.  Every number is in `rse_pf.settings`; overrides are in cdk.json.
+"""Say which stacks there are.  Every number is in `rse_pf.config.settings`; overrides are in cdk.json.
 
 Promises to complain in two lines before anything is synthesised, and to let no ``-c`` of the command line
 pass that nobody reads.
@@ -13,8 +13,8 @@ from typing import Any
 
 import aws_cdk as cdk
 
+from rse_pf.config import PlatformSettings, load_settings
 from rse_pf.errors import ConfigurationError, RsePfError, SettingsError
-from rse_pf.settings import PlatformSettings, load_settings
 from stacks.backend_stack import BackendStack
 from stacks.data_stack import DataStack
 from stacks.network_stack import NetworkStack

@@ -27,7 +27,7 @@ from urllib.parse import urlsplit
 
 from rse_pf.wire import SUBPROTOCOLS, Command, Failure, Hello, make_codec
 
-__all__ = ["ATTACKS", "Door", "Outcome", "Socket", "frame"]
+__all__ = ["ATTACKS", "HandshakePolicy", "Outcome", "Socket", "frame"]
 
 CONTINUATION, BINARY, CLOSE, PING, PONG = 0, 2, 8, 9, 10
 FIN, MASKED = 0x80, 0x80
@@ -47,7 +47,7 @@ def frame(payload: bytes, opcode: int = BINARY, *, fin: bool = True) -> bytes:
 
 
 @dataclass(frozen=True, slots=True)
-class Door:
+class HandshakePolicy:
     """Where to knock, and with which tokens."""
 
     url: str
@@ -150,7 +150,7 @@ def bomb() -> bytes:
     return made[:262144]
 
 
-async def zip_bombs(door: Door, count: int = 1000, pause_s: float = 1.0) -> Outcome:
+async def zip_bombs(door: HandshakePolicy, count: int = 1000, pause_s: float = 1.0) -> Outcome:
     """Send *count* messages of 255 KB that would inflate to 256 MiB, ten a robot, all robots at once.
 
     Who is thrown out comes back at once, and after *pause_s* if the door stays shut; each try counts.
@@ -188,20 +188,20 @@ async def zip_bombs(door: Door, count: int = 1000, pause_s: float = 1.0) -> Outc
     return outcome
 
 
-async def empty_fragments(door: Door, count: int = 200_000) -> Outcome:
+async def empty_fragments(door: HandshakePolicy, count: int = 200_000) -> Outcome:
     """Begin one message and never end it: *count* empty fragments."""
     socket = await door.enter(door.tokens[0])
     began = frame(b"", fin=False)
     return await _flood(socket, began, frame(b"", CONTINUATION, fin=False), count)
 
 
-async def ping_flood(door: Door, count: int = 200_000) -> Outcome:
+async def ping_flood(door: HandshakePolicy, count: int = 200_000) -> Outcome:
     """Send *count* ping frames as fast as the connection takes them."""
     socket = await door.enter(door.tokens[0])
     return await _flood(socket, b"", frame(b"x", PING), count)
 
 
-async def slow_headers(door: Door, count: int = 400, pause_s: float = 0.5) -> Outcome:
+async def slow_headers(door: HandshakePolicy, count: int = 400, pause_s: float = 0.5) -> Outcome:
     """Send the head of *count* handshakes one header at a time."""
     outcome = Outcome(tried=count)
 
@@ -220,7 +220,7 @@ async def slow_headers(door: Door, count: int = 400, pause_s: float = 0.5) -> Ou
     return outcome
 
 
-async def silent_connects(door: Door, count: int = 2000) -> Outcome:
+async def silent_connects(door: HandshakePolicy, count: int = 2000) -> Outcome:
     """Open *count* connections and say nothing."""
     outcome = Outcome(tried=count)
 
@@ -235,7 +235,7 @@ async def silent_connects(door: Door, count: int = 2000) -> Outcome:
     return outcome
 
 
-async def slow_reader(door: Door, count: int = 20) -> Outcome:
+async def slow_reader(door: HandshakePolicy, count: int = 20) -> Outcome:
     """Ask on *count* sockets for large replies, and read none of them."""
     outcome = Outcome(tried=count)
     filling = {"value": "x" * 200_000}
@@ -269,7 +269,7 @@ async def slow_reader(door: Door, count: int = 20) -> Outcome:
     return outcome
 
 
-async def rate_flood(door: Door, per_s: float = 500.0, seconds: float = 10.0) -> Outcome:
+async def rate_flood(door: HandshakePolicy, per_s: float = 500.0, seconds: float = 10.0) -> Outcome:
     """Be one robot that sends *per_s* commands a second, and comes back whenever it is cut off."""
     outcome, until = Outcome(), time.monotonic() + seconds
     while time.monotonic() < until:
@@ -339,7 +339,7 @@ async def _all(works: list[Awaitable[None]]) -> None:
             raise result
 
 
-ATTACKS: dict[str, Callable[[Door], Awaitable[Outcome]]] = {
+ATTACKS: dict[str, Callable[[HandshakePolicy], Awaitable[Outcome]]] = {
     "zip-bombs": zip_bombs,
     "empty-fragments": empty_fragments,
     "ping-flood": ping_flood,
@@ -350,7 +350,7 @@ ATTACKS: dict[str, Callable[[Door], Awaitable[Outcome]]] = {
 }
 
 
-async def _attack(name: str, door: Door) -> Outcome:
+async def _attack(name: str, door: HandshakePolicy) -> Outcome:
     began = time.monotonic()
     outcome = await ATTACKS[name](door)
     outcome.took_s = time.monotonic() - began
@@ -360,7 +360,7 @@ async def _attack(name: str, door: Door) -> Outcome:
 def main() -> None:
     """Get ready, wait, attack, tell."""
     name, url = sys.argv[1:]
-    door = Door(url, tuple(json.loads(sys.stdin.readline())))
+    door = HandshakePolicy(url, tuple(json.loads(sys.stdin.readline())))
     if name == "zip-bombs":
         bomb()
     print("ready", flush=True)

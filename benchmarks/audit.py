@@ -26,9 +26,9 @@ from typing import Any
 
 import numpy as np
 
-from rse_pf.audit_check import check_folder
-from rse_pf.auth import SigningKey
-from rse_pf.settings import PlatformSettings
+from rse_pf.audit.verify import check_folder
+from rse_pf.auth.tokens import SigningKey
+from rse_pf.config import PlatformSettings
 from rse_pf.wire import SUBPROTOCOLS
 
 KEY = SigningKey.from_seed(b"a" * 32, "bench-1")

@@ -21,12 +21,12 @@ from typing import Any
 
 import numpy as np
 
+from rse_pf.config import PlatformSettings
 from rse_pf.pnp import solve_pnp
 from rse_pf.pnp.problems import PnpProblem, make_problem
 from rse_pf.service import Registry, dispatch
 from rse_pf.services.builtin import builtin_services
 from rse_pf.services.pnp import PnpReply, PnpRequest, make_request
-from rse_pf.settings import PlatformSettings
 from rse_pf.wire import CODECS, Command, Result, as_type, make_codec
 
 __all__ = ["main", "measure"]

@@ -35,13 +35,13 @@ from typing import Any
 import numpy as np
 from windows import poses
 
-from client_sdk.background import Pace
-from client_sdk.data import DataClient, DataOptions
+from client_sdk.transfer.background_upload import UploadRate
+from client_sdk.transfer.data_client import DataClient, DataOptions
+from rse_pf.config import PlatformSettings
 from rse_pf.errors import RsePfError
-from rse_pf.experiments.swarm import Swarm, SwarmOptions
-from rse_pf.local.cloud import LocalCloud
-from rse_pf.objects import DirectoryStore, digest_of
-from rse_pf.settings import PlatformSettings
+from rse_pf.experiments.load.swarm import Swarm, SwarmOptions
+from rse_pf.local.control.platform import LocalPlatform
+from rse_pf.object_store import DirectoryStore, digest_of
 
 MIB = 1 << 20
 UPLOADERS = 4
@@ -72,7 +72,7 @@ def upload_all(
         part_bytes = size // 4 if not bytes_per_s else 64 * 1024
         options = DataOptions(part_bytes=part_bytes, first_pause_s=0.05, random=random.Random(row))
         client = DataClient(url, tokens[row], options)
-        pace = Pace(bytes_per_s, time.monotonic()) if bytes_per_s else None
+        pace = UploadRate(bytes_per_s, time.monotonic()) if bytes_per_s else None
         for number in numbers[row::UPLOADERS]:
             if pace is not None:
                 time.sleep(pace.wait_s(size, time.monotonic()))  # the pace is what is measured
@@ -91,7 +91,7 @@ def upload_all(
 class Uploads:
     """The uploading process as the platform's loop sees it."""
 
-    def __init__(self, cloud: LocalCloud, numbers: list[int], size: int, bytes_per_s: float = 0.0) -> None:
+    def __init__(self, cloud: LocalPlatform, numbers: list[int], size: int, bytes_per_s: float = 0.0) -> None:
         self.acknowledged: list[tuple[str, float]] = []
         self.is_over = False
         self._heard = asyncio.Event()
@@ -134,7 +134,7 @@ class Uploads:
         self._pipe.close()
 
 
-async def kill_on_the_way(cloud: LocalCloud, uploads: Uploads, args: argparse.Namespace) -> list[float]:
+async def kill_on_the_way(cloud: LocalPlatform, uploads: Uploads, args: argparse.Namespace) -> list[float]:
     """Kill the data server at equal shares of the uploads; return when it was ready again (s)."""
     back: list[float] = []
     for kill in range(args.kills):
@@ -151,7 +151,7 @@ async def kill_on_the_way(cloud: LocalCloud, uploads: Uploads, args: argparse.Na
     return back
 
 
-def judge(cloud: LocalCloud, acknowledged: list[str], wanted: set[str]) -> dict[str, Any]:
+def judge(cloud: LocalPlatform, acknowledged: list[str], wanted: set[str]) -> dict[str, Any]:
     """Read everything back through the balancer and in the store."""
     tokens = {f"uploader-{row}": cloud.issue_token(f"uploader-{row}") for row in range(UPLOADERS)}
     readable = set()
@@ -175,7 +175,7 @@ async def run(args: argparse.Namespace) -> dict[str, Any]:
     """Return every figure of the table."""
     size, settings = args.size_kib * 1024, PlatformSettings()
     with tempfile.TemporaryDirectory() as folder:
-        cloud = LocalCloud(settings, state=Path(folder), port=0, servers=2, data=True, elastic=True)
+        cloud = LocalPlatform(settings, state=Path(folder), port=0, servers=2, data=True, elastic=True)
         async with cloud:
             began = time.monotonic()
             options = SwarmOptions(robots=args.robots, fps=args.fps, join_every_s=0.02)

@@ -27,14 +27,14 @@ from pathlib import Path
 from typing import Any
 
 from client_sdk import connect
-from rse_pf.auth import SigningKey
+from rse_pf.auth.tokens import SigningKey
 from rse_pf.cli.main import main as rse_pf
+from rse_pf.config import PlatformSettings
 from rse_pf.errors import RsePfError
 from rse_pf.pnp.problems import make_problem
-from rse_pf.services.installed import install, read_service
+from rse_pf.services.custom.installed import install, read_service
+from rse_pf.services.custom.runtime import open_runtime
 from rse_pf.services.pnp import make_request
-from rse_pf.services.runtime import open_runtime
-from rse_pf.settings import PlatformSettings
 
 LANGUAGES = ("python", "cpp", "lua")
 POINTS = {"points": [float(i % 7) for i in range(300)]}
@@ -66,9 +66,9 @@ class Service:
 SERVE = """
 import json, sys
 from pathlib import Path
-from rse_pf.auth import KeySet
-from rse_pf.backend import serve
-from rse_pf.settings import PlatformSettings
+from rse_pf.auth.tokens import KeySet
+from rse_pf.backend.supervisor import serve
+from rse_pf.config import PlatformSettings
 order = json.loads(sys.argv[1])
 keys = KeySet.from_json(order["keys"])
 settings = PlatformSettings.from_dict(order["settings"])
@@ -339,8 +339,8 @@ async def _settled(server: Server, most: int) -> None:
 
 async def state(folder: Path, kills: int = 5) -> list[Row]:
     """Kill the server of a counter five times, behind the load balancer; its count must not go back."""
-    from rse_pf.local.cloud import LocalCloud
-    from rse_pf.local.faults import signal_tree
+    from rse_pf.local.control.platform import LocalPlatform
+    from rse_pf.local.faults.faults import signal_tree
     from rse_pf.local.state import read_state
 
     chosen = PlatformSettings().replace(
@@ -350,7 +350,7 @@ async def state(folder: Path, kills: int = 5) -> list[Row]:
     failures: list[str] = []
     place = folder / "platform"
     async with (
-        LocalCloud(chosen, state=place, servers=2, port=0, name="bench", elastic=True) as cloud,
+        LocalPlatform(chosen, state=place, servers=2, port=0, name="bench", elastic=True) as cloud,
         connect(cloud.url, token=cloud.issue_token("counter")) as robot,
     ):
         for _ in range(kills):

@@ -29,10 +29,10 @@ from typing import Any
 import numpy as np
 from attacks import ATTACKS
 
-from rse_pf.experiments.report import CommandRecord
-from rse_pf.experiments.swarm import Swarm, SwarmOptions
-from rse_pf.local.cloud import LocalCloud
-from rse_pf.settings import PlatformSettings
+from rse_pf.config import PlatformSettings
+from rse_pf.experiments.load.swarm import Swarm, SwarmOptions
+from rse_pf.experiments.results.report import CommandRecord
+from rse_pf.local.control.platform import LocalPlatform
 
 REST_S = 3.0
 TOKENS = 100
@@ -53,7 +53,7 @@ def resident_mib(pids: Sequence[int]) -> float:
     return total * os.sysconf("SC_PAGE_SIZE") / 2**20
 
 
-async def attacker(name: str, cloud: LocalCloud) -> Process:
+async def attacker(name: str, cloud: LocalPlatform) -> Process:
     """Start the process of one attack and wait until it is ready: it would have a machine of its own."""
     tokens = json.dumps([cloud.issue_token(f"hostile-{n}") for n in range(TOKENS)]).encode()
     process = await asyncio.create_subprocess_exec(
@@ -67,7 +67,7 @@ async def attacker(name: str, cloud: LocalCloud) -> Process:
     return process
 
 
-async def attack(process: Process, cloud: LocalCloud) -> tuple[dict[str, Any], float]:
+async def attack(process: Process, cloud: LocalPlatform) -> tuple[dict[str, Any], float]:
     """Let one attack go; return its outcome and by how many MiB the servers grew."""
     servers = [mark.pid for mark in cloud.backend_servers.marks.values()]
     before = most = resident_mib(servers)
@@ -109,7 +109,7 @@ async def run(names: Sequence[str], robots: int, seconds: float, folder: Path) -
     def now() -> float:
         return time.monotonic() - origin
 
-    async with LocalCloud(settings, state=folder / "platform", port=0, name="hostile") as cloud:
+    async with LocalPlatform(settings, state=folder / "platform", port=0, name="hostile") as cloud:
         options = SwarmOptions(robots=robots, fps=5.0, seed=7)
         async with Swarm(
             options, url=cloud.url, token_of=cloud.issue_token, session=settings.session, on_event=heard,

@@ -31,15 +31,15 @@ from windows import poses
 import client_sdk
 from client_sdk.datasets import open_dataset
 from client_sdk.frontend import Frame, FrontEndOptions, extract
-from client_sdk.simulate import render_frames, true_trajectory
+from client_sdk.simulator import render_frames, true_trajectory
+from rse_pf.config import PlatformSettings
 from rse_pf.errors import RsePfError
-from rse_pf.experiments.swarm import Swarm, SwarmOptions
+from rse_pf.experiments.load.swarm import Swarm, SwarmOptions
 from rse_pf.geometry import Array, inverse
-from rse_pf.local.cloud import LocalCloud
-from rse_pf.maps import Keyframe, MapVersion, encode_map
-from rse_pf.objects import digest_of, object_name, open_store
-from rse_pf.services.merge import MergeReply
-from rse_pf.settings import PlatformSettings
+from rse_pf.local.control.platform import LocalPlatform
+from rse_pf.maps.format import Keyframe, MapVersion, encode_map
+from rse_pf.object_store import digest_of, object_name, open_store
+from rse_pf.services.mapping.merge import MergeReply
 from rse_pf.wire import as_type
 
 BAR = 1.3
@@ -88,7 +88,7 @@ def two_maps(recordings: Path | None, count: int) -> list[bytes]:
 class Bench:
     """One run: a platform, robots that stream, and robots that merge."""
 
-    def __init__(self, args: argparse.Namespace, cloud: LocalCloud, maps: list[bytes]) -> None:
+    def __init__(self, args: argparse.Namespace, cloud: LocalPlatform, maps: list[bytes]) -> None:
         self.args = args
         self.cloud = cloud
         self.maps = maps
@@ -156,7 +156,7 @@ async def run(args: argparse.Namespace) -> dict[str, Any]:
     maps = two_maps(args.recordings, args.keyframes)
     settings = PlatformSettings.from_dict({"local": {"servers": 2}})
     with tempfile.TemporaryDirectory() as folder:
-        async with LocalCloud(settings, state=Path(folder), port=0, servers=2) as cloud:
+        async with LocalPlatform(settings, state=Path(folder), port=0, servers=2) as cloud:
             bench = Bench(args, cloud, maps)
             origin = time.monotonic()
             options = SwarmOptions(robots=args.robots, fps=args.fps, join_every_s=0.02)

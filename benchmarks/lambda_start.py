@@ -22,7 +22,7 @@ began = time.process_time()
 import base64, json, sys, zlib
 from lambda_pnp.answering import Answering
 from lambda_pnp.keys import KeyCache
-from rse_pf.settings import PlatformSettings
+from rse_pf.config import PlatformSettings
 imported = time.process_time()
 told = json.loads(sys.stdin.read())
 answering = Answering(PlatformSettings(), KeyCache(lambda: told["keys"], 60.0))
@@ -38,10 +38,10 @@ def order() -> str:
     """Return keys and one event, as JSON: a problem of 200 matches, a third of them wrong."""
     import base64
 
-    from rse_pf.auth import SigningKey
+    from rse_pf.auth.tokens import SigningKey
+    from rse_pf.config import PlatformSettings
     from rse_pf.pnp.problems import make_problem
     from rse_pf.services.pnp import make_request
-    from rse_pf.settings import PlatformSettings
     from rse_pf.wire import SUBPROTOCOLS, Command, make_codec
 
     key, now_s = SigningKey.from_seed(bytes(32), "k"), 1_800_000_000.0

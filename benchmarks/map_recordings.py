@@ -18,7 +18,7 @@ from client_sdk.frontend import FrontEndOptions, PoseQuery, Tracker, extract
 from client_sdk.mapping import MapOptions, PointMap
 from rse_pf.errors import PnpError
 from rse_pf.geometry import Array, inverse
-from rse_pf.maps import Keyframe, MapVersion
+from rse_pf.maps.format import Keyframe, MapVersion
 from rse_pf.pnp import PnpOptions, solve_pnp
 
 __all__ = ["Run", "ate_m", "cloud_of", "drive", "frame_poses", "keyframe_of", "red_kitchen", "truth_of"]

@@ -35,15 +35,22 @@ from benchmarks.map_recordings import (
 )
 from client_sdk.datasets import Dataset, open_dataset
 from rse_pf.geometry import Array, exp_se3, inverse, pose_difference
-from rse_pf.services.icp import align
-from rse_pf.services.join import Atlas, Merged, MergeOptions, Proposals, join_maps, propose_links
-from rse_pf.services.localise import locate
-from rse_pf.services.loops import Link
-from rse_pf.services.map_problems import make_building, make_room, make_sphere
-from rse_pf.services.optimise import Report, optimise_graph
-from rse_pf.services.place import PlaceIndex
-from rse_pf.services.steps import View
-from rse_pf.services.wifi import Locator, fingerprint_of
+from rse_pf.services.mapping.icp import align
+from rse_pf.services.mapping.localise import locate
+from rse_pf.services.mapping.loop_consistency import LoopClosure
+from rse_pf.services.mapping.map_merge import (
+    Atlas,
+    Merged,
+    MergeOptions,
+    Proposals,
+    join_maps,
+    propose_links,
+)
+from rse_pf.services.mapping.optimise import Report, optimise_graph
+from rse_pf.services.mapping.place import PlaceIndex
+from rse_pf.services.mapping.relative_pose import View
+from rse_pf.services.mapping.wifi import Locator, fingerprint_of
+from rse_pf.services.synthetic_maps import make_building, make_room, make_sphere
 
 THREE_ROBOTS = ((0, 84), (84, 168), (168, 250))
 LOCALISE_INLIERS = 30
@@ -134,7 +141,7 @@ def planted(share: float, seed: int) -> Callable[[Atlas, MergeOptions, Report], 
         links = list(found.links)
         for k in rng.choice(len(links), max(1, round(share * len(links))), replace=False).tolist():
             off = exp_se3(rng.uniform(-1, 1, 6) * [1.5, 1.5, 1.5, 1.0, 1.0, 1.0])
-            links[k] = Link(
+            links[k] = LoopClosure(
                 a=links[k].a, b=links[k].b, T_a_b=links[k].T_a_b @ off, information=links[k].information
             )
         return Proposals(links=tuple(links), failed=found.failed)

@@ -27,11 +27,11 @@ import numpy as np
 from benchmarks.map_recordings import ate_m
 from benchmarks.map_services import robots_of
 from rse_pf.geometry import Array
-from rse_pf.services import join
-from rse_pf.services.join import join_maps
-from rse_pf.services.map_problems import make_sphere
-from rse_pf.services.optimise import Optimised, OptimiseOptions, optimise_graph, robust_cost
-from rse_pf.services.pose_graph import PoseGraph, write_g2o
+from rse_pf.services.mapping import map_merge as join
+from rse_pf.services.mapping.map_merge import join_maps
+from rse_pf.services.mapping.optimise import Optimised, OptimiseOptions, optimise_graph, robust_cost
+from rse_pf.services.mapping.pose_graph import PoseGraph, write_g2o
+from rse_pf.services.synthetic_maps import make_sphere
 
 REFERENCE = Path(__file__).with_name("g2o_reference.py")
 CAUCHY = 3.0

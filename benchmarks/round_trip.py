@@ -45,8 +45,8 @@ ROWS = [
 SERVE = """
 import json, sys
 from pathlib import Path
-from rse_pf.backend import serve
-from rse_pf.settings import PlatformSettings
+from rse_pf.backend.supervisor import serve
+from rse_pf.config import PlatformSettings
 settings = PlatformSettings.from_dict(json.loads(sys.argv[2]))
 sys.exit(serve(settings, keys=None, server_id="bench", announce=Path(sys.argv[1])))
 """

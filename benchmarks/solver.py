@@ -30,8 +30,8 @@ from rse_pf.pnp.problems import KINECT, PnpProblem, make_problem
 MATCHES = 200
 OUTLIER_RATIOS = (0.1, 0.3, 0.5, 0.7)
 RIGHT_M, RIGHT_DEG = 0.1, 2.0
-MOST_PROBLEMS = 2000
-LEAST_PAIRS = 500
+MAX_PROBLEMS = 2000
+MIN_PAIRS = 500
 PACKAGES = {"poselib": "poselib", "opencv": "opencv-python-headless"}
 
 
@@ -144,17 +144,17 @@ def table(report: dict[str, Any]) -> str:
 def main() -> None:
     """Run, print the table, and write ``--out``."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    parser.add_argument("--n", type=int, default=200, help=f"problems a cell, at most {MOST_PROBLEMS}")
+    parser.add_argument("--n", type=int, default=200, help=f"problems a cell, at most {MAX_PROBLEMS}")
     parser.add_argument("--out", type=Path, help="write the figures as JSON")
     arguments = parser.parse_args()
-    problems = max(1, min(arguments.n, MOST_PROBLEMS))
+    problems = max(1, min(arguments.n, MAX_PROBLEMS))
     before = [round(load, 2) for load in os.getloadavg()]
     report = {
         "machine": f"{platform.machine()}, {os.cpu_count()} cores",
         "python": platform.python_version(),
         "versions": {engine: version(PACKAGES[engine]) for engine in available_engines()},
         "engines": measure_engines(problems),
-        "overhead": measure_overhead(max(LEAST_PAIRS, problems)),
+        "overhead": measure_overhead(max(MIN_PAIRS, problems)),
         "load_before": before,
         "load_after": [round(load, 2) for load in os.getloadavg()],
     }

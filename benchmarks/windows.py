@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from rse_pf.experiments.report import CommandRecord
+from rse_pf.experiments.results.report import CommandRecord
 
 
 def poses(commands: list[CommandRecord], begin_s: float, end_s: float) -> dict[str, Any]:

@@ -11,15 +11,15 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from client_sdk.answers import Answer, PoseAnswer, decode_reply
-    from client_sdk.background import BackgroundUploader
     from client_sdk.blocking import BlockingRobot, connect_blocking
-    from client_sdk.data import DataClient, DataOptions
     from client_sdk.datasets import Dataset, open_dataset
     from client_sdk.frontend import Frame, FrontEndOptions, PoseQuery, TrackedFrame, Tracker
     from client_sdk.mapping import MapOptions, PointMap, Trajectory
     from client_sdk.offload import CloudFirst
     from client_sdk.robot import Robot, connect
     from client_sdk.stats import Stats
+    from client_sdk.transfer.background_upload import BackgroundUploader
+    from client_sdk.transfer.data_client import DataClient, DataOptions
 
 __all__ = [
     "Answer",
@@ -48,11 +48,11 @@ __all__ = [
 
 _HOMES = {
     "Answer": "answers",
-    "BackgroundUploader": "background",
+    "BackgroundUploader": "transfer.background_upload",
     "BlockingRobot": "blocking",
     "CloudFirst": "offload",
-    "DataClient": "data",
-    "DataOptions": "data",
+    "DataClient": "transfer.data_client",
+    "DataOptions": "transfer.data_client",
     "Dataset": "datasets",
     "Frame": "frontend",
     "FrontEndOptions": "frontend",

@@ -19,8 +19,8 @@ from client_sdk.connection import OnChange, Token
 from client_sdk.offload import CloudFirst
 from client_sdk.robot import OnProgress, Robot, connect
 from client_sdk.stats import Stats
+from rse_pf.config import SessionSettings
 from rse_pf.errors import Disconnected
-from rse_pf.settings import SessionSettings
 
 if TYPE_CHECKING:
     import numpy as np

@@ -16,7 +16,8 @@ from websockets.asyncio.client import connect as websocket_connect
 from websockets.exceptions import ConnectionClosed, InvalidStatus, WebSocketException
 from websockets.typing import Subprotocol
 
-from client_sdk.dialling import Refused, again_after_s, dial_beside, refusal, shown_address
+from client_sdk.dial_errors import Refused, again_after_s, dial_beside, refusal, shown_address
+from rse_pf.config import SessionSettings
 from rse_pf.errors import (
     Conflict,
     ConnectError,
@@ -25,12 +26,11 @@ from rse_pf.errors import (
     Unauthorized,
     UnsupportedProtocol,
 )
-from rse_pf.settings import SessionSettings
 from rse_pf.wire import SUBPROTOCOLS
-from rse_pf.wire.robot_session import (
+from rse_pf.wire.client_session import (
     Answered,
+    ClientLink,
     Event,
-    Link,
     LinkLost,
     MoveAsked,
     Notice,
@@ -39,7 +39,7 @@ from rse_pf.wire.robot_session import (
     RobotSession,
     Welcomed,
 )
-from rse_pf.wire.session import CLOSE_RATE, CLOSE_REPLACED
+from rse_pf.wire.server_session import CLOSE_RATE, CLOSE_REPLACED
 
 __all__ = ["Connection", "OnChange", "Token", "websocket_options"]
 
@@ -52,7 +52,7 @@ OnChange = Callable[[str, str], None] | None
 _FIRST_TRIES = 4
 _DIALS_OF_A_ROW = 8
 """Time-outs after which a robot that lost its link begins anew, with a fresh token."""
-_SHORTEST_TICK_S = 0.001
+_MIN_TICK_S = 0.001
 _GHOST_S = 60.0
 """So long a dial that was given up may still be welcomed, by a server that was stopped meanwhile."""
 _IS_IT_RUNNING = "is the platform running? start it with rse-pf local start"
@@ -73,7 +73,7 @@ def websocket_options(settings: SessionSettings) -> dict[str, Any]:
 class _Socket:
     """One WebSocket with its link and its two tasks."""
 
-    def __init__(self, websocket: ClientConnection, link: Link) -> None:
+    def __init__(self, websocket: ClientConnection, link: ClientLink) -> None:
         self.websocket = websocket
         self.link = link
         self.welcome: asyncio.Future[None] = asyncio.get_running_loop().create_future()
@@ -178,7 +178,7 @@ class Connection:
                 self._take(socket, self._session.tend(socket.link, now))
             self._next_tick = self._session.next_due(now)
             self.flush()
-            pause_s = max(_SHORTEST_TICK_S, self._next_tick - self._clock())
+            pause_s = max(_MIN_TICK_S, self._next_tick - self._clock())
             await _either(self._wake, pause_s)
             self._wake.clear()
 

@@ -16,13 +16,13 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from client_sdk.answers import Answer, PoseAnswer
 from client_sdk.connection import Connection, OnChange, Token
+from client_sdk.local_services import LocalServices
 from client_sdk.offload import CloudFirst
-from client_sdk.own_services import OwnServices
 from client_sdk.stats import Stats, StatsKeeper
+from rse_pf.config import SessionSettings
 from rse_pf.errors import Disconnected, RsePfError, UsageError, error_from_code
-from rse_pf.settings import SessionSettings
 from rse_pf.wire import CODECS, Command, Failure, Result, as_type, make_codec
-from rse_pf.wire.robot_session import Answered, Progressed, RobotSession
+from rse_pf.wire.client_session import Answered, Progressed, RobotSession
 
 if TYPE_CHECKING:
     import numpy as np
@@ -38,7 +38,7 @@ T = TypeVar("T")
 OnProgress = Callable[[float, str], None]
 """Told the share of a long command that is done (0..1), and what was done last."""
 
-_LONGEST_DEADLINE_S = 3600.0
+_MAX_DEADLINE_S = 3600.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -119,7 +119,7 @@ class Robot:
         self._settings = settings
         self._offload = offload
         self._clock = clock
-        self._own = None if offload is None else OwnServices(offload.registry, clock)
+        self._own = None if offload is None else LocalServices(offload.registry, clock)
         self._waiting: dict[int, asyncio.Future[Answered] | Callable[[Answered], None]] = {}
         self._hearing: dict[int, OnProgress] = {}
         self._tasks: set[asyncio.Task[Answer | Failure]] = set()
@@ -239,9 +239,9 @@ class Robot:
         if not self._open:
             raise Disconnected("the robot is not connected", hint="use async with client_sdk.connect(...)")
         wait_s = self._settings.answer_timeout_s if deadline_s is None else deadline_s
-        if not 0 < wait_s <= _LONGEST_DEADLINE_S:
+        if not 0 < wait_s <= _MAX_DEADLINE_S:
             raise UsageError(
-                f"deadline_s = {wait_s} is not within 0..{_LONGEST_DEADLINE_S:g}",
+                f"deadline_s = {wait_s} is not within 0..{_MAX_DEADLINE_S:g}",
                 hint="give the seconds it may take",
             )
         self._keeper.sent += 1
@@ -275,9 +275,9 @@ class Robot:
     ) -> int:
         """Ask *service* without waiting, and return the command's number; *on_end* hears its one end.
 
-        For generators of load: no task, no future and no statistics, and *request* may be `Prepared`.
-        Once the robot is connected it works without a link too, as `call` does; it never asks the robot
-        itself.
+        For generators of load: no task, no future and no statistics, and *request* may be
+        `PreencodedCommand`. Once the robot is connected it works without a link too, as `call` does; it
+        never asks the robot itself.
 
         Raises:
             Disconnected: The robot is not open, or has given up for good.
@@ -354,7 +354,7 @@ class Robot:
         self._keeper.add_round_trip(round_trip_s)
         return self._from_cloud(ended, ended.answer, round_trip_s)
 
-    async def _ask_both(self, offload: CloudFirst, own: OwnServices, ask: _Ask) -> Answer | Failure:
+    async def _ask_both(self, offload: CloudFirst, own: LocalServices, ask: _Ask) -> Answer | Failure:
         """Carry out the plan of *offload*: the cloud, the robot, or the first of the two."""
         started = self._clock()
         plan = offload.plan(
@@ -410,7 +410,7 @@ class Robot:
         message = "neither the cloud nor the robot answered in time"
         return Failure(code="expired", message=message, hint="allow more time")
 
-    async def _ask_robot(self, own: OwnServices, ask: _Ask, why: str) -> Answer | Failure:
+    async def _ask_robot(self, own: LocalServices, ask: _Ask, why: str) -> Answer | Failure:
         started = self._clock()
         ended = await own.ask(Command(id=0, service=ask.service, payload=ask.request))
         if isinstance(ended, Failure):

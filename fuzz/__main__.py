@@ -15,7 +15,7 @@ import time
 import traceback
 from pathlib import Path
 
-from fuzz.meter import MOST_MIB, MOST_MS, Meter
+from fuzz.meter import MAX_MIB, MAX_MS, Meter
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -56,10 +56,10 @@ def _with_mutations(options: argparse.Namespace) -> int:
     load = os.getloadavg()[0]
     print(f"{options.target}: {inputs} inputs in {options.seconds:g} s, load {load:.1f}, nothing found")
     print(f"  {meter.line()}")
-    bars = {"slowest_ms": (meter.worst_ms, MOST_MS), "most_mib": (meter.worst_mib, MOST_MIB)}
+    bars = {"slowest_ms": (meter.worst_ms, MAX_MS), "max_mib": (meter.worst_mib, MAX_MIB)}
     missed = {name: round(worst, 2) for name, (worst, most) in bars.items() if worst > most}
     if options.target == "codec" and missed:
-        print(f"  above the bars of {MOST_MS:g} ms and {MOST_MIB:g} MiB: {json.dumps(missed)}")
+        print(f"  above the bars of {MAX_MS:g} ms and {MAX_MIB:g} MiB: {json.dumps(missed)}")
         for data in (meter.slowest, meter.largest):
             print(f"  {_kept(options.found, data)}")
     return 0

@@ -12,10 +12,10 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
-__all__ = ["MOST_MIB", "MOST_MS", "Meter"]
+__all__ = ["MAX_MIB", "MAX_MS", "Meter"]
 
-MOST_MS = 10.0
-MOST_MIB = 2.0
+MAX_MS = 10.0
+MAX_MIB = 2.0
 
 _TRACED_FROM_MS = 0.5
 """Nothing takes two MiB in less."""

@@ -13,11 +13,18 @@ from typing import Any
 import numpy as np
 
 from fuzz.meter import Meter
-from rse_pf.backend.frames import CloseBorder, CloseSocket, FrameAssembler, FrameDecision, Received, SendPong
+from rse_pf.backend.gateway.frames import (
+    CloseBorder,
+    CloseSocket,
+    FrameAssembler,
+    FrameDecision,
+    Received,
+    SendPong,
+)
+from rse_pf.config import PlatformSettings, SessionSettings
 from rse_pf.errors import InternalError, ProtocolError, RsePfError
 from rse_pf.service import Service, dispatch, request_of
 from rse_pf.services.builtin import builtin_services
-from rse_pf.settings import PlatformSettings, SessionSettings
 from rse_pf.wire import Command, Failure, Result, make_codec
 from rse_pf.wire.envelope import peek
 

@@ -16,24 +16,24 @@ from pathlib import Path
 from typing import Any
 
 from lambda_pnp.keys import KeyCache, read_object
-from rse_pf.auth import verify_token
-from rse_pf.enrolment import holds
+from rse_pf.auth.roster import holds
+from rse_pf.auth.tokens import verify_token
+from rse_pf.config import PlatformSettings, load_settings
 from rse_pf.errors import BadMessage, Expired, Forbidden, RsePfError, Unauthorized, UnsupportedProtocol
 from rse_pf.service import Registry, dispatch, failure_of
 from rse_pf.services import pnp
-from rse_pf.settings import PlatformSettings, load_settings
 from rse_pf.wire import SUBPROTOCOLS, Codec, Command, codec_for, make_codec
 
-__all__ = ["Answered", "Answering", "load_answering"]
+__all__ = ["Answering", "LambdaAnswer", "load_answering"]
 
 _ROOT = Path(__file__).resolve().parents[1]
 _SERVER = "lambda"
-_MOST_STALE_S = 30.0
+_MAX_STALE_S = 30.0
 """So long a revoked token may still be answered here; there is no socket that could be closed."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Answered:
+class LambdaAnswer:
     """One answer: HTTP status, sub-protocol (empty: a JSON body of the door) and the bytes."""
 
     status: int
@@ -66,7 +66,7 @@ class Answering:
 
     def answer(
         self, event: Mapping[str, Any], *, now_s: float, left_ms: float, clock: Callable[[], float]
-    ) -> Answered:
+    ) -> LambdaAnswer:
         """Answer *event*: Unix time *now_s*, *left_ms* before the function is cut, *clock* in seconds."""
         arrived = clock()
         headers = {str(name).lower(): str(each) for name, each in (event.get("headers") or {}).items()}
@@ -114,16 +114,16 @@ class Answering:
         return failure_of(error, command, server=_SERVER)
 
     @staticmethod
-    def _said(codec: Codec, message: Any) -> Answered:
-        return Answered(
+    def _said(codec: Codec, message: Any) -> LambdaAnswer:
+        return LambdaAnswer(
             status=200, content_type=f"application/{SUBPROTOCOLS[codec.name]}", body=codec.encode(message)
         )
 
 
-def _turned_away(error: RsePfError) -> Answered:
+def _turned_away(error: RsePfError) -> LambdaAnswer:
     told = {"code": error.code, "message": error.message, "hint": error.hint}
     status = 401 if isinstance(error, Unauthorized) else 400
-    return Answered(status=status, content_type="application/json", body=json.dumps(told).encode())
+    return LambdaAnswer(status=status, content_type="application/json", body=json.dumps(told).encode())
 
 
 def _body(event: Mapping[str, Any]) -> bytes:
@@ -146,5 +146,5 @@ def load_answering() -> Answering:
     def read_control(name: str) -> str:
         return read_object(os.environ, datetime.now(timezone.utc), name)
 
-    period_s = min(_MOST_STALE_S, settings.scaling.period_s)
+    period_s = min(_MAX_STALE_S, settings.scaling.period_s)
     return Answering(settings, KeyCache(read, period_s, read_control=read_control))

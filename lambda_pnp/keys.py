@@ -16,8 +16,8 @@ from collections.abc import Callable, Mapping
 from datetime import datetime
 from typing import TypeVar
 
-from rse_pf.auth import KeySet
-from rse_pf.enrolment import DenyList, Roster, from_json
+from rse_pf.auth.roster import DenyList, Roster, from_json
+from rse_pf.auth.tokens import KeySet
 from rse_pf.errors import NotFound, RsePfError
 
 __all__ = ["KeyCache", "read_object", "signed_request"]

@@ -13,8 +13,8 @@ from typing import Any, get_args
 import msgspec
 import numpy as np
 
+from rse_pf.config import PlatformSettings
 from rse_pf.services.builtin import builtin_services
-from rse_pf.settings import PlatformSettings
 from rse_pf.wire import PROTOCOL_VERSION, SUBPROTOCOLS, FromRobot, FromServer
 
 __all__ = ["asyncapi_document", "main"]

@@ -12,8 +12,8 @@ import zipfile
 import zlib
 from pathlib import Path
 
+from rse_pf.config import PlatformSettings
 from rse_pf.errors import ConfigurationError
-from rse_pf.settings import PlatformSettings
 
 __all__ = ["SETTINGS_FILE", "SUMS_FILE", "WHEELHOUSE", "staged", "sums_digest"]
 

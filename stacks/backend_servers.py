@@ -20,9 +20,9 @@ from aws_cdk import aws_s3_assets as s3_assets
 from aws_cdk import aws_sns as sns
 from constructs import Construct
 
-from rse_pf.names import AUDIT_PREFIX, GROUP, HOOK
+from rse_pf.config import PlatformSettings
+from rse_pf.config.resource_names import AUDIT_PREFIX, GROUP, HOOK
 from rse_pf.scaling.alarms import NAMESPACE
-from rse_pf.settings import PlatformSettings
 from stacks.findings import acknowledge
 
 __all__ = ["BackendServers"]

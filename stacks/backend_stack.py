@@ -11,8 +11,8 @@ from aws_cdk import aws_s3_assets as s3_assets
 from aws_cdk import aws_sns as sns
 from constructs import Construct
 
-from rse_pf.names import DENY_NAME, GROUP, KEYS_NAME, ROBOTS_NAME
-from rse_pf.settings import PlatformSettings
+from rse_pf.config import PlatformSettings
+from rse_pf.config.resource_names import DENY_NAME, GROUP, KEYS_NAME, ROBOTS_NAME
 from stacks.assets import WHEELHOUSE, staged, sums_digest
 from stacks.backend_servers import BackendServers
 from stacks.data_stack import DataStack

@@ -11,7 +11,7 @@ from aws_cdk import aws_s3 as s3
 from aws_cdk import aws_secretsmanager as secretsmanager
 from constructs import Construct
 
-from rse_pf.settings import PlatformSettings
+from rse_pf.config import PlatformSettings
 from stacks.findings import acknowledge
 
 __all__ = ["DataStack"]

@@ -9,8 +9,8 @@ from __future__ import annotations
 from aws_cdk import aws_ec2 as ec2
 from constructs import Construct
 
+from rse_pf.config import PlatformSettings
 from rse_pf.errors import ConfigurationError
-from rse_pf.settings import PlatformSettings
 from stacks.findings import acknowledge
 
 __all__ = ["S3_PREFIX_LISTS", "Firewall", "front_port", "inner_ports", "s3_prefix_list"]

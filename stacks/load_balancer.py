@@ -9,7 +9,7 @@ from aws_cdk import aws_s3 as s3
 from aws_cdk import aws_wafv2 as wafv2
 from constructs import Construct
 
-from rse_pf.settings import PlatformSettings
+from rse_pf.config import PlatformSettings
 from stacks.firewall import front_port
 
 __all__ = ["LoadBalancer"]

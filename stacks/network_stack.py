@@ -11,7 +11,7 @@ from aws_cdk import aws_iam as iam
 from aws_cdk import aws_logs as logs
 from constructs import Construct
 
-from rse_pf.settings import PlatformSettings
+from rse_pf.config import PlatformSettings
 from stacks.findings import acknowledge
 from stacks.firewall import Firewall, front_port, inner_ports
 

@@ -11,8 +11,8 @@ from aws_cdk import aws_cloudwatch_actions as actions
 from aws_cdk import aws_elasticloadbalancingv2 as elbv2
 from constructs import Construct
 
+from rse_pf.config import PlatformSettings
 from rse_pf.scaling.alarms import NAMESPACE
-from rse_pf.settings import PlatformSettings
 from stacks.backend_stack import BackendStack
 
 __all__ = ["ObservabilityStack"]

@@ -6,8 +6,8 @@ from aws_cdk import aws_autoscaling as autoscaling
 from aws_cdk import aws_cloudwatch as cloudwatch
 from constructs import Construct
 
+from rse_pf.config import PlatformSettings
 from rse_pf.scaling.alarms import Alarm, Metric, alarms_of
-from rse_pf.settings import PlatformSettings
 
 __all__ = ["ScaleModifier"]
 

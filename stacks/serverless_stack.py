@@ -12,7 +12,7 @@ from aws_cdk import aws_lambda as lambda_
 from aws_cdk import aws_logs as logs
 from constructs import Construct
 
-from rse_pf.settings import PlatformSettings
+from rse_pf.config import PlatformSettings
 from stacks.assets import staged
 from stacks.backend_stack import KEY_SET, TRUSTED
 from stacks.data_stack import DataStack

@@ -9,10 +9,10 @@ from collections.abc import Iterable, Mapping
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
 
-from rse_pf.auth import SigningKey
+from rse_pf.auth.tokens import SigningKey
+from rse_pf.config import PlatformSettings
 from rse_pf.data_server import DataServer
-from rse_pf.objects import ObjectStore
-from rse_pf.settings import PlatformSettings
+from rse_pf.object_store import ObjectStore
 
 NOW = 1_700_000_000.0
 KEY = SigningKey.from_seed(b"k" * 32, "key-1")
@@ -97,7 +97,7 @@ class Service:
         )
 
 
-class Door:
+class FrontDoor:
     """The service on a port of this machine, for clients that speak HTTP; one request at a time."""
 
     def __init__(self, service: Service) -> None:

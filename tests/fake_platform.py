@@ -16,11 +16,11 @@ from websockets.datastructures import Headers
 from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
 
+from rse_pf.config import SessionSettings
 from rse_pf.service import Registry, dispatch
 from rse_pf.services import echo
-from rse_pf.settings import SessionSettings
 from rse_pf.wire import SUBPROTOCOLS, Command, Failure, Result, codec_for, make_codec
-from rse_pf.wire.session import Close, Send, ServerSession, Submit
+from rse_pf.wire.server_session import Close, Send, ServerSession, Submit
 
 __all__ = ["FakePlatform", "FakeSocket", "echo_services"]
 

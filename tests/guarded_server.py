@@ -17,10 +17,10 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-from rse_pf.auth import SigningKey
-from rse_pf.control import ControlRoom
-from rse_pf.objects import DirectoryStore
-from rse_pf.settings import PlatformSettings
+from rse_pf.auth.tokens import SigningKey
+from rse_pf.auth.trust_store import AccessControlStore
+from rse_pf.config import PlatformSettings
+from rse_pf.object_store import DirectoryStore
 from rse_pf.wire import SUBPROTOCOLS
 
 __all__ = ["KEY", "GuardedServer"]
@@ -36,7 +36,7 @@ class GuardedServer:
     def __init__(self, folder: Path, *, workers: int = 2, **groups: dict[str, Any]) -> None:
         self.folder = folder
         self.settings = PlatformSettings.from_dict({**_UNLIMITED, **groups})
-        self.room = ControlRoom(DirectoryStore(folder))
+        self.room = AccessControlStore(DirectoryStore(folder))
         self.port = 0
         self._workers = workers
         self._process: subprocess.Popen[bytes] | None = None

@@ -11,13 +11,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from rse_pf.config import PlatformSettings
 from rse_pf.errors import Busy, ConfigurationError, DegenerateGeometry
 from rse_pf.pnp import PnpOptions, solve_pnp
 from rse_pf.pnp.problems import KINECT, make_problem
 from rse_pf.service import Registry, Service, dispatch, failure_of
 from rse_pf.services.builtin import builtin_services
 from rse_pf.services.pnp import PnpReply, PnpRequest, make_request
-from rse_pf.settings import PlatformSettings
 from rse_pf.wire import CODECS, Command, Failure, Result, as_type, make_codec
 
 

@@ -1,6 +1,4 @@
-"""What runs on AWS beside the platform's own code: objects in S3, secrets, and the machine's agent."""
+"""What runs on AWS beside the platform's own code; the only package that imports boto3.
 
-from rse_pf.aws.s3_store import S3Store, open_bucket
-from rse_pf.aws.secrets import read_secret, write_secret
-
-__all__ = ["S3Store", "open_bucket", "read_secret", "write_secret"]
+Clients and the account are here; `fleet` watches servers, `storage` keeps objects, `money` counts cost.
+"""

@@ -12,10 +12,10 @@ from typing import Any, TypeVar
 
 from rse_pf.errors import ConfigurationError, MissingExtra, StoreError
 
-__all__ = ["MOST_S", "MOST_TRIES", "ask", "make_client", "patiently", "status_of"]
+__all__ = ["MAX_S", "MAX_TRIES", "ask", "make_client", "patiently", "status_of"]
 
-MOST_TRIES = 3
-MOST_S = 10.0
+MAX_TRIES = 3
+MAX_S = 10.0
 _CONNECT_S, _READ_S = 1.0, 3.5
 _FIRST_PAUSE_S = 0.1
 _THROTTLED = 429
@@ -65,14 +65,14 @@ def patiently(
     from botocore.exceptions import BotoCoreError, ClientError
 
     began, pause_s = clock(), _FIRST_PAUSE_S
-    for left in range(MOST_TRIES - 1, -1, -1):
+    for left in range(MAX_TRIES - 1, -1, -1):
         try:
             return call()
         except (BotoCoreError, ClientError) as error:
             last: Exception = error
         if isinstance(last, ClientError) and not _may_pass(last):
             raise last
-        if not left or clock() - began + pause_s + _CONNECT_S + _READ_S > MOST_S:
+        if not left or clock() - began + pause_s + _CONNECT_S + _READ_S > MAX_S:
             break
         rest(pause_s)
         pause_s *= 2

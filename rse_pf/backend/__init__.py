@@ -1,6 +1,5 @@
-"""A backend server: `serve` is the whole of it; the files beside it are its parts."""
+"""A backend server, in packages: supervisor, gateway, scheduling, sandbox and jobs.
 
-from rse_pf.backend.supervisor import serve
-from rse_pf.backend.worker_process import warm_up
-
-__all__ = ["serve", "warm_up"]
+Here is what they share: ports, log, metrics, quota and references to stored objects. The entry is
+`rse_pf.backend.supervisor.serve`.
+"""

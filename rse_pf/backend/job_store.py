@@ -5,8 +5,8 @@ Promises that the two see the same objects wherever the store outlives a process
 
 from __future__ import annotations
 
-from rse_pf.objects import ObjectStore, open_store
-from rse_pf.settings import PlatformSettings
+from rse_pf.config import PlatformSettings
+from rse_pf.object_store import ObjectStore, open_store
 
 __all__ = ["is_shared", "open_job_store"]
 
@@ -22,7 +22,7 @@ def open_job_store(settings: PlatformSettings) -> ObjectStore:
     """Return the store of ``data.store``; raises UsageError for one that does not exist."""
 
     def bucket(name: str) -> ObjectStore:
-        from rse_pf.aws import open_bucket
+        from rse_pf.aws.storage import open_bucket
 
         return open_bucket(name, settings.cloud.region)
 

@@ -18,9 +18,9 @@ import msgspec
 __all__ = ["JsonLog"]
 
 _LEVELS = {"debug": 10, "info": 20, "warning": 30, "error": 40}
-_LONGEST_TEXT = 256
-_LONGEST_TRACEBACK = 8192
-_MOST_HELD_LINES = 20_000
+_MAX_TEXT = 256
+_MAX_TRACEBACK = 8192
+_MAX_HELD_LINES = 20_000
 _CHUNK_BYTES = 4096
 """A write up to this size does not mix with other writers of the same pipe."""
 _FLUSH_S = 0.2
@@ -73,12 +73,12 @@ class JsonLog:
         if _LEVELS[level] < self._lowest:
             return
         for name, value in fields.items():
-            if isinstance(value, str) and len(value) > _LONGEST_TEXT:
-                fields[name] = value[-_LONGEST_TRACEBACK:] if name == "traceback" else value[:_LONGEST_TEXT]
+            if isinstance(value, str) and len(value) > _MAX_TEXT:
+                fields[name] = value[-_MAX_TRACEBACK:] if name == "traceback" else value[:_MAX_TEXT]
         line = _encode(
             {"time": self._wall_clock(), "level": level, "event": event, "server": self._server, **fields}
         )
-        if len(self._lines) >= _MOST_HELD_LINES:
+        if len(self._lines) >= _MAX_HELD_LINES:
             self.dropped += 1
             return
         self._lines.append(line)

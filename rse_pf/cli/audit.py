@@ -29,11 +29,11 @@ from collections.abc import Iterable, Sequence
 from datetime import datetime, timezone
 from pathlib import Path
 
-from rse_pf.audit import Entry, Head, head_word
-from rse_pf.audit_check import Verdict, check_chain, check_folder, entries_of
-from rse_pf.audit_log import audit_folder, files_of, names_in
+from rse_pf.audit.chain import Entry, Head, head_word
+from rse_pf.audit.log import audit_folder, files_of, names_in
+from rse_pf.audit.verify import Verdict, check_chain, check_folder, entries_of
+from rse_pf.config import PlatformSettings
 from rse_pf.errors import UsageError
-from rse_pf.settings import PlatformSettings
 
 __all__ = ["add_arguments", "run"]
 
@@ -72,7 +72,7 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
 def _run_in_cloud(args: argparse.Namespace, settings: PlatformSettings) -> int:
     """Fetch what the bucket holds, and go on as with any folder."""
     from rse_pf.aws.account import open_account
-    from rse_pf.aws.audit_archive import fetch_audit, open_audit_archive
+    from rse_pf.aws.storage.audit_archive import fetch_audit, open_audit_archive
 
     if args.files:
         raise UsageError("--cloud and files are two places", hint="leave one of them out")

@@ -25,8 +25,8 @@ from importlib import metadata
 from pathlib import Path
 
 from rse_pf.cli.doctor import Finding
+from rse_pf.config import PlatformSettings
 from rse_pf.errors import RsePfError, UsageError
-from rse_pf.settings import PlatformSettings
 
 __all__ = ["add_arguments", "check_tools", "run"]
 
@@ -36,7 +36,7 @@ _CLI = Path("node_modules", "aws-cdk", "package.json")
 _PINNED = Path("package.json")
 _PACKAGES = Path("build")
 _SCHEMA = "@aws-cdk/cloud-assembly-schema"
-_MOST_ROBOTS = 1_000_000
+_MAX_ROBOTS = 1_000_000
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -77,7 +77,7 @@ def _doctor(args: argparse.Namespace, settings: PlatformSettings) -> int:
 
 def _account_findings(settings: PlatformSettings) -> Iterator[Finding]:
     from rse_pf.aws.account import open_account
-    from rse_pf.aws.quotas import check_account
+    from rse_pf.aws.money.quotas import check_account
 
     try:
         for check in check_account(open_account(settings.cloud.region), settings):
@@ -143,12 +143,10 @@ def _has_files(folder: Path) -> bool:
 
 
 def _cost(args: argparse.Namespace, settings: PlatformSettings) -> int:
-    from rse_pf.aws.costs import HOURS, NOT_INCLUDED, Load, compare
+    from rse_pf.aws.money.costs import HOURS, NOT_INCLUDED, Load, compare
 
-    if not 1 <= args.robots <= _MOST_ROBOTS:
-        raise UsageError(
-            f"--robots is not within 1 and {_MOST_ROBOTS}", hint="name how many robots there are"
-        )
+    if not 1 <= args.robots <= _MAX_ROBOTS:
+        raise UsageError(f"--robots is not within 1 and {_MAX_ROBOTS}", hint="name how many robots there are")
     if not (math.isfinite(args.fps) and 0 < args.fps <= 1000 and 0 < args.hours_per_day <= 24):
         raise UsageError(
             "--fps or --hours-per-day is out of range", hint="up to 1000 a second, up to 24 hours"
@@ -191,7 +189,7 @@ def _cost(args: argparse.Namespace, settings: PlatformSettings) -> int:
 
 def _status(args: argparse.Namespace, settings: PlatformSettings) -> int:
     from rse_pf.aws.account import open_account
-    from rse_pf.aws.fleet import look_at
+    from rse_pf.aws.fleet.fleet import look_at
 
     account = open_account(settings.cloud.region)
     fleet = look_at(account, settings, now=datetime.now(timezone.utc))
@@ -214,7 +212,7 @@ def _status(args: argparse.Namespace, settings: PlatformSettings) -> int:
 
 def _leftovers(args: argparse.Namespace, settings: PlatformSettings) -> int:
     from rse_pf.aws.account import open_account
-    from rse_pf.aws.leftovers import find_leftovers, living_stacks
+    from rse_pf.aws.money.leftovers import find_leftovers, living_stacks
 
     account = open_account(settings.cloud.region)
     stacks = living_stacks(account)

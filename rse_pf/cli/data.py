@@ -13,9 +13,9 @@ import argparse
 import sys
 from pathlib import Path
 
+from rse_pf.config import PlatformSettings, setting_rows
 from rse_pf.errors import UsageError
-from rse_pf.objects import ObjectStore, open_store
-from rse_pf.settings import PlatformSettings, setting_rows
+from rse_pf.object_store import ObjectStore, open_store
 
 __all__ = ["add_arguments", "open_any_store", "run"]
 
@@ -71,7 +71,7 @@ def open_any_store(settings: PlatformSettings) -> ObjectStore:
     """Return the store of ``data.store``, also if it is a bucket; raises UsageError."""
 
     def bucket(name: str) -> ObjectStore:
-        from rse_pf.aws import open_bucket
+        from rse_pf.aws.storage import open_bucket
 
         return open_bucket(name, settings.cloud.region)
 

@@ -16,12 +16,12 @@ import importlib.util
 import math
 from pathlib import Path
 
+from rse_pf.config import PlatformSettings
 from rse_pf.errors import MissingExtra, UsageError
-from rse_pf.settings import PlatformSettings
 
 __all__ = ["add_arguments", "run"]
 
-_MOST_ROBOTS = 32
+_MAX_ROBOTS = 32
 _MERGE_NEEDS = {"gtsam": "maps", "faiss": "maps", "uvicorn": "data"}
 
 
@@ -67,8 +67,8 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
     robots = (
         args.robots if args.robots is not None else (1 if args.data is not None and not args.merge else 3)
     )
-    if not 1 <= robots <= _MOST_ROBOTS:
-        raise UsageError(f"--robots {robots} is not within 1..{_MOST_ROBOTS}", hint="choose fewer robots")
+    if not 1 <= robots <= _MAX_ROBOTS:
+        raise UsageError(f"--robots {robots} is not within 1..{_MAX_ROBOTS}", hint="choose fewer robots")
     if not (math.isfinite(args.rate) and 0.1 <= args.rate <= 60):
         raise UsageError(f"--rate {args.rate:g} is not within 0.1..60 Hz", hint="the paper has 5")
     if args.frames is not None and not 2 <= args.frames <= 2000:
@@ -79,7 +79,7 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
         for package, extra in _MERGE_NEEDS.items():
             if importlib.util.find_spec(package) is None:  # better now than after the drive
                 raise MissingExtra(package, extra)
-    from rse_pf.experiments.demo import DemoOptions, run_demo
+    from rse_pf.experiments.demo.run import DemoOptions, run_demo
 
     if args.data is not None:
         from client_sdk.datasets import open_dataset

@@ -20,8 +20,8 @@ from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
 
+from rse_pf.config import PlatformSettings
 from rse_pf.errors import ConfigurationError, MissingExtra
-from rse_pf.settings import PlatformSettings
 
 __all__ = ["Finding", "add_arguments", "check_machine", "run"]
 
@@ -115,7 +115,7 @@ def _engines(settings: PlatformSettings) -> Iterator[Finding]:
 
 
 def _balancer(settings: PlatformSettings) -> Iterator[Finding]:
-    from rse_pf.local.load_balancer import envoy_binary
+    from rse_pf.local.balancer.load_balancer import envoy_binary
 
     try:
         binary = envoy_binary()

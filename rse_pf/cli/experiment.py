@@ -16,14 +16,14 @@ import argparse
 import math
 from pathlib import Path
 
+from rse_pf.config import PlatformSettings
 from rse_pf.errors import UsageError
-from rse_pf.settings import PlatformSettings
 
 __all__ = ["KINDS", "add_arguments", "run"]
 
 KINDS = ("latency", "elasticity", "robustness", "map", "verify")
 _ROBOTS = {"latency": 100, "elasticity": 100, "robustness": 100, "map": 3}
-_MOST_ROBOTS = {"latency": 2000, "elasticity": 2000, "robustness": 2000, "map": 32}
+_MAX_ROBOTS = {"latency": 2000, "elasticity": 2000, "robustness": 2000, "map": 32}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -70,7 +70,7 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
 
 
 def _check(args: argparse.Namespace) -> None:
-    most = _MOST_ROBOTS[args.kind]
+    most = _MAX_ROBOTS[args.kind]
     if not 1 <= args.robots <= most:
         raise UsageError(f"--robots {args.robots} is not within 1..{most}", hint="the paper has 100")
     _within("--fps", args.fps, 0.1, 60, "the paper has 5")
@@ -92,7 +92,7 @@ def _within(name: str, value: float, low: float, high: float, hint: str) -> None
 
 
 def _elasticity(args: argparse.Namespace, settings: PlatformSettings) -> int:
-    from rse_pf.experiments.elasticity import ElasticityOptions, run_elasticity
+    from rse_pf.experiments.paper.elasticity import ElasticityOptions, run_elasticity
 
     if settings.scaling.period_s / args.speed < 0.5:
         raise UsageError(
@@ -114,8 +114,8 @@ def _elasticity(args: argparse.Namespace, settings: PlatformSettings) -> int:
 
 
 def _latency(args: argparse.Namespace, settings: PlatformSettings) -> int:
-    from rse_pf.experiments.latency import LatencyOptions, run_latency
-    from rse_pf.local.link import profile_named
+    from rse_pf.experiments.paper.latency import LatencyOptions, run_latency
+    from rse_pf.local.faults.network_emulator import profile_named
 
     link = None if args.link == "none" else profile_named(args.link).name
     options = LatencyOptions(
@@ -131,8 +131,8 @@ def _latency(args: argparse.Namespace, settings: PlatformSettings) -> int:
 
 
 def _robustness(args: argparse.Namespace, settings: PlatformSettings) -> int:
-    from rse_pf.experiments.robustness import RobustnessOptions, run_robustness
-    from rse_pf.experiments.scenarios import SCENARIOS
+    from rse_pf.experiments.paper.fault_scenarios import SCENARIOS
+    from rse_pf.experiments.paper.robustness import RobustnessOptions, run_robustness
 
     only = tuple(word for word in (args.only or "").split(",") if word)
     for word in only:
@@ -152,7 +152,7 @@ def _robustness(args: argparse.Namespace, settings: PlatformSettings) -> int:
 
 
 def _map(args: argparse.Namespace, settings: PlatformSettings) -> int:
-    from rse_pf.experiments.mapping_run import MapRunOptions, run_map
+    from rse_pf.experiments.paper.mapping import MapRunOptions, run_map
 
     options = MapRunOptions(
         out=args.out,
@@ -167,7 +167,7 @@ def _map(args: argparse.Namespace, settings: PlatformSettings) -> int:
 
 
 def _verify(folder: Path | None) -> int:
-    from rse_pf.experiments.verify import verify
+    from rse_pf.experiments.paper.verify import verify
 
     if folder is None:
         raise UsageError("verify needs a folder", hint="rse-pf experiment verify DIR")

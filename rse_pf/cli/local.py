@@ -24,8 +24,8 @@ import time
 from pathlib import Path
 from typing import Any
 
+from rse_pf.config import PlatformSettings
 from rse_pf.errors import UsageError
-from rse_pf.settings import PlatformSettings
 
 __all__ = ["DEFAULT_NAME", "add_arguments", "run"]
 
@@ -78,7 +78,7 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
     _check(args)
     folder = state_folder(args.name, os.environ)
     if args.action == "stop":
-        from rse_pf.local.stopping import stop_platform
+        from rse_pf.local.shutdown import stop_platform
 
         stopped = stop_platform(folder, settings.local.stop_timeout_s)
         print(f"platform {args.name!r} {'is stopped' if stopped else 'was not running'}")
@@ -95,7 +95,7 @@ def _with_services(settings: PlatformSettings, args: argparse.Namespace) -> Plat
     """Return *settings* with what the options say of installed services; a changed one is refused here."""
     told: dict[str, Any] = {"accept_weak_isolation": True} if args.accept_weak_isolation else {}
     if args.services is not None:
-        from rse_pf.services.installed import installed_services
+        from rse_pf.services.custom.installed import installed_services
 
         folder = Path(args.services).absolute()
         installed_services(folder)
@@ -120,9 +120,9 @@ def _check(args: argparse.Namespace) -> None:
 
 
 def _on_running(args: argparse.Namespace, folder: Any) -> int:
-    from rse_pf.local import faults
+    from rse_pf.local.control.status import platform_status, status_table
+    from rse_pf.local.faults import faults
     from rse_pf.local.state import read_state
-    from rse_pf.local.status import platform_status, status_table
 
     state = read_state(folder)
     if state is None:
@@ -173,7 +173,7 @@ class _Patience:
 
 
 async def _foreground(name: str, folder: Any, settings: PlatformSettings, *, data: bool) -> int:
-    from rse_pf.local.cloud import LocalCloud
+    from rse_pf.local.control.platform import LocalPlatform
 
     stopped = asyncio.Event()
     loop = asyncio.get_running_loop()
@@ -189,7 +189,7 @@ async def _foreground(name: str, folder: Any, settings: PlatformSettings, *, dat
     ready = False
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         loop.add_signal_handler(number, leave)
-    cloud = LocalCloud(
+    cloud = LocalPlatform(
         settings, state=folder, name=name, adoptable=True, elastic=True, data=data, on_event=_show
     )
     try:
@@ -205,7 +205,7 @@ async def _foreground(name: str, folder: Any, settings: PlatformSettings, *, dat
 
 
 def _welcome(cloud: Any, name: str) -> None:
-    from rse_pf.local.status import data_url
+    from rse_pf.local.control.status import data_url
 
     which = "" if name == DEFAULT_NAME else f" --name {name}"
     large = f"large data goes to {data_url(cloud.url)}\n" if cloud.data_servers.is_running() else ""

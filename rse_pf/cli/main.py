@@ -17,8 +17,8 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
+from rse_pf.config import load_settings
 from rse_pf.errors import ConfigurationError, RsePfError, UsageError
-from rse_pf.settings import load_settings
 
 __all__ = ["VERBS", "Parser", "main"]
 

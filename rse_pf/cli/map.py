@@ -30,16 +30,16 @@ import msgspec
 import numpy as np
 
 from rse_pf.cli.data import open_any_store
-from rse_pf.cli.recorded import record_map_change
-from rse_pf.data_server.map_files import FORMATS, export_map
-from rse_pf.data_server.maps import MapRecord, MapRegistry, difference
+from rse_pf.cli.operator import record_map_change
+from rse_pf.config import PlatformSettings
 from rse_pf.errors import NotFound, UsageError
-from rse_pf.settings import PlatformSettings
+from rse_pf.maps.export import FORMATS, export_map
+from rse_pf.maps.registry import MapRecord, MapRegistry, difference
 
 __all__ = ["add_arguments", "run"]
 
 _SHORT = 12
-_LONGEST_VALUE = 80
+_MAX_VALUE = 80
 _ACTIONS = {
     "list": ("list the maps", "list"),
     "show": ("show a version: what is in it, and where it came from", "show kitchen --png kitchen.png"),
@@ -121,8 +121,8 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
     def told(action: str, name: str, record: MapRecord) -> None:
         record_map_change(chosen, action, name, version=record.id, number=record.number)
 
-    most_bytes = 4 * chosen.data.max_object_bytes
-    maps = MapRegistry(open_any_store(chosen), args.tenant, most_bytes=most_bytes, told=told)
+    max_bytes = 4 * chosen.data.max_object_bytes
+    maps = MapRegistry(open_any_store(chosen), args.tenant, max_bytes=max_bytes, told=told)
     if args.action in ("merge", "localise"):
         return _work(args, maps, chosen)
     actions = {
@@ -194,7 +194,7 @@ def _show(args: argparse.Namespace, maps: MapRegistry) -> None:
 def _view(args: argparse.Namespace, maps: MapRegistry) -> None:
     record = maps.record(args.name, args.version)
     if args.browser:
-        from rse_pf.experiments.map_browser import browse_map
+        from rse_pf.experiments.plots.map_viewer import browse_map
 
         version = maps.load(args.name, record.id)
         with contextlib.suppress(KeyboardInterrupt):
@@ -246,7 +246,7 @@ def _export(args: argparse.Namespace, maps: MapRegistry) -> None:
 
 
 def _draw(args: argparse.Namespace, maps: MapRegistry, record: MapRecord) -> None:
-    from rse_pf.experiments.map_picture import PathOfRobot, draw_map
+    from rse_pf.experiments.plots.map_image import PathOfRobot, draw_map
 
     if not args.png.absolute().parent.is_dir():
         raise UsageError(f"there is no folder {args.png.absolute().parent}", hint="make it")
@@ -283,7 +283,7 @@ def _counts(counted: Counter[str]) -> str:
 
 
 def _shortened(text: str) -> str:
-    return text if len(text) <= _LONGEST_VALUE else f"{text[:_LONGEST_VALUE]} ... (whole with --json)"
+    return text if len(text) <= _MAX_VALUE else f"{text[:_MAX_VALUE]} ... (whole with --json)"
 
 
 def _when(created_s: float) -> str:

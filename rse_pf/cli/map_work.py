@@ -17,15 +17,15 @@ from typing import Any
 
 import numpy as np
 
-from rse_pf.data_server.maps import MapRegistry
+from rse_pf.config import ServiceSettings
 from rse_pf.errors import CommandFailed, NotFound, UsageError
 from rse_pf.geometry import Camera, rotation_angle_deg, to_quaternion
-from rse_pf.maps import MapVersion
-from rse_pf.services.localise import Location, locate
-from rse_pf.services.merge import MergeReply, MergeRequest, merge_maps
-from rse_pf.services.place import opened_map
-from rse_pf.services.steps import View
-from rse_pf.settings import ServiceSettings
+from rse_pf.maps.format import MapVersion
+from rse_pf.maps.registry import MapRegistry
+from rse_pf.services.mapping.localise import Location, locate
+from rse_pf.services.mapping.merge import MergeReply, MergeRequest, merge_maps
+from rse_pf.services.mapping.place import opened_map
+from rse_pf.services.mapping.relative_pose import View
 
 __all__ = ["localise_frames", "merge_into", "version_of"]
 

@@ -23,10 +23,8 @@ import time
 from pathlib import Path
 from typing import Any
 
-from rse_pf.audit import Value
-from rse_pf.cli.recorded import record
-from rse_pf.control import ControlRoom
-from rse_pf.enrolment import (
+from rse_pf.audit.chain import Value
+from rse_pf.auth.roster import (
     DenyList,
     EnrolledRobot,
     Roster,
@@ -36,8 +34,10 @@ from rse_pf.enrolment import (
     check_tenant,
     public_key_of,
 )
+from rse_pf.auth.trust_store import AccessControlStore
+from rse_pf.cli.operator import record
+from rse_pf.config import PlatformSettings
 from rse_pf.errors import UsageError
-from rse_pf.settings import PlatformSettings
 
 __all__ = ["add_arguments", "add_place", "control_room", "longest_s", "note", "run"]
 
@@ -76,7 +76,7 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
     """Do one action."""
     _check(args)
     if args.action == "keygen":
-        from rse_pf.robot_key import make_robot_key
+        from rse_pf.auth.robot_key import make_robot_key
 
         print(make_robot_key(args.out))
         return 0
@@ -109,21 +109,21 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
     return 0
 
 
-def control_room(args: argparse.Namespace, settings: PlatformSettings) -> ControlRoom:
+def control_room(args: argparse.Namespace, settings: PlatformSettings) -> AccessControlStore:
     """Return the control room of the platform that *args* name; raises UsageError if there is none."""
     if args.cloud:
         from rse_pf.aws.account import open_account
-        from rse_pf.aws.key_store import open_key_store
+        from rse_pf.aws.storage.key_store import open_key_store
 
         return open_key_store(open_account(settings.cloud.region)).control_room()
     from rse_pf.local.firewall import key_set_file
     from rse_pf.local.state import state_folder
-    from rse_pf.objects import DirectoryStore
+    from rse_pf.object_store import DirectoryStore
 
     folder = state_folder(args.name, os.environ)
     if not key_set_file(folder).exists():
         raise UsageError(f"there is no platform {args.name!r}", hint="start one with rse-pf local")
-    return ControlRoom(DirectoryStore(folder))
+    return AccessControlStore(DirectoryStore(folder))
 
 
 def note(
@@ -157,7 +157,7 @@ def _check(args: argparse.Namespace) -> None:
         raise UsageError("--scope and --quota are for enrol", hint="enrol the robot again to change them")
 
 
-def _enrol(args: argparse.Namespace, room: ControlRoom, now: float, settings: PlatformSettings) -> int:
+def _enrol(args: argparse.Namespace, room: AccessControlStore, now: float, settings: PlatformSettings) -> int:
     robot = EnrolledRobot(
         robot=args.robot,
         tenant=args.tenant,
@@ -173,7 +173,7 @@ def _enrol(args: argparse.Namespace, room: ControlRoom, now: float, settings: Pl
     return 0
 
 
-def _remove(args: argparse.Namespace, room: ControlRoom, settings: PlatformSettings) -> int:
+def _remove(args: argparse.Namespace, room: AccessControlStore, settings: PlatformSettings) -> int:
     found = room.roster().find(args.tenant, args.robot)
     if found is None:
         raise UsageError(f"robot {args.robot!r} is not enrolled", hint="rse-pf robot list shows who is")
@@ -204,7 +204,7 @@ def _quota(text: str) -> tuple[str, float]:
         raise UsageError(f"{text[:80]!r} is no quota", hint="for example: data_bytes=1e9") from error
 
 
-def _list(args: argparse.Namespace, room: ControlRoom) -> int:
+def _list(args: argparse.Namespace, room: AccessControlStore) -> int:
     roster, denied = room.roster(), room.denied()
     rows = [_row(robot, denied) for robot in roster.robots if robot.tenant == args.tenant]
     for each in denied.disabled:

@@ -16,11 +16,11 @@ import os
 import resource
 from pathlib import Path
 
-from rse_pf.auth import KeySet
-from rse_pf.control import Trust
-from rse_pf.control_token import read_control_token
+from rse_pf.auth.control_token import read_control_token
+from rse_pf.auth.tokens import KeySet
+from rse_pf.auth.trust_store import TrustStore
+from rse_pf.config import PlatformSettings, setting_rows
 from rse_pf.errors import UsageError
-from rse_pf.settings import PlatformSettings, setting_rows
 
 __all__ = ["add_arguments", "run"]
 
@@ -91,12 +91,12 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
             hint="make it, or name another --announce",
         )
     _open_many_files()
-    from rse_pf.backend import serve
+    from rse_pf.backend.supervisor import serve
 
     return serve(
         chosen,
         keys=keys,
-        trust=None if args.keys is None else Trust(args.keys),
+        trust=None if args.keys is None else TrustStore(args.keys),
         server_id=server_id,
         announce=args.announce,
         conformance_echo=args.conformance_echo,

@@ -28,8 +28,8 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+from rse_pf.config import PlatformSettings
 from rse_pf.errors import CommandFailed, RsePfError, UsageError
-from rse_pf.settings import PlatformSettings
 
 __all__ = ["add_arguments", "run"]
 
@@ -86,7 +86,7 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
 
 
 def _new(name: str, language: str, where: Path) -> int:
-    from rse_pf.services.native import INCLUDE_FOLDER
+    from rse_pf.services.custom.native import INCLUDE_FOLDER
 
     if not _NAME.fullmatch(name):
         raise UsageError(
@@ -112,7 +112,7 @@ def _new(name: str, language: str, where: Path) -> int:
 
 
 def _install(source: Path, folder: Path) -> int:
-    from rse_pf.services.installed import install, read_service
+    from rse_pf.services.custom.installed import install, read_service
 
     _build(source)
     service = install(read_service(source).folder, folder)
@@ -124,7 +124,7 @@ def _install(source: Path, folder: Path) -> int:
 
 
 def _list(folder: Path) -> int:
-    from rse_pf.services.installed import installed_services
+    from rse_pf.services.custom.installed import installed_services
 
     for service in installed_services(folder):
         print(f"{service.name:<24} {service.language:<8} {service.kind:<18} {service.folder}")
@@ -141,7 +141,7 @@ def _services_folder(settings: PlatformSettings) -> Path:
 
 def _build(source: Path) -> None:
     """Build a service that has a CMakeLists.txt and sources newer than its libraries."""
-    from rse_pf.services.installed import read_service
+    from rse_pf.services.custom.installed import read_service
 
     folder = read_service(source).folder
     if not (folder / "CMakeLists.txt").exists():
@@ -172,8 +172,8 @@ def _mtimes(folder: Path, *, without: str) -> Iterable[float]:
 
 
 def _test(source: Path, settings: PlatformSettings) -> int:
-    from rse_pf.backend.trial import try_service
-    from rse_pf.services.installed import read_service
+    from rse_pf.backend.sandbox.dry_run import try_service
+    from rse_pf.services.custom.installed import read_service
     from rse_pf.wire import Failure
 
     _build(source)
@@ -245,8 +245,8 @@ def _difference(got: Any, expected: Any, tolerance: float, path: str = "reply") 
 
 
 async def _run(source: Path, settings: PlatformSettings, *, once: bool) -> int:
-    from rse_pf.local.cloud import LocalCloud
-    from rse_pf.services.installed import install, read_service
+    from rse_pf.local.control.platform import LocalPlatform
+    from rse_pf.services.custom.installed import install, read_service
 
     _build(source)
     service, recorded = read_service(source), _recorded(source)
@@ -257,7 +257,9 @@ async def _run(source: Path, settings: PlatformSettings, *, once: bool) -> int:
         stopped = asyncio.Event()
         for number in (signal.SIGINT, signal.SIGTERM):
             asyncio.get_running_loop().add_signal_handler(number, stopped.set)
-        async with LocalCloud(chosen, state=place / "platform", servers=1, port=0, name="service") as cloud:
+        async with LocalPlatform(
+            chosen, state=place / "platform", servers=1, port=0, name="service"
+        ) as cloud:
             print(f"{service.name} is served at {cloud.url}", flush=True)
             good = await _ask_recorded(cloud, service, recorded, settings)
             if once:
@@ -278,7 +280,7 @@ async def _run(source: Path, settings: PlatformSettings, *, once: bool) -> int:
 async def _reload(
     cloud: Any, source: Path, services: Path, recorded: Recorded, settings: PlatformSettings
 ) -> None:
-    from rse_pf.services.installed import install, read_service
+    from rse_pf.services.custom.installed import install, read_service
 
     try:
         _build(source)
@@ -295,7 +297,7 @@ async def _ask_recorded(cloud: Any, service: Any, recorded: Recorded, settings: 
     A robot is not told why a service failed; its author is: the first such request is tried once more here.
     """
     from client_sdk import connect
-    from rse_pf.backend.trial import try_service
+    from rse_pf.backend.sandbox.dry_run import try_service
 
     failed = []
     async with connect(cloud.url, token=cloud.issue_token("robot-1")) as robot:

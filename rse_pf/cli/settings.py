@@ -10,8 +10,8 @@ from __future__ import annotations
 import argparse
 import json
 
+from rse_pf.config import PlatformSettings, setting_rows, settings_page
 from rse_pf.errors import UsageError
-from rse_pf.settings import PlatformSettings, setting_rows, settings_page
 
 __all__ = ["add_arguments", "run"]
 

@@ -20,15 +20,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 from urllib.parse import urlsplit
 
+from rse_pf.config import PlatformSettings, load_settings
 from rse_pf.errors import UsageError
-from rse_pf.settings import PlatformSettings, load_settings
 
 if TYPE_CHECKING:
-    from rse_pf.experiments.swarm_run import Platform
+    from rse_pf.experiments.load.run import Platform
 
 __all__ = ["add_arguments", "run"]
 
-_LONGEST_S = 86400.0
+_MAX_S = 86400.0
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -56,11 +56,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
     """Check the options and run the swarm."""
-    from rse_pf.experiments.swarm import SwarmOptions
-    from rse_pf.experiments.swarm_run import SwarmRun, run_swarm
+    from rse_pf.experiments.load.run import SwarmRun, run_swarm
+    from rse_pf.experiments.load.swarm import SwarmOptions
 
-    if not (math.isfinite(args.seconds) and 0 < args.seconds <= _LONGEST_S):
-        raise UsageError(f"--seconds {args.seconds:g} is not within 0..{_LONGEST_S:g}", hint="20 is plenty")
+    if not (math.isfinite(args.seconds) and 0 < args.seconds <= _MAX_S):
+        raise UsageError(f"--seconds {args.seconds:g} is not within 0..{_MAX_S:g}", hint="20 is plenty")
     options = SwarmOptions(
         robots=args.robots,
         fps=args.fps,
@@ -86,7 +86,7 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
 
 
 def _platform(args: argparse.Namespace, settings: PlatformSettings) -> Platform | None:
-    from rse_pf.experiments.swarm_run import Platform
+    from rse_pf.experiments.load.run import Platform
     from rse_pf.local.firewall import key_file, read_key
     from rse_pf.local.state import read_state, settings_file, state_folder
 

@@ -31,15 +31,15 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rse_pf.auth import KeySet, SigningKey
+from rse_pf.auth.roster import check_robot, check_tenant
+from rse_pf.auth.tokens import KeySet, SigningKey
+from rse_pf.auth.trust_store import AccessControlStore
 from rse_pf.cli.robot import add_place, control_room, longest_s, note
-from rse_pf.control import ControlRoom
-from rse_pf.enrolment import check_robot, check_tenant
+from rse_pf.config import PlatformSettings, load_settings
 from rse_pf.errors import ConfigurationError, Unauthorized, UsageError
-from rse_pf.settings import PlatformSettings, load_settings
 
 if TYPE_CHECKING:
-    from rse_pf.aws.key_store import KeyStore
+    from rse_pf.aws.storage.key_store import KeyStore
 
 __all__ = ["add_arguments", "run"]
 
@@ -152,7 +152,7 @@ def _revoke(args: argparse.Namespace, settings: PlatformSettings) -> int:
     return 0
 
 
-def _tenant_of(room: ControlRoom, header: dict[str, Any], claims: dict[str, Any]) -> str:
+def _tenant_of(room: AccessControlStore, header: dict[str, Any], claims: dict[str, Any]) -> str:
     """Return whose robot a token names; for one that its robot signed, the roster knows."""
     enrolled = [each for each in room.roster().robots if each.key_id == header.get("kid")]
     return enrolled[0].tenant if enrolled else str(claims.get("tenant", "default"))
@@ -167,7 +167,7 @@ def _signing_key(args: argparse.Namespace, settings: PlatformSettings, now: floa
 
 
 def _change_keys(args: argparse.Namespace, settings: PlatformSettings) -> int:
-    from rse_pf.aws.key_store import KeyRing, spread_s
+    from rse_pf.aws.storage.key_store import KeyRing, spread_s
 
     if args.action == "rotate-keys" and args.subject is None and not args.cloud:
         return _rotate_local(args, settings)
@@ -224,7 +224,7 @@ def _replace(file: Path, text: str, mode: int) -> None:
 
 def _key_store(settings: PlatformSettings) -> KeyStore:
     from rse_pf.aws.account import open_account
-    from rse_pf.aws.key_store import open_key_store
+    from rse_pf.aws.storage.key_store import open_key_store
 
     return open_key_store(open_account(settings.cloud.region))
 
@@ -263,7 +263,7 @@ def _parts(token: str) -> tuple[dict[str, Any], dict[str, Any]]:
 
 
 def _verdict(token: str, keys: Any, now: float, settings: PlatformSettings) -> tuple[str, int]:
-    from rse_pf.auth import token_problem, verify_token
+    from rse_pf.auth.tokens import token_problem, verify_token
 
     if keys is None:
         return "unknown: no public keys at hand; name them with --keys", 0
@@ -277,7 +277,7 @@ def _verdict(token: str, keys: Any, now: float, settings: PlatformSettings) -> t
 def _keys(args: argparse.Namespace, settings: PlatformSettings) -> Any:
     """Return the public keys that were named, or the platform's, under its control room; None if none."""
     from rse_pf.local.firewall import key_set_file
-    from rse_pf.objects import DirectoryStore
+    from rse_pf.object_store import DirectoryStore
 
     if args.cloud:
         store = _key_store(settings)
@@ -285,7 +285,7 @@ def _keys(args: argparse.Namespace, settings: PlatformSettings) -> Any:
     path = args.keys if args.keys is not None else key_set_file(_folder(args.name))
     try:
         keys = KeySet.from_json(path.read_text(encoding="utf-8"))
-        return _governed(keys, ControlRoom(DirectoryStore(path.absolute().parent)))
+        return _governed(keys, AccessControlStore(DirectoryStore(path.absolute().parent)))
     except FileNotFoundError as error:
         if args.keys is None:
             return None
@@ -294,7 +294,7 @@ def _keys(args: argparse.Namespace, settings: PlatformSettings) -> Any:
         raise ConfigurationError(f"cannot read {path}", hint="name a JWKS with --keys") from error
 
 
-def _governed(keys: KeySet, room: ControlRoom) -> KeySet:
+def _governed(keys: KeySet, room: AccessControlStore) -> KeySet:
     return keys.governed_by(room.roster(), room.denied())
 
 

@@ -13,13 +13,14 @@ import uuid
 from collections.abc import AsyncIterator, Callable, Mapping
 from typing import Any
 
-from rse_pf.audit import Note, Refusals
-from rse_pf.audit_log import AuditLog
-from rse_pf.auth import Claims, KeySet, token_problem, verify_token
+from rse_pf.audit.chain import Note, Refusals
+from rse_pf.audit.log import AuditLog
+from rse_pf.auth.roster import holds
+from rse_pf.auth.tokens import Claims, KeySet, token_problem, verify_token
+from rse_pf.config import PlatformSettings
 from rse_pf.data_server.handlers import Handler, Handlers
-from rse_pf.data_server.http import MethodNotAllowed, Receive, Reply, Request, Send, failure_reply
+from rse_pf.data_server.http import HttpReply, HttpRequest, MethodNotAllowed, Receive, Send, failure_reply
 from rse_pf.data_server.routes import ROUTES, Route
-from rse_pf.enrolment import holds
 from rse_pf.errors import (
     BadRequest,
     Busy,
@@ -30,8 +31,7 @@ from rse_pf.errors import (
     RsePfError,
     Unauthorized,
 )
-from rse_pf.objects import ObjectStore
-from rse_pf.settings import PlatformSettings
+from rse_pf.object_store import ObjectStore
 
 __all__ = ["DataServer"]
 
@@ -82,7 +82,7 @@ class DataServer:
         if scope["type"] != "http":
             raise BadRequest(f"{scope['type']} is not offered here", hint="speak HTTP")
         began = self._clock()
-        request = Request(scope, receive, self._clock, self._settings.data)
+        request = HttpRequest(scope, receive, self._clock, self._settings.data)
         said: dict[str, Any] = {"event": "request", "method": request.method}
         try:
             reply = await self._answer(request, said)
@@ -98,7 +98,7 @@ class DataServer:
         if request.path not in _PROBES:
             self._log(said)
 
-    async def _answer(self, request: Request, said: dict[str, Any]) -> Reply:
+    async def _answer(self, request: HttpRequest, said: dict[str, Any]) -> HttpReply:
         try:
             reply = await self._handled(request, said)
         except Disconnected:
@@ -111,13 +111,13 @@ class DataServer:
             said |= {"code": InternalError.code, "trace": trace, "error": repr(error)[:500]}
             reply = failure_reply(InternalError("the data server failed", hint=f"its log has {trace}"))
         if not request.over and (reply.status == _TOO_SLOW or not await self._drained(request)):
-            reply = Reply(
+            reply = HttpReply(
                 status=reply.status, body=reply.body, media_type=reply.media_type,
                 headers={**reply.headers, "Connection": "close"},
             )  # fmt: skip
         return reply
 
-    async def _drained(self, request: Request) -> bool:
+    async def _drained(self, request: HttpRequest) -> bool:
         """Read the rest of a small body, so that the robot hears us before the connection closes."""
         try:
             return await request.drain(self._settings.data.part_bytes)
@@ -126,13 +126,13 @@ class DataServer:
         except RsePfError:
             return False
 
-    async def _handled(self, request: Request, said: dict[str, Any]) -> Reply:
+    async def _handled(self, request: HttpRequest, said: dict[str, Any]) -> HttpReply:
         route, handler, path = self._find(request)
         said["operation"] = route.operation
         who = _NOBODY if route.scope is None else self._who(request, route.scope, path.get("name", ""), said)
         if route.body is None:
             return await handler(request, who, path)
-        if self._bodies >= self._settings.data.most_uploads:
+        if self._bodies >= self._settings.data.max_uploads:
             raise Busy("too many uploads at once", hint="come again", retry_after_ms=_COME_AGAIN_MS)
         self._bodies += 1
         try:
@@ -140,7 +140,7 @@ class DataServer:
         finally:
             self._bodies -= 1
 
-    def _find(self, request: Request) -> tuple[Route, Handler, dict[str, str]]:
+    def _find(self, request: HttpRequest) -> tuple[Route, Handler, dict[str, str]]:
         others = []
         for pattern, route, handler in self._routes:
             found = pattern.fullmatch(request.path)
@@ -154,7 +154,7 @@ class DataServer:
             raise refused
         raise NotFound("there is nothing here", hint="see /data/openapi.json")
 
-    def _who(self, request: Request, scope: str, name: str, said: dict[str, Any]) -> Claims:
+    def _who(self, request: HttpRequest, scope: str, name: str, said: dict[str, Any]) -> Claims:
         kind, _, token = request.headers.get("authorization", "").partition(" ")
         keys = self._keys()
         if keys is None:
@@ -191,7 +191,7 @@ def _handler(handlers: Handlers, route: Route) -> Handler:
     return found
 
 
-async def _send(reply: Reply, request: Request, send: Send) -> int:
+async def _send(reply: HttpReply, request: HttpRequest, send: Send) -> int:
     """Send *reply*; return how many bytes of body went out."""
     body = reply.body
     headers = {"Content-Type": reply.media_type, "Cache-Control": "no-store", **reply.headers}

@@ -14,34 +14,34 @@ from typing import Any, TypeVar
 
 import msgspec
 
-from rse_pf.audit_log import AuditLog
-from rse_pf.auth import Claims
-from rse_pf.data_server.http import Reply, Request, failure_reply, json_reply, wanted_range
-from rse_pf.data_server.maps import MapRecord, MapRegistry
+from rse_pf.audit.log import AuditLog
+from rse_pf.auth.tokens import Claims
+from rse_pf.config import DataSettings
+from rse_pf.data_server.http import HttpReply, HttpRequest, failure_reply, json_reply, wanted_range
 from rse_pf.data_server.openapi import openapi_page
 from rse_pf.data_server.routes import (
     BYTES,
-    Begin,
     Commit,
     Direct,
-    Health,
     MapName,
     MapPage,
     MapVersionInfo,
     MoveHead,
     ObjectPage,
+    ServiceHealth,
     StoredObject,
     Upload,
+    UploadBegin,
 )
 from rse_pf.data_server.uploads import Objects, UploadState
 from rse_pf.errors import BadRequest, NotFound
-from rse_pf.objects import ObjectStore, PresigningStore, read_range
-from rse_pf.settings import DataSettings
+from rse_pf.maps.registry import MapRecord, MapRegistry
+from rse_pf.object_store import ObjectStore, PresigningStore, read_range
 
 __all__ = ["Handler", "Handlers"]
 
 _T = TypeVar("_T")
-Handler = Callable[[Request, Claims, dict[str, str]], Awaitable[Reply]]
+Handler = Callable[[HttpRequest, Claims, dict[str, str]], Awaitable[HttpReply]]
 
 _PIECE_BYTES = 1 << 20
 _JSON_BYTES = 16384
@@ -69,21 +69,21 @@ class Handlers:
         self.objects = Objects(store, settings, clock, wall_clock)
         self._document = openapi_page().encode()
 
-    async def healthz(self, request: Request, who: Claims, path: dict[str, str]) -> Reply:
+    async def healthz(self, request: HttpRequest, who: Claims, path: dict[str, str]) -> HttpReply:
         """Answer at once."""
-        return json_reply(200, Health(status="ok"))
+        return json_reply(200, ServiceHealth(status="ok"))
 
-    async def readyz(self, request: Request, who: Claims, path: dict[str, str]) -> Reply:
+    async def readyz(self, request: HttpRequest, who: Claims, path: dict[str, str]) -> HttpReply:
         """Ask the store for something that is not there; any other failure means not ready."""
         with contextlib.suppress(NotFound):
             await asyncio.to_thread(self._store.head, _PROBE)
-        return json_reply(200, Health(status="ready"))
+        return json_reply(200, ServiceHealth(status="ready"))
 
-    async def document(self, request: Request, who: Claims, path: dict[str, str]) -> Reply:
+    async def document(self, request: HttpRequest, who: Claims, path: dict[str, str]) -> HttpReply:
         """Return the OpenAPI document."""
-        return Reply(status=200, body=self._document)
+        return HttpReply(status=200, body=self._document)
 
-    async def list_objects(self, request: Request, who: Claims, path: dict[str, str]) -> Reply:
+    async def list_objects(self, request: HttpRequest, who: Claims, path: dict[str, str]) -> HttpReply:
         """List a page of objects."""
         text = request.query.get("limit", str(_PAGE))
         limit = int(text) if text.isdecimal() and text.isascii() and len(text) < 6 else 0
@@ -93,32 +93,32 @@ class Handlers:
         page = [StoredObject(digest=info.name.rpartition("/")[2], size=info.size) for info in found]
         return json_reply(200, ObjectPage(objects=page, next=page[-1].digest if more else None))
 
-    async def get_object(self, request: Request, who: Claims, path: dict[str, str]) -> Reply:
+    async def get_object(self, request: HttpRequest, who: Claims, path: dict[str, str]) -> HttpReply:
         """Send an object or a range."""
         info = await asyncio.to_thread(self.objects.head, who, path["digest"])
         return await self._content(request, info.name, info.size, path["digest"])
 
-    async def head_object(self, request: Request, who: Claims, path: dict[str, str]) -> Reply:
+    async def head_object(self, request: HttpRequest, who: Claims, path: dict[str, str]) -> HttpReply:
         """Send the size alone."""
         info = await asyncio.to_thread(self.objects.head, who, path["digest"])
         headers = {**_content_headers(path["digest"]), "Content-Length": str(info.size)}
-        return Reply(status=200, headers=headers, media_type=BYTES)
+        return HttpReply(status=200, headers=headers, media_type=BYTES)
 
-    async def put_object(self, request: Request, who: Claims, path: dict[str, str]) -> Reply:
+    async def put_object(self, request: HttpRequest, who: Claims, path: dict[str, str]) -> HttpReply:
         """Store a small object."""
         self.objects.name(who, path["digest"])
         data = await request.body(self._settings.part_bytes)
         new = await asyncio.to_thread(self.objects.put, who, path["digest"], data)
         return json_reply(201 if new else 200, StoredObject(digest=path["digest"], size=len(data)))
 
-    async def delete_object(self, request: Request, who: Claims, path: dict[str, str]) -> Reply:
+    async def delete_object(self, request: HttpRequest, who: Claims, path: dict[str, str]) -> HttpReply:
         """Remove an object."""
         await asyncio.to_thread(self.objects.delete, who, path["digest"])
-        return Reply(status=204)
+        return HttpReply(status=204)
 
-    async def begin_upload(self, request: Request, who: Claims, path: dict[str, str]) -> Reply:
+    async def begin_upload(self, request: HttpRequest, who: Claims, path: dict[str, str]) -> HttpReply:
         """Open an upload."""
-        begin = await _json_body(request, Begin)
+        begin = await _json_body(request, UploadBegin)
         if begin.size < 1:
             raise BadRequest(f"a size of {begin.size} bytes needs no upload", hint="PUT the object")
         state = await asyncio.to_thread(self.objects.begin, who, path["digest"], begin.size)
@@ -133,13 +133,13 @@ class Handlers:
         url, headers = store.presigned_put(name, size=state.size, sha256=state.digest, life_s=life_s)
         return Direct(url=url, headers=headers, life_s=life_s)
 
-    async def get_upload(self, request: Request, who: Claims, path: dict[str, str]) -> Reply:
+    async def get_upload(self, request: HttpRequest, who: Claims, path: dict[str, str]) -> HttpReply:
         """Tell how far an upload has come."""
         return _upload(200, await asyncio.to_thread(self.objects.progress, who, path["digest"]))
 
     head_upload = get_upload
 
-    async def append_part(self, request: Request, who: Claims, path: dict[str, str]) -> Reply:
+    async def append_part(self, request: HttpRequest, who: Claims, path: dict[str, str]) -> HttpReply:
         """Store a part."""
         offset = request.header_number("Upload-Offset")
         if offset is None:
@@ -149,12 +149,12 @@ class Handlers:
         state = await asyncio.to_thread(self.objects.append, who, path["digest"], offset, data)
         return _upload(201 if state.offset == state.size else 200, state)
 
-    async def abandon_upload(self, request: Request, who: Claims, path: dict[str, str]) -> Reply:
+    async def abandon_upload(self, request: HttpRequest, who: Claims, path: dict[str, str]) -> HttpReply:
         """Forget an upload."""
         await asyncio.to_thread(self.objects.abandon, who, path["digest"])
-        return Reply(status=204)
+        return HttpReply(status=204)
 
-    async def list_maps(self, request: Request, who: Claims, path: dict[str, str]) -> Reply:
+    async def list_maps(self, request: HttpRequest, who: Claims, path: dict[str, str]) -> HttpReply:
         """List maps with their heads."""
         maps = self._maps(who)
 
@@ -163,12 +163,12 @@ class Handlers:
 
         return json_reply(200, await asyncio.to_thread(named))
 
-    async def list_versions(self, request: Request, who: Claims, path: dict[str, str]) -> Reply:
+    async def list_versions(self, request: HttpRequest, who: Claims, path: dict[str, str]) -> HttpReply:
         """List versions."""
         records = await asyncio.to_thread(self._maps(who).versions, path["name"])
         return json_reply(200, [MapVersionInfo(id=record.id, record=record) for record in records])
 
-    async def commit_version(self, request: Request, who: Claims, path: dict[str, str]) -> Reply:
+    async def commit_version(self, request: HttpRequest, who: Claims, path: dict[str, str]) -> HttpReply:
         """Commit an object of this robot as a version."""
         commit = await _json_body(request, Commit)
         if len(commit.note) > _NOTE_LETTERS:
@@ -185,17 +185,17 @@ class Handlers:
 
         return _version(201, await asyncio.to_thread(work))
 
-    async def show_version(self, request: Request, who: Claims, path: dict[str, str]) -> Reply:
+    async def show_version(self, request: HttpRequest, who: Claims, path: dict[str, str]) -> HttpReply:
         """Show a version."""
         return _version(200, await asyncio.to_thread(self._maps(who).record, path["name"], path["version"]))
 
-    async def get_version(self, request: Request, who: Claims, path: dict[str, str]) -> Reply:
+    async def get_version(self, request: HttpRequest, who: Claims, path: dict[str, str]) -> HttpReply:
         """Send the bytes of a version or a range of them."""
         maps = self._maps(who)
         record = await asyncio.to_thread(maps.record, path["name"], path["version"])
         return await self._content(request, maps.blob_name(path["name"], record), record.size, record.digest)
 
-    async def move_head(self, request: Request, who: Claims, path: dict[str, str]) -> Reply:
+    async def move_head(self, request: HttpRequest, who: Claims, path: dict[str, str]) -> HttpReply:
         """Move a head."""
         wanted = await _json_body(request, MoveHead)
 
@@ -210,24 +210,24 @@ class Handlers:
                 subject = name if who.tenant == "default" else f"{who.tenant}/{name}"
                 self._audit.record(action, subject, actor=who.robot, version=record.id, number=record.number)
 
-        most_bytes = 4 * self._settings.max_object_bytes
-        return MapRegistry(self._store, who.tenant, most_bytes=most_bytes, told=told)
+        max_bytes = 4 * self._settings.max_object_bytes
+        return MapRegistry(self._store, who.tenant, max_bytes=max_bytes, told=told)
 
-    async def _content(self, request: Request, name: str, size: int, digest: str) -> Reply:
+    async def _content(self, request: HttpRequest, name: str, size: int, digest: str) -> HttpReply:
         store, life_s = self._store, self._settings.direct_life_s
         if request.headers.get("x-accept-direct") == "1" and isinstance(store, PresigningStore):
             url = await asyncio.to_thread(store.presigned_get, name, life_s=life_s)
-            return Reply(status=307, headers={"Location": url, **_content_headers(digest)})
+            return HttpReply(status=307, headers={"Location": url, **_content_headers(digest)})
         try:
             wanted = wanted_range(request.headers.get("range"), size)
         except BadRequest as error:
             refused = failure_reply(error)
-            return Reply(status=416, body=refused.body, headers={"Content-Range": f"bytes */{size}"})
+            return HttpReply(status=416, body=refused.body, headers={"Content-Range": f"bytes */{size}"})
         start, end = wanted or (0, size)
         headers = {**_content_headers(digest), "Content-Length": str(end - start)}
         if wanted:
             headers["Content-Range"] = f"bytes {start}-{end - 1}/{size}"
-        return Reply(
+        return HttpReply(
             status=206 if wanted else 200, body=self._pieces(name, start, end), headers=headers,
             media_type=BYTES,
         )  # fmt: skip
@@ -250,15 +250,15 @@ def _content_headers(digest: str) -> dict[str, str]:
     }  # fmt: skip
 
 
-def _upload(status: int, state: UploadState, direct: Direct | None = None) -> Reply:
+def _upload(status: int, state: UploadState, direct: Direct | None = None) -> HttpReply:
     return json_reply(status, Upload(**asdict(state), direct=direct), Upload_Offset=str(state.offset))
 
 
-def _version(status: int, record: MapRecord) -> Reply:
+def _version(status: int, record: MapRecord) -> HttpReply:
     return json_reply(status, MapVersionInfo(id=record.id, record=record))
 
 
-async def _json_body(request: Request, kind: type[_T]) -> _T:
+async def _json_body(request: HttpRequest, kind: type[_T]) -> _T:
     raw: Any = await request.body(_JSON_BYTES)
     try:
         return msgspec.json.decode(raw, type=kind)

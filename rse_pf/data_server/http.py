@@ -15,6 +15,7 @@ from urllib.parse import parse_qsl
 
 import msgspec
 
+from rse_pf.config import DataSettings
 from rse_pf.errors import (
     BadRequest,
     Busy,
@@ -30,14 +31,13 @@ from rse_pf.errors import (
     StoreFull,
     Unauthorized,
 )
-from rse_pf.settings import DataSettings
 
 __all__ = [
-    "Failure",
+    "HttpFailure",
+    "HttpReply",
+    "HttpRequest",
     "MethodNotAllowed",
     "Receive",
-    "Reply",
-    "Request",
     "Send",
     "failure_reply",
     "json_reply",
@@ -63,7 +63,7 @@ _INTERNAL = 500
 _RANGE = re.compile(r"bytes=(\d{0,18})-(\d{0,18})")
 
 
-class Failure(msgspec.Struct, frozen=True, kw_only=True):
+class HttpFailure(msgspec.Struct, frozen=True, kw_only=True):
     """What went wrong: a stable code, a sentence, and what to do."""
 
     code: str
@@ -72,7 +72,7 @@ class Failure(msgspec.Struct, frozen=True, kw_only=True):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Reply:
+class HttpReply:
     """An answer; *body* is bytes, or pieces that are read while they are sent."""
 
     status: int
@@ -81,7 +81,7 @@ class Reply:
     media_type: str = "application/json"
 
 
-class Request:
+class HttpRequest:
     """One request whose body has not been read yet."""
 
     def __init__(
@@ -108,31 +108,31 @@ class Request:
             raise BadRequest(f"{name}: {text[:40]!r} is no number of bytes", hint="send decimal digits")
         return int(text)
 
-    async def body(self, most_bytes: int) -> bytes:
+    async def body(self, max_bytes: int) -> bytes:
         """Return the whole body.
 
         Raises:
-            LimitExceeded: It holds more than *most_bytes*.
+            LimitExceeded: It holds more than *max_bytes*.
             Expired: It pauses for ``data.body_timeout_s`` or stays below ``data.min_body_bytes_per_s``.
             Disconnected: The robot left in the middle.
         """
         announced = self.header_number("content-length")
-        if announced is not None and announced > most_bytes:
-            raise _too_long(announced, most_bytes)
+        if announced is not None and announced > max_bytes:
+            raise _too_long(announced, max_bytes)
         held = bytearray()
         async for piece in self._pieces():
             held += piece
-            if len(held) > most_bytes:
-                raise _too_long(len(held), most_bytes)
+            if len(held) > max_bytes:
+                raise _too_long(len(held), max_bytes)
         return bytes(held)
 
-    async def drain(self, most_bytes: int) -> bool:
+    async def drain(self, max_bytes: int) -> bool:
         """Read what is left and forget it, so that the robot reads our answer; say whether all was read."""
         announced = self.header_number("content-length") or 0
-        if announced > most_bytes:
+        if announced > max_bytes:
             return False
         async for _ in self._pieces():
-            if self.received_bytes > most_bytes:
+            if self.received_bytes > max_bytes:
                 return False
         return True
 
@@ -156,13 +156,13 @@ class Request:
                 raise _too_slow(f"{self.received_bytes} bytes in {lasted:.1f} s; at least {lowest} a second")
 
 
-def json_reply(status: int, value: Any, **headers: str) -> Reply:
+def json_reply(status: int, value: Any, **headers: str) -> HttpReply:
     """Return *value* as JSON."""
     named = {name.replace("_", "-"): text for name, text in headers.items()}
-    return Reply(status=status, body=msgspec.json.encode(value), headers=named)
+    return HttpReply(status=status, body=msgspec.json.encode(value), headers=named)
 
 
-def failure_reply(error: RsePfError) -> Reply:
+def failure_reply(error: RsePfError) -> HttpReply:
     """Return the answer that *error* is."""
     status = next((_STATUS[kind] for kind in type(error).__mro__ if kind in _STATUS), _INTERNAL)
     headers: dict[str, str] = {}
@@ -172,8 +172,8 @@ def failure_reply(error: RsePfError) -> Reply:
         headers["WWW-Authenticate"] = "Bearer"
     if error.retry_after_ms is not None:
         headers["Retry-After"] = str(max(1, round(error.retry_after_ms / 1000)))
-    said = Failure(code=error.code, message=error.message, hint=error.hint)
-    return Reply(status=status, body=msgspec.json.encode(said), headers=headers)
+    said = HttpFailure(code=error.code, message=error.message, hint=error.hint)
+    return HttpReply(status=status, body=msgspec.json.encode(said), headers=headers)
 
 
 def wanted_range(text: str | None, size: int) -> tuple[int, int] | None:

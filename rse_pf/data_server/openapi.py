@@ -12,7 +12,7 @@ from typing import Any
 
 import msgspec
 
-from rse_pf.data_server.http import Failure
+from rse_pf.data_server.http import HttpFailure
 from rse_pf.data_server.routes import BYTES, ROUTES, Field, Route
 
 __all__ = ["openapi", "openapi_page"]
@@ -35,7 +35,7 @@ _WORDS = {
 
 def openapi() -> dict[str, Any]:
     """Return the document as JSON values, OpenAPI 3.1."""
-    types = {kind for route in ROUTES for kind in (route.body, *route.replies.values())} | {Failure}
+    types = {kind for route in ROUTES for kind in (route.body, *route.replies.values())} | {HttpFailure}
     structs = sorted((kind for kind in types if _is_struct(kind)), key=lambda kind: kind.__name__)
     listed = [kind for kind in types if kind not in (None, bytes, dict) and not _is_struct(kind)]
     _, components = msgspec.json.schema_components(
@@ -68,7 +68,7 @@ def openapi_page() -> str:
 def _operation(route: Route) -> dict[str, Any]:
     replies = dict(route.replies)
     if route.scope is not None:
-        failure = None if route.method == "HEAD" else Failure
+        failure = None if route.method == "HEAD" else HttpFailure
         replies |= {401: failure, 403: failure, 503: failure}
     made: dict[str, Any] = {
         "operationId": route.operation,

@@ -12,23 +12,23 @@ from typing import Any
 
 import msgspec
 
-from rse_pf.data_server.http import Failure
-from rse_pf.data_server.maps import MapRecord
+from rse_pf.data_server.http import HttpFailure
+from rse_pf.maps.registry import MapRecord
 
 __all__ = [
     "ROUTES",
-    "Begin",
     "Commit",
     "Field",
-    "Health",
     "MapName",
     "MapPage",
     "MapVersionInfo",
     "MoveHead",
     "ObjectPage",
     "Route",
+    "ServiceHealth",
     "StoredObject",
     "Upload",
+    "UploadBegin",
 ]
 
 BYTES = "application/octet-stream"
@@ -48,7 +48,7 @@ class ObjectPage(msgspec.Struct, frozen=True, kw_only=True):
     next: str | None = None
 
 
-class Begin(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class UploadBegin(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """An object that will come in parts."""
 
     size: int
@@ -110,7 +110,7 @@ class MoveHead(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     expected: str
 
 
-class Health(msgspec.Struct, frozen=True, kw_only=True):
+class ServiceHealth(msgspec.Struct, frozen=True, kw_only=True):
     """How the service is."""
 
     status: str
@@ -161,19 +161,19 @@ _DIRECT = Field(
 _AFTER = Field(name="after", place="query", doc="only objects behind this digest")
 _LIMIT = Field(name="limit", place="query", doc="at most so many", whole_number=True, most=1000)
 
-_BAD, _NOT_FOUND, _CONFLICT = {400: Failure}, {404: Failure}, {409: Failure}
-_STORING = {408: Failure, 413: Failure, 503: Failure, 507: Failure}
+_BAD, _NOT_FOUND, _CONFLICT = {400: HttpFailure}, {404: HttpFailure}, {409: HttpFailure}
+_STORING = {408: HttpFailure, 413: HttpFailure, 503: HttpFailure, 507: HttpFailure}
 _OBJECT, _UPLOAD = "/data/v1/objects/{digest}", "/data/v1/uploads/{digest}"
 _MAP, _VERSION = "/data/v1/maps/{name}/versions", "/data/v1/maps/{name}/versions/{version}"
 
 ROUTES: tuple[Route, ...] = (
     Route(
         operation="healthz", method="GET", path="/data/healthz", scope=None,
-        doc="Say that the process lives", replies={200: Health},
+        doc="Say that the process lives", replies={200: ServiceHealth},
     ),
     Route(
         operation="readyz", method="GET", path="/data/readyz", scope=None,
-        doc="Say whether the store answers", replies={200: Health, 503: Failure},
+        doc="Say whether the store answers", replies={200: ServiceHealth, 503: HttpFailure},
     ),
     Route(
         operation="document", method="GET", path="/data/openapi.json", scope=None,
@@ -186,7 +186,7 @@ ROUTES: tuple[Route, ...] = (
     Route(
         operation="get_object", method="GET", path=_OBJECT, scope="data:read", fields=(_RANGE, _DIRECT),
         doc="Return an object or one range of it",
-        replies={200: bytes, 206: bytes, 307: None, 416: Failure, **_NOT_FOUND},
+        replies={200: bytes, 206: bytes, 307: None, 416: HttpFailure, **_NOT_FOUND},
     ),
     Route(
         operation="head_object", method="HEAD", path=_OBJECT, scope="data:read",
@@ -202,7 +202,7 @@ ROUTES: tuple[Route, ...] = (
         doc="Remove an object; a missing one is no error", replies={204: None, **_NOT_FOUND},
     ),
     Route(
-        operation="begin_upload", method="PUT", path=_UPLOAD, scope="data:write", body=Begin,
+        operation="begin_upload", method="PUT", path=_UPLOAD, scope="data:write", body=UploadBegin,
         doc="Begin an upload in parts, or learn how far it has come",
         replies={200: Upload, **_BAD, **_NOT_FOUND, **_CONFLICT, **_STORING},
     ),
@@ -246,7 +246,7 @@ ROUTES: tuple[Route, ...] = (
     Route(
         operation="get_version", method="GET", path=_VERSION + "/content", scope="maps:read",
         fields=(_RANGE, _DIRECT), doc="Return the bytes of a version",
-        replies={200: bytes, 206: bytes, 307: None, 416: Failure, **_BAD, **_NOT_FOUND},
+        replies={200: bytes, 206: bytes, 307: None, 416: HttpFailure, **_BAD, **_NOT_FOUND},
     ),
     Route(
         operation="move_head", method="PUT", path="/data/v1/maps/{name}/head", scope="maps:write",

@@ -19,13 +19,13 @@ from typing import Any
 
 import msgspec
 
-from rse_pf.audit_log import AuditLog
-from rse_pf.auth import KeySet
-from rse_pf.control import Trust
+from rse_pf.audit.log import AuditLog
+from rse_pf.auth.tokens import KeySet
+from rse_pf.auth.trust_store import TrustStore
+from rse_pf.config import PlatformSettings
 from rse_pf.data_server.app import DataServer
 from rse_pf.errors import ConfigurationError, MissingExtra, StoreError
-from rse_pf.objects import DirectoryStore, ObjectStore
-from rse_pf.settings import PlatformSettings
+from rse_pf.object_store import DirectoryStore, ObjectStore
 
 __all__ = ["KeysFile", "serve_data"]
 
@@ -34,10 +34,10 @@ _BACKLOG = 1024
 
 
 class KeysFile:
-    """The public keys in a file and the control room beside it, read again and again; see `control.Trust`."""
+    """The public keys in a file and the control room beside it, read again and again; see `TrustStore`."""
 
     def __init__(self, path: Path, pause_s: float, clock: Callable[[], float] = time.monotonic) -> None:
-        self._trust = Trust(path)
+        self._trust = TrustStore(path)
         self._pause_s = pause_s
         self._clock = clock
         self._looked = float("-inf")
@@ -98,7 +98,7 @@ def serve_data(
 
 def _audit_log(folder: Path, settings: PlatformSettings) -> AuditLog:
     log = AuditLog(
-        folder, "data", wall_clock=time.time, most_bytes=settings.auth.audit_file_bytes,
+        folder, "data", wall_clock=time.time, max_bytes=settings.auth.audit_file_bytes,
         sync_s=settings.auth.audit_sync_ms / 1e3, on_problem=_say_problem,
     ).open()  # fmt: skip
     log.start()

@@ -12,10 +12,17 @@ import threading
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
-from rse_pf.auth import Claims
+from rse_pf.auth.tokens import Claims
+from rse_pf.config import DataSettings
 from rse_pf.errors import BadRequest, Conflict, LimitExceeded, NotFound, QuotaExceeded
-from rse_pf.objects import ObjectInfo, ObjectStore, digest_of, name_segment, object_name, put_scratch
-from rse_pf.settings import DataSettings
+from rse_pf.object_store import (
+    ObjectInfo,
+    ObjectStore,
+    digest_of,
+    name_segment,
+    object_name,
+    put_scratch,
+)
 
 __all__ = ["Objects", "UploadState", "check_digest"]
 

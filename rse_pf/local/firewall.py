@@ -12,9 +12,9 @@ import socket
 import stat
 from pathlib import Path
 
-from rse_pf.auth import KeySet, SigningKey
+from rse_pf.auth.tokens import KeySet, SigningKey
+from rse_pf.config import PlatformSettings
 from rse_pf.errors import ConfigurationError, UsageError
-from rse_pf.settings import PlatformSettings
 
 __all__ = ["check_front_door", "ensure_key", "front_door_url", "key_file", "key_set_file", "read_key"]
 

@@ -9,22 +9,20 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cache, lru_cache
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from rse_pf.errors import BadRequest, MissingExtra
 from rse_pf.geometry import Array, Camera
-
-if TYPE_CHECKING:
-    from rse_pf.pnp.solver import PnpOptions
+from rse_pf.pnp.options import PnpOptions
 
 __all__ = ["ENGINES", "Engine", "available_engines", "engine_for"]
 
 _ROUNDS = 4
 """Refinements of the opencv engine, each on the inliers that the one before left."""
 
-Engine = Callable[[Array, Array, Camera, "PnpOptions"], "Array | None"]
+Engine = Callable[[Array, Array, Camera, PnpOptions], "Array | None"]
 """``(points_world (n, 3), pixels (n, 2), camera, options)`` to ``(3, 4)`` [R | t], or None."""
 
 

@@ -6,7 +6,6 @@ Promises determinism, no threads, and no state.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import Literal
 
 import msgspec
@@ -17,9 +16,10 @@ from rse_pf.errors import BadRequest, DegenerateGeometry, NoConsensus, PnpError,
 from rse_pf.geometry import Array, Camera
 from rse_pf.pnp import evidence
 from rse_pf.pnp.engines import Engine, engine_for
-from rse_pf.pnp.twin import twin_of
+from rse_pf.pnp.options import PnpOptions, WeakLimits
+from rse_pf.pnp.planar_ambiguity import twin_of
 
-__all__ = ["PnpOptions", "PnpSolution", "WeakLimits", "solve_pnp"]
+__all__ = ["PnpSolution", "solve_pnp"]
 
 _LARGEST = 1e6
 _CHANCE = -5.0
@@ -32,47 +32,6 @@ _SAME_FIT, _SIMILAR_FIT = 9.0, 40.0
 _NOISE_FLOOR_PX2 = 0.01
 _MIRROR_ITERATIONS = 50
 """Enough where half of the matches agree: a whole world that is mirrored, not a part of it."""
-
-
-def _within(name: str, value: float, low: float, high: float) -> None:
-    if not low <= value <= high:
-        raise BadRequest(
-            f"{name} = {value:g} is not within {low:g}..{high:g}", hint="leave it out for the default"
-        )
-
-
-class PnpOptions(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """How to solve; it travels with a command.
-
-    Raises:
-        BadRequest: A number is out of its range.
-    """
-
-    engine: Literal["poselib", "opencv"] | None = None
-    inlier_px: float = 8.0
-    max_iterations: int = 1000
-    min_iterations: int = 10
-    confidence: float = 0.999
-
-    def __post_init__(self) -> None:
-        _within("inlier_px", self.inlier_px, 1e-3, 100.0)
-        _within("max_iterations", self.max_iterations, 1, 100_000)
-        _within("min_iterations", self.min_iterations, 1, 100_000)
-        _within("confidence", self.confidence, 1e-6, 1.0 - 1e-9)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class WeakLimits:
-    """Where a pose is called weak: fewer inliers, a smaller ratio, larger standard deviations.
-
-    Fewer places in the image than half of *inliers* are weak, too.  Three standard deviations are
-    0.1 m and 2 degrees, which is what our benchmarks call right.
-    """
-
-    inliers: int = 12
-    inlier_ratio: float = 0.25
-    translation_m: float = 0.1 / 3.0
-    rotation_rad: float = math.radians(2.0 / 3.0)
 
 
 class PnpSolution(msgspec.Struct, frozen=True, kw_only=True, eq=False):

@@ -8,9 +8,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from rse_pf.settings import ScalingSettings
+from rse_pf.config import ScalingSettings
 
-__all__ = ["NAMESPACE", "Alarm", "Metric", "Step", "alarms_of"]
+__all__ = ["NAMESPACE", "Alarm", "Metric", "ScalingStep", "alarms_of"]
 
 NAMESPACE = "RsePf"
 """CloudWatch namespace of what the backend servers publish."""
@@ -29,7 +29,7 @@ class Metric:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Step:
+class ScalingStep:
     """Change the number of servers while the value lies in ``[lower, upper)`` above the threshold."""
 
     lower: float | None
@@ -52,7 +52,7 @@ class Alarm:
     period_s: int
     periods: int
     missing: str
-    steps: tuple[Step, ...]
+    steps: tuple[ScalingStep, ...]
     meaning: str
 
 
@@ -68,13 +68,13 @@ def alarms_of(settings: ScalingSettings) -> tuple[Alarm, ...]:
     Missing data never breaches: a fleet that nobody hears of is neither grown nor shrunk.
     """
     further = settings.very_busy_cpu_percent - settings.busy_cpu_percent
-    steps = [Step(lower=0.0, upper=further, change=settings.step)] if further else []
+    steps = [ScalingStep(lower=0.0, upper=further, change=settings.step)] if further else []
     busy = _grow(
         settings,
         "busy",
         _CPU,
         settings.busy_cpu_percent,
-        (*steps, Step(lower=further, upper=None, change=settings.big_step)),
+        (*steps, ScalingStep(lower=further, upper=None, change=settings.big_step)),
         "the servers compute more than they should",
     )
     idle = Alarm(
@@ -86,11 +86,11 @@ def alarms_of(settings: ScalingSettings) -> tuple[Alarm, ...]:
         period_s=settings.period_s,
         periods=settings.idle_s // settings.period_s,
         missing="notBreaching",
-        steps=(Step(lower=0.0, upper=None, change=-1),),
+        steps=(ScalingStep(lower=0.0, upper=None, change=-1),),
         meaning="no robot asked for anything, and the servers rest",
     )
     alarms = [busy, idle]
-    one = (Step(lower=0.0, upper=None, change=settings.step),)
+    one = (ScalingStep(lower=0.0, upper=None, change=settings.step),)
     if settings.max_robots_per_server:
         alarms.append(
             _grow(
@@ -114,7 +114,7 @@ def _grow(
     name: str,
     metric: Metric,
     threshold: float,
-    steps: tuple[Step, ...],
+    steps: tuple[ScalingStep, ...],
     meaning: str,
 ) -> Alarm:
     return Alarm(

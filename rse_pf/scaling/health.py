@@ -10,7 +10,7 @@ import dataclasses
 from dataclasses import dataclass
 from typing import Literal
 
-from rse_pf.settings import HealthSettings
+from rse_pf.config import HealthSettings
 
 __all__ = ["Health", "observe", "time_to_notice_s"]
 

@@ -12,9 +12,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-from rse_pf.settings import ScalingSettings
+from rse_pf.config import ScalingSettings
 
-__all__ = ["Action", "Fleet", "Kind", "Sample", "decide"]
+__all__ = ["Action", "FleetState", "Kind", "Sample", "decide"]
 
 Kind = Literal["grow", "shrink", "replace", "stay"]
 
@@ -34,7 +34,7 @@ class Sample:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Fleet:
+class FleetState:
     """The servers as they stand: all of them, those still warming up, those that failed their checks."""
 
     servers: int
@@ -54,7 +54,7 @@ class Action:
 
 def decide(
     samples: Sequence[Sample],
-    fleet: Fleet,
+    fleet: FleetState,
     settings: ScalingSettings,
     *,
     now_s: float,
@@ -99,7 +99,7 @@ def decide(
     return (*replacements, _scale(by_period, ended, fleet, settings))
 
 
-def _scale(by_period: dict[int, Sample], ended: int, fleet: Fleet, settings: ScalingSettings) -> Action:
+def _scale(by_period: dict[int, Sample], ended: int, fleet: FleetState, settings: ScalingSettings) -> Action:
     wish, reason = _growth(_last(by_period, ended, settings.busy_periods), settings)
     if wish:
         most = min(settings.max_servers, fleet.servers - fleet.warming + wish)

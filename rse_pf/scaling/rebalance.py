@@ -11,7 +11,7 @@ import heapq
 import math
 from collections.abc import Mapping
 
-from rse_pf.settings import ScalingSettings
+from rse_pf.config import ScalingSettings
 
 __all__ = ["moves", "share"]
 

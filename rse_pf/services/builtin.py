@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from rse_pf.config import PlatformSettings
 from rse_pf.service import Registry
-from rse_pf.services import echo, icp, localise, merge, optimise, place, pnp, wifi
-from rse_pf.settings import PlatformSettings
+from rse_pf.services import echo, pnp
+from rse_pf.services.mapping import icp, localise, merge, optimise, place, wifi
 
 __all__ = ["builtin_services"]
 

@@ -9,11 +9,11 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
+from rse_pf.config import PnpSettings
 from rse_pf.errors import LimitExceeded, TooFewCorrespondences
 from rse_pf.geometry import Camera
 from rse_pf.pnp import PnpOptions, PnpSolution, WeakLimits, solve_pnp
 from rse_pf.service import Registry
-from rse_pf.settings import PnpSettings
 from rse_pf.wire.arrays import Array, reshaped
 
 __all__ = ["PnpReply", "PnpRequest", "make_request", "register"]

@@ -14,11 +14,11 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
+from rse_pf.config import SessionSettings
 from rse_pf.errors import BadMessage, LimitExceeded, RsePfError, UnsupportedProtocol
-from rse_pf.settings import SessionSettings
 from rse_pf.wire import arrays
 from rse_pf.wire.messages import FromRobot, FromServer, Message
-from rse_pf.wire.packed import LIST_VALUES, MAP_VALUES, check_packed, too_many_values
+from rse_pf.wire.msgpack_limits import LIST_VALUES, MAP_VALUES, check_packed, too_many_values
 
 __all__ = ["CODECS", "SUBPROTOCOLS", "Codec", "as_type", "codec_for", "make_codec"]
 

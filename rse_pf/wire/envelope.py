@@ -17,7 +17,7 @@ from rse_pf.wire.messages import Failure
 
 __all__ = ["Envelope", "encode_refusal", "peek"]
 
-_MOST_GLANCED_BYTES = 512
+_MAX_GLANCED_BYTES = 512
 _INFLATED_BYTES = 160
 """The head of a command as our robots write it: type, id, and a service of at most 64 letters."""
 
@@ -50,7 +50,7 @@ def peek(codec: Codec, data: bytes) -> Envelope | None:
         except (msgspec.DecodeError, RecursionError, UnicodeDecodeError):
             return None
         return Envelope(command.id, command.service) if 0 <= command.id < 2**53 else None
-    head = data[:_MOST_GLANCED_BYTES]
+    head = data[:_MAX_GLANCED_BYTES]
     if codec.name == "zlib":
         try:
             head = zlib.decompressobj().decompress(head, _INFLATED_BYTES)

@@ -13,8 +13,8 @@ from typing import Any
 
 import pytest
 
-from rse_pf.aws.key_store import KEYS_NAME
-from rse_pf.aws.s3_store import S3Store
+from rse_pf.aws.storage.key_store import KEYS_NAME
+from rse_pf.aws.storage.s3_store import S3Store
 from rse_pf.errors import Conflict, NotFound
 
 pytestmark = pytest.mark.skipif(

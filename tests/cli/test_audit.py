@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from rse_pf.audit_log import record_once
+from rse_pf.audit.log import record_once
 from rse_pf.cli.main import main
 
 
@@ -22,7 +22,7 @@ def folder(tmp_path: Path) -> Path:
     ):
         record_once(
             tmp_path / "audit", who, action, subject, wall_clock=lambda at=row: 1e9 + at,
-            most_bytes=1 << 20, reason="a reason\n\x1b[2J",
+            max_bytes=1 << 20, reason="a reason\n\x1b[2J",
         )  # fmt: skip
     return tmp_path / "audit"
 

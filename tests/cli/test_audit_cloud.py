@@ -8,9 +8,9 @@ from typing import Any
 
 import pytest
 
-from rse_pf.audit_log import record_once
-from rse_pf.aws.audit_ship import Shipper
-from rse_pf.aws.s3_store import S3Store
+from rse_pf.audit.log import record_once
+from rse_pf.aws.storage.audit_ship import Shipper
+from rse_pf.aws.storage.s3_store import S3Store
 from rse_pf.cli.main import main
 
 Capture = pytest.CaptureFixture[str]
@@ -25,7 +25,7 @@ def sent(s3: Any, folder: Path, instance: str, *actions: str) -> None:
     for row, action in enumerate(actions):
         record_once(
             folder / instance, instance, action, "robot-1", wall_clock=lambda at=row: 1e9 + at,
-            most_bytes=1 << 20,
+            max_bytes=1 << 20,
         )  # fmt: skip
         shipper.ship()
 

@@ -11,7 +11,7 @@ import pytest
 
 from rse_pf.aws.account import Account
 from rse_pf.aws.clients import make_client
-from rse_pf.aws.fleet import Fleet, Server
+from rse_pf.aws.fleet.fleet import AutoScalingGroup, Server
 from rse_pf.cli import cloud
 from rse_pf.cli.cloud import check_tools
 from rse_pf.cli.main import main
@@ -220,9 +220,9 @@ def test_a_node_that_the_cdk_no_longer_supports_is_caught(
     assert next(check_tools(tmp_path)).grade == grade
 
 
-def show(monkeypatch: pytest.MonkeyPatch, fleet: Fleet) -> None:
+def show(monkeypatch: pytest.MonkeyPatch, fleet: AutoScalingGroup) -> None:
     monkeypatch.setattr("rse_pf.aws.account.open_account", lambda region: Account(region))
-    monkeypatch.setattr("rse_pf.aws.fleet.look_at", lambda *args, **named: fleet)
+    monkeypatch.setattr("rse_pf.aws.fleet.fleet.look_at", lambda *args, **named: fleet)
 
 
 def server(name: str, **changes: Any) -> Server:
@@ -233,7 +233,10 @@ def server(name: str, **changes: Any) -> Server:
 def test_the_status_of_a_well_fleet(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    show(monkeypatch, Fleet(least=1, wanted=1, most=4, servers=(server("i-1"),), alarms={"idle": "OK"}))
+    show(
+        monkeypatch,
+        AutoScalingGroup(least=1, wanted=1, most=4, servers=(server("i-1"),), alarms={"idle": "OK"}),
+    )
 
     assert main(["cloud", "status"]) == 0
 
@@ -247,7 +250,7 @@ def test_servers_that_told_no_robots_are_not_counted_as_empty(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     both = (server("i-1"), server("i-2", robots=None))
-    show(monkeypatch, Fleet(least=1, wanted=2, most=4, servers=both, alarms={}))
+    show(monkeypatch, AutoScalingGroup(least=1, wanted=2, most=4, servers=both, alarms={}))
 
     assert main(["cloud", "status"]) == 0
 
@@ -258,7 +261,10 @@ def test_the_status_of_an_ill_fleet_leads_to_the_runbook(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     ill = server("i-1", targets=("unhealthy",), robots=None)
-    show(monkeypatch, Fleet(least=1, wanted=1, most=4, servers=(ill,), alarms={"unhealthy": "ALARM"}))
+    show(
+        monkeypatch,
+        AutoScalingGroup(least=1, wanted=1, most=4, servers=(ill,), alarms={"unhealthy": "ALARM"}),
+    )
 
     assert main(["cloud", "status"]) == 1
 

@@ -14,18 +14,18 @@ from typing import Any
 
 import pytest
 import websockets
-from aws.fake_machine import FakeMachine, FakeScaling
+from aws.fleet.fake_machine import FakeMachine, FakeScaling
 from guarded_server import GuardedServer
 
-from rse_pf.aws.agent import Agent, Post
-from rse_pf.aws.s3_store import S3Store
+from rse_pf.auth.robot_key import RobotKey
+from rse_pf.auth.trust_store import DENY_NAME, ROBOTS_NAME, AccessControlStore, TrustStore
+from rse_pf.aws.fleet.agent import Agent, AgentConfig
+from rse_pf.aws.storage.s3_store import S3Store
 from rse_pf.cli.main import main
-from rse_pf.control import DENY_NAME, ROBOTS_NAME, ControlRoom, Trust
+from rse_pf.config import AuthSettings, PlatformSettings
 from rse_pf.errors import Unauthorized
-from rse_pf.robot_key import RobotKey
-from rse_pf.settings import AuthSettings, PlatformSettings
 from rse_pf.wire import SUBPROTOCOLS
-from rse_pf.wire.session import CLOSE_REVOKED
+from rse_pf.wire.server_session import CLOSE_REVOKED
 
 Capture = pytest.CaptureFixture[str]
 SETTINGS = AuthSettings()
@@ -42,7 +42,7 @@ def agent_of(s3: Any, folder: Path) -> Agent:
     machine = FakeMachine()
     return Agent(
         machine, cloudwatch=None, autoscaling=FakeScaling(machine), artifacts=S3Store(s3, "artifacts"),
-        post=Post(group="g", hook="h", keys_name="keys.json", keys_file=folder / "keys.json"),
+        post=AgentConfig(group="g", hook="h", keys_name="keys.json", keys_file=folder / "keys.json"),
         settings=PlatformSettings(), log=lambda event, **fields: None,
     )  # fmt: skip
 
@@ -101,7 +101,7 @@ def test_robots_of_a_cloud_are_enrolled_listed_disabled_enabled_and_removed(
     said(capsys, "robot", "remove", "robot-2", "--cloud")
 
     assert listed(capsys) == {"robot-1": "enrolled"}
-    room = ControlRoom(S3Store(cloud, "artifacts"))
+    room = AccessControlStore(S3Store(cloud, "artifacts"))
     assert [each.robot for each in room.roster().robots] == ["robot-1"]
     assert main(["robot", "remove", "robot-2", "--cloud"]) == 2
     assert "is not enrolled" in capsys.readouterr().err
@@ -123,7 +123,7 @@ def test_two_operators_at_once_lose_nobody(
 ) -> None:
     """The other one disables a robot between this command's read and its write."""
     said(capsys, "token", "init", "--cloud")
-    other, swap = ControlRoom(S3Store(cloud, "artifacts")), S3Store.compare_and_swap
+    other, swap = AccessControlStore(S3Store(cloud, "artifacts")), S3Store.compare_and_swap
     waiting = [lambda: other.change_denied(lambda d: d.with_robot("default", "robot-2", 1.0))]
 
     def late(self: S3Store, name: str, expected: bytes | None, data: bytes) -> None:
@@ -137,9 +137,9 @@ def test_two_operators_at_once_lose_nobody(
     assert {each.robot for each in other.denied().disabled} == {"robot-1", "robot-2"}
 
 
-def problem_of(trust: Trust, token: str) -> str:
+def problem_of(trust: TrustStore, token: str) -> str:
     """Return why a server that trusts so refuses *token*; empty if it does not."""
-    from rse_pf.auth import token_problem, verify_token
+    from rse_pf.auth.tokens import token_problem, verify_token
 
     assert trust.keys is not None
     try:
@@ -155,7 +155,7 @@ def test_one_look_of_the_agent_and_one_of_the_server_are_enough(
     said(capsys, "token", "init", "--cloud")
     key = enrolled(capsys, "robot-1")
     (tmp_path / "machine").mkdir()
-    agent, trust = agent_of(cloud, tmp_path / "machine"), Trust(tmp_path / "machine" / "keys.json")
+    agent, trust = agent_of(cloud, tmp_path / "machine"), TrustStore(tmp_path / "machine" / "keys.json")
     tokens = [asyncio.run(key.token()), said(capsys, "token", "issue", "robot-3", "--cloud").strip()]
     tokens.append(said(capsys, "token", "issue", "robot-2", "--cloud").strip())
 

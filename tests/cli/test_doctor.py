@@ -12,8 +12,8 @@ import pytest
 from rse_pf.cli import doctor
 from rse_pf.cli.doctor import Finding, check_machine
 from rse_pf.cli.main import main
+from rse_pf.config import PlatformSettings
 from rse_pf.errors import MissingExtra
-from rse_pf.settings import PlatformSettings
 
 pytestmark = pytest.mark.system
 
@@ -83,7 +83,7 @@ def missing_envoy() -> str:
 
 @pytest.mark.parametrize("binary", [missing_envoy, lambda: "/nowhere/envoy", lambda: "/bin/false"])
 def test_an_envoy_that_does_not_run_fails(monkeypatch: pytest.MonkeyPatch, binary: object) -> None:
-    monkeypatch.setattr("rse_pf.local.load_balancer.envoy_binary", binary)
+    monkeypatch.setattr("rse_pf.local.balancer.load_balancer.envoy_binary", binary)
 
     (broken,) = [each for each in findings() if each.grade == "fail"]
     assert "nvoy" in broken.what

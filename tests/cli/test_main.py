@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from rse_pf.cli.main import VERBS, main
-from rse_pf.settings import PlatformSettings, settings_page
+from rse_pf.config import PlatformSettings, settings_page
 
 EMPTY = [
     "demo", "experiment", "local", "swarm", "token", "robot", "service", "serve", "data",

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from rse_pf.cli.main import main
-from rse_pf.data_server.maps import MapRegistry
 from rse_pf.geometry import Camera
-from rse_pf.maps import Keyframe, MapVersion, encode_map
-from rse_pf.objects import DirectoryStore
+from rse_pf.maps.format import Keyframe, MapVersion, encode_map
+from rse_pf.maps.registry import MapRegistry
+from rse_pf.object_store import DirectoryStore
 
 
 def make(keyframes: int) -> bytes:

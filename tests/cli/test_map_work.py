@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from rse_pf.cli.main import main
-from rse_pf.data_server.maps import MapRegistry
 from rse_pf.geometry import Camera, pose_difference
-from rse_pf.maps import Keyframe, MapVersion, encode_map
-from rse_pf.objects import DirectoryStore
-from rse_pf.services.map_problems import make_world
+from rse_pf.maps.format import Keyframe, MapVersion, encode_map
+from rse_pf.maps.registry import MapRegistry
+from rse_pf.object_store import DirectoryStore
+from rse_pf.services.synthetic_maps import make_world
 
 for package in ("faiss", "gtsam", "PIL", "cv2"):
     pytest.importorskip(package, reason="the extras maps, local and vision are needed")

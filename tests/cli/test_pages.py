@@ -21,13 +21,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rse_pf.auth import SigningKey
+from rse_pf.auth.tokens import SigningKey
 from rse_pf.cli.main import VERBS, Parser, main
-from rse_pf.data_server.maps import MapRegistry
 from rse_pf.errors import UsageError
 from rse_pf.geometry import Camera
-from rse_pf.maps import Keyframe, MapVersion, encode_map
-from rse_pf.objects import DirectoryStore
+from rse_pf.maps.format import Keyframe, MapVersion, encode_map
+from rse_pf.maps.registry import MapRegistry
+from rse_pf.object_store import DirectoryStore
 
 PAGES = ("data.md", "security.md", "services.md", "map_services.md", "operations.md", "protocol.md")
 BLOCK = re.compile(r"^```(\w*)\n(.*?)^```", re.DOTALL | re.MULTILINE)

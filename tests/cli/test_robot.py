@@ -12,14 +12,14 @@ from pathlib import Path
 
 import pytest
 
-from rse_pf.auth import KeySet, token_problem, verify_token
+from rse_pf.auth.robot_key import RobotKey
+from rse_pf.auth.tokens import KeySet, token_problem, verify_token
+from rse_pf.auth.trust_store import AccessControlStore
 from rse_pf.cli.main import main
-from rse_pf.control import ControlRoom
+from rse_pf.config import AuthSettings
 from rse_pf.errors import Unauthorized, UsageError
 from rse_pf.local.firewall import key_file, key_set_file
-from rse_pf.objects import DirectoryStore
-from rse_pf.robot_key import RobotKey
-from rse_pf.settings import AuthSettings
+from rse_pf.object_store import DirectoryStore
 
 Capture = pytest.CaptureFixture[str]
 SETTINGS = AuthSettings()
@@ -50,7 +50,7 @@ def enrolled(capsys: Capture, name: str = "robot-1", *options: str) -> RobotKey:
 
 def trusted(folder: Path) -> KeySet:
     """Return what a server of the platform would trust."""
-    room = ControlRoom(DirectoryStore(folder))
+    room = AccessControlStore(DirectoryStore(folder))
     keys = KeySet.from_json(key_set_file(folder).read_text())
     return keys.governed_by(room.roster(), room.denied())
 

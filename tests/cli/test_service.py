@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from rse_pf.cli.main import main
-from rse_pf.services.installed import read_service
+from rse_pf.services.custom.installed import read_service
 
 
 @pytest.fixture(autouse=True)

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from rse_pf.auth import KeySet
+from rse_pf.auth.tokens import KeySet
 from rse_pf.aws.clients import make_client
 from rse_pf.cli.main import main
 from rse_pf.local.firewall import ensure_key, key_file, key_set_file

@@ -12,6 +12,7 @@ from fake_platform import FakePlatform
 
 import client_sdk
 from client_sdk.connection import websocket_options
+from rse_pf.config import SessionSettings
 from rse_pf.errors import (
     Conflict,
     ConnectError,
@@ -21,8 +22,7 @@ from rse_pf.errors import (
     UnsupportedProtocol,
     UsageError,
 )
-from rse_pf.settings import SessionSettings
-from rse_pf.wire.session import CLOSE_REPLACED, CLOSE_TOKEN_OVER
+from rse_pf.wire.server_session import CLOSE_REPLACED, CLOSE_TOKEN_OVER
 
 pytestmark = pytest.mark.system
 
@@ -409,7 +409,7 @@ def test_an_old_server_says_which_protocol_it_wants(monkeypatch):
             with pytest.raises(UnsupportedProtocol, match="protocol 1 is not 99"):
                 await robot(platform.url).__aenter__()
 
-    monkeypatch.setattr("rse_pf.wire.session.PROTOCOL_VERSION", 99)
+    monkeypatch.setattr("rse_pf.wire.server_session.PROTOCOL_VERSION", 99)
     run(test())
 
 

@@ -25,9 +25,9 @@ from client_sdk.frontend import (
 )
 from client_sdk.mapping import Trajectory
 from rse_pf.errors import PnpError, UsageError
-from rse_pf.experiments.trajectories import absolute_error, relative_error
+from rse_pf.experiments.results.trajectory_error import absolute_error, relative_error
 from rse_pf.geometry import Array, Camera, inverse, pose_difference, transform
-from rse_pf.pnp.solver import PnpOptions, solve_pnp
+from rse_pf.pnp import PnpOptions, solve_pnp
 
 cv2 = pytest.importorskip("cv2", reason="pip install 'rse-pf[vision]'")
 

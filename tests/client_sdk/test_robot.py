@@ -15,6 +15,7 @@ from fakes import FakeRobot, FakeServer, answer_at_once, answer_nothing
 
 import client_sdk
 from client_sdk.connection import Connection
+from rse_pf.config import PnpSettings, SessionSettings
 from rse_pf.errors import (
     Busy,
     ConnectError,
@@ -27,7 +28,6 @@ from rse_pf.errors import (
 )
 from rse_pf.pnp.problems import make_problem
 from rse_pf.services import pnp
-from rse_pf.settings import PnpSettings, SessionSettings
 from rse_pf.wire import Command, Failure, Result
 
 FAST = SessionSettings(reconnect_base_s=0.01, reconnect_max_s=0.05, silence_s=0.4, ping_interval_s=0.2)

@@ -12,8 +12,9 @@ import pytest
 from fake_platform import FakePlatform, echo_services
 
 import client_sdk
-from client_sdk.own_services import OwnServices
+from client_sdk.local_services import LocalServices
 from client_sdk.stats import StatsKeeper
+from rse_pf.config import PlatformSettings, SessionSettings
 from rse_pf.errors import (
     BadMessage,
     Busy,
@@ -26,7 +27,6 @@ from rse_pf.errors import (
 from rse_pf.pnp.problems import make_degenerate, make_problem
 from rse_pf.services.builtin import builtin_services
 from rse_pf.services.echo import EchoReply
-from rse_pf.settings import PlatformSettings, SessionSettings
 from rse_pf.wire import Failure
 
 FAST = SessionSettings(reconnect_base_s=0.01, reconnect_max_s=0.05, silence_s=0.4)
@@ -199,7 +199,7 @@ def test_a_robot_without_a_solver_is_told_what_to_install(monkeypatch):
 def test_the_robots_own_services_take_the_engine_that_is_there(monkeypatch):
     pytest.importorskip("cv2")
     monkeypatch.setattr("rse_pf.pnp.available_engines", lambda: ("opencv",))
-    own = OwnServices(None, clock=lambda: 0.0)
+    own = LocalServices(None, clock=lambda: 0.0)
 
     run(own.prepare())
     own.close()

@@ -12,9 +12,9 @@ from hypothesis import HealthCheck, given
 from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 
-from rse_pf.auth import SigningKey
+from rse_pf.auth.tokens import SigningKey
 from rse_pf.errors import StoreError, StoreFull
-from rse_pf.objects import DirectoryStore, MemoryStore, ObjectInfo, digest_of
+from rse_pf.object_store import DirectoryStore, MemoryStore, ObjectInfo, digest_of
 
 DATA = bytes(range(256)) * 4
 DIGEST = digest_of(DATA)

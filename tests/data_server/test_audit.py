@@ -9,12 +9,12 @@ from pathlib import Path
 import pytest
 from fake_data_service import KEY, Service, small_settings
 
-from rse_pf.audit import Entry
-from rse_pf.audit_check import check_folder, entries_of
-from rse_pf.audit_log import AuditLog, files_of
+from rse_pf.audit.chain import Entry
+from rse_pf.audit.log import AuditLog, files_of
+from rse_pf.audit.verify import check_folder, entries_of
 from rse_pf.data_server.app import DataServer
-from rse_pf.maps import MapVersion, encode_map
-from rse_pf.objects import MemoryStore, digest_of
+from rse_pf.maps.format import MapVersion, encode_map
+from rse_pf.object_store import MemoryStore, digest_of
 
 MAPS = "/data/v1/maps/kitchen"
 
@@ -24,7 +24,7 @@ class Recorded(Service):
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        self.log = AuditLog(folder, "data", wall_clock=lambda: 1e9, most_bytes=1 << 20, sync_s=0.1).open()
+        self.log = AuditLog(folder, "data", wall_clock=lambda: 1e9, max_bytes=1 << 20, sync_s=0.1).open()
         super().__init__(small_settings(), MemoryStore())
 
     def restart(self) -> None:

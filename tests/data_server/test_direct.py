@@ -7,7 +7,7 @@ import json
 import pytest
 from fake_data_service import Service, small_settings
 
-from rse_pf.objects import MemoryStore, digest_of, object_name
+from rse_pf.object_store import MemoryStore, digest_of, object_name
 
 DATA = bytes(range(256)) * 40
 DIGEST = digest_of(DATA)

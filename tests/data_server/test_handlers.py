@@ -6,8 +6,8 @@ import json
 
 from fake_data_service import Answer, Service, small_settings
 
-from rse_pf.maps import MapVersion, encode_map
-from rse_pf.objects import MemoryStore, digest_of
+from rse_pf.maps.format import MapVersion, encode_map
+from rse_pf.object_store import MemoryStore, digest_of
 
 MAPS = "/data/v1/maps/kitchen"
 
@@ -72,7 +72,7 @@ def test_what_is_no_map_or_not_ones_own_object_is_refused(service: Service) -> N
 
 
 def test_more_bodies_than_allowed_are_told_to_come_again() -> None:
-    service = Service(small_settings(most_uploads=1), MemoryStore())
+    service = Service(small_settings(max_uploads=1), MemoryStore())
     inner: list[Answer] = []
     body = iter([{"type": "http.request", "body": b"x", "more_body": False}])
 

@@ -30,7 +30,7 @@ def test_every_reference_leads_somewhere() -> None:
 
     names = {part.split('"')[0] for part in text.split("#/components/schemas/")[1:]}
     assert names <= set(document["components"]["schemas"])
-    assert {"Failure", "MapRecord", "Upload"} <= names
+    assert {"HttpFailure", "MapRecord", "Upload"} <= names
 
 
 @pytest.mark.parametrize("route", ROUTES, ids=lambda route: route.operation)

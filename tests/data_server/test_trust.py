@@ -7,12 +7,12 @@ from pathlib import Path
 import pytest
 from fake_data_service import KEY, Service, small_settings
 
-from rse_pf.auth import SigningKey
-from rse_pf.control import ControlRoom
+from rse_pf.auth.roster import EnrolledRobot, public_key_of
+from rse_pf.auth.tokens import SigningKey
+from rse_pf.auth.trust_store import AccessControlStore
 from rse_pf.data_server import DataServer
 from rse_pf.data_server.server import KeysFile
-from rse_pf.enrolment import EnrolledRobot, public_key_of
-from rse_pf.objects import DirectoryStore, MemoryStore, digest_of
+from rse_pf.object_store import DirectoryStore, MemoryStore, digest_of
 
 ROBOT = SigningKey.of_robot(b"r" * 32)
 PAUSE_S = 0.5
@@ -23,7 +23,7 @@ class Governed(Service):
 
     def __init__(self, folder: Path) -> None:
         (folder / "keys.json").write_text(KEY.key_set().to_json())
-        self.room = ControlRoom(DirectoryStore(folder))
+        self.room = AccessControlStore(DirectoryStore(folder))
         self.folder = folder
         super().__init__(small_settings(), MemoryStore())
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from fake_data_service import Answer, Service, small_settings
 
-from rse_pf.objects import DirectoryStore, MemoryStore, digest_of
+from rse_pf.object_store import DirectoryStore, MemoryStore, digest_of
 
 DATA = bytes(n % 251 for n in range(10_000))
 DIGEST = digest_of(DATA)

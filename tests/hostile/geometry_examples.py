@@ -19,11 +19,11 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from fuzz.targets import check_pose
+from rse_pf.config import PlatformSettings
 from rse_pf.geometry import Camera
 from rse_pf.pnp.problems import DEGENERATE, KINECT, make_degenerate
 from rse_pf.service import dispatch
 from rse_pf.services.builtin import builtin_services
-from rse_pf.settings import PlatformSettings
 from rse_pf.wire import Command, Failure
 
 ENGINES = ("poselib", "opencv")

@@ -17,7 +17,7 @@ import pytest
 from guarded_server import GuardedServer
 
 from benchmarks import attacks
-from benchmarks.attacks import Door, Outcome
+from benchmarks.attacks import HandshakePolicy, Outcome
 from client_sdk import connect
 from rse_pf.wire import Command, Result
 
@@ -69,13 +69,13 @@ def counted(server: GuardedServer, name: str, label: str, at_least: float) -> bo
 
 
 def attacked(
-    server: GuardedServer, attack: Callable[[Door], Awaitable[Outcome]], *, robots: int = 1
+    server: GuardedServer, attack: Callable[[HandshakePolicy], Awaitable[Outcome]], *, robots: int = 1
 ) -> tuple[Outcome, int]:
     """Return what came of *attack*, and how many calls of a robot beside it were answered, of 5."""
     tokens = tuple(server.token(f"hostile-{next(_NUMBERS)}") for _ in range(robots))
 
     async def run() -> tuple[Outcome, int]:
-        door, answered = Door(server.url, tokens), 0
+        door, answered = HandshakePolicy(server.url, tokens), 0
         async with connect(server.url, token=server.token("calm")) as calm:
             attacking = asyncio.ensure_future(attack(door))
             for _ in range(5):
@@ -99,7 +99,7 @@ def test_endless_frames_are_cut_off_at_the_limit(server, attack, code):
 
 
 def test_a_robot_at_a_hundred_times_its_rate_is_told_cut_off_and_kept_out(server):
-    async def attack(door: Door) -> Outcome:
+    async def attack(door: HandshakePolicy) -> Outcome:
         return await attacks.rate_flood(door, 2000.0, 1.5)
 
     outcome, answered = attacked(server, attack)
@@ -113,7 +113,7 @@ def test_a_robot_at_a_hundred_times_its_rate_is_told_cut_off_and_kept_out(server
 
 
 def test_every_bomb_is_refused_and_memory_stays(server):
-    async def attack(door: Door) -> Outcome:
+    async def attack(door: HandshakePolicy) -> Outcome:
         return await attacks.zip_bombs(door, 100)
 
     attacks.bomb()  # takes a second, in which the robot beside it could not say a word
@@ -126,7 +126,7 @@ def test_every_bomb_is_refused_and_memory_stays(server):
 
 
 def test_silent_connections_leave_for_newer_ones_and_after_their_time(server):
-    async def attack(door: Door) -> Outcome:
+    async def attack(door: HandshakePolicy) -> Outcome:
         return await attacks.silent_connects(door, 100)
 
     outcome, answered = attacked(server, attack)
@@ -137,7 +137,7 @@ def test_silent_connections_leave_for_newer_ones_and_after_their_time(server):
 
 
 def test_slow_heads_are_cut_after_the_time_of_a_handshake(server):
-    async def attack(door: Door) -> Outcome:
+    async def attack(door: HandshakePolicy) -> Outcome:
         return await attacks.slow_headers(door, 20, pause_s=0.2)
 
     outcome, answered = attacked(server, attack)
@@ -149,7 +149,7 @@ def test_slow_heads_are_cut_after_the_time_of_a_handshake(server):
 
 def test_a_long_head_is_answered_with_431(server):
     async def knock() -> bytes:
-        reader, writer = await Door(server.url).knock()
+        reader, writer = await HandshakePolicy(server.url).knock()
         writer.write(b"GET /ws HTTP/1.1\r\nHost: a\r\nX-Long: " + b"x" * 9000)
         answer = await asyncio.wait_for(reader.read(), 10)
         writer.close()
@@ -160,7 +160,7 @@ def test_a_long_head_is_answered_with_431(server):
 
 def test_equal_ids_and_streams_of_many_robots_never_meet(server):
     async def run() -> list[tuple[int, object]]:
-        door = Door(server.url)
+        door = HandshakePolicy(server.url)
         robots = [await door.enter(server.token(f"twin-{n}"), "bin") for n in range(20)]
         heard: list[tuple[int, object]] = []
         for number, robot in enumerate(robots):

@@ -14,8 +14,8 @@ from fuzz.meter import Meter
 from fuzz.mutations import mutations
 from fuzz.samples import LONGEST, samples
 from fuzz.targets import TARGETS, Finding
-from rse_pf.backend import frames as frame_layer
-from rse_pf.backend.frames import CloseBorder, FrameAssembler
+from rse_pf.backend.gateway import frames as frame_layer
+from rse_pf.backend.gateway.frames import CloseBorder, FrameAssembler
 
 
 def fuzzed(target: str, *, seed: int, inputs: int) -> Meter:

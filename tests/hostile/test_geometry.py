@@ -14,10 +14,10 @@ import pytest
 from hostile.geometry_examples import search
 
 from fuzz.targets import check_pose
+from rse_pf.config import PlatformSettings
 from rse_pf.pnp import solver
 from rse_pf.service import dispatch
 from rse_pf.services.builtin import builtin_services
-from rse_pf.settings import PlatformSettings
 from rse_pf.wire import Command, Failure, make_codec
 
 SETTINGS = PlatformSettings()

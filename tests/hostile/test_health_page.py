@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from rse_pf.local.load_balancer import LoadBalancer
-from rse_pf.settings import PlatformSettings
+from rse_pf.config import PlatformSettings
+from rse_pf.local.balancer.load_balancer import EnvoyLoadBalancer
 
 pytestmark = pytest.mark.system
 
@@ -30,7 +30,7 @@ def asked(port: int, path: str) -> tuple[int, list[str]]:
 
 def test_without_a_server_the_door_says_that_robots_are_not_served(tmp_path: Path) -> None:
     async def run() -> dict[str, tuple[int, list[str]]]:
-        balancer = LoadBalancer(PlatformSettings(), folder=tmp_path, port=0)
+        balancer = EnvoyLoadBalancer(PlatformSettings(), folder=tmp_path, port=0)
         balancer.launch()
         try:
             await balancer.wait_live(SOON_S)

@@ -19,8 +19,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rse_pf.backend.log import JsonLog
-from rse_pf.local.cloud import LocalCloud
-from rse_pf.settings import PlatformSettings
+from rse_pf.config import PlatformSettings
+from rse_pf.local.control.platform import LocalPlatform
 from rse_pf.wire import SUBPROTOCOLS, Command, Hello, make_codec
 
 CODEC = make_codec("json")
@@ -142,7 +142,7 @@ def test_no_token_and_no_payload_is_in_any_log_of_a_real_run(tmp_path: Path) -> 
     folder = tmp_path / "platform"
 
     async def run() -> tuple[int, int]:
-        async with LocalCloud(loud, servers=1, port=0, state=folder, data=True) as cloud:
+        async with LocalPlatform(loud, servers=1, port=0, state=folder, data=True) as cloud:
             tokens.extend(cloud.issue_token(f"robot-{number}") for number in range(3))
             good, other, _ = tokens
             damaged = other[:-6] + "AAAAAA"

@@ -9,8 +9,8 @@ from collections.abc import Iterator
 import msgspec
 import pytest
 
+from rse_pf.config import PlatformSettings
 from rse_pf.services.builtin import builtin_services
-from rse_pf.settings import PlatformSettings
 from rse_pf.wire.messages import FromRobot
 
 _ADDRESS = re.compile(r"url|uri|host|port$|bucket|endpoint|address|path$|file", re.IGNORECASE)

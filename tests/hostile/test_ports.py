@@ -11,10 +11,10 @@ from typing import Any
 
 import pytest
 
-from rse_pf.control_token import bearer, read_control_token
-from rse_pf.local.cloud import LocalCloud
-from rse_pf.local.envoy_config import ADMIN_SOCKET
-from rse_pf.settings import PlatformSettings
+from rse_pf.auth.control_token import bearer, read_control_token
+from rse_pf.config import PlatformSettings
+from rse_pf.local.balancer.envoy_config import ADMIN_SOCKET
+from rse_pf.local.control.platform import LocalPlatform
 
 pytestmark = pytest.mark.system
 
@@ -84,7 +84,7 @@ def listening(pids: list[int]) -> list[str]:
 
 def test_the_door_knows_three_paths_and_nothing_else_listens_to_the_world(tmp_path: Path) -> None:
     async def scan() -> tuple[dict[str, int], int, list[str], int, Any]:
-        async with LocalCloud(PlatformSettings(), state=tmp_path / "p", port=0, servers=1) as cloud:
+        async with LocalPlatform(PlatformSettings(), state=tmp_path / "p", port=0, servers=1) as cloud:
             door = cloud.load_balancer.port
             statuses = {
                 f"{method} {path}": await asyncio.to_thread(status_of, door, path, method)
@@ -127,7 +127,7 @@ def test_a_control_port_tells_its_health_to_all_and_the_rest_to_who_carries_its_
         return [status for status, _ in told], health, bodies, carried, page
 
     async def scan() -> tuple[Any, int, int]:
-        async with LocalCloud(PlatformSettings(), state=folder, port=0, servers=1) as cloud:
+        async with LocalPlatform(PlatformSettings(), state=folder, port=0, servers=1) as cloud:
             (server,) = cloud.servers
             status_port = cloud._status.sockets[0].getsockname()[1] if cloud._status else 0
             unasked = await asyncio.to_thread(status_of, status_port, "/status")

@@ -15,12 +15,12 @@ import websockets
 from guarded_server import GuardedServer
 
 from client_sdk import Robot, connect
-from rse_pf.auth import SigningKey
-from rse_pf.enrolment import EnrolledRobot, public_key_of
+from rse_pf.auth.robot_key import RobotKey, make_robot_key
+from rse_pf.auth.roster import EnrolledRobot, public_key_of
+from rse_pf.auth.tokens import SigningKey
 from rse_pf.errors import Forbidden, Unauthorized
-from rse_pf.robot_key import RobotKey, make_robot_key
 from rse_pf.wire import SUBPROTOCOLS, Command, Failure, Hello, Renew, Renewed, Result, make_codec
-from rse_pf.wire.session import CLOSE_REPLACED, CLOSE_REVOKED, CLOSE_TOKEN_OVER
+from rse_pf.wire.server_session import CLOSE_REPLACED, CLOSE_REVOKED, CLOSE_TOKEN_OVER
 
 pytestmark = pytest.mark.system
 

@@ -13,13 +13,13 @@ from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
-from rse_pf.auth import SigningKey, verify_token
-from rse_pf.enrolment import DenyList, Roster
+from rse_pf.auth.roster import DenyList, Roster
+from rse_pf.auth.tokens import SigningKey, verify_token
+from rse_pf.config import AuthSettings, SessionSettings
 from rse_pf.errors import Unauthorized
-from rse_pf.settings import AuthSettings, SessionSettings
 from rse_pf.wire import Command, Failure, Result, make_codec
-from rse_pf.wire.robot_session import Answered, Link, RobotSession, Welcomed
-from rse_pf.wire.session import Close, Send, ServerSession, Submit
+from rse_pf.wire.client_session import Answered, ClientLink, RobotSession, Welcomed
+from rse_pf.wire.server_session import Close, Send, ServerSession, Submit
 
 LIMITS = SessionSettings(max_in_flight=3, max_bad_messages=2)
 CODEC = make_codec("json", LIMITS)
@@ -35,7 +35,7 @@ picks = st.integers(0, 10**6)
 class Socket:
     """One connection: what is under way in each direction, and what its server still has to answer."""
 
-    def __init__(self, link: Link, server: ServerSession) -> None:
+    def __init__(self, link: ClientLink, server: ServerSession) -> None:
         self.link = link
         self.server = server
         self.up: deque[bytes] = deque()

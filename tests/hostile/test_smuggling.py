@@ -22,9 +22,9 @@ import pytest
 from guarded_server import KEY, GuardedServer
 from hostile.smuggling_samples import HIDDEN, REFUSED, SAMPLES, put, upgrade
 
-from rse_pf.local.envoy_config import Target
-from rse_pf.local.load_balancer import LoadBalancer
-from rse_pf.settings import PlatformSettings
+from rse_pf.config import PlatformSettings
+from rse_pf.local.balancer.envoy_config import Target
+from rse_pf.local.balancer.load_balancer import EnvoyLoadBalancer
 
 pytestmark = pytest.mark.system
 
@@ -230,7 +230,7 @@ async def through_the_door(folder: Path, *, opens: bool) -> tuple[dict[str, Told
     recorder = Recorder(opens)
     upstream = await asyncio.start_server(recorder.serve, "127.0.0.1", 0)
     port = upstream.sockets[0].getsockname()[1]
-    balancer = LoadBalancer(PlatformSettings(), folder=folder, port=0)
+    balancer = EnvoyLoadBalancer(PlatformSettings(), folder=folder, port=0)
     balancer.launch()
     try:
         await balancer.wait_live(SOON_S)

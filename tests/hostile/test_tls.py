@@ -20,9 +20,9 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import NameOID
 
 from client_sdk import connect
+from rse_pf.config import PlatformSettings
 from rse_pf.errors import RsePfError, SettingsError
-from rse_pf.local.cloud import LocalCloud
-from rse_pf.settings import PlatformSettings
+from rse_pf.local.control.platform import LocalPlatform
 
 SOON_S = 20.0
 
@@ -55,7 +55,7 @@ def write_certificate(folder: Path) -> tuple[Path, Path]:
     return files
 
 
-class Door:
+class HandshakePolicy:
     """A platform behind TLS, run in a loop of its own so that a test may block."""
 
     def __init__(self, folder: Path) -> None:
@@ -64,7 +64,7 @@ class Door:
             local={"certificate": str(self.certificate), "private_key": str(key)}
         )
         self._loop = asyncio.new_event_loop()
-        self._cloud = LocalCloud(settings, servers=1, port=0, state=folder / "platform")
+        self._cloud = LocalPlatform(settings, servers=1, port=0, state=folder / "platform")
         self._loop.run_until_complete(self._cloud.__aenter__())
         self.url = self._cloud.url
         self.port = self._cloud.port
@@ -89,8 +89,8 @@ class Door:
 
 
 @pytest.fixture(scope="module")
-def door(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Door]:
-    opened = Door(tmp_path_factory.mktemp("tls"))
+def door(tmp_path_factory: pytest.TempPathFactory) -> Iterator[HandshakePolicy]:
+    opened = HandshakePolicy(tmp_path_factory.mktemp("tls"))
     yield opened
     opened.close()
 
@@ -109,7 +109,9 @@ def speaking(version: ssl.TLSVersion, ciphers: str = "ALL:@SECLEVEL=0") -> ssl.S
 
 @pytest.mark.system
 @pytest.mark.parametrize("version", ["TLSv1_2", "TLSv1_3"])
-def test_today_s_versions_are_spoken_with_ciphers_that_authenticate(door: Door, version: str) -> None:
+def test_today_s_versions_are_spoken_with_ciphers_that_authenticate(
+    door: HandshakePolicy, version: str
+) -> None:
     agreed = door.shake_hands(speaking(ssl.TLSVersion[version]))
 
     assert agreed is not None
@@ -119,12 +121,14 @@ def test_today_s_versions_are_spoken_with_ciphers_that_authenticate(door: Door, 
 
 @pytest.mark.system
 @pytest.mark.parametrize("version", ["TLSv1", "TLSv1_1"])
-def test_old_versions_get_no_handshake(door: Door, version: str) -> None:
+def test_old_versions_get_no_handshake(door: HandshakePolicy, version: str) -> None:
     assert door.shake_hands(speaking(ssl.TLSVersion[version])) is None
 
 
 @pytest.mark.system
-def test_of_all_ciphers_that_this_machine_can_offer_only_those_with_authentication_pass(door: Door) -> None:
+def test_of_all_ciphers_that_this_machine_can_offer_only_those_with_authentication_pass(
+    door: HandshakePolicy,
+) -> None:
     offered = [
         each["name"]
         for each in speaking(ssl.TLSVersion.TLSv1_2).get_ciphers()
@@ -142,7 +146,7 @@ def test_of_all_ciphers_that_this_machine_can_offer_only_those_with_authenticati
 
 
 @pytest.mark.system
-def test_plain_text_gets_no_answer(door: Door) -> None:
+def test_plain_text_gets_no_answer(door: HandshakePolicy) -> None:
     with socket.create_connection(("127.0.0.1", door.port), timeout=SOON_S) as plain:
         plain.sendall(b"GET /ws HTTP/1.1\r\nHost: a\r\n\r\n")
         answer = b""
@@ -154,7 +158,7 @@ def test_plain_text_gets_no_answer(door: Door) -> None:
 
 @pytest.mark.system
 def test_a_robot_dials_wss_and_refuses_a_certificate_that_nobody_signed(
-    door: Door, monkeypatch: pytest.MonkeyPatch
+    door: HandshakePolicy, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     async def echoed() -> object:
         async with connect(url=door.url, token=door.token()) as robot:
@@ -168,7 +172,7 @@ def test_a_robot_dials_wss_and_refuses_a_certificate_that_nobody_signed(
 
 
 @pytest.mark.system
-def test_sslscan_sees_neither_old_versions_nor_weak_ciphers(door: Door) -> None:
+def test_sslscan_sees_neither_old_versions_nor_weak_ciphers(door: HandshakePolicy) -> None:
     try:
         done = subprocess.run(
             ["sslscan", "--no-colour", f"127.0.0.1:{door.port}"], capture_output=True, text=True, check=False

@@ -16,8 +16,8 @@ from typing import Any
 import pytest
 from guarded_server import KEY, GuardedServer
 
-from rse_pf.auth import SigningKey
-from rse_pf.enrolment import DenyList, EnrolledRobot, Roster, public_key_of
+from rse_pf.auth.roster import DenyList, EnrolledRobot, Roster, public_key_of
+from rse_pf.auth.tokens import SigningKey
 
 pytestmark = pytest.mark.system
 

@@ -15,8 +15,8 @@ import pytest
 
 from lambda_pnp.answering import Answering
 from lambda_pnp.keys import KeyCache
-from rse_pf.auth import SigningKey
-from rse_pf.settings import PlatformSettings
+from rse_pf.auth.tokens import SigningKey
+from rse_pf.config import PlatformSettings
 from rse_pf.wire import SUBPROTOCOLS, Command, Failure, Hello, Message, Result, make_codec
 
 SETTINGS = PlatformSettings()
@@ -136,10 +136,10 @@ def test_a_late_answer_is_expired_before_and_after_the_work() -> None:
 
 def over_the_websocket(body: bytes) -> Failure:
     """Return what a backend's session, scheduler and dispatch say to the same bytes."""
-    from rse_pf.backend.scheduler import Job, Scheduler
+    from rse_pf.backend.scheduling.scheduler import QueuedCommand, Scheduler
     from rse_pf.service import dispatch, failure_of
     from rse_pf.services.builtin import builtin_services
-    from rse_pf.wire.session import Send, ServerSession, Submit
+    from rse_pf.wire.server_session import Send, ServerSession, Submit
 
     codec = make_codec("zlib", SETTINGS.session)
     session = ServerSession(
@@ -155,7 +155,7 @@ def over_the_websocket(body: bytes) -> Failure:
         allowed_s = SETTINGS.session.answer_timeout_s
         if command.deadline_ms is not None:
             allowed_s = command.deadline_ms / 1e3
-        job = Job(None, "robot-1", command, len(body), 0.0, allowed_s)
+        job = QueuedCommand(None, "robot-1", command, len(body), 0.0, allowed_s)
         refusals = Scheduler(SETTINGS.serving).submit(job, 0.0)
         if refusals:
             told = failure_of(refusals[0].error, command, server="lambda")

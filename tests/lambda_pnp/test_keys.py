@@ -7,8 +7,8 @@ from datetime import datetime, timezone
 import pytest
 
 from lambda_pnp.keys import KeyCache, signed_request
-from rse_pf.auth import Claims, SigningKey
-from rse_pf.enrolment import DenyList, EnrolledRobot, Roster, public_key_of, to_json
+from rse_pf.auth.roster import DenyList, EnrolledRobot, Roster, public_key_of, to_json
+from rse_pf.auth.tokens import Claims, SigningKey
 from rse_pf.errors import NotFound
 
 ENVIRONMENT = {

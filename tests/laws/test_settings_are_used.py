@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from rse_pf.settings import PlatformSettings, setting_rows, settings_page
+from rse_pf.config import PlatformSettings, setting_rows, settings_page
 
 GROUPS = set(PlatformSettings().to_dict())
 NAMES = [(row.group, row.name) for row in setting_rows()]
@@ -28,7 +28,7 @@ def unread(tree: Mapping[str, str]) -> set[tuple[str, str]]:
     """Return the settings, as ``(group, name)``, that no source of *tree* reads."""
     seen: set[tuple[str, str]] = set()
     for path, text in tree.items():
-        if path == "rse_pf/settings.py":
+        if path == "rse_pf/config/settings.py":
             continue
         for node in ast.walk(ast.parse(text)):
             if isinstance(node, ast.Attribute) and isinstance(node.ctx, ast.Load):
@@ -47,7 +47,8 @@ def spelt_elsewhere(tree: Mapping[str, str]) -> list[str]:
     return [
         f"{path}: {found.group()} is a setting"
         for path, text in tree.items()
-        if path != "rse_pf/settings.py" and path.startswith(("rse_pf/", "client_sdk/", "stacks/", "app.py"))
+        if path != "rse_pf/config/settings.py"
+        and path.startswith(("rse_pf/", "client_sdk/", "stacks/", "app.py"))
         for found in LITERALS.finditer(_without_comments(text))
     ]
 
@@ -77,9 +78,9 @@ def test_every_setting_is_read_or_waits_on_the_list(sources: Mapping[str, str]) 
 
 
 def test_an_unread_setting_is_caught(sources: Mapping[str, str]) -> None:
-    text = sources["rse_pf/auth.py"].replace("settings.max_token_bytes", "4096")
+    text = sources["rse_pf/auth/tokens.py"].replace("settings.max_token_bytes", "4096")
 
-    assert ("auth", "max_token_bytes") in unread({**sources, "rse_pf/auth.py": text})
+    assert ("auth", "max_token_bytes") in unread({**sources, "rse_pf/auth/tokens.py": text})
 
 
 def test_the_same_name_in_another_group_is_not_taken_for_a_reader() -> None:

@@ -17,10 +17,13 @@ SOURCES = ("rse_pf", "client_sdk", "lambda_pnp", "stacks", "scripts", "app.py")
 
 HARMLESS: Mapping[tuple[str, str], str] = {
     ("lambda_pnp/keys.py", "B310"): "the address of the bucket, from the stack, always https",
-    ("rse_pf/aws/instance.py", "B105"): "seconds that a metadata token lives",
-    ("rse_pf/aws/instance.py", "B310"): "the instance's own metadata, a literal address",
-    ("rse_pf/aws/leftovers.py", "B105"): "a sentence about the secret, not the secret",
-    ("rse_pf/backend/walls.py", "B108"): "what an environment does not see; its own scratch folder",
+    ("rse_pf/aws/fleet/instance.py", "B105"): "seconds that a metadata token lives",
+    ("rse_pf/aws/fleet/instance.py", "B310"): "the instance's own metadata, a literal address",
+    ("rse_pf/aws/money/leftovers.py", "B105"): "a sentence about the secret, not the secret",
+    (
+        "rse_pf/backend/sandbox/isolation.py",
+        "B108",
+    ): "what an environment does not see; its own scratch folder",
     ("rse_pf/cli/main.py", "B105"): "help of the verb named token",
     ("rse_pf/data_server/app.py", "B106"): "an empty default",
     ("stacks/boot/first_boot.py", "B310"): "the bucket and the instance's own metadata",
@@ -30,17 +33,20 @@ HARMLESS: Mapping[tuple[str, str], str] = {
 NO_SECRETS: Mapping[tuple[str, str], str] = {
     ("docs/protocol.md", "JSON Web Token"): "the page's example; its signature says 'signature'",
     ("docs/protocol.md", "Base64 High Entropy String"): "the same",
-    ("rse_pf/aws/leftovers.py", "Secret Keyword"): "a sentence about the secret, not the secret",
-    ("tests/aws/test_leftovers.py", "Secret Keyword"): "a name",
-    ("tests/backend/test_witness.py", "JSON Web Token"): "made up, to be looked for in the audit log",
-    ("tests/test_audit.py", "JSON Web Token"): "made up, to be looked for in the audit log",
-    ("tests/test_settings.py", "Secret Keyword"): "the name of a file",
-    ("tests/aws/test_secrets.py", "Secret Keyword"): "made for moto",
+    ("rse_pf/aws/money/leftovers.py", "Secret Keyword"): "a sentence about the secret, not the secret",
+    ("tests/aws/money/test_leftovers.py", "Secret Keyword"): "a name",
+    (
+        "tests/backend/gateway/test_audit_recorder.py",
+        "JSON Web Token",
+    ): "made up, to be looked for in the audit log",
+    ("tests/audit/test_chain.py", "JSON Web Token"): "made up, to be looked for in the audit log",
+    ("tests/config/test_settings.py", "Secret Keyword"): "the name of a file",
+    ("tests/aws/storage/test_secrets.py", "Secret Keyword"): "made for moto",
     ("tests/cli/conftest.py", "Secret Keyword"): "made for moto",
     ("tests/lambda_pnp/test_keys.py", "Secret Keyword"): "made for moto",
     ("tests/stacks/test_first_boot.py", "Secret Keyword"): "made for moto",
     ("tests/system/boot/imds.py", "Secret Keyword"): "made for moto",
-    ("tests/test_objects.py", "Hex High Entropy String"): "the sha256 of 'abc'",
+    ("tests/test_object_store.py", "Hex High Entropy String"): "the sha256 of 'abc'",
 }
 """File and kind of detect-secrets to why it is none."""
 

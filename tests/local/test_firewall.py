@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from rse_pf.auth import KeySet, SigningKey, verify_token
+from rse_pf.auth.tokens import KeySet, SigningKey, verify_token
+from rse_pf.config import AuthSettings
 from rse_pf.errors import ConfigurationError, UsageError
 from rse_pf.local.firewall import check_front_door, ensure_key, key_file, key_set_file, read_key
-from rse_pf.settings import AuthSettings
 
 SEED = b"s" * 32
 

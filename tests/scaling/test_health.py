@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+from rse_pf.config import HealthSettings
 from rse_pf.scaling.health import Health, observe, time_to_notice_s
-from rse_pf.settings import HealthSettings
 
 SETTINGS = HealthSettings()
 

@@ -14,9 +14,9 @@ import pytest
 from hypothesis import given, seed, settings
 from hypothesis import strategies as st
 
+from rse_pf.config import ScalingSettings
 from rse_pf.scaling.alarms import Alarm, alarms_of
-from rse_pf.scaling.policy import Fleet, Sample, decide
-from rse_pf.settings import ScalingSettings
+from rse_pf.scaling.policy import FleetState, Sample, decide
 
 Point = dict[str, float] | None
 Run = list[int]
@@ -93,7 +93,7 @@ class Local:
                 )
             )
         warming = sum(now_s - each < self.scaling.warm_up_s for each in self.launched)
-        fleet = Fleet(servers=len(self.launched), warming=warming)
+        fleet = FleetState(servers=len(self.launched), warming=warming)
         (action,) = decide(self.samples, fleet, self.scaling, now_s=now_s)
         if action.kind == "grow":
             self.launched += [now_s] * action.servers

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from rse_pf.scaling.policy import Action, Fleet, Sample, decide
-from rse_pf.settings import ScalingSettings
+from rse_pf.config import ScalingSettings
+from rse_pf.scaling.policy import Action, FleetState, Sample, decide
 
 SETTINGS = ScalingSettings(min_servers=1)
 
@@ -18,11 +18,11 @@ def actions(
         Sample(start_s=60.0 * i, cpu_percent=each, requests=each if requests is None else requests)
         for i, each in enumerate(cpu)
     ]
-    fleet = Fleet(servers=servers)
+    fleet = FleetState(servers=servers)
     return [decide(samples, fleet, settings, now_s=60.0 * (i + 1))[-1].kind for i in range(len(samples))]
 
 
-def last(*cpu: float, fleet: Fleet, settings: ScalingSettings = SETTINGS) -> Action:
+def last(*cpu: float, fleet: FleetState, settings: ScalingSettings = SETTINGS) -> Action:
     samples = [Sample(start_s=60.0 * i, cpu_percent=each, requests=each) for i, each in enumerate(cpu)]
     return decide(samples, fleet, settings, now_s=60.0 * len(cpu))[-1]
 
@@ -42,27 +42,27 @@ def test_grows_at_the_second_busy_minute_and_the_threshold_counts_as_busy() -> N
 
 
 def test_a_very_busy_fleet_grows_by_two() -> None:
-    assert last(75, 84.9, fleet=Fleet(servers=3)).servers == 1
-    assert last(75, 85, fleet=Fleet(servers=3)).servers == 2
+    assert last(75, 84.9, fleet=FleetState(servers=3)).servers == 1
+    assert last(75, 85, fleet=FleetState(servers=3)).servers == 2
 
 
 def test_servers_that_warm_up_count_as_added_already() -> None:
-    assert last(90, 90, fleet=Fleet(servers=4, warming=1)).servers == 1
-    assert last(90, 90, fleet=Fleet(servers=5, warming=2)).kind == "stay"
+    assert last(90, 90, fleet=FleetState(servers=4, warming=1)).servers == 1
+    assert last(90, 90, fleet=FleetState(servers=5, warming=2)).kind == "stay"
 
 
 def test_nothing_shrinks_while_a_server_warms_up() -> None:
-    assert last(0, 0, 0, 0, 0, fleet=Fleet(servers=4, warming=1)).kind == "stay"
+    assert last(0, 0, 0, 0, 0, fleet=FleetState(servers=4, warming=1)).kind == "stay"
 
 
 def test_never_leaves_the_bounds() -> None:
-    assert last(99, 99, fleet=Fleet(servers=9)).servers == 1
-    assert last(99, 99, fleet=Fleet(servers=10)).kind == "stay"
-    assert last(0, 0, 0, 0, 0, fleet=Fleet(servers=1)).kind == "stay"
+    assert last(99, 99, fleet=FleetState(servers=9)).servers == 1
+    assert last(99, 99, fleet=FleetState(servers=10)).kind == "stay"
+    assert last(0, 0, 0, 0, 0, fleet=FleetState(servers=1)).kind == "stay"
 
 
 def test_too_few_servers_are_made_up_for_at_once() -> None:
-    action = decide([], Fleet(servers=0), ScalingSettings(min_servers=2), now_s=0.0)[-1]
+    action = decide([], FleetState(servers=0), ScalingSettings(min_servers=2), now_s=0.0)[-1]
 
     assert (action.kind, action.servers) == ("grow", 2)
 
@@ -70,12 +70,12 @@ def test_too_few_servers_are_made_up_for_at_once() -> None:
 def test_a_period_without_a_sample_is_no_reason_to_act() -> None:
     samples = [Sample(start_s=60.0 * i, cpu_percent=0, requests=0) for i in (0, 1, 3, 4)]
 
-    assert decide(samples, Fleet(servers=3), SETTINGS, now_s=300.0)[-1].kind == "stay"
+    assert decide(samples, FleetState(servers=3), SETTINGS, now_s=300.0)[-1].kind == "stay"
 
 
 def test_a_period_is_acted_on_once() -> None:
     samples = [Sample(start_s=60.0 * i, cpu_percent=80, requests=1) for i in range(3)]
-    fleet = Fleet(servers=3)
+    fleet = FleetState(servers=3)
 
     assert decide(samples, fleet, SETTINGS, now_s=130.0, acted_s=121.0)[-1].kind == "stay"
     assert decide(samples, fleet, SETTINGS, now_s=180.0, acted_s=121.0)[-1].kind == "grow"
@@ -84,12 +84,12 @@ def test_a_period_is_acted_on_once() -> None:
 def test_a_sample_speaks_for_the_period_it_began_in() -> None:
     samples = [Sample(start_s=60.0 * i, cpu_percent=80, requests=1) for i in range(2)]
 
-    assert decide(samples, Fleet(servers=3), SETTINGS, now_s=119.0)[-1].kind == "stay"
-    assert decide(samples, Fleet(servers=3), SETTINGS, now_s=120.0)[-1].kind == "grow"
+    assert decide(samples, FleetState(servers=3), SETTINGS, now_s=119.0)[-1].kind == "stay"
+    assert decide(samples, FleetState(servers=3), SETTINGS, now_s=120.0)[-1].kind == "grow"
 
 
 def test_broken_servers_are_replaced_whatever_the_load() -> None:
-    replace, scale = decide([], Fleet(servers=3, unhealthy=("b",)), SETTINGS, now_s=0.0)
+    replace, scale = decide([], FleetState(servers=3, unhealthy=("b",)), SETTINGS, now_s=0.0)
 
     assert (replace.kind, replace.names) == ("replace", ("b",))
     assert scale.kind == "stay"
@@ -107,12 +107,12 @@ def test_crowds_and_queues_grow_the_fleet_when_switched_on(
 ) -> None:
     samples = [Sample(start_s=60.0 * i, cpu_percent=30, requests=1, **sample) for i in range(2)]
 
-    assert decide(samples, Fleet(servers=3), settings, now_s=120.0)[-1].servers == 1
-    assert decide(samples, Fleet(servers=3), SETTINGS, now_s=120.0)[-1].kind == "stay"
+    assert decide(samples, FleetState(servers=3), settings, now_s=120.0)[-1].servers == 1
+    assert decide(samples, FleetState(servers=3), SETTINGS, now_s=120.0)[-1].kind == "stay"
 
 
 def test_compressed_time_gives_the_same_actions() -> None:
     samples = [Sample(start_s=1.0 * i, cpu_percent=0, requests=0) for i in range(5)]
 
-    assert decide(samples, Fleet(servers=3), SETTINGS, now_s=4.9, compress=60.0)[-1].kind == "stay"
-    assert decide(samples, Fleet(servers=3), SETTINGS, now_s=5.0, compress=60.0)[-1].kind == "shrink"
+    assert decide(samples, FleetState(servers=3), SETTINGS, now_s=4.9, compress=60.0)[-1].kind == "stay"
+    assert decide(samples, FleetState(servers=3), SETTINGS, now_s=5.0, compress=60.0)[-1].kind == "shrink"

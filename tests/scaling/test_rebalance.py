@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from rse_pf.config import ScalingSettings
 from rse_pf.scaling.rebalance import moves, share
-from rse_pf.settings import ScalingSettings
 
 SETTINGS = ScalingSettings()
 fleets = st.lists(st.integers(0, 400), min_size=2, max_size=12).map(

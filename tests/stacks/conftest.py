@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from rse_pf.settings import PlatformSettings
+from rse_pf.config import PlatformSettings
 
 LAB = PlatformSettings()
 PUBLIC = PlatformSettings.from_dict(

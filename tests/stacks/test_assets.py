@@ -12,8 +12,8 @@ from typing import Any
 
 import pytest
 
+from rse_pf.config import PlatformSettings, load_settings
 from rse_pf.errors import ConfigurationError
-from rse_pf.settings import PlatformSettings, load_settings
 from stacks.assets import SETTINGS_FILE, SUMS_FILE, WHEELHOUSE, staged, sums_digest
 
 
@@ -88,7 +88,7 @@ def test_packages_of_other_sources_are_refused(
 ) -> None:
     files = {name: text for name, text in sources.items() if name.startswith("rse_pf/")}
     if change == "older":
-        files["rse_pf/settings.py"] += "# before\n"
+        files["rse_pf/config/settings.py"] += "# before\n"
     if change == "missing":
         del files["rse_pf/errors.py"]
     if change == "more":

@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 
 from lambda_pnp.keys import signed_request
-from rse_pf.settings import PlatformSettings
+from rse_pf.config import PlatformSettings
 from stacks.boot.first_boot import signed_headers, verified
 from stacks.boot.install import environment_file, units_of
 

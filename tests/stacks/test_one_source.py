@@ -9,8 +9,8 @@ from typing import Any
 
 import pytest
 
-from rse_pf.local.cloud import LocalCloud
-from rse_pf.settings import PlatformSettings, load_settings
+from rse_pf.config import PlatformSettings, load_settings
+from rse_pf.local.control.platform import LocalPlatform
 
 Assembly = Any
 
@@ -60,7 +60,7 @@ def test_local_servers_answer_with_the_digest_of_the_same_file(assembly: Assembl
     settings = assembly.settings.replace(data={"enabled": False})
 
     async def run() -> tuple[dict[str, Any], Any]:
-        async with LocalCloud(settings, state=tmp_path / "state", servers=1, port=0) as cloud:
+        async with LocalPlatform(settings, state=tmp_path / "state", servers=1, port=0) as cloud:
             return (await cloud.status())[0], load_settings(tmp_path / "state" / "settings.json")
 
     status, written = asyncio.run(run())

@@ -12,9 +12,9 @@ import pytest
 
 from rse_pf.aws.account import Account
 from rse_pf.aws.clients import make_client
-from rse_pf.aws.costs import Load, compare
+from rse_pf.aws.money.costs import Load, compare
 from rse_pf.cli.main import main
-from rse_pf.settings import PlatformSettings
+from rse_pf.config import PlatformSettings
 
 REGION = "ap-northeast-2"
 MARK = "needs an account"

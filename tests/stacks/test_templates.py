@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from rse_pf.errors import ConfigurationError
-from rse_pf.scaling.alarms import Alarm, Metric, Step, alarms_of
+from rse_pf.scaling.alarms import Alarm, Metric, ScalingStep, alarms_of
 
 Assembly = Any
 
@@ -46,7 +46,7 @@ def parsed_alarms(assembly: Assembly) -> list[Alarm]:
                 periods=alarm["EvaluationPeriods"],
                 missing=alarm["TreatMissingData"],
                 steps=tuple(
-                    Step(
+                    ScalingStep(
                         lower=each.get("MetricIntervalLowerBound"),
                         upper=each.get("MetricIntervalUpperBound"),
                         change=each["ScalingAdjustment"],
@@ -113,10 +113,10 @@ def _listed(value: str | list[str]) -> list[str]:
 
 
 def test_what_the_commands_look_for_is_what_the_stacks_call_it(assembly: Assembly) -> None:
-    from rse_pf.aws.costs import interface_endpoints
-    from rse_pf.aws.fleet import GROUP
-    from rse_pf.aws.key_store import DATA_STACK, KEYS_NAME
-    from rse_pf.control import DENY_NAME, ROBOTS_NAME
+    from rse_pf.auth.trust_store import DENY_NAME, ROBOTS_NAME
+    from rse_pf.aws.fleet.fleet import GROUP
+    from rse_pf.aws.money.costs import interface_endpoints
+    from rse_pf.aws.storage.key_store import DATA_STACK, KEYS_NAME
     from stacks import backend_stack
 
     (group,) = assembly.all("AWS::AutoScaling::AutoScalingGroup")
@@ -284,7 +284,7 @@ def test_audit_logs_are_written_once_and_read_changed_or_deleted_by_no_server(as
 
 
 def test_packages_carry_the_merged_settings_and_one_digest(assembly: Assembly) -> None:
-    from rse_pf.settings import load_settings
+    from rse_pf.config import load_settings
 
     digests = {load_settings(path).digest() for path in assembly.folder.glob("asset.*/settings.json")}
 
@@ -315,7 +315,7 @@ def test_cfn_lint_finds_nothing(assembly: Assembly) -> None:
 
 
 def test_missing_packages_are_one_line_and_a_hint(tmp_path: Path) -> None:
-    from rse_pf.settings import PlatformSettings
+    from rse_pf.config import PlatformSettings
     from stacks.assets import staged
 
     with pytest.raises(ConfigurationError) as told:

@@ -20,16 +20,16 @@ import pytest
 import websockets
 from websockets.asyncio.client import ClientConnection
 
-from rse_pf.auth import SigningKey
-from rse_pf.settings import PlatformSettings
+from rse_pf.auth.tokens import SigningKey
+from rse_pf.config import PlatformSettings
 from rse_pf.wire import SUBPROTOCOLS, Command, Hello, make_codec
 
 _SERVE = """
 import json, sys
 from pathlib import Path
-from rse_pf.auth import KeySet
-from rse_pf.backend import serve
-from rse_pf.settings import PlatformSettings
+from rse_pf.auth.tokens import KeySet
+from rse_pf.backend.supervisor import serve
+from rse_pf.config import PlatformSettings
 o = json.loads(sys.argv[1])
 sys.exit(serve(PlatformSettings.from_dict(o["settings"]), keys=o["keys"] and KeySet.from_json(o["keys"]),
     server_id=o["server"], announce=Path(o["announce"]), conformance_echo=o["echo"], services=o["services"]))

@@ -13,12 +13,12 @@ from typing import Any
 import pytest
 from guarded_server import GuardedServer
 
-from rse_pf.audit import Entry
-from rse_pf.audit_check import check_folder, entries_of
-from rse_pf.audit_log import audit_folder, files_of, names_in
+from rse_pf.audit.chain import Entry
+from rse_pf.audit.log import audit_folder, files_of, names_in
+from rse_pf.audit.verify import check_folder, entries_of
 from rse_pf.cli.main import main
-from rse_pf.local.cloud import LocalCloud
-from rse_pf.settings import PlatformSettings
+from rse_pf.config import PlatformSettings
+from rse_pf.local.control.platform import LocalPlatform
 
 pytestmark = pytest.mark.system
 
@@ -103,7 +103,7 @@ async def test_a_platform_records_its_deeds_its_robots_its_operator_and_the_head
     state = tmp_path / "rse-pf" / "audited"
     settings = PlatformSettings.from_dict({"auth": {"audit_heads_s": 0.1}})
     audit = audit_folder(state)
-    async with LocalCloud(settings, state=state, servers=1, port=0, data=True) as cloud:
+    async with LocalPlatform(settings, state=state, servers=1, port=0, data=True) as cloud:
         from client_sdk import connect
 
         async with connect(cloud.url, token=cloud.issue_token("robot-1")):

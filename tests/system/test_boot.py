@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 from system.boot.world import World, debian_root, missing
 
-from rse_pf.auth import SigningKey
-from rse_pf.settings import PlatformSettings
+from rse_pf.auth.tokens import SigningKey
+from rse_pf.config import PlatformSettings
 
 pytestmark = [pytest.mark.slow, pytest.mark.system, pytest.mark.timeout(900)]
 

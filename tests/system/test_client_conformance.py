@@ -16,7 +16,7 @@ import pytest
 import websockets
 
 from client_sdk.connection import websocket_options
-from rse_pf.settings import SessionSettings
+from rse_pf.config import SessionSettings
 
 pytestmark = [pytest.mark.system, pytest.mark.slow]
 

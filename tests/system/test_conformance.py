@@ -11,9 +11,9 @@ from pathlib import Path
 
 import pytest
 
-from rse_pf.local.envoy_config import Target
-from rse_pf.local.load_balancer import LoadBalancer
-from rse_pf.settings import PlatformSettings
+from rse_pf.config import PlatformSettings
+from rse_pf.local.balancer.envoy_config import Target
+from rse_pf.local.balancer.load_balancer import EnvoyLoadBalancer
 
 pytestmark = [pytest.mark.system, pytest.mark.slow]
 
@@ -72,7 +72,7 @@ def test_the_fragment_limit_refuses_exactly_the_ten_cases_above_it(start_server,
 def test_through_the_load_balancer_only_the_order_of_closing_differs(start_server, tmp_path):
     server = start_server(echo=True, serving={"workers": 2})
     settings = PlatformSettings()
-    balancer = LoadBalancer(settings, folder=tmp_path, port=0, dies_with_parent=True)
+    balancer = EnvoyLoadBalancer(settings, folder=tmp_path, port=0, dies_with_parent=True)
     target = Target(name="echo", port=server.port, control_port=server.identity["control_port"])
 
     async def start() -> None:

@@ -19,12 +19,12 @@ from typing import Any
 import pytest
 
 from client_sdk import connect
-from rse_pf.control_token import bearer, read_control_token
+from rse_pf.auth.control_token import bearer, read_control_token
+from rse_pf.config import PlatformSettings
 from rse_pf.errors import ConfigurationError, UsageError
-from rse_pf.local.cloud import LocalCloud
+from rse_pf.local.control.platform import LocalPlatform
 from rse_pf.local.processes import is_alive, mark_of, send_signal, wait_ended
 from rse_pf.local.state import read_state
-from rse_pf.settings import PlatformSettings
 
 pytestmark = pytest.mark.system
 
@@ -82,9 +82,9 @@ class News:
             task.add_done_callback(lambda _: None)
 
 
-def platform(folder: Path, news: News, **options: Any) -> LocalCloud:
+def platform(folder: Path, news: News, **options: Any) -> LocalPlatform:
     chosen = {"settings": SETTINGS, "servers": 2, "port": 0, "elastic": True, **options}
-    return LocalCloud(
+    return LocalPlatform(
         chosen.pop("settings"), state=folder, on_event=news.event, on_reading=news.reading, **chosen
     )
 
@@ -99,7 +99,7 @@ class Tally:
 
 
 @contextlib.asynccontextmanager
-async def asking(cloud: LocalCloud, count: int = ROBOTS, every_s: float = EVERY_S) -> AsyncIterator[Tally]:
+async def asking(cloud: LocalPlatform, count: int = ROBOTS, every_s: float = EVERY_S) -> AsyncIterator[Tally]:
     """Let *count* robots ask all the time; the block is left when each has its last answer."""
     tally, over = Tally(), asyncio.Event()
 
@@ -307,7 +307,7 @@ def test_a_server_that_is_told_to_leave_is_replaced_but_not_cut_off(tmp_path: Pa
 def test_without_elastic_nothing_is_replaced_but_drain_and_grow_can_be_asked_for(tmp_path: Path) -> None:
     async def run() -> None:
         news = News()
-        async with LocalCloud(
+        async with LocalPlatform(
             SETTINGS, servers=1, port=0, state=tmp_path / "a", on_event=news.event
         ) as cloud:
             with pytest.raises(UsageError, match="server-1 is the last server"):
@@ -326,11 +326,11 @@ def test_without_elastic_nothing_is_replaced_but_drain_and_grow_can_be_asked_for
 CONTROL_PLANE = """
 import asyncio
 from pathlib import Path
-from rse_pf.local.cloud import LocalCloud
-from rse_pf.settings import PlatformSettings
+from rse_pf.local.control.platform import LocalPlatform
+from rse_pf.config import PlatformSettings
 async def run():
     options = dict(servers=2, port=0, state=Path("a"), adoptable=True, elastic=True)
-    async with LocalCloud(PlatformSettings(), **options) as cloud:
+    async with LocalPlatform(PlatformSettings(), **options) as cloud:
         print(cloud.url, cloud.issue_token("robot-0"), flush=True)
         await asyncio.Event().wait()
 asyncio.run(run())

@@ -16,12 +16,12 @@ from pathlib import Path
 
 import pytest
 
-from client_sdk.data import DataClient, DataOptions
-from rse_pf.auth import SigningKey
+from client_sdk.transfer.data_client import DataClient, DataOptions
+from rse_pf.auth.tokens import SigningKey
+from rse_pf.config import PlatformSettings
 from rse_pf.errors import StoreFull
-from rse_pf.local.data_servers import DataServers
-from rse_pf.objects import DirectoryStore, digest_of, object_name
-from rse_pf.settings import PlatformSettings
+from rse_pf.local.servers.data_servers import LocalDataServers
+from rse_pf.object_store import DirectoryStore, digest_of, object_name
 
 pytestmark = pytest.mark.system
 
@@ -42,7 +42,7 @@ class Platform:
         self.loop = asyncio.new_event_loop()
         self.thread = threading.Thread(target=self.loop.run_forever, daemon=True)
         self.thread.start()
-        self.servers = DataServers(
+        self.servers = LocalDataServers(
             SETTINGS, folder=folder, settings_file=folder / "cdk.json", keys_file=folder / "keys.json",
             store=f"dir:{store}", tell=self._tell,
         )  # fmt: skip

@@ -11,8 +11,8 @@ from typing import Any
 import pytest
 
 from client_sdk.mapping import read_ply, read_trajectory
-from rse_pf.data_server.maps import MapRegistry
-from rse_pf.objects import DirectoryStore
+from rse_pf.maps.registry import MapRegistry
+from rse_pf.object_store import DirectoryStore
 
 pytestmark = pytest.mark.system
 

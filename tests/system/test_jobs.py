@@ -15,7 +15,7 @@ import pytest
 
 import client_sdk
 from rse_pf.errors import Busy, Cancelled, Crashed, Expired
-from rse_pf.objects import DirectoryStore, digest_of
+from rse_pf.object_store import DirectoryStore, digest_of
 
 pytestmark = pytest.mark.system
 
@@ -62,14 +62,14 @@ def make(settings):
 '''
 
 
-class Door:
+class HandshakePolicy:
     """A front door that leads to one server at a time."""
 
     def __init__(self) -> None:
         self.target = 0
         self._cutters: set[asyncio.StreamWriter] = set()
 
-    async def __aenter__(self) -> Door:
+    async def __aenter__(self) -> HandshakePolicy:
         self._server = await asyncio.start_server(self._serve, "127.0.0.1", 0)
         self.url = f"ws://127.0.0.1:{self._server.sockets[0].getsockname()[1]}/ws"
         return self
@@ -199,7 +199,7 @@ async def test_a_reply_that_is_too_large_for_a_message_is_named(platform, tmp_pa
 @in_a_loop
 async def test_a_job_ends_on_the_other_server_when_its_own_is_killed(platform, runs, gone, tmp_path):
     first, second, heard = platform(), platform(), Heard()
-    async with Door() as door:
+    async with HandshakePolicy() as door:
         door.target = first.port
         async with client_sdk.connect(door.url, token=first.token()) as robot:
             task = asked(robot, heard)
@@ -220,7 +220,7 @@ async def test_a_job_ends_on_the_other_server_when_its_own_is_killed(platform, r
 @in_a_loop
 async def test_after_a_cut_the_robot_waits_for_the_same_run(platform, runs, tmp_path):
     server, heard = platform(), Heard()
-    async with Door() as door:
+    async with HandshakePolicy() as door:
         door.target = server.port
         async with client_sdk.connect(door.url, token=server.token()) as robot:
             task = asked(robot, heard)
@@ -238,7 +238,7 @@ async def test_after_a_cut_the_robot_waits_for_the_same_run(platform, runs, tmp_
 @in_a_loop
 async def test_a_drained_server_gives_its_jobs_up_at_once(platform, runs, tmp_path):
     first, second, heard = platform(job_lease_s=600.0), platform(job_lease_s=600.0), Heard()
-    async with Door() as door:
+    async with HandshakePolicy() as door:
         door.target = first.port
         async with client_sdk.connect(door.url, token=first.token()) as robot:
             task = asked(robot, heard)

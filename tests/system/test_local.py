@@ -16,12 +16,12 @@ import pytest
 import websockets
 from websockets.asyncio.client import ClientConnection
 
+from rse_pf.config import PlatformSettings
 from rse_pf.errors import ConfigurationError, UsageError
-from rse_pf.local.cloud import LocalCloud
+from rse_pf.local.control.platform import LocalPlatform
 from rse_pf.local.firewall import key_file
 from rse_pf.local.processes import mark_of, wait_ended
 from rse_pf.local.state import read_state
-from rse_pf.settings import PlatformSettings
 from rse_pf.wire import SUBPROTOCOLS, Hello, Ping, make_codec
 
 pytestmark = pytest.mark.system
@@ -56,7 +56,7 @@ def dial(url: str, token: str) -> Any:
 
 
 @contextlib.asynccontextmanager
-async def robots(cloud: LocalCloud, count: int, first: int = 0) -> AsyncIterator[list[Robot]]:
+async def robots(cloud: LocalPlatform, count: int, first: int = 0) -> AsyncIterator[list[Robot]]:
     """Open *count* sockets, of robot *first* and on, in turn; each knows which server welcomed it."""
     async with contextlib.AsyncExitStack() as stack:
         opened = []
@@ -77,7 +77,7 @@ async def refusal(url: str, token: str = "") -> int:
     return told.value.response.status_code
 
 
-async def event(cloud: LocalCloud, name: str, heard: asyncio.Queue[Any]) -> Any:
+async def event(cloud: LocalPlatform, name: str, heard: asyncio.Queue[Any]) -> Any:
     async def wait() -> Any:
         while (told := await heard.get())["event"] != name:
             pass
@@ -86,7 +86,7 @@ async def event(cloud: LocalCloud, name: str, heard: asyncio.Queue[Any]) -> Any:
     return await asyncio.wait_for(wait(), SOON_S)
 
 
-def processes(cloud: LocalCloud) -> list[int]:
+def processes(cloud: LocalPlatform) -> list[int]:
     """Return every process of a running platform."""
     assert cloud.load_balancer.mark is not None
     workers = [pid for server in cloud.servers for pid in server.workers]
@@ -97,7 +97,7 @@ def test_robots_with_a_token_are_welcomed_by_both_servers_and_nothing_is_left(
     tmp_path: Path, gone: Callable[[int], None]
 ) -> None:
     async def run() -> list[int]:
-        async with LocalCloud(SETTINGS, servers=2, port=0, state=tmp_path / "a") as cloud:
+        async with LocalPlatform(SETTINGS, servers=2, port=0, state=tmp_path / "a") as cloud:
             async with robots(cloud, 8) as all_robots:
                 assert {robot.server for robot in all_robots} == {"server-1", "server-2"}
                 status = await cloud.status()
@@ -122,7 +122,7 @@ def test_robots_with_a_token_are_welcomed_by_both_servers_and_nothing_is_left(
 
 def test_the_door_refuses_who_has_no_token_and_knows_one_path_only(tmp_path: Path) -> None:
     async def run() -> list[int]:
-        async with LocalCloud(SETTINGS, servers=1, port=0, state=tmp_path / "a") as cloud:
+        async with LocalPlatform(SETTINGS, servers=1, port=0, state=tmp_path / "a") as cloud:
             elsewhere = cloud.url.replace(SETTINGS.serving.path, "/elsewhere")
             token = cloud.issue_token("robot-1")
             return [
@@ -136,7 +136,7 @@ def test_the_door_refuses_who_has_no_token_and_knows_one_path_only(tmp_path: Pat
 
 def test_targets_change_without_cutting_open_sockets(tmp_path: Path) -> None:
     async def run() -> None:
-        async with LocalCloud(SETTINGS, servers=2, port=0, state=tmp_path / "a") as cloud:
+        async with LocalPlatform(SETTINGS, servers=2, port=0, state=tmp_path / "a") as cloud:
             first, second = cloud.servers
             balancer = cloud.load_balancer
             async with robots(cloud, 8) as early:
@@ -156,7 +156,7 @@ def test_targets_change_without_cutting_open_sockets(tmp_path: Path) -> None:
 def test_a_killed_server_is_noticed_and_the_other_one_serves_on(tmp_path: Path) -> None:
     async def run() -> None:
         heard: asyncio.Queue[Any] = asyncio.Queue()
-        async with LocalCloud(
+        async with LocalPlatform(
             SETTINGS, servers=2, port=0, state=tmp_path / "a", on_event=heard.put_nowait
         ) as cloud:
             cloud.kill("server-1")
@@ -175,15 +175,15 @@ def test_a_killed_server_is_noticed_and_the_other_one_serves_on(tmp_path: Path) 
 def test_two_platforms_do_not_collide_and_a_name_or_port_is_taken_once(tmp_path: Path) -> None:
     async def run() -> None:
         async with (
-            LocalCloud(SETTINGS, servers=1, port=0, state=tmp_path / "a") as first,
-            LocalCloud(SETTINGS, servers=1, port=0, state=tmp_path / "b") as second,
+            LocalPlatform(SETTINGS, servers=1, port=0, state=tmp_path / "a") as first,
+            LocalPlatform(SETTINGS, servers=1, port=0, state=tmp_path / "b") as second,
         ):
             assert not set(processes(first)) & set(processes(second))
             assert await refusal(second.url, first.issue_token("robot-1")) == 401
             with pytest.raises(ConfigurationError, match="named 'a' is running already"):
-                await LocalCloud(SETTINGS, servers=1, port=0, state=tmp_path / "a").__aenter__()
+                await LocalPlatform(SETTINGS, servers=1, port=0, state=tmp_path / "a").__aenter__()
             with pytest.raises(ConfigurationError, match="Address already in use"):
-                await LocalCloud(SETTINGS, servers=1, port=first.port, state=tmp_path / "c").__aenter__()
+                await LocalPlatform(SETTINGS, servers=1, port=first.port, state=tmp_path / "c").__aenter__()
             async with robots(first, 1), robots(second, 1):
                 pass
 
@@ -194,7 +194,7 @@ def test_nothing_is_left_when_the_block_fails(tmp_path: Path, gone: Callable[[in
     started: list[int] = []
 
     async def run() -> None:
-        async with LocalCloud(SETTINGS, servers=1, port=0, state=tmp_path / "a") as cloud:
+        async with LocalPlatform(SETTINGS, servers=1, port=0, state=tmp_path / "a") as cloud:
             started.extend(processes(cloud))
             raise ZeroDivisionError
 
@@ -214,7 +214,7 @@ def test_nothing_is_left_when_the_block_fails(tmp_path: Path, gone: Callable[[in
 def test_a_server_that_does_not_start_ends_the_start_and_leaves_nothing(
     tmp_path: Path, script: str, complaint: str, gone: Callable[[int], None]
 ) -> None:
-    cloud = LocalCloud(
+    cloud = LocalPlatform(
         SETTINGS.replace(local={"start_timeout_s": 2.0}),
         servers=2, port=0, state=tmp_path / "a", program=(sys.executable, "-c", script),
     )  # fmt: skip
@@ -233,10 +233,10 @@ def test_everything_dies_with_a_program_that_is_killed(tmp_path: Path) -> None:
     script = """
 import asyncio
 from pathlib import Path
-from rse_pf.local.cloud import LocalCloud
-from rse_pf.settings import PlatformSettings
+from rse_pf.local.control.platform import LocalPlatform
+from rse_pf.config import PlatformSettings
 async def run():
-    async with LocalCloud(PlatformSettings(), servers=1, port=0, state=Path("a")) as cloud:
+    async with LocalPlatform(PlatformSettings(), servers=1, port=0, state=Path("a")) as cloud:
         workers = [pid for server in cloud.servers for pid in server.workers]
         print(cloud.load_balancer.mark.pid, cloud.servers[0].pid, *workers, flush=True)
         await asyncio.Event().wait()
@@ -255,7 +255,7 @@ asyncio.run(run())
 
 def test_an_oversized_head_is_refused_at_the_door(tmp_path: Path) -> None:
     async def run() -> bytes:
-        async with LocalCloud(SETTINGS, servers=1, port=0, state=tmp_path / "a") as cloud:
+        async with LocalPlatform(SETTINGS, servers=1, port=0, state=tmp_path / "a") as cloud:
             return await asyncio.to_thread(answer, cloud.port)
 
     def answer(port: int) -> bytes:

@@ -15,14 +15,14 @@ import numpy as np
 import pytest
 
 import client_sdk
-from client_sdk.data import DataClient, DataOptions
+from client_sdk.transfer.data_client import DataClient, DataOptions
+from rse_pf.config import PlatformSettings
 from rse_pf.errors import ConnectError, RsePfError
-from rse_pf.local import faults
-from rse_pf.local.cloud import LocalCloud
+from rse_pf.local.control.platform import LocalPlatform
+from rse_pf.local.control.status import data_url, platform_status, status_table
+from rse_pf.local.faults import faults
 from rse_pf.local.state import read_state
-from rse_pf.local.status import data_url, platform_status, status_table
-from rse_pf.objects import DirectoryStore, object_name
-from rse_pf.settings import PlatformSettings
+from rse_pf.object_store import DirectoryStore, object_name
 
 pytestmark = pytest.mark.system
 
@@ -50,12 +50,12 @@ class Events:
         return found
 
 
-def client(cloud: LocalCloud, robot: str = "robot-1", **options: Any) -> DataClient:
+def client(cloud: LocalPlatform, robot: str = "robot-1", **options: Any) -> DataClient:
     chosen = DataOptions(part_bytes=MIB // 4, first_pause_s=0.02, random=random.Random(1), **options)
     return DataClient(cloud.url, lambda: cloud.issue_token(robot), chosen)
 
 
-async def localise_in(cloud: LocalCloud, name: str, digest: str) -> str:
+async def localise_in(cloud: LocalPlatform, name: str, digest: str) -> str:
     """Return with which code robot *name* is refused that asks where it is in a map which is none."""
     camera = {"fx": 500.0, "fy": 500.0, "cx": 320.0, "cy": 240.0, "width": 640, "height": 480}
     request = {
@@ -75,7 +75,7 @@ def test_a_robot_stores_through_the_front_door_what_its_services_can_read(
     events = Events()
 
     async def run() -> list[int]:
-        cloud = LocalCloud(
+        cloud = LocalPlatform(
             SETTINGS, servers=1, port=0, state=tmp_path / "a", data=True, elastic=True, on_event=events
         )
         async with cloud:
@@ -123,7 +123,7 @@ def test_a_robot_stores_through_the_front_door_what_its_services_can_read(
 
 def test_without_a_data_service_the_door_says_come_again(tmp_path: Path) -> None:
     async def run() -> None:
-        async with LocalCloud(SETTINGS, servers=1, port=0, state=tmp_path / "a") as cloud:
+        async with LocalPlatform(SETTINGS, servers=1, port=0, state=tmp_path / "a") as cloud:
             assert cloud.status_document()["data_servers"] == []
             robot = client(cloud, deadline_s=0.1)
             with pytest.raises(Exception, match="503") as refused:

@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 
 from rse_pf.cli.main import VERBS
-from rse_pf.local.cloud import LocalCloud
+from rse_pf.config import PlatformSettings
+from rse_pf.local.control.platform import LocalPlatform
 from rse_pf.pnp.problems import make_problem
-from rse_pf.settings import PlatformSettings
 
 pytestmark = pytest.mark.system
 
@@ -26,7 +26,7 @@ def test_the_robot_in_ten_lines_gets_its_pose(repository, tmp_path, capsys):
     problem = make_problem(seed=5, camera=make_problem(seed=0).camera)
 
     async def work() -> None:
-        async with LocalCloud(PlatformSettings(), state=tmp_path / "platform", servers=1, port=0) as cloud:
+        async with LocalPlatform(PlatformSettings(), state=tmp_path / "platform", servers=1, port=0) as cloud:
             names: dict = {}
             mine = code.replace("127.0.0.1:8700", f"127.0.0.1:{cloud.port}")
             assert mine != code

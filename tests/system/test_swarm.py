@@ -18,12 +18,12 @@ from typing import Any
 
 import pytest
 
+from rse_pf.config import PlatformSettings
 from rse_pf.errors import CommandFailed
-from rse_pf.experiments.report import summarise
-from rse_pf.experiments.swarm import Swarm, SwarmOptions
-from rse_pf.local.cloud import LocalCloud
+from rse_pf.experiments.load.swarm import Swarm, SwarmOptions
+from rse_pf.experiments.results.report import summarise
+from rse_pf.local.control.platform import LocalPlatform
 from rse_pf.local.processes import wait_ended
-from rse_pf.settings import PlatformSettings
 
 pytestmark = pytest.mark.system
 
@@ -34,7 +34,7 @@ def run(work: Coroutine[Any, Any, None]) -> None:
     asyncio.run(asyncio.wait_for(work, 90))
 
 
-def swarm_of(cloud: LocalCloud, options: SwarmOptions, **more: Any) -> Swarm:
+def swarm_of(cloud: LocalPlatform, options: SwarmOptions, **more: Any) -> Swarm:
     return Swarm(options, url=cloud.url, token_of=cloud.issue_token, session=SETTINGS.session, **more)
 
 
@@ -44,7 +44,7 @@ def free_port() -> int:
         return int(found.getsockname()[1])
 
 
-async def start_again(cloud: LocalCloud, before: Any) -> None:
+async def start_again(cloud: LocalPlatform, before: Any) -> None:
     """Start a balancer that was killed, at the same port, unless the platform has done so itself."""
     balancer = cloud.load_balancer
     await asyncio.to_thread(wait_ended, before, 5.0)
@@ -57,7 +57,7 @@ async def start_again(cloud: LocalCloud, before: Any) -> None:
 def test_robots_of_two_processes_get_right_poses_and_leave(tmp_path: Path) -> None:
     async def work() -> None:
         heard: list[Any] = []
-        async with LocalCloud(SETTINGS, servers=1, port=0, state=tmp_path / "a") as cloud:
+        async with LocalPlatform(SETTINGS, servers=1, port=0, state=tmp_path / "a") as cloud:
             options = SwarmOptions(robots=6, processes=2, join_every_s=0.05)
             async with swarm_of(cloud, options, on_event=heard.append) as swarm:
                 await swarm.start()
@@ -89,7 +89,7 @@ def test_robots_of_two_processes_get_right_poses_and_leave(tmp_path: Path) -> No
 def test_robots_whose_tokens_are_refused_are_reported_and_no_process_is_left(tmp_path: Path) -> None:
     async def work() -> None:
         heard: list[Any] = []
-        async with LocalCloud(SETTINGS, servers=1, port=0, state=tmp_path / "a") as cloud, Swarm(
+        async with LocalPlatform(SETTINGS, servers=1, port=0, state=tmp_path / "a") as cloud, Swarm(
             SwarmOptions(robots=2), url=cloud.url, token_of=lambda robot: "no-token",
             session=SETTINGS.session, on_event=heard.append,
         ) as swarm:  # fmt: skip
@@ -105,7 +105,7 @@ def test_robots_whose_tokens_are_refused_are_reported_and_no_process_is_left(tmp
 def test_through_the_papers_link_the_median_is_the_link_and_a_little(tmp_path: Path) -> None:
     async def work() -> None:
         async with (
-            LocalCloud(SETTINGS, servers=1, port=0, state=tmp_path / "a") as cloud,
+            LocalPlatform(SETTINGS, servers=1, port=0, state=tmp_path / "a") as cloud,
             swarm_of(cloud, SwarmOptions(robots=3, link="paper")) as swarm,
         ):
             await swarm.start()
@@ -130,7 +130,7 @@ def test_a_herd_is_back_soon_after_the_balancer_was_killed_and_came_back(tmp_pat
             if len({each["robot"] for each in heard if each["event"] == "link-back"}) == robots:
                 all_back.set()
 
-        async with LocalCloud(SETTINGS, servers=2, port=free_port(), state=tmp_path / "a") as cloud:
+        async with LocalPlatform(SETTINGS, servers=2, port=free_port(), state=tmp_path / "a") as cloud:
             origin = time.monotonic()
             async with swarm_of(cloud, SwarmOptions(robots=robots), on_event=listen, origin=origin) as swarm:
                 await swarm.start()

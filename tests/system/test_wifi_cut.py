@@ -10,10 +10,10 @@ from urllib.parse import urlsplit
 
 import pytest
 
-from rse_pf.experiments.swarm import Swarm, SwarmOptions
-from rse_pf.local.cloud import LocalCloud
-from rse_pf.local.link import PROFILES, LinkProcess
-from rse_pf.settings import PlatformSettings
+from rse_pf.config import PlatformSettings
+from rse_pf.experiments.load.swarm import Swarm, SwarmOptions
+from rse_pf.local.control.platform import LocalPlatform
+from rse_pf.local.faults.network_emulator import PROFILES, LinkProcess
 
 pytestmark = [pytest.mark.system, pytest.mark.slow]
 
@@ -43,7 +43,7 @@ class Listener:
             await self._news.wait()
 
 
-async def until_no_server_has_robots(cloud: LocalCloud) -> None:
+async def until_no_server_has_robots(cloud: LocalPlatform) -> None:
     while any(status["robots"] for status in await cloud.status()):
         await asyncio.sleep(0.1)  # the servers tell their numbers only when asked
 
@@ -51,7 +51,7 @@ async def until_no_server_has_robots(cloud: LocalCloud) -> None:
 def test_both_sides_notice_a_cut_and_the_first_answers_come_soon_after_it(tmp_path: Path) -> None:
     async def work() -> None:
         listener = Listener()
-        async with LocalCloud(SETTINGS, servers=2, port=0, state=tmp_path / "a") as cloud:
+        async with LocalPlatform(SETTINGS, servers=2, port=0, state=tmp_path / "a") as cloud:
             parts = urlsplit(cloud.url)
             async with LinkProcess(PROFILES["none"], parts.hostname or "", parts.port or 0) as link:
                 url = parts._replace(netloc=f"127.0.0.1:{link.port}").geturl()

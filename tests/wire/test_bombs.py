@@ -7,8 +7,8 @@ import zlib
 
 import pytest
 
+from rse_pf.config import SessionSettings
 from rse_pf.errors import BadMessage, LimitExceeded
-from rse_pf.settings import SessionSettings
 from rse_pf.wire import Command, make_codec
 
 LIMITS = SessionSettings()

@@ -14,8 +14,8 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
+from rse_pf.config import SessionSettings
 from rse_pf.errors import BadMessage, LimitExceeded, ProtocolError, UnsupportedProtocol
-from rse_pf.settings import SessionSettings
 from rse_pf.wire import (
     CODECS,
     SUBPROTOCOLS,

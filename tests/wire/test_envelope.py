@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from rse_pf.wire import CODECS, Command, Failure, Hello, Ping, make_codec
 from rse_pf.wire.envelope import Envelope, encode_refusal, peek
-from rse_pf.wire.prepared import encode_command, prepare
+from rse_pf.wire.preencoded import encode_command, prepare
 
 FAILURE = Failure(id=7, code="busy", message="behind", hint="later", retry_after_ms=100.0, server="server-1")
 

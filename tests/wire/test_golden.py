@@ -14,9 +14,9 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
+from rse_pf.config import PlatformSettings
 from rse_pf.service import dispatch
 from rse_pf.services.builtin import builtin_services
-from rse_pf.settings import PlatformSettings
 from rse_pf.wire import CODECS, SUBPROTOCOLS, Command, FromRobot, Message, Result, make_codec
 
 GOLDEN = Path(__file__).parent / "golden"

@@ -12,8 +12,17 @@ import msgspec
 import pytest
 
 from rse_pf import errors
-from rse_pf.settings import SessionSettings
-from rse_pf.wire import SUBPROTOCOLS, FromRobot, FromServer, Message, make_codec, session
+from rse_pf.config import SessionSettings
+from rse_pf.wire import (
+    SUBPROTOCOLS,
+    FromRobot,
+    FromServer,
+    Message,
+    make_codec,
+)
+from rse_pf.wire import (
+    server_session as session,
+)
 from rse_pf.wire.codec import Codec
 
 KINDS = get_args(Message)

@@ -11,8 +11,8 @@ from rse_pf.wire.arrays import Array, reshaped
 
 __all__ = ["Reply", "Request", "serve"]
 
-_MOST_POINTS = 2000
-_FEWEST_POINTS = 3
+_MAX_POINTS = 2000
+_MIN_POINTS = 3
 
 
 class Request(msgspec.Struct):
@@ -38,8 +38,8 @@ def serve(request: Request) -> Reply:
     """
     source, target = reshaped("source", request.source, 3), reshaped("target", request.target, 3)
     for name, points in (("source", source), ("target", target)):
-        if not _FEWEST_POINTS <= len(points) <= _MOST_POINTS:
-            raise BadRequest(f"{name} has {len(points)} points, not 3 to {_MOST_POINTS}")
+        if not _MIN_POINTS <= len(points) <= _MAX_POINTS:
+            raise BadRequest(f"{name} has {len(points)} points, not 3 to {_MAX_POINTS}")
     T = np.eye(4)
     for _ in range(min(max(request.iterations, 1), 100)):
         moved = source @ T[:3, :3].T + T[:3, 3]

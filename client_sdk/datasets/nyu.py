@@ -1,0 +1,210 @@
+"""What NYU Depth V2 needs beyond other data sets: its raw depth, its registration, its .mat file.
+
+Promises to work on arrays and named files alone, to need h5py for the labelled file only, and not
+to undistort images (`client_sdk.datasets.recordings` does that, before registration).
+
+Source:
+    Silberman et al., ECCV 2012; the calibration is the one shipped with the data set's toolbox.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from rse_pf.errors import MissingExtra, UsageError
+from rse_pf.geometry import Array, Camera, transform
+
+__all__ = [
+    "COLOUR_CAMERA",
+    "COLOUR_DISTORTION",
+    "DEPTH_CAMERA",
+    "DEPTH_DISTORTION",
+    "LabelledFile",
+    "RawFile",
+    "depth_from_raw",
+    "raw_files",
+    "read_pnm",
+    "register_depth",
+]
+
+COLOUR_CAMERA = Camera(
+    fx=518.85790117450188,
+    fy=519.46961112127485,
+    cx=325.58244941119034,
+    cy=253.73616633400465,
+    width=640,
+    height=480,
+)
+COLOUR_DISTORTION = (
+    0.20796615318809061,
+    -0.58613825163911781,
+    7.2231363135888329e-04,
+    1.0479627195765181e-03,
+    0.49856986684705107,
+)
+DEPTH_CAMERA = Camera(
+    fx=582.62448167737955,
+    fy=582.69103270988637,
+    cx=313.04475870804731,
+    cy=238.44389626620386,
+    width=640,
+    height=480,
+)
+DEPTH_DISTORTION = (
+    -0.099897236553084481,
+    0.39065324602765344,
+    1.9290592870229277e-03,
+    -1.9422022475975055e-03,
+    -0.51031725053400578,
+)
+_MAX_DEPTH_M = 10.0
+
+_STAMPED = re.compile(r"[dr]-(\d+(?:\.\d+)?)-\d+\.(?:pgm|ppm)$")
+
+
+class RawFile(NamedTuple):
+    """One image of a raw dump and the time in its name."""
+
+    timestamp_s: float
+    path: Path
+
+
+def T_colour_depth() -> Array:
+    """Return the pose of the depth camera in the colour camera's frame, metres.
+
+    The toolbox keeps minus its rotation and the opposite translation; dividing by a negative z
+    hides that.  This is the same map with points in front of the camera.
+    """
+    T = np.eye(4)
+    T[:3, :3] = [
+        [0.99997798940829263, -0.0050359919480810989, -0.0043196624923060242],
+        [0.0050518419386157446, 0.99998051861143999, 0.0036662365748484798],
+        [0.0043011152014118693, -0.0036879781309514218, 0.99998394948385538],
+    ]
+    T[:3, 3] = [-0.025031875059141302, 2.9342312935846411e-04, -6.6238747008330102e-04]
+    return T
+
+
+def depth_from_raw(raw: npt.NDArray[np.uint16]) -> npt.NDArray[np.float32]:
+    """Return metres, 0 without a reading or beyond 10 m: ``351.3 / (1092.5 - raw)``."""
+    difference = 1092.5 - raw.astype(np.float32)
+    is_reading = (raw > 0) & (difference >= 351.3 / _MAX_DEPTH_M)
+    return np.where(is_reading, 351.3 / np.where(is_reading, difference, 1.0), 0.0).astype(np.float32)
+
+
+def register_depth(depth_m: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+    """Return an undistorted depth image as the colour camera sees it, nearest surface first."""
+    rows, columns = np.nonzero(depth_m > 0)
+    pixels = np.column_stack((columns, rows)).astype(np.float64)
+    points_depth = DEPTH_CAMERA.back_project(pixels, depth_m[rows, columns].astype(np.float64))
+    points_colour = transform(T_colour_depth(), points_depth)
+    columns, rows = np.rint(COLOUR_CAMERA.project(points_colour)).astype(np.int64).T
+    size = (COLOUR_CAMERA.height, COLOUR_CAMERA.width)
+    seen = (columns >= 0) & (rows >= 0) & (columns < size[1]) & (rows < size[0])
+    far_first = np.flatnonzero(seen)[np.argsort(-points_colour[seen, 2], kind="stable")]
+    registered = np.zeros(size, dtype=np.float32)
+    registered[rows[far_first], columns[far_first]] = points_colour[far_first, 2]
+    return registered
+
+
+def raw_files(folder: Path, prefix: str) -> list[RawFile]:
+    """Return the images ``prefix-SECONDS-TICKS.p?m`` of a raw dump by time; empty ones are left out.
+
+    The published dump holds some files that were cut short; a frame without its bytes is no frame.
+    """
+    found = []
+    for path in folder.glob(f"{prefix}-*.p[gp]m"):
+        stamp = _STAMPED.match(path.name)
+        if stamp and path.stat().st_size > COLOUR_CAMERA.width * COLOUR_CAMERA.height:
+            found.append(RawFile(float(stamp[1]), path))
+    return sorted(found)
+
+
+def read_pnm(path: Path) -> npt.NDArray[Any]:
+    """Return the pixels of a binary PPM ``(h, w, 3)`` uint8 or a 16-bit PGM ``(h, w)`` uint16.
+
+    The 16-bit files of the raw dump are *little* endian, against the format's own rule.
+
+    Raises:
+        UsageError: The file cannot be read or is of another kind.
+    """
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise UsageError(f"cannot read {path}: {error.strerror}", hint="unpack the dump again") from error
+    head = re.match(rb"(P[56])\s+(?:#.*\s+)*(\d+)\s+(\d+)\s+(\d+)\s", content)
+    if head:
+        width, height = int(head[2]), int(head[3])
+        colours = 3 if head[1] == b"P6" else 1
+        kind = np.dtype("<u2") if int(head[4]) > 255 else np.dtype(np.uint8)
+        body = content[head.end() :]
+        if len(body) >= width * height * colours * kind.itemsize:
+            pixels = np.frombuffer(body, dtype=kind, count=width * height * colours)
+            return pixels.reshape((height, width, 3) if colours == 3 else (height, width))
+    raise UsageError(f"{path} is not a whole PPM or PGM image", hint="unpack the dump again")
+
+
+class LabelledFile:
+    """The labelled ``.mat`` file (HDF5), one image at a time.
+
+    MATLAB stores columns first, so HDF5 shows ``images`` as ``(n, 3, w, h)`` and depths as
+    ``(n, w, h)``.  ``rawDepths`` (0 = no reading) are preferred; ``depths`` have their holes painted.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def rows(self, scene: str | None) -> list[int]:
+        """Return the rows of one scene, of all without a *scene*.
+
+        Raises:
+            UsageError: The file is no labelled file, or holds no such scene.
+            MissingExtra: h5py is not installed.
+        """
+        with self._open() as file:
+            count = len(file["images"])
+            if scene is None:
+                return list(range(count))
+            names = _strings(file, "scenes")
+        rows = [row for row, name in enumerate(names) if name == scene]
+        if not rows:
+            some = ", ".join(sorted(set(names))[:5]) or "none"
+            raise UsageError(f"no scene {scene} in {self.path}", hint=f"scenes begin with {some}")
+        return rows
+
+    def read(self, row: int) -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.float32]]:
+        """Return colour ``(h, w, 3)`` and registered depth ``(h, w)`` in metres of one row."""
+        with self._open() as file:
+            depths = file["rawDepths"] if "rawDepths" in file else file["depths"]
+            rgb = np.ascontiguousarray(np.transpose(file["images"][row], (2, 1, 0)), dtype=np.uint8)
+            depth_m = np.ascontiguousarray(np.transpose(depths[row]), dtype=np.float32)
+        depth_m[~np.isfinite(depth_m) | (depth_m >= _MAX_DEPTH_M)] = 0.0
+        return rgb, depth_m
+
+    def _open(self) -> Any:
+        try:
+            import h5py
+        except ImportError as error:
+            raise MissingExtra("h5py", "vision") from error
+        hint = "name nyu_depth_v2_labeled.mat as it was published"
+        try:
+            file = h5py.File(self.path, "r")
+        except OSError as error:
+            raise UsageError(f"{self.path} is not an HDF5 .mat file", hint=hint) from error
+        if "images" not in file or not ("rawDepths" in file or "depths" in file):
+            file.close()
+            raise UsageError(f"{self.path} holds no images and depths", hint=hint)
+        return file
+
+
+def _strings(file: Any, name: str) -> list[str]:
+    """Return a MATLAB cell array of strings; an absent one is empty."""
+    if name not in file:
+        return []
+    cells = np.asarray(file[name]).ravel()
+    return ["".join(chr(code) for code in np.asarray(file[cell]).ravel()) for cell in cells]

@@ -1,0 +1,363 @@
+"""RGB-D recordings as frames: TUM folders, NYU Depth V2 (labelled file or raw dump).
+
+Whatever the source, a `Frame` comes out undistorted, registered, in metres, red first.  Promises to
+read an image only when its frame is asked for, and to say in one line what is wrong with a path.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from client_sdk.datasets import nyu
+from client_sdk.frontend import Frame
+from client_sdk.mapping import Trajectory, read_trajectory
+from rse_pf.errors import InvalidCamera, MissingExtra, UsageError
+from rse_pf.geometry import Camera
+
+__all__ = ["Dataset", "associate_stamps", "open_dataset", "read_colour"]
+
+_MAX_STAMP_DIFFERENCE_S = 0.02
+_MAX_RAW_STAMP_DIFFERENCE_S = 0.05
+"""The raw dump's two streams run freely; the nearest images are at most half a period apart."""
+
+_Distortion = tuple[float, ...]
+
+_FREIBURG: dict[str, tuple[float, float, float, float, _Distortion]] = {
+    "freiburg1": (517.3, 516.5, 318.6, 255.3, (0.2624, -0.9531, -0.0054, 0.0026, 1.1633)),
+    "freiburg2": (520.9, 521.0, 325.1, 249.7, (0.2312, -0.7849, -0.0033, -0.0001, 0.9172)),
+    "freiburg3": (535.4, 539.2, 320.1, 247.6, ()),
+    "": (525.0, 525.0, 319.5, 239.5, ()),
+}
+"""Intrinsics of the TUM benchmark by folder name; the last is its default for unnamed cameras."""
+_FREIBURG_DEPTH_SCALE = 5000.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Dataset:
+    """A recording: iterate over it to get its frames in order of time."""
+
+    name: str
+    camera: Camera
+    timestamps_s: tuple[float, ...]
+    truth: Trajectory | None
+    truth_kind: Literal["ground truth", "reference", "none"]
+    """"reference": poses that came with the source, an estimate."""
+    rows: tuple[int, ...]
+    read: Callable[[int], Frame]
+    """Reads one of *rows*; row *i* has time stamp ``timestamps_s[i]`` of this very dataset."""
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    def __iter__(self) -> Iterator[Frame]:
+        return map(self.read, self.rows)
+
+    def thinned(self, rate_hz: float) -> Dataset:
+        """Return the frames that are at least ``1 / rate_hz`` s apart by time stamp."""
+        if not (math.isfinite(rate_hz) and rate_hz > 0):
+            raise UsageError(f"rate {rate_hz:g} is not above 0", hint="name frames per second, such as 5")
+        kept: list[int] = []
+        for place, timestamp_s in enumerate(self.timestamps_s):
+            # A microsecond is forgiven: the stamps are decimal fractions.
+            if not kept or timestamp_s - self.timestamps_s[kept[-1]] >= 1.0 / rate_hz - 1e-6:
+                kept.append(place)
+        return self._only(kept)
+
+    def share(self, robot: int, robots: int) -> Dataset:
+        """Return the contiguous share of ``ceil(n / robots)`` frames of *robot* 0, 1, ..."""
+        if not 0 <= robot < robots:
+            raise UsageError(f"robot {robot} is not one of 0..{robots - 1}", hint="count robots from 0")
+        size = math.ceil(len(self) / robots)
+        return self._only(range(len(self))[robot * size : (robot + 1) * size])
+
+    def _only(self, places: Sequence[int]) -> Dataset:
+        return replace(
+            self,
+            timestamps_s=tuple(self.timestamps_s[place] for place in places),
+            rows=tuple(self.rows[place] for place in places),
+        )
+
+
+def open_dataset(path: Path, *, scene: str | None = None) -> Dataset:
+    """Find out what *path* is and return its frames; images are read later.
+
+    Accepts a folder in TUM layout (``rgb.txt``, ``depth.txt``, with or without ``intrinsics.json``),
+    a raw NYU Depth V2 folder (``r-*.ppm``, ``d-*.pgm``), or its labelled ``.mat`` file, of which
+    *scene* picks one scene.
+
+    Raises:
+        UsageError: The path is none of these, or a part is missing or broken.
+        MissingExtra: OpenCV or h5py is needed and not installed.
+    """
+    if path.is_file():
+        if path.suffix != ".mat":
+            raise UsageError(f"{path} is not a recording", hint="name a folder, or the labelled .mat file")
+        return _open_labelled(path, scene)
+    if not path.is_dir():
+        raise UsageError(f"no folder {path}", hint="name a folder in TUM layout: rgb.txt, depth.txt, images")
+    if scene is not None:
+        raise UsageError(f"{path} has no scenes", hint="a scene picks from the labelled .mat file only")
+    if not (path / "rgb.txt").exists() and any(path.glob("d-*.pgm")):
+        return _open_raw(path)
+    return _open_tum(path)
+
+
+def read_colour(path: Path) -> npt.NDArray[np.uint8]:
+    """Return a colour image ``(h, w, 3)``, red first, as it is in its file.
+
+    Raises:
+        UsageError: It is no image.
+        MissingExtra: OpenCV is not installed.
+    """
+    return _read_image(path, is_depth=False)
+
+
+def associate_stamps(
+    first: Sequence[float], second: Sequence[float], max_difference_s: float
+) -> list[tuple[int, int]]:
+    """Return ``(row of first, row of second)`` pairs, nearest in time, each row at most once.
+
+    Both must ascend.  Of several that want one partner, the nearest gets it.
+    """
+    wanted: dict[int, tuple[float, int]] = {}
+    stamps = np.asarray(second, dtype=np.float64)
+    for row, timestamp_s in enumerate(first):
+        if not len(stamps):
+            break
+        partner = int(np.argmin(np.abs(stamps - timestamp_s)))
+        difference_s = abs(float(stamps[partner]) - timestamp_s)
+        if difference_s <= max_difference_s and difference_s < wanted.get(partner, (math.inf, 0))[0]:
+            wanted[partner] = (difference_s, row)
+    return sorted((row, partner) for partner, (_, row) in wanted.items())
+
+
+# --- TUM layout --------------------------------------------------------------------------------
+
+
+def _open_tum(folder: Path) -> Dataset:
+    colours, depths = _read_list(folder, "rgb.txt"), _read_list(folder, "depth.txt")
+    pairs = associate_stamps(
+        [stamp for stamp, _ in colours], [stamp for stamp, _ in depths], _MAX_STAMP_DIFFERENCE_S
+    )
+    if not pairs:
+        raise UsageError(
+            f"no colour image of {folder} has a depth image within {_MAX_STAMP_DIFFERENCE_S:g} s",
+            hint="check that rgb.txt and depth.txt use the same clock",
+        )
+    camera, distortion, depth_scale = _intrinsics(folder)
+    undistort = _Undistortion(camera, distortion)
+
+    def read(row: int) -> Frame:
+        colour_row, depth_row = pairs[row]
+        rgb = _read_image(folder / colours[colour_row][1], is_depth=False)
+        png = _read_image(folder / depths[depth_row][1], is_depth=True)
+        depth_m = png.astype(np.float32) / np.float32(depth_scale)
+        depth_m[png == np.iinfo(png.dtype).max] = 0.0  # how some recorders write "no reading"
+        _check_metres(depth_m, folder)
+        return Frame(
+            timestamp_s=colours[colour_row][0],
+            rgb=undistort.colour(rgb),
+            depth_m=undistort.depth(depth_m),
+            camera=camera,
+        )
+
+    truth, truth_kind = _read_truth(folder)
+    return Dataset(
+        name=folder.name,
+        camera=camera,
+        timestamps_s=tuple(colours[row][0] for row, _ in pairs),
+        truth=truth,
+        truth_kind=truth_kind,
+        rows=tuple(range(len(pairs))),
+        read=read,
+    )
+
+
+def _read_list(folder: Path, name: str) -> list[tuple[float, str]]:
+    try:
+        text = (folder / name).read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise UsageError(
+            f"no {name} in {folder}", hint="name a folder in TUM layout: rgb.txt, depth.txt, images"
+        ) from error
+    entries = []
+    for number, line in enumerate(text.splitlines(), start=1):
+        words = line.split(maxsplit=1)
+        if not words or words[0].startswith("#"):
+            continue
+        try:
+            entries.append((float(words[0]), words[1].strip()))
+        except (ValueError, IndexError) as error:
+            raise UsageError(
+                f"{folder / name}, line {number} is not an image", hint="write: timestamp filename"
+            ) from error
+    return sorted(entries)
+
+
+def _intrinsics(folder: Path) -> tuple[Camera, _Distortion, float]:
+    path = folder / "intrinsics.json"
+    if not path.exists():
+        name = next(key for key in _FREIBURG if key in folder.resolve().name)
+        fx, fy, cx, cy, distortion = _FREIBURG[name]
+        camera = Camera(fx=fx, fy=fy, cx=cx, cy=cy, width=640, height=480)
+        return camera, distortion, _FREIBURG_DEPTH_SCALE
+    hint = "it needs fx fy cx cy width height distortion[k1 k2 p1 p2 k3] depth_scale"
+    try:
+        values = json.loads(path.read_text(encoding="utf-8"))
+        camera = Camera(
+            **{name: float(values[name]) for name in ("fx", "fy", "cx", "cy")},
+            width=int(values["width"]),
+            height=int(values["height"]),
+        )
+        distortion = tuple(float(value) for value in values.get("distortion", ()))
+        depth_scale = float(values["depth_scale"])
+    except InvalidCamera as error:
+        raise UsageError(f"{path}: {error}", hint=error.hint) from error
+    except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
+        raise UsageError(f"{path} cannot be used: {error!r}", hint=hint) from error
+    if len(distortion) not in (0, 4, 5) or not (math.isfinite(depth_scale) and depth_scale > 0):
+        raise UsageError(
+            f"{path}: {len(distortion)} distortion numbers, depth_scale {depth_scale:g}", hint=hint
+        )
+    return camera, distortion, depth_scale
+
+
+def _read_truth(folder: Path) -> tuple[Trajectory | None, Literal["ground truth", "reference", "none"]]:
+    if (folder / "groundtruth.txt").exists():
+        return read_trajectory(folder / "groundtruth.txt"), "ground truth"
+    if (folder / "reference_poses.txt").exists():
+        return read_trajectory(folder / "reference_poses.txt"), "reference"
+    return None, "none"
+
+
+def _check_metres(depth_m: npt.NDArray[np.float32], folder: Path) -> None:
+    some = depth_m[::8, ::8]
+    readings = some[some > 0]
+    if len(readings) and not 0.05 <= float(np.median(readings)) <= 30.0:
+        raise UsageError(
+            f"the median depth in {folder} is {float(np.median(readings)):g} m",
+            hint="set depth_scale in intrinsics.json: 5000 for TUM, 1000 for millimetres",
+        )
+
+
+# --- NYU Depth V2 ------------------------------------------------------------------------------
+
+
+def _open_raw(folder: Path) -> Dataset:
+    depths, colours = nyu.raw_files(folder, "d"), nyu.raw_files(folder, "r")
+    pairs = associate_stamps(
+        [file.timestamp_s for file in depths],
+        [file.timestamp_s for file in colours],
+        _MAX_RAW_STAMP_DIFFERENCE_S,
+    )
+    if not pairs:
+        raise UsageError(
+            f"no depth image of {folder} has a colour image within {_MAX_RAW_STAMP_DIFFERENCE_S:g} s",
+            hint="unpack the whole scene: r-*.ppm and d-*.pgm",
+        )
+    colour = _Undistortion(nyu.COLOUR_CAMERA, nyu.COLOUR_DISTORTION)
+    depth = _Undistortion(nyu.DEPTH_CAMERA, nyu.DEPTH_DISTORTION)
+
+    def read(row: int) -> Frame:
+        depth_row, colour_row = pairs[row]
+        depth_m = nyu.depth_from_raw(nyu.read_pnm(depths[depth_row].path))
+        return Frame(
+            timestamp_s=depths[depth_row].timestamp_s,
+            rgb=colour.colour(nyu.read_pnm(colours[colour_row].path)),
+            depth_m=nyu.register_depth(depth.depth(depth_m)),
+            camera=nyu.COLOUR_CAMERA,
+        )
+
+    return Dataset(
+        name=folder.name,
+        camera=nyu.COLOUR_CAMERA,
+        timestamps_s=tuple(depths[row].timestamp_s for row, _ in pairs),
+        truth=None,
+        truth_kind="none",
+        rows=tuple(range(len(pairs))),
+        read=read,
+    )
+
+
+def _open_labelled(path: Path, scene: str | None) -> Dataset:
+    """Return the labelled images, one second apart: the file keeps no times of its own."""
+    file = nyu.LabelledFile(path)
+    rows = file.rows(scene)
+
+    def read(row: int) -> Frame:
+        rgb, depth_m = file.read(rows[row])
+        return Frame(timestamp_s=float(row), rgb=rgb, depth_m=depth_m, camera=nyu.COLOUR_CAMERA)
+
+    return Dataset(
+        name=scene or path.stem,
+        camera=nyu.COLOUR_CAMERA,
+        timestamps_s=tuple(float(row) for row in range(len(rows))),
+        truth=None,
+        truth_kind="none",
+        rows=tuple(range(len(rows))),
+        read=read,
+    )
+
+
+# --- images ------------------------------------------------------------------------------------
+
+
+class _Undistortion:
+    """Maps images of a distorted lens to the pinhole camera of the same intrinsics."""
+
+    def __init__(self, camera: Camera, distortion: _Distortion) -> None:
+        self._maps: tuple[Any, Any] | None = None
+        if any(distortion):
+            size = (camera.width, camera.height)
+            cv2 = _opencv()
+            self._maps = cv2.initUndistortRectifyMap(
+                camera.matrix, np.array(distortion), None, camera.matrix, size, cv2.CV_32FC1
+            )
+
+    def colour(self, rgb: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
+        return rgb if self._maps is None else self._remap(rgb, "INTER_LINEAR")
+
+    def depth(self, depth_m: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+        """Take the nearest reading: a mean of two surfaces, or with a hole, lies on neither."""
+        return depth_m if self._maps is None else self._remap(depth_m, "INTER_NEAREST")
+
+    def _remap(self, image: npt.NDArray[Any], interpolation: str) -> npt.NDArray[Any]:
+        cv2 = _opencv()
+        assert self._maps is not None
+        mapped: npt.NDArray[Any] = cv2.remap(image, *self._maps, getattr(cv2, interpolation))
+        return mapped
+
+
+def _read_image(path: Path, *, is_depth: bool) -> npt.NDArray[Any]:
+    cv2 = _opencv()
+    image = None
+    if path.is_file():  # OpenCV would print a warning of its own
+        image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED if is_depth else cv2.IMREAD_COLOR)
+    if image is None:
+        raise UsageError(f"cannot read the image {path}", hint="unpack the recording again")
+    if not is_depth:
+        rgb: npt.NDArray[Any] = cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+        return rgb
+    if image.dtype != np.uint16 or image.ndim != 2:
+        raise UsageError(
+            f"{path} is not a 16-bit depth image",
+            hint="depth is one 16-bit channel, value / depth_scale in m",
+        )
+    depth: npt.NDArray[Any] = image
+    return depth
+
+
+def _opencv() -> Any:
+    try:
+        import cv2
+    except ImportError as error:
+        raise MissingExtra("opencv-python-headless", "vision") from error
+    return cv2

@@ -1,0 +1,123 @@
+"""A world to drive through for robots without a recording: rendered frames with exact poses.
+
+Robots follow one loop through three furnished rooms; each starts at its own place on it, so their
+maps overlap.  Promises pure numpy (no image library), and the same frames for the same arguments.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from client_sdk.frontend import Frame
+from client_sdk.mapping import Trajectory
+from client_sdk.simulator.camera import Painter, add_depth_noise, add_image_noise
+from client_sdk.simulator.world import make_world
+from rse_pf.errors import UsageError
+from rse_pf.geometry import Array, Camera
+
+__all__ = ["RATE_HZ", "SIMULATED_CAMERA", "STEP_M", "render_frames", "true_trajectory"]
+
+RATE_HZ = 5.0
+"""The paper's frame rate (Sect. 6.2)."""
+STEP_M = 0.068
+"""Distance between frames: a robot that drives at 0.34 m/s."""
+SIMULATED_CAMERA = Camera(fx=525.0, fy=525.0, cx=319.5, cy=239.5, width=640, height=480)
+
+_WAYPOINTS_M = (
+    (5.0, 2.05), (6.4, 1.75), (7.5, 1.65), (8.6, 1.75), (10.0, 2.05), (11.3, 1.35), (12.5, 1.0), (13.6, 1.4),
+    (13.95, 2.3), (13.6, 3.2), (12.5, 3.45), (11.3, 3.2), (10.0, 2.55), (8.6, 2.8), (7.5, 2.9), (6.4, 2.8),
+    (5.0, 2.55), (3.7, 3.2), (2.5, 3.45), (1.4, 3.2), (1.05, 2.3), (1.4, 1.4), (2.5, 1.0), (3.7, 1.35),
+)  # fmt: skip
+"""Corners of the loop: through both doors, around the tables of the outer rooms, and back."""
+
+
+def render_frames(robot: int, robots: int, frames: int, seed: int) -> Iterator[Frame]:
+    """Yield what robot 0, 1, ... of *robots* sees on its way; frame *i* is at ``true_trajectory[i]``.
+
+    Raises:
+        UsageError: The robot is not one of *robots*, or there are no frames.
+    """
+    truth = true_trajectory(robot, robots, frames, seed)
+    painter = Painter(make_world(seed), SIMULATED_CAMERA)
+    for row in range(len(truth)):
+        rng = np.random.default_rng([seed, robots, robot, row])
+        colour, depth_m, cosine = painter.draw(truth.T_world_camera[row])
+        yield Frame(
+            timestamp_s=float(truth.timestamps_s[row]),
+            rgb=add_image_noise(colour, rng),
+            depth_m=add_depth_noise(depth_m, cosine, rng),
+            camera=SIMULATED_CAMERA,
+        )
+
+
+def true_trajectory(robot: int, robots: int, frames: int, seed: int) -> Trajectory:
+    """Return the exact ``T_world_camera`` of `render_frames`; the world's z axis points up.
+
+    Robots are spread evenly over the loop of about 28 m; a robot takes 6.8 cm and at most 4 degrees
+    from one frame to the next, so 80 frames are a path of 5.4 m.
+
+    Raises:
+        UsageError: The robot is not one of *robots*, or there are no frames.
+    """
+    if not 0 <= robot < robots or frames < 1:
+        raise UsageError(
+            f"robot {robot} of {robots} with {frames} frames cannot be rendered",
+            hint="count robots from 0, and ask for one frame or more",
+        )
+    path, length_m = _loop()
+    phase = float(np.random.default_rng([seed, 7]).uniform(0.0, 2.0 * np.pi))
+    travelled_m = STEP_M * np.arange(frames) + length_m * robot / robots
+    poses = np.array([_pose_at(path, length_m, s, phase) for s in travelled_m])
+    return Trajectory(np.arange(frames) / RATE_HZ, poses)
+
+
+def _loop() -> tuple[Array, float]:
+    """Return the closed path as ``(n, 2)`` points one centimetre apart, and its length."""
+    corners = np.array(_WAYPOINTS_M)
+    path = _resample(corners, 0.01)[0]
+    for _ in range(2):
+        path = _resample(_smooth(path, 45), 0.01)[0]
+    return _resample(path, 0.01)
+
+
+def _resample(corners: Array, step_m: float) -> tuple[Array, float]:
+    closed = np.vstack((corners, corners[:1]))
+    along = np.concatenate(([0.0], np.cumsum(np.linalg.norm(np.diff(closed, axis=0), axis=1))))
+    places = np.linspace(0.0, along[-1], round(along[-1] / step_m), endpoint=False)
+    points = np.column_stack([np.interp(places, along, closed[:, axis]) for axis in range(2)])
+    return points, float(along[-1])
+
+
+def _smooth(path: Array, half: int) -> Array:
+    """Return the running mean over *half* points to either side of a closed path."""
+    window = np.ones(2 * half + 1) / (2 * half + 1)
+    around = np.vstack((path[-half:], path, path[:half]))
+    return np.column_stack([np.convolve(around[:, axis], window, mode="valid") for axis in range(2)])
+
+
+def _pose_at(path: Array, length_m: float, travelled_m: float, phase: float) -> Array:
+    """Return the pose at a distance along the loop: looking ahead, slightly down, swaying a little."""
+    position, ahead = (_point(path, length_m, travelled_m + more) for more in (0.0, 1.0))
+    yaw = np.arctan2(*(ahead - position)[::-1])
+    wave = 2.0 * np.pi * travelled_m / 1.7 + phase
+    pitch = np.radians(-7.0 + 1.2 * np.sin(0.6 * wave))
+    roll = np.radians(0.8 * np.sin(0.8 * wave))
+    height_m = 1.25 + 0.02 * np.sin(wave)
+    forward = np.array([np.cos(yaw) * np.cos(pitch), np.sin(yaw) * np.cos(pitch), np.sin(pitch)])
+    level_right = np.array([np.sin(yaw), -np.cos(yaw), 0.0])
+    level_down = np.cross(forward, level_right)
+    right = np.cos(roll) * level_right + np.sin(roll) * level_down
+    pose = np.eye(4)
+    pose[:3, 0], pose[:3, 1], pose[:3, 2] = right, np.cross(forward, right), forward
+    pose[:3, 3] = [*position, height_m]
+    return pose
+
+
+def _point(path: Array, length_m: float, travelled_m: float) -> Array:
+    place = (travelled_m % length_m) / length_m * len(path)
+    low = int(place) % len(path)
+    share = place - int(place)
+    point: Array = (1.0 - share) * path[low] + share * path[(low + 1) % len(path)]
+    return point

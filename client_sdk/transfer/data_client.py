@@ -1,0 +1,379 @@
+"""Send and fetch large data by HTTP (paper, Sect. 5.2): images, keyframes, clouds, maps.
+
+Blocking; run it in a thread.  Objects are named by their sha256, so a repeated or resumed transfer can
+neither store twice nor mix two versions.  Promises to return from an upload only when the data server has
+called the object durable, and to try no longer than it was told.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import http.client
+import json
+import os
+import random
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, BinaryIO
+from urllib.parse import urlsplit
+
+from client_sdk.transfer.presigned import fetch_direct, is_allowed, put_direct
+from rse_pf.errors import (
+    BadRequest,
+    CommandFailed,
+    Conflict,
+    ConnectError,
+    NotFound,
+    RsePfError,
+    StoreError,
+    UsageError,
+    error_from_code,
+)
+
+__all__ = ["DataClient", "DataOptions", "Progress"]
+
+Progress = Callable[[int, int], None]
+"""Gets bytes done and bytes in all, after each part."""
+
+_SMALL_BYTES = 262_144
+_PIECE_BYTES = 1 << 20
+_DIRECT_TRIES = 3
+_REDIRECTED = 307
+_BUSY = {408, 429, 500, 502, 503, 504}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DataOptions:
+    """How patient a client is; ``deadline_s`` is for one transfer without any progress."""
+
+    timeout_s: float = 10.0
+    deadline_s: float = 60.0
+    first_pause_s: float = 0.1
+    longest_pause_s: float = 5.0
+    part_bytes: int = 1 << 20
+    clock: Callable[[], float] = time.monotonic
+    sleep: Callable[[float], None] = time.sleep
+    random: random.Random = field(default_factory=random.Random)
+
+
+class DataClient:
+    """A robot's way to the data service; one connection, used by one thread at a time."""
+
+    def __init__(self, url: str, token: str | Callable[[], str], options: DataOptions | None = None) -> None:
+        """Remember where; nothing is sent yet.
+
+        Args:
+            url: ``http://HOST:PORT`` or ``https://...``; ``ws:`` and ``wss:`` addresses of robots work, too.
+            token: The robot's token, or what gives one that is good now.
+            options: Timeouts, retries and part sizes.
+
+        Raises:
+            UsageError: *url* is no such address.
+        """
+        parts = urlsplit(url)
+        if parts.scheme not in ("http", "https", "ws", "wss") or not parts.hostname:
+            raise UsageError(f"{url!r} is no address of a data service", hint="write https://HOST")
+        self._secure = parts.scheme in ("https", "wss")
+        self._host, self._port = parts.hostname, parts.port
+        self._token = token
+        self._options = options or DataOptions()
+        self._connection: http.client.HTTPConnection | None = None
+        self._lock = threading.Lock()
+
+    def close(self) -> None:
+        """Close the connection; the next call opens another."""
+        connection, self._connection = self._connection, None
+        if connection is not None:
+            connection.close()
+
+    def upload(self, source: bytes | Path, progress: Progress | None = None) -> str:
+        """Store bytes or a file and return its digest, once it is durable.
+
+        Goes on where an earlier upload of the same bytes ended, also one of another process.
+
+        Raises:
+            ConnectError: No progress for ``deadline_s``.
+            StoreFull, QuotaExceeded, LimitExceeded, Unauthorized, Forbidden: The server refuses it.
+            UsageError: The file cannot be read.
+        """
+        with self._lock, _opened(source) as opened:
+            size, digest = opened.size, opened.digest()
+            if size <= _SMALL_BYTES:
+                self._patiently("PUT", f"/data/v1/objects/{digest}", opened.read(0, size))
+                _tell(progress, size, size)
+                return digest
+            self._upload_parts(opened, digest, progress)
+            return digest
+
+    def download(self, digest: str, to: Path | None = None, progress: Progress | None = None) -> bytes:
+        """Return an object, or write it to file *to* (and return nothing), checked by its digest.
+
+        A file appears only when it is whole; what came before a cut is kept beside it and gone on from.
+
+        Raises:
+            NotFound: There is no such object of this robot.
+            StoreError: The bytes are not those of the digest.
+        """
+        with self._lock:
+            return self._download(f"/data/v1/objects/{digest}", digest, to, progress)
+
+    def delete(self, digest: str) -> None:
+        """Remove an object; a missing one is no error."""
+        with self._lock:
+            self._patiently("DELETE", f"/data/v1/objects/{digest}")
+
+    def objects(self) -> Iterator[tuple[str, int]]:
+        """Yield digest and size of this robot's objects."""
+        after = ""
+        while True:
+            with self._lock:
+                page = self._json("GET", f"/data/v1/objects?after={after}")
+            yield from ((str(each["digest"]), int(each["size"])) for each in page["objects"])
+            if page["next"] is None:
+                return
+            after = page["next"]
+
+    def maps(self) -> dict[str, str]:
+        """Return the maps of this tenant: name to id of the head."""
+        with self._lock:
+            return {each["name"]: each["head"] for each in self._json("GET", "/data/v1/maps")["maps"]}
+
+    def map_version(self, name: str, version: str = "head") -> dict[str, Any]:
+        """Return ``id`` and ``record`` of a version of a map."""
+        with self._lock:
+            found: dict[str, Any] = self._json("GET", f"/data/v1/maps/{name}/versions/{version}")
+            return found
+
+    def download_map(self, name: str, version: str = "head", progress: Progress | None = None) -> bytes:
+        """Return a version's bytes, for `rse_pf.maps.format.decode_map`."""
+        found = self.map_version(name, version)
+        with self._lock:
+            path = f"/data/v1/maps/{name}/versions/{found['id']}/content"
+            return self._download(path, found["record"]["digest"], None, progress)
+
+    def commit_map(self, name: str, data: bytes, *, parent: str | None, note: str = "") -> str:
+        """Upload the bytes of a map and make them the head; return the version's id.
+
+        Raises:
+            Conflict: Another robot was quicker: *parent* is not the head any more.
+        """
+        body = {"digest": self.upload(data), "parent": parent, "note": note}
+        with self._lock:
+            made = self._json("POST", f"/data/v1/maps/{name}/versions", json.dumps(body).encode())
+        return str(made["id"])
+
+    def _upload_parts(self, opened: _Source, digest: str, progress: Progress | None) -> None:
+        path, size = f"/data/v1/uploads/{digest}", opened.size
+        begin = json.dumps({"size": size}).encode()
+        state = self._begin(path, begin, opened, progress)
+        part_bytes = min(int(state["part_bytes"]), self._options.part_bytes)
+        offset = int(state["offset"])
+        _tell(progress, offset, size)
+        while offset < size:
+            part = opened.read(offset, min(part_bytes, size - offset))
+            try:
+                state = self._json("PATCH", path, part, {"Upload-Offset": str(offset)})
+            except (Conflict, NotFound):  # the answer to this part was lost, or another process was at work
+                state = self._json("PUT", path, begin)
+            offset = int(state["offset"])
+            _tell(progress, offset, size)
+
+    def _begin(self, path: str, begin: bytes, opened: _Source, progress: Progress | None) -> Any:
+        """Open an upload, and send all straight to the bucket if the service offers that and it works."""
+        tries, pause = _DIRECT_TRIES, self._options.first_pause_s
+        while True:
+            state = self._json("PUT", path, begin)
+            direct = state.get("direct")
+            if direct is None or not tries or not is_allowed(direct["url"], secure=self._secure):
+                return state
+            tries -= 1
+            body = opened.pieces(progress)
+            if put_direct(direct["url"], direct["headers"], body, timeout_s=self._options.timeout_s):
+                continue  # asking again tells whether it is there
+            self._options.sleep(pause)
+            pause *= 2
+
+    def _piece(
+        self, path: str, headers: dict[str, str], way: _Way
+    ) -> tuple[int, http.client.HTTPMessage, bytes]:
+        """Fetch a range straight from the bucket if the service offers that, else from the service."""
+        options = self._options
+        while way.tries:
+            if not way.url:
+                asking = {**headers, "X-Accept-Direct": "1"}
+                status, answer, piece = self._patiently("GET", path, None, asking, also=(416,))
+                way.url = answer.get("Location", "") if status == _REDIRECTED else ""
+                if status != _REDIRECTED:
+                    return status, answer, piece
+            found = None
+            if is_allowed(way.url, secure=self._secure):
+                found = fetch_direct(way.url, headers, timeout_s=options.timeout_s)
+            if found is not None:
+                return found
+            way.url, way.tries = "", way.tries - 1  # it has expired, or the bucket is out of reach
+            options.sleep(options.first_pause_s)
+        return self._patiently("GET", path, None, headers, also=(416,))
+
+    def _download(self, path: str, digest: str, to: Path | None, progress: Progress | None) -> bytes:
+        partial = None if to is None else to.with_name(f".{to.name}.{digest[:16]}.part")
+        held = bytearray() if partial is None else bytearray(_bytes_of(partial))
+        size, way = -1, _Way()
+        while size != len(held):
+            end = len(held) + _PIECE_BYTES - 1
+            headers = {"Range": f"bytes={len(held)}-{end}"}
+            status, answer, piece = self._piece(path, headers, way)
+            told = answer.get("Content-Range", "")
+            size = int(told.rpartition("/")[2]) if told else len(piece)
+            if status == 200:
+                held[:] = piece
+            elif status == 206:
+                held += piece
+                _append(partial, piece)
+            elif size != len(held):  # what was kept is longer than the object
+                held.clear()
+                _remove(partial)
+            _tell(progress, len(held), size)
+        if hashlib.sha256(held).hexdigest() != digest:
+            _remove(partial)
+            raise StoreError("the bytes are not those of the digest", hint="fetch it again")
+        if to is None or partial is None:
+            return bytes(held)
+        partial.write_bytes(held)
+        os.replace(partial, to)
+        return b""
+
+    def _json(
+        self, method: str, path: str, body: bytes | None = None, headers: dict[str, str] | None = None
+    ) -> Any:
+        return json.loads(self._patiently(method, path, body, headers)[2])
+
+    def _patiently(
+        self, method: str, path: str, body: bytes | None = None, headers: dict[str, str] | None = None,
+        also: tuple[int, ...] = (),
+    ) -> tuple[int, http.client.HTTPMessage, bytes]:  # fmt: skip
+        """Ask until there is an answer that is not "come again"; every request here may be repeated."""
+        options = self._options
+        end, pause = options.clock() + options.deadline_s, options.first_pause_s
+        while True:
+            error: RsePfError
+            after_s = 0.0
+            try:
+                status, answer, content = self._ask(method, path, body, headers or {})
+            except (OSError, http.client.HTTPException) as broken:
+                self.close()
+                error = ConnectError(
+                    f"no answer from {self._host}: {broken or type(broken).__name__}",
+                    hint="the transfer goes on from where it was when you call again",
+                )
+            else:
+                if status < 400 or status in also:
+                    return status, answer, content
+                error = _refusal(status, content)
+                if status not in _BUSY:
+                    raise error
+                told = answer.get("Retry-After", "")
+                after_s = float(told) if told.isdecimal() else 0.0
+            wait_s = max(after_s, pause * options.random.uniform(0.5, 1.0))
+            if options.clock() + wait_s > end:
+                raise error
+            options.sleep(wait_s)
+            pause = min(2 * pause, options.longest_pause_s)
+
+    def _ask(
+        self, method: str, path: str, body: bytes | None, headers: dict[str, str]
+    ) -> tuple[int, http.client.HTTPMessage, bytes]:
+        if self._connection is None:
+            kind = http.client.HTTPSConnection if self._secure else http.client.HTTPConnection
+            self._connection = kind(self._host, self._port, timeout=self._options.timeout_s)
+        token = self._token if isinstance(self._token, str) else self._token()
+        self._connection.request(method, path, body, {"Authorization": f"Bearer {token}", **headers})
+        answer = self._connection.getresponse()
+        content = answer.read()
+        if answer.will_close:
+            self.close()
+        return answer.status, answer.headers, content
+
+
+@dataclass(slots=True)
+class _Way:
+    """How a download goes: straight from *url*, which ends soon, or through the service without tries."""
+
+    url: str = ""
+    tries: int = _DIRECT_TRIES
+
+
+class _Source:
+    """Bytes or a file, read by position."""
+
+    def __init__(self, source: bytes | Path) -> None:
+        self._data = source if isinstance(source, bytes) else b""
+        self._file: BinaryIO | None = None
+        if isinstance(source, Path):
+            try:
+                self._file = source.open("rb")
+            except OSError as error:
+                raise UsageError(f"cannot read {source}: {error.strerror}", hint="name a file") from error
+        self.size = os.fstat(self._file.fileno()).st_size if self._file else len(self._data)
+
+    def digest(self) -> str:
+        made = hashlib.sha256()
+        for offset in range(0, self.size, _PIECE_BYTES):
+            made.update(self.read(offset, _PIECE_BYTES))
+        return made.hexdigest()
+
+    def pieces(self, progress: Progress | None) -> Iterator[bytes]:
+        for offset in range(0, self.size, _PIECE_BYTES):
+            yield self.read(offset, _PIECE_BYTES)
+            _tell(progress, min(offset + _PIECE_BYTES, self.size), self.size)
+
+    def read(self, offset: int, length: int) -> bytes:
+        if self._file is None:
+            return self._data[offset : offset + length]
+        self._file.seek(offset)
+        return self._file.read(length)
+
+    def __enter__(self) -> _Source:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._file is not None:
+            self._file.close()
+
+
+def _opened(source: bytes | Path) -> _Source:
+    return _Source(source)
+
+
+def _refusal(status: int, content: bytes) -> RsePfError:
+    try:
+        said = json.loads(content)
+        return error_from_code(str(said["code"]), str(said["message"]), hint=str(said.get("hint", "")))
+    except (ValueError, KeyError, TypeError):
+        kind = NotFound if status == 404 else BadRequest if status < 500 else CommandFailed
+        return kind(f"the data service answered {status}", hint="look at its log")
+
+
+def _tell(progress: Progress | None, done: int, size: int) -> None:
+    if progress is not None:
+        progress(done, size)
+
+
+def _bytes_of(path: Path) -> bytes:
+    try:
+        return path.read_bytes()
+    except FileNotFoundError:
+        return b""
+
+
+def _append(path: Path | None, piece: bytes) -> None:
+    if path is not None:
+        with path.open("ab") as file:
+            file.write(piece)
+
+
+def _remove(path: Path | None) -> None:
+    if path is not None:
+        path.unlink(missing_ok=True)

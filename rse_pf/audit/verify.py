@@ -1,0 +1,119 @@
+"""Judge the audit logs in a folder: is every chain whole, and does it hold the heads that others recorded?
+
+Promises to change nothing, and to say in one sentence which file and which entry is the first that is wrong.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from rse_pf.audit.chain import CONTINUED, GENESIS, HEADS, Chain, Entry, Head, head_word
+from rse_pf.audit.log import files_of, lines_of, names_in
+
+__all__ = ["Verdict", "check_chain", "check_folder", "entries_of"]
+
+
+@dataclass(slots=True, kw_only=True)
+class Verdict:
+    """What was found in one chain.  ``problem`` is empty if all is well."""
+
+    who: str
+    entries: int = 0
+    head: Head = GENESIS
+    file: str = ""
+    problem: str = ""
+    notes: list[str] = field(default_factory=list)
+    hashes: dict[int, str] = field(default_factory=dict)
+    claims: list[tuple[str, Head, int]] = field(default_factory=list)
+    """Heads of other chains that this one recorded, with the number of the entry."""
+
+
+def check_chain(who: str, files: Sequence[Path], *, from_genesis: bool = True) -> Verdict:
+    """Return what is true of the chain in *files*, oldest first, up to its first wrong entry.
+
+    Args:
+        who: Its name.
+        files: As `files_of` gives them.
+        from_genesis: Whether it has to begin with entry 1.
+    """
+    verdict = Verdict(who=who)
+    chain = Chain(GENESIS if from_genesis else None)
+    is_torn = False
+    for path in files:
+        verdict.file = path.name
+        for line in lines_of(path):
+            if not line.endswith(b"\n"):
+                verdict.notes.append(_torn(path, verdict.entries))
+                is_torn = True
+                break
+            found = chain.add(line)
+            if isinstance(found, str):
+                verdict.problem = found
+                return verdict
+            if is_torn and not _names_a_torn_file(found):
+                verdict.problem = f"entry {found.seq} does not say that the file before it was torn"
+                return verdict
+            is_torn = False
+            _take(verdict, found)
+    if is_torn:
+        verdict.problem = f"ended in the middle of a line, {verdict.entries} whole entries good"
+    return verdict
+
+
+def check_folder(folder: Path, *, known: Mapping[str, Head] | None = None) -> list[Verdict]:
+    """Return a verdict for each chain in *folder*.
+
+    Args:
+        folder: Where the logs lie.
+        known: Heads that somebody kept elsewhere, by name of the chain.
+
+    Raises:
+        OSError: A file cannot be read.
+    """
+    verdicts = {who: check_chain(who, files_of(folder, who)) for who in names_in(folder)}
+    claims = [
+        (name, head, f"entry {seq} of {teller.who}")
+        for teller in verdicts.values()
+        for name, head, seq in teller.claims
+    ]
+    claims += [(name, head, "the head kept elsewhere") for name, head in (known or {}).items()]
+    for name, head, teller in claims:
+        verdict = verdicts.setdefault(name, Verdict(who=name, file=f"{name}.jsonl"))
+        if not verdict.problem and verdict.hashes.get(head.seq) != head.hash:
+            state = "was changed" if head.seq in verdict.hashes else "is missing"
+            verdict.problem = f"entry {head.seq} {state}: {teller} names another"
+            if state == "is missing":
+                verdict.problem = f"entry {head.seq} is missing: {teller} has seen it"
+    return [verdicts[name] for name in sorted(verdicts)]
+
+
+def entries_of(files: Sequence[Path]) -> Iterator[Entry]:
+    """Yield what can be read, whether the chain is whole or not."""
+    for path in files:
+        for line in lines_of(path):
+            found = Chain(None).add(line)
+            if isinstance(found, Entry):
+                yield found
+
+
+def _take(verdict: Verdict, entry: Entry) -> None:
+    if verdict.entries == 0 and entry.seq > 1:
+        verdict.notes.append(f"begins with entry {entry.seq}; earlier ones are not looked at")
+    verdict.entries += 1
+    verdict.head = entry.head
+    verdict.hashes[entry.seq] = entry.hash
+    if entry.action == HEADS:
+        for name, word in entry.detail.items():
+            head = head_word(word) if isinstance(word, str) else None
+            if head is not None:
+                verdict.claims.append((name, head, entry.seq))
+
+
+def _names_a_torn_file(entry: Entry) -> bool:
+    return entry.action == CONTINUED and entry.detail.get("reason") == "torn"
+
+
+def _torn(path: Path, good: int) -> str:
+    return f"{path.name} ended in the middle of a line, {good} whole entries good"

@@ -1,0 +1,352 @@
+"""Robot tokens: issue, verify; Ed25519-signed JWTs after the RFC 8725 profile.
+
+A key set maps ``kid`` to a public key; the algorithm is fixed, never read from a token.  A robot that is
+enrolled signs its own tokens, and then its name, tenant, scopes and quotas come from the roster.  Promises
+never to read a clock (the library's own checks are off; ``now`` is an argument) and to tell a caller
+only `Unauthorized`, whatever the cause; the cause is in ``__cause__`` and ``reason`` for the log.
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+from rse_pf.auth.roster import (
+    ROBOT_KEY,
+    DenyList,
+    EnrolledRobot,
+    Roster,
+    check_robot,
+    check_scopes,
+    check_tenant,
+    key_id_of,
+)
+from rse_pf.config import AuthSettings
+from rse_pf.errors import MissingExtra, Unauthorized, UsageError
+
+if TYPE_CHECKING:
+    from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey, Ed25519PublicKey
+
+__all__ = ["Claims", "KeySet", "SigningKey", "standing_problem", "token_problem", "verify_token"]
+
+_ALGORITHM = "EdDSA"
+_TYPE = "robot+jwt"
+_REQUIRED = ("iss", "aud", "sub", "exp", "iat", "jti")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Claims:
+    """What a verified token says; a robot's identity comes from here alone."""
+
+    robot: str
+    token_id: str
+    issued_s: float
+    expires_s: float
+    key_id: str
+    tenant: str = "default"
+    scopes: tuple[str, ...] = ()
+    quotas: tuple[tuple[str, float], ...] = ()
+
+    def quota(self, name: str) -> float | None:
+        """Return what the roster limits this robot to, None if it says nothing (see `enrolment.QUOTAS`)."""
+        return dict(self.quotas).get(name)
+
+
+class SigningKey:
+    """The private half: issues tokens; lives in one file of mode 0600, or in a secret."""
+
+    def __init__(self, private: Ed25519PrivateKey, key_id: str) -> None:
+        self._private = private
+        self.key_id = key_id
+
+    @classmethod
+    def from_seed(cls, seed: bytes, key_id: str) -> SigningKey:
+        """Return the key of 32 secret random bytes."""
+        return cls(_ed25519().Ed25519PrivateKey.from_private_bytes(seed), key_id)
+
+    @classmethod
+    def of_robot(cls, seed: bytes) -> SigningKey:
+        """Return a robot's own key, made of 32 secret random bytes; its id is its RFC 7638 thumbprint."""
+        private = _ed25519().Ed25519PrivateKey.from_private_bytes(seed)
+        return cls(private, key_id_of(_b64(private.public_key().public_bytes_raw())))
+
+    @classmethod
+    def from_json(cls, text: str) -> SigningKey:
+        """Return the key that `to_json` wrote; raises UsageError."""
+        try:
+            document = json.loads(text)
+            return cls.from_seed(_unb64(document["d"]), str(document["kid"]))
+        except (ValueError, KeyError, TypeError, RecursionError) as error:
+            raise UsageError("this is not a signing key", hint="make one with rse-pf local") from error
+
+    def to_json(self) -> str:
+        """Return the key as a private JWK; keep it secret."""
+        return json.dumps({**self._public_jwk(), "d": _b64(self._private.private_bytes_raw())})
+
+    def key_set(self) -> KeySet:
+        """Return the public half, as servers hold it."""
+        return KeySet({self.key_id: self._private.public_key()})
+
+    def issue(
+        self,
+        robot: str,
+        *,
+        now: float,
+        token_id: str,
+        settings: AuthSettings,
+        life_s: float | None = None,
+        scopes: tuple[str, ...] = (),
+        tenant: str = "default",
+    ) -> str:
+        """Return a token for *robot* that is good from *now* (Unix seconds) for *life_s*."""
+        check_robot(robot)
+        check_tenant(tenant)
+        check_scopes(scopes)
+        if not 0 < len(token_id) <= 64:
+            raise UsageError("a token id has 1 to 64 letters", hint="leave it to rse-pf token issue")
+        life = settings.token_life_s if life_s is None else life_s
+        if not 0 < life <= settings.token_life_s:
+            raise UsageError(
+                f"a life of {life:g} s is not within {settings.token_life_s} s",
+                hint="ask for a shorter life",
+            )
+        claims = {
+            "iss": settings.issuer, "aud": settings.audience, "sub": robot, "tenant": tenant,
+            "iat": int(now), "exp": int(now + life), "jti": token_id, "scope": " ".join(scopes),
+        }  # fmt: skip
+        headers = {"kid": self.key_id, "typ": _TYPE}
+        token: str = _jwt().encode(claims, self._private, algorithm=_ALGORITHM, headers=headers)
+        return token
+
+    def public_json(self) -> str:
+        """Return the public half as a JWK."""
+        return json.dumps(self._public_jwk())
+
+    def _public_jwk(self) -> dict[str, str]:
+        x = _b64(self._private.public_key().public_bytes_raw())
+        return {"kty": "OKP", "crv": "Ed25519", "kid": self.key_id, "x": x}
+
+    def __repr__(self) -> str:
+        return f"SigningKey(key_id={self.key_id!r})"
+
+
+class KeySet:
+    """Whom a server trusts: keys that may sign, robots that are enrolled, less what is denied."""
+
+    def __init__(
+        self,
+        keys: Mapping[str, Ed25519PublicKey],
+        *,
+        roster: Roster | None = None,
+        denied: DenyList | None = None,
+    ) -> None:
+        self._keys = dict(keys)
+        denied = denied or DenyList()
+        self._robots = {robot.key_id: robot for robot in (roster or Roster()).robots}
+        self._revoked = {(each.tenant, each.robot, each.id) for each in denied.tokens}
+        self._disabled = {(each.tenant, each.robot) for each in denied.disabled}
+        self._not_before = {(each.tenant, each.robot): each.at_s for each in denied.not_before}
+
+    def governed_by(self, roster: Roster, denied: DenyList) -> KeySet:
+        """Return the same platform keys under what the control room says."""
+        return KeySet(self._keys, roster=roster, denied=denied)
+
+    @classmethod
+    def from_json(cls, text: str) -> KeySet:
+        """Return the set written as a JWKS; raises UsageError."""
+        public = _ed25519().Ed25519PublicKey
+        try:
+            return cls(
+                {
+                    str(jwk["kid"]): public.from_public_bytes(_unb64(jwk["x"]))
+                    for jwk in json.loads(text)["keys"]
+                }
+            )
+        except (ValueError, KeyError, TypeError, RecursionError) as error:
+            raise UsageError("this is not a key set", hint="write a JWKS of Ed25519 keys") from error
+
+    def to_json(self) -> str:
+        """Return the set as a JWKS."""
+        keys = [
+            {"kty": "OKP", "crv": "Ed25519", "kid": kid, "x": _b64(key.public_bytes_raw())}
+            for kid, key in self._keys.items()
+        ]
+        return json.dumps({"keys": keys})
+
+    def get(self, key_id: Any) -> Ed25519PublicKey | None:
+        """Return the key called *key_id*, of the platform or of an enrolled robot, if it is in the set."""
+        if not isinstance(key_id, str):
+            return None
+        if not key_id.startswith(ROBOT_KEY):
+            return self._keys.get(key_id)
+        robot = self._robots.get(key_id)
+        if robot is None:
+            return None
+        key: Ed25519PublicKey = _ed25519().Ed25519PublicKey.from_public_bytes(_unb64(robot.x))
+        return key
+
+    def knows(self, key_id: str) -> bool:
+        """Return whether `get` would find the key; without making it, for ten thousand sockets at once."""
+        return key_id in (self._robots if key_id.startswith(ROBOT_KEY) else self._keys)
+
+    def robot_of(self, key_id: str) -> EnrolledRobot | None:
+        """Return the enrolled robot whose key *key_id* is."""
+        return self._robots.get(key_id)
+
+    def denies(self, claims: Claims) -> str:
+        """Return why *claims* are refused although they are signed; empty if they are not."""
+        robot = (claims.tenant, claims.robot)
+        if robot in self._disabled:
+            return "disabled"
+        if (*robot, claims.token_id) in self._revoked:
+            return "revoked"
+        return "issued-too-early" if claims.issued_s < self._not_before.get(robot, 0.0) else ""
+
+
+def verify_token(token: str, *, keys: KeySet, now: float, settings: AuthSettings) -> Claims:
+    """Return the claims of a good *token*.
+
+    Args:
+        token: As it stood behind ``Bearer``.
+        keys: Who may sign.
+        now: Unix seconds.
+        settings: Issuer, audience, longest life, leeway.
+
+    Raises:
+        Unauthorized: Always the same words; ``__cause__`` holds the reason, for the log.
+    """
+    try:
+        return _checked(token, keys, now, settings)
+    except _Refused as refused:
+        raise Unauthorized(
+            "the token is missing or not valid", hint="issue one with rse-pf token issue ROBOT"
+        ) from refused
+
+
+def standing_problem(claims: Claims, keys: KeySet) -> str:
+    """Return why *claims* that were verified once no longer stand under *keys*; empty if they do.
+
+    Whoever lives on them, as a socket does, has to go then.  Their end in time is not looked at.
+    """
+    if not keys.knows(claims.key_id):
+        return "unknown-key"
+    enrolled = keys.robot_of(claims.key_id)
+    if enrolled is not None and (enrolled.tenant, enrolled.robot) != (claims.tenant, claims.robot):
+        return "wrong-robot"
+    return keys.denies(claims)
+
+
+def token_problem(error: Unauthorized) -> str:
+    """Return the constant reason behind *error*, for the log and for nobody else."""
+    return str(error.__cause__) if isinstance(error.__cause__, _Refused) else "unknown"
+
+
+class _Refused(ValueError):
+    """Why a token is refused; one of a closed list of words."""
+
+
+def _checked(token: str, keys: KeySet, now: float, settings: AuthSettings) -> Claims:
+    jwt = _jwt()
+    if not token or len(token) > settings.max_token_bytes or not token.isascii():
+        raise _Refused("missing-or-too-long")
+    if not _is_canonical(token):
+        raise _Refused("malformed")
+    try:
+        header = jwt.get_unverified_header(token)
+    except (jwt.PyJWTError, RecursionError) as error:
+        raise _Refused("malformed") from error
+    if header.get("alg") != _ALGORITHM or header.get("typ") != _TYPE or "crit" in header:
+        raise _Refused("wrong-algorithm-or-type")
+    key = keys.get(header.get("kid"))
+    if key is None:
+        raise _Refused("unknown-key")
+    try:
+        claims: dict[str, Any] = jwt.decode(
+            token,
+            key,
+            algorithms=[_ALGORITHM],
+            audience=settings.audience,
+            issuer=settings.issuer,
+            options={
+                "require": list(_REQUIRED), "verify_exp": False, "verify_iat": False, "verify_nbf": False,
+            },
+        )  # fmt: skip
+    except jwt.PyJWTError as error:
+        raise _Refused("bad-signature-or-claims") from error
+    told = _timed(claims, str(header["kid"]), now, settings)
+    enrolled = keys.robot_of(told.key_id)
+    if enrolled is not None:
+        if enrolled.robot != told.robot:
+            raise _Refused("wrong-robot")
+        told = replace(
+            told, tenant=enrolled.tenant, scopes=enrolled.scopes, quotas=tuple(enrolled.quotas.items())
+        )
+    denied = keys.denies(told)
+    if denied:
+        raise _Refused(denied)
+    return told
+
+
+def _timed(claims: dict[str, Any], key_id: str, now: float, settings: AuthSettings) -> Claims:
+    issued, expires, starts = (claims.get(name) for name in ("iat", "exp", "nbf"))
+    for stamp in (issued, expires, 0 if starts is None else starts):
+        if isinstance(stamp, bool) or not isinstance(stamp, (int, float)) or not 0 <= stamp < 1e11:
+            raise _Refused("bad-time")
+    assert isinstance(issued, (int, float))
+    assert isinstance(expires, (int, float))
+    if expires - issued > settings.token_life_s:
+        raise _Refused("life-too-long")
+    if now > expires + settings.leeway_s:
+        raise _Refused("expired")
+    if issued > now + settings.leeway_s or (starts is not None and starts > now + settings.leeway_s):
+        raise _Refused("not-yet-valid")
+    robot, token_id = claims["sub"], claims["jti"]
+    if not all(isinstance(word, str) and 0 < len(word) <= 64 for word in (robot, token_id)):
+        raise _Refused("bad-subject")
+    return Claims(
+        robot=robot,
+        token_id=token_id,
+        issued_s=float(issued),
+        expires_s=float(expires),
+        key_id=key_id,
+        tenant=str(claims.get("tenant", "default")),
+        scopes=tuple(str(claims.get("scope", "")).split()),
+    )
+
+
+def _is_canonical(token: str) -> bool:
+    """Refuse base64 whose unused last bits are set: two spellings of one token."""
+    parts = token.split(".")
+    if len(parts) != 3:
+        return False
+    try:
+        return all(_b64(_unb64(part)) == part for part in parts)
+    except ValueError:
+        return False
+
+
+def _b64(data: bytes) -> str:
+    return base64.urlsafe_b64encode(data).rstrip(b"=").decode()
+
+
+def _unb64(text: str) -> bytes:
+    return base64.b64decode(text + "=" * (-len(text) % 4), altchars=b"-_", validate=True)
+
+
+def _ed25519() -> Any:
+    try:
+        from cryptography.hazmat.primitives.asymmetric import ed25519
+    except ImportError as error:
+        raise MissingExtra("cryptography", "keys") from error
+    return ed25519
+
+
+def _jwt() -> Any:
+    try:
+        import jwt
+    except ImportError as error:
+        raise MissingExtra("pyjwt", "keys") from error
+    return jwt

@@ -1,0 +1,120 @@
+"""Turn a server's own metrics page into what CloudWatch's alarms and dashboard read.
+
+Pure: text in, data out.  A counter that fell was reset by a restart, and counts from zero again.  Promises
+the names of `rse_pf.scaling.alarms`, the dimensions of `dimensions_of`, and no robot's name.
+"""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+__all__ = ["ROBOTS", "ServerMetrics", "datums", "dimensions_of", "read_page"]
+
+ROBOTS = "Robots"
+"""The one metric that is told for each server, too."""
+
+_LINE = re.compile(r"^rse_pf_(\w+?)(?:\{(.*)\})? (\S+)$", flags=re.M)
+_LABEL = re.compile(r'(\w+)="([^"]*)"')
+_INF = "+Inf"
+_BEYOND = 2.0
+"""An answer slower than the last bound is told as twice that bound."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ServerMetrics:
+    """One look at a server: gauges as they are, counters since its start.
+
+    ``answers`` maps an upper bound in milliseconds to the answers that took at most so long.
+    """
+
+    robots: float = 0.0
+    in_flight: float = 0.0
+    queue_ms: float = 0.0
+    requests: float = 0.0
+    bytes_in: float = 0.0
+    bytes_out: float = 0.0
+    answers: Mapping[float, float] = field(default_factory=dict)
+
+
+def read_page(text: str) -> ServerMetrics:
+    """Return the reading on a page of /metrics, in Prometheus' text format."""
+    totals: Counter[str] = Counter()
+    answers: Counter[float] = Counter()
+    bounds_ms: list[float] = []
+    for name, labels, value in _LINE.findall(text):
+        found = dict(_LABEL.findall(labels))
+        if name == "duration_seconds_bucket":
+            bound_ms = float(found["le"]) * 1e3
+            answers[bound_ms] += float(value)  # type: ignore[assignment]
+            if found["le"] != _INF:
+                bounds_ms.append(bound_ms)
+        else:
+            totals[f"{name} {found['direction']}" if "direction" in found else name] += float(value)  # type: ignore[assignment]
+    if bounds_ms:
+        answers[max(bounds_ms) * _BEYOND] = answers.pop(float("inf"))
+    return ServerMetrics(
+        robots=totals["robots"],
+        in_flight=totals["in_flight"],
+        queue_ms=totals["queue_oldest_s"] * 1e3,
+        requests=totals["requests_total"],
+        bytes_in=totals["bytes_total in"],
+        bytes_out=totals["bytes_total out"],
+        answers=dict(answers),
+    )
+
+
+def dimensions_of(group: str, server: str = "") -> list[dict[str, str]]:
+    """Return the dimensions of what is told for a group or, where *server* is an instance, for it alone."""
+    named = {"AutoScalingGroupName": group, **({"InstanceId": server} if server else {})}
+    return [{"Name": name, "Value": value} for name, value in named.items()]
+
+
+def datums(before: ServerMetrics, now: ServerMetrics, group: str, server: str) -> list[dict[str, Any]]:
+    """Return the MetricData of one period between two looks of the instance *server*, for PutMetricData."""
+    values = {
+        ROBOTS: (now.robots, "Count"),
+        "InFlight": (now.in_flight, "Count"),
+        "QueueMs": (now.queue_ms, "Milliseconds"),
+        "Requests": (_since(before.requests, now.requests), "Count"),
+        "BytesIn": (_since(before.bytes_in, now.bytes_in), "Bytes"),
+        "BytesOut": (_since(before.bytes_out, now.bytes_out), "Bytes"),
+    }
+    dimensions = dimensions_of(group)
+    made: list[dict[str, Any]] = [
+        {"MetricName": name, "Dimensions": dimensions, "Value": value, "Unit": unit}
+        for name, (value, unit) in values.items()
+    ]
+    of_server = dimensions_of(group, server)
+    made.append({"MetricName": ROBOTS, "Dimensions": of_server, "Value": now.robots, "Unit": "Count"})
+    slots = _answers_between(before.answers, now.answers)
+    if slots:
+        made.append(
+            {
+                "MetricName": "AnswerMs",
+                "Dimensions": dimensions,
+                "Values": list(slots),
+                "Counts": list(slots.values()),
+                "Unit": "Milliseconds",
+            }
+        )
+    return made
+
+
+def _answers_between(before: Mapping[float, float], now: Mapping[float, float]) -> dict[float, float]:
+    """Return how many answers fell between each bound and the one below; empty slots are left out."""
+    slots, below = {}, 0.0
+    restarted = any(now.get(bound, 0.0) < count for bound, count in before.items())
+    for bound in sorted(now):
+        passed = now[bound] - (0.0 if restarted else before.get(bound, 0.0))
+        if passed > below:
+            slots[bound] = passed - below
+        below = passed
+    return slots
+
+
+def _since(before: float, now: float) -> float:
+    return now - before if now >= before else now

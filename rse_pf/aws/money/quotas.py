@@ -1,0 +1,132 @@
+"""Check that an account can take the platform before anything is created: room, certificate, bootstrap.
+
+Each check stands alone: one that may not be made warns, and the next follows.  Promises to change nothing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import NamedTuple
+
+from rse_pf.aws.account import Account
+from rse_pf.aws.money.leftovers import living_stacks
+from rse_pf.config import PlatformSettings
+from rse_pf.errors import ConfigurationError
+
+__all__ = ["Check", "check_account"]
+
+_BOOTSTRAP = "/cdk-bootstrap/hnb659fds/version"
+_VCPUS, _EXECUTIONS, _VPCS = ("ec2", "L-1216C47A"), ("lambda", "L-B99A9384"), ("vpc", "L-F678F1CE")
+_ALWAYS_UNRESERVED = 100
+"""Executions of an account that no function may reserve."""
+_NETWORK_STACK = "RsePf-Network"
+_ASK_FOR_MORE = "ask for more in the Service Quotas console"
+
+
+class Check(NamedTuple):
+    """One line: ``grade`` is ok, warn or fail; ``fix`` says what to do unless it is ok."""
+
+    grade: str
+    what: str
+    fix: str = ""
+
+
+def check_account(account: Account, settings: PlatformSettings) -> Iterator[Check]:
+    """Yield what is found.
+
+    Raises:
+        ConfigurationError: AWS does not know who asks.
+        StoreError: AWS does not answer.
+    """
+    who = account.find("sts", "get_caller_identity") or {}
+    yield Check("ok", f"signed in as {who.get('Arn', '?')}, region {account.region}")
+    checks: tuple[Callable[[Account, PlatformSettings], Check], ...] = (
+        _bootstrap, _certificate, _instance_type, _vcpus, _executions, _vpcs,
+    )  # fmt: skip
+    for check in checks:
+        try:
+            yield check(account, settings)
+        except ConfigurationError as error:
+            yield Check("warn", f"not checked: {error.message}", error.hint)
+
+
+def _bootstrap(account: Account, settings: PlatformSettings) -> Check:
+    found = account.find("ssm", "get_parameter", Name=_BOOTSTRAP)
+    if found is None:
+        return Check("fail", f"the CDK is not bootstrapped in {account.region}", "npx cdk bootstrap")
+    return Check("ok", f"bootstrapped, version {found['Parameter']['Value']}")
+
+
+def _certificate(account: Account, settings: PlatformSettings) -> Check:
+    cloud = settings.cloud
+    if cloud.lab:
+        return Check("warn", "cloud.lab is true: no TLS", "for more than trials, set cloud.lab to false")
+    parts = cloud.certificate_arn.split(":")
+    if len(parts) < 6 or parts[2:4] != ["acm", account.region]:
+        return Check(
+            "fail", f"{cloud.certificate_arn} is no ACM certificate of {account.region}",
+            "a load balancer takes certificates of its own region",
+        )  # fmt: skip
+    found = account.find("acm", "describe_certificate", CertificateArn=cloud.certificate_arn)
+    if found is None:
+        return Check("fail", "there is no such certificate", "mend cloud.certificate_arn")
+    told = found["Certificate"]
+    names = {told["DomainName"], *told.get("SubjectAlternativeNames", ())}
+    if not any(_covers(name, cloud.domain_name) for name in names):
+        return Check(
+            "fail", f"the certificate is for {', '.join(sorted(names))}, not for {cloud.domain_name}",
+            "order one for cloud.domain_name",
+        )  # fmt: skip
+    if told["Status"] != "ISSUED":
+        return Check("fail", f"the certificate is {told['Status']}", "add the DNS record that ACM shows")
+    return Check("ok", f"certificate for {cloud.domain_name}")
+
+
+def _covers(name: str, domain: str) -> bool:
+    if name.startswith("*."):
+        return domain.partition(".")[2] == name[2:]
+    return name == domain
+
+
+def _instance_type(account: Account, settings: PlatformSettings) -> Check:
+    kind = settings.cloud.instance_type
+    found = account.pages(
+        "ec2", "describe_instance_type_offerings", "InstanceTypeOfferings",
+        Filters=[{"Name": "instance-type", "Values": [kind]}],
+    )  # fmt: skip
+    if not found:
+        return Check("fail", f"{account.region} offers no {kind}", "choose another cloud.instance_type")
+    return Check("ok", f"{kind} is offered")
+
+
+def _vcpus(account: Account, settings: PlatformSettings) -> Check:
+    # An instance that drains stands beside the one that follows it.
+    needed = (settings.scaling.max_servers + 1) * settings.prices.server_vcpus
+    return _enough(
+        account, _VCPUS, needed, "vCPUs of on-demand instances for scaling.max_servers and one more"
+    )
+
+
+def _executions(account: Account, settings: PlatformSettings) -> Check:
+    needed = settings.cloud.lambda_concurrency + _ALWAYS_UNRESERVED
+    what = f"concurrent executions: cloud.lambda_concurrency, and {_ALWAYS_UNRESERVED} that stay unreserved"
+    return _enough(account, _EXECUTIONS, needed, what)
+
+
+def _vpcs(account: Account, settings: PlatformSettings) -> Check:
+    ours = _NETWORK_STACK in living_stacks(account)
+    there = len(account.pages("ec2", "describe_vpcs", "Vpcs"))
+    return _enough(account, _VPCS, there + (0 if ours else 1), "VPCs in the region, with this one")
+
+
+def _enough(account: Account, quota: tuple[str, str], needed: int, what: str) -> Check:
+    service, code = quota
+    asked = {"ServiceCode": service, "QuotaCode": code}
+    found = account.find("service-quotas", "get_service_quota", **asked)
+    if found is None:  # nobody ever asked for another than AWS's own
+        found = account.find("service-quotas", "get_aws_default_service_quota", **asked)
+    if found is None:
+        return Check("warn", f"quota {service} {code} is not told; needed are {needed} {what}", _ASK_FOR_MORE)
+    most = float(found["Quota"]["Value"])
+    line = f"quota {most:g}, needed {needed}: {what}"
+    return Check("ok", line) if most >= needed else Check("fail", line, _ASK_FOR_MORE)

@@ -1,0 +1,159 @@
+"""Where a cloud's keys are: private halves in one secret, public halves as a JWKS in the artifact bucket.
+
+Two keys overlap in a rotation: servers learn the new one before anything is signed with it, and the old one
+stays until its last token is over.  Promises to print no private half, and to publish only what is stored.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from typing import Any
+
+from rse_pf.auth.tokens import KeySet, SigningKey
+from rse_pf.auth.trust_store import AccessControlStore
+from rse_pf.aws.account import Account
+from rse_pf.aws.storage.s3_store import S3Store
+from rse_pf.aws.storage.secrets import read_secret, write_secret
+from rse_pf.config import PlatformSettings
+from rse_pf.config.resource_names import DATA_STACK, KEYS_NAME
+from rse_pf.errors import ConfigurationError, NotFound, UsageError
+
+__all__ = ["DATA_STACK", "KEYS_NAME", "KeyRing", "KeyStore", "open_key_store", "spread_s"]
+
+_SECRET, _BUCKET = "SigningKey", "Artifacts"
+_MAKE_ONE = "make one with rse-pf token init --cloud"
+
+
+def spread_s(settings: PlatformSettings) -> float:
+    """Return how long it takes until every server and function has fetched a new key set."""
+    return 2.0 * settings.scaling.period_s
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class KeyRing:
+    """The keys, oldest first, each with the Unix time from which it may sign."""
+
+    keys: tuple[tuple[SigningKey, float], ...]
+
+    @classmethod
+    def from_json(cls, text: str) -> KeyRing | None:
+        """Return the ring that `to_json` wrote; None for what CloudFormation put there at first."""
+        try:
+            document = json.loads(text)
+            rows = document["keys"]
+        except (ValueError, TypeError, KeyError):
+            return None
+        try:
+            made = tuple((SigningKey.from_json(json.dumps(row["jwk"])), float(row["from_s"])) for row in rows)
+        except (TypeError, KeyError, ValueError, UsageError) as error:
+            raise ConfigurationError(
+                "the secret holds keys that cannot be read", hint="restore its version AWSPREVIOUS"
+            ) from error
+        return cls(keys=made) if made else None
+
+    def to_json(self) -> str:
+        """Return the ring with its private halves; for the secret alone."""
+        rows = [{"jwk": json.loads(key.to_json()), "from_s": from_s} for key, from_s in self.keys]
+        return json.dumps({"keys": rows})
+
+    def key_set(self) -> KeySet:
+        """Return the public halves."""
+        halves = {key.key_id: key.key_set().get(key.key_id) for key, _ in self.keys}
+        return KeySet({name: half for name, half in halves.items() if half is not None})
+
+    def signer(self, now: float) -> SigningKey:
+        """Return the newest key that may sign at *now*, in Unix seconds."""
+        may = [key for key, from_s in self.keys if from_s <= now]
+        return may[-1] if may else self.keys[0][0]
+
+    def rotated(self, key: SigningKey, *, now: float, settings: PlatformSettings) -> KeyRing:
+        """Return the newest key and *key*, which signs once every server knows it.
+
+        Raises:
+            ConfigurationError: The rotation before this one is not over yet.
+        """
+        _, from_s = self.keys[-1]
+        old_tokens_over = from_s + settings.auth.token_life_s + settings.auth.leeway_s
+        if len(self.keys) > 1 and now < old_tokens_over:
+            raise ConfigurationError(
+                f"tokens of the key before are good for {old_tokens_over - now:.0f} s more",
+                hint="wait, or end them at once with rse-pf token retire --cloud",
+            )
+        return KeyRing(keys=(self.keys[-1], (key, now + spread_s(settings))))
+
+    def retired(self, *, now: float, force: bool = False) -> KeyRing:
+        """Return the newest key alone, signing from *now*: the others are trusted no longer.
+
+        Raises:
+            ConfigurationError: There is no other key; or not every server knows the newest yet and *force* is
+                not given: robots with good tokens would be refused.
+        """
+        if len(self.keys) == 1:
+            raise ConfigurationError(
+                "there is one key only, and every token is signed with it",
+                hint="add another with rse-pf token rotate --cloud first",
+            )
+        key, from_s = self.keys[-1]
+        if now < from_s and not force:
+            raise ConfigurationError(
+                f"for {from_s - now:.0f} s more servers may not know key {key.key_id} and refuse robots",
+                hint="wait; if the key before was stolen, add --force",
+            )
+        return KeyRing(keys=((key, min(from_s, now)),))
+
+
+class KeyStore:
+    """The secret and the bucket of one deployment."""
+
+    def __init__(self, secrets: Any, secret: str, bucket: S3Store) -> None:
+        self._secrets = secrets
+        self._secret = secret
+        self._bucket = bucket
+
+    def read(self) -> KeyRing | None:
+        """Return the ring; None if no key was made yet."""
+        try:
+            return KeyRing.from_json(read_secret(self._secrets, self._secret))
+        except NotFound:
+            return None
+
+    def ring(self) -> KeyRing:
+        """Return the ring; raises ConfigurationError if there is none."""
+        found = self.read()
+        if found is None:
+            raise ConfigurationError("this cloud has no signing key yet", hint=_MAKE_ONE)
+        return found
+
+    def write(self, ring: KeyRing) -> None:
+        """Store *ring*, then publish its public half; after a crash between the two, `publish` mends it."""
+        write_secret(self._secrets, self._secret, ring.to_json())
+        self.publish(ring)
+
+    def control_room(self) -> AccessControlStore:
+        """Return the room beside the public keys, which servers look into every few hundred milliseconds."""
+        return AccessControlStore(self._bucket)
+
+    def publish(self, ring: KeyRing) -> None:
+        """Write the public half, which servers fetch within `spread_s`, and furnish the control room."""
+        self.control_room().furnish()
+        self._bucket.put(KEYS_NAME, ring.key_set().to_json().encode())
+
+
+def open_key_store(account: Account) -> KeyStore:
+    """Return the store of the deployment in *account*; raises ConfigurationError if there is none."""
+    found = account.pages(
+        "cloudformation", "list_stack_resources", "StackResourceSummaries", StackName=DATA_STACK
+    )
+    names = {
+        word: row["PhysicalResourceId"]
+        for row in found
+        for word, kind in ((_SECRET, "AWS::SecretsManager::Secret"), (_BUCKET, "AWS::S3::Bucket"))
+        if row["LogicalResourceId"].startswith(word) and row["ResourceType"] == kind
+    }
+    if len(names) < 2:
+        raise ConfigurationError(
+            f"there is no stack {DATA_STACK} in {account.region}", hint="deploy it: npx cdk deploy --all"
+        )
+    bucket = S3Store(account.client("s3"), names[_BUCKET])
+    return KeyStore(account.client("secretsmanager"), names[_SECRET], bucket)

@@ -1,0 +1,184 @@
+"""Keep objects in one S3 bucket, under the same contract as a folder or the memory.
+
+Swaps are S3's own conditional writes, so two servers never both win.  A presigned address fixes name, length
+and sha256 of what may be stored, so a robot uploads by itself and nothing else.  Promises no listing of names
+that are not ours, and no call that lasts longer than `rse_pf.aws.clients` allows.
+"""
+
+from __future__ import annotations
+
+import base64
+import contextlib
+from collections.abc import Iterator
+from typing import Any
+
+from rse_pf.aws.clients import make_client, patiently, status_of
+from rse_pf.errors import Conflict, NotFound, StoreError, StoreFull
+from rse_pf.object_store import ObjectInfo, check_name
+
+__all__ = ["S3Store", "open_bucket"]
+
+_MISSING, _CHANGED, _RACED, _OUTSIDE = 404, 412, 409, 416
+_FULL = {"QuotaExceeded", "EntityTooLarge", "InsufficientStorage"}
+
+
+def open_bucket(bucket: str, region: str) -> S3Store:
+    """Return the store in *bucket*; raises MissingExtra.  Nothing is asked of AWS yet."""
+    return S3Store(make_client("s3", region), bucket)
+
+
+class S3Store:
+    """Objects of one bucket."""
+
+    def __init__(self, client: Any, bucket: str) -> None:
+        self._client = client
+        self._bucket = bucket
+
+    def get(self, name: str) -> bytes:
+        """Return the object; raises NotFound."""
+        return self._read(name)[0]
+
+    def get_range(self, name: str, start: int, length: int) -> bytes:
+        """Return at most *length* bytes from *start* on; raises NotFound."""
+        from botocore.exceptions import ClientError
+
+        if length <= 0:
+            return b""
+
+        def piece() -> bytes:
+            wanted = f"bytes={start}-{start + length - 1}"
+            found = self._client.get_object(Bucket=self._bucket, Key=check_name(name), Range=wanted)
+            data: bytes = found["Body"].read()
+            return data
+
+        with _as_store_errors(name):
+            try:
+                return patiently(piece)
+            except ClientError as error:
+                if status_of(error) == _OUTSIDE:
+                    return b""
+                raise
+
+    def put(self, name: str, data: bytes) -> None:
+        """Store the object durably; raises StoreFull."""
+        self._write(check_name(name), data)
+
+    def head(self, name: str) -> ObjectInfo:
+        """Return size and name; raises NotFound."""
+        found = self._ask(name, "head_object", Key=check_name(name))
+        return ObjectInfo(name=name, size=int(found["ContentLength"]))
+
+    def list(self, prefix: str = "") -> Iterator[ObjectInfo]:
+        """Yield the objects whose names begin with *prefix*, sorted by name."""
+        more: dict[str, str] = {}
+        while True:
+            page = self._ask(prefix, "list_objects_v2", Prefix=prefix, **more)
+            for each in page.get("Contents", ()):
+                with contextlib.suppress(StoreError):  # somebody else's name is no object of ours
+                    yield ObjectInfo(name=check_name(each["Key"]), size=int(each["Size"]))
+            if not page.get("IsTruncated"):
+                return
+            more = {"ContinuationToken": page["NextContinuationToken"]}
+
+    def delete(self, name: str) -> None:
+        """Remove the object; a missing one is no error."""
+        with contextlib.suppress(NotFound):
+            self._ask(name, "delete_object", Key=check_name(name))
+
+    def compare_and_swap(self, name: str, expected: bytes | None, data: bytes) -> None:
+        """Replace the object if it still holds *expected* (None: is missing); raises Conflict.
+
+        When the answer to a write that won is lost, the repeated write finds its own data and has won, too.
+        """
+        check_name(name)
+        condition = {"IfNoneMatch": "*"}
+        if expected is not None:
+            try:
+                current, tag = self._read(name)
+            except NotFound as error:
+                raise _conflict(name) from error
+            if current != expected:
+                raise _conflict(name)
+            condition = {"IfMatch": tag}
+        self._write(name, data, **condition)
+
+    def presigned_put(self, name: str, *, size: int, sha256: str, life_s: int) -> tuple[str, dict[str, str]]:
+        """Return an address and the headers with which exactly these bytes may be PUT there.
+
+        Args:
+            name: Name of the object.
+            size: Its length in bytes.
+            sha256: Its digest in hex; S3 refuses other bytes.
+            life_s: The address is good for so long.
+        """
+        checksum = base64.b64encode(bytes.fromhex(sha256)).decode()
+        url = self._client.generate_presigned_url(
+            "put_object",
+            Params={
+                "Bucket": self._bucket, "Key": check_name(name), "ContentLength": size,
+                "ChecksumSHA256": checksum,
+            },
+            ExpiresIn=life_s,
+        )  # fmt: skip
+        return str(url), {"Content-Length": str(size), "x-amz-checksum-sha256": checksum}
+
+    def presigned_get(self, name: str, *, life_s: int) -> str:
+        """Return an address from which the object may be read for *life_s* seconds."""
+        place = {"Bucket": self._bucket, "Key": check_name(name)}
+        return str(self._client.generate_presigned_url("get_object", Params=place, ExpiresIn=life_s))
+
+    def _read(self, name: str) -> tuple[bytes, str]:
+        def whole() -> tuple[bytes, str]:
+            found = self._client.get_object(Bucket=self._bucket, Key=name)
+            return found["Body"].read(), found["ETag"]
+
+        check_name(name)
+        with _as_store_errors(name):
+            return patiently(whole)
+
+    def _write(self, name: str, data: bytes, **condition: str) -> None:
+        tries = 0
+
+        def write() -> None:
+            nonlocal tries
+            tries += 1
+            self._client.put_object(Bucket=self._bucket, Key=name, Body=data, **condition)
+
+        try:
+            with _as_store_errors(name):
+                patiently(write)
+        except Conflict:
+            if tries == 1 or self.get(name) != data:
+                raise
+
+    def _ask(self, name: str, method: str, **arguments: Any) -> dict[str, Any]:
+        with _as_store_errors(name):
+            found: dict[str, Any] = patiently(
+                lambda: getattr(self._client, method)(Bucket=self._bucket, **arguments)
+            )
+        return found
+
+
+@contextlib.contextmanager
+def _as_store_errors(name: str) -> Iterator[None]:
+    from botocore.exceptions import ClientError
+
+    try:
+        yield
+    except ClientError as error:
+        code = error.response.get("Error", {}).get("Code", "")
+        if code == "NoSuchBucket":
+            raise StoreError("the bucket does not exist", hint="look at data.store") from error
+        if status_of(error) == _MISSING:
+            raise NotFound(f"no object named {name!r}") from error
+        if status_of(error) in (_CHANGED, _RACED):
+            raise _conflict(name) from error
+        if code in _FULL:
+            raise StoreFull(f"no room for {name!r}", hint="free some space") from error
+        raise StoreError(
+            f"{name!r}: S3 says {code}", hint="look at the role's policy and the bucket's"
+        ) from error
+
+
+def _conflict(name: str) -> Conflict:
+    return Conflict(f"{name!r} was changed meanwhile", hint="read it again and retry")

@@ -1,0 +1,196 @@
+"""What a backend server records of its door: who came in, who was refused, whose socket lost its standing.
+
+`AuditRecorder` collects in a worker, `ServerAudit` writes in the supervisor, the one writer of the server's
+log. Promises that a handshake waits for nothing, that a flood of refusals is counted instead of written,
+and that a name which nobody verified is called so.
+"""
+
+from __future__ import annotations
+
+import base64
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from types import TracebackType
+from typing import Any, TypeVar
+
+import msgspec
+
+from rse_pf.audit.chain import Note, Refusals, Value
+from rse_pf.audit.log import AuditLog
+from rse_pf.auth.tokens import Claims
+from rse_pf.backend.gateway.handshake import Accepted, Rejected
+from rse_pf.backend.ports import Clocks, Handle, Loop
+from rse_pf.config import AuthSettings
+
+__all__ = ["AuditRecorder", "ServerAudit", "open_records"]
+
+_MAX_IN_A_MESSAGE = 500
+"""Entries that travel together; the channel's longest line is 1 MiB."""
+_SUM_UP_S = 10.0
+_UNAUTHORIZED = 401
+_MAX_CLAIM = 64
+
+_W = TypeVar("_W")
+
+
+class AuditRecorder:
+    """Notes of one worker, sent to the supervisor in batches."""
+
+    def __init__(
+        self, settings: AuthSettings, clocks: Clocks, *, loop: Loop, tell: Callable[..., None] | None
+    ) -> None:
+        """Hold nothing yet.
+
+        Args:
+            settings: How long notes are held, and how many refusals are told one by one.
+            clocks: Monotonic for the rate, wall for the entries.
+            loop: For the time of the next batch.
+            tell: Says something to the supervisor; None: nothing is recorded.
+        """
+        self._clocks = clocks
+        self._loop = loop
+        self._tell = tell
+        self._pause_s = settings.audit_sync_ms / 1e3
+        self._refusals = Refusals(settings.audit_refused_per_s, float(settings.audit_refused_burst))
+        self._held: list[dict[str, Any]] = []
+        self._next: Handle | None = None
+        self._sum: Handle | None = None
+
+    def judged(self, verdict: Accepted | Rejected, source: str, authorization: str) -> None:
+        """Take what the door said to the address *source*."""
+        if isinstance(verdict, Accepted):
+            if verdict.claims is not None:
+                self._note("auth.accepted", _subject(verdict.claims), **_of(verdict.claims), source=source)
+        elif verdict.status == _UNAUTHORIZED and self._may_tell(verdict.reason):
+            self._note("auth.refused", "", reason=verdict.reason, source=source, **_claimed(authorization))
+
+    def renewed(self, before: Claims, claims: Claims) -> None:
+        """Take the fresh token of a live socket; the same token again is no news."""
+        if claims.token_id != before.token_id:
+            self._note("auth.renewed", _subject(claims), **_of(claims))
+
+    def renewal_refused(self, before: Claims | None, reason: str) -> None:
+        """Take that a live socket showed a token that is not good."""
+        if self._may_tell(reason):
+            self._note("auth.renewal-refused", "" if before is None else _subject(before), reason=reason)
+
+    def cut_off(self, claims: Claims, reason: str) -> None:
+        """Take that a live socket was ended because its token no longer stands."""
+        self._note("auth.cut-off", _subject(claims), **_of(claims), reason=reason)
+
+    def flush(self) -> None:
+        """Send what is held, now."""
+        self._sum_up()
+        self._send()
+
+    def _may_tell(self, reason: str) -> bool:
+        if self._tell is None:
+            return False
+        may = self._refusals.take(reason, self._clocks.monotonic())
+        if not may and self._sum is None:
+            self._sum = self._loop.call_later(_SUM_UP_S, self._sum_up)
+        return may
+
+    def _sum_up(self) -> None:
+        self._sum = None
+        counted = self._refusals.summary()
+        if counted:
+            self._note("auth.refused-many", "", **counted)
+
+    def _note(self, action: str, subject: str, /, **detail: Value) -> None:
+        if self._tell is None:
+            return
+        note = {"time": self._clocks.wall(), "action": action, "subject": subject, "detail": detail}
+        self._held.append(note)
+        if self._next is None:
+            self._next = self._loop.call_later(self._pause_s, self._send)
+
+    def _send(self) -> None:
+        self._next = None
+        held, self._held = self._held, []
+        if self._tell is not None:
+            for first in range(0, len(held), _MAX_IN_A_MESSAGE):
+                self._tell(event="audit", notes=held[first : first + _MAX_IN_A_MESSAGE])
+
+
+class ServerAudit:
+    """The audit log of one server; without one, nothing is recorded."""
+
+    def __init__(self, log: AuditLog | None) -> None:
+        self._log = log
+
+    @property
+    def is_on(self) -> bool:
+        """Whether anything is recorded."""
+        return self._log is not None
+
+    def complain_to(self, say: Callable[[str], None]) -> None:
+        """Tell *say*, by any thread, when the log cannot be written."""
+        if self._log is not None:
+            self._log.on_problem = say
+
+    def note(self, action: str, **detail: Value) -> None:
+        """Record what this server did."""
+        if self._log is not None:
+            self._log.record(action, **detail)  # type: ignore[arg-type]
+
+    def heard(self, otherwise: Callable[[_W, dict[str, Any]], None]) -> Callable[[_W, dict[str, Any]], None]:
+        """Return what takes the messages of workers: notes are recorded, the rest goes on to *otherwise*."""
+
+        def hear(worker: _W, message: dict[str, Any]) -> None:
+            if message["event"] != "audit":
+                otherwise(worker, message)
+            elif self._log is not None:
+                self._log.add(Note(actor=self._log.who, **note) for note in message["notes"])
+
+        return hear
+
+    def __enter__(self) -> ServerAudit:
+        if self._log is not None:
+            self._log.open().start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._log is not None:
+            self._log.close()
+
+
+def open_records(folder: Path | None, server_id: str, settings: AuthSettings) -> ServerAudit:
+    """Return the records of a server; entering them raises ConfigurationError if they cannot be kept."""
+    if folder is None:
+        return ServerAudit(None)
+    return ServerAudit(
+        AuditLog(
+            folder, server_id, wall_clock=time.time, max_bytes=settings.audit_file_bytes,
+            sync_s=settings.audit_sync_ms / 1e3,
+        )
+    )  # fmt: skip
+
+
+class _Shown(msgspec.Struct):
+    """What a token that nobody verified says of itself."""
+
+    sub: str = ""
+    jti: str = ""
+
+
+def _claimed(authorization: str) -> Mapping[str, str]:
+    parts = authorization.split(".")
+    if len(parts) != 3:
+        return {}
+    try:
+        shown = msgspec.json.decode(base64.urlsafe_b64decode(parts[1] + "=="), type=_Shown)
+    except (ValueError, msgspec.MsgspecError, RecursionError):
+        return {}
+    return {"claimed_robot": shown.sub[:_MAX_CLAIM], "claimed_token": shown.jti[:_MAX_CLAIM]}
+
+
+def _subject(claims: Claims) -> str:
+    return claims.robot if claims.tenant == "default" else f"{claims.tenant}/{claims.robot}"
+
+
+def _of(claims: Claims) -> dict[str, str]:
+    return {"token": claims.token_id, "key": claims.key_id}

@@ -1,0 +1,264 @@
+"""Assemble WebSocket frames into messages, and say when a robot broke RFC 6455 or a limit.
+
+Frames and readings of the clock go in, decisions come out (`Received`, `SendPong`, `CloseSocket`).
+Promises no input or output, no clock, and never to hold more than one message of allowed size.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from rse_pf.config import SessionSettings
+
+__all__ = [
+    "CLOSE_INVALID_TEXT",
+    "CLOSE_NORMAL",
+    "CLOSE_POLICY",
+    "CLOSE_PROTOCOL_ERROR",
+    "CLOSE_TOO_BIG",
+    "CloseBorder",
+    "CloseSocket",
+    "FrameAssembler",
+    "FrameDecision",
+    "Received",
+    "SendPong",
+]
+
+CONTINUATION, TEXT, BINARY, CLOSE, PING, PONG = 0, 1, 2, 8, 9, 10
+
+CLOSE_NORMAL = 1000
+CLOSE_PROTOCOL_ERROR = 1002
+CLOSE_INVALID_TEXT = 1007
+CLOSE_POLICY = 1008
+CLOSE_TOO_BIG = 1009
+
+_CONTROL = (CLOSE, PING, PONG)
+_MAX_CONTROL = 125
+_KNOWN_CLOSE_CODES = frozenset({1000, 1001, 1002, 1003, 1007, 1008, 1009, 1010, 1011, 1012, 1013, 1014})
+
+
+@dataclass(frozen=True, slots=True)
+class Received:
+    """One whole message; text is valid UTF-8."""
+
+    data: bytes
+    is_text: bool
+
+
+@dataclass(frozen=True, slots=True)
+class SendPong:
+    """Answer a ping frame."""
+
+    data: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class CloseSocket:
+    """Send this close code, then end the connection."""
+
+    code: int
+    reason: str = ""
+
+
+FrameDecision = Received | SendPong | CloseSocket
+
+
+class FrameAssembler:
+    """What one socket has sent so far, between its messages and inside of one."""
+
+    __slots__ = (
+        "_control_at",
+        "_control_left",
+        "_count",
+        "_limits",
+        "_message",
+        "_opcode",
+        "_size",
+        "closed",
+    )
+
+    def __init__(self, limits: SessionSettings) -> None:
+        self.closed = False
+        self._limits = limits
+        self._message: list[bytes] | None = None
+        self._opcode = 0
+        self._count = 0
+        self._size = 0
+        self._control_left = self._burst
+        self._control_at = 0.0
+
+    def receive(self, opcode: int, fin: bool, rsv: bool, payload: bytes, now: float) -> FrameDecision | None:
+        """Return what one frame, unmasked, that arrived at *now* (s) means; None: wait for more."""
+        if self.closed:
+            return None
+        if rsv:
+            return self._close(CLOSE_PROTOCOL_ERROR, "reserved bits are set")
+        if opcode in (TEXT, BINARY):
+            return self._begin(opcode, fin, payload)
+        if opcode == CONTINUATION:
+            return self._continue(fin, payload)
+        if opcode not in _CONTROL or not fin or len(payload) > _MAX_CONTROL:
+            return self._close(CLOSE_PROTOCOL_ERROR, "bad frame")
+        if opcode == CLOSE:
+            return self._answer_close(payload)
+        if not self._may_control(now):
+            return self._close(CLOSE_POLICY, "too many control frames")
+        return SendPong(payload) if opcode == PING else None
+
+    def _begin(self, opcode: int, fin: bool, payload: bytes) -> FrameDecision | None:
+        if self._message is not None:
+            return self._close(CLOSE_PROTOCOL_ERROR, "a message inside of a message")
+        if len(payload) > self._limits.max_message_bytes:
+            return self._close(CLOSE_TOO_BIG, "message too big")
+        if fin:
+            return self._finish(opcode, payload)
+        self._message, self._opcode = [payload], opcode
+        self._count, self._size = 1, len(payload)
+        return None
+
+    def _continue(self, fin: bool, payload: bytes) -> FrameDecision | None:
+        if self._message is None:
+            return self._close(CLOSE_PROTOCOL_ERROR, "nothing to continue")
+        self._count += 1
+        self._size += len(payload)
+        if self._count > self._limits.max_fragments:
+            return self._close(CLOSE_TOO_BIG, "too many fragments")
+        if self._size > self._limits.max_message_bytes:
+            return self._close(CLOSE_TOO_BIG, "message too big")
+        self._message.append(payload)
+        if not fin:
+            return None
+        whole, self._message = b"".join(self._message), None
+        return self._finish(self._opcode, whole)
+
+    def _finish(self, opcode: int, data: bytes) -> FrameDecision:
+        if opcode == BINARY:
+            return Received(data, False)
+        if not data.isascii():
+            try:
+                data.decode()
+            except UnicodeDecodeError:
+                return self._close(CLOSE_INVALID_TEXT, "text is not UTF-8")
+        return Received(data, True)
+
+    def _answer_close(self, payload: bytes) -> CloseSocket:
+        if not payload:
+            return self._close(CLOSE_NORMAL, "")
+        code = int.from_bytes(payload[:2], "big")
+        if len(payload) == 1 or not (code in _KNOWN_CLOSE_CODES or 3000 <= code <= 4999):
+            return self._close(CLOSE_PROTOCOL_ERROR, "bad close code")
+        try:
+            payload[2:].decode()
+        except UnicodeDecodeError:
+            return self._close(CLOSE_PROTOCOL_ERROR, "close reason is not UTF-8")
+        return self._close(code, "")
+
+    def _close(self, code: int, reason: str) -> CloseSocket:
+        self.closed = True
+        self._message = None
+        return CloseSocket(code, reason)
+
+    @property
+    def _burst(self) -> float:
+        return max(1.0, self._limits.max_control_per_s)
+
+    def _may_control(self, now: float) -> bool:
+        earned = (now - self._control_at) * self._limits.max_control_per_s
+        self._control_left = min(self._burst, self._control_left + earned)
+        self._control_at = now
+        if self._control_left < 1.0:
+            return False
+        self._control_left -= 1.0
+        return True
+
+
+class CloseBorder:
+    """Find where the first CLOSE frame of a byte stream ends.
+
+    A parser that looks one frame ahead would answer garbage behind a CLOSE before the CLOSE itself
+    (RFC 6455, 5.5.1: nothing behind it counts).  This walks frame borders only; it judges nothing.
+    """
+
+    __slots__ = ("_head", "_is_close", "_left", "_upgraded", "shut")
+
+    def __init__(self, *, upgraded: bool = False) -> None:
+        self.shut = False
+        self._upgraded = upgraded
+        self._head = b""
+        self._left = 0
+        self._is_close = False
+
+    @property
+    def is_upgraded(self) -> bool:
+        """Whether the handshake's head is over."""
+        return self._upgraded
+
+    def wanted(self, data: memoryview) -> int:
+        """Return how many of the next bytes of the stream belong to the conversation."""
+        if self.shut:
+            return 0
+        start = 0
+        if not self._upgraded:
+            start = self._end_of_request(data)
+            if start < 0:
+                return len(data)
+        elif not self._left and not self._head and _is_one_data_frame(data):
+            return len(data)
+        return self._walk(data, start)
+
+    def _end_of_request(self, data: memoryview) -> int:
+        seen = self._head + bytes(data)
+        blank = seen.find(b"\r\n\r\n")
+        if blank < 0:
+            self._head = seen[-3:]
+            return -1
+        start = blank + 4 - len(self._head)
+        self._head, self._upgraded = b"", True
+        return start
+
+    def _walk(self, data: memoryview, i: int) -> int:
+        n = len(data)
+        while i < n:
+            if self._left:
+                step = min(self._left, n - i)
+                self._left -= step
+                i += step
+            else:
+                i = self._read_head(data, i)
+            if self._is_close and not self._left and not self._head:
+                self.shut = True
+                return i
+        return n
+
+    def _read_head(self, data: memoryview, i: int) -> int:
+        head = self._head + bytes(data[i : i + 14 - len(self._head)])
+        length = _head_length(head)
+        if length > len(head):
+            self._head = head
+            return len(data)
+        used = length - len(self._head)
+        self._head = b""
+        self._left = _payload_length(head)
+        self._is_close = head[0] & 15 == CLOSE
+        return i + used
+
+
+def _head_length(head: bytes | memoryview) -> int:
+    if len(head) < 2:
+        return 2
+    size = head[1] & 127
+    return 2 + (2 if size == 126 else 8 if size == 127 else 0) + (4 if head[1] & 128 else 0)
+
+
+def _payload_length(head: bytes | memoryview) -> int:
+    size = head[1] & 127
+    if size == 126:
+        return int.from_bytes(head[2:4], "big")
+    return int.from_bytes(head[2:10], "big") if size == 127 else size
+
+
+def _is_one_data_frame(data: memoryview) -> bool:
+    if len(data) < 2 or data[0] & 8:
+        return False
+    length = _head_length(data)
+    return length <= len(data) and length + _payload_length(data) == len(data)

@@ -1,0 +1,165 @@
+"""Judge a WebSocket handshake: path, room, token and sub-protocol, before anything is accepted.
+
+Every refusal has a fixed body; the cause of a refused token goes to the log alone.  Promises no
+socket and no clock: what a robot sent and the time come in, `Accepted` or `Rejected` goes out.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from rse_pf.auth.tokens import Claims, KeySet, token_problem, verify_token
+from rse_pf.config import PlatformSettings
+from rse_pf.errors import Unauthorized
+from rse_pf.wire import SUBPROTOCOLS, codec_for
+
+__all__ = ["HEALTH", "Accepted", "HandshakePolicy", "Rejected"]
+
+HEALTH = "health"
+"""Result of who asked for no WebSocket, but whether robots are served."""
+
+_RETRY_AFTER_S = 2
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Accepted:
+    """A robot that may upgrade.  ``expires_s`` is Unix time; None never expires."""
+
+    robot: str
+    codec: str
+    subprotocol: str
+    expires_s: float | None = None
+    claims: Claims | None = field(default=None, compare=False)
+    tenant: str = "default"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Rejected:
+    """An HTTP answer instead of the upgrade.  ``reason`` is for the log and never sent."""
+
+    status: int
+    body: bytes
+    result: str
+    reason: str = ""
+    headers: Mapping[str, str] = field(default_factory=dict)
+
+
+def _refusal(status: int, code: str, message: str, hint: str, **headers: str) -> Rejected:
+    body = json.dumps({"code": code, "message": message, "hint": hint}, separators=(",", ":")).encode()
+    return _answer(status, body, code, **headers)
+
+
+def _answer(status: int, body: bytes, result: str, **headers: str) -> Rejected:
+    named = {name.replace("_", "-"): value for name, value in headers.items()}
+    return Rejected(
+        status=status, body=body, result=result, headers={"Content-Type": "application/json", **named}
+    )
+
+
+class HandshakePolicy:
+    """The rules of one worker's front door."""
+
+    def __init__(
+        self, settings: PlatformSettings, keys: KeySet | None, *, conformance_echo: bool = False
+    ) -> None:
+        self._settings = settings
+        self.keys = keys
+        self._conformance_echo = conformance_echo
+        path = settings.serving.path
+        self._path = path.encode()
+        self._health_path = settings.serving.health_path.encode()
+        self._healthy = _answer(200, b'{"status":"ok"}', HEALTH)
+        self.defect = _refusal(500, "internal", "the handshake failed", "try again")
+        self._not_found = _refusal(404, "not-found", "nothing is served here", f"connect to {path}")
+        self._full = _refusal(
+            503, "full", "this server has no room for another robot", "try again later",
+            Retry_After=str(_RETRY_AFTER_S),
+        )  # fmt: skip
+        rest_s = settings.session.rate_rest_s
+        self.too_fast = _refusal(
+            429, "quota", "too many messages, or handshakes of this address", "wait, and slow down",
+            Retry_After=str(max(1, math.ceil(rest_s))),
+        )  # fmt: skip
+        self._no_token = _refusal(
+            401, "unauthorized", "the token is missing or not valid",
+            "issue one with rse-pf token issue ROBOT", WWW_Authenticate="Bearer",
+        )  # fmt: skip
+        self._no_subprotocol = _refusal(
+            400, "unsupported", "no sub-protocol that this server speaks was offered",
+            f"offer one of {', '.join(SUBPROTOCOLS.values())}",
+        )  # fmt: skip
+
+    def judge(
+        self,
+        *,
+        path: bytes,
+        authorization: str,
+        offered: list[str],
+        is_full: bool,
+        anonymous: str,
+        now_s: float,
+    ) -> Accepted | Rejected:
+        """Return who may come in, or the answer that turns them away.
+
+        Args:
+            path: As requested, with its query.
+            authorization: The header, "" if absent.
+            offered: Sub-protocols, in the robot's order.
+            is_full: Whether the worker has as many robots as it may.
+            anonymous: Name of a robot where no token is required.
+            now_s: Unix seconds.
+        """
+        if self._conformance_echo:
+            return Accepted(robot=anonymous, codec="", subprotocol="")
+        if path == self._health_path:
+            return self._healthy
+        if path.split(b"?")[0] != self._path:
+            return self._not_found
+        if is_full:
+            return self._full
+        robot, tenant, expires_s = anonymous, "default", None
+        claims = None
+        if self.keys is not None:
+            scheme, _, token = authorization.partition(" ")
+            try:
+                if scheme.lower() != "bearer":
+                    raise Unauthorized("no bearer token")
+                claims = verify_token(token.strip(), keys=self.keys, now=now_s, settings=self._settings.auth)
+            except Unauthorized as error:
+                return _because(self._no_token, token_problem(error))
+            robot, tenant = claims.robot, claims.tenant
+            expires_s = self.ends_s(claims, now_s)
+        codec = codec_for(offered)
+        if codec is None:
+            return self._no_subprotocol
+        return Accepted(
+            robot=robot, codec=codec, subprotocol=SUBPROTOCOLS[codec], expires_s=expires_s, tenant=tenant,
+            claims=claims,
+        )  # fmt: skip
+
+    def ends_s(self, claims: Claims, now_s: float) -> float:
+        """Return when a socket on *claims* ends, in Unix seconds; one within the leeway lives to its end."""
+        leeway_s = self._settings.auth.leeway_s
+        return claims.expires_s if now_s < claims.expires_s else claims.expires_s + leeway_s
+
+    def renewed(self, token: str, now_s: float) -> Claims | str:
+        """Return the claims of a fresh token, or, for the log alone, why it is refused."""
+        if self.keys is None:
+            return "no-keys"
+        try:
+            return verify_token(token, keys=self.keys, now=now_s, settings=self._settings.auth)
+        except Unauthorized as error:
+            return token_problem(error)
+
+
+def _because(refusal: Rejected, reason: str) -> Rejected:
+    return Rejected(
+        status=refusal.status,
+        body=refusal.body,
+        result=refusal.result,
+        reason=reason,
+        headers=refusal.headers,
+    )

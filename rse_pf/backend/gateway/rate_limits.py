@@ -1,0 +1,189 @@
+"""Say who asks too much: a robot's rate with its strikes, a source's handshakes, sockets without a token yet.
+
+Readings of the clock and names go in, verdicts come out.  Promises no input or output, no clock, memory that
+strangers cannot make grow, and that whoever keeps to its rate is never refused.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Hashable
+from dataclasses import dataclass, field
+from typing import Generic, TypeVar
+
+from rse_pf.config import ServingSettings, SessionSettings
+from rse_pf.wire.rate_limit import Bucket
+
+__all__ = ["Bucket", "CutOff", "PendingHandshakes", "RobotRates", "SourceRates", "TooFast"]
+
+_MAX_NAMES = 20000
+"""Names kept at a time; whoever had no reason to be remembered is forgotten first."""
+_MIN_RETRY_MS = 1.0
+
+Key = TypeVar("Key", bound=Hashable)
+Value = TypeVar("Value")
+
+
+@dataclass(frozen=True, slots=True)
+class TooFast:
+    """Refuse this one; after *retry_after_ms* there is room for another."""
+
+    retry_after_ms: float
+
+
+@dataclass(frozen=True, slots=True)
+class CutOff:
+    """End the socket: this robot does not listen to refusals."""
+
+
+@dataclass(slots=True)
+class _Robot:
+    bucket: Bucket
+    refused: int = 0
+    strikes: deque[float] = field(default_factory=deque)
+    rests_until: float = -math.inf
+
+
+class RobotRates:
+    """The rate of each robot, over all of its sockets of one worker.
+
+    A strike is ``command_burst`` refusals: a robot a little above its rate is told so for ever, one far
+    above it is cut off within a second and rests for ``rest_s``.
+    """
+
+    def __init__(self, limits: SessionSettings) -> None:
+        self._limits = limits
+        self._robots: dict[tuple[str, str], _Robot] = {}
+
+    @property
+    def is_on(self) -> bool:
+        """Whether there is a limit at all."""
+        return self._limits.max_commands_per_s > 0
+
+    def judge(self, robot: tuple[str, str], now: float) -> TooFast | CutOff | None:
+        """Return what to do with one more message of *robot* (tenant, name) at *now* (s); None: take it."""
+        if not self.is_on:
+            return None
+        known = self._robots.get(robot)
+        if known is None:
+            known = self._robots[robot] = self._new(now)
+        wait_s = known.bucket.take(now)
+        if wait_s == 0.0:
+            return None
+        if self._strikes(known, now) >= self._limits.rate_strikes:
+            known.strikes.clear()
+            known.rests_until = now + self._limits.rate_rest_s
+            return CutOff()
+        return TooFast(max(_MIN_RETRY_MS, wait_s * 1e3))
+
+    def rest(self, robot: tuple[str, str], now: float) -> None:
+        """Let *robot*, cut off at *now* (s), rest before it may come in again."""
+        known = self._robots.get(robot)
+        if known is None:
+            known = self._robots[robot] = self._new(now)
+        known.rests_until = now + self._limits.rate_rest_s
+
+    def rests_s(self, robot: tuple[str, str], now: float) -> float:
+        """Return for how many seconds more *robot*, cut off before, is not let in."""
+        known = self._robots.get(robot)
+        return 0.0 if known is None else max(0.0, known.rests_until - now)
+
+    def _strikes(self, known: _Robot, now: float) -> int:
+        known.refused += 1
+        if known.refused >= self._limits.command_burst:
+            known.refused = 0
+            known.strikes.append(now)
+        while known.strikes and now - known.strikes[0] > self._limits.rate_window_s:
+            known.strikes.popleft()
+        return len(known.strikes)
+
+    def _new(self, now: float) -> _Robot:
+        if len(self._robots) >= _MAX_NAMES:
+            self._robots = _half(
+                {
+                    name: each
+                    for name, each in self._robots.items()
+                    if each.strikes or each.rests_until > now or not each.bucket.is_full(now)
+                }
+            )
+        return _Robot(Bucket(self._limits.max_commands_per_s, float(self._limits.command_burst)))
+
+
+class SourceRates:
+    """Handshakes of each address in a second; judged before any token is read."""
+
+    def __init__(self, serving: ServingSettings) -> None:
+        self._serving = serving
+        self._sources: dict[str, Bucket] = {}
+
+    def wait_s(self, source: str, now: float) -> float:
+        """Return 0 if *source* may shake hands at *now* (s), else the seconds until it may."""
+        rate = self._serving.handshakes_per_source_per_s
+        if rate <= 0:
+            return 0.0
+        bucket = self._sources.get(source)
+        if bucket is None:
+            if len(self._sources) >= _MAX_NAMES:
+                self._sources = _half({name: b for name, b in self._sources.items() if not b.is_full(now)})
+            bucket = self._sources[source] = Bucket(rate, float(self._serving.handshake_burst))
+        return bucket.take(now)
+
+    def source(self, peer: str, forwarded_for: str) -> str:
+        """Return the address that a handshake came from.
+
+        Args:
+            peer: The other end of the TCP connection.
+            forwarded_for: The ``x-forwarded-for`` headers, joined; each trusted proxy appended one entry, and
+                whatever stands before those may be a lie.
+        """
+        trusted = self._serving.trusted_proxies
+        entries = [entry.strip() for entry in forwarded_for.split(",") if entry.strip()]
+        return entries[-trusted] if 0 < trusted <= len(entries) else peer
+
+
+class PendingHandshakes(Generic[Key]):
+    """Sockets that have not shown a token yet; when there are too many, the one that waited longest leaves.
+
+    A robot shows its token in milliseconds, so the longest wait is the least likely to become one.  (Were the
+    newest to leave, a few silent sockets would lock the robots out.)
+    """
+
+    def __init__(self, most: int, max_per_source: int) -> None:
+        self._most = most
+        self._max_per_source = max_per_source
+        self._sources: dict[Key, str] = {}
+        self._of_source: dict[str, dict[Key, None]] = {}
+
+    def __len__(self) -> int:
+        """Return how many wait."""
+        return len(self._sources)
+
+    def enter(self, key: Key, source: str) -> Key | None:
+        """Take one more; return who has to leave for it, if anybody."""
+        self._sources[key] = source
+        own = self._of_source.setdefault(source, {})
+        own[key] = None
+        leaving: Key | None = None
+        if self._max_per_source and len(own) > self._max_per_source:
+            leaving = next(iter(own))
+        elif len(self._sources) > self._most:
+            leaving = next(iter(self._sources))
+        if leaving is not None:
+            self.leave(leaving)
+        return leaving
+
+    def leave(self, key: Key) -> None:
+        """Forget one that showed a token, or is gone."""
+        source = self._sources.pop(key, None)
+        if source is None:
+            return
+        own = self._of_source[source]
+        del own[key]
+        if not own:
+            del self._of_source[source]
+
+
+def _half(names: dict[Key, Value]) -> dict[Key, Value]:
+    """Return the younger ones, at most half of the names that are kept: to forget must stay rare."""
+    return dict(list(names.items())[-_MAX_NAMES // 2 :])

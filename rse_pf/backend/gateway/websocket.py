@@ -1,0 +1,349 @@
+"""The robots' sockets of one worker: picows on uvloop, between the supervisor's descriptors and the core.
+
+The only file that knows picows.  Promises that no text of ours or of an exception reaches a stranger
+at the door, that a reader who stays slow is cut, and that the first CLOSE frame is the last one read.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+from collections.abc import Callable
+from functools import partial
+from typing import Any, Protocol
+
+from rse_pf.backend.gateway.connection import RobotConnection
+from rse_pf.backend.gateway.decoder_thread import DecoderThread
+from rse_pf.backend.gateway.dispatcher import Dispatcher
+from rse_pf.backend.gateway.frames import CloseBorder
+from rse_pf.backend.gateway.handshake import HEALTH, Accepted, HandshakePolicy, Rejected
+from rse_pf.backend.gateway.rate_limits import PendingHandshakes, SourceRates
+from rse_pf.backend.log import JsonLog
+from rse_pf.backend.ports import Handle
+from rse_pf.config import ServingSettings, SessionSettings
+from rse_pf.errors import MissingExtra
+
+__all__ = ["RobotSockets"]
+
+_MAX_CLOSE_REASON_BYTES = 123
+_TOO_LONG = b"HTTP/1.1 431 Request Header Fields Too Large\r\nConnection: close\r\nContent-Length: 0\r\n\r\n"
+_MAX_READ_BYTES = 16384
+"""At once: of the smallest frames this holds thousands, and the other robots wait while they are walked."""
+_LINGER_S = 2.0
+"""Time a robot has to read our CLOSE and to end its side; then the connection is cut."""
+
+
+class Judged(Protocol):
+    """Gets every verdict of the door."""
+
+    def __call__(self, verdict: Accepted | Rejected, source: str, authorization: str) -> None:
+        """Take one verdict, of the address *source*."""
+
+
+class _Quiet:
+    """The logger picows gets: it would make one logger object for each socket otherwise."""
+
+    def isEnabledFor(self, level: int) -> bool:
+        return False
+
+    def log(self, *args: Any) -> None: ...
+
+    debug = info = warning = error = exception = log
+
+
+class _Arrival:
+    """A socket until its handshake is judged."""
+
+    __slots__ = ("_is_cut", "_transport", "number", "peer", "room", "source")
+
+    def __init__(self, peer: str, room: int, number: int = 0) -> None:
+        self.peer = self.source = peer
+        self.number = number
+        self.room = room
+        """Bytes that the head of its handshake may still have."""
+        self._transport: Any = None
+        self._is_cut = False
+
+    def made(self, transport: Any) -> None:
+        """Know the transport, which may be too late to matter."""
+        self._transport = transport
+        if self._is_cut:
+            transport.abort()
+
+    def cut(self) -> None:
+        """End the socket without a word."""
+        self._is_cut = True
+        if self._transport is not None:
+            self._transport.abort()
+
+    def is_too_long(self, size: int) -> bool:
+        """Take *size* more bytes of the head; answer one that is too long."""
+        self.room -= size
+        if self.room < 0 and not self._is_cut:
+            self._is_cut = True
+            self._transport.write(_TOO_LONG)
+            self._transport.close()
+            return True
+        return self._is_cut
+
+
+class RobotSockets:
+    """Takes accepted sockets and gives the core a `RobotConnection` for each robot that may come in."""
+
+    def __init__(
+        self,
+        *,
+        core: Dispatcher,
+        door: HandshakePolicy,
+        serving: ServingSettings,
+        session: SessionSettings,
+        max_robots: int,
+        workers: int,
+        new_name: Callable[[], str],
+        judged: Judged,
+        log: JsonLog,
+        loop: asyncio.AbstractEventLoop,
+    ) -> None:
+        self._core = core
+        core.reading = DecoderThread(serving, call_soon_threadsafe=loop.call_soon_threadsafe)
+        self._door = door
+        self._max_robots = max_robots
+        self._sources = SourceRates(serving)
+        per_source = 0 if serving.trusted_proxies else serving.max_unauthenticated_per_source
+        self._waiting: PendingHandshakes[_Arrival] = PendingHandshakes(
+            -(-serving.max_unauthenticated // workers), -(-per_source // workers)
+        )
+        self._new_name = new_name
+        self._judged = judged
+        self._log = log
+        self._loop = loop
+        self._serving = serving
+        self._tasks: set[asyncio.Task[None]] = set()
+        picows, self._connect_accepted_socket = _libraries()
+        self._picows = picows
+        self._protocol = _protocol_type(picows)
+        self._listener = _listener_type(picows, loop, serving)
+        self._arguments = (
+            _Quiet(), True, serving.handshake_timeout_s,
+            False, 20.0, 20.0, picows.WSAutoPingStrategy.PING_WHEN_IDLE, False,
+            session.max_message_bytes, None, serving.read_buffer_bytes,
+        )  # fmt: skip
+
+    def take(self, fd: int, ended: Callable[[], None], number: int) -> None:
+        """Serve the accepted socket *fd*, the server's *number*-th; *ended* is called once, at its end."""
+        accepted = socket.socket(fileno=fd)
+        accepted.setblocking(False)
+        # The kernel would keep megabytes for a reader who is slow, and tell nobody.
+        accepted.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, self._serving.write_buffer_bytes)
+        arrival = _Arrival(_peer(accepted), self._serving.max_handshake_bytes, number)
+        leaving = self._waiting.enter(arrival, arrival.peer)
+        if leaving is not None:
+            self._core.metrics.closed["unauthenticated"] += 1
+            leaving.cut()
+
+        def gone() -> None:
+            self._waiting.leave(arrival)
+            ended()
+
+        task = self._loop.create_task(self._serve(accepted, arrival, gone))
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
+
+    async def _serve(self, accepted: socket.socket, arrival: _Arrival, ended: Callable[[], None]) -> None:
+        judge = partial(self._judge, arrival)
+        try:
+            await self._connect_accepted_socket(
+                self._loop,
+                lambda: self._protocol(arrival, ended, None, None, False, judge, *self._arguments),
+                accepted,
+            )
+        except OSError:
+            accepted.close()
+            ended()
+
+    def _judge(self, arrival: _Arrival, request: Any) -> Any:
+        """Answer a handshake; picows would send an exception's text, so none may leave."""
+        self._waiting.leave(arrival)
+        try:
+            verdict = self._verdict(arrival, request)
+            self._judged(verdict, arrival.source, request.headers.get("Authorization", ""))
+        except Exception as error:  # noqa: BLE001  see above
+            self._log.error("defect", at="door", traceback=repr(error))
+            verdict = self._door.defect
+        if isinstance(verdict, Rejected):
+            self._core.metrics.handshakes[verdict.result] += 1
+            kinds = self._picows.WSUpgradeResponse
+            if verdict.result == HEALTH:
+                response = kinds.create_ok_response(verdict.body, dict(verdict.headers))
+            else:
+                self._log.info("refused", result=verdict.result, reason=verdict.reason)
+                response = kinds.create_error_response(verdict.status, verdict.body, dict(verdict.headers))
+            return self._picows.WSUpgradeResponseWithListener(response, None)
+        self._core.metrics.handshakes["ok"] += 1
+        chosen = {"Sec-WebSocket-Protocol": verdict.subprotocol} if verdict.subprotocol else None
+        response = self._picows.WSUpgradeResponse.create_101_response(chosen)
+        return self._picows.WSUpgradeResponseWithListener(
+            response, self._listener(self._core, verdict, arrival.number)
+        )
+
+    def _verdict(self, arrival: _Arrival, request: Any) -> Accepted | Rejected:
+        headers, now = request.headers, self._core.clocks.monotonic()
+        source = arrival.source = self._sources.source(
+            arrival.peer, ",".join(headers.getall("X-Forwarded-For", []))
+        )
+        if self._sources.wait_s(source, now) > 0:
+            return self._door.too_fast
+        connection = [
+            word.strip().lower() for word in ",".join(headers.getall("Connection", [])).split(",")
+        ]
+        if "upgrade" in connection:
+            headers["Connection"] = "upgrade"
+        offered = ",".join(headers.getall("Sec-WebSocket-Protocol", [])).split(",")
+        verdict = self._door.judge(
+            path=bytes(request.path),
+            authorization=headers.get("Authorization", ""),
+            offered=[word.strip() for word in offered],
+            is_full=len(self._core.connections) >= self._max_robots,
+            anonymous=self._new_name(),
+            now_s=self._core.clocks.wall(),
+        )
+        if not isinstance(verdict, Accepted):
+            return verdict
+        rests_s = self._core.rates.rests_s((verdict.tenant, verdict.robot), now)
+        return self._door.too_fast if rests_s > 0 else verdict
+
+
+def _peer(accepted: socket.socket) -> str:
+    try:
+        return str(accepted.getpeername()[0])
+    except OSError:
+        return ""  # gone already
+
+
+def _libraries() -> tuple[Any, Any]:
+    try:
+        import aiofastnet
+        from picows import picows
+    except ImportError as error:
+        raise MissingExtra("picows", "backend") from error
+    return picows, aiofastnet.connect_accepted_socket
+
+
+def _protocol_type(picows: Any) -> Any:
+    base = picows.WSProtocol
+    get_buffer, buffer_updated, connection_lost = base.get_buffer, base.buffer_updated, base.connection_lost
+    connection_made = base.connection_made
+
+    class Protocol(base):  # type: ignore[misc, valid-type]
+        """Hands picows nothing behind the first CLOSE, and tells when the socket is gone."""
+
+        def __init__(self, arrival: _Arrival, ended: Callable[[], None], *arguments: Any) -> None:
+            super().__init__(*arguments)
+            self._arrival = arrival
+            self._ended = ended
+            self._border = CloseBorder()
+            self._room = memoryview(b"")
+
+        def connection_made(self, transport: Any) -> None:
+            connection_made(self, transport)
+            self._arrival.made(transport)
+
+        def get_buffer(self, hint: int) -> memoryview:
+            self._room = get_buffer(self, hint)[:_MAX_READ_BYTES]
+            return self._room
+
+        def buffer_updated(self, n: int) -> None:
+            if not self._border.is_upgraded and self._arrival.is_too_long(n):
+                return
+            if self.transport is not None and self.transport.is_close_frame_sent:
+                return
+            wanted = self._border.wanted(self._room[:n])
+            if wanted:
+                buffer_updated(self, wanted)
+
+        def connection_lost(self, error: Exception | None) -> None:
+            try:
+                connection_lost(self, error)
+            finally:
+                self._ended()
+
+    return Protocol
+
+
+def _listener_type(picows: Any, loop: asyncio.AbstractEventLoop, serving: ServingSettings) -> Any:
+    kinds = picows.WSMsgType
+
+    class Listener(picows.WSListener):  # type: ignore[misc]
+        """One robot's socket: frames to the core, and the core's `Wire`."""
+
+        def __init__(self, core: Dispatcher, admitted: Accepted, number: int) -> None:
+            self._core = core
+            self._admitted = admitted
+            self._number = number
+            self._transport: Any = None
+            self._connection: RobotConnection | None = None
+            self._cut: Handle | None = None
+            self._holds = 0
+
+        def on_ws_connected(self, transport: Any) -> None:
+            self._transport = transport
+            high = serving.write_buffer_bytes
+            transport.underlying_transport.set_write_buffer_limits(high=high, low=high // 4)
+            self._connection = self._core.connect(self, self._admitted, self._number)
+
+        def on_ws_frame(self, transport: Any, frame: Any) -> None:
+            if self._connection is not None:
+                rsv = bool(frame.rsv1 or frame.rsv2 or frame.rsv3)
+                payload = frame.get_payload_as_bytes()
+                self._connection.frame(int(frame.msg_type), bool(frame.fin), rsv, payload)
+
+        def on_ws_disconnected(self, transport: Any) -> None:
+            if self._cut is not None:
+                self._cut.cancel()
+            if self._connection is not None:
+                self._connection.ended()
+                self._connection = None
+
+        def pause_writing(self) -> None:
+            if self._cut is None:
+                self._cut = loop.call_later(serving.slow_reader_s, self._cut_off)
+                # Who does not read its answers is not heard: they would be made for nobody.
+                self.hold()
+
+        def resume_writing(self) -> None:
+            if self._cut is not None:
+                self._cut.cancel()
+                self._cut = None
+                self.read_on()
+
+        def send(self, data: bytes, is_text: bool) -> None:
+            if self._connection is not None:
+                self._transport.send(kinds.TEXT if is_text else kinds.BINARY, data)
+
+        def send_pong(self, data: bytes) -> None:
+            self._transport.send_pong(data)
+
+        def pause(self, seconds: float) -> None:
+            self.hold()
+            loop.call_later(seconds, self.read_on)
+
+        def hold(self) -> None:
+            self._holds += 1
+            self._transport.underlying_transport.pause_reading()
+
+        def read_on(self) -> None:
+            self._holds -= 1
+            if self._connection is not None and not self._holds:
+                self._transport.underlying_transport.resume_reading()
+
+        def close(self, code: int, reason: str) -> None:
+            self._transport.send_close(code, reason.encode()[:_MAX_CLOSE_REASON_BYTES])
+            # Closing with unread bytes would reset the connection, and the robot would not see the code.
+            self._transport.underlying_transport.write_eof()
+            loop.call_later(_LINGER_S, self._transport.disconnect, False)
+
+        def _cut_off(self) -> None:
+            self._core.metrics.closed["slow-reader"] += 1
+            self._transport.disconnect(False)
+
+    return Listener

@@ -1,0 +1,225 @@
+"""Who works on a job, as one record in the object store that changes by compare-and-swap only.
+
+The owner renews the record; whoever else wants the job watches it with a clock of its own: clocks of two
+machines are never compared.  Promises no clock, no thread and no process, and that of two who want the same
+job one gets it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import msgspec
+
+from rse_pf.errors import BadMessage, BadRequest, Conflict, NotFound, StoreError
+from rse_pf.object_store import ObjectStore, name_segment
+from rse_pf.wire.arrays import binary_encode_hook
+
+__all__ = [
+    "MAX_TRIES",
+    "JobLease",
+    "JobRecord",
+    "Verdict",
+    "decode_record",
+    "encode_record",
+    "is_over",
+    "job_key",
+    "marked",
+    "record_name",
+    "tombstone",
+    "verdict_on",
+]  # fmt: skip
+
+MAX_TRIES = 3
+"""A job whose servers died so often is not tried again: it may have been the cause."""
+
+State = Literal["running", "given-up", "done", "failed", "swept"]
+Verdict = Literal["take", "follow", "done", "failed", "poison"]
+
+
+class JobRecord(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """One job.  ``beat`` counts renewals; ``reply`` is the sha256 of what it came to."""
+
+    state: State
+    owner: str
+    beat: int = 0
+    tries: int = 1
+    share: float = 0.0
+    what: str = ""
+    cancel: bool = False
+    """Somebody who watches wants it to end."""
+    reply: str = ""
+    reply_bytes: int = 0
+    compute_ms: float = 0.0
+    server: str = ""
+    code: str = ""
+    message: str = ""
+    hint: str = ""
+    marked_s: float = 0.0
+    """Unix time when a sweep first saw the record as it is; 0 if none did since its owner last wrote."""
+
+
+encode_record = msgspec.json.Encoder().encode
+_decode = msgspec.json.Decoder(JobRecord).decode
+
+
+def decode_record(name: str, data: bytes) -> JobRecord:
+    """Return the record in *data*, the object *name*; raises StoreError."""
+    try:
+        return _decode(data)
+    except msgspec.DecodeError as error:
+        raise StoreError(f"{name!r} is no record of a job", hint="delete it") from error
+
+
+def marked(record: JobRecord, now: float) -> JobRecord:
+    """Return *record* as a sweep leaves it when it sees it first; *now* is Unix time."""
+    return msgspec.structs.replace(record, marked_s=now)
+
+
+def is_over(record: JobRecord, now: float, life_s: float) -> bool:
+    """Return whether nobody has touched *record* for *life_s* since a sweep marked it."""
+    return record.marked_s > 0 and now - record.marked_s >= life_s
+
+
+def tombstone(now: float) -> JobRecord:
+    """Return what stands in the place of a record that is about to go."""
+    return JobRecord(state="swept", owner="", marked_s=now)
+
+
+def job_key(service: str, payload: Any, settings: str) -> str:
+    """Return the digest of a service's name, its inputs (large ones by digest) and the server's settings.
+
+    Raises:
+        BadRequest: The payload has no one encoding.
+    """
+    try:
+        plain = msgspec.msgpack.encode(
+            [service, settings, payload], enc_hook=binary_encode_hook, order="deterministic"
+        )
+    except (BadMessage, TypeError, ValueError, OverflowError, RecursionError) as error:
+        raise BadRequest("the request cannot be encoded", hint="send numbers, strings and lists") from error
+    return hashlib.sha256(plain).hexdigest()
+
+
+def record_name(tenant: str, robot: str, key: str) -> str:
+    """Return where the record of a robot's job lives: ``jobs/TENANT/ROBOT/KEY``."""
+    return f"jobs/{name_segment(tenant)}/{name_segment(robot)}/{key}"
+
+
+def verdict_on(record: JobRecord | None, *, unchanged_s: float, lease_s: float, is_watched: bool) -> Verdict:
+    """Return what to do about a job that a robot wants.
+
+    Args:
+        record: As it stands in the store; None if nobody ever worked on it.
+        unchanged_s: For how long this process has seen it unchanged.
+        lease_s: After so long without a renewal its owner is taken for dead.
+        is_watched: Whether this process waits for the very run that the record tells of; the failure of
+            an earlier run is tried again.
+    """
+    if record is None or record.state == "given-up":
+        return "take"
+    if record.state == "done":
+        return "done"
+    if record.state == "failed":
+        return "failed" if is_watched else "take"
+    if unchanged_s < lease_s:
+        return "follow"  # who sweeps is about to remove the record, or who works renews it
+    if record.state == "swept":
+        return "take"
+    return "take" if record.tries < MAX_TRIES else "poison"
+
+
+@dataclass(slots=True)
+class _Seen:
+    data: bytes | None = None
+    since: float = 0.0
+
+
+class JobLease:
+    """One process's view of one job's record, and its hold on it."""
+
+    def __init__(self, store: ObjectStore, name: str, owner: str, clock: Callable[[], float]) -> None:
+        """Touch nothing yet.
+
+        Args:
+            store: Shared by all who may work on the job.
+            name: Of the record.
+            owner: Unique to this process and this job.
+            clock: Seconds, monotonic.
+        """
+        self.record: JobRecord | None = None
+        self.is_watched = False
+        self._store = store
+        self._name = name
+        self._owner = owner
+        self._clock = clock
+        self._seen = _Seen(since=clock())
+
+    @property
+    def unchanged_s(self) -> float:
+        """For how long the record has stood as it does."""
+        return self._clock() - self._seen.since
+
+    @property
+    def is_ours(self) -> bool:
+        """Whether this process holds the job, as far as it has looked."""
+        return self.record is not None and self.record.owner == self._owner
+
+    def look(self) -> JobRecord | None:
+        """Read the record; raises StoreError."""
+        try:
+            data: bytes | None = self._store.get(self._name)
+        except NotFound:
+            data = None
+        self._note(data)
+        if self.record is not None and self.record.state == "running":
+            self.is_watched = True
+        return self.record
+
+    def take(self) -> bool:
+        """Become the owner; False if somebody was quicker.
+
+        A run whose owner died counts as a try, one that was given up or failed in an orderly way does not.
+        """
+        before = self.record
+        tries = before.tries + 1 if before is not None and before.state == "running" else 1
+        return self._swap(JobRecord(state="running", owner=self._owner, tries=tries))
+
+    def renew(self, share: float, what: str) -> bool:
+        """Say that the owner lives and how far it is; False if the job was taken or cancelled meanwhile."""
+        assert self.record is not None
+        beat = msgspec.structs.replace(
+            self.record, beat=self.record.beat + 1, share=share, what=what, marked_s=0.0
+        )
+        return self._swap(beat) and not beat.cancel
+
+    def end(self, record: JobRecord) -> bool:
+        """Replace our hold by what became of the job; False if it is not ours any longer."""
+        while self.is_ours:
+            if self._swap(msgspec.structs.replace(record, owner=self._owner)):
+                return True
+        return False
+
+    def ask_to_cancel(self) -> None:
+        """Let the owner know that the robot takes the job back."""
+        while self.record is not None and self.record.state == "running" and not self.record.cancel:
+            if self._swap(msgspec.structs.replace(self.record, cancel=True)):
+                return
+
+    def _swap(self, record: JobRecord) -> bool:
+        data = encode_record(record)
+        try:
+            self._store.compare_and_swap(self._name, self._seen.data, data)
+        except Conflict:
+            self.look()
+            return False
+        self._note(data)
+        return True
+
+    def _note(self, data: bytes | None) -> None:
+        if data != self._seen.data:
+            self._seen = _Seen(data, self._clock())
+        self.record = None if data is None else decode_record(self._name, data)

@@ -1,0 +1,276 @@
+"""Put objects in the place of their names before a service is called, so that services stay pure.
+
+Where a request type declares ``bytes``, a robot may send ``{"object": DIGEST}`` instead: an object that it
+stored with the data service.  Promises that a robot reaches its own objects only (what is missing and what
+belongs to others look the same), that no more is read than the limits allow, and that a service sees only
+bytes whose digest is right.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+import re
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import msgspec
+
+from rse_pf.auth.tokens import Claims
+from rse_pf.backend.quota import quota_bytes, store_within
+from rse_pf.config import ServingSettings
+from rse_pf.errors import BadRequest, LimitExceeded, NotFound, QuotaExceeded, StoreError
+from rse_pf.object_store import ObjectStore, digest_of, object_name
+from rse_pf.service import Registry, Service
+from rse_pf.wire import Command, Failure, Result
+from rse_pf.wire.arrays import binary_encode_hook
+
+__all__ = ["ObjectRefs", "named_in", "resolve", "takes_objects"]
+
+_KEY = "object"
+_DIGEST = re.compile(r"[0-9a-f]{64}")
+_DEEPEST = 8
+"""Request types that nest deeper (or in themselves) hold no objects below."""
+
+_Put = Callable[[Any], Any]
+
+
+def takes_objects(request_type: type[Any]) -> bool:
+    """Return whether *request_type* declares ``bytes`` anywhere, so that a name may stand there."""
+    return _shape(request_type) is not None
+
+
+def named_in(request_type: type[Any], payload: Any) -> list[str]:
+    """Return the digests that *payload* names where *request_type* declares ``bytes``, in order.
+
+    Raises:
+        BadRequest: A name there is no sha256 in hex.
+    """
+    found: list[str] = []
+
+    def note(digest: str) -> str:
+        found.append(digest)
+        return digest
+
+    _walk(_shape(request_type), payload, note)
+    return found
+
+
+def resolve(
+    request_type: type[Any],
+    payload: Any,
+    tenant: str,
+    robot: str,
+    store: ObjectStore,
+    *,
+    settings: ServingSettings,
+) -> Any:
+    """Return *payload* with the robot's own objects in the place of their names; blocks for the store.
+
+    A payload that names nothing is returned as it is, and the store is not asked.
+
+    Args:
+        request_type: What the service takes, a msgspec Struct.
+        payload: As decoded from the wire: plain dicts and lists; not changed.
+        tenant: Of the robot's token.
+        robot: Likewise.
+        store: Of the platform.
+        settings: ``objects_per_command`` and ``object_bytes_per_command``.
+
+    Raises:
+        BadRequest: A name is no sha256 in hex.
+        NotFound: The robot has no such object; another one may have.
+        LimitExceeded: More objects, or bytes in them, than one command may name.
+        StoreError: The store fails, or holds other bytes than the digest says.
+    """
+    digests = list(dict.fromkeys(named_in(request_type, payload)))
+    if not digests:
+        return payload
+    if len(digests) > settings.objects_per_command:
+        raise LimitExceeded(
+            f"{len(digests)} objects are named, at most {settings.objects_per_command} may be",
+            hint="put them into fewer commands",
+        )
+    sizes = {digest: _size(store, object_name(tenant, robot, digest), digest) for digest in digests}
+    most = settings.object_bytes_per_command
+    if sum(sizes.values()) > most:
+        raise LimitExceeded(
+            f"the named objects have {sum(sizes.values())} bytes, a command may name {most}",
+            hint="put them into fewer commands",
+        )
+    held = {digest: _read(store, object_name(tenant, robot, digest), digest) for digest in digests}
+    return _walk(_shape(request_type), payload, held.__getitem__)
+
+
+class Owner(Protocol):
+    """Whose objects."""
+
+    robot: str
+    tenant: str
+    claims: Claims | None
+
+
+@dataclass(frozen=True, slots=True)
+class ObjectRefs:
+    """One worker's store and limits, as the command path uses them; without a store nothing is a name."""
+
+    store: ObjectStore | None
+    settings: ServingSettings
+    quota_bytes: float = math.inf
+    """Of a robot whose token says nothing of it."""
+
+    def named_by(self, command: Command, service: Service) -> bool:
+        """Return whether the store would have to be asked; cheap for services that take no ``bytes``."""
+        shape = None if self.store is None else _shape(service.request_type)
+        return shape is not None and any(True for _ in _names(shape, command.payload))
+
+    def put_in(self, command: Command, registry: Registry, who: Owner) -> Command:
+        """Return *command* with what it names in its payload; blocks for the store.
+
+        Raises:
+            UnknownService: The registry does not know the service.
+            RsePfError: As `resolve` says.
+        """
+        service = registry.get(command.service)
+        if self.store is None or not self.named_by(command, service):
+            return command
+        payload = resolve(
+            service.request_type, command.payload, who.tenant, who.robot, self.store, settings=self.settings
+        )
+        return msgspec.structs.replace(command, payload=payload)
+
+    def kept(self, answer: Result | Failure, sent: Result | Failure, who: Owner) -> Result | Failure:
+        """Return *answer* with its reply named where it was too large and *sent* says so; blocks.
+
+        Of a robot that has no room left, the failure that says so.
+        """
+        if self.store is None or not isinstance(answer, Result) or not isinstance(sent, Failure):
+            return sent
+        if sent.code != LimitExceeded.code:
+            return sent
+        reply = msgspec.msgpack.encode(answer.reply, enc_hook=binary_encode_hook)
+        if len(reply) > self.settings.object_bytes_per_command:
+            return sent
+        max_bytes = quota_bytes(who.claims, self.quota_bytes)
+        try:
+            digest = store_within(self.store, who.tenant, who.robot, reply, max_bytes)
+        except QuotaExceeded as error:
+            return msgspec.structs.replace(sent, code=error.code, message=error.message, hint=error.hint)
+        except StoreError:
+            return sent  # true, too, and says what to do
+        return msgspec.structs.replace(answer, reply=None, object=digest)
+
+
+# --- where names may stand -----------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class _Bytes:
+    """Here."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Each:
+    """In each item of a list, or in each value of a dict."""
+
+    below: Any
+
+
+@dataclass(frozen=True, slots=True)
+class _Fields:
+    """In these fields of a struct."""
+
+    below: dict[str, Any]
+
+
+def _shape(request_type: Any) -> Any:
+    return _remembered_shape(request_type)
+
+
+@functools.lru_cache(maxsize=1024)
+def _remembered_shape(request_type: type[Any]) -> Any:
+    return _shape_of(msgspec.inspect.type_info(request_type), _DEEPEST)
+
+
+def _shape_of(kind: Any, depth: int) -> Any:
+    """Return where below *kind* bytes are declared; None for nowhere."""
+    known = msgspec.inspect
+    if depth == 0:
+        return None
+    if isinstance(kind, known.BytesType):
+        return _Bytes()
+    if isinstance(kind, known.Metadata):
+        return _shape_of(kind.type, depth)
+    if isinstance(kind, known.UnionType):
+        shapes = [shape for each in kind.types if (shape := _shape_of(each, depth)) is not None]
+        return shapes[0] if len(shapes) == 1 else None
+    if isinstance(kind, (known.ListType, known.VarTupleType)):
+        below = _shape_of(kind.item_type, depth - 1)
+        return None if below is None else _Each(below)
+    if isinstance(kind, known.DictType):
+        below = _shape_of(kind.value_type, depth - 1)
+        return None if below is None else _Each(below)
+    if isinstance(kind, (known.StructType, known.DataclassType)):
+        fields = {field.encode_name: _shape_of(field.type, depth - 1) for field in kind.fields}
+        fields = {name: shape for name, shape in fields.items() if shape is not None}
+        return _Fields(fields) if fields else None
+    return None
+
+
+def _names(shape: Any, value: Any) -> Iterator[dict[str, Any]]:
+    """Yield what stands in the place of bytes and looks like a name."""
+    if isinstance(shape, _Bytes):
+        if isinstance(value, dict) and _KEY in value:
+            yield value
+    elif isinstance(shape, _Each) and isinstance(value, (list, tuple, dict)):
+        for item in value.values() if isinstance(value, dict) else value:
+            yield from _names(shape.below, item)
+    elif isinstance(shape, _Fields) and isinstance(value, dict):
+        for name, below in shape.below.items():
+            if name in value:
+                yield from _names(below, value[name])
+
+
+def _walk(shape: Any, value: Any, put: _Put) -> Any:
+    """Return *value* with what *put* returns for each named digest; shares what it does not change."""
+    if isinstance(shape, _Bytes):
+        return put(_digest(value)) if isinstance(value, dict) and _KEY in value else value
+    if isinstance(shape, _Each) and isinstance(value, dict):
+        return {key: _walk(shape.below, item, put) for key, item in value.items()}
+    if isinstance(shape, _Each) and isinstance(value, (list, tuple)):
+        return [_walk(shape.below, item, put) for item in value]
+    if isinstance(shape, _Fields) and isinstance(value, dict):
+        below = shape.below
+        return {key: _walk(below[key], item, put) if key in below else item for key, item in value.items()}
+    return value
+
+
+def _digest(value: dict[str, Any]) -> str:
+    digest = value[_KEY]
+    if len(value) != 1 or not isinstance(digest, str) or not _DIGEST.fullmatch(digest):
+        raise BadRequest(
+            "this names no object", hint='write {"object": "..."} with the sha256, 64 small hex digits'
+        )
+    return digest
+
+
+def _size(store: ObjectStore, name: str, digest: str) -> int:
+    try:
+        return store.head(name).size
+    except NotFound:
+        raise _missing(digest) from None
+
+
+def _read(store: ObjectStore, name: str, digest: str) -> bytes:
+    try:
+        data = store.get(name)
+    except NotFound:
+        raise _missing(digest) from None
+    if digest_of(data) != digest:
+        raise StoreError("the bytes are not those of the digest", hint="store the object again")
+    return data
+
+
+def _missing(digest: str) -> NotFound:
+    return NotFound(f"this robot has no object {digest[:16]}...", hint="upload it to the data service first")

@@ -1,0 +1,286 @@
+"""The walls of an isolated environment: namespaces, a root of its own, limits, no new privileges, seccomp.
+
+Each function puts up one wall around the calling process, by plain Linux calls.  Promises that a wall
+which cannot be put up raises `IsolationUnavailable` with its name, and that nothing here is undone by `exec`.
+Source: the paper's Fig. 4 gives each robot an environment of its own; the means are ours.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import platform
+import resource
+import struct
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+__all__ = [
+    "WALLS",
+    "IsolationUnavailable",
+    "close_other_descriptors",
+    "enter_namespaces",
+    "forbid_system_calls",
+    "give_up_privileges",
+    "limit_resources",
+    "make_root",
+    "missing_walls",
+]
+
+WALLS = ("namespaces", "root", "privileges", "seccomp")
+"""Names of the walls that a kernel may lack; limits on resources always hold."""
+
+_LIBC = ctypes.CDLL(None, use_errno=True)
+
+_CLONE_NEWNS, _CLONE_NEWUTS, _CLONE_NEWIPC = 0x00020000, 0x04000000, 0x08000000
+_CLONE_NEWUSER, _CLONE_NEWPID, _CLONE_NEWNET = 0x10000000, 0x20000000, 0x40000000
+_PLACES = tuple(map(Path, ("/mnt", "/media", "/srv", "/opt", "/tmp", "/run")))
+_MS_NOSUID, _MS_NODEV, _MS_BIND, _MS_REC, _MS_PRIVATE = 0x2, 0x4, 0x1000, 0x4000, 1 << 18
+_MNT_DETACH = 2
+_AT_RECURSIVE = 0x8000
+_MOUNT_ATTR_RDONLY, _MOUNT_ATTR_NOSUID, _MOUNT_ATTR_NODEV = 0x1, 0x2, 0x4
+_SYS_MOUNT_SETATTR = 442
+_SYS_PIVOT_ROOT = {"x86_64": 155, "aarch64": 41}
+_PR_SET_NO_NEW_PRIVS, _PR_SET_SECCOMP, _PR_CAPBSET_DROP = 38, 22, 24
+_PR_SET_DUMPABLE = 4
+_SECCOMP_MODE_FILTER = 2
+_CAP_VERSION_3 = 0x20080522
+_LAST_CAP = 63
+_MAX_THREADS = 64
+
+_AUDIT_ARCH_X86_64 = 0xC000003E
+_X32 = 0x40000000
+_ALLOW, _KILL, _ERRNO = 0x7FFF0000, 0x80000000, 0x00050000
+_EPERM, _ENOSYS = 1, 38
+_LOAD, _JUMP_EQUAL, _JUMP_AT_LEAST, _JUMP_SET, _RETURN = 0x20, 0x15, 0x35, 0x45, 0x06
+_CLONE, _CLONE3, _CLONE_THREAD = 56, 435, 0x00010000
+
+_FORBIDDEN_X86_64 = {
+    "socket": 41, "fork": 57, "vfork": 58, "execve": 59, "ptrace": 101, "syslog": 103,
+    "personality": 135, "pivot_root": 155, "adjtimex": 159, "chroot": 161, "acct": 163,
+    "settimeofday": 164, "mount": 165, "umount2": 166, "swapon": 167, "swapoff": 168, "reboot": 169,
+    "init_module": 175, "delete_module": 176, "quotactl": 179, "clock_settime": 227, "kexec_load": 246,
+    "add_key": 248, "request_key": 249, "keyctl": 250, "unshare": 272, "perf_event_open": 298,
+    "open_by_handle_at": 304, "setns": 308, "process_vm_readv": 310, "process_vm_writev": 311,
+    "kcmp": 312, "finit_module": 313, "kexec_file_load": 320, "bpf": 321, "execveat": 322,
+    "userfaultfd": 323, "io_uring_setup": 425, "io_uring_enter": 426, "io_uring_register": 427,
+    "open_tree": 428, "move_mount": 429, "fsopen": 430, "fsconfig": 431, "fsmount": 432, "fspick": 433,
+    "pidfd_getfd": 438, "mount_setattr": 442,
+}  # fmt: skip
+"""No new programs, processes, sockets or mounts, no kernel interfaces; threads stay allowed."""
+
+
+class IsolationUnavailable(Exception):
+    """This kernel, or this account, cannot put up a wall; ``args`` are its name and the reason."""
+
+
+def missing_walls(program: Sequence[Callable[[], None]], names: Sequence[str] = WALLS) -> list[str]:
+    """Try each of *program* in a child of its own and return the *names* of those that failed."""
+    missing = []
+    for name, wall in zip(names, program, strict=True):
+        child = os.fork()
+        if child == 0:
+            try:
+                wall()
+            except BaseException:  # noqa: BLE001  the exit code says it all
+                os._exit(1)
+            os._exit(0)
+        if os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) != 0:
+            missing.append(name)
+    return missing
+
+
+def enter_namespaces() -> None:
+    """Leave the network, mounts, processes and shared memory of the rest; a plain user becomes its own root.
+
+    The process namespace begins with the next child.
+    """
+    flags = _CLONE_NEWNS | _CLONE_NEWPID | _CLONE_NEWNET | _CLONE_NEWIPC | _CLONE_NEWUTS
+    uid, gid = os.getuid(), os.getgid()
+    if uid != 0:
+        flags |= _CLONE_NEWUSER
+    _call("namespaces", _LIBC.unshare, flags)
+    if uid != 0:
+        try:
+            Path("/proc/self/setgroups").write_text("deny")
+            Path("/proc/self/uid_map").write_text(f"{uid} {uid} 1")
+            Path("/proc/self/gid_map").write_text(f"{gid} {gid} 1")
+        except OSError as error:
+            raise IsolationUnavailable("namespaces", str(error)) from error
+
+
+def make_root(readable: Sequence[Path], scratch_bytes: int, owner: int) -> None:
+    """Make a root of *readable* paths (read-only), three devices and an empty ``/scratch``; stand in it.
+
+    Args:
+        readable: Files and folders that keep their names; missing ones are left out.
+        scratch_bytes: Size of the scratch folder, in memory.
+        owner: User of the scratch folder.
+    """
+    _mount(None, "/", None, _MS_REC | _MS_PRIVATE, None)
+    base = _free_place(readable)
+    _mount("root", base, "tmpfs", _MS_NOSUID | _MS_NODEV, "size=1m,mode=755")
+    for path in (*_outermost(readable), *(Path("/dev") / name for name in ("null", "zero", "urandom"))):
+        _show(path, base)
+    scratch = base + "/scratch"
+    os.mkdir(scratch)
+    _mount("scratch", scratch, "tmpfs", _MS_NOSUID | _MS_NODEV, f"size={scratch_bytes},mode=700")
+    os.chown(scratch, owner, owner if os.getuid() == 0 else os.getgid())
+    if not os.path.lexists(base + "/tmp"):
+        os.symlink("scratch", base + "/tmp")
+    old = base + "/old"
+    os.mkdir(old)
+    number = _SYS_PIVOT_ROOT.get(platform.machine())
+    if number is None:
+        raise IsolationUnavailable("root", f"pivot_root is unknown on {platform.machine()}")
+    _call("root", _LIBC.syscall, number, base.encode(), old.encode())
+    os.chdir("/")
+    _call("root", _LIBC.umount2, b"/old", _MNT_DETACH)
+    os.rmdir("/old")
+    _read_only("/", recursive=False)
+    os.chdir("/scratch")
+
+
+def limit_resources(memory_bytes: int, scratch_bytes: int, *, alone: bool) -> None:
+    """Bound address space, file size, open files and threads; no core files.
+
+    Processes are bounded by seccomp, processor time by the deadline.
+
+    Args:
+        memory_bytes: Address space.
+        scratch_bytes: One file.
+        alone: Whether user or user namespace are this environment's own, so that threads can be counted.
+    """
+    if alone:
+        resource.setrlimit(resource.RLIMIT_NPROC, (_MAX_THREADS, _MAX_THREADS))
+    for which, most in (
+        (resource.RLIMIT_AS, memory_bytes),
+        (resource.RLIMIT_FSIZE, scratch_bytes),
+        (resource.RLIMIT_NOFILE, 64),
+        (resource.RLIMIT_CORE, 0),
+        (resource.RLIMIT_MEMLOCK, 0),
+        (resource.RLIMIT_MSGQUEUE, 0),
+    ):
+        resource.setrlimit(which, (most, most))
+
+
+def give_up_privileges(uid: int | None) -> None:
+    """Become *uid* (root only; None stays), hold no capability and never gain one."""
+    for capability in range(_LAST_CAP + 1):
+        if _LIBC.prctl(_PR_CAPBSET_DROP, capability, 0, 0, 0) != 0:
+            break  # past the last one, or not allowed to: the sets below are emptied anyway
+    if uid is not None:
+        os.setgroups([])
+        os.setresgid(uid, uid, uid)
+        os.setresuid(uid, uid, uid)
+    header = struct.pack("=Ii", _CAP_VERSION_3, 0)
+    _call("privileges", _LIBC.capset, header, b"\0" * 24)
+    _call("privileges", _LIBC.prctl, _PR_SET_NO_NEW_PRIVS, 1, 0, 0, 0)
+    _LIBC.prctl(_PR_SET_DUMPABLE, 0, 0, 0, 0)
+    os.umask(0o077)
+
+
+def forbid_system_calls() -> None:
+    """Let Linux refuse new programs, processes, sockets and mounts from now on."""
+    if platform.machine() != "x86_64" or struct.calcsize("P") != 8:
+        raise IsolationUnavailable("seccomp", f"no filter is written for {platform.machine()}")
+    code = _filter(sorted(_FORBIDDEN_X86_64.values()))
+    buffer = ctypes.create_string_buffer(code, len(code))
+    program = struct.pack("@HxxxxxxP", len(code) // 8, ctypes.addressof(buffer))
+    _call("seccomp", _LIBC.prctl, _PR_SET_NO_NEW_PRIVS, 1, 0, 0, 0)
+    _call("seccomp", _LIBC.prctl, _PR_SET_SECCOMP, _SECCOMP_MODE_FILTER, program, 0, 0)
+
+
+def close_other_descriptors(keep: Sequence[int]) -> None:
+    """Close every file that a parent left open, but *keep*."""
+    last = 2
+    for fd in sorted(keep):
+        os.closerange(last + 1, fd)
+        last = max(last, fd)
+    os.closerange(last + 1, 1 << 16)
+
+
+def _filter(forbidden: Sequence[int]) -> bytes:
+    """Return the filter as instructions of 8 bytes.
+
+    Layout: architecture, x32, the forbidden numbers, then ``clone`` (threads only) and ``clone3`` (said
+    to be unknown, so that the C library falls back to ``clone``, whose flags can be looked at).
+    """
+
+    def step(code: int, k: int, if_true: int = 0, if_false: int = 0) -> bytes:
+        return struct.pack("=HBBI", code, if_true, if_false, k)
+
+    number_at, architecture_at, first_argument_at = 0, 4, 16
+    checks = len(forbidden)
+    # What follows the forbidden numbers: clone3, clone (3 steps), allow, refuse, unknown.
+    tail = [
+        step(_JUMP_EQUAL, _CLONE3, 5, 0),
+        step(_JUMP_EQUAL, _CLONE, 0, 2),
+        step(_LOAD, first_argument_at),
+        step(_JUMP_SET, _CLONE_THREAD, 0, 1),
+        step(_RETURN, _ALLOW),
+        step(_RETURN, _ERRNO | _EPERM),
+        step(_RETURN, _ERRNO | _ENOSYS),
+    ]
+    steps = [
+        step(_LOAD, architecture_at),
+        step(_JUMP_EQUAL, _AUDIT_ARCH_X86_64, 1, 0),
+        step(_RETURN, _KILL),
+        step(_LOAD, number_at),
+        step(_JUMP_AT_LEAST, _X32, checks + 5, 0),
+        *(step(_JUMP_EQUAL, number, checks - 1 - i + 5, 0) for i, number in enumerate(forbidden)),
+        *tail,
+    ]
+    return b"".join(steps)
+
+
+def _free_place(readable: Sequence[Path]) -> str:
+    """Return a folder to put a fresh file system over: nothing that will be shown may lie below it."""
+    for place in _PLACES:
+        if place.is_dir() and not any(Path(path).is_relative_to(place) for path in readable):
+            return str(place)
+    raise IsolationUnavailable("root", f"none of {', '.join(map(str, _PLACES))} is free")
+
+
+def _outermost(paths: Sequence[Path]) -> list[Path]:
+    """Return *paths* without those inside another one, in an order in which they can be mounted."""
+    chosen: list[Path] = []
+    for path in sorted({Path(os.path.normpath(path)) for path in paths}, key=lambda p: len(p.parts)):
+        if not any(path.is_relative_to(outer) and not outer.is_symlink() for outer in chosen):
+            chosen.append(path)
+    return chosen
+
+
+def _show(path: Path, base: str) -> None:
+    target = base + str(path)
+    if path.is_symlink():
+        os.makedirs(os.path.dirname(target), mode=0o755, exist_ok=True)
+        if not os.path.lexists(target):
+            os.symlink(os.readlink(path), target)
+        return
+    if not path.exists():
+        return
+    if path.is_dir():
+        os.makedirs(target, mode=0o755, exist_ok=True)
+    else:
+        os.makedirs(os.path.dirname(target), mode=0o755, exist_ok=True)
+        os.close(os.open(target, os.O_CREAT | os.O_WRONLY, 0o644))
+    _mount(str(path), target, None, _MS_BIND | _MS_REC, None)
+    if not str(path).startswith("/dev/"):
+        _read_only(target, recursive=True)
+
+
+def _read_only(path: str, *, recursive: bool) -> None:
+    attributes = struct.pack("=QQQQ", _MOUNT_ATTR_RDONLY | _MOUNT_ATTR_NOSUID | _MOUNT_ATTR_NODEV, 0, 0, 0)
+    flags = _AT_RECURSIVE if recursive else 0
+    _call("root", _LIBC.syscall, _SYS_MOUNT_SETATTR, -1, path.encode(), flags, attributes, len(attributes))
+
+
+def _mount(source: str | None, target: str, kind: str | None, flags: int, data: str | None) -> None:
+    texts = [None if text is None else text.encode() for text in (source, target, kind, data)]
+    _call("root", _LIBC.mount, texts[0], texts[1], texts[2], ctypes.c_ulong(flags), texts[3])
+
+
+def _call(wall: str, function: Callable[..., int], *arguments: object) -> None:
+    if function(*arguments) != 0:
+        raise IsolationUnavailable(wall, os.strerror(ctypes.get_errno()))

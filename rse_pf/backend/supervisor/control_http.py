@@ -1,0 +1,112 @@
+"""Serve the control port: a very small HTTP/1.1 server for health checks, metrics and drain.
+
+Promises short requests only (8 KiB of head, no chunked bodies), a time limit on each of them, and
+to know nothing of what the answers mean.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import ipaddress
+from collections.abc import Awaitable, Callable, Mapping
+from dataclasses import dataclass, field
+from http import HTTPStatus
+from urllib.parse import parse_qsl, urlsplit
+
+__all__ = ["ControlReply", "ControlRequest", "serve_control"]
+
+_MAX_HEAD_BYTES = 8192
+_MAX_BODY_BYTES = 65536
+_IDLE_S = 60.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ControlRequest:
+    """One request.  ``is_local``: from this machine, and not by a web page."""
+
+    method: str
+    path: str
+    query: Mapping[str, str]
+    is_local: bool
+    authorization: str = field(default="", repr=False)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ControlReply:
+    """One response."""
+
+    status: int = 200
+    body: bytes = b""
+    content_type: str = "application/json"
+    headers: Mapping[str, str] = field(default_factory=dict)
+
+
+async def serve_control(
+    host: str, port: int, answer: Callable[[ControlRequest], Awaitable[ControlReply]]
+) -> asyncio.Server:
+    """Listen on *host* and *port* (0 takes a free one) and let *answer* speak."""
+
+    async def talk(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        try:
+            while await asyncio.wait_for(_exchange(reader, writer, answer), _IDLE_S):
+                pass
+        except (
+            OSError,
+            ValueError,
+            asyncio.IncompleteReadError,
+            asyncio.LimitOverrunError,
+            asyncio.TimeoutError,
+        ):
+            pass  # a stranger's broken request ends its own connection, and only that
+        except asyncio.CancelledError:
+            pass  # the loop ends: a kept-alive connection is no error, and asyncio would log one
+        finally:
+            writer.close()
+
+    return await asyncio.start_server(talk, host, port, limit=_MAX_HEAD_BYTES)
+
+
+async def _exchange(
+    reader: asyncio.StreamReader,
+    writer: asyncio.StreamWriter,
+    answer: Callable[[ControlRequest], Awaitable[ControlReply]],
+) -> bool:
+    """Serve one request; return whether another may follow."""
+    head = (await reader.readuntil(b"\r\n\r\n")).decode("latin-1")
+    request_line, *lines = head.rstrip("\r\n").split("\r\n")
+    method, target, version = request_line.split(" ")
+    headers = {
+        name.strip().lower(): value.strip() for name, _, value in (line.partition(":") for line in lines)
+    }
+    length = int(headers.get("content-length", "0"))
+    if "transfer-encoding" in headers or not 0 <= length <= _MAX_BODY_BYTES:
+        _write(writer, method, ControlReply(status=413), keep=False)
+        return False
+    await reader.readexactly(length)
+    url = urlsplit(target)
+    peer = writer.get_extra_info("peername")[0]
+    ask = ControlRequest(
+        method="GET" if method == "HEAD" else method,
+        path=url.path,
+        query=dict(parse_qsl(url.query)),
+        is_local=ipaddress.ip_address(peer.partition("%")[0]).is_loopback and "origin" not in headers,
+        authorization=headers.get("authorization", ""),
+    )
+    keep = version == "HTTP/1.1" and headers.get("connection", "").lower() != "close"
+    _write(writer, method, await answer(ask), keep=keep)
+    await writer.drain()
+    return keep
+
+
+def _write(writer: asyncio.StreamWriter, method: str, answer: ControlReply, *, keep: bool) -> None:
+    headers = {
+        "Content-Type": answer.content_type,
+        "Content-Length": str(len(answer.body)),
+        "Cache-Control": "no-store",
+        "Connection": "keep-alive" if keep else "close",
+        **answer.headers,
+    }
+    lines = [f"HTTP/1.1 {answer.status} {HTTPStatus(answer.status).phrase}"]
+    lines += [f"{name}: {value}" for name, value in headers.items()]
+    body = b"" if method == "HEAD" else answer.body
+    writer.write("\r\n".join(lines).encode("latin-1") + b"\r\n\r\n" + body)

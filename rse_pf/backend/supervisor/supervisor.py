@@ -1,0 +1,491 @@
+"""One backend server: listener, worker processes, control port and drain; the body of `rse-pf serve`.
+
+The supervisor accepts each robot and hands the socket to the least-loaded worker, so the spread is
+even.  Promises that supervisor and workers live and die together (it restarts nothing: the scale
+modifier replaces servers), that it never reads a robot's bytes, and that a drain loses no command.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+import random
+import signal
+import socket
+import time
+from collections.abc import Awaitable, Callable
+from contextlib import suppress
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+from rse_pf.auth.control_token import is_carried
+from rse_pf.auth.tokens import KeySet
+from rse_pf.auth.trust_store import TrustStore
+from rse_pf.backend.gateway.audit_recorder import ServerAudit, open_records
+from rse_pf.backend.gateway.migration import plan
+from rse_pf.backend.gateway.rate_limits import Bucket
+from rse_pf.backend.jobs.slots import make_pipe
+from rse_pf.backend.log import JsonLog
+from rse_pf.backend.metrics import merge, merge_isolation, render
+from rse_pf.backend.supervisor.control_http import ControlReply, ControlRequest, serve_control
+from rse_pf.backend.supervisor.listener import bound, check_open_door
+from rse_pf.backend.supervisor.session_registry import SessionRegistry
+from rse_pf.backend.supervisor.trust_poller import TrustPoller, first_order
+from rse_pf.backend.supervisor.worker import WorkerPlan
+from rse_pf.backend.supervisor.worker_handle import BUILTIN, WorkerProcess, fork_workers
+from rse_pf.config import PlatformSettings
+from rse_pf.errors import ConfigurationError
+from rse_pf.linux import cpu_seconds, raise_descriptor_limit, resident_bytes
+
+__all__ = ["serve"]
+
+_ACCEPTS_AT_ONCE = 64
+_ACCEPT_PAUSE_S = 0.1
+_MIN_PAUSE_S = 0.01
+_FRESH_S = 0.25
+_REPORT_S = 0.3
+_LEAVE_S = 3.0
+_AT_ONCE_S = 0.0
+_MAX_MOVES = 10000
+_MAX_SPREAD_S = 3600.0
+_EXIT_OK, _EXIT_LOST = 0, 1
+_PAGES_OF_ALL = ("/healthz", "/readyz")
+"""A load balancer asks them, and carries no token."""
+
+
+def serve(
+    settings: PlatformSettings,
+    *,
+    keys: KeySet | None,
+    trust: TrustStore | None = None,
+    server_id: str,
+    announce: Path | None = None,
+    conformance_echo: bool = False,
+    services: str = BUILTIN,
+    settings_digest: str = "",
+    audit: Path | None = None,
+    control_token: str | None = None,
+) -> int:
+    """Serve robots until a drain or a signal ends it; call it in the main thread of a process.
+
+    Args:
+        settings: ``serving.port`` and ``serving.control_port`` may be 0.
+        keys: Who may sign robots' tokens; None only where ``auth.required`` is false.
+        trust: Reads the same again and again, and who is enrolled and who is denied; None: *keys* stay.
+        server_id: Name of this server in every Welcome, Result and log line.
+        announce: File that tells, once everything listens, pids and ports as JSON.
+        conformance_echo: Echo raw messages without token or sub-protocol, for conformance suites.
+        services: ``module:function`` that makes the registry of a worker from the settings.
+        settings_digest: What /healthz says; empty means that of *settings*.  Whoever lays an address of this
+            machine over shared settings names the digest of the shared ones.
+        audit: Folder of the audit log; None records nothing.
+        control_token: What must be carried to the control port, but to its two health pages; None: nothing.
+
+    Returns:
+        0 after a drain or a signal, 1 when a worker was lost.
+
+    Raises:
+        ConfigurationError: An open door on a public address, no keys, or the port is taken.
+    """
+    if trust is not None:
+        trust.first()
+        keys = trust.keys
+    check_open_door(settings, keys, conformance_echo)
+    raise_descriptor_limit()
+    count = settings.serving.workers or len(os.sched_getaffinity(0))
+    slots = make_pipe(settings.serving.jobs)
+    plans = [
+        WorkerPlan(
+            settings=settings, keys=keys if settings.auth.required else None, server_id=server_id,
+            services=services, workers=count, index=index, job_slots=slots, supervisor=os.getpid(),
+            conformance_echo=conformance_echo, audit=audit is not None,
+        )
+        for index in range(count)
+    ]  # fmt: skip
+    with bound(settings.serving.host, settings.serving.port) as listener:
+        workers = fork_workers(plans, listener=listener)
+        try:
+            with open_records(audit, server_id, settings.auth) as records:
+                supervisor = _Supervisor(
+                    settings, workers=workers, trust=trust, server_id=server_id, announce=announce,
+                    listener=listener, digest=settings_digest or settings.digest(), records=records,
+                    control_token=control_token,
+                )  # fmt: skip
+                return asyncio.run(supervisor.run())
+        finally:
+            for worker in workers:
+                worker.kill()
+
+
+class _Supervisor:
+    def __init__(
+        self,
+        settings: PlatformSettings,
+        *,
+        workers: list[WorkerProcess],
+        trust: TrustStore | None,
+        server_id: str,
+        announce: Path | None,
+        listener: socket.socket,
+        digest: str,
+        records: ServerAudit,
+        control_token: str | None,
+    ) -> None:
+        self._settings = settings
+        self._digest = digest
+        self._server_id = server_id
+        self._records = records
+        self._announce = announce
+        self._listener = listener
+        self._state = "starting"
+        self._began = time.monotonic()
+        self._reported = float("-inf")
+        self._reporting = asyncio.Lock()
+        self._tasks: set[asyncio.Task[None]] = set()
+        self._control_port = 0
+        self._moving_until = 0.0
+        self._signals = 0
+        self._accepted = self._refused_full = 0
+        self._trust = trust if settings.auth.required else None
+        self._accepts = Bucket(settings.serving.accepts_per_s, float(settings.serving.handshake_burst))
+        self._accept_pauses = self._control_refused = 0
+        self._control_token = control_token
+        self._log = JsonLog(level=settings.serving.log_level, server=server_id, wall_clock=time.time)
+        records.complain_to(lambda problem: self._log.error("audit", reason=problem))
+        self._workers = workers
+
+    async def run(self) -> int:
+        loop = asyncio.get_running_loop()
+        self._over: asyncio.Future[int] = loop.create_future()
+        for number in (signal.SIGTERM, signal.SIGINT):
+            loop.add_signal_handler(number, self._on_signal, number)
+        control = await self._open_control()
+        try:
+            await self._start(loop)
+            return await self._over
+        finally:
+            self._stop_accepting()
+            control.close()
+            for worker in self._workers:
+                worker.kill()
+            if self._announce is not None:
+                self._announce.unlink(missing_ok=True)
+            code = self._over.result() if self._over.done() else None
+            self._log.info("server-over", exit_code=code)
+            self._records.note("server.over", exit_code=code)
+            self._log.close()
+
+    async def _open_control(self) -> asyncio.Server:
+        host, port = self._settings.serving.control_host, self._settings.serving.control_port
+        try:
+            control = await serve_control(host, port, self._answer)
+        except OSError as error:
+            raise ConfigurationError(
+                f"cannot listen on {host}:{port}: {error.strerror}",
+                hint="choose another serving.control_port, or 0",
+            ) from error
+        self._control_port = control.sockets[0].getsockname()[1]
+        return control
+
+    async def _start(self, loop: asyncio.AbstractEventLoop) -> None:
+        hear, order = self._records.heard(SessionRegistry().hear), first_order(self._trust)
+        readiness = [
+            loop.create_task(worker.connect(order, on_lost=self._on_lost, on_robot=hear))
+            for worker in self._workers
+        ]
+        everything = asyncio.gather(*readiness)
+        either: list[asyncio.Future[Any]] = [self._over, everything]
+        await asyncio.wait(
+            either,
+            timeout=self._settings.local.start_timeout_s,
+            return_when=asyncio.FIRST_COMPLETED,
+        )
+        if self._over.done() or not everything.done():
+            everything.cancel()
+            with suppress(asyncio.CancelledError):
+                await everything
+            self._finish(_EXIT_LOST)
+            return
+        self._listener.listen(self._settings.serving.backlog)
+        loop.add_reader(self._listener.fileno(), self._accept_some)
+        self._state = "ready"
+        if self._announce is not None:
+            _write_atomically(self._announce, self._identity())
+        if self._trust is not None:
+            pause_s = self._settings.auth.deny_list_refresh_s
+            watch = TrustPoller(self._trust, workers=lambda: self._workers, log=self._log, pause_s=pause_s)
+            self._keep(watch.run())
+        self._log.info("server-ready", **self._identity(), settings=self._digest)
+        self._records.note("server.ready", settings=self._digest)
+
+    def _identity(self) -> dict[str, Any]:
+        return {
+            "server": self._server_id,
+            "pid": os.getpid(),
+            "port": self._listener.getsockname()[1],
+            "control_port": self._control_port,
+            "workers": [worker.pid for worker in self._workers],
+        }
+
+    # --- robots --------------------------------------------------------------------------------
+
+    def _accept_some(self) -> None:
+        for _ in range(_ACCEPTS_AT_ONCE):
+            wait_s = self._accepts.take(time.monotonic()) if self._accepts.rate > 0 else 0.0
+            if wait_s > 0:
+                self._accept_pauses += 1
+                self._pause_accepting(max(wait_s, _MIN_PAUSE_S))
+                return
+            try:
+                accepted, _ = self._listener.accept()
+            except BlockingIOError:
+                return
+            except OSError as error:  # out of descriptors, or the robot is gone already
+                self._log.warning("accept-failed", reason=str(error))
+                self._pause_accepting(_ACCEPT_PAUSE_S)
+                return
+            self._accepted += 1
+            with accepted:
+                if not any(
+                    worker.give(accepted, self._accepted)
+                    for worker in sorted(self._workers, key=lambda w: w.load)
+                ):
+                    self._refused_full += 1
+
+    def _pause_accepting(self, pause_s: float) -> None:
+        """The listener stays readable meanwhile: do not spin on it."""
+        loop = asyncio.get_running_loop()
+        loop.remove_reader(self._listener.fileno())
+        loop.call_later(pause_s, self._resume_accepting)
+
+    def _resume_accepting(self) -> None:
+        if self._listener.fileno() >= 0:
+            asyncio.get_running_loop().add_reader(self._listener.fileno(), self._accept_some)
+
+    # --- the end -------------------------------------------------------------------------------
+
+    def _on_lost(self, worker: WorkerProcess) -> None:
+        if self._state != "leaving":
+            self._log.error("worker-lost", pid=worker.pid, exit_code=worker.exit_code())
+            self._finish(_EXIT_LOST)
+
+    def _on_signal(self, number: signal.Signals) -> None:
+        self._signals += 1
+        if number == signal.SIGINT or self._signals > 1 or self._state == "starting":
+            self._keep(self._leave(_AT_ONCE_S))
+        elif self._state == "ready":
+            self._keep(self._drain(self._settings.serving.drain_wait_s))
+
+    async def _drain(self, wait_s: float) -> None:
+        """Not ready but accepting, then Move to all, finish what is held, leave."""
+        self._state = "draining"
+        self._log.info("drain", wait_s=wait_s)
+        self._records.note("server.drain", wait_s=wait_s)
+        await asyncio.sleep(wait_s)
+        within_ms = self._settings.serving.drain_within_ms
+        for worker in self._workers:
+            worker.order(do="move", reason="drain", within_ms=within_ms)
+        empty = [asyncio.ensure_future(worker.empty.wait()) for worker in self._workers]
+        await asyncio.wait(empty, timeout=within_ms / 1e3)
+        for waiting in empty:
+            waiting.cancel()
+        await self._leave(self._settings.session.answer_timeout_s)
+
+    async def _leave(self, held_s: float) -> None:
+        if self._state == "leaving" and held_s > 0:
+            return
+        self._state = "leaving"
+        self._stop_accepting()
+        for worker in self._workers:
+            worker.order(do="leave", held_s=held_s)
+        gone = [asyncio.ensure_future(worker.gone.wait()) for worker in self._workers]
+        if gone:
+            await asyncio.wait(gone, timeout=held_s + _LEAVE_S)
+        self._finish(_EXIT_OK)
+
+    def _stop_accepting(self) -> None:
+        if self._listener.fileno() >= 0:
+            asyncio.get_running_loop().remove_reader(self._listener.fileno())
+            self._listener.close()
+
+    def _finish(self, code: int) -> None:
+        self._state = "leaving"
+        if not self._over.done():
+            self._over.set_result(code)
+
+    def _keep(self, work: Any) -> None:
+        task = asyncio.get_running_loop().create_task(work)
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
+
+    # --- the control port ------------------------------------------------------------------------
+
+    async def _answer(self, ask: ControlRequest) -> ControlReply:
+        pages: dict[tuple[str, str], Callable[[ControlRequest], Awaitable[ControlReply]]] = {
+            ("GET", "/healthz"): self._healthz,
+            ("GET", "/readyz"): self._readyz,
+            ("GET", "/metrics"): self._metrics,
+            ("GET", "/status"): self._status,
+            ("POST", "/drain"): self._post_drain,
+            ("POST", "/move"): self._post_move,
+        }
+        token = self._control_token
+        if token is not None and ask.path not in _PAGES_OF_ALL and not is_carried(ask.authorization, token):
+            self._control_refused += 1
+            return _json({"code": "unauthorized"}, status=401, headers={"WWW-Authenticate": "Bearer"})
+        page = pages.get((ask.method, ask.path))
+        if page is not None:
+            return await page(ask)
+        known = any(path == ask.path for _, path in pages)
+        return _json({"code": "not-found"}, status=405 if known else 404)
+
+    async def _healthz(self, ask: ControlRequest) -> ControlReply:
+        return _json(
+            {
+                "server": self._server_id,
+                "version": _version(),
+                "settings": self._digest,
+                "uptime_s": round(time.monotonic() - self._began, 3),
+            }
+        )
+
+    async def _readyz(self, ask: ControlRequest) -> ControlReply:
+        told: dict[str, Any] = {"state": self._state}
+        if self._settings.services.folder or self._settings.services.published:
+            await self._merged()
+            isolation = merge_isolation(worker.report for worker in self._workers)
+            told.update(missing_walls=isolation["missing_walls"], quarantined=isolation["quarantined"])
+        if self._state == "ready":
+            return _json(told)
+        return _json(told, status=503, headers={"x-envoy-immediate-health-check-fail": "1"})
+
+    async def _metrics(self, ask: ControlRequest) -> ControlReply:
+        merged = await self._merged()
+        merged["gauges"].update(
+            {
+                "cpu_s": self._cpu_s(),
+                "resident_bytes": float(sum(map(resident_bytes, self._pids()))),
+                "ready": float(self._state == "ready"),
+                "accept_pauses": float(self._accept_pauses),
+                "control_refused": float(self._control_refused),
+            }
+        )
+        return ControlReply(body=render(merged), content_type="text/plain; version=0.0.4; charset=utf-8")
+
+    async def _status(self, ask: ControlRequest) -> ControlReply:
+        merged = await self._merged()
+        gauges = merged["gauges"]
+        results: dict[str, int] = {}
+        for _, result, n in merged["requests"]:
+            results[result] = results.get(result, 0) + n
+        return _json(
+            {
+                **self._identity_while_open(),
+                "version": _version(),
+                "state": self._state,
+                "uptime_s": round(time.monotonic() - self._began, 3),
+                "robots": int(gauges.get("robots", 0)),
+                "robots_of_workers": [worker.load for worker in self._workers],
+                "requests": sum(results.values()),
+                "results": results,
+                "queue": int(gauges.get("queue", 0)),
+                "queue_oldest_s": gauges["queue_oldest_s"],
+                "queue_ms": round(gauges["queue_ms"], 3),
+                "in_flight": int(gauges.get("in_flight", 0)),
+                "loop_lag_s": gauges["loop_lag_s"],
+                "bytes_in": int(merged["bytes"].get("in", 0)),
+                "bytes_out": int(merged["bytes"].get("out", 0)),
+                "moved": int(gauges.get("moved", 0)),
+                "cpu_s": self._cpu_s(),
+                "worker_cpu_s": [cpu_seconds(worker.pid) for worker in self._workers],
+                "resident_bytes": sum(map(resident_bytes, self._pids())),
+                "size": self._settings.serving.size,
+                "settings": self._digest,
+                "isolation": merge_isolation(worker.report for worker in self._workers),
+            }
+        )
+
+    async def _post_drain(self, ask: ControlRequest) -> ControlReply:
+        if not ask.is_local:
+            return _json({"code": "forbidden", "hint": "drain from the server's own machine"}, status=403)
+        try:
+            wait_s = float(ask.query.get("wait", self._settings.serving.drain_wait_s))
+        except ValueError:
+            return _json({"code": "bad-request", "hint": "wait is a number of seconds"}, status=400)
+        if not 0 <= wait_s <= 3600:
+            return _json({"code": "bad-request", "hint": "wait is 0 to 3600 seconds"}, status=400)
+        if self._state == "ready":
+            self._state = "draining"
+            self._keep(self._drain(wait_s))
+        return _json({"state": self._state}, status=202)
+
+    async def _post_move(self, ask: ControlRequest) -> ControlReply:
+        """Hand robots over; while one hand-over is under way, a further ask moves nobody."""
+        if not ask.is_local:
+            return _json({"code": "forbidden", "hint": "move from the server's own machine"}, status=403)
+        try:
+            robots, spread_s = int(ask.query["robots"]), float(ask.query.get("spread_s", "0"))
+        except (KeyError, ValueError):
+            hint = "robots is a whole number, spread_s a number of seconds"
+            return _json({"code": "bad-request", "hint": hint}, status=400)
+        if not (0 <= robots <= _MAX_MOVES and 0 <= spread_s <= _MAX_SPREAD_S):
+            hint = f"robots is 0 to {_MAX_MOVES}, spread_s 0 to {_MAX_SPREAD_S:g} seconds"
+            return _json({"code": "bad-request", "hint": hint}, status=400)
+        if self._state != "ready":
+            return _json({"code": "draining", "hint": "all its robots move already"}, status=409)
+        now = time.monotonic()
+        if now < self._moving_until:
+            left_s = self._moving_until - now
+            return _json({"robots": 0, "spread_s": round(left_s, 3), "under_way": True}, status=202)
+        delays = plan(
+            [worker.load for worker in self._workers], robots, spread_s=spread_s,
+            moves_per_s=self._settings.scaling.moves_per_s, random=random.random,
+        )  # fmt: skip
+        asked, last_s = sum(map(len, delays)), max((each[-1] for each in delays if each), default=0.0)
+        self._moving_until = now + last_s
+        for worker, delays_s in zip(self._workers, delays, strict=True):
+            if delays_s:
+                within_ms = self._settings.serving.drain_within_ms
+                worker.order(do="hand-over", delays_s=delays_s, within_ms=within_ms)
+        self._log.info("hand-over", robots=asked, spread_s=round(last_s, 3))
+        self._records.note("server.move", robots=asked, spread_s=round(last_s, 3))
+        return _json({"robots": asked, "spread_s": round(last_s, 3), "under_way": False}, status=202)
+
+    def _identity_while_open(self) -> dict[str, Any]:
+        identity = {"server": self._server_id, "pid": os.getpid(), "workers": [w.pid for w in self._workers]}
+        return identity if self._listener.fileno() < 0 else self._identity()
+
+    async def _merged(self) -> dict[str, Any]:
+        """Ask the workers at most every quarter second; one that does not answer keeps its old numbers."""
+        async with self._reporting:
+            if time.monotonic() - self._reported >= _FRESH_S:
+                await asyncio.gather(*(worker.ask_report(_REPORT_S) for worker in self._workers))
+                self._reported = time.monotonic()
+        merged = merge(worker.report for worker in self._workers if worker.report is not None)
+        merged["handshakes"]["no-worker"] = self._refused_full
+        return merged
+
+    def _pids(self) -> list[int]:
+        return [os.getpid(), *(worker.pid for worker in self._workers)]
+
+    def _cpu_s(self) -> float:
+        return round(sum(map(cpu_seconds, self._pids())), 3)
+
+
+def _json(value: Any, *, status: int = 200, headers: dict[str, str] | None = None) -> ControlReply:
+    return ControlReply(status=status, body=json.dumps(value).encode() + b"\n", headers=headers or {})
+
+
+def _version() -> str:
+    try:
+        return metadata.version("rse-pf")
+    except metadata.PackageNotFoundError:
+        return "unknown"
+
+
+def _write_atomically(path: Path, value: dict[str, Any]) -> None:
+    temporary = path.with_name(f".{path.name}.{os.getpid()}")
+    temporary.write_text(json.dumps(value), encoding="utf-8")
+    temporary.replace(path)

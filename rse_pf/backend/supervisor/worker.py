@@ -1,0 +1,279 @@
+"""One worker process, forked by the supervisor (`worker_process`).
+
+Accepted sockets arrive as descriptors on the data channel, orders as JSON lines on the control
+channel.  Promises to die with its supervisor (parent-death signal, and the end of either channel),
+and to leave signals of the terminal or of a service manager to the supervisor.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import gc
+import json
+import os
+import secrets
+import signal
+import socket
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from rse_pf.auth.tokens import KeySet
+from rse_pf.auth.trust_store import key_set_of
+from rse_pf.backend.gateway.audit_recorder import AuditRecorder
+from rse_pf.backend.gateway.dispatcher import Dispatcher
+from rse_pf.backend.gateway.handshake import HandshakePolicy
+from rse_pf.backend.gateway.migration import Migration
+from rse_pf.backend.gateway.token_watch import TokenWatch
+from rse_pf.backend.gateway.websocket import RobotSockets
+from rse_pf.backend.job_store import open_job_store
+from rse_pf.backend.jobs.manager import JobManager
+from rse_pf.backend.jobs.runner import JobContext
+from rse_pf.backend.jobs.slots import JobSlots
+from rse_pf.backend.jobs.spawn import spawner
+from rse_pf.backend.log import JsonLog
+from rse_pf.backend.object_refs import ObjectRefs
+from rse_pf.backend.ports import Clocks
+from rse_pf.backend.sandbox.manager import SandboxManager
+from rse_pf.config import PlatformSettings
+from rse_pf.errors import MissingExtra
+from rse_pf.linux import call_this_process, die_with_parent
+from rse_pf.services.custom.installed import installed_services, published_services
+from rse_pf.services.loading import load_services
+
+__all__ = ["NUMBER_BYTES", "WorkerPlan", "event_loop_maker", "run_worker"]
+
+NUMBER_BYTES = 8
+"""Length of a socket's number, which travels with its descriptor."""
+_POLL_S = 0.01
+_OURS_ALONE = "memory:"
+"""A store that no robot and no data server reaches, so that names in it are worth nothing."""
+_MAX_LINE_BYTES = 1 << 26
+"""An order may name every robot that is enrolled."""
+_CLOSING_S = 1.0
+
+
+@dataclass(frozen=True)
+class WorkerPlan:
+    """What a worker is told before it is forked."""
+
+    settings: PlatformSettings
+    keys: KeySet | None
+    server_id: str
+    services: str
+    workers: int
+    index: int
+    job_slots: tuple[int, int]
+    supervisor: int
+    conformance_echo: bool = False
+    audit: bool = False
+
+
+def event_loop_maker() -> Callable[[], asyncio.AbstractEventLoop]:
+    """Return what makes the event loop of a worker; raises MissingExtra."""
+    try:
+        import uvloop
+    except ImportError as error:
+        raise MissingExtra("uvloop", "backend") from error
+    make: Callable[[], asyncio.AbstractEventLoop] = uvloop.new_event_loop
+    return make
+
+
+def run_worker(plan: WorkerPlan, data: socket.socket, control: socket.socket) -> None:
+    """Serve robots until the worker is told to leave or its supervisor is gone."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    if not die_with_parent(plan.supervisor):
+        return
+    call_this_process("rse-pf worker")
+    loop = event_loop_maker()()
+    asyncio.set_event_loop(loop)
+    loop.run_until_complete(_Worker(plan, data, control, loop).run())
+
+
+class _Worker:
+    def __init__(
+        self,
+        plan: WorkerPlan,
+        data: socket.socket,
+        control: socket.socket,
+        loop: asyncio.AbstractEventLoop,
+    ) -> None:
+        settings = plan.settings
+        self._data = data
+        self._control = control
+        self._loop = loop
+        self._ended = 0
+        self._flushing = False
+        self._tasks: set[asyncio.Task[None]] = set()
+        self._log = JsonLog(level=settings.serving.log_level, server=plan.server_id, wall_clock=time.time)
+        self._core = Dispatcher(
+            settings=settings,
+            registry=load_services(plan.services, settings),
+            server_id=plan.server_id,
+            clocks=Clocks(monotonic=time.monotonic, wall=time.time, cpu=time.process_time),
+            loop=loop,
+            log=self._log,
+            new_session_id=lambda: secrets.token_hex(8),
+            rest=time.sleep,
+        )
+        if settings.data.store != _OURS_ALONE:
+            self._core.objects = ObjectRefs(
+                open_job_store(settings), settings.serving, settings.data.quota_bytes
+            )
+        if settings.services.folder or settings.services.published:
+            self._core.environments = self._environments(settings, plan.server_id, plan.workers)
+        if settings.serving.jobs:
+            self._core.jobs = self._jobs(settings, plan)
+        self._hand_over = Migration(
+            self._core.connections, timers=loop, now=time.monotonic, choose=secrets.choice
+        )
+        self._index, self._workers, self._named = plan.index, plan.workers, 0
+        door = HandshakePolicy(settings, plan.keys, conformance_echo=plan.conformance_echo)
+        self._witness = AuditRecorder(
+            settings.auth, self._core.clocks, loop=loop, tell=self._say if plan.audit else None
+        )
+        self._standing = self._core.standing = TokenWatch(
+            self._core, door, loop=loop, log=self._log, tell=self._say, witness=self._witness
+        )
+        self._sockets = RobotSockets(
+            core=self._core,
+            door=door,
+            serving=settings.serving,
+            session=settings.session,
+            max_robots=-(-settings.serving.max_robots // self._workers),
+            workers=self._workers,
+            new_name=self._new_name,
+            judged=self._witness.judged,
+            log=self._log,
+            loop=loop,
+        )
+
+    def _environments(self, settings: PlatformSettings, server: str, workers: int) -> SandboxManager:
+        chosen = settings.services
+        services = installed_services(Path(chosen.folder)) if chosen.folder else []
+        services += published_services() if chosen.published else []
+        return SandboxManager(
+            services,
+            settings=settings,
+            most=-(-settings.services.max_environments // workers),
+            server_id=server,
+            store=open_job_store(settings),
+            monotonic=time.monotonic,
+            loop=self._loop,
+            log=self._log,
+            answer=self._core.answer_isolated,
+        )
+
+    def _jobs(self, settings: PlatformSettings, plan: WorkerPlan) -> JobManager:
+        session = settings.session
+        read, write = plan.job_slots
+        context = JobContext(
+            store=open_job_store(settings),
+            slots=JobSlots((read, write)),
+            settings=settings.serving,
+            quota_bytes=settings.data.quota_bytes,
+            max_bytes=settings.data.max_object_bytes,
+            inline_bytes=session.max_message_bytes // 2,
+            server_id=plan.server_id,
+            start=spawner(plan.services, settings),
+            clock=time.monotonic,
+        )
+        return JobManager(
+            context, settings=settings, loop=self._loop, log=self._log, answer=self._core.answer_isolated,
+            progress=self._core.progress, new_owner=lambda: f"{plan.server_id}-{secrets.token_hex(8)}",
+        )  # fmt: skip
+
+    async def run(self) -> None:
+        reader, self._writer = await asyncio.open_unix_connection(sock=self._control, limit=_MAX_LINE_BYTES)
+        self._data.setblocking(False)
+        self._loop.add_reader(self._data.fileno(), self._take_sockets)
+        self._obey_trust(json.loads(await reader.readline()))
+        gc.collect()
+        gc.freeze()
+        self._say(event="ready")
+        while line := await reader.readline():
+            order = json.loads(line)
+            if order["do"] == "report":
+                self._say(event="report", report=self._report())
+            elif order["do"] == "move":
+                self._core.move_all(order["reason"], order["within_ms"])
+                self._keep(self._tell_when_empty())
+            elif order["do"] == "hand-over":
+                self._hand_over.begin(order["delays_s"], order["within_ms"])
+            elif order["do"] == "trust":
+                self._obey_trust(order)
+            elif order["do"] == "replace":
+                self._standing.replace(order["number"])
+            elif order["do"] == "leave":
+                await self._leave(order["held_s"])
+                break
+        self._witness.flush()
+        self._log.close()
+        os._exit(0)  # sockets and threads of a worker that has no supervisor are nobody's
+
+    def _obey_trust(self, order: Mapping[str, Any]) -> None:
+        if order["text"]:
+            self._standing.trust(key_set_of(order["text"]))
+
+    def _report(self) -> dict[str, Any]:
+        report = self._core.snapshot()
+        report["gauges"]["moved"] = float(self._hand_over.asked)
+        return report
+
+    async def _tell_when_empty(self) -> None:
+        while self._core.connections:
+            await asyncio.sleep(_POLL_S)
+        self._say(event="empty")
+
+    async def _leave(self, held_s: float) -> None:
+        until = time.monotonic() + held_s
+        while self._core.held and time.monotonic() < until:
+            await asyncio.sleep(_POLL_S)
+        self._core.close_all()
+        until = time.monotonic() + _CLOSING_S
+        while self._core.connections and time.monotonic() < until:
+            await asyncio.sleep(_POLL_S)
+
+    def _take_sockets(self) -> None:
+        while True:
+            try:
+                message, fds, _, _ = socket.recv_fds(self._data, NUMBER_BYTES, 1)
+            except BlockingIOError:
+                return
+            if not message:
+                self._loop.remove_reader(self._data.fileno())
+                return
+            for fd in fds:
+                self._sockets.take(fd, self._count_end, int.from_bytes(message, "big"))
+
+    def _count_end(self) -> None:
+        self._ended += 1
+        if not self._flushing:
+            self._flushing = True
+            self._loop.call_soon(self._flush_ends)
+
+    def _flush_ends(self) -> None:
+        """Tell the supervisor, one byte for each socket that ended, so that it knows our load."""
+        self._flushing = False
+        try:
+            self._ended -= self._data.send(b"e" * self._ended)
+        except BlockingIOError:
+            self._flushing = True
+            self._loop.call_later(_POLL_S, self._flush_ends)
+        except OSError:
+            self._ended = 0  # the supervisor is gone; the control channel ends this process
+
+    def _new_name(self) -> str:
+        self._named += 1
+        return f"anonymous-{(self._named - 1) * self._workers + self._index + 1}"
+
+    def _say(self, **message: Any) -> None:
+        self._writer.write(json.dumps(message).encode() + b"\n")
+
+    def _keep(self, work: Any) -> None:
+        task = self._loop.create_task(work)
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)

@@ -1,0 +1,217 @@
+"""A worker as its supervisor sees it: a process, its load, and two channels.
+
+Workers are forked from the supervisor after its imports, which most of a server's start is spent on, and
+before its event loop and its threads.  Promises that a worker holds no channel of another worker nor the
+listener, and never to block the supervisor: a full channel is a refusal, a silent worker a time-out.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import gc
+import json
+import os
+import signal
+import socket
+import sys
+import traceback
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from typing import Any, NoReturn
+
+from rse_pf.backend.supervisor.worker import NUMBER_BYTES, WorkerPlan, event_loop_maker, run_worker
+from rse_pf.config import PlatformSettings
+from rse_pf.services.loading import load_services
+
+__all__ = ["BUILTIN", "WorkerProcess", "fork_workers", "warm_up"]
+
+BUILTIN = "rse_pf.services.builtin:builtin_services"
+"""The platform's own services."""
+_MAX_LINE_BYTES = 1 << 20
+_READ_BYTES = 4096
+
+
+def warm_up(services: str = BUILTIN, settings: PlatformSettings | None = None) -> None:
+    """Import what every worker needs, which most of a server's start is spent on.
+
+    Raises:
+        ConfigurationError: There are no such services.
+        MissingExtra: The extra ``backend`` is not installed.
+    """
+    event_loop_maker()
+    load_services(services, settings or PlatformSettings())
+
+
+def fork_workers(plans: Sequence[WorkerPlan], *, listener: socket.socket) -> list[WorkerProcess]:
+    """Import what every worker needs, then fork one for each plan; call it before any thread or event loop.
+
+    Raises:
+        ConfigurationError: There are no such services.
+        MissingExtra: The extra ``backend`` is not installed.
+    """
+    for plan in plans[:1]:
+        warm_up(plan.services, plan.settings)
+    gc.collect()
+    gc.freeze()  # or the first collection of a worker would copy every page that it shares
+    workers: list[WorkerProcess] = []
+    try:
+        for plan in plans:
+            workers.append(
+                WorkerProcess(plan, strangers=[listener, *(end for each in workers for end in each.ends())])
+            )
+    except OSError:
+        for worker in workers:
+            worker.kill()
+        raise
+    return workers
+
+
+class WorkerProcess:
+    """One worker process, forked at once; `connect` waits until it is ready."""
+
+    def __init__(self, plan: WorkerPlan, *, strangers: Sequence[socket.socket]) -> None:
+        """Fork.  The child closes *strangers*, sockets of its parent that are none of its business."""
+        self.load = 0
+        self.report: dict[str, Any] | None = None
+        self.empty = asyncio.Event()
+        self.gone = asyncio.Event()
+        self._data, data = socket.socketpair()
+        self._control, control = socket.socketpair()
+        self._exit_code: int | None = None
+        with data, control:
+            self._pid = os.fork()
+            if self._pid == 0:
+                _be_worker(plan, data, control, [*strangers, *self.ends()])
+        self._data.setblocking(False)
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._writer: asyncio.StreamWriter | None = None
+        self._reading: asyncio.Task[None] | None = None
+        self._reported: asyncio.Future[None] | None = None
+
+    def ends(self) -> tuple[socket.socket, socket.socket]:
+        """Return the supervisor's ends of both channels."""
+        return self._data, self._control
+
+    @property
+    def pid(self) -> int:
+        """Process id."""
+        return self._pid
+
+    def exit_code(self) -> int | None:
+        """Return how the process ended (negative: by which signal), None while it runs."""
+        self._reap(os.WNOHANG)
+        return self._exit_code
+
+    async def connect(
+        self,
+        first_order: Mapping[str, Any],
+        *,
+        on_lost: Callable[[WorkerProcess], None],
+        on_robot: Callable[[WorkerProcess, dict[str, Any]], None],
+    ) -> None:
+        """Wait until the worker takes sockets; *on_lost* is called if it never does, or ends later."""
+        self._on_lost, self._on_robot = on_lost, on_robot
+        reader, self._writer = await asyncio.open_unix_connection(sock=self._control, limit=_MAX_LINE_BYTES)
+        self._loop = loop = asyncio.get_running_loop()
+        self.order(**first_order)
+        ready = asyncio.Event()
+        self._reading = loop.create_task(self._listen(reader, ready))
+        await ready.wait()
+        loop.add_reader(self._data.fileno(), self._count_ends)
+
+    def give(self, accepted: socket.socket, number: int) -> bool:
+        """Hand over the *number*-th accepted socket; False if the worker's channel is full or gone."""
+        try:
+            socket.send_fds(self._data, [number.to_bytes(NUMBER_BYTES, "big")], [accepted.fileno()])
+        except OSError:
+            return False
+        self.load += 1
+        return True
+
+    def order(self, **what: Any) -> None:
+        """Send an order; one to a worker that is gone is lost."""
+        if self._writer is not None and not self._writer.is_closing():
+            self._writer.write(json.dumps(what).encode() + b"\n")
+
+    async def ask_report(self, timeout_s: float) -> None:
+        """Renew `report`, or leave it as it is when the worker does not answer in time."""
+        self._reported = asyncio.get_running_loop().create_future()
+        self.order(do="report")
+        await asyncio.wait([self._reported], timeout=timeout_s)
+
+    def kill(self) -> None:
+        """End the process, whatever it does, and close the channels; a second call does nothing."""
+        if self._data.fileno() < 0:
+            return
+        if self._loop is not None and self._reading is not None:
+            self._reading.cancel()
+            self._loop.remove_reader(self._data.fileno())
+        if self.exit_code() is None:
+            with suppress(ProcessLookupError):
+                os.kill(self._pid, signal.SIGKILL)
+            self._reap(0)
+        self._data.close()
+        if self._writer is not None:
+            self._writer.close()
+        else:
+            self._control.close()
+
+    def _reap(self, how: int) -> None:
+        if self._exit_code is None:
+            try:
+                pid, status = os.waitpid(self._pid, how)
+            except ChildProcessError:
+                pid, status = self._pid, 0  # somebody else reaped it
+            if pid:
+                self._exit_code = os.waitstatus_to_exitcode(status)
+
+    async def _listen(self, reader: asyncio.StreamReader, ready: asyncio.Event) -> None:
+        try:
+            while line := await reader.readline():
+                self._hear(json.loads(line), ready)
+        except OSError:
+            pass  # a killed worker resets its channel: the same end as below
+        self.gone.set()
+        self.empty.set()
+        self._on_lost(self)
+
+    def _hear(self, message: dict[str, Any], ready: asyncio.Event) -> None:
+        if message["event"] == "ready":
+            ready.set()
+        elif message["event"] == "empty":
+            self.empty.set()
+        elif message["event"] != "report":
+            self._on_robot(self, message)
+        else:
+            self.report = message["report"]
+            if self._reported is not None and not self._reported.done():
+                self._reported.set_result(None)
+
+    def _count_ends(self) -> None:
+        try:
+            ended = self._data.recv(_READ_BYTES)
+        except OSError:
+            ended = b""
+        if ended:
+            self.load -= len(ended)
+        else:
+            asyncio.get_running_loop().remove_reader(self._data.fileno())
+
+
+def _be_worker(
+    plan: WorkerPlan, data: socket.socket, control: socket.socket, strangers: Sequence[socket.socket]
+) -> NoReturn:
+    """The child's whole life: whatever happens, it does not return into the supervisor's code."""
+    try:
+        for stranger in strangers:
+            stranger.close()
+        nothing = os.open(os.devnull, os.O_RDONLY)
+        os.dup2(nothing, 0)
+        os.close(nothing)
+        run_worker(plan, data, control)
+        os._exit(0)
+    except BaseException:  # noqa: BLE001  it must not come back to life as a second supervisor
+        traceback.print_exc()
+        sys.stderr.flush()
+    finally:
+        os._exit(1)

@@ -1,0 +1,49 @@
+"""Record in a platform's audit log what an operator did by a command.
+
+Promises never to undo or hide what was done: if it cannot be recorded, one line says so.
+"""
+
+from __future__ import annotations
+
+import getpass
+import sys
+import time
+from pathlib import Path
+
+from rse_pf.audit.chain import Value
+from rse_pf.audit.log import audit_folder, record_once
+from rse_pf.config import AuthSettings, PlatformSettings
+from rse_pf.errors import ConfigurationError
+
+__all__ = ["record", "record_map_change"]
+
+_WHO = "operator"
+_DIRECTORY = "dir:"
+
+
+def record(state: Path, settings: AuthSettings, action: str, subject: str, **detail: Value) -> None:
+    """Record *action* on *subject* in the platform whose files lie in *state*."""
+    try:
+        record_once(
+            audit_folder(state), _WHO, action, subject, wall_clock=time.time,
+            max_bytes=settings.audit_file_bytes, user=_user(), **detail,
+        )  # fmt: skip
+    except ConfigurationError as error:
+        print(f"this is done, but not in the audit log: {error}", file=sys.stderr)
+
+
+def record_map_change(
+    settings: PlatformSettings, action: str, name: str, *, version: str, number: int
+) -> None:
+    """Record how a map changed, if its store lies in the folder of a platform that keeps an audit log."""
+    place = settings.data.store
+    state = Path(place.removeprefix(_DIRECTORY)).absolute().parent
+    if place.startswith(_DIRECTORY) and audit_folder(state).is_dir():
+        record(state, settings.auth, action, name, version=version, number=number)
+
+
+def _user() -> str:
+    try:
+        return getpass.getuser()
+    except (KeyError, OSError):  # a number without a name
+        return "unknown"

@@ -1,0 +1,63 @@
+"""Refuse a setting of the wrong type, out of its range, or in contradiction to another one.
+
+The rows themselves are in `rse_pf.config.settings`.  Promises to name the setting, both numbers, and what
+to do.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Mapping
+from typing import Any
+
+from rse_pf.config.schema import SettingRow
+from rse_pf.errors import SettingsError
+
+__all__ = ["WHERE", "check_range", "did_you_mean", "typed"]
+
+_LARGEST = 1e15
+WHERE = 'in cdk.json, context."rse-pf"'
+
+
+def typed(name: str, value: Any, kind: Any) -> Any:
+    """Return *value* as *kind*, a whole number as a float where one is meant; raises SettingsError."""
+    if kind in (int, float) and type(value) in (int, float) and not abs(value) <= _LARGEST:
+        raise SettingsError(f"{name} is not a finite number below {_LARGEST:g}", hint=f"mend it {WHERE}")
+    if kind is float and type(value) is int:
+        return float(value)
+    if type(value) is not kind:
+        raise SettingsError(
+            f"{name} = {_shown(value)} is not of type {kind.__name__}", hint=f"mend it {WHERE}"
+        )
+    return value
+
+
+def _shown(value: Any) -> str:
+    try:
+        text = repr(value)
+    except (ValueError, RecursionError):
+        text = type(value).__name__
+    return text if len(text) <= 80 else f"{text[:77]}..."
+
+
+def check_range(row: SettingRow) -> None:
+    """Raise SettingsError if the value of *row* is not among its choices or out of its range."""
+    if row.choices and row.value not in row.choices:
+        raise SettingsError(
+            f"{row.group}.{row.name} = {row.value!r} is not one of {', '.join(row.choices)}",
+            hint=f"choose one of them {WHERE}",
+        )
+    if row.low is not None and not row.value >= row.low:
+        raise SettingsError(
+            f"{row.group}.{row.name} = {row.value} is below {row.low:g}", hint=f"raise it {WHERE}"
+        )
+    if row.high is not None and not row.value <= row.high:
+        raise SettingsError(
+            f"{row.group}.{row.name} = {row.value} is above {row.high:g}", hint=f"lower it {WHERE}"
+        )
+
+
+def did_you_mean(name: str, known: Mapping[str, Any]) -> str:
+    """Return a hint: the known name that is close to *name*, else all of them."""
+    close = difflib.get_close_matches(name, known, n=1)
+    return f"did you mean {close[0]}?" if close else f"known are {', '.join(known)}"

@@ -1,0 +1,375 @@
+"""Many robots that load a platform: `Swarm` starts them in processes of their own and collects what they saw.
+
+`SwarmResult.commands` has one record a command, by the robots' clocks; ``round_trip_ms`` counts from the time
+at which the command was *planned*, so a stall of platform or generator is never left out.  Promises to run no
+robot in the caller's loop, and to leave no process behind.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import math
+import multiprocessing
+import time
+from array import array
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from multiprocessing.connection import Connection
+from types import TracebackType
+from typing import Any
+from urllib.parse import urlsplit
+
+import numpy as np
+
+from rse_pf.config import SessionSettings
+from rse_pf.errors import CommandFailed, UsageError
+from rse_pf.experiments.load.swarm_process import (
+    Begin,
+    Ended,
+    Failed,
+    Finish,
+    Happened,
+    Joined,
+    Leave,
+    Ready,
+    Rows,
+    SwarmSpec,
+    Token,
+    TokenWanted,
+    run_swarm_process,
+)
+from rse_pf.experiments.results.report import CommandRecord
+from rse_pf.local.faults.network_emulator import LinkProcess, profile_named
+from rse_pf.wire import CODECS
+
+__all__ = ["SERVICES", "Swarm", "SwarmOptions", "SwarmResult"]
+
+SERVICES = ("pnp", "echo")
+"""What the robots can ask, and know the answers of."""
+
+_READY_TIMEOUT_S = 60.0
+_END_TIMEOUT_S = 30.0
+_HEAD_START_S = 0.2
+_MAX_ROBOTS, _MAX_PROCESSES, _FASTEST_FPS, _MAX_MATCHES = 5000, 16, 200.0, 5000
+
+Event = Mapping[str, Any]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SwarmOptions:
+    """How many robots do what; raises UsageError for what is none.
+
+    Robot k connects ``k * join_every_s`` after the start.  ``keep`` asks the platform to answer every
+    frame, not only the newest.  ``link`` is the name of a profile of `rse_pf.local.faults.network_emulator`.
+    """
+
+    robots: int
+    fps: float = 5.0
+    codec: str = "zlib"
+    matches: int = 200
+    outliers: float = 0.3
+    seed: int = 0
+    join_every_s: float = 0.0
+    deadline_s: float = 5.0
+    keep: bool = True
+    service: str = "pnp"
+    processes: int = 1
+    link: str | None = None
+    robot_prefix: str = "robot"
+
+    def __post_init__(self) -> None:
+        """Check every field."""
+        _within("robots", self.robots, 1, _MAX_ROBOTS)
+        _within("fps", self.fps, 0.01, _FASTEST_FPS)
+        _within("matches", self.matches, 4, _MAX_MATCHES)
+        _within("outliers", self.outliers, 0.0, 0.9)
+        _within("seed", self.seed, 0, 2**31)
+        _within("join_every_s", self.join_every_s, 0.0, 3600.0)
+        _within("deadline_s", self.deadline_s, 0.01, 3600.0)
+        _within("processes", self.processes, 1, _MAX_PROCESSES)
+        for name, value, known in (("codec", self.codec, CODECS), ("service", self.service, SERVICES)):
+            if value not in known:
+                raise UsageError(f"no {name} named {value!r}", hint=f"choose one of {', '.join(known)}")
+        if self.link is not None:
+            profile_named(self.link)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SwarmResult:
+    """What the robots saw, and what it cost to make them.
+
+    ``cpu_s`` is the processor time of all generating processes during ``wall_s``; ``twice`` counts
+    answers that were delivered twice; ``late_sends`` is by how many ms (p99) the generator itself
+    sent after the planned time.
+    """
+
+    commands: list[CommandRecord]
+    cpu_s: float
+    wall_s: float
+    wrong_poses: int
+    reconnects: int
+    resent: int
+    moves: int
+    twice: int
+    link: str | None
+    late_sends: float
+
+
+@dataclass(slots=True, eq=False)
+class _Child:
+    """A process of robots as its parent sees it."""
+
+    process: Any
+    pipe: Connection
+    numbers: tuple[int, ...]
+    ready: bool = False
+    ended: Ended | None = None
+
+
+class Swarm:
+    """Robots in child processes; use it with ``async with``, then `start`."""
+
+    def __init__(
+        self,
+        options: SwarmOptions,
+        *,
+        url: str,
+        token_of: Callable[[str], str],
+        session: SessionSettings,
+        on_event: Callable[[Event], None] | None = None,
+        origin: float | None = None,
+    ) -> None:
+        """Describe the robots; nothing is started.
+
+        Args:
+            options: How many do what.
+            url: Of the platform; with a link, what the link leads to.
+            token_of: Returns a token for a robot; called here whenever one dials.
+            session: The robots' limits and patience.
+            on_event: Hears of joins, lost links and moves; ``time`` as in the records.
+            origin: The `time.monotonic` that is 0 in all records; None means the start.
+        """
+        self.options = options
+        self.joined: set[str] = set()
+        self.left: set[str] = set()
+        self.rows: list[Rows] = []
+        self.link: LinkProcess | None = None
+        self._url = url
+        self._token_of = token_of
+        self._session = session
+        self._on_event = on_event
+        self._origin_s = origin
+        self._start_s = 0.0
+        self._staying = list(range(options.robots))
+        self._children: list[_Child] = []
+        self._changed = asyncio.Event()
+        self._problem: CommandFailed | None = None
+
+    async def __aenter__(self) -> Swarm:
+        """Start the processes and the link; returns when their payloads are encoded.
+
+        Raises:
+            CommandFailed: A process did not come up.
+        """
+        try:
+            await self._launch()
+            await self._until(
+                lambda: all(child.ready for child in self._children), _READY_TIMEOUT_S, "get ready"
+            )
+        except BaseException:
+            await self._end()
+            raise
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """End every process."""
+        await self._end()
+
+    async def start(self) -> None:
+        """Begin to join: robot k connects ``k * join_every_s`` from now."""
+        self._start_s = time.monotonic() + _HEAD_START_S
+        if self._origin_s is None:
+            self._origin_s = self._start_s
+        for child in self._children:
+            child.pipe.send(Begin(self._start_s, self._origin_s))
+
+    async def wait_joined(self, timeout_s: float) -> None:
+        """Return when every robot is connected and sends; raises CommandFailed when that takes longer."""
+        wanted = self.options.robots
+        await self._until(lambda: len(self.joined) >= wanted, timeout_s, "join")
+
+    async def wait_answered(self, count: int, timeout_s: float) -> None:
+        """Return when *count* more commands than now have ended; raises CommandFailed if that is too late."""
+        wanted = count + sum(map(len, self.rows))
+        await self._until(lambda: sum(map(len, self.rows)) >= wanted, timeout_s, f"answer {count} times")
+
+    async def leave(self, n: int | None = None) -> None:
+        """Have *n* robots, the youngest, or all stop and disconnect; returns when they have."""
+        count = len(self._staying) if n is None else min(n, len(self._staying))
+        leaving = set(self._staying[len(self._staying) - count :])
+        self._staying = [number for number in self._staying if number not in leaving]
+        for child in self._children:
+            child.pipe.send(Leave(tuple(sorted(leaving & set(child.numbers)))))
+        names = {self._name(number) for number in leaving}
+        await self._until(lambda: names <= self.left, self.options.deadline_s + _END_TIMEOUT_S, "leave")
+
+    async def finish(self, grace_s: float = 5.0) -> SwarmResult:
+        """Stop sending, wait up to *grace_s* for answers, end the processes; what is open then is lost."""
+        for child in self._children:
+            child.pipe.send(Finish(grace_s))
+        await self._until(
+            lambda: all(child.ended is not None for child in self._children), grace_s + _END_TIMEOUT_S, "end"
+        )
+        wall_s = time.monotonic() - self._start_s
+        return self._result(wall_s, [child.ended for child in self._children if child.ended is not None])
+
+    def _result(self, wall_s: float, ended: Iterable[Ended]) -> SwarmResult:
+        last = list(ended)
+        commands = [command for rows in self.rows for command in _records(rows, self.options.robot_prefix)]
+        late_ms = [1e3 * (command.sent - command.planned) for command in commands]
+        counts = Counter((command.robot, command.id) for command in commands)
+        return SwarmResult(
+            commands=commands,
+            cpu_s=round(sum(each.cpu_s for each in last), 3),
+            wall_s=round(wall_s, 3),
+            wrong_poses=sum(each.wrong_poses for each in last),
+            reconnects=sum(each.reconnects for each in last),
+            resent=sum(each.resent for each in last),
+            moves=sum(each.moves for each in last),
+            twice=sum(each.twice for each in last) + sum(count - 1 for count in counts.values()),
+            link=self.options.link,
+            late_sends=round(float(np.percentile(late_ms, 99)), 3) if late_ms else 0.0,
+        )
+
+    async def _launch(self) -> None:
+        url = self._url
+        if self.options.link is not None:
+            profile, parts = profile_named(self.options.link), urlsplit(url)
+            port = parts.port or (443 if parts.scheme == "wss" else 80)
+            link = LinkProcess(profile, parts.hostname or "", port, seed=self.options.seed)
+            self.link = await link.__aenter__()
+            url = parts._replace(netloc=f"127.0.0.1:{self.link.port}").geturl()
+        context = multiprocessing.get_context("spawn")
+        count = min(self.options.processes, self.options.robots)
+        loop = asyncio.get_running_loop()
+        for share in range(count):
+            numbers = tuple(range(share, self.options.robots, count))
+            mine, theirs = context.Pipe()
+            process = context.Process(
+                target=run_swarm_process, args=(self._spec(numbers, url), theirs), name="swarm", daemon=True
+            )
+            child = _Child(process, mine, numbers)
+            await asyncio.to_thread(process.start)
+            theirs.close()
+            self._children.append(child)
+            loop.add_reader(mine.fileno(), self._hear, child)
+
+    def _spec(self, numbers: tuple[int, ...], url: str) -> SwarmSpec:
+        o = self.options
+        return SwarmSpec(
+            numbers=numbers, robots=o.robots, prefix=o.robot_prefix, url=url, service=o.service,
+            codec=o.codec, fps=o.fps, matches=o.matches, outliers=o.outliers, seed=o.seed,
+            join_every_s=o.join_every_s, deadline_s=o.deadline_s, keep=o.keep, session=self._session,
+        )  # fmt: skip
+
+    def _name(self, number: int) -> str:
+        return f"{self.options.robot_prefix}-{number + 1}"
+
+    def _hear(self, child: _Child) -> None:
+        try:
+            while child.pipe.poll():
+                self._about(child, child.pipe.recv())
+        except (EOFError, OSError):
+            asyncio.get_running_loop().remove_reader(child.pipe.fileno())
+            if child.ended is None and self._problem is None:
+                self._problem = CommandFailed(
+                    "a process of the swarm ended early", hint="is there enough memory?"
+                )
+        self._changed.set()
+
+    def _about(self, child: _Child, message: Any) -> None:
+        if isinstance(message, Rows):
+            self.rows.append(message)
+        elif isinstance(message, TokenWanted):
+            child.pipe.send(Token(message.robot, self._token_of(message.robot)))
+        elif isinstance(message, Happened):
+            if message.event["event"] == "robot-left":
+                self.left.add(message.event["robot"])
+            if self._on_event is not None:
+                self._on_event(message.event)
+        elif isinstance(message, Joined):
+            self.joined.add(message.robot)
+        elif isinstance(message, Ready):
+            child.ready = True
+        elif isinstance(message, Failed):
+            what, _, hint = message.report.partition("\n  hint: ")
+            self._problem = CommandFailed(f"the swarm failed: {what}", hint=hint)
+        elif isinstance(message, Ended):
+            child.ended = message
+
+    async def _until(self, condition: Callable[[], bool], timeout_s: float, what: str) -> None:
+        end = time.monotonic() + timeout_s
+        while not condition():
+            left_s = end - time.monotonic()
+            if self._problem is not None:
+                raise self._problem
+            if left_s <= 0:
+                raise CommandFailed(
+                    f"the robots did not {what} within {timeout_s:g} s ({len(self.joined)} of "
+                    f"{self.options.robots} had joined)",
+                    hint="does the platform run, and does it accept their tokens?",
+                )
+            self._changed.clear()
+            try:
+                await asyncio.wait_for(self._changed.wait(), left_s)
+            except asyncio.TimeoutError:
+                continue
+
+    async def _end(self) -> None:
+        loop = asyncio.get_running_loop()
+        for child in self._children:
+            loop.remove_reader(child.pipe.fileno())
+            child.pipe.close()
+        for child in self._children:
+            await asyncio.to_thread(child.process.join, _HEAD_START_S if child.ended is None else 5.0)
+            if child.process.is_alive():
+                child.process.kill()
+                await asyncio.to_thread(child.process.join)
+        self._children.clear()
+        link, self.link = self.link, None
+        if link is not None:
+            await link.__aexit__(None, None, None)
+
+
+def _records(rows: Rows, prefix: str) -> Iterator[CommandRecord]:
+    """Return the records of *rows*; a command without a code was never answered."""
+    for place, (server, code) in enumerate(zip(rows.servers, rows.codes, strict=True)):
+        row: array[float] = rows.numbers[place * Rows.WIDTH : (place + 1) * Rows.WIDTH]
+        number, identity, planned, sent, answered, size, up_ms, queue_ms, compute_ms, down_ms = row
+        yield CommandRecord(
+            id=int(identity),
+            robot=f"{prefix}-{int(number) + 1}",
+            planned=round(planned, 6),
+            sent=round(sent, 6),
+            answered=_known(answered, 6),
+            server=server,
+            code=code,
+            payload_bytes=int(size),
+            round_trip_ms=_known(1e3 * (answered - planned), 3) if code == "ok" else None,
+            up_ms=_known(up_ms, 3),
+            queue_ms=_known(queue_ms, 3),
+            compute_ms=_known(compute_ms, 3),
+            down_ms=_known(down_ms, 3),
+        )
+
+
+def _known(value: float, digits: int) -> float | None:
+    return None if math.isnan(value) else round(value, digits)
+
+
+def _within(name: str, value: float, low: float, high: float) -> None:
+    if not low <= value <= high:
+        raise UsageError(f"{name} = {value:g} is not within {low:g}..{high:g}", hint="choose another")

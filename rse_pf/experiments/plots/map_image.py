@@ -1,0 +1,288 @@
+"""The paper's Fig. 7 as a picture: a coloured point cloud with the path of its camera.
+
+Drawn with Pillow alone, because matplotlib and its fonts would be a fifth of what the demo
+installs.  Promises to draw what is in the map and nothing else.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from rse_pf.errors import MissingExtra
+from rse_pf.geometry import Array
+
+__all__ = ["COLOURS", "PathOfRobot", "draw_map"]
+
+_WIDTH, _HEIGHT, _CAPTION, _MARGIN = 1600, 900, 64, 40
+_BACKGROUND, _INK, _WHITE = (228, 231, 236), (30, 34, 42), (255, 255, 255)
+"""Not white: white walls and tables must be told from places that nobody saw."""
+COLOURS = ((0, 114, 178), (213, 94, 0), (0, 158, 115), (204, 121, 167), (230, 159, 0), (86, 180, 233))
+"""Apart for colour-blind eyes, too; Okabe and Ito 2008."""
+_MAX_LABELS = 8
+"""More robots than this have their names in the legend only."""
+_FOCAL = 1.35
+_CAMERA_EVERY_M = 0.5
+_SCALES_M = (1.0, 0.5, 2.0, 0.2, 5.0, 0.1, 10.0, 20.0, 50.0, 100.0, 0.05, 0.02, 0.01)
+_SCALE_PX = (80.0, 400.0)
+_LONG_SCENE = 1.25
+"""Longer than wide by this, a scene lies across the picture."""
+_CEILING_M = 0.7
+"""Points this far above the camera hide the room from an observer above; they are not drawn."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class PathOfRobot:
+    """Where a robot's camera went: ``T_world_camera`` ``(n, 4, 4)``, in order."""
+
+    name: str
+    T_world_camera: Array
+
+
+def draw_map(
+    path: Path,
+    points_world: npt.NDArray[np.floating[Any]],
+    colours: npt.NDArray[np.uint8],
+    robots: list[PathOfRobot],
+    caption: str,
+) -> None:
+    """Write a PNG that shows ``(n, 3)`` points from obliquely above, with the robots' paths.
+
+    Raises:
+        MissingExtra: Pillow is not installed.
+    """
+    image_module, draw_module, font_module = _pillow()
+    up = _up(robots)
+    shown = _below_ceiling(points_world, robots, up)
+    points, tints = points_world[shown].astype(np.float64), colours[shown]
+    view = _Observer(points, robots, up)
+    image = image_module.fromarray(_splat(view, points, tints))
+    draw = draw_module.Draw(image)
+    big, small = font_module.load_default(size=26), font_module.load_default(size=20)
+    for number, robot in enumerate(robots):
+        _draw_path(draw, view, robot, COLOURS[number % len(COLOURS)])
+    for number, robot in enumerate(robots):
+        _draw_ends(draw, view, robot, COLOURS[number % len(COLOURS)])
+    if 1 < len(robots) <= _MAX_LABELS:
+        for robot, place in zip(robots, _label_places(view, robots), strict=True):
+            draw.text(
+                place, robot.name, fill=_INK, font=small, anchor="mm", stroke_width=4, stroke_fill=_WHITE
+            )
+    scale_left = _draw_scale(draw, view, small)
+    draw.text((_MARGIN, 18), _fitting(draw, caption, big, _WIDTH - 2 * _MARGIN), fill=_INK, font=big)
+    _draw_legend(draw, robots, small, scale_left - _MARGIN)
+    image.save(path, format="PNG")
+
+
+class _Observer:
+    """A pinhole camera that looks down on the scene from its most telling side."""
+
+    def __init__(self, points: Array, robots: list[PathOfRobot], up: Array) -> None:
+        low, high = (np.percentile(points, q, axis=0) if len(points) else np.zeros(3) for q in (2, 98))
+        self.centre = (low + high) / 2
+        forward = self._side(points, robots, up)
+        slope = math.radians(40)
+        self.axis_z = math.cos(slope) * forward - math.sin(slope) * up
+        self.axis_x = np.cross(self.axis_z, up)
+        self.axis_x /= np.linalg.norm(self.axis_x)
+        self.axis_y = np.cross(self.axis_z, self.axis_x)
+        self.axis_y *= -1 if self.axis_y @ up > 0 else 1
+        self.distance = max(1.0, float(np.linalg.norm(high - low)))
+        self.scale, self.shift = 1.0, np.zeros(2)
+        shown = np.concatenate(
+            [points[:: max(1, len(points) // 20_000)]]
+            + [robot.T_world_camera[:, :3, 3] for robot in robots for _ in range(20)]
+        )
+        if len(shown):
+            low_px, high_px = np.percentile(self._flat(shown), (0.5, 99.5), axis=0)
+            room = np.array([_WIDTH - 2 * _MARGIN, _HEIGHT - 2 * _CAPTION - _MARGIN])
+            self.scale = float((room / np.maximum(high_px - low_px, 1e-9)).min())
+            self.shift = np.array([_WIDTH / 2, _HEIGHT / 2]) - self.scale * (high_px + low_px) / 2
+
+    @staticmethod
+    def _side(points: Array, robots: list[PathOfRobot], up: Array) -> Array:
+        """Look the way the robots looked on average, or across the scene if it is much longer than wide."""
+        looks = np.concatenate([robot.T_world_camera[:, :3, 2] for robot in robots])
+        mean = looks.mean(axis=0) if len(looks) else np.zeros(3)
+        level = np.eye(3) - np.outer(up, up)
+        mean = level @ mean
+        if len(points):
+            flat = (points - points.mean(axis=0)) @ level
+            spread, axes = np.linalg.eigh(flat.T @ flat)
+            if spread[2] > _LONG_SCENE**2 * spread[1]:
+                across = level @ axes[:, 1]
+                mean = across if across @ mean >= 0 else -across
+        if np.linalg.norm(mean) < 0.05:
+            mean = np.cross(up, [1.0, 0.0, 0.0] if abs(up[0]) < 0.9 else [0.0, 1.0, 0.0])
+        side: Array = mean / np.linalg.norm(mean)
+        return side
+
+    def depth(self, points: Array) -> Array:
+        """Return the distances along the line of sight, metres."""
+        depth: Array = (points - self.centre) @ self.axis_z + 1.6 * self.distance
+        return depth
+
+    def project(self, points: Array) -> Array:
+        """Return the picture's ``(n, 2)`` pixels."""
+        return self._flat(points) + self.shift
+
+    def _flat(self, points: Array) -> Array:
+        moved = points - self.centre
+        flat = np.column_stack([moved @ self.axis_x, moved @ self.axis_y])
+        flat *= (_FOCAL * self.scale / np.maximum(self.depth(points), 0.1))[:, None]
+        return flat
+
+
+def _splat(view: _Observer, points: Array, colours: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
+    """Paint the points, nearest on top, each as a small square."""
+    picture = np.empty((_HEIGHT, _WIDTH, 3), dtype=np.uint8)
+    picture[:] = _BACKGROUND
+    if not len(points):
+        return picture
+    pixels = np.round(view.project(points)).astype(np.int64)
+    order = np.argsort(-view.depth(points))
+    size = _splat_size(pixels)
+    top, bottom = _CAPTION, _HEIGHT - _CAPTION
+    for dy in range(size):
+        for dx in range(size):
+            x, y = pixels[order, 0] + dx, pixels[order, 1] + dy
+            inside = (x >= 0) & (x < _WIDTH) & (y >= top) & (y < bottom)
+            picture[y[inside], x[inside]] = colours[order[inside]]
+    return picture
+
+
+def _splat_size(pixels: npt.NDArray[np.int64]) -> int:
+    """Choose squares just large enough to close the gaps between neighbours."""
+    spread = np.percentile(pixels, 98, axis=0) - np.percentile(pixels, 2, axis=0)
+    each = float(spread[0] * spread[1]) / max(1, len(pixels))
+    return int(np.clip(round(math.sqrt(2.5 * each)), 1, 4))
+
+
+def _draw_path(draw: Any, view: _Observer, robot: PathOfRobot, colour: tuple[int, int, int]) -> None:
+    if not len(robot.T_world_camera):
+        return
+    line = [(float(x), float(y)) for x, y in view.project(robot.T_world_camera[:, :3, 3])]
+    draw.line(line, fill=(255, 255, 255), width=9, joint="curve")
+    draw.line(line, fill=colour, width=5, joint="curve")
+    for pose in _spaced(robot.T_world_camera):
+        _draw_camera(draw, view, pose, colour)
+
+
+def _draw_ends(draw: Any, view: _Observer, robot: PathOfRobot, colour: tuple[int, int, int]) -> None:
+    """Draw start and end; the ring is so wide that another robot's start within it leaves it in sight."""
+    if not len(robot.T_world_camera):
+        return
+    (x0, y0), (x1, y1) = view.project(robot.T_world_camera[[0, -1], :3, 3])
+    draw.ellipse([x1 - 16, y1 - 16, x1 + 16, y1 + 16], outline=_WHITE, width=9)
+    draw.ellipse([x1 - 14, y1 - 14, x1 + 14, y1 + 14], outline=colour, width=5)
+    draw.ellipse([x0 - 9, y0 - 9, x0 + 9, y0 + 9], fill=colour, outline=_WHITE, width=3)
+
+
+def _label_places(view: _Observer, robots: list[PathOfRobot]) -> list[tuple[float, float]]:
+    """Return for each robot a place beside its path, as far from the other paths as there is one."""
+    lines = [view.project(robot.T_world_camera[:, :3, 3]) for robot in robots]
+    places = []
+    for number, line in enumerate(lines):
+        if not len(line):
+            places.append((-100.0, -100.0))
+            continue
+        spots = line[:: max(1, len(line) // 50)]
+        spots = np.concatenate([spots + np.array(off) for off in ((0, -34), (0, 34), (70, 0), (-70, 0))])
+        taken = [other for row, other in enumerate(lines) if row != number] + [
+            np.array(places).reshape(-1, 2)
+        ]
+        others = np.concatenate(taken)
+        if len(others):
+            free = np.linalg.norm(spots[:, None] - others[None], axis=2).min(axis=1)
+        else:
+            free = np.zeros(len(spots))
+        inside = (np.abs(spots - [_WIDTH / 2, _HEIGHT / 2]) < [_WIDTH / 2 - 60, _HEIGHT / 2 - 80]).all(axis=1)
+        x, y = spots[int(np.argmax(np.where(inside, free, -1.0)))]
+        places.append((float(x), float(y)))
+    return places
+
+
+def _draw_legend(draw: Any, robots: list[PathOfRobot], font: Any, max_px: float) -> None:
+    """Draw one line of names; those that do not fit are counted."""
+    left, y = _MARGIN, _HEIGHT - 34
+    for number, robot in enumerate(robots):
+        label = f"{robot.name} (dot: start, ring: end)" if number == 0 else robot.name
+        length = int(draw.textlength(label, font=font))
+        if left + 46 + length > max_px:
+            draw.text((left, y), f"and {len(robots) - number} more", fill=_INK, font=font, anchor="lm")
+            return
+        draw.line([(left, y), (left + 36, y)], fill=COLOURS[number % len(COLOURS)], width=6)
+        draw.text((left + 46, y), label, fill=_INK, font=font, anchor="lm")
+        left += 76 + length
+
+
+def _fitting(draw: Any, text: str, font: Any, max_px: float) -> str:
+    """Return *text*, cut where it is wider than there is room."""
+    if draw.textlength(text, font=font) <= max_px:
+        return text
+    while text and draw.textlength(f"{text} ...", font=font) > max_px:
+        text = text[:-1]
+    return f"{text} ..."
+
+
+def _spaced(poses: Array) -> list[Array]:
+    """Return the first pose and every one that lies far enough from the last chosen."""
+    chosen = [poses[0]]
+    for pose in poses[1:]:
+        if np.linalg.norm(pose[:3, 3] - chosen[-1][:3, 3]) >= _CAMERA_EVERY_M:
+            chosen.append(pose)
+    return chosen
+
+
+def _draw_camera(draw: Any, view: _Observer, T_world_camera: Array, colour: tuple[int, int, int]) -> None:
+    corners = np.array([[-0.09, -0.07, 0.14], [0.09, -0.07, 0.14], [0.09, 0.07, 0.14], [-0.09, 0.07, 0.14]])
+    world = np.vstack([np.zeros(3), corners]) @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]
+    flat = [(float(x), float(y)) for x, y in view.project(world)]
+    for corner in flat[1:]:
+        draw.line([flat[0], corner], fill=colour, width=2)
+    draw.line([*flat[1:], flat[1]], fill=colour, width=2)
+
+
+def _draw_scale(draw: Any, view: _Observer, font: Any) -> float:
+    """Draw one metre (or a round number of them) as it looks at the scene's centre; return its left end."""
+    ends = view.project(np.stack([view.centre, view.centre + view.axis_x]))
+    one_px = max(float(np.linalg.norm(ends[1] - ends[0])), 1e-9)
+    metres = next((m for m in _SCALES_M if _SCALE_PX[0] <= m * one_px <= _SCALE_PX[1]), 1.0)
+    length, label = min(metres * one_px, _WIDTH / 2), f"{metres:g} m"
+    right, y = _WIDTH - _MARGIN, _HEIGHT - 34
+    draw.line([(right - length, y), (right, y)], fill=_INK, width=3)
+    for x in (right - length, right):
+        draw.line([(x, y - 7), (x, y + 7)], fill=_INK, width=3)
+    draw.text((right - length - 16, y), label, fill=_INK, font=font, anchor="rm")
+    return right - length - 16 - float(draw.textlength(label, font=font))
+
+
+def _up(robots: list[PathOfRobot]) -> Array:
+    """Return the mean upward direction of the cameras: their -y axes."""
+    if not sum(len(robot.T_world_camera) for robot in robots):
+        return np.array([0.0, -1.0, 0.0])
+    mean = -np.concatenate([robot.T_world_camera[:, :3, 1] for robot in robots]).mean(axis=0)
+    up: Array = mean / np.linalg.norm(mean)
+    return up
+
+
+def _below_ceiling(
+    points: npt.NDArray[np.floating[Any]], robots: list[PathOfRobot], up: Array
+) -> npt.NDArray[np.bool_]:
+    heights = points @ up
+    cameras = np.concatenate([robot.T_world_camera[:, :3, 3] for robot in robots]) @ up
+    highest = float(cameras.max()) if len(cameras) else math.inf
+    return np.asarray(heights < highest + _CEILING_M)
+
+
+def _pillow() -> tuple[Any, Any, Any]:
+    try:
+        from PIL import Image, ImageDraw, ImageFont
+    except ImportError as error:
+        raise MissingExtra("pillow", "local") from error
+    return Image, ImageDraw, ImageFont

@@ -1,0 +1,241 @@
+"""How good a merged map is: where its robots went in it, and how far that is from the truth.
+
+Promises to use the truth for scores alone, and to say what was left out of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from client_sdk.mapping import Trajectory
+from rse_pf.errors import UsageError
+from rse_pf.experiments.results.trajectory_error import align, associate
+from rse_pf.geometry import Array, inverse, pose_difference
+from rse_pf.maps.format import MapVersion
+from rse_pf.services.mapping.merge import MergeReply
+
+__all__ = ["JoinedRobot", "joined_robots", "merge_section", "merged_lines", "merged_rows", "move_frames"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class JoinedRobot:
+    """A robot in the merged map: its path in its own world, and in that of the map."""
+
+    name: str
+    own: Trajectory
+    merged: Trajectory
+    truth: Trajectory | None
+
+
+def joined_robots(
+    names: Sequence[str],
+    paths: Sequence[Trajectory],
+    truths: Sequence[Trajectory | None],
+    versions: Sequence[MapVersion],
+    reply: MergeReply,
+    merged: MapVersion,
+) -> list[JoinedRobot]:
+    """Return the robots that were joined, with every frame's pose in the merged map.
+
+    Args:
+        names: Of the robots, in the order in which their maps were sent.
+        paths: All their frames, each in its robot's own world.
+        truths: Their true paths, in one common world, where known.
+        versions: The maps that were sent.
+        reply: What the merge service said.
+        merged: The map of *reply*; its provenance says whose keyframe is whose.
+    """
+    poses: dict[tuple[int, int], Array] = {
+        (int(whose), int(number)): keyframe.T_world_camera
+        for (whose, number), keyframe in zip(merged.provenance["from"], merged.keyframes, strict=True)
+    }
+    robots = []
+    for row in reply.joined:
+        keyframes = versions[row].keyframes
+        moved = move_frames(
+            paths[row],
+            np.array([each.timestamp_s for each in keyframes]),
+            np.array([each.T_world_camera for each in keyframes]),
+            np.array([poses[row, each.id] for each in keyframes]),
+        )
+        robots.append(JoinedRobot(name=names[row], own=paths[row], merged=moved, truth=truths[row]))
+    return robots
+
+
+def move_frames(path: Trajectory, stamps_s: Array, T_before: Array, T_after: Array) -> Trajectory:
+    """Return *path* after its keyframes moved.
+
+    A frame between two keyframes takes a part of the correction of each, by its place in time between
+    them; a frame outside follows the nearest keyframe.
+
+    Args:
+        path: ``n`` poses ``T_world_camera``, in the world of *T_before*.
+        stamps_s: ``(k,)``, ascending, of the keyframes.
+        T_before: ``(k, 4, 4)``.
+        T_after: ``(k, 4, 4)``, in another world.
+    """
+    corrections = T_after @ np.array([inverse(each) for each in T_before])
+    after = np.clip(np.searchsorted(stamps_s, path.timestamps_s, side="right"), 0, len(stamps_s) - 1)
+    before = np.clip(np.searchsorted(stamps_s, path.timestamps_s, side="right") - 1, 0, len(stamps_s) - 1)
+    gap_s = stamps_s[after] - stamps_s[before]
+    share = np.clip((path.timestamps_s - stamps_s[before]) / np.where(gap_s > 0, gap_s, 1.0), 0.0, 1.0)
+    first, second = (corrections[rows] @ path.T_world_camera for rows in (before, after))
+    mean = (1.0 - share)[:, None, None] * first + share[:, None, None] * second
+    U, _, Vt = np.linalg.svd(mean[:, :3, :3])  # the rotation nearest to the mean of two that are close
+    mean[:, :3, :3] = U @ Vt
+    return Trajectory(path.timestamps_s, mean)
+
+
+def merge_section(
+    names: Sequence[str],
+    robots: Sequence[JoinedRobot],
+    reply: MergeReply,
+    merged: MapVersion,
+    how: Mapping[str, Any],
+) -> dict[str, Any]:
+    """Return ``merged`` of ``report.json``.
+
+    ``ate_cm`` is over all frames of the joined robots after one rigid alignment to the truth.  Before the
+    merge no robot knows where the others are, so ``ate_before_cm`` aligns every robot to the truth by itself:
+    it holds their drift, and no error of how they lie to each other.  For ``ate_stiff_cm`` every map lies
+    where the merge laid it, but is not bent.
+    ``origins`` is how far a robot's first pose is off, seen from the first robot's.
+    """
+    return {
+        "joined": [names[row] for row in reply.joined],
+        "not_joined": [{"robot": names[each.map], "reason": each.reason} for each in reply.not_joined],
+        "refused": [
+            {"robots": [names[row] for row in each.maps], "reason": each.reason, "count": each.count}
+            for each in reply.refused
+        ],
+        "links_between_robots": reply.merges,
+        "loops": reply.loops,
+        "keyframes": len(merged.keyframes),
+        "points": len(merged.points),
+        "frames": sum(len(robot.own) for robot in robots),
+        **_errors(robots),
+        **how,
+    }
+
+
+def merged_lines(section: Mapping[str, Any]) -> str:
+    """Return what a person sees of ``merged``; each line ends with a newline."""
+    joined = section["joined"]
+    what = (
+        f"{section['links_between_robots']} links between them and {section['loops']} loops"
+        if len(joined) > 1
+        else f"{section['loops']} loops closed"
+    )
+    lines = [f"merged {', '.join(joined)}: {section['keyframes']} keyframes, {what}"]
+    if section["ate_cm"] is not None:
+        alone = ", every robot aligned to the truth by itself" if len(joined) > 1 else ""
+        lines.append(
+            f"ATE {section['ate_cm']:.2f} cm in the merged map "
+            f"(before: {section['ate_before_cm']:.2f} cm{alone})"
+        )
+    lines += [f"{each['robot']} not joined: {each['reason']}" for each in section["not_joined"]]
+    refused = sum(each["count"] for each in section["refused"])
+    if refused:
+        reasons: dict[str, int] = {}
+        for each in section["refused"]:
+            reasons[each["reason"]] = reasons.get(each["reason"], 0) + each["count"]
+        told = ", ".join(f"{count} {reason}" for reason, count in sorted(reasons.items()))
+        lines.append(f"{refused} pairs of keyframes make no link ({told})")
+    return "".join(f"{line}\n" for line in lines)
+
+
+def merged_rows(section: Mapping[str, Any] | None) -> list[str]:
+    """Return the lines of ``report.md`` about a merged map; none where there was no merge."""
+    if section is None:
+        return []
+    rows = [
+        ("joined", ", ".join(section["joined"])),
+        ("not joined", "; ".join(f"{e['robot']}: {e['reason']}" for e in section["not_joined"]) or "-"),
+        ("keyframes / links between robots / loops",
+         f"{section['keyframes']} / {section['links_between_robots']} / {section['loops']}"),
+        ("ATE cm", _two(section["ate_cm"])),
+        ("ATE cm before, every robot aligned to the truth by itself", _two(section["ate_before_cm"])),
+        ("ATE cm of the maps laid beside each other, not bent", _two(section["ate_stiff_cm"])),
+        *((f"origin of {e['robot']} off", f"{e['cm']:.1f} cm, {e['deg']:.2f} deg")
+          for e in section["origins"]),
+        *(("refused " + between, reasons) for between, reasons in _refused_by_pair(section).items()),
+    ]  # fmt: skip
+    return ["| merged map | |", "|---|---|", *(f"| {what} | {value} |" for what, value in rows), ""]
+
+
+def _refused_by_pair(section: Mapping[str, Any]) -> dict[str, str]:
+    pairs: dict[str, list[str]] = {}
+    for each in section["refused"]:
+        one, other = each["robots"]
+        between = f"within {one}" if one == other else f"between {one} and {other}"
+        pairs.setdefault(between, []).append(f"{each['count']} {each['reason']}")
+    return {between: ", ".join(told) for between, told in pairs.items()}
+
+
+def _two(value: float | None) -> str:
+    return "-" if value is None else f"{value:.2f}"
+
+
+def _errors(robots: Sequence[JoinedRobot]) -> dict[str, Any]:
+    pairs = [_matched(robot) for robot in robots]
+    if not robots or any(pair is None for pair in pairs):
+        return {"ate_cm": None, "ate_before_cm": None, "ate_stiff_cm": None, "origins": []}
+    known = [pair for pair in pairs if pair is not None]
+    together = _residuals(
+        np.concatenate([merged[:, :3, 3] for _, merged, _ in known]),
+        np.concatenate([truth[:, :3, 3] for _, _, truth in known]),
+    )
+    stiff = _residuals(
+        np.concatenate([(_laid(own, merged) @ own)[:, :3, 3] for own, merged, _ in known]),
+        np.concatenate([truth[:, :3, 3] for _, _, truth in known]),
+    )
+    before = np.concatenate([_residuals(own[:, :3, 3], truth[:, :3, 3]) for own, _, truth in known])
+    _, first, first_truth = known[0]
+    origins = []
+    for robot, (_, merged, truth) in zip(robots[1:], known[1:], strict=True):
+        off_m, off_deg = pose_difference(inverse(first[0]) @ merged[0], inverse(first_truth[0]) @ truth[0])
+        origins.append({"robot": robot.name, "cm": round(100 * off_m, 3), "deg": round(off_deg, 3)})
+    return {
+        "ate_cm": round(100 * _rms(together), 4),
+        "ate_before_cm": round(100 * _rms(before), 4),
+        "ate_stiff_cm": round(100 * _rms(stiff), 4),
+        "origins": origins,
+    }
+
+
+def _matched(robot: JoinedRobot) -> tuple[Array, Array, Array] | None:
+    """Return own, merged and true poses ``(n, 4, 4)`` of the frames whose truth is known."""
+    if robot.truth is None:
+        return None
+    try:
+        mine, theirs = associate(robot.merged, robot.truth, 0.02)
+    except UsageError:
+        return None
+    return (
+        robot.own.T_world_camera[mine],
+        robot.merged.T_world_camera[mine],
+        robot.truth.T_world_camera[theirs],
+    )
+
+
+def _laid(own: Array, merged: Array) -> Array:
+    """Return the rigid motion that brings whole poses ``(n, 4, 4)`` closest: mean rotation, then shift."""
+    U, _, Vt = np.linalg.svd((merged[:, :3, :3] @ np.swapaxes(own[:, :3, :3], 1, 2)).sum(axis=0))
+    T = np.eye(4)
+    T[:3, :3] = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+    T[:3, 3] = (merged[:, :3, 3] - own[:, :3, 3] @ T[:3, :3].T).mean(axis=0)
+    return T
+
+
+def _residuals(points: Array, wanted: Array) -> Array:
+    _, T = align(points, wanted)
+    distances: Array = np.linalg.norm(points @ T[:3, :3].T + T[:3, 3] - wanted, axis=1)
+    return distances
+
+
+def _rms(distances: Array) -> float:
+    return float(np.sqrt(np.mean(np.square(distances))))

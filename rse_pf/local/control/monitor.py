@@ -1,0 +1,218 @@
+"""The monitor box on one machine: what every server does, as readings, and whole periods as samples.
+
+A `MonitorSample` comes about once a second; `Periods` adds readings up to the
+`rse_pf.scaling.policy.Sample`s that the policy judges, by the rule with which a report can be checked
+later: a reading speaks for the time since the one before it, and belongs to the period in which the middle
+of that time lies.  The functions here are pure: promises no clock, no socket, and that a server which does
+not answer has no numbers rather than zeros.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any, Literal
+
+from rse_pf.config import ServingSettings
+from rse_pf.scaling.policy import Sample
+
+__all__ = [
+    "MonitorSample",
+    "Observed",
+    "Periods",
+    "ServerReading",
+    "capacity_cores",
+    "reading_every_s",
+    "reading_of",
+    "server_reading",
+]
+
+ServerPhase = Literal["starting", "healthy", "unhealthy", "draining"]
+
+_MAX_S, _MIN_S = 1.0, 0.25
+_WHOLE = 0.5
+"""A period of which less than this share was watched gives no sample."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Observed:
+    """What a server said of itself at one time, monotonic seconds; ``status`` is its /status page."""
+
+    at_s: float
+    status: Mapping[str, Any]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ServerReading:
+    """One server.  Counts are of this interval; CPU is relative to its size, None when it did not answer."""
+
+    name: str
+    pid: int
+    state: ServerPhase
+    robots: int = 0
+    cpu_percent: float | None = None
+    requests: int = 0
+    queue: int = 0
+    queue_ms: float = 0.0
+    in_flight: int = 0
+    bytes_in: int = 0
+    bytes_out: int = 0
+    warming: bool = False
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MonitorSample:
+    """All servers at one time.  ``cpu_percent`` is the mean over servers past their warm-up, or None."""
+
+    time: float
+    cpu_percent: float | None
+    healthy_servers: int
+    servers_count: int
+    robots: int
+    requests: int
+    queue_ms: float
+    bytes_in: int
+    bytes_out: int
+    servers: tuple[ServerReading, ...]
+
+    def document(self) -> dict[str, Any]:
+        """Return the reading as plain JSON values."""
+        return {**asdict(self), "servers": [asdict(server) for server in self.servers]}
+
+
+def reading_every_s(period_s: float) -> float:
+    """Return the time between readings: a whole part of the period, near 1 s, and never below 0.25 s."""
+    return max(period_s / math.ceil(period_s / _MAX_S), _MIN_S)
+
+
+def capacity_cores(serving: ServingSettings, workers: int, machine_cores: int) -> float:
+    """Return the CPU seconds per second that count as 100 % of a server."""
+    if serving.size > 0:
+        return serving.size * workers
+    return float(min(workers, machine_cores))
+
+
+def server_reading(
+    before: Observed | None,
+    now: Observed | None,
+    *,
+    name: str,
+    pid: int,
+    state: ServerPhase,
+    warming: bool,
+    capacity: float,
+) -> ServerReading:
+    """Return what a server did between *before* and *now*; None means that it did not answer.
+
+    Args:
+        before: Its last answer.
+        now: Its answer of this reading.
+        name: Of the server.
+        pid: Of its supervisor.
+        state: As the platform sees it.
+        warming: Whether its CPU does not count yet.
+        capacity: CPU seconds per second that are 100 %.
+    """
+    if now is None:
+        return ServerReading(name=name, pid=pid, state=state, warming=warming)
+    told = now.status
+    then: Mapping[str, Any] = {} if before is None else before.status
+
+    def more(field: str) -> int:
+        return max(int(told.get(field, 0)) - int(then.get(field, 0)), 0)
+
+    cpu_percent = None
+    if before is not None and now.at_s > before.at_s:
+        spent_s = float(told["cpu_s"]) - float(then["cpu_s"])
+        cpu_percent = round(100.0 * max(spent_s, 0.0) / (capacity * (now.at_s - before.at_s)), 2)
+    return ServerReading(
+        name=name,
+        pid=pid,
+        state=state,
+        warming=warming,
+        robots=int(told.get("robots", 0)),
+        cpu_percent=cpu_percent,
+        requests=more("requests"),
+        queue=int(told.get("queue", 0)),
+        queue_ms=round(float(told.get("queue_ms", 1e3 * float(told.get("queue_oldest_s", 0.0)))), 3),
+        in_flight=int(told.get("in_flight", 0)),
+        bytes_in=more("bytes_in"),
+        bytes_out=more("bytes_out"),
+    )
+
+
+def reading_of(time_s: float, servers: Sequence[ServerReading], in_balancer: frozenset[str]) -> MonitorSample:
+    """Return the reading of all *servers*; *in_balancer* are those the balancer sends robots to."""
+    known = [each.cpu_percent for each in servers if each.cpu_percent is not None and not each.warming]
+    return MonitorSample(
+        time=time_s,
+        cpu_percent=round(sum(known) / len(known), 2) if known else None,
+        healthy_servers=sum(each.state == "healthy" and each.name in in_balancer for each in servers),
+        servers_count=len(servers),
+        robots=sum(each.robots for each in servers),
+        requests=sum(each.requests for each in servers),
+        queue_ms=max((each.queue_ms for each in servers), default=0.0),
+        bytes_in=sum(each.bytes_in for each in servers),
+        bytes_out=sum(each.bytes_out for each in servers),
+        servers=tuple(servers),
+    )
+
+
+class Periods:
+    """Readings, added up to samples of whole periods of the readings' clock; the newest are kept."""
+
+    def __init__(self, period_s: float, keep: int) -> None:
+        self._period_s = period_s
+        self._keep = keep
+        self._sums: dict[int, _Sums] = {}
+        self._before_s: float | None = None
+
+    def add(self, reading: MonitorSample) -> bool:
+        """Take *reading* in; return whether a period ended since the one before it."""
+        before_s, self._before_s = self._before_s, reading.time
+        if before_s is None or reading.time <= before_s:
+            return False
+        since_s = reading.time - before_s
+        period = math.floor((reading.time - since_s / 2) / self._period_s)
+        self._sums.setdefault(period, _Sums()).add(reading, since_s)
+        for old in sorted(self._sums)[: -self._keep]:
+            del self._sums[old]
+        return math.floor(reading.time / self._period_s) > math.floor(before_s / self._period_s)
+
+    def samples(self, now_s: float) -> tuple[Sample, ...]:
+        """Return the samples of the periods that have ended by *now_s*, oldest first."""
+        ended = math.floor(now_s / self._period_s + 1e-6)
+        return tuple(
+            sums.sample(period * self._period_s)
+            for period, sums in sorted(self._sums.items())
+            if period < ended and sums.known_s >= _WHOLE * self._period_s
+        )
+
+
+class _Sums:
+    """One period.  CPU and robots are means over time, queue the worst, requests the sum."""
+
+    def __init__(self) -> None:
+        self.known_s = 0.0
+        self._cpu = 0.0
+        self._robots = 0.0
+        self._requests = 0
+        self._queue_ms = 0.0
+
+    def add(self, reading: MonitorSample, since_s: float) -> None:
+        self._requests += reading.requests
+        self._queue_ms = max(self._queue_ms, reading.queue_ms)
+        if reading.cpu_percent is not None:
+            self.known_s += since_s
+            self._cpu += since_s * reading.cpu_percent
+            self._robots += since_s * reading.robots / reading.servers_count
+
+    def sample(self, start_s: float) -> Sample:
+        return Sample(
+            start_s=start_s,
+            cpu_percent=self._cpu / self.known_s,
+            requests=self._requests,
+            robots_per_server=self._robots / self.known_s,
+            queue_ms=self._queue_ms,
+        )

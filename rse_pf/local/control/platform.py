@@ -1,0 +1,499 @@
+"""The whole platform on one machine: a real load balancer in front of real backend servers.
+
+``async with LocalPlatform(settings, state=folder) as cloud`` is everything that a demo, an experiment or a
+test needs.  Promises that nothing it started is left running, however the block ends, unless it was told
+to be adoptable and was killed with SIGKILL; and that it grows, shrinks and heals itself only if elastic.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import dataclasses
+import json
+import os
+import secrets
+import signal
+import time
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+from rse_pf.auth.control_token import ensure_control_token
+from rse_pf.auth.tokens import SigningKey
+from rse_pf.config import PlatformSettings, ScalingSettings
+from rse_pf.errors import ConfigurationError, UsageError
+from rse_pf.local.balancer.load_balancer import EnvoyLoadBalancer
+from rse_pf.local.control.adoption import adopt, adopt_data
+from rse_pf.local.control.audit_recorder import PlatformAudit
+from rse_pf.local.control.control_plane import ControlPlane
+from rse_pf.local.control.fleet import Fleet
+from rse_pf.local.control.status_api import serve_status
+from rse_pf.local.firewall import check_front_door, ensure_key, front_door_url, key_file, key_set_file
+from rse_pf.local.processes import ProcessMark, is_alive, mark_of, send_signal
+from rse_pf.local.servers.backend_servers import RSE_PF, BackendServer, LocalBackendServers
+from rse_pf.local.servers.data_servers import LocalDataServers
+from rse_pf.local.servers.log_rotation import keep_short
+from rse_pf.local.state import (
+    PlatformLock,
+    PlatformState,
+    ServerState,
+    control_token_file,
+    read_state,
+    remove_state,
+    settings_file,
+)
+
+__all__ = ["LocalPlatform"]
+
+Event = Mapping[str, Any]
+
+_LOOPBACK = "127.0.0.1"
+_LAST_EVENTS = 50
+
+
+class LocalPlatform:
+    """A local platform, started on entry and gone on exit."""
+
+    def __init__(
+        self,
+        settings: PlatformSettings,
+        *,
+        state: Path,
+        servers: int | None = None,
+        port: int | None = None,
+        name: str | None = None,
+        adoptable: bool = False,
+        on_event: Callable[[Event], None] | None = None,
+        program: Sequence[str] = RSE_PF,
+        elastic: bool = False,
+        compress: float = 1.0,
+        rebalance: bool = True,
+        data: bool | None = None,
+        on_reading: Callable[[Mapping[str, Any]], None] | None = None,
+    ) -> None:
+        """Describe a platform; nothing is started.
+
+        Args:
+            settings: For the front door and for every server.
+            state: Folder of keys, logs and ``platform.json``; made with mode 0700.
+            servers: How many; None means ``local.servers``.  Asked for fewer than ``scaling.min_servers`` or
+                more than ``scaling.max_servers``, the scale modifier takes this number for its bound.
+            port: Of the front door, 0 takes a free one; None means ``local.port``.
+            name: What people call this platform; None means the name of the folder.
+            adoptable: Whether servers and balancer outlive a control plane that is killed, and whether those
+                of an earlier one in *state* are adopted.
+            on_event: Called with each event, at once.
+            program: The command that ``serve`` follows.
+            elastic: Whether monitor and scale modifier run, and what breaks is replaced.
+            compress: Periods, idle time, warm-up and grace are shorter by this factor; for experiments.
+            rebalance: Whether crowded servers hand robots over, if *elastic*.
+            data: Whether robots get the data service under ``/data/``; None means ``data.enabled``.
+            on_reading: Called with each reading of the monitor, which runs then even if not *elastic*.
+        """
+        self.events: list[Event] = []
+        self.url = ""
+        self.name = name or state.name
+        self.state = state.absolute()
+        self.settings = settings
+        self._server_settings = _for_servers(settings, self.state)
+        self._count = settings.local.servers if servers is None else servers
+        self._adoptable = adoptable
+        self._on_event = on_event
+        self._lock = PlatformLock(self.state)
+        self._chronicle = PlatformAudit(self.state, settings.auth)
+        self._key: SigningKey | None = None
+        self._wanted_port = settings.local.port if port is None else port
+        self._settings_file = settings_file(self.state)
+        self._status: asyncio.Server | None = None
+        self._monitored = elastic or on_reading is not None
+        self.backend_servers = LocalBackendServers(
+            self._server_settings,
+            folder=self.state,
+            settings_file=self._settings_file,
+            keys_file=key_set_file(self.state),
+            control_token_file=control_token_file(self.state),
+            dies_with_parent=not adoptable,
+            program=program,
+        )
+        self.load_balancer = EnvoyLoadBalancer(
+            self.settings, folder=self.state, port=self._wanted_port, dies_with_parent=not adoptable
+        )
+        self._has_data = settings.data.enabled if data is None else data
+        self.data_servers = LocalDataServers(
+            self._server_settings,
+            folder=self.state,
+            settings_file=self._settings_file,
+            keys_file=key_set_file(self.state),
+            store=self._server_settings.data.store,
+            dies_with_parent=not adoptable,
+            replaces=elastic,
+            program=program,
+            tell=self._data_changed,
+        )
+        self._fleet = Fleet(
+            self.backend_servers,
+            self.load_balancer,
+            self._server_settings,
+            compress=compress,
+            tell=self._tell,
+            changed=self._write_state,
+        )
+        self._control = ControlPlane(
+            self._fleet,
+            self.load_balancer,
+            self._server_settings,
+            _bounds(settings.scaling, self._count),
+            elastic=elastic,
+            compress=compress,
+            rebalance=rebalance,
+            tell=self._tell,
+            changed=self._write_state,
+            on_reading=on_reading,
+        )
+
+    @property
+    def servers(self) -> tuple[BackendServer, ...]:
+        """The servers that have announced themselves, and neither ended nor are to leave."""
+        return self._fleet.serving
+
+    @property
+    def port(self) -> int:
+        """Port of the front door."""
+        return self.load_balancer.port
+
+    @property
+    def reading(self) -> dict[str, Any] | None:
+        """The newest reading of the monitor; None before the first."""
+        reading = self._control.reading
+        return None if reading is None else reading.document()
+
+    async def __aenter__(self) -> LocalPlatform:
+        """Start everything, or adopt what an earlier control plane left running.
+
+        Raises:
+            ConfigurationError: A port is taken, the platform runs already, or a process did not start.
+            MissingExtra: Envoy or the backend is not installed.
+        """
+        began = time.monotonic()
+        if self._count < 1:
+            raise UsageError(f"a platform of {self._count} servers serves nobody", hint="start at least 1")
+        self._make_folder()
+        self._lock.take(self.name)
+        try:
+            left = self._leftovers()
+            if left is None:
+                check_front_door(self.settings.serving.host, self._wanted_port)
+            self._chronicle.open()
+        except ConfigurationError:
+            self._lock.release()
+            raise
+        try:
+            await self._start(left, began + self.settings.local.start_timeout_s)
+        except BaseException:
+            await self._end()
+            raise
+        self._tell("platform-ready", url=self.url, seconds=round(time.monotonic() - began, 3))
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """End everything that was started."""
+        await self._end()
+
+    def issue_token(self, robot: str, life_s: float | None = None) -> str:
+        """Return a token for *robot*, good from now; raises UsageError for a name that is none."""
+        if self._key is None:
+            raise UsageError("the platform has not started", hint="enter it with async with")
+        return self._key.issue(
+            robot,
+            now=time.time(),
+            token_id=secrets.token_hex(8),
+            settings=self.settings.auth,
+            life_s=life_s,
+        )
+
+    async def status(self) -> list[dict[str, Any]]:
+        """Return what each server says of itself; one that does not answer is left out."""
+        told = await asyncio.gather(*(self.backend_servers.status(server) for server in self.servers))
+        return [status for status in told if status is not None]
+
+    def status_document(self) -> dict[str, Any]:
+        """Return everything the control plane knows, as plain JSON values."""
+        mark, reading = self.load_balancer.mark, self.reading
+        servers = [
+            {
+                "name": member.name,
+                "state": member.phase,
+                "pid": None if member.server is None else member.server.pid,
+                "port": None if member.server is None else member.server.port,
+                "control_port": None if member.server is None else member.server.control_port,
+            }
+            for member in self._fleet.members.values()
+        ]
+        read = {each["name"]: each for each in ([] if reading is None else reading["servers"])}
+        return {
+            "platform": self.name,
+            "url": self.url,
+            "settings_digest": self.settings.digest(),
+            "balancer": {
+                "pid": None if mark is None else mark.pid,
+                "port": self.load_balancer.port,
+                "running": self.load_balancer.is_running(),
+            },
+            "servers": [{**read.get(str(each["name"]), {}), **each} for each in servers],
+            "data_servers": self.data_servers.document(),
+            "reading": reading,
+            "policy": self._control.document(),
+            "events": [dict(event) for event in self.events[-_LAST_EVENTS:]],
+        }
+
+    # --- what an operator asks for ---------------------------------------------------------------
+
+    async def grow(self, n: int, reason: str) -> list[str]:
+        """Launch *n* servers and wait until robots are sent to them; return their names.
+
+        Raises:
+            ConfigurationError: One of them did not become healthy.
+        """
+        names = list(self._fleet.grow(n, reason))
+        self._tell("grow", servers=n, names=names, reason=reason)
+        await self._until_healthy(names)
+        return names
+
+    async def drain(self, name: str, reason: str = "asked") -> dict[str, Any]:
+        """Let *name* move its robots and leave, and wait until it has; return the ``drain-over`` report.
+
+        Raises:
+            UsageError: There is no such server, or it is the last one.
+        """
+        member = self._fleet.member(name)
+        others = [server for server in self.servers if server.name != name]
+        if not others:
+            raise UsageError(f"{name} is the last server", hint="grow or roll the platform instead")
+        began = time.monotonic()
+        if member.leaving:
+            await member.over.wait()
+            return {"server": name, "seconds": round(time.monotonic() - began, 3), "clean": True}
+        self._fleet.begin_drain(member, reason)
+        return await self._fleet.finish_drain(member, began)
+
+    async def replace(self, name: str, reason: str) -> str:
+        """Cut *name* off, and wait until robots are sent to a server in its place; return the new name.
+
+        Raises:
+            UsageError: There is no such server.
+            ConfigurationError: The new one did not become healthy.
+        """
+        self._fleet.member(name)
+        new = self._fleet.put_in_place_of(name, reason)
+        self._tell("replace", servers=1, server=name, by=new, reason=reason)
+        await self._until_healthy([new])
+        return new
+
+    async def roll(self) -> None:
+        """Replace every server, one by one: the new one serves before the old one is drained.
+
+        Raises:
+            ConfigurationError: A new server did not become healthy; the old ones that are left serve on.
+        """
+        self._control.hold = True
+        try:
+            for old in [server.name for server in self.servers]:
+                await self.backend_servers.wait_warm(self.settings.local.start_timeout_s)
+                names = list(self._fleet.grow(1, "rolling replacement"))
+                await self._until_healthy(names)
+                if old in self._fleet.members:
+                    await self.drain(old, reason="rolling replacement")
+        finally:
+            self._control.hold = False
+            self._control.watch_spread()
+
+    # --- faults ----------------------------------------------------------------------------------
+
+    def kill(self, name: str) -> None:
+        """End *name* with SIGKILL, as a crash would; raises UsageError for a name that is none."""
+        self._fleet.member(name)
+        self.backend_servers.send(name, signal.SIGKILL)
+        self._tell("server-killed", server=name)
+
+    def pause(self, name: str) -> None:
+        """Stop all processes of *name* with SIGSTOP, as a hang would; raises UsageError."""
+        self._signal_all(name, signal.SIGSTOP)
+        self._tell("server-paused", server=name)
+
+    def resume(self, name: str) -> None:
+        """Let a paused server go on; raises UsageError."""
+        self._signal_all(name, signal.SIGCONT)
+        self._tell("server-resumed", server=name)
+
+    def kill_balancer(self) -> None:
+        """End the balancer with SIGKILL, which cuts every socket; an elastic platform brings it back."""
+        mark = self.load_balancer.mark
+        self._tell("balancer-killed", pid=None if mark is None else mark.pid)
+        if mark is not None:
+            send_signal(mark, signal.SIGKILL)
+
+    def _signal_all(self, name: str, number: signal.Signals) -> None:
+        server = self._fleet.member(name).server
+        self.backend_servers.send(name, number)
+        for mark in () if server is None else server.worker_marks:
+            send_signal(mark, number)
+
+    async def _until_healthy(self, names: Sequence[str]) -> None:
+        members = [self._fleet.members[name] for name in names if name in self._fleet.members]
+        await self._fleet.until_healthy(members, 2 * self.settings.local.start_timeout_s)
+
+    # --- the beginning -------------------------------------------------------------------------
+
+    def _make_folder(self) -> None:
+        try:
+            self.state.mkdir(mode=0o700, parents=True, exist_ok=True)
+            self.state.chmod(0o700)
+        except OSError as error:
+            raise ConfigurationError(
+                f"cannot use the folder {self.state}: {error.strerror}",
+                hint="make it writable for you, or set XDG_STATE_HOME",
+            ) from error
+
+    def _leftovers(self) -> PlatformState | None:
+        """Return what an earlier control plane says of processes that still run; None if none does."""
+        state = read_state(self.state)
+        if state is None or not any(map(is_alive, state.processes())):
+            return None
+        if not self._adoptable:
+            raise ConfigurationError(
+                f"servers of platform {self.name!r} outlived their control plane",
+                hint=f"end them with: rse-pf local stop --name {self.name}",
+            )
+        return state
+
+    async def _start(self, left: PlatformState | None, end: float) -> None:
+        self._key = ensure_key(self.state, seed=secrets.token_bytes(32), key_id=secrets.token_hex(4))
+        token = ensure_control_token(control_token_file(self.state), seed=secrets.token_bytes(32))
+        document = {"context": {"rse-pf": self.settings.to_dict()}}
+        self._settings_file.write_text(json.dumps(document, indent=1), encoding="utf-8")
+        if self._monitored:
+            self._control.attend()
+        if left is None:
+            await self._begin(end)
+        else:
+            await _all(
+                adopt(left, self._fleet, self.backend_servers, self.load_balancer, self._tell, end),
+                adopt_data(left, self.data_servers, self.load_balancer, wanted=self._has_data),
+            )
+        self.url = front_door_url(self.settings, self.port)
+        self._status = await serve_status(self.status_document, token)
+        self._fleet.keep(self._chronicle.watch())
+        self._fleet.keep(keep_short(self.state, self.settings.local.log_file_bytes))
+        if self._monitored:
+            self._control.start()
+        self._write_state()
+
+    async def _begin(self, end: float) -> None:
+        self.load_balancer.launch()
+        members = [self._fleet.launch() for _ in range(self._count)]
+        await _all(
+            self.load_balancer.wait_live(end - time.monotonic()),
+            *(self._fleet.bring_up(member, end - time.monotonic()) for member in members),
+            *((self.data_servers.start(),) if self._has_data else ()),
+        )
+
+    def _write_state(self) -> None:
+        control_plane = mark_of(os.getpid())
+        assert control_plane is not None
+        PlatformState(
+            name=self.name,
+            control_plane=control_plane,
+            url=self.url,
+            settings_digest=self.settings.digest(),
+            settings_file=str(self._settings_file),
+            key_file=str(key_file(self.state)),
+            control_token_file=str(control_token_file(self.state)),
+            servers=tuple(
+                self._server_state(name, mark) for name, mark in self.backend_servers.marks.items()
+            ),
+            data_server=self.data_servers.state,
+            load_balancer=self.load_balancer.mark,
+            port=self.load_balancer.port,
+            status_port=0 if self._status is None else self._status.sockets[0].getsockname()[1],
+            launched=self._fleet.launched,
+        ).write(self.state)
+
+    def _data_changed(self, event: str, **details: Any) -> None:
+        self._tell(event, **details)
+        if event == "data-server-up":
+            self.load_balancer.set_data_targets([self.data_servers.target])
+        self._write_state()
+
+    def _server_state(self, name: str, mark: ProcessMark) -> ServerState:
+        member = self._fleet.members.get(name)
+        server = None if member is None else member.server
+        if server is None:
+            return ServerState(name=name, process=mark)
+        return ServerState(name=name, process=mark, port=server.port, control_port=server.control_port)
+
+    # --- the end -------------------------------------------------------------------------------
+
+    async def _end(self) -> None:
+        """Robots first hear their servers say goodbye; whatever fails or is cut short, all is killed."""
+        timeout_s = self.settings.local.stop_timeout_s
+        try:
+            self._control.stop()
+            await self._fleet.close()
+            if self._status is not None:
+                self._status.close()
+            await asyncio.gather(self.backend_servers.stop(timeout_s), self.data_servers.stop(timeout_s))
+            await self.load_balancer.stop(timeout_s)
+        finally:
+            self.backend_servers.kill_all()
+            self.data_servers.kill_all()
+            self.load_balancer.kill()
+            self._fleet.members.clear()
+            with contextlib.suppress(OSError):  # the folder may have been removed under our feet
+                remove_state(self.state)
+                if not self._adoptable:  # nobody can come back to this platform: nor may its tokens
+                    key_file(self.state).unlink(missing_ok=True)
+                    control_token_file(self.state).unlink(missing_ok=True)
+            self._chronicle.close()
+            self._lock.release()
+        self._tell("platform-gone")
+
+    def _tell(self, event: str, **details: Any) -> None:
+        told = {"event": event, **details}
+        self.events.append(told)
+        self._chronicle.take(told)
+        if self._on_event is not None:
+            self._on_event(told)
+
+
+def _bounds(scaling: ScalingSettings, count: int) -> ScalingSettings:
+    """Return the bounds of the scale modifier; whoever asks for *count* servers gets them."""
+    least, most = min(scaling.min_servers, count), max(scaling.max_servers, count)
+    return dataclasses.replace(scaling, min_servers=least, max_servers=most)
+
+
+def _for_servers(settings: PlatformSettings, state: Path) -> PlatformSettings:
+    """Return the settings of every local server: loopback, ephemeral ports, workers as on this machine.
+
+    Objects of servers that come and go lie in the platform's folder, if they were to lie in memory.
+    """
+    address = {"host": _LOOPBACK, "port": 0, "control_host": _LOOPBACK, "control_port": 0}
+    store = settings.data.store
+    return settings.replace(
+        serving={**address, "workers": settings.local.workers},
+        data={"store": f"dir:{state / 'objects'}" if store == "memory:" else store},
+    )
+
+
+async def _all(*works: Any) -> None:
+    """Wait for all, or for the first failure, after which none of them goes on."""
+    tasks = [asyncio.ensure_future(work) for work in works]
+    try:
+        await asyncio.gather(*tasks)
+    finally:
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)

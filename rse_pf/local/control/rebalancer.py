@@ -1,0 +1,66 @@
+"""When crowded servers are asked to hand robots over: after servers came or everybody came back, for a while.
+
+How many is said by `rse_pf.scaling.rebalance.moves`; here is only the patience: nobody is asked while the
+numbers still change, and an order is not repeated before its robots had time to move and be counted where
+they went.  Promises no clock: time is an argument.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from rse_pf.config import ScalingSettings
+from rse_pf.scaling.rebalance import moves
+
+__all__ = ["Order", "Rebalancer"]
+
+_WATCH_S = 30.0
+_SETTLE_S = 1.5
+_STEADY_SHARE = 0.1
+"""Of all robots; numbers that change by more from one reading to the next are not acted on."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Order:
+    """Ask *server* to let *robots* of its robots move, spread over *spread_s*."""
+
+    server: str
+    robots: int
+    spread_s: float
+
+
+class Rebalancer:
+    """Remembers until when the spread of the robots is watched."""
+
+    def __init__(self, settings: ScalingSettings) -> None:
+        self._settings = settings
+        self._until_s = -math.inf
+        self._quiet_until_s = -math.inf
+        self._before: Mapping[str, int] = {}
+
+    def watch(self, now_s: float) -> None:
+        """Look at the spread from now on, for half a minute."""
+        self._until_s = now_s + _WATCH_S
+
+    def orders(self, robots: Mapping[str, int], now_s: float) -> tuple[Order, ...]:
+        """Return whom to ask now; *robots* are those of each healthy server, by name."""
+        before, self._before = self._before, dict(robots)
+        if not self._quiet_until_s <= now_s <= self._until_s or not _steady(before, robots):
+            return ()
+        rate = self._settings.moves_per_s
+        found = tuple(
+            Order(server=name, robots=count, spread_s=round(count / rate, 3))
+            for name, count in moves(robots, self._settings).items()
+            if count > 0
+        )
+        if found:
+            self._quiet_until_s = now_s + max(order.spread_s for order in found) + _SETTLE_S
+        return found
+
+
+def _steady(before: Mapping[str, int], now: Mapping[str, int]) -> bool:
+    """Return whether the same servers carry about the same robots as a reading ago."""
+    changed = sum(abs(count - before.get(name, 0)) for name, count in now.items())
+    return before.keys() == now.keys() and changed <= max(2.0, _STEADY_SHARE * sum(now.values()))

@@ -1,0 +1,181 @@
+"""The scale modifier box on one machine: turn what the policy decides into what is done to servers.
+
+Three rules stand between the policy and the processes: a server that died is replaced at once, servers
+that die young are not started for ever (a crash loop), and servers that live but fail their checks are never
+replaced all at once, because then the fault is rather the monitor's or the machine's.  Promises no clock and
+no process of its own: time is an argument, and the effects belong to whoever is `Servers`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+from rse_pf.config import ScalingSettings
+from rse_pf.scaling.policy import Action, FleetState, Sample, decide
+
+__all__ = ["LocalScaleModifier", "ServerHealth", "Servers", "may_start_s", "replace_now"]
+
+_MINUTE_S = 60.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ServerHealth:
+    """The servers as they stand.
+
+    ``servers`` counts all that are or should be there: those that start, serve, failed or died, but not
+    those that leave.  ``broken`` live and failed their checks; ``dead`` ended unasked, and whether young.
+    ``replacing`` are replacements of broken ones that do not serve yet.
+    """
+
+    servers: int
+    warming: int = 0
+    healthy: int = 0
+    replacing: int = 0
+    broken: tuple[str, ...] = ()
+    dead: Mapping[str, bool] = field(default_factory=dict)
+
+
+class Servers(Protocol):
+    """What is done to servers; each call returns at once."""
+
+    def standing(self, now_s: float) -> ServerHealth:
+        """Return the servers as they stand."""
+
+    def grow(self, count: int, reason: str) -> Sequence[str]:
+        """Launch *count* servers; return their names."""
+
+    def shrink(self, reason: str) -> str | None:
+        """Drain the server with the fewest robots; return its name, None if none can be spared."""
+
+    def put_in_place_of(self, name: str, reason: str) -> str:
+        """Launch a server in place of *name*, which is killed if it lives; return the new name."""
+
+
+def may_start_s(starts: Sequence[float], *, now_s: float, per_minute: int) -> float:
+    """Return when a replacement of a server that died young may start; *now_s* means at once.
+
+    Args:
+        starts: When replacements were started, in order.
+        now_s: The same clock.
+        per_minute: Most starts in any 60 s.
+    """
+    within = [start for start in starts if now_s - start < _MINUTE_S]
+    return now_s if len(within) < per_minute else within[-per_minute] + _MINUTE_S
+
+
+def replace_now(broken: Sequence[str], *, healthy: int, replacing: int) -> tuple[str, ...]:
+    """Return which of the living *broken* servers are replaced now: the rest may recover meanwhile.
+
+    At most half as many as there are healthy ones are being replaced at a time, and at least one.
+    """
+    return tuple(broken[: max(max(1, healthy // 2) - replacing, 0)])
+
+
+class LocalScaleModifier:
+    """Applies the policy to `Servers`; remembers only when it acted and what it started."""
+
+    def __init__(
+        self,
+        servers: Servers,
+        settings: ScalingSettings,
+        *,
+        restarts_per_minute: int,
+        compress: float = 1.0,
+        tell: Callable[..., None],
+    ) -> None:
+        self._servers = servers
+        self._settings = settings
+        self._restarts_per_minute = restarts_per_minute
+        self._compress = compress
+        self._tell = tell
+        self._acted_s = -math.inf
+        self._starts: list[float] = []
+        self._looping = False
+        self._last: Action | None = None
+
+    def act(
+        self, samples: Sequence[Sample], *, now_s: float, period_over: bool, hold: bool = False
+    ) -> tuple[Action, ...]:
+        """Decide, do it, and return what was decided.
+
+        Args:
+            samples: Of whole periods.
+            now_s: The clock of the samples.
+            period_over: Whether the newest period is complete; between periods nothing is grown or shrunk,
+                unless servers are missing.
+            hold: Only replace: somebody else changes the number of servers just now.
+        """
+        self._starts = [start for start in self._starts if now_s - start < _MINUTE_S]
+        self._looping = self._looping and bool(self._starts)
+        standing = self._servers.standing(now_s)
+        fleet = FleetState(
+            servers=standing.servers,
+            warming=standing.warming,
+            unhealthy=(*standing.dead, *standing.broken),
+        )
+        actions = decide(
+            samples,
+            fleet,
+            self._settings,
+            now_s=now_s,
+            acted_s=self._acted_s if period_over else now_s,
+            compress=self._compress,
+        )
+        if period_over:
+            self._acted_s = now_s
+        for action in actions:
+            if action.kind == "replace":
+                self._replace(standing, now_s)
+            elif not hold:
+                self._scale(action)
+        return actions
+
+    def document(self) -> dict[str, Any]:
+        """Return the state of the policy as plain JSON values."""
+        last = None
+        if self._last is not None:
+            last = {"kind": self._last.kind, "servers": self._last.servers, "reason": self._last.reason}
+        scaling = self._settings
+        return {
+            "min_servers": scaling.min_servers,
+            "max_servers": scaling.max_servers,
+            "compress": self._compress,
+            "crash_loop": self._looping,
+            "last_action": last,
+        }
+
+    def _scale(self, action: Action) -> None:
+        if action.kind == "grow":
+            names = self._servers.grow(action.servers, action.reason)
+            self._tell("grow", servers=len(names), names=list(names), reason=action.reason)
+            self._last = action
+        elif action.kind == "shrink":
+            name = self._servers.shrink(action.reason)
+            if name is not None:
+                self._tell("shrink", servers=1, names=[name], reason=action.reason)
+                self._last = action
+
+    def _replace(self, standing: ServerHealth, now_s: float) -> None:
+        for name, young in standing.dead.items():
+            at_s = may_start_s(self._starts, now_s=now_s, per_minute=self._restarts_per_minute)
+            if young and at_s > now_s:
+                self._tell_loop(name, at_s - now_s)
+            else:
+                self._put(name, "it ended", now_s)
+        for name in replace_now(standing.broken, healthy=standing.healthy, replacing=standing.replacing):
+            self._put(name, "it failed its health checks", now_s)
+
+    def _put(self, name: str, reason: str, now_s: float) -> None:
+        self._starts.append(now_s)
+        new = self._servers.put_in_place_of(name, reason)
+        self._tell("replace", servers=1, server=name, by=new, names=[name], reason=reason)
+        self._last = Action(kind="replace", servers=1, names=(name,), reason=reason)
+
+    def _tell_loop(self, name: str, wait_s: float) -> None:
+        """Say it once, however often the wait is looked at."""
+        if not self._looping:
+            self._tell("crash-loop", server=name, wait_s=round(wait_s, 3), reason="servers die young")
+        self._looping = True

@@ -1,0 +1,148 @@
+"""What runs, told by the running processes themselves: the table of ``rse-pf local status``.
+
+Needs no control plane: who runs is in the state file, and each server answers on its control port.  Promises
+to start and to change nothing, and that a server which is stopped or cut off costs at most the patience.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
+
+from rse_pf.auth.control_token import read_control_token
+from rse_pf.local.processes import is_alive
+from rse_pf.local.servers.control_client import ControlPort
+from rse_pf.local.state import PlatformState, ServerState
+
+__all__ = ["data_url", "platform_status", "status_table"]
+
+_PATIENCE_S = 0.5
+_COLUMNS = ("server", "pid", "state", "robots", "CPU %", "requests/s", "queue")
+
+
+async def platform_status(state: PlatformState, *, sample_s: float) -> dict[str, Any]:
+    """Return what runs; CPU (% of the server's size) and requests are those of *sample_s* seconds.
+
+    Raises:
+        UsageError: The control ports ask for a token, and its file is gone or not for us to read.
+    """
+    file = state.control_token_file
+    token = read_control_token(Path(file)) if file else None
+    data = () if state.data_server is None else (state.data_server,)
+    servers, data_servers = await asyncio.gather(
+        asyncio.gather(*(_server(server, token, sample_s) for server in state.servers)),
+        asyncio.gather(*map(_data_server, data)),
+    )
+    balancer = state.load_balancer
+    return {
+        "platform": state.name,
+        "url": state.url,
+        "control_plane": {"pid": state.control_plane.pid, "running": is_alive(state.control_plane)},
+        "balancer": {
+            "pid": None if balancer is None else balancer.pid,
+            "port": state.port,
+            "running": balancer is not None and is_alive(balancer) and not _is_stopped(balancer.pid),
+        },
+        "servers": list(servers),
+        "data_servers": list(data_servers),
+    }
+
+
+def status_table(status: Mapping[str, Any]) -> str:
+    """Return *status* as lines for a terminal."""
+    rows = [_COLUMNS, *(_row(server) for server in status["servers"])]
+    widths = [max(len(row[column]) for row in rows) for column in range(len(_COLUMNS))]
+    lines = [
+        "  ".join(
+            cell.ljust(width) if i in (0, 2) else cell.rjust(width)
+            for i, (cell, width) in enumerate(zip(row, widths, strict=True))
+        ).rstrip()
+        for row in rows
+    ]
+    for told in status["data_servers"]:
+        lines.append(f"data server  {told['name']} is {told['state']} (pid {told['pid']})")
+    for what, told in (("load balancer", status["balancer"]), ("control plane", status["control_plane"])):
+        lines.append(f"{what}  {'runs' if told['running'] else 'does not run'} (pid {told['pid']})")
+    lines.append(f"robots connect to  {status['url'] or 'nothing yet'}")
+    if status["data_servers"] and status["url"]:
+        lines.append(f"large data goes to  {data_url(status['url'])}")
+    return "\n".join(lines)
+
+
+def data_url(url: str) -> str:
+    """Return where the data service answers, by the address *url* of the robots' door."""
+    parts = urlsplit(url)
+    return f"{'https' if parts.scheme == 'wss' else 'http'}://{parts.netloc}/data/"
+
+
+async def _data_server(server: ServerState) -> dict[str, Any]:
+    known: dict[str, Any] = {"name": server.name, "pid": server.process.pid, "port": server.port}
+    if not is_alive(server.process):
+        return {**known, "state": "gone"}
+    if _is_stopped(server.process.pid):
+        return {**known, "state": "stopped"}
+    if not server.port:
+        return {**known, "state": "starting"}
+    port = ControlPort(server.port)
+    try:
+        reply = await port.ask("/data/readyz", timeout_s=_PATIENCE_S)
+    except ConnectionError:
+        return {**known, "state": "silent"}
+    finally:
+        port.close()
+    return {**known, "state": "ready" if reply.status == 200 else "not ready"}
+
+
+async def _server(server: ServerState, token: str | None, sample_s: float) -> dict[str, Any]:
+    known: dict[str, Any] = {"name": server.name, "pid": server.process.pid}
+    if not is_alive(server.process):
+        return {**known, "state": "gone"}
+    if _is_stopped(server.process.pid):
+        return {**known, "state": "stopped"}
+    if not server.control_port:
+        return {**known, "state": "starting"}
+    port = ControlPort(server.control_port, token)
+    try:
+        first, began = await _ask(port), time.monotonic()
+        await asyncio.sleep(sample_s)
+        second, wall_s = await _ask(port), time.monotonic() - began
+    except ConnectionError:
+        return {**known, "state": "silent"}
+    finally:
+        port.close()
+    workers = len(second["workers"])
+    cores = second["size"] * workers if second["size"] else workers
+    return {
+        **known,
+        **{key: second[key] for key in ("state", "robots", "queue", "queue_ms", "in_flight", "moved")},
+        "requests": second["requests"],
+        "requests_per_s": round((second["requests"] - first["requests"]) / wall_s, 1),
+        "cpu_percent": round(100 * (second["cpu_s"] - first["cpu_s"]) / (wall_s * cores), 1),
+        "bytes_in": second["bytes_in"],
+        "bytes_out": second["bytes_out"],
+    }
+
+
+async def _ask(port: ControlPort) -> dict[str, Any]:
+    reply = await port.ask("/status", timeout_s=_PATIENCE_S)
+    told = reply.document()
+    if reply.status != 200 or "workers" not in told:
+        raise ConnectionError(f"the control port answers {reply.status}")
+    return told
+
+
+def _row(server: Mapping[str, Any]) -> tuple[str, ...]:
+    keys = ("name", "pid", "state", "robots", "cpu_percent", "requests_per_s", "queue")
+    return tuple(str(server.get(key, "-")) for key in keys)
+
+
+def _is_stopped(pid: int) -> bool:
+    try:
+        text = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8")
+    except OSError:
+        return False
+    return text.rpartition(")")[2].split()[0] in "Tt"

@@ -1,0 +1,490 @@
+"""A network link in user space: delay, jitter, a rate and cuts between robots and a server, without root.
+
+`EmulatedLink` relays TCP on loopback; `LinkProcess` does so in a process of its own, so that a busy robot
+does not stretch the link.  Promises to keep the order of bytes, to lose none, and that a cut is silent:
+sockets stay open, and what was sent meanwhile arrives after it heals, when TCP would have sent it again.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import functools
+import heapq
+import math
+import multiprocessing
+import random
+import socket
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from multiprocessing.connection import Connection
+from types import TracebackType
+from typing import Any
+
+from rse_pf.errors import ConfigurationError, UsageError
+
+__all__ = [
+    "PROFILES",
+    "EmulatedLink",
+    "Lane",
+    "LinkProcess",
+    "LinkProfile",
+    "profile_named",
+    "retransmitted_s",
+]
+
+_LOOPBACK = "127.0.0.1"
+_MIN_S = 0.001
+_HELD_BYTES = 1 << 20
+_FIRST_RETRY_S, _FIRST_DIAL_RETRY_S, _MAX_RETRY_S = 0.2, 1.0, 120.0
+_START_TIMEOUT_S = 20.0
+_TIMER_GRAIN_S = 0.0005
+"""A timer of the loop rings up to a millisecond late; half of that early is right on average."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LinkProfile:
+    """What a link does to each connection: every robot has a radio of its own.
+
+    ``up`` is from the robots to the server.  Delays are one way; ``jitter_s`` is the half width of
+    a uniform spread around them; a rate of None has no limit.  ``cut_every_s`` None never cuts.
+    """
+
+    name: str
+    up_s: float
+    down_s: float
+    jitter_s: float = 0.0
+    up_mbit_per_s: float | None = None
+    down_mbit_per_s: float | None = None
+    cut_every_s: float | None = None
+    cut_for_s: float = 0.0
+
+    @property
+    def round_trip_s(self) -> float:
+        """The nominal delay there and back."""
+        return self.up_s + self.down_s
+
+
+PROFILES = {
+    "none": LinkProfile(name="none", up_s=0.0, down_s=0.0),
+    # RSE-PF paper, Sect. 6.1: Shenzhen to Seoul; round trip less computing.
+    "paper": LinkProfile(name="paper", up_s=0.065, down_s=0.065),
+    "wifi-bad": LinkProfile(
+        name="wifi-bad", up_s=0.015, down_s=0.015, jitter_s=0.025, up_mbit_per_s=5.0, down_mbit_per_s=5.0,
+        cut_every_s=10.0, cut_for_s=0.3,
+    ),
+    "lte": LinkProfile(
+        name="lte", up_s=0.035, down_s=0.035, jitter_s=0.015, up_mbit_per_s=10.0, down_mbit_per_s=30.0
+    ),
+}  # fmt: skip
+"""The links that have a name."""
+
+
+def profile_named(name: str) -> LinkProfile:
+    """Return a profile; raises UsageError for a name that is none."""
+    if name not in PROFILES:
+        raise UsageError(f"no link named {name!r}", hint=f"choose one of {', '.join(PROFILES)}")
+    return PROFILES[name]
+
+
+def retransmitted_s(sent_s: float, healed_s: float, first_s: float = _FIRST_RETRY_S) -> float:
+    """Return when TCP sends again, for the first time after *healed_s*, what it sent in vain at *sent_s*.
+
+    Source:
+        RFC 6298: the pause doubles with every try; Linux begins with 0.2 s, or 1 s for a SYN.
+    """
+    pause_s, at_s = first_s, sent_s
+    while at_s < healed_s:
+        at_s += pause_s
+        pause_s = min(_MAX_RETRY_S, 2.0 * pause_s)
+    return at_s
+
+
+class Lane:
+    """One direction of one connection: when do bytes arrive?  Reads no clock and moves no bytes."""
+
+    def __init__(
+        self, *, delay_s: float, jitter_s: float, mbit_per_s: float | None, random: random.Random
+    ) -> None:
+        self._delay_s = delay_s
+        self._jitter_s = jitter_s
+        self._bytes_per_s = None if mbit_per_s is None else mbit_per_s * 125_000.0
+        self._random = random
+        self._sent_s = 0.0
+        self._last_s = 0.0
+
+    def arrival_s(self, now_s: float, size: int) -> float:
+        """Return when *size* bytes that are sent now arrive: never before what was sent earlier."""
+        self._sent_s = max(self._sent_s, now_s)
+        if self._bytes_per_s is not None:
+            self._sent_s += size / self._bytes_per_s
+        late_s = self._random.uniform(-self._jitter_s, self._jitter_s) if self._jitter_s else 0.0
+        delay_s = max(min(self._delay_s, _MIN_S), self._delay_s + late_s)
+        self._last_s = max(self._last_s, self._sent_s + delay_s)
+        return self._last_s
+
+
+class EmulatedLink:
+    """A relay between a port of its own and a server; use it with ``async with``."""
+
+    def __init__(self, profile: LinkProfile, target_host: str, target_port: int, *, seed: int = 0) -> None:
+        self.profile = profile
+        self.port = 0
+        self.is_cut = False
+        self.cuts = 0
+        self.healed_s = 0.0
+        self.ways: set[_Way] = set()
+        self._target = (target_host, target_port)
+        self._seed = seed
+        self._accepted = 0
+        self._cutting: set[str] = set()
+        self._dials: set[asyncio.Task[None]] = set()
+        self._server: asyncio.Server | None = None
+        self._own_cuts: asyncio.Task[None] | None = None
+
+    async def __aenter__(self) -> EmulatedLink:
+        """Listen on a free port of loopback."""
+        loop = asyncio.get_running_loop()
+        self.timers = _Timers(loop)
+        self._server = await loop.create_server(lambda: _RobotEnd(self), _LOOPBACK, 0, backlog=1024)
+        self.port = self._server.sockets[0].getsockname()[1]
+        if self.profile.cut_every_s is not None:
+            self._own_cuts = asyncio.create_task(self._cut_now_and_then(self.profile.cut_every_s))
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Stop listening and close every connection."""
+        assert self._server is not None
+        self._server.close()
+        tasks = [*self._dials, *([self._own_cuts] if self._own_cuts else [])]
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+        for way in list(self.ways):
+            way.end()
+        self.timers.close()
+        await asyncio.sleep(0)
+
+    def cut(self, cause: str = "asked") -> None:
+        """Let nothing through, either way, and say so to nobody."""
+        self._cutting.add(cause)
+        self.cuts += not self.is_cut
+        self.is_cut = True
+
+    def heal(self, cause: str = "asked") -> None:
+        """Let through again what was and will be sent, unless another cause still cuts."""
+        self._cutting.discard(cause)
+        if self._cutting or not self.is_cut:
+            return
+        self.is_cut = False
+        self.healed_s = asyncio.get_running_loop().time()
+        for way in list(self.ways):
+            way.retry(self.healed_s)
+
+    def lanes(self) -> tuple[Lane, Lane]:
+        """Return the two directions of a new connection, up first."""
+        self._accepted += 1
+        p, source = self.profile, random.Random(f"{self._seed}/{self._accepted}")
+        up = Lane(delay_s=p.up_s, jitter_s=p.jitter_s, mbit_per_s=p.up_mbit_per_s, random=source)
+        down = Lane(delay_s=p.down_s, jitter_s=p.jitter_s, mbit_per_s=p.down_mbit_per_s, random=source)
+        return up, down
+
+    def dial(self, make: Callable[[], asyncio.Protocol], failed: Callable[[], None]) -> None:
+        """Open a connection to the server for a robot."""
+
+        async def work() -> None:
+            try:
+                await asyncio.get_running_loop().create_connection(make, *self._target)
+            except OSError:
+                failed()
+
+        task = asyncio.get_running_loop().create_task(work())
+        self._dials.add(task)
+        task.add_done_callback(self._dials.discard)
+
+    async def _cut_now_and_then(self, every_s: float) -> None:
+        source = random.Random(f"{self._seed}/cuts")
+        while True:
+            await asyncio.sleep(source.expovariate(1.0 / every_s))
+            self.cut("profile")
+            await asyncio.sleep(source.expovariate(1.0 / self.profile.cut_for_s))
+            self.heal("profile")
+
+
+class _Timers:
+    """All deliveries of a link behind one timer of the loop."""
+
+    def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
+        self.now = loop.time
+        self._loop = loop
+        self._heap: list[tuple[float, int, Callable[[], None]]] = []
+        self._count = 0
+        self._handle: asyncio.TimerHandle | None = None
+
+    def at(self, when_s: float, act: Callable[[], None]) -> None:
+        self._count += 1
+        heapq.heappush(self._heap, (when_s, self._count, act))
+        if self._heap[0][0] == when_s:
+            self._arm()
+
+    def close(self) -> None:
+        self._heap.clear()
+        self._arm()
+
+    def _arm(self) -> None:
+        if self._handle is not None:
+            self._handle.cancel()
+        self._handle = None
+        if self._heap:
+            self._handle = self._loop.call_at(self._heap[0][0] - _TIMER_GRAIN_S, self._ring)
+
+    def _ring(self) -> None:
+        until = self.now() + _TIMER_GRAIN_S
+        while self._heap and self._heap[0][0] <= until:
+            heapq.heappop(self._heap)[2]()
+        self._arm()
+
+
+class _Way:
+    """Bytes on their way from one socket to the other; None stands for the end."""
+
+    def __init__(self, link: EmulatedLink, lane: Lane) -> None:
+        self.source: asyncio.Transport | None = None
+        self.sink: asyncio.Transport | None = None
+        self._link = link
+        self._lane = lane
+        self._opens_s: float | None = None
+        self._queue: deque[tuple[float, float, bytes | None]] = deque()
+        self._held = 0
+        self._armed_s: float | None = None
+        self._is_paused = False
+        link.ways.add(self)
+
+    def send(self, data: bytes | None) -> None:
+        """Take bytes from the source; hold it back when too many are on their way."""
+        now = self._link.timers.now()
+        size = len(data) if data is not None else 0
+        due = math.inf if self._opens_s is None else self._lane.arrival_s(max(now, self._opens_s), size)
+        self._queue.append((due, now, data))
+        self._held += size
+        if self._held > _HELD_BYTES and self.source is not None and not self._is_paused:
+            self._is_paused = True
+            self.source.pause_reading()
+        self._arm()
+
+    def attach(self, sink: asyncio.Transport) -> None:
+        """Tell where the bytes go."""
+        self.sink = sink
+        self._arm()
+
+    def open(self, when_s: float) -> None:
+        """Tell when the handshake is over: only then is anything sent."""
+        self._opens_s = when_s
+        self._queue = deque(
+            (self._lane.arrival_s(when_s, len(data or b"")), when_s, data) for _, _, data in self._queue
+        )
+        self._arm()
+
+    def retry(self, healed_s: float) -> None:
+        """Deliver what fell into the cut, when TCP sends the first of it again."""
+        if not self._queue or self._opens_s is None:
+            return
+        first = retransmitted_s(self._queue[0][1], healed_s)
+        again = self._lane.arrival_s(first, 0)
+        self._queue = deque((max(due, again), sent, data) for due, sent, data in self._queue)
+        self._armed_s = None  # the timer that was set finds another time here, and does nothing
+        self._arm()
+
+    def end(self) -> None:
+        """Forget everything and close both sockets."""
+        self._link.ways.discard(self)
+        self._queue.clear()
+        for transport in (self.source, self.sink):
+            if transport is not None:
+                transport.abort()
+
+    def _arm(self) -> None:
+        is_ready = self.sink is not None and self._opens_s is not None and not self._link.is_cut
+        if self._queue and is_ready and self._armed_s is None:
+            self._armed_s = self._queue[0][0]
+            self._link.timers.at(self._armed_s, functools.partial(self._deliver, self._armed_s))
+
+    def _deliver(self, armed_s: float) -> None:
+        if armed_s != self._armed_s:
+            return
+        self._armed_s = None
+        if self._link.is_cut or self.sink is None:
+            return
+        until = self._link.timers.now() + _TIMER_GRAIN_S
+        while self._queue and self._queue[0][0] <= until:
+            data = self._queue.popleft()[2]
+            if data is None:
+                self._link.ways.discard(self)
+                self.sink.close()
+                return
+            self._held -= len(data)
+            if not self.sink.is_closing():
+                self.sink.write(data)
+        if self._is_paused and self._held <= _HELD_BYTES // 2 and self.source is not None:
+            self._is_paused = False
+            if not self.source.is_closing():
+                self.source.resume_reading()
+        self._arm()
+
+
+class _End(asyncio.Protocol):
+    """One socket: what it says goes *out*."""
+
+    out: _Way
+    back: _Way
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        assert isinstance(transport, asyncio.Transport)
+        transport.get_extra_info("socket").setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        self.out.source = transport
+        self.back.attach(transport)
+
+    def data_received(self, data: bytes) -> None:
+        self.out.send(data)
+
+    def connection_lost(self, error: Exception | None) -> None:
+        self.out.send(None)
+
+
+class _ServerEnd(_End):
+    def __init__(self, up: _Way, down: _Way) -> None:
+        self.out, self.back = down, up
+
+
+class _RobotEnd(_End):
+    """Accepted from a robot; the server is dialled once the SYN would have arrived there."""
+
+    def __init__(self, link: EmulatedLink) -> None:
+        self._link = link
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        up, down = self._link.lanes()
+        now, link = self._link.timers.now(), self._link
+        self.out, self.back = _Way(link, up), _Way(link, down)
+        self.back.open(now)
+        super().connection_made(transport)
+        self._dial_when_open(now, now + link.profile.up_s)
+
+    def _dial_when_open(self, accepted_s: float, when_s: float) -> None:
+        """A SYN that falls into a cut is sent again too."""
+        self._link.timers.at(when_s, functools.partial(self._dial, accepted_s))
+
+    def _dial(self, accepted_s: float) -> None:
+        link = self._link
+        if link.is_cut:
+            again = retransmitted_s(accepted_s, link.timers.now() + _MIN_S, _FIRST_DIAL_RETRY_S)
+            self._dial_when_open(accepted_s, again)
+        elif self.out.source is not None and not self.out.source.is_closing():
+            self.out.open(link.timers.now() + link.profile.down_s)
+            link.dial(lambda: _ServerEnd(self.out, self.back), self._refused)
+        else:
+            self._refused()
+
+    def _refused(self) -> None:
+        self.back.send(None)
+        self._link.ways.discard(self.out)
+
+
+class LinkProcess:
+    """A `EmulatedLink` in a process of its own; use it with ``async with``."""
+
+    def __init__(self, profile: LinkProfile, target_host: str, target_port: int, *, seed: int = 0) -> None:
+        self.profile = profile
+        self.port = 0
+        self.cpu_s = 0.0
+        self._arguments = (profile, target_host, target_port, seed)
+        self._process: Any = None
+        self._pipe: Connection | None = None
+
+    async def __aenter__(self) -> LinkProcess:
+        """Start it; raises ConfigurationError if it does not come up."""
+        context = multiprocessing.get_context("spawn")
+        self._pipe, theirs = context.Pipe()
+        self._process = context.Process(target=_run, args=(self._arguments, theirs), name="link", daemon=True)
+        await asyncio.to_thread(self._process.start)
+        theirs.close()
+        try:
+            self.port = await self._ask(None)
+        except BaseException:
+            await self._end()
+            raise
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """End the process."""
+        await self._end()
+
+    async def cut(self) -> None:
+        """Let nothing through; returns once that is so."""
+        await self._ask("cut")
+
+    async def heal(self) -> None:
+        """Let everything through again; returns once that is so."""
+        await self._ask("heal")
+
+    async def read_cpu_s(self) -> float:
+        """Return the processor time that the link has used."""
+        return float(await self._ask("cpu"))
+
+    async def _ask(self, word: str | None) -> Any:
+        assert self._pipe is not None, "entered with async with"
+        return await asyncio.to_thread(_talk, self._pipe, word)
+
+    async def _end(self) -> None:
+        assert self._pipe is not None
+        self._pipe.close()
+        await asyncio.to_thread(self._process.join, 2.0)
+        if self._process.is_alive():
+            self._process.kill()
+            await asyncio.to_thread(self._process.join)
+
+
+def _talk(pipe: Connection, word: str | None) -> Any:
+    try:
+        if word is not None:
+            pipe.send(word)
+        if pipe.poll(_START_TIMEOUT_S):
+            return pipe.recv()
+    except (EOFError, OSError):
+        pass
+    raise ConfigurationError("the process of the link does not answer", hint="is the machine overloaded?")
+
+
+def _run(arguments: tuple[LinkProfile, str, int, int], pipe: Connection) -> None:
+    """Be the process of a link until the parent is gone."""
+    try:
+        asyncio.run(_serve(arguments, pipe))
+    except KeyboardInterrupt:
+        return
+
+
+async def _serve(arguments: tuple[LinkProfile, str, int, int], pipe: Connection) -> None:
+    import time
+
+    profile, host, port, seed = arguments
+    loop, over = asyncio.get_running_loop(), asyncio.Event()
+    async with EmulatedLink(profile, host, port, seed=seed) as link:
+
+        def hear() -> None:
+            try:
+                word = pipe.recv()
+            except (EOFError, OSError):
+                loop.remove_reader(pipe.fileno())
+                over.set()
+                return
+            if word in ("cut", "heal"):
+                getattr(link, word)()
+            pipe.send(time.process_time())
+
+        pipe.send(link.port)
+        loop.add_reader(pipe.fileno(), hear)
+        await over.wait()

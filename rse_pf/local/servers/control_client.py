@@ -1,0 +1,93 @@
+"""Ask a server's control port over one connection that stays open: health checks must cost next to nothing.
+
+Promises a deadline on every question, one kind of error for everything that may go wrong, and that a late
+answer is never taken for the answer to a later question.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from dataclasses import dataclass
+from typing import Any
+
+from rse_pf.auth.control_token import bearer
+
+__all__ = ["ControlPort", "ControlPortReply"]
+
+_LOOPBACK = "127.0.0.1"
+_MAX_HEAD_BYTES = 16384
+_MAX_BODY_BYTES = 1 << 20
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ControlPortReply:
+    """What a control port answered."""
+
+    status: int
+    body: bytes
+
+    def document(self) -> dict[str, Any]:
+        """Return the body as a JSON object; empty when it is none."""
+        try:
+            told = json.loads(self.body)
+        except ValueError:
+            return {}
+        return told if isinstance(told, dict) else {}
+
+
+class ControlPort:
+    """One control port on this machine; connects with the first question, and anew after a failure.
+
+    Each question carries *token*, if the port has one.
+    """
+
+    def __init__(self, port: int, token: str | None = None) -> None:
+        self._port = port
+        self._headers = f"Host: {_LOOPBACK}\r\nContent-Length: 0\r\n"
+        if token is not None:
+            self._headers += f"Authorization: {bearer(token)}\r\n"
+        self._reader: asyncio.StreamReader | None = None
+        self._writer: asyncio.StreamWriter | None = None
+        self._turn = asyncio.Lock()
+
+    async def ask(self, target: str, *, timeout_s: float, method: str = "GET") -> ControlPortReply:
+        """Return the answer to *target*.
+
+        Raises:
+            ConnectionError: Nobody listens, the answer is no HTTP, or it took longer than *timeout_s*.
+        """
+        async with self._turn:
+            try:
+                return await asyncio.wait_for(self._exchange(method, target), timeout_s)
+            except (OSError, EOFError, ValueError, asyncio.LimitOverrunError, asyncio.TimeoutError) as error:
+                self.close()
+                raise ConnectionError(
+                    f"no answer from port {self._port}: {error or type(error).__name__}"
+                ) from error
+            except BaseException:
+                self.close()
+                raise
+
+    def close(self) -> None:
+        """Give the connection up."""
+        if self._writer is not None:
+            self._writer.transport.abort()
+        self._reader = self._writer = None
+
+    async def _exchange(self, method: str, target: str) -> ControlPortReply:
+        if self._reader is None or self._writer is None:
+            self._reader, self._writer = await asyncio.open_connection(
+                _LOOPBACK, self._port, limit=_MAX_HEAD_BYTES
+            )
+        reader, writer = self._reader, self._writer
+        writer.write(f"{method} {target} HTTP/1.1\r\n{self._headers}\r\n".encode())
+        head = (await reader.readuntil(b"\r\n\r\n")).decode("latin-1").split("\r\n")
+        headers = dict(line.lower().split(": ", 1) for line in head[1:] if ": " in line)
+        length = int(headers["content-length"]) if "content-length" in headers else -1
+        if not 0 <= length <= _MAX_BODY_BYTES:
+            raise ValueError(f"an answer of {length} bytes")
+        body = await reader.readexactly(length)
+        if headers.get("connection") == "close":
+            self.close()
+        return ControlPortReply(status=int(head[0].split(" ")[1]), body=body)

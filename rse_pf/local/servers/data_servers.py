@@ -1,0 +1,292 @@
+"""The data servers box on one machine: an ``rse-pf data`` process, started, watched and replaced.
+
+A replacement takes the port of the one before, so the load balancer's configuration never changes.
+Promises to keep no state of its own (objects are in the store, tokens' keys in a file), and that one which
+answers nobody any more is ended and replaced like one that died.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import http.client
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from rse_pf.audit.log import audit_folder
+from rse_pf.config import PlatformSettings
+from rse_pf.errors import ConfigurationError
+from rse_pf.local.balancer.envoy_config import Target
+from rse_pf.local.processes import ProcessMark, ended, is_alive, last_line, mark_of, send_signal, spawn
+from rse_pf.local.state import ServerState
+
+__all__ = ["DataServerProcess", "LocalDataServers"]
+
+_RSE_PF = (sys.executable, "-m", "rse_pf.cli.main")
+_LOOPBACK = "127.0.0.1"
+_LOOK_AGAIN_S = 0.01
+_ASK_S = 1.0
+_READY, _ALIVE = "/data/readyz", "/data/healthz"
+_FIRST_PAUSE_S, _MAX_PAUSE_S = 0.1, 5.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DataServerProcess:
+    """A data server that has announced itself."""
+
+    name: str
+    pid: int
+    port: int
+    log: Path
+    mark: ProcessMark
+
+
+class LocalDataServers:
+    """The data service of one platform: one process with a name, and its successors."""
+
+    def __init__(
+        self,
+        settings: PlatformSettings,
+        *,
+        folder: Path,
+        settings_file: Path,
+        keys_file: Path,
+        store: str | None = None,
+        name: str = "data-1",
+        dies_with_parent: bool = True,
+        replaces: bool = True,
+        program: Sequence[str] = _RSE_PF,
+        tell: Callable[..., None] = lambda event, **details: None,
+    ) -> None:
+        """Remember what to start.
+
+        Args:
+            settings: Groups data and local.
+            folder: For the log and the announcement.
+            settings_file: Given to the process.
+            keys_file: Public keys of the tokens.
+            store: Overrides ``data.store``; a platform whose store is ``memory:`` names a folder here.
+            name: Of the process, in log and events.
+            dies_with_parent: Whether the process ends when this one does.
+            replaces: Whether one that ends or hangs gets a successor; else its end is told, and that is all.
+            program: What to run; ``data`` and its options follow.
+            tell: Gets ``data-server-start`` with name and pid, ``data-server-up`` with port, too,
+                ``data-server-down`` with name and code, ``data-server-silent`` and ``data-server-failed``.
+        """
+        self._settings = settings
+        self._folder = folder
+        self._name = name
+        self._dies_with_parent = dies_with_parent
+        self._replaces = replaces
+        self._tell = tell
+        self._port = 0
+        self._process: subprocess.Popen[bytes] | None = None
+        self._mark: ProcessMark | None = None
+        self._watching: asyncio.Task[None] | None = None
+        self._command = [
+            *program, "data", "--settings", str(settings_file), "--keys", str(keys_file),
+            "--host", _LOOPBACK, "--announce", str(self._announce), "--audit", str(audit_folder(folder)),
+            *(() if store is None else ("--store", store)),
+        ]  # fmt: skip
+
+    @property
+    def name(self) -> str:
+        """What people call it."""
+        return self._name
+
+    @property
+    def mark(self) -> ProcessMark | None:
+        """The process that runs now."""
+        return self._mark
+
+    @property
+    def port(self) -> int:
+        """Where it listens, and its successors will; 0 before the first start."""
+        return self._port
+
+    @property
+    def target(self) -> Target:
+        """The service as the load balancer sees it."""
+        return Target(name=self._name, port=self._port, control_port=self._port)
+
+    @property
+    def state(self) -> ServerState | None:
+        """What the state file says of it; None if there is none."""
+        mark = self._mark
+        return None if mark is None else ServerState(name=self._name, process=mark, port=self._port)
+
+    def document(self) -> list[dict[str, Any]]:
+        """Return what is known of it, as plain JSON values."""
+        if self._mark is None:
+            return []
+        return [{"name": self._name, "pid": self._mark.pid, "port": self._port, "running": self.is_running()}]
+
+    def is_running(self) -> bool:
+        """Return whether the process is there."""
+        return self._mark is not None and is_alive(self._mark)
+
+    async def start(self, port: int = 0) -> DataServerProcess:
+        """Start the process at *port* (0: a free one), wait until it answers, and watch it from then on.
+
+        Raises:
+            ConfigurationError: It ended or was not ready within ``local.start_timeout_s``.
+        """
+        self._port = port
+        try:
+            server = await self._launch()
+        except ConfigurationError:
+            if not port:
+                raise
+            self._port = 0  # somebody took it meanwhile
+            server = await self._launch()
+        self._watching = asyncio.create_task(self._watch())
+        return server
+
+    def adopt(self, mark: ProcessMark, port: int) -> None:
+        """Watch the process of an earlier control plane, and replace it when it ends."""
+        self._mark, self._port = mark, port
+        self._watching = asyncio.create_task(self._watch())
+
+    async def is_ready(self) -> bool:
+        """Return whether the service answers and its store does."""
+        return self._port > 0 and await asyncio.to_thread(_ask, self._port, _READY)
+
+    def send(self, number: signal.Signals) -> bool:
+        """Signal the process; return False if it is gone."""
+        return self._mark is not None and send_signal(self._mark, number)
+
+    async def forget(self) -> None:
+        """Stop watching and leave the process to whoever adopts it."""
+        if self._watching is not None:
+            self._watching.cancel()
+            await asyncio.gather(self._watching, return_exceptions=True)
+        self._watching = None
+
+    async def stop(self, timeout_s: float) -> None:
+        """Let the service leave, and kill it after *timeout_s*."""
+        await self.forget()
+        if self._mark is not None:
+            self.send(signal.SIGTERM)
+            await ended(self._mark, timeout_s)
+        self.kill_all()
+
+    def kill_all(self) -> None:
+        """End what is left, at once, and reap it."""
+        self.send(signal.SIGKILL)
+        if self._process is not None:
+            self._process.kill()  # a no-operation for one that was reaped
+            self._process.wait()
+        self._announce.unlink(missing_ok=True)
+        self._process = self._mark = None
+
+    async def _watch(self) -> None:
+        pause_s = _FIRST_PAUSE_S
+        while True:
+            if self._mark is not None:
+                await self._until_over(self._mark)
+            code = None if self._process is None else self._process.wait()
+            self._tell("data-server-down", name=self._name, code=code)
+            if not self._replaces:
+                return
+            try:
+                await self._launch()
+                pause_s = _FIRST_PAUSE_S
+            except ConfigurationError as error:
+                self._tell("data-server-failed", name=self._name, error=str(error))
+                await asyncio.sleep(pause_s)
+                pause_s = min(2 * pause_s, _MAX_PAUSE_S)
+                self._port = 0  # whatever holds the old one may hold it for ever
+
+    async def _until_over(self, mark: ProcessMark) -> None:
+        """Wait until the process has ended; end it when it leaves too many questions unanswered."""
+        over = asyncio.ensure_future(ended(mark))
+        silent = 0
+        try:
+            while not over.done():
+                await asyncio.wait({over}, timeout=_ASK_S)
+                silent = 0 if await asyncio.to_thread(_ask, self._port, _ALIVE) else silent + 1
+                if silent > self._settings.health.unhealthy_checks and self._replaces and not over.done():
+                    self._tell("data-server-silent", name=self._name, pid=mark.pid)
+                    send_signal(mark, signal.SIGKILL)
+        finally:
+            over.cancel()
+
+    async def _launch(self) -> DataServerProcess:
+        self._announce.unlink(missing_ok=True)
+        process = spawn(
+            [*self._command, "--port", str(self._port)],
+            log=self._log, folder=self._folder, dies_with_parent=self._dies_with_parent,
+        )  # fmt: skip
+        _step_back(process.pid, self._settings.local.data_nice)
+        self._process, self._mark = process, mark_of(process.pid)
+        self._tell("data-server-start", name=self._name, pid=process.pid)
+        try:
+            server = await self._announced(process)
+        except (ConfigurationError, asyncio.CancelledError):
+            process.kill()
+            process.wait()
+            raise
+        self._port = server.port
+        self._tell("data-server-up", name=self._name, pid=server.pid, port=server.port)
+        return server
+
+    async def _announced(self, process: subprocess.Popen[bytes]) -> DataServerProcess:
+        timeout_s = self._settings.local.start_timeout_s
+        end = time.monotonic() + timeout_s
+        while not self._announce.exists():
+            code = process.poll()
+            if code is not None:
+                raise self._failed(f"ended with exit code {code}")
+            if time.monotonic() >= end:
+                raise self._failed(f"was not ready within {timeout_s:g} s")
+            await asyncio.sleep(_LOOK_AGAIN_S)
+        told: dict[str, Any] = json.loads(self._announce.read_text(encoding="utf-8"))
+        if self._mark is None or told["pid"] != self._mark.pid:
+            raise self._failed(f"announced pid {told['pid']}, but was started as {process.pid}")
+        return DataServerProcess(
+            name=self._name, pid=self._mark.pid, port=told["port"], log=self._log, mark=self._mark
+        )
+
+    @property
+    def _announce(self) -> Path:
+        return self._folder / f"{self._name}.json"
+
+    @property
+    def _log(self) -> Path:
+        return self._folder / f"{self._name}.log"
+
+    def _failed(self, what: str) -> ConfigurationError:
+        last = last_line(self._log)
+        return ConfigurationError(
+            f"{self._name} {what}{': ' if last else ''}{last}", hint=f"its log is {self._log}"
+        )
+
+
+def _step_back(pid: int, nice: int) -> None:
+    """Let poses go first where both share a machine; threads that the process starts later do the same.
+
+    As a batch process it never takes the processor from who is at work when a piece of a body arrives; its
+    niceness leaves it a share of a full machine, so that it answers its health checks there, too.
+    """
+    with contextlib.suppress(OSError):
+        os.setpriority(os.PRIO_PROCESS, pid, max(nice, os.getpriority(os.PRIO_PROCESS, 0)))
+        if os.sched_getscheduler(pid) == os.SCHED_OTHER:
+            os.sched_setscheduler(pid, os.SCHED_BATCH, os.sched_param(0))
+
+
+def _ask(port: int, path: str) -> bool:
+    connection = http.client.HTTPConnection(_LOOPBACK, port, timeout=_ASK_S)
+    with contextlib.closing(connection):
+        try:
+            connection.request("GET", path)
+            return connection.getresponse().status == 200
+        except (OSError, http.client.HTTPException):
+            return False

@@ -1,0 +1,98 @@
+"""Maps for other programs: PLY and PCD clouds, TUM trajectories, g2o pose graphs.
+
+Promises the conventions of those programs: metres, little-endian, TUM's and g2o's quaternions end with w,
+information matrices by their upper triangle.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import numpy.typing as npt
+
+from rse_pf.errors import UsageError
+from rse_pf.geometry import Array, to_quaternion
+from rse_pf.maps.format import MapVersion
+
+__all__ = ["FORMATS", "export_map"]
+
+_TO_G2O = np.diag([1.0, 1.0, 1.0, 2.0, 2.0, 2.0])
+"""g2o's rotation error is the vector part of a quaternion, half of our phi."""
+
+
+def export_map(version: MapVersion, kind: str, robot: str | None = None) -> bytes:
+    """Return the file of *kind* (one of `FORMATS`).
+
+    Args:
+        version: The map.
+        kind: ``ply``, ``pcd``, ``tum`` or ``g2o``.
+        robot: ``tum`` only: this robot's keyframes; None for all.
+
+    Raises:
+        UsageError: There is no such format, or no such robot in the map.
+    """
+    if kind not in FORMATS:
+        raise UsageError(f"{kind!r} is no format of maps", hint=f"use one of {', '.join(FORMATS)}")
+    return FORMATS[kind](version, robot)
+
+
+def _ply(version: MapVersion, robot: str | None) -> bytes:
+    rows = np.empty(
+        len(version.points), dtype=[("xyz", "<f4", (3,)), ("rgb", "u1", (3,))]
+    )  # packed: 15 bytes a vertex
+    rows["xyz"], rows["rgb"] = version.points, version.colours
+    header = (
+        "ply\nformat binary_little_endian 1.0\n"
+        f"element vertex {len(rows)}\n"
+        "property float x\nproperty float y\nproperty float z\n"
+        "property uchar red\nproperty uchar green\nproperty uchar blue\nend_header\n"
+    )
+    return header.encode("ascii") + rows.tobytes()
+
+
+def _pcd(version: MapVersion, robot: str | None) -> bytes:
+    n = len(version.points)
+    rows = np.empty(n, dtype=[("xyz", "<f4", (3,)), ("rgb", "<u4")])
+    red, green, blue = version.colours.astype(np.uint32).T if n else np.zeros((3, 0), dtype=np.uint32)
+    rows["xyz"], rows["rgb"] = version.points, (red << 16) | (green << 8) | blue
+    header = (
+        "# .PCD v0.7 - Point Cloud Data file format\nVERSION 0.7\nFIELDS x y z rgb\nSIZE 4 4 4 4\n"
+        f"TYPE F F F U\nCOUNT 1 1 1 1\nWIDTH {n}\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\n"
+        f"POINTS {n}\nDATA binary\n"
+    )
+    return header.encode("ascii") + rows.tobytes()
+
+
+def _tum(version: MapVersion, robot: str | None) -> bytes:
+    chosen = [keyframe for keyframe in version.keyframes if robot in (None, keyframe.robot)]
+    if robot is not None and not chosen:
+        raise UsageError(f"no keyframe of robot {robot!r} is in this map", hint="see rse-pf map show")
+    chosen.sort(key=lambda keyframe: (keyframe.timestamp_s, keyframe.id))
+    lines = ["# timestamp tx ty tz qx qy qz qw"]
+    lines += [f"{keyframe.timestamp_s:.6f} {_pose(keyframe.T_world_camera)}" for keyframe in chosen]
+    return ("\n".join(lines) + "\n").encode("ascii")
+
+
+def _g2o(version: MapVersion, robot: str | None) -> bytes:
+    lines = [f"VERTEX_SE3:QUAT {k.id} {_pose(k.T_world_camera)}" for k in version.keyframes]
+    if version.keyframes:
+        lines.append(f"FIX {version.keyframes[0].id}")
+    for edge in version.edges:
+        upper = (_TO_G2O @ edge.information @ _TO_G2O)[np.triu_indices(6)]
+        lines.append(f"EDGE_SE3:QUAT {edge.a} {edge.b} {_pose(edge.T_a_b)} {_numbers(upper)}")
+    return ("\n".join(lines) + "\n").encode("ascii")
+
+
+def _pose(T: Array) -> str:
+    return _numbers(np.concatenate([T[:3, 3], to_quaternion(T[:3, :3])]))
+
+
+def _numbers(values: npt.NDArray[np.float64]) -> str:
+    return " ".join(f"{value:.9g}" for value in values)
+
+
+FORMATS: dict[str, Callable[[MapVersion, str | None], bytes]] = {
+    "ply": _ply, "pcd": _pcd, "tum": _tum, "g2o": _g2o,
+}  # fmt: skip
+"""What a map can be written as."""

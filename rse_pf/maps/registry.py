@@ -1,0 +1,256 @@
+"""The map registry: versions that never change, a head that moves by compare-and-swap.
+
+A commit writes the map, then its record, then the head, each durable before the next; a crash between
+leaves the old head and, at most, bytes that nobody names.  Promises that every version a head or a
+parent names is whole, and that two robots never both move one head.
+
+Layout: ``maps/TENANT/NAME/blobs/DIGEST``, ``.../versions/ID`` (ID is the sha256 of the record), ``.../head``.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import msgspec
+
+from rse_pf.errors import BadRequest, Conflict, NotFound, StoreError
+from rse_pf.object_store import ObjectStore, digest_of, name_segment
+
+if TYPE_CHECKING:  # numpy is a third of a data server's start, and only maps need it
+    from rse_pf.geometry import Array
+    from rse_pf.maps.format import MapVersion
+
+__all__ = ["MapDiff", "MapRecord", "MapRegistry", "difference"]
+
+_NAME = re.compile(r"[a-z0-9][a-z0-9-]{0,63}")
+_ID = re.compile(r"[0-9a-f]{64}")
+_MIN_ID = 6
+_MOVED_M, _MOVED_DEG = 1e-3, 0.05
+"""Closer than this a keyframe has not moved: below what rounding on the wire changes."""
+
+
+class MapRecord(msgspec.Struct, frozen=True, kw_only=True):
+    """What is known of a version without reading the map; its sha256 is the version's id."""
+
+    digest: str
+    size: int
+    parent: str | None
+    number: int
+    author: str
+    created_s: float
+    note: str
+    keyframes: int
+    edges: int
+    points: int
+    robots: tuple[str, ...]
+
+    @property
+    def id(self) -> str:
+        """The id of this version."""
+        return digest_of(msgspec.json.encode(self))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MapDiff:
+    """What differs between two versions; keyframes by id, edges as ``(a, b, kind)``."""
+
+    added: tuple[int, ...]
+    removed: tuple[int, ...]
+    moved: tuple[int, ...]
+    largest_move_m: float
+    largest_turn_deg: float
+    edges_added: tuple[tuple[int, int, str], ...]
+    edges_removed: tuple[tuple[int, int, str], ...]
+    points_before: int
+    points_after: int
+
+
+class MapRegistry:
+    """The maps of one tenant in one store.  Blocking."""
+
+    def __init__(
+        self,
+        store: ObjectStore,
+        tenant: str = "default",
+        *,
+        max_bytes: int = 1 << 30,
+        told: Callable[[str, str, MapRecord], None] = lambda action, name, record: None,
+    ) -> None:
+        """Look after the maps of *tenant*; *told* gets ``map.commit`` or ``map.head``, map and version."""
+        self._store = store
+        self._told = told
+        self._prefix = f"maps/{name_segment(tenant)}/"
+        self._max_bytes = max_bytes
+
+    def names(self) -> list[str]:
+        """Return the names of all maps that have a head."""
+        found = (info.name.removeprefix(self._prefix).split("/") for info in self._store.list(self._prefix))
+        return sorted({name for name, *rest in found if rest == ["head"]})
+
+    def commit(
+        self, name: str, data: bytes, *, parent: str | None, author: str, created_s: float, note: str = ""
+    ) -> MapRecord:
+        """Make *data* (of `encode_map`) the next version and the head of map *name*.
+
+        Args:
+            name: Lower-case letters, digits and hyphens.
+            parent: The head as the caller knows it; None for the first version.
+            author: Who made it.
+            created_s: Unix seconds.
+            note: What was done.
+
+        Raises:
+            BadRequest: *data* is no map.
+            Conflict: The head is not *parent*; read it, merge, commit again.
+            StoreError: The head is as it was.
+        """
+        from rse_pf.maps.format import decode_map
+
+        base = self._base(name)
+        decoded = decode_map(data, self._max_bytes)
+        before = self.record(name, parent) if parent is not None else None
+        if self._head(name) != parent:
+            raise _moved(name)
+        record = MapRecord(
+            digest=digest_of(data), size=len(data), parent=None if before is None else before.id,
+            number=1 if before is None else before.number + 1, author=author, created_s=created_s, note=note,
+            keyframes=len(decoded.keyframes), edges=len(decoded.edges), points=len(decoded.points),
+            robots=tuple(sorted({keyframe.robot for keyframe in decoded.keyframes})),
+        )  # fmt: skip
+        self._store.put(f"{base}blobs/{record.digest}", data)
+        self._store.put(f"{base}versions/{record.id}", msgspec.json.encode(record))
+        self._swap(name, parent, record.id)
+        self._told("map.commit", name, record)
+        return record
+
+    def head(self, name: str) -> MapRecord:
+        """Return the record of the newest version; raises NotFound."""
+        head = self._head(name)
+        if head is None:
+            raise NotFound(f"there is no map {name!r}", hint="see rse-pf map list")
+        return self.record(name, head)
+
+    def record(self, name: str, version: str) -> MapRecord:
+        """Return a version's record by its id or an unambiguous beginning of it; ``head`` is the newest."""
+        if version == "head":
+            return self.head(name)
+        prefix = f"{self._base(name)}versions/"
+        if not _ID.fullmatch(version):
+            version = self._whole_id(prefix, version)
+        raw = self._store.get(prefix + version)
+        if digest_of(raw) != version:
+            raise StoreError(f"the record {version} is damaged", hint="restore it from a backup")
+        return msgspec.json.decode(raw, type=MapRecord)
+
+    def versions(self, name: str) -> list[MapRecord]:
+        """Return all versions, oldest first; also those that the head has left, or never reached."""
+        prefix = f"{self._base(name)}versions/"
+        ids = [info.name.removeprefix(prefix) for info in self._store.list(prefix)]
+        if not ids:
+            raise NotFound(f"there is no map {name!r}", hint="see rse-pf map list")
+        return sorted((self.record(name, each) for each in ids), key=lambda r: (r.number, r.created_s, r.id))
+
+    def lineage(self, name: str, version: str = "head") -> Iterator[MapRecord]:
+        """Yield a version and its ancestors, newest first."""
+        record = self.record(name, version)
+        yield record
+        while record.parent is not None:
+            record = self.record(name, record.parent)
+            yield record
+
+    def data(self, name: str, version: str = "head") -> bytes:
+        """Return the bytes of a version, checked by their digest."""
+        record = self.record(name, version)
+        raw = self._store.get(self.blob_name(name, record))
+        if digest_of(raw) != record.digest:
+            raise StoreError(f"map {name!r} {record.id[:12]} is damaged", hint="restore it from a backup")
+        return raw
+
+    def blob_name(self, name: str, record: MapRecord) -> str:
+        """Return the name of a version's bytes in the store."""
+        return f"{self._base(name)}blobs/{record.digest}"
+
+    def load(self, name: str, version: str = "head") -> MapVersion:
+        """Return a version as a value."""
+        from rse_pf.maps.format import decode_map
+
+        return decode_map(self.data(name, version), self._max_bytes)
+
+    def move_head(self, name: str, version: str, *, expected: str) -> MapRecord:
+        """Let the head name an existing *version*, as a rollback does.
+
+        Raises:
+            NotFound: There is no such version.
+            Conflict: The head is not *expected*.
+        """
+        record = self.record(name, version)
+        self._swap(name, self.record(name, expected).id, record.id)
+        self._told("map.head", name, record)
+        return record
+
+    def _base(self, name: str) -> str:
+        if not _NAME.fullmatch(name):
+            raise BadRequest(
+                f"{name[:80]!r} is no name of a map",
+                hint="use 1 to 64 lower-case letters, digits and hyphens",
+            )
+        return f"{self._prefix}{name}/"
+
+    def _head(self, name: str) -> str | None:
+        try:
+            return self._store.get(f"{self._base(name)}head").decode("ascii")
+        except NotFound:
+            return None
+
+    def _swap(self, name: str, expected: str | None, version: str) -> None:
+        known = None if expected is None else expected.encode("ascii")
+        try:
+            self._store.compare_and_swap(f"{self._base(name)}head", known, version.encode("ascii"))
+        except Conflict as error:
+            raise _moved(name) from error
+
+    def _whole_id(self, prefix: str, beginning: str) -> str:
+        if not re.fullmatch(r"[0-9a-f]{1,64}", beginning) or len(beginning) < _MIN_ID:
+            raise NotFound(f"no version {beginning[:80]!r}", hint=f"give {_MIN_ID} or more hex digits")
+        found = [info.name.removeprefix(prefix) for info in self._store.list(prefix + beginning)]
+        if len(found) != 1:
+            raise NotFound(
+                f"{len(found)} versions begin with {beginning!r}", hint="see rse-pf map show NAME --all"
+            )
+        return found[0]
+
+
+def difference(before: MapVersion, after: MapVersion) -> MapDiff:
+    """Return what *after* changed; a keyframe moved if by more than 1 mm or 0.05 deg."""
+    old = {keyframe.id: keyframe.T_world_camera for keyframe in before.keyframes}
+    new = {keyframe.id: keyframe.T_world_camera for keyframe in after.keyframes}
+    moves = {each: _move(old[each], new[each]) for each in sorted(old.keys() & new.keys())}
+    old_edges = {(edge.a, edge.b, str(edge.kind)) for edge in before.edges}
+    new_edges = {(edge.a, edge.b, str(edge.kind)) for edge in after.edges}
+    return MapDiff(
+        added=tuple(sorted(new.keys() - old.keys())),
+        removed=tuple(sorted(old.keys() - new.keys())),
+        moved=tuple(each for each, (m, deg) in moves.items() if m > _MOVED_M or deg > _MOVED_DEG),
+        largest_move_m=max((m for m, _ in moves.values()), default=0.0),
+        largest_turn_deg=max((deg for _, deg in moves.values()), default=0.0),
+        edges_added=tuple(sorted(new_edges - old_edges)),
+        edges_removed=tuple(sorted(old_edges - new_edges)),
+        points_before=len(before.points),
+        points_after=len(after.points),
+    )
+
+
+def _move(before: Array, after: Array) -> tuple[float, float]:
+    import numpy as np
+
+    from rse_pf.geometry import pose_difference
+
+    metres, degrees = pose_difference(before, after)
+    return float(np.asarray(metres)), float(np.asarray(degrees))
+
+
+def _moved(name: str) -> Conflict:
+    return Conflict(f"the head of map {name!r} was moved meanwhile", hint="read it, merge, and commit again")

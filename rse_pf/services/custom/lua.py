@@ -1,0 +1,187 @@
+"""Services in Lua: one LuaJIT virtual machine per robot, as in the paper (Sect. 5.2, Figs. 3 and 4).
+
+A script returns a function of one table, or a table with ``serve`` and maybe ``snapshot`` and ``restore``.
+It may require ``json``, ``zlib`` and ``ffi``, and load shared libraries of its own folder.  Promises that the
+machine sees nothing of Python but these; the walls around the process are what isolates it, not Lua.
+"""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Mapping
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from rse_pf.errors import (
+    BadRequest,
+    CommandFailed,
+    ConfigurationError,
+    InternalError,
+    MissingExtra,
+    RsePfError,
+    error_from_code,
+)
+from rse_pf.services.custom.installed import InstalledService
+
+__all__ = ["LuaRuntime", "warm_up"]
+
+_MAX_INFLATED = 1 << 24
+_SETUP = """
+local json_decode, json_encode, inflate, deflate, folder = ...
+package.preload.json = function() return {decode = json_decode, encode = json_encode} end
+package.preload.zlib = function() return {inflate = inflate, deflate = deflate} end
+package.path = folder .. "/?.lua"
+package.cpath = folder .. "/?.so;" .. folder .. "/build/?.so"
+service_folder = folder
+python = nil
+return pcall
+"""
+
+
+def warm_up() -> Any:
+    """Load LuaJIT into this process and return its module; raises MissingExtra."""
+    try:
+        import lupa.luajit21 as lupa
+    except ImportError as error:
+        raise MissingExtra("lupa", "services") from error
+    return lupa
+
+
+class LuaRuntime:
+    """One virtual machine with one script."""
+
+    def __init__(self, service: InstalledService) -> None:
+        lupa = warm_up()
+        self._name = service.name
+        self._lupa = lupa
+        self._lua = lupa.LuaRuntime(
+            unpack_returned_tuples=True, register_eval=False, register_builtins=False,
+            attribute_filter=_no_attributes, encoding=None,
+        )  # fmt: skip
+        try:
+            setup = self._lua.execute(f"return function(...) {_SETUP} end".encode())
+            folder = str(service.folder).encode()
+            self._pcall = setup(self._decode, self._encode, _inflate, zlib.compress, folder)
+            made = self._lua.execute(service.entry_path.read_bytes(), name=b"=" + service.entry.encode())
+        except (lupa.LuaError, OSError, ValueError) as error:
+            raise ConfigurationError(
+                f"{service.name} cannot be loaded: {_first_line(error)}", hint="mend the script"
+            ) from error
+        self._functions: dict[str, Any] = {}
+        if lupa.lua_type(made) == "function":
+            self._functions["serve"] = made
+        elif lupa.lua_type(made) == "table":
+            self._functions = {_text(key): value for key, value in made.items()}
+        if lupa.lua_type(self._functions.get("serve")) != "function":
+            raise ConfigurationError(
+                f"{service.entry} returns neither a function nor a table with serve",
+                hint="end the script with: return function(request) ... end",
+            )
+        self._raw = bool(self._functions.get("takes_text"))
+        self.has_snapshots = {"snapshot", "restore"} <= set(self._functions)
+
+    def call(self, payload: Any) -> Any:
+        """Return the reply to *payload*; a script with ``takes_text`` gets and returns JSON text."""
+        if self._raw:
+            return self._parsed(self._run("serve", msgspec.json.encode(_plain(payload))))
+        return self._from_lua(self._run("serve", self._to_lua(payload)))
+
+    def snapshot(self) -> bytes:
+        """Return what the script's ``snapshot`` returned, as JSON."""
+        return msgspec.json.encode(self._from_lua(self._run("snapshot")))
+
+    def restore(self, data: bytes) -> None:
+        """Give a snapshot to the script's ``restore``."""
+        self._run("restore", self._to_lua(msgspec.json.decode(data)))
+
+    def _run(self, function: str, *arguments: Any) -> Any:
+        try:
+            told = self._pcall(self._functions[function], *arguments)
+        except self._lupa.LuaError as error:  # out of memory: pcall does not hold that
+            raise InternalError(f"{self._name}: {_first_line(error)}") from error
+        done, value = (*told, None)[:2] if isinstance(told, tuple) else (told, None)
+        if not done:
+            raise self._failure(value)
+        return value
+
+    def _failure(self, raised: Any) -> RsePfError:
+        """``error({code = "bad-request", message = "..."})`` is a typed failure, all else a defect."""
+        if isinstance(raised, RsePfError):
+            return raised
+        if self._lupa.lua_type(raised) == "table":
+            told = self._from_lua(raised)
+            if isinstance(told, Mapping) and "message" in told:
+                return error_from_code(str(told.get("code", "failed")), f"{self._name}: {told['message']}")
+        return InternalError(f"{self._name}: {_text(raised)[:300]}")
+
+    def _parsed(self, text: Any) -> Any:
+        try:
+            return msgspec.json.decode(text)
+        except (msgspec.DecodeError, TypeError) as error:
+            raise CommandFailed(f"{self._name} replied with something that is no JSON: {error}") from error
+
+    def _to_lua(self, value: Any) -> Any:
+        value = _in_bytes(value)
+        return self._lua.table_from(value, recursive=True) if isinstance(value, dict | list) else value
+
+    def _from_lua(self, value: Any) -> Any:
+        if self._lupa.lua_type(value) != "table":
+            if value is None or isinstance(value, bool | int | float):
+                return value
+            if isinstance(value, bytes):
+                return _text(value)
+            raise CommandFailed(f"{self._name} replied with a {self._lupa.lua_type(value)}")
+        length = len(value)
+        if length and sum(1 for _ in value.keys()) == length:  # noqa: SIM118  a Lua table is no mapping
+            return [self._from_lua(value[i]) for i in range(1, length + 1)]
+        return {_text(key): self._from_lua(each) for key, each in value.items()}
+
+    def _decode(self, text: bytes) -> Any:
+        try:
+            return self._to_lua(msgspec.json.decode(text))
+        except msgspec.DecodeError as error:
+            raise BadRequest(f"not JSON: {error}") from error
+
+    def _encode(self, value: Any) -> bytes:
+        return msgspec.json.encode(self._from_lua(value))
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, np.ndarray):
+        return value.tolist()
+    if isinstance(value, Mapping):
+        return {str(key): _plain(each) for key, each in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(each) for each in value]
+    return value
+
+
+def _in_bytes(value: Any) -> Any:
+    """Return *value* with every text as bytes, which is what Lua's strings are."""
+    if isinstance(value, str):
+        return value.encode()
+    if isinstance(value, np.ndarray):
+        return value.tolist()
+    if isinstance(value, Mapping):
+        return {str(key).encode(): _in_bytes(each) for key, each in value.items()}
+    if isinstance(value, list | tuple):
+        return [_in_bytes(each) for each in value]
+    return value
+
+
+def _text(value: Any) -> str:
+    return value.decode("utf-8", "replace") if isinstance(value, bytes) else str(value)
+
+
+def _inflate(data: bytes) -> bytes:
+    return zlib.decompressobj().decompress(data, _MAX_INFLATED)
+
+
+def _no_attributes(thing: object, name: object, setting: bool) -> object:
+    raise AttributeError(f"{name!r} is not for scripts")
+
+
+def _first_line(error: BaseException) -> str:
+    return str(error).split("\n")[0][:300]

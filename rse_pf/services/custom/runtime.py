@@ -1,0 +1,116 @@
+"""Open an installed service and call it: one interface over Python, C/C++ and Lua.
+
+Runs inside of an isolated environment, in `rse-pf service test`, and nowhere else.  Promises that what a
+service raises leaves as an error of `rse_pf.errors`, and that a payload reaches every language as it was
+sent: names, numbers, texts, lists and arrays.
+"""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import inspect
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Protocol
+
+from rse_pf.errors import ConfigurationError, RsePfError
+from rse_pf.service import Registry, request_of
+from rse_pf.services.custom.installed import InstalledService
+
+__all__ = ["Runtime", "open_runtime"]
+
+
+class Runtime(Protocol):
+    """An opened service."""
+
+    has_snapshots: bool
+
+    def call(self, payload: Any) -> Any:
+        """Return the reply to *payload*: a struct, or plain values and arrays."""
+
+    def snapshot(self) -> bytes:
+        """Return the state, so that `restore` can go on from it elsewhere."""
+
+    def restore(self, data: bytes) -> None:
+        """Take a state that `snapshot` returned."""
+
+
+def open_runtime(service: InstalledService, scratch: Path) -> Runtime:
+    """Load *service*; its files may be written below *scratch* only.
+
+    Raises:
+        ConfigurationError: It cannot be loaded; the message says why.
+        MissingExtra: Its language is not installed on this server.
+    """
+    if service.language in ("python", "package"):
+        return _PythonRuntime(service)
+    if service.language == "cpp":
+        from rse_pf.services.custom.native import NativeRuntime
+
+        return NativeRuntime(service, scratch)
+    from rse_pf.services.custom.lua import LuaRuntime
+
+    return LuaRuntime(service)
+
+
+class _PythonRuntime:
+    """A function ``serve(request: Request) -> Reply``, or a class ``Service`` with such a method."""
+
+    def __init__(self, service: InstalledService) -> None:
+        module = _load_package(service) if service.language == "package" else _load(service)
+        maker = getattr(module, "Service", None)
+        self._object = maker() if callable(maker) else None
+        function: Callable[[Any], Any] | None = getattr(self._object or module, "serve", None)
+        if function is None:
+            raise ConfigurationError(
+                f"{service.entry} has neither a function serve nor a class Service",
+                hint="write def serve(request: Request) -> Reply",
+            )
+        registry = Registry()
+        registry.service(service.name)(function)
+        self._service = registry.get(service.name)
+        self.has_snapshots = all(
+            inspect.ismethod(getattr(self._object, name, None)) for name in ("snapshot", "restore")
+        )
+
+    def call(self, payload: Any) -> Any:
+        return self._service.function(request_of(payload, self._service))
+
+    def snapshot(self) -> bytes:
+        assert self._object is not None
+        return bytes(self._object.snapshot())
+
+    def restore(self, data: bytes) -> None:
+        assert self._object is not None
+        self._object.restore(data)
+
+
+def _load_package(service: InstalledService) -> Any:
+    try:
+        return importlib.import_module(service.entry)
+    except Exception as error:
+        where = f"{type(error).__name__}: {error}"
+        raise ConfigurationError(
+            f"{service.name} cannot be loaded: {where}", hint="mend the package"
+        ) from error
+
+
+def _load(service: InstalledService) -> Any:
+    name = f"rse_pf_service_{service.name.replace('-', '_')}"
+    spec = importlib.util.spec_from_file_location(name, service.entry_path)
+    if spec is None or spec.loader is None:
+        raise ConfigurationError(f"{service.entry_path} is no Python file", hint="mend entry in service.json")
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module
+    if str(service.folder) not in sys.path:
+        sys.path.insert(0, str(service.folder))
+    try:
+        spec.loader.exec_module(module)
+    except RsePfError:
+        raise
+    except Exception as error:
+        where = f"{type(error).__name__}: {error}"
+        raise ConfigurationError(f"{service.name} cannot be loaded: {where}", hint="mend it") from error
+    return module

@@ -1,0 +1,199 @@
+"""The localisation service: one view and a map in, the camera's pose in that map out.
+
+Promises never to call a pose ok that few matches speak for or that two keyframes disagree about, and
+to ask the map alone: no memory of earlier views.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import msgspec
+import numpy as np
+
+from rse_pf.config import ServiceSettings
+from rse_pf.errors import BadRequest, PnpError
+from rse_pf.geometry import Array as Matrix
+from rse_pf.geometry import Camera, inverse, pose_difference, transform
+from rse_pf.pnp import PnpOptions, PnpSolution, solve_pnp
+from rse_pf.service import Registry
+from rse_pf.services.mapping.place import PlaceIndex, Within, opened_map, view_of
+from rse_pf.services.mapping.relative_pose import StepOptions, View, matched_points
+from rse_pf.wire.arrays import Array
+
+__all__ = ["LocaliseOptions", "LocaliseReply", "LocaliseRequest", "Location", "locate", "register"]
+
+
+class LocaliseOptions(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """How to localise.
+
+    A pose is ok from *min_inliers*; *candidates* keyframes are looked at; keyframes whose own pose of
+    the view differs by more than *agree_m* or *agree_deg* from the best one do not count for it.
+
+    Raises:
+        BadRequest: A number is out of its range.
+    """
+
+    candidates: int = 8
+    min_inliers: int = 30
+    min_inlier_ratio: float = 0.3
+    agree_m: float = 0.15
+    agree_deg: float = 5.0
+    inlier_px: float = 3.0
+
+    def __post_init__(self) -> None:
+        if not (1 <= self.candidates <= 100 and self.min_inliers >= 12 and 0 < self.inlier_px <= 100):
+            raise BadRequest(
+                f"candidates = {self.candidates} is not within 1..100, min_inliers = {self.min_inliers} "
+                f"below 12, or inlier_px = {self.inlier_px:g} not within 0..100",
+                hint="leave them out to get the defaults",
+            )
+
+
+class LocaliseRequest(msgspec.Struct, frozen=True, kw_only=True):
+    """A view and an encoded map version; *within* is a prior, such as what ``wifi`` answers."""
+
+    map: bytes
+    camera: Camera
+    pixels: Array
+    descriptors: bytes
+    within: Within | None = None
+    options: LocaliseOptions | None = None
+
+
+class LocaliseReply(msgspec.Struct, frozen=True, kw_only=True):
+    """A pose ``T_map_camera`` (16 numbers, row-major) with its evidence.
+
+    ``inliers`` counts the matches of the best keyframe alone; *rmse_px* is over those of all.
+
+    ``verdict``: ok; weak, with a *reason*; or lost, with a reason and without a pose.
+    """
+
+    verdict: str
+    reason: str = ""
+    T_map_camera: Array | None = None
+    inliers: int = 0
+    rmse_px: float = 0.0
+    keyframes: list[int] = []
+    """Ids of the keyframes whose points carry the pose, best first."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Location:
+    """What `locate` found; the fields are those of `LocaliseReply`."""
+
+    verdict: Literal["ok", "weak", "lost"]
+    reason: str
+    T_map_camera: Matrix | None = None
+    inliers: int = 0
+    rmse_px: float = 0.0
+    keyframes: tuple[int, ...] = ()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Vote:
+    row: int
+    points_map: Matrix
+    pixels: Matrix
+    solution: PnpSolution
+
+
+def locate(
+    index: PlaceIndex, view: View, options: LocaliseOptions | None = None, *, within: Within | None = None
+) -> Location:
+    """Find the pose of *view* among the keyframes of *index*.
+
+    Candidates by place recognition, a pose from each by PnP; the best one is solved once more with
+    the points of all candidates that agree with it.
+
+    Raises:
+        MissingExtra: faiss or the solver is not installed.
+    """
+    options = options or LocaliseOptions()
+    rows = index.nearest(view.descriptors, options.candidates, index.rows_within(within))
+    if not rows:
+        return Location(verdict="lost", reason="no-candidates")
+    votes = [vote for row, _ in rows if (vote := _vote(index, row, view, options)) is not None]
+    if not votes:
+        return Location(verdict="lost", reason="no-pose")
+    votes.sort(key=lambda vote: -len(vote.solution.inliers))
+    best = votes[0]
+    agreeing = [vote for vote in votes if _agrees(vote, best, options)]
+    solution = _joint(agreeing, view, options) or best.solution
+    count = len(best.solution.inliers)
+    if count < options.min_inliers // 2:
+        return Location(verdict="lost", reason="few-inliers", inliers=count)
+    reason = _doubt(votes, agreeing, solution, options)
+    return Location(
+        verdict="weak" if reason else "ok",
+        reason=reason,
+        T_map_camera=inverse(solution.T_camera_world),
+        inliers=count,
+        rmse_px=solution.rmse_px,
+        keyframes=tuple(index.keyframes[vote.row].id for vote in agreeing),
+    )
+
+
+def register(registry: Registry, settings: ServiceSettings) -> None:
+    """Add ``localise`` to *registry*."""
+
+    @registry.service("localise")
+    def localise(request: LocaliseRequest) -> LocaliseReply:
+        """Find the camera's pose in a map."""
+        view = view_of(request.camera, request.pixels, request.descriptors)
+        _, index = opened_map(request.map, settings.max_map_keyframes)
+        found = locate(index, view, request.options, within=request.within)
+        return LocaliseReply(
+            verdict=found.verdict,
+            reason=found.reason,
+            T_map_camera=None if found.T_map_camera is None else found.T_map_camera.ravel(),
+            inliers=found.inliers,
+            rmse_px=found.rmse_px,
+            keyframes=list(found.keyframes),
+        )
+
+
+def _vote(index: PlaceIndex, row: int, view: View, options: LocaliseOptions) -> _Vote | None:
+    keyframe = index.keyframes[row]
+    points, rows, columns = matched_points(keyframe, view, StepOptions(inlier_px=options.inlier_px))
+    if len(rows) < options.min_inliers // 2:
+        return None
+    points_map = transform(keyframe.T_world_camera, points)
+    solution = _solved(points_map, view.pixels[columns], view, options)
+    return None if solution is None else _Vote(row, points_map, view.pixels[columns], solution)
+
+
+def _joint(votes: list[_Vote], view: View, options: LocaliseOptions) -> PnpSolution | None:
+    """Solve with the inliers of all *votes* together."""
+    points = np.concatenate([vote.points_map[vote.solution.inliers] for vote in votes])
+    pixels = np.concatenate([vote.pixels[vote.solution.inliers] for vote in votes])
+    return _solved(points, pixels, view, options)
+
+
+def _solved(points: Matrix, pixels: Matrix, view: View, options: LocaliseOptions) -> PnpSolution | None:
+    try:
+        return solve_pnp(points, pixels, view.camera, PnpOptions(inlier_px=options.inlier_px))
+    except PnpError:
+        return None
+
+
+def _agrees(vote: _Vote, best: _Vote, options: LocaliseOptions) -> bool:
+    metres, degrees = pose_difference(
+        inverse(vote.solution.T_camera_world), inverse(best.solution.T_camera_world)
+    )
+    return metres <= options.agree_m and degrees <= options.agree_deg
+
+
+def _doubt(votes: list[_Vote], agreeing: list[_Vote], solution: PnpSolution, options: LocaliseOptions) -> str:
+    best = agreeing[0]
+    if len(best.solution.inliers) < options.min_inliers:
+        return "few-inliers"
+    if len(best.solution.inliers) < options.min_inlier_ratio * len(best.pixels):
+        return "low-inlier-ratio"
+    if solution.verdict != "ok":
+        return solution.reason
+    rival = max(options.min_inliers, len(best.solution.inliers) // 2)
+    if any(vote not in agreeing and len(vote.solution.inliers) >= rival for vote in votes):
+        return "keyframes-disagree"
+    return ""

@@ -1,0 +1,146 @@
+"""Which measured steps between keyframes agree with each other: the judge of loops and merges.
+
+Promises that its verdict does not depend on where two robots' origins are believed to be: only steps
+and odometry are compared.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from rse_pf.geometry import Array
+from rse_pf.services.mapping.pose_graph import inverses, log_se3
+
+__all__ = ["LoopClosure", "OdometryNoise", "consistent", "largest_clique", "pairwise_consistency"]
+
+_CHI2_3_99 = 11.345
+"""99 % of the squared Mahalanobis norms of a 3-vector lie below."""
+_MAX_STEPS = 200_000
+"""Branches of the clique search; beyond, the best clique so far is taken."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class OdometryNoise:
+    """How odometry drifts: standard deviations for each axis over one keyframe step (a random walk)."""
+
+    step_m: float = 0.02
+    step_deg: float = 0.7
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class LoopClosure:
+    """A measured step between two keyframes (row numbers of one list)."""
+
+    a: int
+    b: int
+    T_a_b: Array
+    information: Array
+    inliers: int = 0
+    matches: int = 0
+
+
+def consistent(
+    links: Sequence[LoopClosure],
+    T_world_camera: Array,
+    order: npt.NDArray[np.int64],
+    noise: OdometryNoise,
+) -> npt.NDArray[np.int64]:
+    """Return the rows of the largest set of *links* that agree pairwise; deterministic.
+
+    Args:
+        links: All between the same two trajectories (or within one).
+        T_world_camera: ``(n, 4, 4)``, odometry of each trajectory in a frame of its own.
+        order: ``(n,)``, each keyframe's place along its trajectory, in keyframe steps.
+        noise: Of the odometry.
+
+    Source:
+        Mangelson et al., Pairwise consistent measurement set maximization, ICRA 2018.
+    """
+    agree = pairwise_consistency(links, T_world_camera, order, noise)
+    return largest_clique(agree)
+
+
+def pairwise_consistency(
+    links: Sequence[LoopClosure],
+    T_world_camera: Array,
+    order: npt.NDArray[np.int64],
+    noise: OdometryNoise,
+) -> npt.NDArray[np.bool_]:
+    """Return the ``(m, m)`` matrix of which two links agree; the diagonal is False.
+
+    The round trip a1 -> b1 -> b2 -> a2 -> a1 should be the identity; translation and rotation are
+    tested apart, at 99 %, against the noise of both links and of the odometry between them, with
+    rotation noise at the lever of the way it swings.
+    """
+    m = len(links)
+    if m == 0:
+        return np.zeros((0, 0), dtype=np.bool_)
+    a = np.array([link.a for link in links])
+    b = np.array([link.b for link in links])
+    steps = np.array([link.T_a_b for link in links])
+    spread = np.array([np.diag(np.linalg.inv(link.information)) for link in links])
+    variance_m2, variance_rad2 = spread[:, :3].mean(axis=1), spread[:, 3:].mean(axis=1)
+    agree = np.zeros((m, m), dtype=np.bool_)
+    T_world_a, T_world_b = T_world_camera[a], T_world_camera[b]
+    for k in range(m):
+        along_b = np.linalg.inv(T_world_b[k]) @ T_world_b
+        along_a = np.linalg.inv(T_world_a) @ T_world_a[k]
+        trip = log_se3(steps[k] @ along_b @ inverses(steps) @ along_a)
+        walked = np.abs(order[a] - order[a[k]]) + np.abs(order[b] - order[b[k]])
+        lever_m2 = (along_a[:, :3, 3] ** 2).sum(axis=1) + (along_b[:, :3, 3] ** 2).sum(axis=1)
+        rad2 = variance_rad2 + variance_rad2[k] + walked * math.radians(noise.step_deg) ** 2
+        m2 = variance_m2 + variance_m2[k] + walked * noise.step_m**2 + rad2 * lever_m2
+        agree[k] = ((trip[:, :3] ** 2).sum(axis=1) <= _CHI2_3_99 * m2) & (
+            (trip[:, 3:] ** 2).sum(axis=1) <= _CHI2_3_99 * rad2
+        )
+    agree &= agree.T
+    np.fill_diagonal(agree, False)
+    return agree
+
+
+def largest_clique(agree: npt.NDArray[np.bool_]) -> npt.NDArray[np.int64]:
+    """Return the sorted rows of a largest set that agree pairwise; exact unless it is very large.
+
+    Branch and bound with a greedy colouring as the bound; among equals the first found wins.
+
+    Source:
+        Tomita and Kameda, An efficient branch-and-bound algorithm for finding a maximum clique, 2007.
+    """
+    neighbours = [frozenset(np.flatnonzero(row).tolist()) for row in agree]
+    by_degree = sorted(range(len(neighbours)), key=lambda row: (-len(neighbours[row]), row))
+    best: list[int] = []
+    left = _MAX_STEPS
+
+    def grow(clique: list[int], rows: list[int]) -> None:
+        nonlocal best, left
+        if len(clique) > len(best):
+            best = list(clique)
+        coloured = _coloured(rows, neighbours)
+        for place in range(len(coloured) - 1, -1, -1):
+            row, colours = coloured[place]
+            if len(clique) + colours <= len(best) or left <= 0:
+                return
+            left -= 1
+            rest = [other for other, _ in coloured[:place] if other in neighbours[row]]
+            grow([*clique, row], rest)
+
+    grow([], by_degree)
+    return np.array(sorted(best), dtype=np.int64)
+
+
+def _coloured(rows: list[int], neighbours: list[frozenset[int]]) -> list[tuple[int, int]]:
+    """Return rows with how many colours those up to each need: no clique in them is larger."""
+    classes: list[list[int]] = []
+    for row in rows:
+        for each in classes:
+            if neighbours[row].isdisjoint(each):
+                each.append(row)
+                break
+        else:
+            classes.append([row])
+    return [(row, colour) for colour, each in enumerate(classes, start=1) for row in each]

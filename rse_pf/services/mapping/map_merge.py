@@ -1,0 +1,389 @@
+"""Joining maps: propose loops, judge them, place the maps, optimise, move the clouds along.
+
+Promises to be a pure function of the maps and the options; `merge` is its face on the wire.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+
+from rse_pf.errors import BadRequest
+from rse_pf.geometry import Array, inverse
+from rse_pf.maps.format import Edge, Keyframe, MapVersion
+from rse_pf.services.mapping.cloud_deform import moved_points
+from rse_pf.services.mapping.loop_consistency import LoopClosure, OdometryNoise, consistent
+from rse_pf.services.mapping.optimise import OptimiseOptions, Report, optimise_graph, silent
+from rse_pf.services.mapping.place import PlaceIndex
+from rse_pf.services.mapping.pose_graph import PoseGraph
+from rse_pf.services.mapping.relative_pose import StepOptions, measure_step
+
+__all__ = ["Atlas", "MergeOptions", "Merged", "Proposals", "join_maps", "propose_links"]
+
+_NEAR = 3
+"""Keyframes of one robot that are closer along its way than this are no loop."""
+
+
+class MergeOptions(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """How to merge.
+
+    ``candidates`` other keyframes are tried for each keyframe and each map; two maps are joined by
+    ``min_links`` loops that agree with each other, or not at all; ``close_loops`` also looks for loops
+    within each map.
+
+    Raises:
+        BadRequest: A number is out of its range.
+    """
+
+    candidates: int = 6
+    min_inliers: int = 40
+    min_inlier_ratio: float = 0.5
+    min_links: int = 3
+    close_loops: bool = True
+    cauchy: float = 3.0
+
+    def __post_init__(self) -> None:
+        within = (
+            1 <= self.candidates <= 100 and self.min_inliers >= 12 and 0 < self.min_inlier_ratio <= 1
+            and self.min_links >= 1 and self.cauchy >= 0
+        )  # fmt: skip
+        if not within:
+            raise BadRequest("an option of merge is out of its range", hint="leave it out for the default")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Atlas:
+    """The keyframes of all maps in one list, each map still in its own world."""
+
+    keyframes: tuple[Keyframe, ...]
+    of_map: npt.NDArray[np.int64]
+    """``(n,)``: the map of each keyframe."""
+    order: npt.NDArray[np.int64]
+    """``(n,)``: each keyframe's place along the way of its robot."""
+    T_world_camera: Array
+    """``(n, 4, 4)``."""
+    row_of: Mapping[tuple[int, int], int]
+    """Row of (map, id)."""
+
+    @classmethod
+    def of(cls, versions: Sequence[MapVersion]) -> Atlas:
+        """Return the atlas of *versions*, keyframes by map, robot and time."""
+        rows = [
+            (which, keyframe)
+            for which, version in enumerate(versions)
+            for keyframe in sorted(version.keyframes, key=lambda k: (k.robot, k.timestamp_s, k.id))
+        ]
+        return cls(
+            keyframes=tuple(keyframe for _, keyframe in rows),
+            of_map=np.array([which for which, _ in rows], dtype=np.int64),
+            order=np.arange(len(rows), dtype=np.int64),
+            T_world_camera=np.array([k.T_world_camera for _, k in rows], dtype=np.float64),
+            row_of={(which, k.id): row for row, (which, k) in enumerate(rows)},
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Proposals:
+    """Links that PnP measured, and how many keyframe pairs of two maps failed for which reason."""
+
+    links: tuple[LoopClosure, ...]
+    failed: Counter[tuple[int, int, str]]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Merged:
+    """What `join_maps` made: the map, who is in it, who is not and why, what was refused."""
+
+    version: MapVersion
+    joined: tuple[int, ...]
+    not_joined: tuple[tuple[int, str], ...]
+    refused: Mapping[tuple[int, int, str], int]
+    loops: int
+    merges: int
+    cost_before: float
+    cost_after: float
+
+
+def join_maps(
+    versions: Sequence[MapVersion],
+    options: MergeOptions | None = None,
+    *,
+    report: Report = silent,
+    propose: Callable[[Atlas, MergeOptions, Report], Proposals] | None = None,
+) -> Merged:
+    """Join *versions* into one map in the world of the first.
+
+    Args:
+        versions: Maps with at least one keyframe each.
+        options: ``None`` means the defaults.
+        report: Told of progress; may raise Cancelled.
+        propose: Finds links; `propose_links` unless a test brings its own.
+
+    Raises:
+        MissingExtra: faiss, gtsam or a solver is not installed.
+        Cancelled: *report* raised it.
+    """
+    options = options or MergeOptions()
+    atlas = Atlas.of(versions)
+    proposals = (propose or propose_links)(atlas, options, report)
+    accepted, refused = _judge(atlas, proposals, options)
+    report(0.8, f"{len(accepted)} of {len(proposals.links)} links agree")
+    placed, joined = _place(atlas, accepted, len(versions))
+    kept = [link for link in accepted if {int(atlas.of_map[link.a]), int(atlas.of_map[link.b])} <= joined]
+    rows = np.flatnonzero(np.isin(atlas.of_map, sorted(joined)))
+    odometry = _odometry(atlas, versions, joined)
+    graph = _graph(atlas, placed, rows, odometry, kept)
+    found = optimise_graph(graph, OptimiseOptions(cauchy=options.cauchy))
+    report(0.95, "optimised")
+    poses = placed.copy()
+    poses[rows] = found.T_world_pose
+    version = _version(atlas, versions, poses, rows, odometry, kept)
+    report(1.0, "merged")
+    merges = sum(atlas.of_map[link.a] != atlas.of_map[link.b] for link in kept)
+    return Merged(
+        version=version,
+        joined=tuple(sorted(joined)),
+        not_joined=tuple(
+            (which, _why_not(which, joined, proposals, refused, options))
+            for which in range(len(versions)) if which not in joined
+        ),
+        refused=refused,
+        loops=len(kept) - int(merges),
+        merges=int(merges),
+        cost_before=found.cost_before,
+        cost_after=found.cost_after,
+    )  # fmt: skip
+
+
+def propose_links(atlas: Atlas, options: MergeOptions, report: Report = silent) -> Proposals:
+    """Measure the steps between keyframes that place recognition takes for the same place."""
+    index = PlaceIndex(atlas.keyframes)
+    pairs = _candidate_pairs(atlas, index, options)
+    step_options = StepOptions(min_inliers=options.min_inliers, min_inlier_ratio=options.min_inlier_ratio)
+    links: list[LoopClosure] = []
+    failed: Counter[tuple[int, int, str]] = Counter()
+    for done, (a, b) in enumerate(pairs):
+        if done % 16 == 0:
+            report(0.1 + 0.7 * done / len(pairs), f"{done} of {len(pairs)} keyframe pairs")
+        step = measure_step(atlas.keyframes[a], atlas.keyframes[b], step_options)
+        if isinstance(step, str):
+            failed[_named(_pair(atlas, a, b), step)] += 1
+        else:
+            links.append(
+                LoopClosure(
+                    a=a, b=b, T_a_b=step.T_a_b, information=step.information,
+                    inliers=step.inliers, matches=step.matches,
+                )
+            )  # fmt: skip
+    return Proposals(links=tuple(links), failed=failed)
+
+
+def _candidate_pairs(atlas: Atlas, index: PlaceIndex, options: MergeOptions) -> list[tuple[int, int]]:
+    pairs: set[tuple[int, int]] = set()
+    every = np.arange(len(atlas.keyframes))
+    for a in range(len(atlas.keyframes)):
+        for which in np.unique(atlas.of_map).tolist():
+            own = which == atlas.of_map[a]
+            if own and not options.close_loops:
+                continue
+            allowed = every[atlas.of_map == which]
+            if own:
+                allowed = allowed[np.abs(atlas.order[allowed] - atlas.order[a]) >= _NEAR]
+            for b, _ in index.nearest_to(index.vectors[a], options.candidates, allowed):
+                pairs.add((min(a, b), max(a, b)))
+    return sorted(pairs)
+
+
+def _judge(
+    atlas: Atlas, proposals: Proposals, options: MergeOptions
+) -> tuple[list[LoopClosure], Counter[tuple[int, int, str]]]:
+    """Return the links that agree, two maps at a time, and why the others were refused."""
+    refused = Counter(proposals.failed)
+    groups: dict[tuple[int, int], list[LoopClosure]] = {}
+    for link in proposals.links:
+        groups.setdefault(_pair(atlas, link.a, link.b), []).append(link)
+    accepted: list[LoopClosure] = []
+    noise = OdometryNoise()
+    for pair, links in sorted(groups.items()):
+        if pair[0] == pair[1]:
+            # The odometry itself is a witness: a link of no motion at the middle of nothing.
+            links = [link for link in links if _fits_odometry(atlas, link, noise)]
+            refused[_named(pair, "against-odometry")] += len(groups[pair]) - len(links)
+        rows = consistent(links, atlas.T_world_camera, atlas.order, noise)
+        if pair[0] != pair[1] and len(rows) < options.min_links:
+            refused[_named(pair, "too-few-agree")] += len(links)
+            continue
+        accepted += [links[row] for row in rows]
+        refused[_named(pair, "inconsistent")] += len(links) - len(rows)
+    return accepted, Counter({key: count for key, count in refused.items() if count})
+
+
+def _fits_odometry(atlas: Atlas, link: LoopClosure, noise: OdometryNoise) -> bool:
+    """Say whether a loop lies within what odometry may have drifted, three sigma."""
+    predicted = inverse(atlas.T_world_camera[link.a]) @ atlas.T_world_camera[link.b]
+    off = inverse(link.T_a_b) @ predicted
+    walked = abs(int(atlas.order[link.a] - atlas.order[link.b])) + 2
+    rad = 3.0 * math.sqrt(3.0 * walked) * math.radians(noise.step_deg)
+    metres = 3.0 * math.sqrt(3.0 * walked) * noise.step_m + rad * _reach_m(atlas, link)
+    turned = math.acos(min(1.0, max(-1.0, (np.trace(off[:3, :3]) - 1.0) / 2.0)))
+    return bool(np.linalg.norm(off[:3, 3]) <= metres and turned <= rad)
+
+
+def _reach_m(atlas: Atlas, link: LoopClosure) -> float:
+    """Return how far the way between a link's ends strays from its end: the lever of a turn."""
+    low, high = sorted((link.a, link.b))
+    way = atlas.T_world_camera[low : high + 1, :3, 3]
+    return float(np.linalg.norm(way - way[-1], axis=1).max())
+
+
+def _place(atlas: Atlas, links: Sequence[LoopClosure], maps: int) -> tuple[Array, set[int]]:
+    """Bring every map that is connected to map 0 into its world; best-supported pairs first.
+
+    The pose of a map is the one, among those that the links of a pair propose, which the others
+    differ from least: a median, so that no average has to be taken of rotations.
+    """
+    placed = atlas.T_world_camera.copy()
+    joined = {0}
+    groups: dict[tuple[int, int], list[LoopClosure]] = {}
+    for link in links:
+        one, other = _pair(atlas, link.a, link.b)
+        if one != other:
+            groups.setdefault((one, other), []).append(link)
+    while True:
+        open_pairs = [pair for pair in groups if len(joined & set(pair)) == 1]
+        if not open_pairs:
+            return placed, joined
+        pair = max(open_pairs, key=lambda each: (len(groups[each]), (-each[0], -each[1])))
+        new = pair[0] if pair[1] in joined else pair[1]
+        T_world_new = _median_pose(
+            [_proposed(atlas, placed, link, new) for link in groups[pair]]
+        )  # fmt: skip
+        rows = atlas.of_map == new
+        placed[rows] = T_world_new @ atlas.T_world_camera[rows]
+        joined.add(new)
+
+
+def _proposed(atlas: Atlas, placed: Array, link: LoopClosure, new: int) -> Array:
+    old, other, T_old_other = link.a, link.b, link.T_a_b
+    if atlas.of_map[link.a] == new:
+        old, other, T_old_other = link.b, link.a, inverse(link.T_a_b)
+    T_world_new: Array = placed[old] @ T_old_other @ inverse(atlas.T_world_camera[other])
+    return T_world_new
+
+
+def _median_pose(poses: list[Array]) -> Array:
+    stack = np.array(poses)
+    apart_m = np.linalg.norm(stack[:, None, :3, 3] - stack[None, :, :3, 3], axis=2)
+    turned = np.linalg.norm(stack[:, None, :3, :3] - stack[None, :, :3, :3], axis=(2, 3))
+    return poses[int(np.argmin((apart_m + turned).sum(axis=1)))]
+
+
+def _odometry(
+    atlas: Atlas, versions: Sequence[MapVersion], joined: set[int]
+) -> list[tuple[LoopClosure, str]]:
+    """Return the maps' own edges; consecutive keyframes without one get the step of their poses."""
+    edges: list[tuple[LoopClosure, str]] = []
+    have: set[tuple[int, int]] = set()
+    for which in sorted(joined):
+        for edge in versions[which].edges:
+            a, b = atlas.row_of[which, edge.a], atlas.row_of[which, edge.b]
+            edges.append((LoopClosure(a=a, b=b, T_a_b=edge.T_a_b, information=edge.information), edge.kind))
+            have.add((min(a, b), max(a, b)))
+    noise = OdometryNoise()
+    spread = np.array([noise.step_m] * 3 + [math.radians(noise.step_deg)] * 3)
+    for a in range(len(atlas.keyframes) - 1):
+        b = a + 1
+        same = atlas.of_map[a] == atlas.of_map[b] and atlas.keyframes[a].robot == atlas.keyframes[b].robot
+        if same and int(atlas.of_map[a]) in joined and (a, b) not in have:
+            T_a_b = inverse(atlas.T_world_camera[a]) @ atlas.T_world_camera[b]
+            edges.append((LoopClosure(a=a, b=b, T_a_b=T_a_b, information=np.diag(spread**-2.0)), "odometry"))
+    return edges
+
+
+def _graph(
+    atlas: Atlas,
+    placed: Array,
+    rows: npt.NDArray[np.int64],
+    odometry: Sequence[tuple[LoopClosure, str]],
+    links: Sequence[LoopClosure],
+) -> PoseGraph:
+    place = np.full(len(atlas.keyframes), -1)
+    place[rows] = np.arange(len(rows))
+    every = [link for link, _ in odometry] + list(links)
+    return PoseGraph(
+        T_world_pose=placed[rows],
+        a=place[np.array([link.a for link in every], dtype=np.int64)],
+        b=place[np.array([link.b for link in every], dtype=np.int64)],
+        T_a_b=np.array([link.T_a_b for link in every]).reshape(-1, 4, 4),
+        information=np.array([link.information for link in every]).reshape(-1, 6, 6),
+        robust=np.array([kind != "odometry" for _, kind in odometry] + [True] * len(links), dtype=np.bool_),
+        ids=np.arange(len(rows)),
+    )
+
+
+def _version(
+    atlas: Atlas,
+    versions: Sequence[MapVersion],
+    poses: Array,
+    rows: npt.NDArray[np.int64],
+    odometry: Sequence[tuple[LoopClosure, str]],
+    links: Sequence[LoopClosure],
+) -> MapVersion:
+    """Return the merged map; ids are row numbers, provenance tells which map and id they came from."""
+    place = {int(row): number for number, row in enumerate(rows)}
+    keyframes = tuple(
+        replace(atlas.keyframes[row], id=place[row], T_world_camera=poses[row]) for row in place
+    )
+    edges = [(link, kind) for link, kind in odometry]
+    edges += [(link, "loop" if atlas.of_map[link.a] == atlas.of_map[link.b] else "merge") for link in links]
+    points, colours = moved_points(versions, atlas.of_map, atlas.keyframes, poses, rows)
+    return MapVersion(
+        keyframes=keyframes,
+        edges=tuple(
+            Edge(
+                a=place[link.a], b=place[link.b], T_a_b=link.T_a_b, information=link.information,
+                kind="odometry" if kind == "odometry" else "loop" if kind == "loop" else "merge",
+            )
+            for link, kind in edges
+        ),
+        points=points,
+        colours=colours,
+        provenance={
+            "made_by": "merge",
+            "from": [[int(atlas.of_map[row]), atlas.keyframes[row].id] for row in place],
+            "parents": [dict(version.provenance) for version in versions],
+        },
+    )  # fmt: skip
+
+
+def _why_not(
+    which: int,
+    joined: set[int],
+    proposals: Proposals,
+    refused: Mapping[tuple[int, int, str], int],
+    options: MergeOptions,
+) -> str:
+    tried: Counter[str] = Counter()
+    for (one, other, reason), count in refused.items():
+        if which in (one, other) and one != other:
+            tried[reason] += count
+    told = ", ".join(f"{count} {reason}" for reason, count in sorted(tried.items()) if count)
+    return (
+        f"fewer than {options.min_links} views shared with maps {sorted(joined)} agree "
+        f"({told or 'no candidates'})"
+    )
+
+
+def _pair(atlas: Atlas, a: int, b: int) -> tuple[int, int]:
+    one, other = int(atlas.of_map[a]), int(atlas.of_map[b])
+    return min(one, other), max(one, other)
+
+
+def _named(pair: tuple[int, int], reason: str) -> tuple[int, int, str]:
+    return pair[0], pair[1], reason

@@ -1,0 +1,95 @@
+"""The merge service: maps of several robots in, one map out, and what was joined or refused and why.
+
+Promises that a map which shares no view with the others is left out and named, never placed by
+guess, and that the same maps give the same result.
+"""
+
+from __future__ import annotations
+
+import msgspec
+
+from rse_pf.config import ServiceSettings
+from rse_pf.errors import BadRequest, LimitExceeded
+from rse_pf.maps.format import MapVersion, decode_map, encode_map
+from rse_pf.service import Registry
+from rse_pf.services.mapping.map_merge import Merged, MergeOptions, join_maps
+from rse_pf.services.mapping.optimise import Report, silent
+
+__all__ = ["MergeReply", "MergeRequest", "NotJoined", "Refusal", "merge_maps", "register"]
+
+
+class MergeRequest(msgspec.Struct, frozen=True, kw_only=True):
+    """Encoded map versions; the world of the first one becomes the world of the result."""
+
+    maps: list[bytes]
+    options: MergeOptions | None = None
+
+
+class Refusal(msgspec.Struct, frozen=True, kw_only=True):
+    """How many proposed loops between two maps (row numbers) were refused, for one *reason*."""
+
+    maps: tuple[int, int]
+    reason: str
+    count: int
+
+
+class NotJoined(msgspec.Struct, frozen=True, kw_only=True):
+    """A map that could not be placed, and why."""
+
+    map: int
+    reason: str
+
+
+class MergeReply(msgspec.Struct, frozen=True, kw_only=True):
+    """One encoded map of all that was joined, and the account of it."""
+
+    map: bytes
+    joined: list[int]
+    not_joined: list[NotJoined]
+    refused: list[Refusal]
+    loops: int
+    merges: int
+    cost_before: float
+    cost_after: float
+
+
+def merge_maps(request: MergeRequest, settings: ServiceSettings, *, report: Report = silent) -> MergeReply:
+    """Answer *request*, telling *report* of the progress; it may raise Cancelled to end the work."""
+    if not request.maps:
+        raise BadRequest("no map was sent", hint="send one or more")
+    versions: list[MapVersion] = []
+    for data in request.maps:
+        versions.append(decode_map(data))
+        count = sum(len(version.keyframes) for version in versions)
+        if count > settings.max_map_keyframes:
+            raise LimitExceeded(
+                f"{count} keyframes are above {settings.max_map_keyframes}", hint="merge fewer maps at once"
+            )
+    if not all(version.keyframes for version in versions):
+        raise BadRequest("a map has no keyframes", hint="leave it out")
+    return _reply(join_maps(versions, request.options, report=report))
+
+
+def register(registry: Registry, settings: ServiceSettings) -> None:
+    """Add ``merge`` to *registry*."""
+
+    @registry.service("merge", kind="long")
+    def merge(request: MergeRequest, *, report: Report = silent) -> MergeReply:
+        """Make one map of several robots' maps, or close the loops of one."""
+        return merge_maps(request, settings, report=report)
+
+
+def _reply(merged: Merged) -> MergeReply:
+    return MergeReply(
+        map=encode_map(merged.version),
+        joined=list(merged.joined),
+        not_joined=[NotJoined(map=which, reason=reason) for which, reason in merged.not_joined],
+        refused=[
+            Refusal(maps=(one, other), reason=reason, count=count)
+            for (one, other, reason), count in sorted(merged.refused.items())
+        ],
+        loops=merged.loops,
+        merges=merged.merges,
+        cost_before=merged.cost_before,
+        cost_after=merged.cost_after,
+    )

@@ -1,0 +1,176 @@
+"""The place service: which keyframes of a map show what this view shows.
+
+Promises that the vocabulary comes from the very map version that is asked, seeded, that the same
+request gives the same candidates, and that a prior only narrows the search.
+
+A map that was asked lately is kept opened, which changes the time of an answer and nothing else.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Sequence
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+
+from rse_pf.config import ServiceSettings
+from rse_pf.errors import BadRequest, LimitExceeded
+from rse_pf.geometry import Camera
+from rse_pf.maps.format import Keyframe, MapVersion, decode_map
+from rse_pf.service import Registry
+from rse_pf.services.mapping.descriptors import (
+    Descriptors,
+    descriptors_of,
+    load_faiss,
+    train_words,
+    view_vector,
+)
+from rse_pf.services.mapping.relative_pose import StepOptions, View, pose_of_view
+from rse_pf.wire.arrays import Array, reshaped
+
+__all__ = [
+    "Candidate",
+    "PlaceIndex",
+    "PlaceReply",
+    "PlaceRequest",
+    "Within",
+    "opened_map",
+    "register",
+    "view_of",
+]
+
+WORDS = 32
+SEED = 20
+_OPENED_MAPS = 2
+
+
+class Within(msgspec.Struct, frozen=True, kw_only=True):
+    """A prior: the camera is within *radius_m* of ``(x, y, z)``, metres, map frame."""
+
+    x: float
+    y: float
+    z: float
+    radius_m: float
+
+
+class PlaceRequest(msgspec.Struct, frozen=True, kw_only=True):
+    """A view and the map to find it in.
+
+    ``map`` is an encoded map version; ``pixels`` ``2n`` undistorted; ``descriptors`` ``32n`` raw bytes.
+    """
+
+    map: bytes
+    camera: Camera
+    pixels: Array
+    descriptors: bytes
+    candidates: int = 5
+    check: bool = True
+    """Check each candidate by PnP and put those that pass first."""
+    within: Within | None = None
+
+
+class Candidate(msgspec.Struct, frozen=True, kw_only=True):
+    """A keyframe that may show the view; *score* is the cosine of the two views' vectors.
+
+    *inliers* counts the matches that agree with one pose; None if that was not asked.
+    """
+
+    keyframe: int
+    robot: str
+    score: float
+    inliers: int | None = None
+
+
+class PlaceReply(msgspec.Struct, frozen=True, kw_only=True):
+    """Candidates, best first: by inliers where they were checked, else by score."""
+
+    candidates: list[Candidate]
+
+
+class PlaceIndex:
+    """The keyframes of some maps, ready to be asked; immutable."""
+
+    def __init__(self, keyframes: Sequence[Keyframe], *, words: int = WORDS, seed: int = SEED) -> None:
+        self.keyframes = tuple(keyframes)
+        self._words = train_words([each.descriptors for each in self.keyframes], words, seed)
+        self.vectors: npt.NDArray[np.float32] = np.stack(
+            [view_vector(each.descriptors, self._words) for each in self.keyframes]
+        )
+        self._index = load_faiss().IndexFlatIP(self.vectors.shape[1])
+        self._index.add(self.vectors)
+
+    def nearest(
+        self, descriptors: Descriptors, count: int, allowed: npt.NDArray[np.int64] | None = None
+    ) -> list[tuple[int, float]]:
+        """Return up to *count* ``(row, score)``, best first, among the *allowed* rows."""
+        return self.nearest_to(view_vector(descriptors, self._words), count, allowed)
+
+    def nearest_to(
+        self, vector: npt.NDArray[np.float32], count: int, allowed: npt.NDArray[np.int64] | None = None
+    ) -> list[tuple[int, float]]:
+        """Return up to *count* ``(row, score)`` for the vector of a view."""
+        count = min(count, len(self.keyframes) if allowed is None else len(allowed))
+        if count == 0:
+            return []
+        faiss, parameters = load_faiss(), None
+        if allowed is not None:
+            parameters = faiss.SearchParameters(sel=faiss.IDSelectorBatch(allowed))
+        scores, rows = self._index.search(vector[None, :], count, params=parameters)
+        return [
+            (int(row), float(score)) for row, score in zip(rows[0], scores[0], strict=True) if row >= 0
+        ]  # fmt: skip
+
+    def rows_within(self, within: Within | None) -> npt.NDArray[np.int64] | None:
+        """Return the rows of keyframes in the sphere of *within*; None means all."""
+        if within is None:
+            return None
+        centre = np.array([within.x, within.y, within.z])
+        places = np.array([each.T_world_camera[:3, 3] for each in self.keyframes])
+        return np.flatnonzero(np.linalg.norm(places - centre, axis=1) <= within.radius_m).astype(np.int64)
+
+
+@functools.lru_cache(maxsize=_OPENED_MAPS)
+def opened_map(data: bytes, max_keyframes: int) -> tuple[MapVersion, PlaceIndex]:
+    """Return the map of *data* and its index; a pure function whose last answers are kept."""
+    version = decode_map(data)
+    if not 1 <= len(version.keyframes) <= max_keyframes:
+        raise LimitExceeded(
+            f"a map of {len(version.keyframes)} keyframes is not within 1..{max_keyframes}",
+            hint="ask a part of the map",
+        )
+    return version, PlaceIndex(version.keyframes)
+
+
+def view_of(camera: Camera, pixels: Array, descriptors: bytes) -> View:
+    """Return what travelled as a view; raises BadRequest."""
+    rows = reshaped("pixels", pixels, 2)
+    return View(camera=camera, pixels=rows, descriptors=descriptors_of(descriptors, len(rows)))
+
+
+def register(registry: Registry, settings: ServiceSettings) -> None:
+    """Add ``place`` to *registry*."""
+
+    @registry.service("place")
+    def place(request: PlaceRequest) -> PlaceReply:
+        """Find the keyframes of a map that show what a view shows."""
+        if not 1 <= request.candidates <= 100:
+            raise BadRequest(
+                f"candidates = {request.candidates} is not within 1..100", hint="5 to 10 are enough"
+            )
+        view = view_of(request.camera, request.pixels, request.descriptors)
+        _, index = opened_map(request.map, settings.max_map_keyframes)
+        rows = index.nearest(view.descriptors, request.candidates, index.rows_within(request.within))
+        found = [_candidate(index.keyframes[row], score, view, request.check) for row, score in rows]
+        if request.check:
+            found.sort(key=lambda each: (-(each.inliers or 0), -each.score))
+        return PlaceReply(candidates=found)
+
+
+def _candidate(keyframe: Keyframe, score: float, view: View, check: bool) -> Candidate:
+    inliers = None
+    if check:
+        pose = pose_of_view(keyframe, view, StepOptions())
+        inliers = 0 if isinstance(pose, str) else len(pose[0].inliers)
+    return Candidate(keyframe=keyframe.id, robot=keyframe.robot, score=score, inliers=inliers)

@@ -1,0 +1,114 @@
+"""The measured step between two views: matches, PnP, and how far it can be trusted.
+
+Promises never to return a step that too few matches agree with.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from rse_pf.errors import PnpError
+from rse_pf.geometry import Array, Camera, inverse
+from rse_pf.maps.format import Keyframe
+from rse_pf.pnp import PnpOptions, PnpSolution, solve_pnp
+from rse_pf.services.mapping.descriptors import Descriptors, hamming_matches
+
+Rows = npt.NDArray[np.int64]
+
+__all__ = ["RelativePose", "StepOptions", "View", "adjoint", "matched_points", "measure_step", "pose_of_view"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StepOptions:
+    """How to match and what to believe; defaults as measured on the red-kitchen recording."""
+
+    ratio: float = 0.75
+    inlier_px: float = 3.0
+    max_matches: int = 700
+    min_inliers: int = 40
+    min_inlier_ratio: float = 0.5
+    floor_m: float = 0.02
+    floor_deg: float = 0.7
+    """Standard deviations that no step goes below, for each axis: depth and calibration err together."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class View:
+    """What a camera saw: ``(n, 2)`` undistorted pixels with their ``(n, 32)`` descriptors."""
+
+    camera: Camera
+    pixels: Array
+    descriptors: Descriptors
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class RelativePose:
+    """``T_a_b`` between two keyframes, its ``(6, 6)`` information, and the matches behind it."""
+
+    T_a_b: Array
+    information: Array
+    inliers: int
+    matches: int
+
+
+def measure_step(a: Keyframe, b: Keyframe, options: StepOptions) -> RelativePose | str:
+    """Return the step from keyframe *a* to *b*, from points of *a* in the image of *b*.
+
+    Returns:
+        The step; or, where there is none, the reason: "no-matches", "no-pose", "few-inliers",
+        "low-inlier-ratio".
+    """
+    view = View(camera=b.camera, pixels=np.asarray(b.pixels, dtype=np.float64), descriptors=b.descriptors)
+    found = pose_of_view(a, view, options)
+    if isinstance(found, str):
+        return found
+    solution, matches = found
+    count = len(solution.inliers)
+    if count < options.min_inliers:
+        return "few-inliers"
+    if count < options.min_inlier_ratio * matches:
+        return "low-inlier-ratio"
+    T_b_a = solution.T_camera_world
+    # T_b_a true = exp(xi) T_b_a, so inverse(T_a_b) T_a_b true = exp(-xi): the same covariance.
+    covariance = solution.covariance + _floor(options)
+    information = np.linalg.inv(covariance).astype(np.float64)
+    return RelativePose(T_a_b=inverse(T_b_a), information=information, inliers=count, matches=matches)
+
+
+def pose_of_view(reference: Keyframe, view: View, options: StepOptions) -> tuple[PnpSolution, int] | str:
+    """Return ``T_view_reference`` as PnP finds it with the number of matches, or why there is none."""
+    points, rows, columns = matched_points(reference, view, options)
+    if len(rows) < max(4, options.min_inliers // 2):
+        return "no-matches"
+    try:
+        solution = solve_pnp(
+            points, view.pixels[columns], view.camera, PnpOptions(inlier_px=options.inlier_px)
+        )
+    except PnpError:
+        return "no-pose"
+    return solution, len(rows)
+
+
+def matched_points(reference: Keyframe, view: View, options: StepOptions) -> tuple[Array, Rows, Rows]:
+    """Return the reference's ``(k, 3)`` matched points (its camera frame), and both row numbers."""
+    known = np.flatnonzero(np.isfinite(reference.points_camera).all(axis=1))
+    rows, columns = hamming_matches(reference.descriptors[known], view.descriptors, options.ratio)
+    rows, columns = known[rows[: options.max_matches]], columns[: options.max_matches]
+    return np.asarray(reference.points_camera[rows], dtype=np.float64), rows, columns
+
+
+def adjoint(T: Array) -> Array:
+    """Return the ``(6, 6)`` matrix that moves twists ``(rho, phi)`` from the right of *T* to its left."""
+    rotation, t = T[:3, :3], T[:3, 3]
+    result = np.zeros((6, 6))
+    result[:3, :3] = result[3:, 3:] = rotation
+    result[:3, 3:] = np.cross(t[None, :], rotation.T).T
+    return result
+
+
+def _floor(options: StepOptions) -> Array:
+    return np.diag([options.floor_m**2] * 3 + [math.radians(options.floor_deg) ** 2] * 3)

@@ -1,0 +1,271 @@
+"""The wifi service: a scan of access points and a survey in, a position with its uncertainty out.
+
+Promises to be told no hardware address: identifiers are keyed hashes that `fingerprint_of` makes on
+the robot, and networks whose owner opted out by ``_nomap`` never leave it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+import msgspec
+import numpy as np
+
+from rse_pf.config import ServiceSettings
+from rse_pf.errors import BadRequest, LimitExceeded
+from rse_pf.geometry import Array
+from rse_pf.service import Registry
+from rse_pf.services.mapping.wifi_signal import SignalModel, fit_signals
+
+__all__ = [
+    "AccessPointReading",
+    "Fingerprint",
+    "Locator",
+    "Position",
+    "WifiOptions",
+    "WifiReply",
+    "WifiRequest",
+    "fingerprint_of",
+    "register",
+]  # fmt: skip
+
+_OPTED_OUT = "_nomap"
+_MAC = re.compile(r"^(?:[0-9a-fA-F]{2}[:\-.]?){5}[0-9a-fA-F]{2}$")
+_WEAKEST_DBM, _STRONGEST_DBM = -120.0, 0.0
+_ONE_SIGMA = 0.68
+_TEMPERS = np.array([0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0])
+_CAUTIOUS = 0.4
+"""The power where a survey is too small to calibrate it."""
+_MIN_HELD_OUT = 30
+_FOLDS = 5
+_CALIBRATION_GRID_M = 0.5
+
+Survey = tuple[tuple[float, float, float], Mapping[str, float]]
+
+
+class AccessPointReading(msgspec.Struct, frozen=True, kw_only=True):
+    """One access point as a robot's radio hears it; it stays on the robot."""
+
+    mac: str
+    ssid: str
+    rssi_dbm: float
+
+
+class Fingerprint(msgspec.Struct, frozen=True, kw_only=True):
+    """Strengths in dBm by hashed access point; *position* is ``(x, y, z)`` in metres, map frame."""
+
+    rssi_dbm: dict[str, float]
+    position: tuple[float, float, float] | None = None
+
+
+class WifiOptions(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """How to locate: the grid's pitch, how far from the survey to look, how many points to hear."""
+
+    grid_m: float = 0.5
+    reach_m: float = 3.0
+    min_common: int = 3
+
+    def __post_init__(self) -> None:
+        if not (0.1 <= self.grid_m <= 5.0 and 0 < self.reach_m <= 50.0 and 1 <= self.min_common <= 100):
+            raise BadRequest("an option of wifi is out of its range", hint="leave it out for the default")
+
+
+class WifiRequest(msgspec.Struct, frozen=True, kw_only=True):
+    """A scan without a position, and the survey: fingerprints with theirs."""
+
+    scan: Fingerprint
+    survey: list[Fingerprint]
+    options: WifiOptions | None = None
+
+
+class WifiReply(msgspec.Struct, frozen=True, kw_only=True):
+    """Where the scan was taken: mean, and the radius that holds the truth 68 times in 100.
+
+    ``found`` is False, with a *reason*, where too few access points are known.  Position and radius
+    (twice the sigma is sensible) fit into ``within`` of ``place`` and ``localise``.
+    """
+
+    found: bool
+    reason: str = ""
+    x: float = 0.0
+    y: float = 0.0
+    z: float = 0.0
+    sigma_m: float = 0.0
+    common: int = 0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Position:
+    """``(x, y, z)`` metres with the radius, in the floor's plane, of 68 % probability."""
+
+    mean: tuple[float, float, float]
+    sigma_m: float
+    common: int
+
+
+def fingerprint_of(
+    readings: Iterable[AccessPointReading], key: bytes, position: tuple[float, float, float] | None = None
+) -> Fingerprint:
+    """Return what a robot may send of *readings*; run on the robot.
+
+    Leaves out networks whose name ends in ``_nomap``, locally administered addresses (phones that
+    share their connection change them) and impossible strengths.  Addresses become keyed hashes: with
+    the team's *key* two robots name an access point alike, without it the name leads nowhere.
+
+    Raises:
+        BadRequest: *key* is shorter than 16 bytes, or an address is none.
+    """
+    if len(key) < 16:
+        raise BadRequest(f"the key has {len(key)} bytes, not 16 or more", hint="make a random key per team")
+    kept: dict[str, float] = {}
+    for reading in readings:
+        if not _MAC.match(reading.mac):
+            raise BadRequest("an address is not six bytes of hexadecimal", hint="send aa:bb:cc:dd:ee:ff")
+        address = bytes.fromhex(re.sub(r"[^0-9a-fA-F]", "", reading.mac))
+        local = bool(address[0] & 0x02)
+        audible = _WEAKEST_DBM <= reading.rssi_dbm <= _STRONGEST_DBM
+        if not reading.ssid.endswith(_OPTED_OUT) and not local and audible:
+            kept[hashlib.blake2b(address, key=key[:64], digest_size=8).hexdigest()] = reading.rssi_dbm
+    return Fingerprint(rssi_dbm=kept, position=position)
+
+
+class Locator:
+    """A survey, ready to place scans; immutable.
+
+    The posterior over a grid around the surveyed places: for each access point that is heard, a
+    Gaussian of the model's mean and variance there; prior uniform.  Access points err together (walls,
+    bodies), which a product of their likelihoods does not know, so the product is tempered by the
+    power at which, of the survey's own places with a fifth of them held out at a time, 68 in 100 lie
+    within their stated radius.
+
+    Source:
+        Ferris, Haehnel and Fox, Gaussian processes for signal strength-based location estimation,
+        RSS 2006; tempering after Grunwald and van Ommen, Bayesian Analysis 2017.
+    """
+
+    def __init__(self, survey: Sequence[Survey], options: WifiOptions | None = None) -> None:
+        self._options = options or WifiOptions()
+        model = fit_signals(survey)
+        self._grid = _grid(model.places, self._options.grid_m, self._options.reach_m)
+        self._fields = {name: field.predict(self._grid) for name, field in model.fields.items()}
+        self.temper = _calibrated(survey, model, self._options)
+
+    def position_of(self, scan: Mapping[str, float]) -> Position | str:
+        """Return the position of *scan* (dBm by access point), or why there is none."""
+        known = sorted(name for name in scan if name in self._fields)
+        if len(known) < self._options.min_common:
+            return f"{len(known)} known access points are fewer than {self._options.min_common}"
+        mean, sigma_m = _summed(self._grid, _log_likelihood(scan, self._fields), self.temper)
+        return Position(
+            mean=(float(mean[0]), float(mean[1]), float(mean[2])),
+            sigma_m=max(sigma_m, 0.3 * self._options.grid_m),
+            common=len(known),
+        )
+
+
+def register(registry: Registry, settings: ServiceSettings) -> None:
+    """Add ``wifi`` to *registry*."""
+
+    @registry.service("wifi")
+    def wifi(request: WifiRequest) -> WifiReply:
+        """Locate a robot by the access points it hears."""
+        if len(request.survey) > settings.max_fingerprints:
+            raise LimitExceeded(
+                f"{len(request.survey)} fingerprints are above {settings.max_fingerprints}",
+                hint="send those near the robot's last position",
+            )
+        for each in (request.scan, *request.survey):
+            _refuse_addresses(each)
+        survey = [(_placed(each), each.rssi_dbm) for each in request.survey]
+        found = Locator(survey, request.options).position_of(request.scan.rssi_dbm)
+        if isinstance(found, str):
+            return WifiReply(found=False, reason=found)
+        x, y, z = found.mean
+        return WifiReply(found=True, x=x, y=y, z=z, sigma_m=found.sigma_m, common=found.common)
+
+
+def _log_likelihood(scan: Mapping[str, float], fields: Mapping[str, tuple[Array, Array]]) -> Array:
+    """Return the log likelihood of *scan* on the grid that *fields* were predicted on."""
+    parts = [
+        (scan[name] - fields[name][0]) ** 2 / fields[name][1] + np.log(fields[name][1])
+        for name in sorted(scan)
+        if name in fields
+    ]
+    total: Array = -0.5 * np.sum(parts, axis=0)
+    return total
+
+
+def _summed(grid: Array, log_likelihood: Array, temper: float) -> tuple[Array, float]:
+    """Return the posterior's mean place and the radius about it that holds 68 %."""
+    weight = np.exp(temper * (log_likelihood - log_likelihood.max()))
+    weight /= weight.sum()
+    mean = weight @ grid
+    distance = np.linalg.norm(grid[:, :2] - mean[:2], axis=1)
+    return mean, _quantile(distance, weight, _ONE_SIGMA)
+
+
+def _calibrated(survey: Sequence[Survey], model: SignalModel, options: WifiOptions) -> float:
+    """Return the power at which held-out places lie within their radius 68 times in 100."""
+    grid = _grid(model.places, max(options.grid_m, _CALIBRATION_GRID_M), options.reach_m)
+    inside = np.zeros(len(_TEMPERS))
+    count = 0
+    for fold in range(_FOLDS):
+        held_out = np.arange(fold, len(survey), _FOLDS)
+        left = {name: field.without(held_out) for name, field in model.fields.items()}
+        fields = {name: field.predict(grid) for name, field in left.items() if field is not None}
+        for row in held_out.tolist():
+            place, scan = survey[row]
+            if sum(name in fields for name in scan) < options.min_common:
+                continue
+            log_likelihood = _log_likelihood(scan, fields)
+            count += 1
+            for number, temper in enumerate(_TEMPERS):
+                mean, sigma_m = _summed(grid, log_likelihood, temper)
+                inside[number] += math.hypot(mean[0] - place[0], mean[1] - place[1]) <= sigma_m
+    if count < _MIN_HELD_OUT:
+        return _CAUTIOUS
+    # More power, smaller radius: the share inside falls as the power grows.
+    share = np.minimum.accumulate(inside / count)
+    return float(np.interp(-_ONE_SIGMA, -share, _TEMPERS))
+
+
+def _refuse_addresses(fingerprint: Fingerprint) -> None:
+    if any(_MAC.match(name) for name in fingerprint.rssi_dbm):
+        raise BadRequest("a fingerprint names a hardware address", hint="send what fingerprint_of returns")
+    if not all(_WEAKEST_DBM <= value <= _STRONGEST_DBM for value in fingerprint.rssi_dbm.values()):
+        raise BadRequest("a strength is not within -120..0 dBm", hint="send dBm")
+
+
+def _placed(fingerprint: Fingerprint) -> tuple[float, float, float]:
+    position = fingerprint.position
+    if position is None or not all(math.isfinite(value) and abs(value) < 1e5 for value in position):
+        raise BadRequest("a fingerprint of the survey has no position", hint="send metres, map frame")
+    return position
+
+
+def _grid(places: Array, grid_m: float, reach_m: float) -> Array:
+    """Return ``(g, 3)`` grid points within reach of surveyed places, at the height of the nearest."""
+    low = places[:, :2].min(axis=0) - reach_m
+    high = places[:, :2].max(axis=0) + reach_m
+    pitch = max(grid_m, math.sqrt(float(np.prod(high - low)) / 40_000.0))
+    x, y = (np.arange(low[axis], high[axis] + pitch, pitch) for axis in (0, 1))
+    flat = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1).reshape(-1, 2)
+    floors = np.round(places[:, 2])
+    parts = []
+    for floor in np.unique(floors):
+        on_floor = places[floors == floor]
+        squared = ((flat[:, None, :] - on_floor[None, :, :2]) ** 2).sum(axis=2)
+        near = squared.min(axis=1) <= reach_m**2
+        height = on_floor[np.argmin(squared, axis=1), 2]
+        parts.append(np.column_stack([flat[near], height[near]]))
+    return np.concatenate(parts)
+
+
+def _quantile(values: Array, weights: Array, share: float) -> float:
+    order = np.argsort(values)
+    below = np.cumsum(weights[order])
+    return float(np.interp(share, below, values[order]))

@@ -1,0 +1,150 @@
+"""The chain: what is bounded and hidden in an entry, and that every way to tamper with a log is named."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rse_pf.audit.chain import GENESIS, Chain, Entry, Head, Note, Refusals, chained, head_word, line_of
+
+A_TOKEN = "eyJhbGciOiJFZERTQSJ9.eyJzdWIiOiJyb2JvdC0xIn0.c2lnbmF0dXJl"
+
+values = st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=400)
+
+
+def log_of(n: int) -> list[bytes]:
+    head, lines = GENESIS, []
+    for number in range(n):
+        entry = chained(
+            head,
+            Note(
+                time=1e9 + number, actor="server-1", action="auth.accepted", subject=f"robot-{number}",
+                detail={"source": "10.0.0.7", "n": number, "ok": True},
+            ),
+        )  # fmt: skip
+        head = entry.head
+        lines.append(line_of(entry))
+    return lines
+
+
+def first_wrong(lines: list[bytes]) -> tuple[int, str] | None:
+    """Return the row of the first line that is wrong, and what is said of it."""
+    chain = Chain()
+    for row, line in enumerate(lines):
+        found = chain.add(line)
+        if isinstance(found, str):
+            return row, found
+    return None
+
+
+def test_a_log_that_nobody_touched_is_good():
+    assert first_wrong(log_of(20)) is None
+
+
+def test_any_flipped_bit_is_found_in_its_own_line():
+    lines = log_of(3)
+    for at in range(len(lines[1]) - 1):
+        for bit in range(8):
+            changed = bytearray(lines[1])
+            changed[at] ^= 1 << bit
+            found = first_wrong([lines[0], bytes(changed), lines[2]])
+            assert found is not None
+            assert found[0] == 1, (at, bit, found)
+
+
+def test_a_dropped_entry_is_found_where_it_stood():
+    lines = log_of(6)
+
+    row, why = first_wrong(lines[:2] + lines[3:]) or (-1, "")
+
+    assert row == 2
+    assert why == "entry 3 is missing or was changed: entry 4 stands in its place"
+
+
+def test_two_swapped_entries_are_found():
+    lines = log_of(6)
+    lines[2], lines[3] = lines[3], lines[2]
+
+    assert (first_wrong(lines) or (-1,))[0] == 2
+
+
+def test_an_inserted_entry_is_found_even_if_it_fits_the_one_before():
+    lines = log_of(4)
+    before = Head(2, json.loads(lines[1])["hash"])
+    forged = line_of(chained(before, Note(time=1.0, actor="nobody", action="token.revoked")))
+
+    assert (first_wrong([*lines[:2], forged, *lines[2:]]) or (-1,))[0] == 3
+
+
+def test_an_entry_that_was_changed_and_hashed_anew_breaks_the_next():
+    lines = log_of(4)
+    before = Head(1, json.loads(lines[0])["hash"])
+    lines[1] = line_of(chained(before, Note(time=1.0, actor="server-1", action="auth.accepted")))
+
+    assert (first_wrong(lines) or (-1,))[0] == 2
+
+
+def test_the_same_words_written_in_another_way_are_a_change():
+    lines = log_of(1)
+
+    assert first_wrong([json.dumps(json.loads(lines[0])).encode() + b"\n"]) is not None
+
+
+@pytest.mark.parametrize("line", [b"\n", b"{}\n", b"[]\n", b"\xff\n", b'{"seq":1}\n', b"[" * 5000 + b"\n"])
+def test_what_is_no_entry_is_said_to_be_none(line: bytes):
+    assert first_wrong([line]) == (0, "entry 1 is not readable: the line was changed")
+
+
+@given(
+    actor=st.text(max_size=300),
+    action=st.text(max_size=300),
+    subject=st.text(max_size=300),
+    detail=st.dictionaries(st.text(max_size=300), values, max_size=80),
+    time=st.floats(0, 1e11),
+)
+def test_whatever_is_noted_becomes_a_bounded_line_that_reads_back(actor, action, subject, detail, time):
+    entry = chained(GENESIS, Note(time=time, actor=actor, action=action, subject=subject, detail=detail))
+
+    assert Chain().add(line_of(entry)) == entry
+    assert len(line_of(entry)) < 1 << 18
+
+
+def test_lone_surrogates_and_numbers_that_json_lacks_are_written_readably():
+    detail = {"a": "\ud800", "b": math.inf, "c": math.nan, "d": 2**80}
+    entry = chained(GENESIS, Note(time=1.0, actor="s", action="x", detail=detail))
+
+    assert isinstance(Chain().add(line_of(entry)), Entry)
+
+
+def test_a_token_never_reaches_the_log():
+    note = Note(
+        time=1.0, actor=A_TOKEN, action=f"x {A_TOKEN}", subject=f"Bearer {A_TOKEN}",
+        detail={"reason": f"bad: {A_TOKEN}", A_TOKEN: 1},
+    )  # fmt: skip
+
+    line = line_of(chained(GENESIS, note)).decode()
+
+    assert "eyJ" not in line
+    assert line.count("(a token)") == 5
+
+
+def test_a_head_is_a_word_that_can_be_kept_elsewhere():
+    head = chained(GENESIS, Note(time=1.0, actor="s", action="x")).head
+
+    assert head_word(str(head)) == head
+    assert head_word("17:xyz") is None
+    assert head_word(f"-1:{'0' * 64}") is None
+
+
+def test_a_flood_of_refusals_is_counted_and_not_written():
+    refusals = Refusals(per_s=2.0, burst=10.0)
+
+    written = sum(refusals.take("bad-signature", 100.0 + row / 1000) for row in range(5000))
+
+    assert written == 10 + 2 * 5 - 1
+    assert refusals.summary() == {"bad-signature": 5000 - written}
+    assert refusals.summary() == {}

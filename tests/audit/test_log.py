@@ -1,0 +1,291 @@
+"""Files of a chain: one writer, torn ends, rotation, a full disk; and verdicts over a folder."""
+
+from __future__ import annotations
+
+import errno
+import os
+import subprocess
+import sys
+import threading
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from rse_pf.audit.chain import HEADS, Head
+from rse_pf.audit.log import AuditLog, files_of, names_in, newest_head, record_once
+from rse_pf.audit.verify import check_chain, check_folder, entries_of
+from rse_pf.errors import ConfigurationError
+
+
+def log_in(
+    folder: Path, who: str = "server-1", *, max_bytes: int = 1 << 20,
+    on_problem: Callable[[str], None] = lambda problem: None,
+) -> AuditLog:  # fmt: skip
+    return AuditLog(
+        folder, who, wall_clock=lambda: 1e9, max_bytes=max_bytes, sync_s=0.001, on_problem=on_problem
+    )
+
+
+def write(folder: Path, n: int, who: str = "server-1", max_bytes: int = 1 << 20) -> None:
+    log = log_in(folder, who, max_bytes=max_bytes).open()
+    for number in range(n):
+        log.record("auth.accepted", f"robot-{number}", source="10.0.0.7")
+        log.flush()
+    log.close()
+
+
+def problem_of(folder: Path, who: str = "server-1") -> str:
+    return next(verdict.problem for verdict in check_folder(folder) if verdict.who == who)
+
+
+def test_a_second_run_goes_on_with_the_chain_of_the_first(tmp_path: Path):
+    write(tmp_path, 3)
+    write(tmp_path, 2)
+
+    (verdict,) = check_folder(tmp_path)
+
+    assert (verdict.entries, verdict.head.seq, verdict.problem, verdict.notes) == (5, 5, "", [])
+
+
+def test_files_are_private(tmp_path: Path):
+    write(tmp_path / "audit", 1)
+
+    modes = {path.stat().st_mode & 0o777 for path in (tmp_path / "audit").iterdir()}
+
+    assert (tmp_path / "audit").stat().st_mode & 0o777 == 0o700
+    assert modes == {0o600}
+
+
+def test_a_chain_runs_through_files_that_are_set_aside(tmp_path: Path):
+    write(tmp_path, 40, max_bytes=2000)
+
+    files = files_of(tmp_path, "server-1")
+    (verdict,) = check_folder(tmp_path)
+
+    assert len(files) > 5
+    assert verdict.problem == ""
+    assert verdict.entries == 40 + len(files) - 1
+    assert files[-1].name == "server-1.jsonl"
+    assert max(path.stat().st_size for path in files) < 2600
+
+
+def test_a_missing_file_in_the_middle_or_at_the_beginning_is_found(tmp_path: Path):
+    write(tmp_path, 40, max_bytes=2000)
+    files = files_of(tmp_path, "server-1")
+    kept = {path: path.read_bytes() for path in files}
+    for gone in (files[2], files[0]):
+        gone.unlink()
+        assert "is missing or was changed" in problem_of(tmp_path)
+        gone.write_bytes(kept[gone])
+    assert problem_of(tmp_path) == ""
+
+
+def test_a_torn_last_line_is_told_with_what_is_good(tmp_path: Path):
+    write(tmp_path, 4)
+    path = tmp_path / "server-1.jsonl"
+    path.write_bytes(path.read_bytes()[:-20])
+
+    assert problem_of(tmp_path) == "ended in the middle of a line, 3 whole entries good"
+
+
+def test_the_writer_goes_on_behind_a_torn_line_and_names_the_head_it_found(tmp_path: Path):
+    write(tmp_path, 4)
+    path = tmp_path / "server-1.jsonl"
+    torn = path.read_bytes()[:-20]
+    path.write_bytes(torn)
+
+    write(tmp_path, 1)
+
+    (verdict,) = check_folder(tmp_path)
+    old, new = files_of(tmp_path, "server-1")
+    continued = next(entries_of([new]))
+    assert old.read_bytes() == torn
+    assert verdict.problem == ""
+    assert verdict.notes == [f"{old.name} ended in the middle of a line, 3 whole entries good"]
+    assert (continued.action, continued.detail["reason"], continued.seq) == ("log.continued", "torn", 4)
+    assert str(continued.detail["head"]).startswith("3:")
+
+
+def test_a_torn_end_that_the_next_file_does_not_name_is_a_problem(tmp_path: Path):
+    write(tmp_path, 40, max_bytes=2000)
+    old = files_of(tmp_path, "server-1")[1]
+    old.write_bytes(old.read_bytes() + b'{"act')
+
+    assert "does not say that the file before it was torn" in problem_of(tmp_path)
+
+
+def test_a_first_line_that_was_never_finished_is_set_aside(tmp_path: Path):
+    (tmp_path / "server-1.jsonl").write_bytes(b'{"action":"auth.acc')
+
+    write(tmp_path, 2)
+
+    (verdict,) = check_folder(tmp_path)
+    assert (verdict.problem, verdict.entries) == ("", 3)
+    assert len(list(tmp_path.glob("*.torn"))) == 1
+
+
+def test_a_log_with_a_changed_end_stays_broken_when_its_writer_goes_on(tmp_path: Path):
+    write(tmp_path, 4)
+    path = tmp_path / "server-1.jsonl"
+    path.write_bytes(path.read_bytes().replace(b"robot-3", b"robot-9"))
+
+    write(tmp_path, 2)
+
+    assert problem_of(tmp_path) == "entry 4 was changed: its hash is not that of what it says"
+
+
+def test_a_crash_between_two_files_leaves_a_chain_that_goes_on(tmp_path: Path):
+    write(tmp_path, 4)
+    (tmp_path / "server-1.jsonl").rename(tmp_path / "server-1.000000000001.jsonl")
+
+    write(tmp_path, 1)
+
+    (verdict,) = check_folder(tmp_path)
+    assert (verdict.problem, verdict.entries) == ("", 6)
+
+
+def test_one_chain_has_one_writer(tmp_path: Path):
+    first = log_in(tmp_path).open()
+
+    with pytest.raises(ConfigurationError, match="another process writes"):
+        log_in(tmp_path).open()
+    first.close()
+    log_in(tmp_path).open().close()
+
+
+def test_names_of_servers_cannot_leave_the_folder(tmp_path: Path):
+    write(tmp_path / "audit", 1, who="../../etc/x y")
+
+    assert names_in(tmp_path / "audit") == ["______etc_x_y"]
+    assert {path.name for path in tmp_path.iterdir()} == {"audit"}
+
+
+def test_entries_reach_the_disk_without_anybody_waiting(tmp_path: Path):
+    synced = threading.Event()
+    log = AuditLog(tmp_path, "s", wall_clock=lambda: 1e9, max_bytes=1 << 20, sync_s=0.001).open()
+    real = log.flush
+
+    def flush() -> None:
+        real()
+        if log.head.seq == 3:
+            synced.set()
+
+    log.flush = flush  # type: ignore[method-assign]
+    log.start()
+    for _ in range(3):
+        log.record("x")
+
+    assert synced.wait(10)
+    log.close()
+    assert check_folder(tmp_path)[0].entries == 3
+
+
+def test_a_full_disk_loses_nothing_that_fits_into_memory_and_leaves_no_torn_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    problems: list[str] = []
+    log = log_in(tmp_path, on_problem=problems.append).open()
+    log.record("one")
+    log.flush()
+    real = os.write
+
+    def full(fd: int, data: bytes) -> int:
+        if len(data) > 50:
+            return real(fd, bytes(data)[:50])
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(os, "write", full)
+    for _ in range(3):
+        log.record("two")
+        log.flush()
+    monkeypatch.undo()
+    log.close()
+
+    (verdict,) = check_folder(tmp_path)
+    assert problems == ["the audit log of server-1 cannot be written: No space left on device"]
+    assert [entry.action for entry in entries_of(files_of(tmp_path, "server-1"))] == ["one", *["two"] * 3]
+    assert verdict.problem == ""
+
+
+def test_what_memory_cannot_hold_is_told_as_a_gap(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("rse_pf.audit.log._MAX_HELD", 100)
+    log = log_in(tmp_path).open()
+    for _ in range(150):
+        log.record("x")
+    log.close()
+
+    *_, last = entries_of(files_of(tmp_path, "server-1"))
+    assert (last.action, last.detail) == ("log.gap", {"entries": 50})
+
+
+def test_a_cut_end_is_found_by_the_head_that_another_chain_holds(tmp_path: Path):
+    write(tmp_path, 5)
+    control = log_in(tmp_path, "control-plane").open()
+    control.record(HEADS, **{"server-1": str(newest_head(tmp_path, "server-1"))})
+    control.close()
+    assert [verdict.problem for verdict in check_folder(tmp_path)] == ["", ""]
+
+    path = tmp_path / "server-1.jsonl"
+    path.write_bytes(b"".join(path.read_bytes().splitlines(keepends=True)[:3]))
+
+    assert problem_of(tmp_path) == "entry 5 is missing: entry 1 of control-plane has seen it"
+    path.unlink()
+    assert problem_of(tmp_path) == "entry 5 is missing: entry 1 of control-plane has seen it"
+
+
+def test_a_chain_that_was_written_anew_is_found_by_a_head_kept_elsewhere(tmp_path: Path):
+    write(tmp_path, 5)
+    head = newest_head(tmp_path, "server-1")
+    assert head is not None
+    assert check_folder(tmp_path, known={"server-1": head})[0].problem == ""
+    (tmp_path / "server-1.jsonl").unlink()
+    write(tmp_path, 7, who="server-1")
+    assert problem_of(tmp_path) == ""
+
+    (verdict,) = check_folder(tmp_path, known={"server-1": Head(head.seq, "f" * 64)})
+
+    assert verdict.problem == "entry 5 was changed: the head kept elsewhere names another"
+
+
+def test_some_files_of_a_chain_can_be_checked_alone(tmp_path: Path):
+    write(tmp_path, 40, max_bytes=2000)
+    some = files_of(tmp_path, "server-1")[2:4]
+
+    verdict = check_chain("server-1", some, from_genesis=False)
+
+    assert verdict.problem == ""
+    assert verdict.notes[0].startswith("begins with entry ")
+
+
+def test_a_command_writes_one_entry_and_lets_go(tmp_path: Path):
+    for robot in ("robot-1", "robot-2"):
+        record_once(tmp_path, "operator", "robot.disabled", robot, wall_clock=lambda: 1e9, max_bytes=1 << 20)
+
+    subjects = [entry.subject for entry in entries_of(files_of(tmp_path, "operator"))]
+    assert subjects == ["robot-1", "robot-2"]
+    assert check_folder(tmp_path)[0].problem == ""
+
+
+@pytest.mark.system
+def test_a_writer_that_is_killed_leaves_a_chain_that_goes_on(tmp_path: Path):
+    code = (
+        "import sys, time; from pathlib import Path; from rse_pf.audit.log import AuditLog\n"
+        "log = AuditLog(Path(sys.argv[1]), 'server-1', wall_clock=time.time, max_bytes=20000, sync_s=0.0)\n"
+        "log.open().start()\n"
+        "while True:\n"
+        "    log.record('auth.accepted', 'robot-1')\n"
+        "    if log.head.seq > 300: print(log.head.seq, flush=True)\n"
+    )
+    for _ in range(3):
+        process = subprocess.Popen([sys.executable, "-c", code, str(tmp_path)], stdout=subprocess.PIPE)
+        assert process.stdout is not None
+        assert process.stdout.readline()
+        process.kill()
+        process.wait()
+        process.stdout.close()
+    write(tmp_path, 1)
+
+    (verdict,) = check_folder(tmp_path)
+    assert verdict.problem == ""
+    assert verdict.entries > 300

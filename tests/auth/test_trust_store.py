@@ -1,0 +1,165 @@
+"""The control room: changed by compare-and-swap, read without ever forgetting."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from rse_pf.auth.roster import DenyList, EnrolledRobot
+from rse_pf.auth.tokens import Claims, SigningKey
+from rse_pf.auth.trust_store import DENY_NAME, AccessControlStore, TrustStore, key_set_of
+from rse_pf.errors import ConfigurationError, Conflict
+from rse_pf.object_store import DirectoryStore, MemoryStore
+
+KEY = SigningKey.from_seed(b"p" * 32, "p1")
+CLAIMS = Claims(robot="r", token_id="t", issued_s=0.0, expires_s=9.0, key_id="p1")
+
+
+def with_robot(denied: DenyList) -> DenyList:
+    return denied.with_robot("default", "r", 1.0)
+
+
+@pytest.fixture
+def keys_file(tmp_path: Path) -> Path:
+    file = tmp_path / "keys.json"
+    file.write_text(KEY.key_set().to_json())
+    return file
+
+
+@pytest.fixture
+def room(keys_file: Path) -> AccessControlStore:
+    return AccessControlStore(DirectoryStore(keys_file.parent))
+
+
+class Racing(MemoryStore):
+    """Another operator writes between our read and our write, *races* times."""
+
+    def __init__(self, races: int) -> None:
+        super().__init__()
+        self.races = races
+
+    def get(self, name: str) -> bytes:
+        try:
+            return super().get(name)
+        finally:
+            if self.races:
+                self.races -= 1
+                other = AccessControlStore(_Quiet(self))
+                other.change_denied(lambda denied: denied.with_robot("default", f"other-{self.races}", 1.0))
+
+
+class _Quiet:
+    """The same store without its races."""
+
+    def __init__(self, store: MemoryStore) -> None:
+        self._store = store
+
+    def get(self, name: str) -> bytes:
+        return MemoryStore.get(self._store, name)
+
+    def compare_and_swap(self, name: str, expected: bytes | None, data: bytes) -> None:
+        MemoryStore.compare_and_swap(self._store, name, expected, data)
+
+
+def test_two_operators_at_once_lose_nothing():
+    store = Racing(races=3)
+
+    AccessControlStore(store).change_denied(with_robot)
+
+    assert {each.robot for each in AccessControlStore(store).denied().disabled} == {
+        "r", "other-0", "other-1", "other-2",
+    }  # fmt: skip
+
+
+def test_endless_races_end_with_an_error():
+    with pytest.raises(Conflict):
+        AccessControlStore(Racing(races=1000)).change_denied(with_robot)
+
+
+def test_an_empty_room_is_furnished_once_and_not_emptied():
+    store = MemoryStore()
+    room = AccessControlStore(store)
+    room.furnish()
+    room.change_denied(with_robot)
+    room.furnish()
+
+    assert room.denied().is_disabled("default", "r")
+    assert room.roster().robots == ()
+
+
+def test_a_platform_without_a_room_trusts_its_keys(keys_file: Path):
+    trust = TrustStore(keys_file)
+    trust.first()
+
+    assert trust.keys is not None
+    assert trust.keys.denies(CLAIMS) == ""
+    assert trust.look() is False
+    assert trust.problem == ""
+
+
+def test_what_is_new_is_seen_and_travels_as_text(keys_file: Path, room: AccessControlStore):
+    trust = TrustStore(keys_file)
+    trust.first()
+    room.change_denied(with_robot)
+    room.change_roster(lambda roster: roster.enrolled(EnrolledRobot(robot="n", x="A" * 43)))
+
+    assert trust.look() is True
+    keys = key_set_of(trust.text)
+    assert keys.denies(CLAIMS) == "disabled"
+    assert keys.robot_of(EnrolledRobot(robot="n", x="A" * 43).key_id) is not None
+    assert trust.look() is False
+
+
+@pytest.mark.parametrize("harm", ["nonsense", "empty", "gone", "folder"])
+def test_a_list_that_cannot_be_read_any_more_stays_as_it_was_known(
+    keys_file: Path, room: AccessControlStore, harm: str
+):
+    room.change_denied(with_robot)
+    trust = TrustStore(keys_file)
+    trust.first()
+    file = keys_file.parent / DENY_NAME
+    if harm in ("gone", "folder"):
+        file.unlink()
+        if harm == "folder":
+            file.mkdir()
+    else:
+        file.write_bytes(b"{" if harm == "nonsense" else b"")
+
+    assert trust.look() is False
+    assert trust.problem
+    assert trust.keys is not None
+    assert trust.keys.denies(CLAIMS) == "disabled"
+
+
+def test_keys_that_vanish_stay_known_and_new_denials_are_still_seen(
+    keys_file: Path, room: AccessControlStore
+):
+    trust = TrustStore(keys_file)
+    trust.first()
+    keys_file.unlink()
+    room.change_denied(with_robot)
+
+    assert trust.look() is True
+    assert trust.keys is not None
+    assert trust.keys.get("p1") is not None
+    assert trust.keys.denies(CLAIMS) == "disabled"
+
+
+@pytest.mark.parametrize("name", ["keys.json", "control/deny.json", "control/robots.json"])
+def test_a_server_that_never_knew_a_list_refuses_to_begin_without(keys_file: Path, name: str):
+    (keys_file.parent / "control").mkdir()
+    (keys_file.parent / name).write_text("nonsense")
+
+    with pytest.raises(ConfigurationError, match="who may come in") as caught:
+        TrustStore(keys_file).first()
+
+    assert str(keys_file) in caught.value.hint
+
+
+def test_the_text_holds_no_private_half(keys_file: Path):
+    trust = TrustStore(keys_file)
+    trust.first()
+
+    assert "d" not in json.loads(json.loads(trust.text)["keys"])["keys"][0]

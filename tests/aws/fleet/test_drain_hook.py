@@ -1,0 +1,85 @@
+"""An instance leaves its group only after its robots, and always before the hook gives up."""
+
+from __future__ import annotations
+
+import boto3
+from aws.fleet.fake_machine import FakeMachine, FakeScaling
+from botocore.stub import Stubber
+
+from rse_pf.aws.fleet.drain_hook import leave_group, wait_before_move_s
+from rse_pf.config import PlatformSettings
+
+SETTINGS = PlatformSettings()
+
+
+def leave(machine: FakeMachine, scaling: object, settings: PlatformSettings = SETTINGS) -> bool:
+    return leave_group(
+        machine, scaling, group="rse-pf", hook="drain", settings=settings, clock=machine.clock,
+        rest=machine.rest,
+    )  # fmt: skip
+
+
+def test_the_hook_is_completed_once_the_server_is_gone() -> None:
+    machine = FakeMachine(leaves_after_s=20.0)
+    scaling = FakeScaling(machine)
+
+    assert leave(machine, scaling)
+
+    ((at_s, told),) = scaling.completed
+    assert 120.0 <= at_s <= 121.0
+    assert told == {
+        "AutoScalingGroupName": "rse-pf", "LifecycleHookName": "drain",
+        "InstanceId": "i-0123456789abcdef0", "LifecycleActionResult": "CONTINUE",
+    }  # fmt: skip
+
+
+def test_a_server_that_does_not_leave_is_left_behind_before_the_hook_times_out() -> None:
+    machine = FakeMachine(leaves_after_s=1e9)
+    scaling = FakeScaling(machine)
+
+    assert not leave(machine, scaling)
+
+    ((at_s, _),) = scaling.completed
+    assert at_s - 100.0 <= SETTINGS.cloud.drain_s - 10.0, "no time for the call and its repeats"
+
+
+def test_without_a_server_the_hook_is_completed_at_once() -> None:
+    machine = FakeMachine(runs=False)
+    scaling = FakeScaling(machine)
+
+    assert leave(machine, scaling)
+    assert [at_s for at_s, _ in scaling.completed] == [100.0]
+
+
+def test_the_load_balancer_hears_of_it_before_a_robot_is_moved() -> None:
+    machine = FakeMachine()
+
+    leave(machine, FakeScaling(machine))
+
+    health = SETTINGS.health
+    assert machine.waits == [health.cloud_interval_s * health.unhealthy_checks + health.cloud_timeout_s]
+    assert wait_before_move_s(SETTINGS) == machine.waits[0]
+
+
+def test_the_whole_drain_fits_into_the_hook_by_default() -> None:
+    longest_s = (
+        wait_before_move_s(SETTINGS)
+        + SETTINGS.serving.drain_within_ms / 1e3
+        + SETTINGS.session.answer_timeout_s
+    )
+
+    assert longest_s < SETTINGS.cloud.drain_s - 15.0
+
+
+def test_aws_knows_the_call_and_its_arguments() -> None:
+    client = boto3.session.Session().client(
+        "autoscaling", region_name="ap-northeast-2", aws_access_key_id="a", aws_secret_access_key="b"
+    )
+    expected = {
+        "AutoScalingGroupName": "rse-pf", "LifecycleHookName": "drain",
+        "InstanceId": "i-0123456789abcdef0", "LifecycleActionResult": "CONTINUE",
+    }  # fmt: skip
+    with Stubber(client) as stub:
+        stub.add_response("complete_lifecycle_action", {}, expected)
+        assert leave(FakeMachine(runs=False), client)
+        stub.assert_no_pending_responses()

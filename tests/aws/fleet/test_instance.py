@@ -1,0 +1,93 @@
+"""The agent's questions to its own server: they carry the token; without one no server runs."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from http.server import BaseHTTPRequestHandler, HTTPServer
+from pathlib import Path
+from typing import ClassVar
+
+import pytest
+
+from rse_pf.auth.control_token import bearer, ensure_control_token, read_control_token
+from rse_pf.aws.fleet.agent import main
+from rse_pf.aws.fleet.instance import ServerControl
+from rse_pf.errors import Disconnected
+
+
+class _Port(BaseHTTPRequestHandler):
+    heard: ClassVar[list[tuple[str, str, str | None]]] = []
+
+    def do_GET(self) -> None:
+        self.heard.append((self.command, self.path, self.headers["Authorization"]))
+        self.send_response(200)
+        self.end_headers()
+        self.wfile.write(b"numbers")
+
+    do_POST = do_GET
+
+    def log_message(self, *_: object) -> None:
+        pass
+
+
+@pytest.fixture
+def port() -> Iterator[int]:
+    """A control port that admits everybody and remembers them."""
+    _Port.heard.clear()
+    with HTTPServer(("127.0.0.1", 0), _Port) as server:
+        thread = threading.Thread(target=server.serve_forever, args=(0.01,))
+        thread.start()
+        yield server.server_port
+        server.shutdown()
+        thread.join()
+
+
+@pytest.mark.system
+def test_numbers_and_drain_are_asked_for_with_the_token_of_that_moment(port: int, tmp_path: Path) -> None:
+    file = tmp_path / "control.token"
+    control = ServerControl(port, file)
+    first = ensure_control_token(file, seed=b"a" * 32)
+
+    assert control.page() == "numbers"
+    file.unlink()
+    second = ensure_control_token(file, seed=b"b" * 32)
+    control.drain(2.5)
+
+    assert _Port.heard == [("GET", "/metrics", bearer(first)), ("POST", "/drain?wait=2.5", bearer(second))]
+
+
+@pytest.mark.system
+def test_without_a_token_file_none_is_carried(port: int) -> None:
+    ServerControl(port).page()
+
+    assert _Port.heard == [("GET", "/metrics", None)]
+
+
+@pytest.mark.system
+def test_a_missing_token_is_a_server_that_does_not_run(port: int, tmp_path: Path) -> None:
+    with pytest.raises(Disconnected, match="cannot read the control token"):
+        ServerControl(port, tmp_path / "none").page()
+
+    assert _Port.heard == []
+
+
+def test_the_unit_makes_the_token_before_it_asks_anybody(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Nobody(Disconnected):
+        pass
+
+    def refuse(*_: object) -> None:
+        raise Nobody("no network")
+
+    monkeypatch.setattr("rse_pf.aws.fleet.agent.make_client", refuse)
+    settings, token = tmp_path / "settings.json", tmp_path / "control.token"
+    settings.write_text('{"context": {"rse-pf": {}}}')
+    place = ["--bucket", "b", "--keys-name", "k", "--keys-file", "k", "--group", "g", "--hook", "h"]
+    command = ["--settings", str(settings), *place, "--control-token", str(token)]
+
+    assert main(command) == 2
+    assert not token.exists()
+    assert main([*command, "--once"]) == 2
+    assert len(read_control_token(token)) == 64

@@ -1,0 +1,87 @@
+"""What CloudWatch is told comes from the server's own page, and fits the alarms by name."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from rse_pf.aws.fleet.metrics import ServerMetrics, datums, dimensions_of, read_page
+from rse_pf.config import PlatformSettings
+from rse_pf.scaling.alarms import NAMESPACE, alarms_of
+
+
+def page(answers: list[tuple[str, float]], **gauges: float) -> str:
+    metrics = pytest.importorskip("rse_pf.backend.metrics")
+    worker = metrics.Metrics()
+    for service, duration_s in answers:
+        worker.answered(service, "ok", duration_s)
+    worker.bytes_in, worker.bytes_out = 1000, 70
+    worker.gauges = gauges
+    return metrics.render(metrics.merge([worker.snapshot()])).decode()
+
+
+def named(found: list[dict[str, Any]]) -> dict[str, Any]:
+    return {each["MetricName"]: each for each in found}
+
+
+def test_a_real_page_is_read_whole() -> None:
+    text = page(
+        [("pnp", 0.0004), ("pnp", 0.015), ("echo", 9.0)], robots=3.0, in_flight=2.0, queue_oldest_s=0.25
+    )
+
+    reading = read_page(text)
+
+    assert (reading.robots, reading.in_flight, reading.queue_ms) == (3.0, 2.0, 250.0)
+    assert (reading.requests, reading.bytes_in, reading.bytes_out) == (3.0, 1000.0, 70.0)
+    assert reading.answers[20.0] == 2.0
+    assert reading.answers[10_000.0] == 3.0
+
+
+def test_counters_are_told_as_what_came_since_the_last_look() -> None:
+    before = ServerMetrics(requests=100, bytes_in=10, answers={1.0: 90, 2.0: 100})
+    now = ServerMetrics(requests=130, bytes_in=15, robots=4, answers={1.0: 95, 2.0: 130})
+
+    told = named(datums(before, now, "group", "i-1"))
+
+    assert told["Requests"]["Value"] == 30
+    assert told["BytesIn"]["Value"] == 5
+    assert told["Robots"]["Value"] == 4
+    assert (told["AnswerMs"]["Values"], told["AnswerMs"]["Counts"]) == ([1.0, 2.0], [5, 25])
+
+
+def test_a_restarted_server_counts_from_zero_again() -> None:
+    told = named(
+        datums(
+            ServerMetrics(requests=100, answers={1.0: 100}),
+            ServerMetrics(requests=7, answers={1.0: 7}),
+            "group",
+            "i-1",
+        )
+    )
+
+    assert told["Requests"]["Value"] == 7
+    assert told["AnswerMs"]["Counts"] == [7]
+
+
+def test_no_answers_are_no_answer_times() -> None:
+    assert "AnswerMs" not in named(datums(ServerMetrics(), ServerMetrics(), "group", "i-1"))
+
+
+def test_every_series_that_an_alarm_reads_is_published_with_the_groups_name() -> None:
+    settings = PlatformSettings.from_dict({"scaling": {"max_robots_per_server": 9, "max_queue_ms": 40}})
+    wanted = {
+        metric.metric
+        for alarm in alarms_of(settings.scaling)
+        for metric in alarm.metrics
+        if metric.namespace == NAMESPACE
+    }
+    told = datums(ServerMetrics(), ServerMetrics(), "rse-pf", "i-1")
+
+    assert wanted == {"Requests", "Robots", "QueueMs"}
+    assert wanted <= set(named(told))
+    *of_group, of_server = told
+    for each in of_group:
+        assert each["Dimensions"] == [{"Name": "AutoScalingGroupName", "Value": "rse-pf"}]
+    assert (of_server["MetricName"], of_server["Dimensions"]) == ("Robots", dimensions_of("rse-pf", "i-1"))
+    assert dimensions_of("rse-pf", "i-1")[1:] == [{"Name": "InstanceId", "Value": "i-1"}]

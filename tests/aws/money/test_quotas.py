@@ -1,0 +1,161 @@
+"""What an account must have before a deployment: each check alone, with what to do when it fails."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from rse_pf.aws.account import Account, open_account
+from rse_pf.aws.clients import make_client
+from rse_pf.aws.money.quotas import Check, check_account
+from rse_pf.config import PlatformSettings
+
+SETTINGS = PlatformSettings()
+
+
+class Quotas:
+    """Service quotas as an account has them; moto knows few."""
+
+    def __init__(self, **values: float) -> None:
+        self.values = values
+
+    def _asked(self, code: str) -> dict[str, Any]:
+        from botocore.exceptions import ClientError
+
+        if code not in self.values:
+            raise ClientError({"Error": {"Code": "NoSuchResourceException"}}, "GetServiceQuota")
+        return {"Quota": {"Value": self.values[code]}}
+
+    def get_service_quota(self, *, ServiceCode: str, QuotaCode: str) -> dict[str, Any]:
+        return self._asked(QuotaCode.replace("-", "_"))
+
+    def get_aws_default_service_quota(self, *, ServiceCode: str, QuotaCode: str) -> dict[str, Any]:
+        return self._asked("default_" + QuotaCode.replace("-", "_"))
+
+
+AMPLE = Quotas(L_1216C47A=22, L_B99A9384=1000, default_L_F678F1CE=5)
+
+
+def account(region: str, quotas: Quotas = AMPLE) -> Account:
+    return Account(region, lambda name, at: quotas if name == "service-quotas" else make_client(name, at))
+
+
+def checks(region: str, settings: PlatformSettings = SETTINGS, quotas: Quotas = AMPLE) -> list[Check]:
+    return list(check_account(account(region, quotas), settings))
+
+
+def only(word: str, found: list[Check]) -> Check:
+    (check,) = [each for each in found if word in each.what]
+    return check
+
+
+def bootstrap(region: str) -> None:
+    make_client("ssm", region).put_parameter(
+        Name="/cdk-bootstrap/hnb659fds/version", Value="28", Type="String"
+    )
+
+
+def public(certificate: str, domain: str = "robots.example.org") -> PlatformSettings:
+    return SETTINGS.replace(cloud={"lab": False, "certificate_arn": certificate, "domain_name": domain})
+
+
+def test_an_account_with_room_is_ready_and_every_complaint_has_a_fix(region: str) -> None:
+    bootstrap(region)
+
+    found = checks(region)
+
+    assert [each for each in found if each.grade == "fail"] == []
+    assert only("signed in", found).grade == "ok"
+    assert only("bootstrapped, version 28", found).grade == "ok"
+    assert only("c7i.large is offered", found).grade == "ok"
+    assert only("quota 22, needed 22", found).grade == "ok"
+    assert all(bool(each.fix) == (each.grade != "ok") for each in found)
+
+
+def test_an_account_without_bootstrap_is_told_the_command(region: str) -> None:
+    check = only("bootstrap", checks(region))
+
+    assert (check.grade, check.fix) == ("fail", "npx cdk bootstrap")
+
+
+def test_too_few_vcpus_for_the_largest_fleet_fail(region: str) -> None:
+    check = only("vCPUs", checks(region, quotas=Quotas(L_1216C47A=21)))
+
+    assert check.grade == "fail"
+    assert check.what.startswith("quota 21, needed 22")
+
+
+def test_reserving_what_must_stay_unreserved_fails(region: str) -> None:
+    small = Quotas(L_1216C47A=22, L_B99A9384=119)
+
+    assert only("quota 119, needed 120", checks(region, quotas=small)).grade == "fail"
+
+
+def test_a_quota_that_nobody_tells_is_a_warning(region: str) -> None:
+    assert only("L-B99A9384 is not told", checks(region, quotas=Quotas())).grade == "warn"
+
+
+def test_a_full_region_has_no_room_for_another_vpc(region: str) -> None:
+    check = only("VPCs", checks(region, quotas=Quotas(L_F678F1CE=1)))
+
+    assert (check.grade, check.what.partition(":")[0]) == ("fail", "quota 1, needed 2")
+
+
+def test_an_instance_type_that_the_region_lacks_fails(region: str) -> None:
+    found = checks(region, SETTINGS.replace(cloud={"instance_type": "x99.huge"}))
+
+    assert only("offers no x99.huge", found).grade == "fail"
+
+
+def test_the_certificate_must_be_there_issued_of_the_region_and_for_the_name(region: str) -> None:
+    acm = make_client("acm", region)
+    arn = acm.request_certificate(DomainName="*.example.org")["CertificateArn"]
+    elsewhere = arn.replace(region, "us-east-1")
+    absent = arn[:-4] + "0000"
+
+    told = [
+        only("certificate", checks(region, public(certificate, domain)))
+        for certificate, domain in (
+            (arn, "robots.example.org"), (arn, "robots.example.com"), (arn, "a.b.example.org"),
+            (elsewhere, "robots.example.org"), (absent, "robots.example.org"),
+        )
+    ]  # fmt: skip
+
+    assert "not for robots.example.com" in told[1].what
+    assert "not for a.b.example.org" in told[2].what
+    assert f"no ACM certificate of {region}" in told[3].what
+    assert "no such certificate" in told[4].what
+    assert [each.grade for each in told[1:]] == ["fail"] * 4
+    status = acm.describe_certificate(CertificateArn=arn)["Certificate"]["Status"]
+    assert (told[0].grade == "ok") == (status == "ISSUED")
+
+
+def test_a_check_that_may_not_be_made_warns_and_the_next_follows(region: str) -> None:
+    from botocore.exceptions import ClientError
+
+    class Closed(Quotas):
+        def get_service_quota(self, *, ServiceCode: str, QuotaCode: str) -> dict[str, Any]:
+            raise ClientError({"Error": {"Code": "AccessDenied"}}, "GetServiceQuota")
+
+    found = checks(region, quotas=Closed())
+
+    assert [each.grade for each in found[-3:]] == ["warn"] * 3
+    assert all("AccessDenied" in each.what for each in found[-3:])
+
+
+def test_an_account_that_knows_nobody_is_refused(region: str) -> None:
+    from botocore.exceptions import ClientError
+
+    from rse_pf.errors import ConfigurationError
+
+    class Stranger:
+        def get_caller_identity(self) -> None:
+            raise ClientError({"Error": {"Code": "InvalidClientTokenId"}}, "GetCallerIdentity")
+
+    with pytest.raises(ConfigurationError, match="InvalidClientTokenId"):
+        list(check_account(Account(region, lambda name, at: Stranger()), SETTINGS))
+
+
+def test_the_account_of_this_region_is_asked(region: str) -> None:
+    assert f"region {region}" in next(check_account(open_account(region), SETTINGS)).what

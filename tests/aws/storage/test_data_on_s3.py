@@ -1,0 +1,131 @@
+"""The data service on S3: bytes go straight to the bucket, and an S3 that fails loses nothing."""
+
+from __future__ import annotations
+
+import random
+import threading
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+from fake_data_service import FrontDoor, Service, small_settings
+
+from client_sdk.transfer.data_client import DataClient, DataOptions
+from rse_pf.aws import clients
+from rse_pf.aws.clients import make_client
+from rse_pf.aws.storage import S3Store, open_bucket
+from rse_pf.object_store import digest_of, object_name
+
+BUCKET = "objects"
+FAILING_SHARE = 0.3
+UPLOADS = 24
+LARGE = random.Random(5).randbytes(700_000)
+
+
+@pytest.fixture
+def s3_server(monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
+    """An emulator of S3 on a port of this machine, which boto3 asks instead of AWS."""
+    server_of = pytest.importorskip("moto.server", reason="the infra extra is not installed")
+    server = server_of.ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)
+    server.start()
+    host, port = server.get_host_and_port()
+    monkeypatch.setenv("AWS_ENDPOINT_URL_S3", f"http://{host}:{port}")
+    for name in ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY"):
+        monkeypatch.setenv(name, "testing")
+    yield f"http://{host}:{port}"
+    server.stop()
+
+
+def bucket_in(region: str) -> S3Store:
+    make_client("s3", region).create_bucket(
+        Bucket=BUCKET, CreateBucketConfiguration={"LocationConstraint": region}
+    )
+    return open_bucket(BUCKET, region)
+
+
+def client_of(door: FrontDoor, service: Service, **options: Any) -> DataClient:
+    chosen = DataOptions(first_pause_s=0.01, longest_pause_s=0.05, random=random.Random(2), **options)
+    return DataClient(door.url, service.token, chosen)
+
+
+def test_large_objects_go_straight_to_the_bucket_and_come_straight_back(s3_server: str) -> None:
+    store = bucket_in("ap-northeast-2")
+    service = Service(small_settings(max_object_bytes=1_000_000, quota_bytes=2_000_000), store)
+    door = FrontDoor(service)
+    robot = client_of(door, service)
+    told: list[int] = []
+
+    digest = robot.upload(LARGE, lambda done, size: told.append(done))
+
+    assert store.get(object_name("default", "robot-1", digest)) == LARGE
+    assert robot.download(digest) == LARGE
+    assert told[-1] == len(LARGE)
+    assert list(store.list("uploads/")) == []
+    assert sum(line["received_bytes"] for line in service.lines) < 1000, "the service never saw them"
+    assert max(line["sent_bytes"] for line in service.lines) < 2000
+    robot.close()
+    door.close()
+
+
+@pytest.mark.parametrize(
+    ("tries", "largest"), [(1, 3000), pytest.param(clients.MAX_TRIES, 300_000, marks=pytest.mark.slow)]
+)
+def test_an_s3_that_fails_three_times_in_ten_loses_nothing_that_was_acknowledged(
+    region: str, monkeypatch: pytest.MonkeyPatch, tries: int, largest: int
+) -> None:
+    """With one try of the service every failure reaches the robot; with as many as it makes, few do."""
+    from botocore.awsrequest import AWSResponse
+
+    monkeypatch.setattr(clients, "_FIRST_PAUSE_S", 0.001)
+    monkeypatch.setattr(clients, "MAX_TRIES", tries)
+    chance, lock = random.Random(11), threading.Lock()
+    asked = failed = 0
+
+    def fails(share: float) -> bool:
+        nonlocal failed
+        with lock:
+            unlucky = chance.random() < share
+            failed += unlucky
+            return unlucky
+
+    def refuse(**_: Any) -> tuple[Any, dict[str, Any]] | None:
+        """Nothing is done."""
+        nonlocal asked
+        asked += 1
+        if not fails(FAILING_SHARE / 2):
+            return None
+        told = {"Error": {"Code": "InternalError"}, "ResponseMetadata": {"HTTPStatusCode": 500}}
+        return AWSResponse("", 500, {}, None), told
+
+    def lose_the_answer(request: Any, **_: Any) -> AWSResponse | None:
+        """The emulator does what it was asked, too."""
+        if not fails(FAILING_SHARE / 2 / (1 - FAILING_SHARE / 2)):
+            return None
+        answer = AWSResponse(request.url, 500, {"content-type": "application/xml"}, None)
+        answer._content = b"<Error><Code>InternalError</Code><Message>no</Message></Error>"
+        return answer
+
+    plain = bucket_in(region)  # its client does not fail
+    store = open_bucket(BUCKET, region)
+    store._client.meta.events.register_first("before-call.s3", refuse)
+    store._client.meta.events.register_first("before-send.s3", lose_the_answer)
+    settings = small_settings(part_bytes=65536, max_object_bytes=1_000_000, quota_bytes=100_000_000)
+    service = Service(settings, store)
+    # Without signed addresses: every byte goes through the service and its failing store.
+    monkeypatch.setattr(type(service.app.handlers), "_direct", lambda *_: None)
+    door = FrontDoor(service)
+    robot = client_of(door, service)
+    contents = [random.Random(number).randbytes(3000) for number in range(UPLOADS)] + [LARGE[:largest]]
+
+    acknowledged = [robot.upload(content) for content in contents]
+
+    assert failed > 0.2 * asked > 10
+    assert acknowledged == [digest_of(content) for content in contents]
+    refused = sum(line["status"] >= 500 for line in service.lines)
+    assert refused > UPLOADS / 4 or tries > 1, "the robot must have heard of failures"
+    for digest, content in zip(acknowledged, contents, strict=True):
+        assert plain.get(object_name("default", "robot-1", digest)) == content
+    names = {object_name("default", "robot-1", digest) for digest in acknowledged}
+    assert {info.name for info in plain.list("objects/")} == names, "no partial object"
+    robot.close()
+    door.close()

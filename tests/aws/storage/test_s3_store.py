@@ -1,0 +1,166 @@
+"""What S3 adds to the contract of every store: patience, lost answers, presigned addresses."""
+
+from __future__ import annotations
+
+import hashlib
+import urllib.parse
+from typing import Any
+
+import pytest
+from botocore.exceptions import ClientError, ConnectTimeoutError
+
+from rse_pf.aws.clients import MAX_S, MAX_TRIES, make_client, patiently
+from rse_pf.aws.storage import S3Store, open_bucket
+from rse_pf.errors import Conflict, NotFound, StoreError
+
+
+@pytest.fixture
+def store(region: str) -> S3Store:
+    """An empty bucket."""
+    make_client("s3", region).create_bucket(
+        Bucket="maps", CreateBucketConfiguration={"LocationConstraint": region}
+    )
+    return open_bucket("maps", region)
+
+
+def refusal(code: str, status: int) -> ClientError:
+    return ClientError({"Error": {"Code": code}, "ResponseMetadata": {"HTTPStatusCode": status}}, "PutObject")
+
+
+class Clock:
+    """Time that passes only when a call or a rest takes it."""
+
+    def __init__(self) -> None:
+        self.now_s = 0.0
+        self.tries = 0
+
+    def fail(self, error: Exception, takes_s: float) -> Any:
+        def call() -> None:
+            self.tries += 1
+            self.now_s += takes_s
+            raise error
+
+        return call
+
+    def rest(self, seconds: float) -> None:
+        self.now_s += seconds
+
+
+@pytest.mark.parametrize(("takes_s", "tries"), [(0.01, 3), (1.0, 3), (4.5, 2)])
+def test_a_service_that_fails_is_asked_three_times_within_ten_seconds(takes_s: float, tries: int) -> None:
+    clock = Clock()
+    lost = ConnectTimeoutError(endpoint_url="https://s3")
+
+    with pytest.raises(StoreError, match="does not answer"):
+        patiently(clock.fail(lost, takes_s), clock=lambda: clock.now_s, rest=clock.rest)
+
+    assert clock.tries == tries <= MAX_TRIES
+    assert clock.now_s <= MAX_S
+
+
+@pytest.mark.parametrize(
+    ("code", "status", "tries"),
+    [
+        ("InternalError", 500, 3),
+        ("SlowDown", 503, 3),
+        ("Throttling", 400, 3),
+        ("AccessDenied", 403, 1),
+        ("ThrottlingException", 400, 3),
+        ("RequestLimitExceeded", 400, 3),
+        ("TooManyRequestsException", 400, 3),
+        ("LimitExceededException", 400, 1),
+    ],
+)
+def test_only_what_may_pass_is_tried_again(code: str, status: int, tries: int) -> None:
+    clock = Clock()
+
+    with pytest.raises((ClientError, StoreError)):
+        patiently(clock.fail(refusal(code, status), 0.0), clock=lambda: clock.now_s, rest=clock.rest)
+
+    assert clock.tries == tries
+
+
+def test_clients_of_aws_try_once_themselves(region: str) -> None:
+    config = make_client("s3", region).meta.config
+
+    assert config.retries["total_max_attempts"] == 1
+    assert config.connect_timeout + config.read_timeout < MAX_S / 2
+
+
+class Lossy:
+    """A bucket's client that loses the answer to the first write, after S3 has done it."""
+
+    def __init__(self, client: Any) -> None:
+        self._client = client
+        self._lose = True
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._client, name)
+
+    def put_object(self, **arguments: Any) -> Any:
+        done = self._client.put_object(**arguments)
+        if self._lose:
+            self._lose = False
+            raise ConnectTimeoutError(endpoint_url="https://s3")
+        return done
+
+
+def test_a_swap_whose_answer_was_lost_is_no_conflict(store: S3Store, region: str) -> None:
+    lossy = S3Store(Lossy(make_client("s3", region)), "maps")
+
+    lossy.compare_and_swap("head", None, b"mine")
+
+    assert store.get("head") == b"mine"
+
+
+def test_a_swap_that_another_won_in_between_is_a_conflict(store: S3Store, region: str) -> None:
+    client = make_client("s3", region)
+
+    class Overtaken(Lossy):
+        def put_object(self, **arguments: Any) -> Any:
+            store.put("head", b"theirs")
+            return client.put_object(**arguments)
+
+    store.put("head", b"before")
+    with pytest.raises(Conflict):
+        S3Store(Overtaken(client), "maps").compare_and_swap("head", b"before", b"mine")
+    assert store.get("head") == b"theirs"
+
+
+def test_more_names_than_a_page_holds_are_all_listed(store: S3Store, region: str) -> None:
+    client = make_client("s3", region)
+    for number in range(1003):
+        client.put_object(Bucket="maps", Key=f"maps/{number:04d}", Body=b"")
+    client.put_object(Bucket="maps", Key="maps/not ours", Body=b"")
+
+    assert [info.name for info in store.list("maps/")] == [f"maps/{number:04d}" for number in range(1003)]
+
+
+def test_a_presigned_address_fixes_name_length_and_digest(store: S3Store) -> None:
+    data = b"keyframe"
+
+    url, headers = store.presigned_put(
+        "maps/a", size=len(data), sha256=hashlib.sha256(data).hexdigest(), life_s=60
+    )
+
+    query = urllib.parse.parse_qs(urllib.parse.urlsplit(url).query)
+    signed = query["X-Amz-SignedHeaders"][0].split(";")
+    assert set(headers) == {"Content-Length", "x-amz-checksum-sha256"}
+    assert {name.lower() for name in headers} <= set(signed), "a header that is not signed binds nobody"
+    assert query["X-Amz-Algorithm"] == ["AWS4-HMAC-SHA256"]
+    assert query["X-Amz-Expires"] == ["60"]
+    assert urllib.parse.urlsplit(url).path.endswith("/maps/a")
+
+
+def test_a_presigned_name_is_checked_too(store: S3Store) -> None:
+    with pytest.raises(StoreError, match="is not a name"):
+        store.presigned_put("../x", size=1, sha256="00" * 32, life_s=60)
+    with pytest.raises(StoreError, match="is not a name"):
+        store.presigned_get("../x", life_s=60)
+
+
+def test_a_missing_bucket_is_said_so(region: str) -> None:
+    with pytest.raises(StoreError, match="bucket does not exist") as told:
+        open_bucket("nowhere", region).get("a")
+
+    assert not isinstance(told.value, NotFound)

@@ -1,0 +1,112 @@
+"""The door: who may upgrade, and the fixed answers for all others."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from rse_pf.auth.tokens import SigningKey
+from rse_pf.backend.gateway.handshake import HEALTH, Accepted, HandshakePolicy, Rejected
+from rse_pf.config import PlatformSettings
+from rse_pf.wire import SUBPROTOCOLS
+
+SETTINGS = PlatformSettings()
+KEY = SigningKey.from_seed(b"d" * 32, "k1")
+NOW_S = 1_000_000.0
+
+
+def token(life_s: float = 100.0, now: float = NOW_S) -> str:
+    return KEY.issue("robot-1", now=now, token_id="t", settings=SETTINGS.auth, life_s=life_s)
+
+
+def judge(door: HandshakePolicy | None = None, **changed: object) -> Accepted | Rejected:
+    asked: dict = {
+        "path": b"/ws", "authorization": f"Bearer {token()}", "offered": [SUBPROTOCOLS["bin"]],
+        "is_full": False, "anonymous": "anonymous-1", "now_s": NOW_S, **changed,
+    }  # fmt: skip
+    return (door or HandshakePolicy(SETTINGS, KEY.key_set())).judge(**asked)
+
+
+def test_a_good_token_names_the_robot_and_when_it_has_to_leave():
+    assert judge() == Accepted(
+        robot="robot-1", codec="bin", subprotocol=SUBPROTOCOLS["bin"], expires_s=NOW_S + 100
+    )
+
+
+def test_a_token_within_the_leeway_lives_until_the_leeway_ends():
+    verdict = judge(authorization=f"Bearer {token(10.0)}", now_s=NOW_S + 20)
+
+    assert isinstance(verdict, Accepted)
+    assert verdict.expires_s == NOW_S + 10 + SETTINGS.auth.leeway_s
+
+
+def test_the_query_of_the_path_does_not_matter():
+    assert isinstance(judge(path=b"/ws?x=1"), Accepted)
+
+
+def test_the_robots_first_choice_that_we_speak_is_taken():
+    verdict = judge(offered=["chat", SUBPROTOCOLS["json"], SUBPROTOCOLS["bin"]])
+
+    assert isinstance(verdict, Accepted)
+    assert verdict.codec == "json"
+
+
+@pytest.mark.parametrize(
+    ("changed", "status", "result"),
+    [
+        ({"path": b"/other"}, 404, "not-found"),
+        ({"is_full": True}, 503, "full"),
+        ({"authorization": ""}, 401, "unauthorized"),
+        ({"authorization": token()}, 401, "unauthorized"),
+        ({"now_s": NOW_S + 1000}, 401, "unauthorized"),
+        ({"offered": []}, 400, "unsupported"),
+    ],
+)
+def test_others_are_turned_away(changed, status, result):
+    verdict = judge(**changed)
+
+    assert isinstance(verdict, Rejected)
+    assert (verdict.status, verdict.result) == (status, result)
+    assert json.loads(verdict.body)["code"] == result
+
+
+def test_all_causes_of_a_bad_token_get_the_same_bytes_but_the_log_knows():
+    stranger = SigningKey.from_seed(b"s" * 32, "k1").issue(
+        "robot-1", now=NOW_S, token_id="t", settings=SETTINGS.auth
+    )
+    verdicts = [
+        judge(authorization=a, now_s=now)
+        for a, now in [
+            ("", NOW_S), ("Bearer x", NOW_S), (f"Bearer {stranger}", NOW_S),
+            (f"Bearer {token()}", NOW_S + 999),
+        ]
+    ]  # fmt: skip
+
+    assert len({(v.status, v.body, tuple(v.headers.items())) for v in verdicts}) == 1
+    assert len({v.reason for v in verdicts}) == 4
+
+
+def test_without_keys_robots_are_anonymous_and_stay():
+    assert judge(HandshakePolicy(SETTINGS, None)) == Accepted(
+        robot="anonymous-1", codec="bin", subprotocol=SUBPROTOCOLS["bin"], expires_s=None
+    )
+
+
+def test_conformance_echo_asks_for_nothing():
+    door = HandshakePolicy(SETTINGS, None, conformance_echo=True)
+
+    assert judge(door, path=b"/", offered=[], authorization="") == Accepted(
+        robot="anonymous-1", codec="", subprotocol=""
+    )
+
+
+def test_the_page_of_health_says_one_thing_to_everybody_also_when_the_server_is_full():
+    answers = [
+        judge(path=b"/healthz", authorization=each, is_full=full) for each in ("", "x") for full in (0, 1)
+    ]
+
+    assert all(answer == answers[0] for answer in answers)
+    assert isinstance(answers[0], Rejected)
+    assert (answers[0].status, answers[0].body, answers[0].result) == (200, b'{"status":"ok"}', HEALTH)
+    assert judge(path=b"/healthz?x").status == 404

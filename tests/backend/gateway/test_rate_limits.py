@@ -1,0 +1,208 @@
+"""The pure cores of the limits: buckets, strikes, sources, and who has to leave the waiting room."""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rse_pf.backend.gateway import rate_limits as limits
+from rse_pf.backend.gateway.rate_limits import (
+    Bucket,
+    CutOff,
+    PendingHandshakes,
+    RobotRates,
+    SourceRates,
+    TooFast,
+)
+from rse_pf.config import ServingSettings, SessionSettings
+
+ROBOT = ("default", "r")
+LIMITS = SessionSettings(
+    max_commands_per_s=20.0, command_burst=40, rate_strikes=3, rate_window_s=10.0, rate_rest_s=5.0
+)
+
+
+def judged(rates: RobotRates, per_s: float, seconds: float, robot: tuple[str, str] = ROBOT) -> list[object]:
+    return [rates.judge(robot, 100.0 + k / per_s) for k in range(int(per_s * seconds))]
+
+
+def test_a_bucket_gives_its_burst_then_its_rate():
+    bucket = Bucket(10.0, 3.0)
+
+    assert [bucket.take(5.0) for _ in range(3)] == [0.0, 0.0, 0.0]
+    assert bucket.take(5.0) == pytest.approx(0.1)
+    assert bucket.take(5.1) == pytest.approx(0.0, abs=1e-9)
+
+
+@given(
+    gaps=st.lists(st.floats(0.0, 2.0), min_size=1, max_size=200),
+    rate=st.floats(0.5, 50.0),
+    burst=st.integers(1, 50),
+)
+def test_no_span_of_time_gives_more_than_burst_and_rate_together(gaps, rate, burst):
+    bucket, now, taken = Bucket(rate, float(burst)), 0.0, []
+    for gap in gaps:
+        now += gap
+        if bucket.take(now) == 0.0:
+            taken.append(now)
+
+    for first, begin in enumerate(taken):
+        for count, end in enumerate(taken[first:], start=1):
+            assert count <= burst + rate * (end - begin) + 1e-6
+
+
+@given(gaps=st.lists(st.floats(0.0, 1.0), min_size=1, max_size=200), rate=st.floats(0.5, 50.0))
+def test_who_waits_as_long_as_told_is_served(gaps, rate):
+    bucket, now = Bucket(rate, 2.0), 0.0
+    for gap in gaps:
+        now += gap
+        wait_s = bucket.take(now)
+        if wait_s > 0:
+            now += wait_s + 1e-9
+            assert bucket.take(now) == 0.0
+
+
+def test_a_clock_that_stands_or_goes_back_gives_nothing():
+    bucket = Bucket(10.0, 1.0)
+    bucket.take(5.0)
+
+    assert bucket.take(5.0) > 0
+    assert bucket.take(4.0) > 0
+
+
+def test_five_frames_a_second_with_the_catch_up_of_a_long_cut_are_never_refused():
+    rates = RobotRates(LIMITS)
+    live = [100.0 + k / 5 for k in range(300)]
+    caught_up = [130.0] * 16  # what was unanswered when the link came back, and eight pings
+
+    assert all(rates.judge(ROBOT, now) is None for now in sorted(live + caught_up))
+
+
+def test_ten_hertz_is_never_refused():
+    assert judged(RobotRates(LIMITS), per_s=10.0, seconds=120.0) == [None] * 1200
+
+
+def test_a_robot_a_little_above_its_rate_is_told_when_to_come_again_and_never_cut_off():
+    verdicts = judged(RobotRates(LIMITS), per_s=25.0, seconds=120.0)
+    refused = [verdict for verdict in verdicts if isinstance(verdict, TooFast)]
+
+    assert CutOff() not in verdicts
+    assert len(refused) == pytest.approx(120.0 * 5 - 40, abs=20)
+    assert all(0 < verdict.retry_after_ms <= 50.0 for verdict in refused)
+
+
+def test_a_robot_at_a_hundred_times_its_rate_is_cut_off_within_half_a_second_and_rests():
+    rates = RobotRates(LIMITS)
+    verdicts = judged(rates, per_s=500.0, seconds=0.5)
+    cut_off = verdicts.index(CutOff())
+
+    assert 40 + 3 * 40 <= cut_off <= 180
+    assert rates.rests_s(ROBOT, 100.0 + cut_off / 500) == pytest.approx(5.0)
+    assert rates.rests_s(ROBOT, 106.0) == 0.0
+    assert rates.rests_s(("default", "another"), 100.5) == 0.0
+
+
+def test_robots_have_buckets_of_their_own():
+    rates = RobotRates(LIMITS)
+    judged(rates, per_s=500.0, seconds=0.5, robot=("a", "flood"))
+
+    assert rates.judge(("a", "calm"), 100.5) is None
+    assert rates.judge(("b", "flood"), 100.5) is None, "a name belongs to its tenant"
+
+
+def test_zero_turns_the_rate_off():
+    rates = RobotRates(SessionSettings(max_commands_per_s=0.0))
+
+    assert not rates.is_on
+    assert judged(rates, per_s=1000.0, seconds=1.0) == [None] * 1000
+
+
+def test_names_do_not_pile_up(monkeypatch):
+    monkeypatch.setattr(limits, "_MAX_NAMES", 100)
+    rates, sources = RobotRates(LIMITS), SourceRates(ServingSettings())
+
+    for k in range(1000):
+        rates.judge(f"r-{k}", 100.0)
+        sources.wait_s(f"10.0.0.{k}", 100.0)
+
+    assert len(rates._robots) <= 100
+    assert len(sources._sources) <= 100
+
+
+def test_who_rests_is_not_forgotten_for_names_that_did_nothing(monkeypatch):
+    monkeypatch.setattr(limits, "_MAX_NAMES", 100)
+    rates = RobotRates(LIMITS)
+    judged(rates, per_s=500.0, seconds=0.5, robot="flood")
+
+    for k in range(40):
+        rates.judge(f"r-{k}", 101.0 + k)
+
+    assert rates.rests_s("flood", 101.0) > 0
+
+
+@pytest.mark.parametrize(
+    ("trusted", "told", "source"),
+    [
+        (0, "10.0.0.9", "peer"),
+        (1, "10.0.0.9", "10.0.0.9"),
+        (1, "a lie, 10.0.0.9", "10.0.0.9"),
+        (2, "a lie, 10.0.0.9, 10.0.0.1", "10.0.0.9"),
+        (1, "", "peer"),
+        (2, "10.0.0.9", "peer"),
+    ],
+)
+def test_a_source_is_what_the_first_trusted_proxy_saw(trusted, told, source):
+    assert SourceRates(ServingSettings(trusted_proxies=trusted)).source("peer", told) == source
+
+
+def test_a_source_has_a_rate_of_handshakes():
+    sources = SourceRates(ServingSettings(handshakes_per_source_per_s=10.0, handshake_burst=3))
+
+    assert [sources.wait_s("a", 1.0) > 0 for _ in range(5)] == [False, False, False, True, True]
+    assert sources.wait_s("b", 1.0) == 0.0
+    assert sources.wait_s("a", 1.2) == 0.0
+
+
+def test_the_longest_wait_leaves_for_the_newcomer():
+    room: PendingHandshakes[int] = PendingHandshakes(most=3, max_per_source=0)
+
+    assert [room.enter(k, "a") for k in range(5)] == [None, None, None, 0, 1]
+    assert len(room) == 3
+
+
+def test_a_source_that_has_too_many_loses_its_own():
+    room: PendingHandshakes[str] = PendingHandshakes(most=100, max_per_source=2)
+    room.enter("other", "b")
+
+    assert [room.enter(name, "a") for name in ("x", "y", "z")] == [None, None, "x"]
+    assert room.enter("other-2", "b") is None
+
+
+def test_who_showed_a_token_makes_room():
+    room: PendingHandshakes[int] = PendingHandshakes(most=2, max_per_source=2)
+    room.enter(1, "a")
+    room.enter(2, "a")
+    room.leave(1)
+    room.leave(1)
+
+    assert room.enter(3, "a") is None
+    assert len(room) == 2
+
+
+@given(steps=st.lists(st.tuples(st.booleans(), st.integers(0, 9), st.integers(0, 3)), max_size=200))
+def test_a_room_never_holds_more_than_it_may(steps):
+    room: PendingHandshakes[int] = PendingHandshakes(most=5, max_per_source=2)
+    inside: dict[int, str] = {}
+    for number, (enters, key, source) in enumerate(steps):
+        if enters:
+            inside[number] = str(source)
+            leaving = room.enter(number, str(source))
+            if leaving is not None:
+                del inside[leaving]
+        elif inside:
+            gone = list(inside)[key % len(inside)]
+            room.leave(gone)
+            del inside[gone]
+        assert len(room) == len(inside) <= 5
+        assert all(list(inside.values()).count(each) <= 2 for each in inside.values())

@@ -1,0 +1,114 @@
+"""Turns: robots share them, whoever asks for most, and nobody waits for ever."""
+
+from __future__ import annotations
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rse_pf.backend.jobs.fair_queue import FairQueue, Who, who_makes_room
+
+A, B, C = ("default", "a"), ("default", "b"), ("default", "c")
+
+
+def order(line: FairQueue, count: int) -> str:
+    """Serve *count* tickets, which begin with their robot's letter, and return whose they were."""
+    served = ""
+    for _ in range(count):
+        ticket = line.first()
+        assert isinstance(ticket, str)
+        line.served(ticket)
+        served += ticket[0]
+    return served
+
+
+def test_a_robot_with_twenty_jobs_gets_every_other_turn_while_another_waits():
+    line = FairQueue()
+    for number in range(20):
+        line.join(f"a{number}", A)
+    for number in range(3):
+        line.join(f"b{number}", B)
+
+    assert order(line, 23) == "ab" * 3 + "a" * 17
+    assert line.first() is None
+
+
+def test_one_robots_jobs_run_in_the_order_of_asking():
+    line = FairQueue()
+    for number in range(3):
+        line.join(number, A)
+
+    seen = []
+    while (ticket := line.first()) is not None:
+        seen.append(ticket)
+        line.served(ticket)
+
+    assert seen == [0, 1, 2]
+
+
+def test_who_comes_late_waits_for_one_turn_of_each_other_and_makes_up_for_nothing():
+    line = FairQueue()
+    for number in range(9):
+        line.join(f"a{number}", A)
+        line.join(f"b{number}", B)
+    assert order(line, 5) == "ababa"
+
+    for number in range(3):
+        line.join(f"c{number}", C)
+
+    assert order(line, 6) == "bacbac"
+
+
+def test_tickets_that_leave_cost_their_robot_no_turn():
+    line = FairQueue()
+    for number in range(9):
+        line.join(f"a{number}", A)
+    for number in range(8):
+        line.leave(f"a{number}")
+    line.leave("a0")
+    line.join("b0", B)
+    line.join("b1", B)
+
+    assert order(line, 3) == "abb"
+
+
+def test_new_robots_that_keep_coming_do_not_starve_one_that_waits():
+    line = FairQueue()
+    line.join("a0", A)
+    line.join("a1", A)
+    served = ""
+    for number in range(5):
+        line.join(f"n{number}", ("default", f"n{number}"))
+        served += order(line, 1)
+
+    assert served.count("a") == 2
+
+
+@given(st.lists(st.sampled_from([A, B, C]), max_size=30))
+def test_while_two_robots_wait_neither_gets_two_turns_more(comers: list[Who]):
+    line = FairQueue()
+    left = dict.fromkeys((A, B, C), 0)
+    for number, who in enumerate(comers):
+        line.join((who, number), who)
+        left[who] += 1
+    turns = dict.fromkeys(left, 0)
+    while (ticket := line.first()) is not None:
+        line.served(ticket)
+        who = ticket[0]  # type: ignore[index]
+        turns[who] += 1
+        left[who] -= 1
+        waiting = [turns[each] for each in left if left[each]]
+        assert not waiting or max(waiting) - min(waiting) <= 1
+
+
+def test_the_newest_waiting_job_of_who_has_most_makes_room():
+    jobs = [(A, False), (A, True), (B, True), (A, True), (B, True), (B, False)]
+
+    assert who_makes_room(jobs, C) == 4
+    assert who_makes_room([*jobs, (A, True)], C) == 6
+
+
+def test_nobody_makes_room_for_who_has_as_many_or_one_less():
+    assert who_makes_room([(A, True), (A, True)], A) is None
+    assert who_makes_room([(A, True), (A, True), (B, True)], B) is None
+    assert who_makes_room([(A, True)], B) is None
+    assert who_makes_room([(A, False), (A, False), (A, False)], B) is None

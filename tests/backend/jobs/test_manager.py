@@ -1,0 +1,297 @@
+"""Who waits for which job and what they are told, in a loop that turns when the test says so."""
+
+from __future__ import annotations
+
+import heapq
+import os
+import queue
+import socket
+import threading
+import time
+from collections.abc import Callable
+from types import SimpleNamespace
+from typing import Any
+
+import msgspec
+import pytest
+
+from rse_pf.backend.jobs.lease import JobRecord, encode_record
+from rse_pf.backend.jobs.manager import JobManager
+from rse_pf.backend.jobs.runner import JobContext, JobRequest
+from rse_pf.backend.jobs.slots import JobSlots, make_pipe
+from rse_pf.backend.log import JsonLog
+from rse_pf.backend.sandbox.child import encoded
+from rse_pf.backend.scheduling.scheduler import QueuedCommand
+from rse_pf.config import PlatformSettings
+from rse_pf.object_store import MemoryStore
+from rse_pf.wire import Command, Failure, Result
+
+WAIT_S = 20.0
+
+
+class FakeProcess:
+    """A job that ends when the test says so."""
+
+    def __init__(self, wanted: JobRequest) -> None:
+        self.wanted = wanted
+        self.connection, self._theirs = socket.socketpair()
+
+    def say(self, *message: Any) -> None:
+        self._theirs.sendall(encoded(list(message)))
+
+    def done(self, value: int = 1) -> None:
+        self.say("done", 5.0, msgspec.msgpack.encode({"value": value}))
+
+    def kill(self) -> None:
+        self._theirs.close()
+        self.connection.close()
+
+    def wait(self) -> int:
+        return 0
+
+
+class Bench:
+    """Jobs with everything around them; time stands still until `advance`."""
+
+    def __init__(self, **serving: Any) -> None:
+        self.settings = PlatformSettings.from_dict({"serving": {"job_beat_s": 0.05, **serving}})
+        self.now = 100.0
+        self.calls: queue.SimpleQueue[tuple[Callable[..., object], tuple[Any, ...]]] = queue.SimpleQueue()
+        self.started: queue.SimpleQueue[FakeProcess] = queue.SimpleQueue()
+        self.answers: dict[int, Result | Failure] = {}
+        self.progress: list[tuple[int, float, str]] = []
+        self._timers: list[tuple[float, int, Callable[[], object]]] = []
+        self._fd = os.open(os.devnull, os.O_WRONLY)
+        self.log = JsonLog(level="error", server="s", wall_clock=lambda: 0.0, fd=self._fd)
+        self.store = MemoryStore()
+        context = JobContext(
+            store=self.store, slots=JobSlots(make_pipe(self.settings.serving.jobs)), server_id="s",
+            settings=self.settings.serving, quota_bytes=1e6, max_bytes=1000, inline_bytes=100,
+            start=self.start, clock=lambda: self.now,
+        )  # fmt: skip
+        self.jobs = JobManager(
+            context, settings=self.settings, loop=self, log=self.log, new_owner=lambda: os.urandom(4).hex(),
+            answer=lambda job, answer: self.answers.__setitem__(job.command.id, answer),
+            progress=lambda _, told: self.progress.append((told.id, told.done, told.what)),
+        )  # fmt: skip
+
+    def start(self, wanted: JobRequest) -> FakeProcess:
+        process = FakeProcess(wanted)
+        self.started.put(process)
+        return process
+
+    def call_soon_threadsafe(self, callback: Callable[..., object], *args: Any) -> None:
+        self.calls.put((callback, args))
+
+    def call_later(self, delay: float, callback: Callable[[], object]) -> None:
+        heapq.heappush(self._timers, (self.now + delay, len(self._timers), callback))
+
+    def advance(self, seconds: float) -> None:
+        self.now += seconds
+        while self._timers and self._timers[0][0] <= self.now:
+            heapq.heappop(self._timers)[2]()
+
+    def turn(self, until: Callable[[], bool]) -> None:
+        """Turn the loop until something is so."""
+        end = time.monotonic() + WAIT_S
+        while not until():
+            callback, args = self.calls.get(timeout=max(0.01, end - time.monotonic()))
+            callback(*args)
+
+    def process(self) -> FakeProcess:
+        """Return the process that started next."""
+        return self.started.get(timeout=WAIT_S)
+
+    def close(self) -> None:
+        self.jobs.close()
+        self.log.close()
+        os.close(self._fd)
+
+
+@pytest.fixture
+def make():
+    benches: list[Bench] = []
+
+    def make(**serving: Any) -> Bench:
+        benches.append(Bench(**serving))
+        return benches[-1]
+
+    yield make
+    for bench in benches:
+        bench.close()
+
+
+def robot(name: str = "robot-1", tenant: str = "default") -> Any:
+    return SimpleNamespace(robot=name, tenant=tenant, claims=None)
+
+
+def ask(bench: Bench, owner: Any, identity: int, value: int = 1) -> None:
+    command = Command(id=identity, service="long", payload={"value": value})
+    bench.jobs.submit(QueuedCommand(owner, owner.robot, command, 10, 100.0, 105.0))
+
+
+def code(answer: Result | Failure) -> str:
+    return "ok" if isinstance(answer, Result) else answer.code
+
+
+def test_who_asks_for_the_same_job_waits_for_the_same_run(make):
+    bench, owner = make(), robot()
+    ask(bench, owner, 1)
+    process = bench.process()
+    ask(bench, owner, 2)
+
+    process.done()
+    bench.turn(lambda: len(bench.answers) == 2)
+
+    assert {each.reply["value"] for each in bench.answers.values()} == {1}
+    assert len({each.object for each in bench.answers.values()}) == 1
+    assert bench.started.empty()
+    assert bench.jobs.known == 0
+
+
+def test_the_same_request_of_another_robot_or_tenant_is_another_job(make):
+    bench = make(jobs=3)
+    for identity, owner in enumerate((robot(), robot("robot-2"), robot(tenant="another"))):
+        ask(bench, owner, identity)
+
+    asked = [bench.process() for _ in range(3)]
+
+    assert len({(each.wanted.tenant, each.wanted.robot) for each in asked}) == 3
+
+
+def test_more_jobs_than_may_wait_are_refused_with_when_to_come_again(make):
+    bench, owner = make(jobs_waiting=1), robot()
+    for identity in range(3):
+        ask(bench, owner, identity, value=identity)
+
+    assert code(bench.answers[2]) == "busy"
+    assert bench.answers[2].retry_after_ms > 0
+    assert bench.jobs.known == 2
+
+
+def test_a_robot_that_fills_the_line_makes_room_for_another_and_asks_again(make):
+    bench, greedy, modest = make(jobs_waiting=3), robot("greedy"), robot("modest")
+    ask(bench, greedy, 0, value=0)
+    bench.process()
+    bench.turn(lambda: bench.advance(0.5) or any(what == "starts" for _, _, what in bench.progress))
+    for identity in range(1, 4):
+        ask(bench, greedy, identity, value=identity)
+
+    ask(bench, modest, 10, value=10)
+
+    assert code(bench.answers[3]) == "busy"
+    assert bench.answers[3].retry_after_ms == 5000.0
+    ask(bench, modest, 11, value=11)
+    assert code(bench.answers[2]) == "busy"
+    ask(bench, modest, 12, value=12)
+    assert code(bench.answers[12]) == "busy"
+    ask(bench, greedy, 4, value=3)
+    bench.turn(lambda: 4 in bench.answers)
+    assert code(bench.answers[4]) == "busy"
+    assert set(bench.answers) == {2, 3, 4, 12}
+
+
+def test_the_robot_is_told_at_once_then_at_most_twice_a_second_and_never_something_old(make):
+    bench, owner = make(), robot()
+    ask(bench, owner, 1)
+    assert bench.progress == [(1, 0.0, "waits for its turn")]
+    process = bench.process()
+    for step in range(5):
+        process.say("progress", step / 10, f"step {step}")
+    bench.turn(lambda: bench.jobs._entries[next(iter(bench.jobs._entries))].what == "step 4")
+    assert len(bench.progress) == 1
+
+    bench.advance(0.5)
+
+    assert bench.progress[1:] == [(1, 0.4, "step 4")]
+    bench.advance(10.0)
+    assert len(bench.progress) == 2
+
+
+def test_a_command_taken_back_leaves_the_job_to_those_who_still_wait(make):
+    bench, owner = make(), robot()
+    ask(bench, owner, 1)
+    ask(bench, owner, 2)
+    process = bench.process()
+
+    bench.jobs.withdraw(owner, 1)
+    assert code(bench.answers[1]) == "cancelled"
+    process.done()
+    bench.turn(lambda: 2 in bench.answers)
+
+    assert code(bench.answers[2]) == "ok"
+
+
+def test_the_last_command_taken_back_ends_the_job_and_who_asks_meanwhile_gets_a_new_run(make):
+    bench, owner = make(), robot()
+    ask(bench, owner, 1)
+    process = bench.process()
+    bench.jobs.withdraw(owner, 1)
+    ask(bench, owner, 2)
+
+    process.say("failed", "cancelled", "the robot took the command back", "")
+    bench.turn(lambda: 1 in bench.answers)
+    bench.process().done()
+    bench.turn(lambda: 2 in bench.answers)
+
+    assert [code(bench.answers[identity]) for identity in (1, 2)] == ["cancelled", "ok"]
+
+
+def test_nobody_takes_back_the_commands_of_others(make):
+    bench, owner = make(), robot()
+    ask(bench, owner, 1)
+    ask(bench, owner, 2)
+    process = bench.process()
+
+    bench.jobs.withdraw(robot("robot-2"), 1)
+    assert bench.answers == {}
+    process.done()
+    bench.turn(lambda: len(bench.answers) == 2)
+
+    assert {code(answer) for answer in bench.answers.values()} == {"ok"}
+
+
+def test_a_job_goes_on_without_its_robot_which_finds_it_when_it_comes_back(make):
+    bench, owner = make(), robot()
+    ask(bench, owner, 1)
+    process = bench.process()
+    bench.jobs.left(owner)
+    assert bench.jobs.known == 1
+
+    again = robot()
+    ask(bench, again, 7)
+    process.done()
+    bench.turn(lambda: 7 in bench.answers)
+
+    assert list(bench.answers) == [7]
+    assert bench.started.empty()
+
+
+def test_a_leaving_server_answers_nothing_for_the_robot_asks_elsewhere(make):
+    bench, owner = make(), robot()
+    ask(bench, owner, 1)
+    bench.process()
+
+    bench.jobs.give_up()
+    bench.turn(lambda: bench.jobs.known == 0)
+    ask(bench, owner, 2)
+
+    assert bench.answers == {}
+    assert bench.jobs.known == 0
+
+
+def test_the_end_of_a_job_is_when_old_records_go(make):
+    bench, owner = make(job_record_s=60.0), robot()
+    old = "jobs/default/robot-9/" + "0" * 64
+    bench.store.put(old, encode_record(JobRecord(state="done", owner="", marked_s=1.0)))
+    ask(bench, owner, 1)
+
+    bench.process().done()
+    bench.turn(lambda: 1 in bench.answers)
+    for thread in threading.enumerate():
+        if thread.name.startswith("job-"):
+            thread.join(WAIT_S)
+
+    names = [info.name for info in bench.store.list("jobs/")]
+    assert len(names) == 1
+    assert old not in names

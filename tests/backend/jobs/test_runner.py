@@ -1,0 +1,331 @@
+"""One job from the first look to its outcome, with a process that says what the test wants."""
+
+from __future__ import annotations
+
+import itertools
+import socket
+import threading
+from collections.abc import Callable
+from typing import Any
+
+import msgspec
+import pytest
+
+from rse_pf.backend.jobs.lease import JobLease, JobRecord, record_name
+from rse_pf.backend.jobs.runner import JobContext, JobOutcome, JobRequest, JobSignals, run_job
+from rse_pf.backend.jobs.slots import JobSlots, make_pipe
+from rse_pf.backend.sandbox.child import encoded
+from rse_pf.config import ServingSettings
+from rse_pf.errors import Conflict, StoreError
+from rse_pf.object_store import MemoryStore, digest_of, object_name
+
+SETTINGS = ServingSettings(job_beat_s=0.05, job_lease_s=0.2)
+WANTED = JobRequest(
+    service="long", payload={}, tenant="default", robot="robot-1", key="ab" * 32, quota_bytes=1e6
+)
+WHO = ("default", "robot-1")
+NAME = record_name("default", "robot-1", WANTED.key)
+REPLY = msgspec.msgpack.encode({"value": 1})
+DONE = ["done", 12.5, REPLY]
+
+
+class FakeProcess:
+    """Says *script* at once; ends then if it *ends*, with *code*."""
+
+    def __init__(self, script: list[Any], *, ends: bool = True, code: int = 0) -> None:
+        self.connection, self.theirs = socket.socketpair()
+        self.killed = threading.Event()
+        self._code = code
+        for message in script:
+            self.theirs.sendall(encoded(message))
+        if ends:
+            self.theirs.close()
+
+    def kill(self) -> None:
+        self.killed.set()
+        self.theirs.close()
+        self.connection.close()
+
+    def wait(self) -> int:
+        return self._code
+
+
+class Clock:
+    """Goes on by a hundredth whenever it is read, so that nothing waits for long."""
+
+    def __init__(self) -> None:
+        self._ticks = itertools.count()
+
+    def __call__(self) -> float:
+        return next(self._ticks) * 0.01
+
+
+class Bench:
+    def __init__(self) -> None:
+        self.store: MemoryStore = MemoryStore()
+        self.processes: list[FakeProcess] = []
+        self.scripts: list[Callable[[], FakeProcess]] = []
+        self.told: list[tuple[float, str]] = []
+        self.signals = JobSignals()
+        self.pipe = make_pipe(1)
+
+    def start(self, wanted: JobRequest) -> FakeProcess:
+        self.processes.append(self.scripts.pop(0)())
+        return self.processes[-1]
+
+    def run(
+        self, *scripts: Callable[[], FakeProcess], max_bytes: int = 1000, inline: int = 100
+    ) -> JobOutcome:
+        self.scripts += scripts
+        context = JobContext(
+            store=self.store, slots=JobSlots(self.pipe), settings=SETTINGS, quota_bytes=1e6,
+            max_bytes=max_bytes, inline_bytes=inline, server_id="s", start=self.start, clock=Clock(),
+        )  # fmt: skip
+
+        def tell(share: float, what: str) -> None:
+            self.told.append((share, what))
+            self.on_tell(share, what)
+
+        return run_job(WANTED, context, self.signals, tell, "us")
+
+    def on_tell(self, share: float, what: str) -> None: ...
+
+    @property
+    def record(self) -> JobRecord:
+        return msgspec.json.decode(self.store.get(NAME), type=JobRecord)
+
+
+@pytest.fixture
+def bench():
+    bench = Bench()
+    yield bench
+    bench.signals.close()
+    for process in bench.processes:
+        assert process.killed.is_set(), "a process outlived its job"
+
+
+def code(outcome: JobOutcome) -> str:
+    return "ok" if outcome.error is None else outcome.error.code
+
+
+def another(bench: Bench) -> JobLease:
+    lease = JobLease(bench.store, NAME, "another", Clock())
+    lease.look()
+    return lease
+
+
+class Ordered(MemoryStore):
+    """Lets nobody call a job done whose reply is not there."""
+
+    def compare_and_swap(self, name: str, expected: bytes | None, data: bytes) -> None:
+        record = msgspec.json.decode(data, type=JobRecord)
+        if record.state == "done":
+            self.get(object_name("default", "robot-1", record.reply))
+        super().compare_and_swap(name, expected, data)
+
+
+def test_a_result_is_durable_before_anybody_hears_of_it(bench):
+    bench.store = Ordered()
+
+    outcome = bench.run(lambda: FakeProcess([["progress", 0.5, "half"], DONE]))
+
+    assert outcome == JobOutcome(object=digest_of(REPLY), reply=REPLY, compute_ms=12.5)
+    assert bench.store.get(object_name("default", "robot-1", outcome.object)) == REPLY
+    assert (bench.record.state, bench.record.reply) == ("done", outcome.object)
+    assert [what for _, what in bench.told] == ["waits for its turn", "starts", "half"]
+
+
+def test_a_job_that_was_done_is_not_done_again(bench):
+    first = bench.run(lambda: FakeProcess([DONE]))
+
+    assert bench.run() == first
+    assert len(bench.processes) == 1
+
+
+def test_a_large_reply_is_named_only(bench):
+    first = bench.run(lambda: FakeProcess([DONE]), inline=3)
+
+    assert (first.reply, first.object) == (None, digest_of(REPLY))
+    assert bench.run(inline=3) == first
+
+
+def test_a_result_whose_object_is_gone_is_made_again(bench):
+    outcome = bench.run(lambda: FakeProcess([DONE]))
+    bench.store.delete(object_name("default", "robot-1", outcome.object))
+
+    assert bench.run(lambda: FakeProcess([DONE])) == outcome
+    assert len(bench.processes) == 2
+
+
+def test_a_failure_is_told_as_it_is_and_tried_again_when_asked_again(bench):
+    outcome = bench.run(lambda: FakeProcess([["failed", "bad-request", "no maps", "send some"]]))
+
+    assert code(outcome) == "bad-request"
+    assert outcome.error is not None
+    assert (outcome.error.message, outcome.error.hint) == ("no maps", "send some")
+    assert code(bench.run(lambda: FakeProcess([DONE]))) == "ok"
+
+
+def test_a_process_that_ends_without_a_word_has_crashed(bench):
+    outcome = bench.run(lambda: FakeProcess([], code=-11))
+
+    assert code(outcome) == "crashed"
+    assert "SIGSEGV" in str(outcome.error)
+    assert bench.record.state == "failed"
+
+
+def test_a_reply_that_is_too_large_ends_the_job(bench):
+    outcome = bench.run(lambda: FakeProcess([["done", 1.0, b"x" * 2000]], ends=False), max_bytes=1000)
+
+    assert code(outcome) == "too-large"
+
+
+def test_a_deaf_process_is_killed_soon_after_the_robot_took_the_job_back(bench):
+    bench.on_tell = lambda share, what: bench.signals.cancel() if what == "half" else None
+
+    outcome = bench.run(lambda: FakeProcess([["progress", 0.5, "half"]], ends=False))
+
+    assert code(outcome) == "cancelled"
+    assert (bench.record.state, bench.record.code) == ("failed", "cancelled")
+
+
+def test_a_result_that_came_before_the_cancel_was_heard_is_kept(bench):
+    bench.on_tell = lambda share, what: bench.signals.cancel() if what == "half" else None
+
+    assert code(bench.run(lambda: FakeProcess([["progress", 0.5, "half"], DONE]))) == "ok"
+
+
+def test_a_leaving_server_gives_its_job_up_for_others_to_take_at_once(bench):
+    bench.on_tell = lambda share, what: bench.signals.give_up() if what == "half" else None
+
+    outcome = bench.run(lambda: FakeProcess([["progress", 0.5, "half"]], ends=False))
+
+    assert outcome.is_given_up
+    assert bench.record.state == "given-up"
+
+
+def test_a_job_that_runs_elsewhere_is_followed_to_its_end(bench):
+    owner = another(bench)
+    owner.take()
+    owner.renew(0.25, "quarter")
+
+    def end(share: float, what: str) -> None:
+        if owner.record is not None and owner.record.state == "running":
+            bench.store.put(object_name("default", "robot-1", digest_of(REPLY)), REPLY)
+            owner.end(JobRecord(state="done", owner="", reply=digest_of(REPLY), reply_bytes=len(REPLY)))
+
+    bench.on_tell = end
+
+    assert bench.run().object == digest_of(REPLY)
+    assert bench.told == [(0.25, "quarter")]
+    assert bench.processes == []
+
+
+def test_the_failure_of_a_followed_job_is_told_not_tried_again(bench):
+    owner = another(bench)
+    owner.take()
+    failed = JobRecord(state="failed", owner="", code="crashed", message="it ended")
+    bench.on_tell = lambda share, what: owner.end(failed)
+
+    assert code(bench.run()) == "crashed"
+    assert bench.processes == []
+
+
+def test_a_job_is_taken_over_when_its_owner_falls_silent(bench):
+    another(bench).take()
+
+    assert code(bench.run(lambda: FakeProcess([DONE]))) == "ok"
+    assert (bench.record.owner, bench.record.state, bench.record.beat) == ("us", "done", 0)
+    assert len(bench.processes) == 1
+
+
+def test_who_lost_the_job_kills_its_process_and_follows_the_new_owner(bench):
+    def overtake(share: float, what: str) -> None:
+        if what == "half" and bench.record.owner == "us":
+            thief = another(bench)
+            thief.take()
+            bench.store.put(object_name("default", "robot-1", digest_of(REPLY)), REPLY)
+            thief.end(JobRecord(state="done", owner="", reply=digest_of(REPLY), reply_bytes=len(REPLY)))
+
+    bench.on_tell = overtake
+
+    outcome = bench.run(lambda: FakeProcess([["progress", 0.5, "half"]], ends=False))
+
+    assert outcome.object == digest_of(REPLY)
+    assert bench.record.owner == "another"
+
+
+class Faulty(MemoryStore):
+    """Fails for the first renewals of a running job; *well* is called when they are over."""
+
+    def __init__(self, failures: int, well: Callable[[], None]) -> None:
+        super().__init__()
+        self.failures = failures
+        self._well = well
+
+    def compare_and_swap(self, name: str, expected: bytes | None, data: bytes) -> None:
+        if expected is not None and self.failures > 0:
+            self.failures -= 1
+            if self.failures == 0:
+                self._well()
+            raise StoreError("503")
+        super().compare_and_swap(name, expected, data)
+
+
+def test_a_store_that_fails_for_a_moment_costs_no_job(bench):
+    bench.store = Faulty(2, lambda: bench.processes[0].theirs.sendall(encoded(DONE)))
+
+    assert code(bench.run(lambda: FakeProcess([], ends=False))) == "ok"
+    assert bench.store.failures == 0
+
+
+def test_a_store_that_fails_is_a_typed_failure(bench):
+    class Gone(MemoryStore):
+        def get(self, name: str) -> bytes:
+            raise StoreError("gone")
+
+    bench.store = Gone()
+
+    assert code(bench.run()) == "store"
+
+
+def test_turns_are_given_in_order_and_come_back(bench):
+    slots = JobSlots(bench.pipe)
+    assert slots.acquire(WHO, lambda seconds: pytest.fail("there is a turn"))
+    rests: list[float] = []
+    assert not slots.acquire(WHO, lambda seconds: bool(rests.append(seconds)))
+    slots.release()
+    assert slots.acquire(WHO, lambda seconds: pytest.fail("there is a turn"))
+    assert len(rests) == 1
+
+
+def test_a_conflict_is_no_reason_to_forget_the_end(bench):
+    class Racing(MemoryStore):
+        races = 1
+
+        def compare_and_swap(self, name: str, expected: bytes | None, data: bytes) -> None:
+            if b'"done"' in data and self.races:
+                self.races -= 1
+                raise Conflict("somebody asked to cancel")
+            super().compare_and_swap(name, expected, data)
+
+    bench.store = Racing()
+
+    assert code(bench.run(lambda: FakeProcess([DONE]))) == "ok"
+    assert bench.record.state == "done"
+
+
+def test_a_reply_that_the_process_stored_is_passed_on_under_its_name(bench):
+    outcome = bench.run(lambda: FakeProcess([["stored", 12.5, "ab" * 32, 10**6, None]]))
+
+    assert outcome == JobOutcome(object="ab" * 32, reply=None, compute_ms=12.5)
+    assert (bench.record.state, bench.record.reply, bench.record.reply_bytes) == ("done", "ab" * 32, 10**6)
+    assert [info.name for info in bench.store.list("objects/")] == []
+
+
+def test_a_reply_that_does_not_fit_the_robots_quota_is_a_typed_failure_and_not_stored(bench):
+    bench.store.put(object_name("default", "robot-1", "full"), bytes(10**6 - 1))
+
+    assert code(bench.run(lambda: FakeProcess([DONE]))) == "quota"
+    assert bench.record.code == "quota"
+    assert len(list(bench.store.list("objects/"))) == 1

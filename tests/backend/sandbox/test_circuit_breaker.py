@@ -1,0 +1,63 @@
+"""What is not tried again: deadly requests, and services that crash again and again."""
+
+from __future__ import annotations
+
+from rse_pf.backend.sandbox.circuit_breaker import CircuitBreaker
+from rse_pf.config import PlatformSettings
+
+SETTINGS = PlatformSettings.from_dict(
+    {"services": {"poison_deaths": 2, "crash_loop_deaths": 3, "crash_loop_s": 30, "quarantine_s": 60}}
+).services
+
+
+def test_a_request_that_killed_twice_is_poison_whenever_it_comes_back():
+    quarantine = CircuitBreaker(SETTINGS)
+    quarantine.died("icp", "a", 0.0)
+    assert quarantine.verdict("icp", "a", 0.0) == "run"
+    quarantine.died("icp", "a", 1000.0)
+
+    assert quarantine.verdict("icp", "a", 5000.0) == "poison"
+    assert quarantine.verdict("icp", "b", 5000.0) == "run"
+
+
+def test_three_deaths_in_half_a_minute_let_a_service_rest_for_a_minute():
+    quarantine = CircuitBreaker(SETTINGS)
+    for now, digest in ((0.0, "a"), (20.0, "b"), (30.0, "c")):
+        assert quarantine.verdict("icp", digest, now) == "run"
+        quarantine.died("icp", digest, now)
+
+    assert quarantine.verdict("icp", "d", 30.1) == "quarantined"
+    assert quarantine.verdict("other", "d", 30.1) == "run"
+    assert quarantine.resting(89.9) == ["icp"]
+    assert quarantine.rests_s("icp", 80.0) == 10.0
+    assert quarantine.verdict("icp", "d", 90.0) == "run"
+    assert quarantine.resting(90.0) == []
+
+
+def test_deaths_further_apart_are_no_crash_loop():
+    quarantine = CircuitBreaker(SETTINGS)
+    for i in range(20):
+        quarantine.died("icp", str(i), i * 15.1)
+
+    assert quarantine.verdict("icp", "x", 20 * 15.1) == "run"
+
+
+def test_after_its_rest_a_service_must_crash_as_often_again():
+    quarantine = CircuitBreaker(SETTINGS)
+    for i in range(3):
+        quarantine.died("icp", str(i), float(i))
+    quarantine.died("icp", "late", 70.0)
+
+    assert quarantine.verdict("icp", "x", 71.0) == "run"
+
+
+def test_memory_is_bounded_whatever_dies():
+    quarantine = CircuitBreaker(SETTINGS)
+    for i in range(12_000):
+        quarantine.died("icp", str(i), i * 100.0)
+    for _ in range(2):
+        quarantine.died("icp", "new", 1e7)
+
+    assert quarantine.verdict("icp", "new", 2e7) == "poison"
+    quarantine.died("icp", "0", 1e7)
+    assert quarantine.verdict("icp", "0", 2e7) == "run", "its first death is forgotten by now"

@@ -1,0 +1,92 @@
+"""What services make for a robot counts as what it stores itself."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import msgspec
+import pytest
+
+from rse_pf.auth.tokens import Claims
+from rse_pf.backend.jobs.process import kept
+from rse_pf.backend.object_refs import ObjectRefs
+from rse_pf.backend.quota import check_room, quota_bytes, store_within
+from rse_pf.config import PlatformSettings
+from rse_pf.errors import QuotaExceeded
+from rse_pf.object_store import DirectoryStore, MemoryStore, digest_of, object_name
+from rse_pf.wire import Failure, Result
+
+ROBOT = ("default", "robot-1")
+REPLY = msgspec.msgpack.encode({"value": bytes(500)})
+
+
+def claims(**quotas: float) -> Claims:
+    return Claims(
+        robot="robot-1", token_id="t", issued_s=0.0, expires_s=1.0, key_id="k", quotas=tuple(quotas.items())
+    )
+
+
+def order(store: str, **others: Any) -> dict[str, Any]:
+    settings = PlatformSettings.from_dict({"data": {"store": store, "max_object_bytes": 4096}})
+    return {
+        "settings": settings.to_dict(), "tenant": "default", "robot": "robot-1", "quota_bytes": 1000.0,
+        "inline_bytes": 1000, **others,
+    }  # fmt: skip
+
+
+def test_a_robots_token_says_how_much_it_may_store_and_the_settings_where_it_does_not():
+    assert quota_bytes(claims(data_bytes=7.0), 10.0) == 7.0
+    assert quota_bytes(claims(), 10.0) == 10.0
+    assert quota_bytes(None, 10.0) == 10.0
+
+
+def test_what_fits_exactly_is_stored_one_byte_more_is_not_and_others_do_not_count():
+    store = MemoryStore()
+    store.put(object_name("default", "robot-2", "other"), bytes(500))
+    store.put(object_name(*ROBOT, "own"), bytes(60))
+
+    with pytest.raises(QuotaExceeded):
+        store_within(store, *ROBOT, bytes(41), 100)
+    digest = store_within(store, *ROBOT, bytes(40), 100)
+
+    assert store.get(object_name(*ROBOT, digest)) == bytes(40)
+    assert store_within(store, *ROBOT, bytes(40), 100) == digest
+    with pytest.raises(QuotaExceeded):
+        check_room(store, *ROBOT, 1, 100)
+
+
+def test_a_large_reply_of_a_robot_without_room_is_refused_with_the_reason():
+    store, settings = MemoryStore(), PlatformSettings()
+    gate = ObjectRefs(store, settings.serving, 100)
+    answer, sent = Result(id=1, reply=bytes(500)), Failure(id=1, code="too-large", message="too large")
+    owner = SimpleNamespace(tenant="default", robot="robot-1", claims=None)
+
+    refused = gate.kept(answer, sent, owner)
+    owner.claims = claims(data_bytes=1000.0)
+    stored = gate.kept(answer, sent, owner)
+
+    assert isinstance(refused, Failure)
+    assert (refused.id, refused.code) == (1, "quota")
+    assert isinstance(stored, Result)
+    assert [info.name for info in store.list()] == [object_name(*ROBOT, stored.object)]
+
+
+def test_a_jobs_process_stores_its_reply_and_sends_only_small_ones_along(tmp_path):
+    small = kept(["done", 5.0, REPLY], order(f"dir:{tmp_path}"))
+    large = kept(["done", 5.0, REPLY], order(f"dir:{tmp_path}", inline_bytes=100))
+
+    assert small == ["stored", 5.0, digest_of(REPLY), len(REPLY), REPLY]
+    assert large == ["stored", 5.0, digest_of(REPLY), len(REPLY), None]
+    assert DirectoryStore(tmp_path).get(object_name(*ROBOT, digest_of(REPLY))) == REPLY
+
+
+def test_a_jobs_process_refuses_what_is_too_large_or_beyond_the_quota(tmp_path):
+    assert kept(["done", 5.0, bytes(5000)], order(f"dir:{tmp_path}"))[:2] == ["failed", "too-large"]
+    assert kept(["done", 5.0, bytes(1001)], order(f"dir:{tmp_path}"))[:2] == ["failed", "quota"]
+    assert list(DirectoryStore(tmp_path).list()) == []
+
+
+def test_a_store_of_the_worker_alone_and_a_failure_are_left_to_the_worker():
+    assert kept(["done", 5.0, REPLY], order("memory:")) == ["done", 5.0, REPLY]
+    assert kept(["failed", "c", "m", "h"], order("memory:")) == ["failed", "c", "m", "h"]

@@ -1,0 +1,141 @@
+"""The rendered world: exact where it must be, flawed as a Kinect is, and the same every time."""
+
+from __future__ import annotations
+
+import ast
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import client_sdk.simulator
+from client_sdk.frontend import PoseQuery, Tracker
+from client_sdk.mapping import Trajectory
+from client_sdk.simulator import SIMULATED_CAMERA, render_frames, true_trajectory
+from client_sdk.simulator.camera import Painter, add_depth_noise
+from client_sdk.simulator.world import DEPTH_M, HEIGHT_M, ROOM_M, make_world
+from rse_pf.errors import UsageError
+from rse_pf.experiments.results.trajectory_error import ate_cm
+from rse_pf.geometry import pose_difference, transform
+from rse_pf.pnp import PnpOptions, solve_pnp
+
+
+@pytest.fixture(scope="module")
+def painter() -> Painter:
+    return Painter(make_world(0), SIMULATED_CAMERA)
+
+
+def test_the_same_arguments_give_the_same_frames_and_another_seed_others():
+    first, again, other = (next(render_frames(1, 3, 1, seed)) for seed in (4, 4, 5))
+    np.testing.assert_array_equal(first.rgb, again.rgb)
+    np.testing.assert_array_equal(first.depth_m, again.depth_m)
+    assert np.mean(first.rgb != other.rgb) > 0.5
+
+
+@pytest.mark.parametrize(("robots", "seed"), [(1, 0), (3, 1), (5, 4)])
+def test_robots_move_smoothly_inside_the_rooms(robots: int, seed: int):
+    for robot in range(robots):
+        truth = true_trajectory(robot, robots, 120, seed)
+        steps = [
+            pose_difference(a, b)
+            for a, b in zip(truth.T_world_camera, truth.T_world_camera[1:], strict=False)
+        ]
+        assert max(metres for metres, _ in steps) <= 0.08
+        assert max(degrees for _, degrees in steps) <= 4.0
+        assert 5.0 <= truth.length_m <= 8.5
+        low, high = truth.positions.min(axis=0), truth.positions.max(axis=0)
+        assert (low > [0.5, 0.5, 1.0]).all()
+        assert (high < [3 * ROOM_M - 0.5, DEPTH_M - 0.5, 1.5]).all()
+        np.testing.assert_allclose(np.linalg.det(truth.T_world_camera[:, :3, :3]), 1.0)
+
+
+def test_every_ray_ends_on_a_surface_of_the_world(painter: Painter):
+    pose = true_trajectory(0, 1, 1, 0).T_world_camera[0]
+
+    _, depth_m, _ = painter.draw(pose)
+
+    assert (depth_m > 0).mean() > 0.9999
+    rows, columns = np.nonzero(depth_m[::7, ::7] > 0)
+    pixels = np.column_stack((columns * 7, rows * 7)).astype(float)
+    camera_points = SIMULATED_CAMERA.back_project(pixels, depth_m[rows * 7, columns * 7].astype(float))
+    points = transform(pose, camera_points)
+    assert (points > -0.001).all()
+    assert (points < [3 * ROOM_M + 0.001, DEPTH_M + 0.001, HEIGHT_M + 0.001]).all()
+
+
+def test_a_wall_is_as_far_away_as_it_is(painter: Painter):
+    pose = np.eye(4)
+    pose[:3, :3] = [[0, 0, -1], [1, 0, 0], [0, -1, 0]]  # looking along -x; x of the image is +y
+    pose[:3, 3] = [1.0, 1.5, 0.5]
+
+    _, depth_m, cosine = painter.draw(pose)
+
+    assert depth_m[240, 320] == pytest.approx(1.0, abs=1e-5)
+    assert cosine[240, 320] == pytest.approx(1.0, abs=1e-4)
+    # the floor, 0.5 m below: row 239.5 + 525 * 0.5 / z, so at row 449 z = 0.5 * 525 / 209.5
+    assert depth_m[449, 320] == pytest.approx(0.5 * 525 / 209.5, abs=1e-4) or depth_m[449, 320] < 1.0001
+
+
+def test_depth_noise_has_the_size_that_the_model_says():
+    rng = np.random.default_rng(0)
+    for z in (1.0, 2.0, 4.0):
+        truth = np.full((400, 400), z, np.float32)
+
+        errors = add_depth_noise(truth, np.ones_like(truth), rng)
+        seen = errors > 0
+
+        step = z * z / (8 * 0.075 * 580)  # 1/8 px of disparity, in metres
+        sigma = np.hypot(0.0012 + 0.0019 * (z - 0.4) ** 2, step / np.sqrt(12))
+        assert np.std(errors[seen] - z) == pytest.approx(sigma, rel=0.05)
+        assert abs(np.mean(errors[seen]) - z) < 0.05 * sigma + step**2
+        assert 0.001 < 1 - seen.mean() < 0.003
+
+
+def test_depth_has_holes_beside_edges_at_grazing_angles_and_out_of_range():
+    truth = np.full((100, 100), 2.0, np.float32)
+    truth[:, 50:] = 3.0
+    truth[0], truth[1] = 0.39, 6.1
+    cosine = np.ones_like(truth)
+    cosine[60] = 0.05
+
+    seen = add_depth_noise(truth, cosine, np.random.default_rng(0)) > 0
+
+    assert not seen[[0, 1, 60]].any()
+    assert not seen[3:59, 50:53].any()  # the shadow of the nearer surface
+    assert seen[3:59, :50].mean() > 0.99
+    assert seen[3:59, 53:].mean() > 0.99
+
+
+def test_robots_that_do_not_exist_are_refused():
+    for arguments in ((3, 3, 10, 0), (-1, 3, 10, 0), (0, 1, 0, 0)):
+        with pytest.raises(UsageError):
+            next(render_frames(*arguments))
+
+
+def test_the_renderer_needs_no_image_library():
+    folder = Path(client_sdk.simulator.__file__).parent
+    for path in folder.glob("simulate*.py"):
+        imported = {
+            alias.name for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.Import)
+            for alias in node.names
+        }  # fmt: skip
+        assert imported <= {"numpy", "numpy.typing"}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("robot", "robots", "seed"), [(0, 3, 0), (2, 3, 1), (4, 5, 2)])
+def test_the_world_can_be_tracked(robot: int, robots: int, seed: int):
+    pytest.importorskip("cv2", reason="pip install 'rse-pf[vision]'")
+    truth, tracker, poses = true_trajectory(robot, robots, 30, seed), Tracker(), []
+    for frame in render_frames(robot, robots, 30, seed):
+        step = tracker.prepare(frame)
+        while isinstance(step, PoseQuery):
+            found = step.correspondences
+            solution = solve_pnp(
+                found.points_world, found.pixels, step.camera, PnpOptions(inlier_px=step.inlier_px)
+            )
+            step = tracker.accept(step, solution.T_camera_world, len(solution.inliers))
+        poses.append(step.T_world_camera)
+
+    assert tracker.lost_frames == 0
+    assert ate_cm(Trajectory(truth.timestamps_s, np.array(poses)), truth) <= 2.0 * truth.length_m

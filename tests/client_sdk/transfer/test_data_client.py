@@ -1,0 +1,396 @@
+"""The robot's side of large data: parts, resuming, patience, and a slow trickle beside live poses."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import queue
+import random
+import threading
+from collections.abc import Callable, Iterator
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+
+import pytest
+
+from client_sdk.transfer.background_upload import BackgroundUploader, UploadRate
+from client_sdk.transfer.data_client import DataClient, DataOptions
+from rse_pf.config import DataSettings
+from rse_pf.errors import BadRequest, ConnectError, NotFound, QuotaExceeded, StoreError, UsageError
+
+DATA = random.Random(1).randbytes(700_000)
+DIGEST = hashlib.sha256(DATA).hexdigest()
+Answer = tuple[int, dict[str, str], bytes]
+Script = Callable[[str, str, dict[str, str], bytes], "Answer | None"]
+
+
+class FakeService:
+    """Stores parts in memory; *script* may answer first, and ``(0, {}, b"")`` cuts the connection."""
+
+    def __init__(self) -> None:
+        self.objects: dict[str, bytes] = {}
+        self.parts: dict[str, bytes] = {}
+        self.sizes: dict[str, int] = {}
+        self.asked: list[tuple[str, str]] = []
+        self.script: Script = lambda method, path, headers, body: None
+        service = self
+
+        class Handler(BaseHTTPRequestHandler):
+            protocol_version = "HTTP/1.1"
+
+            def answer(self) -> None:
+                body = self.rfile.read(int(self.headers.get("Content-Length", 0)))
+                service.asked.append((self.command, self.path))
+                given = dict(self.headers.items())
+                made = service.script(self.command, self.path, given, body)
+                status, headers, content = made or service.answer(self.command, self.path, given, body)
+                if status == 0:
+                    self.close_connection = True
+                    return
+                self.send_response(status)
+                for name, value in {**headers, "Content-Length": str(len(content))}.items():
+                    self.send_header(name, value)
+                self.end_headers()
+                self.wfile.write(content)
+
+            do_GET = do_PUT = do_PATCH = do_DELETE = do_POST = answer
+
+            def log_message(self, *_: object) -> None:
+                """Stay silent."""
+
+        self.server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
+        self.thread = threading.Thread(target=self.server.serve_forever, args=(0.01,), daemon=True)
+        self.thread.start()
+        self.url = f"http://127.0.0.1:{self.server.server_address[1]}"
+
+    def answer(self, method: str, path: str, headers: dict[str, str], body: bytes) -> Answer:
+        kind, digest = path.split("/")[3:5]
+        if kind == "uploads":
+            if method == "PUT":
+                self.sizes[digest] = json.loads(body)["size"]
+            held = self.parts.setdefault(digest, b"")
+            if method == "PATCH":
+                if int(headers["Upload-Offset"]) != len(held):
+                    return failure(409, "conflict")
+                held = self.parts[digest] = held + body
+            if len(held) == self.sizes[digest]:
+                self.objects[digest] = held
+            state = {"digest": digest, "size": self.sizes[digest], "offset": len(held), "part_bytes": 200_000}
+            return 200, {}, json.dumps(state).encode()
+        if method == "PUT":
+            self.objects[digest] = body
+            return 201, {}, b"{}"
+        if digest not in self.objects:
+            return failure(404, "not-found")
+        whole = self.objects[digest]
+        first, _, last = headers["Range"].removeprefix("bytes=").partition("-")
+        if int(first) >= len(whole):
+            return 416, {"Content-Range": f"bytes */{len(whole)}"}, b"{}"
+        piece = whole[int(first) : int(last) + 1]
+        told = f"bytes {first}-{int(first) + len(piece) - 1}/{len(whole)}"
+        return 206, {"Content-Range": told}, piece
+
+    def close(self) -> None:
+        self.server.shutdown()
+        self.server.server_close()
+        self.thread.join(10)
+
+
+def failure(status: int, code: str, **headers: str) -> Answer:
+    return status, headers, json.dumps({"code": code, "message": "so it is", "hint": "do this"}).encode()
+
+
+@pytest.fixture
+def service() -> Iterator[FakeService]:
+    made = FakeService()
+    yield made
+    made.close()
+
+
+class Robot:
+    """A client whose clock and pauses are the test's."""
+
+    def __init__(self, service: FakeService) -> None:
+        self.now = 0.0
+        self.pauses: list[float] = []
+        options = DataOptions(clock=lambda: self.now, sleep=self.sleep, random=random.Random(3))
+        self.client = DataClient(service.url, "token", options)
+
+    def sleep(self, seconds: float) -> None:
+        self.pauses.append(seconds)
+        self.now += seconds
+
+
+@pytest.fixture
+def robot(service: FakeService) -> Iterator[Robot]:
+    made = Robot(service)
+    yield made
+    made.client.close()
+
+
+def once(answer: Answer, method: str = "PATCH", after: int = 0) -> Script:
+    """Return a script that gives *answer* to one request of *method*, the one after *after* others."""
+    left = [after]
+
+    def script(asked: str, path: str, headers: dict[str, str], body: bytes) -> Answer | None:
+        if asked != method:
+            return None
+        left[0] -= 1
+        return answer if left[0] == -1 else None
+
+    return script
+
+
+def test_a_small_object_goes_at_once(service: FakeService, robot: Robot) -> None:
+    assert robot.client.upload(b"small") == hashlib.sha256(b"small").hexdigest()
+    assert [method for method, _ in service.asked] == ["PUT"]
+
+
+def test_a_large_one_goes_in_the_parts_that_the_server_names(service: FakeService, robot: Robot) -> None:
+    told: list[tuple[int, int]] = []
+
+    assert robot.client.upload(DATA, lambda done, size: told.append((done, size))) == DIGEST
+
+    assert service.objects[DIGEST] == DATA
+    assert [done for done, _ in told] == [0, 200_000, 400_000, 600_000, 700_000]
+    assert {size for _, size in told} == {700_000}
+
+
+@pytest.mark.parametrize(
+    "cut", [(0, {}, b""), failure(503, "busy"), failure(500, "internal"), failure(408, "expired")]
+)
+def test_a_cut_is_tried_again_after_a_growing_pause(service: FakeService, robot: Robot, cut: Answer) -> None:
+    service.script = once(cut, after=1)
+
+    assert robot.client.upload(DATA) == DIGEST
+
+    assert service.objects[DIGEST] == DATA
+    assert len(robot.pauses) == 1
+
+
+def test_a_part_whose_answer_was_lost_is_not_sent_twice(service: FakeService, robot: Robot) -> None:
+    def stored_but_cut(method: str, path: str, headers: dict[str, str], body: bytes) -> Answer | None:
+        if (
+            method == "PATCH"
+            and headers["Upload-Offset"] == "200000"
+            and len(service.parts[DIGEST]) == 200_000
+        ):
+            service.answer(method, path, headers, body)
+            return 0, {}, b""
+        return None
+
+    service.script = stored_but_cut
+
+    assert robot.client.upload(DATA) == DIGEST
+    assert service.objects[DIGEST] == DATA
+
+
+def test_an_upload_of_another_process_is_gone_on_with(
+    service: FakeService, robot: Robot, tmp_path: Path
+) -> None:
+    service.parts[DIGEST] = DATA[:400_000]
+    (tmp_path / "cloud").write_bytes(DATA)
+
+    robot.client.upload(tmp_path / "cloud")
+
+    assert service.objects[DIGEST] == DATA
+    assert [method for method, _ in service.asked].count("PATCH") == 2
+
+
+def test_a_refusal_is_final_and_has_its_name(service: FakeService, robot: Robot) -> None:
+    service.script = once(failure(413, "quota"), "PUT")
+
+    with pytest.raises(QuotaExceeded, match="so it is"):
+        robot.client.upload(DATA)
+    assert robot.pauses == []
+
+
+def test_patience_ends(service: FakeService, robot: Robot) -> None:
+    service.script = lambda *_: (0, {}, b"")
+
+    with pytest.raises(ConnectError):
+        robot.client.upload(DATA)
+
+    assert 30.0 < robot.now <= 60.0
+    assert max(robot.pauses) <= 5.0
+
+
+def test_the_server_says_how_long_to_wait(service: FakeService, robot: Robot) -> None:
+    service.script = once(failure(503, "busy", **{"Retry-After": "7"}), "PUT")
+
+    robot.client.upload(b"small")
+
+    assert robot.pauses == [7.0]
+
+
+def test_a_download_is_checked_and_goes_on_after_a_cut(
+    service: FakeService, robot: Robot, tmp_path: Path
+) -> None:
+    large = random.Random(2).randbytes(2_500_000)
+    digest = hashlib.sha256(large).hexdigest()
+    service.objects[digest] = large
+    service.script = once((0, {}, b""), "GET", after=1)
+
+    assert robot.client.download(digest) == large
+
+    (tmp_path / f".map.{digest[:16]}.part").write_bytes(large[:1_000_000])
+    service.asked.clear()
+    robot.client.download(digest, tmp_path / "map")
+    assert (tmp_path / "map").read_bytes() == large
+    assert len(service.asked) == 2
+    assert [path.name for path in tmp_path.iterdir()] == ["map"]
+
+
+def test_other_bytes_than_asked_for_are_refused(service: FakeService, robot: Robot, tmp_path: Path) -> None:
+    service.objects[DIGEST] = DATA[:-1] + b"?"
+
+    with pytest.raises(StoreError, match="digest"):
+        robot.client.download(DIGEST, tmp_path / "map")
+
+    assert list(tmp_path.iterdir()) == []
+    with pytest.raises(NotFound):
+        robot.client.download("0" * 64)
+
+
+@pytest.mark.parametrize("url", ["", "ftp://x", "http://", "x"])
+def test_an_address_is_checked_before_anything_is_sent(url: str) -> None:
+    with pytest.raises(UsageError):
+        DataClient(url, "token")
+
+
+def test_no_credit_is_saved_up_while_nothing_is_sent() -> None:
+    pace = UploadRate(1000.0, 0.0)
+
+    waits = [pace.wait_s(500, now) for now in (3600.0, 3600.0, 3600.0)]
+
+    assert waits == [0.0, 0.5, 1.0]
+
+
+class FakeUploads:
+    """Takes files, or fails as told; knows when each came."""
+
+    def __init__(self) -> None:
+        self.taken: list[bytes] = []
+        self.errors: list[Exception] = []
+        self.parts: queue.SimpleQueue[int] = queue.SimpleQueue()
+
+    def upload(self, source: Path, progress: Callable[[int, int], None]) -> str:
+        if self.errors:
+            raise self.errors.pop(0)
+        data = source.read_bytes()
+        for done in (0, len(data) // 2, len(data)):
+            self.parts.put(done)
+            progress(done, len(data))
+        self.taken.append(data)
+        return ""
+
+    def close(self) -> None:
+        """Nothing is open."""
+
+
+def uploader(uploads: FakeUploads, folder: Path, **more: object) -> BackgroundUploader:
+    settings = DataSettings(background_bytes_per_s=100_000_000, spool_bytes=4000)
+    return BackgroundUploader(uploads, folder, settings, **more)  # type: ignore[arg-type]
+
+
+def test_keyframes_go_in_order_and_leave_the_folder(tmp_path: Path) -> None:
+    uploads = FakeUploads()
+    background = uploader(uploads, tmp_path / "spool")
+    background.start()
+    for n in range(5):
+        assert background.add(bytes([n]) * 100)
+
+    assert background.wait_sent(20)
+    background.close()
+
+    assert uploads.taken == [bytes([n]) * 100 for n in range(5)]
+    assert list((tmp_path / "spool").iterdir()) == []
+    assert background.sent == 5
+
+
+def test_the_folder_is_bounded_and_what_it_cannot_hold_is_counted(tmp_path: Path) -> None:
+    background = uploader(FakeUploads(), tmp_path / "spool", is_busy=lambda: True)
+    background.start()
+
+    kept = [background.add(bytes([n]) * 1000) for n in range(6)]
+    background.close()
+
+    assert [each is not None for each in kept] == [True] * 4 + [False] * 2
+    assert background.dropped == 2
+    assert sum(path.stat().st_size for path in (tmp_path / "spool").iterdir()) == 4000
+
+
+def test_the_next_run_sends_what_this_one_could_not(tmp_path: Path) -> None:
+    first = uploader(FakeUploads(), tmp_path / "spool", is_busy=lambda: True)
+    first.start()
+    first.add(b"one")
+    first.add(b"two")
+    first.close()
+    uploads = FakeUploads()
+    second = uploader(uploads, tmp_path / "spool")
+    second.start()
+    second.add(b"three")
+
+    assert second.wait_sent(20)
+    second.close()
+
+    assert uploads.taken == [b"one", b"two", b"three"]
+
+
+def test_nothing_is_begun_while_live_poses_wait(tmp_path: Path) -> None:
+    uploads, busy, asked = FakeUploads(), threading.Event(), threading.Event()
+    busy.set()
+
+    def is_busy() -> bool:
+        asked.set()
+        return busy.is_set()
+
+    background = uploader(uploads, tmp_path / "spool", is_busy=is_busy)
+    background.start()
+    background.add(b"keyframe")
+    assert asked.wait(20)
+    assert uploads.taken == []
+
+    busy.clear()
+    assert background.wait_sent(20)
+    background.close()
+
+
+def test_no_part_is_begun_while_live_poses_wait(tmp_path: Path) -> None:
+    uploads, busy, asked = FakeUploads(), threading.Event(), threading.Event()
+
+    def is_busy() -> bool:
+        if not uploads.parts.empty():
+            busy.set()  # a pose comes while the first part is on its way
+            asked.set()
+        return busy.is_set() and not let.is_set()
+
+    let = threading.Event()
+    background = uploader(uploads, tmp_path / "spool", is_busy=is_busy)
+    background.start()
+    background.add(b"keyframe")
+    assert asked.wait(20)
+    assert uploads.parts.get(timeout=20) == 0
+    assert uploads.parts.empty()
+    assert uploads.taken == []
+
+    let.set()
+    assert background.wait_sent(20)
+    background.close()
+
+    assert [uploads.parts.get(timeout=20) for _ in range(2)] == [4, 8]
+
+
+def test_what_the_server_will_never_take_is_dropped_and_the_next_goes(tmp_path: Path) -> None:
+    uploads = FakeUploads()
+    uploads.errors = [BadRequest("no")]
+    background = uploader(uploads, tmp_path / "spool")
+    background.start()
+    background.add(b"bad")
+    background.add(b"good")
+
+    assert background.wait_sent(20)
+    background.close()
+
+    assert uploads.taken == [b"good"]
+    assert (background.dropped, background.last_error) == (1, "no")

@@ -1,0 +1,162 @@
+"""The robot's way straight to the bucket: without its token, and back to the service when it is closed."""
+
+from __future__ import annotations
+
+import random
+import threading
+from collections.abc import Iterator
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+
+import pytest
+from fake_data_service import FrontDoor, Service, small_settings
+
+from client_sdk.transfer.data_client import DataClient, DataOptions
+from client_sdk.transfer.presigned import is_allowed
+from rse_pf.object_store import MemoryStore, digest_of
+
+DATA = random.Random(1).randbytes(700_000)
+DIGEST = digest_of(DATA)
+
+
+class Bucket(MemoryStore):
+    """A store in memory with a door of its own, which robots reach by signed addresses while it is *open*."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.is_open = True
+        self.asked: list[tuple[str, int]] = []
+        self.tokens = 0
+        bucket = self
+
+        class Handler(BaseHTTPRequestHandler):
+            protocol_version = "HTTP/1.1"
+
+            def answer(self) -> None:
+                data = self.rfile.read(int(self.headers.get("Content-Length", 0)))
+                name = self.path.partition("?")[0].removeprefix("/")
+                bucket.tokens += "Authorization" in self.headers
+                body = b""
+                if not bucket.is_open or not self.path.endswith("?signed"):
+                    status = 403
+                elif self.command == "PUT":
+                    assert self.headers["x-checksum"] == digest_of(data)
+                    bucket.put(name, data)
+                    status = 200
+                else:
+                    first, _, last = self.headers["Range"].removeprefix("bytes=").partition("-")
+                    whole = bucket.get(name)
+                    status, body = 206, whole[int(first) : int(last) + 1]
+                bucket.asked.append((self.command, status))
+                self.send_response(status)
+                if status == 206:
+                    told = f"bytes {first}-{int(first) + len(body) - 1}/{len(whole)}"
+                    self.send_header("Content-Range", told)
+                self.send_header("Content-Length", str(len(body)))
+                self.end_headers()
+                self.wfile.write(body)
+
+            do_GET = do_PUT = answer
+
+            def log_message(self, *_: object) -> None:
+                """Stay silent."""
+
+        self._server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
+        self._server.daemon_threads = True
+        self._thread = threading.Thread(target=self._server.serve_forever, args=(0.01,), daemon=True)
+        self._thread.start()
+        self._url = f"http://127.0.0.1:{self._server.server_address[1]}"
+
+    def presigned_put(self, name: str, *, size: int, sha256: str, life_s: int) -> tuple[str, dict[str, str]]:
+        return f"{self._url}/{name}?signed", {"Content-Length": str(size), "x-checksum": sha256}
+
+    def presigned_get(self, name: str, *, life_s: int) -> str:
+        return f"{self._url}/{name}?signed"
+
+    def close(self) -> None:
+        self._server.shutdown()
+        self._server.server_close()
+        self._thread.join(10)
+
+
+@pytest.fixture
+def bucket() -> Iterator[Bucket]:
+    """An open bucket."""
+    made = Bucket()
+    yield made
+    made.close()
+
+
+@pytest.fixture
+def service(bucket: Bucket) -> Service:
+    """A data service on it."""
+    return Service(small_settings(part_bytes=200_000, max_object_bytes=1 << 20, quota_bytes=1 << 22), bucket)
+
+
+@pytest.fixture
+def robot(service: Service) -> Iterator[DataClient]:
+    """A robot that waits for nothing."""
+    door = FrontDoor(service)
+    client = DataClient(door.url, service.token, DataOptions(sleep=lambda seconds: None))
+    yield client
+    client.close()
+    door.close()
+
+
+def carried(service: Service) -> int:
+    """How many bytes of objects went through the service."""
+    lines = [line for line in service.lines if line["operation"] in ("append_part", "get_object")]
+    return sum(line["received_bytes"] + line["sent_bytes"] for line in lines)
+
+
+def test_large_data_goes_straight_both_ways_and_the_token_stays_at_home(
+    service: Service, bucket: Bucket, robot: DataClient
+) -> None:
+    assert robot.upload(DATA) == DIGEST
+    assert robot.download(DIGEST) == DATA
+
+    assert bucket.asked == [("PUT", 200), ("GET", 206)]
+    assert carried(service) == 0
+    assert bucket.tokens == 0
+
+
+def test_a_closed_bucket_is_asked_three_times_and_then_the_service_carries_the_bytes(
+    service: Service, bucket: Bucket, robot: DataClient
+) -> None:
+    bucket.is_open = False
+
+    assert robot.upload(DATA) == DIGEST
+    assert robot.download(DIGEST) == DATA
+
+    assert bucket.asked == [("PUT", 403)] * 3 + [("GET", 403)] * 3
+    assert carried(service) >= 2 * len(DATA)
+
+
+def test_an_address_that_expired_is_asked_for_again(
+    service: Service, bucket: Bucket, robot: DataClient
+) -> None:
+    bucket.is_open = False
+    pauses: list[float] = []
+
+    def open_it(seconds: float) -> None:
+        pauses.append(seconds)
+        bucket.is_open = True
+
+    robot._options = DataOptions(sleep=open_it)
+
+    assert robot.upload(DATA) == DIGEST
+    bucket.is_open = False
+    assert robot.download(DIGEST) == DATA
+
+    assert bucket.asked == [("PUT", 403), ("PUT", 200), ("GET", 403), ("GET", 206)]
+    assert carried(service) == 0
+
+
+@pytest.mark.parametrize(
+    ("url", "secure", "allowed"),
+    [
+        ("https://bucket.s3.amazonaws.com/a?x", True, True), ("http://bucket/a", True, False),
+        ("http://127.0.0.1:1/a", False, True), ("ftp://bucket/a", False, False), ("", False, False),
+    ],
+)  # fmt: skip
+def test_tls_is_never_left(url: str, secure: bool, allowed: bool) -> None:
+    assert is_allowed(url, secure=secure) is allowed

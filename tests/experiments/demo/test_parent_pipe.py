@@ -1,0 +1,81 @@
+"""A demo robot's pipe: tokens and the start are told apart, from any thread, and a gone parent is noticed."""
+
+from __future__ import annotations
+
+import contextlib
+import multiprocessing
+import threading
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from multiprocessing.connection import Connection
+
+import pytest
+
+from rse_pf.errors import Disconnected
+from rse_pf.experiments.demo.parent_pipe import ParentPipe, TokenWanted
+
+
+def pair(clock: list[float]) -> tuple[ParentPipe, Connection]:
+    mine, theirs = multiprocessing.Pipe()
+    robot = ParentPipe(mine, clock=lambda: clock[0])
+    robot.listen()
+    return robot, theirs
+
+
+@contextlib.contextmanager
+def workers(parent: Connection) -> Iterator[ThreadPoolExecutor]:
+    """Give threads, and hang up at the end so that none waits for ever."""
+    with ThreadPoolExecutor() as pool:
+        try:
+            yield pool
+        finally:
+            parent.close()
+
+
+def answer(parent: Connection, count: int) -> None:
+    """Answer *count* questions with token-1, token-2, ..."""
+    for number in range(1, count + 1):
+        assert isinstance(parent.recv(), TokenWanted)
+        parent.send(f"token-{number}")
+
+
+def test_a_token_that_comes_before_the_start_is_not_taken_for_it() -> None:
+    robot, parent = pair([0.0])
+    with workers(parent) as pool:
+        start = pool.submit(robot.wait_start)
+        token = pool.submit(robot.fresh_token)
+        answer(parent, 1)
+        assert token.result(10) == "token-1"
+        parent.send(7.5)
+        assert start.result(10) == 7.5
+
+
+def test_two_threads_that_ask_at_once_both_get_a_token() -> None:
+    robot, parent = pair([0.0])
+    threading.Thread(target=answer, args=(parent, 2), daemon=True).start()
+    with workers(parent) as pool:
+        asked = [pool.submit(robot.fresh_token) for _ in range(2)]
+        assert {each.result(10) for each in asked} == {"token-1", "token-2"}
+
+
+def test_uploads_get_a_new_token_only_when_theirs_has_aged() -> None:
+    clock = [0.0]
+    robot, parent = pair(clock)
+    threading.Thread(target=answer, args=(parent, 2), daemon=True).start()
+
+    first = robot.token()
+    clock[0] = 59.0
+    again = robot.token()
+    clock[0] = 61.0
+
+    assert (first, again, robot.token()) == ("token-1", "token-1", "token-2")
+
+
+def test_a_parent_that_is_gone_is_said_to_everyone_who_waits() -> None:
+    robot, parent = pair([0.0])
+    with workers(parent) as pool:
+        waiting = [pool.submit(robot.wait_start) for _ in range(2)]
+        parent.close()
+        for each in waiting:
+            with pytest.raises(Disconnected):
+                each.result(10)

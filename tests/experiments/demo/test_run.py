@@ -1,0 +1,98 @@
+"""The demo's folder and report, without running it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from client_sdk.mapping import Trajectory
+from rse_pf.errors import UsageError
+from rse_pf.experiments.demo.report import as_markdown, closing_lines, make_report
+from rse_pf.experiments.demo.robot import Finished
+from rse_pf.experiments.demo.run import _fresh_folder
+from rse_pf.experiments.results.report import CommandRecord
+
+COMMAND = CommandRecord(
+    id=1, robot="robot-1", planned=0.0, sent=0.0, answered=0.01, server="a", code="ok",
+    payload_bytes=4000, round_trip_ms=9.0, queue_ms=0.1, compute_ms=2.0,
+)  # fmt: skip
+
+
+def walk(wrong_m: float = 0.0) -> Trajectory:
+    poses = np.tile(np.eye(4), (10, 1, 1))
+    poses[:, 0, 3] = np.linspace(0, 0.9, 10)
+    poses[:, 1, 3] = np.where(np.arange(10) % 2, wrong_m, -wrong_m)
+    return Trajectory(np.arange(10) / 5.0, poses)
+
+
+def finished(truth: Trajectory | None) -> Finished:
+    return Finished(
+        frames=10, lost_frames=1, keyframes=2, weak_poses=0, map_points=5, fps=4.9, matches=[300, 310],
+        inliers=[290, 300], commands=[COMMAND], trajectory=walk(0.01), truth=truth, truth_kind="ground truth",
+    )  # fmt: skip
+
+
+def report(truth: Trajectory | None):
+    return make_report(
+        [finished(truth)], [COMMAND], {"rate_hz": 5.0}, {"settings_digest": "d", "load_average": [0]}, [0]
+    )
+
+
+def test_judges_the_trajectory_against_the_truth():
+    made = report(walk())
+    assert made["ate_cm"][0] == pytest.approx(1.0, abs=0.15)
+    assert made["rpe_cm"][0] == pytest.approx(2.0, abs=0.01)
+    assert made["lost_frames"] == 1
+    assert made["paper"]["round_trip_ms"] == 156.36
+
+
+def test_says_nothing_about_accuracy_without_a_truth():
+    made = report(None)
+    assert made["ate_cm"] == [None]
+    assert "ATE" not in closing_lines(made, Path("out"))
+
+
+def test_has_the_fields_that_others_read():
+    made = report(walk())
+    for name in ("robots", "frames", "lost_frames", "ate_cm", "rpe_cm", "fps_per_robot", "failures_by_code"):
+        assert name in made
+    assert {"median", "max"} <= set(made["payload_bytes"])
+    assert {"p50", "p95", "p99"} <= set(made["round_trip_ms"]) & set(made["compute_ms"])
+    assert {"sent", "answered", "failed", "lost", "twice"} <= set(made["commands"])
+
+
+def test_the_markdown_puts_our_figures_beside_the_papers():
+    text = as_markdown(report(walk()))
+    assert "| round trip, mean ms | 9.0 | 156.36 |" in text
+    assert "29.82" in text
+
+
+def test_the_last_line_names_the_files(tmp_path):
+    last = closing_lines(report(walk()), tmp_path).splitlines()[-1]
+    assert str(tmp_path) in last
+    assert "map.ply" in last
+    assert "report.md" in last
+
+
+def test_an_earlier_run_is_replaced(tmp_path):
+    (tmp_path / "events.jsonl").write_text("")
+    (tmp_path / "robot-1").mkdir()
+    (tmp_path / "report.json").write_text("{}")
+    _fresh_folder(tmp_path)
+    assert not (tmp_path / "robot-1").exists()
+    assert not (tmp_path / "report.json").exists()
+
+
+def test_a_folder_with_other_files_is_not_touched(tmp_path):
+    (tmp_path / "thesis.tex").write_text("years of work")
+    with pytest.raises(UsageError, match="other files"):
+        _fresh_folder(tmp_path)
+    assert (tmp_path / "thesis.tex").read_text() == "years of work"
+
+
+def test_a_file_is_no_folder(tmp_path):
+    (tmp_path / "x").write_text("")
+    with pytest.raises(UsageError, match="is a file"):
+        _fresh_folder(tmp_path / "x")

@@ -1,0 +1,133 @@
+"""The swarm's plan, its payloads and its books; `tests/system/test_swarm.py` plays it."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+
+from rse_pf.config import SessionSettings
+from rse_pf.errors import UsageError
+from rse_pf.experiments.load.run import SwarmRun, report_of
+from rse_pf.experiments.load.swarm import SwarmOptions, SwarmResult
+from rse_pf.experiments.load.swarm import _records as records_of
+from rse_pf.experiments.load.swarm_process import Rows, SwarmSpec, is_right, make_payloads, planned_s
+from rse_pf.experiments.results.report import CommandRecord
+from rse_pf.geometry import exp_se3
+from rse_pf.pnp import solve_pnp
+from rse_pf.services.pnp import PnpReply, PnpRequest
+from rse_pf.wire import Command, as_type, make_codec
+from rse_pf.wire.preencoded import encode_command
+
+
+def spec(**changes: Any) -> SwarmSpec:
+    given: dict[str, Any] = {
+        "numbers": (0, 1), "robots": 2, "prefix": "robot", "url": "ws://h/ws", "service": "pnp",
+        "codec": "zlib", "fps": 5.0, "matches": 200, "outliers": 0.3, "seed": 0, "join_every_s": 0.0,
+        "deadline_s": 5.0, "keep": True, "session": SessionSettings(), **changes,
+    }  # fmt: skip
+    return SwarmSpec(**given)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("robots", 0), ("fps", 0.0), ("fps", math.nan), ("fps", math.inf), ("matches", 3), ("outliers", 1.0),
+        ("codec", "xml"), ("service", "pmp"), ("link", "moon"), ("processes", 0), ("deadline_s", 0.0),
+        ("join_every_s", -1.0), ("seed", -1),
+    ],
+)  # fmt: skip
+def test_options_that_are_none_are_refused_with_a_hint(name: str, value: Any) -> None:
+    with pytest.raises(UsageError) as told:
+        SwarmOptions(**{"robots": 2, name: value})
+    assert told.value.hint
+
+
+def test_send_times_are_fixed_beforehand_and_evenly_spread_over_the_robots() -> None:
+    robots = 100
+    phases = sorted(planned_s(spec(), number, 0.0, 0) for number in range(robots))
+    assert phases[0] >= 0.0
+    assert phases[-1] < 0.2
+    assert max(np.diff(phases)) < 3 * 0.2 / robots
+    assert planned_s(spec(), 7, 100.0, 10) - planned_s(spec(), 7, 100.0, 9) == pytest.approx(0.2)
+    assert planned_s(spec(join_every_s=20.0), 3, 0.0, 0) >= 60.0
+
+
+@pytest.mark.parametrize("codec_name", ["zlib", "json", "bin"])
+def test_a_right_solution_of_every_payload_is_called_right_and_a_wrong_one_wrong(codec_name: str) -> None:
+    codec = make_codec(codec_name)
+    for problem in make_payloads(spec(codec=codec_name))[:8]:
+        data = encode_command(codec, Command(id=1, service="pnp", payload=problem.payload))
+        message = codec.decode_from_robot(data)
+        assert isinstance(message, Command)
+        request = as_type(message.payload, PnpRequest)
+        solution = solve_pnp(
+            request.points_world.reshape(-1, 3), request.pixels.reshape(-1, 2), request.camera, None
+        )
+        reply = PnpReply.of(solution)
+        assert is_right(problem, {"T_camera_world": reply.T_camera_world.tolist()})
+        for twist in ([0.06, 0, 0, 0, 0, 0], [0, 0, 0, 0, 0.03, 0]):
+            moved = exp_se3(np.array(twist, dtype=np.float64)) @ solution.T_camera_world
+            assert not is_right(problem, {"T_camera_world": moved.ravel().tolist()})
+
+
+@pytest.mark.parametrize("reply", [None, {}, {"T_camera_world": [1.0]}, {"T_camera_world": "x"}, 7])
+def test_a_reply_that_is_no_pose_is_wrong(reply: Any) -> None:
+    assert not is_right(make_payloads(spec())[0], reply)
+
+
+def test_an_echo_is_right_only_if_it_is_the_same() -> None:
+    problem = make_payloads(spec(service="echo", matches=5))[0]
+    assert is_right(problem, {"value": list(problem.echo or [])})
+    assert not is_right(problem, {"value": [0.5]})
+
+
+def test_equal_seeds_make_equal_payloads() -> None:
+    def payloads(seed: int) -> list[bytes]:
+        return [problem.payload.encoded for problem in make_payloads(spec(seed=seed))[:3]]
+
+    assert payloads(1) == payloads(1)
+    assert payloads(1) != payloads(100)
+
+
+def rows() -> Rows:
+    told = Rows()
+    nan = math.nan
+    for row, server, code in (
+        ((4, 1, 1.0, 1.01, 1.13, 3500, 1.5, 0.25, 2.0, 3.0), "server-1", "ok"),
+        ((4, 2, 1.2, 1.20, 6.20, 3500, nan, nan, nan, nan), "", "expired"),
+        ((4, 3, 1.4, 1.40, nan, 0, nan, nan, nan, nan), "", ""),
+    ):
+        told.numbers.extend(row)
+        told.servers.append(server)
+        told.codes.append(code)
+    return told
+
+
+def test_the_round_trip_counts_from_the_planned_time() -> None:
+    answered, failed, lost = records_of(rows(), "robot")
+    assert answered.robot == "robot-5"
+    assert (answered.planned, answered.sent, answered.round_trip_ms) == (1.0, 1.01, pytest.approx(130.0))
+    assert (answered.up_ms, answered.queue_ms, answered.compute_ms, answered.down_ms) == (1.5, 0.25, 2.0, 3.0)
+    assert (failed.code, failed.round_trip_ms, failed.answered) == ("expired", None, 6.2)
+    assert (lost.code, lost.answered) == ("", None)
+
+
+def result(commands: list[CommandRecord]) -> SwarmResult:
+    return SwarmResult(
+        commands=commands, cpu_s=2.0, wall_s=10.0, wrong_poses=0, reconnects=0, resent=0, moves=0, twice=0,
+        link=None, late_sends=0.5,
+    )  # fmt: skip
+
+
+def test_the_report_counts_what_was_answered_in_time(tmp_path: Any) -> None:
+    run = SwarmRun(options=SwarmOptions(robots=1), seconds=1.0, out=tmp_path)
+    report = report_of(run, result(list(records_of(rows(), "robot"))), {})
+    assert report["commands"]["sent"] == 3
+    assert report["commands"]["lost"] == 1
+    assert report["failures_by_code"] == {"expired": 1}
+    assert report["answered_in_time_percent"] == pytest.approx(33.333)
+    assert report["generator"]["cpu_percent"] == 20.0
+    assert report["fps_per_robot"]["mean"] == pytest.approx(1 / 0.6, rel=1e-3)

@@ -1,0 +1,167 @@
+"""An elasticity run is judged by its records: counts, recovery, and the law of busy samples."""
+
+from __future__ import annotations
+
+import pytest
+
+from rse_pf.errors import UsageError
+from rse_pf.experiments.paper.elasticity import Cost
+from rse_pf.experiments.paper.elasticity_report import (
+    busy_periods_before,
+    crashes,
+    judge_elasticity,
+    unjustified_scale_outs,
+)
+from rse_pf.experiments.results.records import RecordedSample, Records, ServerSample
+from rse_pf.experiments.results.report import CommandRecord
+
+ASKED = {
+    "time": 0.0, "action": "experiment", "kind": "elasticity", "min_servers": 2, "period_s": 2.0,
+    "busy_periods": 2, "busy_cpu_percent": 70.0, "origin_s": 1000.0,
+}  # fmt: skip
+
+
+def reading(time_s, *cpu_percents, healthy=None, warming=()):
+    servers = tuple(
+        ServerSample(
+            server=f"server-{n + 1}",
+            pid=100 + n,
+            state="healthy",
+            robots=10,
+            cpu_percent=cpu,
+            warming=n in warming,
+        )
+        for n, cpu in enumerate(cpu_percents)
+    )
+    return RecordedSample(
+        time=time_s, healthy_servers=len(servers) if healthy is None else healthy, servers=servers
+    )
+
+
+def event(time_s, action, **details):
+    return {"time": time_s, "action": action, **details}
+
+
+def grow(time_s, reason="CPU at 80 %"):
+    return event(time_s, "grow", servers=1, reason=reason)
+
+
+def run(events=(), readings=(), commands=()):
+    return Records(commands=list(commands), events=[ASKED, *events], readings=list(readings))
+
+
+BUSY = [reading(t / 2, 80.0, 80.0) for t in range(1, 20)]
+"""80 % throughout, twice a second, from 0 to 9.5 s."""
+
+
+def test_counts_scale_events_but_not_the_filling_of_a_gap():
+    judged = judge_elasticity(
+        run(
+            events=[
+                grow(4.0), grow(5.0, "fewer than scaling.min_servers"), event(9.0, "shrink", servers=1),
+                event(9.1, "shrink", servers=1),
+            ],
+            readings=[reading(1.0, 10, 10), reading(5.0, 10, 10, 10, 10), reading(9.9, 1, 1)],
+        )
+    )  # fmt: skip
+
+    assert (judged["scale_outs"], judged["scale_ins"]) == (1, 2)
+    assert (judged["min_servers"], judged["max_servers"], judged["final_servers"]) == (2, 4, 2)
+    assert judged["healthy_servers_series"] == [[1.0, 2], [5.0, 4], [9.9, 2]]
+    assert judged["cpu_percent_series"] == [[1.0, 10.0], [5.0, 10.0], [9.9, 1.0]]
+
+
+def test_the_mean_leaves_out_servers_that_warm_up_or_did_not_answer():
+    assert reading(1.0, 80.0, 10.0, None, warming=(1,)).cpu_percent == 80.0
+    assert reading(1.0, None).cpu_percent is None
+
+
+def test_a_crash_is_replaced_by_the_next_server_that_was_launched_after_it():
+    events = [
+        event(1.0, "server-launched", server="server-3"),
+        event(9.9, "fault", fault="kill", server="server-1", pid=11),
+        event(10.0, "server-gone", server="server-1", pid=11, exit_code=-9),
+        event(10.1, "server-launched", server="server-4"),
+        event(11.0, "server-healthy", server="server-3"),
+        event(12.4, "server-healthy", server="server-4"),
+    ]
+
+    found = crashes(events)
+
+    assert found == [{"server": "server-1", "pid": 11, "time": 9.9, "by": "server-4", "replaced_in_s": 2.5}]
+
+
+def test_two_crashes_need_two_replacements():
+    events = [
+        event(10.0, "server-gone", server="server-1", pid=11),
+        event(10.0, "server-gone", server="server-2", pid=12),
+        event(10.1, "server-launched", server="server-3"),
+        event(12.0, "server-healthy", server="server-3"),
+    ]
+
+    assert [each["replaced_in_s"] for each in crashes(events)] == [2.0, None]
+    assert judge_elasticity(run(events=events))["replaced_in_s"] is None
+
+
+def test_a_drained_server_did_not_crash():
+    events = [event(1.0, "drain-start", server="server-1"), event(2.0, "server-gone", server="server-1")]
+
+    assert judge_elasticity(run(events=events))["crashes"] == 0
+
+
+def test_periods_are_those_of_the_monitors_clock():
+    readings = [reading(t / 2, 100.0 if t <= 8 else 0.0) for t in range(20)]
+
+    seen = busy_periods_before(readings, 6.1, origin_s=1000.0, period_s=2.0, periods=3)
+
+    assert seen == [pytest.approx(100.0), pytest.approx(100.0), pytest.approx(0.0)]
+    shifted = busy_periods_before(readings, 6.1, origin_s=1001.0, period_s=2.0, periods=2)
+    assert shifted == [pytest.approx(100.0), pytest.approx(50.0)]
+
+
+def test_a_scale_out_after_busy_periods_is_lawful():
+    assert unjustified_scale_outs(run(events=[grow(4.05)], readings=BUSY)) == []
+
+
+def test_a_scale_out_without_enough_busy_periods_is_told():
+    calm = [reading(t / 2, 80.0 if t > 4 else 40.0) for t in range(1, 20)]
+
+    wrong = unjustified_scale_outs(run(events=[grow(4.05)], readings=calm))
+
+    assert wrong == ["at 4.05 s: 40.0 %, 80.0 % before it, 70 % is required"]
+
+
+def test_a_scale_out_without_readings_is_told():
+    assert "none" in unjustified_scale_outs(run(events=[grow(30.0)], readings=BUSY))[0]
+
+
+def test_phases_split_the_commands_by_plan():
+    def command(number, planned):
+        return CommandRecord(
+            id=number, robot="r", planned=planned, sent=planned, answered=planned + 0.01, server="a",
+            code="ok", round_trip_ms=10.0,
+        )  # fmt: skip
+
+    judged = judge_elasticity(
+        run(
+            events=[event(0.0, "phase", phase="joining"), event(5.0, "phase", phase="full")],
+            commands=[command(1, 1.0), command(2, 4.9), command(3, 5.0)],
+        )
+    )
+
+    assert judged["phases"]["joining"]["commands"]["answered"] == 2
+    assert judged["phases"]["full"]["commands"]["answered"] == 1
+
+
+def test_a_run_that_does_not_say_what_was_asked_is_no_run():
+    with pytest.raises(UsageError, match="which experiment"):
+        judge_elasticity(Records(commands=[], events=[], readings=[]))
+
+
+def test_the_size_is_such_that_the_fleet_needs_five_servers_at_the_limit():
+    cost = Cost(command_s=0.002, idle_s_per_s=0.01, commands=400)
+
+    size = cost.size(commands_per_s=500.0, busy_percent=70.0)
+
+    cpu_percent_of_five = 100.0 * (500.0 * 0.002 + 5 * 0.01) / (5 * size)
+    assert cpu_percent_of_five == pytest.approx(70.0, abs=0.05)

@@ -1,0 +1,177 @@
+"""A fault is judged by its records: who was hit, for how long, and which bars were missed."""
+
+from __future__ import annotations
+
+import pytest
+
+from rse_pf.experiments.paper.robustness_report import BARS, evened_out_s, judge_scenario
+from rse_pf.experiments.results.records import RecordedSample, Records, ServerSample
+from rse_pf.experiments.results.report import CommandRecord
+
+
+def event(time_s, action, **details):
+    return {"time": time_s, "action": action, **details}
+
+
+def asked(scenario, **more):
+    return event(0.0, "experiment", kind="robustness", scenario=scenario, deadline_s=5.0, **more)
+
+
+def steady(robot, server, start_s, end_s, *, silent=(0.0, 0.0), other=None):
+    """Five answers a second, none in *silent*, after which *other* answers."""
+    commands = []
+    for number in range(int(start_s * 5), int(end_s * 5)):
+        planned = number / 5
+        answered = planned + 0.01
+        by = server
+        if silent[0] <= planned < silent[1]:
+            answered, by = silent[1] + 0.01, other or server
+        elif planned >= silent[1] > 0:
+            by = other or server
+        commands.append(
+            CommandRecord(
+                id=number, robot=robot, planned=planned, sent=planned, answered=answered, server=by,
+                code="ok", round_trip_ms=1000 * (answered - planned),
+            )
+        )  # fmt: skip
+    return commands
+
+
+def run(scenario, events, commands, readings=()):
+    return Records(commands=commands, events=[asked(scenario), *events], readings=list(readings))
+
+
+KILL = [
+    event(4.0, "fault", fault="kill -9", server="server-1", pid=11, watch_s=6.0),
+    event(4.2, "server-gone", server="server-1", pid=11),
+    event(4.3, "server-out", server="server-1"),
+    event(4.3, "server-launched", server="server-3"),
+    event(6.5, "server-healthy", server="server-3"),
+]
+HIT = steady("hit", "server-1", 0, 12, silent=(4.0, 4.8), other="server-2")
+OTHER = steady("other", "server-2", 0, 12)
+
+
+def unanswered(answered, code):
+    return CommandRecord(id=999, robot="hit", planned=5, sent=5, answered=answered, server="", code=code)
+
+
+def test_a_kill_that_was_survived_holds_every_bar():
+    judged = judge_scenario(run("kill", KILL, [*HIT, *OTHER]))
+
+    assert judged["gap_s"]["robots"] == 1
+    assert judged["gap_s"]["p99"] == pytest.approx(1.0)
+    assert judged["out_of_rotation_s"] == pytest.approx(0.3)
+    assert judged["replaced_in_s"] == pytest.approx(2.5)
+    assert judged["answered_percent"] == 100.0
+    assert all(bar["held"] for bar in judged["bars"].values())
+
+
+@pytest.mark.parametrize(
+    ("events", "commands", "missed"),
+    [
+        (KILL[:-1], [*HIT, *OTHER], "replaced_in_s"),
+        ([e for e in KILL if e["action"] != "server-out"], [*HIT, *OTHER], "out_of_rotation_s"),
+        (KILL, [*steady("hit", "server-1", 0, 12, silent=(4.0, 5.4)), *OTHER], "gap_s/p99"),
+        (KILL, [*HIT, *OTHER, OTHER[0]], "commands/twice"),
+        (KILL, [*HIT, *OTHER, unanswered(None, "")], "commands/lost"),
+        (KILL, [*HIT, *OTHER, unanswered(10.0, "expired")], "commands/failed"),
+    ],
+)
+def test_each_bar_of_a_kill_is_missed_by_what_breaks_it(events, commands, missed):
+    bars = judge_scenario(run("kill", events, commands))["bars"]
+
+    assert [name for name, bar in bars.items() if not bar["held"]] == [missed]
+
+
+def test_a_figure_that_was_not_measured_misses_its_bar():
+    bars = judge_scenario(run("kill", [], OTHER))["bars"]
+
+    assert not bars["replaced_in_s"]["held"]
+    assert not bars["gap_s/p99"]["held"]
+
+
+def test_a_fault_of_the_balancer_hits_every_robot():
+    fault = event(4.0, "fault", fault="kill -9", watch_s=5.0)
+    commands = [*steady("a", "server-1", 0, 9, silent=(4, 5)), *steady("b", "server-2", 0, 9, silent=(4, 6))]
+    events = [fault, event(4.1, "balancer-gone"), event(4.6, "balancer-back")]
+
+    judged = judge_scenario(run("balancer", events, commands))
+
+    assert judged["gap_s"]["robots"] == 2
+    assert judged["gap_s"]["max"] == pytest.approx(2.2)
+    assert judged["balancer_back_s"] == pytest.approx(0.5)
+    assert not judged["bars"]["gap_s/p99"]["held"]
+
+
+@pytest.mark.parametrize(("after", "not_adopted"), [([1, 2, 3], 0), ([1, 2, 9], 1)])
+def test_adoption_compares_the_processes_before_and_after(after, not_adopted):
+    events = [
+        event(3.0, "processes", when="before", pids=[1, 2, 3]),
+        event(4.0, "fault", fault="kill -9 of the control plane", watch_s=5.0),
+        event(8.0, "control-plane-back"),
+        event(8.1, "processes", when="after", pids=after),
+    ]
+
+    judged = judge_scenario(run("control-plane", events, OTHER))
+
+    assert judged["not_adopted"] == not_adopted
+    assert judged["control_plane_down_s"] == pytest.approx(4.0)
+    assert judged["bars"]["not_adopted"]["held"] is (not_adopted == 0)
+
+
+def test_a_cut_is_judged_on_both_sides_and_by_the_first_answers_after_it():
+    events = [
+        event(4.0, "fault", fault="link cut", watch_s=10.0),
+        event(8.5, "link-lost", robot="robot-1"),
+        event(10.0, "healed"),
+    ]
+    readings = [robots(3.0, 1), robots(8.9, 1), robots(9.1, 0), robots(11.0, 1)]
+    stale = CommandRecord(
+        id=999, robot="robot-1", planned=4.5, sent=4.5, answered=10.6, server="server-1", code="ok",
+        round_trip_ms=6100.0,
+    )  # fmt: skip
+    commands = [*steady("robot-1", "server-1", 0, 4), *steady("robot-1", "server-1", 11, 13), stale]
+
+    judged = judge_scenario(run("wifi", events, commands, readings))
+
+    assert judged["server_noticed_s"] == pytest.approx(5.1)
+    assert judged["noticed_s"]["max"] == pytest.approx(4.5)
+    assert judged["first_answer_after_heal_s"]["p99"] == pytest.approx(0.6)
+    assert judged["stale_as_fresh"] == 1
+    assert not judged["bars"]["stale_as_fresh"]["held"]
+
+    looked = run("wifi", [*events[:2], event(9.02, "servers-empty"), events[2]], commands, readings)
+    assert judge_scenario(looked)["server_noticed_s"] == pytest.approx(5.02)
+
+
+def robots(time_s, *counts):
+    servers = tuple(
+        ServerSample(server=f"server-{n + 1}", pid=n, state="healthy", robots=count)
+        for n, count in enumerate(counts)
+    )
+    return RecordedSample(time=time_s, healthy_servers=len(servers), servers=servers)
+
+
+def test_even_means_within_a_fifth_of_the_mean_and_staying_so():
+    readings = [robots(1, 50, 50, 0), robots(2, 34, 33, 33), robots(3, 50, 30, 20), robots(4, 36, 36, 28)]
+
+    assert evened_out_s(readings, 0.5) == pytest.approx(3.5)
+    assert evened_out_s(readings[:3], 0.5) is None
+
+
+def test_growth_of_memory_is_that_of_one_process():
+    events = [
+        event(1.0, "resources", when="before", memory_bytes=200, descriptors=20, processes=2),
+        event(9.0, "resources", when="after", memory_bytes=330, descriptors=30, processes=3),
+    ]
+
+    judged = judge_scenario(run("random", events, OTHER))
+
+    assert (judged["memory_percent"], judged["descriptors_percent"]) == (10.0, 0.0)
+    assert not judged["bars"]["memory_percent"]["held"]
+    assert judged["bars"]["descriptors_percent"]["held"]
+
+
+def test_every_scenario_asks_that_nothing_is_lost_or_answered_twice():
+    assert all({"commands/lost", "commands/twice"} <= set(bars) for bars in BARS.values())

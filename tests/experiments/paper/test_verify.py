@@ -1,0 +1,237 @@
+"""A report is recomputed from its records; an edited record, an edited report and a broken law all show."""
+
+from __future__ import annotations
+
+import gzip
+import json
+from dataclasses import replace
+
+import pytest
+
+from rse_pf.errors import UsageError
+from rse_pf.experiments.paper.verify import broken_laws, judge_folder, run_folders, verify
+from rse_pf.experiments.results.records import (
+    RecordedSample,
+    SampleLog,
+    ServerSample,
+    read_records,
+    read_samples,
+    reading_of,
+)
+from rse_pf.experiments.results.report import CommandRecord, EventLog, write_commands, write_json
+
+ORIGIN_S = 1000.0
+
+
+def command(number, planned, **more):
+    fields = {
+        "id": number, "robot": f"robot-{number % 3}", "planned": planned, "sent": planned + 0.001,
+        "answered": planned + 0.02, "server": "server-1", "code": "ok", "round_trip_ms": 20.0,
+        "compute_ms": 0.4, "queue_ms": 0.1, "up_ms": 0.2, "down_ms": 0.2,
+    }  # fmt: skip
+    return CommandRecord(**{**fields, **more})
+
+
+def server(cpu, name="server-1"):
+    return ServerSample(server=name, pid=7, state="healthy", robots=3, cpu_percent=cpu)
+
+
+@pytest.fixture
+def run(tmp_path):
+    """A small elasticity run, reported truly."""
+    commands = [command(number, number / 5) for number in range(50)]
+    write_commands(tmp_path / "commands.csv", commands)
+    with (tmp_path / "events.jsonl").open("w") as file:
+        log = EventLog(file)
+        log.write(
+            0.0, "experiment", kind="elasticity", robots=3, fps=5.0, min_servers=1, period_s=2.0,
+            busy_periods=2, busy_cpu_percent=70.0, origin_s=ORIGIN_S,
+        )  # fmt: skip
+        log.write(0.0, "phase", phase="joining")
+        log.write(6.05, "grow", servers=1, reason="CPU at 90 %")
+        log.write(9.0, "shrink", servers=1, reason="idle")
+    with (tmp_path / "samples.csv").open("w", newline="") as file:
+        log = SampleLog(file)
+        for step in range(1, 20):
+            cpu = 90.0 if step > 4 else 30.0
+            log.write(
+                RecordedSample(
+                    time=step / 2, healthy_servers=1, servers=(server(cpu), server(cpu, "server-2"))
+                )
+            )
+    write_report(tmp_path)
+    return tmp_path
+
+
+def write_report(folder):
+    write_json(folder / "report.json", {"experiment": "elasticity", **judge_folder(folder)})
+
+
+def differing(folder):
+    return [finding.what for finding in verify(folder) if not finding.agrees]
+
+
+def edit(path, old, new):
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new, 1))
+
+
+def test_a_true_report_agrees_in_every_figure(run):
+    findings = verify(run)
+
+    assert all(finding.agrees for finding in findings)
+    names = {finding.what for finding in findings}
+    assert {"scale_outs", "commands/lost", "round_trip_ms/p99", "cpu_percent_series"} <= names
+    assert "law: every scale-out follows the required busy samples" in names
+
+
+def test_an_edited_report_differs(run):
+    report = json.loads((run / "report.json").read_text())
+    report["round_trip_ms"]["p99"] -= 1.0
+    report["commands"]["failed"] = 3
+    write_json(run / "report.json", report)
+
+    assert differing(run) == ["commands/failed", "round_trip_ms/p99"]
+
+
+def test_a_figure_that_the_report_leaves_out_differs(run):
+    report = json.loads((run / "report.json").read_text())
+    del report["final_servers"]
+    write_json(run / "report.json", report)
+
+    assert differing(run) == ["final_servers"]
+
+
+def test_an_edited_command_differs(run):
+    rows = (run / "commands.csv").read_text().splitlines()
+    rows[5] = rows[5].replace(",ok,", ",busy,")
+    (run / "commands.csv").write_text("\n".join(rows) + "\n")
+
+    assert {"commands/answered", "commands/failed"} <= set(differing(run))
+
+
+def test_a_removed_command_differs(run):
+    rows = (run / "commands.csv").read_text().splitlines()
+    (run / "commands.csv").write_text("\n".join(rows[:-1]) + "\n")
+
+    assert "commands/sent" in differing(run)
+
+
+def test_a_round_trip_that_its_time_stamps_deny_breaks_a_law(run):
+    edit(run / "commands.csv", ",20.0,", ",2.0,")
+    write_report(run)
+
+    assert differing(run) == [
+        "law: no command is answered before it is sent, and a round trip is what its time stamps say"
+    ]
+
+
+def test_an_edited_sample_differs(run):
+    edit(run / "samples.csv", "90.0", "10.0")
+
+    assert "cpu_percent_series" in differing(run)
+
+
+def test_a_scale_out_that_the_samples_do_not_justify_breaks_the_law(run):
+    text = (run / "samples.csv").read_text()
+    (run / "samples.csv").write_text(text.replace("90.0", "60.0"))
+    write_report(run)
+
+    assert differing(run) == ["law: every scale-out follows the required busy samples"]
+
+
+def test_a_scale_out_before_enough_busy_periods_breaks_the_law(run):
+    edit(run / "events.jsonl", '"time": 6.05', '"time": 4.05')
+    write_report(run)
+
+    assert differing(run) == ["law: every scale-out follows the required busy samples"]
+
+
+def test_a_lost_command_and_a_second_answer_break_laws(run):
+    records = read_records(run)
+    lost = replace(records.commands[0], code="", answered=None, server="", round_trip_ms=None)
+    again = records.commands[1]
+    write_commands(run / "commands.csv", [lost, *records.commands[1:], again])
+    write_report(run)
+
+    broken = {name for name, what in broken_laws(read_records(run)).items() if what}
+    assert broken == {"every command came to an end", "no answer was delivered twice"}
+
+
+def test_every_run_of_a_folder_is_verified_by_its_name(run, tmp_path):
+    whole = tmp_path / "whole"
+    whole.mkdir()
+    for name in ("first", "second"):
+        (whole / name).mkdir()
+        for file in ("commands.csv", "events.jsonl", "samples.csv"):
+            (whole / name / file).write_bytes((run / file).read_bytes())
+    runs = {name: judge_folder(part) for name, part in run_folders(whole).items()}
+    write_json(whole / "report.json", {"runs": {**runs, "third": runs["first"]}})
+    edit(whole / "second" / "samples.csv", "90.0", "10.0")
+
+    assert differing(whole) == ["second: cpu_percent_series", "third: run"]
+
+
+def test_a_folder_without_a_run_is_refused(tmp_path):
+    (tmp_path / "report.json").write_text("{}")
+    with pytest.raises(UsageError, match="holds no run"):
+        verify(tmp_path)
+
+
+@pytest.mark.parametrize("name", ["commands.csv", "events.jsonl", "samples.csv", "report.json"])
+def test_a_damaged_file_is_one_line_not_a_traceback(run, name):
+    (run / name).write_text("time,nonsense\n1,{{\n")
+    with pytest.raises(UsageError, match="cannot read"):
+        verify(run)
+
+
+def test_what_the_monitor_says_comes_back_from_the_file_unchanged(tmp_path):
+    full = {
+        "name": "server-1", "pid": 7, "state": "healthy", "robots": 2, "cpu_percent": 71.25, "requests": 5,
+        "queue": 1, "queue_ms": 0.5, "in_flight": 1, "bytes_in": 10, "bytes_out": 20, "warming": True,
+        "something": "new",
+    }  # fmt: skip
+    silent = {"name": "server-2", "pid": 8, "state": "starting", "cpu_percent": None}
+    told = {"time": ORIGIN_S + 1.5, "healthy_servers": 1, "servers": [full, silent]}
+    readings = [reading_of(told, ORIGIN_S), RecordedSample(time=2.0, healthy_servers=0)]
+
+    with (tmp_path / "samples.csv").open("w", newline="") as file:
+        log = SampleLog(file)
+        for reading in readings:
+            log.write(reading)
+
+    assert read_samples(tmp_path / "samples.csv") == readings
+    assert readings[0].time == 1.5
+    assert readings[0].servers[0].warming is True
+
+
+def test_answers_that_reached_a_caller_twice_are_the_generators_to_tell(run):
+    with (run / "events.jsonl").open("a") as file:
+        EventLog(file).write(10.0, "generator", twice=2, wrong_poses=1)
+
+    assert differing(run) == ["commands/twice", "wrong_poses", "law: no answer was delivered twice"]
+
+
+def test_packed_commands_are_read_like_plain_ones(run):
+    plain = run / "commands.csv"
+    (run / "commands.csv.gz").write_bytes(gzip.compress(plain.read_bytes()))
+    plain.unlink()
+    assert differing(run) == []
+
+    (run / "commands.csv.gz").write_bytes(b"not packed at all")
+    with pytest.raises(UsageError, match="cannot read"):
+        verify(run)
+
+
+def test_the_bars_of_a_fault_are_verified_too(run):
+    events = (run / "events.jsonl").read_text().splitlines()
+    asked = {**json.loads(events[0]), "kind": "robustness", "scenario": "kill"}
+    (run / "events.jsonl").write_text("\n".join([json.dumps(asked), *events[1:]]) + "\n")
+    write_report(run)
+    assert differing(run) == []
+
+    report = json.loads((run / "report.json").read_text())
+    report["bars"]["replaced_in_s"]["held"] = True
+    write_json(run / "report.json", report)
+    assert differing(run) == ["bars/replaced_in_s/held"]

@@ -1,0 +1,55 @@
+"""The picture shows the map's own points, in their own colours."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from rse_pf.experiments.plots.map_image import _BACKGROUND, COLOURS, PathOfRobot, draw_map
+
+image = pytest.importorskip("PIL.Image")
+
+
+def draw(tmp_path, points, colours):
+    poses = np.tile(np.eye(4), (5, 1, 1))
+    poses[:, 2, 3] = np.linspace(0.0, 1.0, 5)
+    path = tmp_path / "map.png"
+    draw_map(path, points, colours, [PathOfRobot(name="robot-1", T_world_camera=poses)], "a caption")
+    with image.open(path) as picture:
+        return np.asarray(picture.convert("RGB"))
+
+
+def plane(y: float, n: int = 4000):
+    rng = np.random.default_rng(1)
+    points = np.column_stack([rng.uniform(-2, 2, n), np.full(n, y), rng.uniform(0, 4, n)])
+    return points.astype(np.float32)
+
+
+def count(picture, colour):
+    return int((picture == np.array(colour)).all(axis=2).sum())
+
+
+def test_draws_the_points_in_their_colours(tmp_path):
+    points = plane(y=1.0)
+    picture = draw(tmp_path, points, np.full((len(points), 3), (10, 200, 30), dtype=np.uint8))
+    assert picture.shape == (900, 1600, 3)
+    assert count(picture, (10, 200, 30)) > 10_000
+
+
+def test_leaves_the_ceiling_out_because_it_hides_the_room(tmp_path):
+    floor, ceiling = plane(y=1.0), plane(y=-1.5)
+    colours = np.array([[10, 200, 30]] * len(floor) + [[200, 10, 30]] * len(ceiling), dtype=np.uint8)
+    picture = draw(tmp_path, np.vstack([floor, ceiling]), colours)
+    assert count(picture, (10, 200, 30)) > 10_000
+    assert count(picture, (200, 10, 30)) == 0
+
+
+def test_draws_the_path_of_the_robot(tmp_path):
+    points = plane(y=1.0)
+    picture = draw(tmp_path, points, np.full((len(points), 3), 128, dtype=np.uint8))
+    assert count(picture[64:836], COLOURS[0]) > 300
+
+
+def test_an_empty_map_is_an_empty_picture(tmp_path):
+    picture = draw(tmp_path, np.empty((0, 3), dtype=np.float32), np.empty((0, 3), dtype=np.uint8))
+    assert count(picture[64:836], _BACKGROUND) > 0.9 * 1600 * 772

@@ -1,0 +1,130 @@
+"""ATE and RPE: hand-computed values, invariances, and figures that another program computed."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from client_sdk.mapping import Trajectory, read_trajectory
+from rse_pf.errors import UsageError
+from rse_pf.experiments.results.trajectory_error import (
+    absolute_error,
+    align,
+    associate,
+    ate_cm,
+    relative_error,
+    rpe_cm,
+    rpe_deg,
+)
+from rse_pf.geometry import exp_se3, inverse
+
+RECORDED = Path(__file__).parents[4] / "shared" / "data" / "tum_trajectories"
+EVO_MAX_DIFFERENCE_S = 0.01
+
+
+def wander(seed: int, count: int = 40) -> Trajectory:
+    rng = np.random.default_rng(seed)
+    poses = [np.eye(4)]
+    for _ in range(count - 1):
+        poses.append(poses[-1] @ exp_se3(rng.normal(0.0, 0.1, 6)))
+    return Trajectory(np.arange(count) * 0.1, np.array(poses))
+
+
+def moved(trajectory: Trajectory, pose: np.ndarray) -> Trajectory:
+    return Trajectory(trajectory.timestamps_s, pose @ trajectory.T_world_camera)
+
+
+def test_another_world_frame_is_no_error():
+    truth = wander(1)
+    estimate = moved(truth, exp_se3([1, 2, 3, 0.5, -1, 2]))
+
+    assert ate_cm(estimate, truth) == pytest.approx(0.0, abs=1e-9)
+    assert rpe_cm(estimate, truth) == pytest.approx(0.0, abs=1e-9)
+    assert rpe_deg(estimate, truth) == pytest.approx(0.0, abs=1e-6)
+
+
+def test_a_known_error_is_measured():
+    truth = Trajectory(np.arange(4.0), np.tile(np.eye(4), (4, 1, 1)))
+    truth.T_world_camera[:, :2, 3] = [[1, 1], [1, -1], [-1, -1], [-1, 1]]
+    estimate = Trajectory(np.arange(4.0), truth.T_world_camera.copy())
+    estimate.T_world_camera[:, 2, 3] = [0.1, -0.1, 0.1, -0.1]  # a saddle: no alignment mends it
+
+    assert ate_cm(estimate, truth) == pytest.approx(10.0)
+    assert rpe_cm(estimate, truth) == pytest.approx(20.0)
+    assert absolute_error(estimate, truth).max_m == pytest.approx(0.1)
+
+
+def test_a_rotation_error_of_each_step_is_the_relative_error():
+    truth = Trajectory(np.arange(5.0), np.tile(np.eye(4), (5, 1, 1)))
+    turning = [exp_se3([0, 0, 0, 0, 0, np.radians(2.0) * row]) for row in range(5)]
+
+    error = relative_error(Trajectory(np.arange(5.0), np.array(turning)), truth)
+
+    assert (error.rmse_deg, error.rmse_m, error.steps) == (pytest.approx(2.0), pytest.approx(0.0), 4)
+
+
+def test_a_scale_is_found_only_when_asked_for():
+    truth = wander(2)
+    estimate = Trajectory(truth.timestamps_s, truth.T_world_camera.copy())
+    estimate.T_world_camera[:, :3, 3] *= 0.5
+
+    with_scale = absolute_error(estimate, truth, with_scale=True)
+
+    assert with_scale.scale == pytest.approx(2.0)
+    assert with_scale.rmse_m == pytest.approx(0.0, abs=1e-9)
+    assert absolute_error(estimate, truth).rmse_m > 0.05
+
+
+def test_the_alignment_is_a_rotation_even_for_mirrored_points():
+    points = np.random.default_rng(3).normal(size=(20, 3))
+
+    _, pose = align(points, points * [1, 1, -1])
+
+    assert np.linalg.det(pose[:3, :3]) == pytest.approx(1.0)
+    np.testing.assert_allclose(pose @ inverse(pose), np.eye(4), atol=1e-12)
+
+
+def test_poses_meet_by_time_and_not_by_row():
+    truth = wander(4, 40)
+    estimate = Trajectory(truth.timestamps_s[5:35:3] + 0.015, truth.T_world_camera[5:35:3])
+
+    mine, theirs = associate(estimate, truth)
+
+    np.testing.assert_array_equal(mine, np.arange(10))
+    np.testing.assert_array_equal(theirs, np.arange(5, 35, 3))
+    assert ate_cm(estimate, truth) == pytest.approx(0.0, abs=1e-9)
+
+
+def test_clocks_that_do_not_meet_are_told():
+    truth = wander(5)
+    estimate = Trajectory(truth.timestamps_s + 0.05, truth.T_world_camera)
+    with pytest.raises(UsageError, match="0 poses match"):
+        ate_cm(estimate, truth)
+
+
+@pytest.mark.data
+@pytest.mark.parametrize(
+    ("estimate", "truth", "expected"),
+    [
+        ("freiburg1_xyz-rgbdslam.txt", "freiburg1_xyz-groundtruth.txt", (0.013470, 0.034760, 0.005764, None)),
+        ("fr2_desk_ORB.txt", "fr2_desk_groundtruth.txt", (0.008119, None, None, 0.006123)),
+    ],
+)
+def test_figures_equal_those_of_another_program(
+    estimate: str, truth: str, expected: tuple[float | None, ...]
+):
+    """The oracle is evo 1.38.1, which pairs poses within 10 ms by default."""
+    if not RECORDED.exists():
+        pytest.skip(f"no recordings at {RECORDED}")
+    mine, true = read_trajectory(RECORDED / estimate), read_trajectory(RECORDED / truth)
+    at = EVO_MAX_DIFFERENCE_S
+
+    absolute = absolute_error(mine, true, max_difference_s=at)
+    scaled = absolute_error(mine, true, with_scale=True, max_difference_s=at)
+    relative = relative_error(mine, true, max_difference_s=at)
+
+    found = (absolute.rmse_m, absolute.max_m, relative.rmse_m, scaled.rmse_m)
+    for value, wanted in zip(found, expected, strict=True):
+        assert wanted is None or value == pytest.approx(wanted, abs=1e-5)

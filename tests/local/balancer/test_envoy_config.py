@@ -1,0 +1,190 @@
+"""What Envoy is told: the values that decided between good and bad, and nothing open to others."""
+
+from __future__ import annotations
+
+import json
+import socket
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from rse_pf.config import PlatformSettings
+from rse_pf.local.balancer.envoy_config import (
+    ADMIN_SOCKET,
+    CLUSTER,
+    DATA_CLUSTER,
+    Target,
+    endpoints,
+    envoy_config,
+)
+
+ENDPOINTS = Path("/somewhere/endpoints.json")
+DATA = Path("/somewhere/data-endpoints.json")
+
+
+def config(**groups: dict[str, Any]) -> dict[str, Any]:
+    return envoy_config(
+        PlatformSettings().replace(**groups), port=0, endpoints_file=ENDPOINTS, data_endpoints_file=DATA
+    )
+
+
+def listener(made: dict[str, Any]) -> dict[str, Any]:
+    (only,) = made["static_resources"]["listeners"]
+    return only
+
+
+def manager(made: dict[str, Any]) -> dict[str, Any]:
+    return listener(made)["filter_chains"][0]["filters"][0]["typed_config"]
+
+
+def cluster(made: dict[str, Any], name: str = CLUSTER) -> dict[str, Any]:
+    (only,) = [each for each in made["static_resources"]["clusters"] if each["name"] == name]
+    return only
+
+
+def routes(made: dict[str, Any]) -> list[dict[str, Any]]:
+    (host,) = manager(made)["route_config"]["virtual_hosts"]
+    return host["routes"]
+
+
+def only_route(made: dict[str, Any]) -> dict[str, Any]:
+    """Return the only one that leads to backend servers, but for the page of health."""
+    leading = [each for each in routes(made) if each.get("route", {}).get("cluster") == CLUSTER]
+    (route,) = [each for each in leading if each["match"] != {"path": "/healthz"}]
+    return route
+
+
+def test_no_clock_of_the_balancer_ends_an_open_socket() -> None:
+    made = config()
+
+    assert manager(made)["stream_idle_timeout"] == "0s"
+    assert manager(made)["request_timeout"] == "0s"
+    assert only_route(made)["route"]["timeout"] == "0s"
+    assert only_route(made)["route"]["idle_timeout"] == "0s"
+
+
+def test_the_settings_that_decided_between_good_and_bad_are_set() -> None:
+    made = config()
+    retry = only_route(made)["route"]["retry_policy"]
+    (breaker,) = cluster(made)["circuit_breakers"]["thresholds"]
+
+    assert cluster(made)["common_lb_config"]["update_merge_window"] == "0s"
+    assert cluster(made)["common_lb_config"]["healthy_panic_threshold"] == {"value": 0}
+    assert cluster(made)["ignore_health_on_host_removal"] is True
+    assert manager(made)["delayed_close_timeout"] == "0s"
+    assert retry["per_try_timeout"] == "0.5s"
+    assert retry["host_selection_retry_max_attempts"] == "8"
+    assert min(breaker.values()) > 1024
+    assert listener(made)["enable_reuse_port"] is False
+
+
+def test_health_checks_follow_the_settings() -> None:
+    health = {"local_interval_s": 0.125, "local_timeout_s": 2.0, "unhealthy_checks": 3, "path": "/ok"}
+
+    (check,) = cluster(config(health=health))["health_checks"]
+
+    assert check["interval"] == check["no_traffic_interval"] == "0.125s"
+    assert check["timeout"] == "2s"
+    assert check["unhealthy_threshold"] == 3
+    assert check["http_health_check"] == {"path": "/ok"}
+
+
+def test_the_door_is_on_loopback_and_the_admin_page_on_no_port() -> None:
+    made = config()
+
+    assert listener(made)["address"]["socket_address"]["address"] == "127.0.0.1"
+    assert made["admin"]["address"] == {"pipe": {"path": ADMIN_SOCKET, "mode": 0o600}}
+
+
+def test_only_the_path_of_the_robots_leads_to_a_server() -> None:
+    assert only_route(config(serving={"path": "/robots"}))["match"] == {"path": "/robots"}
+
+
+def test_headers_are_bounded_in_number_size_and_time() -> None:
+    made = manager(config(serving={"handshake_timeout_s": 1.5, "max_handshake_bytes": 4096}))
+
+    assert made["request_headers_timeout"] == "1.5s"
+    assert made["common_http_protocol_options"]["idle_timeout"] == "1.5s"
+    assert made["max_request_headers_kb"] == 4
+    assert made["common_http_protocol_options"]["max_headers_count"] <= 100
+
+
+def test_large_data_has_a_way_of_its_own_that_is_never_repeated_by_the_balancer() -> None:
+    made = config(data={"body_timeout_s": 4.0})
+    (data,) = [each for each in routes(made) if each.get("route", {}).get("cluster") == DATA_CLUSTER]
+
+    assert data["match"] == {"prefix": "/data/"}
+    assert data["route"]["timeout"] == "0s", "an upload takes as long as it takes"
+    assert data["route"]["idle_timeout"] == "12s"
+    assert "retry_policy" not in data["route"], "a part may have arrived: only the robot knows"
+    assert cluster(made, DATA_CLUSTER)["health_checks"][0]["http_health_check"] == {"path": "/data/readyz"}
+    assert endpoints([], DATA_CLUSTER)["resources"][0]["cluster_name"] == DATA_CLUSTER
+    files = [
+        cluster(made, name)["eds_cluster_config"]["eds_config"]["path_config_source"]["path"]
+        for name in (CLUSTER, DATA_CLUSTER)
+    ]
+    assert files == [str(ENDPOINTS), str(DATA)]
+    matches = [each["match"] for each in routes(made)]
+    assert matches == [{"path": "/ws"}, {"path": "/healthz"}, {"path": "/data/readyz"}, {"prefix": "/data/"}]
+
+
+def test_connections_and_buffers_are_bounded() -> None:
+    made = config(local={"max_connections": 500}, serving={"write_buffer_bytes": 65536})
+    (monitor,) = made["overload_manager"]["resource_monitors"]
+
+    assert monitor["typed_config"]["max_active_downstream_connections"] == "500"
+    assert listener(made)["per_connection_buffer_limit_bytes"] == 65536
+    assert cluster(made)["per_connection_buffer_limit_bytes"] == 65536
+
+
+def test_a_robot_that_takes_nothing_is_ended_by_the_kernel() -> None:
+    made = config(
+        serving={"write_buffer_bytes": 65536}, session={"ping_interval_s": 2.0, "ping_patience_s": 1.0}
+    )
+    options = {(each["level"], each["name"]): each["int_value"] for each in listener(made)["socket_options"]}
+    (upstream,) = cluster(made)["upstream_bind_config"]["socket_options"]
+
+    assert options == {
+        (socket.SOL_SOCKET, socket.SO_SNDBUF): 65536,
+        (socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT): 6000,
+    }
+    assert (upstream["name"], upstream["int_value"]) == (socket.SO_RCVBUF, 65536)
+
+
+def test_what_a_robot_says_of_its_address_is_not_believed() -> None:
+    assert manager(config())["use_remote_address"] is True
+    assert manager(config())["xff_num_trusted_hops"] == 0
+
+
+def test_the_endpoint_file_sends_robots_and_checks_to_different_ports() -> None:
+    made = endpoints([Target(name="a", port=1001, control_port=2001)])
+    (resource,) = made["resources"]
+    ((member,),) = [each["lb_endpoints"] for each in resource["endpoints"]]
+
+    assert resource["cluster_name"] == CLUSTER
+    assert member["endpoint"]["address"]["socket_address"]["port_value"] == 1001
+    assert member["endpoint"]["health_check_config"]["port_value"] == 2001
+
+
+def test_no_targets_are_an_empty_list_not_a_missing_one() -> None:
+    assert endpoints([])["resources"][0]["endpoints"] == [{"lb_endpoints": []}]
+
+
+@pytest.mark.parametrize("made", [config(), endpoints([Target(name="a", port=1, control_port=2)])])
+def test_everything_is_plain_json(made: dict[str, Any]) -> None:
+    assert json.loads(json.dumps(made)) == made
+
+
+def test_the_door_tells_that_robots_are_served_and_nothing_of_itself() -> None:
+    made = config()
+    (health,) = [each for each in routes(made) if each["match"].get("path") == "/healthz"]
+    closed = [each for each in routes(made) if "direct_response" in each]
+
+    assert health["route"]["cluster"] == CLUSTER, "without a healthy server it is no 200"
+    assert health["route"]["timeout"] != "0s", "no WebSocket begins here"
+    assert [(each["match"], each["direct_response"]) for each in closed] == [
+        ({"path": "/data/readyz"}, {"status": 404})
+    ]
+    assert manager(made)["server_header_transformation"] == "PASS_THROUGH"
+    assert manager(made)["http_filters"][0]["typed_config"]["suppress_envoy_headers"] is True

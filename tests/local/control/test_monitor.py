@@ -1,0 +1,132 @@
+"""The monitor on known numbers: CPU against a server's size, counts of an interval, whole periods."""
+
+from __future__ import annotations
+
+import pytest
+
+from rse_pf.config import ServingSettings
+from rse_pf.local.control.monitor import (
+    MonitorSample,
+    Observed,
+    Periods,
+    ServerReading,
+    capacity_cores,
+    reading_every_s,
+    reading_of,
+    server_reading,
+)
+
+STATUS = {
+    "cpu_s": 10.0,
+    "requests": 100,
+    "robots": 7,
+    "queue": 3,
+    "queue_oldest_s": 0.0125,
+    "in_flight": 1,
+    "bytes_in": 1000,
+    "bytes_out": 50,
+}
+
+
+def observed(at_s: float, **more: float) -> Observed:
+    return Observed(at_s=at_s, status={name: value + more.get(name, 0) for name, value in STATUS.items()})
+
+
+def one(before: Observed | None, now: Observed | None, capacity: float = 1.0) -> ServerReading:
+    return server_reading(
+        before, now, name="server-1", pid=5, state="healthy", warming=False, capacity=capacity
+    )
+
+
+def server(name: str, cpu_percent: float | None, *, state: str = "healthy", **more: object) -> ServerReading:
+    return ServerReading(name=name, pid=1, state=state, cpu_percent=cpu_percent, **more)  # type: ignore[arg-type]
+
+
+def reading(time_s: float, cpu_percent: float | None, *, requests: int = 0, robots: int = 0) -> MonitorSample:
+    servers = [server("server-1", cpu_percent, requests=requests, robots=robots)]
+    return reading_of(time_s, servers, frozenset({"server-1"}))
+
+
+def test_cpu_is_relative_to_the_size_and_to_the_time_between_two_answers() -> None:
+    told = one(observed(100.0), observed(102.0, cpu_s=0.25), capacity=0.25)
+
+    assert told.cpu_percent == 50.0
+
+
+def test_counts_are_those_of_the_interval_and_levels_are_those_of_now() -> None:
+    told = one(observed(100.0), observed(101.0, requests=40, bytes_in=500, bytes_out=5, robots=2))
+
+    assert (told.requests, told.bytes_in, told.bytes_out) == (40, 500, 5)
+    assert (told.robots, told.queue, told.queue_ms, told.in_flight) == (9, 3, 12.5, 1)
+
+
+def test_a_first_answer_has_no_cpu_and_no_answer_has_no_numbers() -> None:
+    assert one(None, observed(100.0)).cpu_percent is None
+    assert one(observed(100.0), None) == ServerReading(name="server-1", pid=5, state="healthy")
+
+
+@pytest.mark.parametrize(
+    ("size", "workers", "cores", "capacity"), [(0.25, 2, 8, 0.5), (0.0, 1, 2, 1.0), (0.0, 4, 2, 2.0)]
+)
+def test_a_server_has_the_emulated_size_of_its_workers_or_their_cores(
+    size: float, workers: int, cores: int, capacity: float
+) -> None:
+    assert capacity_cores(ServingSettings(size=size), workers, cores) == capacity
+
+
+def test_the_mean_leaves_out_who_warms_up_and_who_does_not_answer() -> None:
+    servers = [server("a", 80.0), server("b", 40.0), server("c", 0.0, warming=True), server("d", None)]
+
+    assert reading_of(1.0, servers, frozenset()).cpu_percent == 60.0
+    assert reading_of(1.0, servers[2:], frozenset()).cpu_percent is None
+
+
+def test_healthy_is_who_passes_our_checks_and_gets_robots_from_the_balancer() -> None:
+    servers = [server("a", 1.0), server("b", 1.0), server("c", 1.0, state="draining")]
+
+    assert reading_of(1.0, servers, frozenset({"a", "c"})).healthy_servers == 1
+
+
+@pytest.mark.parametrize(("period_s", "every_s"), [(60.0, 1.0), (2.0, 1.0), (2.5, 2.5 / 3), (0.1, 0.25)])
+def test_readings_divide_a_period(period_s: float, every_s: float) -> None:
+    assert reading_every_s(period_s) == pytest.approx(every_s)
+
+
+def test_a_sample_is_the_mean_over_time_of_one_period_and_the_sum_of_its_requests() -> None:
+    periods = Periods(10.0, keep=4)
+    over = [
+        periods.add(reading(time_s, cpu, requests=count, robots=4))
+        for time_s, cpu, count in ((100.0, 50.0, 9), (102.0, 10.0, 1), (110.01, 90.0, 2), (111.0, 70.0, 4))
+    ]
+
+    (sample,) = periods.samples(111.0)
+
+    assert over == [False, False, True, False], "the first reading speaks for no time"
+    assert sample.start_s == 100.0
+    assert sample.cpu_percent == pytest.approx((2.0 * 10.0 + 8.01 * 90.0) / 10.01)
+    assert (sample.requests, sample.robots_per_server) == (3, pytest.approx(4.0))
+
+
+def test_a_period_that_goes_on_or_was_hardly_watched_gives_no_sample() -> None:
+    periods = Periods(10.0, keep=4)
+    for time_s in (106.0, 109.9, 111.0, 119.0):
+        periods.add(reading(time_s, 50.0))
+
+    assert periods.samples(119.0) == ()
+    assert [sample.start_s for sample in periods.samples(120.0)] == [110.0]
+
+
+def test_a_period_in_which_nobody_answered_gives_no_sample() -> None:
+    periods = Periods(10.0, keep=4)
+    for time_s in (100.0, 110.0, 120.0):
+        periods.add(reading(time_s, None))
+
+    assert periods.samples(120.0) == ()
+
+
+def test_only_the_newest_periods_are_kept() -> None:
+    periods = Periods(10.0, keep=3)
+    for number in range(9):
+        periods.add(reading(100.0 + 10.0 * number, 50.0))
+
+    assert [sample.start_s for sample in periods.samples(180.0)] == [150.0, 160.0, 170.0]

@@ -1,0 +1,168 @@
+"""The policy is carried out: deaths are made good at once, crash loops slowly, never all at once."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rse_pf.config import ScalingSettings
+from rse_pf.local.control.scale_modifier import LocalScaleModifier, ServerHealth, may_start_s, replace_now
+from rse_pf.scaling.policy import Sample
+
+SCALING = ScalingSettings()
+PERIOD_S = float(SCALING.period_s)
+
+
+class FakeServers:
+    """Remembers what was asked; a replaced server leaves the dead."""
+
+    def __init__(self, standing: ServerHealth) -> None:
+        self.now = standing
+        self.asked: list[tuple[Any, ...]] = []
+        self.number = 10
+
+    def standing(self, now_s: float) -> ServerHealth:
+        return self.now
+
+    def grow(self, count: int, reason: str) -> list[str]:
+        self.asked.append(("grow", count))
+        return [self._name() for _ in range(count)]
+
+    def shrink(self, reason: str) -> str | None:
+        self.asked.append(("shrink",))
+        return "server-1" if self.now.healthy > 1 else None
+
+    def put_in_place_of(self, name: str, reason: str) -> str:
+        self.asked.append(("replace", name))
+        return self._name()
+
+    def _name(self) -> str:
+        self.number += 1
+        return f"server-{self.number}"
+
+
+def made(standing: ServerHealth) -> tuple[LocalScaleModifier, FakeServers, list[Mapping[str, Any]]]:
+    servers, told = FakeServers(standing), []
+
+    def tell(event: str, **details: Any) -> None:
+        told.append({"event": event, **details})
+
+    return LocalScaleModifier(servers, SCALING, restarts_per_minute=5, tell=tell), servers, told
+
+
+def samples(count: int, cpu_percent: float, requests: int = 1) -> list[Sample]:
+    return [Sample(start_s=i * PERIOD_S, cpu_percent=cpu_percent, requests=requests) for i in range(count)]
+
+
+def test_a_busy_platform_grows_once_in_a_period() -> None:
+    modifier, servers, told = made(ServerHealth(servers=2, healthy=2))
+    busy = samples(2, 75.0)
+
+    for now_s, over in ((119.0, True), (120.1, False), (120.2, True), (121.0, False), (122.0, True)):
+        modifier.act(busy, now_s=now_s, period_over=over)
+
+    assert servers.asked == [("grow", 1)]
+    assert told == [{"event": "grow", "servers": 1, "names": ["server-11"], "reason": "CPU at 75 %"}]
+
+
+def test_an_idle_platform_drains_one_server() -> None:
+    modifier, servers, told = made(ServerHealth(servers=3, healthy=3))
+
+    modifier.act(samples(5, 1.0, requests=0), now_s=300.0, period_over=True)
+
+    assert servers.asked == [("shrink",)]
+    assert told[0]["event"] == "shrink"
+
+
+def test_a_shrink_that_finds_nobody_to_spare_is_no_event() -> None:
+    modifier, _, told = made(ServerHealth(servers=3, healthy=1))
+
+    modifier.act(samples(5, 1.0, requests=0), now_s=300.0, period_over=True)
+
+    assert told == []
+
+
+def test_missing_servers_are_launched_at_once_but_not_while_somebody_else_changes_the_number() -> None:
+    modifier, servers, _ = made(ServerHealth(servers=1, healthy=1))
+
+    modifier.act([], now_s=61.0, period_over=False, hold=True)
+    assert servers.asked == []
+    modifier.act([], now_s=61.0, period_over=False)
+    assert servers.asked == [("grow", 1)]
+
+
+def test_a_dead_server_is_replaced_at_once_also_between_periods_and_on_hold() -> None:
+    modifier, servers, told = made(ServerHealth(servers=2, healthy=1, dead={"server-1": False}))
+
+    modifier.act([], now_s=61.0, period_over=False, hold=True)
+
+    assert servers.asked == [("replace", "server-1")]
+    assert (told[0]["event"], told[0]["server"], told[0]["by"]) == ("replace", "server-1", "server-11")
+
+
+def deaths(young: bool, seconds: int) -> tuple[list[float], list[Mapping[str, Any]]]:
+    """Let each replacement die at once, look once a second, and return when one was started."""
+    modifier, servers, told = made(ServerHealth(servers=2, healthy=1, dead={"server-1": young}))
+    starts = []
+    for second in range(seconds):
+        before = len(servers.asked)
+        modifier.act([], now_s=1000.0 + second, period_over=False)
+        starts += [1000.0 + second] * (len(servers.asked) - before)
+    return starts, told
+
+
+def test_a_crash_loop_gets_five_starts_a_minute_and_is_told_once() -> None:
+    starts, told = deaths(young=True, seconds=180)
+
+    assert max(sum(0 <= later - start < 60.0 for later in starts) for start in starts) == 5
+    assert len(starts) == 15
+    assert [event["event"] for event in told].count("crash-loop") == 1
+
+
+def test_servers_that_lived_long_are_replaced_however_many_they_are() -> None:
+    starts, told = deaths(young=False, seconds=20)
+
+    assert len(starts) == 20
+    assert "crash-loop" not in {event["event"] for event in told}
+
+
+@given(st.lists(st.floats(0.0, 300.0), max_size=30), st.integers(1, 6))
+def test_whoever_obeys_never_starts_more_than_allowed_in_any_minute(wishes: list[float], most: int) -> None:
+    starts: list[float] = []
+    for wish in sorted(wishes):
+        if may_start_s(starts, now_s=wish, per_minute=most) <= wish:
+            starts.append(wish)
+
+    for start in starts:
+        assert sum(0.0 <= later - start < 60.0 for later in starts) <= most
+
+
+def test_who_must_wait_is_told_until_when() -> None:
+    assert may_start_s([10.0, 20.0, 30.0], now_s=40.0, per_minute=2) == 80.0
+    assert may_start_s([10.0, 20.0, 30.0], now_s=85.0, per_minute=2) == 85.0
+
+
+@pytest.mark.parametrize(
+    ("broken", "healthy", "replacing", "chosen"),
+    [("a", 3, 0, "a"), ("abc", 4, 0, "ab"), ("abc", 4, 1, "a"), ("abcd", 0, 0, "a"), ("abc", 0, 1, "")],
+)
+def test_living_servers_are_never_replaced_all_at_once(
+    broken: str, healthy: int, replacing: int, chosen: str
+) -> None:
+    assert replace_now(tuple(broken), healthy=healthy, replacing=replacing) == tuple(chosen)
+
+
+def test_a_whole_fleet_that_fails_its_checks_loses_one_server_only_but_dead_ones_all() -> None:
+    modifier, servers, _ = made(
+        ServerHealth(
+            servers=4, healthy=0, broken=("server-3", "server-4"), dead={"server-1": False, "server-2": False}
+        )
+    )
+
+    modifier.act([], now_s=61.0, period_over=False)
+
+    assert servers.asked == [("replace", "server-1"), ("replace", "server-2"), ("replace", "server-3")]

@@ -1,0 +1,58 @@
+"""The control plane's page: one document, nothing else, and nothing for a web page of another origin."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+
+import pytest
+
+from rse_pf.local.control.status_api import serve_status
+
+SOON_S = 10.0
+TOKEN = "0123456789abcdef" * 4
+CARRIED = b"Authorization: Bearer %s\r\n" % TOKEN.encode()
+
+
+def answer(request: bytes) -> bytes:
+    async def run() -> bytes:
+        server = await serve_status(lambda: {"platform": "a"}, TOKEN)
+        reader, writer = await asyncio.open_connection(*server.sockets[0].getsockname())
+        try:
+            writer.write(request)
+            writer.write_eof()
+            return await asyncio.wait_for(reader.read(), SOON_S)
+        finally:
+            writer.close()
+            server.close()
+
+    return asyncio.run(run())
+
+
+def test_the_document_is_told() -> None:
+    head, _, body = answer(b"GET /status HTTP/1.1\r\nHost: x\r\n%s\r\n" % CARRIED).partition(b"\r\n\r\n")
+
+    assert head.startswith(b"HTTP/1.1 200 OK\r\n")
+    assert json.loads(body) == {"platform": "a"}
+
+
+@pytest.mark.parametrize(
+    ("request_", "status"),
+    [
+        (b"GET /elsewhere HTTP/1.1\r\n%s\r\n" % CARRIED, b"404"),
+        (b"POST /status HTTP/1.1\r\n%s\r\n" % CARRIED, b"405"),
+        (b"GET /status HTTP/1.1\r\nOrigin: http://example.org\r\n%s\r\n" % CARRIED, b"403"),
+        (b"GET /status HTTP/1.1\r\nHost: x\r\n\r\n", b"401"),
+        (b"GET /status HTTP/1.1\r\nAuthorization: Bearer %s\r\n\r\n" % TOKEN[:-1].encode(), b"401"),
+    ],
+)
+def test_everything_else_is_refused(request_: bytes, status: bytes) -> None:
+    told = answer(request_)
+
+    assert told.split(b" ")[1] == status
+    assert b"platform" not in told
+
+
+@pytest.mark.parametrize("broken", [b"", b"nonsense\r\n\r\n", b"GET /status"])
+def test_a_broken_question_ends_its_own_connection(broken: bytes) -> None:
+    assert answer(broken) == b""

@@ -1,0 +1,186 @@
+"""The data server is started, announced, and replaced on its own port; a bad start is told."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from rse_pf.config import PlatformSettings
+from rse_pf.errors import ConfigurationError
+from rse_pf.local.processes import is_alive
+from rse_pf.local.servers.data_servers import LocalDataServers
+
+pytestmark = pytest.mark.system
+
+_PROGRAM = """
+import json, os, signal, sys, time
+args = dict(zip(sys.argv[2::2], sys.argv[3::2]))
+port = int(args["--port"]) or 40001
+with open("starts", "a") as file:
+    file.write(f"{port} {args['--store']}\\n")
+temporary = args["--announce"] + ".new"
+json.dump({"pid": os.getpid(), "port": port}, open(temporary, "w"))
+os.replace(temporary, args["--announce"])
+signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
+signal.pause()
+"""
+"""Answers no question, so it must not live long where hanging servers are ended."""
+PATIENT: dict[str, Any] = {"unhealthy_checks": 10}
+
+
+class Box:
+    """Data servers that run a program of the test, and what they told."""
+
+    def __init__(
+        self, folder: Path, program: str, *, health: dict[str, Any] = PATIENT, replaces: bool = True
+    ) -> None:
+        self.told: asyncio.Queue[str] = asyncio.Queue()
+        self.servers = LocalDataServers(
+            PlatformSettings().replace(local={"start_timeout_s": 15.0}, health=health),
+            folder=folder, settings_file=folder / "s", keys_file=folder / "k", store="dir:objects",
+            replaces=replaces, program=(sys.executable, "-W", "ignore", "-c", program),
+            tell=lambda event, **_: self.told.put_nowait(event),
+        )  # fmt: skip
+
+    async def next(self) -> str:
+        while (event := await asyncio.wait_for(self.told.get(), 15)) == "data-server-start":
+            pass
+        return event
+
+
+def test_a_server_that_dies_is_replaced_on_its_port(tmp_path: Path) -> None:
+    async def run() -> None:
+        box = Box(tmp_path, _PROGRAM)
+        first = await box.servers.start()
+        assert await box.next() == "data-server-up"
+
+        assert box.servers.send(9)  # type: ignore[arg-type]
+        assert [await box.next(), await box.next()] == ["data-server-down", "data-server-up"]
+        second = box.servers.mark
+        await box.servers.stop(10.0)
+
+        assert second is not None
+        assert second != first.mark
+        assert not is_alive(first.mark)
+        assert not is_alive(second)
+        assert box.servers.mark is None
+        assert (tmp_path / "starts").read_text() == "40001 dir:objects\n" * 2
+        assert not (tmp_path / "data-1.json").exists()
+
+    asyncio.run(run())
+
+
+def test_the_server_of_an_earlier_control_plane_is_adopted_and_replaced(tmp_path: Path) -> None:
+    async def run() -> None:
+        earlier, later = Box(tmp_path, _PROGRAM), Box(tmp_path, _PROGRAM)
+        server = await earlier.servers.start()
+        later.servers.adopt(server.mark, server.port)
+        await earlier.servers.forget()
+
+        assert later.servers.send(9)  # type: ignore[arg-type]
+        assert [await later.next(), await later.next()] == ["data-server-down", "data-server-up"]
+        await later.servers.stop(10.0)
+        earlier.servers.kill_all()  # reaps its child
+
+        assert later.servers.port == server.port
+        assert earlier.told.qsize() == 2, "its start and its being up"
+
+    asyncio.run(run())
+
+
+def test_a_server_steps_back_behind_the_poses(tmp_path: Path) -> None:
+    async def run() -> None:
+        box = Box(tmp_path, _PROGRAM)
+        server = await box.servers.start()
+
+        ours, its = os.getpriority(os.PRIO_PROCESS, 0), os.getpriority(os.PRIO_PROCESS, server.pid)
+        mine, policy = os.sched_getscheduler(0), os.sched_getscheduler(server.pid)
+        await box.servers.stop(10.0)
+
+        assert its == max(ours, PlatformSettings().local.data_nice) > 0
+        assert policy == {os.SCHED_OTHER: os.SCHED_BATCH}.get(mine, mine)
+
+    asyncio.run(run())
+
+
+def test_a_server_that_answers_nobody_is_ended_and_replaced(tmp_path: Path) -> None:
+    async def run() -> None:
+        box = Box(tmp_path, _PROGRAM, health={"unhealthy_checks": 2})
+        first = await box.servers.start()
+        assert await box.next() == "data-server-up"
+
+        told = [await box.next(), await box.next(), await box.next()]
+        assert told == ["data-server-silent", "data-server-down", "data-server-up"]
+        assert not is_alive(first.mark)
+        await box.servers.stop(10.0)
+
+    asyncio.run(run())
+
+
+def test_a_platform_that_heals_nothing_only_tells_of_the_end(tmp_path: Path) -> None:
+    async def run() -> None:
+        box = Box(tmp_path, _PROGRAM, replaces=False)
+        await box.servers.start()
+        assert await box.next() == "data-server-up"
+
+        assert box.servers.send(9)  # type: ignore[arg-type]
+        assert await box.next() == "data-server-down"
+        assert not box.servers.is_running()
+        await box.servers.stop(10.0)
+        assert (tmp_path / "starts").read_text().count("\n") == 1
+
+    asyncio.run(run())
+
+
+def test_a_port_that_somebody_took_meanwhile_is_given_up(tmp_path: Path) -> None:
+    async def run() -> None:
+        box = Box(
+            tmp_path, _PROGRAM.replace("port = ", "args['--port'] == '0' or sys.exit('taken')\nport = ")
+        )
+
+        server = await box.servers.start(port=40002)
+
+        assert server.port == box.servers.port == 40001
+        assert box.servers.state is not None
+        assert box.servers.state.port == 40001
+        await box.servers.stop(10.0)
+
+    asyncio.run(run())
+
+
+def test_a_server_that_ends_at_once_is_told_with_its_last_words(tmp_path: Path) -> None:
+    async def run() -> None:
+        box = Box(tmp_path, "import sys; sys.exit('the disk is gone')")
+
+        with pytest.raises(ConfigurationError, match=r"exit code 1.*the disk is gone"):
+            await box.servers.start()
+
+        box.servers.kill_all()
+
+    asyncio.run(run())
+
+
+def test_a_server_that_stays_is_killed(tmp_path: Path) -> None:
+    async def run() -> None:
+        stays = "signal.signal(signal.SIGTERM, signal.SIG_IGN)\ntemporary = "
+        stubborn = _PROGRAM.replace("temporary = ", stays).replace("lambda *_: sys.exit(0)", "signal.SIG_IGN")
+        box = Box(tmp_path, stubborn)
+        server = await box.servers.start()
+
+        await box.servers.stop(0.2)
+
+        assert not is_alive(server.mark)
+
+    asyncio.run(run())
+
+
+def test_nobody_is_ready_before_the_first_start(tmp_path: Path) -> None:
+    box = Box(tmp_path, _PROGRAM)
+
+    assert asyncio.run(box.servers.is_ready()) is False
+    assert box.servers.send(15) is False  # type: ignore[arg-type]

@@ -1,0 +1,155 @@
+"""Service folders: what may be installed, and that nothing of it changes afterwards."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from rse_pf.errors import ConfigurationError, UsageError
+from rse_pf.services.custom.installed import (
+    install,
+    installed_services,
+    published_services,
+    read_service,
+)
+from rse_pf.services.custom.runtime import open_runtime
+
+GOOD = {"name": "adder", "language": "python", "entry": "service.py"}
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """A folder with a service in it."""
+    made = tmp_path / "adder"
+    (made / "requests").mkdir(parents=True)
+    (made / "service.json").write_text(json.dumps(GOOD))
+    (made / "service.py").write_text("x = 1\n")
+    (made / "requests" / "a.json").write_text("{}")
+    (made / "helper").mkdir()
+    (made / "helper" / "more.py").write_text("y = 2\n")
+    return made
+
+
+def test_a_service_is_what_its_manifest_says(folder):
+    service = read_service(folder)
+
+    assert (service.name, service.language, service.kind) == ("adder", "python", "stateless")
+    assert service.entry_path == folder / "service.py"
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"name": "Adder"}, {"name": "../adder"}, {"name": ""}, {"name": "a" * 41}, {"name": 5},
+        {"language": "perl"}, {"kind": "long"}, {"kind": "eternal"}, {"entry": "/etc/passwd"},
+        {"entry": "../service.py"}, {"entry": ""}, {"entry": 1}, {"unknown": 1},
+    ],
+)  # fmt: skip
+def test_a_manifest_that_cannot_be_is_one_line(folder, change):
+    (folder / "service.json").write_text(json.dumps({**GOOD, **change}))
+
+    with pytest.raises(UsageError) as caught:
+        read_service(folder)
+    assert caught.value.hint
+    assert "\n" not in caught.value.message
+
+
+@pytest.mark.parametrize("text", ["", "[]", "{", '{"name": "adder"}', "\x00"])
+def test_a_manifest_that_is_none_is_one_line(folder, text):
+    (folder / "service.json").write_text(text)
+
+    with pytest.raises(UsageError, match=r"service\.json"):
+        read_service(folder)
+
+
+def test_an_installed_service_runs_from_its_own_copy(folder, tmp_path):
+    installed = install(folder, tmp_path / "services")
+    (folder / "service.py").write_text("changed\n")
+
+    assert installed.entry_path.read_text() == "x = 1\n"
+    assert [service.name for service in installed_services(tmp_path / "services")] == ["adder"]
+    assert (installed.folder / "helper" / "more.py").exists()
+    assert not (installed.folder / "requests").exists()
+
+
+def test_installing_again_replaces_every_file(folder, tmp_path):
+    install(folder, tmp_path / "services")
+    (folder / "helper" / "more.py").unlink()
+    (folder / "service.py").write_text("x = 3\n")
+    installed = install(folder, tmp_path / "services")
+
+    assert installed.entry_path.read_text() == "x = 3\n"
+    assert not (installed.folder / "helper" / "more.py").exists()
+    assert len(list((tmp_path / "services").iterdir())) == 1
+
+
+@pytest.mark.parametrize("harm", ["change", "add", "remove", "pins", "manifest"])
+def test_a_service_that_was_changed_since_is_refused(folder, tmp_path, harm):
+    place = install(folder, tmp_path / "services").folder
+    if harm == "change":
+        (place / "helper" / "more.py").write_text("y = 3\n")
+    elif harm == "add":
+        (place / "new.py").write_text("")
+    elif harm == "remove":
+        (place / "helper" / "more.py").unlink()
+    elif harm == "pins":
+        (place / "pins.json").unlink()
+    else:
+        (place / "service.json").write_text(json.dumps({**GOOD, "entry": "helper/more.py"}))
+
+    with pytest.raises(ConfigurationError, match="install"):
+        installed_services(tmp_path / "services")
+
+
+def test_a_library_that_was_not_built_is_one_line(folder, tmp_path):
+    (folder / "service.json").write_text(json.dumps({**GOOD, "language": "cpp", "entry": "build/lib.so"}))
+
+    with pytest.raises(UsageError, match="missing") as caught:
+        install(folder, tmp_path / "services")
+    assert "cmake" in caught.value.hint
+
+
+def test_a_services_folder_that_is_not_there_is_one_line(tmp_path):
+    with pytest.raises(ConfigurationError, match="no services folder"):
+        installed_services(tmp_path / "none")
+
+
+PUBLISHED = """
+import msgspec
+class Request(msgspec.Struct):
+    x: int
+class Reply(msgspec.Struct):
+    y: int
+def serve(request: Request) -> Reply:
+    return Reply(y=2 * request.x)
+"""
+
+
+@pytest.fixture
+def package(tmp_path, monkeypatch):
+    """A function that pretends to install a package with entry points."""
+
+    def installed(entry_points):
+        (tmp_path / "doubling_for_tests.py").write_text(PUBLISHED)
+        info = tmp_path / "doubling_for_tests-1.0.dist-info"
+        info.mkdir()
+        (info / "METADATA").write_text("Metadata-Version: 2.1\nName: doubling-for-tests\nVersion: 1.0\n")
+        (info / "entry_points.txt").write_text(f"[rse_pf.services]\n{entry_points}\n")
+        monkeypatch.syspath_prepend(tmp_path)
+
+    return installed
+
+
+def test_a_package_publishes_a_service_by_an_entry_point(package, tmp_path):
+    package("doubling = doubling_for_tests")
+    (service,) = [each for each in published_services() if each.name == "doubling"]
+
+    assert open_runtime(service, tmp_path).call({"x": 21}).y == 42
+
+
+def test_a_published_service_with_a_bad_name_is_one_line(package):
+    package("Doubling! = doubling_for_tests")
+
+    with pytest.raises(ConfigurationError, match="Doubling!"):
+        published_services()

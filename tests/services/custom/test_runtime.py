@@ -1,0 +1,258 @@
+"""Services in three languages behind one interface."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+
+import numpy as np
+import pytest
+
+from rse_pf.errors import (
+    BadRequest,
+    CommandFailed,
+    ConfigurationError,
+    DegenerateGeometry,
+    InternalError,
+    RsePfError,
+)
+from rse_pf.services.custom.installed import read_service
+from rse_pf.services.custom.native import INCLUDE_FOLDER
+from rse_pf.services.custom.runtime import open_runtime
+
+PYTHON = """
+from __future__ import annotations
+import msgspec
+from rse_pf.errors import DegenerateGeometry
+from rse_pf.wire.arrays import Array
+
+class Request(msgspec.Struct):
+    values: Array
+    label: str = ""
+
+class Reply(msgspec.Struct):
+    total: float
+    count: int
+    label: str
+
+class Service:
+    def __init__(self):
+        self.count = 0
+    def serve(self, request: Request) -> Reply:
+        if request.values.sum() < 0:
+            raise DegenerateGeometry("negative")
+        self.count += 1
+        return Reply(total=request.values.sum(), count=self.count, label=request.label)
+    def snapshot(self):
+        return str(self.count).encode()
+    def restore(self, data):
+        self.count = int(data)
+"""
+LUA = """
+local json, zlib = require "json", require "zlib"
+local count = 0
+return {
+  serve = function(request)
+    if type(request.values) ~= "table" then error({code = "bad-request", message = "values"}) end
+    local total = 0
+    for _, value in ipairs(request.values) do total = total + value end
+    if total < 0 then error({code = "degenerate", message = "negative"}) end
+    if request.label == "oops" then local nothing = nil; return nothing.x end
+    if request.label == "zlib" then
+      local binary = "\\0\\255h"
+      assert(zlib.inflate(zlib.deflate(binary)) == binary)
+    end
+    count = count + 1
+    return {total = total, count = count, label = json.decode(json.encode({request.label or ""}))[1]}
+  end,
+  snapshot = function() return {count = count} end,
+  restore = function(state) count = state.count end,
+}
+"""
+CPP = """
+#include "rse_pf_service.hpp"
+struct Adder {
+  int count = 0;
+  rse_pf::Fields call(const rse_pf::Fields &request) {
+    double total = 0;
+    for (double value : request.at("values").values) total += value;
+    if (total < 0) throw rse_pf::Degenerate("negative");
+    ++count;
+    rse_pf::Fields reply;
+    reply["total"] = rse_pf::Field::number(total);
+    reply["count"] = rse_pf::Field::number(count);
+    reply["label"] = rse_pf::Field::of_text(request.count("label") ? request.at("label").text : "");
+    return reply;
+  }
+  std::string snapshot() const { return std::to_string(count); }
+  void restore(const std::string &data) { count = std::stoi(data); }
+};
+RSE_PF_SERVICE_WITH_SNAPSHOTS(Adder)
+"""
+C_BYTES = """
+#include <stdlib.h>
+#include <string.h>
+#include "rse_pf_service.h"
+uint32_t rse_pf_service_abi(void) { return ABI; }
+int rse_pf_service_open(const char *scratch, void **state) { *state = 0; return scratch[0] != '/'; }
+void rse_pf_service_close(void *state) { (void)state; }
+void rse_pf_service_free(void *state, void *memory) { (void)state; free(memory); }
+int rse_pf_service_call(void *state, const uint8_t *request, uint64_t size, uint8_t **reply,
+                        uint64_t *reply_size) {
+  (void)state;
+  if (memchr(request, '!', size)) return RSE_PF_FAILED;
+  *reply = malloc(size);
+  memcpy(*reply, request, size);
+  *reply_size = size;
+  return RSE_PF_OK;
+}
+"""
+
+
+def compiled(folder, source, name, *flags):
+    """Build *source* into ``lib.so``, or skip where there is no compiler."""
+    compiler = shutil.which("c++" if name.endswith("cpp") else "cc")
+    if compiler is None:
+        pytest.skip("no compiler for C and C++ is installed")
+    (folder / name).write_text(source)
+    subprocess.run(
+        [compiler, "-Wall", "-Wextra", "-Werror", "-fPIC", "-shared", f"-I{INCLUDE_FOLDER}", *flags, name,
+         "-o", "lib.so"],
+        cwd=folder, check=True,
+    )  # fmt: skip
+
+
+def opened(folder, language, entry, source=None):
+    """Return the runtime of a service written into *folder*."""
+    if source is not None:
+        (folder / entry).write_text(source)
+    manifest = {"name": "adder", "language": language, "entry": entry, "kind": "per_robot_state"}
+    (folder / "service.json").write_text(json.dumps(manifest))
+    return open_runtime(read_service(folder), folder)
+
+
+@pytest.fixture(params=["python", "lua", "cpp"])
+def adder(request, tmp_path):
+    """A function that opens the same service, in each of the three languages."""
+    if request.param == "cpp":
+        compiled(tmp_path, CPP, "adder.cpp", "-std=c++17")
+    source = {"python": PYTHON, "lua": LUA, "cpp": None}[request.param]
+    entry = {"python": "service.py", "lua": "service.lua", "cpp": "lib.so"}[request.param]
+    return lambda: opened(tmp_path, request.param, entry, source)
+
+
+@pytest.mark.parametrize("values", [[1.5, 2.0], np.array([1.5, 2.0]), np.array([1.5, 2.0], np.float32)])
+def test_every_language_gets_what_was_sent(adder, values):
+    reply = plain(adder().call({"values": values, "label": "é"}))
+
+    assert reply == {"total": 3.5, "count": 1, "label": "é"}
+
+
+def test_every_language_keeps_state_and_goes_on_from_a_snapshot(adder):
+    first = adder()
+    for _ in range(3):
+        first.call({"values": [1.0]})
+    second = adder()
+    assert second.has_snapshots
+    second.restore(first.snapshot())
+
+    assert plain(second.call({"values": [1.0]}))["count"] == 4
+
+
+def test_every_language_has_typed_failures(adder):
+    service = adder()
+
+    with pytest.raises(DegenerateGeometry, match="negative"):
+        service.call({"values": [-1.0]})
+    with pytest.raises(RsePfError) as caught:
+        service.call({})
+    assert caught.value.code == "bad-request"
+    assert plain(service.call({"values": [1.0]}))["count"] == 1, "a failure changes nothing"
+
+
+def test_a_defect_of_a_script_is_internal_with_its_line(tmp_path):
+    service = opened(tmp_path, "lua", "service.lua", LUA)
+
+    with pytest.raises(InternalError, match=r"service\.lua:10: .*nil value"):
+        service.call({"values": [1.0], "label": "oops"})
+    assert service.call({"values": [1.0], "label": "zlib"})["total"] == 1
+
+
+@pytest.mark.parametrize(
+    ("language", "entry", "source", "says"),
+    [
+        ("python", "service.py", "import nothing_of_this_name", "ModuleNotFoundError"),
+        ("python", "service.py", "x = 1", "neither a function serve"),
+        ("python", "service.py", "def serve(request): pass", r"msgspec\.Struct"),
+        ("lua", "service.lua", "return function(", "cannot be loaded"),
+        ("lua", "service.lua", "return 5", "neither a function"),
+        ("lua", "service.lua", "return {serve = 5}", "neither a function"),
+        ("cpp", "lib.so", "no library", "cannot be loaded"),
+    ],
+)
+def test_what_cannot_be_loaded_is_one_line(tmp_path, language, entry, source, says):
+    with pytest.raises(ConfigurationError, match=says):
+        opened(tmp_path, language, entry, source)
+
+
+def test_a_script_sees_nothing_of_python(tmp_path):
+    service = opened(
+        tmp_path, "lua", "service.lua",
+        "local json = require 'json'\nreturn function(r) return {p = tostring(python), ok = pcall(function() "
+        "return json.encode.__globals__ end)} end",
+    )  # fmt: skip
+
+    assert service.call({}) == {"p": "nil", "ok": False}
+
+
+def test_plain_c_may_take_json_bytes(tmp_path):
+    compiled(tmp_path, C_BYTES, "echo.c", "-DABI=RSE_PF_SERVICE_ABI")
+    service = opened(tmp_path, "cpp", "lib.so")
+
+    assert service.call({"a": [1, "é", None]}) == {"a": [1, "é", None]}
+    assert not service.has_snapshots
+    with pytest.raises(CommandFailed, match="returned 2"):
+        service.call({"a": "!"})
+
+
+def test_a_library_for_another_interface_is_refused(tmp_path):
+    compiled(tmp_path, C_BYTES, "echo.c", "-DABI=7")
+
+    with pytest.raises(ConfigurationError, match="interface 7"):
+        opened(tmp_path, "cpp", "lib.so")
+
+
+def test_a_library_without_a_call_is_refused_with_the_missing_name(tmp_path):
+    source = C_BYTES.replace("rse_pf_service_call", "something_else")
+    compiled(tmp_path, source, "echo.c", "-DABI=RSE_PF_SERVICE_ABI", "-Wno-missing-prototypes")
+
+    with pytest.raises(ConfigurationError, match="rse_pf_service_call"):
+        opened(tmp_path, "cpp", "lib.so")
+
+
+@pytest.mark.parametrize(
+    "payload", [[1.0], {"values": {"a": 1}}, {"values": [[1.0], [1.0, 2.0]]}, {"values": [float("nan")]}]
+)
+def test_a_library_sees_only_numbers_and_texts(tmp_path, payload):
+    compiled(tmp_path, CPP, "adder.cpp", "-std=c++17")
+    service = opened(tmp_path, "cpp", "lib.so")
+
+    with pytest.raises(BadRequest):
+        service.call(payload)
+
+
+def test_a_matrix_keeps_its_shape_on_its_way_into_a_library(tmp_path):
+    source = CPP.replace("double total = 0;", 'double total = request.at("values").shape.size();')
+    compiled(tmp_path, source, "adder.cpp", "-std=c++17")
+    service = opened(tmp_path, "cpp", "lib.so")
+
+    assert service.call({"values": [[0.0, 0.0], [0.0, 0.0]]})["total"] == 2
+    assert service.call({"values": 0.0})["total"] == 0
+
+
+def plain(reply):
+    """Return a reply of any language as a dictionary."""
+    if isinstance(reply, dict):
+        return reply
+    return {name: getattr(reply, name) for name in reply.__struct_fields__}

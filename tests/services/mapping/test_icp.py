@@ -1,0 +1,95 @@
+"""icp recovers small offsets, and returns its start, with a reason, where it cannot do better."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from rse_pf.errors import BadRequest
+from rse_pf.geometry import Array, exp_se3, pose_difference
+from rse_pf.services.mapping.icp import IcpOptions, align
+from rse_pf.services.synthetic_maps import make_room as full_room
+
+pytest.importorskip("small_gicp", reason="the extra maps is not installed")
+
+
+def make_room(seed: int, *, walls: int = 3) -> Array:
+    """Return a room of few points, to be quick."""
+    return full_room(seed, points=6000, walls=walls)
+
+
+def offset(seed: int, metres: float, degrees: float) -> Array:
+    """Return a motion of exactly these lengths in a random direction."""
+    rng = np.random.default_rng(seed)
+    t, r = rng.normal(size=3), rng.normal(size=3)
+    return exp_se3(
+        np.concatenate([metres * t / np.linalg.norm(t), math.radians(degrees) * r / np.linalg.norm(r)])
+    )
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_recovers_five_centimetres_and_three_degrees_between_overlapping_clouds(seed: int) -> None:
+    target, source = make_room(seed), make_room(seed + 100)
+    source = source[source[:, 0] < 2.6]
+
+    found = align(target, source, offset(seed, 0.05, 3.0))
+
+    metres, degrees = pose_difference(found.T_target_source, np.eye(4))
+    assert found.verdict == "ok", found.reason
+    assert metres <= 0.01
+    assert degrees <= 0.5
+
+
+@pytest.mark.parametrize("walls", [1, 2])
+def test_surfaces_that_let_a_cloud_slide_are_refused(walls: int) -> None:
+    start = offset(1, 0.03, 1.0)
+
+    found = align(make_room(1, walls=walls), make_room(2, walls=walls), start)
+
+    assert (found.verdict, found.reason) == ("refused", "sliding")
+    np.testing.assert_array_equal(found.T_target_source, start)
+
+
+def test_clouds_that_hardly_overlap_are_refused_with_the_start() -> None:
+    far = exp_se3([3.0, 3.0, 3.0, 0.0, 0.0, 0.0])
+
+    found = align(make_room(1), make_room(2), far)
+
+    assert found.verdict == "refused"
+    assert found.reason in ("little-overlap", "not-converged")
+    np.testing.assert_array_equal(found.T_target_source, far)
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_an_answer_called_ok_is_never_farther_from_the_truth_than_its_start(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    start = offset(seed, float(rng.uniform(0.005, 0.5)), float(rng.uniform(0.2, 25.0)))
+    target, source = make_room(seed), make_room(seed + 50)
+    source = source[source[:, 1] < rng.uniform(1.0, 4.0)]
+
+    found = align(target, source, start)
+
+    before, after = pose_difference(start, np.eye(4)), pose_difference(found.T_target_source, np.eye(4))
+    assert after[0] <= before[0] + 1e-3
+    assert after[1] <= before[1] + 0.05
+
+
+def test_a_jump_beyond_the_limit_is_refused() -> None:
+    found = align(make_room(1), make_room(2), offset(3, 0.08, 1.0), IcpOptions(max_motion_m=0.02))
+
+    assert (found.verdict, found.reason) == ("refused", "jumped")
+
+
+def test_the_same_clouds_give_the_same_pose() -> None:
+    target, source, start = make_room(1), make_room(2), offset(3, 0.05, 3.0)
+
+    first, second = align(target, source, start), align(target, source, start)
+
+    np.testing.assert_array_equal(first.T_target_source, second.T_target_source)
+
+
+def test_too_few_points_are_refused_with_the_number() -> None:
+    with pytest.raises(BadRequest, match="points are left"):
+        align(full_room(1)[:50], make_room(2), np.eye(4))

@@ -1,0 +1,239 @@
+"""Maps are joined by loops that agree; what does not agree, or is not seen, is refused and named."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from rse_pf.config import ServiceSettings
+from rse_pf.errors import Cancelled, MissingExtra
+from rse_pf.geometry import Array, exp_se3, inverse, pose_difference
+from rse_pf.maps.format import MapVersion, decode_map, encode_map
+from rse_pf.services.mapping.loop_consistency import LoopClosure, OdometryNoise, consistent, largest_clique
+from rse_pf.services.mapping.map_merge import (
+    Atlas,
+    Merged,
+    MergeOptions,
+    Proposals,
+    join_maps,
+    propose_links,
+)
+from rse_pf.services.mapping.merge import MergeRequest, merge_maps
+from rse_pf.services.mapping.optimise import Report, silent
+from rse_pf.services.synthetic_maps import make_world
+
+for package in ("faiss", "gtsam"):
+    pytest.importorskip(package, reason="the extra maps is not installed")
+
+WORLD = make_world(1)
+
+
+def two_robots() -> tuple[list[MapVersion], list[Array]]:
+    """Return the maps and true poses of two robots that both see the second quarter of the hall."""
+    a, truth_a = WORLD.walk("a", np.linspace(0.0, 0.5, 13), seed=1)
+    b, truth_b = WORLD.walk("b", np.linspace(0.3, 0.8, 13), seed=2)
+    return [a, b], [truth_a, truth_b]
+
+
+def rmse_m(merged: Merged, truth: Array) -> float:
+    """Return the rmse of keyframe positions, both in the frame of the first true pose."""
+    estimate = np.array([each.T_world_camera for each in merged.version.keyframes])
+    start = inverse(estimate[0])
+    true_start = inverse(truth[0])
+    off = [(start @ e)[:3, 3] - (true_start @ t)[:3, 3] for e, t in zip(estimate, truth, strict=True)]
+    return float(np.sqrt((np.array(off) ** 2).sum(axis=1).mean()))
+
+
+def test_two_maps_that_share_views_become_one() -> None:
+    maps, truths = two_robots()
+
+    merged = join_maps(maps)
+
+    assert merged.joined == (0, 1)
+    assert merged.merges >= 3
+    origin = merged.version.keyframes[13].T_world_camera
+    metres, degrees = pose_difference(origin, inverse(truths[0][0]) @ truths[1][0])
+    assert metres <= 0.1
+    assert degrees <= 2.5
+    assert {edge.kind for edge in merged.version.edges} >= {"odometry", "merge"}
+    assert [row[0] for row in merged.version.provenance["from"]] == [0] * 13 + [1] * 13
+
+
+def test_the_same_maps_give_the_same_map() -> None:
+    maps, _ = two_robots()
+
+    assert encode_map(join_maps(maps).version) == encode_map(join_maps(maps).version)
+
+
+def test_maps_that_share_no_view_are_not_joined_and_the_reason_is_told() -> None:
+    here, _ = WORLD.walk("a", np.linspace(0.0, 0.3, 8), seed=1)
+    elsewhere, _ = make_world(2).walk("b", np.linspace(0.0, 0.3, 8), seed=2)
+
+    merged = join_maps([here, elsewhere])
+
+    assert merged.joined == (0,)
+    assert merged.merges == 0
+    ((which, reason),) = merged.not_joined
+    assert which == 1
+    assert "no-matches" in reason
+    assert len(merged.version.keyframes) == 8
+
+
+def planted(share: float, seed: int):  # type: ignore[no-untyped-def]
+    """Return a proposer that turns a share of the links into wrong ones, and counts them."""
+
+    def propose(atlas: Atlas, options: MergeOptions, report: Report) -> Proposals:
+        found = propose_links(atlas, options, report)
+        rng = np.random.default_rng(seed)
+        links = list(found.links)
+        for k in rng.choice(len(links), max(1, round(share * len(links))), replace=False).tolist():
+            wrong = links[k].T_a_b @ exp_se3(rng.uniform(-1, 1, 6) * [1.5, 1.5, 1.5, 1, 1, 1])
+            links[k] = LoopClosure(a=links[k].a, b=links[k].b, T_a_b=wrong, information=links[k].information)
+        return Proposals(links=tuple(links), failed=found.failed)
+
+    return propose
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_planted_wrong_loops_are_refused_and_do_not_bend_the_map(seed: int) -> None:
+    maps, truths = two_robots()
+    truth = np.concatenate(truths)
+
+    clean, wrong = join_maps(maps), join_maps(maps, propose=planted(0.1, seed))
+
+    assert wrong.joined == (0, 1)
+    assert rmse_m(wrong, truth) <= max(1.1 * rmse_m(clean, truth), rmse_m(clean, truth) + 0.005)
+    wrongs = planted(0.1, seed)(Atlas.of(maps), MergeOptions(), silent).links
+    rights = propose_links(Atlas.of(maps), MergeOptions()).links
+    fakes = {
+        w.T_a_b.tobytes() for w, r in zip(wrongs, rights, strict=True) if not np.array_equal(w.T_a_b, r.T_a_b)
+    }
+    assert len(fakes) >= 1
+    assert not fakes & {edge.T_a_b.tobytes() for edge in wrong.version.edges}
+    refusals = sum(count for (_, _, why), count in wrong.refused.items() if why in JUDGED)
+    assert refusals >= sum(count for (_, _, why), count in clean.refused.items() if why in JUDGED) + 1
+
+
+JUDGED = ("inconsistent", "against-odometry")
+
+
+def test_a_single_wrong_link_joins_nothing() -> None:
+    maps, _ = two_robots()
+
+    def propose(atlas: Atlas, options: MergeOptions, report: Report) -> Proposals:
+        links = propose_links(atlas, options, report)
+        across = [link for link in links.links if (link.a < 13) != (link.b < 13)]
+        return Proposals(links=tuple(across[:1]), failed=links.failed)
+
+    merged = join_maps(maps, propose=propose)
+
+    assert merged.joined == (0,)
+    assert "too-few-agree" in merged.not_joined[0][1]
+
+
+def test_closing_the_loop_of_one_robot_brings_its_ends_together() -> None:
+    version, truth = WORLD.walk("a", np.linspace(0.0, 1.1, 30), seed=4, drift_m=0.02, drift_deg=0.7)
+
+    without = join_maps([version], MergeOptions(close_loops=False))
+    merged = join_maps([version])
+
+    assert without.loops == 0
+    assert merged.loops >= 1
+    assert rmse_m(merged, truth) < 0.7 * rmse_m(without, truth)
+
+
+def test_points_follow_the_keyframes_that_saw_them() -> None:
+    version, truth = WORLD.walk("a", np.linspace(0.0, 1.1, 30), seed=4, drift_m=0.02, drift_deg=0.7)
+    seen = [
+        k.points_camera[:40] @ k.T_world_camera[:3, :3].T + k.T_world_camera[:3, 3] for k in version.keyframes
+    ]
+    cloud = np.concatenate(seen).astype(np.float32)
+    version = MapVersion(
+        keyframes=version.keyframes, points=cloud, colours=np.zeros((len(cloud), 3), dtype=np.uint8)
+    )
+    T_first_world = inverse(truth[0])
+    true_points = WORLD.points @ T_first_world[:3, :3].T + T_first_world[:3, 3]
+
+    merged = join_maps([version])
+
+    assert median_distance(merged.version.points, true_points) < 0.8 * median_distance(cloud, true_points)
+
+
+def median_distance(points: Array, others: Array) -> float:
+    """Return the median distance of points to their nearest other."""
+    squared = ((points[:, None, :] - others[None]) ** 2).sum(axis=2).min(axis=1)
+    return float(np.sqrt(np.median(squared)))
+
+
+def test_the_service_takes_bytes_and_accounts_for_every_map() -> None:
+    maps, _ = two_robots()
+
+    reply = merge_maps(MergeRequest(maps=[encode_map(each) for each in maps]), ServiceSettings())
+
+    assert reply.joined == [0, 1]
+    assert reply.not_joined == []
+    assert len(decode_map(reply.map).keyframes) == 26
+    assert reply.cost_after <= reply.cost_before
+
+
+def test_a_merge_can_be_cancelled_half_way() -> None:
+    maps, _ = two_robots()
+    heard: list[float] = []
+
+    def stop(done: float, what: str) -> None:
+        heard.append(done)
+        if done > 0.2:
+            raise Cancelled("the robot left")
+
+    with pytest.raises(Cancelled):
+        join_maps(maps, report=stop)
+    assert heard == sorted(heard)
+
+
+def test_the_largest_set_that_agrees_is_found() -> None:
+    agree = np.zeros((7, 7), dtype=bool)
+    for group in ((0, 1, 2), (2, 3, 4, 5), (5, 6)):
+        for one in group:
+            for other in group:
+                agree[one, other] = one != other
+
+    assert largest_clique(agree).tolist() == [2, 3, 4, 5]
+    assert largest_clique(np.zeros((0, 0), dtype=bool)).tolist() == []
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_clique_is_as_large_as_brute_force_says(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    agree = rng.random((11, 11)) < 0.5
+    agree = np.triu(agree, 1) | np.triu(agree, 1).T
+    best = 0
+    for mask in range(1 << 11):
+        rows = [row for row in range(11) if mask >> row & 1]
+        if len(rows) > best and all(agree[a, b] for a in rows for b in rows if a != b):
+            best = len(rows)
+
+    found = largest_clique(agree)
+
+    assert len(found) == best
+    assert all(agree[a, b] for a in found for b in found if a != b)
+
+
+def test_consistency_does_not_ask_where_the_origins_are() -> None:
+    maps, _ = two_robots()
+    atlas = Atlas.of(maps)
+    links = propose_links(atlas, MergeOptions(close_loops=False)).links
+    moved = atlas.T_world_camera.copy()
+    moved[atlas.of_map == 1] = exp_se3([5.0, -3.0, 1.0, 1.0, 2.0, 0.5]) @ moved[atlas.of_map == 1]
+
+    here = consistent(links, atlas.T_world_camera, atlas.order, OdometryNoise())
+
+    np.testing.assert_array_equal(here, consistent(links, moved, atlas.order, OdometryNoise()))
+
+
+def test_without_the_extra_the_answer_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    import sys
+
+    monkeypatch.setitem(sys.modules, "faiss", None)
+
+    with pytest.raises(MissingExtra, match="faiss"):
+        join_maps(two_robots()[0])

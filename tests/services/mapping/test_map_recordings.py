@@ -1,0 +1,83 @@
+"""The map services on the red-kitchen recording: the rows of issue 6 that need no platform."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from benchmarks.map_services import (
+    cloud_distances,
+    joined_poses,
+    localise_row,
+    origin_errors,
+    planted,
+    robots_of,
+)
+from rse_pf.services.mapping.map_merge import MergeOptions, join_maps
+
+pytestmark = [pytest.mark.data, pytest.mark.slow]
+
+for package in ("faiss", "gtsam", "cv2", "poselib"):
+    pytest.importorskip(package)
+
+
+def test_three_robots_become_one_map_within_the_bar(recordings: Path) -> None:
+    robots = robots_of(recordings)
+
+    merged = join_maps([robot.version for robot in robots.runs])
+
+    assert merged.joined == (0, 1, 2)
+    assert robots.ate_m(joined_poses(robots.runs, merged)) <= 0.045
+    for metres, degrees in origin_errors(robots, merged):
+        assert metres <= 0.07
+        assert degrees <= 2.5
+    median_m, share = cloud_distances(robots, merged)
+    assert median_m <= 0.015
+    assert share >= 0.85
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_wrong_loops_change_the_error_by_less_than_a_tenth(recordings: Path, seed: int) -> None:
+    robots = robots_of(recordings)
+    versions = [robot.version for robot in robots.runs]
+
+    clean = robots.ate_m(joined_poses(robots.runs, join_maps(versions)))
+    merged = join_maps(versions, propose=planted(0.1, seed))
+
+    assert merged.joined == (0, 1, 2)
+    assert robots.ate_m(joined_poses(robots.runs, merged)) <= 1.1 * clean
+
+
+def test_closing_loops_makes_one_robot_better(recordings: Path) -> None:
+    robots = robots_of(recordings, cuts=((0, 250),))
+    versions = [robot.version for robot in robots.runs]
+
+    without = join_maps(versions, MergeOptions(close_loops=False))
+    merged = join_maps(versions)
+
+    ate_m = robots.ate_m(joined_poses(robots.runs, merged))
+    assert merged.loops >= 3
+    assert ate_m <= 0.045
+    assert ate_m <= robots.ate_m(joined_poses(robots.runs, without))
+
+
+def test_two_recordings_that_share_no_view_stay_apart(recordings: Path) -> None:
+    kitchen = robots_of(recordings, cuts=((0, 84),)).runs[0]
+    desk = robots_of(recordings, cuts=((0, 10),), name="tum_fr1_xyz_start").runs[0]
+
+    merged = join_maps([kitchen.version, desk.version])
+
+    assert merged.joined == (0,)
+    assert merged.not_joined[0][0] == 1
+
+
+def test_every_fifth_frame_is_found_in_a_map_of_the_others(recordings: Path) -> None:
+    row = localise_row(recordings)
+
+    assert row["found_percent"] >= 60
+    assert row["median_m"] <= 0.03
+    assert row["median_deg"] <= 2.0
+    assert row["wrong_ok"] == 0
+    assert np.isfinite(row["max_m"])

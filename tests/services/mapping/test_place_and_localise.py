@@ -1,0 +1,177 @@
+"""A view is recognised and placed in a map, or said to be lost; a prior only narrows the search."""
+
+from __future__ import annotations
+
+import msgspec
+import numpy as np
+import pytest
+
+from rse_pf.config import PlatformSettings
+from rse_pf.errors import BadRequest
+from rse_pf.geometry import Array, pose_difference
+from rse_pf.maps.format import Keyframe, MapVersion, encode_map
+from rse_pf.service import dispatch
+from rse_pf.services.builtin import builtin_services
+from rse_pf.services.mapping.descriptors import hamming_matches
+from rse_pf.services.mapping.localise import LocaliseOptions, LocaliseReply, LocaliseRequest, locate
+from rse_pf.services.mapping.place import PlaceIndex, PlaceReply, PlaceRequest, Within
+from rse_pf.services.mapping.relative_pose import View
+from rse_pf.services.synthetic_maps import make_world
+from rse_pf.wire import Command, Failure, Result
+
+pytest.importorskip("faiss", reason="the extra maps is not installed")
+
+WORLD = make_world(1)
+TURNS = np.linspace(0.0, 1.0, 24, endpoint=False)
+
+
+def true_map() -> MapVersion:
+    """Return a map of the whole hall with true poses."""
+    rng = np.random.default_rng(5)
+    poses = [WORLD.pose(turn) for turn in TURNS]
+    return MapVersion(
+        keyframes=tuple(WORLD.keyframe(n, "map", T, T, rng) for n, T in enumerate(poses))
+    )  # fmt: skip
+
+
+MAP = true_map()
+INDEX = PlaceIndex(MAP.keyframes)
+
+
+def seen(turn: float, seed: int = 9) -> tuple[Keyframe, Array]:
+    """Return what a camera sees between the map's keyframes, and where it is."""
+    truth = WORLD.pose(turn)
+    return WORLD.keyframe(0, "r", truth, np.eye(4), np.random.default_rng(seed)), truth
+
+
+def view(keyframe: Keyframe) -> View:
+    """Return a keyframe as a bare view."""
+    return View(
+        camera=keyframe.camera, pixels=keyframe.pixels.astype(np.float64), descriptors=keyframe.descriptors
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("turn", [0.02, 0.31, 0.55, 0.98])
+def test_a_view_of_the_hall_is_placed_where_it_was_taken(turn: float) -> None:
+    keyframe, truth = seen(turn)
+
+    found = locate(INDEX, view(keyframe))
+
+    assert found.verdict == "ok", found.reason
+    assert found.T_map_camera is not None
+    metres, degrees = pose_difference(found.T_map_camera, truth)
+    assert metres <= 0.03
+    assert degrees <= 0.5
+
+
+@pytest.mark.parametrize("turn", [0.02, 0.31, 0.55])
+def test_the_best_candidate_is_a_neighbour(turn: float) -> None:
+    ((row, score), *_) = INDEX.nearest(seen(turn)[0].descriptors, 3)
+
+    apart = abs(TURNS[row] - turn)
+    assert min(apart, 1.0 - apart) <= 2 / 24
+    assert 0 < score <= 1
+
+
+def test_a_view_of_another_hall_is_lost_and_not_guessed() -> None:
+    elsewhere = make_world(2)
+    keyframe = elsewhere.keyframe(0, "r", elsewhere.pose(0.3), np.eye(4), np.random.default_rng(1))
+
+    found = locate(INDEX, view(keyframe))
+
+    assert found.verdict == "lost"
+    assert found.T_map_camera is None
+
+
+def test_two_halls_that_look_alike_are_doubted() -> None:
+    far = np.eye(4)
+    far[0, 3] = 50.0
+    rng = np.random.default_rng(6)
+    copies = [
+        WORLD.keyframe(100 + number, "map", WORLD.pose(turn), far @ WORLD.pose(turn), rng)
+        for number, turn in enumerate(TURNS)
+    ]
+
+    found = locate(PlaceIndex([*MAP.keyframes, *copies]), view(seen(0.31)[0]), LocaliseOptions(candidates=12))
+
+    assert (found.verdict, found.reason) == ("weak", "keyframes-disagree")
+
+
+def test_a_prior_narrows_the_search_and_a_wrong_one_finds_nothing() -> None:
+    keyframe, truth = seen(0.31)
+    x, y, z = truth[:3, 3].tolist()
+
+    near = locate(INDEX, view(keyframe), within=Within(x=x, y=y, z=z, radius_m=0.8))
+    nowhere = locate(INDEX, view(keyframe), within=Within(x=90.0, y=0.0, z=0.0, radius_m=1.0))
+
+    assert near.verdict == "ok"
+    assert (nowhere.verdict, nowhere.reason) == ("lost", "no-candidates")
+
+
+def test_the_vocabulary_is_the_same_for_the_same_map() -> None:
+    np.testing.assert_array_equal(INDEX.vectors, PlaceIndex(MAP.keyframes).vectors)
+
+
+def test_matches_are_closest_and_unambiguous_and_used_once() -> None:
+    rng = np.random.default_rng(3)
+    reference = rng.integers(0, 256, (50, 32), dtype=np.uint8)
+    order = rng.permutation(50)
+    other = reference[order].copy()
+    other[:, 0] ^= 1
+
+    rows, columns = hamming_matches(np.concatenate([reference, reference[:5]]), other, 0.75)
+
+    assert len(columns) == len(set(columns.tolist())) == 50
+    np.testing.assert_array_equal(order[columns], rows % 50)
+
+
+def request_of(keyframe: Keyframe, kind: type[PlaceRequest] | type[LocaliseRequest], **more: object):  # type: ignore[no-untyped-def]
+    """Return the request that a robot sends of *keyframe*."""
+    return kind(
+        map=encode_map(MAP), camera=keyframe.camera, pixels=keyframe.pixels.ravel().astype(np.float64),
+        descriptors=keyframe.descriptors.tobytes(), **more,  # type: ignore[arg-type]
+    )  # fmt: skip
+
+
+def ask(service: str, request: object) -> Result | Failure:
+    """Send *request* through a server's dispatch."""
+    registry = builtin_services(PlatformSettings())
+    return dispatch(registry, Command(id=1, service=service, payload=request), lambda: 0.0)
+
+
+def test_the_services_answer_what_travelled() -> None:
+    keyframe, truth = seen(0.31)
+
+    place = ask("place", request_of(keyframe, PlaceRequest))
+    location = ask("localise", request_of(keyframe, LocaliseRequest))
+
+    assert isinstance(place, Result), place
+    assert isinstance(place.reply, PlaceReply)
+    counts = [each.inliers or 0 for each in place.reply.candidates]
+    assert counts == sorted(counts, reverse=True)
+    assert counts[0] >= 30
+    assert isinstance(location, Result), location
+    assert isinstance(location.reply, LocaliseReply)
+    assert location.reply.T_map_camera is not None
+    assert pose_difference(location.reply.T_map_camera.reshape(4, 4), truth)[0] <= 0.03
+
+
+def test_descriptors_that_do_not_fit_the_pixels_are_refused() -> None:
+    keyframe, _ = seen(0.31)
+    request = msgspec.structs.replace(request_of(keyframe, PlaceRequest), descriptors=b"x" * 33)
+
+    answer = ask("place", request)
+
+    assert isinstance(answer, Failure)
+    assert answer.code == BadRequest.code
+    assert "33 bytes" in answer.message
+
+
+def test_a_damaged_map_is_refused() -> None:
+    keyframe, _ = seen(0.31)
+    request = msgspec.structs.replace(request_of(keyframe, PlaceRequest), map=encode_map(MAP)[:-40])
+
+    answer = ask("place", request)
+
+    assert isinstance(answer, Failure)
+    assert answer.code == BadRequest.code

@@ -1,0 +1,500 @@
+"""Isolated environments on a real server: what a service may do to others, which is nothing."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+import shutil
+import subprocess
+import time
+from pathlib import Path
+
+import pytest
+
+from rse_pf.services.custom.installed import install
+from rse_pf.services.custom.native import INCLUDE_FOLDER
+from rse_pf.wire import Failure, Result
+
+pytestmark = pytest.mark.system
+
+COUNTER = """
+from __future__ import annotations
+import ctypes, os, signal, sys, threading, time, msgspec
+
+class Request(msgspec.Struct):
+    do: str = "add"
+
+class Reply(msgspec.Struct):
+    count: int = 0
+    seen: str = ""
+
+class Service:
+    def __init__(self):
+        self.count = 0
+        self.held = []
+
+    def snapshot(self):
+        return str(self.count).encode()
+
+    def restore(self, data):
+        self.count = int(data)
+
+    def serve(self, request: Request) -> Reply:
+        seen = getattr(self, request.do)() or ""
+        return Reply(count=self.count, seen=str(seen))
+
+    def look(self): pass
+    def add(self): self.count += 1
+    def segv(self): ctypes.string_at(0)
+    def abort(self): os.abort()
+    def leave(self): os._exit(3)
+    def exit(self): sys.exit(3)
+    def loop(self):
+        while True: pass
+    def leak(self):
+        while True: self.held.append(bytearray(1 << 22))
+    def big(self): return "x" * (1 << 30)
+    def shout(self):
+        for _ in range(20000): print("noise" * 100)
+    def fork(self):
+        while True: os.fork()
+    def threads(self):
+        for _ in range(100000): threading.Thread(target=time.sleep, args=(100,), daemon=True).start()
+    def socket(self):
+        import socket
+        socket.socket()
+    def program(self): os.execv("/usr/bin/true", ["true"])
+    def others(self): return sorted(os.listdir("/proc")) if os.path.isdir("/proc") else ""
+    def signal(self): os.kill(-1, signal.SIGKILL)
+    def write_code(self): open(__file__, "a").write("x = 1")
+    def files(self, *names):
+        found = []
+        for folder, below, files in os.walk("/"):
+            large = ("/usr", sys.prefix, sys.base_prefix)
+            below[:] = [b for b in below if os.path.join(folder, b) not in large]
+            found += [os.path.join(folder, name) for name in files if name in names]
+        return found
+    def read_keys(self): return self.files("keys.json", "key.json")
+    def environment(self): return sorted(os.environ)
+    def fill_disk(self):
+        with open("full", "wb") as file:
+            while True: file.write(b"x" * (1 << 20))
+    def leave_note(self): open("note", "w").write("mine")
+    def find_note(self): return self.files("note")
+    def descriptors(self):
+        found = []
+        for fd in range(3, 256):
+            try: os.fstat(fd)
+            except OSError: continue
+            found.append(fd)
+        return len(found)
+"""
+
+HOSTILE_LUA = {
+    "ffi_read0": "local ffi = require 'ffi' return ffi.cast('int*', 0)[0]",
+    "ffi_system": "local f = require 'ffi' f.cdef 'int system(const char *);' return f.C.system('true') == 0",
+    "os_execute": "return os.execute('true') == 0",
+    "io_open": "return io.open('/etc/hostname'):read('*a')",
+    "popen": "return io.popen('id'):read('*a')",
+    "py_eval": "return python.eval('1')",
+    "py_builtins": "return python.builtins.__import__('os').getpid()",
+    "loadlib": "return tostring(package.loadlib('libc.so.6', 'system')('true'))",
+    "loop": "while true do end",
+    "mem": "local t = {} for i = 1, 1e9 do t[i] = ('x'):rep(1000) .. i end return #t",
+    "strrep": "return #(('x'):rep(2 ^ 31))",
+    "recursion": "local function f() return 1 + f() end return f()",
+    "pattern": "return tostring((('a'):rep(40)):find(('a*'):rep(40) .. 'b'))",
+    "debug": "return tostring(debug.getregistry ~= nil)",
+    "bytecode": "return load(string.dump(function() return 7 end))()",
+}
+HARMLESS = {"debug", "bytecode", "loadlib"}
+"""They may run: what they reach is the robot's own process, and system() cannot start a program there."""
+
+HOSTILE_CPP = """
+#include <fcntl.h>
+#include <sys/socket.h>
+#include <unistd.h>
+#include <cerrno>
+#include "rse_pf_service.hpp"
+struct Hostile {
+  rse_pf::Fields call(const rse_pf::Fields &request) {
+    const std::string &what = request.at("do").text;
+    double got = -1;
+    if (what == "read0") got = *static_cast<volatile char *>(nullptr);
+    if (what == "fork") got = fork();
+    if (what == "socket") got = socket(AF_INET, SOCK_STREAM, 0);
+    if (what == "file") got = open(request.at("path").text.c_str(), O_RDONLY);
+    rse_pf::Fields reply;
+    reply["got"] = rse_pf::Field::number(got);
+    return reply;
+  }
+};
+RSE_PF_SERVICE(Hostile)
+"""
+
+
+def written(folder: Path, name: str, language: str, entry: str, source: str, kind: str = "stateless") -> Path:
+    """Write a service folder."""
+    made = folder / name
+    made.mkdir()
+    (made / "service.json").write_text(
+        json.dumps({"name": name, "language": language, "entry": entry, "kind": kind})
+    )
+    (made / entry).write_text(source)
+    return made
+
+
+@pytest.fixture
+def services(tmp_path):
+    """A services folder with a stateful and a stateless Python service."""
+    install(written(tmp_path, "counter", "python", "service.py", COUNTER, "per_robot_state"), tmp_path / "s")
+    plain = COUNTER.replace("def snapshot", "def no_snapshot")
+    install(written(tmp_path, "worker", "python", "service.py", plain), tmp_path / "s")
+    return tmp_path / "s"
+
+
+@pytest.fixture
+def serve_isolated(start_server, services, tmp_path):
+    """A function that starts a server with them."""
+
+    def start(**more):
+        chosen = {"folder": str(services), "grace_s": 0.2, "crash_loop_deaths": 1000, **more}
+        store = f"dir:{tmp_path / 'store'}"
+        return start_server(keys=True, services=chosen, data={"store": store})
+
+    return start
+
+
+def ask_all(server, robot_name, asks, deadline_ms=3000.0):
+    """Return what one robot is told, ask after ask."""
+
+    async def run():
+        async with server.robot(token=server.token(robot_name)) as robot:
+            return [
+                await robot.ask(i, service, payload, deadline_ms=deadline_ms, keep=True)
+                for i, (service, payload) in enumerate(asks)
+            ]
+
+    return asyncio.run(run())
+
+
+def children(pid):
+    """Return the pids below *pid*."""
+    found = []
+    for stat in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            fields = stat.read_text().rpartition(")")[2].split()
+        except OSError:
+            continue
+        if int(fields[1]) == pid:
+            found += [int(stat.parent.name), *children(int(stat.parent.name))]
+    return found
+
+
+def until(condition, within_s=10.0):
+    """Wait until *condition* holds; return what it last said."""
+    end = time.monotonic() + within_s
+    while not (said := condition()) and time.monotonic() < end:
+        time.sleep(0.02)
+    return said
+
+
+def test_each_robot_has_a_process_and_a_count_of_its_own(serve_isolated):
+    server = serve_isolated()
+
+    async def run():
+        async with (
+            server.robot(token=server.token("robot-1")) as one,
+            server.robot(token=server.token("robot-2")) as two,
+        ):
+            return [
+                (await robot.ask(i, "counter", {})).reply["count"] for i, robot in enumerate([one, one, two])
+            ]
+
+    assert asyncio.run(run()) == [1, 2, 1]
+
+
+def test_a_crash_is_one_typed_failure_and_nobody_else_notices(serve_isolated):
+    server = serve_isolated()
+
+    async def run(crash):
+        async with (
+            server.robot(token=server.token(f"victim-{crash}")) as victim,
+            server.robot(token=server.token(f"other-{crash}")) as other,
+        ):
+            await other.ask(0, "counter", {})
+            failure = await victim.ask(1, "worker", {"do": crash}, keep=True)
+            return failure, await victim.ask(3, "worker", {}), await other.ask(4, "counter", {})
+
+    for number, crash in enumerate(("segv", "abort", "leave"), 1):
+        failure, after, other = asyncio.run(run(crash))
+        assert isinstance(failure, Failure)
+        assert failure.code == "poison", "it was tried twice, and killed two environments"
+        assert isinstance(after, Result)
+        assert other.reply["count"] == 2
+        assert until(lambda: server.status()["isolation"]["counts"].get("died", 0) >= 2 * number)  # noqa: B023
+        assert server.status()["isolation"]["counts"]["died"] == 2 * number
+
+
+def test_what_is_forbidden_is_a_typed_failure_and_the_server_lives(serve_isolated):
+    server = serve_isolated()
+    before = server.status()["resident_bytes"]
+    harms = ["exit", "leak", "big", "fork", "threads", "socket", "program", "write_code", "fill_disk"]
+
+    for harm in harms:
+        failure, after = ask_all(server, harm, [("worker", {"do": harm}), ("worker", {"do": "look"})])
+        assert isinstance(failure, Failure), harm
+        assert failure.code in ("internal", "poison", "too-large", "worker-lost"), harm
+        assert isinstance(after, Result), harm
+    assert server.status()["resident_bytes"] - before < 32 << 20
+
+
+def test_an_environment_sees_neither_keys_nor_others_nor_open_files(serve_isolated):
+    server = serve_isolated()
+    asks = [("worker", {"do": what}) for what in ("read_keys", "others", "environment", "descriptors")]
+    keys, others, environment, descriptors = (answer.reply["seen"] for answer in ask_all(server, "a", asks))
+
+    assert keys == ""
+    assert others in ("", "['1']")
+    assert environment == "['HOME', 'LANG', 'PATH', 'TMPDIR']"
+    assert int(descriptors) <= 1, "the conversation, and nothing inherited"
+
+
+def test_nobody_finds_what_another_robot_left_in_its_scratch_folder(serve_isolated):
+    server = serve_isolated()
+
+    async def run():
+        async with (
+            server.robot(token=server.token("one")) as one,
+            server.robot(token=server.token("two")) as two,
+        ):
+            await one.ask(0, "worker", {"do": "leave_note"})
+            mine = await one.ask(1, "worker", {"do": "find_note"})
+            return mine.reply["seen"], (await two.ask(2, "worker", {"do": "find_note"})).reply["seen"]
+
+    mine, theirs = asyncio.run(run())
+    assert "/scratch/note" in mine
+    assert theirs == ""
+
+
+def test_an_endless_loop_is_expired_at_its_deadline_and_killed_at_twice_that(serve_isolated):
+    server = serve_isolated()
+
+    async def run():
+        async with server.robot(token=server.token("robot-1")) as robot:
+            began = time.monotonic()
+            late = await robot.ask(1, "worker", {"do": "loop"}, deadline_ms=300.0, keep=True)
+            took = time.monotonic() - began
+            return late, took, await robot.ask(2, "worker", {"do": "look"}, deadline_ms=3000.0, keep=True)
+
+    late, took, after = asyncio.run(run())
+    assert late.code == "expired"
+    assert took < 1.0
+    assert isinstance(after, Result)
+    died = server.wait_for_log("environment-died")
+    assert "too long" in died["reason"]
+
+
+def test_what_a_service_prints_is_in_the_log_in_bounds(serve_isolated):
+    server = serve_isolated()
+    (answer,) = ask_all(server, "robot-1", [("worker", {"do": "shout"})], deadline_ms=5000.0)
+
+    assert isinstance(answer, Result)
+    server.wait_for_log("service-output")
+    assert len(server.text) < 200 * 600
+
+
+def test_one_poison_request_costs_two_environments_however_often_it_comes(serve_isolated):
+    server = serve_isolated()
+    asks = [("worker", {"do": "segv"})] * 5 + [("worker", {"do": "look"})] * 20
+    answers = ask_all(server, "robot-1", asks)
+
+    assert [answer.code for answer in answers[:5]] == ["poison"] * 5
+    assert all(isinstance(answer, Result) for answer in answers[5:])
+    assert until(lambda: server.status()["isolation"]["counts"].get("died", 0) >= 2)
+    assert server.status()["isolation"]["counts"]["died"] == 2
+
+
+def test_a_service_that_crashes_again_and_again_rests_and_readyz_says_so(serve_isolated):
+    server = serve_isolated(crash_loop_deaths=3, poison_deaths=1)
+    asks = [("worker", {"do": what}) for what in ("segv", "abort", "leave", "look")]
+    answers = ask_all(server, "robot-1", asks)
+
+    assert answers[3].code == "worker-lost"
+    assert answers[3].retry_after_ms > 1000
+    status, _, body = server.http("/readyz")
+    assert status == 200, "the server itself is well"
+    assert json.loads(body)["quarantined"] == ["worker"]
+
+
+def test_an_environment_goes_with_its_robot_and_leaves_nothing(serve_isolated):
+    server = serve_isolated()
+    (worker,) = server.workers
+    template = children(worker)
+    descriptors = len(os.listdir(f"/proc/{worker}/fd"))
+    ask_all(server, "robot-1", [("worker", {"do": "leave_note"}), ("counter", {})])
+
+    assert until(lambda: children(worker) == template)
+    assert until(lambda: len(os.listdir(f"/proc/{worker}/fd")) <= descriptors)
+
+
+def test_a_reconnect_within_the_grace_keeps_the_state_without_any_store(serve_isolated):
+    server = serve_isolated(grace_s=5.0)
+
+    first = ask_all(server, "robot-1", [("worker", {}), ("worker", {})])
+    second = ask_all(server, "robot-1", [("worker", {})])
+
+    assert [answer.reply["count"] for answer in first] == [1, 2]
+    assert second[0].reply["count"] == 3
+
+
+def test_state_survives_the_death_of_its_server(serve_isolated, gone):
+    first = serve_isolated()
+    assert ask_all(first, "robot-1", [("counter", {}), ("counter", {})])[-1].reply["count"] == 2
+    pids = [first.process.pid, *children(first.process.pid)]
+    first.process.kill()
+    for pid in pids[1:]:
+        gone(pid)
+    second = serve_isolated()
+    assert ask_all(second, "robot-1", [("counter", {})])[0].reply["count"] == 3
+
+
+def test_an_environment_whose_state_went_on_elsewhere_answers_with_no_older_count(serve_isolated):
+    first, second = serve_isolated(), serve_isolated()
+
+    async def run():
+        tokens = first.token("robot-1"), second.token("robot-1")
+        async with first.robot(token=tokens[0]) as old, second.robot(token=tokens[1]) as new:
+            assert (await old.ask(1, "counter", {})).reply["count"] == 1
+            assert (await new.ask(1, "counter", {})).reply["count"] == 2
+            return [await old.ask(i, "counter", {}, keep=True) for i in (2, 3)]
+
+    stale, after = asyncio.run(run())
+    assert (getattr(stale, "code", stale), after.reply["count"]) == ("worker-lost", 3)
+
+
+def test_more_robots_than_environments_are_busy_and_come_in_when_one_leaves(serve_isolated):
+    server = serve_isolated(max_environments=2)
+
+    async def run():
+        async with server.robot(token=server.token("three")) as three:
+            async with (
+                server.robot(token=server.token("one")) as one,
+                server.robot(token=server.token("two")) as two,
+            ):
+                await one.ask(1, "worker", {})
+                await two.ask(2, "worker", {})
+                busy = await three.ask(3, "worker", {})
+            while True:
+                answer = await three.ask(4, "worker", {})
+                if isinstance(answer, Result):
+                    return busy
+
+    busy = asyncio.run(asyncio.wait_for(run(), 10))
+    assert busy.code == "busy"
+    assert busy.retry_after_ms > 0
+
+
+def test_the_template_may_die_and_robots_go_on(serve_isolated):
+    server = serve_isolated()
+    (worker,) = server.workers
+
+    async def run():
+        async with server.robot(token=server.token("robot-1")) as robot:
+            await robot.ask(1, "counter", {})
+            os.kill(children(worker)[0], 9)
+            while not isinstance(answer := await robot.ask(2, "counter", {}), Result):
+                pass
+            return answer.reply["count"]
+
+    assert asyncio.run(asyncio.wait_for(run(), 10)) >= 2
+
+
+def test_hostile_lua_is_held(start_server, tmp_path):
+    for name, script in HOSTILE_LUA.items():
+        source = f"return function(request) return {{got = (function() {script} end)()}} end"
+        install(written(tmp_path, name, "lua", "service.lua", source), tmp_path / "s")
+    server = start_server(
+        keys=True,
+        services={"folder": str(tmp_path / "s"), "memory_bytes": 300_000_000, "crash_loop_deaths": 1000},
+    )
+
+    for name in HOSTILE_LUA:
+        (answer,) = ask_all(server, name, [(name, {})], deadline_ms=1000.0)
+        if isinstance(answer, Result):
+            got = answer.reply.get("got")
+            assert name in HARMLESS or got in (False, -1, None, "nil"), f"{name} got {got!r}"
+        assert server.http("/readyz")[0] == 200
+        assert ask_all(server, "bystander", [("echo", {"value": 1})])[0].reply == {"value": 1}
+
+
+def test_a_hostile_library_is_held(start_server, tmp_path):
+    compiler = shutil.which("c++")
+    if compiler is None:
+        pytest.skip("no compiler for C++ is installed")
+    folder = written(tmp_path, "hostile", "cpp", "hostile.cpp", HOSTILE_CPP)
+    subprocess.run(
+        [compiler, "-std=c++17", "-fPIC", "-shared", f"-I{INCLUDE_FOLDER}", "hostile.cpp", "-o", "lib.so"],
+        cwd=folder, check=True,
+    )  # fmt: skip
+    manifest = {"name": "hostile", "language": "cpp", "entry": "lib.so"}
+    (folder / "service.json").write_text(json.dumps(manifest))
+    install(folder, tmp_path / "s")
+    secret = tmp_path / "secret"
+    secret.write_text("of another robot")
+    secret.chmod(0o644)
+    server = start_server(keys=True, services={"folder": str(tmp_path / "s"), "crash_loop_deaths": 1000})
+    asks = [("hostile", {"do": what, "path": str(secret)}) for what in ("read0", "fork", "socket", "file")]
+
+    read0, fork, socket, file = ask_all(server, "robot-1", asks)
+
+    assert read0.code == "poison"
+    assert [answer.reply["got"] for answer in (fork, socket, file)] == [-1, -1, -1]
+
+
+@pytest.mark.skipif(os.getuid() != 0, reason="needs root, to become a plain user")
+def test_the_same_walls_stand_for_a_plain_user(tmp_path):
+    python = shutil.which("python3", path="/usr/bin")
+    if python is None or shutil.which("setpriv") is None:
+        pytest.skip("no python3 outside of this user's home, or no setpriv")
+    walls = Path(__file__).resolve().parents[2] / "rse_pf" / "backend" / "sandbox" / "isolation.py"
+    (tmp_path / "walls.py").write_text(walls.read_text())
+    (tmp_path / "walls.py").chmod(0o644)
+    for folder in (tmp_path, *tmp_path.parents):
+        if folder != Path("/tmp") and folder.is_relative_to("/tmp"):
+            folder.chmod(0o755)
+    script = f"""
+import os, sys
+sys.dont_write_bytecode = True
+sys.path.insert(0, {str(tmp_path)!r})
+from pathlib import Path
+import walls
+def root():
+    walls.enter_namespaces()
+    walls.make_root([Path("/usr")], 1 << 20, os.getuid())
+    assert sorted(os.listdir("/")) == ["dev", "scratch", "tmp", "usr"], os.listdir("/")
+def syscalls():
+    walls.forbid_system_calls()
+    import socket
+    for forbidden in (socket.socket, os.fork):
+        try:
+            forbidden()
+        except PermissionError:
+            continue
+        raise AssertionError(forbidden)
+tries = (walls.enter_namespaces, root, lambda: walls.give_up_privileges(None), syscalls)
+print(os.getuid(), walls.missing_walls(tries))
+"""
+    done = subprocess.run(
+        ["setpriv", "--reuid", "12345", "--regid", "12345", "--clear-groups", python, "-c", script],
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+
+    assert done.stdout.strip() == "12345 []", done.stderr
+
+
+def test_without_a_services_folder_there_is_no_template(start_server):
+    server = start_server()
+
+    assert children(server.workers[0]) == []

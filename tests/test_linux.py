@@ -1,0 +1,30 @@
+"""What Linux tells about processes, and what is changed of them."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+
+import pytest
+
+from rse_pf.linux import step_back
+
+pytestmark = pytest.mark.system
+
+
+def test_a_child_that_stepped_back_runs_last_before_it_does_anything() -> None:
+    with subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as child:
+        step_back(child.pid)
+        try:
+            assert os.sched_getscheduler(child.pid) == os.SCHED_IDLE
+            assert os.getpriority(os.PRIO_PROCESS, child.pid) == 19
+        finally:
+            child.kill()
+
+
+def test_a_process_that_is_gone_is_no_error() -> None:
+    child = subprocess.Popen([sys.executable, "-c", ""])
+    child.wait()
+
+    step_back(child.pid)

@@ -1,0 +1,298 @@
+"""One contract for every object store, and what a crash leaves behind."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+from hypothesis import HealthCheck, given
+from hypothesis import settings as hypothesis_settings
+from hypothesis import strategies as st
+
+from rse_pf.aws.clients import make_client
+from rse_pf.aws.storage import open_bucket
+from rse_pf.errors import Conflict, NotFound, StoreError, StoreFull, UsageError
+from rse_pf.object_store import (
+    DirectoryStore,
+    MemoryStore,
+    ObjectInfo,
+    ObjectStore,
+    RangedStore,
+    check_name,
+    digest_of,
+    open_store,
+    read_range,
+)
+
+STORES: dict[str, Callable[[Path], ObjectStore]] = {
+    "directory": lambda folder: DirectoryStore(folder / "objects"),
+    "memory": lambda folder: MemoryStore(),
+}
+"""Whoever writes another store adds it here; S3 comes with its emulator, in the fixture."""
+REGION = "ap-northeast-2"
+
+
+@pytest.fixture(params=[*STORES, "s3"])
+def store(
+    request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> Iterator[ObjectStore]:
+    """Each kind of store, empty."""
+    if request.param in STORES:
+        yield STORES[request.param](tmp_path)
+        return
+    moto = pytest.importorskip("moto", reason="the dev extra is not installed")
+    for name in ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY"):
+        monkeypatch.setenv(name, "testing")
+    with moto.mock_aws():
+        bucket = open_bucket("objects", REGION)
+        make_client("s3", REGION).create_bucket(
+            Bucket="objects", CreateBucketConfiguration={"LocationConstraint": REGION}
+        )
+        yield bucket
+
+
+def names(store: ObjectStore, prefix: str = "") -> list[str]:
+    return [info.name for info in store.list(prefix)]
+
+
+def test_what_was_put_is_there_whole(store: ObjectStore) -> None:
+    data = bytes(range(256)) * 1000
+
+    store.put("maps/lab/cloud.bin", data)
+
+    assert store.get("maps/lab/cloud.bin") == data
+    assert store.head("maps/lab/cloud.bin") == ObjectInfo(name="maps/lab/cloud.bin", size=len(data))
+
+
+def test_a_piece_is_read_where_it_lies_and_ends_where_the_object_does(store: ObjectStore) -> None:
+    store.put("a", b"0123456789")
+
+    pieces = [read_range(store, "a", start, length) for start, length in [(0, 4), (8, 4), (10, 4), (3, 0)]]
+
+    assert pieces == [b"0123", b"89", b"", b""]
+    assert isinstance(store, RangedStore), "pieces of a large object must not cost the whole"
+    with pytest.raises(NotFound):
+        read_range(store, "b", 0, 1)
+
+
+def test_an_empty_object_is_an_object(store: ObjectStore) -> None:
+    store.put("empty", b"")
+
+    assert store.get("empty") == b""
+    assert names(store) == ["empty"]
+
+
+def test_a_second_put_replaces_the_first(store: ObjectStore) -> None:
+    store.put("a", b"a long first version")
+    store.put("a", b"second")
+
+    assert store.get("a") == b"second"
+
+
+def test_what_was_never_put_is_not_found(store: ObjectStore) -> None:
+    store.put("folder/object", b"x")
+
+    for missing in ("nothing", "folder", "folder/other", "folder/object/below"):
+        with pytest.raises(NotFound):
+            store.get(missing)
+        with pytest.raises(NotFound):
+            store.head(missing)
+        store.delete(missing)
+    assert names(store) == ["folder/object"]
+
+
+def test_a_deleted_object_is_gone(store: ObjectStore) -> None:
+    store.put("a", b"x")
+
+    store.delete("a")
+    store.delete("a")
+
+    with pytest.raises(NotFound):
+        store.get("a")
+
+
+def test_names_are_listed_in_order_and_by_prefix(store: ObjectStore) -> None:
+    for name in ("b", "a/2", "a/10", "a-1", "ab/c"):
+        store.put(name, name.encode())
+
+    assert names(store) == sorted(["b", "a/2", "a/10", "a-1", "ab/c"])
+    assert names(store, "a/") == ["a/10", "a/2"]
+    assert names(store, "a") == ["a-1", "a/10", "a/2", "ab/c"]
+    assert names(store, "c") == []
+    assert [info.size for info in store.list("a/")] == [4, 3]
+
+
+def test_a_swap_happens_only_if_nobody_else_was_there(store: ObjectStore) -> None:
+    store.compare_and_swap("head", None, b"1")
+    store.compare_and_swap("head", b"1", b"2")
+
+    for expected in (None, b"1", b""):
+        with pytest.raises(Conflict):
+            store.compare_and_swap("head", expected, b"3")
+    with pytest.raises(Conflict):
+        store.compare_and_swap("other", b"1", b"3")
+    assert store.get("head") == b"2"
+    assert names(store) == ["head"]
+
+
+HOSTILE = [
+    "", ".", "..", "/", "/etc/passwd", "../x", "a/../../x", "a//b", "a/", "./a", ".hidden", "a/.hidden",
+    "a\0b", "a\n", "a b", "a\\b", "C:\\x", "%2e%2e/x", "~root", "ünïcode", "\u202eexe", "x" * 129,
+    "/".join("a" * 11), "-rf", "a/-rf", "\ud800",
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("name", HOSTILE)
+def test_a_hostile_name_is_refused_by_every_method(store: ObjectStore, name: str) -> None:
+    for call in (
+        lambda: store.get(name),
+        lambda: store.head(name),
+        lambda: store.put(name, b"x"),
+        lambda: store.delete(name),
+        lambda: store.compare_and_swap(name, None, b"x"),
+    ):
+        with pytest.raises(StoreError, match="is not a name") as caught:
+            call()
+        assert type(caught.value) is StoreError
+    assert names(store) == []
+
+
+@given(st.text(max_size=40))
+@hypothesis_settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_no_name_leads_out_of_the_folder(tmp_path: Path, name: str) -> None:
+    folder = tmp_path / "store"
+    with contextlib.suppress(StoreError):
+        DirectoryStore(folder).put(name, b"x")
+    assert {path.name for path in tmp_path.iterdir()} <= {"store"}
+
+
+def test_a_link_in_the_folder_is_no_object(tmp_path: Path) -> None:
+    (tmp_path / "secret").write_bytes(b"secret")
+    store = DirectoryStore(tmp_path / "objects")
+    store.put("real", b"x")
+    (tmp_path / "objects" / "link").symlink_to(tmp_path / "secret")
+
+    with pytest.raises(NotFound):
+        store.get("link")
+    with pytest.raises(NotFound):
+        store.head("link")
+    assert names(store) == ["real"]
+
+
+def test_an_object_cannot_be_a_folder_too(tmp_path: Path) -> None:
+    store = DirectoryStore(tmp_path)
+    store.put("a", b"x")
+
+    with pytest.raises(StoreError) as caught:
+        store.put("a/b", b"y")
+
+    assert not isinstance(caught.value, NotFound)
+    assert store.get("a") == b"x"
+
+
+@pytest.mark.parametrize("code", [errno.ENOSPC, errno.EDQUOT])
+def test_a_full_disk_is_said_so_and_leaves_the_old_version(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: int
+) -> None:
+    store = DirectoryStore(tmp_path)
+    store.put("a", b"old")
+
+    def full(handle: int) -> None:
+        raise OSError(code, "no space")
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(StoreFull):
+        store.put("a", b"new")
+
+    assert store.get("a") == b"old"
+    assert [path.name for path in tmp_path.iterdir()] == ["a"]
+
+
+CRASH = """
+import os, signal, sys
+from pathlib import Path
+from rse_pf.object_store import DirectoryStore
+store = DirectoryStore(Path(sys.argv[1]))
+store.put("a", b"old")
+die = lambda *args: os.kill(os.getpid(), signal.SIGKILL)
+setattr(os, sys.argv[2], die)
+store.put("a", b"new" * 100000)
+"""
+
+
+@pytest.mark.system
+@pytest.mark.parametrize("moment", ["fsync", "replace"])
+def test_a_crash_in_the_middle_of_a_write_leaves_the_old_version(tmp_path: Path, moment: str) -> None:
+    ended = subprocess.run([sys.executable, "-c", CRASH, str(tmp_path), moment], timeout=60, check=False)
+
+    store = DirectoryStore(tmp_path)
+    assert ended.returncode == -signal.SIGKILL
+    assert store.get("a") == b"old"
+    assert names(store) == ["a"], "a half-written object is visible"
+
+
+RACE = """
+import sys
+from pathlib import Path
+from rse_pf.aws.storage import open_bucket
+from rse_pf.aws.clients import make_client
+from rse_pf.errors import Conflict
+from rse_pf.object_store import DirectoryStore
+store = DirectoryStore(Path(sys.argv[1]))
+won = 0
+while won < 50:
+    before = store.get("counter")
+    try:
+        store.compare_and_swap("counter", before, b"%d" % (int(before) + 1))
+    except Conflict:
+        continue
+    won += 1
+"""
+
+
+@pytest.mark.system
+def test_no_swap_is_lost_between_processes(tmp_path: Path) -> None:
+    store = DirectoryStore(tmp_path)
+    store.put("counter", b"0")
+
+    racers = [subprocess.Popen([sys.executable, "-c", RACE, str(tmp_path)]) for _ in range(3)]
+    ended = [racer.wait(timeout=60) for racer in racers]
+
+    assert ended == [0, 0, 0]
+    assert store.get("counter") == b"150"
+
+
+def test_a_location_names_its_store(tmp_path: Path) -> None:
+    assert isinstance(open_store("memory:"), MemoryStore)
+    directory = open_store(f"dir:{tmp_path}")
+    directory.put("a", b"x")
+    assert (tmp_path / "a").read_bytes() == b"x"
+
+
+@pytest.mark.parametrize("location", ["", "dir:", "ftp:x", "dir"])
+def test_a_location_without_a_store_is_a_usage_error(location: str) -> None:
+    with pytest.raises(UsageError, match="names no store"):
+        open_store(location)
+
+
+def test_a_kind_that_the_caller_can_open_is_opened() -> None:
+    store = MemoryStore()
+
+    assert open_store("s3:maps", {"s3": lambda bucket: {"maps": store}[bucket]}) is store
+    for location in ("s3:maps", "s3:"):
+        with pytest.raises(UsageError, match="names no store"):
+            open_store(location)
+
+
+def test_a_digest_is_a_name() -> None:
+    digest = digest_of(b"abc")
+
+    assert digest == "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"
+    assert check_name(digest) == digest

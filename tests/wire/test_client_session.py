@@ -1,0 +1,487 @@
+"""The robot's rules: one final answer per command, whatever happens to the links."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from rse_pf.config import SessionSettings
+from rse_pf.errors import BadMessage, LimitExceeded, ProtocolError
+from rse_pf.wire import Command, Failure, Hello, Limits, Move, Ping, Pong, Result, Welcome, make_codec
+from rse_pf.wire.client_session import Answered, ClientLink, LinkLost, MoveAsked, RobotSession, Welcomed
+
+SETTINGS = SessionSettings()
+CODEC = make_codec("json", SETTINGS)
+
+
+def make_session(settings: SessionSettings = SETTINGS) -> RobotSession:
+    return RobotSession(codec=CODEC, settings=settings, sdk="test")
+
+
+def tell(session: RobotSession, link: ClientLink, message, now: float):
+    return session.receive(link, CODEC.encode(message), now)
+
+
+def open_link(session: RobotSession, now: float = 0.0, server: str = "a", *, room: int = 8) -> ClientLink:
+    """Open, welcome and adopt a link."""
+    link = session.open_link(now)
+    welcome = Welcome(
+        server=server, session="s", robot="r", protocol=1, clock_s=now,
+        limits=Limits(max_message_bytes=4096, max_in_flight=room),
+    )  # fmt: skip
+    (event,) = tell(session, link, welcome, now)
+    assert event == Welcomed(welcome)
+    session.adopt(link, now)
+    return link
+
+
+def sent(link: ClientLink) -> list:
+    """Return and forget what the session wrote on *link*."""
+    messages = [CODEC.decode_from_robot(data) for data in link.outgoing]
+    link.outgoing.clear()
+    return messages
+
+
+def commands(link: ClientLink) -> list[Command]:
+    return [message for message in sent(link) if isinstance(message, Command)]
+
+
+def result(command: Command, **stamps: float) -> Result:
+    return Result(id=command.id, reply=command.seq, server="a", **stamps)
+
+
+def failure(command: Command, code: str, **more) -> Failure:
+    return Failure(id=command.id, code=code, message=code, **more)
+
+
+def codes(events) -> dict[int, str]:
+    """Return how each answered command ended."""
+    return {
+        event.id: event.answer.code if isinstance(event.answer, Failure) else "ok"
+        for event in events
+        if isinstance(event, Answered)
+    }
+
+
+def tend_until_lost(session: RobotSession, link: ClientLink) -> tuple[float, list]:
+    """Return when an unanswering *link* was given up, and what the session said then."""
+    now, events = 0.0, []
+    while not events:
+        now = session.next_due(now)
+        events = session.tend(link, now)
+    return now, events
+
+
+def test_a_link_begins_with_hello():
+    (hello,) = sent(make_session().open_link(0.0))
+
+    assert hello == Hello(sdk="test", capabilities=("move", "progress"))
+
+
+def test_a_command_waits_for_a_link_and_then_tells_the_time_it_has_left():
+    session = make_session()
+    session.submit("pnp", {"x": 1}, now=0.0, deadline_s=1.0)
+
+    link = open_link(session, now=0.4)
+
+    (command,) = commands(link)
+    assert command.deadline_ms == pytest.approx(600.0)
+    assert session.resent == 0
+
+
+def test_an_answer_ends_its_command_once_and_its_twin_is_dropped():
+    session = make_session()
+    link = open_link(session)
+    identity = session.submit("pnp", None, now=0.0)
+    (command,) = commands(link)
+
+    first = tell(session, link, result(command), 0.1)
+    second = tell(session, link, result(command), 0.2)
+
+    assert codes(first) == {identity: "ok"}
+    assert second == []
+    assert (session.dropped_answers, session.unanswered) == (1, 0)
+
+
+def test_a_lost_link_hands_its_commands_to_the_next_by_the_same_id():
+    session = make_session()
+    first = open_link(session)
+    ids = [session.submit("pnp", None, now=0.0) for _ in range(3)]
+    commands(first)
+
+    session.close_link(first)
+    second = open_link(session, now=0.5, server="b")
+
+    assert [command.id for command in commands(second)] == ids
+    assert session.resent == 3
+
+
+def test_of_a_latest_wins_stream_only_the_newest_frame_is_sent_again():
+    session = make_session()
+    link = open_link(session)
+    old, new = (session.submit("pnp", None, now=0.0, stream="pose") for _ in range(2))
+    session.close_link(link)
+
+    fresh = session.open_link(1.0)
+    events = session.adopt(fresh, 1.0)
+
+    assert codes(events) == {old: "stale"}
+    assert [command.id for command in commands(fresh)] == [new]
+
+
+def test_after_a_long_cut_there_is_no_catch_up_burst():
+    session = make_session()
+    link = open_link(session)
+    session.close_link(link)
+    for step in range(100):
+        session.submit("pnp", None, now=step * 0.01, stream="pose", deadline_s=5.0)
+
+    assert [command.seq for command in commands(open_link(session, now=1.0))] == [100]
+
+
+def test_an_older_answer_than_the_last_delivered_one_is_stale():
+    session = make_session()
+    link = open_link(session)
+    for _ in range(2):
+        session.submit("pnp", None, now=0.0, stream="pose")
+    older, newer = commands(link)
+
+    assert codes(tell(session, link, result(newer), 0.1)) == {newer.id: "ok"}
+    assert codes(tell(session, link, result(older), 0.2)) == {older.id: "stale"}
+
+
+def test_streams_do_not_make_each_other_stale():
+    session = make_session()
+    link = open_link(session)
+    for stream in ("left", "left", "right"):
+        session.submit("pnp", None, now=0.0, stream=stream)
+    _, newer, other = commands(link)
+
+    tell(session, link, result(newer), 0.1)
+
+    assert codes(tell(session, link, result(other), 0.2)) == {other.id: "ok"}
+
+
+def test_an_unanswered_command_expires_at_its_deadline_and_not_before():
+    session = make_session()
+    open_link(session)
+    identity = session.submit("pnp", None, now=0.0, deadline_s=0.5)
+
+    assert session.due(0.499) == []
+    assert codes(session.due(0.5)) == {identity: "expired"}
+    assert session.next_due(0.0) <= 0.5
+
+
+def test_a_robot_keeps_back_what_the_server_has_no_room_for():
+    session = make_session()
+    link = open_link(session, room=2)
+    for _ in range(5):
+        session.submit("pnp", None, now=0.0)
+    first, second = commands(link)
+
+    tell(session, link, result(first), 0.1)
+
+    assert [command.id for command in commands(link)] == [second.id + 1]
+    assert session.unanswered == 4
+
+
+def test_busy_is_tried_again_after_the_servers_pause():
+    session = make_session()
+    link = open_link(session)
+    session.submit("pnp", None, now=0.0, deadline_s=1.0)
+    (command,) = commands(link)
+
+    assert tell(session, link, failure(command, "busy", retry_after_ms=200), 0.1) == []
+    session.due(0.29)
+    assert commands(link) == []
+    assert session.next_due(0.1) == pytest.approx(0.3)
+    session.due(0.31)
+
+    assert [again.id for again in commands(link)] == [command.id]
+
+
+def test_a_new_link_respects_the_pause_that_busy_asked_for():
+    session = make_session()
+    link = open_link(session)
+    session.submit("pnp", None, now=0.0)
+    (command,) = commands(link)
+    tell(session, link, failure(command, "busy", retry_after_ms=500), 0.0)
+
+    assert commands(open_link(session, now=0.1, server="b")) == []
+
+
+def test_busy_beyond_the_deadline_is_final():
+    session = make_session()
+    link = open_link(session)
+    session.submit("pnp", None, now=0.0, deadline_s=0.2)
+    (command,) = commands(link)
+
+    events = tell(session, link, failure(command, "busy", retry_after_ms=200), 0.1)
+
+    assert codes(events) == {command.id: "busy"}
+
+
+def test_retries_after_busy_stay_within_their_budget():
+    session = make_session()
+    link = open_link(session, room=1)
+    retries = final = 0
+    for _ in range(400):
+        session.submit("pnp", None, now=0.0, deadline_s=9.0)
+        (command,) = commands(link)
+        while not (events := tell(session, link, failure(command, "busy", retry_after_ms=0), 0.0)):
+            retries += 1
+            (command,) = commands(link) or (session.due(0.0) or commands(link))
+        final += codes(events) == {command.id: "busy"}
+
+    assert final == 400
+    assert retries <= 5 + 400 * SETTINGS.retry_percent / 100 + 1
+    assert retries >= 400 * SETTINGS.retry_percent / 100
+
+
+def test_a_lost_worker_is_tried_twice_more_and_then_believed():
+    session = make_session()
+    link = open_link(session)
+    session.submit("pnp", None, now=0.0)
+
+    for _ in range(2):
+        (command,) = commands(link)
+        assert tell(session, link, failure(command, "worker-lost"), 0.1) == []
+    (command,) = commands(link)
+
+    assert codes(tell(session, link, failure(command, "worker-lost"), 0.2)) == {command.id: "worker-lost"}
+
+
+def test_a_failure_from_a_link_the_command_has_left_is_dropped_but_its_result_is_taken():
+    session = make_session()
+    old = open_link(session)
+    session.submit("pnp", None, now=0.0)
+    (command,) = commands(old)
+    session.close_link(old)
+    open_link(session, now=0.1, server="b")
+
+    assert tell(session, old, failure(command, "internal"), 0.2) == []
+    assert codes(tell(session, old, result(command), 0.3)) == {command.id: "ok"}
+
+
+def test_a_move_leaves_what_is_unanswered_on_the_old_link():
+    session = make_session()
+    old = open_link(session)
+    session.submit("pnp", None, now=0.0)
+    (command,) = commands(old)
+
+    assert tell(session, old, Move(reason="drain", within_ms=2000), 0.1) == [MoveAsked("drain", 2.0)]
+    new = open_link(session, now=0.2, server="b")
+    session.submit("pnp", None, now=0.3)
+
+    assert old.leaving
+    assert session.unanswered_on(old) == 1
+    assert len(commands(new)) == 1
+    assert codes(tell(session, old, result(command), 0.4)) == {command.id: "ok"}
+    assert session.unanswered_on(old) == 0
+
+
+def test_a_cancelled_command_is_forgotten_and_never_resent():
+    session = make_session()
+    link = open_link(session)
+    identity = session.submit("pnp", None, now=0.0)
+    (command,) = commands(link)
+
+    session.cancel(identity)
+    assert session.unanswered == 0
+    assert tell(session, link, result(command), 0.1) == []
+    session.close_link(link)
+
+    assert commands(open_link(session, now=1.0)) == []
+
+
+def test_a_command_cancelled_on_its_way_is_not_sent_again_when_its_link_dies():
+    session = make_session()
+    link = open_link(session)
+    session.cancel(session.submit("pnp", None, now=0.0))
+    commands(link)
+
+    session.close_link(link)
+
+    assert commands(open_link(session, now=1.0)) == []
+
+
+def test_a_cancelled_command_still_takes_its_room_until_the_server_answered():
+    session = make_session()
+    link = open_link(session, room=1)
+    session.cancel(session.submit("pnp", None, now=0.0))
+    (first,) = commands(link)
+    session.submit("pnp", None, now=0.0)
+    assert commands(link) == []
+
+    tell(session, link, result(first), 0.1)
+
+    assert len(commands(link)) == 1
+
+
+def test_silence_ends_a_link_with_an_unanswered_command_in_time():
+    session = make_session()
+    link = open_link(session)
+    session.submit("pnp", None, now=0.0, deadline_s=60.0)
+
+    now, events = tend_until_lost(session, link)
+    assert events == [LinkLost("silence")]
+    assert now <= SETTINGS.silence_s + SETTINGS.silence_s / 3 + 1e-9
+    assert session.current is None
+
+
+def test_a_slow_command_is_no_silence_while_the_server_answers_pings():
+    session = make_session()
+    link = open_link(session)
+    session.submit("merge", None, now=0.0, deadline_s=60.0)
+
+    now = 0.0
+    while now < 20.0:
+        now = session.next_due(now)
+        assert session.tend(link, now) == []
+        for message in sent(link):
+            if isinstance(message, Ping):
+                tell(session, link, Pong(sent_s=message.sent_s, received_s=now, answered_s=now), now)
+
+
+def test_a_command_on_a_long_idle_link_is_no_reason_to_doubt_it():
+    session = make_session()
+    link = open_link(session)
+    session.tend(link, 0.0)
+    tell(session, link, Pong(sent_s=0.0, received_s=0.0, answered_s=0.0), 0.0)
+    sent(link)
+    for tick in range(1, 6):
+        session.tend(link, tick * 0.3)
+
+    session.submit("merge", None, now=1.5, deadline_s=60.0)
+    session.tend(link, 1.6)
+
+    assert any(isinstance(message, Ping) for message in sent(link))
+
+
+def test_an_idle_link_is_lost_when_its_ping_stays_unanswered():
+    session = make_session()
+    link = open_link(session)
+
+    now, events = tend_until_lost(session, link)
+    assert events == [LinkLost("no pong")]
+    assert now <= SETTINGS.ping_interval_s + SETTINGS.ping_patience_s
+
+
+def test_a_robot_that_slept_does_not_blame_the_server():
+    session = make_session()
+    link = open_link(session)
+    session.submit("pnp", None, now=0.0, deadline_s=60.0)
+    session.tend(link, 0.3)
+
+    assert session.tend(link, 5.0) == []
+
+
+def test_a_socket_without_a_welcome_is_given_up():
+    session = make_session()
+    link = session.open_link(0.0)
+
+    now, events = tend_until_lost(session, link)
+    assert events == [LinkLost("no welcome")]
+    assert now <= SETTINGS.hello_timeout_s + SETTINGS.silence_s
+
+
+def test_pings_measure_the_offset_and_results_the_two_delays():
+    session = make_session()
+    link = open_link(session)
+    tell(session, link, Pong(sent_s=0.0, received_s=100.01, answered_s=100.01), 0.02)
+    session.submit("pnp", None, now=1.0)
+    (command,) = commands(link)
+
+    (event,) = tell(session, link, result(command, received_s=101.03, sent_s=101.05), 1.06)
+
+    assert (event.up_s, event.down_s) == (pytest.approx(0.03), pytest.approx(0.01))
+
+
+def test_delays_add_up_to_the_time_on_the_network_and_are_never_negative():
+    session = make_session()
+    link = open_link(session)
+    tell(session, link, Pong(sent_s=0.0, received_s=100.05, answered_s=100.05), 0.1)
+    session.submit("pnp", None, now=1.0)
+    (command,) = commands(link)
+
+    (event,) = tell(session, link, result(command, received_s=101.0, sent_s=101.0), 1.02)
+
+    assert event.up_s == 0.0
+    assert event.down_s == pytest.approx(0.02)
+
+
+@pytest.mark.parametrize("sent_s", [-5.0, 1e9])
+def test_a_pong_to_no_ping_of_ours_does_not_move_the_clock(sent_s):
+    session = make_session()
+    link = open_link(session)
+
+    tell(session, link, Pong(sent_s=sent_s, received_s=1e6, answered_s=1e6), 0.1)
+
+    assert link.clock_offset.offset_s is None
+
+
+def test_a_server_without_stamps_gives_no_delays():
+    session = make_session()
+    link = open_link(session)
+    tell(session, link, Pong(sent_s=0.0, received_s=5.0, answered_s=5.0), 0.02)
+    session.submit("pnp", None, now=1.0)
+    (command,) = commands(link)
+
+    (event,) = tell(session, link, result(command), 1.1)
+
+    assert (event.up_s, event.down_s) == (None, None)
+
+
+def test_garbage_is_a_protocol_error_and_harms_no_command():
+    session = make_session()
+    link = open_link(session)
+    identity = session.submit("pnp", None, now=0.0)
+    (command,) = commands(link)
+
+    for garbage in (b"", b"{", b'{"type":"welcome"}', b"\xff\xff", b'{"type":"result","id":"x"}'):
+        with pytest.raises(ProtocolError):
+            session.receive(link, garbage, 0.1)
+
+    assert codes(tell(session, link, result(command), 0.2)) == {identity: "ok"}
+
+
+def test_an_absurd_move_or_pause_cannot_stop_the_clockwork():
+    session = RobotSession(codec=make_codec("bin"), settings=SETTINGS, sdk="test")
+    link = session.open_link(0.0)
+    session.adopt(link, 0.0)
+    identity = session.submit("pnp", None, now=0.0, deadline_s=1.0)
+    encode = session.codec.encode
+
+    (move,) = session.receive(link, encode(Move(reason="x", within_ms=math.nan)), 0.1)
+    busy = Failure(id=identity, code="busy", message="", retry_after_ms=math.nan)
+    session.receive(link, encode(busy), 0.1)
+
+    assert move == MoveAsked("x", 0.0)
+    assert session.next_due(0.1) <= 1.0
+    assert set(codes(session.due(1.0))) <= {identity}
+    assert session.unanswered == 0
+
+
+def test_what_does_not_travel_is_refused_before_it_becomes_a_command():
+    session = make_session()
+    open_link(session)
+
+    with pytest.raises(BadMessage):
+        session.submit("pnp", {"x": object()}, now=0.0)
+    with pytest.raises(LimitExceeded, match="4096"):
+        session.submit("pnp", "x" * 5000, now=0.0)
+
+    assert session.unanswered == 0
+
+
+def test_abandoned_commands_end_with_the_reason():
+    session = make_session()
+    link = open_link(session)
+    ids = [session.submit("pnp", None, now=0.0) for _ in range(3)]
+    session.close_link(link)
+
+    events = session.abandon("unauthorized", "the token is over", "get another")
+
+    assert codes(events) == dict.fromkeys(ids, "unauthorized")
+    assert {event.answer.hint for event in events} == {"get another"}

@@ -1,0 +1,247 @@
+"""The rules of a server's side of one connection, as a table and as a state machine."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+from hypothesis import strategies as st
+from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
+
+from rse_pf.config import SessionSettings
+from rse_pf.wire import (
+    CODECS,
+    Command,
+    Failure,
+    FromServer,
+    Hello,
+    Message,
+    Move,
+    Ping,
+    Pong,
+    Result,
+    Welcome,
+    make_codec,
+)
+from rse_pf.wire.server_session import (
+    CLOSE_PROTOCOL,
+    CLOSE_UNSUPPORTED,
+    Close,
+    Send,
+    ServerSession,
+    Submit,
+)
+
+LIMITS = SessionSettings(max_in_flight=2, max_bad_messages=2, max_message_bytes=2048)
+HELLO = Hello(sdk="test")
+COMMAND = Command(id=1, service="echo", payload=1, trace="t")
+
+
+def session(codec: str = "json") -> ServerSession:
+    return ServerSession(
+        codec=make_codec(codec, LIMITS), robot="robot-7", server="s1", session="x1", limits=LIMITS
+    )
+
+
+def say(server: ServerSession, message: Message, now: float = 5.0) -> list[Any]:
+    """Return the decisions on *message*, with what was sent decoded."""
+    return [heard(server, each) for each in server.receive(server.codec.encode(message), now)]
+
+
+def heard(server: ServerSession, decision: Any) -> Any:
+    return server.codec.decode_from_server(decision.data) if isinstance(decision, Send) else decision
+
+
+def opened(codec: str = "json") -> ServerSession:
+    server = session(codec)
+    say(server, HELLO)
+    return server
+
+
+@pytest.mark.parametrize("codec", CODECS)
+def test_hello_is_answered_with_who_serves_and_what_it_accepts(codec: str) -> None:
+    server = session(codec)
+
+    [welcome] = say(server, HELLO, now=12.5)
+
+    assert isinstance(welcome, Welcome)
+    assert (welcome.server, welcome.session, welcome.robot, welcome.protocol) == ("s1", "x1", "robot-7", 1)
+    assert (welcome.limits.max_message_bytes, welcome.limits.max_in_flight) == (2048, 2)
+    assert welcome.clock_s == 12.5
+    assert server.state == "open"
+
+
+def test_another_protocol_version_is_told_so_and_closed() -> None:
+    server = session()
+
+    failure, close = say(server, Hello(protocol=2))
+
+    assert failure.code == "unsupported"
+    assert close.code == CLOSE_UNSUPPORTED
+    assert server.state == "closed"
+
+
+@pytest.mark.parametrize("message", [COMMAND, Ping(sent_s=1.0)])
+def test_whoever_speaks_before_hello_is_closed(message: Message) -> None:
+    assert say(session(), message) == [Close(CLOSE_PROTOCOL, "say hello first")]
+
+
+def test_hello_is_said_once() -> None:
+    assert say(opened(), HELLO) == [Close(CLOSE_PROTOCOL, "hello came twice")]
+
+
+def test_a_ping_comes_back_with_the_servers_two_stamps() -> None:
+    assert say(opened(), Ping(sent_s=3.25), now=7.5) == [Pong(sent_s=3.25, received_s=7.5, answered_s=7.5)]
+
+
+def test_a_command_is_submitted_and_its_answer_goes_out() -> None:
+    server = opened()
+
+    assert say(server, COMMAND) == [Submit(COMMAND)]
+    assert heard(server, server.answer(Result(id=1, reply=1))) == Result(id=1, reply=1)
+    assert server.in_flight == 0
+
+
+def test_more_unanswered_commands_than_agreed_are_busy_with_a_time() -> None:
+    server = opened()
+    for number in (1, 2):
+        say(server, Command(id=number, service="echo"))
+
+    [busy] = say(server, Command(id=3, service="echo", trace="t3"))
+
+    assert (busy.id, busy.code, busy.trace, busy.server) == (3, "busy", "t3", "s1")
+    assert busy.retry_after_ms > 0
+    assert busy.hint
+    server.answer(Result(id=1))
+    assert isinstance(say(server, Command(id=3, service="echo"))[0], Submit)
+
+
+def test_bad_messages_are_forgiven_up_to_a_number() -> None:
+    server = opened()
+
+    for _ in range(LIMITS.max_bad_messages):
+        [failure] = [heard(server, each) for each in server.receive(b"nonsense", 1.0)]
+        assert (failure.id, failure.code) == (None, "bad-message")
+    failure, close = [heard(server, each) for each in server.receive(b"nonsense", 1.0)]
+
+    assert failure.code == "bad-message"
+    assert close == Close(CLOSE_PROTOCOL, "too many bad messages")
+
+
+def test_a_closed_session_hears_nothing() -> None:
+    server = session()
+    say(server, COMMAND)
+
+    assert say(server, HELLO) == []
+    assert server.receive(b"nonsense", 1.0) == []
+    assert server.move("drain", 100.0) == []
+
+
+def test_only_an_open_session_is_asked_to_move() -> None:
+    assert session().move("drain", 100.0) == []
+    server = opened()
+    assert [heard(server, each) for each in server.move("drain", 100.0)] == [
+        Move(reason="drain", within_ms=100.0)
+    ]
+
+
+def test_a_reply_that_is_too_large_for_a_message_becomes_a_failure() -> None:
+    server = opened()
+    say(server, COMMAND)
+
+    failure = heard(server, server.answer(Result(id=1, reply="x" * 4096)))
+
+    assert (failure.id, failure.code) == (1, "too-large")
+    assert "2048" in failure.message
+    assert server.in_flight == 0
+
+
+@pytest.mark.parametrize("codec", CODECS)
+def test_a_reply_that_cannot_be_encoded_becomes_a_failure(codec: str) -> None:
+    server = opened(codec)
+    say(server, COMMAND)
+
+    failure = heard(server, server.answer(Result(id=1, reply=object())))
+
+    assert (failure.id, failure.code) == (1, "internal")
+
+
+class IpcChannel(RuleBasedStateMachine):
+    """A robot that says anything, against a model of three counters."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.server = session()
+        self.state = "opening"
+        self.bad = 0
+        self.waiting: list[int] = []
+        self.next_id = 0
+
+    @rule(protocol=st.sampled_from([1, 1, 1, 2]))
+    def hello(self, protocol: int) -> None:
+        said = say(self.server, Hello(protocol=protocol))
+        if self.state == "closed":
+            assert said == []
+        elif self.state == "open":
+            assert [type(each) for each in said] == [Close]
+            self.state = "closed"
+        else:
+            assert [type(each) for each in said] == ([Welcome] if protocol == 1 else [Failure, Close])
+            self.state = "open" if protocol == 1 else "closed"
+
+    @rule(sent_s=st.floats(0, 1e6), now=st.floats(0, 1e6))
+    def ping(self, sent_s: float, now: float) -> None:
+        said = say(self.server, Ping(sent_s=sent_s), now)
+        self._only_after_hello(said, [Pong(sent_s=sent_s, received_s=now, answered_s=now)])
+
+    @rule()
+    def command(self) -> None:
+        self.next_id += 1
+        command = Command(id=self.next_id, service="echo")
+        said = say(self.server, command)
+        if self.state == "open" and len(self.waiting) >= LIMITS.max_in_flight:
+            assert [each.code for each in said] == ["busy"]
+            return
+        if self.state == "open":
+            self.waiting.append(command.id)
+        self._only_after_hello(said, [Submit(command)])
+
+    @rule(data=st.sampled_from([b"", b"[]", b'{"type":"welcome"}', b"\xff", b"[" * 100]))
+    def nonsense(self, data: bytes) -> None:
+        said = [heard(self.server, each) for each in self.server.receive(data, 1.0)]
+        if self.state == "closed":
+            assert said == []
+            return
+        self.bad += 1
+        if self.bad > LIMITS.max_bad_messages:
+            assert [type(each) for each in said] == [Failure, Close]
+            self.state = "closed"
+        else:
+            assert [type(each) for each in said] == [Failure]
+
+    @precondition(lambda self: self.waiting)
+    @rule(pick=st.integers(0, 9), fails=st.booleans())
+    def answer(self, pick: int, fails: bool) -> None:
+        number = self.waiting.pop(pick % len(self.waiting))
+        message: Result | Failure = (
+            Failure(id=number, code="expired", message="m") if fails else Result(id=number)
+        )
+        answered: FromServer = heard(self.server, self.server.answer(message))
+        assert answered == message
+
+    @invariant()
+    def the_counters_agree(self) -> None:
+        assert self.server.state == self.state
+        assert self.server.in_flight == len(self.waiting)
+
+    def _only_after_hello(self, said: list[Any], when_open: list[Any]) -> None:
+        if self.state == "open":
+            assert said == when_open
+        elif self.state == "opening":
+            assert said == [Close(CLOSE_PROTOCOL, "say hello first")]
+            self.state = "closed"
+        else:
+            assert said == []
+
+
+TestConversation = IpcChannel.TestCase

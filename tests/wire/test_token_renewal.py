@@ -1,0 +1,125 @@
+"""A fresh token on a live socket: asked for in time, judged by whoever knows, never a reason to end."""
+
+from __future__ import annotations
+
+import itertools
+
+import pytest
+
+from rse_pf.config import SessionSettings
+from rse_pf.wire import Failure, Hello, Limits, Renew, Renewed, Welcome, make_codec
+from rse_pf.wire.client_session import ClientLink, RenewalDue, RobotSession
+from rse_pf.wire.server_session import RENEWAL_PAUSE_S, Renewal, Send, ServerSession
+from rse_pf.wire.token_renewal import RenewalTimer
+
+SETTINGS = SessionSettings()
+CODEC = make_codec("json", SETTINGS)
+
+
+def server_session(token_s: float | None = 100.0) -> tuple[ServerSession, Welcome]:
+    session = ServerSession(codec=CODEC, robot="r", server="s", session="x", limits=SETTINGS)
+    session.ends_s = token_s  # the session hears Hello at 0
+    (send,) = session.receive(CODEC.encode(Hello()), 0.0)
+    assert isinstance(send, Send)
+    welcome = CODEC.decode_from_server(send.data)
+    assert isinstance(welcome, Welcome)
+    return session, welcome
+
+
+def linked(token_s: float | None) -> tuple[RobotSession, ClientLink]:
+    session = RobotSession(codec=CODEC, settings=SETTINGS, sdk="test")
+    link = session.open_link(0.0)
+    limits = Limits(max_message_bytes=4096, max_in_flight=8)
+    welcome = Welcome(
+        server="a", session="s", robot="r", protocol=1, clock_s=0.0, limits=limits, token_s=token_s
+    )
+    session.receive(link, CODEC.encode(welcome), 0.0)
+    session.adopt(link, 0.0)
+    return session, link
+
+
+def asked_at(session: RobotSession, link: ClientLink, until: int) -> list[int]:
+    """Return in which seconds the session asked for a fresh token, with a server that answers pings."""
+    asked = []
+    for now in range(1, until):
+        link.ping_sent, link.last_heard = None, float(now)
+        if RenewalDue() in session.tend(link, float(now)):
+            asked.append(now)
+    return asked
+
+
+def test_the_welcome_says_how_long_the_token_is_good():
+    assert server_session(100.0)[1].token_s == 100.0
+    assert server_session(None)[1].token_s is None
+
+
+def test_a_fresh_token_is_handed_out_to_be_judged_and_the_answer_is_sent():
+    session, _ = server_session()
+
+    assert session.receive(CODEC.encode(Renew(token="t")), 5.0) == [Renewal("t")]
+    (told,) = session.renewed(900.0)
+    (refused,) = session.renewed(None)
+
+    assert isinstance(told, Send)
+    assert isinstance(refused, Send)
+    assert CODEC.decode_from_server(told.data) == Renewed(token_s=900.0)
+    failure = CODEC.decode_from_server(refused.data)
+    assert isinstance(failure, Failure)
+    assert (failure.id, failure.code) == (None, "unauthorized")
+
+
+def test_renewals_that_come_too_fast_are_not_judged():
+    session, _ = server_session()
+    renew = CODEC.encode(Renew(token="t"))
+    session.receive(renew, 5.0)
+
+    (send,) = session.receive(renew, 5.0 + RENEWAL_PAUSE_S / 2)
+
+    assert isinstance(send, Send)
+    failure = CODEC.decode_from_server(send.data)
+    assert isinstance(failure, Failure)
+    assert failure.code == "busy"
+    assert session.receive(renew, 5.0 + RENEWAL_PAUSE_S) == [Renewal("t")]
+
+
+def test_a_robot_asks_for_a_fresh_token_at_four_fifths_of_its_life_and_then_more_often():
+    asked = asked_at(*linked(100.0), 100)
+
+    assert asked[:3] == [80, 90, 95]
+    assert asked == sorted(set(asked))
+    assert min(b - a for a, b in itertools.pairwise(asked)) >= RENEWAL_PAUSE_S
+
+
+def test_after_renewed_the_next_fresh_token_is_due_in_the_new_life():
+    session, link = linked(100.0)
+    session.receive(link, CODEC.encode(Renewed(token_s=1000.0)), 80.0)
+
+    assert asked_at(session, link, 1080)[:2] == [880, 980]
+
+
+def test_a_server_that_does_not_speak_of_tokens_is_never_asked():
+    assert asked_at(*linked(None), 2000) == []
+
+
+def test_a_link_that_is_left_is_not_renewed():
+    session, link = linked(100.0)
+    link.leaving = True
+
+    assert asked_at(session, link, 100) == []
+
+
+def test_renew_writes_one_message():
+    session, link = linked(100.0)
+    link.outgoing.clear()
+
+    session.renew(link, "fresh")
+
+    assert [CODEC.decode_from_robot(data) for data in link.outgoing] == [Renew(token="fresh")]
+
+
+@pytest.mark.parametrize("absurd", [-1.0, 1e12])
+def test_what_a_server_says_of_time_is_believed_within_an_hour(absurd: float):
+    lease = RenewalTimer()
+    lease.lasts(absurd, 0.0)
+
+    assert lease.ends_s == 3600.0
