@@ -74,7 +74,7 @@ class Server:
 
     def __init__(self, folder: Path, has_log: bool) -> None:
         folder.mkdir(parents=True)
-        unlimited = {"serving": {"handshakes_per_source_per_s": 0.0, "accepts_per_s": 0.0}}
+        unlimited = {"serving": {"max_handshakes_per_source_per_s": 0.0, "max_accepts_per_s": 0.0}}
         (folder / "settings.json").write_text(json.dumps({"context": {"rse-pf": unlimited}}))
         (folder / "keys.json").write_text(KEY.key_set().to_json())
         announce = folder / "announce.json"

@@ -225,7 +225,7 @@ async def crashes(folder: Path, seconds: float, others: int = 20, count: int = 5
     """Let a robot crash its environment while others do PnP, in turns with quiet stretches."""
     rows, turns = [], 4
     for deaths in (100_000, None):
-        limits = {} if deaths is None else {"crash_loop_deaths": deaths}
+        limits = {} if deaths is None else {"breaker_crashes": deaths}
         async with serving(folder, **limits) as server:
             times: dict[bool, list[float]] = {False: [], True: []}
             failed: list[str] = []

@@ -1,6 +1,7 @@
 """What one small server still delivers when it is offered 0.9, 2 and 5 times what it can do.
 
-    python benchmarks/overload.py [--seconds 20] [--size 0.25] [--threads 1] [--codec zlib] [--out FILE]
+    python benchmarks/overload.py [--seconds 20] [--emulated-cores 0.25] [--threads 1]
+        [--codec zlib] [--out FILE]
 
 Real PnP (200 matches, 30 % wrong), open loop: Poisson send times fixed beforehand, latency from the planned
 time, a deadline of 250 ms, every frame kept.  Phases 0.9, 2, 0.9, 5, 0.9 in one run, so that a slower machine
@@ -343,7 +344,7 @@ def main() -> None:
     )
     parser.add_argument("--seconds", type=float, default=20.0, help="of each phase")
     parser.add_argument("--capacity-seconds", type=float, default=6.0, help="of the closed loop before")
-    parser.add_argument("--size", type=float, default=0.25, help="emulated cores of the server")
+    parser.add_argument("--emulated-cores", type=float, default=0.25, help="emulated cores of the server")
     parser.add_argument("--threads", type=int, default=1, help="solver threads")
     parser.add_argument("--codec", default="zlib", choices=("zlib", "json", "bin"))
     parser.add_argument("--seed", type=int, default=1)
@@ -352,7 +353,11 @@ def main() -> None:
     load = os.getloadavg()
     with tempfile.TemporaryDirectory() as folder:
         process, identity = start(
-            folder, workers=1, size=args.size, solver_threads=args.threads, log_level="warning"
+            folder,
+            workers=1,
+            emulated_cores=args.emulated_cores,
+            solver_threads=args.threads,
+            log_level="warning",
         )
         try:
             report = asyncio.run(run(args, identity))
@@ -361,11 +366,15 @@ def main() -> None:
             process.wait(10)
     report |= {
         "machine": f"{platform.machine()}, {os.cpu_count()} cores",
-        "settings": {"size": args.size, "threads": args.threads, "codec": args.codec, "seed": args.seed},
+        "settings": {
+            "emulated_cores": args.emulated_cores, "threads": args.threads, "codec": args.codec,
+            "seed": args.seed,
+        },
         "seconds": args.seconds, "load_before": load, "load_after": os.getloadavg(),
         "verdict": verdict(report),
     }  # fmt: skip
-    about = f"size {args.size}, {args.threads} threads, {args.codec}, {args.seconds:g} s a phase"
+    cores = f"{args.emulated_cores} emulated cores"
+    about = f"{cores}, {args.threads} threads, {args.codec}, {args.seconds:g} s a phase"
     print(f"{report['machine']}, {about}")
     print(f"capacity {report['capacity_per_s']}/s; control port at most {report['control_max_ms']} ms")
     for row in report["phases"]:

@@ -1,4 +1,4 @@
-"""Sockets of a robot: dial, read, write, ping, reconnect, move; the rules are in `RobotSession`.
+"""Sockets of a robot: dial, read, write, ping, reconnect, move; the rules are in `ClientSession`.
 
 Promises to be the only file that knows the WebSocket library, to keep one current socket (two
 during a move), to dial with full jitter, and that no command is lost because a socket was.
@@ -16,7 +16,7 @@ from websockets.asyncio.client import connect as websocket_connect
 from websockets.exceptions import ConnectionClosed, InvalidStatus, WebSocketException
 from websockets.typing import Subprotocol
 
-from client_sdk.dial_errors import Refused, again_after_s, dial_beside, refusal, shown_address
+from client_sdk.dial_errors import DialError, again_after_s, dial_beside, refusal, shown_address
 from rse_pf.config import SessionSettings
 from rse_pf.errors import (
     Conflict,
@@ -29,14 +29,14 @@ from rse_pf.errors import (
 from rse_pf.wire import SUBPROTOCOLS
 from rse_pf.wire.client_session import (
     Answered,
-    ClientLink,
+    ConnectionState,
     Event,
-    LinkLost,
-    MoveAsked,
+    ConnectionLost,
+    MoveRequested,
     Notice,
     Progressed,
     RenewalDue,
-    RobotSession,
+    ClientSession,
     Welcomed,
 )
 from rse_pf.wire.server_session import CLOSE_RATE, CLOSE_REPLACED
@@ -65,7 +65,7 @@ def websocket_options(settings: SessionSettings) -> dict[str, Any]:
         "max_size": settings.max_message_bytes,
         "ping_interval": None,
         "open_timeout": settings.connect_timeout_s,
-        "close_timeout": settings.silence_s,
+        "close_timeout": settings.stall_timeout_s,
         "proxy": None,
     }
 
@@ -73,7 +73,7 @@ def websocket_options(settings: SessionSettings) -> dict[str, Any]:
 class _Socket:
     """One WebSocket with its link and its two tasks."""
 
-    def __init__(self, websocket: ClientConnection, link: ClientLink) -> None:
+    def __init__(self, websocket: ClientConnection, link: ConnectionState) -> None:
         self.websocket = websocket
         self.link = link
         self.welcome: asyncio.Future[None] = asyncio.get_running_loop().create_future()
@@ -85,14 +85,14 @@ class _Socket:
 
 
 class Connection:
-    """Keeps a `RobotSession` connected until it is closed."""
+    """Keeps a `ClientSession` connected until it is closed."""
 
     def __init__(
         self,
         url: str,
         *,
         token: Token,
-        session: RobotSession,
+        session: ClientSession,
         on_answer: Callable[[Answered | Progressed], None],
         clock: Callable[[], float],
         random: random_module.Random,
@@ -137,7 +137,7 @@ class Connection:
             try:
                 self._adopt(await self._dial())
                 break
-            except Refused as refused:
+            except DialError as refused:
                 if attempt == _FIRST_TRIES or refused.for_good or refused.wrong_address:
                     raise refused.error from None
                 await asyncio.sleep(self._pause_s(refused.after_s))
@@ -207,7 +207,7 @@ class Connection:
             began = self._clock()
             try:
                 socket = await self._dial(_DIALS_OF_A_ROW)
-            except Refused as refused:
+            except DialError as refused:
                 after_s, spent_s = refused.after_s, self._clock() - began
                 if refused.for_good:
                     self._end(refused.error)
@@ -225,7 +225,7 @@ class Connection:
             after_s = 0.0
             try:
                 fresh = await self._dial()
-            except Refused as refused:
+            except DialError as refused:
                 after_s = refused.after_s
             else:
                 if self._session.current is not old.link:
@@ -248,7 +248,7 @@ class Connection:
         """Open a socket through the load balancer and wait for its Welcome."""
         try:
             websocket = await self._handshake(most)
-        except Refused as refused:
+        except DialError as refused:
             if not callable(self._token) or not isinstance(refused.error, Unauthorized):
                 self.last_error = refused.error.message
                 raise
@@ -261,7 +261,7 @@ class Connection:
             done, _ = await asyncio.wait({socket.welcome}, timeout=self._settings.connect_timeout_s)
             if not done:
                 mute = ConnectError(f"{self._address} does not say welcome", hint="is it an RSE-PF server?")
-                raise Refused(mute)
+                raise DialError(mute)
             socket.welcome.result()
         except BaseException:
             self._ghost_until = self._clock() + _GHOST_S
@@ -294,7 +294,7 @@ class Connection:
         except (OSError, asyncio.TimeoutError, WebSocketException, EOFError) as error:
             self._ghost_until = self._clock() + _GHOST_S
             cause = getattr(error, "strerror", None) or str(error) or type(error).__name__
-            raise Refused(
+            raise DialError(
                 ConnectError(f"cannot connect to {self._address}: {cause}", hint=_IS_IT_RUNNING)
             ) from error
         if websocket.subprotocol != wanted:
@@ -302,7 +302,7 @@ class Connection:
             unsupported = UnsupportedProtocol(
                 f"{self._address} does not speak {wanted}", hint="is it an RSE-PF server?"
             )
-            raise Refused(unsupported, wrong_address=True)
+            raise DialError(unsupported, wrong_address=True)
         return websocket
 
     async def _read_token(self) -> str | None:
@@ -314,13 +314,13 @@ class Connection:
             told = ConnectError(
                 f"no token: the token callable raised {type(error).__name__}", hint="mend the token callable"
             )
-            raise Refused(told) from error
+            raise DialError(told) from error
 
     async def _renew(self, socket: _Socket) -> None:
         """Show a fresh token on a live socket; without one its end brings a new dial, with a new try."""
         try:
             token = await self._read_token()
-        except Refused as refused:
+        except DialError as refused:
             self.last_error = refused.error.message
             return
         if token and not socket.ended.is_set() and not socket.is_closing:
@@ -384,7 +384,7 @@ class Connection:
         """Act on what concerns the socket itself."""
         if isinstance(event, Welcomed) and not socket.welcome.done():
             socket.welcome.set_result(None)
-        elif isinstance(event, LinkLost):
+        elif isinstance(event, ConnectionLost):
             self.last_error = f"connection lost: {event.reason}"
             if not socket.link.leaving and self._session.current is None:
                 self._changed_to("link-lost", event.reason)
@@ -396,8 +396,8 @@ class Connection:
             self.last_error = failure.message
             if not socket.welcome.done():
                 unsupported = UnsupportedProtocol(failure.message, hint=failure.hint)
-                socket.welcome.set_exception(Refused(unsupported, for_good=failure.code == unsupported.code))
-        elif isinstance(event, MoveAsked) and socket.link is self._session.current and not self._move_asked:
+                socket.welcome.set_exception(DialError(unsupported, for_good=failure.code == unsupported.code))
+        elif isinstance(event, MoveRequested) and socket.link is self._session.current and not self._move_asked:
             self._move_asked = (socket, self._clock() + event.within_s)
             self._changed.set()
 
@@ -436,7 +436,7 @@ class Connection:
                 task.cancel()
         if not socket.welcome.done():
             cut = ConnectError(f"{self._address} closed without a welcome", hint=_IS_IT_RUNNING)
-            socket.welcome.set_exception(Refused(cut))
+            socket.welcome.set_exception(DialError(cut))
             socket.welcome.exception()
         self._changed.set()
         self._wake.set()

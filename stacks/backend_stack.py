@@ -100,9 +100,10 @@ class BackendStack(cdk.Stack):
         cdk.CfnOutput(self, "Topic", value=self.topic.topic_arn, description="subscribe to be told of alarms")
         name = self.balancer.alb.load_balancer_dns_name
         path = settings.serving.path
-        if settings.cloud.lab:
+        if settings.cloud.allow_insecure:
             cdk.Annotations.of(self).add_warning_v2(
-                "rse-pf:lab", "cloud.lab is true: robots and tokens travel without TLS; for trials only"
+                "rse-pf:lab",
+                "cloud.allow_insecure is true: robots and tokens travel without TLS; for trials only",
             )
             cdk.CfnOutput(self, "Url", value=f"ws://{name}{path}")
             return

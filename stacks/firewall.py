@@ -41,7 +41,7 @@ def s3_prefix_list(settings: PlatformSettings) -> str:
 
 def front_port(settings: PlatformSettings) -> int:
     """Return the port of the front door: plain in the lab, TLS otherwise."""
-    return _HTTP if settings.cloud.lab else _HTTPS
+    return _HTTP if settings.cloud.allow_insecure else _HTTPS
 
 
 class Firewall(Construct):

@@ -38,7 +38,7 @@ class LoadBalancer(Construct):
         )  # fmt: skip
         self.alb.log_access_logs(logs, "alb")
         self.targets = {"robots": self._targets("Robots", vpc, settings.serving.port, settings)}
-        lab = settings.cloud.lab
+        lab = settings.cloud.allow_insecure
         listener = self.alb.add_listener(
             "Front", port=front_port(settings), open=False,
             protocol=elbv2.ApplicationProtocol.HTTP if lab else elbv2.ApplicationProtocol.HTTPS,

@@ -27,7 +27,7 @@ __all__ = ["KEY", "GuardedServer"]
 
 KEY = SigningKey.from_seed(b"g" * 32, "guard-1")
 _START_S = 60.0
-_UNLIMITED: dict[str, Any] = {"serving": {"handshakes_per_source_per_s": 0.0, "accepts_per_s": 0.0}}
+_UNLIMITED: dict[str, Any] = {"serving": {"max_handshakes_per_source_per_s": 0.0, "max_accepts_per_s": 0.0}}
 
 
 class GuardedServer:

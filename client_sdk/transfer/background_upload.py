@@ -66,7 +66,7 @@ class BackgroundUploader:
         Args:
             uploads: Where to.
             folder: The spool; made by `start`, and read first if it holds keyframes of an earlier run.
-            settings: ``background_bytes_per_s``, ``spool_bytes``.
+            settings: ``background_bytes_per_s``, ``max_spool_bytes``.
             clock: Monotonic seconds.
             is_busy: Says that live poses wait for the link; no keyframe and no part is begun while they do.
         """
@@ -101,7 +101,7 @@ class BackgroundUploader:
 
     @property
     def held_bytes(self) -> int:
-        """How much of ``spool_bytes`` is in use."""
+        """How much of ``max_spool_bytes`` is in use."""
         with self._condition:
             return sum(self._held.values())
 
@@ -109,7 +109,7 @@ class BackgroundUploader:
         """Keep a keyframe for sending and return its digest; None if there is no room and it was dropped."""
         digest = hashlib.sha256(data).hexdigest()
         with self._condition:
-            if sum(self._held.values()) + len(data) > self._settings.spool_bytes:
+            if sum(self._held.values()) + len(data) > self._settings.max_spool_bytes:
                 self.dropped += 1
                 return None
             name = f"{self._next:012d}-{digest[:16]}.keyframe"

@@ -30,7 +30,7 @@ from rse_pf.errors import MissingExtra, Unauthorized, UsageError
 if TYPE_CHECKING:
     from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey, Ed25519PublicKey
 
-__all__ = ["Claims", "KeySet", "SigningKey", "standing_problem", "token_problem", "verify_token"]
+__all__ = ["Claims", "KeySet", "SigningKey", "claims_problem", "token_problem", "verify_token"]
 
 _ALGORITHM = "EdDSA"
 _TYPE = "robot+jwt"
@@ -107,10 +107,10 @@ class SigningKey:
         check_scopes(scopes)
         if not 0 < len(token_id) <= 64:
             raise UsageError("a token id has 1 to 64 letters", hint="leave it to rse-pf token issue")
-        life = settings.token_life_s if life_s is None else life_s
-        if not 0 < life <= settings.token_life_s:
+        life = settings.token_ttl_s if life_s is None else life_s
+        if not 0 < life <= settings.token_ttl_s:
             raise UsageError(
-                f"a life of {life:g} s is not within {settings.token_life_s} s",
+                f"a life of {life:g} s is not within {settings.token_ttl_s} s",
                 hint="ask for a shorter life",
             )
         claims = {
@@ -150,7 +150,7 @@ class KeySet:
         self._disabled = {(each.tenant, each.robot) for each in denied.disabled}
         self._not_before = {(each.tenant, each.robot): each.at_s for each in denied.not_before}
 
-    def governed_by(self, roster: Roster, denied: DenyList) -> KeySet:
+    def with_access_control(self, roster: Roster, denied: DenyList) -> KeySet:
         """Return the same platform keys under what the control room says."""
         return KeySet(self._keys, roster=roster, denied=denied)
 
@@ -226,7 +226,7 @@ def verify_token(token: str, *, keys: KeySet, now: float, settings: AuthSettings
         ) from refused
 
 
-def standing_problem(claims: Claims, keys: KeySet) -> str:
+def claims_problem(claims: Claims, keys: KeySet) -> str:
     """Return why *claims* that were verified once no longer stand under *keys*; empty if they do.
 
     Whoever lives on them, as a socket does, has to go then.  Their end in time is not looked at.
@@ -297,7 +297,7 @@ def _timed(claims: dict[str, Any], key_id: str, now: float, settings: AuthSettin
             raise _Refused("bad-time")
     assert isinstance(issued, (int, float))
     assert isinstance(expires, (int, float))
-    if expires - issued > settings.token_life_s:
+    if expires - issued > settings.token_ttl_s:
         raise _Refused("life-too-long")
     if now > expires + settings.leeway_s:
         raise _Refused("expired")

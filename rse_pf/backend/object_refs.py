@@ -76,7 +76,7 @@ def resolve(
         tenant: Of the robot's token.
         robot: Likewise.
         store: Of the platform.
-        settings: ``objects_per_command`` and ``object_bytes_per_command``.
+        settings: ``max_objects_per_command`` and ``max_object_bytes_per_command``.
 
     Raises:
         BadRequest: A name is no sha256 in hex.
@@ -87,13 +87,13 @@ def resolve(
     digests = list(dict.fromkeys(named_in(request_type, payload)))
     if not digests:
         return payload
-    if len(digests) > settings.objects_per_command:
+    if len(digests) > settings.max_objects_per_command:
         raise LimitExceeded(
-            f"{len(digests)} objects are named, at most {settings.objects_per_command} may be",
+            f"{len(digests)} objects are named, at most {settings.max_objects_per_command} may be",
             hint="put them into fewer commands",
         )
     sizes = {digest: _size(store, object_name(tenant, robot, digest), digest) for digest in digests}
-    most = settings.object_bytes_per_command
+    most = settings.max_object_bytes_per_command
     if sum(sizes.values()) > most:
         raise LimitExceeded(
             f"the named objects have {sum(sizes.values())} bytes, a command may name {most}",
@@ -150,7 +150,7 @@ class ObjectRefs:
         if sent.code != LimitExceeded.code:
             return sent
         reply = msgspec.msgpack.encode(answer.reply, enc_hook=binary_encode_hook)
-        if len(reply) > self.settings.object_bytes_per_command:
+        if len(reply) > self.settings.max_object_bytes_per_command:
             return sent
         max_bytes = quota_bytes(who.claims, self.quota_bytes)
         try:

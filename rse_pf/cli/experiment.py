@@ -37,7 +37,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--codec", choices=("zlib", "json", "bin"), default="zlib", help="default: zlib")
     parser.add_argument("--seed", type=int, default=0, help="of problems, worlds and random faults")
     elasticity = parser.add_argument_group("elasticity")
-    elasticity.add_argument("--size", type=float, metavar="S", help="cores of a server (default: measured)")
+    elasticity.add_argument(
+        "--emulated-cores", type=float, metavar="S", help="cores of a server (default: measured)"
+    )
     elasticity.add_argument(
         "--no-rebalance", action="store_true", help="connected robots stay where they are"
     )
@@ -76,8 +78,8 @@ def _check(args: argparse.Namespace) -> None:
     _within("--fps", args.fps, 0.1, 60, "the paper has 5")
     _within("--speed", args.speed, 1, 100, "1 takes as long as the paper; 30 suits CI")
     _within("--seconds", args.seconds, 1, 3600, "30 is enough for percentiles")
-    if args.size is not None:
-        _within("--size", args.size, 0.001, 64, "leave it out, and it is measured")
+    if args.emulated_cores is not None:
+        _within("--emulated-cores", args.emulated_cores, 0.001, 64, "leave it out, and it is measured")
     if not 1 <= args.repeat <= 20:
         raise UsageError(f"--repeat {args.repeat} is not within 1..20", hint="3 shows the spread")
     if not 2 <= args.frames <= 2000:
@@ -105,7 +107,7 @@ def _elasticity(args: argparse.Namespace, settings: PlatformSettings) -> int:
         fps=args.fps,
         speed=args.speed,
         codec=args.codec,
-        size=args.size,
+        size=args.emulated_cores,
         rebalance=not args.no_rebalance,
         compare=args.compare,
         seed=args.seed,

@@ -90,20 +90,20 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
     if args.action == "remove":
         return _remove(args, room, settings)
     if args.action == "disable":
-        room.change_denied(
+        room.change_deny_list(
             lambda denied: denied.pruned(now=now, longest_s=longest).with_robot(tenant, robot, now)
         )
         note(args, settings, "robot.disabled", robot, tenant=tenant)
         print(f"robot {robot!r} is disabled: its connections end within 2 s, and no token of it is taken")
         return 0
-    if not room.denied().is_disabled(tenant, robot):
+    if not room.deny_list().is_disabled(tenant, robot):
         raise UsageError(f"robot {robot!r} is not disabled", hint="rse-pf robot list shows who is")
 
     def enabled(denied: DenyList) -> DenyList:
         kept = denied.pruned(now=now, longest_s=longest).without_robot(tenant, robot)
         return kept.with_all_tokens(tenant, robot, float(int(now)))
 
-    room.change_denied(enabled)
+    room.change_deny_list(enabled)
     note(args, settings, "robot.enabled", robot, tenant=tenant)
     print(f"robot {robot!r} may come in again, with tokens that are made from now on")
     return 0
@@ -138,7 +138,7 @@ def note(
 
 def longest_s(settings: PlatformSettings) -> float:
     """Return how long after it was issued a token may be good at most."""
-    return float(settings.auth.token_life_s + settings.auth.leeway_s)
+    return float(settings.auth.token_ttl_s + settings.auth.leeway_s)
 
 
 def _check(args: argparse.Namespace) -> None:
@@ -205,7 +205,7 @@ def _quota(text: str) -> tuple[str, float]:
 
 
 def _list(args: argparse.Namespace, room: AccessControlStore) -> int:
-    roster, denied = room.roster(), room.denied()
+    roster, denied = room.roster(), room.deny_list()
     rows = [_row(robot, denied) for robot in roster.robots if robot.tenant == args.tenant]
     for each in denied.disabled:
         if each.tenant == args.tenant and roster.find(each.tenant, each.robot) is None:

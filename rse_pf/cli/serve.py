@@ -25,8 +25,8 @@ from rse_pf.errors import UsageError
 __all__ = ["add_arguments", "run"]
 
 _OPTIONS: dict[str, type] = {
-    "host": str, "port": int, "control_host": str, "control_port": int, "workers": int, "size": float,
-    "log_level": str,
+    "host": str, "port": int, "control_host": str, "control_port": int, "workers": int,
+    "emulated_cores": float, "log_level": str,
 }  # fmt: skip
 """Options that are settings of the same name."""
 

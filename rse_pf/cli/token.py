@@ -51,7 +51,7 @@ _SEED_BYTES = 32
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
-    life_s = PlatformSettings().auth.token_life_s
+    life_s = PlatformSettings().auth.token_ttl_s
     parser.add_argument("action", choices=("issue", "inspect", "revoke", *_KEY_ACTIONS), help="what to do")
     parser.add_argument(
         "subject", nargs="?", metavar="ROBOT|TOKEN", help="name of the robot; or the token, - reads it"
@@ -67,7 +67,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--life",
         type=float,
         metavar="S",
-        help=f"issue: life in seconds (auth.token_life_s, default {life_s})",
+        help=f"issue: life in seconds (auth.token_ttl_s, default {life_s})",
     )
     parser.add_argument("--keys", type=Path, metavar="FILE", help="inspect: verify with this JWKS")
     parser.add_argument(
@@ -127,7 +127,7 @@ def _revoke(args: argparse.Namespace, settings: PlatformSettings) -> int:
     if args.all_of is not None:
         robot, tenant = check_robot(args.all_of), check_tenant(args.tenant)
         from_s = float(int(now) + 1)  # a token says when it was issued in whole seconds, rounded down
-        control_room(args, settings).change_denied(
+        control_room(args, settings).change_deny_list(
             lambda denied: denied.pruned(now=now, longest_s=longest).with_all_tokens(tenant, robot, from_s)
         )
         note(args, settings, "token.revoked-all", robot, tenant=tenant)
@@ -144,7 +144,7 @@ def _revoke(args: argparse.Namespace, settings: PlatformSettings) -> int:
     room = control_room(args, settings)
     tenant = _tenant_of(room, header, claims)
     until_s = min(float(over), now + longest)
-    room.change_denied(
+    room.change_deny_list(
         lambda denied: denied.pruned(now=now, longest_s=longest).with_token(tenant, name, token_id, until_s)
     )
     note(args, settings, "token.revoked", name, tenant=tenant, token=token_id)
@@ -295,7 +295,7 @@ def _keys(args: argparse.Namespace, settings: PlatformSettings) -> Any:
 
 
 def _governed(keys: KeySet, room: AccessControlStore) -> KeySet:
-    return keys.governed_by(room.roster(), room.denied())
+    return keys.with_access_control(room.roster(), room.deny_list())
 
 
 def _of_platform(name: str) -> PlatformSettings | None:

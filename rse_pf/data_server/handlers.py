@@ -126,7 +126,7 @@ class Handlers:
 
     def _direct(self, who: Claims, state: UploadState) -> Direct | None:
         """Return where all bytes may go at once; None if some are here, or the store has no such place."""
-        store, life_s = self._store, self._settings.direct_life_s
+        store, life_s = self._store, self._settings.presigned_url_ttl_s
         if state.offset or not isinstance(store, PresigningStore):
             return None
         name = self.objects.name(who, state.digest)
@@ -214,7 +214,7 @@ class Handlers:
         return MapRegistry(self._store, who.tenant, max_bytes=max_bytes, told=told)
 
     async def _content(self, request: HttpRequest, name: str, size: int, digest: str) -> HttpReply:
-        store, life_s = self._store, self._settings.direct_life_s
+        store, life_s = self._store, self._settings.presigned_url_ttl_s
         if request.headers.get("x-accept-direct") == "1" and isinstance(store, PresigningStore):
             url = await asyncio.to_thread(store.presigned_get, name, life_s=life_s)
             return HttpReply(status=307, headers={"Location": url, **_content_headers(digest)})

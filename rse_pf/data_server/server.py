@@ -46,7 +46,7 @@ class KeysFile:
         """Return the keys; None while there are none."""
         if self._clock() - self._looked >= self._pause_s:
             self._looked = self._clock()
-            self._trust.look()
+            self._trust.refresh()
         return self._trust.keys
 
 
@@ -117,8 +117,8 @@ async def _run(
     server: Any, app: DataServer, store: ObjectStore, listening: socket.socket, settings: PlatformSettings,
     announce: Path | None,
 ) -> None:  # fmt: skip
-    await asyncio.to_thread(_sweep, app, store, settings.data.upload_life_s)
-    sweeping = asyncio.create_task(_sweep_on(app, store, settings.data.upload_life_s))
+    await asyncio.to_thread(_sweep, app, store, settings.data.upload_ttl_s)
+    sweeping = asyncio.create_task(_sweep_on(app, store, settings.data.upload_ttl_s))
     serving = asyncio.create_task(server.serve(sockets=[listening]))
     try:
         while not server.started and not serving.done():

@@ -176,13 +176,13 @@ class Objects:
         self._forget_usage(who)
 
     def sweep(self) -> int:
-        """Forget uploads that ended in a crash or are older than ``data.upload_life_s``; return how many."""
+        """Forget uploads that ended in a crash or are older than ``data.upload_ttl_s``; return how many."""
         folders: dict[str, float] = {}
         for info in list(self._store.list("uploads/")):
             folder, _, last = info.name.rpartition("/")
             begun = float(self._store.get(info.name).split()[1]) if last == "size" else 0.0
             folders[folder] = max(begun, folders.get(folder, 0.0))
-        oldest = self._wall_clock() - self._settings.upload_life_s
+        oldest = self._wall_clock() - self._settings.upload_ttl_s
         old = [folder for folder, begun in folders.items() if begun < oldest]
         for folder in old:
             self._drop(f"{folder}/")

@@ -1,6 +1,6 @@
 """The rules of a robot's side, over any number of connections, without any input or output.
 
-A `RobotSession` lives as long as the robot; a `ClientLink` as long as one socket.  Commands survive the
+A `ClientSession` lives as long as the robot; a `ConnectionState` as long as one socket.  Commands survive the
 death of a link: they are sent again, by the same id, on the next one.  Promises that a command gets
 exactly one final answer, that nothing stale is delivered as fresh, that no more commands are on
 their way than the server accepts, and never to read a clock.
@@ -20,8 +20,8 @@ from rse_pf.wire.backlog import Backlog, is_long, turn
 from rse_pf.wire.client_events import (
     Answered,
     Event,
-    LinkLost,
-    MoveAsked,
+    ConnectionLost,
+    MoveRequested,
     Notice,
     Progressed,
     RenewalDue,
@@ -50,14 +50,14 @@ from rse_pf.wire.token_renewal import RenewalTimer
 
 __all__ = [
     "Answered",
-    "ClientLink",
+    "ConnectionState",
     "Event",
-    "LinkLost",
-    "MoveAsked",
+    "ConnectionLost",
+    "MoveRequested",
     "Notice",
     "Progressed",
     "RenewalDue",
-    "RobotSession",
+    "ClientSession",
     "Welcomed",
 ]  # fmt: skip
 
@@ -74,7 +74,7 @@ class _Pending:
     submitted: float
     wire_bytes: int
     sent_at: float | None = None
-    link: ClientLink | None = None
+    link: ConnectionState | None = None
     not_before: float = 0.0
     losses: int = 0
     cancelled: bool = False
@@ -83,7 +83,7 @@ class _Pending:
 
 
 @dataclass(slots=True, kw_only=True, eq=False)
-class ClientLink:
+class ConnectionState:
     """What the robot knows of one socket."""
 
     opened: float
@@ -107,13 +107,13 @@ class ClientLink:
         return self.welcome.server if self.welcome else ""
 
 
-class RobotSession:
+class ClientSession:
     """All commands of one robot, and the links that they travel on."""
 
     def __init__(self, *, codec: Codec, settings: SessionSettings, sdk: str, first_id: int = 1) -> None:
         self.codec = codec
         self.settings = settings
-        self.current: ClientLink | None = None
+        self.current: ConnectionState | None = None
         self.resent = 0
         self.dropped_answers = 0
         self._sdk = sdk
@@ -183,13 +183,13 @@ class RobotSession:
         elif pending.link is None:
             del self._pending[identity]
 
-    def open_link(self, now: float) -> ClientLink:
+    def open_link(self, now: float) -> ConnectionState:
         """Return a new link with a Hello to send; call when a socket is open."""
-        link = ClientLink(opened=now, last_heard=now, last_tended=now)
+        link = ConnectionState(opened=now, last_heard=now, last_tended=now)
         link.outgoing.append(self.codec.encode(Hello(sdk=self._sdk, capabilities=("move", PROGRESS))))
         return link
 
-    def close_link(self, link: ClientLink) -> None:
+    def close_link(self, link: ConnectionState) -> None:
         """Tell that the socket of *link* is gone; its commands wait for the next link."""
         link.lost = True
         if self.current is link:
@@ -200,11 +200,11 @@ class RobotSession:
                 if pending.cancelled and not pending.is_long:
                     del self._pending[identity]
 
-    def unanswered_on(self, link: ClientLink) -> int:
+    def unanswered_on(self, link: ConnectionState) -> int:
         """How many commands sent on *link* still wait for an answer that somebody wants."""
         return sum(pending.link is link and not pending.cancelled for pending in self._pending.values())
 
-    def adopt(self, link: ClientLink, now: float) -> list[Event]:
+    def adopt(self, link: ConnectionState, now: float) -> list[Event]:
         """Make a welcomed *link* the current one and send on it what has no link.
 
         Of a latest-wins stream only the newest frame is sent again: no catch-up burst.  Frames that waited
@@ -221,7 +221,7 @@ class RobotSession:
             link.comeback = Backlog(newest=frames[-1].command.id)
         return self._flush(now)
 
-    def receive(self, link: ClientLink, data: bytes, now: float) -> list[Event]:
+    def receive(self, link: ConnectionState, data: bytes, now: float) -> list[Event]:
         """Return what one WebSocket message on *link* means; raises ProtocolError if it is garbage."""
         link.last_heard = now
         message = self.codec.decode_from_server(data)
@@ -236,7 +236,7 @@ class RobotSession:
             return self._pong(link, message, now)
         if isinstance(message, Move):
             within_s = message.within_ms / 1e3
-            return [MoveAsked(message.reason, within_s if math.isfinite(within_s) else 0.0)]
+            return [MoveRequested(message.reason, within_s if math.isfinite(within_s) else 0.0)]
         if isinstance(message, Renewed):
             link.lease.lasts(message.token_s, now)
             return []
@@ -246,7 +246,7 @@ class RobotSession:
             return self._progress(link, message)
         return self._answer(link, message, now)
 
-    def renew(self, link: ClientLink, token: str) -> None:
+    def renew(self, link: ConnectionState, token: str) -> None:
         """Show a fresh *token* on *link*, whose end the server then moves."""
         link.outgoing.append(self.codec.encode(Renew(token=token)))
 
@@ -271,7 +271,7 @@ class RobotSession:
             events += self._end(identity, failure)
         return events
 
-    def tend(self, link: ClientLink, now: float) -> list[Event]:
+    def tend(self, link: ConnectionState, now: float) -> list[Event]:
         """Ping *link* when it is time; say when it is dead.
 
         A robot that did not look for a while cannot tell whether the server was silent meanwhile,
@@ -280,25 +280,25 @@ class RobotSession:
         s = self.settings
         if link.lost:
             return []
-        if now - link.last_tended >= s.silence_s:
+        if now - link.last_tended >= s.stall_timeout_s:
             link.last_heard = now
             link.ping_sent = None if link.ping_sent is None else now
         link.last_tended = now
         if link.welcome is None:
             late = now - link.opened >= s.hello_timeout_s
             return self._lose(link, "no welcome") if late else []
-        if link.ping_sent is not None and now - link.ping_sent >= s.ping_patience_s:
+        if link.ping_sent is not None and now - link.ping_sent >= s.ping_timeout_s:
             return self._lose(link, "no pong")
         waiting = [
             pending.sent_at
             for pending in self._pending.values()
             if pending.link is link and pending.sent_at is not None and not pending.is_long
         ]
-        if waiting and now - max(link.last_heard, min(waiting)) >= s.silence_s:
+        if waiting and now - max(link.last_heard, min(waiting)) >= s.stall_timeout_s:
             return self._lose(link, "silence")
         pause = s.ping_interval_s
         if waiting:
-            pause = min(pause, s.silence_s / _PINGS_PER_SILENCE)
+            pause = min(pause, s.stall_timeout_s / _PINGS_PER_SILENCE)
         if link.last_ping is None or now - link.last_ping >= pause:
             link.ping_sent = now if link.ping_sent is None else link.ping_sent
             link.last_ping = now
@@ -308,7 +308,7 @@ class RobotSession:
 
     def next_due(self, now: float) -> float:
         """Return when `due` and `tend` should be called again, at the latest."""
-        times = [now + self.settings.silence_s / _PINGS_PER_SILENCE]
+        times = [now + self.settings.stall_timeout_s / _PINGS_PER_SILENCE]
         times += [pending.deadline for pending in self._pending.values()]
         times += [p.not_before for p in self._pending.values() if p.link is None and p.not_before > now]
         if self.current is not None and not self.current.pace.room(now):
@@ -341,13 +341,13 @@ class RobotSession:
                     self._take_back(pending)
         return events
 
-    def _may_go(self, command: Command, link: ClientLink, room: int) -> bool:
+    def _may_go(self, command: Command, link: ConnectionState, room: int) -> bool:
         if room <= 0 or not command.stream or link.comeback is None:
             return room > 0
         under_way = sum(_is_frame(each) and each.link is link for each in self._pending.values())
         return under_way < link.comeback.room
 
-    def _room(self, link: ClientLink, now: float) -> int:
+    def _room(self, link: ConnectionState, now: float) -> int:
         most = link.welcome.limits.max_in_flight if link.welcome else self.settings.max_in_flight
         free = max(1, most) - sum(pending.link is link for pending in self._pending.values())
         return min(free, link.pace.room(now))
@@ -362,7 +362,7 @@ class RobotSession:
                 hint="send fewer matches, or send large data to the data server",
             )
 
-    def _write(self, pending: _Pending, link: ClientLink, now: float, data: bytes | None = None) -> None:
+    def _write(self, pending: _Pending, link: ConnectionState, now: float, data: bytes | None = None) -> None:
         self.resent += pending.sent_at is not None
         pending.link, pending.sent_at = link, now
         link.pace.spend(now)
@@ -372,7 +372,7 @@ class RobotSession:
             else data
         )
 
-    def _answer(self, link: ClientLink, answer: Result | Failure, now: float) -> list[Event]:
+    def _answer(self, link: ConnectionState, answer: Result | Failure, now: float) -> list[Event]:
         pending = self._pending.get(-1 if answer.id is None else answer.id)
         elsewhere = pending is not None and pending.link is not link
         if pending is None or (elsewhere and isinstance(answer, Failure)):
@@ -413,7 +413,7 @@ class RobotSession:
         pending.link, pending.not_before = None, after
         return True
 
-    def _progress(self, link: ClientLink, progress: Progress) -> list[Event]:
+    def _progress(self, link: ConnectionState, progress: Progress) -> list[Event]:
         """Note that a command is a long one: the default deadline is not for it."""
         pending = self._pending.get(progress.id)
         if pending is None or pending.link is not link:
@@ -434,7 +434,7 @@ class RobotSession:
         if pending.link is not None:
             pending.link.outgoing.append(self.codec.encode(Cancel(id=pending.command.id)))
 
-    def _pong(self, link: ClientLink, pong: Pong, now: float) -> list[Event]:
+    def _pong(self, link: ConnectionState, pong: Pong, now: float) -> list[Event]:
         link.ping_sent = None
         exchange = Exchange(pong.sent_s, pong.received_s, pong.answered_s, now)
         if link.opened <= pong.sent_s <= now and exchange.is_plausible:
@@ -442,9 +442,9 @@ class RobotSession:
             link.clock_offset.add(exchange)
         return []
 
-    def _lose(self, link: ClientLink, reason: str) -> list[Event]:
+    def _lose(self, link: ConnectionState, reason: str) -> list[Event]:
         self.close_link(link)
-        return [LinkLost(reason)]
+        return [ConnectionLost(reason)]
 
     def _end(
         self, identity: int, answer: Result | Failure, up_s: float | None = None, down_s: float | None = None

@@ -119,7 +119,7 @@ FORGED: dict[str, Callable[[], str]] = {
     "not before is a word": lambda: sign({**GOOD, "nbf": "now"}),
     "not before tomorrow": lambda: sign({**GOOD, "nbf": NOW + 86400}),
     "issued tomorrow": lambda: sign({**GOOD, "iat": NOW + 86400, "exp": NOW + 86500}),
-    "lives too long": lambda: sign({**GOOD, "exp": int(NOW) + SETTINGS.token_life_s + 1}),
+    "lives too long": lambda: sign({**GOOD, "exp": int(NOW) + SETTINGS.token_ttl_s + 1}),
     "expired": lambda: sign({**GOOD, "iat": NOW - 800, "exp": NOW - 200}),
 }
 
@@ -180,7 +180,7 @@ def test_odd_claims_under_a_good_signature_are_accepted_or_refused(changes: dict
     except Unauthorized:
         return
     assert 0 < len(claims.robot) <= 64
-    assert claims.expires_s - claims.issued_s <= SETTINGS.token_life_s
+    assert claims.expires_s - claims.issued_s <= SETTINGS.token_ttl_s
 
 
 @pytest.mark.parametrize("now", [1000.0, NOW, 9e10], ids=["1970", "2026", "the year 4821"])
@@ -188,7 +188,7 @@ def test_time_is_an_argument_and_the_machines_clock_never_decides(now: float) ->
     token = KEY.issue("robot-7", now=now, token_id="t1", settings=SETTINGS)
 
     assert verify_token(token, keys=KEYS, now=now + 1, settings=SETTINGS).robot == "robot-7"
-    assert refused(token, now=now + SETTINGS.token_life_s + SETTINGS.leeway_s + 2) == "expired"
+    assert refused(token, now=now + SETTINGS.token_ttl_s + SETTINGS.leeway_s + 2) == "expired"
 
 
 def test_the_leeway_is_kept_to_the_second() -> None:
@@ -207,7 +207,7 @@ def test_not_before_has_the_same_leeway() -> None:
     assert refused(token, now=NOW - 1) == "not-yet-valid"
 
 
-@pytest.mark.parametrize("life_s", [0.0, -1.0, SETTINGS.token_life_s + 1.0, float("nan"), float("inf")])
+@pytest.mark.parametrize("life_s", [0.0, -1.0, SETTINGS.token_ttl_s + 1.0, float("nan"), float("inf")])
 def test_a_life_outside_the_settings_is_not_issued(life_s: float) -> None:
     with pytest.raises(UsageError, match="a life of"):
         issue(life_s=life_s)

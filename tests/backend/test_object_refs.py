@@ -130,7 +130,7 @@ def test_what_is_no_digest_names_nothing(store: Counting, wrong: dict[str, Any])
 
 
 @pytest.mark.parametrize(
-    ("limit", "reads"), [({"objects_per_command": 1}, 0), ({"object_bytes_per_command": len(MAP)}, 2)]
+    ("limit", "reads"), [({"max_objects_per_command": 1}, 0), ({"max_object_bytes_per_command": len(MAP)}, 2)]
 )
 def test_more_than_a_command_may_name_is_refused_before_it_is_read(
     store: Counting, limit: dict[str, Any], reads: int

@@ -14,7 +14,7 @@ from rse_pf.cli.main import main
         (["elasticity", "--speed", "0.5"], "--speed 0.5 is not within 1..100"),
         (["elasticity", "--speed", "nan"], "--speed nan"),
         (["elasticity", "--fps", "inf"], "--fps inf"),
-        (["elasticity", "--size", "0"], "--size 0"),
+        (["elasticity", "--emulated-cores", "0"], "--emulated-cores 0"),
         (["latency", "--link", "papre"], "no link named 'papre'"),
         (["robustness", "--only", "kill,fire"], "there is no fault 'fire'"),
         (["robustness", "--repeat", "0"], "--repeat 0"),

@@ -85,7 +85,7 @@ def test_a_token_is_read_from_the_standard_input(
 def test_a_token_follows_the_settings_that_its_platform_was_started_with(
     capsys: pytest.CaptureFixture[str], platform: Path
 ) -> None:
-    chosen = {"context": {"rse-pf": {"auth": {"issuer": "my-lab", "token_life_s": 30}}}}
+    chosen = {"context": {"rse-pf": {"auth": {"issuer": "my-lab", "token_ttl_s": 30}}}}
     settings_file(platform).write_text(json.dumps(chosen))
 
     _, told = inspected(capsys, issued(capsys))

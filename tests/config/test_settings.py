@@ -55,7 +55,7 @@ def test_the_paper_is_the_default() -> None:
         ({"pnp": {"max_iterations": 5}}, ["pnp.min_iterations = 10"]),
         ({"health": {"cloud_timeout_s": 6}}, ["health.cloud_interval_s = 5"]),
         ({"data": {"infrequent_after_days": 100}}, ["data.glacier_after_days = 90"]),
-        ({"cloud": {"lab": False}}, ["cloud.certificate_arn", "cloud.domain_name"]),
+        ({"cloud": {"allow_insecure": False}}, ["cloud.certificate_arn", "cloud.domain_name"]),
     ],
 )
 def test_a_contradiction_is_refused_with_both_numbers(overrides: dict[str, Any], words: list[str]) -> None:
@@ -113,7 +113,7 @@ def test_the_digest_changes_with_every_setting(row: SettingRow) -> None:
         "period_s": {"period_s": 100},
         "step": {"big_step": 2},
         "max_servers": {"max_servers": 11},
-        "lab": {"certificate_arn": "arn", "domain_name": "door.example"},
+        "allow_insecure": {"certificate_arn": "arn", "domain_name": "door.example"},
         "certificate": {"private_key": "key.pem"},
         "private_key": {"certificate": "door.pem"},
     }
@@ -131,7 +131,7 @@ def test_the_digest_is_the_same_wherever_the_settings_are() -> None:
 
 
 def test_all_settings_survive_a_round_trip_through_json() -> None:
-    settings = PlatformSettings.from_dict({"scaling": {"max_servers": 4}, "serving": {"size": 1}})
+    settings = PlatformSettings.from_dict({"scaling": {"max_servers": 4}, "serving": {"emulated_cores": 1}})
 
     assert PlatformSettings.from_dict(json.loads(json.dumps(settings.to_dict()))) == settings
 
@@ -205,7 +205,7 @@ GROUPS = st.dictionaries(SETTINGS, VALUES, max_size=3) | VALUES
 
 
 @given(st.dictionaries(WORDS, GROUPS, max_size=3))
-@example({"serving": {"size": 10**400}})
+@example({"serving": {"emulated_cores": 10**400}})
 @example({"serving": {"workers": -(10**5000)}})
 def test_any_overrides_give_settings_or_a_settings_error(overrides: dict[str, Any]) -> None:
     try:

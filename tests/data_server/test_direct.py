@@ -39,7 +39,7 @@ def bucket() -> Bucket:
 @pytest.fixture
 def direct(bucket: Bucket) -> Service:
     """A service on it."""
-    return Service(small_settings(direct_life_s=60), bucket)
+    return Service(small_settings(presigned_url_ttl_s=60), bucket)
 
 
 def test_an_upload_that_begins_may_go_straight_to_the_bucket(direct: Service, bucket: Bucket) -> None:

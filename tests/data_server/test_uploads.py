@@ -158,7 +158,7 @@ def test_an_old_upload_and_parts_without_one_are_swept_up_and_a_young_one_is_not
 
     assert service.app.handlers.objects.sweep() == 1
     assert service.ask("GET", UPLOAD).json["offset"] == 4096
-    service.wall += service.settings.data.upload_life_s + 1
+    service.wall += service.settings.data.upload_ttl_s + 1
     assert service.app.handlers.objects.sweep() == 1
     assert list(service.store.list()) == []
 

@@ -34,9 +34,9 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[GuardedServer]:
     """One worker with short patience, where sockets come directly and from one address."""
     groups: dict[str, dict[str, Any]] = {
         "serving": {
-            "handshake_timeout_s": ONE_S, "slow_reader_s": 0.3, "write_buffer_bytes": 65536,
+            "handshake_timeout_s": ONE_S, "slow_reader_timeout_s": 0.3, "write_buffer_bytes": 65536,
             "trusted_proxies": 0, "max_unauthenticated_per_source": 20, "max_unauthenticated": 40,
-            "handshakes_per_source_per_s": 0.0, "accepts_per_s": 0.0,
+            "max_handshakes_per_source_per_s": 0.0, "max_accepts_per_s": 0.0,
         },
     }  # fmt: skip
     with GuardedServer(tmp_path_factory.mktemp("floods"), workers=1, **groups) as made:

@@ -97,7 +97,7 @@ async def is_refused(server: GuardedServer, token: str) -> bool:
 
 @pytest.fixture(scope="module")
 def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[GuardedServer]:
-    session = {"max_commands_per_s": 0.0, "ping_patience_s": 30.0}  # these robots send no pings
+    session = {"max_commands_per_s": 0.0, "ping_timeout_s": 30.0}  # these robots send no pings
     with GuardedServer(tmp_path_factory.mktemp("guarded"), session=session) as server:
         yield server
 
@@ -112,10 +112,10 @@ async def revoke_some(server: GuardedServer, robot_count: int, revoked_count: in
         for number in gone:
             name, token_id = names[number], f"t-{server._issued - robot_count + number + 1}"
             if number % 2:
-                server.room.change_denied(lambda d, name=name: d.with_robot("default", name, time.time()))
+                server.room.change_deny_list(lambda d, name=name: d.with_robot("default", name, time.time()))
             else:
                 until_s = time.time() + 900
-                server.room.change_denied(
+                server.room.change_deny_list(
                     lambda d, n=name, t=token_id, u=until_s: d.with_token("default", n, t, u)
                 )
         told = time.monotonic()
@@ -190,7 +190,7 @@ def test_revoking_the_fresh_token_ends_the_socket_that_was_renewed_with_it(serve
         async with robots(server, [server.token("twice")]) as (socket,):
             assert isinstance(await socket.ask(Renew(token=server.token("twice"))), Renewed)
             fresh = f"t-{server._issued}"
-            server.room.change_denied(lambda d: d.with_token("default", "twice", fresh, time.time() + 900))
+            server.room.change_deny_list(lambda d: d.with_token("default", "twice", fresh, time.time() + 900))
             assert await socket.end(30.0) == CLOSE_REVOKED
 
     asyncio.run(run())
@@ -203,7 +203,7 @@ def test_a_run_outlives_its_tokens_without_a_gap_and_ends_when_its_robot_is_disa
     public = make_robot_key(tmp_path / "robot.key")
     enrolled = EnrolledRobot(robot="own-key", x=public_key_of(public), scopes=("services:echo",))
     server.room.change_roster(lambda roster: roster.enrolled(enrolled))
-    short = server.settings.replace(auth={"token_life_s": 10}).auth
+    short = server.settings.replace(auth={"token_ttl_s": 10}).auth
     key = RobotKey(tmp_path / "robot.key", "own-key", settings=short)
     tokens = 0
 
@@ -221,7 +221,7 @@ def test_a_run_outlives_its_tokens_without_a_gap_and_ends_when_its_robot_is_disa
             assert tokens >= 3
             with pytest.raises(Forbidden):
                 await robot.call("pnp", {})
-            server.room.change_denied(lambda d: d.with_robot("default", "own-key", time.time()))
+            server.room.change_deny_list(lambda d: d.with_robot("default", "own-key", time.time()))
             with pytest.raises(Unauthorized):
                 await echo_on(robot, until_s=began + 60.0)
 

@@ -92,7 +92,7 @@ def test_a_bad_token_is_turned_away_before_anything_is_decoded(token: str) -> No
 
 
 def test_an_expired_token_is_turned_away() -> None:
-    late = NOW_S + SETTINGS.auth.token_life_s + SETTINGS.auth.leeway_s + 1
+    late = NOW_S + SETTINGS.auth.token_ttl_s + SETTINGS.auth.leeway_s + 1
     answered = Answering(SETTINGS, KEYS).answer(event(b""), now_s=late, left_ms=9e3, clock=lambda: 0.0)
 
     assert answered.status == 401

@@ -17,7 +17,7 @@ LAB = PlatformSettings()
 PUBLIC = PlatformSettings.from_dict(
     {
         "cloud": {
-            "lab": False, "domain_name": "robots.example.org", "endpoints": "full",
+            "allow_insecure": False, "domain_name": "robots.example.org", "endpoints": "full",
             "certificate_arn": "arn:aws:acm:ap-northeast-2:111122223333:certificate/a",
         },
         "data": {"enabled": True},

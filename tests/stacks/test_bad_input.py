@@ -21,7 +21,7 @@ if shutil.which("node") is None:
     pytest.skip("the CDK needs Node.js", allow_module_level=True)
 pytest.importorskip("aws_cdk", reason="the infra extra is not installed")
 
-NOT_PUBLIC = {"cloud": {"lab": False, "domain_name": "robots.example.org"}}
+NOT_PUBLIC = {"cloud": {"allow_insecure": False, "domain_name": "robots.example.org"}}
 ENOUGH_S = 240
 
 
@@ -112,7 +112,7 @@ def surroundings(repository: Path) -> dict[str, str]:
         (settings(scaling={"max_server": 4}), "unknown setting scaling.max_server"),
         (settings(skaling={}), "skaling"),
         (settings(scaling={"min_servers": 5, "max_servers": 4}), "scaling.max_servers = 4 is less than"),
-        (settings(**NOT_PUBLIC), "cloud.lab = false needs cloud.certificate_arn"),
+        (settings(**NOT_PUBLIC), "cloud.allow_insecure = false needs cloud.certificate_arn"),
         (settings(cloud={"region": "mars-north-1"}), "cloud.region = 'mars-north-1'"),
         (settings(scaling={"max_servers": "many"}), "'many' is not of type int"),
         (no_json, "is not JSON"),

@@ -170,7 +170,7 @@ def test_every_stack_is_created_and_what_moto_made_equals_the_settings(
     assert len(targets) == len(group["TargetGroupARNs"]) == (2 if settings.data.enabled else 1)
     (balancer,) = elb.describe_load_balancers()["LoadBalancers"]
     (listener,) = elb.describe_listeners(LoadBalancerArn=balancer["LoadBalancerArn"])["Listeners"]
-    expected = ("HTTP", 80) if settings.cloud.lab else ("HTTPS", 443)
+    expected = ("HTTP", 80) if settings.cloud.allow_insecure else ("HTTPS", 443)
     assert (listener["Protocol"], listener["Port"]) == expected
     buckets = [each["Name"] for each in client("s3").list_buckets()["Buckets"]]
     for word in ("map", "artifact", "log"):
@@ -187,4 +187,4 @@ def test_every_stack_is_created_and_what_moto_made_equals_the_settings(
         for cidr in rule.get("IpRanges", [])
         if cidr["CidrIp"] == "0.0.0.0/0"
     ]
-    assert [port for _, port in open_to_all] == [80 if settings.cloud.lab else 443]
+    assert [port for _, port in open_to_all] == [80 if settings.cloud.allow_insecure else 443]

@@ -190,7 +190,7 @@ def test_the_front_door_speaks_tls_unless_it_is_a_lab(assembly: Assembly) -> Non
     listener = assembly.one("AWS::ElasticLoadBalancingV2::Listener")
     url = assembly.templates["RsePf-Backend"]["Outputs"]["Url"]["Value"]
 
-    if assembly.settings.cloud.lab:
+    if assembly.settings.cloud.allow_insecure:
         assert (listener["Port"], listener["Protocol"]) == (80, "HTTP")
         assert json.dumps(url).count("ws://") == 1
     else:
@@ -230,7 +230,7 @@ def test_only_the_front_door_is_open_to_the_world(assembly: Assembly) -> None:
         for rule in group.get("SecurityGroupEgress", [])
     ]
     loose = [*assembly.all("AWS::EC2::SecurityGroupIngress"), *assembly.all("AWS::EC2::SecurityGroupEgress")]
-    front = 80 if assembly.settings.cloud.lab else 443
+    front = 80 if assembly.settings.cloud.allow_insecure else 443
 
     assert [rule["FromPort"] for rule in inline if rule.get("CidrIp") == "0.0.0.0/0"] == [front]
     assert not [rule for rule in [*outward, *loose] if rule.get("CidrIp") == "0.0.0.0/0"]
@@ -302,7 +302,7 @@ def test_synthesis_asks_nobody(assembly: Assembly) -> None:
 def test_nag_finds_nothing_that_is_not_acknowledged(assembly: Assembly) -> None:
     found = [each["ruleName"] for each in assembly.findings]
 
-    assert found == (["Annotation::rse-pf:lab"] if assembly.settings.cloud.lab else [])
+    assert found == (["Annotation::rse-pf:lab"] if assembly.settings.cloud.allow_insecure else [])
 
 
 def test_cfn_lint_finds_nothing(assembly: Assembly) -> None:

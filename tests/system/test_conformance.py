@@ -53,7 +53,7 @@ def test_all_247_cases_pass_with_the_products_limits(start_server, tmp_path):
 
 def test_all_54_large_cases_pass_with_raised_limits(start_server, tmp_path):
     limits = {**BIG, "max_fragments": 100_000}
-    server = start_server(echo=True, serving={"slow_reader_s": 30.0}, session=limits)
+    server = start_server(echo=True, serving={"slow_reader_timeout_s": 30.0}, session=limits)
 
     passed, failed, printed = run_suite(server.port, tmp_path / "r", "-i", "9.*")
 
@@ -62,7 +62,7 @@ def test_all_54_large_cases_pass_with_raised_limits(start_server, tmp_path):
 
 
 def test_the_fragment_limit_refuses_exactly_the_ten_cases_above_it(start_server, tmp_path):
-    server = start_server(echo=True, serving={"slow_reader_s": 30.0}, session=BIG)
+    server = start_server(echo=True, serving={"slow_reader_timeout_s": 30.0}, session=BIG)
 
     _, failed, printed = run_suite(server.port, tmp_path / "r", "-i", "9.*")
 

@@ -241,7 +241,9 @@ def test_robots_that_are_there_already_spread_over_a_new_server(tmp_path: Path) 
 def test_load_makes_it_grow_and_rest_makes_it_shrink(tmp_path: Path) -> None:
     """The ticks of CPU time, 10 ms, are coarse for periods this short: what is idle is set accordingly."""
     short = {"period_s": 10, "idle_s": 60, "warm_up_s": 0, "idle_cpu_percent": 65.0}
-    settings = SETTINGS.replace(serving={"size": 0.1}, scaling={**short, "min_servers": 1, "max_servers": 2})
+    settings = SETTINGS.replace(
+        serving={"emulated_cores": 0.1}, scaling={**short, "min_servers": 1, "max_servers": 2}
+    )
 
     async def run() -> None:
         news = News()
@@ -267,7 +269,7 @@ def test_new_servers_that_all_crash_are_started_slowly_and_old_ones_serve_on(tmp
         f"import os, sys\nif os.path.exists({str(broken)!r}): sys.exit('no cheese today')\n"
         "from rse_pf.cli.main import main\nsys.exit(main())"
     )
-    settings = SETTINGS.replace(local={"restarts_per_minute": 2})
+    settings = SETTINGS.replace(local={"max_restarts_per_minute": 2})
 
     async def run() -> None:
         news = News()

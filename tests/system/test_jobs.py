@@ -130,7 +130,7 @@ def platform(start_server, tmp_path):
     (tmp_path / "served_in_tests.py").write_text(_SERVICES)
 
     def start(**serving: Any):
-        chosen = {"job_beat_s": 0.1, "job_lease_s": 1.0, "drain_wait_s": 0.0, **serving}
+        chosen = {"job_heartbeat_s": 0.1, "job_lease_s": 1.0, "drain_wait_s": 0.0, **serving}
         return start_server(keys=True, serving=chosen, data={"store": f"dir:{tmp_path / 'store'}"})
 
     return start
@@ -306,7 +306,7 @@ async def test_a_job_that_crashes_is_a_typed_failure_and_the_server_lives(platfo
 @pytest.mark.slow
 @in_a_loop
 async def test_one_job_runs_at_a_time_some_wait_and_more_are_refused(platform, runs, tmp_path):
-    server, heard = platform(jobs_waiting=1), Heard()
+    server, heard = platform(max_waiting_jobs=1), Heard()
     async with client_sdk.connect(server.url, token=server.token()) as robot:
         first = asked(robot, heard, name="a")
         await heard.until("half")

@@ -159,7 +159,7 @@ def serve_isolated(start_server, services, tmp_path):
     """A function that starts a server with them."""
 
     def start(**more):
-        chosen = {"folder": str(services), "grace_s": 0.2, "crash_loop_deaths": 1000, **more}
+        chosen = {"folder": str(services), "grace_s": 0.2, "breaker_crashes": 1000, **more}
         store = f"dir:{tmp_path / 'store'}"
         return start_server(keys=True, services=chosen, data={"store": store})
 
@@ -317,7 +317,7 @@ def test_one_poison_request_costs_two_environments_however_often_it_comes(serve_
 
 
 def test_a_service_that_crashes_again_and_again_rests_and_readyz_says_so(serve_isolated):
-    server = serve_isolated(crash_loop_deaths=3, poison_deaths=1)
+    server = serve_isolated(breaker_crashes=3, poison_crashes=1)
     asks = [("worker", {"do": what}) for what in ("segv", "abort", "leave", "look")]
     answers = ask_all(server, "robot-1", asks)
 
@@ -375,7 +375,7 @@ def test_an_environment_whose_state_went_on_elsewhere_answers_with_no_older_coun
 
 
 def test_more_robots_than_environments_are_busy_and_come_in_when_one_leaves(serve_isolated):
-    server = serve_isolated(max_environments=2)
+    server = serve_isolated(max_sandboxes=2)
 
     async def run():
         async with server.robot(token=server.token("three")) as three:
@@ -417,7 +417,7 @@ def test_hostile_lua_is_held(start_server, tmp_path):
         install(written(tmp_path, name, "lua", "service.lua", source), tmp_path / "s")
     server = start_server(
         keys=True,
-        services={"folder": str(tmp_path / "s"), "memory_bytes": 300_000_000, "crash_loop_deaths": 1000},
+        services={"folder": str(tmp_path / "s"), "memory_bytes": 300_000_000, "breaker_crashes": 1000},
     )
 
     for name in HOSTILE_LUA:
@@ -444,7 +444,7 @@ def test_a_hostile_library_is_held(start_server, tmp_path):
     secret = tmp_path / "secret"
     secret.write_text("of another robot")
     secret.chmod(0o644)
-    server = start_server(keys=True, services={"folder": str(tmp_path / "s"), "crash_loop_deaths": 1000})
+    server = start_server(keys=True, services={"folder": str(tmp_path / "s"), "breaker_crashes": 1000})
     asks = [("hostile", {"do": what, "path": str(secret)}) for what in ("read0", "fork", "socket", "file")]
 
     read0, fork, socket, file = ask_all(server, "robot-1", asks)

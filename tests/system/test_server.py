@@ -296,7 +296,12 @@ def test_a_socket_without_hello_is_closed(start_server):
 
 def test_a_silent_robot_is_closed(start_server):
     server = start_server(
-        session={"ping_interval_s": 0.1, "ping_patience_s": 0.1, "hello_timeout_s": 0.4, "silence_s": 0.1}
+        session={
+            "ping_interval_s": 0.1,
+            "ping_timeout_s": 0.1,
+            "hello_timeout_s": 0.4,
+            "stall_timeout_s": 0.1,
+        }
     )
 
     async def run():
@@ -307,7 +312,7 @@ def test_a_silent_robot_is_closed(start_server):
 
 
 def test_a_reader_that_does_not_read_is_cut(start_server):
-    server = start_server(serving={"slow_reader_s": 0.3}, session={"max_commands_per_s": 0.0})
+    server = start_server(serving={"slow_reader_timeout_s": 0.3}, session={"max_commands_per_s": 0.0})
 
     async def run():
         async with server.robot(max_queue=1, max_size=1 << 20) as robot:
@@ -323,7 +328,7 @@ def test_a_reader_that_does_not_read_is_cut(start_server):
 
 @pytest.mark.slow
 def test_a_server_of_a_fixed_size_uses_no_more_cpu(start_server):
-    server = start_server(serving={"size": 0.25})
+    server = start_server(serving={"emulated_cores": 0.25})
 
     async def run():
         async with server.robot() as robot:

@@ -9,21 +9,21 @@ import pytest
 from rse_pf.config import SessionSettings
 from rse_pf.errors import BadMessage, LimitExceeded, ProtocolError
 from rse_pf.wire import Command, Failure, Hello, Limits, Move, Ping, Pong, Result, Welcome, make_codec
-from rse_pf.wire.client_session import Answered, ClientLink, LinkLost, MoveAsked, RobotSession, Welcomed
+from rse_pf.wire.client_session import Answered, ConnectionState, ConnectionLost, MoveRequested, ClientSession, Welcomed
 
 SETTINGS = SessionSettings()
 CODEC = make_codec("json", SETTINGS)
 
 
-def make_session(settings: SessionSettings = SETTINGS) -> RobotSession:
-    return RobotSession(codec=CODEC, settings=settings, sdk="test")
+def make_session(settings: SessionSettings = SETTINGS) -> ClientSession:
+    return ClientSession(codec=CODEC, settings=settings, sdk="test")
 
 
-def tell(session: RobotSession, link: ClientLink, message, now: float):
+def tell(session: ClientSession, link: ConnectionState, message, now: float):
     return session.receive(link, CODEC.encode(message), now)
 
 
-def open_link(session: RobotSession, now: float = 0.0, server: str = "a", *, room: int = 8) -> ClientLink:
+def open_link(session: ClientSession, now: float = 0.0, server: str = "a", *, room: int = 8) -> ConnectionState:
     """Open, welcome and adopt a link."""
     link = session.open_link(now)
     welcome = Welcome(
@@ -36,14 +36,14 @@ def open_link(session: RobotSession, now: float = 0.0, server: str = "a", *, roo
     return link
 
 
-def sent(link: ClientLink) -> list:
+def sent(link: ConnectionState) -> list:
     """Return and forget what the session wrote on *link*."""
     messages = [CODEC.decode_from_robot(data) for data in link.outgoing]
     link.outgoing.clear()
     return messages
 
 
-def commands(link: ClientLink) -> list[Command]:
+def commands(link: ConnectionState) -> list[Command]:
     return [message for message in sent(link) if isinstance(message, Command)]
 
 
@@ -64,7 +64,7 @@ def codes(events) -> dict[int, str]:
     }
 
 
-def tend_until_lost(session: RobotSession, link: ClientLink) -> tuple[float, list]:
+def tend_until_lost(session: ClientSession, link: ConnectionState) -> tuple[float, list]:
     """Return when an unanswering *link* was given up, and what the session said then."""
     now, events = 0.0, []
     while not events:
@@ -270,7 +270,7 @@ def test_a_move_leaves_what_is_unanswered_on_the_old_link():
     session.submit("pnp", None, now=0.0)
     (command,) = commands(old)
 
-    assert tell(session, old, Move(reason="drain", within_ms=2000), 0.1) == [MoveAsked("drain", 2.0)]
+    assert tell(session, old, Move(reason="drain", within_ms=2000), 0.1) == [MoveRequested("drain", 2.0)]
     new = open_link(session, now=0.2, server="b")
     session.submit("pnp", None, now=0.3)
 
@@ -325,8 +325,8 @@ def test_silence_ends_a_link_with_an_unanswered_command_in_time():
     session.submit("pnp", None, now=0.0, deadline_s=60.0)
 
     now, events = tend_until_lost(session, link)
-    assert events == [LinkLost("silence")]
-    assert now <= SETTINGS.silence_s + SETTINGS.silence_s / 3 + 1e-9
+    assert events == [ConnectionLost("silence")]
+    assert now <= SETTINGS.stall_timeout_s + SETTINGS.stall_timeout_s / 3 + 1e-9
     assert session.current is None
 
 
@@ -364,8 +364,8 @@ def test_an_idle_link_is_lost_when_its_ping_stays_unanswered():
     link = open_link(session)
 
     now, events = tend_until_lost(session, link)
-    assert events == [LinkLost("no pong")]
-    assert now <= SETTINGS.ping_interval_s + SETTINGS.ping_patience_s
+    assert events == [ConnectionLost("no pong")]
+    assert now <= SETTINGS.ping_interval_s + SETTINGS.ping_timeout_s
 
 
 def test_a_robot_that_slept_does_not_blame_the_server():
@@ -382,8 +382,8 @@ def test_a_socket_without_a_welcome_is_given_up():
     link = session.open_link(0.0)
 
     now, events = tend_until_lost(session, link)
-    assert events == [LinkLost("no welcome")]
-    assert now <= SETTINGS.hello_timeout_s + SETTINGS.silence_s
+    assert events == [ConnectionLost("no welcome")]
+    assert now <= SETTINGS.hello_timeout_s + SETTINGS.stall_timeout_s
 
 
 def test_pings_measure_the_offset_and_results_the_two_delays():
@@ -447,7 +447,7 @@ def test_garbage_is_a_protocol_error_and_harms_no_command():
 
 
 def test_an_absurd_move_or_pause_cannot_stop_the_clockwork():
-    session = RobotSession(codec=make_codec("bin"), settings=SETTINGS, sdk="test")
+    session = ClientSession(codec=make_codec("bin"), settings=SETTINGS, sdk="test")
     link = session.open_link(0.0)
     session.adopt(link, 0.0)
     identity = session.submit("pnp", None, now=0.0, deadline_s=1.0)
@@ -457,7 +457,7 @@ def test_an_absurd_move_or_pause_cannot_stop_the_clockwork():
     busy = Failure(id=identity, code="busy", message="", retry_after_ms=math.nan)
     session.receive(link, encode(busy), 0.1)
 
-    assert move == MoveAsked("x", 0.0)
+    assert move == MoveRequested("x", 0.0)
     assert session.next_due(0.1) <= 1.0
     assert set(codes(session.due(1.0))) <= {identity}
     assert session.unanswered == 0

@@ -59,8 +59,12 @@ def _bootstrap(account: Account, settings: PlatformSettings) -> Check:
 
 def _certificate(account: Account, settings: PlatformSettings) -> Check:
     cloud = settings.cloud
-    if cloud.lab:
-        return Check("warn", "cloud.lab is true: no TLS", "for more than trials, set cloud.lab to false")
+    if cloud.allow_insecure:
+        return Check(
+            "warn",
+            "cloud.allow_insecure is true: no TLS",
+            "for more than trials, set cloud.allow_insecure to false",
+        )
     parts = cloud.certificate_arn.split(":")
     if len(parts) < 6 or parts[2:4] != ["acm", account.region]:
         return Check(

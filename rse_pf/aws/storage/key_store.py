@@ -74,7 +74,7 @@ class KeyRing:
             ConfigurationError: The rotation before this one is not over yet.
         """
         _, from_s = self.keys[-1]
-        old_tokens_over = from_s + settings.auth.token_life_s + settings.auth.leeway_s
+        old_tokens_over = from_s + settings.auth.token_ttl_s + settings.auth.leeway_s
         if len(self.keys) > 1 and now < old_tokens_over:
             raise ConfigurationError(
                 f"tokens of the key before are good for {old_tokens_over - now:.0f} s more",
@@ -136,7 +136,7 @@ class KeyStore:
 
     def publish(self, ring: KeyRing) -> None:
         """Write the public half, which servers fetch within `spread_s`, and furnish the control room."""
-        self.control_room().furnish()
+        self.control_room().create_missing()
         self._bucket.put(KEYS_NAME, ring.key_set().to_json().encode())
 
 

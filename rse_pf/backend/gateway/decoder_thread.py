@@ -36,7 +36,7 @@ class DecoderThread:
         self.short_bytes = serving.inline_bytes
         """A message up to this size, on the wire, is tried in the event loop."""
         self.short_inflated_bytes = _INFLATED * serving.inline_bytes
-        self._max_bytes = serving.unread_bytes
+        self._max_bytes = serving.max_unread_bytes
         self._call = call_soon_threadsafe
         self._bytes = 0
         self._count = 0

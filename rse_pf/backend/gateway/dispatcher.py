@@ -87,7 +87,7 @@ class Dispatcher:
         self._scheduler = Scheduler(settings.serving)
         self._waits = LongestRecently()
         self._gate = CpuThrottle(
-            settings.serving.size,
+            settings.serving.emulated_cores,
             settings.serving.size_burst_ms / 1e3,
             now=clocks.monotonic(),
             cpu_s=clocks.cpu(),

@@ -78,7 +78,7 @@ class HandshakePolicy:
             503, "full", "this server has no room for another robot", "try again later",
             Retry_After=str(_RETRY_AFTER_S),
         )  # fmt: skip
-        rest_s = settings.session.rate_rest_s
+        rest_s = settings.session.rate_ban_s
         self.too_fast = _refusal(
             429, "quota", "too many messages, or handshakes of this address", "wait, and slow down",
             Retry_After=str(max(1, math.ceil(rest_s))),

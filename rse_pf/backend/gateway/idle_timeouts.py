@@ -2,7 +2,7 @@
 
 Silence is the robot's, not the worker's: what the worker slept does not count, and nobody is given up before
 what the kernel holds of him was read.  A socket is so noticed within a tick of its limit, which is far below
-what `session.ping_patience_s` allows.  Promises no clock and no loop: times go in, closes come out.
+what `session.ping_timeout_s` allows.  Promises no clock and no loop: times go in, closes come out.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ _SLEPT_S = 1.0
 
 def longest_silence_s(settings: SessionSettings) -> float:
     """Return how long a robot may say nothing: it pings in time, and its ping may take a while."""
-    return settings.ping_interval_s + settings.ping_patience_s
+    return settings.ping_interval_s + settings.ping_timeout_s
 
 
 class IdleTimeouts:

@@ -13,9 +13,9 @@ from dataclasses import dataclass, field
 from typing import Generic, TypeVar
 
 from rse_pf.config import ServingSettings, SessionSettings
-from rse_pf.wire.rate_limit import Bucket
+from rse_pf.wire.rate_limit import TokenBucket
 
-__all__ = ["Bucket", "CutOff", "PendingHandshakes", "RobotRates", "SourceRates", "TooFast"]
+__all__ = ["TokenBucket", "CutOff", "PendingHandshakes", "RobotRates", "SourceRates", "TooFast"]
 
 _MAX_NAMES = 20000
 """Names kept at a time; whoever had no reason to be remembered is forgotten first."""
@@ -39,7 +39,7 @@ class CutOff:
 
 @dataclass(slots=True)
 class _Robot:
-    bucket: Bucket
+    bucket: TokenBucket
     refused: int = 0
     strikes: deque[float] = field(default_factory=deque)
     rests_until: float = -math.inf
@@ -71,9 +71,9 @@ class RobotRates:
         wait_s = known.bucket.take(now)
         if wait_s == 0.0:
             return None
-        if self._strikes(known, now) >= self._limits.rate_strikes:
+        if self._strikes(known, now) >= self._limits.max_rate_violations:
             known.strikes.clear()
-            known.rests_until = now + self._limits.rate_rest_s
+            known.rests_until = now + self._limits.rate_ban_s
             return CutOff()
         return TooFast(max(_MIN_RETRY_MS, wait_s * 1e3))
 
@@ -82,7 +82,7 @@ class RobotRates:
         known = self._robots.get(robot)
         if known is None:
             known = self._robots[robot] = self._new(now)
-        known.rests_until = now + self._limits.rate_rest_s
+        known.rests_until = now + self._limits.rate_ban_s
 
     def rests_s(self, robot: tuple[str, str], now: float) -> float:
         """Return for how many seconds more *robot*, cut off before, is not let in."""
@@ -107,7 +107,7 @@ class RobotRates:
                     if each.strikes or each.rests_until > now or not each.bucket.is_full(now)
                 }
             )
-        return _Robot(Bucket(self._limits.max_commands_per_s, float(self._limits.command_burst)))
+        return _Robot(TokenBucket(self._limits.max_commands_per_s, float(self._limits.command_burst)))
 
 
 class SourceRates:
@@ -115,18 +115,18 @@ class SourceRates:
 
     def __init__(self, serving: ServingSettings) -> None:
         self._serving = serving
-        self._sources: dict[str, Bucket] = {}
+        self._sources: dict[str, TokenBucket] = {}
 
     def wait_s(self, source: str, now: float) -> float:
         """Return 0 if *source* may shake hands at *now* (s), else the seconds until it may."""
-        rate = self._serving.handshakes_per_source_per_s
+        rate = self._serving.max_handshakes_per_source_per_s
         if rate <= 0:
             return 0.0
         bucket = self._sources.get(source)
         if bucket is None:
             if len(self._sources) >= _MAX_NAMES:
                 self._sources = _half({name: b for name, b in self._sources.items() if not b.is_full(now)})
-            bucket = self._sources[source] = Bucket(rate, float(self._serving.handshake_burst))
+            bucket = self._sources[source] = TokenBucket(rate, float(self._serving.handshake_burst))
         return bucket.take(now)
 
     def source(self, peer: str, forwarded_for: str) -> str:

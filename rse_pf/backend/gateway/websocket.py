@@ -193,9 +193,7 @@ class RobotSockets:
         )
         if self._sources.wait_s(source, now) > 0:
             return self._door.too_fast
-        connection = [
-            word.strip().lower() for word in ",".join(headers.getall("Connection", [])).split(",")
-        ]
+        connection = [word.strip().lower() for word in ",".join(headers.getall("Connection", [])).split(",")]
         if "upgrade" in connection:
             headers["Connection"] = "upgrade"
         offered = ",".join(headers.getall("Sec-WebSocket-Protocol", [])).split(",")
@@ -306,7 +304,7 @@ def _listener_type(picows: Any, loop: asyncio.AbstractEventLoop, serving: Servin
 
         def pause_writing(self) -> None:
             if self._cut is None:
-                self._cut = loop.call_later(serving.slow_reader_s, self._cut_off)
+                self._cut = loop.call_later(serving.slow_reader_timeout_s, self._cut_off)
                 # Who does not read its answers is not heard: they would be made for nobody.
                 self.hold()
 

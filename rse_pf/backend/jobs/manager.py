@@ -105,7 +105,10 @@ class JobManager:
         self._entries: dict[tuple[str, str, str], _Entry] = {}
         self._leaving = False
         self._sweep = RecordCollector(
-            context.store, life_s=settings.serving.job_record_s, clock=context.clock, wall_clock=wall_clock
+            context.store,
+            life_s=settings.serving.job_record_ttl_s,
+            clock=context.clock,
+            wall_clock=wall_clock,
         )
         plain = settings.to_dict()
         chosen = json.dumps([plain["services"], plain["pnp"]], sort_keys=True)
@@ -179,7 +182,7 @@ class JobManager:
     def _has_room(self, wanted: JobRequest) -> bool:
         """Return whether one more job may wait; another robot's newest may have to come again for it."""
         here = [entry for entry in self._entries.values() if not entry.signals.giving_up]
-        if len(here) < self._serving.jobs + self._serving.jobs_waiting:
+        if len(here) < self._serving.max_running_jobs + self._serving.max_waiting_jobs:
             return True
         jobs = [((entry.wanted.tenant, entry.wanted.robot), entry.what == WAITS) for entry in here]
         row = who_makes_room(jobs, (wanted.tenant, wanted.robot))

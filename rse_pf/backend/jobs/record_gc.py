@@ -38,7 +38,7 @@ class RecordCollector:
 
         Args:
             store: Shared by all servers; their sweeps do not disturb each other.
-            life_s: ``serving.job_record_s``.
+            life_s: ``serving.job_record_ttl_s``.
             clock: Monotonic seconds.
             wall_clock: Unix seconds; may differ between machines by far less than *life_s*.
         """

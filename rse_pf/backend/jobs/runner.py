@@ -182,7 +182,7 @@ def _pursue(
         )
         if verdict == "follow" and record is not None:
             tell(record.share, record.what)
-            signals.rest(serving.job_beat_s * _POLL_SHARE)
+            signals.rest(serving.job_heartbeat_s * _POLL_SHARE)
             continue
         if verdict == "failed" and record is not None:
             return JobOutcome(error=error_from_code(record.code, record.message, hint=record.hint))
@@ -250,7 +250,7 @@ class _Run:
         if why == "cancelled":
             return self._failed(_cancelled())
         if why == "late":
-            longest_s = self._context.settings.job_longest_s
+            longest_s = self._context.settings.max_job_s
             return self._failed(
                 Expired(f"the job took longer than {longest_s:g} s", hint="send less at once")
             )
@@ -267,7 +267,7 @@ class _Run:
         """Listen to the process and renew the lease until one of them ends it."""
         serving, clock, signals = self._context.settings, self._context.clock, self._signals
         began = renewed = clock()
-        next_beat, killed_s = began + serving.job_beat_s, float("inf")
+        next_beat, killed_s = began + serving.job_heartbeat_s, float("inf")
         while not self._is_over:
             now = clock()
             if signals.giving_up:
@@ -277,10 +277,10 @@ class _Run:
                 killed_s = now + _PATIENCE_S
             if now >= killed_s:
                 return "cancelled"
-            if now - began >= serving.job_longest_s:
+            if now - began >= serving.max_job_s:
                 return "late"
             if now >= next_beat:
-                next_beat = now + serving.job_beat_s
+                next_beat = now + serving.job_heartbeat_s
                 if self._renew():
                     renewed = clock()
                 elif not self._lease.is_ours or clock() - renewed >= serving.job_lease_s:

@@ -63,7 +63,7 @@ def spawner(services: str, settings: PlatformSettings) -> Callable[[JobRequest],
         return JobProcess(
             {
                 "worker": os.getpid(), "services": services, "settings": plain,
-                "memory_bytes": settings.serving.job_memory_bytes, "service": wanted.service,
+                "memory_bytes": settings.serving.max_job_memory_bytes, "service": wanted.service,
                 "payload": wanted.payload, "tenant": wanted.tenant, "robot": wanted.robot,
                 "quota_bytes": wanted.quota_bytes, "inline_bytes": settings.session.max_message_bytes // 2,
             }

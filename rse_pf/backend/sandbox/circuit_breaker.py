@@ -29,7 +29,7 @@ class CircuitBreaker:
 
     def verdict(self, service: str, digest: str, now: float) -> Verdict:
         """Say whether a request with this digest may run now."""
-        if self._deaths_of_request.get(digest, 0) >= self._settings.poison_deaths:
+        if self._deaths_of_request.get(digest, 0) >= self._settings.poison_crashes:
             return "poison"
         return "quarantined" if self.rests_s(service, now) > 0 else "run"
 
@@ -38,11 +38,11 @@ class CircuitBreaker:
         self._deaths_of_request[digest] = self._deaths_of_request.pop(digest, 0) + 1
         if len(self._deaths_of_request) > _MAX_DIGESTS:
             self._deaths_of_request.popitem(last=False)
-        deaths = self._deaths_of_service.setdefault(service, deque(maxlen=self._settings.crash_loop_deaths))
+        deaths = self._deaths_of_service.setdefault(service, deque(maxlen=self._settings.breaker_crashes))
         deaths.append(now)
-        full = len(deaths) == self._settings.crash_loop_deaths
-        if full and now - deaths[0] <= self._settings.crash_loop_s:
-            self._until[service] = now + self._settings.quarantine_s
+        full = len(deaths) == self._settings.breaker_crashes
+        if full and now - deaths[0] <= self._settings.breaker_window_s:
+            self._until[service] = now + self._settings.breaker_open_s
             deaths.clear()
 
     def rests_s(self, service: str, now: float) -> float:

@@ -201,7 +201,7 @@ class SandboxManager:
             return
         if environment is None:
             environment = self._create(job.robot)
-        if len(environment.waiting) >= self._settings.serving.queue_per_robot:
+        if len(environment.waiting) >= self._settings.serving.max_queue_per_robot:
             busy = Busy(
                 "too many commands of this robot wait", hint="wait for answers", retry_after_ms=_BUSY_RETRY_MS
             )

@@ -85,8 +85,8 @@ class Scheduler:
         self.is_behind = False
         self._target_s = settings.queue_target_ms / 1e3
         self._interval_s = settings.queue_interval_ms / 1e3
-        self._max_waiting = settings.queue_per_robot
-        self._is_serial = settings.solver_threads == 1 or 0 < settings.size <= 1
+        self._max_waiting = settings.max_queue_per_robot
+        self._is_serial = settings.solver_threads == 1 or 0 < settings.emulated_cores <= 1
         self._robots: dict[str, _Robot] = {}
         self._round: deque[str] = deque()
         self._late_since: float | None = None

@@ -90,12 +90,12 @@ def serve(
         ConfigurationError: An open door on a public address, no keys, or the port is taken.
     """
     if trust is not None:
-        trust.first()
+        trust.load()
         keys = trust.keys
     check_open_door(settings, keys, conformance_echo)
     raise_descriptor_limit()
     count = settings.serving.workers or len(os.sched_getaffinity(0))
-    slots = make_pipe(settings.serving.jobs)
+    slots = make_pipe(settings.serving.max_running_jobs)
     plans = [
         WorkerPlan(
             settings=settings, keys=keys if settings.auth.required else None, server_id=server_id,
@@ -149,7 +149,7 @@ class _Supervisor:
         self._signals = 0
         self._accepted = self._refused_full = 0
         self._trust = trust if settings.auth.required else None
-        self._accepts = Bucket(settings.serving.accepts_per_s, float(settings.serving.handshake_burst))
+        self._accepts = Bucket(settings.serving.max_accepts_per_s, float(settings.serving.handshake_burst))
         self._accept_pauses = self._control_refused = 0
         self._control_token = control_token
         self._log = JsonLog(level=settings.serving.log_level, server=server_id, wall_clock=time.time)
@@ -208,7 +208,7 @@ class _Supervisor:
                 await everything
             self._finish(_EXIT_LOST)
             return
-        self._listener.listen(self._settings.serving.backlog)
+        self._listener.listen(self._settings.serving.listen_backlog)
         loop.add_reader(self._listener.fileno(), self._accept_some)
         self._state = "ready"
         if self._announce is not None:
@@ -401,7 +401,7 @@ class _Supervisor:
                 "cpu_s": self._cpu_s(),
                 "worker_cpu_s": [cpu_seconds(worker.pid) for worker in self._workers],
                 "resident_bytes": sum(map(resident_bytes, self._pids())),
-                "size": self._settings.serving.size,
+                "emulated_cores": self._settings.serving.emulated_cores,
                 "settings": self._digest,
                 "isolation": merge_isolation(worker.report for worker in self._workers),
             }

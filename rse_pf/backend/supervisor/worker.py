@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 from rse_pf.auth.tokens import KeySet
-from rse_pf.auth.trust_store import key_set_of
+from rse_pf.auth.trust_store import key_set_from_snapshot
 from rse_pf.backend.gateway.audit_recorder import AuditRecorder
 from rse_pf.backend.gateway.dispatcher import Dispatcher
 from rse_pf.backend.gateway.handshake import HandshakePolicy
@@ -125,7 +125,7 @@ class _Worker:
             )
         if settings.services.folder or settings.services.published:
             self._core.environments = self._environments(settings, plan.server_id, plan.workers)
-        if settings.serving.jobs:
+        if settings.serving.max_running_jobs:
             self._core.jobs = self._jobs(settings, plan)
         self._hand_over = Migration(
             self._core.connections, timers=loop, now=time.monotonic, choose=secrets.choice
@@ -158,7 +158,7 @@ class _Worker:
         return SandboxManager(
             services,
             settings=settings,
-            most=-(-settings.services.max_environments // workers),
+            most=-(-settings.services.max_sandboxes // workers),
             server_id=server,
             store=open_job_store(settings),
             monotonic=time.monotonic,
@@ -216,7 +216,7 @@ class _Worker:
 
     def _obey_trust(self, order: Mapping[str, Any]) -> None:
         if order["text"]:
-            self._standing.trust(key_set_of(order["text"]))
+            self._standing.trust(key_set_from_snapshot(order["text"]))
 
     def _report(self) -> dict[str, Any]:
         report = self._core.snapshot()

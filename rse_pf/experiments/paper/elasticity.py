@@ -75,7 +75,9 @@ def run_elasticity(options: ElasticityOptions, settings: PlatformSettings) -> in
     for part, _ in runs.values():
         part.mkdir(exist_ok=True)
     size, cost = asyncio.run(_size(options, settings, folder))
-    chosen = settings.replace(serving={"size": size}, local={"servers": settings.scaling.min_servers})
+    chosen = settings.replace(
+        serving={"emulated_cores": size}, local={"servers": settings.scaling.min_servers}
+    )
     for part, rebalance in runs.values():
         asyncio.run(_run(options, chosen, part, rebalance))
     records = {name: read_records(part) for name, (part, _) in runs.items()}
@@ -130,7 +132,7 @@ async def _size(
 
 async def _measure(options: ElasticityOptions, settings: PlatformSettings, folder: Path) -> Cost:
     """Return what a command costs one server without an emulated size, under the robots' own load."""
-    chosen = settings.replace(serving={"size": 0.0})
+    chosen = settings.replace(serving={"emulated_cores": 0.0})
     robots = min(options.robots, _CALIBRATION_ROBOTS)
     asked = {"kind": "calibration", "robots": robots, "fps": options.fps}
     async with Harness(folder, chosen, asked, elastic=False, servers=1) as stage:

@@ -75,5 +75,5 @@ def policy_of(settings: PlatformSettings, compress: float) -> dict[str, Any]:
         "busy_periods": scaling.busy_periods,
         "period_s": scaling.period_s / compress,
         "idle_s": scaling.idle_s / compress,
-        "size": settings.serving.size,
+        "size": settings.serving.emulated_cores,
     }

@@ -100,7 +100,7 @@ async def _run(
     seconds = scenario.seconds / options.speed
     if scenario.needs_link:  # a cut must outlast the robots' patience to be one
         session = settings.session
-        seconds = max(seconds, 2 * (session.ping_interval_s + session.ping_patience_s))
+        seconds = max(seconds, 2 * (session.ping_interval_s + session.ping_timeout_s))
     asked = {
         "kind": "robustness",
         "scenario": name,

@@ -177,7 +177,7 @@ def _kernel_buffer(name: int, settings: PlatformSettings) -> dict[str, Any]:
 def _unread_timeout(settings: PlatformSettings) -> dict[str, Any]:
     """End a connection whose robot takes nothing: with what it did not read, Envoy would keep it for ever."""
     session = settings.session
-    max_ms = int(2e3 * (session.ping_interval_s + session.ping_patience_s))
+    max_ms = int(2e3 * (session.ping_interval_s + session.ping_timeout_s))
     return {"level": _IPPROTO_TCP, "name": _TCP_USER_TIMEOUT, "int_value": max_ms, "state": "STATE_PREBIND"}
 
 

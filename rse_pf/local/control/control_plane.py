@@ -66,7 +66,7 @@ class ControlPlane:
         self.modifier = LocalScaleModifier(
             fleet,
             scaling,
-            restarts_per_minute=settings.local.restarts_per_minute,
+            max_restarts_per_minute=settings.local.max_restarts_per_minute,
             compress=compress,
             tell=tell,
         )

@@ -374,7 +374,7 @@ class Fleet:
 
     def _lost(self, member: Member) -> None:
         lived_s = math.inf if member.healthy_s is None else time.monotonic() - member.healthy_s
-        self.dead[member.name] = member.healthy_s is None or lived_s < self._settings.local.young_s
+        self.dead[member.name] = member.healthy_s is None or lived_s < self._settings.local.min_uptime_s
         self.on_lost()
 
     def _set_targets(self) -> None:

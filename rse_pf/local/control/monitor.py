@@ -88,8 +88,8 @@ def reading_every_s(period_s: float) -> float:
 
 def capacity_cores(serving: ServingSettings, workers: int, machine_cores: int) -> float:
     """Return the CPU seconds per second that count as 100 % of a server."""
-    if serving.size > 0:
-        return serving.size * workers
+    if serving.emulated_cores > 0:
+        return serving.emulated_cores * workers
     return float(min(workers, machine_cores))
 
 

@@ -82,13 +82,13 @@ class LocalScaleModifier:
         servers: Servers,
         settings: ScalingSettings,
         *,
-        restarts_per_minute: int,
+        max_restarts_per_minute: int,
         compress: float = 1.0,
         tell: Callable[..., None],
     ) -> None:
         self._servers = servers
         self._settings = settings
-        self._restarts_per_minute = restarts_per_minute
+        self._restarts_per_minute = max_restarts_per_minute
         self._compress = compress
         self._tell = tell
         self._acted_s = -math.inf

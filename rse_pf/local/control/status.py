@@ -115,7 +115,7 @@ async def _server(server: ServerState, token: str | None, sample_s: float) -> di
     finally:
         port.close()
     workers = len(second["workers"])
-    cores = second["size"] * workers if second["size"] else workers
+    cores = second["emulated_cores"] * workers if second["emulated_cores"] else workers
     return {
         **known,
         **{key: second[key] for key in ("state", "robots", "queue", "queue_ms", "in_flight", "moved")},

@@ -81,7 +81,7 @@ class LocalBackendServers:
         self._processes: dict[str, subprocess.Popen[bytes]] = {}
         self._marks: dict[str, ProcessMark] = {}
         self._spare: WarmStandby | None = None
-        if self._program == RSE_PF and settings.local.spare:
+        if self._program == RSE_PF and settings.local.warm_standby:
             self._spare = WarmStandby(folder, dies_with_parent=dies_with_parent)
 
     @property

@@ -57,7 +57,9 @@ def bootstrap(region: str) -> None:
 
 
 def public(certificate: str, domain: str = "robots.example.org") -> PlatformSettings:
-    return SETTINGS.replace(cloud={"lab": False, "certificate_arn": certificate, "domain_name": domain})
+    return SETTINGS.replace(
+        cloud={"allow_insecure": False, "certificate_arn": certificate, "domain_name": domain}
+    )
 
 
 def test_an_account_with_room_is_ready_and_every_complaint_has_a_fix(region: str) -> None:

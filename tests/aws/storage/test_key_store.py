@@ -81,18 +81,18 @@ def test_a_new_key_signs_only_when_every_server_knows_it() -> None:
 def test_tokens_are_good_all_through_a_rotation() -> None:
     before = ring("a")
     rotated = before.rotated(key("b"), now=BORN_S, settings=SETTINGS)
-    for at_s in range(0, 2 * AUTH.token_life_s, 30):
+    for at_s in range(0, 2 * AUTH.token_ttl_s, 30):
         now = BORN_S + at_s
         token = rotated.signer(now).issue("robot-1", now=now, token_id="t", settings=AUTH)
         known = before if at_s < spread_s(SETTINGS) else rotated  # the slowest server
 
         assert is_trusted(token, known, now), at_s
-        assert is_trusted(token, rotated, now + AUTH.token_life_s), at_s
+        assert is_trusted(token, rotated, now + AUTH.token_ttl_s), at_s
 
 
 def test_the_old_key_stays_until_its_last_token_is_over() -> None:
     rotated = ring("a").rotated(key("b"), now=BORN_S, settings=SETTINGS)
-    over_s = BORN_S + spread_s(SETTINGS) + AUTH.token_life_s + AUTH.leeway_s
+    over_s = BORN_S + spread_s(SETTINGS) + AUTH.token_ttl_s + AUTH.leeway_s
 
     with pytest.raises(ConfigurationError, match="1 s more"):
         rotated.rotated(key("c"), now=over_s - 1, settings=SETTINGS)

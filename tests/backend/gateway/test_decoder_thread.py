@@ -169,7 +169,7 @@ def test_three_long_bombs_end_the_socket_and_the_robot_rests(loop, reading):
 
     assert wire.closed == (4400, "too many bad messages")
     assert wire.pauses == pytest.approx([5 * limits.bad_message_pause_s, 10 * limits.bad_message_pause_s])
-    assert core.rates.rests_s(("default", "r"), 50.0) == limits.rate_rest_s
+    assert core.rates.rests_s(("default", "r"), 50.0) == limits.rate_ban_s
     assert core.rates.rests_s(("default", "r2"), 50.0) == 0
 
 
@@ -219,7 +219,7 @@ def test_who_sent_garbage_before_is_read_last_whatever_came_first(loop, reading)
 def test_bytes_that_wait_are_bounded_and_suspects_get_a_quarter(loop):
     most = 1_000_000
     reading = DecoderThread(
-        replace(SETTINGS.serving, unread_bytes=most), call_soon_threadsafe=loop.call_soon_threadsafe
+        replace(SETTINGS.serving, max_unread_bytes=most), call_soon_threadsafe=loop.call_soon_threadsafe
     )
     codec = Held()
 

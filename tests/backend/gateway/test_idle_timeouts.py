@@ -153,7 +153,7 @@ def test_a_look_costs_a_few_a_second_and_not_more():
 @pytest.mark.parametrize("interval_s", [0.05, 0.5, 2.0])
 @pytest.mark.parametrize("hello_s", [0.2, 5.0])
 def test_the_limit_follows_the_settings(interval_s, hello_s):
-    settings = SessionSettings(ping_interval_s=interval_s, ping_patience_s=1.0, hello_timeout_s=hello_s)
+    settings = SessionSettings(ping_interval_s=interval_s, ping_timeout_s=1.0, hello_timeout_s=hello_s)
     robot = Socket()
 
     noticed_s = closed_at(Worker(robot, settings=settings), robot)

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from rse_pf.backend.gateway import rate_limits as limits
 from rse_pf.backend.gateway.rate_limits import (
-    Bucket,
+    TokenBucket,
     CutOff,
     PendingHandshakes,
     RobotRates,
@@ -19,7 +19,7 @@ from rse_pf.config import ServingSettings, SessionSettings
 
 ROBOT = ("default", "r")
 LIMITS = SessionSettings(
-    max_commands_per_s=20.0, command_burst=40, rate_strikes=3, rate_window_s=10.0, rate_rest_s=5.0
+    max_commands_per_s=20.0, command_burst=40, max_rate_violations=3, rate_window_s=10.0, rate_ban_s=5.0
 )
 
 
@@ -28,7 +28,7 @@ def judged(rates: RobotRates, per_s: float, seconds: float, robot: tuple[str, st
 
 
 def test_a_bucket_gives_its_burst_then_its_rate():
-    bucket = Bucket(10.0, 3.0)
+    bucket = TokenBucket(10.0, 3.0)
 
     assert [bucket.take(5.0) for _ in range(3)] == [0.0, 0.0, 0.0]
     assert bucket.take(5.0) == pytest.approx(0.1)
@@ -41,7 +41,7 @@ def test_a_bucket_gives_its_burst_then_its_rate():
     burst=st.integers(1, 50),
 )
 def test_no_span_of_time_gives_more_than_burst_and_rate_together(gaps, rate, burst):
-    bucket, now, taken = Bucket(rate, float(burst)), 0.0, []
+    bucket, now, taken = TokenBucket(rate, float(burst)), 0.0, []
     for gap in gaps:
         now += gap
         if bucket.take(now) == 0.0:
@@ -54,7 +54,7 @@ def test_no_span_of_time_gives_more_than_burst_and_rate_together(gaps, rate, bur
 
 @given(gaps=st.lists(st.floats(0.0, 1.0), min_size=1, max_size=200), rate=st.floats(0.5, 50.0))
 def test_who_waits_as_long_as_told_is_served(gaps, rate):
-    bucket, now = Bucket(rate, 2.0), 0.0
+    bucket, now = TokenBucket(rate, 2.0), 0.0
     for gap in gaps:
         now += gap
         wait_s = bucket.take(now)
@@ -64,7 +64,7 @@ def test_who_waits_as_long_as_told_is_served(gaps, rate):
 
 
 def test_a_clock_that_stands_or_goes_back_gives_nothing():
-    bucket = Bucket(10.0, 1.0)
+    bucket = TokenBucket(10.0, 1.0)
     bucket.take(5.0)
 
     assert bucket.take(5.0) > 0
@@ -157,7 +157,7 @@ def test_a_source_is_what_the_first_trusted_proxy_saw(trusted, told, source):
 
 
 def test_a_source_has_a_rate_of_handshakes():
-    sources = SourceRates(ServingSettings(handshakes_per_source_per_s=10.0, handshake_burst=3))
+    sources = SourceRates(ServingSettings(max_handshakes_per_source_per_s=10.0, handshake_burst=3))
 
     assert [sources.wait_s("a", 1.0) > 0 for _ in range(5)] == [False, False, False, True, True]
     assert sources.wait_s("b", 1.0) == 0.0

@@ -54,7 +54,7 @@ class Bench:
     """Jobs with everything around them; time stands still until `advance`."""
 
     def __init__(self, **serving: Any) -> None:
-        self.settings = PlatformSettings.from_dict({"serving": {"job_beat_s": 0.05, **serving}})
+        self.settings = PlatformSettings.from_dict({"serving": {"job_heartbeat_s": 0.05, **serving}})
         self.now = 100.0
         self.calls: queue.SimpleQueue[tuple[Callable[..., object], tuple[Any, ...]]] = queue.SimpleQueue()
         self.started: queue.SimpleQueue[FakeProcess] = queue.SimpleQueue()
@@ -65,7 +65,8 @@ class Bench:
         self.log = JsonLog(level="error", server="s", wall_clock=lambda: 0.0, fd=self._fd)
         self.store = MemoryStore()
         context = JobContext(
-            store=self.store, slots=JobSlots(make_pipe(self.settings.serving.jobs)), server_id="s",
+            store=self.store, server_id="s",
+            slots=JobSlots(make_pipe(self.settings.serving.max_running_jobs)),
             settings=self.settings.serving, quota_bytes=1e6, max_bytes=1000, inline_bytes=100,
             start=self.start, clock=lambda: self.now,
         )  # fmt: skip
@@ -150,7 +151,7 @@ def test_who_asks_for_the_same_job_waits_for_the_same_run(make):
 
 
 def test_the_same_request_of_another_robot_or_tenant_is_another_job(make):
-    bench = make(jobs=3)
+    bench = make(max_running_jobs=3)
     for identity, owner in enumerate((robot(), robot("robot-2"), robot(tenant="another"))):
         ask(bench, owner, identity)
 
@@ -160,7 +161,7 @@ def test_the_same_request_of_another_robot_or_tenant_is_another_job(make):
 
 
 def test_more_jobs_than_may_wait_are_refused_with_when_to_come_again(make):
-    bench, owner = make(jobs_waiting=1), robot()
+    bench, owner = make(max_waiting_jobs=1), robot()
     for identity in range(3):
         ask(bench, owner, identity, value=identity)
 
@@ -170,7 +171,7 @@ def test_more_jobs_than_may_wait_are_refused_with_when_to_come_again(make):
 
 
 def test_a_robot_that_fills_the_line_makes_room_for_another_and_asks_again(make):
-    bench, greedy, modest = make(jobs_waiting=3), robot("greedy"), robot("modest")
+    bench, greedy, modest = make(max_waiting_jobs=3), robot("greedy"), robot("modest")
     ask(bench, greedy, 0, value=0)
     bench.process()
     bench.turn(lambda: bench.advance(0.5) or any(what == "starts" for _, _, what in bench.progress))
@@ -281,7 +282,7 @@ def test_a_leaving_server_answers_nothing_for_the_robot_asks_elsewhere(make):
 
 
 def test_the_end_of_a_job_is_when_old_records_go(make):
-    bench, owner = make(job_record_s=60.0), robot()
+    bench, owner = make(job_record_ttl_s=60.0), robot()
     old = "jobs/default/robot-9/" + "0" * 64
     bench.store.put(old, encode_record(JobRecord(state="done", owner="", marked_s=1.0)))
     ask(bench, owner, 1)

@@ -19,7 +19,7 @@ from rse_pf.config import ServingSettings
 from rse_pf.errors import Conflict, StoreError
 from rse_pf.object_store import MemoryStore, digest_of, object_name
 
-SETTINGS = ServingSettings(job_beat_s=0.05, job_lease_s=0.2)
+SETTINGS = ServingSettings(job_heartbeat_s=0.05, job_lease_s=0.2)
 WANTED = JobRequest(
     service="long", payload={}, tenant="default", robot="robot-1", key="ab" * 32, quota_bytes=1e6
 )

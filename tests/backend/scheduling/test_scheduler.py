@@ -11,7 +11,7 @@ from rse_pf.backend.scheduling.scheduler import QueuedCommand, Scheduler
 from rse_pf.config import ServingSettings
 from rse_pf.wire import Command
 
-SETTINGS = ServingSettings(queue_target_ms=50.0, queue_interval_ms=100.0, queue_per_robot=4)
+SETTINGS = ServingSettings(queue_target_ms=50.0, queue_interval_ms=100.0, max_queue_per_robot=4)
 
 
 def job(
@@ -456,7 +456,7 @@ def test_one_long_pause_does_not_make_the_server_refuse_for_ever():
 
 def test_a_lone_solver_thread_lends_its_work_to_the_loop_only_while_behind():
     alone, pair = Scheduler(SETTINGS), Scheduler(ServingSettings(solver_threads=2))
-    small = Scheduler(ServingSettings(solver_threads=2, size=0.25))
+    small = Scheduler(ServingSettings(solver_threads=2, emulated_cores=0.25))
     for scheduler in (alone, pair, small):
         scheduler.submit(job("a"), 0.0)
         scheduler.submit(job("b"), 0.0)

@@ -17,7 +17,7 @@ from rse_pf.wire import Command, Failure, Result, make_codec
 from rse_pf.wire.client_session import Answered
 from rse_pf.wire.preencoded import prepare
 
-FAST = SessionSettings(reconnect_base_s=0.01, reconnect_max_s=0.05, silence_s=0.4, ping_interval_s=0.2)
+FAST = SessionSettings(reconnect_base_s=0.01, reconnect_max_s=0.05, stall_timeout_s=0.4, ping_interval_s=0.2)
 
 
 def run(work: Coroutine[Any, Any, None]) -> None:
@@ -71,7 +71,7 @@ def test_a_posted_command_is_sent_again_on_the_next_socket_and_ends_once() -> No
             assert isinstance(ends.heard[0].answer, Result)
             assert ends.heard[0].answer.reply == {"value": 7}
             assert robot.stats.resent == 1
-            assert robot.stats.twice == 0
+            assert robot.stats.duplicates == 0
 
     run(work())
 

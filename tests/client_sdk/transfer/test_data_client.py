@@ -289,7 +289,7 @@ class FakeUploads:
 
 
 def uploader(uploads: FakeUploads, folder: Path, **more: object) -> BackgroundUploader:
-    settings = DataSettings(background_bytes_per_s=100_000_000, spool_bytes=4000)
+    settings = DataSettings(background_bytes_per_s=100_000_000, max_spool_bytes=4000)
     return BackgroundUploader(uploads, folder, settings, **more)  # type: ignore[arg-type]
 
 

@@ -140,7 +140,7 @@ def test_connections_and_buffers_are_bounded() -> None:
 
 def test_a_robot_that_takes_nothing_is_ended_by_the_kernel() -> None:
     made = config(
-        serving={"write_buffer_bytes": 65536}, session={"ping_interval_s": 2.0, "ping_patience_s": 1.0}
+        serving={"write_buffer_bytes": 65536}, session={"ping_interval_s": 2.0, "ping_timeout_s": 1.0}
     )
     options = {(each["level"], each["name"]): each["int_value"] for each in listener(made)["socket_options"]}
     (upstream,) = cluster(made)["upstream_bind_config"]["socket_options"]

@@ -71,7 +71,7 @@ def test_a_first_answer_has_no_cpu_and_no_answer_has_no_numbers() -> None:
 def test_a_server_has_the_emulated_size_of_its_workers_or_their_cores(
     size: float, workers: int, cores: int, capacity: float
 ) -> None:
-    assert capacity_cores(ServingSettings(size=size), workers, cores) == capacity
+    assert capacity_cores(ServingSettings(emulated_cores=size), workers, cores) == capacity
 
 
 def test_the_mean_leaves_out_who_warms_up_and_who_does_not_answer() -> None:

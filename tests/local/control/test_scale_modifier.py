@@ -51,7 +51,7 @@ def made(standing: ServerHealth) -> tuple[LocalScaleModifier, FakeServers, list[
     def tell(event: str, **details: Any) -> None:
         told.append({"event": event, **details})
 
-    return LocalScaleModifier(servers, SCALING, restarts_per_minute=5, tell=tell), servers, told
+    return LocalScaleModifier(servers, SCALING, max_restarts_per_minute=5, tell=tell), servers, told
 
 
 def samples(count: int, cpu_percent: float, requests: int = 1) -> list[Sample]:
