@@ -1,13 +1,20 @@
-"""Fakes for tests: a server that speaks the protocol with the real `ServerSession`, on demand badly.
+"""Fakes for tests: an event loop whose time stands still, the wire of a robot, and a server.
 
-It answers ``echo`` through the real `dispatch`; what it does otherwise, a test decides.
+`FakeLoop` behaves as asyncio's loop does (``tests/test_fakes.py`` compares them).  `FakeServer` speaks the
+protocol with the real `ServerSession` and answers ``echo`` through the real `dispatch`; a test can make it
+misbehave.
 """
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
+import heapq
+import itertools
+import select
+import threading
 import time
+from collections import deque
 from collections.abc import AsyncIterator, Callable
 from dataclasses import dataclass, field
 from http import HTTPStatus
@@ -21,8 +28,174 @@ from websockets.http11 import Request, Response
 from rse_pf.config import SessionSettings
 from rse_pf.service import Registry, dispatch
 from rse_pf.services import echo
-from rse_pf.wire import SUBPROTOCOLS, Command, Failure, Result, codec_for, make_codec
+from rse_pf.wire import SUBPROTOCOLS, Codec, Command, Failure, Result, codec_for, make_codec
 from rse_pf.wire.server_session import Close, Send, ServerSession, Submit
+
+
+class FakeTimer:
+    """What `FakeLoop.call_later` returns."""
+
+    def __init__(self, due_s: float, callback: Callable[..., object], args: tuple[Any, ...]) -> None:
+        self.due_s = due_s
+        self._callback = callback
+        self._args = args
+        self._is_cancelled = False
+
+    def cancel(self) -> None:
+        self._is_cancelled = True
+
+    def cancelled(self) -> bool:
+        return self._is_cancelled
+
+    def run(self) -> None:
+        if not self._is_cancelled:
+            self._callback(*self._args)
+
+
+class FakeLoop:
+    """An event loop whose clock moves only when a test calls `advance`.
+
+    Callbacks, timers, descriptors and futures come in the order of asyncio's loop.  An exception of a
+    callback reaches the test.  `run_in_executor` runs its function in the thread of the test, in the next
+    round of the loop.
+    """
+
+    def __init__(self, now: float = 100.0) -> None:
+        self.now = now
+        self._ready: deque[FakeTimer] = deque()
+        self._timers: list[tuple[float, int, FakeTimer]] = []
+        self._numbers = itertools.count()
+        self._watched: dict[tuple[int, int], FakeTimer] = {}
+        self._woken = threading.Event()
+
+    def time(self) -> float:
+        return self.now
+
+    def get_debug(self) -> bool:
+        return False
+
+    def call_soon(self, callback: Callable[..., object], *args: Any, context: Any = None) -> FakeTimer:
+        handle = FakeTimer(self.now, callback, args)
+        self._ready.append(handle)
+        return handle
+
+    def call_soon_threadsafe(self, callback: Callable[..., object], *args: Any) -> FakeTimer:
+        handle = self.call_soon(callback, *args)
+        self._woken.set()
+        return handle
+
+    def call_later(self, delay: float, callback: Callable[..., object], *args: Any) -> FakeTimer:
+        timer = FakeTimer(self.now + delay, callback, args)
+        heapq.heappush(self._timers, (timer.due_s, next(self._numbers), timer))
+        return timer
+
+    def create_future(self) -> asyncio.Future[Any]:
+        return asyncio.Future(loop=self)  # type: ignore[arg-type]
+
+    def run_in_executor(
+        self, executor: None, function: Callable[..., Any], *args: Any
+    ) -> asyncio.Future[Any]:
+        future = self.create_future()
+
+        def work() -> None:
+            try:
+                result = function(*args)
+            except Exception as error:  # noqa: BLE001  it belongs to whoever waits for the future
+                self.call_soon(future.set_exception, error)
+            else:
+                self.call_soon(future.set_result, result)
+
+        self.call_soon(work)
+        return future
+
+    def add_reader(self, fd: int, callback: Callable[..., object], *args: Any) -> None:
+        self._watched[fd, select.POLLIN] = FakeTimer(0.0, callback, args)
+
+    def remove_reader(self, fd: int) -> bool:
+        return self._watched.pop((fd, select.POLLIN), None) is not None
+
+    def add_writer(self, fd: int, callback: Callable[..., object], *args: Any) -> None:
+        self._watched[fd, select.POLLOUT] = FakeTimer(0.0, callback, args)
+
+    def remove_writer(self, fd: int) -> bool:
+        return self._watched.pop((fd, select.POLLOUT), None) is not None
+
+    def turn(self) -> bool:
+        """Run one round: descriptors, timers that are due, callbacks.  Return whether anything ran."""
+        self._poll()
+        return self._run_ready()
+
+    def advance(self, seconds: float = 0.0) -> None:
+        """Let *seconds* pass and run all that becomes due; descriptors are looked at once in each step."""
+        until = self.now + seconds
+        while True:
+            self._poll()
+            while self._run_ready():
+                pass
+            if not self._timers or self._timers[0][0] > until:
+                break
+            self.now = max(self.now, self._timers[0][0])
+        self.now = until
+
+    def run_until(self, condition: Callable[[], object], deadline_s: float = 10.0) -> None:
+        """Run rounds, while time stands still, until threads and descriptors made *condition* true."""
+        deadline = time.monotonic() + deadline_s
+        while not condition():
+            assert time.monotonic() < deadline, "the condition did not come true"
+            if not self.turn():
+                self._woken.wait(0.005)
+                self._woken.clear()
+
+    def _run_ready(self) -> bool:
+        while self._timers and self._timers[0][0] <= self.now:
+            self._ready.append(heapq.heappop(self._timers)[2])
+        count = len(self._ready)
+        for _ in range(count):
+            self._ready.popleft().run()
+        return count > 0
+
+    def _poll(self) -> None:
+        if not self._watched:
+            return
+        poll = select.poll()
+        for fd in {fd for fd, _ in self._watched}:
+            poll.register(fd, sum(event for watched, event in self._watched if watched == fd))
+        for fd, events in poll.poll(0):
+            both = events & (select.POLLHUP | select.POLLERR)
+            for event in (select.POLLIN, select.POLLOUT):
+                handle = self._watched.get((fd, event))
+                if handle is not None and events & (event | both):
+                    self._ready.append(handle)
+
+
+class FakeWire:
+    """The socket of one robot as a worker sees it; keeps what was sent, decoded."""
+
+    def __init__(self, codec: Codec | None = None) -> None:
+        self.sent: list[Any] = []
+        self.closed: tuple[int, str] | None = None
+        self.pauses: list[float] = []
+        self.holds = 0
+        self._codec = codec or make_codec("bin")
+
+    def send(self, data: bytes, is_text: bool) -> None:
+        self.sent.append(self._codec.decode_from_server(data))
+
+    def send_pong(self, data: bytes) -> None:
+        self.sent.append(data)
+
+    def pause(self, seconds: float) -> None:
+        self.pauses.append(seconds)
+
+    def hold(self) -> None:
+        self.holds += 1
+
+    def read_on(self) -> None:
+        self.holds -= 1
+
+    def close(self, code: int, reason: str) -> None:
+        self.closed = (code, reason)
+
 
 Answerer = Callable[["FakeServer", "FakeRobot", Command], Result | Failure | None]
 
