@@ -9,7 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-__all__ = ["Clocks", "Handle", "Loop", "Wire"]
+__all__ = ["Clocks", "Handle", "Log", "Loop", "Wire"]
 
 
 class Wire(Protocol):
@@ -49,6 +49,34 @@ class Loop(Protocol):
 
     def call_soon_threadsafe(self, callback: Callable[..., object], *args: Any) -> object:
         """Call *callback* in the loop's thread."""
+
+    def run_in_executor(self, executor: None, function: Callable[..., Any], *args: Any) -> Any:
+        """Run *function* in a thread and return its future."""
+
+    def add_reader(self, fd: int, callback: Callable[..., object], *args: Any) -> None:
+        """Call *callback* whenever *fd* can be read."""
+
+    def remove_reader(self, fd: int) -> bool:
+        """Stop watching *fd* for reading."""
+
+    def add_writer(self, fd: int, callback: Callable[..., object], *args: Any) -> None:
+        """Call *callback* whenever *fd* can be written."""
+
+    def remove_writer(self, fd: int) -> bool:
+        """Stop watching *fd* for writing."""
+
+
+class Log(Protocol):
+    """Where events go; `rse_pf.backend.log.JsonLog` is one."""
+
+    def info(self, event: str, **fields: Any) -> None:
+        """Write what happened."""
+
+    def warning(self, event: str, **fields: Any) -> None:
+        """Write what an operator should look at."""
+
+    def error(self, event: str, **fields: Any) -> None:
+        """Write a defect."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
