@@ -1,6 +1,6 @@
-"""Small facts of Linux about processes: die with the parent, priority, open files, CPU seconds, memory.
+"""What the project asks Linux about processes, and changes of them: their end, name, priority and limits.
 
-Promises to raise nothing for a process that is gone, and to change no process but its own and its children.
+A process that is gone is no error: it has no CPU seconds and no memory, and its priority cannot be changed.
 """
 
 from __future__ import annotations
@@ -13,31 +13,41 @@ import signal
 from pathlib import Path
 
 __all__ = [
-    "call_this_process", "cpu_seconds", "die_with_parent", "raise_descriptor_limit", "resident_bytes",
-    "step_back",
+    "PR_CAPBSET_DROP", "PR_SET_CHILD_SUBREAPER", "PR_SET_DUMPABLE", "PR_SET_NO_NEW_PRIVS", "PR_SET_SECCOMP",
+    "cpu_seconds", "die_with_parent", "prctl", "raise_descriptor_limit", "resident_bytes",
+    "run_as_batch", "run_when_idle", "set_process_name",
 ]  # fmt: skip
 
-_PR_SET_PDEATHSIG = 1
-_PR_SET_NAME = 15
+PR_SET_DUMPABLE, PR_SET_SECCOMP, PR_CAPBSET_DROP = 4, 22, 24
+PR_SET_CHILD_SUBREAPER, PR_SET_NO_NEW_PRIVS = 36, 38
+_PR_SET_PDEATHSIG, _PR_SET_NAME = 1, 15
 _LOWEST = 19
+_PRCTL = ctypes.CDLL(None, use_errno=True).prctl
+"""Looked up once, at import: a child that was just forked may not take locks."""
 
 
-def die_with_parent(parent: int) -> bool:
-    """Ask Linux to kill this process when *parent* dies; False if it died already."""
-    libc = ctypes.CDLL(None, use_errno=True)
-    libc.prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
-    return os.getppid() == parent
+def prctl(option: int, *arguments: int | bytes | ctypes.Structure) -> int:
+    """Call prctl(2) and return its result, -1 after an error; `ctypes.get_errno` says which."""
+    result: int = _PRCTL(option, *arguments, *[0] * (4 - len(arguments)))
+    return result
 
 
-def call_this_process(name: str) -> None:
+def die_with_parent(parent: int | None = None) -> bool:
+    """Have Linux kill this process when its parent's thread ends; False if *parent* has ended already."""
+    prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+    return parent is None or os.getppid() == parent
+
+
+def set_process_name(name: str) -> None:
     """Let tools like top show *name* for this process, its first 15 bytes."""
-    ctypes.CDLL(None).prctl(_PR_SET_NAME, name.encode(), 0, 0, 0)
+    prctl(_PR_SET_NAME, name.encode())
 
 
 def raise_descriptor_limit() -> None:
-    """Allow this process and its children as many open files as the system lets it."""
-    _, most = resource.getrlimit(resource.RLIMIT_NOFILE)
-    resource.setrlimit(resource.RLIMIT_NOFILE, (most, most))
+    """Allow this process and its children as many open files as the system permits."""
+    _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    with contextlib.suppress(OSError, ValueError):
+        resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
 
 
 def cpu_seconds(pid: int) -> float:
@@ -58,13 +68,24 @@ def resident_bytes(pid: int) -> int:
     return pages * os.sysconf("SC_PAGE_SIZE")
 
 
-def step_back(pid: int) -> None:
-    """Let *pid* (0: this process) run only when nothing else wants to.
+def run_when_idle(pid: int) -> None:
+    """Let *pid* (0: this process) run only when nothing else wants the processor, for good.
 
-    A parent that does it right after the start spares its other children the imports of the new one: a second
-    of CPU for a job.
+    A parent that does this right after the start spares its other children the imports of the new one: a
+    second of CPU for a job.
     """
     with contextlib.suppress(OSError):
         os.setpriority(os.PRIO_PROCESS, pid, _LOWEST)
     with contextlib.suppress(OSError):
         os.sched_setscheduler(pid, os.SCHED_IDLE, os.sched_param(0))
+
+
+def run_as_batch(pid: int, nice: int) -> None:
+    """Let *pid* wait for a processor rather than take one from a process that runs, with niceness *nice*.
+
+    Threads that it starts later inherit both.  The niceness leaves it a share of a machine that is full.
+    """
+    with contextlib.suppress(OSError):
+        os.setpriority(os.PRIO_PROCESS, pid, max(nice, os.getpriority(os.PRIO_PROCESS, 0)))
+        if os.sched_getscheduler(pid) == os.SCHED_OTHER:
+            os.sched_setscheduler(pid, os.SCHED_BATCH, os.sched_param(0))

@@ -12,7 +12,6 @@ import hashlib
 import os
 import re
 import stat
-import tempfile
 import threading
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
@@ -20,6 +19,7 @@ from pathlib import Path
 from typing import BinaryIO, Protocol, runtime_checkable
 
 from rse_pf.errors import Conflict, NotFound, StoreError, StoreFull, UsageError
+from rse_pf.files import OWNER_ONLY, TEMPORARY_PREFIX, replace_file, sync_folder
 
 __all__ = [
     "DirectoryStore",
@@ -39,7 +39,7 @@ __all__ = [
 ]
 
 _PLAIN_SEGMENT = re.compile(r"[a-z0-9][a-z0-9-]{0,63}")
-_LEFT_BEHIND = ".part-*"
+_LEFT_BEHIND = f"{TEMPORARY_PREFIX}*"
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._=-]{0,127}(/[A-Za-z0-9][A-Za-z0-9._=-]{0,127}){0,9}")
 
 
@@ -301,20 +301,7 @@ class DirectoryStore:
 
     @staticmethod
     def _write(path: Path, data: bytes, *, is_durable: bool = True) -> None:
-        handle, temporary = tempfile.mkstemp(prefix=".part-", dir=path.parent)
-        try:
-            with os.fdopen(handle, "wb") as file:
-                file.write(data)
-                file.flush()
-                if is_durable:
-                    os.fsync(file.fileno())
-            os.replace(temporary, path)
-        except BaseException:
-            with contextlib.suppress(FileNotFoundError):
-                os.unlink(temporary)
-            raise
-        if is_durable:
-            _sync_folder(path.parent)
+        replace_file(path, data, mode=OWNER_ONLY, is_durable=is_durable)
 
 
 def _read(path: Path) -> bytes:
@@ -340,15 +327,7 @@ def _make_folder(folder: Path) -> None:
             raise StoreError(
                 f"{each.name!r} is an object, not a folder", hint="choose another name"
             ) from error
-        _sync_folder(each.parent)
-
-
-def _sync_folder(folder: Path) -> None:
-    handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)
+        sync_folder(each.parent)
 
 
 @contextlib.contextmanager

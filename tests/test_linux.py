@@ -8,14 +8,14 @@ import sys
 
 import pytest
 
-from rse_pf.linux import step_back
+from rse_pf.linux import run_when_idle
 
 pytestmark = pytest.mark.system
 
 
 def test_a_child_that_stepped_back_runs_last_before_it_does_anything() -> None:
     with subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as child:
-        step_back(child.pid)
+        run_when_idle(child.pid)
         try:
             assert os.sched_getscheduler(child.pid) == os.SCHED_IDLE
             assert os.getpriority(os.PRIO_PROCESS, child.pid) == 19
@@ -27,4 +27,4 @@ def test_a_process_that_is_gone_is_no_error() -> None:
     child = subprocess.Popen([sys.executable, "-c", ""])
     child.wait()
 
-    step_back(child.pid)
+    run_when_idle(child.pid)

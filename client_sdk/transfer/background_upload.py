@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-import os
 import threading
 import time
 from collections.abc import Callable
@@ -18,6 +17,7 @@ from typing import Protocol
 
 from rse_pf.config import DataSettings
 from rse_pf.errors import BadRequest, LimitExceeded, RsePfError, UsageError
+from rse_pf.files import replace_file
 
 __all__ = ["BackgroundUploader", "UploadRate"]
 
@@ -114,12 +114,9 @@ class BackgroundUploader:
                 return None
             name = f"{self._next:012d}-{digest[:16]}.keyframe"
             self._next += 1
-            temporary = self._folder / f".{name}"
             try:
-                temporary.write_bytes(data)
-                os.replace(temporary, self._folder / name)
+                replace_file(self._folder / name, data)
             except OSError as error:
-                temporary.unlink(missing_ok=True)
                 self.dropped += 1
                 self.last_error = str(error)
                 return None

@@ -8,17 +8,15 @@ refusal tells nothing about it.
 from __future__ import annotations
 
 import hmac
-import os
 import re
-import stat
 from pathlib import Path
 
 from rse_pf.errors import UsageError
+from rse_pf.files import OWNER_ONLY, read_private_file, replace_file
 
 __all__ = ["bearer", "ensure_control_token", "is_carried", "read_control_token"]
 
 _TOKEN = re.compile(rb"[0-9a-fA-F]{32,256}")
-_MAX_BYTES = 1024
 _MAKE = "make one: (umask 077; openssl rand -hex 32 > FILE)"
 
 
@@ -41,15 +39,7 @@ def read_control_token(path: Path) -> str:
         UsageError: There is no such file, others may read it, or it holds less than 32 hexadecimal letters
             or anything else beside them.
     """
-    try:
-        with open(os.open(path, os.O_RDONLY | os.O_NONBLOCK), "rb") as file:  # a pipe must not hold us up
-            mode = os.fstat(file.fileno()).st_mode
-            text = file.read(_MAX_BYTES) if stat.S_ISREG(mode) else b""
-    except OSError as error:
-        raise UsageError(f"cannot read the control token {path}: {error.strerror}", hint=_MAKE) from error
-    if stat.S_IMODE(mode) & 0o077:
-        raise UsageError(f"others may read the control token {path}", hint=f"chmod 600 {path}")
-    token = text.strip()
+    token = read_private_file(path, "the control token", hint=_MAKE).strip()
     if not _TOKEN.fullmatch(token):
         raise UsageError(f"{path} holds no control token of 32 to 256 hexadecimal letters", hint=_MAKE)
     return token.decode("ascii")
@@ -65,9 +55,5 @@ def ensure_control_token(path: Path, *, seed: bytes) -> str:
         OSError: The file cannot be made.
     """
     if not path.exists():
-        temporary = path.with_name(f".{path.name}")
-        temporary.unlink(missing_ok=True)
-        with open(os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w") as file:
-            file.write(f"{seed.hex()}\n")
-        temporary.replace(path)
+        replace_file(path, f"{seed.hex()}\n", mode=OWNER_ONLY)
     return read_control_token(path)

@@ -7,9 +7,7 @@ Promises to make nothing that lives longer than a token may, and to read one fil
 
 from __future__ import annotations
 
-import os
 import secrets
-import stat
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -17,6 +15,7 @@ from pathlib import Path
 from rse_pf.auth.tokens import SigningKey
 from rse_pf.config import AuthSettings
 from rse_pf.errors import UsageError
+from rse_pf.files import create_private_file, read_private_file
 
 __all__ = ["RobotKey", "make_robot_key"]
 
@@ -49,7 +48,8 @@ class RobotKey:
 
     async def token(self) -> str:
         """Return a fresh token; raises UsageError if the file holds no key of its owner alone."""
-        key = _read(self._path)
+        hint = "make one with rse-pf robot keygen"
+        key = SigningKey.from_json(read_private_file(self._path, "the key", hint=hint))
         token_id = secrets.token_hex(_ID_BYTES)
         return key.issue(self._robot, now=self._clock(), token_id=token_id, settings=self._settings)
 
@@ -62,26 +62,9 @@ def make_robot_key(path: Path) -> str:
     """
     key = SigningKey.of_robot(secrets.token_bytes(_SEED_BYTES))
     try:
-        handle = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW, 0o600)
+        create_private_file(path, key.to_json())
     except FileExistsError as error:
         raise UsageError(f"there is a file {path} already", hint="name another with --out") from error
     except OSError as error:
         raise UsageError(f"cannot write {path}: {error.strerror}", hint="name another with --out") from error
-    with os.fdopen(handle, "w", encoding="utf-8") as file:
-        file.write(key.to_json())
-        file.flush()
-        os.fsync(handle)
     return key.public_json()
-
-
-def _read(path: Path) -> SigningKey:
-    hint = "make one with rse-pf robot keygen"
-    try:
-        with path.open(encoding="utf-8") as file:
-            mode = os.fstat(file.fileno()).st_mode
-            text = file.read()
-    except (OSError, UnicodeDecodeError) as error:
-        raise UsageError(f"cannot read the key {path}", hint=hint) from error
-    if stat.S_IMODE(mode) & 0o077:
-        raise UsageError(f"others may read the key {path}", hint=f"chmod 600 {path}")
-    return SigningKey.from_json(text)

@@ -19,7 +19,6 @@ from __future__ import annotations
 import argparse
 import contextlib
 import json
-import os
 import threading
 import time
 from collections import Counter
@@ -33,6 +32,7 @@ from rse_pf.cli.data import open_any_store
 from rse_pf.cli.operator import record_map_change
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import NotFound, UsageError
+from rse_pf.files import replace_file
 from rse_pf.maps.export import FORMATS, export_map
 from rse_pf.maps.registry import MapRecord, MapRegistry, difference
 
@@ -236,9 +236,7 @@ def _export(args: argparse.Namespace, maps: MapRegistry) -> None:
     if not args.out.absolute().parent.is_dir():
         raise UsageError(f"there is no folder {args.out.absolute().parent}", hint="make it")
     data = export_map(maps.load(args.name, args.version), args.format, args.robot)
-    temporary = args.out.with_name(f".{args.out.name}.{os.getpid()}")
-    temporary.write_bytes(data)
-    os.replace(temporary, args.out)
+    replace_file(args.out, data)
     if args.json:
         _print_json({"file": str(args.out), "bytes": len(data)})
     else:

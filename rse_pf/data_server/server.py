@@ -7,7 +7,6 @@ with what it is doing done, at most `local.stop_timeout_s` later.
 from __future__ import annotations
 
 import asyncio
-import json
 import os
 import signal
 import socket
@@ -25,6 +24,7 @@ from rse_pf.auth.trust_store import TrustStore
 from rse_pf.config import PlatformSettings
 from rse_pf.data_server.app import DataServer
 from rse_pf.errors import ConfigurationError, MissingExtra, StoreError
+from rse_pf.files import replace_json
 from rse_pf.object_store import DirectoryStore, ObjectStore
 
 __all__ = ["KeysFile", "serve_data"]
@@ -161,9 +161,7 @@ def _listen(settings: PlatformSettings) -> socket.socket:
 
 
 def _announce(path: Path, port: int) -> None:
-    temporary = path.with_name(f".{path.name}.{os.getpid()}")
-    temporary.write_text(json.dumps({"pid": os.getpid(), "port": port}), encoding="utf-8")
-    os.replace(temporary, path)
+    replace_json(path, {"pid": os.getpid(), "port": port})
 
 
 def _write_line(fields: dict[str, Any]) -> None:

@@ -6,15 +6,14 @@ nobody else, and never to open a port itself.
 
 from __future__ import annotations
 
-import ipaddress
-import os
 import socket
-import stat
 from pathlib import Path
 
 from rse_pf.auth.tokens import KeySet, SigningKey
 from rse_pf.config import PlatformSettings
+from rse_pf.config.placement import is_loopback
 from rse_pf.errors import ConfigurationError, UsageError
+from rse_pf.files import OWNER_ONLY, read_private_file, replace_file
 
 __all__ = ["check_front_door", "ensure_key", "front_door_url", "key_file", "key_set_file", "read_key"]
 
@@ -42,7 +41,7 @@ def check_front_door(host: str, port: int) -> None:
     Raises:
         ConfigurationError: *host* is not a loopback address, or something listens on *port*.
     """
-    if not _is_loopback(host):
+    if not is_loopback(host):
         raise ConfigurationError(
             f"serving.host = {host} would open the local platform to other machines",
             hint="set serving.host to 127.0.0.1",
@@ -67,18 +66,12 @@ def ensure_key(folder: Path, *, seed: bytes, key_id: str) -> SigningKey:
     """
     path = key_file(folder)
     if not path.exists():
-        temporary = path.with_name(f".{path.name}")
-        temporary.unlink(missing_ok=True)
-        with open(os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w") as file:
-            file.write(SigningKey.from_seed(seed, key_id).to_json())
-        temporary.replace(path)
+        replace_file(path, SigningKey.from_seed(seed, key_id).to_json(), mode=OWNER_ONLY)
     key = read_key(path)
     public = key_set_file(folder)
     if _holds(public, key):
         return key
-    temporary = public.with_name(f".{public.name}")
-    temporary.write_text(key.key_set().to_json(), encoding="utf-8")
-    temporary.replace(public)
+    replace_file(public, key.key_set().to_json())
     return key
 
 
@@ -98,23 +91,5 @@ def read_key(path: Path) -> SigningKey:
     Raises:
         UsageError: There is no such file, others may read it, or it holds no signing key.
     """
-    try:
-        mode = path.stat().st_mode
-        text = path.read_text(encoding="utf-8")
-    except OSError as error:
-        raise UsageError(
-            f"cannot read the key {path}: {error.strerror}",
-            hint="start a platform with rse-pf local, or name a key with --key",
-        ) from error
-    except ValueError as error:
-        raise UsageError(f"{path} holds no signing key", hint="name a key with --key") from error
-    if stat.S_IMODE(mode) & 0o077:
-        raise UsageError(f"others may read the key {path}", hint=f"chmod 600 {path}")
-    return SigningKey.from_json(text)
-
-
-def _is_loopback(host: str) -> bool:
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return False
+    hint = "start a platform with rse-pf local, or name a key with --key"
+    return SigningKey.from_json(read_private_file(path, "the key", hint=hint))

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import ctypes
 import os
 import resource
 import select
@@ -18,9 +17,10 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from rse_pf.linux import die_with_parent
+
 __all__ = ["ProcessMark", "ended", "is_alive", "last_line", "mark_of", "send_signal", "spawn", "wait_ended"]
 
-_PR_SET_PDEATHSIG = 1
 _TAIL_BYTES = 8192
 
 
@@ -135,14 +135,11 @@ def last_line(log: Path) -> str:
 
 def _apart(parent: int | None) -> Callable[[], None]:
     """Return what a child does before its program: leave the group, and be killed with *parent*, if any."""
-    prctl = ctypes.CDLL(None).prctl  # looked up before the fork: the child may not take locks
 
     def leave() -> None:
         os.setpgid(0, 0)
-        if parent is not None:
-            prctl(_PR_SET_PDEATHSIG, int(signal.SIGKILL), 0, 0, 0)
-            if os.getppid() != parent:
-                os._exit(1)
+        if parent is not None and not die_with_parent(parent):
+            os._exit(1)
 
     return leave
 

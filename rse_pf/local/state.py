@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from rse_pf.errors import ConfigurationError, UsageError
+from rse_pf.files import replace_file
 from rse_pf.local.processes import ProcessMark
 
 __all__ = [
@@ -75,9 +76,7 @@ class PlatformState:
 
     def write(self, folder: Path) -> None:
         """Replace the file in *folder* in one step."""
-        temporary = folder / f".{_FILE}"
-        temporary.write_text(json.dumps(asdict(self), indent=2) + "\n", encoding="utf-8")
-        temporary.replace(folder / _FILE)
+        replace_file(folder / _FILE, json.dumps(asdict(self), indent=2) + "\n")
 
 
 class PlatformLock:

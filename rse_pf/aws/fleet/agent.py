@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import secrets
 import sys
 import threading
@@ -33,6 +32,7 @@ from rse_pf.aws.storage.audit_ship import Shipper
 from rse_pf.aws.storage.s3_store import open_bucket
 from rse_pf.config import PlatformSettings, load_settings
 from rse_pf.errors import NotFound, RsePfError
+from rse_pf.files import replace_file
 from rse_pf.object_store import ObjectStore
 from rse_pf.scaling.alarms import NAMESPACE
 
@@ -102,13 +102,13 @@ class Agent:
             fresh = self._artifacts.get(self._post.keys_name)
         except NotFound:
             if not file.exists():
-                self._replace(file, b'{"keys":[]}\n')
+                replace_file(file, b'{"keys":[]}\n')
                 self._log("no-keys", hint=_NO_KEYS)
             return
         if file.exists() and file.read_bytes() == fresh:
             return
         KeySet.from_json(fresh.decode("utf-8", "replace"))
-        self._replace(file, fresh)
+        replace_file(file, fresh)
         self._log("keys", bytes=len(fresh))
 
     def fetch_control(self) -> None:
@@ -123,7 +123,7 @@ class Agent:
                 continue
             from_json(fresh, kind)
             file.parent.mkdir(exist_ok=True)
-            self._replace(file, fresh)
+            replace_file(file, fresh)
             self._log("control", name=name, bytes=len(fresh))
 
     def watch_control(self, rest: Callable[[float], None] = time.sleep) -> None:
@@ -165,11 +165,6 @@ class Agent:
             work()
         except (RsePfError, OSError) as error:
             self._log("failed", duty=duty, why=str(error)[:200])
-
-    def _replace(self, file: Path, data: bytes) -> None:
-        temporary = file.with_name(f".{file.name}.new")
-        temporary.write_bytes(data)
-        os.replace(temporary, file)
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -25,7 +25,7 @@ from rse_pf.backend.quota import check_room, store_within
 from rse_pf.backend.sandbox.child import HEADER, decoded, encoded
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import BadMessage, Cancelled, Crashed, LimitExceeded, RsePfError, StoreError
-from rse_pf.linux import die_with_parent, step_back
+from rse_pf.linux import die_with_parent, run_when_idle
 from rse_pf.object_store import ObjectStore
 from rse_pf.service import dispatch, failure_of
 from rse_pf.services.loading import load_services
@@ -157,7 +157,7 @@ def _told(answer: Result | Failure) -> list[Any]:
 
 def _step_back() -> None:
     """Run only when nothing else wants to; be the first to go when memory is short."""
-    step_back(0)
+    run_when_idle(0)
     with contextlib.suppress(OSError), open("/proc/self/oom_score_adj", "w", encoding="ascii") as file:
         file.write("1000")
 

@@ -16,7 +16,7 @@ from typing import Any
 from rse_pf.backend.jobs.runner import JobRequest
 from rse_pf.backend.sandbox.child import encoded
 from rse_pf.config import PlatformSettings
-from rse_pf.linux import step_back
+from rse_pf.linux import run_when_idle
 
 __all__ = ["JobProcess", "spawner"]
 
@@ -33,7 +33,7 @@ class JobProcess:
                 [sys.executable, "-m", "rse_pf.backend.jobs.process", str(theirs.fileno())],
                 pass_fds=(theirs.fileno(),), stdin=subprocess.DEVNULL, env={**os.environ, **_ONE_THREAD},
             )  # fmt: skip
-        step_back(self._process.pid)
+        run_when_idle(self._process.pid)
         try:
             self.connection.sendall(encoded(order))
         except OSError:

@@ -5,11 +5,11 @@ Promises to accept nobody, and that a refusal says which setting to change.
 
 from __future__ import annotations
 
-import ipaddress
 import socket
 
 from rse_pf.auth.tokens import KeySet
 from rse_pf.config import PlatformSettings
+from rse_pf.config.placement import is_loopback
 from rse_pf.errors import ConfigurationError
 
 __all__ = ["bound", "check_open_door"]
@@ -18,7 +18,7 @@ __all__ = ["bound", "check_open_door"]
 def check_open_door(settings: PlatformSettings, keys: KeySet | None, conformance_echo: bool) -> None:
     """Refuse a door through which anybody could come; raises ConfigurationError."""
     host = settings.serving.host
-    if conformance_echo and not _is_loopback(host):
+    if conformance_echo and not is_loopback(host):
         raise ConfigurationError(
             f"conformance echo on {host} would let anybody in", hint="set serving.host to 127.0.0.1"
         )
@@ -29,18 +29,11 @@ def check_open_door(settings: PlatformSettings, keys: KeySet | None, conformance
             "robots need tokens, but there are no keys to check them with",
             hint="name a key set file, or set auth.required to false on a loopback address",
         )
-    if not settings.auth.required and not _is_loopback(host):
+    if not settings.auth.required and not is_loopback(host):
         raise ConfigurationError(
             f"auth.required = false on {host} would let anybody in",
             hint="set auth.required to true, or serving.host to 127.0.0.1",
         )
-
-
-def _is_loopback(host: str) -> bool:
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return host == "localhost"
 
 
 def bound(host: str, port: int) -> socket.socket:

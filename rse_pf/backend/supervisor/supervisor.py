@@ -37,6 +37,7 @@ from rse_pf.backend.supervisor.worker import WorkerPlan
 from rse_pf.backend.supervisor.worker_handle import BUILTIN, WorkerProcess, fork_workers
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import ConfigurationError
+from rse_pf.files import replace_json
 from rse_pf.linux import cpu_seconds, raise_descriptor_limit, resident_bytes
 
 __all__ = ["serve"]
@@ -212,7 +213,7 @@ class _Supervisor:
         loop.add_reader(self._listener.fileno(), self._accept_some)
         self._state = "ready"
         if self._announce is not None:
-            _write_atomically(self._announce, self._identity())
+            replace_json(self._announce, self._identity())
         if self._trust is not None:
             pause_s = self._settings.auth.deny_list_refresh_s
             watch = TrustPoller(self._trust, workers=lambda: self._workers, log=self._log, pause_s=pause_s)
@@ -483,9 +484,3 @@ def _version() -> str:
         return metadata.version("rse-pf")
     except metadata.PackageNotFoundError:
         return "unknown"
-
-
-def _write_atomically(path: Path, value: dict[str, Any]) -> None:
-    temporary = path.with_name(f".{path.name}.{os.getpid()}")
-    temporary.write_text(json.dumps(value), encoding="utf-8")
-    temporary.replace(path)

@@ -39,7 +39,7 @@ from rse_pf.backend.ports import Clocks
 from rse_pf.backend.sandbox.manager import SandboxManager
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import MissingExtra
-from rse_pf.linux import call_this_process, die_with_parent
+from rse_pf.linux import die_with_parent, set_process_name
 from rse_pf.services.custom.installed import installed_services, published_services
 from rse_pf.services.loading import load_services
 
@@ -87,7 +87,7 @@ def run_worker(plan: WorkerPlan, data: socket.socket, control: socket.socket) ->
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
     if not die_with_parent(plan.supervisor):
         return
-    call_this_process("rse-pf worker")
+    set_process_name("rse-pf worker")
     loop = event_loop_maker()()
     asyncio.set_event_loop(loop)
     loop.run_until_complete(_Worker(plan, data, control, loop).run())

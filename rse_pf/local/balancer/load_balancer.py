@@ -21,6 +21,7 @@ from typing import Any
 
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import ConfigurationError, MissingExtra
+from rse_pf.files import replace_json
 from rse_pf.local.balancer.envoy_config import (
     ADMIN_SOCKET,
     CLUSTER,
@@ -127,11 +128,11 @@ class EnvoyLoadBalancer:
     def set_targets(self, targets: Sequence[Target]) -> None:
         """Let new sockets go to *targets* and nowhere else; open sockets stay where they are."""
         self._names.update({target.port: target.name for target in targets})
-        _replace(self._endpoints, endpoints(targets))
+        replace_json(self._endpoints, endpoints(targets))
 
     def set_data_targets(self, targets: Sequence[Target]) -> None:
         """Let what is asked under ``/data/`` go to *targets*."""
-        _replace(self._data_endpoints, endpoints(targets, DATA_CLUSTER))
+        replace_json(self._data_endpoints, endpoints(targets, DATA_CLUSTER))
 
     async def stats(self) -> Mapping[str, TargetStats]:
         """Return the targets that Envoy has now, by server name; empty when it does not answer."""
@@ -241,9 +242,3 @@ def _ask(folder: Path, path: str) -> bytes:
         return b""
     finally:
         connection.close()
-
-
-def _replace(path: Path, value: Mapping[str, Any]) -> None:
-    temporary = path.with_name(f".{path.name}")
-    temporary.write_text(json.dumps(value), encoding="utf-8")
-    temporary.replace(path)

@@ -11,7 +11,6 @@ import asyncio
 import contextlib
 import http.client
 import json
-import os
 import signal
 import subprocess
 import sys
@@ -24,6 +23,7 @@ from typing import Any
 from rse_pf.audit.log import audit_folder
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import ConfigurationError
+from rse_pf.linux import run_as_batch
 from rse_pf.local.balancer.envoy_config import Target
 from rse_pf.local.processes import ProcessMark, ended, is_alive, last_line, mark_of, send_signal, spawn
 from rse_pf.local.state import ServerState
@@ -225,7 +225,7 @@ class LocalDataServers:
             [*self._command, "--port", str(self._port)],
             log=self._log, folder=self._folder, dies_with_parent=self._dies_with_parent,
         )  # fmt: skip
-        _step_back(process.pid, self._settings.local.data_nice)
+        run_as_batch(process.pid, self._settings.local.data_nice)
         self._process, self._mark = process, mark_of(process.pid)
         self._tell("data-server-start", name=self._name, pid=process.pid)
         try:
@@ -268,18 +268,6 @@ class LocalDataServers:
         return ConfigurationError(
             f"{self._name} {what}{': ' if last else ''}{last}", hint=f"its log is {self._log}"
         )
-
-
-def _step_back(pid: int, nice: int) -> None:
-    """Let poses go first where both share a machine; threads that the process starts later do the same.
-
-    As a batch process it never takes the processor from who is at work when a piece of a body arrives; its
-    niceness leaves it a share of a full machine, so that it answers its health checks there, too.
-    """
-    with contextlib.suppress(OSError):
-        os.setpriority(os.PRIO_PROCESS, pid, max(nice, os.getpriority(os.PRIO_PROCESS, 0)))
-        if os.sched_getscheduler(pid) == os.SCHED_OTHER:
-            os.sched_setscheduler(pid, os.SCHED_BATCH, os.sched_param(0))
 
 
 def _ask(port: int, path: str) -> bool:

@@ -1,0 +1,99 @@
+"""Small files that hold state: replaced in one step, and private where they hold a secret.
+
+A reader of a replaced file sees the old content or the new one, never a part of either.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import secrets
+import stat
+from pathlib import Path
+from typing import Any
+
+from rse_pf.errors import UsageError
+
+__all__ = [
+    "OWNER_ONLY", "TEMPORARY_PREFIX", "create_private_file", "read_private_file", "replace_file",
+    "replace_json", "sync_folder",
+]  # fmt: skip
+
+OWNER_ONLY = 0o600
+"""Mode of a file that holds a secret."""
+TEMPORARY_PREFIX = ".part-"
+"""Names of files that a writer left behind when it was killed begin so."""
+_BY_UMASK = 0o666
+_OTHERS = 0o077
+_MAX_BYTES = 1 << 20
+
+
+def replace_file(path: Path, data: bytes | str, *, mode: int = _BY_UMASK, is_durable: bool = False) -> None:
+    """Replace *path* by a file of *data* in one step, or raise OSError and leave it as it is.
+
+    Args:
+        path: The file; its folder exists.
+        data: The whole content; text is written as UTF-8.
+        mode: Permissions of the new file; the umask is taken off.
+        is_durable: Whether content and name survive a power failure once this returns.
+    """
+    temporary = path.with_name(f"{TEMPORARY_PREFIX}{secrets.token_hex(8)}")
+    handle = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, mode)
+    try:
+        _write(handle, data, is_durable)
+        os.replace(temporary, path)
+    except BaseException:
+        temporary.unlink(missing_ok=True)
+        raise
+    if is_durable:
+        sync_folder(path.parent)
+
+
+def replace_json(path: Path, value: Any, *, indent: int | None = None) -> None:
+    """Replace *path* by the JSON document of *value* in one step; raises OSError."""
+    replace_file(path, json.dumps(value, indent=indent))
+
+
+def create_private_file(path: Path, text: str) -> None:
+    """Write *text* durably to a new file that only its owner can read; raises OSError, also if it exists."""
+    handle = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW, OWNER_ONLY)
+    _write(handle, text, True)
+
+
+def read_private_file(path: Path, what: str, *, hint: str) -> bytes:
+    """Return the first MiB of a file that only its owner can read.
+
+    Args:
+        path: The file; a pipe or a device reads as empty.
+        what: What the file holds, for the error: "the key".
+        hint: What to do if the file cannot be read.
+
+    Raises:
+        UsageError: The file cannot be read, or others than its owner can read it, too.
+    """
+    try:
+        with os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb") as file:
+            mode = os.fstat(file.fileno()).st_mode
+            data = file.read(_MAX_BYTES) if stat.S_ISREG(mode) else b""
+    except OSError as error:
+        raise UsageError(f"cannot read {what} {path}: {error.strerror}", hint=hint) from error
+    if stat.S_IMODE(mode) & _OTHERS:
+        raise UsageError(f"others may read {what} {path}", hint=f"chmod 600 {path}")
+    return data
+
+
+def sync_folder(folder: Path) -> None:
+    """Make the names in *folder* survive a power failure."""
+    handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+def _write(handle: int, data: bytes | str, is_durable: bool) -> None:
+    with os.fdopen(handle, "wb") as file:
+        file.write(data.encode() if isinstance(data, str) else data)
+        file.flush()
+        if is_durable:
+            os.fsync(file.fileno())
