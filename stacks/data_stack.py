@@ -16,6 +16,9 @@ from stacks.findings import acknowledge
 
 __all__ = ["DataStack"]
 
+_INFREQUENT_AFTER_DAYS = 30
+"""The soonest that S3 takes an object there; ``data.glacier_after_days`` is not less."""
+
 
 class DataStack(cdk.Stack):
     """Map, artifact, audit-log and access-log buckets; the secret of the signing key."""
@@ -31,7 +34,7 @@ class DataStack(cdk.Stack):
             transitions=[
                 s3.Transition(storage_class=kind, transition_after=cdk.Duration.days(days))
                 for kind, days in (
-                    (s3.StorageClass.INFREQUENT_ACCESS, settings.data.infrequent_after_days),
+                    (s3.StorageClass.INFREQUENT_ACCESS, _INFREQUENT_AFTER_DAYS),
                     (s3.StorageClass.GLACIER, settings.data.glacier_after_days),
                 )
             ]

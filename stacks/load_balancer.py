@@ -10,11 +10,17 @@ from aws_cdk import aws_wafv2 as wafv2
 from constructs import Construct
 
 from rse_pf.config import PlatformSettings
+from rse_pf.config.resource_names import READY_PATH
+from rse_pf.scaling.health import CLOUD_TIMEOUT_S, HEALTHY_CHECKS
 from stacks.firewall import front_port
 
 __all__ = ["LoadBalancer"]
 
 _FIVE_MINUTES_S = 300
+_IDLE_TIMEOUT_S = 120
+"""The ALB ends a connection that has been silent for so long; robots ping far more often."""
+_DEREGISTRATION_S = 30
+"""Time a server that leaves gets to end its connections."""
 
 
 class LoadBalancer(Construct):
@@ -33,7 +39,7 @@ class LoadBalancer(Construct):
         super().__init__(scope, construct_id)
         self.alb = elbv2.ApplicationLoadBalancer(
             self, "Alb", vpc=vpc, internet_facing=True, security_group=group, drop_invalid_header_fields=True,
-            idle_timeout=cdk.Duration.seconds(settings.cloud.idle_timeout_s),
+            idle_timeout=cdk.Duration.seconds(_IDLE_TIMEOUT_S),
             desync_mitigation_mode=elbv2.DesyncMitigationMode.STRICTEST,
         )  # fmt: skip
         self.alb.log_access_logs(logs, "alb")
@@ -55,7 +61,7 @@ class LoadBalancer(Construct):
             # Each would ask the bucket; the balancer's own checks do not come through the listener.
             listener.add_action(
                 "NotReady", priority=5,
-                conditions=[elbv2.ListenerCondition.path_patterns([f"/data{settings.health.path}"])],
+                conditions=[elbv2.ListenerCondition.path_patterns([f"/data{READY_PATH}"])],
                 action=elbv2.ListenerAction.fixed_response(404),
             )  # fmt: skip
         self._waf(settings)
@@ -66,19 +72,17 @@ class LoadBalancer(Construct):
         health = settings.health
         # The data service answers for itself, below /data; a backend server at its control port.
         robots = name == "Robots"
-        asked, path = (
-            (settings.serving.control_port, health.path) if robots else (port, f"/data{health.path}")
-        )
+        asked, path = (settings.serving.control_port, READY_PATH) if robots else (port, f"/data{READY_PATH}")
         return elbv2.ApplicationTargetGroup(
             self, name, vpc=vpc, port=port, protocol=elbv2.ApplicationProtocol.HTTP,
             target_type=elbv2.TargetType.INSTANCE,
             load_balancing_algorithm_type=elbv2.TargetGroupLoadBalancingAlgorithmType.LEAST_OUTSTANDING_REQUESTS,
-            deregistration_delay=cdk.Duration.seconds(settings.scaling.deregistration_s),
+            deregistration_delay=cdk.Duration.seconds(_DEREGISTRATION_S),
             health_check=elbv2.HealthCheck(
                 path=path, port=str(asked), healthy_http_codes="200",
                 interval=cdk.Duration.seconds(health.cloud_interval_s),
-                timeout=cdk.Duration.seconds(health.cloud_timeout_s),
-                healthy_threshold_count=health.healthy_checks,
+                timeout=cdk.Duration.seconds(CLOUD_TIMEOUT_S),
+                healthy_threshold_count=HEALTHY_CHECKS,
                 unhealthy_threshold_count=health.unhealthy_checks,
             ),
         )  # fmt: skip

@@ -20,6 +20,9 @@ from stacks.findings import acknowledge
 
 __all__ = ["ServerlessStack"]
 
+_TIMEOUT_S = 10
+"""Of one execution."""
+
 
 class ServerlessStack(cdk.Stack):
     """The function, its URL and its log."""
@@ -50,7 +53,7 @@ class ServerlessStack(cdk.Stack):
                 self, "Pnp", runtime=lambda_.Runtime.PYTHON_3_13, architecture=lambda_.Architecture.X86_64,
                 handler="lambda_pnp.handler.handler", code=code, role=role, log_group=log,
                 memory_size=settings.cloud.lambda_memory_mb,
-                timeout=cdk.Duration.seconds(settings.cloud.lambda_timeout_s),
+                timeout=cdk.Duration.seconds(_TIMEOUT_S),
                 reserved_concurrent_executions=settings.cloud.lambda_concurrency,
                 environment={"RSE_PF_KEYS": f"{data.artifacts.bucket_name}/{KEY_SET}"},
             )  # fmt: skip

@@ -5,12 +5,26 @@ Promises to import nothing, and to hold no setting: a name here is the same in e
 
 from __future__ import annotations
 
-__all__ = ["AUDIT_PREFIX", "DATA_STACK", "DENY_NAME", "GROUP", "HOOK", "KEYS_NAME", "ROBOTS_NAME"]
+__all__ = [
+    "AUDIT_PREFIX",
+    "DATA_STACK",
+    "DENY_NAME",
+    "GROUP",
+    "HEALTH_PATH",
+    "HOOK",
+    "KEYS_NAME",
+    "READY_PATH",
+    "ROBOTS_NAME",
+]
 
 GROUP = "rse-pf"
 """Of the Auto Scaling group; fixed, so that an instance knows it before the group exists."""
 HOOK = "rse-pf-drain"
 """Of the lifecycle hook that an instance completes when its robots are gone."""
+HEALTH_PATH = "/healthz"
+"""At the robots' port; it tells everybody that robots are served, and nothing else."""
+READY_PATH = "/readyz"
+"""At the control port, and below ``/data`` at the data service; load balancers ask it."""
 DATA_STACK = "RsePf-Data"
 KEYS_NAME = "keys.json"
 """Of the public key set in the artifact bucket."""

@@ -12,7 +12,22 @@ from typing import Literal
 
 from rse_pf.config import HealthSettings
 
-__all__ = ["Health", "observe", "time_to_notice_s"]
+__all__ = [
+    "CLOUD_TIMEOUT_S",
+    "HEALTHY_CHECKS",
+    "LOCAL_INTERVAL_S",
+    "LOCAL_TIMEOUT_S",
+    "Health",
+    "observe",
+    "time_to_notice_s",
+]
+
+HEALTHY_CHECKS = 2
+"""Good checks in a row that bring a server in."""
+LOCAL_INTERVAL_S, LOCAL_TIMEOUT_S = 0.25, 0.25
+"""Time between checks on one machine; a check that takes longer than the second failed."""
+CLOUD_TIMEOUT_S = 4
+"""A check of the ALB that takes longer failed; below the least ``health.cloud_interval_s``."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -28,12 +43,12 @@ class Health:
 def observe(health: Health, ok: bool, settings: HealthSettings, *, now_s: float) -> Health:
     """Return the health after one more check.
 
-    A server becomes healthy after ``healthy_checks`` good ones in a row, and unhealthy after
+    A server becomes healthy after `HEALTHY_CHECKS` good ones in a row, and unhealthy after
     ``unhealthy_checks`` failed ones; one that was never healthy only after ``grace_s``.
     """
     row = health.row + 1 if ok == health.last_ok else 1
     state = health.state
-    if ok and row >= settings.healthy_checks:
+    if ok and row >= HEALTHY_CHECKS:
         state = "healthy"
     elif not ok and row >= settings.unhealthy_checks:
         in_grace = state == "starting" and now_s - health.started_s < settings.grace_s
@@ -43,6 +58,6 @@ def observe(health: Health, ok: bool, settings: HealthSettings, *, now_s: float)
 
 def time_to_notice_s(settings: HealthSettings, *, local: bool) -> float:
     """Return the longest time between a failure and its verdict, in seconds; a drain waits for it."""
-    interval_s = settings.local_interval_s if local else settings.cloud_interval_s
-    timeout_s = settings.local_timeout_s if local else settings.cloud_timeout_s
+    interval_s = LOCAL_INTERVAL_S if local else settings.cloud_interval_s
+    timeout_s = LOCAL_TIMEOUT_S if local else CLOUD_TIMEOUT_S
     return interval_s * settings.unhealthy_checks + timeout_s

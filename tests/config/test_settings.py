@@ -53,8 +53,6 @@ def test_the_paper_is_the_default() -> None:
         ({"session": {"max_inflated_bytes": 2048}}, ["session.max_message_bytes"]),
         ({"session": {"reconnect_base_s": 2}}, ["session.reconnect_max_s = 1"]),
         ({"pnp": {"max_iterations": 5}}, ["pnp.min_iterations = 10"]),
-        ({"health": {"cloud_timeout_s": 6}}, ["health.cloud_interval_s = 5"]),
-        ({"data": {"infrequent_after_days": 100}}, ["data.glacier_after_days = 90"]),
         ({"cloud": {"allow_insecure": False}}, ["cloud.certificate_arn", "cloud.domain_name"]),
     ],
 )

@@ -16,6 +16,8 @@ from typing import Any
 
 import pytest
 
+from rse_pf.config.resource_names import READY_PATH
+
 boto3 = pytest.importorskip("boto3", reason="the infra extra is not installed")
 moto = pytest.importorskip("moto", reason="the infra extra is not installed")
 
@@ -160,7 +162,7 @@ def test_every_stack_is_created_and_what_moto_made_equals_the_settings(
     elb = client("elbv2")
     targets = elb.describe_target_groups()["TargetGroups"]
     robots = next(each for each in targets if each["Port"] == settings.serving.port)
-    assert robots["HealthCheckPath"] == settings.health.path
+    assert robots["HealthCheckPath"] == READY_PATH
     assert robots["HealthCheckPort"] == str(settings.serving.control_port)
     assert robots["HealthCheckIntervalSeconds"] == settings.health.cloud_interval_s
     if settings.data.enabled:
@@ -177,7 +179,7 @@ def test_every_stack_is_created_and_what_moto_made_equals_the_settings(
         assert any(word in name.lower() for name in buckets), (word, buckets)
     (function,) = client("lambda").list_functions()["Functions"]
     assert function["MemorySize"] == settings.cloud.lambda_memory_mb
-    assert function["Timeout"] == settings.cloud.lambda_timeout_s
+    assert function["Timeout"] == 10
     groups = client("ec2").describe_security_groups()["SecurityGroups"]
     open_to_all = [
         (each["GroupName"], rule.get("FromPort"))

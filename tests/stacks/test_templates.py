@@ -8,8 +8,10 @@ from typing import Any
 
 import pytest
 
+from rse_pf.config.resource_names import READY_PATH
 from rse_pf.errors import ConfigurationError
 from rse_pf.scaling.alarms import Alarm, Metric, ScalingStep, alarms_of
+from rse_pf.scaling.health import CLOUD_TIMEOUT_S
 
 Assembly = Any
 
@@ -175,15 +177,13 @@ def test_the_target_group_checks_the_control_port_as_the_settings_say(assembly: 
     group = next(each for each in groups if each["Port"] == serving.port)
 
     assert group["HealthCheckPort"] == str(serving.control_port)
-    assert group["HealthCheckPath"] == health.path
+    assert group["HealthCheckPath"] == READY_PATH
     assert group["HealthCheckIntervalSeconds"] == health.cloud_interval_s
-    assert group["HealthCheckTimeoutSeconds"] == health.cloud_timeout_s
+    assert group["HealthCheckTimeoutSeconds"] == CLOUD_TIMEOUT_S
     assert group["UnhealthyThresholdCount"] == health.unhealthy_checks
     attributes = {each["Key"]: each["Value"] for each in group["TargetGroupAttributes"]}
     assert attributes["load_balancing.algorithm.type"] == "least_outstanding_requests"
-    assert attributes["deregistration_delay.timeout_seconds"] == str(
-        assembly.settings.scaling.deregistration_s
-    )
+    assert attributes["deregistration_delay.timeout_seconds"] == "30"
 
 
 def test_the_front_door_speaks_tls_unless_it_is_a_lab(assembly: Assembly) -> None:

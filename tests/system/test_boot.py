@@ -13,6 +13,7 @@ from system.boot.world import World, debian_root, missing
 
 from rse_pf.auth.tokens import SigningKey
 from rse_pf.config import PlatformSettings
+from rse_pf.config.resource_names import READY_PATH
 
 pytestmark = [pytest.mark.slow, pytest.mark.system, pytest.mark.timeout(900)]
 
@@ -53,9 +54,9 @@ def ask_for_a_pose(world: World) -> dict:
 
 
 def test_the_machine_becomes_healthy_in_every_attached_target_group(world: World) -> None:
-    serving, health = SETTINGS.serving, SETTINGS.health
+    serving = SETTINGS.serving
 
-    world.wait(lambda: world.status(serving.control_port, health.path) == 200, 120, "healthy server")
+    world.wait(lambda: world.status(serving.control_port, READY_PATH) == 200, 120, "healthy server")
 
     assert "user-data ended with 0" in world.text()
 

@@ -13,6 +13,7 @@ from rse_pf.aws.clients import ask
 from rse_pf.aws.fleet.instance import Machine
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import Disconnected
+from rse_pf.scaling.health import time_to_notice_s
 
 __all__ = ["leave_group", "wait_before_move_s"]
 
@@ -23,8 +24,7 @@ _SPARE_S = 15.0
 
 def wait_before_move_s(settings: PlatformSettings) -> float:
     """Return how long a load balancer may go on sending robots after the server says not ready."""
-    health = settings.health
-    return float(health.cloud_interval_s * health.unhealthy_checks + health.cloud_timeout_s)
+    return time_to_notice_s(settings.health, local=False)
 
 
 def leave_group(

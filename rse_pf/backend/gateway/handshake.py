@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 
 from rse_pf.auth.tokens import Claims, KeySet, token_problem, verify_token
 from rse_pf.config import PlatformSettings
+from rse_pf.config.resource_names import HEALTH_PATH
 from rse_pf.errors import Unauthorized
 from rse_pf.wire import SUBPROTOCOLS, codec_for
 
@@ -70,7 +71,7 @@ class HandshakePolicy:
         self._conformance_echo = conformance_echo
         path = settings.serving.path
         self._path = path.encode()
-        self._health_path = settings.serving.health_path.encode()
+        self._health_path = HEALTH_PATH.encode()
         self._healthy = _answer(200, b'{"status":"ok"}', HEALTH)
         self.defect = _refusal(500, "internal", "the handshake failed", "try again")
         self._not_found = _refusal(404, "not-found", "nothing is served here", f"connect to {path}")

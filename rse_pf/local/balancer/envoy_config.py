@@ -12,6 +12,8 @@ from pathlib import Path
 from typing import Any
 
 from rse_pf.config import PlatformSettings
+from rse_pf.config.resource_names import HEALTH_PATH, READY_PATH
+from rse_pf.scaling.health import HEALTHY_CHECKS, LOCAL_INTERVAL_S, LOCAL_TIMEOUT_S
 
 __all__ = ["ADMIN_SOCKET", "CLUSTER", "DATA_CLUSTER", "Target", "endpoints", "envoy_config"]
 
@@ -33,6 +35,8 @@ _CIPHERS = (
     "ECDHE-RSA-AES256-GCM-SHA384", "ECDHE-ECDSA-CHACHA20-POLY1305", "ECDHE-RSA-CHACHA20-POLY1305",
 )  # fmt: skip
 """Of TLS 1.2: those that authenticate what they encrypt, with forward secrecy.  TLS 1.3 has no others."""
+_MAX_CONNECTIONS = 12_000
+"""Of robots and others; more are closed."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -55,15 +59,14 @@ def envoy_config(
         endpoints_file: What `endpoints` returned, as JSON; replaced by rename, never written in place.
         data_endpoints_file: The same for the data servers; without targets ``/data/`` is answered with 503.
     """
-    health = settings.health
     return {
         "node": {"id": "front-door", "cluster": "rse-pf"},  # endpoint files are refused without
         "admin": {"address": {"pipe": {"path": ADMIN_SOCKET, "mode": 0o600}}},
-        "overload_manager": _max_connections(settings.local.max_connections),
+        "overload_manager": _max_connections(_MAX_CONNECTIONS),
         "static_resources": {
             "listeners": [_front_door(settings, port)],
             "clusters": [
-                _cluster(settings, CLUSTER, endpoints_file, health.path, panic_percent=0),
+                _cluster(settings, CLUSTER, endpoints_file, READY_PATH, panic_percent=0),
                 # One data server, and its successor on the same port: better asked in vain than not asked.
                 _cluster(settings, DATA_CLUSTER, data_endpoints_file, _DATA_READY, panic_percent=100),
             ],
@@ -219,7 +222,7 @@ def _virtual_host(settings: PlatformSettings) -> dict[str, Any]:
         "domains": ["*"],
         "routes": [
             {"match": {"path": settings.serving.path}, "route": route},
-            {"match": {"path": settings.serving.health_path}, "route": {**route, "timeout": patience}},
+            {"match": {"path": HEALTH_PATH}, "route": {**route, "timeout": patience}},
             # Each would ask the store; the balancer's own checks do not come through the door.
             {"match": {"path": _DATA_READY}, "direct_response": {"status": 404}},
             {"match": {"prefix": _DATA_PATH}, "route": data_route},
@@ -258,12 +261,12 @@ def _cluster(
         "circuit_breakers": {"thresholds": [dict.fromkeys(limits, _NO_LIMIT)]},
         "health_checks": [
             {
-                "interval": _seconds(health.local_interval_s),
+                "interval": _seconds(LOCAL_INTERVAL_S),
                 # By default a server without traffic is asked once a minute only.
-                "no_traffic_interval": _seconds(health.local_interval_s),
-                "timeout": _seconds(health.local_timeout_s),
+                "no_traffic_interval": _seconds(LOCAL_INTERVAL_S),
+                "timeout": _seconds(LOCAL_TIMEOUT_S),
                 "unhealthy_threshold": health.unhealthy_checks,
-                "healthy_threshold": health.healthy_checks,
+                "healthy_threshold": HEALTHY_CHECKS,
                 "http_health_check": {"path": ready},
             }
         ],

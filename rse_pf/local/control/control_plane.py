@@ -15,6 +15,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from rse_pf.config import PlatformSettings, ScalingSettings
+from rse_pf.config.resource_names import READY_PATH
 from rse_pf.errors import ConfigurationError
 from rse_pf.local.balancer.load_balancer import EnvoyLoadBalancer
 from rse_pf.local.control.fleet import Fleet, Member
@@ -31,7 +32,7 @@ from rse_pf.local.control.monitor import (
 from rse_pf.local.control.rebalancer import Order, Rebalancer
 from rse_pf.local.control.scale_modifier import LocalScaleModifier
 from rse_pf.local.servers.control_client import ControlPort, ControlPortReply
-from rse_pf.scaling.health import observe
+from rse_pf.scaling.health import LOCAL_INTERVAL_S, LOCAL_TIMEOUT_S, observe
 
 __all__ = ["ControlPlane"]
 
@@ -129,23 +130,23 @@ class ControlPlane:
     async def _check_on(self, member: Member) -> None:
         """Ask */readyz* of one server again and again, as the balancer does."""
         assert member.server is not None
-        port, health = self._fleet.control(member.server), self._settings.health
+        port = self._fleet.control(member.server)
         try:
             while not (member.over.is_set() or member.leaving or member.out):
                 began_s = time.monotonic()
                 ok = await self._check(member, port, began_s)
                 if ok is not None:
                     self._judge(member, ok)
-                left_s = began_s + health.local_interval_s - time.monotonic()
+                left_s = began_s + LOCAL_INTERVAL_S - time.monotonic()
                 await asyncio.sleep(max(left_s, 0.0))
         finally:
             port.close()
 
     async def _check(self, member: Member, port: ControlPort, began_s: float) -> bool | None:
         """Return the outcome of one check; None if it tells nothing about the server."""
-        timeout_s = self._settings.health.local_timeout_s
+        timeout_s = LOCAL_TIMEOUT_S
         try:
-            reply: ControlPortReply = await port.ask(self._settings.health.path, timeout_s=timeout_s)
+            reply: ControlPortReply = await port.ask(READY_PATH, timeout_s=timeout_s)
         except ConnectionError:
             late_s = time.monotonic() - began_s - timeout_s
             return None if late_s > _LATE_SHARE * timeout_s else False
@@ -276,7 +277,7 @@ class ControlPlane:
             self.watch_spread()
 
     async def _bring_balancer_back(self) -> None:
-        pause_s = self._settings.health.local_interval_s
+        pause_s = LOCAL_INTERVAL_S
         while True:
             self._load_balancer.launch()
             try:

@@ -8,6 +8,7 @@ from botocore.stub import Stubber
 
 from rse_pf.aws.fleet.drain_hook import leave_group, wait_before_move_s
 from rse_pf.config import PlatformSettings
+from rse_pf.scaling.health import CLOUD_TIMEOUT_S
 
 SETTINGS = PlatformSettings()
 
@@ -57,7 +58,7 @@ def test_the_load_balancer_hears_of_it_before_a_robot_is_moved() -> None:
     leave(machine, FakeScaling(machine))
 
     health = SETTINGS.health
-    assert machine.waits == [health.cloud_interval_s * health.unhealthy_checks + health.cloud_timeout_s]
+    assert machine.waits == [health.cloud_interval_s * health.unhealthy_checks + CLOUD_TIMEOUT_S]
     assert wait_before_move_s(SETTINGS) == machine.waits[0]
 
 

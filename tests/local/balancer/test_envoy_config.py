@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 
 from rse_pf.config import PlatformSettings
+from rse_pf.config.resource_names import READY_PATH
 from rse_pf.local.balancer.envoy_config import (
     ADMIN_SOCKET,
     CLUSTER,
@@ -18,6 +19,7 @@ from rse_pf.local.balancer.envoy_config import (
     endpoints,
     envoy_config,
 )
+from rse_pf.scaling.health import HEALTHY_CHECKS, LOCAL_INTERVAL_S, LOCAL_TIMEOUT_S
 
 ENDPOINTS = Path("/somewhere/endpoints.json")
 DATA = Path("/somewhere/data-endpoints.json")
@@ -80,14 +82,12 @@ def test_the_settings_that_decided_between_good_and_bad_are_set() -> None:
 
 
 def test_health_checks_follow_the_settings() -> None:
-    health = {"local_interval_s": 0.125, "local_timeout_s": 2.0, "unhealthy_checks": 3, "path": "/ok"}
+    (check,) = cluster(config(health={"unhealthy_checks": 3}))["health_checks"]
 
-    (check,) = cluster(config(health=health))["health_checks"]
-
-    assert check["interval"] == check["no_traffic_interval"] == "0.125s"
-    assert check["timeout"] == "2s"
-    assert check["unhealthy_threshold"] == 3
-    assert check["http_health_check"] == {"path": "/ok"}
+    assert check["interval"] == check["no_traffic_interval"] == f"{LOCAL_INTERVAL_S}s"
+    assert check["timeout"] == f"{LOCAL_TIMEOUT_S}s"
+    assert (check["healthy_threshold"], check["unhealthy_threshold"]) == (HEALTHY_CHECKS, 3)
+    assert check["http_health_check"] == {"path": READY_PATH}
 
 
 def test_the_door_is_on_loopback_and_the_admin_page_on_no_port() -> None:
@@ -130,10 +130,10 @@ def test_large_data_has_a_way_of_its_own_that_is_never_repeated_by_the_balancer(
 
 
 def test_connections_and_buffers_are_bounded() -> None:
-    made = config(local={"max_connections": 500}, serving={"write_buffer_bytes": 65536})
+    made = config(serving={"write_buffer_bytes": 65536})
     (monitor,) = made["overload_manager"]["resource_monitors"]
 
-    assert monitor["typed_config"]["max_active_downstream_connections"] == "500"
+    assert monitor["typed_config"]["max_active_downstream_connections"] == "12000"
     assert listener(made)["per_connection_buffer_limit_bytes"] == 65536
     assert cluster(made)["per_connection_buffer_limit_bytes"] == 65536
 
