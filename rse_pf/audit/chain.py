@@ -23,15 +23,17 @@ __all__ = [
     "GAP",
     "GENESIS",
     "HEADS",
+    "REFUSALS_PER_S",
+    "REFUSAL_BURST",
     "Chain",
     "Entry",
     "Head",
     "Note",
-    "Refusals",
+    "RefusalLimiter",
     "Value",
-    "chained",
-    "head_word",
     "line_of",
+    "next_entry",
+    "parse_head",
 ]
 
 Value = str | int | float | bool | None
@@ -44,6 +46,9 @@ _TOKEN = re.compile(r"eyJ[\w-]{5,}\.[\w.-]+")
 _encode = msgspec.json.Encoder(order="sorted").encode
 """Keys in order, no space, UTF-8: with the same text, every reader makes the same bytes."""
 _HEAD_WORD = re.compile(r"(\d{1,15}):([0-9a-f]{64})")
+REFUSALS_PER_S = 2.0
+REFUSAL_BURST = 50
+"""Refused tokens that one writer records one by one, in the long run and at once; the rest are counted."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,7 +95,7 @@ class Entry(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
         return Head(self.seq, self.hash)
 
 
-def chained(head: Head, note: Note) -> Entry:
+def next_entry(head: Head, note: Note) -> Entry:
     """Return *note* as the entry after *head*; long words are cut, what looks like a token is hidden."""
     details = list(note.detail.items())[:_MAX_DETAILS]
     open_entry = Entry(
@@ -111,7 +116,7 @@ def line_of(entry: Entry) -> bytes:
     return _canonical(msgspec.structs.asdict(entry)) + b"\n"
 
 
-def head_word(text: str) -> Head | None:
+def parse_head(text: str) -> Head | None:
     """Return the head that ``str`` made *text* of; None if it is none."""
     found = _HEAD_WORD.fullmatch(text)
     return None if found is None else Head(int(found[1]), found[2])
@@ -140,10 +145,10 @@ class Chain:
         return entry
 
 
-class Refusals:
+class RefusalLimiter:
     """How many refusals are written one by one; the rest are counted, so that a flood fills no disk."""
 
-    def __init__(self, per_s: float, burst: float) -> None:
+    def __init__(self, per_s: float = REFUSALS_PER_S, burst: float = REFUSAL_BURST) -> None:
         self.counted: dict[str, int] = {}
         self._per_s = per_s
         self._burst = burst

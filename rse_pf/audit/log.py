@@ -25,12 +25,23 @@ from rse_pf.audit.chain import (
     Head,
     Note,
     Value,
-    chained,
     line_of,
+    next_entry,
 )
 from rse_pf.errors import ConfigurationError
+from rse_pf.files import sync_folder
 
-__all__ = ["AuditLog", "audit_folder", "files_of", "lines_of", "names_in", "newest_head", "record_once"]
+__all__ = [
+    "MAX_FILE_BYTES",
+    "SYNC_S",
+    "AuditLog",
+    "audit_folder",
+    "chain_names",
+    "files_of",
+    "lines_of",
+    "newest_head",
+    "record_once",
+]
 
 _FILE = re.compile(r"(?P<who>[A-Za-z0-9_-]{1,64})(\.(?P<first>\d{12}))?\.jsonl")
 _UNSAFE = re.compile(r"[^A-Za-z0-9_-]")
@@ -39,6 +50,10 @@ _MAX_ENTRY_BYTES = 1 << 18
 """Longer than any entry: 64 details of two words of 200 letters, each letter six bytes at worst."""
 _WAIT_S = 5.0
 _LOOK_AGAIN_S = 0.01
+MAX_FILE_BYTES = 16 << 20
+"""A file that has grown longer is set aside, and the chain goes on in the next."""
+SYNC_S = 0.1
+"""An entry is on the disk after this."""
 
 
 class AuditLog:
@@ -50,8 +65,8 @@ class AuditLog:
         who: str,
         *,
         wall_clock: Callable[[], float],
-        max_bytes: int,
-        sync_s: float,
+        max_bytes: int = MAX_FILE_BYTES,
+        sync_s: float = SYNC_S,
         on_problem: Callable[[str], None] = lambda problem: None,
     ) -> None:
         """Describe a log; nothing is opened.
@@ -209,7 +224,7 @@ class AuditLog:
     def _write(self, notes: list[Note]) -> None:
         head, lines = self.head, []
         for note in notes:
-            entry = chained(head, note)
+            entry = next_entry(head, note)
             head = entry.head
             lines.append(line_of(entry))
         data = b"".join(lines)
@@ -235,7 +250,7 @@ class AuditLog:
             time=self._wall_clock(), actor=self.who, action=CONTINUED,
             detail={"reason": reason, "head": str(self.head)},
         )  # fmt: skip
-        entry = chained(self.head, note)
+        entry = next_entry(self.head, note)
         os.write(self._fd, line_of(entry))
         os.fsync(self._fd)
         self.head, self._size = entry.head, self._size + len(line_of(entry))
@@ -248,11 +263,7 @@ class AuditLog:
     def _open_file(self) -> None:
         self._fd = os.open(self._current, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o600)
         self._size = os.fstat(self._fd).st_size
-        folder = os.open(self._folder, os.O_RDONLY)
-        try:
-            os.fsync(folder)
-        finally:
-            os.close(folder)
+        sync_folder(self._folder)
 
     def _release(self) -> None:
         for fd in (self._fd, self._lock):
@@ -276,7 +287,7 @@ class AuditLog:
 
 def record_once(
     folder: Path, who: str, action: str, subject: str = "", *, wall_clock: Callable[[], float],
-    max_bytes: int, **detail: Value,
+    max_bytes: int = MAX_FILE_BYTES, **detail: Value,
 ) -> None:  # fmt: skip
     """Open the log, write one entry, and close it: for commands of an operator; raises ConfigurationError."""
     log = AuditLog(folder, who, wall_clock=wall_clock, max_bytes=max_bytes, sync_s=0.0).open(_WAIT_S)
@@ -289,7 +300,7 @@ def audit_folder(state: Path) -> Path:
     return state / "audit"
 
 
-def names_in(folder: Path) -> list[str]:
+def chain_names(folder: Path) -> list[str]:
     """Return the names of all chains in *folder*."""
     matches = (_FILE.fullmatch(path.name) for path in folder.iterdir()) if folder.is_dir() else ()
     return sorted({match["who"] for match in matches if match})

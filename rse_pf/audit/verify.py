@@ -9,8 +9,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from rse_pf.audit.chain import CONTINUED, GENESIS, HEADS, Chain, Entry, Head, head_word
-from rse_pf.audit.log import files_of, lines_of, names_in
+from rse_pf.audit.chain import CONTINUED, GENESIS, HEADS, Chain, Entry, Head, parse_head
+from rse_pf.audit.log import chain_names, files_of, lines_of
 
 __all__ = ["Verdict", "check_chain", "check_folder", "entries_of"]
 
@@ -72,7 +72,7 @@ def check_folder(folder: Path, *, known: Mapping[str, Head] | None = None) -> li
     Raises:
         OSError: A file cannot be read.
     """
-    verdicts = {who: check_chain(who, files_of(folder, who)) for who in names_in(folder)}
+    verdicts = {who: check_chain(who, files_of(folder, who)) for who in chain_names(folder)}
     claims = [
         (name, head, f"entry {seq} of {teller.who}")
         for teller in verdicts.values()
@@ -106,7 +106,7 @@ def _take(verdict: Verdict, entry: Entry) -> None:
     verdict.hashes[entry.seq] = entry.hash
     if entry.action == HEADS:
         for name, word in entry.detail.items():
-            head = head_word(word) if isinstance(word, str) else None
+            head = parse_head(word) if isinstance(word, str) else None
             if head is not None:
                 verdict.claims.append((name, head, entry.seq))
 

@@ -18,11 +18,20 @@ from rse_pf.config.resource_names import DENY_NAME, ROBOTS_NAME
 from rse_pf.errors import ConfigurationError, Conflict, NotFound, RsePfError
 from rse_pf.object_store import DirectoryStore, ObjectStore
 
-__all__ = ["DENY_NAME", "ROBOTS_NAME", "AccessControlStore", "TrustStore", "key_set_of"]
+__all__ = [
+    "DENY_NAME",
+    "REFRESH_S",
+    "ROBOTS_NAME",
+    "AccessControlStore",
+    "TrustStore",
+    "key_set_from_snapshot",
+]
 
 _TRIES = 20
 
 _T = TypeVar("_T", Roster, DenyList)
+REFRESH_S = 0.5
+"""Time between two looks at the deny-list and the roster: a revoked robot is disconnected within 2 s."""
 
 
 class AccessControlStore:
@@ -43,14 +52,14 @@ class AccessControlStore:
         """Apply *edit* to the newest roster; raises Conflict when others write all the time."""
         self._change(ROBOTS_NAME, Roster, edit)
 
-    def change_denied(self, edit: Callable[[DenyList], DenyList]) -> None:
+    def change_deny_list(self, edit: Callable[[DenyList], DenyList]) -> None:
         """Apply *edit* to the newest deny-list; raises Conflict when others write all the time."""
         self._change(DENY_NAME, DenyList, edit)
 
-    def furnish(self) -> None:
+    def create_missing(self) -> None:
         """Write empty objects where there are none, so that a reader can tell "empty" from "forbidden"."""
         self.change_roster(lambda roster: roster)
-        self.change_denied(lambda denied: denied)
+        self.change_deny_list(lambda denied: denied)
 
     def _read(self, name: str, kind: type[_T]) -> tuple[_T, bytes | None]:
         try:
@@ -76,7 +85,7 @@ class AccessControlStore:
 class TrustStore:
     """What one server knows of keys, robots and denials; `look` learns what is new.  Blocking.
 
-    ``text`` is all of it as JSON for a server's other processes, see `key_set_of`.
+    ``text`` is all of it as JSON for a server's other processes, see `key_set_from_snapshot`.
     """
 
     def __init__(self, keys_file: Path) -> None:
@@ -120,7 +129,7 @@ class TrustStore:
             return False
         self._parts = parts
         self.text = json.dumps(parts)
-        self.keys = key_set_of(self.text)
+        self.keys = key_set_from_snapshot(self.text)
         return True
 
     def first(self) -> None:
@@ -146,8 +155,8 @@ class TrustStore:
         return data.decode()
 
 
-def key_set_of(text: str) -> KeySet:
+def key_set_from_snapshot(text: str) -> KeySet:
     """Return what the ``text`` of a `TrustStore` says; raises UsageError or ConfigurationError."""
     parts = json.loads(text)
     roster = from_json(parts["robots"], Roster)
-    return KeySet.from_json(parts["keys"]).governed_by(roster, from_json(parts["denied"], DenyList))
+    return KeySet.from_json(parts["keys"]).with_access_control(roster, from_json(parts["denied"], DenyList))

@@ -13,6 +13,7 @@ import argparse
 import sys
 from pathlib import Path
 
+from rse_pf.auth.trust_store import REFRESH_S
 from rse_pf.config import PlatformSettings, setting_rows
 from rse_pf.errors import UsageError
 from rse_pf.object_store import ObjectStore, open_store
@@ -63,7 +64,7 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
     store = open_any_store(chosen)
     from rse_pf.data_server.server import KeysFile, serve_data
 
-    keys = KeysFile(args.keys, chosen.auth.deny_list_refresh_s)
+    keys = KeysFile(args.keys, REFRESH_S)
     return serve_data(chosen, store, keys=keys, announce=args.announce, audit=args.audit)
 
 

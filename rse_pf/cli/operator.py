@@ -12,7 +12,7 @@ from pathlib import Path
 
 from rse_pf.audit.chain import Value
 from rse_pf.audit.log import audit_folder, record_once
-from rse_pf.config import AuthSettings, PlatformSettings
+from rse_pf.config import PlatformSettings
 from rse_pf.errors import ConfigurationError
 
 __all__ = ["record", "record_map_change"]
@@ -21,12 +21,12 @@ _WHO = "operator"
 _DIRECTORY = "dir:"
 
 
-def record(state: Path, settings: AuthSettings, action: str, subject: str, **detail: Value) -> None:
+def record(state: Path, action: str, subject: str, **detail: Value) -> None:
     """Record *action* on *subject* in the platform whose files lie in *state*."""
     try:
         record_once(
             audit_folder(state), _WHO, action, subject, wall_clock=time.time,
-            max_bytes=settings.audit_file_bytes, user=_user(), **detail,
+            user=_user(), **detail,
         )  # fmt: skip
     except ConfigurationError as error:
         print(f"this is done, but not in the audit log: {error}", file=sys.stderr)
@@ -39,7 +39,7 @@ def record_map_change(
     place = settings.data.store
     state = Path(place.removeprefix(_DIRECTORY)).absolute().parent
     if place.startswith(_DIRECTORY) and audit_folder(state).is_dir():
-        record(state, settings.auth, action, name, version=version, number=number)
+        record(state, action, name, version=version, number=number)
 
 
 def _user() -> str:

@@ -80,7 +80,7 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
 
         print(make_robot_key(args.out))
         return 0
-    room, now = control_room(args, settings), time.time()
+    room, now = open_access_control(args, settings), time.time()
     if args.action == "list":
         return _list(args, room)
     robot, tenant = check_robot(args.robot), check_tenant(args.tenant)
@@ -109,13 +109,13 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
     return 0
 
 
-def control_room(args: argparse.Namespace, settings: PlatformSettings) -> AccessControlStore:
+def open_access_control(args: argparse.Namespace, settings: PlatformSettings) -> AccessControlStore:
     """Return the control room of the platform that *args* name; raises UsageError if there is none."""
     if args.cloud:
         from rse_pf.aws.account import open_account
         from rse_pf.aws.storage.key_store import open_key_store
 
-        return open_key_store(open_account(settings.cloud.region)).control_room()
+        return open_key_store(open_account(settings.cloud.region)).access_control_store()
     from rse_pf.local.firewall import key_set_file
     from rse_pf.local.state import state_folder
     from rse_pf.object_store import DirectoryStore
@@ -133,7 +133,7 @@ def note(
     if not args.cloud:
         from rse_pf.local.state import state_folder
 
-        record(state_folder(args.name, os.environ), settings.auth, action, subject, **detail)
+        record(state_folder(args.name, os.environ), action, subject, **detail)
 
 
 def longest_s(settings: PlatformSettings) -> float:

@@ -1,10 +1,74 @@
-"""Where one server runs: its addresses, its processes, and where its data and its keys are."""
+"""Where one server runs: what differs from server to server while the settings are the same.
+
+A settings file may hold a placement beside the settings, for the servers of one machine; options of
+``rse-pf serve`` override it.  The digest of the settings does not depend on it.
+"""
 
 from __future__ import annotations
 
 import ipaddress
+import json
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
 
-__all__ = ["is_loopback"]
+from rse_pf.config.settings import PlatformSettings
+from rse_pf.errors import SettingsError
+
+__all__ = ["ServerPlacement", "is_loopback"]
+
+_STORE = "store"
+_FILE_KEY = "placement"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ServerPlacement:
+    """The addresses, processes and object store of one backend server.
+
+    Each field is a setting of the same name, ``store`` of the group data and the others of the group serving;
+    port 0 takes a free one, workers 0 means one for each core.
+    """
+
+    host: str
+    port: int
+    control_host: str
+    control_port: int
+    workers: int
+    store: str
+
+    @classmethod
+    def of(cls, settings: PlatformSettings, **changes: Any) -> ServerPlacement:
+        """Return the placement that *settings* describe, with *changes*; raises SettingsError."""
+        return cls(**_values(_placed(settings, changes)))
+
+    @classmethod
+    def read(cls, file: Path | None, settings: PlatformSettings) -> ServerPlacement:
+        """Return the placement in a settings file; what the file does not say is taken from *settings*.
+
+        Raises:
+            SettingsError: The file cannot be read, or holds a value that no such setting may have.
+        """
+        if file is None:
+            return cls.of(settings)
+        try:
+            document = json.loads(file.read_text(encoding="utf-8"))
+        except (OSError, ValueError) as error:
+            raise SettingsError(f"cannot read {file}: {error}", hint="name another with --settings") from error
+        changes = document.get(_FILE_KEY, {})
+        unknown = set(changes) - set(cls.__slots__) if isinstance(changes, dict) else {_FILE_KEY}
+        if unknown:
+            raise SettingsError(
+                f"{file}: placement has no {min(unknown)!r}", hint=f"it takes {', '.join(cls.__slots__)}"
+            )
+        return cls.of(settings, **changes)
+
+    def apply(self, settings: PlatformSettings) -> PlatformSettings:
+        """Return *settings* as they are for this server."""
+        return _placed(settings, asdict(self))
+
+    def document(self, settings: PlatformSettings) -> dict[str, Any]:
+        """Return the content of a settings file for servers with this placement, as plain JSON values."""
+        return {"context": {"rse-pf": settings.to_dict()}, _FILE_KEY: asdict(self)}
 
 
 def is_loopback(host: str) -> bool:
@@ -17,3 +81,14 @@ def is_loopback(host: str) -> bool:
         return ipaddress.ip_address(host).is_loopback
     except ValueError:
         return host == "localhost"
+
+
+def _placed(settings: PlatformSettings, changes: dict[str, Any]) -> PlatformSettings:
+    serving = {name: value for name, value in changes.items() if name != _STORE}
+    data = {_STORE: changes[_STORE]} if _STORE in changes else {}
+    return settings.replace(serving=serving, data=data)
+
+
+def _values(settings: PlatformSettings) -> dict[str, Any]:
+    serving = {name: getattr(settings.serving, name) for name in ServerPlacement.__slots__ if name != _STORE}
+    return {**serving, _STORE: settings.data.store}

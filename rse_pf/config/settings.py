@@ -48,145 +48,42 @@ class ServingSettings:
     host: str = setting("127.0.0.1", doc="address the robots' socket listens on")
     port: int = setting(8765, doc="port of the robots' socket; 0 takes a free one", low=0, high=65535)
     control_host: str = setting("127.0.0.1", doc="address of the control port")
-    control_port: int = setting(
-        8766, doc="port of /healthz, /readyz, /metrics and drain; 0 takes a free one", low=0, high=65535
-    )
+    control_port: int = setting(8766, doc="port of /healthz, /readyz, /metrics and drain; 0 takes a free one", low=0, high=65535)
     path: str = setting("/ws", doc="path of the robots' WebSocket")
     workers: int = setting(0, doc="worker processes; 0 means one per core", low=0, high=256)
     solver_threads: int = setting(1, doc="solver threads of each worker", low=1, high=64)
     listen_backlog: int = setting(4096, doc="connections that wait for accept", low=16, high=65535)
-    max_robots: int = setting(
-        10000, unit="robots", doc="connections of one server; more are refused with 503", low=1
-    )
-    handshake_timeout_s: float = setting(
-        5.0, unit="s", doc="a handshake that takes longer is cut", source="slowloris, OWASP", low=0.1
-    )
-    max_handshake_bytes: int = setting(
-        8192,
-        unit="bytes",
-        doc="head of a handshake; a longer one is cut",
-        source="slowloris, OWASP",
-        low=1024,
-        high=16384,
-    )
-    max_unauthenticated: int = setting(
-        200,
-        unit="sockets",
-        doc="sockets that have shown no token yet; the one that waited longest leaves",
-        low=1,
-    )
-    max_unauthenticated_per_source: int = setting(
-        50,
-        unit="sockets",
-        doc="the same, of one address; not counted behind trusted proxies; 0 is off",
-        low=0,
-    )
-    max_accepts_per_s: float = setting(
-        500.0, unit="sockets/s", doc="sockets accepted in a second; more wait in the backlog; 0 is off", low=0
-    )
-    max_handshakes_per_source_per_s: float = setting(
-        200.0,
-        unit="handshakes/s",
-        doc="handshakes of one address; more are refused with 429; 0 is off",
-        low=0,
-    )
-    handshake_burst: int = setting(
-        1000, unit="handshakes", doc="handshakes of one address at once, and sockets accepted at once", low=1
-    )
-    trusted_proxies: int = setting(
-        1,
-        unit="proxies",
-        doc="load balancers that append to x-forwarded-for; 0: robots come directly",
-        low=0,
-        high=8,
-    )
+    max_robots: int = setting(10000, unit="robots", doc="connections of one server; more are refused with 503", low=1)
+    handshake_timeout_s: float = setting(5.0, unit="s", doc="a handshake that takes longer is cut", source="slowloris, OWASP", low=0.1)
+    max_handshake_bytes: int = setting(8192, unit="bytes", doc="head of a handshake; a longer one is cut", source="slowloris, OWASP", low=1024, high=16384)
+    max_unauthenticated: int = setting(200, unit="sockets", doc="sockets that have shown no token yet; the one that waited longest leaves", low=1)
+    max_unauthenticated_per_source: int = setting(50, unit="sockets", doc="the same, of one address; not counted behind trusted proxies; 0 is off", low=0)
+    max_accepts_per_s: float = setting(500.0, unit="sockets/s", doc="sockets accepted in a second; more wait in the backlog; 0 is off", low=0)
+    max_handshakes_per_source_per_s: float = setting(200.0, unit="handshakes/s", doc="handshakes of one address; more are refused with 429; 0 is off", low=0)
+    handshake_burst: int = setting(1000, unit="handshakes", doc="handshakes of one address at once, and sockets accepted at once", low=1)
+    trusted_proxies: int = setting(1, unit="proxies", doc="load balancers that append to x-forwarded-for; 0: robots come directly", low=0, high=8)
     read_buffer_bytes: int = setting(2048, unit="bytes", doc="first read buffer of a socket", low=256)
-    write_buffer_bytes: int = setting(
-        262144, unit="bytes", doc="unsent bytes at which a reader counts as slow", low=4096
-    )
-    slow_reader_timeout_s: float = setting(
-        1.0, unit="s", doc="a reader that stays slow this long is cut off", low=0.05
-    )
-    inline_bytes: int = setting(
-        16384,
-        unit="bytes",
-        doc="a command up to this size is solved in the event loop when nothing waits",
-        low=0,
-    )
-    max_unread_bytes: int = setting(
-        16777216,
-        unit="bytes",
-        doc="messages of more than inline_bytes that wait to be read in one worker; more are refused",
-        low=262144,
-    )
-    queue_target_ms: float = setting(
-        50.0,
-        unit="ms",
-        doc="waiting time above which the server counts as behind",
-        source="CoDel, Nichols and Jacobson 2012",
-        low=1,
-    )
-    queue_interval_ms: float = setting(
-        100.0,
-        unit="ms",
-        doc="behind for this long, the server sheds",
-        source="CoDel, Nichols and Jacobson 2012",
-        low=1,
-    )
-    max_queue_per_robot: int = setting(
-        8, unit="commands", doc="commands of one robot that wait; more are refused", low=1
-    )
-    max_objects_per_command: int = setting(
-        64, doc="stored objects that one command may name in the place of bytes", low=0
-    )
-    max_object_bytes_per_command: int = setting(
-        134217728, unit="bytes", doc="of all objects that one command names", low=1024
-    )
-    emulated_cores: float = setting(
-        0.0,
-        unit="cores",
-        doc="emulated size of each worker in CPU seconds per second; 0 is off",
-        low=0,
-        high=64,
-    )
+    write_buffer_bytes: int = setting(262144, unit="bytes", doc="unsent bytes at which a reader counts as slow", low=4096)
+    slow_reader_timeout_s: float = setting(1.0, unit="s", doc="a reader that stays slow this long is cut off", low=0.05)
+    inline_bytes: int = setting(16384, unit="bytes", doc="a command up to this size is solved in the event loop when nothing waits", low=0)
+    max_unread_bytes: int = setting(16777216, unit="bytes", doc="messages of more than inline_bytes that wait to be read in one worker; more are refused", low=262144)
+    queue_target_ms: float = setting(50.0, unit="ms", doc="waiting time above which the server counts as behind", source="CoDel, Nichols and Jacobson 2012", low=1)
+    queue_interval_ms: float = setting(100.0, unit="ms", doc="behind for this long, the server sheds", source="CoDel, Nichols and Jacobson 2012", low=1)
+    max_queue_per_robot: int = setting(8, unit="commands", doc="commands of one robot that wait; more are refused", low=1)
+    max_objects_per_command: int = setting(64, doc="stored objects that one command may name in the place of bytes", low=0)
+    max_object_bytes_per_command: int = setting(134217728, unit="bytes", doc="of all objects that one command names", low=1024)
+    emulated_cores: float = setting(0.0, unit="cores", doc="emulated size of each worker in CPU seconds per second; 0 is off", low=0, high=64)
     size_burst_ms: float = setting(20.0, unit="ms", doc="CPU time an emulated server may run ahead", low=1)
-    max_running_jobs: int = setting(
-        1, doc="long services that run at a time on one server; 0 offers none", low=0, high=64
-    )
-    max_waiting_jobs: int = setting(
-        8,
-        doc="jobs of one worker beside those, that wait or run on another server; more are refused",
-        low=0,
-        high=1000,
-    )
-    max_job_memory_bytes: int = setting(
-        2147483648, unit="bytes", doc="memory of one job; one that needs more is ended", low=134217728
-    )
-    job_heartbeat_s: float = setting(
-        1.0, unit="s", doc="time between two renewals of a job's lease", low=0.05
-    )
-    job_lease_s: float = setting(
-        5.0,
-        unit="s",
-        doc="a job whose lease is not renewed for so long is taken over by another server",
-        low=0.1,
-    )
+    max_running_jobs: int = setting(1, doc="long services that run at a time on one server; 0 offers none", low=0, high=64)
+    max_waiting_jobs: int = setting(8, doc="jobs of one worker beside those, that wait or run on another server; more are refused", low=0, high=1000)
+    max_job_memory_bytes: int = setting(2147483648, unit="bytes", doc="memory of one job; one that needs more is ended", low=134217728)
+    job_heartbeat_s: float = setting(1.0, unit="s", doc="time between two renewals of a job's lease", low=0.05)
+    job_lease_s: float = setting(5.0, unit="s", doc="a job whose lease is not renewed for so long is taken over by another server", low=0.1)
     max_job_s: float = setting(3600.0, unit="s", doc="a job that takes longer is ended", low=1)
-    job_record_ttl_s: float = setting(
-        604800.0,
-        unit="s",
-        doc="the record of a job that nobody touched for so long is forgotten; asked again, the job is done again",
-        low=60,
-    )
-    drain_wait_s: float = setting(
-        1.0, unit="s", doc="not ready, but still accepting, before robots are moved", low=0
-    )
-    drain_within_ms: float = setting(
-        5000.0, unit="ms", doc="time robots get to move to another server", low=100
-    )
-    log_level: str = setting(
-        "info", doc="lines below this level are not written", choices=("debug", "info", "warning", "error")
-    )
+    job_record_ttl_s: float = setting(604800.0, unit="s", doc="the record of a job that nobody touched for so long is forgotten; asked again, the job is done again", low=60)
+    drain_wait_s: float = setting(1.0, unit="s", doc="not ready, but still accepting, before robots are moved", low=0)
+    drain_within_ms: float = setting(5000.0, unit="ms", doc="time robots get to move to another server", low=100)
+    log_level: str = setting("info", doc="lines below this level are not written", choices=("debug", "info", "warning", "error"))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -196,85 +93,30 @@ class SessionSettings:
     max_message_bytes: int = setting(262144, unit="bytes", doc="one WebSocket message on the wire", low=1024)
     max_inflated_bytes: int = setting(1048576, unit="bytes", doc="one message after inflating", low=1024)
     max_inflate_ratio: float = setting(100.0, unit="x", doc="inflated size over wire size", low=2)
-    max_fragments: int = setting(
-        64, doc="fragments of one message, empty ones included", source="GHSA-96hv-2xvq-fx4p", low=1
-    )
+    max_fragments: int = setting(64, doc="fragments of one message, empty ones included", source="GHSA-96hv-2xvq-fx4p", low=1)
     max_json_depth: int = setting(16, unit="levels", doc="nesting of a JSON message", low=4, high=200)
     max_json_lists: int = setting(7000, doc="lists and objects of a message, at any depth", low=16)
-    max_json_values: int = setting(
-        30000,
-        doc="values of a robot's message outside of raw arrays; a list counts as three, an object as six",
-        low=64,
-    )
-    max_json_memory_bytes: int = setting(
-        2000000,
-        unit="bytes",
-        doc="what a JSON message of a robot may take in memory, as estimated before it is read",
-        low=65536,
-    )
-    max_bad_messages: int = setting(
-        10,
-        unit="messages",
-        doc="undecodable messages of one socket before it is closed, and its robot rests for rate_ban_s",
-        low=0,
-    )
-    bad_message_bytes: int = setting(
-        65536, unit="bytes", doc="an undecodable message counts once more for so many bytes", low=1024
-    )
-    bad_message_pause_s: float = setting(
-        0.1,
-        unit="s",
-        doc="after an undecodable message its socket is not read for this, times their number",
-        low=0,
-    )
+    max_json_values: int = setting(30000, doc="values of a robot's message outside of raw arrays; a list counts as three, an object as six", low=64)
+    max_json_memory_bytes: int = setting(2000000, unit="bytes", doc="what a JSON message of a robot may take in memory, as estimated before it is read", low=65536)
+    max_bad_messages: int = setting(10, unit="messages", doc="undecodable messages of one socket before it is closed, and its robot rests for rate_ban_s", low=0)
+    bad_message_bytes: int = setting(65536, unit="bytes", doc="an undecodable message counts once more for so many bytes", low=1024)
+    bad_message_pause_s: float = setting(0.1, unit="s", doc="after an undecodable message its socket is not read for this, times their number", low=0)
     max_control_per_s: float = setting(10.0, unit="frames/s", doc="control frames of one socket", low=1)
     max_in_flight: int = setting(8, unit="commands", doc="unanswered commands of one robot", low=1)
-    max_commands_per_s: float = setting(
-        20.0,
-        unit="commands/s",
-        doc="messages of one robot; more are refused; 0 is off",
-        source="AWS IoT and Discord limit so",
-        low=0,
-    )
+    max_commands_per_s: float = setting(20.0, unit="commands/s", doc="messages of one robot; more are refused; 0 is off", source="AWS IoT and Discord limit so", low=0)
     command_burst: int = setting(40, unit="commands", doc="messages of one robot at once", low=1)
-    max_rate_violations: int = setting(
-        3,
-        unit="strikes",
-        doc="a strike is command_burst refusals; so many within rate_window_s close the socket with 4429",
-        low=1,
-    )
+    max_rate_violations: int = setting(3, unit="strikes", doc="a strike is command_burst refusals; so many within rate_window_s close the socket with 4429", low=1)
     rate_window_s: float = setting(10.0, unit="s", doc="see max_rate_violations", low=0.1)
-    rate_ban_s: float = setting(
-        5.0, unit="s", doc="a robot that was cut off for its rate is refused this long", low=0
-    )
-    ping_interval_s: float = setting(
-        2.0,
-        unit="s",
-        doc="time between application pings",
-        source="paper, Sect. 3.3 (delays); ours in value",
-        low=0.05,
-    )
-    ping_timeout_s: float = setting(
-        3.0, unit="s", doc="silence after a ping that counts as a lost link", low=0.1
-    )
+    rate_ban_s: float = setting(5.0, unit="s", doc="a robot that was cut off for its rate is refused this long", low=0)
+    ping_interval_s: float = setting(2.0, unit="s", doc="time between application pings", source="paper, Sect. 3.3 (delays); ours in value", low=0.05)
+    ping_timeout_s: float = setting(3.0, unit="s", doc="silence after a ping that counts as a lost link", low=0.1)
     hello_timeout_s: float = setting(5.0, unit="s", doc="a socket without a Hello is closed", low=0.1)
     connect_timeout_s: float = setting(2.0, unit="s", doc="one try to connect", low=0.1)
-    reconnect_base_s: float = setting(
-        0.1, unit="s", doc="first back-off; full jitter", source="AWS Architecture Blog, 2015", low=0.001
-    )
+    reconnect_base_s: float = setting(0.1, unit="s", doc="first back-off; full jitter", source="AWS Architecture Blog, 2015", low=0.001)
     reconnect_max_s: float = setting(1.0, unit="s", doc="longest back-off", low=0.01)
     answer_timeout_s: float = setting(5.0, unit="s", doc="deadline of a command that names none", low=0.05)
-    stall_timeout_s: float = setting(
-        1.0, unit="s", doc="an unanswered command and this much silence end the socket", low=0.05
-    )
-    retry_percent: float = setting(
-        10.0,
-        unit="%",
-        doc="retries after busy, as a share of commands",
-        source="Google SRE book, ch. 21",
-        low=0,
-        high=100,
-    )
+    stall_timeout_s: float = setting(1.0, unit="s", doc="an unanswered command and this much silence end the socket", low=0.05)
+    retry_percent: float = setting(10.0, unit="%", doc="retries after busy, as a share of commands", source="Google SRE book, ch. 21", low=0, high=100)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -284,16 +126,9 @@ class PnpSettings:
     engine: str = setting("poselib", doc="solver when a command names none", choices=("poselib", "opencv"))
     max_correspondences: int = setting(5000, doc="correspondences of one command", low=4)
     max_iterations: int = setting(1000, doc="RANSAC iterations a command may ask for", low=1, high=100000)
-    min_iterations: int = setting(
-        10,
-        doc="RANSAC iterations that are always done (poselib)",
-        source="measured: 2-5x faster than poselib's default at equal success",
-        low=1,
-    )
+    min_iterations: int = setting(10, doc="RANSAC iterations that are always done (poselib)", source="measured: 2-5x faster than poselib's default at equal success", low=1)
     weak_inliers: int = setting(12, unit="inliers", doc="a pose with fewer is called weak", low=4)
-    weak_inlier_percent: float = setting(
-        25.0, unit="%", doc="a pose with a smaller share of inliers is called weak", low=0, high=100
-    )
+    weak_inlier_percent: float = setting(25.0, unit="%", doc="a pose with a smaller share of inliers is called weak", low=0, high=100)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -301,9 +136,7 @@ class HealthSettings:
     """When a server counts as healthy."""
 
     cloud_interval_s: int = setting(5, unit="s", doc="time between checks of the ALB", low=5, high=300)
-    unhealthy_checks: int = setting(
-        2, unit="checks", doc="failed checks in a row that take a server out", low=2, high=10
-    )
+    unhealthy_checks: int = setting(2, unit="checks", doc="failed checks in a row that take a server out", low=2, high=10)
     grace_s: int = setting(90, unit="s", doc="a new server is not judged before", low=0)
 
 
@@ -311,18 +144,10 @@ class HealthSettings:
 class ScalingSettings:
     """When the cloud grows and shrinks."""
 
-    busy_cpu_percent: float = setting(
-        70.0, unit="%", source="paper, Sect. 6.2", doc="add a server above this average CPU", low=1, high=100
-    )
-    very_busy_cpu_percent: float = setting(
-        85.0, unit="%", doc="add two servers above this average CPU", low=1, high=100
-    )
-    idle_s: int = setting(
-        300, unit="s", source="paper, Sect. 6.2", doc="remove a server after this long without work", low=60
-    )
-    idle_cpu_percent: float = setting(
-        20.0, unit="%", doc="idle means no requests and CPU below this", low=0, high=100
-    )
+    busy_cpu_percent: float = setting(70.0, unit="%", source="paper, Sect. 6.2", doc="add a server above this average CPU", low=1, high=100)
+    very_busy_cpu_percent: float = setting(85.0, unit="%", doc="add two servers above this average CPU", low=1, high=100)
+    idle_s: int = setting(300, unit="s", source="paper, Sect. 6.2", doc="remove a server after this long without work", low=60)
+    idle_cpu_percent: float = setting(20.0, unit="%", doc="idle means no requests and CPU below this", low=0, high=100)
     period_s: int = setting(60, unit="s", doc="one sample of the monitor", low=10)
     busy_periods: int = setting(2, unit="periods", doc="busy samples in a row before growing", low=1)
     step: int = setting(1, unit="servers", doc="servers added when busy", low=1)
@@ -330,27 +155,10 @@ class ScalingSettings:
     min_servers: int = setting(2, unit="servers", doc="never fewer", low=1)
     max_servers: int = setting(10, unit="servers", doc="never more", low=1)
     warm_up_s: int = setting(60, unit="s", doc="a new server's CPU does not count for this long", low=0)
-    max_robots_per_server: int = setting(
-        0,
-        unit="robots",
-        source="paper, Sect. 3.1",
-        doc="add a server above this many robots each; 0 is off",
-        low=0,
-    )
+    max_robots_per_server: int = setting(0, unit="robots", source="paper, Sect. 3.1", doc="add a server above this many robots each; 0 is off", low=0)
     max_queue_ms: float = setting(0.0, unit="ms", doc="add a server above this queue delay; 0 is off", low=0)
-    rebalance_percent: float = setting(
-        20.0,
-        unit="%",
-        doc="crowded servers hand robots over until all are within this of even",
-        low=0,
-        high=100,
-    )
-    moves_per_s: float = setting(
-        20.0,
-        unit="robots/s",
-        doc="robots that one server asks to move each second when it is crowded",
-        low=0.1,
-    )
+    rebalance_percent: float = setting(20.0, unit="%", doc="crowded servers hand robots over until all are within this of even", low=0, high=100)
+    moves_per_s: float = setting(20.0, unit="robots/s", doc="robots that one server asks to move each second when it is crowded", low=0.1)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -363,26 +171,16 @@ class DataSettings:
     host: str = setting("127.0.0.1", doc="address the data service listens on")
     max_object_bytes: int = setting(268435456, unit="bytes", doc="one object", low=1024)
     quota_bytes: int = setting(10737418240, unit="bytes", doc="all objects of one robot", low=1024)
-    part_bytes: int = setting(
-        4194304, unit="bytes", doc="body of one request; larger objects are sent in parts", low=1024
-    )
+    part_bytes: int = setting(4194304, unit="bytes", doc="body of one request; larger objects are sent in parts", low=1024)
     max_uploads: int = setting(32, doc="bodies received at once; more are told to come again", low=1)
     upload_ttl_s: int = setting(86400, unit="s", doc="an unfinished upload is forgotten after this", low=60)
     body_timeout_s: float = setting(10.0, unit="s", doc="longest silence within a body", low=0.1)
     body_grace_s: float = setting(5.0, unit="s", doc="then the lowest body rate applies", low=0.1)
     min_body_bytes_per_s: int = setting(1024, unit="bytes/s", doc="a slower body is refused", low=1)
-    presigned_url_ttl_s: int = setting(
-        300, unit="s", doc="a signed address of the bucket is good for so long", low=10, high=300
-    )
-    background_bytes_per_s: int = setting(
-        262144, unit="bytes/s", doc="keyframes a robot sends beside its live poses", low=1024
-    )
-    max_spool_bytes: int = setting(
-        1073741824, unit="bytes", doc="keyframes a robot keeps on its disk while offline", low=1024
-    )
-    glacier_after_days: int = setting(
-        90, unit="days", source="paper, Sect. 5.1", doc="maps move to Glacier", low=30
-    )
+    presigned_url_ttl_s: int = setting(300, unit="s", doc="a signed address of the bucket is good for so long", low=10, high=300)
+    background_bytes_per_s: int = setting(262144, unit="bytes/s", doc="keyframes a robot sends beside its live poses", low=1024)
+    max_spool_bytes: int = setting(1073741824, unit="bytes", doc="keyframes a robot keeps on its disk while offline", low=1024)
+    glacier_after_days: int = setting(90, unit="days", source="paper, Sect. 5.1", doc="maps move to Glacier", low=30)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -391,44 +189,11 @@ class AuthSettings:
 
     issuer: str = setting("rse-pf", doc="who signs the tokens")
     audience: str = setting("rse-pf", doc="whom the tokens are for")
-    token_ttl_s: int = setting(
-        900, unit="s", doc="life of a robot token", source="RFC 8725; short-lived", low=10, high=900
-    )
+    token_ttl_s: int = setting(900, unit="s", doc="life of a robot token", source="RFC 8725; short-lived", low=10, high=900)
     leeway_s: int = setting(30, unit="s", doc="clock difference that is forgiven", low=0, high=300)
     max_token_bytes: int = setting(4096, unit="bytes", doc="a longer token is refused unread", low=512)
     required: bool = setting(True, doc="robots without a token are refused")
-    deny_list_refresh_s: float = setting(
-        0.5,
-        unit="s",
-        doc="time between two looks of a server at revoked tokens, disabled and enrolled robots",
-        source="live sockets end within 2 s",
-        low=0.05,
-        high=30,
-    )
-    audit_sync_ms: float = setting(
-        100.0, unit="ms", doc="an entry of the audit log is on the disk after this", low=1, high=10000
-    )
-    audit_file_bytes: int = setting(
-        16777216,
-        unit="bytes",
-        doc="a file of the audit log that has grown longer is set aside, and the chain goes on in the next",
-        low=65536,
-    )
-    audit_refused_per_s: float = setting(
-        2.0,
-        unit="1/s",
-        doc="refused tokens that a worker records one by one, in the long run; the rest are counted",
-        low=0,
-    )
-    audit_refused_burst: int = setting(
-        50, unit="entries", doc="refused tokens that it records at once", low=1
-    )
-    audit_heads_s: float = setting(
-        60.0,
-        unit="s",
-        doc="time between two looks of the control plane at the heads of the other audit logs",
-        low=0.1,
-    )
+    audit_heads_s: float = setting(60.0, unit="s", doc="time between two looks of the control plane at the heads of the other audit logs", low=0.1)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -436,46 +201,19 @@ class ServiceSettings:
     """Services that the operator installs, each robot in its own environment."""
 
     folder: str = setting("", doc="folder of installed services; empty means none")
-    published: bool = setting(
-        False,
-        doc="also run the services that installed Python packages publish (entry points rse_pf.services)",
-    )
+    published: bool = setting(False, doc="also run the services that installed Python packages publish (entry points rse_pf.services)")
     max_sandboxes: int = setting(64, doc="isolated environments of one server", low=1)
     memory_bytes: int = setting(536870912, unit="bytes", doc="address space of one environment", low=16777216)
-    scratch_bytes: int = setting(
-        16777216, unit="bytes", doc="private folder of one environment, in memory", low=65536
-    )
+    scratch_bytes: int = setting(16777216, unit="bytes", doc="private folder of one environment, in memory", low=65536)
     grace_s: float = setting(5.0, unit="s", doc="an environment outlives its connection by this", low=0)
-    start_timeout_s: float = setting(
-        5.0, unit="s", doc="an environment that is not ready by then is killed", low=0.1
-    )
-    deadline_factor: float = setting(
-        2.0, unit="x", doc="an environment is killed when a command takes this many deadlines", low=1
-    )
-    poison_crashes: int = setting(
-        2,
-        unit="deaths",
-        doc="a request that killed so many environments is not tried again",
-        source="dead-letter queues; OWASP",
-        low=1,
-    )
-    breaker_crashes: int = setting(
-        5,
-        unit="deaths",
-        doc="a service that killed so many environments within breaker_window_s rests",
-        low=2,
-    )
+    start_timeout_s: float = setting(5.0, unit="s", doc="an environment that is not ready by then is killed", low=0.1)
+    deadline_factor: float = setting(2.0, unit="x", doc="an environment is killed when a command takes this many deadlines", low=1)
+    poison_crashes: int = setting(2, unit="deaths", doc="a request that killed so many environments is not tried again", source="dead-letter queues; OWASP", low=1)
+    breaker_crashes: int = setting(5, unit="deaths", doc="a service that killed so many environments within breaker_window_s rests", low=2)
     breaker_window_s: float = setting(30.0, unit="s", doc="see breaker_crashes", low=1)
     breaker_open_s: float = setting(60.0, unit="s", doc="so long a service rests after a crash loop", low=1)
-    accept_weak_isolation: bool = setting(
-        False, doc="run installed services even where the kernel lacks a wall"
-    )
-    first_uid: int = setting(
-        1000000,
-        doc="environments of a server that runs as root get user ids from here",
-        low=1000,
-        high=2000000000,
-    )
+    accept_weak_isolation: bool = setting(False, doc="run installed services even where the kernel lacks a wall")
+    first_uid: int = setting(1000000, doc="environments of a server that runs as root get user ids from here", low=1000, high=2000000000)
     max_graph_edges: int = setting(100000, doc="edges of one pose graph that a map service takes", low=1)
     max_cloud_points: int = setting(1000000, doc="points of one cloud that icp takes", low=100)
     max_map_keyframes: int = setting(2000, doc="keyframes of one map that a map service takes", low=1)
@@ -490,32 +228,13 @@ class LocalSettings:
     servers: int = setting(2, unit="servers", doc="backend servers at the start", low=1, high=64)
     workers: int = setting(1, doc="worker processes of each local server", low=1, high=64)
     start_timeout_s: float = setting(20.0, unit="s", doc="a server that is not ready by then failed", low=1)
-    stop_timeout_s: float = setting(
-        10.0, unit="s", doc="a process that does not leave by then is killed", low=0.5
-    )
-    warm_standby: bool = setting(
-        True,
-        doc="keep one more process warm, about 60 MB, that becomes the next server at once",
-        source="warm pools of AWS Auto Scaling",
-    )
-    data_nice: int = setting(
-        10, doc="niceness of the data server: on one machine poses go first", low=0, high=19
-    )
-    max_restarts_per_minute: int = setting(
-        5, unit="servers", doc="replacements of servers that died young, in any minute", low=1
-    )
-    min_uptime_s: float = setting(
-        10.0, unit="s", doc="a server that ends this soon after it became healthy died young", low=0
-    )
-    log_file_bytes: int = setting(
-        67108864,
-        unit="bytes",
-        doc="a log that has grown longer is set aside, in place of the one set aside before, and begins anew",
-        low=65536,
-    )
-    certificate: str = setting(
-        "", doc="file of the front door's certificate chain (PEM); with it robots dial wss://"
-    )
+    stop_timeout_s: float = setting(10.0, unit="s", doc="a process that does not leave by then is killed", low=0.5)
+    warm_standby: bool = setting(True, doc="keep one more process warm, about 60 MB, that becomes the next server at once", source="warm pools of AWS Auto Scaling")
+    data_nice: int = setting(10, doc="niceness of the data server: on one machine poses go first", low=0, high=19)
+    max_restarts_per_minute: int = setting(5, unit="servers", doc="replacements of servers that died young, in any minute", low=1)
+    min_uptime_s: float = setting(10.0, unit="s", doc="a server that ends this soon after it became healthy died young", low=0)
+    log_file_bytes: int = setting(67108864, unit="bytes", doc="a log that has grown longer is set aside, in place of the one set aside before, and begins anew", low=65536)
+    certificate: str = setting("", doc="file of the front door's certificate chain (PEM); with it robots dial wss://")
     private_key: str = setting("", doc="file of the private key of local.certificate (PEM)")
 
 
@@ -525,100 +244,41 @@ class CloudSettings:
 
     region: str = setting("ap-northeast-2", doc="AWS region", source="paper, Sect. 6.1 (Seoul)")
     allow_insecure: bool = setting(True, doc="true: ws:// without a certificate, for trials; false: wss://")
-    certificate_arn: str = setting(
-        "", doc="certificate of the front door; needed when allow_insecure is false"
-    )
+    certificate_arn: str = setting("", doc="certificate of the front door; needed when allow_insecure is false")
     domain_name: str = setting("", doc="name of the front door; needed when allow_insecure is false")
     instance_type: str = setting("c7i.large", doc="EC2 type of a backend server (x86-64)")
-    image_parameter: str = setting(
-        "/aws/service/debian/release/12/latest/amd64",
-        doc="SSM parameter that names the machine image",
-        source="Debian's public parameter",
-    )
-    endpoints: str = setting(
-        "minimal",
-        doc="interface endpoints: minimal (monitoring, autoscaling, logs) or full (also ssm, secretsmanager)",
-        choices=("minimal", "full"),
-    )
-    s3_prefix_list: str = setting(
-        "", doc="prefix list of S3 in the region; empty takes it from the table in stacks/firewall.py"
-    )
+    image_parameter: str = setting("/aws/service/debian/release/12/latest/amd64", doc="SSM parameter that names the machine image", source="Debian's public parameter")
+    endpoints: str = setting("minimal", doc="interface endpoints: minimal (monitoring, autoscaling, logs) or full (also ssm, secretsmanager)", choices=("minimal", "full"))
+    s3_prefix_list: str = setting("", doc="prefix list of S3 in the region; empty takes it from the table in stacks/firewall.py")
     robot_cidr: str = setting("0.0.0.0/0", doc="addresses that robots may come from")
-    requests_per_5_minutes: int = setting(
-        2000, unit="requests", doc="WAF: handshakes of one address in five minutes", low=100
-    )
-    drain_s: int = setting(
-        60, unit="s", doc="time the termination hook gives a leaving server", low=30, high=7200
-    )
-    poll_s: int = setting(
-        5, unit="s", doc="time between an instance's looks at its lifecycle state", low=1, high=60
-    )
-    lambda_memory_mb: int = setting(
-        1769, unit="MB", doc="memory of the serverless PnP; 1769 is one vCPU", low=128, high=10240
-    )
+    requests_per_5_minutes: int = setting(2000, unit="requests", doc="WAF: handshakes of one address in five minutes", low=100)
+    drain_s: int = setting(60, unit="s", doc="time the termination hook gives a leaving server", low=30, high=7200)
+    poll_s: int = setting(5, unit="s", doc="time between an instance's looks at its lifecycle state", low=1, high=60)
+    lambda_memory_mb: int = setting(1769, unit="MB", doc="memory of the serverless PnP; 1769 is one vCPU", low=128, high=10240)
     lambda_concurrency: int = setting(20, doc="executions of the serverless PnP at a time", low=1)
     log_days: int = setting(30, unit="days", doc="logs are kept this long", low=1)
-    audit_ship_s: int = setting(
-        60,
-        unit="s",
-        doc="time between two pieces of a server's audit log on their way to the bucket; a machine that dies at once loses so much",
-        low=5,
-        high=3600,
-    )
-    audit_days: int = setting(
-        365,
-        unit="days",
-        doc="nobody can change or delete an audit log in the bucket for so long; then it goes by itself",
-        low=1,
-    )
+    audit_ship_s: int = setting(60, unit="s", doc="time between two pieces of a server's audit log on their way to the bucket; a machine that dies at once loses so much", low=5, high=3600)
+    audit_days: int = setting(365, unit="days", doc="nobody can change or delete an audit log in the bucket for so long; then it goes by itself", low=1)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PriceSettings:
     """What AWS asks for, for `rse-pf cloud cost`: one dated table for one region, without taxes. Lay your own over it."""
 
-    as_of: str = setting(
-        "2025-06, Seoul, from memory", doc="when and where these prices held, and who read them", source=_LIST
-    )
+    as_of: str = setting("2025-06, Seoul, from memory", doc="when and where these prices held, and who read them", source=_LIST)
     region: str = setting("ap-northeast-2", doc="region for which these prices held")
     instance_type: str = setting("c7i.large", doc="type of server for which they held")
-    server_hour_usd: float = setting(
-        0.1008, unit="USD/h", doc="one prices.instance_type, on demand", source=_LIST, low=0
-    )
+    server_hour_usd: float = setting(0.1008, unit="USD/h", doc="one prices.instance_type, on demand", source=_LIST, low=0)
     server_vcpus: int = setting(2, doc="vCPUs of one prices.instance_type", source=_LIST, low=1)
-    server_month_usd: float = setting(
-        3.13,
-        unit="USD/month",
-        doc="beside the hours of a server: 8 GB of gp3, seven detailed metrics, one of ours",
-        source=_LIST,
-        low=0,
-    )
-    balancer_hour_usd: float = setting(
-        0.0325, unit="USD/h", doc="the load balancer with two public addresses", source=_LIST, low=0
-    )
-    balancer_unit_hour_usd: float = setting(
-        0.008, unit="USD/h", doc="one capacity unit: 3000 sockets, or 1 GB an hour", source=_LIST, low=0
-    )
-    endpoint_hour_usd: float = setting(
-        0.013, unit="USD/h", doc="one interface endpoint in one zone", source=_LIST, low=0
-    )
-    fixed_month_usd: float = setting(
-        9.1, unit="USD/month", doc="WAF with one rule, alarms, our metrics, one secret", source=_LIST, low=0
-    )
+    server_month_usd: float = setting(3.13, unit="USD/month", doc="beside the hours of a server: 8 GB of gp3, seven detailed metrics, one of ours", source=_LIST, low=0)
+    balancer_hour_usd: float = setting(0.0325, unit="USD/h", doc="the load balancer with two public addresses", source=_LIST, low=0)
+    balancer_unit_hour_usd: float = setting(0.008, unit="USD/h", doc="one capacity unit: 3000 sockets, or 1 GB an hour", source=_LIST, low=0)
+    endpoint_hour_usd: float = setting(0.013, unit="USD/h", doc="one interface endpoint in one zone", source=_LIST, low=0)
+    fixed_month_usd: float = setting(9.1, unit="USD/month", doc="WAF with one rule, alarms, our metrics, one secret", source=_LIST, low=0)
     lambda_million_usd: float = setting(0.2, unit="USD", doc="a million executions", source=_LIST, low=0)
-    lambda_gb_s_usd: float = setting(
-        0.0000166667, unit="USD", doc="a gigabyte of memory for a second, x86-64", source=_LIST, low=0
-    )
-    command_cpu_ms: float = setting(
-        1.5,
-        unit="ms",
-        doc="CPU of one PnP command on a server or in the Lambda",
-        source="benchmarks/handler.py: 1.2 ms, plus the socket",
-        low=0.01,
-    )
-    command_bytes: int = setting(
-        3467, unit="bytes", doc="one PnP command on the wire: 200 matches, zlib", source="measured", low=1
-    )
+    lambda_gb_s_usd: float = setting(0.0000166667, unit="USD", doc="a gigabyte of memory for a second, x86-64", source=_LIST, low=0)
+    command_cpu_ms: float = setting(1.5, unit="ms", doc="CPU of one PnP command on a server or in the Lambda", source="benchmarks/handler.py: 1.2 ms, plus the socket", low=0.01)
+    command_bytes: int = setting(3467, unit="bytes", doc="one PnP command on the wire: 200 matches, zlib", source="measured", low=1)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -740,18 +400,8 @@ def settings_page() -> str:
             group = row.group
             kind = typing.get_type_hints(PlatformSettings)[group]
             lines += ["", f"## {group}", "", kind.__doc__, ""]
-            lines += [
-                "| Setting | Default | Unit | Allowed | Source | Meaning |",
-                "|---|---|---|---|---|---|",
-            ]
-        cells = (
-            f"`{row.name}`",
-            f"`{json.dumps(row.default)}`",
-            row.unit,
-            _allowed(row),
-            row.source,
-            row.doc,
-        )
+            lines += ["| Setting | Default | Unit | Allowed | Source | Meaning |", "|---|---|---|---|---|---|"]
+        cells = (f"`{row.name}`", f"`{json.dumps(row.default)}`", row.unit, _allowed(row), row.source, row.doc)
         lines.append("| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |")
     return "\n".join(lines) + "\n"
 

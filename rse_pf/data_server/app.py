@@ -13,7 +13,7 @@ import uuid
 from collections.abc import AsyncIterator, Callable, Mapping
 from typing import Any
 
-from rse_pf.audit.chain import Note, Refusals
+from rse_pf.audit.chain import Note, RefusalLimiter
 from rse_pf.audit.log import AuditLog
 from rse_pf.auth.roster import holds
 from rse_pf.auth.tokens import Claims, KeySet, token_problem, verify_token
@@ -67,7 +67,7 @@ class DataServer:
             audit: Gets refused tokens and changes of maps; None records nothing.
         """
         self._audit = audit
-        self._refusals = Refusals(settings.auth.audit_refused_per_s, settings.auth.audit_refused_burst)
+        self._refusals = RefusalLimiter()
         self._settings = settings
         self._keys = keys
         self._log = log

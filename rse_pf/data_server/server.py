@@ -98,8 +98,7 @@ def serve_data(
 
 def _audit_log(folder: Path, settings: PlatformSettings) -> AuditLog:
     log = AuditLog(
-        folder, "data", wall_clock=time.time, max_bytes=settings.auth.audit_file_bytes,
-        sync_s=settings.auth.audit_sync_ms / 1e3, on_problem=_say_problem,
+        folder, "data", wall_clock=time.time, on_problem=_say_problem,
     ).open()  # fmt: skip
     log.start()
     return log

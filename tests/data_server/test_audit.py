@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from fake_data_service import KEY, Service, small_settings
 
-from rse_pf.audit.chain import Entry
+from rse_pf.audit.chain import REFUSAL_BURST, Entry
 from rse_pf.audit.log import AuditLog, files_of
 from rse_pf.audit.verify import check_folder, entries_of
 from rse_pf.data_server.app import DataServer
@@ -82,7 +82,7 @@ def test_what_changed_nothing_is_not_recorded(recorded: Recorded) -> None:
 
 
 def test_refused_tokens_are_recorded_and_a_flood_of_them_is_counted(recorded: Recorded) -> None:
-    burst = recorded.settings.auth.audit_refused_burst
+    burst = REFUSAL_BURST
     for _ in range(burst + 30):
         assert recorded.ask("GET", "/data/v1/maps", token="nonsense").status == 401
 

@@ -1,10 +1,10 @@
-"""Stand beside a backend server on its instance: numbers out; keys, roster and deny-list in; the drain.
+"""The agent of a backend server on its instance: publish metrics, fetch keys and access control, drain.
 
     python -m rse_pf.aws.fleet.agent --settings FILE --bucket B --keys-file FILE --group G --hook H
 
-Without it the idle alarm never fires and a scale-in cuts robots off.  Each duty fails by itself, with one
-line in the log, and is tried again.  Promises to write the public keys and the control room beside them, and
-no secret but the token of the control port, which never leaves the machine.
+Without it the idle alarm never fires and a scale-in disconnects robots.  A task that fails writes one line to
+the log and is repeated; the other tasks go on.  The agent writes public keys, roster and deny list; the only
+secret it writes is the token of the control port, which never leaves the machine.
 """
 
 from __future__ import annotations
@@ -20,11 +20,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from rse_pf.audit.log import SYNC_S
 from rse_pf.auth.control_token import ensure_control_token
 from rse_pf.auth.roster import DenyList, Roster, from_json
 from rse_pf.auth.tokens import KeySet
-from rse_pf.auth.trust_store import DENY_NAME, ROBOTS_NAME
-from rse_pf.aws.clients import ask, make_client
+from rse_pf.auth.trust_store import DENY_NAME, REFRESH_S, ROBOTS_NAME
+from rse_pf.aws.clients import call_api, make_client
 from rse_pf.aws.fleet.drain_hook import leave_group
 from rse_pf.aws.fleet.instance import Instance, Machine
 from rse_pf.aws.fleet.metrics import ServerMetrics, datums, read_page
@@ -38,12 +39,12 @@ from rse_pf.scaling.alarms import NAMESPACE
 
 __all__ = ["Agent", "AgentConfig", "main"]
 
-_NO_KEYS = "no keys in the bucket yet, robots are refused; run rse-pf token init --cloud"
+_NO_KEYS = "no keys in the bucket yet, so robots are refused; run rse-pf token init --cloud"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AgentConfig:
-    """Where this agent stands: group, hook, and where the keys are and go."""
+    """Group and lifecycle hook of the instance; object name and local file of the public keys."""
 
     group: str
     hook: str
@@ -52,7 +53,7 @@ class AgentConfig:
 
 
 class Agent:
-    """The duties, each when it is due; `step` is called again and again."""
+    """The tasks of the agent; `step` runs those that are due and is called repeatedly."""
 
     def __init__(
         self,
@@ -61,31 +62,31 @@ class Agent:
         cloudwatch: Any,
         autoscaling: Any,
         artifacts: ObjectStore,
-        post: AgentConfig,
+        config: AgentConfig,
         settings: PlatformSettings,
         log: Callable[..., None],
         shipper: Shipper | None = None,
         clock: Callable[[], float] = time.monotonic,
-        rest: Callable[[float], None] = time.sleep,
+        sleep: Callable[[float], None] = time.sleep,
     ) -> None:
         self._machine = machine
         self._cloudwatch = cloudwatch
         self._autoscaling = autoscaling
         self._artifacts = artifacts
-        self._post = post
+        self._config = config
         self._settings = settings
         self._log = log
         self._shipper = shipper
         self._clock = clock
-        self._rest = rest
+        self._sleep = sleep
         self._before: ServerMetrics | None = None
         self._due_s = self._ship_due_s = 0.0
         self.has_left = False
 
     def step(self) -> None:
-        """Look at the lifecycle; each in its period, fetch keys, publish numbers, ship the audit log."""
+        """Check the lifecycle; when due, fetch keys, publish metrics and ship the audit log."""
         if not self.has_left:
-            self._try("lifecycle", self._look_at_lifecycle)
+            self._try("lifecycle", self._check_lifecycle)
         if self._clock() >= self._due_s:
             self._due_s = self._clock() + self._settings.scaling.period_s
             self._try("keys", self.fetch_keys)
@@ -96,10 +97,10 @@ class Agent:
             self._try("audit", self._ship)
 
     def fetch_keys(self) -> None:
-        """Write the public keys if they changed; what is no key set is refused and the old one stays."""
-        file = self._post.keys_file
+        """Write the public keys if they changed; an invalid key set is refused and the old one stays."""
+        file = self._config.keys_file
         try:
-            fresh = self._artifacts.get(self._post.keys_name)
+            fresh = self._artifacts.get(self._config.keys_name)
         except NotFound:
             if not file.exists():
                 replace_file(file, b'{"keys":[]}\n')
@@ -111,40 +112,40 @@ class Agent:
         replace_file(file, fresh)
         self._log("keys", bytes=len(fresh))
 
-    def fetch_control(self) -> None:
-        """Write what the bucket's control room says; what is nonsense or gone changes nothing."""
+    def fetch_access_control(self) -> None:
+        """Write roster and deny list if they changed; a missing or invalid one changes nothing."""
         for name, kind in ((ROBOTS_NAME, Roster), (DENY_NAME, DenyList)):
-            file = self._post.keys_file.parent / name
+            file = self._config.keys_file.parent / name
             try:
                 fresh = self._artifacts.get(name)
             except NotFound:
-                continue  # nobody was ever enrolled or denied, or somebody deleted what servers still know
+                continue  # it was never written, or it was deleted and the servers keep what they know
             if file.exists() and file.read_bytes() == fresh:
                 continue
             from_json(fresh, kind)
             file.parent.mkdir(exist_ok=True)
             replace_file(file, fresh)
-            self._log("control", name=name, bytes=len(fresh))
+            self._log("access-control", name=name, bytes=len(fresh))
 
-    def watch_control(self, rest: Callable[[float], None] = time.sleep) -> None:
-        """Fetch it again and again, for ever; in a thread, since a drain holds `step` up."""
+    def watch_access_control(self, sleep: Callable[[float], None] = time.sleep) -> None:
+        """Fetch roster and deny list for ever; in a thread, because a drain blocks `step`."""
         while True:
-            self._try("control", self.fetch_control)
-            rest(self._settings.auth.deny_list_refresh_s)
+            self._try("access-control", self.fetch_access_control)
+            sleep(REFRESH_S)
 
-    def _look_at_lifecycle(self) -> None:
+    def _check_lifecycle(self) -> None:
         if self._machine.is_leaving():
-            self._log("leaving", group=self._post.group)
-            self._try("audit", self._ship)  # most of it goes before the time is short
+            self._log("leaving", group=self._config.group)
+            self._try("audit", self._ship)  # most of the log is uploaded before time is short
             drained = leave_group(
-                self._machine, self._autoscaling, group=self._post.group, hook=self._post.hook,
-                settings=self._settings, clock=self._clock, rest=self._rest, before_end=self._ship_the_rest,
+                self._machine, self._autoscaling, group=self._config.group, hook=self._config.hook,
+                settings=self._settings, clock=self._clock, sleep=self._sleep, before_end=self._ship_last,
             )  # fmt: skip
             self.has_left = True
             self._log("left", drained=drained)
 
-    def _ship_the_rest(self) -> None:
-        self._rest(2e-3 * self._settings.auth.audit_sync_ms)  # a server that has left is still writing
+    def _ship_last(self) -> None:
+        self._sleep(2 * SYNC_S)  # a server that has ended was still writing
         self._try("audit", self._ship)
 
     def _ship(self) -> None:
@@ -155,21 +156,21 @@ class Agent:
     def _publish(self) -> None:
         now = read_page(self._machine.page())
         if self._before is None:
-            self._before = now  # what was before this agent began is not this period's
-        data = datums(self._before, now, self._post.group, self._machine.instance_id())
-        ask(self._cloudwatch, "put_metric_data", Namespace=NAMESPACE, MetricData=data)
+            self._before = now  # counts from before the agent's start do not belong to this period
+        data = datums(self._before, now, self._config.group, self._machine.instance_id())
+        call_api(self._cloudwatch, "put_metric_data", Namespace=NAMESPACE, MetricData=data)
         self._before = now
 
-    def _try(self, duty: str, work: Callable[[], None]) -> None:
+    def _try(self, task: str, work: Callable[[], None]) -> None:
         try:
             work()
         except (RsePfError, OSError) as error:
-            self._log("failed", duty=duty, why=str(error)[:200])
+            self._log("failed", task=task, error=str(error)[:200])
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Stand at the post until a signal ends it; ``--once`` only makes the token and fetches the keys."""
-    parser = argparse.ArgumentParser(prog="rse-pf-agent", description="the agent of a backend server on AWS")
+    """Run until a signal ends the process; ``--once`` only makes the token and fetches the keys."""
+    parser = argparse.ArgumentParser(prog="rse-pf-agent", description="agent of a backend server on AWS")
     parser.add_argument("--settings", type=Path, required=True, metavar="FILE")
     for name in ("bucket", "keys-name", "group", "hook"):
         parser.add_argument(f"--{name}", required=True)
@@ -179,14 +180,14 @@ def main(arguments: list[str] | None = None) -> int:
     )
     parser.add_argument("--audit", type=Path, metavar="FOLDER", help="where servers write their audit logs")
     parser.add_argument("--audit-bucket", metavar="B", help="where the audit logs go")
-    parser.add_argument("--once", action="store_true", help="fetch the keys and leave")
+    parser.add_argument("--once", action="store_true", help="fetch the keys and exit")
     args = parser.parse_args(arguments)
     try:
         settings = load_settings(args.settings)
         if args.once and args.control_token is not None:
             ensure_control_token(args.control_token, seed=secrets.token_bytes(32))
         region = settings.cloud.region
-        post = AgentConfig(
+        config = AgentConfig(
             group=args.group, hook=args.hook, keys_name=args.keys_name, keys_file=args.keys_file
         )
         machine = Instance(settings.serving.control_port, args.control_token)
@@ -194,19 +195,19 @@ def main(arguments: list[str] | None = None) -> int:
             machine,
             cloudwatch=make_client("cloudwatch", region),
             autoscaling=make_client("autoscaling", region), artifacts=open_bucket(args.bucket, region),
-            post=post, settings=settings, log=_log, shipper=_shipper(args, region, machine),
+            config=config, settings=settings, log=_log, shipper=_shipper(args, region, machine),
         )  # fmt: skip
         if args.once:
             agent.fetch_keys()
-            agent.fetch_control()
+            agent.fetch_access_control()
             return 0
     except RsePfError as error:
         sys.stderr.write(f"{error.report()}\n")
         return 2
-    threading.Thread(target=agent.watch_control, daemon=True).start()
+    threading.Thread(target=agent.watch_access_control, daemon=True).start()
     while True:
         agent.step()
-        time.sleep(settings.cloud.poll_s)  # it polls, because nobody calls an instance
+        time.sleep(settings.cloud.poll_s)  # AWS does not notify an instance, so the agent polls
 
 
 def _shipper(args: argparse.Namespace, region: str, machine: Machine) -> Shipper | None:
@@ -215,7 +216,7 @@ def _shipper(args: argparse.Namespace, region: str, machine: Machine) -> Shipper
     return Shipper(
         args.audit, open_bucket(args.audit_bucket, region), instance=machine.instance_id,
         marks_file=args.audit.with_name(f"{args.audit.name}-shipped.json"),
-        on_broken=lambda who, why: _log("audit-broken", who=who, why=why[:200]),
+        on_broken=lambda chain, problem: _log("audit-broken", chain=chain, problem=problem[:200]),
     )  # fmt: skip
 
 

@@ -16,12 +16,11 @@ from typing import Any, TypeVar
 
 import msgspec
 
-from rse_pf.audit.chain import Note, Refusals, Value
-from rse_pf.audit.log import AuditLog
+from rse_pf.audit.chain import Note, RefusalLimiter, Value
+from rse_pf.audit.log import SYNC_S, AuditLog
 from rse_pf.auth.tokens import Claims
 from rse_pf.backend.gateway.handshake import Accepted, Rejected
 from rse_pf.backend.ports import Clocks, Handle, Loop
-from rse_pf.config import AuthSettings
 
 __all__ = ["AuditRecorder", "ServerAudit", "open_records"]
 
@@ -38,21 +37,25 @@ class AuditRecorder:
     """Notes of one worker, sent to the supervisor in batches."""
 
     def __init__(
-        self, settings: AuthSettings, clocks: Clocks, *, loop: Loop, tell: Callable[..., None] | None
+        self,
+        clocks: Clocks,
+        *,
+        loop: Loop,
+        tell: Callable[..., None] | None,
+        refusals: RefusalLimiter | None = None,
     ) -> None:
         """Hold nothing yet.
 
         Args:
-            settings: How long notes are held, and how many refusals are told one by one.
             clocks: Monotonic for the rate, wall for the entries.
             loop: For the time of the next batch.
             tell: Says something to the supervisor; None: nothing is recorded.
+            refusals: How many refusals are recorded one by one; None means the default.
         """
         self._clocks = clocks
         self._loop = loop
         self._tell = tell
-        self._pause_s = settings.audit_sync_ms / 1e3
-        self._refusals = Refusals(settings.audit_refused_per_s, float(settings.audit_refused_burst))
+        self._refusals = refusals or RefusalLimiter()
         self._held: list[dict[str, Any]] = []
         self._next: Handle | None = None
         self._sum: Handle | None = None
@@ -104,7 +107,7 @@ class AuditRecorder:
         note = {"time": self._clocks.wall(), "action": action, "subject": subject, "detail": detail}
         self._held.append(note)
         if self._next is None:
-            self._next = self._loop.call_later(self._pause_s, self._send)
+            self._next = self._loop.call_later(SYNC_S, self._send)
 
     def _send(self) -> None:
         self._next = None
@@ -158,14 +161,13 @@ class ServerAudit:
             self._log.close()
 
 
-def open_records(folder: Path | None, server_id: str, settings: AuthSettings) -> ServerAudit:
+def open_records(folder: Path | None, server_id: str) -> ServerAudit:
     """Return the records of a server; entering them raises ConfigurationError if they cannot be kept."""
     if folder is None:
         return ServerAudit(None)
     return ServerAudit(
         AuditLog(
-            folder, server_id, wall_clock=time.time, max_bytes=settings.audit_file_bytes,
-            sync_s=settings.audit_sync_ms / 1e3,
+            folder, server_id, wall_clock=time.time,
         )
     )  # fmt: skip
 

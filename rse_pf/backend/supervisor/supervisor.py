@@ -22,7 +22,7 @@ from typing import Any
 
 from rse_pf.auth.control_token import is_carried
 from rse_pf.auth.tokens import KeySet
-from rse_pf.auth.trust_store import TrustStore
+from rse_pf.auth.trust_store import REFRESH_S, TrustStore
 from rse_pf.backend.gateway.audit_recorder import ServerAudit, open_records
 from rse_pf.backend.gateway.migration import plan
 from rse_pf.backend.gateway.rate_limits import Bucket
@@ -31,8 +31,9 @@ from rse_pf.backend.log import JsonLog
 from rse_pf.backend.metrics import merge, merge_isolation, render
 from rse_pf.backend.supervisor.control_http import ControlReply, ControlRequest, serve_control
 from rse_pf.backend.supervisor.listener import bound, check_open_door
+from rse_pf.backend.supervisor.orders import DrainOrder, LeaveOrder, MigrateOrder
 from rse_pf.backend.supervisor.session_registry import SessionRegistry
-from rse_pf.backend.supervisor.trust_poller import TrustPoller, first_order
+from rse_pf.backend.supervisor.trust_poller import TrustPoller
 from rse_pf.backend.supervisor.worker import WorkerPlan
 from rse_pf.backend.supervisor.worker_handle import BUILTIN, WorkerProcess, fork_workers
 from rse_pf.config import PlatformSettings
@@ -108,7 +109,7 @@ def serve(
     with bound(settings.serving.host, settings.serving.port) as listener:
         workers = fork_workers(plans, listener=listener)
         try:
-            with open_records(audit, server_id, settings.auth) as records:
+            with open_records(audit, server_id) as records:
                 supervisor = _Supervisor(
                     settings, workers=workers, trust=trust, server_id=server_id, announce=announce,
                     listener=listener, digest=settings_digest or settings.digest(), records=records,
@@ -191,9 +192,9 @@ class _Supervisor:
         return control
 
     async def _start(self, loop: asyncio.AbstractEventLoop) -> None:
-        hear, order = self._records.heard(SessionRegistry().hear), first_order(self._trust)
+        on_robot = self._records.heard(SessionRegistry().hear)
         readiness = [
-            loop.create_task(worker.connect(order, on_lost=self._on_lost, on_robot=hear))
+            loop.create_task(worker.connect(on_lost=self._on_lost, on_robot=on_robot))
             for worker in self._workers
         ]
         everything = asyncio.gather(*readiness)
@@ -215,7 +216,7 @@ class _Supervisor:
         if self._announce is not None:
             replace_json(self._announce, self._identity())
         if self._trust is not None:
-            pause_s = self._settings.auth.deny_list_refresh_s
+            pause_s = REFRESH_S
             watch = TrustPoller(self._trust, workers=lambda: self._workers, log=self._log, pause_s=pause_s)
             self._keep(watch.run())
         self._log.info("server-ready", **self._identity(), settings=self._digest)
@@ -287,7 +288,7 @@ class _Supervisor:
         await asyncio.sleep(wait_s)
         within_ms = self._settings.serving.drain_within_ms
         for worker in self._workers:
-            worker.order(do="move", reason="drain", within_ms=within_ms)
+            worker.order(DrainOrder(within_ms))
         empty = [asyncio.ensure_future(worker.empty.wait()) for worker in self._workers]
         await asyncio.wait(empty, timeout=within_ms / 1e3)
         for waiting in empty:
@@ -300,7 +301,7 @@ class _Supervisor:
         self._state = "leaving"
         self._stop_accepting()
         for worker in self._workers:
-            worker.order(do="leave", held_s=held_s)
+            worker.order(LeaveOrder(held_s))
         gone = [asyncio.ensure_future(worker.gone.wait()) for worker in self._workers]
         if gone:
             await asyncio.wait(gone, timeout=held_s + _LEAVE_S)
@@ -357,7 +358,9 @@ class _Supervisor:
         if self._settings.services.folder or self._settings.services.published:
             await self._merged()
             isolation = merge_isolation(worker.report for worker in self._workers)
-            told.update(missing_walls=isolation["missing_walls"], quarantined=isolation["quarantined"])
+            told.update(
+                missing_isolation=isolation["missing_isolation"], open_breakers=isolation["open_breakers"]
+            )
         if self._state == "ready":
             return _json(told)
         return _json(told, status=503, headers={"x-envoy-immediate-health-check-fail": "1"})

@@ -1,8 +1,8 @@
-"""One worker process, forked by the supervisor (`worker_process`).
+"""One worker process, forked by the supervisor (`worker_handle`).
 
-Accepted sockets arrive as descriptors on the data channel, orders as JSON lines on the control
-channel.  Promises to die with its supervisor (parent-death signal, and the end of either channel),
-and to leave signals of the terminal or of a service manager to the supervisor.
+Accepted sockets arrive as descriptors on the data channel, orders (`orders`) on the control channel.  A
+worker ends with its supervisor, by the parent-death signal and by the end of its control channel, and
+ignores the signals of a terminal or a service manager: they are for the supervisor.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import secrets
 import signal
 import socket
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -37,6 +37,16 @@ from rse_pf.backend.log import JsonLog
 from rse_pf.backend.object_refs import ObjectRefs
 from rse_pf.backend.ports import Clocks
 from rse_pf.backend.sandbox.manager import SandboxManager
+from rse_pf.backend.supervisor.orders import (
+    DrainOrder,
+    LeaveOrder,
+    MigrateOrder,
+    ReplaceOrder,
+    ReportOrder,
+    TrustOrder,
+    WorkerOrder,
+    decode_order,
+)
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import MissingExtra
 from rse_pf.linux import die_with_parent, set_process_name
@@ -48,16 +58,16 @@ __all__ = ["NUMBER_BYTES", "WorkerPlan", "event_loop_maker", "run_worker"]
 NUMBER_BYTES = 8
 """Length of a socket's number, which travels with its descriptor."""
 _POLL_S = 0.01
-_OURS_ALONE = "memory:"
-"""A store that no robot and no data server reaches, so that names in it are worth nothing."""
+_PRIVATE_STORE = "memory:"
+"""A store that no robot and no data server can reach, so that no command can refer to objects in it."""
 _MAX_LINE_BYTES = 1 << 26
-"""An order may name every robot that is enrolled."""
-_CLOSING_S = 1.0
+"""A `TrustOrder` names every robot that is enrolled."""
+_CLOSE_TIMEOUT_S = 1.0
 
 
 @dataclass(frozen=True)
 class WorkerPlan:
-    """What a worker is told before it is forked."""
+    """What a worker knows when it is forked; it checks tokens with ``keys`` until a `TrustOrder` comes."""
 
     settings: PlatformSettings
     keys: KeySet | None
@@ -119,7 +129,7 @@ class _Worker:
             new_session_id=lambda: secrets.token_hex(8),
             rest=time.sleep,
         )
-        if settings.data.store != _OURS_ALONE:
+        if settings.data.store != _PRIVATE_STORE:
             self._core.objects = ObjectRefs(
                 open_job_store(settings), settings.serving, settings.data.quota_bytes
             )
@@ -127,14 +137,12 @@ class _Worker:
             self._core.environments = self._environments(settings, plan.server_id, plan.workers)
         if settings.serving.max_running_jobs:
             self._core.jobs = self._jobs(settings, plan)
-        self._hand_over = Migration(
+        self._migration = Migration(
             self._core.connections, timers=loop, now=time.monotonic, choose=secrets.choice
         )
         self._index, self._workers, self._named = plan.index, plan.workers, 0
         door = HandshakePolicy(settings, plan.keys, conformance_echo=plan.conformance_echo)
-        self._witness = AuditRecorder(
-            settings.auth, self._core.clocks, loop=loop, tell=self._say if plan.audit else None
-        )
+        self._witness = AuditRecorder(self._core.clocks, loop=loop, tell=self._say if plan.audit else None)
         self._standing = self._core.standing = TokenWatch(
             self._core, door, loop=loop, log=self._log, tell=self._say, witness=self._witness
         )
@@ -158,7 +166,7 @@ class _Worker:
         return SandboxManager(
             services,
             settings=settings,
-            most=-(-settings.services.max_sandboxes // workers),
+            max_sandboxes=-(-settings.services.max_sandboxes // workers),
             server_id=server,
             store=open_job_store(settings),
             monotonic=time.monotonic,
@@ -190,37 +198,36 @@ class _Worker:
         reader, self._writer = await asyncio.open_unix_connection(sock=self._control, limit=_MAX_LINE_BYTES)
         self._data.setblocking(False)
         self._loop.add_reader(self._data.fileno(), self._take_sockets)
-        self._obey_trust(json.loads(await reader.readline()))
         gc.collect()
         gc.freeze()
         self._say(event="ready")
         while line := await reader.readline():
-            order = json.loads(line)
-            if order["do"] == "report":
-                self._say(event="report", report=self._report())
-            elif order["do"] == "move":
-                self._core.move_all(order["reason"], order["within_ms"])
-                self._keep(self._tell_when_empty())
-            elif order["do"] == "hand-over":
-                self._hand_over.begin(order["delays_s"], order["within_ms"])
-            elif order["do"] == "trust":
-                self._obey_trust(order)
-            elif order["do"] == "replace":
-                self._standing.replace(order["number"])
-            elif order["do"] == "leave":
-                await self._leave(order["held_s"])
+            order = decode_order(line)
+            self._obey(order)
+            if isinstance(order, LeaveOrder):
+                await self._leave(order.held_s)
                 break
         self._witness.flush()
         self._log.close()
-        os._exit(0)  # sockets and threads of a worker that has no supervisor are nobody's
+        os._exit(0)  # nobody waits for the sockets and threads that are left
 
-    def _obey_trust(self, order: Mapping[str, Any]) -> None:
-        if order["text"]:
-            self._standing.trust(key_set_from_snapshot(order["text"]))
+    def _obey(self, order: WorkerOrder) -> None:
+        match order:
+            case ReportOrder():
+                self._say(event="report", report=self._report())
+            case DrainOrder():
+                self._core.move_all("drain", order.within_ms)
+                self._keep(self._tell_when_empty())
+            case MigrateOrder():
+                self._migration.begin(order.delays_s, order.within_ms)
+            case TrustOrder():
+                self._standing.trust(key_set_from_snapshot(order.snapshot))
+            case ReplaceOrder():
+                self._standing.replace(order.number)
 
     def _report(self) -> dict[str, Any]:
         report = self._core.snapshot()
-        report["gauges"]["moved"] = float(self._hand_over.asked)
+        report["gauges"]["moved"] = float(self._migration.asked)
         return report
 
     async def _tell_when_empty(self) -> None:
@@ -233,7 +240,7 @@ class _Worker:
         while self._core.held and time.monotonic() < until:
             await asyncio.sleep(_POLL_S)
         self._core.close_all()
-        until = time.monotonic() + _CLOSING_S
+        until = time.monotonic() + _CLOSE_TIMEOUT_S
         while self._core.connections and time.monotonic() < until:
             await asyncio.sleep(_POLL_S)
 
@@ -256,7 +263,7 @@ class _Worker:
             self._loop.call_soon(self._flush_ends)
 
     def _flush_ends(self) -> None:
-        """Tell the supervisor, one byte for each socket that ended, so that it knows our load."""
+        """Send the supervisor one byte for each socket that ended, so that it knows this worker's load."""
         self._flushing = False
         try:
             self._ended -= self._data.send(b"e" * self._ended)

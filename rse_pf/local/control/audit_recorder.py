@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from rse_pf.audit.chain import HEADS, Note, Value
-from rse_pf.audit.log import AuditLog, audit_folder, names_in, newest_head
+from rse_pf.audit.log import AuditLog, audit_folder, chain_names, newest_head
 from rse_pf.config import AuthSettings
 
 __all__ = ["PlatformAudit"]
@@ -34,8 +34,7 @@ class PlatformAudit:
         self._is_open = False
         self._told: dict[str, str] = {}
         self._log = AuditLog(
-            self.folder, _WHO, wall_clock=time.time, max_bytes=settings.audit_file_bytes,
-            sync_s=settings.audit_sync_ms / 1e3,
+            self.folder, _WHO, wall_clock=time.time,
         )  # fmt: skip
 
     def open(self) -> None:
@@ -59,7 +58,7 @@ class PlatformAudit:
     def look(self) -> None:
         """Record the heads of the other chains that have grown."""
         grown: dict[str, Value] = {}
-        for who in names_in(self.folder):
+        for who in chain_names(self.folder):
             head = None if who == _WHO else newest_head(self.folder, who)
             if head is not None and self._told.get(who) != str(head):
                 grown[who] = self._told[who] = str(head)

@@ -11,13 +11,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from rse_pf.audit.chain import RefusalLimiter
 from rse_pf.audit.log import files_of
 from rse_pf.audit.verify import check_folder, entries_of
 from rse_pf.auth.tokens import Claims
 from rse_pf.backend.gateway.audit_recorder import AuditRecorder, open_records
 from rse_pf.backend.gateway.handshake import Accepted, Rejected
 from rse_pf.backend.ports import Clocks
-from rse_pf.config import AuthSettings
 
 CLAIMS = Claims(robot="robot-1", token_id="t-1", issued_s=1.0, expires_s=900.0, key_id="k-1")
 LET_IN = Accepted(robot="robot-1", codec="bin", subprotocol="x", claims=CLAIMS)
@@ -29,13 +29,13 @@ SHOWN = "Bearer eyJhbGciOiJFZERTQSJ9.eyJzdWIiOiJyb2JvdC05IiwianRpIjoidC05In0.c2l
 class Room:
     """A witness on a loop whose timers fire by hand."""
 
-    def __init__(self, *, is_on: bool = True, **settings: Any) -> None:
+    def __init__(self, *, is_on: bool = True, refusals: RefusalLimiter | None = None) -> None:
         self.told: list[dict[str, Any]] = []
         self.now_s = 0.0
         self._timers: list[tuple[float, Callable[[], object]]] = []
         clocks = Clocks(monotonic=lambda: self.now_s, wall=lambda: 1e9 + self.now_s, cpu=lambda: 0.0)
         self.witness = AuditRecorder(
-            AuthSettings(**settings), clocks, loop=self, tell=self._tell if is_on else None  # type: ignore[arg-type]
+            clocks, refusals=refusals, loop=self, tell=self._tell if is_on else None  # type: ignore[arg-type]
         )  # fmt: skip
 
     def call_later(self, delay: float, callback: Callable[[], object]) -> Mock:
@@ -115,7 +115,7 @@ def test_whatever_a_header_holds_the_refusal_is_noted(header: str):
 
 
 def test_a_flood_of_refusals_is_summed_up():
-    room = Room(audit_refused_burst=10, audit_refused_per_s=0.0)
+    room = Room(refusals=RefusalLimiter(per_s=0.0, burst=10.0))
 
     for _ in range(3000):
         room.witness.judged(REFUSED, "10.0.0.7", SHOWN)
@@ -168,7 +168,7 @@ def test_what_workers_say_is_written_by_the_supervisor_and_other_words_go_on(tmp
     room.witness.judged(LET_IN, "10.0.0.7", "")
     room.witness.flush()
 
-    with open_records(tmp_path, "server-1", AuthSettings()) as records:
+    with open_records(tmp_path, "server-1") as records:
         hear = records.heard(lambda worker, message: others.append(message))
         hear("worker", room.told[0])
         hear("worker", {"event": "left", "robot": "robot-1"})
@@ -184,7 +184,7 @@ def test_what_workers_say_is_written_by_the_supervisor_and_other_words_go_on(tmp
 
 @pytest.mark.parametrize("message", [{"event": "audit", "notes": []}])
 def test_without_a_folder_notes_are_dropped(message: dict[str, Any]):
-    with open_records(None, "server-1", AuthSettings()) as records:
+    with open_records(None, "server-1") as records:
         assert not records.is_on
         records.heard(lambda worker, other: None)("worker", message)
         records.note("server.over")
