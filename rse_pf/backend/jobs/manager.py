@@ -14,7 +14,7 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any
 
 import msgspec
 
@@ -22,8 +22,8 @@ from rse_pf.backend.jobs.fair_queue import who_makes_room
 from rse_pf.backend.jobs.lease import job_key
 from rse_pf.backend.jobs.record_gc import RecordCollector
 from rse_pf.backend.jobs.runner import WAITS, JobContext, JobOutcome, JobRequest, JobSignals, run_job
+from rse_pf.backend.ports import Log, Loop
 from rse_pf.backend.quota import quota_bytes
-from rse_pf.backend.sandbox.zygote_client import SandboxLog
 from rse_pf.backend.scheduling.scheduler import QueuedCommand
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import BadRequest, Busy, Cancelled, RsePfError
@@ -36,16 +36,6 @@ __all__ = ["JobManager"]
 _PROGRESS_PAUSE_S = 0.5
 _BUSY_RETRY_MS = 5000.0
 _CLOSING_S = 1.0
-
-
-class Loop(Protocol):
-    """What jobs need of an event loop."""
-
-    def call_soon_threadsafe(self, callback: Callable[..., object], *args: Any) -> object:
-        """Call *callback* in the loop's thread."""
-
-    def call_later(self, delay: float, callback: Callable[[], object]) -> object:
-        """Call *callback* in *delay* seconds."""
 
 
 @dataclass(eq=False, slots=True)
@@ -76,7 +66,7 @@ class JobManager:
         *,
         settings: PlatformSettings,
         loop: Loop,
-        log: SandboxLog,
+        log: Log,
         answer: Callable[[QueuedCommand, Result | Failure], None],
         progress: Callable[[Any, Progress], None],
         new_owner: Callable[[], str],

@@ -22,7 +22,7 @@ import msgspec
 from rse_pf.backend.job_store import is_shared, open_job_store
 from rse_pf.backend.object_refs import named_in, resolve
 from rse_pf.backend.quota import check_room, store_within
-from rse_pf.backend.sandbox.child import HEADER, decoded, encoded
+from rse_pf.backend.sandbox.ipc import encode_message, receive
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import BadMessage, Cancelled, Crashed, LimitExceeded, RsePfError, StoreError
 from rse_pf.linux import die_with_parent, run_when_idle
@@ -32,7 +32,7 @@ from rse_pf.services.loading import load_services
 from rse_pf.wire import Command, Failure, Result
 from rse_pf.wire.arrays import binary_encode_hook
 
-__all__ = ["kept", "main", "receive"]
+__all__ = ["kept", "main"]
 
 _REPORT_PAUSE_S = 0.5
 _STORE_TRIES = 3
@@ -48,16 +48,7 @@ def main(arguments: list[str]) -> None:
         resource.setrlimit(resource.RLIMIT_DATA, (order["memory_bytes"],) * 2)
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
         with contextlib.suppress(OSError):  # a worker that does not wait any longer is no defect
-            worker.sendall(encoded(kept(_work(order, _Reporter(worker, time.monotonic)), order)))
-
-
-def receive(connection: socket.socket) -> Any:
-    """Return the next message on a blocking socket, None at its end."""
-    header = _exactly(connection, HEADER.size)
-    if header is None:
-        return None
-    body = _exactly(connection, *HEADER.unpack(header))
-    return None if body is None else decoded(body)
+            worker.sendall(encode_message(kept(_work(order, _Reporter(worker, time.monotonic)), order)))
 
 
 class _Reporter:
@@ -74,7 +65,7 @@ class _Reporter:
         now = self._clock()
         if now - self._told_s >= _REPORT_PAUSE_S:
             self._told_s = now
-            self._worker.sendall(encoded(["progress", float(done), str(what)[:200]]))
+            self._worker.sendall(encode_message(["progress", float(done), str(what)[:200]]))
 
 
 def _work(order: dict[str, Any], report: Callable[[float, str], None]) -> list[Any]:
@@ -160,16 +151,6 @@ def _step_back() -> None:
     run_when_idle(0)
     with contextlib.suppress(OSError), open("/proc/self/oom_score_adj", "w", encoding="ascii") as file:
         file.write("1000")
-
-
-def _exactly(connection: socket.socket, count: int) -> bytes | None:
-    data = bytearray()
-    while len(data) < count:
-        piece = connection.recv(count - len(data))
-        if not piece:
-            return None
-        data += piece
-    return bytes(data)
 
 
 if __name__ == "__main__":

@@ -19,12 +19,13 @@ from typing import Any, Literal, Protocol
 from rse_pf.backend.jobs.lease import MAX_TRIES, JobLease, JobRecord, record_name, verdict_on
 from rse_pf.backend.jobs.slots import JobSlots
 from rse_pf.backend.quota import store_within
-from rse_pf.backend.sandbox.child import HEADER, decoded, encoded
+from rse_pf.backend.sandbox.ipc import FrameReader, encode_message
 from rse_pf.config import ServingSettings
 from rse_pf.errors import (
     Cancelled,
     Crashed,
     Expired,
+    LimitExceeded,
     NotFound,
     Poison,
     QuotaExceeded,
@@ -230,7 +231,7 @@ class _Run:
         self._tell = tell
         self._lease = lease
         self._share, self._what = 0.0, STARTS
-        self._received = bytearray()
+        self._frames = FrameReader(context.max_bytes)
         self._end: list[Any] | None = None
         self._is_over = False
 
@@ -309,22 +310,15 @@ class _Run:
         except OSError:
             data = b""
         self._is_over = not data
-        self._received += data
-        while len(self._received) >= HEADER.size:
-            (length,) = HEADER.unpack_from(self._received)
-            if length > self._context.max_bytes:
-                self._end, self._is_over = ["failed", "too-large", _too_large(length), "ask for less"], True
-                process.kill()
-                return
-            if len(self._received) < HEADER.size + length:
-                return
-            message = decoded(bytes(self._received[HEADER.size : HEADER.size + length]))
-            del self._received[: HEADER.size + length]
-            if message[0] == "progress":
-                self._share, self._what = float(message[1]), str(message[2])
-                self._tell(self._share, self._what)
-            else:
-                self._end, self._is_over = message, True
+        try:
+            for message in self._frames.feed(data):
+                if message[0] == "progress":
+                    self._share, self._what = float(message[1]), str(message[2])
+                    self._tell(self._share, self._what)
+                else:
+                    self._end, self._is_over = message, True
+        except LimitExceeded as error:
+            self._end, self._is_over = ["failed", error.code, error.message, "ask for less"], True
 
     def _done(self, compute_ms: float, reply: bytes) -> JobOutcome:
         """Make the reply durable before anybody hears of it, as the process could not."""
@@ -370,7 +364,7 @@ class _Run:
 
 def _order_to_end(process: Process) -> None:
     try:
-        process.connection.sendall(encoded(["cancel"]))
+        process.connection.sendall(encode_message(["cancel"]))
     except OSError:
         return  # it is gone, and reading says so
 
@@ -391,7 +385,3 @@ def _poison() -> RsePfError:
         f"{MAX_TRIES} servers died while they worked on this job",
         hint="send less at once; tell the operator",
     )
-
-
-def _too_large(length: int) -> str:
-    return f"a reply of {length} bytes is too large"

@@ -14,7 +14,7 @@ from collections.abc import Callable
 from typing import Any
 
 from rse_pf.backend.jobs.runner import JobRequest
-from rse_pf.backend.sandbox.child import encoded
+from rse_pf.backend.sandbox.ipc import encode_message
 from rse_pf.config import PlatformSettings
 from rse_pf.linux import run_when_idle
 
@@ -35,7 +35,7 @@ class JobProcess:
             )  # fmt: skip
         run_when_idle(self._process.pid)
         try:
-            self.connection.sendall(encoded(order))
+            self.connection.sendall(encode_message(order))
         except OSError:
             return  # it died at once, and reading says so
 

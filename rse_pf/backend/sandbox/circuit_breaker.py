@@ -1,7 +1,8 @@
-"""Decide which commands and services are not tried again: the poison and the crash-loop rules.
+"""Decide which requests and services are not run again after crashes.
 
-A request that killed two environments is poison; a service that killed five of them in half a minute rests
-for a while.  Promises no clock: time comes in; and bounded memory whatever robots send.
+A request that crashed ``poison_crashes`` sandboxes is poison.  A service that crashed ``breaker_crashes`` of
+them within ``breaker_window_s`` is refused for ``breaker_open_s``: its circuit breaker is open.  Time is an
+argument, and memory is bounded whatever robots send.
 """
 
 from __future__ import annotations
@@ -11,44 +12,42 @@ from typing import Literal
 
 from rse_pf.config import ServiceSettings
 
-__all__ = ["CircuitBreaker", "Verdict"]
-
-Verdict = Literal["run", "poison", "quarantined"]
+__all__ = ["CircuitBreaker"]
 
 _MAX_DIGESTS = 10_000
 
 
 class CircuitBreaker:
-    """What one worker knows of deadly requests and services."""
+    """What one worker knows of crashing requests and services."""
 
     def __init__(self, settings: ServiceSettings) -> None:
         self._settings = settings
-        self._deaths_of_request: OrderedDict[str, int] = OrderedDict()
-        self._deaths_of_service: dict[str, deque[float]] = {}
-        self._until: dict[str, float] = {}
+        self._crashes_of_request: OrderedDict[str, int] = OrderedDict()
+        self._crashes_of_service: dict[str, deque[float]] = {}
+        self._open_until: dict[str, float] = {}
 
-    def verdict(self, service: str, digest: str, now: float) -> Verdict:
-        """Say whether a request with this digest may run now."""
-        if self._deaths_of_request.get(digest, 0) >= self._settings.poison_crashes:
+    def verdict(self, service: str, digest: str, now: float) -> Literal["run", "poison", "open"]:
+        """Return whether a request with this digest may run now, and if not, why."""
+        if self._crashes_of_request.get(digest, 0) >= self._settings.poison_crashes:
             return "poison"
-        return "quarantined" if self.rests_s(service, now) > 0 else "run"
+        return "open" if self.open_for_s(service, now) > 0 else "run"
 
-    def died(self, service: str, digest: str, now: float) -> None:
-        """Note that an environment died while it worked on this request."""
-        self._deaths_of_request[digest] = self._deaths_of_request.pop(digest, 0) + 1
-        if len(self._deaths_of_request) > _MAX_DIGESTS:
-            self._deaths_of_request.popitem(last=False)
-        deaths = self._deaths_of_service.setdefault(service, deque(maxlen=self._settings.breaker_crashes))
-        deaths.append(now)
-        full = len(deaths) == self._settings.breaker_crashes
-        if full and now - deaths[0] <= self._settings.breaker_window_s:
-            self._until[service] = now + self._settings.breaker_open_s
-            deaths.clear()
+    def crashed(self, service: str, digest: str, now: float) -> None:
+        """Note that a sandbox crashed while it worked on this request."""
+        self._crashes_of_request[digest] = self._crashes_of_request.pop(digest, 0) + 1
+        if len(self._crashes_of_request) > _MAX_DIGESTS:
+            self._crashes_of_request.popitem(last=False)
+        crashes = self._crashes_of_service.setdefault(service, deque(maxlen=self._settings.breaker_crashes))
+        crashes.append(now)
+        full = len(crashes) == self._settings.breaker_crashes
+        if full and now - crashes[0] <= self._settings.breaker_window_s:
+            self._open_until[service] = now + self._settings.breaker_open_s
+            crashes.clear()
 
-    def rests_s(self, service: str, now: float) -> float:
-        """Return for how long *service* still rests, in seconds; 0 if it may run."""
-        return max(0.0, self._until.get(service, now) - now)
+    def open_for_s(self, service: str, now: float) -> float:
+        """Return for how many more seconds *service* is refused; 0 if it may run."""
+        return max(0.0, self._open_until.get(service, now) - now)
 
-    def resting(self, now: float) -> list[str]:
-        """Return the services that rest, sorted."""
-        return sorted(service for service in self._until if self.rests_s(service, now) > 0)
+    def open_services(self, now: float) -> list[str]:
+        """Return the services that are refused now, sorted."""
+        return sorted(service for service in self._open_until if self.open_for_s(service, now) > 0)

@@ -1,6 +1,6 @@
-"""Call one installed service as a server would, without a server: the body of `rse-pf service test`.
+"""Call one installed service as a server would, without a server: used by `rse-pf service test`.
 
-The same environments, walls and limits; only sockets and robots are missing.  Promises to leave no process.
+The sandbox, isolation and limits are those of a server; sockets and robots are missing.
 """
 
 from __future__ import annotations
@@ -18,44 +18,44 @@ from rse_pf.object_store import MemoryStore
 from rse_pf.services.custom.installed import InstalledService
 from rse_pf.wire import Command, Failure, Result
 
-__all__ = ["DryRun", "try_service"]
+__all__ = ["DryRun", "dry_run"]
 
-_ROBOT = "trial"
+_ROBOT = "dry-run"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DryRun:
-    """What one request came to."""
+    """The answer to one request, and how long it took."""
 
     answer: Result | Failure
     took_ms: float
 
 
-def try_service(
+def dry_run(
     service: InstalledService,
     payloads: Sequence[Any],
     settings: PlatformSettings,
     say: Callable[[str], None],
 ) -> tuple[tuple[str, ...], list[DryRun]]:
-    """Send each payload to *service* in one environment.
+    """Send each payload to *service* in one sandbox.
 
     Args:
         service: A folder that was read; it need not be installed.
-        payloads: Requests, one after the other.
+        payloads: Requests, sent one after the other.
         settings: Limits.
-        say: Told what the service prints, line by line, and how its environment died.
+        say: Called with each line that the service prints, and with the reason of each crash.
 
     Returns:
-        The walls that this machine lacks, and what came of each payload.
+        The means of isolation that this machine lacks, and the answer to each payload.
 
     Raises:
-        ConfigurationError: The environment's template did not start.
+        ConfigurationError: The zygote did not start.
     """
-    return asyncio.run(_try(service, payloads, settings, say))
+    return asyncio.run(_dry_run(service, payloads, settings, say))
 
 
-class _SaidAloud:
-    """Events of an environment as lines for a person."""
+class _Printer:
+    """Log events of a sandbox as lines for a person."""
 
     def __init__(self, say: Callable[[str], None]) -> None:
         self._say = say
@@ -65,13 +65,13 @@ class _SaidAloud:
             self._say(str(fields["text"]))
 
     def warning(self, event: str, **fields: Any) -> None:
-        pass  # the walls that are missing are returned
+        pass  # missing isolation is returned
 
     def error(self, event: str, **fields: Any) -> None:
         self._say(f"{event}: {fields.get('reason', '')}")
 
 
-async def _try(
+async def _dry_run(
     service: InstalledService,
     payloads: Sequence[Any],
     settings: PlatformSettings,
@@ -79,28 +79,28 @@ async def _try(
 ) -> tuple[tuple[str, ...], list[DryRun]]:
     loop = asyncio.get_running_loop()
     answers: dict[int, asyncio.Future[Result | Failure]] = {}
-    environments = SandboxManager(
+    sandboxes = SandboxManager(
         [service],
         settings=settings.replace(services={"accept_weak_isolation": True}),
-        most=1,
-        server_id="trial",
+        max_sandboxes=1,
+        server_id=_ROBOT,
         store=MemoryStore(),
         monotonic=time.monotonic,
         loop=loop,
-        log=_SaidAloud(say),
-        answer=lambda job, answer: answers[job.command.id].set_result(answer),
+        log=_Printer(say),
+        answer=lambda queued, answer: answers[queued.command.id].set_result(answer),
     )
-    environments.connected(_ROBOT)
-    trials = []
+    sandboxes.connected(_ROBOT)
+    runs = []
     try:
         for number, payload in enumerate(payloads):
             now = time.monotonic()
             answers[number] = loop.create_future()
             deadline_s = now + settings.session.answer_timeout_s
             command = Command(id=number, service=service.name, payload=payload, keep=True)
-            environments.submit(QueuedCommand(None, _ROBOT, command, 0, now, deadline_s))
+            sandboxes.submit(QueuedCommand(None, _ROBOT, command, 0, now, deadline_s))
             answer = await answers[number]
-            trials.append(DryRun(answer=answer, took_ms=(time.monotonic() - now) * 1e3))
-        return environments.missing, trials
+            runs.append(DryRun(answer=answer, took_ms=(time.monotonic() - now) * 1e3))
+        return sandboxes.missing, runs
     finally:
-        environments.close()
+        sandboxes.close()

@@ -1,96 +1,127 @@
-"""The bytes between a worker and one environment: whole messages out and in, and what the service prints.
+"""Messages between a worker and its child processes, and what a sandbox prints.
 
-Promises that neither a slow nor a hostile environment blocks the loop or fills the worker's memory: messages
-have a largest size, printed lines a number and a length.
+A message on a stream socket is its length and its MessagePack body; sandboxes and job processes both use
+this format.  Neither a slow nor a hostile sandbox can block the event loop or fill the worker's memory:
+the size of a message and the number and length of printed lines have limits.
 """
 
 from __future__ import annotations
 
 import os
 import socket
-from collections.abc import Callable
-from typing import Any, Protocol
+import struct
+from collections.abc import Callable, Iterator
+from typing import Any
 
 import msgspec
 
-from rse_pf.backend.sandbox.child import HEADER, decoded
-from rse_pf.errors import RsePfError
+from rse_pf.backend.ports import Loop
+from rse_pf.errors import BadMessage, LimitExceeded, RsePfError
+from rse_pf.wire.arrays import binary_encode_hook, extension_hook
 
-__all__ = ["FdWatcher", "IpcChannel"]
+__all__ = ["FrameReader", "IpcChannel", "encode_message", "receive"]
 
+_HEADER = struct.Struct("<I")
 _READ_BYTES = 1 << 18
 _MAX_LINES = 200
 _MAX_LINE = 256
 
 
-class FdWatcher(Protocol):
-    """What watches descriptors, for both directions."""
+def encode_message(message: Any) -> bytes:
+    """Return *message* with its length before it."""
+    body = msgspec.msgpack.encode(message, enc_hook=binary_encode_hook)
+    return _HEADER.pack(len(body)) + body
 
-    def add_reader(self, fd: int, callback: Callable[..., object], *args: Any) -> None:
-        """Call *callback* whenever *fd* can be read."""
 
-    def remove_reader(self, fd: int) -> bool:
-        """Stop that."""
+def receive(connection: socket.socket) -> Any:
+    """Return the next message on a blocking socket, None at its end."""
+    header = connection.recv(_HEADER.size, socket.MSG_WAITALL)
+    if len(header) < _HEADER.size:
+        return None
+    (length,) = _HEADER.unpack(header)
+    body = connection.recv(length, socket.MSG_WAITALL)
+    return _decode(body) if len(body) == length else None
 
-    def add_writer(self, fd: int, callback: Callable[..., object], *args: Any) -> None:
-        """Call *callback* whenever *fd* can be written."""
 
-    def remove_writer(self, fd: int) -> bool:
-        """Stop that."""
+class FrameReader:
+    """Splits the bytes of a stream into messages of at most *max_bytes*."""
+
+    def __init__(self, max_bytes: int) -> None:
+        self._max_bytes = max_bytes
+        self._received = bytearray()
+
+    def feed(self, data: bytes) -> Iterator[Any]:
+        """Yield every message that *data* completes.
+
+        Raises:
+            LimitExceeded: A message is longer than the limit.
+            BadMessage: A body is not MessagePack.
+        """
+        self._received += data
+        while len(self._received) >= _HEADER.size:
+            (length,) = _HEADER.unpack_from(self._received)
+            if length > self._max_bytes:
+                raise LimitExceeded(f"a message of {length} bytes is longer than {self._max_bytes}")
+            end = _HEADER.size + length
+            if len(self._received) < end:
+                return
+            body = bytes(self._received[_HEADER.size : end])
+            del self._received[:end]
+            yield _decode(body)
 
 
 class IpcChannel:
-    """Ends of a socket and of a pipe; ``theirs`` go to the environment, then `begin`."""
+    """A socket and an output pipe to one sandbox; pass on ``theirs`` and ``their_output``, then `start`."""
 
     def __init__(
         self,
-        loop: FdWatcher,
+        loop: Loop,
         *,
         max_bytes: int,
-        on_message: Callable[[list[Any]], None],
+        on_message: Callable[[Any], None],
         on_fault: Callable[[str], None],
         on_line: Callable[[str], None],
     ) -> None:
         """Open both.
 
         Args:
-            loop: Of the worker.
-            max_bytes: Of one message from the environment.
-            on_message: Told each message.
-            on_fault: Told once, when the other side is gone ("") or said something that is no message.
-            on_line: Told what the service printed, line by line, as long as there are not too many.
+            loop: Event loop of the worker.
+            max_bytes: Limit of one message from the sandbox.
+            on_message: Called with each message.
+            on_fault: Called once with the reason when the sandbox sent an invalid message, with "" when
+                it closed the socket.
+            on_line: Called with each line that the service printed, up to a limit.
         """
         self._loop = loop
-        self._max_bytes = max_bytes
+        self._frames = FrameReader(max_bytes)
         self._on_message = on_message
         self._on_fault = on_fault
         self._on_line = on_line
         self._socket, self.theirs = socket.socketpair()
         self._output, self.their_output = os.pipe()
-        self._received = bytearray()
         self._unsent = bytearray()
         self._lines = 0
         self._closed = False
         self._socket.setblocking(False)
         os.set_blocking(self._output, False)
 
-    def begin(self) -> None:
-        """Forget the environment's ends, which it has by now, and listen."""
+    def start(self) -> None:
+        """Close the sandbox's ends, which it has by now, and read from ours."""
         self.theirs.close()
         os.close(self.their_output)
-        self._loop.add_reader(self._socket.fileno(), self._readable)
-        self._loop.add_reader(self._output, self._printed)
+        self._loop.add_reader(self._socket.fileno(), self._read_messages)
+        self._loop.add_reader(self._output, self._read_output)
 
     def send(self, data: bytes) -> None:
-        """Write *data* as soon as it fits."""
+        """Write an encoded message as soon as the socket takes it."""
         self._unsent += data
         self._flush()
 
     def close(self) -> None:
-        """Take what was printed last, and close both."""
+        """Read what was printed last, and close both."""
         if self._closed:
             return
-        self._printed()
+        self._read_output()
         self._closed = True
         self._loop.remove_reader(self._output)
         self._loop.remove_reader(self._socket.fileno())
@@ -106,44 +137,34 @@ class IpcChannel:
         except BlockingIOError:
             pass
         except OSError:
-            self._unsent.clear()  # it is gone, and reading says so
+            self._unsent.clear()  # the sandbox is gone; the reader reports it
         if self._unsent:
             self._loop.add_writer(self._socket.fileno(), self._flush)
         else:
             self._loop.remove_writer(self._socket.fileno())
 
-    def _readable(self) -> None:
+    def _read_messages(self) -> None:
         try:
             data = self._socket.recv(_READ_BYTES)
         except BlockingIOError:
             return
         except OSError:
             data = b""
-        if not data:
-            self._end("")
+        try:
+            messages = list(self._frames.feed(data))
+        except RsePfError as error:
+            self._fail(f"it sent an invalid message: {error.message}")
             return
-        self._received += data
-        while not self._closed and len(self._received) >= HEADER.size:
-            (length,) = HEADER.unpack_from(self._received)
-            if length > self._max_bytes:
-                self._end(f"it sent a message of {length} bytes")
-                return
-            end = HEADER.size + length
-            if len(self._received) < end:
-                return
-            body = bytes(self._received[HEADER.size : end])
-            del self._received[:end]
-            try:
-                self._on_message(decoded(body))
-            except (msgspec.DecodeError, RsePfError, TypeError, ValueError, LookupError):
-                self._end("it sent something that is no message")
-                return
+        for message in messages:
+            self._on_message(message)
+        if not data:
+            self._fail("")
 
-    def _end(self, fault: str) -> None:
+    def _fail(self, why: str) -> None:
         self._loop.remove_reader(self._socket.fileno())
-        self._on_fault(fault)
+        self._on_fault(why)
 
-    def _printed(self) -> None:
+    def _read_output(self) -> None:
         if self._closed:
             return
         try:
@@ -159,3 +180,10 @@ class IpcChannel:
             self._lines += 1
             if self._lines <= _MAX_LINES:
                 self._on_line(line[:_MAX_LINE])
+
+
+def _decode(body: bytes) -> Any:
+    try:
+        return msgspec.msgpack.decode(body, ext_hook=extension_hook)
+    except (msgspec.DecodeError, TypeError, ValueError, LookupError) as error:
+        raise BadMessage(f"not MessagePack: {error}") from error

@@ -1,8 +1,8 @@
-"""The walls of an isolated environment: namespaces, a root of its own, limits, no new privileges, seccomp.
+"""Isolate the calling process: namespaces, a root of its own, limits, no new privileges, seccomp.
 
-Each function puts up one wall around the calling process, by plain Linux calls.  Promises that a wall
-which cannot be put up raises `IsolationUnavailable` with its name, and that nothing here is undone by `exec`.
-Source: the paper's Fig. 4 gives each robot an environment of its own; the means are ours.
+Each function applies one means by plain Linux calls.  One that the kernel refuses raises
+`IsolationUnavailable` with its name; `exec` undoes none of them.
+Source: the paper's Fig. 4 gives each robot an isolated environment; the means are ours.
 """
 
 from __future__ import annotations
@@ -15,8 +15,10 @@ import struct
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+from rse_pf.linux import PR_CAPBSET_DROP, PR_SET_DUMPABLE, PR_SET_NO_NEW_PRIVS, PR_SET_SECCOMP, prctl
+
 __all__ = [
-    "WALLS",
+    "ISOLATION",
     "IsolationUnavailable",
     "close_other_descriptors",
     "enter_namespaces",
@@ -24,25 +26,23 @@ __all__ = [
     "give_up_privileges",
     "limit_resources",
     "make_root",
-    "missing_walls",
+    "missing_isolation",
 ]
 
-WALLS = ("namespaces", "root", "privileges", "seccomp")
-"""Names of the walls that a kernel may lack; limits on resources always hold."""
+ISOLATION = ("namespaces", "root", "privileges", "seccomp")
+"""Names of the means that a kernel may lack; limits on resources always hold."""
 
 _LIBC = ctypes.CDLL(None, use_errno=True)
 
 _CLONE_NEWNS, _CLONE_NEWUTS, _CLONE_NEWIPC = 0x00020000, 0x04000000, 0x08000000
 _CLONE_NEWUSER, _CLONE_NEWPID, _CLONE_NEWNET = 0x10000000, 0x20000000, 0x40000000
-_PLACES = tuple(map(Path, ("/mnt", "/media", "/srv", "/opt", "/tmp", "/run")))
+_MOUNT_POINTS = tuple(map(Path, ("/mnt", "/media", "/srv", "/opt", "/tmp", "/run")))
 _MS_NOSUID, _MS_NODEV, _MS_BIND, _MS_REC, _MS_PRIVATE = 0x2, 0x4, 0x1000, 0x4000, 1 << 18
 _MNT_DETACH = 2
 _AT_RECURSIVE = 0x8000
 _MOUNT_ATTR_RDONLY, _MOUNT_ATTR_NOSUID, _MOUNT_ATTR_NODEV = 0x1, 0x2, 0x4
 _SYS_MOUNT_SETATTR = 442
 _SYS_PIVOT_ROOT = {"x86_64": 155, "aarch64": 41}
-_PR_SET_NO_NEW_PRIVS, _PR_SET_SECCOMP, _PR_CAPBSET_DROP = 38, 22, 24
-_PR_SET_DUMPABLE = 4
 _SECCOMP_MODE_FILTER = 2
 _CAP_VERSION_3 = 0x20080522
 _LAST_CAP = 63
@@ -71,18 +71,18 @@ _FORBIDDEN_X86_64 = {
 
 
 class IsolationUnavailable(Exception):
-    """This kernel, or this account, cannot put up a wall; ``args`` are its name and the reason."""
+    """This kernel or this account lacks a means of isolation; ``args`` are its name and the reason."""
 
 
-def missing_walls(program: Sequence[Callable[[], None]], names: Sequence[str] = WALLS) -> list[str]:
-    """Try each of *program* in a child of its own and return the *names* of those that failed."""
+def missing_isolation(tries: Sequence[Callable[[], None]]) -> list[str]:
+    """Call each of *tries*, one for each of `ISOLATION`, in a child process; return the names that failed."""
     missing = []
-    for name, wall in zip(names, program, strict=True):
+    for name, isolate in zip(ISOLATION, tries, strict=True):
         child = os.fork()
         if child == 0:
             try:
-                wall()
-            except BaseException:  # noqa: BLE001  the exit code says it all
+                isolate()
+            except BaseException:  # noqa: BLE001  the exit code reports it
                 os._exit(1)
             os._exit(0)
         if os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) != 0:
@@ -91,7 +91,7 @@ def missing_walls(program: Sequence[Callable[[], None]], names: Sequence[str] = 
 
 
 def enter_namespaces() -> None:
-    """Leave the network, mounts, processes and shared memory of the rest; a plain user becomes its own root.
+    """Enter new namespaces of network, mounts, processes and IPC; a plain user becomes its own root.
 
     The process namespace begins with the next child.
     """
@@ -110,7 +110,7 @@ def enter_namespaces() -> None:
 
 
 def make_root(readable: Sequence[Path], scratch_bytes: int, owner: int) -> None:
-    """Make a root of *readable* paths (read-only), three devices and an empty ``/scratch``; stand in it.
+    """Make a root of *readable* paths (read-only), three devices and an empty ``/scratch``, and enter it.
 
     Args:
         readable: Files and folders that keep their names; missing ones are left out.
@@ -118,10 +118,10 @@ def make_root(readable: Sequence[Path], scratch_bytes: int, owner: int) -> None:
         owner: User of the scratch folder.
     """
     _mount(None, "/", None, _MS_REC | _MS_PRIVATE, None)
-    base = _free_place(readable)
+    base = _free_mount_point(readable)
     _mount("root", base, "tmpfs", _MS_NOSUID | _MS_NODEV, "size=1m,mode=755")
     for path in (*_outermost(readable), *(Path("/dev") / name for name in ("null", "zero", "urandom"))):
-        _show(path, base)
+        _bind(path, base)
     scratch = base + "/scratch"
     os.mkdir(scratch)
     _mount("scratch", scratch, "tmpfs", _MS_NOSUID | _MS_NODEV, f"size={scratch_bytes},mode=700")
@@ -149,11 +149,12 @@ def limit_resources(memory_bytes: int, scratch_bytes: int, *, alone: bool) -> No
     Args:
         memory_bytes: Address space.
         scratch_bytes: One file.
-        alone: Whether user or user namespace are this environment's own, so that threads can be counted.
+        alone: Whether the user or the user namespace belongs to this sandbox alone, so that its threads
+            can be counted.
     """
     if alone:
         resource.setrlimit(resource.RLIMIT_NPROC, (_MAX_THREADS, _MAX_THREADS))
-    for which, most in (
+    for which, limit in (
         (resource.RLIMIT_AS, memory_bytes),
         (resource.RLIMIT_FSIZE, scratch_bytes),
         (resource.RLIMIT_NOFILE, 64),
@@ -161,13 +162,13 @@ def limit_resources(memory_bytes: int, scratch_bytes: int, *, alone: bool) -> No
         (resource.RLIMIT_MEMLOCK, 0),
         (resource.RLIMIT_MSGQUEUE, 0),
     ):
-        resource.setrlimit(which, (most, most))
+        resource.setrlimit(which, (limit, limit))
 
 
 def give_up_privileges(uid: int | None) -> None:
     """Become *uid* (root only; None stays), hold no capability and never gain one."""
     for capability in range(_LAST_CAP + 1):
-        if _LIBC.prctl(_PR_CAPBSET_DROP, capability, 0, 0, 0) != 0:
+        if prctl(PR_CAPBSET_DROP, capability) != 0:
             break  # past the last one, or not allowed to: the sets below are emptied anyway
     if uid is not None:
         os.setgroups([])
@@ -175,29 +176,26 @@ def give_up_privileges(uid: int | None) -> None:
         os.setresuid(uid, uid, uid)
     header = struct.pack("=Ii", _CAP_VERSION_3, 0)
     _call("privileges", _LIBC.capset, header, b"\0" * 24)
-    _call("privileges", _LIBC.prctl, _PR_SET_NO_NEW_PRIVS, 1, 0, 0, 0)
-    _LIBC.prctl(_PR_SET_DUMPABLE, 0, 0, 0, 0)
+    _call("privileges", prctl, PR_SET_NO_NEW_PRIVS, 1)
+    prctl(PR_SET_DUMPABLE, 0)
     os.umask(0o077)
 
 
 def forbid_system_calls() -> None:
-    """Let Linux refuse new programs, processes, sockets and mounts from now on."""
+    """Forbid new programs, processes, sockets and mounts from now on."""
     if platform.machine() != "x86_64" or struct.calcsize("P") != 8:
         raise IsolationUnavailable("seccomp", f"no filter is written for {platform.machine()}")
     code = _filter(sorted(_FORBIDDEN_X86_64.values()))
     buffer = ctypes.create_string_buffer(code, len(code))
     program = struct.pack("@HxxxxxxP", len(code) // 8, ctypes.addressof(buffer))
-    _call("seccomp", _LIBC.prctl, _PR_SET_NO_NEW_PRIVS, 1, 0, 0, 0)
-    _call("seccomp", _LIBC.prctl, _PR_SET_SECCOMP, _SECCOMP_MODE_FILTER, program, 0, 0)
+    _call("seccomp", prctl, PR_SET_NO_NEW_PRIVS, 1)
+    _call("seccomp", prctl, PR_SET_SECCOMP, _SECCOMP_MODE_FILTER, program)
 
 
-def close_other_descriptors(keep: Sequence[int]) -> None:
-    """Close every file that a parent left open, but *keep*."""
-    last = 2
-    for fd in sorted(keep):
-        os.closerange(last + 1, fd)
-        last = max(last, fd)
-    os.closerange(last + 1, 1 << 16)
+def close_other_descriptors(keep: int) -> None:
+    """Close every file that a parent left open, but *keep* and the standard ones."""
+    os.closerange(3, keep)
+    os.closerange(max(3, keep + 1), 1 << 16)
 
 
 def _filter(forbidden: Sequence[int]) -> bytes:
@@ -234,12 +232,12 @@ def _filter(forbidden: Sequence[int]) -> bytes:
     return b"".join(steps)
 
 
-def _free_place(readable: Sequence[Path]) -> str:
-    """Return a folder to put a fresh file system over: nothing that will be shown may lie below it."""
-    for place in _PLACES:
+def _free_mount_point(readable: Sequence[Path]) -> str:
+    """Return a folder to mount the new root on; no readable path may lie below it."""
+    for place in _MOUNT_POINTS:
         if place.is_dir() and not any(Path(path).is_relative_to(place) for path in readable):
             return str(place)
-    raise IsolationUnavailable("root", f"none of {', '.join(map(str, _PLACES))} is free")
+    raise IsolationUnavailable("root", f"none of {', '.join(map(str, _MOUNT_POINTS))} is free")
 
 
 def _outermost(paths: Sequence[Path]) -> list[Path]:
@@ -251,7 +249,7 @@ def _outermost(paths: Sequence[Path]) -> list[Path]:
     return chosen
 
 
-def _show(path: Path, base: str) -> None:
+def _bind(path: Path, base: str) -> None:
     target = base + str(path)
     if path.is_symlink():
         os.makedirs(os.path.dirname(target), mode=0o755, exist_ok=True)
@@ -281,6 +279,6 @@ def _mount(source: str | None, target: str, kind: str | None, flags: int, data: 
     _call("root", _LIBC.mount, texts[0], texts[1], texts[2], ctypes.c_ulong(flags), texts[3])
 
 
-def _call(wall: str, function: Callable[..., int], *arguments: object) -> None:
+def _call(means: str, function: Callable[..., int], *arguments: object) -> None:
     if function(*arguments) != 0:
-        raise IsolationUnavailable(wall, os.strerror(ctypes.get_errno()))
+        raise IsolationUnavailable(means, os.strerror(ctypes.get_errno()))

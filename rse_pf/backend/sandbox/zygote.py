@@ -1,14 +1,12 @@
-"""The warm template of environments: `python -m rse_pf.backend.sandbox.zygote FD`, started by a worker.
+"""The process that forks sandboxes: `python -m rse_pf.backend.sandbox.zygote FD`, started by a worker.
 
-It imports what services need, then forks an environment for each robot that asks.  Promises to start no
-thread and no event loop, to run no service itself, and to die with its worker and take every environment
-along.
+It imports once what services need, so that a fork starts without imports.  It starts no thread and no event
+loop, runs no service itself, and ends with its worker, together with every sandbox.
 """
 
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import gc
 import importlib
 import json
@@ -20,22 +18,22 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from rse_pf.backend.sandbox import isolation as walls
-from rse_pf.backend.sandbox.child import SandboxPlan, readable_paths, run_environment
+from rse_pf.backend.sandbox import isolation
+from rse_pf.backend.sandbox.child import SandboxPlan, readable_paths, run_sandbox
 from rse_pf.errors import MissingExtra
-from rse_pf.linux import die_with_parent
+from rse_pf.linux import PR_SET_CHILD_SUBREAPER, die_with_parent, prctl
 from rse_pf.services.custom.installed import InstalledService
 
 __all__ = ["main"]
 
-_PR_SET_CHILD_SUBREAPER = 36
 _MAX_MESSAGE = 1 << 20
+_GO = b"g"
 _SLOTS = 500
 """User ids of one zygote; the next zygote's begin after them."""
 
 
 def main(arguments: list[str]) -> None:
-    """Fork environments until the worker is gone."""
+    """Fork sandboxes until the worker is gone."""
     worker = socket.socket(fileno=int(arguments[0]))
     config = json.loads(worker.recv(_MAX_MESSAGE) or b"null")
     if config is not None and die_with_parent(config["worker"]):
@@ -46,8 +44,8 @@ class _Zygote:
     def __init__(self, worker: socket.socket, config: dict[str, Any]) -> None:
         self._worker = worker
         services = {
-            told["name"]: InstalledService(**{**told, "folder": Path(told["folder"])})
-            for told in config["services"]
+            each["name"]: InstalledService(**{**each, "folder": Path(each["folder"])})
+            for each in config["services"]
         }
         _warm_up({service.language for service in services.values()})
         self._first_uid = config["first_uid"] + os.getpid() * _SLOTS if os.getuid() == 0 else None
@@ -56,38 +54,38 @@ class _Zygote:
             memory_bytes=config["memory_bytes"],
             scratch_bytes=config["scratch_bytes"],
             max_bytes=config["max_bytes"],
-            missing=self._missing(list(services.values()), config["scratch_bytes"]),
+            missing=self._missing_isolation(list(services.values()), config["scratch_bytes"]),
         )
         self._children: dict[int, int] = {}
         self._slots: dict[int, int] = {}
 
     def run(self) -> None:
-        ctypes.CDLL(None).prctl(_PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0)
-        awake, wake = os.pipe()
-        for fd in (awake, wake):
+        prctl(PR_SET_CHILD_SUBREAPER, 1)
+        child_ended, wakeup = os.pipe()
+        for fd in (child_ended, wakeup):
             os.set_blocking(fd, False)
-        signal.set_wakeup_fd(wake, warn_on_full_buffer=False)
+        signal.set_wakeup_fd(wakeup, warn_on_full_buffer=False)
         signal.signal(signal.SIGCHLD, lambda *_: None)
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, signal.SIG_IGN)
         gc.collect()
         gc.freeze()
-        self._say(event="ready", missing=list(self._plan.missing))
+        self._report(event="ready", missing=list(self._plan.missing))
         poll = select.poll()
         poll.register(self._worker, select.POLLIN)
-        poll.register(awake, select.POLLIN)
+        poll.register(child_ended, select.POLLIN)
         while True:
             ready = {fd for fd, _ in poll.poll()}
-            if awake in ready:
-                os.read(awake, 4096)
+            if child_ended in ready:
+                os.read(child_ended, 4096)
             self._reap()
-            if self._worker.fileno() in ready and not self._obey():
+            if self._worker.fileno() in ready and not self._follow_order():
                 break
         for pid in self._children:
             os.kill(pid, signal.SIGKILL)
         os._exit(0)
 
-    def _obey(self) -> bool:
+    def _follow_order(self) -> bool:
         try:
             message, fds, _, _ = socket.recv_fds(self._worker, _MAX_MESSAGE, 2)
         except OSError:
@@ -98,46 +96,46 @@ class _Zygote:
         if order["do"] == "create":
             self._create(order["id"], *fds)
         else:
-            for pid in [pid for pid, which in self._children.items() if which == order["id"]]:
-                os.kill(pid, signal.SIGKILL)
+            for pid, number in self._children.items():
+                if number == order["id"]:
+                    os.kill(pid, signal.SIGKILL)
         for fd in fds:
             os.close(fd)
         return True
 
-    def _create(self, which: int, conversation: int, output: int) -> None:
+    def _create(self, number: int, channel: int, output: int) -> None:
         """Fork twice: the first child enters the namespaces, the second is the first process inside them."""
         slot = next(n for n in range(_SLOTS) if n not in self._slots.values())
         uid = None if self._first_uid is None else self._first_uid + slot
-        told, tell = os.pipe()
-        go, let_go = os.pipe()
-        keeper = os.fork()
-        if keeper == 0:
-            self._keep(conversation, output, uid, tell, go, let_go)
-        os.close(tell)
-        os.close(go)
-        os.waitpid(keeper, 0)
-        pid = int(os.read(told, 32) or b"0")
-        os.close(told)
+        pid_read, pid_write = os.pipe()
+        go_read, go_write = os.pipe()
+        first = os.fork()
+        if first == 0:
+            os.close(go_write)
+            self._fork_inside(channel, output, uid, pid_write, go_read)
+        os.close(pid_write)
+        os.close(go_read)
+        os.waitpid(first, 0)
+        pid = int(os.read(pid_read, 32) or b"0")
+        os.close(pid_read)
         if pid:
-            self._children[pid] = which
+            self._children[pid] = number
             self._slots[pid] = slot
-            os.write(let_go, b"g")
-            self._say(event="created", id=which, pid=pid)
+            os.write(go_write, _GO)
         else:
-            self._say(event="gone", id=which, how="could not enter its namespaces")
-        os.close(let_go)
+            self._report(event="gone", id=number, how="it could not enter its namespaces")
+        os.close(go_write)
 
-    def _keep(self, conversation: int, output: int, uid: int | None, tell: int, go: int, let_go: int) -> None:
+    def _fork_inside(self, channel: int, output: int, uid: int | None, pid_write: int, go_read: int) -> None:
+        """Enter the namespaces, fork the sandbox, tell its pid and exit."""
         try:
             if "namespaces" not in self._plan.missing:
-                walls.enter_namespaces()
+                isolation.enter_namespaces()
             pid = os.fork()
-            if pid == 0:
-                os.close(let_go)
-                run_environment(
-                    self._plan, conversation, output, uid, lambda: _wait_for(go)
-                )  # does not return
-            os.write(tell, str(pid).encode())
+            if pid == 0 and os.read(go_read, 1) == _GO:  # the zygote knows the pid
+                run_sandbox(self._plan, channel, output, uid)
+            elif pid:
+                os.write(pid_write, str(pid).encode())
         finally:
             os._exit(0)
 
@@ -149,38 +147,34 @@ class _Zygote:
                 return
             if pid == 0:
                 return
-            which = self._children.pop(pid, None)
+            number = self._children.pop(pid, None)
             self._slots.pop(pid, None)
-            if which is not None:
+            if number is not None:
                 code = os.waitstatus_to_exitcode(status)
                 how = f"exit code {code}" if code >= 0 else f"signal {signal.Signals(-code).name}"
-                self._say(event="gone", id=which, how=how)
+                self._report(event="gone", id=number, how=how)
 
-    def _missing(self, services: list[InstalledService], scratch_bytes: int) -> list[str]:
+    def _missing_isolation(self, services: list[InstalledService], scratch_bytes: int) -> list[str]:
         uid = self._first_uid
 
-        def root() -> None:
-            walls.enter_namespaces()
-            walls.make_root(readable_paths(services), scratch_bytes, os.getuid() if uid is None else uid)
+        def make_root() -> None:
+            isolation.enter_namespaces()
+            isolation.make_root(readable_paths(services), scratch_bytes, os.getuid() if uid is None else uid)
 
-        tries = (
-            walls.enter_namespaces, root, lambda: walls.give_up_privileges(uid), walls.forbid_system_calls
-        )  # fmt: skip
-        return walls.missing_walls(tries)
+        def give_up_privileges() -> None:
+            isolation.give_up_privileges(uid)
 
-    def _say(self, **message: Any) -> None:
-        with contextlib.suppress(OSError):  # the worker is gone: the next poll tells
+        return isolation.missing_isolation(
+            [isolation.enter_namespaces, make_root, give_up_privileges, isolation.forbid_system_calls]
+        )
+
+    def _report(self, **message: Any) -> None:
+        with contextlib.suppress(OSError):  # the worker is gone, which the next poll shows
             self._worker.send(json.dumps(message).encode())
 
 
-def _wait_for(go: int) -> None:
-    if os.read(go, 1) != b"g":
-        os._exit(1)
-    os.close(go)
-
-
 def _warm_up(languages: set[str]) -> None:
-    """Import once what every environment would import again."""
+    """Import what every sandbox would import otherwise."""
     importlib.import_module("numpy.linalg")
 
     if "cpp" in languages:
@@ -188,7 +182,7 @@ def _warm_up(languages: set[str]) -> None:
     if "lua" in languages:
         from rse_pf.services.custom.lua import warm_up
 
-        with contextlib.suppress(MissingExtra):  # said when a robot calls the service
+        with contextlib.suppress(MissingExtra):  # reported when a robot calls the service
             warm_up()
 
 

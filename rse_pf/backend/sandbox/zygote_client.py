@@ -1,6 +1,6 @@
-"""The worker's side of the warm template (`zygote`): start it, order environments, hear how they ended.
+"""The worker's side of the `zygote`: start it, order sandboxes, learn how they ended.
 
-Promises not to block once it is warm: orders to a template that starts again wait in its channel.
+Only the first start blocks; orders to a zygote that is restarted wait in its channel.
 """
 
 from __future__ import annotations
@@ -12,65 +12,43 @@ import socket
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
-from typing import Any, Protocol
 
+from rse_pf.backend.ports import Log, Loop
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import ConfigurationError
 from rse_pf.services.custom.installed import InstalledService
 
-__all__ = ["Reading", "SandboxLog", "ZygoteClient"]
+__all__ = ["ZygoteClient"]
 
 _MAX_MESSAGE = 1 << 16
 
 
-class SandboxLog(Protocol):
-    """Where events go; `rse_pf.backend.log.JsonLog` is one."""
-
-    def info(self, event: str, **fields: Any) -> None:
-        """Write what happened."""
-
-    def warning(self, event: str, **fields: Any) -> None:
-        """Write what an operator should look at."""
-
-    def error(self, event: str, **fields: Any) -> None:
-        """Write a defect."""
-
-
-class Reading(Protocol):
-    """What watches descriptors."""
-
-    def add_reader(self, fd: int, callback: Callable[..., object], *args: Any) -> None:
-        """Call *callback* whenever *fd* can be read."""
-
-    def remove_reader(self, fd: int) -> bool:
-        """Stop that."""
-
-
 class ZygoteClient:
-    """The template process of one worker; ``missing`` names the walls that this machine lacks."""
+    """The zygote of one worker; ``missing`` names the means of isolation that this machine lacks."""
 
     def __init__(
         self,
         services: Sequence[InstalledService],
         settings: PlatformSettings,
         *,
-        loop: Reading,
-        log: SandboxLog,
+        loop: Loop,
+        log: Log,
         on_gone: Callable[[int, str], None],
         on_lost: Callable[[], None],
     ) -> None:
-        """Start it and wait until it is warm.
+        """Start it and wait until it is ready.
 
         Args:
-            services: That environments may load.
-            settings: Limits of environments.
-            loop: Of the worker.
-            log: Of the worker.
-            on_gone: Told the number of an environment that ended, and how.
-            on_lost: Told when the template died, and every environment with it; a new one is starting then.
+            services: Services that sandboxes may load.
+            settings: Limits of sandboxes.
+            loop: Event loop of the worker.
+            log: Log of the worker.
+            on_gone: Called with the number of a sandbox that ended, and how it ended.
+            on_lost: Called when the zygote ended, and every sandbox with it; a new one is starting then.
 
         Raises:
-            ConfigurationError: It did not start, or a wall is missing and weak isolation was not accepted.
+            ConfigurationError: It did not start, or a means of isolation is missing and weak isolation
+                was not accepted.
         """
         self._services = services
         self._settings = settings
@@ -79,25 +57,25 @@ class ZygoteClient:
         self._on_gone = on_gone
         self._on_lost = on_lost
         self._launch()
-        self.missing: tuple[str, ...] = self._wait_until_warm()
+        self.missing: tuple[str, ...] = self._wait_until_ready()
         self._listen()
 
-    def create(self, number: int, conversation: socket.socket, output: int) -> bool:
-        """Order environment *number* with its descriptors; return False if the channel is full."""
+    def create(self, number: int, channel: socket.socket, output: int) -> bool:
+        """Order sandbox *number* with its descriptors; return False if too many orders wait."""
         order = json.dumps({"do": "create", "id": number}).encode()
         try:
-            socket.send_fds(self._channel, [order], [conversation.fileno(), output])
+            socket.send_fds(self._channel, [order], [channel.fileno(), output])
         except OSError:
             return False
         return True
 
     def end(self, number: int) -> None:
-        """Let environment *number* be killed; one that is gone already is no error."""
+        """Have sandbox *number* killed; one that is gone already is no error."""
         with contextlib.suppress(OSError):
             self._channel.send(json.dumps({"do": "end", "id": number}).encode())
 
     def close(self) -> None:
-        """End the template, which takes every environment along."""
+        """End the zygote, and with it every sandbox."""
         self._loop.remove_reader(self._channel.fileno())
         self._stop()
 
@@ -117,30 +95,28 @@ class ZygoteClient:
             "first_uid": limits.first_uid, "max_bytes": self._settings.session.max_inflated_bytes,
         }  # fmt: skip
         # No credentials, and no threads of the linear algebra library: it will be forked.
-        environment = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "PYTHONDONTWRITEBYTECODE": "1"}
+        variables = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "PYTHONDONTWRITEBYTECODE": "1"}
         with theirs:
             self._process = subprocess.Popen(
                 [sys.executable, "-m", "rse_pf.backend.sandbox.zygote", str(theirs.fileno())],
-                pass_fds=(theirs.fileno(),), stdin=subprocess.DEVNULL, env=environment,
+                pass_fds=(theirs.fileno(),), stdin=subprocess.DEVNULL, env=variables,
             )  # fmt: skip
         self._channel.send(json.dumps(config).encode())
 
-    def _wait_until_warm(self) -> tuple[str, ...]:
+    def _wait_until_ready(self) -> tuple[str, ...]:
         self._channel.settimeout(self._settings.local.start_timeout_s)
         try:
-            told = json.loads(self._channel.recv(_MAX_MESSAGE) or b"{}")
+            report = json.loads(self._channel.recv(_MAX_MESSAGE) or b"{}")
         except OSError:
-            told = {}
-        missing = tuple(told.get("missing", ()))
-        if told.get("event") != "ready":
+            report = {}
+        missing = tuple(report.get("missing", ()))
+        if report.get("event") != "ready":
             self._stop()
-            raise ConfigurationError(
-                "the template of environments did not start", hint="the server's log says why"
-            )
+            raise ConfigurationError("the zygote of sandboxes did not start", hint="see the server's log")
         if missing and not self._settings.services.accept_weak_isolation:
             self._stop()
             raise ConfigurationError(
-                f"installed services need walls that this machine lacks: {', '.join(missing)}",
+                f"installed services need isolation that this machine lacks: {', '.join(missing)}",
                 hint="allow unprivileged user namespaces and seccomp, or start with --accept-weak-isolation",
             )
         if missing:
@@ -149,9 +125,9 @@ class ZygoteClient:
 
     def _listen(self) -> None:
         self._channel.setblocking(False)
-        self._loop.add_reader(self._channel.fileno(), self._hear)
+        self._loop.add_reader(self._channel.fileno(), self._read_reports)
 
-    def _hear(self) -> None:
+    def _read_reports(self) -> None:
         while True:
             try:
                 message = self._channel.recv(_MAX_MESSAGE)
@@ -162,14 +138,14 @@ class ZygoteClient:
             if not message:
                 self._loop.remove_reader(self._channel.fileno())
                 self._stop()
-                self._log.error("template-lost")
+                self._log.error("zygote-lost")
                 self._launch()
                 self._listen()
                 self._on_lost()
                 return
-            told = json.loads(message)
-            if told["event"] == "gone":
-                self._on_gone(told["id"], told["how"])
+            report = json.loads(message)
+            if report["event"] == "gone":
+                self._on_gone(report["id"], report["how"])
 
     def _stop(self) -> None:
         self._channel.close()

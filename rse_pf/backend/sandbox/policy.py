@@ -1,0 +1,506 @@
+"""Decide what happens to the sandboxes of one worker: start, retry, deadline, kill, grace, capacity.
+
+Events come in as method calls with the time, `Action` values come out, and `manager` executes them in
+order.  The rules:
+
+- Each robot has at most one sandbox, which works on one command at a time; the others wait in order.
+- A command whose sandbox crashed is retried once in a new sandbox, unless its deadline has passed, its
+  service keeps state that no snapshot holds, or `CircuitBreaker` refuses it.
+- A command is answered at its deadline; its sandbox is killed at a multiple of the deadline.
+- A sandbox outlives the last connection of its robot by a grace period, unless its place is needed.
+- Commands that wait for a sandbox which crashed move to the new one.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter, deque
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+from rse_pf.backend.sandbox.circuit_breaker import CircuitBreaker
+from rse_pf.backend.sandbox.ipc import encode_message
+from rse_pf.backend.scheduling.scheduler import QueuedCommand
+from rse_pf.config import PlatformSettings
+from rse_pf.errors import Busy, Conflict, Expired, Poison, RsePfError, StoreError, WorkerLost
+from rse_pf.service import Kind
+
+__all__ = [
+    "Action",
+    "AnswerCall",
+    "CreateSandbox",
+    "KillSandbox",
+    "LoadSnapshot",
+    "LogCrash",
+    "ReleaseSandbox",
+    "SandboxCall",
+    "SandboxPolicy",
+    "SandboxReply",
+    "SaveSnapshot",
+    "SendMessage",
+]
+
+_MAX_TRIES = 2
+_BUSY_RETRY_MS = 1000.0
+
+
+@dataclass(eq=False, slots=True)
+class SandboxCall:
+    """A command on its way through a sandbox; ``data`` is the message that asks for it."""
+
+    queued: QueuedCommand
+    digest: str
+    data: bytes
+    tries: int = 0
+    is_answered: bool = False
+
+    @property
+    def service(self) -> str:
+        """Name of the service."""
+        return self.queued.command.service
+
+
+@dataclass(frozen=True, slots=True)
+class SandboxReply:
+    """What a service returned, and the state that belongs to it (None: it keeps none)."""
+
+    value: Any
+    compute_ms: float
+    snapshot: bytes | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class CreateSandbox:
+    """Start a process for *robot* and report `ready` or `gone`."""
+
+    number: int
+    robot: str
+
+
+@dataclass(frozen=True, slots=True)
+class SendMessage:
+    """Send *data* to the sandbox and report what it `replied`."""
+
+    number: int
+    data: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class KillSandbox:
+    """Kill the process; `gone` follows."""
+
+    number: int
+
+
+@dataclass(frozen=True, slots=True)
+class ReleaseSandbox:
+    """Kill the process, if it runs, and free what belongs to it; nothing more is reported of it."""
+
+    number: int
+
+
+@dataclass(frozen=True, slots=True)
+class LoadSnapshot:
+    """Read the last snapshot of the service and report `store_replied`."""
+
+    number: int
+    call: SandboxCall
+
+
+@dataclass(frozen=True, slots=True)
+class SaveSnapshot:
+    """Replace the snapshot *expected* by *data* and report `store_replied`."""
+
+    number: int
+    call: SandboxCall
+    expected: bytes | None
+    data: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class AnswerCall:
+    """Answer the robot; at most once for each call."""
+
+    call: SandboxCall
+    outcome: SandboxReply | RsePfError
+
+
+@dataclass(frozen=True, slots=True)
+class LogCrash:
+    """Log that a sandbox crashed; *service* is "" if it ran none."""
+
+    robot: str
+    service: str
+    reason: str
+
+
+Action = (
+    CreateSandbox
+    | SendMessage
+    | KillSandbox
+    | ReleaseSandbox
+    | LoadSnapshot
+    | SaveSnapshot
+    | AnswerCall
+    | LogCrash
+)
+
+
+@dataclass(eq=False, slots=True)
+class _Sandbox:
+    number: int
+    robot: str
+    kill_s: float
+    """When it is killed: it did not start, or works too long."""
+    state: Literal["starting", "idle", "loading", "restoring", "running", "saving", "dying"] = "starting"
+    waiting: deque[SandboxCall] = field(default_factory=deque)
+    running: SandboxCall | None = None
+    late_s: float = math.inf
+    """Deadline of the running call."""
+    release_s: float = math.inf
+    """End of the grace period; infinite while the robot is connected."""
+    snapshots: dict[str, bytes | None] = field(default_factory=dict)
+    """Last snapshot of each stateful service, as it stands in the store."""
+    unsaved: SandboxReply | None = None
+    """The reply whose snapshot is being saved."""
+    fault: str = ""
+
+
+class SandboxPolicy:
+    """All sandboxes of one worker; every event returns the actions that follow from it."""
+
+    def __init__(
+        self,
+        kinds: Mapping[str, Kind],
+        settings: PlatformSettings,
+        *,
+        max_sandboxes: int,
+        keeps_snapshots: bool,
+    ) -> None:
+        """Begin without any sandbox.
+
+        Args:
+            kinds: Kind of each installed service.
+            settings: Limits, grace and the rules of the circuit breaker.
+            max_sandboxes: Sandboxes of this worker at a time.
+            keeps_snapshots: Whether there is a store for the state of services.
+        """
+        self.counts: Counter[str] = Counter()
+        self._kinds = kinds
+        self._settings = settings.services
+        self._max_waiting = settings.serving.max_queue_per_robot
+        self._max_sandboxes = max_sandboxes
+        self._keeps_snapshots = keeps_snapshots
+        self._breaker = CircuitBreaker(settings.services)
+        self._sandboxes: dict[int, _Sandbox] = {}
+        self._by_robot: dict[str, _Sandbox] = {}
+        self._connections: Counter[str] = Counter()
+        self._last_number = 0
+        self._actions: list[Action] = []
+
+    @property
+    def held(self) -> int:
+        """Commands that wait or run."""
+        return sum(len(each.waiting) + (each.running is not None) for each in self._sandboxes.values())
+
+    @property
+    def sandboxes(self) -> int:
+        """Sandboxes that exist."""
+        return len(self._sandboxes)
+
+    @property
+    def wake_s(self) -> float:
+        """When `tick` is due next; infinite if nothing is waited for."""
+        times = (min(each.kill_s, each.late_s, each.release_s) for each in self._sandboxes.values())
+        return min(times, default=math.inf)
+
+    def open_services(self, now: float) -> list[str]:
+        """Return the services whose circuit breaker is open, sorted."""
+        return self._breaker.open_services(now)
+
+    # --- events from the gateway -------------------------------------------------------------------
+
+    def connected(self, robot: str) -> None:
+        """A connection of *robot* was opened: its sandbox, if it still has one, is kept."""
+        self._connections[robot] += 1
+        if robot in self._by_robot:
+            self._by_robot[robot].release_s = math.inf
+
+    def disconnected(self, robot: str, now: float) -> None:
+        """A connection of *robot* was closed; after the last one the grace period of its sandbox begins."""
+        self._connections[robot] -= 1
+        if self._connections[robot] > 0:
+            return
+        del self._connections[robot]
+        sandbox = self._by_robot.get(robot)
+        if sandbox is not None:
+            sandbox.waiting.clear()
+            sandbox.release_s = now + self._settings.grace_s
+
+    def submit(self, call: SandboxCall, now: float) -> list[Action]:
+        """A robot sent a command."""
+        refusal = self._refusal(call, now)
+        sandbox = self._by_robot.get(call.queued.robot)
+        if refusal is None and sandbox is None and not self._has_capacity():
+            refusal = Busy(
+                f"all {self._max_sandboxes} sandboxes of this server are in use",
+                hint="try again later",
+                retry_after_ms=_BUSY_RETRY_MS,
+            )
+        if refusal is None and sandbox is not None and len(sandbox.waiting) >= self._max_waiting:
+            refusal = Busy(
+                "too many commands of this robot wait", hint="wait for answers", retry_after_ms=_BUSY_RETRY_MS
+            )
+        if refusal is not None:
+            self._answer(call, refusal)
+            return self._take_actions()
+        sandbox = sandbox or self._create(call.queued.robot, now)
+        sandbox.waiting.append(call)
+        self._start_next(sandbox, now)
+        return self._take_actions()
+
+    # --- events from processes and the store -------------------------------------------------------
+
+    def ready(self, number: int, now: float) -> list[Action]:
+        """A sandbox has started and takes requests."""
+        sandbox = self._sandboxes.get(number)
+        if sandbox is None:
+            return []
+        if sandbox.state != "starting":
+            return self.broken(number, "it reported its start twice")
+        sandbox.state, sandbox.kill_s = "idle", math.inf
+        self._start_next(sandbox, now)
+        return self._take_actions()
+
+    def replied(self, number: int, outcome: SandboxReply | RsePfError, now: float) -> list[Action]:
+        """A sandbox answered the last message."""
+        sandbox = self._sandboxes.get(number)
+        if sandbox is None:
+            return []
+        call, failed = sandbox.running, isinstance(outcome, RsePfError)
+        if call is None or sandbox.state not in ("restoring", "running"):
+            return self.broken(number, "it replied without a request")
+        if sandbox.state == "restoring" and not failed:
+            self._send(sandbox, call)
+        elif sandbox.state == "restoring":
+            del sandbox.snapshots[call.service]  # its state is unknown: the next command restores again
+            self._finish(sandbox, call, outcome, now)
+        elif isinstance(outcome, SandboxReply) and self._is_changed(sandbox, call, outcome):
+            sandbox.state, sandbox.unsaved = "saving", outcome
+            assert outcome.snapshot is not None
+            expected = sandbox.snapshots[call.service]
+            self._actions.append(SaveSnapshot(number, call, expected, outcome.snapshot))
+        else:
+            self._finish(sandbox, call, outcome, now)
+        return self._take_actions()
+
+    def store_replied(
+        self, number: int, call: SandboxCall, outcome: bytes | BaseException | None, now: float
+    ) -> list[Action]:
+        """The store has read a snapshot (None: there is none), has saved one (None), or failed.
+
+        A Conflict means that it holds a newer snapshot: the robot's state was changed on another server.
+        """
+        sandbox = self._sandboxes.get(number)
+        if sandbox is None or sandbox.running is not call or sandbox.state not in ("loading", "saving"):
+            return []
+        if isinstance(outcome, Conflict):
+            self._release(sandbox)
+            self._answer(call, _lost(call.service, "its state was changed on another server"))
+            self._move_waiting(sandbox, now)
+        elif isinstance(outcome, BaseException):
+            failure = StoreError(f"the state of the service cannot be kept: {outcome}", hint="send it again")
+            self._finish(sandbox, call, failure, now)
+        elif sandbox.unsaved is not None:
+            sandbox.snapshots[call.service] = sandbox.unsaved.snapshot
+            self._finish(sandbox, call, sandbox.unsaved, now)
+        else:
+            sandbox.snapshots[call.service] = outcome
+            if outcome is None:
+                self._send(sandbox, call)
+            else:
+                sandbox.state = "restoring"
+                message = encode_message(["restore", call.service, outcome])
+                self._actions.append(SendMessage(number, message))
+        return self._take_actions()
+
+    def broken(self, number: int, why: str) -> list[Action]:
+        """A sandbox violated the protocol or closed its channel ("")."""
+        if number in self._sandboxes:
+            self._kill(self._sandboxes[number], why)
+        return self._take_actions()
+
+    def gone(self, number: int, how: str, now: float) -> list[Action]:
+        """The process of a sandbox ended."""
+        sandbox = self._sandboxes.get(number)
+        if sandbox is not None:
+            self._crashed(sandbox, how, now)
+        return self._take_actions()
+
+    def all_gone(self, how: str, now: float) -> list[Action]:
+        """Every sandbox ended, because the zygote did."""
+        for sandbox in list(self._sandboxes.values()):
+            self._crashed(sandbox, how, now)
+        return self._take_actions()
+
+    def tick(self, now: float) -> list[Action]:
+        """Time has passed: answer calls at their deadline, kill and release what is due."""
+        for sandbox in list(self._sandboxes.values()):
+            call = sandbox.running
+            if sandbox.release_s <= now:
+                self.counts["released"] += 1
+                self._release(sandbox)
+                continue
+            if call is not None and sandbox.late_s <= now:
+                sandbox.late_s = math.inf
+                self._answer(call, Expired("the service did not answer before the deadline"))
+            if sandbox.kill_s <= now:
+                self._kill(sandbox, "it did not start in time" if call is None else "it took too long")
+        return self._take_actions()
+
+    def close(self) -> list[Action]:
+        """The worker ends: release everything, answer nothing."""
+        for sandbox in list(self._sandboxes.values()):
+            self._release(sandbox)
+        return self._take_actions()
+
+    # --- rules -------------------------------------------------------------------------------------
+
+    def _refusal(self, call: SandboxCall, now: float) -> RsePfError | None:
+        verdict = self._breaker.verdict(call.service, call.digest, now)
+        if verdict == "poison":
+            self.counts["poison"] += 1
+            return Poison(
+                "this request crashed every sandbox that ran it and is not tried again",
+                hint="send another one; the server's log has the crash",
+            )
+        if verdict == "open":
+            open_s = self._breaker.open_for_s(call.service, now)
+            return WorkerLost(
+                f"service {call.service!r} crashed repeatedly and is refused for another {open_s:.0f} s",
+                hint="tell the operator; the server's log has the crashes",
+                retry_after_ms=open_s * 1e3,
+            )
+        return None
+
+    def _has_capacity(self) -> bool:
+        """Return whether one more sandbox fits; an idle one in its grace period is released for it."""
+        if len(self._sandboxes) < self._max_sandboxes:
+            return True
+        for sandbox in self._sandboxes.values():
+            if sandbox.release_s < math.inf and sandbox.running is None:
+                self._release(sandbox)
+                return True
+        return False
+
+    def _may_retry(self, call: SandboxCall, sandbox: _Sandbox, now: float) -> bool:
+        is_stateless = self._kinds[call.service] == "stateless"
+        return (
+            not call.is_answered
+            and call.tries < _MAX_TRIES
+            and call.queued.deadline_s > now
+            and (is_stateless or sandbox.snapshots.get(call.service) is not None)
+            and self._breaker.verdict(call.service, call.digest, now) == "run"
+        )
+
+    def _crashed(self, sandbox: _Sandbox, how: str, now: float) -> None:
+        call, why = sandbox.running, sandbox.fault or how
+        self._release(sandbox)
+        self.counts["crashed"] += 1
+        service = "" if call is None else call.service
+        self._actions.append(LogCrash(sandbox.robot, service, f"{why} ({how})"))
+        if call is not None:
+            self._breaker.crashed(service, call.digest, now)
+            call.tries += 1
+            if self._may_retry(call, sandbox, now):
+                sandbox.waiting.appendleft(call)
+            else:
+                self._answer(call, self._refusal(call, now) or _lost(service, why))
+        if sandbox.state == "starting":
+            while sandbox.waiting:
+                waiting = sandbox.waiting.popleft()
+                self._answer(waiting, _lost(waiting.service, why))
+        self._move_waiting(sandbox, now)
+
+    def _move_waiting(self, sandbox: _Sandbox, now: float) -> None:
+        """Let the commands that waited for a released sandbox wait for a new one."""
+        if sandbox.waiting and self._connections[sandbox.robot] > 0:
+            self._create(sandbox.robot, now).waiting.extend(sandbox.waiting)
+
+    # --- steps -------------------------------------------------------------------------------------
+
+    def _create(self, robot: str, now: float) -> _Sandbox:
+        self._last_number += 1
+        sandbox = _Sandbox(self._last_number, robot, kill_s=now + self._settings.start_timeout_s)
+        self._sandboxes[sandbox.number] = self._by_robot[robot] = sandbox
+        self.counts["created"] += 1
+        self._actions.append(CreateSandbox(sandbox.number, robot))
+        return sandbox
+
+    def _release(self, sandbox: _Sandbox) -> None:
+        del self._sandboxes[sandbox.number], self._by_robot[sandbox.robot]
+        self._actions.append(ReleaseSandbox(sandbox.number))
+
+    def _kill(self, sandbox: _Sandbox, why: str) -> None:
+        sandbox.fault = sandbox.fault or why
+        sandbox.kill_s = math.inf
+        if sandbox.state == "idle":
+            sandbox.state = "dying"  # a command that comes now waits for the next sandbox
+        self._actions.append(KillSandbox(sandbox.number))
+
+    def _start_next(self, sandbox: _Sandbox, now: float) -> None:
+        """Start the next call of an idle sandbox; refuse those that are no longer worth it."""
+        while sandbox.state == "idle" and sandbox.waiting:
+            call = sandbox.waiting.popleft()
+            queued, refusal = call.queued, self._refusal(call, now)
+            if refusal is None and queued.deadline_s <= now:
+                refusal = Expired("the deadline passed before the work began")
+            if refusal is not None:
+                self._answer(call, refusal)
+                continue
+            sandbox.running, queued.started_s = call, now
+            sandbox.late_s = queued.deadline_s
+            allowed_s = queued.deadline_s - queued.received_s
+            sandbox.kill_s = queued.received_s + allowed_s * self._settings.deadline_factor
+            if self._keeps_state(call) and call.service not in sandbox.snapshots:
+                sandbox.state = "loading"
+                self._actions.append(LoadSnapshot(sandbox.number, call))
+            else:
+                self._send(sandbox, call)
+
+    def _send(self, sandbox: _Sandbox, call: SandboxCall) -> None:
+        sandbox.state = "running"
+        self._actions.append(SendMessage(sandbox.number, call.data))
+
+    def _finish(
+        self, sandbox: _Sandbox, call: SandboxCall, outcome: SandboxReply | RsePfError, now: float
+    ) -> None:
+        sandbox.state, sandbox.running, sandbox.unsaved = "idle", None, None
+        sandbox.late_s = sandbox.kill_s = math.inf
+        self._answer(call, outcome)
+        self._start_next(sandbox, now)
+
+    def _answer(self, call: SandboxCall, outcome: SandboxReply | RsePfError) -> None:
+        if not call.is_answered:
+            call.is_answered = True
+            self._actions.append(AnswerCall(call, outcome))
+
+    def _keeps_state(self, call: SandboxCall) -> bool:
+        return self._keeps_snapshots and self._kinds[call.service] == "per_robot_state"
+
+    def _is_changed(self, sandbox: _Sandbox, call: SandboxCall, reply: SandboxReply) -> bool:
+        if reply.snapshot is None or not self._keeps_state(call):
+            return False
+        return reply.snapshot != sandbox.snapshots[call.service]
+
+    def _take_actions(self) -> list[Action]:
+        actions, self._actions = self._actions, []
+        return actions
+
+
+def _lost(service: str, why: str) -> WorkerLost:
+    return WorkerLost(
+        f"service {service!r} ended while it worked on this command: {why}",
+        hint="the server's log has what it printed last",
+    )
