@@ -11,53 +11,53 @@ SETTINGS = PlatformSettings.from_dict(
 
 
 def test_a_request_that_killed_twice_is_poison_whenever_it_comes_back():
-    quarantine = CircuitBreaker(SETTINGS)
-    quarantine.died("icp", "a", 0.0)
-    assert quarantine.verdict("icp", "a", 0.0) == "run"
-    quarantine.died("icp", "a", 1000.0)
+    breaker = CircuitBreaker(SETTINGS)
+    breaker.crashed("icp", "a", 0.0)
+    assert breaker.verdict("icp", "a", 0.0) == "run"
+    breaker.crashed("icp", "a", 1000.0)
 
-    assert quarantine.verdict("icp", "a", 5000.0) == "poison"
-    assert quarantine.verdict("icp", "b", 5000.0) == "run"
+    assert breaker.verdict("icp", "a", 5000.0) == "poison"
+    assert breaker.verdict("icp", "b", 5000.0) == "run"
 
 
 def test_three_deaths_in_half_a_minute_let_a_service_rest_for_a_minute():
-    quarantine = CircuitBreaker(SETTINGS)
+    breaker = CircuitBreaker(SETTINGS)
     for now, digest in ((0.0, "a"), (20.0, "b"), (30.0, "c")):
-        assert quarantine.verdict("icp", digest, now) == "run"
-        quarantine.died("icp", digest, now)
+        assert breaker.verdict("icp", digest, now) == "run"
+        breaker.crashed("icp", digest, now)
 
-    assert quarantine.verdict("icp", "d", 30.1) == "quarantined"
-    assert quarantine.verdict("other", "d", 30.1) == "run"
-    assert quarantine.resting(89.9) == ["icp"]
-    assert quarantine.rests_s("icp", 80.0) == 10.0
-    assert quarantine.verdict("icp", "d", 90.0) == "run"
-    assert quarantine.resting(90.0) == []
+    assert breaker.verdict("icp", "d", 30.1) == "open"
+    assert breaker.verdict("other", "d", 30.1) == "run"
+    assert breaker.open_services(89.9) == ["icp"]
+    assert breaker.open_for_s("icp", 80.0) == 10.0
+    assert breaker.verdict("icp", "d", 90.0) == "run"
+    assert breaker.open_services(90.0) == []
 
 
 def test_deaths_further_apart_are_no_crash_loop():
-    quarantine = CircuitBreaker(SETTINGS)
+    breaker = CircuitBreaker(SETTINGS)
     for i in range(20):
-        quarantine.died("icp", str(i), i * 15.1)
+        breaker.crashed("icp", str(i), i * 15.1)
 
-    assert quarantine.verdict("icp", "x", 20 * 15.1) == "run"
+    assert breaker.verdict("icp", "x", 20 * 15.1) == "run"
 
 
 def test_after_its_rest_a_service_must_crash_as_often_again():
-    quarantine = CircuitBreaker(SETTINGS)
+    breaker = CircuitBreaker(SETTINGS)
     for i in range(3):
-        quarantine.died("icp", str(i), float(i))
-    quarantine.died("icp", "late", 70.0)
+        breaker.crashed("icp", str(i), float(i))
+    breaker.crashed("icp", "late", 70.0)
 
-    assert quarantine.verdict("icp", "x", 71.0) == "run"
+    assert breaker.verdict("icp", "x", 71.0) == "run"
 
 
 def test_memory_is_bounded_whatever_dies():
-    quarantine = CircuitBreaker(SETTINGS)
+    breaker = CircuitBreaker(SETTINGS)
     for i in range(12_000):
-        quarantine.died("icp", str(i), i * 100.0)
+        breaker.crashed("icp", str(i), i * 100.0)
     for _ in range(2):
-        quarantine.died("icp", "new", 1e7)
+        breaker.crashed("icp", "new", 1e7)
 
-    assert quarantine.verdict("icp", "new", 2e7) == "poison"
-    quarantine.died("icp", "0", 1e7)
-    assert quarantine.verdict("icp", "0", 2e7) == "run", "its first death is forgotten by now"
+    assert breaker.verdict("icp", "new", 2e7) == "poison"
+    breaker.crashed("icp", "0", 1e7)
+    assert breaker.verdict("icp", "0", 2e7) == "run", "its first death is forgotten by now"

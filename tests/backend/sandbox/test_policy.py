@@ -1,0 +1,531 @@
+"""Every rule about sandboxes: events and the time go in, actions come out, no process is started."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from rse_pf.backend.sandbox.ipc import encode_message
+from rse_pf.backend.sandbox.policy import (
+    Action,
+    AnswerCall,
+    CreateSandbox,
+    KillSandbox,
+    LoadSnapshot,
+    LogCrash,
+    ReleaseSandbox,
+    SandboxCall,
+    SandboxPolicy,
+    SandboxReply,
+    SaveSnapshot,
+    SendMessage,
+)
+from rse_pf.backend.scheduling.scheduler import QueuedCommand
+from rse_pf.config import PlatformSettings
+from rse_pf.errors import BadRequest, Conflict, RsePfError, StoreError
+from rse_pf.wire import Command
+
+GRACE_S, START_S, FACTOR, OPEN_S = 5.0, 2.0, 2.0, 60.0
+KINDS = {"icp": "stateless", "counter": "per_robot_state"}
+
+
+def make_policy(*, max_sandboxes: int = 4, keeps_snapshots: bool = True, **services: Any) -> SandboxPolicy:
+    """Return a policy that knows the connections of robots a, b and c."""
+    limits = {
+        "grace_s": GRACE_S, "start_timeout_s": START_S, "breaker_crashes": 100, "breaker_open_s": OPEN_S,
+        **services,
+    }  # fmt: skip
+    settings = PlatformSettings.from_dict({"services": limits})
+    policy = SandboxPolicy(KINDS, settings, max_sandboxes=max_sandboxes, keeps_snapshots=keeps_snapshots)
+    for robot in "abc":
+        policy.connected(robot)
+    return policy
+
+
+def make_call(
+    robot: str = "a", service: str = "icp", *, payload: str = "x", now: float = 0.0, deadline_s: float = 10.0
+) -> SandboxCall:
+    """Return a command that was received *now* and has *deadline_s* seconds."""
+    command = Command(id=1, service=service, payload=payload)
+    queued = QueuedCommand(None, robot, command, 10, now, now + deadline_s)
+    return SandboxCall(queued, f"{service}/{payload}", payload.encode())
+
+
+def start(policy: SandboxPolicy, call: SandboxCall, now: float = 0.0) -> int:
+    """Submit *call* to a sandbox that is created for it, let it start, and return its number."""
+    (create,) = policy.submit(call, now)
+    assert isinstance(create, CreateSandbox)
+    policy.ready(create.number, now)
+    return create.number
+
+
+def outcomes(actions: list[Action]) -> list[tuple[SandboxCall, str]]:
+    """Return the answers among *actions* as call and "ok" or error code."""
+    return [
+        (each.call, each.outcome.code if isinstance(each.outcome, RsePfError) else "ok")
+        for each in actions
+        if isinstance(each, AnswerCall)
+    ]
+
+
+def created(actions: list[Action]) -> int:
+    """Return the number of the one sandbox that *actions* create."""
+    (number,) = (each.number for each in actions if isinstance(each, CreateSandbox))
+    return number
+
+
+OK = SandboxReply("done", 1.5)
+
+
+# --- the usual way ---------------------------------------------------------------------------------
+
+
+def test_the_first_command_of_a_robot_creates_its_sandbox_and_runs_once_that_is_ready():
+    policy, call = make_policy(), make_call()
+
+    assert policy.submit(call, 0.0) == [CreateSandbox(1, "a")]
+    assert policy.ready(1, 0.5) == [SendMessage(1, b"x")]
+    assert call.queued.started_s == 0.5
+    assert policy.replied(1, OK, 1.0) == [AnswerCall(call, OK)]
+    assert policy.held == 0
+
+
+def test_a_second_command_waits_for_the_first_and_uses_the_same_sandbox():
+    policy, first, second = make_policy(), make_call(payload="1"), make_call(payload="2")
+    start(policy, first)
+
+    assert policy.submit(second, 0.0) == []
+    assert policy.held == 2
+    assert policy.replied(1, OK, 1.0) == [AnswerCall(first, OK), SendMessage(1, b"2")]
+
+
+def test_each_robot_has_a_sandbox_of_its_own():
+    policy = make_policy()
+
+    assert policy.submit(make_call("a"), 0.0) == [CreateSandbox(1, "a")]
+    assert policy.submit(make_call("b"), 0.0) == [CreateSandbox(2, "b")]
+
+
+def test_an_error_of_the_service_is_answered_and_costs_no_sandbox():
+    policy, call = make_policy(), make_call()
+    start(policy, call)
+    error = BadRequest("too few points")
+
+    assert policy.replied(1, error, 1.0) == [AnswerCall(call, error)]
+    assert policy.sandboxes == 1
+
+
+# --- crashes: retry, poison, circuit breaker -------------------------------------------------------
+
+
+def test_a_stateless_command_whose_sandbox_crashed_is_tried_once_more_in_a_new_one():
+    policy, call = make_policy(), make_call()
+    start(policy, call)
+
+    actions = policy.gone(1, "signal SIGSEGV", 1.0)
+
+    assert actions == [
+        ReleaseSandbox(1), LogCrash("a", "icp", "signal SIGSEGV (signal SIGSEGV)"), CreateSandbox(2, "a")
+    ]  # fmt: skip
+    assert policy.ready(2, 1.5) == [SendMessage(2, b"x")]
+    assert outcomes(policy.replied(2, OK, 2.0)) == [(call, "ok")]
+
+
+def test_a_command_is_tried_twice_and_no_more():
+    policy, call = make_policy(poison_crashes=10), make_call()
+    start(policy, call)
+    number = created(policy.gone(1, "exit code 1", 1.0))
+    policy.ready(number, 1.0)
+
+    actions = policy.gone(number, "exit code 1", 2.0)
+
+    assert outcomes(actions) == [(call, "worker-lost")]
+    assert policy.sandboxes == 0
+
+
+def test_a_request_that_crashed_so_many_sandboxes_is_poison_for_every_robot():
+    policy, call = make_policy(poison_crashes=2), make_call("a")
+    start(policy, call)
+    number = created(policy.gone(1, "exit code 1", 1.0))
+    policy.ready(number, 1.0)
+    assert outcomes(policy.gone(number, "exit code 1", 2.0)) == [(call, "poison")]
+
+    same, other = make_call("b"), make_call("b", payload="y")
+
+    assert outcomes(policy.submit(same, 3.0)) == [(same, "poison")]
+    assert created(policy.submit(other, 3.0)) == 3
+    assert policy.counts == {"created": 3, "crashed": 2, "poison": 2}
+
+
+def test_an_open_circuit_breaker_refuses_the_service_until_it_closes():
+    policy = make_policy(breaker_crashes=2, poison_crashes=1)
+    for i in range(2):
+        number = start(policy, make_call(payload=str(i)), now=i)
+        policy.gone(number, "exit code 1", i)
+
+    refused = make_call(payload="new")
+    (answer,) = policy.submit(refused, 2.0)
+    assert isinstance(answer, AnswerCall)
+    assert isinstance(answer.outcome, RsePfError)
+    assert answer.outcome.code == "worker-lost"
+    assert answer.outcome.retry_after_ms == (OPEN_S - 1.0) * 1e3
+    assert policy.open_services(2.0) == ["icp"]
+    assert policy.open_services(OPEN_S + 1.0) == []
+    assert created(policy.submit(make_call(payload="new"), OPEN_S + 1.0)) == 3
+
+
+def test_an_open_circuit_breaker_refuses_what_waits_as_well():
+    policy = make_policy(breaker_crashes=2, poison_crashes=1)
+    first, second = make_call("a", payload="1"), make_call("b", payload="2")
+    start(policy, first)
+    start(policy, second)
+    waiting = make_call("b", payload="3")
+    policy.submit(waiting, 0.0)
+    policy.gone(1, "exit code 1", 1.0)
+    number = created(policy.gone(2, "exit code 1", 1.0))
+
+    assert outcomes(policy.ready(number, 1.5)) == [(waiting, "worker-lost")]
+
+
+def test_a_command_whose_deadline_has_passed_is_not_tried_again():
+    policy, call = make_policy(), make_call(deadline_s=1.0)
+    start(policy, call)
+
+    assert outcomes(policy.gone(1, "exit code 1", 1.0)) == [(call, "worker-lost")]
+    assert policy.sandboxes == 0
+
+
+def test_a_command_to_state_that_no_snapshot_holds_is_not_tried_again():
+    policy, call = make_policy(keeps_snapshots=False), make_call(service="counter")
+    start(policy, call)
+
+    assert outcomes(policy.gone(1, "exit code 1", 1.0)) == [(call, "worker-lost")]
+
+
+def test_a_command_to_state_in_a_snapshot_is_restored_and_tried_again():
+    policy, call = make_policy(), make_call(service="counter")
+    start(policy, call)
+    policy.store_replied(1, call, b"7", 0.1)
+    policy.replied(1, SandboxReply(True, 0.1), 0.2)
+
+    number = created(policy.gone(1, "exit code 1", 1.0))
+
+    assert policy.ready(number, 1.0) == [LoadSnapshot(number, call)]
+
+
+def test_commands_that_wait_move_to_the_new_sandbox_in_order():
+    policy = make_policy(poison_crashes=1)
+    running, second, third = (make_call(payload=name) for name in "123")
+    start(policy, running)
+    policy.submit(second, 0.0)
+    policy.submit(third, 0.0)
+
+    actions = policy.gone(1, "exit code 1", 1.0)
+    number = created(actions)
+
+    assert outcomes(actions) == [(running, "poison")]
+    assert policy.ready(number, 1.0) == [SendMessage(number, b"2")]
+    assert policy.replied(number, OK, 1.0) == [AnswerCall(second, OK), SendMessage(number, b"3")]
+
+
+def test_the_retried_command_runs_before_those_that_waited_for_it():
+    policy, running, second = make_policy(), make_call(payload="1"), make_call(payload="2")
+    start(policy, running)
+    policy.submit(second, 0.0)
+
+    number = created(policy.gone(1, "exit code 1", 1.0))
+
+    assert policy.ready(number, 1.0) == [SendMessage(number, b"1")]
+
+
+def test_a_sandbox_that_ends_before_it_is_ready_fails_all_that_wait_and_is_not_replaced():
+    policy, first, second = make_policy(), make_call(payload="1"), make_call(payload="2")
+    policy.submit(first, 0.0)
+    policy.submit(second, 0.0)
+
+    actions = policy.gone(1, "exit code 1", 0.5)
+
+    assert outcomes(actions) == [(first, "worker-lost"), (second, "worker-lost")]
+    assert policy.sandboxes == 0
+
+
+def test_the_end_of_the_zygote_is_a_crash_of_every_sandbox():
+    policy, one, two = make_policy(), make_call("a"), make_call("b", payload="y")
+    start(policy, one)
+    start(policy, two)
+
+    actions = policy.all_gone("the zygote ended", 1.0)
+
+    assert [each.robot for each in actions if isinstance(each, CreateSandbox)] == ["a", "b"]
+    assert policy.counts["crashed"] == 2
+
+
+def test_what_is_reported_of_a_sandbox_that_was_released_changes_nothing():
+    policy, call = make_policy(), make_call()
+    start(policy, call)
+    policy.gone(1, "exit code 1", 1.0)
+
+    assert policy.ready(1, 2.0) == []
+    assert policy.replied(1, OK, 2.0) == []
+    assert policy.gone(1, "exit code 1", 2.0) == []
+    assert policy.broken(1, "") == []
+
+
+# --- deadlines and kills ---------------------------------------------------------------------------
+
+
+def test_a_command_is_answered_at_its_deadline_and_its_sandbox_killed_at_a_factor_of_it():
+    policy, call = make_policy(), make_call(now=1.0, deadline_s=3.0)
+    start(policy, call, now=2.0)
+    assert policy.wake_s == 4.0
+
+    assert policy.tick(3.9) == []
+    assert outcomes(policy.tick(4.0)) == [(call, "expired")]
+    assert policy.wake_s == 1.0 + 3.0 * FACTOR
+    assert policy.tick(6.9) == []
+    assert policy.tick(7.0) == [KillSandbox(1)]
+    assert policy.tick(8.0) == [], "once is enough"
+    assert policy.gone(1, "signal SIGKILL", 8.0) == [
+        ReleaseSandbox(1), LogCrash("a", "icp", "it took too long (signal SIGKILL)")
+    ]  # fmt: skip
+
+
+def test_a_late_reply_is_not_answered_again_and_lets_the_next_command_run():
+    policy, call, second = make_policy(), make_call(deadline_s=1.0), make_call(payload="2")
+    start(policy, call)
+    policy.submit(second, 0.5)
+    assert outcomes(policy.tick(1.0)) == [(call, "expired")]
+
+    assert policy.replied(1, OK, 1.5) == [SendMessage(1, b"2")]
+    assert policy.tick(1e9) != [], "the deadline of the second holds"
+
+
+def test_a_command_that_waited_beyond_its_deadline_costs_no_compute():
+    policy, running, late = make_policy(), make_call(payload="1"), make_call(payload="2", deadline_s=1.0)
+    start(policy, running)
+    policy.submit(late, 0.0)
+
+    actions = policy.replied(1, OK, 1.0)
+
+    assert outcomes(actions) == [(running, "ok"), (late, "expired")]
+    assert not any(isinstance(each, SendMessage) for each in actions)
+
+
+def test_a_sandbox_that_does_not_start_in_time_is_killed():
+    policy, call = make_policy(), make_call()
+    policy.submit(call, 0.0)
+    assert policy.wake_s == START_S
+
+    assert policy.tick(START_S) == [KillSandbox(1)]
+    actions = policy.gone(1, "signal SIGKILL", START_S)
+
+    assert outcomes(actions) == [(call, "worker-lost")]
+    assert LogCrash("a", "", "it did not start in time (signal SIGKILL)") in actions
+
+
+def test_a_sandbox_that_violates_the_protocol_is_killed():
+    policy = make_policy()
+    start(policy, make_call())
+    assert policy.broken(1, "it sent an invalid message") == [KillSandbox(1)]
+
+    policy = make_policy()
+    start(policy, make_call())
+    policy.replied(1, OK, 1.0)
+    assert policy.replied(1, OK, 1.0) == [KillSandbox(1)], "a reply that nobody asked for"
+
+    policy = make_policy()
+    start(policy, make_call())
+    assert policy.ready(1, 1.0) == [KillSandbox(1)], "ready for the second time"
+
+
+def test_a_command_for_an_idle_sandbox_that_is_being_killed_waits_for_the_next_one():
+    policy, second = make_policy(), make_call(payload="2")
+    start(policy, make_call())
+    policy.replied(1, OK, 1.0)
+    policy.broken(1, "")
+
+    assert policy.submit(second, 1.0) == []
+    number = created(policy.gone(1, "exit code 0", 1.1))
+
+    assert policy.ready(number, 1.2) == [SendMessage(number, b"2")]
+    assert second.tries == 0
+
+
+# --- connections, grace and capacity ---------------------------------------------------------------
+
+
+def test_a_sandbox_is_released_a_grace_period_after_the_last_connection_of_its_robot():
+    policy = make_policy()
+    policy.connected("a")
+    start(policy, make_call())
+    policy.replied(1, OK, 1.0)
+    policy.disconnected("a", 2.0)
+    assert policy.wake_s == math.inf, "one connection is left"
+    policy.disconnected("a", 3.0)
+
+    assert policy.tick(3.0 + GRACE_S - 0.1) == []
+    assert policy.tick(3.0 + GRACE_S) == [ReleaseSandbox(1)]
+    assert policy.counts["released"] == 1
+
+
+def test_a_robot_that_reconnects_within_the_grace_period_keeps_its_sandbox():
+    policy = make_policy()
+    start(policy, make_call())
+    policy.replied(1, OK, 1.0)
+    policy.disconnected("a", 2.0)
+    policy.connected("a")
+
+    assert policy.tick(100.0) == []
+    assert policy.submit(make_call(payload="2", now=100.0), 100.0) == [SendMessage(1, b"2")]
+
+
+def test_commands_that_wait_for_a_robot_that_left_are_dropped_and_not_moved():
+    policy = make_policy()
+    start(policy, make_call(payload="1"))
+    policy.submit(make_call(payload="2"), 0.0)
+    policy.disconnected("a", 1.0)
+    assert policy.held == 1
+
+    assert not any(isinstance(each, CreateSandbox) for each in policy.gone(1, "exit code 1", 1.5))
+
+
+def test_a_robot_beyond_the_capacity_is_told_when_to_try_again():
+    policy = make_policy(max_sandboxes=1)
+    start(policy, make_call("a"))
+
+    (answer,) = policy.submit(make_call("b"), 0.0)
+
+    assert isinstance(answer, AnswerCall)
+    assert isinstance(answer.outcome, RsePfError)
+    assert (answer.outcome.code, answer.outcome.retry_after_ms) == ("busy", 1000.0)
+
+
+def test_an_idle_sandbox_in_its_grace_period_gives_its_place_to_another_robot():
+    policy = make_policy(max_sandboxes=1)
+    start(policy, make_call("a"))
+    policy.replied(1, OK, 1.0)
+    policy.disconnected("a", 1.0)
+
+    assert policy.submit(make_call("b"), 1.5) == [ReleaseSandbox(1), CreateSandbox(2, "b")]
+
+
+def test_a_sandbox_that_works_or_whose_robot_is_connected_keeps_its_place():
+    policy = make_policy(max_sandboxes=2)
+    start(policy, make_call("a"))
+    start(policy, make_call("b", payload="y"))
+    policy.replied(2, OK, 0.5)
+    policy.disconnected("a", 1.0)
+    call = make_call("c")
+
+    assert outcomes(policy.submit(call, 1.5)) == [(call, "busy")]
+
+
+def test_closing_releases_everything_and_answers_nothing():
+    policy = make_policy()
+    start(policy, make_call("a"))
+    start(policy, make_call("b", payload="y"))
+
+    assert policy.close() == [ReleaseSandbox(1), ReleaseSandbox(2)]
+    assert policy.wake_s == math.inf
+
+
+# --- state that outlives a sandbox -----------------------------------------------------------------
+
+
+def run_counter(policy: SandboxPolicy, stored: bytes | None = b"1") -> SandboxCall:
+    """Submit a command to a service with state, and bring it to where it runs."""
+    call = make_call(service="counter")
+    start(policy, call)
+    policy.store_replied(1, call, stored, 0.1)
+    if stored is not None:
+        policy.replied(1, SandboxReply(True, 0.1), 0.2)
+    return call
+
+
+def test_the_last_snapshot_is_restored_before_the_first_command_and_only_once():
+    policy, call = make_policy(), make_call(service="counter")
+    policy.submit(call, 0.0)
+
+    assert policy.ready(1, 0.0) == [LoadSnapshot(1, call)]
+    assert policy.store_replied(1, call, b"7", 0.1) == [
+        SendMessage(1, encode_message(["restore", "counter", b"7"]))
+    ]
+    assert policy.replied(1, SandboxReply(True, 0.1), 0.2) == [SendMessage(1, b"x")]
+    policy.replied(1, SandboxReply("done", 1.0, b"7"), 0.3)
+    assert policy.submit(make_call(service="counter", payload="2"), 1.0) == [SendMessage(1, b"2")]
+
+
+def test_a_robot_without_a_snapshot_begins_with_fresh_state():
+    policy, call = make_policy(), make_call(service="counter")
+    start(policy, call)
+
+    assert policy.store_replied(1, call, None, 0.1) == [SendMessage(1, b"x")]
+
+
+def test_a_reply_is_sent_only_after_the_state_that_belongs_to_it_is_stored():
+    policy = make_policy()
+    call, reply = run_counter(policy, b"1"), SandboxReply("done", 1.0, b"2")
+
+    assert policy.replied(1, reply, 1.0) == [SaveSnapshot(1, call, b"1", b"2")]
+    assert policy.store_replied(1, call, None, 1.1) == [AnswerCall(call, reply)]
+
+
+def test_the_next_snapshot_replaces_the_one_that_was_stored_last():
+    policy = make_policy()
+    call, second = run_counter(policy, b"1"), make_call(service="counter", payload="2")
+    policy.replied(1, SandboxReply("done", 1.0, b"2"), 1.0)
+    policy.store_replied(1, call, None, 1.1)
+    policy.submit(second, 2.0)
+
+    actions = policy.replied(1, SandboxReply("done", 1.0, b"3"), 2.1)
+
+    assert actions == [SaveSnapshot(1, second, b"2", b"3")]
+
+
+def test_state_that_did_not_change_is_not_stored_again():
+    policy = make_policy()
+    call, reply = run_counter(policy, b"1"), SandboxReply("done", 1.0, b"1")
+
+    assert policy.replied(1, reply, 1.0) == [AnswerCall(call, reply)]
+
+
+def test_a_store_that_fails_is_answered_as_such_and_the_sandbox_goes_on():
+    policy = make_policy()
+    call = run_counter(policy)
+    policy.replied(1, SandboxReply("done", 1.0, b"2"), 1.0)
+
+    assert outcomes(policy.store_replied(1, call, StoreError("503"), 1.1)) == [(call, "store")]
+    assert policy.submit(make_call(service="counter", payload="2"), 1.2) == [SendMessage(1, b"2")]
+
+
+def test_a_newer_snapshot_in_the_store_ends_the_sandbox_and_moves_what_waits():
+    policy = make_policy()
+    call, second = run_counter(policy), make_call(service="counter", payload="2")
+    policy.submit(second, 0.5)
+    policy.replied(1, SandboxReply("done", 1.0, b"2"), 1.0)
+
+    actions = policy.store_replied(1, call, Conflict("changed"), 1.1)
+
+    assert outcomes(actions) == [(call, "worker-lost")]
+    assert actions[0] == ReleaseSandbox(1)
+    assert policy.ready(created(actions), 1.2) == [LoadSnapshot(2, second)]
+
+
+def test_a_restore_that_failed_is_repeated_before_the_next_command():
+    policy, call = make_policy(), make_call(service="counter")
+    start(policy, call)
+    policy.store_replied(1, call, b"7", 0.1)
+    assert outcomes(policy.replied(1, BadRequest("not a count"), 0.2)) == [(call, "bad-request")]
+
+    second = make_call(service="counter", payload="2")
+
+    assert policy.submit(second, 1.0) == [LoadSnapshot(1, second)]
+
+
+def test_what_the_store_says_after_the_sandbox_crashed_changes_nothing():
+    policy = make_policy(poison_crashes=1)
+    call = run_counter(policy)
+    policy.replied(1, SandboxReply("done", 1.0, b"2"), 1.0)
+    policy.gone(1, "exit code 1", 1.1)
+
+    assert policy.store_replied(1, call, None, 1.2) == []
