@@ -66,6 +66,7 @@ docs: ## write the generated pages anew
 	@$(BIN)/rse-pf settings --markdown > docs/settings.md
 	@$(BIN)/rse-pf data --openapi > docs/openapi.json
 	@$(BIN)/python scripts/asyncapi.py
+	@$(BIN)/python scripts/architecture.py
 
 fuzz: ## strangers' bytes for FUZZ_S seconds a target (600), guided by coverage where atheris runs
 	@$(SETUP) dev
