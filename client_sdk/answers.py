@@ -1,11 +1,8 @@
-"""What a robot gets back: a reply, a pose, and how they came.
-
-Promises to hold values and how to read them, nothing that waits.
-"""
+"""The answers that a robot receives: a reply or a pose, who computed it, and where the time went."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 import msgspec
@@ -25,15 +22,9 @@ Source = Literal["cloud", "robot"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Answer:
-    """A reply and how it came: who answered, and where the time went (ms; None if unknown).
+class _Origin:
+    """Who answered, and where the time went (ms; None if unknown); ``why`` is empty for the cloud."""
 
-    ``why`` says, if *source* is ``robot``, why the cloud did not answer.  ``object`` is the digest of a reply
-    that is kept as an object (of long services); where it is too large for a message, ``reply`` is None, and
-    ``decode_reply(DataClient(...).download(answer.object), ReplyType)`` gives it.
-    """
-
-    reply: Any
     source: Source
     server: str
     round_trip_ms: float
@@ -43,29 +34,37 @@ class Answer:
     down_ms: float | None = None
     payload_bytes: int = 0
     why: str = ""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Answer(_Origin):
+    """A reply, who computed it, and where the time went (ms; None if unknown).
+
+    If *source* is ``robot``, ``why`` says why the cloud did not answer.  ``object`` is the digest of a reply
+    that is stored as an object (of long services); if it is too large for a message, ``reply`` is None, and
+    ``decode_reply(DataClient(...).download(answer.object), ReplyType)`` returns it.
+    """
+
+    reply: Any
     object: str = ""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class PoseAnswer:
-    """A pose with its evidence, and how it came; the fields are those of `Answer`."""
+class PoseAnswer(_Origin):
+    """A pose with its evidence; the other fields are those of `Answer`."""
 
     solution: PnpSolution
-    source: Source
-    server: str
-    round_trip_ms: float
-    queue_ms: float
-    compute_ms: float
-    up_ms: float | None = None
-    down_ms: float | None = None
-    payload_bytes: int = 0
-    why: str = ""
+
+    @classmethod
+    def of(cls, answer: Answer, solution: PnpSolution) -> PoseAnswer:
+        """Return *solution* with the origin of *answer*, whose reply it was."""
+        return cls(solution=solution, **{each.name: getattr(answer, each.name) for each in fields(_Origin)})
 
 
 def decode_reply(data: bytes, reply_type: type[T]) -> T:
-    """Return the reply that was kept as an object; raises BadMessage if *data* is none of that type."""
+    """Return the reply that was stored as an object; raises BadMessage if *data* is not of that type."""
     try:
         plain = msgspec.msgpack.decode(data, ext_hook=extension_hook)
     except msgspec.DecodeError as error:
-        raise BadMessage("this object is no reply", hint="download what answer.object names") from error
+        raise BadMessage("this object is not a reply", hint="download what answer.object names") from error
     return as_type(plain, reply_type)

@@ -1,7 +1,6 @@
-"""The SDK for programs without asyncio: the same robot, its event loop in a thread of its own.
+"""The SDK for programs without asyncio: a robot whose event loop runs in a thread of its own.
 
-Promises no rules of its own: every method hands over to `client_sdk.robot.Robot`, and any number of
-threads may call at the same time.
+Every method calls its namesake of `client_sdk.robot.Robot`; any number of threads may call at the same time.
 """
 
 from __future__ import annotations
@@ -47,18 +46,24 @@ def connect_blocking(
 ) -> BlockingRobot:
     """Return a robot for ``with connect_blocking(url, token=...) as robot``; see `connect`.
 
-    *on_change* is called in the robot's own thread.
+    *on_change* is called in the thread of the event loop.
     """
     return BlockingRobot(
         connect(
-            url, token=token, codec=codec, settings=settings, offload=offload, clock=clock, random=random,
+            url,
+            token=token,
+            codec=codec,
+            settings=settings,
+            offload=offload,
+            clock=clock,
+            random=random,
             on_change=on_change,
         )
-    )  # fmt: skip
+    )
 
 
 class BlockingRobot:
-    """`Robot` whose methods wait for their answers."""
+    """A `Robot` whose methods block until their answers arrive."""
 
     def __init__(self, robot: Robot) -> None:
         self._robot = robot
@@ -123,13 +128,18 @@ class BlockingRobot:
         keep: bool = False,
         on_progress: OnProgress | None = None,
     ) -> Answer:
-        """Ask a service; see `Robot.call`.  *on_progress* is called in another thread."""
+        """Call a service; see `Robot.call`.  *on_progress* is called in the thread of the event loop."""
         return self._wait(
             self._robot.call(
-                service, request, reply_type, deadline_s=deadline_s, stream=stream, keep=keep,
+                service,
+                request,
+                reply_type,
+                deadline_s=deadline_s,
+                stream=stream,
+                keep=keep,
                 on_progress=on_progress,
             )
-        )  # fmt: skip
+        )
 
     @property
     def stats(self) -> Stats:

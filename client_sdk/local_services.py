@@ -1,6 +1,6 @@
-"""The robot's own services: the same `dispatch` as on a server, in one thread of the robot.
+"""Services on the robot itself: the same `dispatch` as on a server, in one thread.
 
-Promises to import a solver only when it is prepared, and one command at a time.
+A solver is imported only by `LocalServices.prepare`.  Commands are answered one at a time.
 """
 
 from __future__ import annotations
@@ -20,17 +20,17 @@ _RECENT = 8
 
 
 class LocalServices:
-    """What a robot can answer without the cloud."""
+    """The services that a robot offers without the cloud."""
 
     def __init__(self, registry: Registry | None, clock: Callable[[], float]) -> None:
         self._recent_s: deque[float] = deque(maxlen=_RECENT)
         self._registry = registry
         self._clock = clock
         self._codec = make_codec("bin")
-        self._executor = ThreadPoolExecutor(1, "rse-pf-own-services")
+        self._executor = ThreadPoolExecutor(1, "rse-pf-local-services")
 
     async def prepare(self) -> None:
-        """Make the services ready and measure a typical solve; the first one pays for imports.
+        """Load the services and measure a typical solve; a first one, which pays for imports, is not counted.
 
         Raises:
             MissingExtra: No solver is installed.
@@ -43,7 +43,7 @@ class LocalServices:
             await self.ask(command)
 
     def offers(self, service: str) -> bool:
-        """Whether *service* is here."""
+        """Return whether the robot offers *service*."""
         return self._registry is not None and any(each.name == service for each in self._registry)
 
     async def ask(self, command: Command) -> Result | Failure:
@@ -60,11 +60,11 @@ class LocalServices:
         return max(self._recent_s, default=None)
 
     def close(self) -> None:
-        """Let go of the thread; what it works on is dropped."""
+        """End the thread; the answer that it works on is dropped."""
         self._executor.shutdown(wait=False, cancel_futures=True)
 
     def _answer(self, command: Command) -> Result | Failure:
-        """Dispatch what a server would see: the command as it arrives over the wire."""
+        """Dispatch the command encoded and decoded, exactly as a server receives it."""
         assert self._registry is not None
         try:
             arrived = self._codec.decode_from_robot(self._codec.encode(command))
@@ -75,7 +75,7 @@ class LocalServices:
             return failure_of(error, command, server="robot")
         if isinstance(sent, Result | Failure):
             return sent
-        return failure_of(InternalError("the robot's own service gave no answer"), command)
+        return failure_of(InternalError("the local service gave no answer"), command)
 
     def _prepare(self) -> None:
         from rse_pf.pnp import available_engines

@@ -1,7 +1,8 @@
-"""Where a command is solved: in the cloud, on the robot, or in the cloud with the robot ready to help.
+"""Where a command is solved: in the cloud, on the robot, or in the cloud with the robot as fallback.
 
 The paper's rule (Sect. 6.2): "the saved time should be more than transmission delay so that real-time
-performance gains from cloud computing".  Promises to decide only: no clock, no socket, no solver.
+performance gains from cloud computing".  This module only decides;
+`client_sdk.robot` carries the plan out.
 """
 
 from __future__ import annotations
@@ -16,21 +17,31 @@ __all__ = ["CloudFirst", "Plan", "gains_from_cloud"]
 _MARGIN = 2.0
 """A fallback begins this many of the robot's own solving times before the deadline."""
 
-_MENDABLE = frozenset(
+_RECOVERABLE = frozenset(
     {
-        "busy", "quota", "expired", "worker-lost", "poison", "internal", "disconnected", "connect",
-        "unknown-service", "unauthorized", "forbidden", "conflict",
+        "busy",
+        "quota",
+        "expired",
+        "worker-lost",
+        "poison",
+        "internal",
+        "disconnected",
+        "connect",
+        "unknown-service",
+        "unauthorized",
+        "forbidden",
+        "conflict",
     }
-)  # fmt: skip
+)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Plan:
-    """What to do with one command.
+    """Where to solve one command.
 
-    ``cloud`` asks the cloud alone, ``robot`` the robot alone; ``both`` asks the cloud, and
-    ``robot_after_s`` seconds from now the robot too, if the cloud has not answered by then.
-    ``why`` is what the answer says if it comes from the robot.
+    ``cloud`` asks the cloud alone and ``robot`` the robot alone; ``both`` asks the cloud, and
+    after ``robot_after_s`` seconds the robot too, unless the cloud has answered by then.
+    ``why`` is the reason given in an answer of the robot.
     """
 
     where: Literal["cloud", "robot", "both"]
@@ -40,12 +51,12 @@ class Plan:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CloudFirst:
-    """Ask the cloud; answer on the robot when the cloud cannot make the deadline, and say so.
+    """Ask the cloud, and answer on the robot when the cloud cannot meet the deadline.
 
     Attributes:
-        registry: The services that the robot has itself; None means the platform's own.
-        robot_solve_s: How long the robot's own solver takes, until that is measured.
-        slack_s: A fallback begins so much earlier still, for what else the robot's processor does.
+        registry: The services that the robot offers itself; None means the built-in ones.
+        robot_solve_s: How long the robot's own solver takes, until it is measured.
+        slack_s: Further time by which a fallback starts earlier, because the processor is shared.
         take_faster: Apply the paper's rule: do not ask a cloud that is slower than the robot.
     """
 
@@ -67,41 +78,41 @@ class CloudFirst:
 
         Args:
             deadline_s: Seconds from now.
-            connected: Whether a link is open.
+            connected: Whether a connection is open.
             expected_round_trip_s: The 95th percentile of recent round trips, or None if unknown.
             robot_solve_s: The robot's own recent time for such a command, or None if unknown.
-            robot_can: Whether the robot has the service.
+            robot_can: Whether the robot offers the service.
         """
         if not robot_can:
             return Plan(where="cloud")
-        mine_s = self.robot_solve_s if robot_solve_s is None else robot_solve_s
+        local_s = self.robot_solve_s if robot_solve_s is None else robot_solve_s
         if not connected:
             return Plan(where="robot", why="no connection to the cloud")
         if expected_round_trip_s is None:
-            return self._both(deadline_s, mine_s)
+            return self._both(deadline_s, local_s)
         if expected_round_trip_s >= deadline_s:
             why = f"the cloud takes {expected_round_trip_s * 1e3:.0f} ms of {deadline_s * 1e3:.0f} ms"
             return Plan(where="both", robot_after_s=0.0, why=why)
-        if self.take_faster and mine_s <= expected_round_trip_s:
-            why = f"the robot takes {mine_s * 1e3:.1f} ms, the cloud {expected_round_trip_s * 1e3:.1f} ms"
+        if self.take_faster and local_s <= expected_round_trip_s:
+            why = f"the robot takes {local_s * 1e3:.1f} ms, the cloud {expected_round_trip_s * 1e3:.1f} ms"
             return Plan(where="robot", why=why)
-        return self._both(deadline_s, mine_s)
+        return self._both(deadline_s, local_s)
 
     @staticmethod
-    def can_mend(code: str) -> bool:
+    def can_recover(code: str) -> bool:
         """Whether the robot may succeed where the cloud failed with *code*.
 
-        What is wrong with the command itself (too few points, no consensus) stays wrong.
+        An error of the command itself (too few points, no consensus) would occur on the robot as well.
         """
-        return code in _MENDABLE
+        return code in _RECOVERABLE
 
-    def _both(self, deadline_s: float, mine_s: float) -> Plan:
-        latest_s = max(0.0, deadline_s - _MARGIN * mine_s - self.slack_s)
+    def _both(self, deadline_s: float, local_s: float) -> Plan:
+        latest_s = max(0.0, deadline_s - _MARGIN * local_s - self.slack_s)
         return Plan(where="both", robot_after_s=latest_s, why="the cloud did not answer in time")
 
 
 def gains_from_cloud(*, robot_s: float, cloud_compute_s: float, transmission_s: float) -> bool:
-    """Return whether the cloud pays in time: what it saves is more than the way there and back.
+    """Return whether the cloud saves time: more in computing than the transmission costs.
 
     Source:
         RSE-PF paper, Sect. 6.2.

@@ -1,6 +1,6 @@
-"""The robot's side of the platform: `connect`, then ask services and get typed answers.
+"""The robot's side of the platform: `connect`, then call services and get typed answers.
 
-Promises that every command ends in exactly one answer or one typed error, within its deadline.
+Every command ends with exactly one answer or one typed error, within its deadline.
 """
 
 from __future__ import annotations
@@ -15,14 +15,14 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from client_sdk.answers import Answer, PoseAnswer
-from client_sdk.connection import Connection, OnChange, Token
+from client_sdk.connection import Connection, OnChange, Token, cancel_all
 from client_sdk.local_services import LocalServices
 from client_sdk.offload import CloudFirst
 from client_sdk.stats import Stats, StatsKeeper
 from rse_pf.config import SessionSettings
 from rse_pf.errors import Disconnected, RsePfError, UsageError, error_from_code
 from rse_pf.wire import CODECS, Command, Failure, Result, as_type, make_codec
-from rse_pf.wire.client_session import Answered, Progressed, RobotSession
+from rse_pf.wire.client_session import Answered, ClientSession, Progressed
 
 if TYPE_CHECKING:
     import numpy as np
@@ -36,14 +36,14 @@ __all__ = ["OnProgress", "Robot", "connect"]
 T = TypeVar("T")
 
 OnProgress = Callable[[float, str], None]
-"""Told the share of a long command that is done (0..1), and what was done last."""
+"""Called with the share of a long command that is done (0..1), and what was done last."""
 
 _MAX_DEADLINE_S = 3600.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class _Ask:
-    """One command as its caller gave it."""
+class _Call:
+    """The arguments of one call."""
 
     service: str
     request: Any
@@ -71,10 +71,10 @@ def connect(
         url: ``ws://HOST:PORT/ws`` or ``wss://HOST/ws``.
         token: The robot's token, or an async callable that gives one (a run outlives a token).
         codec: ``zlib`` (the paper's), ``json`` or ``bin``.
-        settings: Limits and patience; None means the defaults.
+        settings: Limits and timeouts; None means the defaults.
         offload: `CloudFirst` lets the robot answer itself when the cloud cannot.
         clock: Seconds, monotonic.
-        random: Jitter of the reconnects.
+        random: Source of the jitter of reconnects.
         on_change: Called with ``link-lost``, ``link-back`` or ``moved``, and the reason or the server.
 
     Raises:
@@ -109,19 +109,24 @@ class Robot:
     ) -> None:
         if codec not in CODECS:
             raise UsageError(f"no codec named {codec!r}", hint=f"choose one of {', '.join(CODECS)}")
-        self._session = RobotSession(
+        self._session = ClientSession(
             codec=make_codec(codec, settings), settings=settings, sdk=f"rse-pf-python/{_version()}"
         )
         self._connection = Connection(
-            url, token=token, session=self._session, on_answer=self._answered, clock=clock, random=random,
+            url,
+            token=token,
+            session=self._session,
+            on_answer=self._answered,
+            clock=clock,
+            random=random,
             on_change=on_change,
-        )  # fmt: skip
+        )
         self._settings = settings
         self._offload = offload
         self._clock = clock
-        self._own = None if offload is None else LocalServices(offload.registry, clock)
+        self._local = None if offload is None else LocalServices(offload.registry, clock)
         self._waiting: dict[int, asyncio.Future[Answered] | Callable[[Answered], None]] = {}
-        self._hearing: dict[int, OnProgress] = {}
+        self._on_progress: dict[int, OnProgress] = {}
         self._tasks: set[asyncio.Task[Answer | Failure]] = set()
         self._keeper = StatsKeeper(random)
         self._open = False
@@ -129,8 +134,8 @@ class Robot:
     async def __aenter__(self) -> Robot:
         """Connect; raises Unauthorized or ConnectError, and MissingExtra with an offload."""
         try:
-            if self._own is not None:
-                await self._own.prepare()
+            if self._local is not None:
+                await self._local.prepare()
             await self._connection.open()
         except BaseException:
             await self.close()
@@ -144,24 +149,22 @@ class Robot:
         error: BaseException | None,
         traceback: TracebackType | None,
     ) -> None:
-        """Close the connection; commands that wait end with Disconnected."""
+        """Close the connection; unanswered commands end with Disconnected."""
         await self.close()
 
     def __await__(self) -> Generator[Any, None, Robot]:
         return self.__aenter__().__await__()
 
     async def close(self) -> None:
-        """Close the connection; commands that wait end with Disconnected."""
+        """Close the connection; unanswered commands end with Disconnected."""
         self._open = False
         for event in self._session.abandon("disconnected", "the robot closed its connection"):
             if isinstance(event, Answered):
                 self._answered(event)
         await self._connection.close()
-        for task in self._tasks:
-            task.cancel()
-        await asyncio.gather(*self._tasks, return_exceptions=True)
-        if self._own is not None:
-            self._own.close()
+        await cancel_all(self._tasks)
+        if self._local is not None:
+            self._local.close()
 
     async def solve_pnp(
         self,
@@ -181,32 +184,21 @@ class Robot:
             pixels: ``(n, 2)``, undistorted pixels of the same points.
             camera: Intrinsics of the image.
             options: RANSAC settings; None means the server's.
-            deadline_s: Seconds until the answer is of no use.
-            stream: Within a stream the newest frame wins and older answers are dropped.
+            deadline_s: Seconds within which the answer is needed.
+            stream: Within a stream the newest frame wins, and older answers are dropped.
             keep: Answer this frame even if newer ones follow.
 
         Raises:
             PnpError: The correspondences give no pose.
-            CommandFailed: Busy, stale, expired or worse, typed.
+            CommandFailed: The typed failure of the command, such as Busy, Stale or Expired.
         """
         from rse_pf.services.pnp import PnpReply, make_request
 
         request = make_request(
             points_world, pixels, camera, options, binary=self._session.codec.name == "bin"
         )
-        got = await self.call("pnp", request, PnpReply, deadline_s=deadline_s, stream=stream, keep=keep)
-        return PoseAnswer(
-            solution=got.reply.solution(),
-            source=got.source,
-            server=got.server,
-            round_trip_ms=got.round_trip_ms,
-            queue_ms=got.queue_ms,
-            compute_ms=got.compute_ms,
-            up_ms=got.up_ms,
-            down_ms=got.down_ms,
-            payload_bytes=got.payload_bytes,
-            why=got.why,
-        )
+        answer = await self.call("pnp", request, PnpReply, deadline_s=deadline_s, stream=stream, keep=keep)
+        return PoseAnswer.of(answer, answer.reply.solution())
 
     async def call(
         self,
@@ -219,19 +211,20 @@ class Robot:
         keep: bool = False,
         on_progress: OnProgress | None = None,
     ) -> Answer:
-        """Ask *service*; many calls may wait at the same time.
+        """Call *service* and wait for the reply; any number of calls may run concurrently.
 
         A long service (``merge``, ``optimise``) runs as a job: it has no deadline but *deadline_s*, survives
-        reconnects and its server's death, and ends when the call is cancelled or its deadline passes.
+        reconnects and the death of its server, and ends when the call is cancelled or its deadline passes.
 
         Args:
             service: Its name, such as ``pnp``.
             request: A `msgspec.Struct`, or plain lists and dicts.
             reply_type: Type of the reply; None leaves it plain.
-            deadline_s: Seconds until the answer is of no use; None means the setting, or none if it is long.
+            deadline_s: Seconds within which the answer is needed; None means ``session.answer_timeout_s``,
+                or no deadline for a long service.
             stream: Within a stream the newest command wins; empty means no stream.
             keep: Answer this one even if newer ones follow.
-            on_progress: Told how far a long service is; with it the call waits for as long as it takes.
+            on_progress: Called with the progress of a long service; with it the default deadline is none.
 
         Raises:
             RsePfError: The typed failure of the command.
@@ -242,22 +235,27 @@ class Robot:
         if not 0 < wait_s <= _MAX_DEADLINE_S:
             raise UsageError(
                 f"deadline_s = {wait_s} is not within 0..{_MAX_DEADLINE_S:g}",
-                hint="give the seconds it may take",
+                hint="give the number of seconds that the call may take",
             )
         self._keeper.sent += 1
-        ask = _Ask(
-            service=service, request=request, deadline_s=wait_s, stream=stream, keep=keep,
-            is_open_ended=deadline_s is None, on_progress=on_progress,
-        )  # fmt: skip
+        call = _Call(
+            service=service,
+            request=request,
+            deadline_s=wait_s,
+            stream=stream,
+            keep=keep,
+            is_open_ended=deadline_s is None,
+            on_progress=on_progress,
+        )
         started = self._clock()
         try:
             fatal = self._connection.fatal
             if fatal is not None:
                 raise error_from_code(fatal.code, fatal.message, hint=fatal.hint)
-            if self._offload is None or self._own is None:
-                answer = await self._ask_cloud(ask)
+            if self._offload is None or self._local is None:
+                answer = await self._ask_cloud(call)
             else:
-                answer = await self._ask_both(self._offload, self._own, ask)
+                answer = await self._ask_both(self._offload, self._local, call)
             return self._typed(answer, reply_type, started)
         except RsePfError as error:
             self._keeper.failures[error.code] += 1
@@ -273,14 +271,14 @@ class Robot:
         stream: str = "",
         keep: bool = False,
     ) -> int:
-        """Ask *service* without waiting, and return the command's number; *on_end* hears its one end.
+        """Send a command without waiting and return its id; *on_end* is called once with its end.
 
-        For generators of load: no task, no future and no statistics, and *request* may be
-        `PreencodedCommand`. Once the robot is connected it works without a link too, as `call` does; it
-        never asks the robot itself.
+        Meant for load generators: no task, no future, no statistics, and *request* may be a
+        `PreencodedCommand`.  As with `call`, a command waits while the connection is lost; it is never
+        answered by the robot itself.
 
         Raises:
-            Disconnected: The robot is not open, or has given up for good.
+            Disconnected: The robot is not open, or has stopped reconnecting.
             LimitExceeded: The message would be larger than the limit.
         """
         if not self._open or self._connection.fatal is not None:
@@ -296,9 +294,9 @@ class Robot:
     def stats(self) -> Stats:
         """A snapshot of the robot's traffic."""
         keeper, session, connection = self._keeper, self._session, self._connection
-        link = session.current
-        clock = link.clock_offset if link else None
-        last = link.last_exchange if link else None
+        current = session.current
+        clock = current.clock_offset if current else None
+        last = current.last_exchange if current else None
         delays = clock.delays_s(last) if clock is not None and last is not None else None
         return Stats(
             sent=keeper.sent,
@@ -309,7 +307,7 @@ class Robot:
             unanswered=session.unanswered,
             resent=session.resent,
             dropped_answers=session.dropped_answers,
-            twice=keeper.twice,
+            duplicates=keeper.duplicates,
             reconnects=connection.reconnects,
             moves=connection.moves,
             bytes_out=connection.bytes_out,
@@ -325,61 +323,64 @@ class Robot:
             clock_uncertainty_s=clock.uncertainty_s if clock else None,
             delay_up_s=delays[0] if delays else None,
             delay_down_s=delays[1] if delays else None,
-            server=link.server if link else "",
+            server=current.server if current else "",
             last_error=connection.last_error,
         )
 
-    async def _ask_cloud(self, ask: _Ask) -> Answer | Failure:
+    async def _ask_cloud(self, call: _Call) -> Answer | Failure:
         identity = self._session.submit(
-            ask.service, ask.request, now=self._clock(), stream=ask.stream, keep=ask.keep,
-            deadline_s=None if ask.is_open_ended else ask.deadline_s, patient=ask.on_progress is not None,
-        )  # fmt: skip
+            call.service,
+            call.request,
+            now=self._clock(),
+            stream=call.stream,
+            keep=call.keep,
+            deadline_s=None if call.is_open_ended else call.deadline_s,
+            is_open_ended=call.on_progress is not None,
+        )
         future: asyncio.Future[Answered] = asyncio.get_running_loop().create_future()
         self._waiting[identity] = future
-        if ask.on_progress is not None:
-            self._hearing[identity] = ask.on_progress
+        if call.on_progress is not None:
+            self._on_progress[identity] = call.on_progress
         self._connection.flush()
         try:
             ended = await future
         finally:
-            self._hearing.pop(identity, None)
+            self._on_progress.pop(identity, None)
             self._waiting.pop(identity, None)
             self._session.cancel(identity)
             self._connection.flush()
         round_trip_s = self._clock() - ended.sent_s
-        if isinstance(ended.answer, Failure):
-            if ended.answer.code == "expired":
-                self._keeper.add_round_trip(round_trip_s)
-            return ended.answer
-        self._keeper.add_round_trip(round_trip_s)
-        return self._from_cloud(ended, ended.answer, round_trip_s)
+        answer = ended.answer
+        if isinstance(answer, Result) or answer.code == "expired":
+            self._keeper.add_round_trip(round_trip_s)
+        return self._from_cloud(ended, answer, round_trip_s) if isinstance(answer, Result) else answer
 
-    async def _ask_both(self, offload: CloudFirst, own: LocalServices, ask: _Ask) -> Answer | Failure:
-        """Carry out the plan of *offload*: the cloud, the robot, or the first of the two."""
+    async def _ask_both(self, offload: CloudFirst, local: LocalServices, call: _Call) -> Answer | Failure:
+        """Carry out the plan of *offload*: ask the cloud, the robot, or both and take the first answer."""
         started = self._clock()
         plan = offload.plan(
-            deadline_s=ask.deadline_s,
+            deadline_s=call.deadline_s,
             connected=self._session.current is not None,
             expected_round_trip_s=self._keeper.expected_round_trip_s(),
-            robot_solve_s=own.solve_s,
-            robot_can=own.offers(ask.service),
+            robot_solve_s=local.solve_s,
+            robot_can=local.offers(call.service),
         )
         if plan.where == "cloud":
-            return await self._ask_cloud(ask)
+            return await self._ask_cloud(call)
         racing: list[asyncio.Task[Answer | Failure]] = []
         try:
             why, cloud = plan.why, None
             if plan.where == "both":
-                cloud = self._spawn(self._ask_cloud(ask))
+                cloud = self._spawn(self._ask_cloud(call))
                 racing.append(cloud)
                 done = await _first(cloud, plan.robot_after_s)
                 if done is not None:
-                    if not (isinstance(done, Failure) and offload.can_mend(done.code)):
+                    if not (isinstance(done, Failure) and offload.can_recover(done.code)):
                         return done
                     why, cloud = f"the cloud answered {done.code}", None
-            robot = self._spawn(self._ask_robot(own, ask, why))
+            robot = self._spawn(self._ask_robot(local, call, why))
             racing.append(robot)
-            remaining_s = max(0.0, ask.deadline_s - (self._clock() - started))
+            remaining_s = max(0.0, call.deadline_s - (self._clock() - started))
             return await self._first_answer(offload, cloud, robot, remaining_s)
         except asyncio.CancelledError:
             for task in racing:
@@ -393,7 +394,7 @@ class Robot:
         robot: asyncio.Task[Answer | Failure],
         remaining_s: float,
     ) -> Answer | Failure:
-        """Return what comes first; a cloud that is too late goes on being measured."""
+        """Return the first good answer; a late answer of the cloud still counts in the statistics."""
         until = self._clock() + remaining_s
         racing = {robot} if cloud is None else {cloud, robot}
         while racing:
@@ -403,40 +404,54 @@ class Robot:
                 break
             for task in sorted(done, key=lambda task: task is robot):
                 answer = task.result()
-                mendable = task is cloud and isinstance(answer, Failure) and offload.can_mend(answer.code)
-                if not mendable:
+                if not (task is cloud and isinstance(answer, Failure) and offload.can_recover(answer.code)):
                     return answer
         robot.cancel()
-        message = "neither the cloud nor the robot answered in time"
-        return Failure(code="expired", message=message, hint="allow more time")
+        return Failure(
+            code="expired",
+            message="neither the cloud nor the robot answered in time",
+            hint="set a longer deadline_s",
+        )
 
-    async def _ask_robot(self, own: LocalServices, ask: _Ask, why: str) -> Answer | Failure:
+    async def _ask_robot(self, local: LocalServices, call: _Call, why: str) -> Answer | Failure:
         started = self._clock()
-        ended = await own.ask(Command(id=0, service=ask.service, payload=ask.request))
+        ended = await local.ask(Command(id=0, service=call.service, payload=call.request))
         if isinstance(ended, Failure):
             return ended
         round_trip_ms = (self._clock() - started) * 1e3
         return Answer(
-            reply=ended.reply, source="robot", server=ended.server, round_trip_ms=round_trip_ms,
-            queue_ms=0.0, compute_ms=ended.compute_ms, why=why,
-        )  # fmt: skip
+            reply=ended.reply,
+            source="robot",
+            server=ended.server,
+            round_trip_ms=round_trip_ms,
+            queue_ms=0.0,
+            compute_ms=ended.compute_ms,
+            why=why,
+        )
 
     def _from_cloud(self, ended: Answered, result: Result, round_trip_s: float) -> Answer:
         up_ms, down_ms = (None if s is None else s * 1e3 for s in (ended.up_s, ended.down_s))
         return Answer(
-            reply=result.reply, source="cloud", server=result.server, round_trip_ms=round_trip_s * 1e3,
-            queue_ms=result.queue_ms, compute_ms=result.compute_ms, up_ms=up_ms, down_ms=down_ms,
-            payload_bytes=ended.wire_bytes, object=result.object,
-        )  # fmt: skip
+            reply=result.reply,
+            source="cloud",
+            server=result.server,
+            round_trip_ms=round_trip_s * 1e3,
+            queue_ms=result.queue_ms,
+            compute_ms=result.compute_ms,
+            up_ms=up_ms,
+            down_ms=down_ms,
+            payload_bytes=ended.wire_bytes,
+            object=result.object,
+        )
 
     def _typed(self, answer: Answer | Failure, reply_type: type[Any] | None, started: float) -> Answer:
-        """Return the answer with its reply typed and the caller's round trip, or raise its failure."""
+        """Return the answer with its reply typed and the caller's round trip; raise if it is a failure."""
         if isinstance(answer, Failure):
             raise error_from_code(
                 answer.code, answer.message, hint=answer.hint, retry_after_ms=answer.retry_after_ms
             )
-        is_named = answer.reply is None and answer.object != ""
-        reply = answer.reply if reply_type is None or is_named else as_type(answer.reply, reply_type)
+        is_stored = answer.reply is None and answer.object != ""
+        reply = answer.reply if reply_type is None or is_stored else as_type(answer.reply, reply_type)
         answer = replace(answer, reply=reply, round_trip_ms=(self._clock() - started) * 1e3)
         keeper = self._keeper
         keeper.answered += 1
@@ -449,20 +464,20 @@ class Robot:
 
     def _answered(self, event: Answered | Progressed) -> None:
         if isinstance(event, Progressed):
-            if event.id in self._hearing:
-                self._hearing[event.id](event.done, event.what)
+            if event.id in self._on_progress:
+                self._on_progress[event.id](event.done, event.what)
             return
         waiting = self._waiting.get(event.id)
         if isinstance(waiting, asyncio.Future):
             if waiting.done():
-                self._keeper.twice += not waiting.cancelled()
+                self._keeper.duplicates += not waiting.cancelled()
             else:
                 waiting.set_result(event)
         elif waiting is not None:
             del self._waiting[event.id]
             waiting(event)
         else:
-            self._keeper.twice += 1
+            self._keeper.duplicates += 1
 
     def _spawn(self, work: Coroutine[Any, Any, Answer | Failure]) -> asyncio.Task[Answer | Failure]:
         task = asyncio.get_running_loop().create_task(work)
@@ -472,7 +487,7 @@ class Robot:
 
 
 async def _first(task: asyncio.Task[T], timeout_s: float) -> T | None:
-    """Return what *task* gives within *timeout_s*, else None; the task goes on."""
+    """Return the result of *task* within *timeout_s*, else None; the task continues."""
     done, _ = await asyncio.wait({task}, timeout=timeout_s)
     return task.result() if done else None
 

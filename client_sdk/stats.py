@@ -1,4 +1,4 @@
-"""What a robot knows about its own traffic, in bounded memory."""
+"""Statistics of a robot's own traffic, in bounded memory."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ from random import Random
 
 __all__ = ["Percentiles", "Stats", "StatsKeeper"]
 
-_KEPT = 2048
-"""So many commands of a run, drawn evenly, are remembered for percentiles."""
+_SAMPLE_SIZE = 2048
+"""Number of commands of a run, drawn uniformly, from which percentiles are computed."""
 
 _RECENT = 32
-"""So many of the last round trips say what to expect of the next."""
+"""Number of the last round trips from which the next one is predicted."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Percentiles:
-    """Over the run, from an even sample of up to 2,048 commands; None before the first."""
+    """Over the run, from a uniform sample of up to 2,048 commands; None before the first."""
 
     p50: float | None
     p95: float | None
@@ -28,7 +28,7 @@ class Percentiles:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Stats:
-    """A snapshot; times in ms, clocks in s.  ``twice`` counts commands that ended twice: always 0."""
+    """A snapshot; times in ms, clocks in s.  ``duplicates`` counts second answers to a command: 0."""
 
     sent: int
     answered: int
@@ -38,7 +38,7 @@ class Stats:
     unanswered: int
     resent: int
     dropped_answers: int
-    twice: int
+    duplicates: int
     reconnects: int
     moves: int
     bytes_out: int
@@ -59,13 +59,13 @@ class Stats:
 
 
 class StatsKeeper:
-    """Counts and remembers; `Robot.stats` makes the snapshot."""
+    """Count and sample a robot's traffic; `Robot.stats` returns the snapshot."""
 
     def __init__(self, random: Random) -> None:
         self.sent = 0
         self.answered = 0
         self.answered_by_robot = 0
-        self.twice = 0
+        self.duplicates = 0
         self.failures: Counter[str] = Counter()
         self.payload_bytes_max = 0
         self._random = random
@@ -73,17 +73,17 @@ class StatsKeeper:
         self._recent_round_trips_s: deque[float] = deque(maxlen=_RECENT)
 
     def add(self, name: str, value: float | None) -> None:
-        """Remember one measured value."""
+        """Record one measured value."""
         if value is not None:
             self._samples.setdefault(name, _Sample()).add(value, self._random)
 
     def add_payload(self, size: int) -> None:
-        """Remember the bytes of one command."""
+        """Record the size of one command in bytes."""
         self.payload_bytes_max = max(self.payload_bytes_max, size)
         self.add("payload_bytes", size)
 
     def add_round_trip(self, seconds: float) -> None:
-        """Remember how long the cloud took, or at least took, for `expected_round_trip_s`."""
+        """Record a round trip to the cloud, or the least that it took, for `expected_round_trip_s`."""
         self._recent_round_trips_s.append(seconds)
 
     def expected_round_trip_s(self) -> float | None:
@@ -91,17 +91,18 @@ class StatsKeeper:
         return _percentile(sorted(self._recent_round_trips_s), 0.95)
 
     def percentile(self, name: str, share: float) -> float | None:
-        """Return a percentile of the remembered values: the nearest rank."""
-        sample = self._samples.get(name)
-        return None if sample is None else _percentile(sorted(sample.values), share)
+        """Return a percentile of the recorded values, by nearest rank; None without a value."""
+        return _percentile(self._sorted(name), share)
 
     def percentiles(self, name: str) -> Percentiles:
-        """Return the three that everybody asks for."""
-        sample = self._samples.get(name)
-        values = [] if sample is None else sorted(sample.values)
+        """Return the 50th, 95th and 99th percentile of the recorded values."""
+        values = self._sorted(name)
         return Percentiles(
             p50=_percentile(values, 0.5), p95=_percentile(values, 0.95), p99=_percentile(values, 0.99)
         )
+
+    def _sorted(self, name: str) -> list[float]:
+        return sorted(self._samples[name].values) if name in self._samples else []
 
 
 class _Sample:
@@ -113,11 +114,11 @@ class _Sample:
 
     def add(self, value: float, random: Random) -> None:
         self._seen += 1
-        if len(self.values) < _KEPT:
+        if len(self.values) < _SAMPLE_SIZE:
             self.values.append(value)
             return
         place = random.randrange(self._seen)
-        if place < _KEPT:
+        if place < _SAMPLE_SIZE:
             self.values[place] = value
 
 

@@ -90,9 +90,17 @@ class _Builder:
             others = [other for other in range(3) if other != axis]
             for sign, offset in ((-1, low[axis]), (1, high[axis])):
                 self.faces.append(
-                    Face(axis, offset, sign, (low[others[0]], low[others[1]]),
-                         (high[others[0]], high[others[1]]), *skin, *colours, room)
-                )  # fmt: skip
+                    Face(
+                        axis,
+                        offset,
+                        sign,
+                        (low[others[0]], low[others[1]]),
+                        (high[others[0]], high[others[1]]),
+                        *skin,
+                        *colours,
+                        room,
+                    )
+                )
 
 
 def make_world(seed: int) -> World:
@@ -140,9 +148,12 @@ def _door_frame(build: _Builder, door: int, wood: int) -> None:
     build.box((x - half, left - 0.06, 0), (x + half, left + 0.02, _DOOR_HEIGHT_M), door, skin, colours)
     build.box((x - half, right - 0.02, 0), (x + half, right + 0.06, _DOOR_HEIGHT_M), door, skin, colours)
     build.box(
-        (x - half, left - 0.06, _DOOR_HEIGHT_M - 0.02), (x + half, right + 0.06, _DOOR_HEIGHT_M + 0.06),
-        door, skin, colours,
-    )  # fmt: skip
+        (x - half, left - 0.06, _DOOR_HEIGHT_M - 0.02),
+        (x + half, right + 0.06, _DOOR_HEIGHT_M + 0.06),
+        door,
+        skin,
+        colours,
+    )
 
 
 def _furnish(build: _Builder, room: int, wood: int, cloth: int) -> None:

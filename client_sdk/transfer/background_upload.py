@@ -1,8 +1,8 @@
-"""Upload keyframes beside live poses: slowly, in order, from a bounded folder that outlives the robot.
+"""Upload keyframes in the background: at a limited rate, in order, from a bounded spool folder.
 
-A token bucket holds the pace, and it holds no more than one keyframe's worth of credit, so hours offline
-end in a steady trickle and not in a burst ahead of live poses.  Promises never to block who adds, and to
-count what was dropped when the folder was full.
+The rate limit allows no burst, so that keyframes collected during hours offline are uploaded at a steady rate
+and do not delay live poses.  The spool survives a restart of the robot.  `BackgroundUploader.add` never
+blocks; keyframes that do not fit into the spool are dropped and counted.
 """
 
 from __future__ import annotations
@@ -18,39 +18,27 @@ from typing import Protocol
 from rse_pf.config import DataSettings
 from rse_pf.errors import BadRequest, LimitExceeded, RsePfError, UsageError
 from rse_pf.files import replace_file
+from rse_pf.wire.rate_limit import TokenBucket
 
-__all__ = ["BackgroundUploader", "UploadRate"]
+__all__ = ["BackgroundUploader"]
 
-_LEFT_S = 5.0
-_TRY_AGAIN_S = 5.0
+_JOIN_TIMEOUT_S = 5.0
+_RETRY_PAUSE_S = 5.0
+_BUSY_POLL_S = 0.05
 
 
 class Uploads(Protocol):
-    """What sends one object; `client_sdk.transfer.data_client.DataClient` does."""
+    """A client that uploads one object at a time, such as `DataClient`."""
 
     def upload(self, source: Path, progress: Callable[[int, int], None] | None = None) -> str:
-        """Store a file and return its digest; tell bytes done and in all after each part."""
+        """Store a file and return its digest; report bytes done and in total after each part."""
 
     def close(self) -> None:
         """Close the connection."""
 
 
-class UploadRate:
-    """A token bucket: ``bytes_per_s`` on average, and no credit is saved up while nothing is sent."""
-
-    def __init__(self, bytes_per_s: float, now: float) -> None:
-        self._rate = bytes_per_s
-        self._free_at = now
-
-    def wait_s(self, size: int, now: float) -> float:
-        """Return how long to wait before *size* bytes may go, and count them as gone after that."""
-        start = max(self._free_at, now)
-        self._free_at = start + size / self._rate
-        return start - now
-
-
 class BackgroundUploader:
-    """Keeps keyframes in *folder* until the data service has them; a thread sends them, oldest first."""
+    """Keep keyframes in a folder until a thread has uploaded them, oldest first."""
 
     def __init__(
         self,
@@ -61,14 +49,14 @@ class BackgroundUploader:
         clock: Callable[[], float] = time.monotonic,
         is_busy: Callable[[], bool] = lambda: False,
     ) -> None:
-        """Remember what to do; `start` begins.
+        """Describe the uploads; `start` begins them.
 
         Args:
-            uploads: Where to.
-            folder: The spool; made by `start`, and read first if it holds keyframes of an earlier run.
+            uploads: Client of the data service.
+            folder: The spool; created by `start`, which also takes over keyframes of an earlier run.
             settings: ``background_bytes_per_s``, ``max_spool_bytes``.
             clock: Monotonic seconds.
-            is_busy: Says that live poses wait for the link; no keyframe and no part is begun while they do.
+            is_busy: Whether live poses are waiting; no keyframe and no part is started meanwhile.
         """
         self.sent = 0
         self.dropped = 0
@@ -85,7 +73,7 @@ class BackgroundUploader:
         self._thread = threading.Thread(target=self._work, name="keyframe-uploads", daemon=True)
 
     def start(self) -> None:
-        """Pick up what an earlier run left, and begin to send."""
+        """Take over the keyframes of an earlier run, and start the uploads."""
         self._folder.mkdir(parents=True, exist_ok=True)
         with self._condition:
             for path in sorted(self._folder.glob("*.keyframe")):
@@ -95,7 +83,7 @@ class BackgroundUploader:
 
     @property
     def waiting(self) -> int:
-        """How many keyframes are not sent yet."""
+        """How many keyframes are not uploaded yet."""
         with self._condition:
             return len(self._held)
 
@@ -106,7 +94,7 @@ class BackgroundUploader:
             return sum(self._held.values())
 
     def add(self, data: bytes) -> str | None:
-        """Keep a keyframe for sending and return its digest; None if there is no room and it was dropped."""
+        """Spool a keyframe and return its digest; None if the spool is full and it was dropped."""
         digest = hashlib.sha256(data).hexdigest()
         with self._condition:
             if sum(self._held.values()) + len(data) > self._settings.max_spool_bytes:
@@ -125,21 +113,21 @@ class BackgroundUploader:
         return digest
 
     def wait_sent(self, timeout_s: float) -> bool:
-        """Wait until everything was sent; return whether it was."""
+        """Wait until all keyframes are uploaded; return whether they are."""
         with self._condition:
             return self._condition.wait_for(lambda: not self._held, timeout_s)
 
     def close(self) -> None:
-        """End the thread; what is not sent stays in the folder for the next run."""
+        """End the thread; keyframes not uploaded stay in the spool for the next run."""
         with self._condition:
             self._over = True
             self._condition.notify_all()
         self._uploads.close()
         if self._thread.is_alive():
-            self._thread.join(_LEFT_S)
+            self._thread.join(_JOIN_TIMEOUT_S)
 
     def _work(self) -> None:
-        pace = UploadRate(self._settings.background_bytes_per_s, self._clock())
+        bucket = TokenBucket(self._settings.background_bytes_per_s, burst=0.0)
         while True:
             with self._condition:
                 self._condition.wait_for(lambda: self._over or bool(self._held))
@@ -147,16 +135,16 @@ class BackgroundUploader:
                     return
                 name = min(self._held)
                 size = self._held[name]
-            if self._pause(pace.wait_s(size, self._clock())) or not self._wait_for_quiet():
+            if self._pause(bucket.spend(size, self._clock())) or not self._wait_for_quiet():
                 return
-            if not self._send(name) and self._pause(_TRY_AGAIN_S):
+            if not self._send(name) and self._pause(_RETRY_PAUSE_S):
                 return
 
     def _send(self, name: str) -> bool:
         path = self._folder / name
         try:
             self._uploads.upload(path, self._between_parts)
-        except (BadRequest, LimitExceeded, UsageError) as error:  # it will never be taken, or is gone
+        except (BadRequest, LimitExceeded, UsageError) as error:  # it is refused for good, or is missing
             self.dropped += 1
             self.last_error = str(error)
         except RsePfError as error:
@@ -177,11 +165,11 @@ class BackgroundUploader:
 
     def _wait_for_quiet(self) -> bool:
         while self._is_busy():
-            if self._pause(0.05):
+            if self._pause(_BUSY_POLL_S):
                 return False
         return True
 
     def _pause(self, seconds: float) -> bool:
-        """Wait, and say whether the work is over."""
+        """Wait, and return whether the uploader was closed."""
         with self._condition:
             return self._condition.wait_for(lambda: self._over, seconds) if seconds > 0 else self._over

@@ -1,8 +1,8 @@
 """Send and fetch large data by HTTP (paper, Sect. 5.2): images, keyframes, clouds, maps.
 
-Blocking; run it in a thread.  Objects are named by their sha256, so a repeated or resumed transfer can
-neither store twice nor mix two versions.  Promises to return from an upload only when the data server has
-called the object durable, and to try no longer than it was told.
+`DataClient` is blocking; run it in a thread.  Objects are named by their sha256, so a repeated or resumed
+transfer can neither store an object twice nor mix two versions.  An upload returns when the data server has
+reported the object durable.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any, BinaryIO
 from urllib.parse import urlsplit
 
-from client_sdk.transfer.presigned import fetch_direct, is_allowed, put_direct
+from client_sdk.transfer.presigned import get_presigned, http_connection, is_allowed, put_presigned
 from rse_pf.errors import (
     BadRequest,
     CommandFailed,
@@ -33,26 +33,26 @@ from rse_pf.errors import (
     error_from_code,
 )
 
-__all__ = ["DataClient", "DataOptions", "Progress"]
+__all__ = ["DataClient", "DataOptions", "OnBytes"]
 
-Progress = Callable[[int, int], None]
-"""Gets bytes done and bytes in all, after each part."""
+OnBytes = Callable[[int, int], None]
+"""Called after each part with the bytes transferred and the bytes in total."""
 
-_SMALL_BYTES = 262_144
+_MAX_SINGLE_PUT_BYTES = 262_144
 _PIECE_BYTES = 1 << 20
-_DIRECT_TRIES = 3
+_PRESIGNED_TRIES = 3
 _REDIRECTED = 307
-_BUSY = {408, 429, 500, 502, 503, 504}
+_RETRIED = {408, 429, 500, 502, 503, 504}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DataOptions:
-    """How patient a client is; ``deadline_s`` is for one transfer without any progress."""
+    """Timeouts and retries of a client; ``deadline_s`` limits the time without any progress."""
 
     timeout_s: float = 10.0
     deadline_s: float = 60.0
     first_pause_s: float = 0.1
-    longest_pause_s: float = 5.0
+    max_pause_s: float = 5.0
     part_bytes: int = 1 << 20
     clock: Callable[[], float] = time.monotonic
     sleep: Callable[[float], None] = time.sleep
@@ -60,22 +60,22 @@ class DataOptions:
 
 
 class DataClient:
-    """A robot's way to the data service; one connection, used by one thread at a time."""
+    """A robot's client of the data service; one connection, used by one thread at a time."""
 
     def __init__(self, url: str, token: str | Callable[[], str], options: DataOptions | None = None) -> None:
-        """Remember where; nothing is sent yet.
+        """Store the address; nothing is sent yet.
 
         Args:
-            url: ``http://HOST:PORT`` or ``https://...``; ``ws:`` and ``wss:`` addresses of robots work, too.
-            token: The robot's token, or what gives one that is good now.
+            url: ``http://HOST:PORT`` or ``https://...``, or the ``ws:`` or ``wss:`` address of the servers.
+            token: The robot's token, or a callable that returns a valid one.
             options: Timeouts, retries and part sizes.
 
         Raises:
-            UsageError: *url* is no such address.
+            UsageError: *url* is not such an address.
         """
         parts = urlsplit(url)
         if parts.scheme not in ("http", "https", "ws", "wss") or not parts.hostname:
-            raise UsageError(f"{url!r} is no address of a data service", hint="write https://HOST")
+            raise UsageError(f"{url!r} is not an address of a data service", hint="write https://HOST")
         self._secure = parts.scheme in ("https", "wss")
         self._host, self._port = parts.hostname, parts.port
         self._token = token
@@ -89,33 +89,33 @@ class DataClient:
         if connection is not None:
             connection.close()
 
-    def upload(self, source: bytes | Path, progress: Progress | None = None) -> str:
-        """Store bytes or a file and return its digest, once it is durable.
+    def upload(self, source: bytes | Path, progress: OnBytes | None = None) -> str:
+        """Store bytes or a file and return the digest, once the object is durable.
 
-        Goes on where an earlier upload of the same bytes ended, also one of another process.
+        An earlier upload of the same bytes is resumed, also one by another process.
 
         Raises:
             ConnectError: No progress for ``deadline_s``.
             StoreFull, QuotaExceeded, LimitExceeded, Unauthorized, Forbidden: The server refuses it.
             UsageError: The file cannot be read.
         """
-        with self._lock, _opened(source) as opened:
+        with self._lock, _Source(source) as opened:
             size, digest = opened.size, opened.digest()
-            if size <= _SMALL_BYTES:
-                self._patiently("PUT", f"/data/v1/objects/{digest}", opened.read(0, size))
-                _tell(progress, size, size)
-                return digest
-            self._upload_parts(opened, digest, progress)
+            if size <= _MAX_SINGLE_PUT_BYTES:
+                self._request("PUT", f"/data/v1/objects/{digest}", opened.read(0, size))
+                _report(progress, size, size)
+            else:
+                self._upload_parts(opened, digest, progress)
             return digest
 
-    def download(self, digest: str, to: Path | None = None, progress: Progress | None = None) -> bytes:
-        """Return an object, or write it to file *to* (and return nothing), checked by its digest.
+    def download(self, digest: str, to: Path | None = None, progress: OnBytes | None = None) -> bytes:
+        """Return an object, or write it to file *to* (and return no bytes), verified by its digest.
 
-        A file appears only when it is whole; what came before a cut is kept beside it and gone on from.
+        The file appears only when it is complete; an interrupted download is kept beside it and resumed.
 
         Raises:
             NotFound: There is no such object of this robot.
-            StoreError: The bytes are not those of the digest.
+            StoreError: The bytes do not match the digest.
         """
         with self._lock:
             return self._download(f"/data/v1/objects/{digest}", digest, to, progress)
@@ -123,10 +123,10 @@ class DataClient:
     def delete(self, digest: str) -> None:
         """Remove an object; a missing one is no error."""
         with self._lock:
-            self._patiently("DELETE", f"/data/v1/objects/{digest}")
+            self._request("DELETE", f"/data/v1/objects/{digest}")
 
     def objects(self) -> Iterator[tuple[str, int]]:
-        """Yield digest and size of this robot's objects."""
+        """Yield digest and size of each of this robot's objects."""
         after = ""
         while True:
             with self._lock:
@@ -147,7 +147,7 @@ class DataClient:
             found: dict[str, Any] = self._json("GET", f"/data/v1/maps/{name}/versions/{version}")
             return found
 
-    def download_map(self, name: str, version: str = "head", progress: Progress | None = None) -> bytes:
+    def download_map(self, name: str, version: str = "head", progress: OnBytes | None = None) -> bytes:
         """Return a version's bytes, for `rse_pf.maps.format.decode_map`."""
         found = self.map_version(name, version)
         with self._lock:
@@ -158,32 +158,35 @@ class DataClient:
         """Upload the bytes of a map and make them the head; return the version's id.
 
         Raises:
-            Conflict: Another robot was quicker: *parent* is not the head any more.
+            Conflict: Another robot committed first: *parent* is no longer the head.
         """
         body = {"digest": self.upload(data), "parent": parent, "note": note}
         with self._lock:
             made = self._json("POST", f"/data/v1/maps/{name}/versions", json.dumps(body).encode())
         return str(made["id"])
 
-    def _upload_parts(self, opened: _Source, digest: str, progress: Progress | None) -> None:
+    def _upload_parts(self, opened: _Source, digest: str, progress: OnBytes | None) -> None:
         path, size = f"/data/v1/uploads/{digest}", opened.size
         begin = json.dumps({"size": size}).encode()
         state = self._begin(path, begin, opened, progress)
         part_bytes = min(int(state["part_bytes"]), self._options.part_bytes)
         offset = int(state["offset"])
-        _tell(progress, offset, size)
+        _report(progress, offset, size)
         while offset < size:
             part = opened.read(offset, min(part_bytes, size - offset))
             try:
                 state = self._json("PATCH", path, part, {"Upload-Offset": str(offset)})
-            except (Conflict, NotFound):  # the answer to this part was lost, or another process was at work
+            except (
+                Conflict,
+                NotFound,
+            ):  # the answer to this part was lost, or another process uploads the same object
                 state = self._json("PUT", path, begin)
             offset = int(state["offset"])
-            _tell(progress, offset, size)
+            _report(progress, offset, size)
 
-    def _begin(self, path: str, begin: bytes, opened: _Source, progress: Progress | None) -> Any:
-        """Open an upload, and send all straight to the bucket if the service offers that and it works."""
-        tries, pause = _DIRECT_TRIES, self._options.first_pause_s
+    def _begin(self, path: str, begin: bytes, opened: _Source, progress: OnBytes | None) -> Any:
+        """Open an upload, and send the object to a presigned address if the service offers one."""
+        tries, pause = _PRESIGNED_TRIES, self._options.first_pause_s
         while True:
             state = self._json("PUT", path, begin)
             direct = state.get("direct")
@@ -191,54 +194,52 @@ class DataClient:
                 return state
             tries -= 1
             body = opened.pieces(progress)
-            if put_direct(direct["url"], direct["headers"], body, timeout_s=self._options.timeout_s):
-                continue  # asking again tells whether it is there
-            self._options.sleep(pause)
-            pause *= 2
+            if not put_presigned(direct["url"], direct["headers"], body, timeout_s=self._options.timeout_s):
+                self._options.sleep(pause)
+                pause *= 2
 
     def _piece(
-        self, path: str, headers: dict[str, str], way: _Way
+        self, path: str, headers: dict[str, str], route: _Route
     ) -> tuple[int, http.client.HTTPMessage, bytes]:
-        """Fetch a range straight from the bucket if the service offers that, else from the service."""
+        """Fetch a range from a presigned address if the service offers one, else from the service."""
         options = self._options
-        while way.tries:
-            if not way.url:
-                asking = {**headers, "X-Accept-Direct": "1"}
-                status, answer, piece = self._patiently("GET", path, None, asking, also=(416,))
-                way.url = answer.get("Location", "") if status == _REDIRECTED else ""
+        while route.tries:
+            if not route.url:
+                offer = {**headers, "X-Accept-Direct": "1"}
+                status, answer, piece = self._request("GET", path, None, offer, also=(416,))
+                route.url = answer.get("Location", "") if status == _REDIRECTED else ""
                 if status != _REDIRECTED:
                     return status, answer, piece
-            found = None
-            if is_allowed(way.url, secure=self._secure):
-                found = fetch_direct(way.url, headers, timeout_s=options.timeout_s)
-            if found is not None:
-                return found
-            way.url, way.tries = "", way.tries - 1  # it has expired, or the bucket is out of reach
+            if is_allowed(route.url, secure=self._secure):
+                found = get_presigned(route.url, headers, timeout_s=options.timeout_s)
+                if found is not None:
+                    return found
+            route.url, route.tries = "", route.tries - 1  # expired, or the bucket cannot be reached
             options.sleep(options.first_pause_s)
-        return self._patiently("GET", path, None, headers, also=(416,))
+        return self._request("GET", path, None, headers, also=(416,))
 
-    def _download(self, path: str, digest: str, to: Path | None, progress: Progress | None) -> bytes:
+    def _download(self, path: str, digest: str, to: Path | None, progress: OnBytes | None) -> bytes:
         partial = None if to is None else to.with_name(f".{to.name}.{digest[:16]}.part")
-        held = bytearray() if partial is None else bytearray(_bytes_of(partial))
-        size, way = -1, _Way()
+        held = bytearray(partial.read_bytes() if partial is not None and partial.exists() else b"")
+        size, route = -1, _Route()
         while size != len(held):
             end = len(held) + _PIECE_BYTES - 1
             headers = {"Range": f"bytes={len(held)}-{end}"}
-            status, answer, piece = self._piece(path, headers, way)
-            told = answer.get("Content-Range", "")
-            size = int(told.rpartition("/")[2]) if told else len(piece)
+            status, answer, piece = self._piece(path, headers, route)
+            content_range = answer.get("Content-Range", "")
+            size = int(content_range.rpartition("/")[2]) if content_range else len(piece)
             if status == 200:
                 held[:] = piece
             elif status == 206:
                 held += piece
                 _append(partial, piece)
-            elif size != len(held):  # what was kept is longer than the object
+            elif size != len(held):  # the partial file is longer than the object
                 held.clear()
                 _remove(partial)
-            _tell(progress, len(held), size)
+            _report(progress, len(held), size)
         if hashlib.sha256(held).hexdigest() != digest:
             _remove(partial)
-            raise StoreError("the bytes are not those of the digest", hint="fetch it again")
+            raise StoreError("the bytes do not match the digest", hint="fetch it again")
         if to is None or partial is None:
             return bytes(held)
         partial.write_bytes(held)
@@ -248,46 +249,47 @@ class DataClient:
     def _json(
         self, method: str, path: str, body: bytes | None = None, headers: dict[str, str] | None = None
     ) -> Any:
-        return json.loads(self._patiently(method, path, body, headers)[2])
+        return json.loads(self._request(method, path, body, headers)[2])
 
-    def _patiently(
+    def _request(
         self, method: str, path: str, body: bytes | None = None, headers: dict[str, str] | None = None,
         also: tuple[int, ...] = (),
     ) -> tuple[int, http.client.HTTPMessage, bytes]:  # fmt: skip
-        """Ask until there is an answer that is not "come again"; every request here may be repeated."""
+        """Repeat a request until it succeeds or is refused; all requests of this class are idempotent."""
         options = self._options
         end, pause = options.clock() + options.deadline_s, options.first_pause_s
         while True:
             error: RsePfError
             after_s = 0.0
             try:
-                status, answer, content = self._ask(method, path, body, headers or {})
+                status, answer, content = self._request_once(method, path, body, headers or {})
             except (OSError, http.client.HTTPException) as broken:
                 self.close()
                 error = ConnectError(
                     f"no answer from {self._host}: {broken or type(broken).__name__}",
-                    hint="the transfer goes on from where it was when you call again",
+                    hint="call again to resume the transfer",
                 )
             else:
                 if status < 400 or status in also:
                     return status, answer, content
-                error = _refusal(status, content)
-                if status not in _BUSY:
+                error = _error_of(status, content)
+                if status not in _RETRIED:
                     raise error
-                told = answer.get("Retry-After", "")
-                after_s = float(told) if told.isdecimal() else 0.0
+                retry_after = answer.get("Retry-After", "")
+                after_s = float(retry_after) if retry_after.isdecimal() else 0.0
             wait_s = max(after_s, pause * options.random.uniform(0.5, 1.0))
             if options.clock() + wait_s > end:
                 raise error
             options.sleep(wait_s)
-            pause = min(2 * pause, options.longest_pause_s)
+            pause = min(2 * pause, options.max_pause_s)
 
-    def _ask(
+    def _request_once(
         self, method: str, path: str, body: bytes | None, headers: dict[str, str]
     ) -> tuple[int, http.client.HTTPMessage, bytes]:
         if self._connection is None:
-            kind = http.client.HTTPSConnection if self._secure else http.client.HTTPConnection
-            self._connection = kind(self._host, self._port, timeout=self._options.timeout_s)
+            self._connection = http_connection(
+                self._host, self._port, secure=self._secure, timeout_s=self._options.timeout_s
+            )
         token = self._token if isinstance(self._token, str) else self._token()
         self._connection.request(method, path, body, {"Authorization": f"Bearer {token}", **headers})
         answer = self._connection.getresponse()
@@ -298,15 +300,15 @@ class DataClient:
 
 
 @dataclass(slots=True)
-class _Way:
-    """How a download goes: straight from *url*, which ends soon, or through the service without tries."""
+class _Route:
+    """How a download is fetched: from the presigned *url*, or from the service when no tries are left."""
 
     url: str = ""
-    tries: int = _DIRECT_TRIES
+    tries: int = _PRESIGNED_TRIES
 
 
 class _Source:
-    """Bytes or a file, read by position."""
+    """Bytes or a file, read at any offset."""
 
     def __init__(self, source: bytes | Path) -> None:
         self._data = source if isinstance(source, bytes) else b""
@@ -319,15 +321,15 @@ class _Source:
         self.size = os.fstat(self._file.fileno()).st_size if self._file else len(self._data)
 
     def digest(self) -> str:
-        made = hashlib.sha256()
-        for offset in range(0, self.size, _PIECE_BYTES):
-            made.update(self.read(offset, _PIECE_BYTES))
-        return made.hexdigest()
+        digest = hashlib.sha256()
+        for piece in self.pieces(None):
+            digest.update(piece)
+        return digest.hexdigest()
 
-    def pieces(self, progress: Progress | None) -> Iterator[bytes]:
+    def pieces(self, progress: OnBytes | None) -> Iterator[bytes]:
         for offset in range(0, self.size, _PIECE_BYTES):
             yield self.read(offset, _PIECE_BYTES)
-            _tell(progress, min(offset + _PIECE_BYTES, self.size), self.size)
+            _report(progress, min(offset + _PIECE_BYTES, self.size), self.size)
 
     def read(self, offset: int, length: int) -> bytes:
         if self._file is None:
@@ -343,29 +345,18 @@ class _Source:
             self._file.close()
 
 
-def _opened(source: bytes | Path) -> _Source:
-    return _Source(source)
-
-
-def _refusal(status: int, content: bytes) -> RsePfError:
+def _error_of(status: int, content: bytes) -> RsePfError:
     try:
-        said = json.loads(content)
-        return error_from_code(str(said["code"]), str(said["message"]), hint=str(said.get("hint", "")))
+        error = json.loads(content)
+        return error_from_code(str(error["code"]), str(error["message"]), hint=str(error.get("hint", "")))
     except (ValueError, KeyError, TypeError):
         kind = NotFound if status == 404 else BadRequest if status < 500 else CommandFailed
-        return kind(f"the data service answered {status}", hint="look at its log")
+        return kind(f"the data service answered {status}", hint="see the log of the data server")
 
 
-def _tell(progress: Progress | None, done: int, size: int) -> None:
+def _report(progress: OnBytes | None, done: int, size: int) -> None:
     if progress is not None:
         progress(done, size)
-
-
-def _bytes_of(path: Path) -> bytes:
-    try:
-        return path.read_bytes()
-    except FileNotFoundError:
-        return b""
 
 
 def _append(path: Path | None, piece: bytes) -> None:

@@ -1,7 +1,7 @@
 """Numeric arrays inside messages: flat JSON lists, or raw little-endian bytes in MessagePack.
 
-A field annotated ``Array`` arrives as float64, whatever the encoding was; its owner gives it its
-shape.  Promises that only finite numbers pass: no strings, no truths, no lists inside lists.
+A field annotated ``Array`` is decoded to a flat float64 array, whatever the encoding was.  Only finite
+numbers are accepted: no strings, no booleans, no nested lists.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _KINDS = {np.dtype(np.float32): _F4, np.dtype(np.uint32): _U4, np.dtype(np.float
 
 
 def json_encode_hook(value: Any) -> Any:
-    """Return what JSON can say of *value*: arrays become flat lists."""
+    """Return *value* as JSON can represent it: arrays become flat lists."""
     if isinstance(value, np.ndarray) and value.dtype.kind in "fiu":
         return value.ravel().tolist()
     raise _unknown(value)
@@ -62,7 +62,7 @@ def extension_hook(kind: int, data: memoryview) -> npt.NDArray[Any]:
 def decode_hook(kind: type[Any], value: Any) -> Any:
     """Return *value* as a flat float64 array of finite numbers."""
     if kind is not np.ndarray:
-        raise BadMessage(f"{kind.__name__} does not travel in messages")
+        raise BadMessage(f"{kind.__name__} cannot be encoded in a message")
     if type(value) is np.ndarray and value.dtype.kind in "fiu":
         array = value.astype(np.float64).ravel() if value.ndim != 1 else value.astype(np.float64)
     elif isinstance(value, list):
@@ -71,7 +71,7 @@ def decode_hook(kind: type[Any], value: Any) -> Any:
         raise BadMessage(f"expected an array of numbers, got {type(value).__name__}", hint="send a flat list")
     # The sum of squares is finite only if every number is; vdot overflows without a warning.
     if not math.isfinite(np.vdot(array, array)):
-        raise BadMessage("an array holds a number that is not finite or absurdly large", hint="leave it out")
+        raise BadMessage("an array holds a number that is not finite or out of range", hint="leave it out")
     return array
 
 
@@ -79,23 +79,23 @@ def reshaped(name: str, array: npt.NDArray[np.float64], columns: int) -> npt.NDA
     """Return a flat *array* as ``(n, columns)``.
 
     Raises:
-        BadRequest: The length is no multiple of *columns*.
+        BadRequest: The length is not a multiple of *columns*.
     """
     if array.size % columns:
         raise BadRequest(
-            f"{name} has {array.size} numbers, which is no multiple of {columns}",
+            f"{name} has {array.size} numbers, which is not a multiple of {columns}",
             hint=f"send {columns} numbers for each row",
         )
     return array.reshape(-1, columns)
 
 
 def _from_list(numbers: list[Any]) -> npt.NDArray[np.float64]:
-    """Return a list of numbers as an array: in two C loops, and strings or truths are no numbers."""
+    """Return a list of numbers as an array, by two loops in C; strings and booleans are refused."""
     try:
         floats = msgspec.convert(numbers, list[float])
     except msgspec.ValidationError as error:
         raise BadMessage(
-            f"an array holds something else than numbers: {error}", hint="send a flat list"
+            f"an array holds values that are not numbers: {error}", hint="send a flat list"
         ) from error
     buffer = bytearray(8 * len(floats))
     struct.pack_into(f"{len(floats)}d", buffer, 0, *floats)
@@ -107,4 +107,4 @@ def _fits_uint32(value: npt.NDArray[Any]) -> bool:
 
 
 def _unknown(value: Any) -> BadMessage:
-    return BadMessage(f"{type(value).__name__} does not travel in messages")
+    return BadMessage(f"{type(value).__name__} cannot be encoded in a message")

@@ -1,11 +1,11 @@
-"""After an outage, send what waited so that something fresh is answered soon: few, and the newest first.
+"""The order and the rate at which a robot sends the frames that waited during an outage.
 
-When a link heals, every robot has seconds of frames to send and the server gets them all at once.  Oldest
-first, they reach their turn when their time is over, and the fresh ones stand behind them.  So, once the
-oldest has used up half of its time, frames go newest first and one at a time, one more with every answer
-that found the server at leisure, until none of those that waited is left.  After a shorter outage, a server
-that died, all can be in time: they go as they came.  Commands without a stream are no frames: they keep their
-order and their room.  Promises to know no clock, and that a robot is never left without room.
+When a network recovers, every robot has seconds of frames to send, and the server receives all of them at
+once.  Sent oldest first, each frame would reach the front of the queue only when its deadline has passed, and
+fresh frames would queue behind it.  After a long outage (`is_long_outage`) frames are therefore sent newest
+first and one at a time; each answer from a server whose queue is short allows one more frame in flight.
+After a short outage, such as the death of a server, every frame can still meet its deadline and the original
+order is kept.  Commands without a stream are no frames: they are sent in their original order.
 
 Source:
     Maurer 2015, "Fail at Scale", ACM Queue 13(8): adaptive LIFO; Jacobson 1988: slow start.
@@ -15,34 +15,32 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-__all__ = ["Backlog", "is_long", "turn"]
+__all__ = ["Backlog", "is_long_outage", "send_order"]
 
-_LEISURE_MS = 50.0
-"""A server in whose queue a command waited longer has enough to do; the default of its `queue_target_ms`."""
-
-
-_LONG = 0.5
-"""An outage that took more of a frame's time than this was a long one."""
+_SHORT_QUEUE_MS = 50.0
+"""A server is loaded if a command queued for longer; equals the default of its ``queue_target_ms``."""
+_LONG_OUTAGE_SHARE = 0.5
+"""An outage is long if it took more than this share of a frame's time."""
 
 
 @dataclass(slots=True, kw_only=True)
 class Backlog:
-    """How many frames may be on their way on a link that came after an outage."""
+    """How many frames may be in flight on a connection that was opened after a long outage."""
 
     newest: int
-    """The last of those that waited for the link."""
-    room: int = 1
+    """Id of the last frame that waited for the connection."""
+    max_in_flight: int = 1
 
-    def heard(self, queue_ms: float) -> None:
-        """Let one more go if the server was at leisure, or begin again with one."""
-        self.room = self.room + 1 if queue_ms <= _LEISURE_MS else 1
-
-
-def is_long(submitted_s: float, deadline_s: float, now_s: float) -> bool:
-    """Whether an outage that ends now took so much of a frame's time that it may have no turn in the rest."""
-    return now_s - submitted_s > _LONG * (deadline_s - submitted_s)
+    def answered(self, queue_ms: float) -> None:
+        """Allow one more frame in flight if the server's queue is short; otherwise restart with one."""
+        self.max_in_flight = self.max_in_flight + 1 if queue_ms <= _SHORT_QUEUE_MS else 1
 
 
-def turn(identity: int, stream: str) -> tuple[bool, int]:
-    """Return the key that sorts what waits: what has no stream as it came, then the newest frame."""
+def is_long_outage(submitted_s: float, deadline_s: float, now_s: float) -> bool:
+    """Return whether an outage that ends now took most of the time that a frame had."""
+    return now_s - submitted_s > _LONG_OUTAGE_SHARE * (deadline_s - submitted_s)
+
+
+def send_order(identity: int, stream: str) -> tuple[bool, int]:
+    """Return the sort key of a waiting command: without a stream oldest first, then frames newest first."""
     return (True, -identity) if stream else (False, identity)

@@ -1,7 +1,4 @@
-"""What a robot's side of the protocol tells whoever holds its sockets.
-
-Promises to be values only: the rules that make them are in `rse_pf.wire.client_session`.
-"""
+"""The events that `rse_pf.wire.client_session` returns to the owner of a robot's sockets."""
 
 from __future__ import annotations
 
@@ -9,15 +6,24 @@ from dataclasses import dataclass
 
 from rse_pf.wire.messages import Failure, Result, Welcome
 
-__all__ = ["Answered", "Event", "LinkLost", "MoveAsked", "Notice", "Progressed", "RenewalDue", "Welcomed"]
+__all__ = [
+    "Answered",
+    "ConnectionLost",
+    "Event",
+    "MoveRequested",
+    "Notice",
+    "Progressed",
+    "RenewalDue",
+    "Welcomed",
+]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Answered:
-    """A command came to its end.
+    """A command ended.
 
-    ``sent_s`` is when the robot took it (its clock); ``up_s`` and ``down_s`` are the paper's two
-    one-way delays, None where no clock offset is known; ``wire_bytes`` is what it weighed.
+    ``sent_s`` is when the robot accepted it (its clock); ``up_s`` and ``down_s`` are the paper's two
+    one-way delays, None where no clock offset is known; ``wire_bytes`` is the size of its message.
     """
 
     id: int
@@ -30,36 +36,36 @@ class Answered:
 
 @dataclass(frozen=True, slots=True)
 class Welcomed:
-    """The link is open; the session sends on it from now on."""
+    """The server accepted the connection; the session sends on it from now on."""
 
     welcome: Welcome
 
 
 @dataclass(frozen=True, slots=True)
-class MoveAsked:
-    """The server wants the robot elsewhere."""
+class MoveRequested:
+    """The server asks the robot to connect to another server."""
 
     reason: str
     within_s: float
 
 
 @dataclass(frozen=True, slots=True)
-class LinkLost:
-    """The link is dead although its socket may look alive."""
+class ConnectionLost:
+    """The connection is lost, although its socket may still be open."""
 
     reason: str
 
 
 @dataclass(frozen=True, slots=True)
 class Notice:
-    """The server complains about a message or the session, not about one command."""
+    """The server reports a failure of a message or of the session, not of one command."""
 
     failure: Failure
 
 
 @dataclass(frozen=True, slots=True)
 class Progressed:
-    """A long command is so far: the share *done* (0..1), and *what* was done last."""
+    """Progress of a long command: the share *done* (0..1), and *what* was done last."""
 
     id: int
     done: float
@@ -68,7 +74,7 @@ class Progressed:
 
 @dataclass(frozen=True, slots=True)
 class RenewalDue:
-    """The link ends soon unless a fresh token is shown: see `RobotSession.renew`."""
+    """The connection expires soon unless a fresh token is sent: see `ClientSession.renew`."""
 
 
-Event = RenewalDue | Answered | Welcomed | MoveAsked | LinkLost | Notice | Progressed
+Event = RenewalDue | Answered | Welcomed | MoveRequested | ConnectionLost | Notice | Progressed

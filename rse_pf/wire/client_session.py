@@ -1,9 +1,9 @@
-"""The rules of a robot's side, over any number of connections, without any input or output.
+"""The rules of a robot's side of the protocol, over any number of connections, without input or output.
 
-A `ClientSession` lives as long as the robot; a `ConnectionState` as long as one socket.  Commands survive the
-death of a link: they are sent again, by the same id, on the next one.  Promises that a command gets
-exactly one final answer, that nothing stale is delivered as fresh, that no more commands are on
-their way than the server accepts, and never to read a clock.
+A `ClientSession` lives as long as the robot, a `ConnectionState` as long as one WebSocket.  Commands survive
+the end of a connection: they are sent again on the next one, under the same id.  Every command gets exactly
+one final answer, no stale answer is delivered as fresh, and no more commands are unanswered than the server
+accepts.  The caller passes the time as ``now``: seconds of the robot's monotonic clock.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ import msgspec
 
 from rse_pf.config import SessionSettings
 from rse_pf.errors import LimitExceeded
-from rse_pf.wire.backlog import Backlog, is_long, turn
+from rse_pf.wire.backlog import Backlog, is_long_outage, send_order
 from rse_pf.wire.client_events import (
     Answered,
-    Event,
     ConnectionLost,
+    Event,
     MoveRequested,
     Notice,
     Progressed,
@@ -50,21 +50,21 @@ from rse_pf.wire.token_renewal import RenewalTimer
 
 __all__ = [
     "Answered",
+    "ClientSession",
+    "ConnectionLost",
     "ConnectionState",
     "Event",
-    "ConnectionLost",
     "MoveRequested",
     "Notice",
     "Progressed",
     "RenewalDue",
-    "ClientSession",
     "Welcomed",
-]  # fmt: skip
+]
 
 _MAX_TRIES_AFTER_LOSS = 2
 _RETRY_BURST = 5.0
-_PINGS_PER_SILENCE = 3.0
-_MAX_MS = 3.6e6
+_PINGS_PER_STALL_TIMEOUT = 3.0
+_MAX_DEADLINE_MS = 3.6e6
 
 
 @dataclass(slots=True, kw_only=True)
@@ -74,32 +74,32 @@ class _Pending:
     submitted: float
     wire_bytes: int
     sent_at: float | None = None
-    link: ConnectionState | None = None
+    connection: ConnectionState | None = None
     not_before: float = 0.0
     losses: int = 0
     cancelled: bool = False
-    is_open_ended: bool = False
+    has_default_deadline: bool = False
     is_long: bool = False
 
 
 @dataclass(slots=True, kw_only=True, eq=False)
 class ConnectionState:
-    """What the robot knows of one socket."""
+    """What the robot knows of one WebSocket."""
 
     opened: float
     welcome: Welcome | None = None
     leaving: bool = False
     lost: bool = False
     last_heard: float = 0.0
-    last_tended: float = 0.0
+    last_checked: float = 0.0
     last_ping: float | None = None
     ping_sent: float | None = None
     clock_offset: ClockOffset = field(default_factory=ClockOffset)
     last_exchange: Exchange | None = None
     outgoing: list[bytes] = field(default_factory=list)
-    pace: RateLimiter = field(default_factory=RateLimiter)
-    lease: RenewalTimer = field(default_factory=RenewalTimer)
-    comeback: Backlog | None = None
+    rate_limiter: RateLimiter = field(default_factory=RateLimiter)
+    renewal: RenewalTimer = field(default_factory=RenewalTimer)
+    backlog: Backlog | None = None
 
     @property
     def server(self) -> str:
@@ -108,7 +108,7 @@ class ConnectionState:
 
 
 class ClientSession:
-    """All commands of one robot, and the links that they travel on."""
+    """All commands of one robot, and the connections that carry them."""
 
     def __init__(self, *, codec: Codec, settings: SessionSettings, sdk: str, first_id: int = 1) -> None:
         self.codec = codec
@@ -125,7 +125,7 @@ class ClientSession:
 
     @property
     def unanswered(self) -> int:
-        """How many commands wait for their end."""
+        """How many commands have no final answer yet."""
         return sum(not pending.cancelled for pending in self._pending.values())
 
     def submit(
@@ -138,120 +138,134 @@ class ClientSession:
         stream: str = "",
         keep: bool = False,
         trace: str = "",
-        patient: bool = False,
+        is_open_ended: bool = False,
     ) -> int:
-        """Take a command; it is written to the current link as soon as there is one with room.
+        """Accept a command and return its id; it is sent when a connection has capacity for it.
 
-        A command without *deadline_s* has the setting's, unless it is *patient* or turns out to be long: the
-        server says so by reporting progress.
+        A command without *deadline_s* gets ``session.answer_timeout_s``, unless it *is_open_ended* or the
+        server reports progress on it, which marks it as long.
 
         Raises:
             BadMessage: The payload does not travel in messages.
             LimitExceeded: The message would be larger than the limit.
         """
-        default_s = math.inf if patient else self.settings.answer_timeout_s
-        wait = default_s if deadline_s is None else deadline_s
+        default_s = math.inf if is_open_ended else self.settings.answer_timeout_s
+        timeout_s = default_s if deadline_s is None else deadline_s
         command = Command(
-            id=self._next_id, service=service, payload=payload, stream=stream,
-            seq=self._sequence.get(stream, 0) + 1, keep=keep, trace=trace,
-        )  # fmt: skip
-        data = encode_command(self.codec, _with_deadline(command, wait))
+            id=self._next_id,
+            service=service,
+            payload=payload,
+            stream=stream,
+            seq=self._sequence.get(stream, 0) + 1,
+            keep=keep,
+            trace=trace,
+        )
+        data = encode_command(self.codec, _with_deadline(command, timeout_s))
         self._check_size(data)
         pending = _Pending(
-            command=command, deadline=now + wait, submitted=now, wire_bytes=len(data),
-            is_open_ended=deadline_s is None,
-        )  # fmt: skip
+            command=command,
+            deadline=now + timeout_s,
+            submitted=now,
+            wire_bytes=len(data),
+            has_default_deadline=deadline_s is None,
+        )
         self._next_id += 1
         self._sequence[stream] = command.seq
         self._pending[command.id] = pending
         self._retry_tokens = min(_RETRY_BURST, self._retry_tokens + self.settings.retry_percent / 100)
-        if self.current is not None and self._may_go(command, self.current, self._room(self.current, now)):
+        if self.current is not None and self._may_send(
+            command, self.current, self._capacity(self.current, now)
+        ):
             self._write(pending, self.current, now, data)
         return command.id
 
     def cancel(self, identity: int) -> None:
-        """Forget a command whose caller went away; its answer, if one comes, is dropped.
+        """Forget a command that its caller gave up; its answer, if one comes, is dropped.
 
-        A long one is asked for once more on the next link, to be taken back there, if this one does not last.
+        The server is asked to cancel a long command.  If the connection ends first, the command is sent
+        again on the next one, because only there can it be cancelled.
         """
         pending = self._pending.get(identity)
         if pending is None or pending.cancelled:
             return
         pending.cancelled = True
         if pending.is_long:
-            self._take_back(pending)
-        elif pending.link is None:
+            self._cancel_on_server(pending)
+        elif pending.connection is None:
             del self._pending[identity]
 
-    def open_link(self, now: float) -> ConnectionState:
-        """Return a new link with a Hello to send; call when a socket is open."""
-        link = ConnectionState(opened=now, last_heard=now, last_tended=now)
-        link.outgoing.append(self.codec.encode(Hello(sdk=self._sdk, capabilities=("move", PROGRESS))))
-        return link
+    def open_connection(self, now: float) -> ConnectionState:
+        """Return the state of a WebSocket that was just opened, with a Hello to send."""
+        connection = ConnectionState(opened=now, last_heard=now, last_checked=now)
+        connection.outgoing.append(self.codec.encode(Hello(sdk=self._sdk, capabilities=("move", PROGRESS))))
+        return connection
 
-    def close_link(self, link: ConnectionState) -> None:
-        """Tell that the socket of *link* is gone; its commands wait for the next link."""
-        link.lost = True
-        if self.current is link:
+    def close_connection(self, connection: ConnectionState) -> None:
+        """Record that the WebSocket of *connection* ended; its commands wait for the next connection."""
+        connection.lost = True
+        if self.current is connection:
             self.current = None
         for identity, pending in list(self._pending.items()):
-            if pending.link is link:
-                pending.link = None
+            if pending.connection is connection:
+                pending.connection = None
                 if pending.cancelled and not pending.is_long:
                     del self._pending[identity]
 
-    def unanswered_on(self, link: ConnectionState) -> int:
-        """How many commands sent on *link* still wait for an answer that somebody wants."""
-        return sum(pending.link is link and not pending.cancelled for pending in self._pending.values())
+    def unanswered_on(self, connection: ConnectionState) -> int:
+        """Return how many commands sent on *connection* are unanswered and not cancelled."""
+        return sum(
+            pending.connection is connection and not pending.cancelled for pending in self._pending.values()
+        )
 
-    def adopt(self, link: ConnectionState, now: float) -> list[Event]:
-        """Make a welcomed *link* the current one and send on it what has no link.
+    def adopt(self, connection: ConnectionState, now: float) -> list[Event]:
+        """Make a welcomed *connection* the current one and send the waiting commands on it.
 
-        Of a latest-wins stream only the newest frame is sent again: no catch-up burst.  Frames that waited
-        long for want of a link go as `rse_pf.wire.backlog` says.
+        Of a latest-wins stream only the newest frame is sent again.  After a long outage frames are sent in
+        the order and at the rate that `rse_pf.wire.backlog` describes.
         """
-        before, self.current = self.current, link
-        if before is not None and before is not link:
+        before, self.current = self.current, connection
+        if before is not None and before is not connection:
             before.leaving = True
             for pending in self._pending.values():
-                if pending.link is before and pending.is_long and not pending.cancelled:
-                    pending.link = None  # it goes on elsewhere: ask there, and do not hold the old server up
-        frames = [each for each in self._pending.values() if _is_frame(each) and each.link is None]
-        if before is None and len(frames) > 1 and is_long(frames[0].submitted, frames[0].deadline, now):
-            link.comeback = Backlog(newest=frames[-1].command.id)
+                if pending.connection is before and pending.is_long and not pending.cancelled:
+                    pending.connection = None  # the job continues on any server; the old one can close now
+        frames = [each for each in self._pending.values() if _is_frame(each) and each.connection is None]
+        if (
+            before is None
+            and len(frames) > 1
+            and is_long_outage(frames[0].submitted, frames[0].deadline, now)
+        ):
+            connection.backlog = Backlog(newest=frames[-1].command.id)
         return self._flush(now)
 
-    def receive(self, link: ConnectionState, data: bytes, now: float) -> list[Event]:
-        """Return what one WebSocket message on *link* means; raises ProtocolError if it is garbage."""
-        link.last_heard = now
+    def receive(self, connection: ConnectionState, data: bytes, now: float) -> list[Event]:
+        """Return the events of one WebSocket message; raises ProtocolError if it is invalid."""
+        connection.last_heard = now
         message = self.codec.decode_from_server(data)
-        if isinstance(message, Welcome):
-            if link.welcome is not None:
+        match message:
+            case Welcome():
+                return self._welcome(connection, message, now)
+            case Pong():
+                return self._pong(connection, message, now)
+            case Move():
+                within_s = message.within_ms / 1e3
+                return [MoveRequested(message.reason, within_s if math.isfinite(within_s) else 0.0)]
+            case Renewed():
+                connection.renewal.expires_in(message.token_s, now)
                 return []
-            link.welcome, link.pace = message, RateLimiter(message.limits)
-            if message.token_s is not None:
-                link.lease.lasts(message.token_s, now)
-            return [Welcomed(message)]
-        if isinstance(message, Pong):
-            return self._pong(link, message, now)
-        if isinstance(message, Move):
-            within_s = message.within_ms / 1e3
-            return [MoveRequested(message.reason, within_s if math.isfinite(within_s) else 0.0)]
-        if isinstance(message, Renewed):
-            link.lease.lasts(message.token_s, now)
-            return []
-        if isinstance(message, Failure) and message.id is None:
-            return [Notice(message)]
-        if isinstance(message, Progress):
-            return self._progress(link, message)
-        return self._answer(link, message, now)
+            case Failure(id=None):
+                return [Notice(message)]
+            case Progress():
+                return self._progress(connection, message)
+            case _:
+                return self._answer(connection, message, now)
 
-    def renew(self, link: ConnectionState, token: str) -> None:
-        """Show a fresh *token* on *link*, whose end the server then moves."""
-        link.outgoing.append(self.codec.encode(Renew(token=token)))
+    def renew(self, connection: ConnectionState, token: str) -> None:
+        """Send a fresh *token* on *connection*; the server then extends the connection."""
+        connection.outgoing.append(self.codec.encode(Renew(token=token)))
 
     def due(self, now: float) -> list[Event]:
-        """Return the commands whose deadline has passed, and send those that may go (again)."""
+        """End the commands whose deadline has passed, and send those that may be sent (again) now."""
         events: list[Event] = []
         for identity, pending in list(self._pending.items()):
             if now >= pending.deadline:
@@ -260,129 +274,132 @@ class ClientSession:
                 events += self._end(identity, failure)
                 if pending.is_long:
                     self._pending[identity] = pending
-                    self._take_back(pending)
+                    self._cancel_on_server(pending)
         return events + self._flush(now)
 
     def abandon(self, code: str, message: str, hint: str = "") -> list[Event]:
-        """End every command with a failure: there will be no other link."""
+        """End every command with a failure, because no further connection will be opened."""
         events: list[Event] = []
         for identity, pending in list(self._pending.items()):
             failure = Failure(id=identity, code=code, message=message, hint=hint, trace=pending.command.trace)
             events += self._end(identity, failure)
         return events
 
-    def tend(self, link: ConnectionState, now: float) -> list[Event]:
-        """Ping *link* when it is time; say when it is dead.
+    def check(self, connection: ConnectionState, now: float) -> list[Event]:
+        """Send a ping when one is due, and return `ConnectionLost` when the server does not respond.
 
-        A robot that did not look for a while cannot tell whether the server was silent meanwhile,
-        so such a gap does not count.
+        A robot that did not run for a while cannot tell whether the server was silent in that time, so such
+        a gap does not count towards a timeout.
         """
         s = self.settings
-        if link.lost:
+        if connection.lost:
             return []
-        if now - link.last_tended >= s.stall_timeout_s:
-            link.last_heard = now
-            link.ping_sent = None if link.ping_sent is None else now
-        link.last_tended = now
-        if link.welcome is None:
-            late = now - link.opened >= s.hello_timeout_s
-            return self._lose(link, "no welcome") if late else []
-        if link.ping_sent is not None and now - link.ping_sent >= s.ping_timeout_s:
-            return self._lose(link, "no pong")
+        if now - connection.last_checked >= s.stall_timeout_s:
+            connection.last_heard = now
+            connection.ping_sent = None if connection.ping_sent is None else now
+        connection.last_checked = now
+        if connection.welcome is None:
+            late = now - connection.opened >= s.hello_timeout_s
+            return self._lose(connection, "no welcome") if late else []
+        if connection.ping_sent is not None and now - connection.ping_sent >= s.ping_timeout_s:
+            return self._lose(connection, "no pong")
         waiting = [
             pending.sent_at
             for pending in self._pending.values()
-            if pending.link is link and pending.sent_at is not None and not pending.is_long
+            if pending.connection is connection and pending.sent_at is not None and not pending.is_long
         ]
-        if waiting and now - max(link.last_heard, min(waiting)) >= s.stall_timeout_s:
-            return self._lose(link, "silence")
+        if waiting and now - max(connection.last_heard, min(waiting)) >= s.stall_timeout_s:
+            return self._lose(connection, "silence")
         pause = s.ping_interval_s
         if waiting:
-            pause = min(pause, s.stall_timeout_s / _PINGS_PER_SILENCE)
-        if link.last_ping is None or now - link.last_ping >= pause:
-            link.ping_sent = now if link.ping_sent is None else link.ping_sent
-            link.last_ping = now
-            link.outgoing.append(self.codec.encode(Ping(sent_s=now)))
-            link.pace.spend(now)
-        return [RenewalDue()] if not link.leaving and link.lease.is_due(now) else []
+            pause = min(pause, s.stall_timeout_s / _PINGS_PER_STALL_TIMEOUT)
+        if connection.last_ping is None or now - connection.last_ping >= pause:
+            connection.ping_sent = now if connection.ping_sent is None else connection.ping_sent
+            connection.last_ping = now
+            connection.outgoing.append(self.codec.encode(Ping(sent_s=now)))
+            connection.rate_limiter.spend(now)
+        return [RenewalDue()] if not connection.leaving and connection.renewal.is_due(now) else []
 
     def next_due(self, now: float) -> float:
-        """Return when `due` and `tend` should be called again, at the latest."""
-        times = [now + self.settings.stall_timeout_s / _PINGS_PER_SILENCE]
+        """Return the time at which `due` and `check` must be called again."""
+        times = [now + self.settings.stall_timeout_s / _PINGS_PER_STALL_TIMEOUT]
         times += [pending.deadline for pending in self._pending.values()]
-        times += [p.not_before for p in self._pending.values() if p.link is None and p.not_before > now]
-        if self.current is not None and not self.current.pace.room(now):
-            times.append(self.current.pace.next_s(now))
+        times += [p.not_before for p in self._pending.values() if p.connection is None and p.not_before > now]
+        if self.current is not None and not self.current.rate_limiter.available(now):
+            times.append(self.current.rate_limiter.next_s(now))
         return max(now, min(times))
 
     def _flush(self, now: float) -> list[Event]:
-        """Send what has no link, oldest first, as far as the server has room."""
-        link = self.current
-        if link is None:
+        """Send the waiting commands, oldest first, as far as the server's limits allow."""
+        connection = self.current
+        if connection is None:
             return []
         events: list[Event] = []
-        room = self._room(link, now)
-        waiting = [each for each in self._pending.items() if each[1].link is None]
-        newest = 0 if link.comeback is None else link.comeback.newest
+        capacity = self._capacity(connection, now)
+        waiting = [each for each in self._pending.items() if each[1].connection is None]
+        newest = 0 if connection.backlog is None else connection.backlog.newest
         if not any(identity <= newest and _is_frame(pending) for identity, pending in waiting):
-            link.comeback = None
+            connection.backlog = None
         else:
-            waiting.sort(key=lambda each: turn(each[0], each[1].command.stream))
+            waiting.sort(key=lambda each: send_order(each[0], each[1].command.stream))
         for identity, pending in waiting:
             if now < pending.not_before:
                 continue
             command = pending.command
             if command.stream and not command.keep and command.seq < self._sequence[command.stream]:
                 events += self._end(identity, _failure(command, "stale", "a newer frame took its place"))
-            elif self._may_go(command, link, room):
-                room -= 1
-                self._write(pending, link, now)
+            elif self._may_send(command, connection, capacity):
+                capacity -= 1
+                self._write(pending, connection, now)
                 if pending.cancelled:
-                    self._take_back(pending)
+                    self._cancel_on_server(pending)
         return events
 
-    def _may_go(self, command: Command, link: ConnectionState, room: int) -> bool:
-        if room <= 0 or not command.stream or link.comeback is None:
-            return room > 0
-        under_way = sum(_is_frame(each) and each.link is link for each in self._pending.values())
-        return under_way < link.comeback.room
+    def _may_send(self, command: Command, connection: ConnectionState, capacity: int) -> bool:
+        if capacity <= 0 or not command.stream or connection.backlog is None:
+            return capacity > 0
+        in_flight = sum(_is_frame(each) and each.connection is connection for each in self._pending.values())
+        return in_flight < connection.backlog.max_in_flight
 
-    def _room(self, link: ConnectionState, now: float) -> int:
-        most = link.welcome.limits.max_in_flight if link.welcome else self.settings.max_in_flight
-        free = max(1, most) - sum(pending.link is link for pending in self._pending.values())
-        return min(free, link.pace.room(now))
+    def _capacity(self, connection: ConnectionState, now: float) -> int:
+        """Return how many commands may be sent now without exceeding the server's limits."""
+        limit = connection.welcome.limits.max_in_flight if connection.welcome else self.settings.max_in_flight
+        free = max(1, limit) - sum(pending.connection is connection for pending in self._pending.values())
+        return min(free, connection.rate_limiter.available(now))
 
     def _check_size(self, data: bytes) -> None:
-        most = self.settings.max_message_bytes
+        max_bytes = self.settings.max_message_bytes
         if self.current is not None and self.current.welcome is not None:
-            most = min(most, self.current.welcome.limits.max_message_bytes)
-        if len(data) > most:
+            max_bytes = min(max_bytes, self.current.welcome.limits.max_message_bytes)
+        if len(data) > max_bytes:
             raise LimitExceeded(
-                f"a command of {len(data)} bytes is above {most}",
+                f"a command of {len(data)} bytes is above {max_bytes}",
                 hint="send fewer matches, or send large data to the data server",
             )
 
-    def _write(self, pending: _Pending, link: ConnectionState, now: float, data: bytes | None = None) -> None:
+    def _write(
+        self, pending: _Pending, connection: ConnectionState, now: float, data: bytes | None = None
+    ) -> None:
         self.resent += pending.sent_at is not None
-        pending.link, pending.sent_at = link, now
-        link.pace.spend(now)
-        link.outgoing.append(
+        pending.connection, pending.sent_at = connection, now
+        connection.rate_limiter.spend(now)
+        connection.outgoing.append(
             encode_command(self.codec, _with_deadline(pending.command, pending.deadline - now))
             if data is None
             else data
         )
 
-    def _answer(self, link: ConnectionState, answer: Result | Failure, now: float) -> list[Event]:
+    def _answer(self, connection: ConnectionState, answer: Result | Failure, now: float) -> list[Event]:
         pending = self._pending.get(-1 if answer.id is None else answer.id)
-        elsewhere = pending is not None and pending.link is not link
+        elsewhere = pending is not None and pending.connection is not connection
         if pending is None or (elsewhere and isinstance(answer, Failure)):
             self.dropped_answers += 1
             return []
-        if link.comeback is not None:
-            link.comeback.heard(answer.queue_ms if isinstance(answer, Result) else math.inf)
+        if connection.backlog is not None:
+            connection.backlog.answered(answer.queue_ms if isinstance(answer, Result) else math.inf)
         if isinstance(answer, Failure):
-            again = self._try_again(pending, answer, now)
-            return self._flush(now) if again else self._end(pending.command.id, answer) + self._flush(now)
+            ended = [] if self._retry(pending, answer, now) else self._end(pending.command.id, answer)
+            return ended + self._flush(now)
         command = pending.command
         if now >= pending.deadline:
             late = _failure(command, "expired", f"its answer came after {now - pending.submitted:.3f} s")
@@ -395,55 +412,65 @@ class ClientSession:
             self._delivered[command.stream] = max(last, command.seq)
         up_s, down_s = None, None
         if not elsewhere and pending.sent_at is not None:
-            up_s, down_s = link.clock_offset.split_s(pending.sent_at, answer.received_s, answer.sent_s, now)
+            up_s, down_s = connection.clock_offset.split_s(
+                pending.sent_at, answer.received_s, answer.sent_s, now
+            )
         return self._end(command.id, answer, up_s, down_s) + self._flush(now)
 
-    def _try_again(self, pending: _Pending, failure: Failure, now: float) -> bool:
-        """Retry what may succeed elsewhere or later, within the deadline and the budget."""
+    def _retry(self, pending: _Pending, failure: Failure, now: float) -> bool:
+        """Schedule a retry if another server or a later time may help; return whether one is scheduled."""
         if pending.cancelled:
             return False
         if failure.code == "worker-lost" and pending.losses < _MAX_TRIES_AFTER_LOSS:
             pending.losses += 1
-            pending.link = None
+            pending.connection = None
             return True
         after = now + max(0.0, failure.retry_after_ms or 0.0) / 1e3
         if failure.code != "busy" or not after < pending.deadline or self._retry_tokens < 1.0:
             return False
         self._retry_tokens -= 1.0
-        pending.link, pending.not_before = None, after
+        pending.connection, pending.not_before = None, after
         return True
 
-    def _progress(self, link: ConnectionState, progress: Progress) -> list[Event]:
-        """Note that a command is a long one: the default deadline is not for it."""
+    def _progress(self, connection: ConnectionState, progress: Progress) -> list[Event]:
+        """Mark a command as long, so that the default deadline no longer applies to it."""
         pending = self._pending.get(progress.id)
-        if pending is None or pending.link is not link:
+        if pending is None or pending.connection is not connection:
             return []
         if pending.cancelled:
             if not pending.is_long:
                 pending.is_long = True
-                self._take_back(pending)
+                self._cancel_on_server(pending)
             return []
         pending.is_long = True
-        if pending.is_open_ended:
+        if pending.has_default_deadline:
             pending.deadline = math.inf
         share = min(1.0, max(0.0, progress.done)) if math.isfinite(progress.done) else 0.0
         return [Progressed(progress.id, share, progress.what)]
 
-    def _take_back(self, pending: _Pending) -> None:
+    def _cancel_on_server(self, pending: _Pending) -> None:
         pending.cancelled, pending.deadline = True, math.inf
-        if pending.link is not None:
-            pending.link.outgoing.append(self.codec.encode(Cancel(id=pending.command.id)))
+        if pending.connection is not None:
+            pending.connection.outgoing.append(self.codec.encode(Cancel(id=pending.command.id)))
 
-    def _pong(self, link: ConnectionState, pong: Pong, now: float) -> list[Event]:
-        link.ping_sent = None
+    def _welcome(self, connection: ConnectionState, welcome: Welcome, now: float) -> list[Event]:
+        if connection.welcome is not None:
+            return []
+        connection.welcome, connection.rate_limiter = welcome, RateLimiter(welcome.limits)
+        if welcome.token_s is not None:
+            connection.renewal.expires_in(welcome.token_s, now)
+        return [Welcomed(welcome)]
+
+    def _pong(self, connection: ConnectionState, pong: Pong, now: float) -> list[Event]:
+        connection.ping_sent = None
         exchange = Exchange(pong.sent_s, pong.received_s, pong.answered_s, now)
-        if link.opened <= pong.sent_s <= now and exchange.is_plausible:
-            link.last_exchange = exchange
-            link.clock_offset.add(exchange)
+        if connection.opened <= pong.sent_s <= now and exchange.is_plausible:
+            connection.last_exchange = exchange
+            connection.clock_offset.add(exchange)
         return []
 
-    def _lose(self, link: ConnectionState, reason: str) -> list[Event]:
-        self.close_link(link)
+    def _lose(self, connection: ConnectionState, reason: str) -> list[Event]:
+        self.close_connection(connection)
         return [ConnectionLost(reason)]
 
     def _end(
@@ -455,18 +482,22 @@ class ClientSession:
             return []
         return [
             Answered(
-                id=identity, answer=answer, sent_s=pending.submitted,
-                wire_bytes=pending.wire_bytes, up_s=up_s, down_s=down_s,
+                id=identity,
+                answer=answer,
+                sent_s=pending.submitted,
+                wire_bytes=pending.wire_bytes,
+                up_s=up_s,
+                down_s=down_s,
             )
-        ]  # fmt: skip
+        ]
 
 
 def _with_deadline(command: Command, remaining_s: float) -> Command:
-    return msgspec.structs.replace(command, deadline_ms=min(_MAX_MS, max(0.0, remaining_s * 1e3)))
+    return msgspec.structs.replace(command, deadline_ms=min(_MAX_DEADLINE_MS, max(0.0, remaining_s * 1e3)))
 
 
 def _is_frame(pending: _Pending) -> bool:
-    """Whether it loses its worth with time: of a stream, and not without an end."""
+    """Return whether the command is a frame: part of a stream, with a deadline."""
     return bool(pending.command.stream) and math.isfinite(pending.deadline)
 
 

@@ -1,6 +1,6 @@
 """Offset between a robot's clock and a server's, and the two one-way delays of the paper's Sect. 3.3.
 
-Promises never to read a clock: all four stamps of an exchange are arguments.
+All four timestamps of an exchange are arguments.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ class Exchange:
 
     @property
     def is_plausible(self) -> bool:
-        """Whether the stamps are numbers and neither clock ran backwards."""
+        """Whether the timestamps are finite and neither clock ran backwards."""
         return (
             math.isfinite(self.sent_s + self.received_s + self.answered_s + self.returned_s)
             and self.sent_s <= self.returned_s
@@ -37,14 +37,14 @@ class Exchange:
 
     @property
     def offset_s(self) -> float:
-        """Server clock minus robot clock, if both ways take equally long."""
+        """Server clock minus robot clock, if both directions take equally long."""
         return ((self.received_s - self.sent_s) + (self.answered_s - self.returned_s)) / 2
 
 
 class ClockOffset:
     """The offset of the exchange with the shortest round trip among the last few.
 
-    The shortest round trip waited least in queues, so its two ways differ least.
+    The shortest round trip waited least in queues, so its two directions differ least.
 
     Source:
         Mills, RFC 5905 (NTP), Sect. 10: the clock filter.
@@ -64,7 +64,7 @@ class ClockOffset:
 
     @property
     def uncertainty_s(self) -> float | None:
-        """Half the shortest round trip: the offset is not further off than this."""
+        """Bound of the error of the offset: half the shortest round trip."""
         return self._best.round_trip_s / 2 if self._window else None
 
     def delays_s(self, exchange: Exchange) -> tuple[float, float] | None:
@@ -79,10 +79,10 @@ class ClockOffset:
     def split_s(
         self, sent_s: float, received_s: float, answered_s: float, returned_s: float
     ) -> tuple[float, float] | tuple[None, None]:
-        """Return how long a command and its answer were on their ways, by the best offset.
+        """Return the one-way delays of a command and its answer, by the best offset.
 
-        What the offset's uncertainty makes negative counts as nothing; without an offset or the server's
-        stamps nothing is known.
+        A delay that the error of the offset makes negative is returned as 0; both are None without an offset
+        or without the server's timestamps.
         """
         offset = self.offset_s
         if offset is None or not 0.0 < received_s <= answered_s:

@@ -1,11 +1,12 @@
 """Bytes to messages and back: JSON, JSON+zlib (the paper's) and MessagePack with raw arrays.
 
-Every byte comes from a stranger, so limits hold *while* decoding, and only errors of
-`rse_pf.errors` leave.  Promises no state between messages and no compression of the transport.
+Input is untrusted: limits hold *while* decoding, and only errors of `rse_pf.errors` are raised.  A codec
+keeps no state between messages.
 """
 
 from __future__ import annotations
 
+import itertools
 import zlib
 from collections.abc import Callable
 from typing import Any, Protocol, TypeVar
@@ -18,7 +19,7 @@ from rse_pf.config import SessionSettings
 from rse_pf.errors import BadMessage, LimitExceeded, RsePfError, UnsupportedProtocol
 from rse_pf.wire import arrays
 from rse_pf.wire.messages import FromRobot, FromServer, Message
-from rse_pf.wire.msgpack_limits import LIST_VALUES, MAP_VALUES, check_packed, too_many_values
+from rse_pf.wire.msgpack_limits import LIST_VALUES, MAP_VALUES, check_msgpack, too_many_values
 
 __all__ = ["CODECS", "SUBPROTOCOLS", "Codec", "as_type", "codec_for", "make_codec"]
 
@@ -35,35 +36,35 @@ SUBPROTOCOLS = {
 CODECS = tuple(SUBPROTOCOLS)
 
 _LEVEL = 6
-"""Robots' uplinks are slower than their processors: at level 1 a command is 6 % longer."""
+"""A robot's uplink is slower than its processor: at level 1 a command is 6 % longer."""
 
 _REPLY_LEVEL, _REPLY_WINDOW_BITS, _REPLY_MEMORY = 1, 12, 5
 """A server's messages are short: level 6 saves 5 of 794 bytes and costs a third more time."""
 
 _PIECE_BYTES = 65536
-_WORD_BYTES, _NUMBER_BYTES, _WIDE, _WORST_WEIGHT = 60, 32, 7, 8
-"""What a word, a number and a letter of a text with one wide letter in it take, and a byte at the worst."""
-_FEW_WORDS = 2000
+_STRING_BYTES, _NUMBER_BYTES, _WIDE, _MAX_BYTES_PER_BYTE = 60, 32, 7, 8
+"""Bytes in memory per string, per number, per character of a text beyond ASCII, and per byte at worst."""
+_FEW_STRINGS = 2000
 _NOT_BRACKETS = bytes(set(range(256)) - set(b"[]{}"))
-_BOXES = frozenset((dict, list, tuple))
+_CONTAINERS = frozenset((dict, list, tuple))
 _NOT_BRACKETS_OR_QUOTES = bytes(set(range(256)) - set(b'[]{}"'))
 _NOT_MARKS_OR_QUOTES = bytes(set(range(256)) - set(b',:[]{}"'))
 
 
 class Codec(Protocol):
-    """One way to write messages."""
+    """One encoding of messages."""
 
     name: str
     is_text: bool
 
     def encode(self, message: Message) -> bytes:
-        """Return the WebSocket message of *message*; raises BadMessage if it cannot be said."""
+        """Return the WebSocket message of *message*; raises BadMessage if it cannot be encoded."""
 
     def decode_from_robot(self, data: bytes) -> FromRobot:
         """Return what a robot sent; raises BadMessage or LimitExceeded."""
 
-    def decode_short_from_robot(self, data: bytes, most: int) -> FromRobot | None:
-        """Return what a robot sent, None if it is longer than *most* bytes, inflated; raises the same."""
+    def decode_short_from_robot(self, data: bytes, max_bytes: int) -> FromRobot | None:
+        """Return what a robot sent, None if it is longer than *max_bytes*, inflated; raises the same."""
 
     def decode_from_server(self, data: bytes) -> FromServer:
         """Return what a server sent; raises BadMessage or LimitExceeded."""
@@ -90,7 +91,7 @@ def as_type(value: Any, kind: type[T]) -> T:
 
 
 def codec_for(offered: list[str]) -> str | None:
-    """Return the codec name of the first offered sub-protocol that we speak, else None."""
+    """Return the codec name of the first offered sub-protocol that is supported, else None."""
     names = {protocol: name for name, protocol in SUBPROTOCOLS.items()}
     return next((names[protocol] for protocol in offered if protocol in names), None)
 
@@ -117,20 +118,20 @@ class _JsonCodec:
     def decode_from_robot(self, data: bytes) -> FromRobot:
         return self._read(self._open(data))
 
-    def decode_short_from_robot(self, data: bytes, most: int) -> FromRobot | None:
-        text = _inflate_short(data, most) if self._compressed else data
-        return None if text is None or len(text) > most else self._read(text)
+    def decode_short_from_robot(self, data: bytes, max_bytes: int) -> FromRobot | None:
+        text = _inflate_short(data, max_bytes) if self._compressed else data
+        return None if text is None or len(text) > max_bytes else self._read(text)
 
     def decode_from_server(self, data: bytes) -> FromServer:
         text = self._open(data)
-        _check_boxes(text, self._limits)
+        _check_containers(text, self._limits)
         message: FromServer = _guarded(self._from_server, text)
         return message
 
     def _read(self, text: Text) -> FromRobot:
-        _check_boxes(text, self._limits)
+        _check_containers(text, self._limits)
         _check_values(text, self._limits.max_json_values)
-        _check_weight(text, self._limits.max_json_memory_bytes)
+        _check_memory(text, self._limits.max_json_memory_bytes)
         message: FromRobot = _guarded(self._from_robot, text)
         return message
 
@@ -154,13 +155,13 @@ class _BinaryCodec:
 
     def decode_from_robot(self, data: bytes) -> FromRobot:
         _check_size(data, self._limits)
-        check_packed(data, self._limits)
+        check_msgpack(data, self._limits)
         message: FromRobot = _guarded(self._from_robot, data)
         _check_nesting(getattr(message, "payload", None), self._limits.max_json_depth)
         return message
 
-    def decode_short_from_robot(self, data: bytes, most: int) -> FromRobot | None:
-        return None if len(data) > most else self.decode_from_robot(data)
+    def decode_short_from_robot(self, data: bytes, max_bytes: int) -> FromRobot | None:
+        return None if len(data) > max_bytes else self.decode_from_robot(data)
 
     def decode_from_server(self, data: bytes) -> FromServer:
         _check_size(data, self._limits)
@@ -170,7 +171,7 @@ class _BinaryCodec:
 
 
 def _guarded(decode: Callable[[Any], Any], data: Any) -> Any:
-    """Let nothing but our own errors leave a decoder."""
+    """Decode *data*, turning every exception of the decoder into `BadMessage`."""
     try:
         return decode(data)
     except RsePfError:
@@ -183,7 +184,7 @@ def _guarded(decode: Callable[[Any], Any], data: Any) -> Any:
         ) from error
     except (RecursionError, ValueError, TypeError, OverflowError) as error:
         raise BadMessage(
-            "a message is nested too deeply or holds an absurd number", hint="send flat lists of numbers"
+            "a message is nested too deeply or holds a number out of range", hint="send flat lists of numbers"
         ) from error
 
 
@@ -206,104 +207,107 @@ def _check_size(data: bytes, limits: SessionSettings) -> None:
 
 
 def _inflate(data: bytes, limits: SessionSettings) -> Text:
-    # The ratio is for large results: what may be sent plain is no bomb, however small it was.
+    # The ratio limits large results only: a text of an allowed size is accepted at any ratio.
     plain = limits.max_message_bytes
-    most = min(limits.max_inflated_bytes, max(plain, int(len(data) * limits.max_inflate_ratio)))
+    max_bytes = min(limits.max_inflated_bytes, max(plain, int(len(data) * limits.max_inflate_ratio)))
     first = int(plain / limits.max_inflate_ratio)
     stream = zlib.decompressobj()
     try:
-        # A bomb shows itself here, for a quarter of what it takes to inflate all that is allowed.
-        head = stream.decompress(data[:first], min(plain, most) + 1)
-        if len(head) > min(plain, most):
+        # A decompression bomb is detected here, at a quarter of the cost of inflating all that is allowed.
+        head = stream.decompress(data[:first], min(plain, max_bytes) + 1)
+        if len(head) > min(plain, max_bytes):
             raise _bomb(data, plain)
         text: Text = head
         if len(data) > first:
-            text = _rest(stream, head, stream.unconsumed_tail + data[first:], most)
+            text = _rest(stream, head, stream.unconsumed_tail + data[first:], max_bytes)
     except zlib.error as error:
-        raise _no_stream() from error
-    if len(text) > most:
-        raise _bomb(data, most)
+        raise _not_zlib() from error
+    if len(text) > max_bytes:
+        raise _bomb(data, max_bytes)
     if not stream.eof or stream.unused_data:
-        raise _no_end()
+        raise _not_one_stream()
     return text
 
 
-def _rest(stream: Any, head: bytes, data: bytes, most: int) -> bytearray:
-    """Inflate piece by piece: at once, zlib holds everything twice."""
+def _rest(stream: Any, head: bytes, data: bytes, max_bytes: int) -> bytearray:
+    """Inflate piece by piece, because zlib would hold the text twice otherwise."""
     text = bytearray(head)
-    while data and len(text) <= most:
-        text += stream.decompress(data, min(_PIECE_BYTES, most + 1 - len(text)))
+    while data and len(text) <= max_bytes:
+        text += stream.decompress(data, min(_PIECE_BYTES, max_bytes + 1 - len(text)))
         data = stream.unconsumed_tail
     return text
 
 
-def _inflate_short(data: bytes, most: int) -> bytes | None:
+def _inflate_short(data: bytes, max_bytes: int) -> bytes | None:
     stream = zlib.decompressobj()
     try:
-        text = stream.decompress(data, most + 1)
+        text = stream.decompress(data, max_bytes + 1)
     except zlib.error as error:
-        raise _no_stream() from error
-    if len(text) > most:
+        raise _not_zlib() from error
+    if len(text) > max_bytes:
         return None
     if not stream.eof or stream.unused_data:
-        raise _no_end()
+        raise _not_one_stream()
     return text
 
 
-def _no_stream() -> BadMessage:
+def _not_zlib() -> BadMessage:
     return BadMessage("not a zlib stream", hint="is this the sub-protocol that was agreed?")
 
 
-def _no_end() -> BadMessage:
+def _not_one_stream() -> BadMessage:
     return BadMessage("the zlib stream does not end with the message", hint="one stream for each message")
 
 
-def _bomb(data: bytes, most: int) -> LimitExceeded:
-    return LimitExceeded(f"{len(data)} bytes inflate to more than {most}", hint="send smaller messages")
+def _bomb(data: bytes, max_bytes: int) -> LimitExceeded:
+    return LimitExceeded(f"{len(data)} bytes inflate to more than {max_bytes}", hint="send smaller messages")
 
 
-def _check_boxes(text: Text, limits: SessionSettings) -> None:
-    """Count brackets before any list is made; only where they look too many are strings told apart."""
-    deepest, most = limits.max_json_depth, limits.max_json_lists
+def _check_containers(text: Text, limits: SessionSettings) -> None:
+    """Check the number and depth of lists and objects before any is created.
+
+    Brackets inside strings are told apart only if all brackets together exceed a limit.
+    """
+    max_depth, max_lists = limits.max_json_depth, limits.max_json_lists
     count = text.count(b"[") + text.count(b"{")
-    if count <= deepest:
+    if count <= max_depth:
         return
-    if count <= most and _depth(text.translate(None, _NOT_BRACKETS)) <= deepest:
+    if count <= max_lists and _depth(text.translate(None, _NOT_BRACKETS)) <= max_depth:
         return
     brackets = _without_strings(text, _NOT_BRACKETS_OR_QUOTES)
-    if brackets.count(b"[") + brackets.count(b"{") > most:
-        raise LimitExceeded(f"JSON of more than {most} lists and objects", hint="send flat lists of numbers")
-    if _depth(brackets) > deepest:
-        raise LimitExceeded(f"JSON is nested deeper than {deepest}", hint="send flat lists")
-
-
-def _check_values(text: Text, most: int) -> None:
-    """Count values before any is made; only where they look too many are strings told apart."""
-    if _values(text) < most:
-        return
-    if _values(_without_strings(text, _NOT_MARKS_OR_QUOTES)) >= most:
-        raise too_many_values(most)
-
-
-def _check_weight(text: Text, most: int) -> None:
-    """Estimate what a message takes in memory before it does; where it looks like too much, look closer."""
-    if _WORST_WEIGHT * len(text) <= most:
-        return
-    words, width = text.count(b'"') // 2, 1 if text.isascii() and b"\\u" not in text else _WIDE
-    numbers = text.count(b",") + text.count(b":")
-    other = len(text) + _WORD_BYTES * words + _NUMBER_BYTES * max(0, numbers - words)
-    if other + width * len(text) <= most:
-        return
-    letters = len(text) if words > _FEW_WORDS or b'\\"' in text else _letters(text)
-    if other + width * letters > most:
+    if brackets.count(b"[") + brackets.count(b"{") > max_lists:
         raise LimitExceeded(
-            f"a message that would take more than {most} bytes of memory",
+            f"JSON of more than {max_lists} lists and objects", hint="send flat lists of numbers"
+        )
+    if _depth(brackets) > max_depth:
+        raise LimitExceeded(f"JSON is nested deeper than {max_depth}", hint="send flat lists")
+
+
+def _check_values(text: Text, max_values: int) -> None:
+    """Check the number of values before any is created; strings are told apart only above the limit."""
+    if _values(text) >= max_values and _values(_without_strings(text, _NOT_MARKS_OR_QUOTES)) >= max_values:
+        raise too_many_values(max_values)
+
+
+def _check_memory(text: Text, max_bytes: int) -> None:
+    """Check the memory that a message will take; estimate more exactly only above the limit."""
+    if _MAX_BYTES_PER_BYTE * len(text) <= max_bytes:
+        return
+    strings, width = text.count(b'"') // 2, 1 if text.isascii() and b"\\u" not in text else _WIDE
+    numbers = text.count(b",") + text.count(b":")
+    other = len(text) + _STRING_BYTES * strings + _NUMBER_BYTES * max(0, numbers - strings)
+    if other + width * len(text) <= max_bytes:
+        return
+    characters = len(text) if strings > _FEW_STRINGS or b'\\"' in text else _characters(text)
+    if other + width * characters > max_bytes:
+        raise LimitExceeded(
+            f"a message that would take more than {max_bytes} bytes of memory",
             hint="send arrays of numbers, or large data to the data server",
         )
 
 
-def _letters(text: Text) -> int:
-    """Count what stands between quotes; none of them is escaped."""
+def _characters(text: Text) -> int:
+    """Return the number of characters between quotes, none of which is escaped."""
     count, end = 0, -1
     while (begin := text.find(b'"', end + 1)) >= 0:
         end = text.find(b'"', begin + 1)
@@ -314,8 +318,8 @@ def _letters(text: Text) -> int:
 
 
 def _values(text: Text) -> int:
-    boxes = LIST_VALUES * text.count(b"[") + MAP_VALUES * text.count(b"{")
-    return text.count(b",") + text.count(b":") + boxes
+    containers = LIST_VALUES * text.count(b"[") + MAP_VALUES * text.count(b"{")
+    return text.count(b",") + text.count(b":") + containers
 
 
 def _depth(brackets: Text) -> int:
@@ -335,18 +339,16 @@ def _without_strings(text: Text, dropped: bytes) -> bytes:
     return b"".join(kept)
 
 
-def _check_nesting(value: Any, deepest: int) -> None:
-    """Refuse what JSON could not say within its depth either; the message itself is the first level."""
-    layer = [value] if type(value) in _BOXES else []
-    for _ in range(deepest - 1):
-        deeper = []
-        for box in layer:
-            if type(box) is dict:
-                deeper += [each for each in box.values() if type(each) in _BOXES]
-                deeper += [each for each in box if type(each) is tuple]
-            else:
-                deeper += [each for each in box if type(each) in _BOXES]
-        if not deeper:
+def _check_nesting(value: Any, max_depth: int) -> None:
+    """Apply the depth limit of JSON to a decoded value; the message itself is the first level."""
+    layer = [value] if type(value) in _CONTAINERS else []
+    for _ in range(max_depth - 1):
+        layer = [
+            each
+            for box in layer
+            for each in (itertools.chain(box, box.values()) if type(box) is dict else box)
+            if type(each) in _CONTAINERS
+        ]
+        if not layer:
             return
-        layer = deeper
-    raise LimitExceeded(f"a message is nested deeper than {deepest}", hint="send flat lists")
+    raise LimitExceeded(f"a message is nested deeper than {max_depth}", hint="send flat lists")

@@ -1,7 +1,7 @@
-"""Look at a command's id and service without reading its payload, and refuse it at the least cost.
+"""Read a command's id and service without its payload, and encode its refusal, both at the least cost.
 
-A server that is behind must say no for much less than it takes to say yes.  Promises to judge nothing: what
-is not recognised at a glance is left to `Codec.decode_from_robot`, and what is may still be bad.
+A server under overload must refuse a command for much less than it costs to accept one.  A message whose
+envelope is not recognised is left to `Codec.decode_from_robot`; one that is recognised may still be invalid.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from rse_pf.wire.messages import Failure
 
 __all__ = ["Envelope", "encode_refusal", "peek"]
 
-_MAX_GLANCED_BYTES = 512
+_MAX_PEEKED_BYTES = 512
 _INFLATED_BYTES = 160
-"""The head of a command as our robots write it: type, id, and a service of at most 64 letters."""
+"""The start of a command as the SDK writes it: type, id, and a service of at most 64 characters."""
 
 _HEAD = re.compile(
     rb'\{"type":"command","id":(0|[1-9][0-9]{0,15}),"service":"([\x20-\x21\x23-\x5b\x5d-\x7e]{1,64})"[,}]'
@@ -36,21 +36,21 @@ _encode_json = msgspec.json.Encoder().encode
 
 
 class Envelope(NamedTuple):
-    """What a refusal has to name."""
+    """The fields of a command that its refusal names."""
 
     id: int
     service: str
 
 
 def peek(codec: Codec, data: bytes) -> Envelope | None:
-    """Return id and service of the command in *data*, None if that takes more than a glance."""
+    """Return id and service of the command in *data*, None if they are not at its start."""
     if codec.name == "bin":
         try:
             command = _decode_binary(data)
         except (msgspec.DecodeError, RecursionError, UnicodeDecodeError):
             return None
         return Envelope(command.id, command.service) if 0 <= command.id < 2**53 else None
-    head = data[:_MAX_GLANCED_BYTES]
+    head = data[:_MAX_PEEKED_BYTES]
     if codec.name == "zlib":
         try:
             head = zlib.decompressobj().decompress(head, _INFLATED_BYTES)
@@ -64,7 +64,7 @@ def peek(codec: Codec, data: bytes) -> Envelope | None:
 
 
 def encode_refusal(codec: Codec, failure: Failure) -> bytes:
-    """Return the message of *failure*; with zlib stored, not deflated: 180 bytes instead of 150.
+    """Return the message of *failure*; with zlib it is stored, not deflated: 180 bytes instead of 150.
 
     Source:
         RFC 1951, Sect. 3.2.4.

@@ -1,7 +1,6 @@
 """The messages of protocol version 1, as types.
 
-``docs/protocol.md`` says the same in words; golden messages hold both together.  Promises to
-decide nothing: no clocks, no sockets, no defaults that depend on the machine.
+``docs/protocol.md`` describes the same in words; the golden messages check both.
 """
 
 from __future__ import annotations

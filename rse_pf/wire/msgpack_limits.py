@@ -1,7 +1,7 @@
-"""Count what a MessagePack message holds before anything of it is made.
+"""Count the values of a MessagePack message before any object is created from it.
 
-One byte of MessagePack can be a list of 56 bytes, so 256 KiB could become 14 MiB.  Promises to read a message
-at most once, to make no object of it, and to judge nothing else: what is broken is left to the decoder.
+One byte of MessagePack can become a list of 56 bytes in memory, so 256 KiB could become 14 MiB.  Only the
+counts are checked here; the decoder reports a message that is malformed.
 
 Source:
     MessagePack specification, https://github.com/msgpack/msgpack/blob/master/spec.md, "Formats".
@@ -12,13 +12,13 @@ from __future__ import annotations
 from rse_pf.config import SessionSettings
 from rse_pf.errors import LimitExceeded
 
-__all__ = ["LIST_VALUES", "MAP_VALUES", "check_packed", "too_many_values"]
+__all__ = ["LIST_VALUES", "MAP_VALUES", "check_msgpack", "too_many_values"]
 
 LIST_VALUES, MAP_VALUES = 3, 6
 
 
 def _steps() -> tuple[int, ...]:
-    """Return how far the next value is, by first byte; 0: see `_LENGTHS`; negative: lists and maps."""
+    """Return the distance to the next value by first byte; 0: see `_LENGTHS`; negative: a list or map."""
     steps = [1] * 256
     steps[0x80:0xA0] = [-1] * 32
     steps[0xA0:0xC0] = [1 + length for length in range(32)]
@@ -37,23 +37,23 @@ _LENGTHS = {
     0xC4: (1, 2), 0xC5: (2, 3), 0xC6: (4, 5), 0xC7: (1, 3), 0xC8: (2, 4), 0xC9: (4, 6), 0xD9: (1, 2),
     0xDA: (2, 3), 0xDB: (4, 5),
 }  # fmt: skip
-"""Bytes of the length, and of all that stands before the content: bin, ext, str."""
+"""By first byte of bin, ext and str: bytes of the length field, and bytes before the content."""
 
 _STEPS = _steps()
 _MORE = tuple((MAP_VALUES if k < 0x90 or k >= 0xDE else LIST_VALUES) - 1 for k in range(256))
 
 
-def check_packed(data: bytes, limits: SessionSettings) -> None:
+def check_msgpack(data: bytes, limits: SessionSettings) -> None:
     """Raise LimitExceeded if *data* holds too many values, or too many lists and maps.
 
-    A list counts as `LIST_VALUES` values, a map as `MAP_VALUES` and a long word as two, which is what they
-    weigh in memory; a raw array as two.  A short message cannot hold too many, and is not read.
+    According to the memory that they take, a list counts as `LIST_VALUES` values, a map as `MAP_VALUES`, and
+    a long string or a raw array as two.  A message too short to exceed a limit is not read.
     """
-    max_values, max_boxes = limits.max_json_values, limits.max_json_lists
+    max_values, max_containers = limits.max_json_values, limits.max_json_lists
     end = len(data)
-    if end <= min(max_values // MAP_VALUES, max_boxes):
+    if end <= min(max_values // MAP_VALUES, max_containers):
         return
-    at = values = boxes = 0
+    at = values = containers = 0
     while at < end:
         step = _STEPS[data[at]]
         values += 1
@@ -61,10 +61,10 @@ def check_packed(data: bytes, limits: SessionSettings) -> None:
             at += step
         elif step < 0:
             at -= step
-            boxes += 1
+            containers += 1
             values += _MORE[data[at + step]]
-            if boxes > max_boxes:
-                raise LimitExceeded(f"more than {max_boxes} lists and maps", hint="send arrays, raw")
+            if containers > max_containers:
+                raise LimitExceeded(f"more than {max_containers} lists and maps", hint="send arrays, raw")
         else:
             width, head = _LENGTHS[data[at]]
             values += 1
@@ -73,6 +73,8 @@ def check_packed(data: bytes, limits: SessionSettings) -> None:
             raise too_many_values(max_values)
 
 
-def too_many_values(most: int) -> LimitExceeded:
-    """Return the error of a message with more than *most* values."""
-    return LimitExceeded(f"more than {most} values in one message", hint="send large data to the data server")
+def too_many_values(max_values: int) -> LimitExceeded:
+    """Return the error of a message with more than *max_values* values."""
+    return LimitExceeded(
+        f"more than {max_values} values in one message", hint="send large data to the data server"
+    )

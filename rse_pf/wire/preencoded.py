@@ -1,7 +1,6 @@
-"""Payloads that are encoded once and sent many times: for load generators, which must be cheap.
+"""Payloads that are encoded once and sent many times, which keeps load generators cheap.
 
-The message is the same to the server as if it had been encoded whole.  Promises no state between
-messages and that a payload which was prepared for one codec is not sent with another.
+The server decodes the same message as if it had been encoded as a whole.
 """
 
 from __future__ import annotations
@@ -17,7 +16,7 @@ from rse_pf.wire import arrays
 from rse_pf.wire.codec import Codec
 from rse_pf.wire.messages import Command
 
-__all__ = ["PreencodedCommand", "encode_command", "prepare"]
+__all__ = ["PreencodedCommand", "encode_command", "preencode"]
 
 _LEVEL = 6
 _ENVELOPE_LEVEL, _ENVELOPE_MEMORY = 1, 1
@@ -37,25 +36,24 @@ class PreencodedCommand:
     deflated: bytes = b""
 
 
-def prepare(codec: Codec, payload: Any) -> PreencodedCommand:
-    """Encode *payload* for *codec*; raises BadMessage if it does not travel in messages."""
+def preencode(codec: Codec, payload: Any) -> PreencodedCommand:
+    """Encode *payload* for *codec*; raises BadMessage if it cannot be encoded."""
     try:
         encoded = _encode_binary(payload) if codec.name == "bin" else _encode_json(payload)
     except (RecursionError, ValueError, TypeError, OverflowError) as error:
         raise BadMessage(f"a payload cannot be encoded: {str(error)[:150]}") from error
-    return PreencodedCommand(
-        codec=codec.name, encoded=encoded, deflated=_flushed(encoded) if codec.name == "zlib" else b""
-    )
+    deflated = _deflated(encoded, zlib.Z_SYNC_FLUSH) if codec.name == "zlib" else b""
+    return PreencodedCommand(codec=codec.name, encoded=encoded, deflated=deflated)
 
 
 def encode_command(codec: Codec, command: Command) -> bytes:
-    """Return the WebSocket message of *command*, whose payload may be prepared.
+    """Return the WebSocket message of *command*, whose payload may be a `PreencodedCommand`.
 
-    With zlib the envelope is deflated, the payload's blocks are appended and the checksum is made anew: a
-    stream may hold blocks of several compressors as long as none refers to what came before itself.
+    With zlib the envelope is deflated, the payload's blocks are appended and the checksum is recomputed: a
+    stream may hold blocks of several compressors if none refers to data before its own.
 
     Raises:
-        BadMessage: It cannot be said, or was prepared for another codec.
+        BadMessage: It cannot be encoded, or was encoded for another codec.
 
     Source:
         RFC 1950 and 1951.
@@ -65,8 +63,8 @@ def encode_command(codec: Codec, command: Command) -> bytes:
         return codec.encode(command)
     if payload.codec != codec.name:
         raise BadMessage(
-            f"a payload prepared for {payload.codec} cannot travel as {codec.name}",
-            hint="prepare it with the codec of the connection",
+            f"a payload encoded for {payload.codec} cannot be sent as {codec.name}",
+            hint="encode it with the codec of the connection",
         )
     if codec.name != "zlib":
         return codec.encode(msgspec.structs.replace(command, payload=msgspec.Raw(payload.encoded)))
@@ -85,15 +83,10 @@ def encode_command(codec: Codec, command: Command) -> bytes:
     )
 
 
-def _flushed(text: bytes) -> bytes:
-    """Return *text* as deflate blocks that end on a byte and refer to nothing before them."""
+def _deflated(text: bytes, mode: int) -> bytes:
+    """Return *text* as deflate blocks that end as *mode* says and refer to nothing before them."""
     deflate = zlib.compressobj(_LEVEL, zlib.DEFLATED, -zlib.MAX_WBITS)
-    return deflate.compress(text) + deflate.flush(zlib.Z_SYNC_FLUSH)
+    return deflate.compress(text) + deflate.flush(mode)
 
 
-def _closed(text: bytes) -> bytes:
-    deflate = zlib.compressobj(_LEVEL, zlib.DEFLATED, -zlib.MAX_WBITS)
-    return deflate.compress(text) + deflate.flush()
-
-
-_CLOSING = _closed(_AFTER)
+_CLOSING = _deflated(_AFTER, zlib.Z_FINISH)

@@ -1,6 +1,6 @@
-"""When a robot shows a fresh token on a link, so that the socket outlives the token it was opened with.
+"""When a robot sends a fresh token on a connection, so that the connection outlives its first token.
 
-Promises no clock, and that a server which answers nothing is asked again, but never more often than it bears.
+A renewal without a reply is repeated, but never faster than the server accepts renewals.
 """
 
 from __future__ import annotations
@@ -10,27 +10,27 @@ from dataclasses import dataclass
 __all__ = ["RenewalTimer"]
 
 _RENEW_AFTER = 0.8
-"""Of a token's rest; the fifth that is left is for a second and a third try."""
-_AGAIN_S = 1.5
-"""Above the server's own pause between two renewals."""
-_MAX_S = 3600.0
+"""Share of a token's remaining time; the rest is for a second and a third attempt."""
+_MIN_RETRY_S = 1.5
+"""Above the server's minimum pause between two renewals."""
+_MAX_TTL_S = 3600.0
 
 
 @dataclass(slots=True)
 class RenewalTimer:
-    """What a server said of the end of one link; times are readings of the robot's clock, in seconds."""
+    """When a connection expires and when to renew its token; seconds of the robot's clock."""
 
     ends_s: float | None = None
     _due_s: float = 0.0
 
-    def lasts(self, token_s: float, now: float) -> None:
-        """Note that the link ends in *token_s*; what a server says is believed within an hour."""
-        left_s = token_s if 0.0 <= token_s <= _MAX_S else _MAX_S
+    def expires_in(self, token_s: float, now: float) -> None:
+        """Record that the connection expires in *token_s*; a value outside 0..3600 counts as 3600."""
+        left_s = token_s if 0.0 <= token_s <= _MAX_TTL_S else _MAX_TTL_S
         self.ends_s, self._due_s = now + left_s, now + _RENEW_AFTER * left_s
 
     def is_due(self, now: float) -> bool:
-        """Return whether to renew now; then again when half of what is left has passed."""
+        """Return whether to renew now; the next attempt is due after half of the remaining time."""
         if self.ends_s is None or now < self._due_s:
             return False
-        self._due_s = now + max(_AGAIN_S, (self.ends_s - now) / 2)
+        self._due_s = now + max(_MIN_RETRY_S, (self.ends_s - now) / 2)
         return True

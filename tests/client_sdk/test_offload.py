@@ -81,10 +81,10 @@ def test_the_faster_side_is_taken_only_when_asked_for():
 
 
 def test_the_robot_mends_what_the_cloud_broke_but_not_what_the_command_broke():
-    assert CloudFirst.can_mend("busy")
-    assert CloudFirst.can_mend("worker-lost")
-    assert CloudFirst.can_mend(Disconnected.code)
-    assert CloudFirst.can_mend(ConnectError.code)
+    assert CloudFirst.can_recover("busy")
+    assert CloudFirst.can_recover("worker-lost")
+    assert CloudFirst.can_recover(Disconnected.code)
+    assert CloudFirst.can_recover(ConnectError.code)
     for code in ("degenerate", "no-consensus", "too-few", "bad-request", "stale", PnpError.code):
-        assert not CloudFirst.can_mend(code)
-    assert not CloudFirst.can_mend(CommandFailed.code)
+        assert not CloudFirst.can_recover(code)
+    assert not CloudFirst.can_recover(CommandFailed.code)

@@ -116,7 +116,7 @@ def test_an_extension_of_another_kind_or_length_is_a_bad_message(code: int, data
 def test_rows_take_their_shape_from_the_owner_of_the_field() -> None:
     np.testing.assert_array_equal(reshaped("points", np.arange(6.0), 3), [[0, 1, 2], [3, 4, 5]])
 
-    with pytest.raises(BadRequest, match="points has 7 numbers, which is no multiple of 3"):
+    with pytest.raises(BadRequest, match="points has 7 numbers, which is not a multiple of 3"):
         reshaped("points", np.arange(7.0), 3)
 
 

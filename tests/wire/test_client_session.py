@@ -1,4 +1,4 @@
-"""The robot's rules: one final answer per command, whatever happens to the links."""
+"""The robot's rules: one final answer per command, whatever happens to the connections."""
 
 from __future__ import annotations
 
@@ -9,7 +9,14 @@ import pytest
 from rse_pf.config import SessionSettings
 from rse_pf.errors import BadMessage, LimitExceeded, ProtocolError
 from rse_pf.wire import Command, Failure, Hello, Limits, Move, Ping, Pong, Result, Welcome, make_codec
-from rse_pf.wire.client_session import Answered, ConnectionState, ConnectionLost, MoveRequested, ClientSession, Welcomed
+from rse_pf.wire.client_session import (
+    Answered,
+    ClientSession,
+    ConnectionLost,
+    ConnectionState,
+    MoveRequested,
+    Welcomed,
+)
 
 SETTINGS = SessionSettings()
 CODEC = make_codec("json", SETTINGS)
@@ -19,32 +26,34 @@ def make_session(settings: SessionSettings = SETTINGS) -> ClientSession:
     return ClientSession(codec=CODEC, settings=settings, sdk="test")
 
 
-def tell(session: ClientSession, link: ConnectionState, message, now: float):
-    return session.receive(link, CODEC.encode(message), now)
+def tell(session: ClientSession, connection: ConnectionState, message, now: float):
+    return session.receive(connection, CODEC.encode(message), now)
 
 
-def open_link(session: ClientSession, now: float = 0.0, server: str = "a", *, room: int = 8) -> ConnectionState:
-    """Open, welcome and adopt a link."""
-    link = session.open_link(now)
+def open_connection(
+    session: ClientSession, now: float = 0.0, server: str = "a", *, room: int = 8
+) -> ConnectionState:
+    """Open, welcome and adopt a connection."""
+    connection = session.open_connection(now)
     welcome = Welcome(
         server=server, session="s", robot="r", protocol=1, clock_s=now,
         limits=Limits(max_message_bytes=4096, max_in_flight=room),
     )  # fmt: skip
-    (event,) = tell(session, link, welcome, now)
+    (event,) = tell(session, connection, welcome, now)
     assert event == Welcomed(welcome)
-    session.adopt(link, now)
-    return link
+    session.adopt(connection, now)
+    return connection
 
 
-def sent(link: ConnectionState) -> list:
-    """Return and forget what the session wrote on *link*."""
-    messages = [CODEC.decode_from_robot(data) for data in link.outgoing]
-    link.outgoing.clear()
+def sent(connection: ConnectionState) -> list:
+    """Return and forget what the session wrote on *connection*."""
+    messages = [CODEC.decode_from_robot(data) for data in connection.outgoing]
+    connection.outgoing.clear()
     return messages
 
 
-def commands(link: ConnectionState) -> list[Command]:
-    return [message for message in sent(link) if isinstance(message, Command)]
+def commands(connection: ConnectionState) -> list[Command]:
+    return [message for message in sent(connection) if isinstance(message, Command)]
 
 
 def result(command: Command, **stamps: float) -> Result:
@@ -64,17 +73,17 @@ def codes(events) -> dict[int, str]:
     }
 
 
-def tend_until_lost(session: ClientSession, link: ConnectionState) -> tuple[float, list]:
-    """Return when an unanswering *link* was given up, and what the session said then."""
+def tend_until_lost(session: ClientSession, connection: ConnectionState) -> tuple[float, list]:
+    """Return when an unanswering *connection* was given up, and what the session said then."""
     now, events = 0.0, []
     while not events:
         now = session.next_due(now)
-        events = session.tend(link, now)
+        events = session.check(connection, now)
     return now, events
 
 
 def test_a_link_begins_with_hello():
-    (hello,) = sent(make_session().open_link(0.0))
+    (hello,) = sent(make_session().open_connection(0.0))
 
     assert hello == Hello(sdk="test", capabilities=("move", "progress"))
 
@@ -83,21 +92,21 @@ def test_a_command_waits_for_a_link_and_then_tells_the_time_it_has_left():
     session = make_session()
     session.submit("pnp", {"x": 1}, now=0.0, deadline_s=1.0)
 
-    link = open_link(session, now=0.4)
+    connection = open_connection(session, now=0.4)
 
-    (command,) = commands(link)
+    (command,) = commands(connection)
     assert command.deadline_ms == pytest.approx(600.0)
     assert session.resent == 0
 
 
 def test_an_answer_ends_its_command_once_and_its_twin_is_dropped():
     session = make_session()
-    link = open_link(session)
+    connection = open_connection(session)
     identity = session.submit("pnp", None, now=0.0)
-    (command,) = commands(link)
+    (command,) = commands(connection)
 
-    first = tell(session, link, result(command), 0.1)
-    second = tell(session, link, result(command), 0.2)
+    first = tell(session, connection, result(command), 0.1)
+    second = tell(session, connection, result(command), 0.2)
 
     assert codes(first) == {identity: "ok"}
     assert second == []
@@ -106,12 +115,12 @@ def test_an_answer_ends_its_command_once_and_its_twin_is_dropped():
 
 def test_a_lost_link_hands_its_commands_to_the_next_by_the_same_id():
     session = make_session()
-    first = open_link(session)
+    first = open_connection(session)
     ids = [session.submit("pnp", None, now=0.0) for _ in range(3)]
     commands(first)
 
-    session.close_link(first)
-    second = open_link(session, now=0.5, server="b")
+    session.close_connection(first)
+    second = open_connection(session, now=0.5, server="b")
 
     assert [command.id for command in commands(second)] == ids
     assert session.resent == 3
@@ -119,11 +128,11 @@ def test_a_lost_link_hands_its_commands_to_the_next_by_the_same_id():
 
 def test_of_a_latest_wins_stream_only_the_newest_frame_is_sent_again():
     session = make_session()
-    link = open_link(session)
+    connection = open_connection(session)
     old, new = (session.submit("pnp", None, now=0.0, stream="pose") for _ in range(2))
-    session.close_link(link)
+    session.close_connection(connection)
 
-    fresh = session.open_link(1.0)
+    fresh = session.open_connection(1.0)
     events = session.adopt(fresh, 1.0)
 
     assert codes(events) == {old: "stale"}
@@ -132,40 +141,40 @@ def test_of_a_latest_wins_stream_only_the_newest_frame_is_sent_again():
 
 def test_after_a_long_cut_there_is_no_catch_up_burst():
     session = make_session()
-    link = open_link(session)
-    session.close_link(link)
+    connection = open_connection(session)
+    session.close_connection(connection)
     for step in range(100):
         session.submit("pnp", None, now=step * 0.01, stream="pose", deadline_s=5.0)
 
-    assert [command.seq for command in commands(open_link(session, now=1.0))] == [100]
+    assert [command.seq for command in commands(open_connection(session, now=1.0))] == [100]
 
 
 def test_an_older_answer_than_the_last_delivered_one_is_stale():
     session = make_session()
-    link = open_link(session)
+    connection = open_connection(session)
     for _ in range(2):
         session.submit("pnp", None, now=0.0, stream="pose")
-    older, newer = commands(link)
+    older, newer = commands(connection)
 
-    assert codes(tell(session, link, result(newer), 0.1)) == {newer.id: "ok"}
-    assert codes(tell(session, link, result(older), 0.2)) == {older.id: "stale"}
+    assert codes(tell(session, connection, result(newer), 0.1)) == {newer.id: "ok"}
+    assert codes(tell(session, connection, result(older), 0.2)) == {older.id: "stale"}
 
 
 def test_streams_do_not_make_each_other_stale():
     session = make_session()
-    link = open_link(session)
+    connection = open_connection(session)
     for stream in ("left", "left", "right"):
         session.submit("pnp", None, now=0.0, stream=stream)
-    _, newer, other = commands(link)
+    _, newer, other = commands(connection)
 
-    tell(session, link, result(newer), 0.1)
+    tell(session, connection, result(newer), 0.1)
 
-    assert codes(tell(session, link, result(other), 0.2)) == {other.id: "ok"}
+    assert codes(tell(session, connection, result(other), 0.2)) == {other.id: "ok"}
 
 
 def test_an_unanswered_command_expires_at_its_deadline_and_not_before():
     session = make_session()
-    open_link(session)
+    open_connection(session)
     identity = session.submit("pnp", None, now=0.0, deadline_s=0.5)
 
     assert session.due(0.499) == []
@@ -175,63 +184,63 @@ def test_an_unanswered_command_expires_at_its_deadline_and_not_before():
 
 def test_a_robot_keeps_back_what_the_server_has_no_room_for():
     session = make_session()
-    link = open_link(session, room=2)
+    connection = open_connection(session, room=2)
     for _ in range(5):
         session.submit("pnp", None, now=0.0)
-    first, second = commands(link)
+    first, second = commands(connection)
 
-    tell(session, link, result(first), 0.1)
+    tell(session, connection, result(first), 0.1)
 
-    assert [command.id for command in commands(link)] == [second.id + 1]
+    assert [command.id for command in commands(connection)] == [second.id + 1]
     assert session.unanswered == 4
 
 
 def test_busy_is_tried_again_after_the_servers_pause():
     session = make_session()
-    link = open_link(session)
+    connection = open_connection(session)
     session.submit("pnp", None, now=0.0, deadline_s=1.0)
-    (command,) = commands(link)
+    (command,) = commands(connection)
 
-    assert tell(session, link, failure(command, "busy", retry_after_ms=200), 0.1) == []
+    assert tell(session, connection, failure(command, "busy", retry_after_ms=200), 0.1) == []
     session.due(0.29)
-    assert commands(link) == []
+    assert commands(connection) == []
     assert session.next_due(0.1) == pytest.approx(0.3)
     session.due(0.31)
 
-    assert [again.id for again in commands(link)] == [command.id]
+    assert [again.id for again in commands(connection)] == [command.id]
 
 
 def test_a_new_link_respects_the_pause_that_busy_asked_for():
     session = make_session()
-    link = open_link(session)
+    connection = open_connection(session)
     session.submit("pnp", None, now=0.0)
-    (command,) = commands(link)
-    tell(session, link, failure(command, "busy", retry_after_ms=500), 0.0)
+    (command,) = commands(connection)
+    tell(session, connection, failure(command, "busy", retry_after_ms=500), 0.0)
 
-    assert commands(open_link(session, now=0.1, server="b")) == []
+    assert commands(open_connection(session, now=0.1, server="b")) == []
 
 
 def test_busy_beyond_the_deadline_is_final():
     session = make_session()
-    link = open_link(session)
+    connection = open_connection(session)
     session.submit("pnp", None, now=0.0, deadline_s=0.2)
-    (command,) = commands(link)
+    (command,) = commands(connection)
 
-    events = tell(session, link, failure(command, "busy", retry_after_ms=200), 0.1)
+    events = tell(session, connection, failure(command, "busy", retry_after_ms=200), 0.1)
 
     assert codes(events) == {command.id: "busy"}
 
 
 def test_retries_after_busy_stay_within_their_budget():
     session = make_session()
-    link = open_link(session, room=1)
+    connection = open_connection(session, room=1)
     retries = final = 0
     for _ in range(400):
         session.submit("pnp", None, now=0.0, deadline_s=9.0)
-        (command,) = commands(link)
-        while not (events := tell(session, link, failure(command, "busy", retry_after_ms=0), 0.0)):
+        (command,) = commands(connection)
+        while not (events := tell(session, connection, failure(command, "busy", retry_after_ms=0), 0.0)):
             retries += 1
-            (command,) = commands(link) or (session.due(0.0) or commands(link))
+            (command,) = commands(connection) or (session.due(0.0) or commands(connection))
         final += codes(events) == {command.id: "busy"}
 
     assert final == 400
@@ -241,24 +250,26 @@ def test_retries_after_busy_stay_within_their_budget():
 
 def test_a_lost_worker_is_tried_twice_more_and_then_believed():
     session = make_session()
-    link = open_link(session)
+    connection = open_connection(session)
     session.submit("pnp", None, now=0.0)
 
     for _ in range(2):
-        (command,) = commands(link)
-        assert tell(session, link, failure(command, "worker-lost"), 0.1) == []
-    (command,) = commands(link)
+        (command,) = commands(connection)
+        assert tell(session, connection, failure(command, "worker-lost"), 0.1) == []
+    (command,) = commands(connection)
 
-    assert codes(tell(session, link, failure(command, "worker-lost"), 0.2)) == {command.id: "worker-lost"}
+    assert codes(tell(session, connection, failure(command, "worker-lost"), 0.2)) == {
+        command.id: "worker-lost"
+    }
 
 
 def test_a_failure_from_a_link_the_command_has_left_is_dropped_but_its_result_is_taken():
     session = make_session()
-    old = open_link(session)
+    old = open_connection(session)
     session.submit("pnp", None, now=0.0)
     (command,) = commands(old)
-    session.close_link(old)
-    open_link(session, now=0.1, server="b")
+    session.close_connection(old)
+    open_connection(session, now=0.1, server="b")
 
     assert tell(session, old, failure(command, "internal"), 0.2) == []
     assert codes(tell(session, old, result(command), 0.3)) == {command.id: "ok"}
@@ -266,12 +277,12 @@ def test_a_failure_from_a_link_the_command_has_left_is_dropped_but_its_result_is
 
 def test_a_move_leaves_what_is_unanswered_on_the_old_link():
     session = make_session()
-    old = open_link(session)
+    old = open_connection(session)
     session.submit("pnp", None, now=0.0)
     (command,) = commands(old)
 
     assert tell(session, old, Move(reason="drain", within_ms=2000), 0.1) == [MoveRequested("drain", 2.0)]
-    new = open_link(session, now=0.2, server="b")
+    new = open_connection(session, now=0.2, server="b")
     session.submit("pnp", None, now=0.3)
 
     assert old.leaving
@@ -283,48 +294,48 @@ def test_a_move_leaves_what_is_unanswered_on_the_old_link():
 
 def test_a_cancelled_command_is_forgotten_and_never_resent():
     session = make_session()
-    link = open_link(session)
+    connection = open_connection(session)
     identity = session.submit("pnp", None, now=0.0)
-    (command,) = commands(link)
+    (command,) = commands(connection)
 
     session.cancel(identity)
     assert session.unanswered == 0
-    assert tell(session, link, result(command), 0.1) == []
-    session.close_link(link)
+    assert tell(session, connection, result(command), 0.1) == []
+    session.close_connection(connection)
 
-    assert commands(open_link(session, now=1.0)) == []
+    assert commands(open_connection(session, now=1.0)) == []
 
 
 def test_a_command_cancelled_on_its_way_is_not_sent_again_when_its_link_dies():
     session = make_session()
-    link = open_link(session)
+    connection = open_connection(session)
     session.cancel(session.submit("pnp", None, now=0.0))
-    commands(link)
+    commands(connection)
 
-    session.close_link(link)
+    session.close_connection(connection)
 
-    assert commands(open_link(session, now=1.0)) == []
+    assert commands(open_connection(session, now=1.0)) == []
 
 
 def test_a_cancelled_command_still_takes_its_room_until_the_server_answered():
     session = make_session()
-    link = open_link(session, room=1)
+    connection = open_connection(session, room=1)
     session.cancel(session.submit("pnp", None, now=0.0))
-    (first,) = commands(link)
+    (first,) = commands(connection)
     session.submit("pnp", None, now=0.0)
-    assert commands(link) == []
+    assert commands(connection) == []
 
-    tell(session, link, result(first), 0.1)
+    tell(session, connection, result(first), 0.1)
 
-    assert len(commands(link)) == 1
+    assert len(commands(connection)) == 1
 
 
 def test_silence_ends_a_link_with_an_unanswered_command_in_time():
     session = make_session()
-    link = open_link(session)
+    connection = open_connection(session)
     session.submit("pnp", None, now=0.0, deadline_s=60.0)
 
-    now, events = tend_until_lost(session, link)
+    now, events = tend_until_lost(session, connection)
     assert events == [ConnectionLost("silence")]
     assert now <= SETTINGS.stall_timeout_s + SETTINGS.stall_timeout_s / 3 + 1e-9
     assert session.current is None
@@ -332,80 +343,80 @@ def test_silence_ends_a_link_with_an_unanswered_command_in_time():
 
 def test_a_slow_command_is_no_silence_while_the_server_answers_pings():
     session = make_session()
-    link = open_link(session)
+    connection = open_connection(session)
     session.submit("merge", None, now=0.0, deadline_s=60.0)
 
     now = 0.0
     while now < 20.0:
         now = session.next_due(now)
-        assert session.tend(link, now) == []
-        for message in sent(link):
+        assert session.check(connection, now) == []
+        for message in sent(connection):
             if isinstance(message, Ping):
-                tell(session, link, Pong(sent_s=message.sent_s, received_s=now, answered_s=now), now)
+                tell(session, connection, Pong(sent_s=message.sent_s, received_s=now, answered_s=now), now)
 
 
 def test_a_command_on_a_long_idle_link_is_no_reason_to_doubt_it():
     session = make_session()
-    link = open_link(session)
-    session.tend(link, 0.0)
-    tell(session, link, Pong(sent_s=0.0, received_s=0.0, answered_s=0.0), 0.0)
-    sent(link)
+    connection = open_connection(session)
+    session.check(connection, 0.0)
+    tell(session, connection, Pong(sent_s=0.0, received_s=0.0, answered_s=0.0), 0.0)
+    sent(connection)
     for tick in range(1, 6):
-        session.tend(link, tick * 0.3)
+        session.check(connection, tick * 0.3)
 
     session.submit("merge", None, now=1.5, deadline_s=60.0)
-    session.tend(link, 1.6)
+    session.check(connection, 1.6)
 
-    assert any(isinstance(message, Ping) for message in sent(link))
+    assert any(isinstance(message, Ping) for message in sent(connection))
 
 
 def test_an_idle_link_is_lost_when_its_ping_stays_unanswered():
     session = make_session()
-    link = open_link(session)
+    connection = open_connection(session)
 
-    now, events = tend_until_lost(session, link)
+    now, events = tend_until_lost(session, connection)
     assert events == [ConnectionLost("no pong")]
     assert now <= SETTINGS.ping_interval_s + SETTINGS.ping_timeout_s
 
 
 def test_a_robot_that_slept_does_not_blame_the_server():
     session = make_session()
-    link = open_link(session)
+    connection = open_connection(session)
     session.submit("pnp", None, now=0.0, deadline_s=60.0)
-    session.tend(link, 0.3)
+    session.check(connection, 0.3)
 
-    assert session.tend(link, 5.0) == []
+    assert session.check(connection, 5.0) == []
 
 
 def test_a_socket_without_a_welcome_is_given_up():
     session = make_session()
-    link = session.open_link(0.0)
+    connection = session.open_connection(0.0)
 
-    now, events = tend_until_lost(session, link)
+    now, events = tend_until_lost(session, connection)
     assert events == [ConnectionLost("no welcome")]
     assert now <= SETTINGS.hello_timeout_s + SETTINGS.stall_timeout_s
 
 
 def test_pings_measure_the_offset_and_results_the_two_delays():
     session = make_session()
-    link = open_link(session)
-    tell(session, link, Pong(sent_s=0.0, received_s=100.01, answered_s=100.01), 0.02)
+    connection = open_connection(session)
+    tell(session, connection, Pong(sent_s=0.0, received_s=100.01, answered_s=100.01), 0.02)
     session.submit("pnp", None, now=1.0)
-    (command,) = commands(link)
+    (command,) = commands(connection)
 
-    (event,) = tell(session, link, result(command, received_s=101.03, sent_s=101.05), 1.06)
+    (event,) = tell(session, connection, result(command, received_s=101.03, sent_s=101.05), 1.06)
 
     assert (event.up_s, event.down_s) == (pytest.approx(0.03), pytest.approx(0.01))
 
 
 def test_delays_add_up_to_the_time_on_the_network_and_are_never_negative():
     session = make_session()
-    link = open_link(session)
-    tell(session, link, Pong(sent_s=0.0, received_s=100.05, answered_s=100.05), 0.1)
+    connection = open_connection(session)
+    tell(session, connection, Pong(sent_s=0.0, received_s=100.05, answered_s=100.05), 0.1)
     session.submit("pnp", None, now=1.0)
-    (command,) = commands(link)
+    (command,) = commands(connection)
 
-    (event,) = tell(session, link, result(command, received_s=101.0, sent_s=101.0), 1.02)
+    (event,) = tell(session, connection, result(command, received_s=101.0, sent_s=101.0), 1.02)
 
     assert event.up_s == 0.0
     assert event.down_s == pytest.approx(0.02)
@@ -414,48 +425,48 @@ def test_delays_add_up_to_the_time_on_the_network_and_are_never_negative():
 @pytest.mark.parametrize("sent_s", [-5.0, 1e9])
 def test_a_pong_to_no_ping_of_ours_does_not_move_the_clock(sent_s):
     session = make_session()
-    link = open_link(session)
+    connection = open_connection(session)
 
-    tell(session, link, Pong(sent_s=sent_s, received_s=1e6, answered_s=1e6), 0.1)
+    tell(session, connection, Pong(sent_s=sent_s, received_s=1e6, answered_s=1e6), 0.1)
 
-    assert link.clock_offset.offset_s is None
+    assert connection.clock_offset.offset_s is None
 
 
 def test_a_server_without_stamps_gives_no_delays():
     session = make_session()
-    link = open_link(session)
-    tell(session, link, Pong(sent_s=0.0, received_s=5.0, answered_s=5.0), 0.02)
+    connection = open_connection(session)
+    tell(session, connection, Pong(sent_s=0.0, received_s=5.0, answered_s=5.0), 0.02)
     session.submit("pnp", None, now=1.0)
-    (command,) = commands(link)
+    (command,) = commands(connection)
 
-    (event,) = tell(session, link, result(command), 1.1)
+    (event,) = tell(session, connection, result(command), 1.1)
 
     assert (event.up_s, event.down_s) == (None, None)
 
 
 def test_garbage_is_a_protocol_error_and_harms_no_command():
     session = make_session()
-    link = open_link(session)
+    connection = open_connection(session)
     identity = session.submit("pnp", None, now=0.0)
-    (command,) = commands(link)
+    (command,) = commands(connection)
 
     for garbage in (b"", b"{", b'{"type":"welcome"}', b"\xff\xff", b'{"type":"result","id":"x"}'):
         with pytest.raises(ProtocolError):
-            session.receive(link, garbage, 0.1)
+            session.receive(connection, garbage, 0.1)
 
-    assert codes(tell(session, link, result(command), 0.2)) == {identity: "ok"}
+    assert codes(tell(session, connection, result(command), 0.2)) == {identity: "ok"}
 
 
 def test_an_absurd_move_or_pause_cannot_stop_the_clockwork():
     session = ClientSession(codec=make_codec("bin"), settings=SETTINGS, sdk="test")
-    link = session.open_link(0.0)
-    session.adopt(link, 0.0)
+    connection = session.open_connection(0.0)
+    session.adopt(connection, 0.0)
     identity = session.submit("pnp", None, now=0.0, deadline_s=1.0)
     encode = session.codec.encode
 
-    (move,) = session.receive(link, encode(Move(reason="x", within_ms=math.nan)), 0.1)
+    (move,) = session.receive(connection, encode(Move(reason="x", within_ms=math.nan)), 0.1)
     busy = Failure(id=identity, code="busy", message="", retry_after_ms=math.nan)
-    session.receive(link, encode(busy), 0.1)
+    session.receive(connection, encode(busy), 0.1)
 
     assert move == MoveRequested("x", 0.0)
     assert session.next_due(0.1) <= 1.0
@@ -465,7 +476,7 @@ def test_an_absurd_move_or_pause_cannot_stop_the_clockwork():
 
 def test_what_does_not_travel_is_refused_before_it_becomes_a_command():
     session = make_session()
-    open_link(session)
+    open_connection(session)
 
     with pytest.raises(BadMessage):
         session.submit("pnp", {"x": object()}, now=0.0)
@@ -477,9 +488,9 @@ def test_what_does_not_travel_is_refused_before_it_becomes_a_command():
 
 def test_abandoned_commands_end_with_the_reason():
     session = make_session()
-    link = open_link(session)
+    connection = open_connection(session)
     ids = [session.submit("pnp", None, now=0.0) for _ in range(3)]
-    session.close_link(link)
+    session.close_connection(connection)
 
     events = session.abandon("unauthorized", "the token is over", "get another")
 

@@ -10,7 +10,7 @@ from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, 
 
 from rse_pf.config import SessionSettings
 from rse_pf.wire import Command, Failure, Limits, Ping, Pong, Result, Welcome, make_codec
-from rse_pf.wire.client_session import Answered, ClientLink, Notice, RobotSession
+from rse_pf.wire.client_session import Answered, ClientSession, ConnectionState, Notice
 
 SETTINGS = SessionSettings()
 CODEC = make_codec("json", SETTINGS)
@@ -25,10 +25,10 @@ class RobotLife(RuleBasedStateMachine):
 
     def __init__(self) -> None:
         super().__init__()
-        self.session = RobotSession(codec=CODEC, settings=SETTINGS, sdk="test")
+        self.session = ClientSession(codec=CODEC, settings=SETTINGS, sdk="test")
         self.now = 0.0
-        self.links: list[ClientLink] = []
-        self.seen: list[tuple[ClientLink, Command]] = []
+        self.connections: list[ConnectionState] = []
+        self.seen: list[tuple[ConnectionState, Command]] = []
         self.open_on: dict[int, set[int]] = {}
         self.commands: dict[int, tuple[str, bool]] = {}
         self.cancelled: set[int] = set()
@@ -50,20 +50,20 @@ class RobotLife(RuleBasedStateMachine):
         self._read()
 
     def _read(self) -> None:
-        for link in self.links:
-            for data in link.outgoing:
+        for connection in self.connections:
+            for data in connection.outgoing:
                 message = CODEC.decode_from_robot(data)
                 if isinstance(message, Command):
-                    assert not link.lost
+                    assert not connection.lost
                     assert self.ends[message.id] == 0
                     assert message.id not in self.cancelled
-                    assert message.id not in self.open_on[id(link)]
-                    self.open_on[id(link)].add(message.id)
-                    self.seen.append((link, message))
-                elif isinstance(message, Ping) and not link.lost:
+                    assert message.id not in self.open_on[id(connection)]
+                    self.open_on[id(connection)].add(message.id)
+                    self.seen.append((connection, message))
+                elif isinstance(message, Ping) and not connection.lost:
                     pong = Pong(sent_s=message.sent_s, received_s=self.now, answered_s=self.now)
-                    self.session.receive(link, CODEC.encode(pong), self.now)
-            link.outgoing.clear()
+                    self.session.receive(connection, CODEC.encode(pong), self.now)
+            connection.outgoing.clear()
 
     @rule(stream=st.sampled_from(["", "a", "b"]), keep=st.booleans(), deadline_s=st.floats(0.05, 4))
     def submit(self, stream: str, keep: bool, deadline_s: float) -> None:
@@ -84,31 +84,31 @@ class RobotLife(RuleBasedStateMachine):
 
     @rule()
     def connect(self) -> None:
-        link = self.session.open_link(self.now)
-        self.links.append(link)
-        self.open_on[id(link)] = set()
+        connection = self.session.open_connection(self.now)
+        self.connections.append(connection)
+        self.open_on[id(connection)] = set()
         welcome = Welcome(
-            server=f"server-{len(self.links)}", session="s", robot="r", protocol=1, clock_s=self.now,
+            server=f"server-{len(self.connections)}", session="s", robot="r", protocol=1, clock_s=self.now,
             limits=Limits(max_message_bytes=4096, max_in_flight=ROOM),
         )  # fmt: skip
-        self.session.receive(link, CODEC.encode(welcome), self.now)
-        self._take(self.session.adopt(link, self.now))
+        self.session.receive(connection, CODEC.encode(welcome), self.now)
+        self._take(self.session.adopt(connection, self.now))
 
     @rule(pick=picks)
-    @precondition(lambda self: self.links)
+    @precondition(lambda self: self.connections)
     def lose(self, pick: int) -> None:
-        self.session.close_link(self.links[pick % len(self.links)])
+        self.session.close_connection(self.connections[pick % len(self.connections)])
 
     @rule(pick=picks, code=st.sampled_from(["", *CODES]), pause_ms=st.sampled_from([None, 0.0, 50.0, 9e5]))
     @precondition(lambda self: self.seen)
     def answer(self, pick: int, code: str, pause_ms: float | None) -> None:
-        """Answer any command that was ever sent, again perhaps, on the link it was sent on."""
-        link, command = self.seen[pick % len(self.seen)]
+        """Answer any command that was ever sent, again perhaps, on the connection it was sent on."""
+        connection, command = self.seen[pick % len(self.seen)]
         message: Result | Failure = Result(id=command.id, reply=command.seq)
         if code:
             message = Failure(id=command.id, code=code, message="", retry_after_ms=pause_ms)
-        self.open_on[id(link)].discard(command.id)
-        self._take(self.session.receive(link, CODEC.encode(message), self.now))
+        self.open_on[id(connection)].discard(command.id)
+        self._take(self.session.receive(connection, CODEC.encode(message), self.now))
 
     @rule(seconds=st.floats(0.001, 1.5))
     def wait(self, seconds: float) -> None:
@@ -116,8 +116,8 @@ class RobotLife(RuleBasedStateMachine):
         while self.now < end:
             self.now = min(end, max(self.session.next_due(self.now), self.now + 1e-3))
             self._take(self.session.due(self.now))
-            for link in self.links:
-                self._take(self.session.tend(link, self.now))
+            for connection in self.connections:
+                self._take(self.session.check(connection, self.now))
 
     @invariant()
     def no_command_ends_twice(self) -> None:
@@ -126,8 +126,8 @@ class RobotLife(RuleBasedStateMachine):
 
     @invariant()
     def the_server_is_never_outrun(self) -> None:
-        for link in self.links:
-            assert self.session.unanswered_on(link) <= ROOM
+        for connection in self.connections:
+            assert self.session.unanswered_on(connection) <= ROOM
 
     @invariant()
     def nobody_waits_longer_than_the_deadline(self) -> None:
@@ -147,24 +147,24 @@ TestRobotLife.settings = hypothesis_settings(max_examples=30, stateful_step_coun
 
 
 def test_a_failure_without_an_id_is_a_notice():
-    session = RobotSession(codec=CODEC, settings=SETTINGS, sdk="test")
+    session = ClientSession(codec=CODEC, settings=SETTINGS, sdk="test")
     told = Failure(code="bad-message", message="what?")
 
-    assert session.receive(session.open_link(0.0), CODEC.encode(told), 0.1) == [Notice(told)]
+    assert session.receive(session.open_connection(0.0), CODEC.encode(told), 0.1) == [Notice(told)]
 
 
 def test_an_answer_that_comes_after_the_deadline_is_not_delivered_as_fresh() -> None:
-    session = RobotSession(codec=CODEC, settings=SETTINGS, sdk="test")
-    link = session.open_link(0.0)
+    session = ClientSession(codec=CODEC, settings=SETTINGS, sdk="test")
+    connection = session.open_connection(0.0)
     limits = Limits(max_message_bytes=4096, max_in_flight=ROOM)
     welcome = Welcome(server="a", session="s", robot="r", protocol=1, clock_s=0.0, limits=limits)
-    session.receive(link, CODEC.encode(welcome), 0.0)
-    session.adopt(link, 0.0)
+    session.receive(connection, CODEC.encode(welcome), 0.0)
+    session.adopt(connection, 0.0)
     for _ in range(2):
         session.submit("x", None, now=0.0, deadline_s=1.0)
 
-    in_time = session.receive(link, CODEC.encode(Result(id=1)), 0.99)
-    late = session.receive(link, CODEC.encode(Result(id=2)), 1.0)
+    in_time = session.receive(connection, CODEC.encode(Result(id=1)), 0.99)
+    late = session.receive(connection, CODEC.encode(Result(id=2)), 1.0)
 
     assert [getattr(event.answer, "code", "ok") for event in in_time + late] == ["ok", "expired"]
     assert session.unanswered == 0

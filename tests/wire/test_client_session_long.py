@@ -4,43 +4,43 @@ from __future__ import annotations
 
 from rse_pf.config import SessionSettings
 from rse_pf.wire import Cancel, Command, Failure, Limits, Progress, Result, Welcome, make_codec
-from rse_pf.wire.client_session import Answered, ClientLink, Progressed, RobotSession
+from rse_pf.wire.client_session import Answered, ClientSession, ConnectionState, Progressed
 
 SETTINGS = SessionSettings()
 CODEC = make_codec("json", SETTINGS)
 
 
-def make_session() -> RobotSession:
-    return RobotSession(codec=CODEC, settings=SETTINGS, sdk="test")
+def make_session() -> ClientSession:
+    return ClientSession(codec=CODEC, settings=SETTINGS, sdk="test")
 
 
-def tell(session: RobotSession, link: ClientLink, message, now: float):
-    return session.receive(link, CODEC.encode(message), now)
+def tell(session: ClientSession, connection: ConnectionState, message, now: float):
+    return session.receive(connection, CODEC.encode(message), now)
 
 
-def open_link(session: RobotSession, now: float = 0.0, server: str = "a") -> ClientLink:
-    """Open, welcome and adopt a link."""
-    link = session.open_link(now)
+def open_connection(session: ClientSession, now: float = 0.0, server: str = "a") -> ConnectionState:
+    """Open, welcome and adopt a connection."""
+    connection = session.open_connection(now)
     limits = Limits(max_message_bytes=4096, max_in_flight=8)
     tell(
         session,
-        link,
+        connection,
         Welcome(server=server, session="s", robot="r", protocol=1, clock_s=now, limits=limits),
         now,
     )
-    session.adopt(link, now)
-    return link
+    session.adopt(connection, now)
+    return connection
 
 
-def sent(link: ClientLink) -> list:
-    """Return and forget what the session wrote on *link*."""
-    messages = [CODEC.decode_from_robot(data) for data in link.outgoing]
-    link.outgoing.clear()
+def sent(connection: ConnectionState) -> list:
+    """Return and forget what the session wrote on *connection*."""
+    messages = [CODEC.decode_from_robot(data) for data in connection.outgoing]
+    connection.outgoing.clear()
     return messages
 
 
-def commands(link: ClientLink) -> list[Command]:
-    return [message for message in sent(link) if isinstance(message, Command)]
+def commands(connection: ConnectionState) -> list[Command]:
+    return [message for message in sent(connection) if isinstance(message, Command)]
 
 
 def result(command: Command) -> Result:
@@ -58,114 +58,114 @@ def codes(events) -> dict[int, str]:
 
 def test_a_command_that_reports_progress_has_no_deadline_but_its_callers():
     session = make_session()
-    link = open_link(session)
+    connection = open_connection(session)
     session.submit("merge", None, now=0.0)
-    (command,) = commands(link)
+    (command,) = commands(connection)
 
-    (progressed,) = tell(session, link, Progress(id=command.id, done=0.25, what="pairs"), 1.0)
+    (progressed,) = tell(session, connection, Progress(id=command.id, done=0.25, what="pairs"), 1.0)
 
     assert progressed == Progressed(command.id, 0.25, "pairs")
     assert session.due(4000.0) == []
-    assert codes(tell(session, link, result(command), 5000.0)) == {command.id: "ok"}
+    assert codes(tell(session, connection, result(command), 5000.0)) == {command.id: "ok"}
 
 
 def test_a_long_command_ends_at_the_deadline_of_its_caller_and_is_taken_back():
     session = make_session()
-    link = open_link(session)
+    connection = open_connection(session)
     identity = session.submit("merge", None, now=0.0, deadline_s=10.0)
-    tell(session, link, Progress(id=identity, done=0.0), 1.0)
-    sent(link)
+    tell(session, connection, Progress(id=identity, done=0.0), 1.0)
+    sent(connection)
 
     assert codes(session.due(10.0)) == {identity: "expired"}
-    assert sent(link) == [Cancel(id=identity)]
+    assert sent(connection) == [Cancel(id=identity)]
 
 
 def test_a_long_command_is_sent_again_after_a_cut_and_on_a_move_without_waiting_for_the_old_server():
     session = make_session()
-    first = open_link(session)
-    identity = session.submit("merge", None, now=0.0, patient=True)
+    first = open_connection(session)
+    identity = session.submit("merge", None, now=0.0, is_open_ended=True)
     tell(session, first, Progress(id=identity, done=0.0), 1.0)
 
-    second = open_link(session, now=50.0, server="b")
+    second = open_connection(session, now=50.0, server="b")
     assert [command.id for command in commands(second)] == [identity]
     assert session.unanswered_on(first) == 0
-    session.close_link(second)
-    third = open_link(session, now=99.0, server="c")
+    session.close_connection(second)
+    third = open_connection(session, now=99.0, server="c")
 
     assert [command.id for command in commands(third)] == [identity]
 
 
 def test_a_cancelled_command_is_taken_back_even_if_the_caller_left_before_it_was_known_to_be_long():
     session = make_session()
-    link = open_link(session)
+    connection = open_connection(session)
     identity = session.submit("merge", None, now=0.0)
     session.cancel(identity)
-    assert Cancel(id=identity) not in sent(link)
+    assert Cancel(id=identity) not in sent(connection)
 
-    assert tell(session, link, Progress(id=identity, done=0.0), 0.1) == []
-    tell(session, link, Progress(id=identity, done=0.1), 0.6)
+    assert tell(session, connection, Progress(id=identity, done=0.0), 0.1) == []
+    tell(session, connection, Progress(id=identity, done=0.1), 0.6)
 
-    assert sent(link).count(Cancel(id=identity)) == 1
+    assert sent(connection).count(Cancel(id=identity)) == 1
 
 
 def test_waiting_for_a_long_command_is_no_silence():
     session = make_session()
-    link = open_link(session)
+    connection = open_connection(session)
     identity = session.submit("merge", None, now=0.0)
-    tell(session, link, Progress(id=identity, done=0.0), 0.1)
-    session.tend(link, 0.1)
-    sent(link)
+    tell(session, connection, Progress(id=identity, done=0.0), 0.1)
+    session.check(connection, 0.1)
+    sent(connection)
 
-    assert session.tend(link, 0.1 + SETTINGS.ping_interval_s / 2) == []
-    assert sent(link) == []
+    assert session.check(connection, 0.1 + SETTINGS.ping_interval_s / 2) == []
+    assert sent(connection) == []
 
 
 def test_a_long_command_whose_caller_leaves_is_taken_back_once():
     session = make_session()
-    link = open_link(session)
+    connection = open_connection(session)
     identity = session.submit("merge", None, now=0.0)
-    tell(session, link, Progress(id=identity, done=0.0), 0.1)
-    sent(link)
+    tell(session, connection, Progress(id=identity, done=0.0), 0.1)
+    sent(connection)
 
     session.cancel(identity)
     session.cancel(identity)
 
-    assert sent(link) == [Cancel(id=identity)]
+    assert sent(connection) == [Cancel(id=identity)]
     cancelled = Failure(id=identity, code="cancelled", message="taken back")
-    assert tell(session, link, cancelled, 0.2) == []
+    assert tell(session, connection, cancelled, 0.2) == []
     assert session.unanswered == 0
 
 
 def test_a_command_that_is_taken_back_while_there_is_no_link_is_taken_back_on_the_next():
     session = make_session()
-    first = open_link(session)
-    identity = session.submit("merge", None, now=0.0, patient=True)
+    first = open_connection(session)
+    identity = session.submit("merge", None, now=0.0, is_open_ended=True)
     tell(session, first, Progress(id=identity, done=0.1), 1.0)
-    session.close_link(first)
+    session.close_connection(first)
     session.cancel(identity)
     session.due(1e6)
 
-    second = open_link(session, now=1e6, server="b")
+    second = open_connection(session, now=1e6, server="b")
 
     asked = [message for message in sent(second) if isinstance(message, Command | Cancel)]
     assert [type(message) for message in asked] == [Command, Cancel]
     assert {message.id for message in asked} == {identity}
     taken_back = Failure(id=identity, code="cancelled", message="taken back")
     assert tell(session, second, taken_back, 1e6 + 1) == []
-    session.close_link(second)
-    assert commands(open_link(session, now=1e6 + 9, server="c")) == []
+    session.close_connection(second)
+    assert commands(open_connection(session, now=1e6 + 9, server="c")) == []
 
 
 def test_a_cancel_that_was_lost_with_its_link_is_sent_again():
     session = make_session()
-    first = open_link(session)
+    first = open_connection(session)
     identity = session.submit("merge", None, now=0.0, deadline_s=10.0)
     tell(session, first, Progress(id=identity, done=0.1), 1.0)
     assert codes(session.due(10.0)) == {identity: "expired"}
     assert session.unanswered == 0
-    session.close_link(first)
+    session.close_connection(first)
 
-    second = open_link(session, now=20.0, server="b")
+    second = open_connection(session, now=20.0, server="b")
 
     assert [message.id for message in sent(second) if isinstance(message, Cancel)] == [identity]
     assert session.due(3600.0) == []
@@ -173,9 +173,9 @@ def test_a_cancel_that_was_lost_with_its_link_is_sent_again():
 
 def test_a_short_command_whose_caller_left_is_not_asked_again():
     session = make_session()
-    first = open_link(session)
+    first = open_connection(session)
     identity = session.submit("pnp", None, now=0.0)
-    session.close_link(first)
+    session.close_connection(first)
     session.cancel(identity)
 
-    assert commands(open_link(session, now=1.0, server="b")) == []
+    assert commands(open_connection(session, now=1.0, server="b")) == []

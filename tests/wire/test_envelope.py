@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from rse_pf.wire import CODECS, Command, Failure, Hello, Ping, make_codec
 from rse_pf.wire.envelope import Envelope, encode_refusal, peek
-from rse_pf.wire.preencoded import encode_command, prepare
+from rse_pf.wire.preencoded import encode_command, preencode
 
 FAILURE = Failure(id=7, code="busy", message="behind", hint="later", retry_after_ms=100.0, server="server-1")
 
@@ -27,7 +27,7 @@ def test_id_and_service_are_seen_whatever_the_payload(name: str, identity: int, 
 @pytest.mark.parametrize("name", CODECS)
 def test_prepared_messages_are_seen_too(name: str) -> None:
     codec = make_codec(name)
-    prepared = prepare(codec, {"x": [1.5] * 500})
+    prepared = preencode(codec, {"x": [1.5] * 500})
 
     message = encode_command(codec, Command(id=5, service="x" * 64, payload=prepared))
 

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from rse_pf.config import SessionSettings
 from rse_pf.errors import LimitExceeded
 from rse_pf.wire import Command, make_codec
-from rse_pf.wire.msgpack_limits import LIST_VALUES, MAP_VALUES, check_packed
+from rse_pf.wire.msgpack_limits import LIST_VALUES, MAP_VALUES, check_msgpack
 
 SMALL = SessionSettings(max_json_values=64, max_json_lists=16)
 
@@ -52,7 +52,7 @@ def test_a_message_is_refused_exactly_when_what_it_holds_weighs_too_much(value):
     too_much = weight(value) > SMALL.max_json_values or boxes(value) > SMALL.max_json_lists
 
     try:
-        check_packed(data, SMALL)
+        check_msgpack(data, SMALL)
     except LimitExceeded:
         assert too_much
     else:
@@ -62,7 +62,7 @@ def test_a_message_is_refused_exactly_when_what_it_holds_weighs_too_much(value):
 @given(data=st.binary(max_size=500))
 def test_what_is_no_message_pack_ends_too(data):
     try:
-        check_packed(data, SMALL)
+        check_msgpack(data, SMALL)
     except LimitExceeded:
         assert len(data) > SMALL.max_json_values // MAP_VALUES
 
@@ -75,14 +75,14 @@ def test_every_kind_of_small_value_has_its_limit(unit):
     limits = SessionSettings(max_json_values=1000, max_json_lists=500)
 
     with pytest.raises(LimitExceeded):
-        check_packed(array_of(unit, 1001), limits)
+        check_msgpack(array_of(unit, 1001), limits)
 
 
 def test_raw_arrays_of_the_largest_message_are_two_values():
     codec = make_codec("bin")
     data = codec.encode(Command(id=1, service="pnp", payload=np.random.default_rng(3).random(32000)))
 
-    check_packed(data, SessionSettings(max_json_values=64, max_json_lists=16))
+    check_msgpack(data, SessionSettings(max_json_values=64, max_json_lists=16))
     assert codec.decode_from_robot(data).id == 1
 
 

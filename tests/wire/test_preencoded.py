@@ -10,7 +10,7 @@ from rse_pf.errors import BadMessage
 from rse_pf.pnp.problems import make_problem
 from rse_pf.services.pnp import PnpRequest, make_request
 from rse_pf.wire import CODECS, Command, as_type, make_codec
-from rse_pf.wire.preencoded import encode_command, prepare
+from rse_pf.wire.preencoded import encode_command, preencode
 
 
 def request(codec: str) -> PnpRequest:
@@ -28,7 +28,7 @@ def command(payload: object) -> Command:
 def test_the_server_decodes_the_same_command_as_if_it_had_been_encoded_whole(name: str) -> None:
     codec, payload = make_codec(name), request(name)
 
-    got = codec.decode_from_robot(encode_command(codec, command(prepare(codec, payload))))
+    got = codec.decode_from_robot(encode_command(codec, command(preencode(codec, payload))))
     whole = codec.decode_from_robot(codec.encode(command(payload)))
 
     assert isinstance(got, Command)
@@ -42,19 +42,19 @@ def test_the_server_decodes_the_same_command_as_if_it_had_been_encoded_whole(nam
 @pytest.mark.parametrize("name", CODECS)
 def test_it_weighs_at_most_two_percent_more(name: str) -> None:
     codec, payload = make_codec(name), request(name)
-    prepared = encode_command(codec, command(prepare(codec, payload)))
+    prepared = encode_command(codec, command(preencode(codec, payload)))
     assert len(prepared) <= 1.02 * len(codec.encode(command(payload)))
 
 
 def test_a_payload_of_another_codec_is_refused() -> None:
     zlib = make_codec("zlib")
-    with pytest.raises(BadMessage, match="prepared for bin"):
-        encode_command(zlib, command(prepare(make_codec("bin"), {"value": 1})))
+    with pytest.raises(BadMessage, match="encoded for bin"):
+        encode_command(zlib, command(preencode(make_codec("bin"), {"value": 1})))
 
 
 def test_what_does_not_travel_is_refused() -> None:
     with pytest.raises(BadMessage):
-        prepare(make_codec("zlib"), {"value": object()})
+        preencode(make_codec("zlib"), {"value": object()})
 
 
 def test_a_plain_payload_is_encoded_as_ever() -> None:

@@ -7,31 +7,31 @@ from hypothesis import strategies as st
 
 from rse_pf.config import SessionSettings
 from rse_pf.wire import Command, Limits, Ping, Result, Welcome, make_codec
-from rse_pf.wire.client_session import Answered, ClientLink, RobotSession
-from rse_pf.wire.rate_limit import Bucket, RateLimiter
+from rse_pf.wire.client_session import Answered, ClientSession, ConnectionState
+from rse_pf.wire.rate_limit import RateLimiter, TokenBucket
 
 CODEC = make_codec("json")
 LIMITS = Limits(max_message_bytes=4096, max_in_flight=8, max_commands_per_s=20.0, command_burst=40)
 
 
-def welcomed(session: RobotSession, limits: Limits = LIMITS) -> ClientLink:
-    link = session.open_link(0.0)
-    link.outgoing.clear()
+def welcomed(session: ClientSession, limits: Limits = LIMITS) -> ConnectionState:
+    connection = session.open_connection(0.0)
+    connection.outgoing.clear()
     welcome = Welcome(server="a", session="s", robot="r", protocol=1, clock_s=0.0, limits=limits)
-    session.receive(link, CODEC.encode(welcome), 0.0)
-    session.adopt(link, 0.0)
-    return link
+    session.receive(connection, CODEC.encode(welcome), 0.0)
+    session.adopt(connection, 0.0)
+    return connection
 
 
-def answer_all(session: RobotSession, link: ClientLink, now: float) -> tuple[list[object], int]:
-    """Answer what was sent on *link*; return the messages and how many commands came to their end."""
-    messages = [CODEC.decode_from_robot(data) for data in link.outgoing]
-    link.outgoing.clear()
+def answer_all(session: ClientSession, connection: ConnectionState, now: float) -> tuple[list[object], int]:
+    """Answer what was sent on *connection*; return the messages and how many commands came to their end."""
+    messages = [CODEC.decode_from_robot(data) for data in connection.outgoing]
+    connection.outgoing.clear()
     ended = 0
     for message in messages:
         if isinstance(message, Command):
             answer = CODEC.encode(Result(id=message.id, reply=None, server="a"))
-            ended += sum(isinstance(event, Answered) for event in session.receive(link, answer, now))
+            ended += sum(isinstance(event, Answered) for event in session.receive(connection, answer, now))
     return messages, ended
 
 
@@ -41,16 +41,16 @@ def answer_all(session: RobotSession, link: ClientLink, now: float) -> tuple[lis
     delays_s=st.lists(st.floats(0.0, 0.1), min_size=1, max_size=10),
 )
 def test_whatever_a_robot_wants_its_server_sees_no_more_than_the_rate(bursts, gap_s, delays_s):
-    session = RobotSession(codec=CODEC, settings=SessionSettings(answer_timeout_s=1e4), sdk="t")
-    link, server, now, sent = welcomed(session), Bucket(20.0, 40.0), 0.0, 0
+    session = ClientSession(codec=CODEC, settings=SessionSettings(answer_timeout_s=1e4), sdk="t")
+    connection, server, now, sent = welcomed(session), TokenBucket(20.0, 40.0), 0.0, 0
     for number, burst in enumerate(bursts):
         for _ in range(burst):
             session.submit("echo", {}, now=now, keep=True)
         until = now + gap_s
         while now < until:
             session.due(now)
-            session.tend(link, now)
-            messages, _ = answer_all(session, link, now)
+            session.check(connection, now)
+            messages, _ = answer_all(session, connection, now)
             for _ in messages:
                 arrives = now + delays_s[(number + sent) % len(delays_s)]
                 assert server.take(max(arrives, server.at)) == 0.0
@@ -59,12 +59,12 @@ def test_whatever_a_robot_wants_its_server_sees_no_more_than_the_rate(bursts, ga
 
 
 def test_what_has_to_wait_goes_as_soon_as_the_rate_allows():
-    session = RobotSession(codec=CODEC, settings=SessionSettings(answer_timeout_s=100.0), sdk="t")
-    link, now, ended = welcomed(session), 0.0, 0
+    session = ClientSession(codec=CODEC, settings=SessionSettings(answer_timeout_s=100.0), sdk="t")
+    connection, now, ended = welcomed(session), 0.0, 0
     for _ in range(90):
         session.submit("echo", {}, now=now, keep=True)
     while ended < 90:
-        _, count = answer_all(session, link, now)
+        _, count = answer_all(session, connection, now)
         ended += count
         now = max(now + 0.001, session.next_due(now))
         session.due(now)
@@ -74,23 +74,23 @@ def test_what_has_to_wait_goes_as_soon_as_the_rate_allows():
 
 
 def test_without_a_rate_nothing_waits():
-    session = RobotSession(codec=CODEC, settings=SessionSettings(), sdk="t")
-    link = welcomed(session, Limits(max_message_bytes=4096, max_in_flight=1000))
+    session = ClientSession(codec=CODEC, settings=SessionSettings(), sdk="t")
+    connection = welcomed(session, Limits(max_message_bytes=4096, max_in_flight=1000))
     for _ in range(500):
         session.submit("echo", {}, now=0.0, keep=True)
 
-    assert len(link.outgoing) == 500
-    assert RateLimiter().room(0.0) > 1000
+    assert len(connection.outgoing) == 500
+    assert RateLimiter().available(0.0) > 1000
     assert RateLimiter().next_s(5.0) == 5.0
 
 
 def test_pings_count_too():
-    pace = RateLimiter(LIMITS)
-    before = pace.room(0.0)
-    session = RobotSession(codec=CODEC, settings=SessionSettings(), sdk="t")
-    link = welcomed(session)
+    limiter = RateLimiter(LIMITS)
+    before = limiter.available(0.0)
+    session = ClientSession(codec=CODEC, settings=SessionSettings(), sdk="t")
+    connection = welcomed(session)
 
-    session.tend(link, 0.5)
+    session.check(connection, 0.5)
 
-    assert isinstance(CODEC.decode_from_robot(link.outgoing[-1]), Ping)
-    assert link.pace.room(0.5) == before - 1
+    assert isinstance(CODEC.decode_from_robot(connection.outgoing[-1]), Ping)
+    assert connection.rate_limiter.available(0.5) == before - 1

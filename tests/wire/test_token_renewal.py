@@ -8,7 +8,7 @@ import pytest
 
 from rse_pf.config import SessionSettings
 from rse_pf.wire import Failure, Hello, Limits, Renew, Renewed, Welcome, make_codec
-from rse_pf.wire.client_session import ClientLink, RenewalDue, RobotSession
+from rse_pf.wire.client_session import ClientSession, ConnectionState, RenewalDue
 from rse_pf.wire.server_session import RENEWAL_PAUSE_S, Renewal, Send, ServerSession
 from rse_pf.wire.token_renewal import RenewalTimer
 
@@ -26,24 +26,24 @@ def server_session(token_s: float | None = 100.0) -> tuple[ServerSession, Welcom
     return session, welcome
 
 
-def linked(token_s: float | None) -> tuple[RobotSession, ClientLink]:
-    session = RobotSession(codec=CODEC, settings=SETTINGS, sdk="test")
-    link = session.open_link(0.0)
+def linked(token_s: float | None) -> tuple[ClientSession, ConnectionState]:
+    session = ClientSession(codec=CODEC, settings=SETTINGS, sdk="test")
+    connection = session.open_connection(0.0)
     limits = Limits(max_message_bytes=4096, max_in_flight=8)
     welcome = Welcome(
         server="a", session="s", robot="r", protocol=1, clock_s=0.0, limits=limits, token_s=token_s
     )
-    session.receive(link, CODEC.encode(welcome), 0.0)
-    session.adopt(link, 0.0)
-    return session, link
+    session.receive(connection, CODEC.encode(welcome), 0.0)
+    session.adopt(connection, 0.0)
+    return session, connection
 
 
-def asked_at(session: RobotSession, link: ClientLink, until: int) -> list[int]:
+def asked_at(session: ClientSession, connection: ConnectionState, until: int) -> list[int]:
     """Return in which seconds the session asked for a fresh token, with a server that answers pings."""
     asked = []
     for now in range(1, until):
-        link.ping_sent, link.last_heard = None, float(now)
-        if RenewalDue() in session.tend(link, float(now)):
+        connection.ping_sent, connection.last_heard = None, float(now)
+        if RenewalDue() in session.check(connection, float(now)):
             asked.append(now)
     return asked
 
@@ -91,10 +91,10 @@ def test_a_robot_asks_for_a_fresh_token_at_four_fifths_of_its_life_and_then_more
 
 
 def test_after_renewed_the_next_fresh_token_is_due_in_the_new_life():
-    session, link = linked(100.0)
-    session.receive(link, CODEC.encode(Renewed(token_s=1000.0)), 80.0)
+    session, connection = linked(100.0)
+    session.receive(connection, CODEC.encode(Renewed(token_s=1000.0)), 80.0)
 
-    assert asked_at(session, link, 1080)[:2] == [880, 980]
+    assert asked_at(session, connection, 1080)[:2] == [880, 980]
 
 
 def test_a_server_that_does_not_speak_of_tokens_is_never_asked():
@@ -102,24 +102,24 @@ def test_a_server_that_does_not_speak_of_tokens_is_never_asked():
 
 
 def test_a_link_that_is_left_is_not_renewed():
-    session, link = linked(100.0)
-    link.leaving = True
+    session, connection = linked(100.0)
+    connection.leaving = True
 
-    assert asked_at(session, link, 100) == []
+    assert asked_at(session, connection, 100) == []
 
 
 def test_renew_writes_one_message():
-    session, link = linked(100.0)
-    link.outgoing.clear()
+    session, connection = linked(100.0)
+    connection.outgoing.clear()
 
-    session.renew(link, "fresh")
+    session.renew(connection, "fresh")
 
-    assert [CODEC.decode_from_robot(data) for data in link.outgoing] == [Renew(token="fresh")]
+    assert [CODEC.decode_from_robot(data) for data in connection.outgoing] == [Renew(token="fresh")]
 
 
 @pytest.mark.parametrize("absurd", [-1.0, 1e12])
 def test_what_a_server_says_of_time_is_believed_within_an_hour(absurd: float):
-    lease = RenewalTimer()
-    lease.lasts(absurd, 0.0)
+    timer = RenewalTimer()
+    timer.expires_in(absurd, 0.0)
 
-    assert lease.ends_s == 3600.0
+    assert timer.ends_s == 3600.0

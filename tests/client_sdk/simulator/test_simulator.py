@@ -116,9 +116,11 @@ def test_the_renderer_needs_no_image_library():
     folder = Path(client_sdk.simulator.__file__).parent
     for path in folder.glob("simulate*.py"):
         imported = {
-            alias.name for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.Import)
+            alias.name
+            for node in ast.walk(ast.parse(path.read_text()))
+            if isinstance(node, ast.Import)
             for alias in node.names
-        }  # fmt: skip
+        }
         assert imported <= {"numpy", "numpy.typing"}
 
 

@@ -1,155 +1,143 @@
-"""`Robot.post` and `on_change`: what a generator of load needs of the SDK."""
+"""Uploads of keyframes in the background: rate limit, order, spool, and yielding to live poses."""
 
 from __future__ import annotations
 
-import asyncio
-import random
-from collections.abc import Coroutine
-from typing import Any
+import queue
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
 
-import pytest
-from fakes import FakeRobot, FakeServer, answer_at_once, answer_nothing
-
-import client_sdk
-from rse_pf.config import SessionSettings
-from rse_pf.errors import Disconnected
-from rse_pf.wire import Command, Failure, Result, make_codec
-from rse_pf.wire.client_session import Answered
-from rse_pf.wire.preencoded import prepare
-
-FAST = SessionSettings(reconnect_base_s=0.01, reconnect_max_s=0.05, stall_timeout_s=0.4, ping_interval_s=0.2)
+from client_sdk.transfer import BackgroundUploader
+from rse_pf.config import DataSettings
+from rse_pf.errors import BadRequest
+from rse_pf.wire.rate_limit import TokenBucket
 
 
-def run(work: Coroutine[Any, Any, None]) -> None:
-    asyncio.run(asyncio.wait_for(work, 30))
+def test_the_rate_limit_of_uploads_allows_no_burst_after_an_idle_time() -> None:
+    bucket = TokenBucket(1000.0, burst=0.0)
+
+    waits = [bucket.spend(500, now) for now in (3600.0, 3600.0, 3600.0)]
+
+    assert waits == [0.0, 0.5, 1.0]
 
 
-def connect(server: FakeServer, **options: Any) -> client_sdk.Robot:
-    return client_sdk.connect(server.url, settings=FAST, random=random.Random(1), **options)
-
-
-class Ends:
-    """Collects what `post` hears."""
+class FakeUploads:
+    """Takes files, or fails as told; knows when each came."""
 
     def __init__(self) -> None:
-        self.heard: list[Answered] = []
-        self._news = asyncio.Event()
+        self.taken: list[bytes] = []
+        self.errors: list[Exception] = []
+        self.parts: queue.SimpleQueue[int] = queue.SimpleQueue()
 
-    def __call__(self, event: Answered) -> None:
-        self.heard.append(event)
-        self._news.set()
+    def upload(self, source: Path, progress: Callable[[int, int], None]) -> str:
+        if self.errors:
+            raise self.errors.pop(0)
+        data = source.read_bytes()
+        for done in (0, len(data) // 2, len(data)):
+            self.parts.put(done)
+            progress(done, len(data))
+        self.taken.append(data)
+        return ""
 
-    async def until(self, count: int) -> None:
-        while len(self.heard) < count:
-            self._news.clear()
-            await self._news.wait()
-
-
-@pytest.mark.parametrize("codec", ["zlib", "json", "bin"])
-def test_a_prepared_payload_is_answered_in_every_codec(codec: str) -> None:
-    async def work() -> None:
-        async with FakeServer().running() as server, connect(server, codec=codec) as robot:
-            ends = Ends()
-            robot.post("echo", prepare(make_codec(codec), {"value": [1, 2.5]}), ends)
-            await ends.until(1)
-            assert isinstance(ends.heard[0].answer, Result)
-            assert ends.heard[0].answer.reply == {"value": [1, 2.5]}
-
-    run(work())
+    def close(self) -> None:
+        """Nothing is open."""
 
 
-def test_a_posted_command_is_sent_again_on_the_next_socket_and_ends_once() -> None:
-    async def work() -> None:
-        async with FakeServer(answer=answer_nothing).running() as server, connect(server) as robot:
-            ends = Ends()
-            payload = prepare(make_codec("zlib"), {"value": 7})
-            robot.post("echo", payload, ends)
-            await server.until(lambda: len(server.all_commands) == 1)
-            server.answer = answer_at_once
-            server.cut()
-            await ends.until(1)
-            assert isinstance(ends.heard[0].answer, Result)
-            assert ends.heard[0].answer.reply == {"value": 7}
-            assert robot.stats.resent == 1
-            assert robot.stats.duplicates == 0
-
-    run(work())
+@contextmanager
+def started(uploads: FakeUploads, folder: Path, **more: object) -> Iterator[BackgroundUploader]:
+    settings = DataSettings(background_bytes_per_s=100_000_000, max_spool_bytes=4000)
+    uploader = BackgroundUploader(uploads, folder, settings, **more)  # type: ignore[arg-type]
+    uploader.start()
+    try:
+        yield uploader
+    finally:
+        uploader.close()
 
 
-def test_a_posted_command_that_nobody_answers_expires() -> None:
-    async def work() -> None:
-        async with FakeServer(answer=answer_nothing).running() as server, connect(server) as robot:
-            ends = Ends()
-            robot.post("echo", {"value": 1}, ends, deadline_s=0.1)
-            await ends.until(1)
-            assert isinstance(ends.heard[0].answer, Failure)
-            assert ends.heard[0].answer.code == "expired"
+def test_keyframes_are_uploaded_in_order_and_removed_from_the_spool(tmp_path: Path) -> None:
+    uploads = FakeUploads()
+    with started(uploads, tmp_path / "spool") as uploader:
+        for n in range(5):
+            assert uploader.add(bytes([n]) * 100)
 
-    run(work())
+        assert uploader.wait_sent(20)
 
-
-def test_a_server_that_answers_twice_is_heard_once() -> None:
-    async def twice(server: FakeServer, robot: FakeRobot, command: Command) -> None:
-        answer = answer_at_once(server, robot, command)
-        await robot.websocket.send(robot.session.codec.encode(answer))
-
-    async def work() -> None:
-        def answer(server: FakeServer, robot: FakeRobot, command: Command) -> Result | Failure | None:
-            server.extra = asyncio.ensure_future(twice(server, robot, command))
-            return answer_at_once(server, robot, command)
-
-        async with FakeServer(answer=answer).running() as server, connect(server) as robot:
-            ends = Ends()
-            robot.post("echo", {"value": 1}, ends)
-            await server.until(lambda: robot.stats.dropped_answers == 1)
-            assert len(ends.heard) == 1
-
-    run(work())
+    assert uploads.taken == [bytes([n]) * 100 for n in range(5)]
+    assert list((tmp_path / "spool").iterdir()) == []
+    assert uploader.sent == 5
 
 
-def test_nothing_is_posted_by_a_robot_that_is_closed() -> None:
-    async def work() -> None:
-        async with FakeServer().running() as server:
-            async with connect(server) as robot:
-                pass
-            with pytest.raises(Disconnected):
-                robot.post("echo", {}, Ends())
+def test_the_spool_is_bounded_and_dropped_keyframes_are_counted(tmp_path: Path) -> None:
+    with started(FakeUploads(), tmp_path / "spool", is_busy=lambda: True) as uploader:
+        kept = [uploader.add(bytes([n]) * 1000) for n in range(6)]
+        assert uploader.held_bytes == 4000
 
-    run(work())
-
-
-def test_a_lost_link_and_its_return_are_told_once_each() -> None:
-    async def work() -> None:
-        told: list[tuple[str, str]] = []
-        back = asyncio.Event()
-
-        def changed(what: str, why: str) -> None:
-            told.append((what, why))
-            if what == "link-back":
-                back.set()
-
-        async with FakeServer().running() as server, connect(server, on_change=changed):
-            server.cut()
-            await back.wait()
-        assert told == [("link-lost", "closed"), ("link-back", "fake")]
-
-    run(work())
+    assert [each is not None for each in kept] == [True] * 4 + [False] * 2
+    assert uploader.dropped == 2
+    assert sum(path.stat().st_size for path in (tmp_path / "spool").iterdir()) == 4000
 
 
-def test_a_silent_link_is_told_with_its_reason() -> None:
-    async def work() -> None:
-        told: list[tuple[str, str]] = []
-        lost = asyncio.Event()
+def test_the_next_run_uploads_what_an_earlier_run_spooled(tmp_path: Path) -> None:
+    with started(FakeUploads(), tmp_path / "spool", is_busy=lambda: True) as first:
+        first.add(b"one")
+        first.add(b"two")
+    uploads = FakeUploads()
+    with started(uploads, tmp_path / "spool") as second:
+        second.add(b"three")
 
-        def changed(what: str, why: str) -> None:
-            told.append((what, why))
-            lost.set()
+        assert second.wait_sent(20)
 
-        async with FakeServer().running() as server, connect(server, on_change=changed) as robot:
-            server.deaf = True
-            robot.post("echo", {"value": 1}, Ends())
-            await lost.wait()
-            server.deaf = False
-        assert told[0] == ("link-lost", "silence")
+    assert uploads.taken == [b"one", b"two", b"three"]
 
-    run(work())
+
+def test_no_keyframe_is_started_while_live_poses_wait(tmp_path: Path) -> None:
+    uploads, busy, asked = FakeUploads(), threading.Event(), threading.Event()
+    busy.set()
+
+    def is_busy() -> bool:
+        asked.set()
+        return busy.is_set()
+
+    with started(uploads, tmp_path / "spool", is_busy=is_busy) as uploader:
+        uploader.add(b"keyframe")
+        assert asked.wait(20)
+        assert uploads.taken == []
+
+        busy.clear()
+        assert uploader.wait_sent(20)
+
+
+def test_no_part_is_started_while_live_poses_wait(tmp_path: Path) -> None:
+    uploads, busy, asked, proceed = FakeUploads(), threading.Event(), threading.Event(), threading.Event()
+
+    def is_busy() -> bool:
+        if not uploads.parts.empty():
+            busy.set()  # a pose arrives while the first part is sent
+            asked.set()
+        return busy.is_set() and not proceed.is_set()
+
+    with started(uploads, tmp_path / "spool", is_busy=is_busy) as uploader:
+        uploader.add(b"keyframe")
+        assert asked.wait(20)
+        assert uploads.parts.get(timeout=20) == 0
+        assert uploads.parts.empty()
+        assert uploads.taken == []
+
+        proceed.set()
+        assert uploader.wait_sent(20)
+
+    assert [uploads.parts.get(timeout=20) for _ in range(2)] == [4, 8]
+
+
+def test_a_keyframe_that_is_refused_for_good_is_dropped_and_the_next_is_uploaded(tmp_path: Path) -> None:
+    uploads = FakeUploads()
+    uploads.errors = [BadRequest("no")]
+    with started(uploads, tmp_path / "spool") as uploader:
+        uploader.add(b"bad")
+        uploader.add(b"good")
+
+        assert uploader.wait_sent(20)
+
+    assert uploads.taken == [b"good"]
+    assert (uploader.dropped, uploader.last_error) == (1, "no")

@@ -1,10 +1,9 @@
-"""The robot's side of large data: parts, resuming, patience, and a slow trickle beside live poses."""
+"""Transfers of large data: parts, resuming, retries and time limits."""
 
 from __future__ import annotations
 
 import hashlib
 import json
-import queue
 import random
 import threading
 from collections.abc import Callable, Iterator
@@ -13,10 +12,8 @@ from pathlib import Path
 
 import pytest
 
-from client_sdk.transfer.background_upload import BackgroundUploader, UploadRate
 from client_sdk.transfer.data_client import DataClient, DataOptions
-from rse_pf.config import DataSettings
-from rse_pf.errors import BadRequest, ConnectError, NotFound, QuotaExceeded, StoreError, UsageError
+from rse_pf.errors import ConnectError, NotFound, QuotaExceeded, StoreError, UsageError
 
 DATA = random.Random(1).randbytes(700_000)
 DIGEST = hashlib.sha256(DATA).hexdigest()
@@ -256,141 +253,3 @@ def test_other_bytes_than_asked_for_are_refused(service: FakeService, robot: Rob
 def test_an_address_is_checked_before_anything_is_sent(url: str) -> None:
     with pytest.raises(UsageError):
         DataClient(url, "token")
-
-
-def test_no_credit_is_saved_up_while_nothing_is_sent() -> None:
-    pace = UploadRate(1000.0, 0.0)
-
-    waits = [pace.wait_s(500, now) for now in (3600.0, 3600.0, 3600.0)]
-
-    assert waits == [0.0, 0.5, 1.0]
-
-
-class FakeUploads:
-    """Takes files, or fails as told; knows when each came."""
-
-    def __init__(self) -> None:
-        self.taken: list[bytes] = []
-        self.errors: list[Exception] = []
-        self.parts: queue.SimpleQueue[int] = queue.SimpleQueue()
-
-    def upload(self, source: Path, progress: Callable[[int, int], None]) -> str:
-        if self.errors:
-            raise self.errors.pop(0)
-        data = source.read_bytes()
-        for done in (0, len(data) // 2, len(data)):
-            self.parts.put(done)
-            progress(done, len(data))
-        self.taken.append(data)
-        return ""
-
-    def close(self) -> None:
-        """Nothing is open."""
-
-
-def uploader(uploads: FakeUploads, folder: Path, **more: object) -> BackgroundUploader:
-    settings = DataSettings(background_bytes_per_s=100_000_000, max_spool_bytes=4000)
-    return BackgroundUploader(uploads, folder, settings, **more)  # type: ignore[arg-type]
-
-
-def test_keyframes_go_in_order_and_leave_the_folder(tmp_path: Path) -> None:
-    uploads = FakeUploads()
-    background = uploader(uploads, tmp_path / "spool")
-    background.start()
-    for n in range(5):
-        assert background.add(bytes([n]) * 100)
-
-    assert background.wait_sent(20)
-    background.close()
-
-    assert uploads.taken == [bytes([n]) * 100 for n in range(5)]
-    assert list((tmp_path / "spool").iterdir()) == []
-    assert background.sent == 5
-
-
-def test_the_folder_is_bounded_and_what_it_cannot_hold_is_counted(tmp_path: Path) -> None:
-    background = uploader(FakeUploads(), tmp_path / "spool", is_busy=lambda: True)
-    background.start()
-
-    kept = [background.add(bytes([n]) * 1000) for n in range(6)]
-    background.close()
-
-    assert [each is not None for each in kept] == [True] * 4 + [False] * 2
-    assert background.dropped == 2
-    assert sum(path.stat().st_size for path in (tmp_path / "spool").iterdir()) == 4000
-
-
-def test_the_next_run_sends_what_this_one_could_not(tmp_path: Path) -> None:
-    first = uploader(FakeUploads(), tmp_path / "spool", is_busy=lambda: True)
-    first.start()
-    first.add(b"one")
-    first.add(b"two")
-    first.close()
-    uploads = FakeUploads()
-    second = uploader(uploads, tmp_path / "spool")
-    second.start()
-    second.add(b"three")
-
-    assert second.wait_sent(20)
-    second.close()
-
-    assert uploads.taken == [b"one", b"two", b"three"]
-
-
-def test_nothing_is_begun_while_live_poses_wait(tmp_path: Path) -> None:
-    uploads, busy, asked = FakeUploads(), threading.Event(), threading.Event()
-    busy.set()
-
-    def is_busy() -> bool:
-        asked.set()
-        return busy.is_set()
-
-    background = uploader(uploads, tmp_path / "spool", is_busy=is_busy)
-    background.start()
-    background.add(b"keyframe")
-    assert asked.wait(20)
-    assert uploads.taken == []
-
-    busy.clear()
-    assert background.wait_sent(20)
-    background.close()
-
-
-def test_no_part_is_begun_while_live_poses_wait(tmp_path: Path) -> None:
-    uploads, busy, asked = FakeUploads(), threading.Event(), threading.Event()
-
-    def is_busy() -> bool:
-        if not uploads.parts.empty():
-            busy.set()  # a pose comes while the first part is on its way
-            asked.set()
-        return busy.is_set() and not let.is_set()
-
-    let = threading.Event()
-    background = uploader(uploads, tmp_path / "spool", is_busy=is_busy)
-    background.start()
-    background.add(b"keyframe")
-    assert asked.wait(20)
-    assert uploads.parts.get(timeout=20) == 0
-    assert uploads.parts.empty()
-    assert uploads.taken == []
-
-    let.set()
-    assert background.wait_sent(20)
-    background.close()
-
-    assert [uploads.parts.get(timeout=20) for _ in range(2)] == [4, 8]
-
-
-def test_what_the_server_will_never_take_is_dropped_and_the_next_goes(tmp_path: Path) -> None:
-    uploads = FakeUploads()
-    uploads.errors = [BadRequest("no")]
-    background = uploader(uploads, tmp_path / "spool")
-    background.start()
-    background.add(b"bad")
-    background.add(b"good")
-
-    assert background.wait_sent(20)
-    background.close()
-
-    assert uploads.taken == [b"good"]
-    assert (background.dropped, background.last_error) == (1, "no")

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import random
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 import pytest
@@ -66,10 +67,10 @@ class Bucket(MemoryStore):
         self._thread.start()
         self._url = f"http://127.0.0.1:{self._server.server_address[1]}"
 
-    def presigned_put(self, name: str, *, size: int, sha256: str, life_s: int) -> tuple[str, dict[str, str]]:
+    def presigned_put(self, name: str, *, size: int, sha256: str, ttl_s: int) -> tuple[str, dict[str, str]]:
         return f"{self._url}/{name}?signed", {"Content-Length": str(size), "x-checksum": sha256}
 
-    def presigned_get(self, name: str, *, life_s: int) -> str:
+    def presigned_get(self, name: str, *, ttl_s: int) -> str:
         return f"{self._url}/{name}?signed"
 
     def close(self) -> None:
@@ -92,14 +93,25 @@ def service(bucket: Bucket) -> Service:
     return Service(small_settings(part_bytes=200_000, max_object_bytes=1 << 20, quota_bytes=1 << 22), bucket)
 
 
+@contextmanager
+def connected(
+    service: Service, sleep: Callable[[float], None] = lambda seconds: None
+) -> Iterator[DataClient]:
+    """A robot that calls *sleep* instead of sleeping."""
+    balancer = FrontDoor(service)
+    client = DataClient(balancer.url, service.token, DataOptions(sleep=sleep))
+    try:
+        yield client
+    finally:
+        client.close()
+        balancer.close()
+
+
 @pytest.fixture
 def robot(service: Service) -> Iterator[DataClient]:
-    """A robot that waits for nothing."""
-    door = FrontDoor(service)
-    client = DataClient(door.url, service.token, DataOptions(sleep=lambda seconds: None))
-    yield client
-    client.close()
-    door.close()
+    """A robot that never sleeps."""
+    with connected(service) as client:
+        yield client
 
 
 def carried(service: Service) -> int:
@@ -131,21 +143,16 @@ def test_a_closed_bucket_is_asked_three_times_and_then_the_service_carries_the_b
     assert carried(service) >= 2 * len(DATA)
 
 
-def test_an_address_that_expired_is_asked_for_again(
-    service: Service, bucket: Bucket, robot: DataClient
-) -> None:
+def test_a_presigned_address_that_expired_is_requested_again(service: Service, bucket: Bucket) -> None:
     bucket.is_open = False
-    pauses: list[float] = []
 
-    def open_it(seconds: float) -> None:
-        pauses.append(seconds)
+    def open_bucket(seconds: float) -> None:
         bucket.is_open = True
 
-    robot._options = DataOptions(sleep=open_it)
-
-    assert robot.upload(DATA) == DIGEST
-    bucket.is_open = False
-    assert robot.download(DIGEST) == DATA
+    with connected(service, sleep=open_bucket) as robot:
+        assert robot.upload(DATA) == DIGEST
+        bucket.is_open = False
+        assert robot.download(DIGEST) == DATA
 
     assert bucket.asked == [("PUT", 403), ("PUT", 200), ("GET", 403), ("GET", 206)]
     assert carried(service) == 0
@@ -154,9 +161,12 @@ def test_an_address_that_expired_is_asked_for_again(
 @pytest.mark.parametrize(
     ("url", "secure", "allowed"),
     [
-        ("https://bucket.s3.amazonaws.com/a?x", True, True), ("http://bucket/a", True, False),
-        ("http://127.0.0.1:1/a", False, True), ("ftp://bucket/a", False, False), ("", False, False),
+        ("https://bucket.s3.amazonaws.com/a?x", True, True),
+        ("http://bucket/a", True, False),
+        ("http://127.0.0.1:1/a", False, True),
+        ("ftp://bucket/a", False, False),
+        ("", False, False),
     ],
-)  # fmt: skip
+)
 def test_tls_is_never_left(url: str, secure: bool, allowed: bool) -> None:
     assert is_allowed(url, secure=secure) is allowed
