@@ -1,4 +1,4 @@
-"""What Linux tells about processes, and what is changed of them."""
+"""Priority, end and name of processes."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from rse_pf.linux import run_when_idle
 pytestmark = pytest.mark.system
 
 
-def test_a_child_that_stepped_back_runs_last_before_it_does_anything() -> None:
+def test_a_child_runs_only_when_the_processor_is_idle_before_it_does_anything() -> None:
     with subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as child:
         run_when_idle(child.pid)
         try:

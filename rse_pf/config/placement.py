@@ -42,25 +42,25 @@ class ServerPlacement:
         return cls(**_values(_placed(settings, changes)))
 
     @classmethod
-    def read(cls, file: Path | None, settings: PlatformSettings) -> ServerPlacement:
-        """Return the placement in a settings file; what the file does not say is taken from *settings*.
+    def read(cls, file: Path | None, settings: PlatformSettings, **changes: Any) -> ServerPlacement:
+        """Return the placement in a settings file with *changes*; *settings* say what both leave out.
 
         Raises:
             SettingsError: The file cannot be read, or holds a value that no such setting may have.
         """
         if file is None:
-            return cls.of(settings)
+            return cls.of(settings, **changes)
         try:
             document = json.loads(file.read_text(encoding="utf-8"))
         except (OSError, ValueError) as error:
             raise SettingsError(f"cannot read {file}: {error}", hint="name another with --settings") from error
-        changes = document.get(_FILE_KEY, {})
-        unknown = set(changes) - set(cls.__slots__) if isinstance(changes, dict) else {_FILE_KEY}
+        placed = document.get(_FILE_KEY, {})
+        unknown = set(placed) - set(cls.__slots__) if isinstance(placed, dict) else {_FILE_KEY}
         if unknown:
             raise SettingsError(
                 f"{file}: placement has no {min(unknown)!r}", hint=f"it takes {', '.join(cls.__slots__)}"
             )
-        return cls.of(settings, **changes)
+        return cls.of(settings, **{**placed, **changes})
 
     def apply(self, settings: PlatformSettings) -> PlatformSettings:
         """Return *settings* as they are for this server."""

@@ -2,9 +2,65 @@
 
 from __future__ import annotations
 
+import json
+from pathlib import Path
+from typing import Any
+
 import pytest
 
-from rse_pf.config.placement import is_loopback
+from rse_pf.config import PlatformSettings, load_settings
+from rse_pf.config.placement import ServerPlacement, is_loopback
+from rse_pf.errors import SettingsError
+
+SETTINGS = PlatformSettings.from_dict({"serving": {"port": 9000, "workers": 3}})
+
+
+def test_settings_describe_the_placement_of_a_server_that_is_told_nothing_else() -> None:
+    placement = ServerPlacement.read(None, SETTINGS)
+
+    assert (placement.port, placement.workers) == (9000, 3)
+    assert placement.host == SETTINGS.serving.host
+    assert placement.store == SETTINGS.data.store
+
+
+def test_a_settings_file_carries_a_placement_beside_the_settings(tmp_path: Path) -> None:
+    placement = ServerPlacement.of(SETTINGS, host="127.0.0.1", port=0, control_port=0, store="dir:/tmp/x")
+    file = tmp_path / "settings.json"
+    file.write_text(json.dumps(placement.document(SETTINGS)))
+
+    settings = load_settings(file)
+
+    assert ServerPlacement.read(file, settings) == placement
+    assert settings == SETTINGS
+    assert settings.digest() == SETTINGS.digest()
+
+
+def test_a_placement_changes_the_settings_of_its_server_and_nothing_else() -> None:
+    placement = ServerPlacement.of(SETTINGS, port=0, store="dir:/tmp/x")
+
+    placed = placement.apply(SETTINGS)
+
+    assert (placed.serving.port, placed.data.store) == (0, "dir:/tmp/x")
+    assert placed.replace(serving={"port": 9000}, data={"store": SETTINGS.data.store}) == SETTINGS
+
+
+@pytest.mark.parametrize(
+    ("placement", "word"),
+    [
+        ({"port": 70000}, "port"), ({"workers": "two"}, "workers"), ({"listen": "all"}, "listen"),
+        ([1], "placement"),
+    ],
+)  # fmt: skip
+def test_a_placement_that_makes_no_sense_is_refused_with_a_hint(
+    tmp_path: Path, placement: Any, word: str
+) -> None:
+    file = tmp_path / "settings.json"
+    file.write_text(json.dumps({"placement": placement}))
+
+    with pytest.raises(SettingsError, match=word) as told:
+        ServerPlacement.read(file, PlatformSettings())
+
+    assert told.value.hint
 
 
 @pytest.mark.parametrize("host", ["127.0.0.1", "127.8.0.1", "::1", "localhost"])

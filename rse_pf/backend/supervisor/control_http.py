@@ -1,7 +1,6 @@
 """Serve the control port: a very small HTTP/1.1 server for health checks, metrics and drain.
 
-Promises short requests only (8 KiB of head, no chunked bodies), a time limit on each of them, and
-to know nothing of what the answers mean.
+A request has at most 8 KiB of head and no chunked body, and must be complete within a minute.
 """
 
 from __future__ import annotations
@@ -44,7 +43,7 @@ class ControlReply:
 async def serve_control(
     host: str, port: int, answer: Callable[[ControlRequest], Awaitable[ControlReply]]
 ) -> asyncio.Server:
-    """Listen on *host* and *port* (0 takes a free one) and let *answer* speak."""
+    """Listen on *host* and *port* (0 takes a free one) and answer each request with *answer*."""
 
     async def talk(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         try:
@@ -57,9 +56,9 @@ async def serve_control(
             asyncio.LimitOverrunError,
             asyncio.TimeoutError,
         ):
-            pass  # a stranger's broken request ends its own connection, and only that
+            pass  # a malformed request ends its own connection only
         except asyncio.CancelledError:
-            pass  # the loop ends: a kept-alive connection is no error, and asyncio would log one
+            pass  # the loop ends: asyncio would log an error for each connection that was kept alive
         finally:
             writer.close()
 

@@ -1,7 +1,4 @@
-"""The listener of a backend server: bound once, and never open to strangers without tokens.
-
-Promises to accept nobody, and that a refusal says which setting to change.
-"""
+"""The listening socket of a backend server, which no other machine reaches without authentication."""
 
 from __future__ import annotations
 
@@ -12,15 +9,15 @@ from rse_pf.config import PlatformSettings
 from rse_pf.config.placement import is_loopback
 from rse_pf.errors import ConfigurationError
 
-__all__ = ["bound", "check_open_door"]
+__all__ = ["bound_socket", "check_authentication"]
 
 
-def check_open_door(settings: PlatformSettings, keys: KeySet | None, conformance_echo: bool) -> None:
-    """Refuse a door through which anybody could come; raises ConfigurationError."""
+def check_authentication(settings: PlatformSettings, keys: KeySet | None, conformance_echo: bool) -> None:
+    """Raise ConfigurationError if robots of other machines could connect without a token."""
     host = settings.serving.host
     if conformance_echo and not is_loopback(host):
         raise ConfigurationError(
-            f"conformance echo on {host} would let anybody in", hint="set serving.host to 127.0.0.1"
+            f"conformance echo on {host} would let anybody connect", hint="set serving.host to 127.0.0.1"
         )
     if conformance_echo:
         return
@@ -31,13 +28,13 @@ def check_open_door(settings: PlatformSettings, keys: KeySet | None, conformance
         )
     if not settings.auth.required and not is_loopback(host):
         raise ConfigurationError(
-            f"auth.required = false on {host} would let anybody in",
+            f"auth.required = false on {host} would let anybody connect",
             hint="set auth.required to true, or serving.host to 127.0.0.1",
         )
 
 
-def bound(host: str, port: int) -> socket.socket:
-    """Return a socket at the address that does not listen yet; raises ConfigurationError."""
+def bound_socket(host: str, port: int) -> socket.socket:
+    """Return a socket that is bound but does not listen yet; raises ConfigurationError."""
     try:
         family, kind, protocol, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
         listener = socket.socket(family, kind, protocol)

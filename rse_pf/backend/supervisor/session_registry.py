@@ -1,13 +1,14 @@
-"""The newer connection of a robot wins: the supervisor knows every worker's robots, and decides.
+"""The robots connected to one server; the newer connection of a robot replaces the older one.
 
-Connections count in the order in which they were accepted, whatever worker was slow to hear their Hello.
-Promises no socket and no clock, and that a robot which is moving keeps its old connection until the move is
-over: its worker asks again then.
+The order is that in which sockets were accepted, however late a worker reads a Hello.  A robot that is
+moving keeps its old connection until the move is over; its worker reports ``stays`` then.
 """
 
 from __future__ import annotations
 
 from typing import Protocol
+
+from rse_pf.backend.supervisor.orders import ReplaceOrder, WorkerOrder
 
 __all__ = ["SessionRegistry", "WorkerHandle"]
 
@@ -18,31 +19,35 @@ Robot = tuple[str, str]
 class WorkerHandle(Protocol):
     """A worker that takes orders."""
 
-    def order(self, **what: object) -> None:
-        """Send an order."""
+    def order(self, order: WorkerOrder) -> None:
+        """Send *order*."""
 
 
 class SessionRegistry:
-    """Who is connected to one server, and by which sockets."""
+    """The sockets of every robot that is connected to one server."""
 
     def __init__(self) -> None:
         self._sockets: dict[Robot, dict[int, WorkerHandle]] = {}
 
-    def hear(self, worker: WorkerHandle, message: dict[str, object]) -> None:
-        """Take what a worker says of one socket: ``arrived``, ``stays`` or ``left``."""
+    def __len__(self) -> int:
+        """Return the number of robots that are connected."""
+        return len(self._sockets)
+
+    def handle(self, worker: WorkerHandle, message: dict[str, object]) -> None:
+        """Handle what a worker reports of one socket: ``arrived``, ``stays`` or ``left``."""
         robot = (str(message["tenant"]), str(message["robot"]))
         number = int(str(message["number"]))
         if message["event"] == "left":
-            self._left(robot, number)
+            self._forget(robot, number)
             return
         if message["event"] == "arrived":
             self._sockets.setdefault(robot, {})[number] = worker
         sockets = self._sockets.get(robot, {})
         for older in sorted(sockets)[:-1]:
             if message["event"] == "arrived" or older == number:
-                sockets[older].order(do="replace", number=older)
+                sockets[older].order(ReplaceOrder(older))
 
-    def _left(self, robot: Robot, number: int) -> None:
+    def _forget(self, robot: Robot, number: int) -> None:
         sockets = self._sockets.get(robot, {})
         sockets.pop(number, None)
         if not sockets:

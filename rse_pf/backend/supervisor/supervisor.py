@@ -1,8 +1,8 @@
 """One backend server: listener, worker processes, control port and drain; the body of `rse-pf serve`.
 
-The supervisor accepts each robot and hands the socket to the least-loaded worker, so the spread is
-even.  Promises that supervisor and workers live and die together (it restarts nothing: the scale
-modifier replaces servers), that it never reads a robot's bytes, and that a drain loses no command.
+The supervisor accepts each robot and passes the socket to the worker with the fewest robots.  It reads no
+byte of a robot and restarts no worker: the server ends with its first worker that is lost, and the scale
+modifier replaces it.  A drain loses no command.
 """
 
 from __future__ import annotations
@@ -25,21 +25,22 @@ from rse_pf.auth.tokens import KeySet
 from rse_pf.auth.trust_store import REFRESH_S, TrustStore
 from rse_pf.backend.gateway.audit_recorder import ServerAudit, open_records
 from rse_pf.backend.gateway.migration import plan
-from rse_pf.backend.gateway.rate_limits import Bucket
 from rse_pf.backend.jobs.slots import make_pipe
 from rse_pf.backend.log import JsonLog
 from rse_pf.backend.metrics import merge, merge_isolation, render
 from rse_pf.backend.supervisor.control_http import ControlReply, ControlRequest, serve_control
-from rse_pf.backend.supervisor.listener import bound, check_open_door
+from rse_pf.backend.supervisor.listener import bound_socket, check_authentication
 from rse_pf.backend.supervisor.orders import DrainOrder, LeaveOrder, MigrateOrder
 from rse_pf.backend.supervisor.session_registry import SessionRegistry
 from rse_pf.backend.supervisor.trust_poller import TrustPoller
 from rse_pf.backend.supervisor.worker import WorkerPlan
 from rse_pf.backend.supervisor.worker_handle import BUILTIN, WorkerProcess, fork_workers
 from rse_pf.config import PlatformSettings
+from rse_pf.config.placement import ServerPlacement
 from rse_pf.errors import ConfigurationError
 from rse_pf.files import replace_json
 from rse_pf.linux import cpu_seconds, raise_descriptor_limit, resident_bytes
+from rse_pf.wire.rate_limit import TokenBucket
 
 __all__ = ["serve"]
 
@@ -49,52 +50,53 @@ _MIN_PAUSE_S = 0.01
 _FRESH_S = 0.25
 _REPORT_S = 0.3
 _LEAVE_S = 3.0
-_AT_ONCE_S = 0.0
 _MAX_MOVES = 10000
-_MAX_SPREAD_S = 3600.0
+_MAX_SPREAD_S = _MAX_DRAIN_WAIT_S = 3600.0
 _EXIT_OK, _EXIT_LOST = 0, 1
-_PAGES_OF_ALL = ("/healthz", "/readyz")
-"""A load balancer asks them, and carries no token."""
+_PUBLIC_PAGES = ("/healthz", "/readyz")
+"""A load balancer asks for them, without a token."""
 
 
 def serve(
     settings: PlatformSettings,
     *,
-    keys: KeySet | None,
+    placement: ServerPlacement | None = None,
+    keys: KeySet | None = None,
     trust: TrustStore | None = None,
     server_id: str,
     announce: Path | None = None,
     conformance_echo: bool = False,
     services: str = BUILTIN,
-    settings_digest: str = "",
     audit: Path | None = None,
     control_token: str | None = None,
 ) -> int:
     """Serve robots until a drain or a signal ends it; call it in the main thread of a process.
 
     Args:
-        settings: ``serving.port`` and ``serving.control_port`` may be 0.
-        keys: Who may sign robots' tokens; None only where ``auth.required`` is false.
-        trust: Reads the same again and again, and who is enrolled and who is denied; None: *keys* stay.
+        settings: What all servers of the platform share.  /healthz shows its digest.
+        placement: Addresses, workers and store of this server; None takes what *settings* say.
+        keys: Public keys of robots' tokens, for the whole run; None only where ``auth.required`` is false.
+        trust: Reads public keys, roster and deny list, now and periodically, instead of *keys*.
         server_id: Name of this server in every Welcome, Result and log line.
-        announce: File that tells, once everything listens, pids and ports as JSON.
+        announce: File for pids and ports, as JSON; written once everything listens.
         conformance_echo: Echo raw messages without token or sub-protocol, for conformance suites.
         services: ``module:function`` that makes the registry of a worker from the settings.
-        settings_digest: What /healthz says; empty means that of *settings*.  Whoever lays an address of this
-            machine over shared settings names the digest of the shared ones.
         audit: Folder of the audit log; None records nothing.
-        control_token: What must be carried to the control port, but to its two health pages; None: nothing.
+        control_token: Token that the control port requires for all but its two health pages; None: no token.
 
     Returns:
         0 after a drain or a signal, 1 when a worker was lost.
 
     Raises:
-        ConfigurationError: An open door on a public address, no keys, or the port is taken.
+        ConfigurationError: No keys, no authentication on a public address, or the port is taken.
     """
     if trust is not None:
         trust.load()
         keys = trust.keys
-    check_open_door(settings, keys, conformance_echo)
+    digest = settings.digest()
+    if placement is not None:
+        settings = placement.apply(settings)
+    check_authentication(settings, keys, conformance_echo)
     raise_descriptor_limit()
     count = settings.serving.workers or len(os.sched_getaffinity(0))
     slots = make_pipe(settings.serving.max_running_jobs)
@@ -106,13 +108,13 @@ def serve(
         )
         for index in range(count)
     ]  # fmt: skip
-    with bound(settings.serving.host, settings.serving.port) as listener:
+    with bound_socket(settings.serving.host, settings.serving.port) as listener:
         workers = fork_workers(plans, listener=listener)
         try:
             with open_records(audit, server_id) as records:
                 supervisor = _Supervisor(
                     settings, workers=workers, trust=trust, server_id=server_id, announce=announce,
-                    listener=listener, digest=settings_digest or settings.digest(), records=records,
+                    listener=listener, digest=digest, records=records,
                     control_token=control_token,
                 )  # fmt: skip
                 return asyncio.run(supervisor.run())
@@ -151,7 +153,7 @@ class _Supervisor:
         self._signals = 0
         self._accepted = self._refused_full = 0
         self._trust = trust if settings.auth.required else None
-        self._accepts = Bucket(settings.serving.max_accepts_per_s, float(settings.serving.handshake_burst))
+        self._accepts = TokenBucket(settings.serving.max_accepts_per_s, float(settings.serving.handshake_burst))
         self._accept_pauses = self._control_refused = 0
         self._control_token = control_token
         self._log = JsonLog(level=settings.serving.log_level, server=server_id, wall_clock=time.time)
@@ -192,7 +194,7 @@ class _Supervisor:
         return control
 
     async def _start(self, loop: asyncio.AbstractEventLoop) -> None:
-        on_robot = self._records.heard(SessionRegistry().hear)
+        on_robot = self._records.heard(SessionRegistry().handle)
         readiness = [
             loop.create_task(worker.connect(on_lost=self._on_lost, on_robot=on_robot))
             for worker in self._workers
@@ -257,7 +259,7 @@ class _Supervisor:
                     self._refused_full += 1
 
     def _pause_accepting(self, pause_s: float) -> None:
-        """The listener stays readable meanwhile: do not spin on it."""
+        """Stop watching the listener for *pause_s*; it stays readable meanwhile."""
         loop = asyncio.get_running_loop()
         loop.remove_reader(self._listener.fileno())
         loop.call_later(pause_s, self._resume_accepting)
@@ -276,12 +278,12 @@ class _Supervisor:
     def _on_signal(self, number: signal.Signals) -> None:
         self._signals += 1
         if number == signal.SIGINT or self._signals > 1 or self._state == "starting":
-            self._keep(self._leave(_AT_ONCE_S))
+            self._keep(self._leave(held_s=0.0))
         elif self._state == "ready":
             self._keep(self._drain(self._settings.serving.drain_wait_s))
 
     async def _drain(self, wait_s: float) -> None:
-        """Not ready but accepting, then Move to all, finish what is held, leave."""
+        """Report not ready but accept, then ask all robots to move, finish what is held, and leave."""
         self._state = "draining"
         self._log.info("drain", wait_s=wait_s)
         self._records.note("server.drain", wait_s=wait_s)
@@ -334,7 +336,7 @@ class _Supervisor:
             ("POST", "/move"): self._post_move,
         }
         token = self._control_token
-        if token is not None and ask.path not in _PAGES_OF_ALL and not is_carried(ask.authorization, token):
+        if token is not None and ask.path not in _PUBLIC_PAGES and not is_carried(ask.authorization, token):
             self._control_refused += 1
             return _json({"code": "unauthorized"}, status=401, headers={"WWW-Authenticate": "Bearer"})
         page = pages.get((ask.method, ask.path))
@@ -413,56 +415,58 @@ class _Supervisor:
 
     async def _post_drain(self, ask: ControlRequest) -> ControlReply:
         if not ask.is_local:
-            return _json({"code": "forbidden", "hint": "drain from the server's own machine"}, status=403)
+            return _refused(403, "forbidden", "drain from the server's own machine")
         try:
-            wait_s = float(ask.query.get("wait", self._settings.serving.drain_wait_s))
+            wait_s = _number(ask, "wait", self._settings.serving.drain_wait_s, _MAX_DRAIN_WAIT_S)
         except ValueError:
-            return _json({"code": "bad-request", "hint": "wait is a number of seconds"}, status=400)
-        if not 0 <= wait_s <= 3600:
-            return _json({"code": "bad-request", "hint": "wait is 0 to 3600 seconds"}, status=400)
+            return _refused(400, "bad-request", f"wait is 0 to {_MAX_DRAIN_WAIT_S:g} seconds")
         if self._state == "ready":
             self._state = "draining"
             self._keep(self._drain(wait_s))
         return _json({"state": self._state}, status=202)
 
     async def _post_move(self, ask: ControlRequest) -> ControlReply:
-        """Hand robots over; while one hand-over is under way, a further ask moves nobody."""
-        if not ask.is_local:
-            return _json({"code": "forbidden", "hint": "move from the server's own machine"}, status=403)
+        """Ask robots to move; while an earlier migration is under way, no further robot is asked."""
         try:
-            robots, spread_s = int(ask.query["robots"]), float(ask.query.get("spread_s", "0"))
+            robots = int(ask.query["robots"])
+            spread_s = _number(ask, "spread_s", 0.0, _MAX_SPREAD_S)
         except (KeyError, ValueError):
-            hint = "robots is a whole number, spread_s a number of seconds"
-            return _json({"code": "bad-request", "hint": hint}, status=400)
-        if not (0 <= robots <= _MAX_MOVES and 0 <= spread_s <= _MAX_SPREAD_S):
-            hint = f"robots is 0 to {_MAX_MOVES}, spread_s 0 to {_MAX_SPREAD_S:g} seconds"
-            return _json({"code": "bad-request", "hint": hint}, status=400)
+            robots, spread_s = -1, 0.0
+        if not ask.is_local:
+            return _refused(403, "forbidden", "move from the server's own machine")
+        if not 0 <= robots <= _MAX_MOVES:
+            return _refused(
+                400, "bad-request", f"robots is 0 to {_MAX_MOVES}, spread_s 0 to {_MAX_SPREAD_S:g} seconds"
+            )
         if self._state != "ready":
-            return _json({"code": "draining", "hint": "all its robots move already"}, status=409)
-        now = time.monotonic()
-        if now < self._moving_until:
-            left_s = self._moving_until - now
+            return _refused(409, "draining", "all its robots move already")
+        left_s = self._moving_until - time.monotonic()
+        if left_s > 0:
             return _json({"robots": 0, "spread_s": round(left_s, 3), "under_way": True}, status=202)
+        asked, last_s = self._migrate(robots, spread_s)
+        return _json({"robots": asked, "spread_s": last_s, "under_way": False}, status=202)
+
+    def _migrate(self, robots: int, spread_s: float) -> tuple[int, float]:
+        """Order the workers to ask *robots* to move; return how many are asked, and the seconds until the last."""
         delays = plan(
             [worker.load for worker in self._workers], robots, spread_s=spread_s,
             moves_per_s=self._settings.scaling.moves_per_s, random=random.random,
         )  # fmt: skip
         asked, last_s = sum(map(len, delays)), max((each[-1] for each in delays if each), default=0.0)
-        self._moving_until = now + last_s
+        self._moving_until = time.monotonic() + last_s
         for worker, delays_s in zip(self._workers, delays, strict=True):
             if delays_s:
-                within_ms = self._settings.serving.drain_within_ms
-                worker.order(do="hand-over", delays_s=delays_s, within_ms=within_ms)
-        self._log.info("hand-over", robots=asked, spread_s=round(last_s, 3))
+                worker.order(MigrateOrder(delays_s, self._settings.serving.drain_within_ms))
+        self._log.info("migration", robots=asked, spread_s=round(last_s, 3))
         self._records.note("server.move", robots=asked, spread_s=round(last_s, 3))
-        return _json({"robots": asked, "spread_s": round(last_s, 3), "under_way": False}, status=202)
+        return asked, round(last_s, 3)
 
     def _identity_while_open(self) -> dict[str, Any]:
         identity = {"server": self._server_id, "pid": os.getpid(), "workers": [w.pid for w in self._workers]}
         return identity if self._listener.fileno() < 0 else self._identity()
 
     async def _merged(self) -> dict[str, Any]:
-        """Ask the workers at most every quarter second; one that does not answer keeps its old numbers."""
+        """Return the numbers of all workers, at most a quarter second old; a silent worker's are older."""
         async with self._reporting:
             if time.monotonic() - self._reported >= _FRESH_S:
                 await asyncio.gather(*(worker.ask_report(_REPORT_S) for worker in self._workers))
@@ -480,6 +484,18 @@ class _Supervisor:
 
 def _json(value: Any, *, status: int = 200, headers: dict[str, str] | None = None) -> ControlReply:
     return ControlReply(status=status, body=json.dumps(value).encode() + b"\n", headers=headers or {})
+
+
+def _refused(status: int, code: str, hint: str) -> ControlReply:
+    return _json({"code": code, "hint": hint}, status=status)
+
+
+def _number(ask: ControlRequest, name: str, default: float, maximum: float) -> float:
+    """Return a parameter of a request; raises ValueError if it is none from 0 to *maximum*."""
+    value = float(ask.query.get(name, default))
+    if not 0 <= value <= maximum:
+        raise ValueError(name)
+    return value
 
 
 def _version() -> str:

@@ -1,6 +1,6 @@
-"""Read the access control store again and again, and tell every worker what is new.
+"""Read the access control store periodically, and send every worker what is new.
 
-What cannot be read leaves everything as it was known, and is logged once.
+What cannot be read stays as it was last known, and is logged once.
 """
 
 from __future__ import annotations
@@ -10,13 +10,14 @@ from collections.abc import Callable, Iterable
 
 from rse_pf.auth.trust_store import TrustStore
 from rse_pf.backend.log import JsonLog
+from rse_pf.backend.supervisor.orders import TrustOrder
 from rse_pf.backend.supervisor.session_registry import WorkerHandle
 
-__all__ = ["TrustPoller", "first_order"]
+__all__ = ["TrustPoller"]
 
 
 class TrustPoller:
-    """Looks into the control room again and again, and has every worker know what is new."""
+    """Reads the access control store periodically; what is new goes to every worker."""
 
     def __init__(
         self,
@@ -33,23 +34,18 @@ class TrustPoller:
         self._problem = ""
 
     async def run(self) -> None:
-        """Look until cancelled."""
+        """Read until cancelled."""
         while True:
             await asyncio.sleep(self._pause_s)
-            self.tell(await asyncio.to_thread(self._trust.look))
+            self.tell(await asyncio.to_thread(self._trust.refresh))
 
     def tell(self, is_new: bool) -> None:
-        """Say once what went wrong, and hand on what *is_new*."""
+        """Log a problem once, and send the workers what *is_new*."""
         if self._trust.problem != self._problem:
             self._problem = self._trust.problem
             if self._problem:
-                self._log.warning("control-room-unread", reason=self._problem)
+                self._log.warning("access-control-unread", reason=self._problem)
         if is_new:
             for worker in self._workers():
-                worker.order(do="trust", text=self._trust.text)
+                worker.order(TrustOrder(self._trust.text))
             self._log.info("trust", bytes=len(self._trust.text))
-
-
-def first_order(trust: TrustStore | None) -> dict[str, str]:
-    """Return what a worker is told before it takes sockets; without a control room its keys stay."""
-    return {"do": "trust", "text": "" if trust is None else trust.text}

@@ -1,8 +1,8 @@
 """A worker as its supervisor sees it: a process, its load, and two channels.
 
-Workers are forked from the supervisor after its imports, which most of a server's start is spent on, and
-before its event loop and its threads.  Promises that a worker holds no channel of another worker nor the
-listener, and never to block the supervisor: a full channel is a refusal, a silent worker a time-out.
+Workers are forked after the supervisor's imports, which take most of the time of a start, and before its
+event loop and its threads.  A worker holds neither another worker's channels nor the listener.  No call
+here blocks the supervisor: a full channel is a refusal, a worker that does not answer a timeout.
 """
 
 from __future__ import annotations
@@ -15,10 +15,11 @@ import signal
 import socket
 import sys
 import traceback
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from typing import Any, NoReturn
 
+from rse_pf.backend.supervisor.orders import ReportOrder, WorkerOrder, encode_order
 from rse_pf.backend.supervisor.worker import NUMBER_BYTES, WorkerPlan, event_loop_maker, run_worker
 from rse_pf.config import PlatformSettings
 from rse_pf.services.loading import load_services
@@ -32,7 +33,7 @@ _READ_BYTES = 4096
 
 
 def warm_up(services: str = BUILTIN, settings: PlatformSettings | None = None) -> None:
-    """Import what every worker needs, which most of a server's start is spent on.
+    """Import what every worker needs: most of the time of a server's start.
 
     Raises:
         ConfigurationError: There are no such services.
@@ -43,7 +44,7 @@ def warm_up(services: str = BUILTIN, settings: PlatformSettings | None = None) -
 
 
 def fork_workers(plans: Sequence[WorkerPlan], *, listener: socket.socket) -> list[WorkerProcess]:
-    """Import what every worker needs, then fork one for each plan; call it before any thread or event loop.
+    """Import what every worker needs, then fork one for each plan; call this before any thread or loop.
 
     Raises:
         ConfigurationError: There are no such services.
@@ -57,7 +58,7 @@ def fork_workers(plans: Sequence[WorkerPlan], *, listener: socket.socket) -> lis
     try:
         for plan in plans:
             workers.append(
-                WorkerProcess(plan, strangers=[listener, *(end for each in workers for end in each.ends())])
+                WorkerProcess(plan, unshared=[listener, *(end for each in workers for end in each.channels())])
             )
     except OSError:
         for worker in workers:
@@ -69,8 +70,8 @@ def fork_workers(plans: Sequence[WorkerPlan], *, listener: socket.socket) -> lis
 class WorkerProcess:
     """One worker process, forked at once; `connect` waits until it is ready."""
 
-    def __init__(self, plan: WorkerPlan, *, strangers: Sequence[socket.socket]) -> None:
-        """Fork.  The child closes *strangers*, sockets of its parent that are none of its business."""
+    def __init__(self, plan: WorkerPlan, *, unshared: Sequence[socket.socket]) -> None:
+        """Fork.  The child closes *unshared*: the sockets of its parent that it must not hold."""
         self.load = 0
         self.report: dict[str, Any] | None = None
         self.empty = asyncio.Event()
@@ -81,14 +82,14 @@ class WorkerProcess:
         with data, control:
             self._pid = os.fork()
             if self._pid == 0:
-                _be_worker(plan, data, control, [*strangers, *self.ends()])
+                _be_worker(plan, data, control, [*unshared, *self.channels()])
         self._data.setblocking(False)
         self._loop: asyncio.AbstractEventLoop | None = None
         self._writer: asyncio.StreamWriter | None = None
         self._reading: asyncio.Task[None] | None = None
         self._reported: asyncio.Future[None] | None = None
 
-    def ends(self) -> tuple[socket.socket, socket.socket]:
+    def channels(self) -> tuple[socket.socket, socket.socket]:
         """Return the supervisor's ends of both channels."""
         return self._data, self._control
 
@@ -104,23 +105,21 @@ class WorkerProcess:
 
     async def connect(
         self,
-        first_order: Mapping[str, Any],
         *,
         on_lost: Callable[[WorkerProcess], None],
         on_robot: Callable[[WorkerProcess, dict[str, Any]], None],
     ) -> None:
-        """Wait until the worker takes sockets; *on_lost* is called if it never does, or ends later."""
+        """Wait until the worker takes sockets; *on_lost* is called if it ends, before that or later."""
         self._on_lost, self._on_robot = on_lost, on_robot
         reader, self._writer = await asyncio.open_unix_connection(sock=self._control, limit=_MAX_LINE_BYTES)
         self._loop = loop = asyncio.get_running_loop()
-        self.order(**first_order)
         ready = asyncio.Event()
         self._reading = loop.create_task(self._listen(reader, ready))
         await ready.wait()
-        loop.add_reader(self._data.fileno(), self._count_ends)
+        loop.add_reader(self._data.fileno(), self._count_ended)
 
     def give(self, accepted: socket.socket, number: int) -> bool:
-        """Hand over the *number*-th accepted socket; False if the worker's channel is full or gone."""
+        """Send the worker the *number*-th accepted socket; False if its channel is full or closed."""
         try:
             socket.send_fds(self._data, [number.to_bytes(NUMBER_BYTES, "big")], [accepted.fileno()])
         except OSError:
@@ -128,19 +127,19 @@ class WorkerProcess:
         self.load += 1
         return True
 
-    def order(self, **what: Any) -> None:
-        """Send an order; one to a worker that is gone is lost."""
+    def order(self, order: WorkerOrder) -> None:
+        """Send *order*; one to a worker that is gone is lost."""
         if self._writer is not None and not self._writer.is_closing():
-            self._writer.write(json.dumps(what).encode() + b"\n")
+            self._writer.write(encode_order(order))
 
     async def ask_report(self, timeout_s: float) -> None:
-        """Renew `report`, or leave it as it is when the worker does not answer in time."""
+        """Update `report`, or leave it as it is when the worker does not answer in time."""
         self._reported = asyncio.get_running_loop().create_future()
-        self.order(do="report")
+        self.order(ReportOrder())
         await asyncio.wait([self._reported], timeout=timeout_s)
 
     def kill(self) -> None:
-        """End the process, whatever it does, and close the channels; a second call does nothing."""
+        """Kill the process and close the channels; a second call does nothing."""
         if self._data.fileno() < 0:
             return
         if self._loop is not None and self._reading is not None:
@@ -168,14 +167,14 @@ class WorkerProcess:
     async def _listen(self, reader: asyncio.StreamReader, ready: asyncio.Event) -> None:
         try:
             while line := await reader.readline():
-                self._hear(json.loads(line), ready)
+                self._on_message(json.loads(line), ready)
         except OSError:
             pass  # a killed worker resets its channel: the same end as below
         self.gone.set()
         self.empty.set()
         self._on_lost(self)
 
-    def _hear(self, message: dict[str, Any], ready: asyncio.Event) -> None:
+    def _on_message(self, message: dict[str, Any], ready: asyncio.Event) -> None:
         if message["event"] == "ready":
             ready.set()
         elif message["event"] == "empty":
@@ -187,7 +186,7 @@ class WorkerProcess:
             if self._reported is not None and not self._reported.done():
                 self._reported.set_result(None)
 
-    def _count_ends(self) -> None:
+    def _count_ended(self) -> None:
         try:
             ended = self._data.recv(_READ_BYTES)
         except OSError:
@@ -199,18 +198,18 @@ class WorkerProcess:
 
 
 def _be_worker(
-    plan: WorkerPlan, data: socket.socket, control: socket.socket, strangers: Sequence[socket.socket]
+    plan: WorkerPlan, data: socket.socket, control: socket.socket, unshared: Sequence[socket.socket]
 ) -> NoReturn:
-    """The child's whole life: whatever happens, it does not return into the supervisor's code."""
+    """Run the child until it exits; it never returns into the supervisor's code."""
     try:
-        for stranger in strangers:
-            stranger.close()
+        for each in unshared:
+            each.close()
         nothing = os.open(os.devnull, os.O_RDONLY)
         os.dup2(nothing, 0)
         os.close(nothing)
         run_worker(plan, data, control)
         os._exit(0)
-    except BaseException:  # noqa: BLE001  it must not come back to life as a second supervisor
+    except BaseException:  # noqa: BLE001  it must not go on as a second supervisor
         traceback.print_exc()
         sys.stderr.flush()
     finally:

@@ -24,7 +24,7 @@ KEYS = SigningKey.from_seed(b"d" * 32, "k1").key_set()
         ({"serving": {"host": "::"}}, None, True, "conformance echo"),
     ],
 )
-def test_an_open_door_is_refused_with_a_hint(groups, keys, echo, word):
+def test_a_server_without_authentication_on_a_public_address_is_refused_with_a_hint(groups, keys, echo, word):
     settings = PlatformSettings.from_dict(groups)
 
     with pytest.raises(ConfigurationError, match=word) as caught:

@@ -1,0 +1,60 @@
+"""What a supervisor orders its workers to do: one JSON line each on the control channel."""
+
+from __future__ import annotations
+
+import msgspec
+
+__all__ = [
+    "DrainOrder", "LeaveOrder", "MigrateOrder", "ReplaceOrder", "ReportOrder", "TrustOrder", "WorkerOrder",
+    "decode_order", "encode_order",
+]  # fmt: skip
+
+
+class ReportOrder(msgspec.Struct, tag="report", tag_field="do", frozen=True):
+    """Report the metrics."""
+
+
+class DrainOrder(msgspec.Struct, tag="drain", tag_field="do", frozen=True):
+    """Ask every robot to move within *within_ms*, and tell when all are gone."""
+
+    within_ms: float
+
+
+class MigrateOrder(msgspec.Struct, tag="migrate", tag_field="do", frozen=True):
+    """Ask one robot after each of *delays_s* to move within *within_ms*."""
+
+    delays_s: list[float]
+    within_ms: float
+
+
+class TrustOrder(msgspec.Struct, tag="trust", tag_field="do", frozen=True):
+    """Trust what *snapshot*, the text of a `TrustStore`, says from now on."""
+
+    snapshot: str
+
+
+class ReplaceOrder(msgspec.Struct, tag="replace", tag_field="do", frozen=True):
+    """End the *number*-th socket: its robot has a newer one."""
+
+    number: int
+
+
+class LeaveOrder(msgspec.Struct, tag="leave", tag_field="do", frozen=True):
+    """Wait at most *held_s* for commands that are held, close every socket, and end."""
+
+    held_s: float
+
+
+WorkerOrder = ReportOrder | DrainOrder | MigrateOrder | TrustOrder | ReplaceOrder | LeaveOrder
+
+_DECODER: msgspec.json.Decoder[WorkerOrder] = msgspec.json.Decoder(WorkerOrder)
+
+
+def encode_order(order: WorkerOrder) -> bytes:
+    """Return the line that carries *order*."""
+    return msgspec.json.encode(order) + b"\n"
+
+
+def decode_order(line: bytes) -> WorkerOrder:
+    """Return the order of a line; raises msgspec.ValidationError for one that is none."""
+    return _DECODER.decode(line)
