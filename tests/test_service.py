@@ -258,17 +258,6 @@ def test_a_camera_that_is_none_is_a_typed_failure() -> None:
     assert failure.code == "invalid-camera"
 
 
-def test_the_settings_decide_what_is_weak() -> None:
-    strict = PlatformSettings.from_dict({"pnp": {"weak_inliers": 1000}})
-
-    usual, doubted = pnp(request_of(100)), pnp(request_of(100), strict)
-
-    assert isinstance(usual, Result)
-    assert isinstance(doubted, Result)
-    assert usual.reply.verdict == "ok"
-    assert (doubted.reply.verdict, doubted.reply.reason) == ("weak", "few-inliers")
-
-
 def test_a_command_without_options_fits_any_limit_of_iterations() -> None:
     assert isinstance(
         pnp(request_of(100), PlatformSettings.from_dict({"pnp": {"max_iterations": 50}})), Result

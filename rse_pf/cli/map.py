@@ -124,7 +124,7 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
     max_bytes = 4 * chosen.data.max_object_bytes
     maps = MapRegistry(open_any_store(chosen), args.tenant, max_bytes=max_bytes, told=told)
     if args.action in ("merge", "localise"):
-        return _work(args, maps, chosen)
+        return _work(args, maps)
     actions = {
         "list": _list,
         "show": _show,
@@ -137,14 +137,14 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
     return 0
 
 
-def _work(args: argparse.Namespace, maps: MapRegistry, settings: PlatformSettings) -> int:
+def _work(args: argparse.Namespace, maps: MapRegistry) -> int:
     from rse_pf.cli import map_work
 
     if args.action == "merge":
-        return map_work.merge_into(args, maps, settings.services)
+        return map_work.merge_into(args, maps)
     if args.every < 1:
         raise UsageError(f"--every {args.every} is below 1", hint="1 takes every frame")
-    return map_work.localise_frames(args, maps, settings.services)
+    return map_work.localise_frames(args, maps)
 
 
 def _list(args: argparse.Namespace, maps: MapRegistry) -> None:

@@ -17,7 +17,6 @@ from typing import Any
 
 import numpy as np
 
-from rse_pf.config import ServiceSettings
 from rse_pf.errors import CommandFailed, NotFound, UsageError
 from rse_pf.geometry import Camera, rotation_angle_deg, to_quaternion
 from rse_pf.maps.format import MapVersion
@@ -32,7 +31,7 @@ __all__ = ["localise_frames", "merge_into", "version_of"]
 _FRAMES = re.compile(r"(?P<folder>.+):(?P<first>\d+)(-(?P<last>\d+))?")
 
 
-def merge_into(args: argparse.Namespace, maps: MapRegistry, settings: ServiceSettings) -> int:
+def merge_into(args: argparse.Namespace, maps: MapRegistry) -> int:
     """Merge the maps of *args* into the next version of one; the exit code is 1 if any was left out."""
     names = [version_of(word) for word in args.names]
     records = [maps.record(*each) for each in names]
@@ -41,7 +40,7 @@ def merge_into(args: argparse.Namespace, maps: MapRegistry, settings: ServiceSet
         maps=[maps.data(name, record.id) for (name, _), record in zip(names, records, strict=True)]
     )
     began = time.perf_counter()
-    reply = merge_maps(request, settings, report=_progress(sys.stderr))
+    reply = merge_maps(request, report=_progress(sys.stderr))
     took_s = time.perf_counter() - began
     left_out = [(args.names[each.map], each.reason) for each in reply.not_joined]
     if len(args.names) > 1 and len(reply.joined) < 2:
@@ -74,11 +73,11 @@ def merge_into(args: argparse.Namespace, maps: MapRegistry, settings: ServiceSet
     return 1 if left_out else 0
 
 
-def localise_frames(args: argparse.Namespace, maps: MapRegistry, settings: ServiceSettings) -> int:
+def localise_frames(args: argparse.Namespace, maps: MapRegistry) -> int:
     """Find each frame of *args* in a map, a line each; the exit code is 1 if none was found."""
     name, version = version_of(args.name)
     data = maps.data(name, version)
-    version_map, index = opened_map(data, settings.max_map_keyframes)
+    version_map, index = opened_map(data)
     asked = [each for word in args.frames for each in _asked(word, args.every)]
     found: list[dict[str, Any]] = []
     for each in asked:

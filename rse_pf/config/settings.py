@@ -126,9 +126,6 @@ class PnpSettings:
     engine: str = setting("poselib", doc="solver when a command names none", choices=("poselib", "opencv"))
     max_correspondences: int = setting(5000, doc="correspondences of one command", low=4)
     max_iterations: int = setting(1000, doc="RANSAC iterations a command may ask for", low=1, high=100000)
-    min_iterations: int = setting(10, doc="RANSAC iterations that are always done (poselib)", source="measured: 2-5x faster than poselib's default at equal success", low=1)
-    weak_inliers: int = setting(12, unit="inliers", doc="a pose with fewer is called weak", low=4)
-    weak_inlier_percent: float = setting(25.0, unit="%", doc="a pose with a smaller share of inliers is called weak", low=0, high=100)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -175,7 +172,6 @@ class DataSettings:
     max_uploads: int = setting(32, doc="bodies received at once; more are told to come again", low=1)
     upload_ttl_s: int = setting(86400, unit="s", doc="an unfinished upload is forgotten after this", low=60)
     body_timeout_s: float = setting(10.0, unit="s", doc="longest silence within a body", low=0.1)
-    body_grace_s: float = setting(5.0, unit="s", doc="then the lowest body rate applies", low=0.1)
     min_body_bytes_per_s: int = setting(1024, unit="bytes/s", doc="a slower body is refused", low=1)
     presigned_url_ttl_s: int = setting(300, unit="s", doc="a signed address of the bucket is good for so long", low=10, high=300)
     background_bytes_per_s: int = setting(262144, unit="bytes/s", doc="keyframes a robot sends beside its live poses", low=1024)
@@ -214,10 +210,6 @@ class ServiceSettings:
     breaker_open_s: float = setting(60.0, unit="s", doc="so long a service rests after a crash loop", low=1)
     accept_weak_isolation: bool = setting(False, doc="run installed services even where the kernel lacks a wall")
     first_uid: int = setting(1000000, doc="environments of a server that runs as root get user ids from here", low=1000, high=2000000000)
-    max_graph_edges: int = setting(100000, doc="edges of one pose graph that a map service takes", low=1)
-    max_cloud_points: int = setting(1000000, doc="points of one cloud that icp takes", low=100)
-    max_map_keyframes: int = setting(2000, doc="keyframes of one map that a map service takes", low=1)
-    max_fingerprints: int = setting(5000, doc="fingerprints of one wifi request", low=1)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -230,10 +222,7 @@ class LocalSettings:
     start_timeout_s: float = setting(20.0, unit="s", doc="a server that is not ready by then failed", low=1)
     stop_timeout_s: float = setting(10.0, unit="s", doc="a process that does not leave by then is killed", low=0.5)
     warm_standby: bool = setting(True, doc="keep one more process warm, about 60 MB, that becomes the next server at once", source="warm pools of AWS Auto Scaling")
-    data_nice: int = setting(10, doc="niceness of the data server: on one machine poses go first", low=0, high=19)
     max_restarts_per_minute: int = setting(5, unit="servers", doc="replacements of servers that died young, in any minute", low=1)
-    min_uptime_s: float = setting(10.0, unit="s", doc="a server that ends this soon after it became healthy died young", low=0)
-    log_file_bytes: int = setting(67108864, unit="bytes", doc="a log that has grown longer is set aside, in place of the one set aside before, and begins anew", low=65536)
     certificate: str = setting("", doc="file of the front door's certificate chain (PEM); with it robots dial wss://")
     private_key: str = setting("", doc="file of the private key of local.certificate (PEM)")
 
@@ -345,7 +334,6 @@ def _check_contradictions(s: PlatformSettings) -> None:
         ("scaling", "step", "big_step"),
         ("session", "max_message_bytes", "max_inflated_bytes"),
         ("session", "reconnect_base_s", "reconnect_max_s"),
-        ("pnp", "min_iterations", "max_iterations"),
     ]
     for group, small, large in pairs:
         low, high = (getattr(getattr(s, group), name) for name in (small, large))

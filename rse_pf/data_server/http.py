@@ -46,6 +46,8 @@ __all__ = [
 
 Receive = Callable[[], Awaitable[Mapping[str, Any]]]
 Send = Callable[[Mapping[str, Any]], Awaitable[None]]
+_BODY_GRACE_S = 5.0
+"""Then ``data.min_body_bytes_per_s`` applies."""
 
 
 class MethodNotAllowed(BadRequest):
@@ -152,7 +154,7 @@ class HttpRequest:
             yield piece
             lasted = self._clock() - began
             lowest = self._limits.min_body_bytes_per_s
-            if not self.over and lasted > self._limits.body_grace_s and self.received_bytes < lowest * lasted:
+            if not self.over and lasted > _BODY_GRACE_S and self.received_bytes < lowest * lasted:
                 raise _too_slow(f"{self.received_bytes} bytes in {lasted:.1f} s; at least {lowest} a second")
 
 

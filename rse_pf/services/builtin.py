@@ -16,6 +16,6 @@ def builtin_services(settings: PlatformSettings) -> Registry:
     pnp.register(registry, settings.pnp)
     echo.register(registry)
     # Extras are looked for when a command comes: a server without them answers missing-extra.
-    for room in (icp, place, localise, merge, optimise, wifi):
-        room.register(registry, settings.services)
+    for each in (icp, place, localise, merge, optimise, wifi):
+        each.register(registry)
     return registry

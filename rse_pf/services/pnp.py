@@ -12,7 +12,7 @@ import numpy.typing as npt
 from rse_pf.config import PnpSettings
 from rse_pf.errors import LimitExceeded, TooFewCorrespondences
 from rse_pf.geometry import Camera
-from rse_pf.pnp import PnpOptions, PnpSolution, WeakLimits, solve_pnp
+from rse_pf.pnp import PnpOptions, PnpSolution, solve_pnp
 from rse_pf.service import Registry
 from rse_pf.wire.arrays import Array, reshaped
 
@@ -106,8 +106,7 @@ def make_request(
 
 def register(registry: Registry, settings: PnpSettings) -> None:
     """Add ``pnp`` to *registry*, with the limits and the engine of *settings*."""
-    defaults = PnpOptions(max_iterations=settings.max_iterations, min_iterations=settings.min_iterations)
-    weak = WeakLimits(inliers=settings.weak_inliers, inlier_ratio=settings.weak_inlier_percent / 100.0)
+    defaults = PnpOptions(max_iterations=settings.max_iterations)
 
     @registry.service("pnp", cheap=True)
     def pnp(request: PnpRequest) -> PnpReply:
@@ -132,7 +131,5 @@ def register(registry: Registry, settings: PnpSettings) -> None:
                 hint="ask for fewer",
             )
         return PnpReply.of(
-            solve_pnp(
-                points_world, pixels, request.camera, options, default_engine=settings.engine, weak=weak
-            )
+            solve_pnp(points_world, pixels, request.camera, options, default_engine=settings.engine)
         )

@@ -52,7 +52,6 @@ def test_the_paper_is_the_default() -> None:
         ({"scaling": {"idle_s": 90}}, ["scaling.idle_s = 90", "scaling.period_s = 60"]),
         ({"session": {"max_inflated_bytes": 2048}}, ["session.max_message_bytes"]),
         ({"session": {"reconnect_base_s": 2}}, ["session.reconnect_max_s = 1"]),
-        ({"pnp": {"max_iterations": 5}}, ["pnp.min_iterations = 10"]),
         ({"cloud": {"allow_insecure": False}}, ["cloud.certificate_arn", "cloud.domain_name"]),
     ],
 )

@@ -34,6 +34,8 @@ _PAUSE_S = 0.02
 _CANCEL_AGAIN_S = 0.2
 _CALM_S = 3.0
 _PREFIX = "server-"
+_MIN_UPTIME_S = 10.0
+"""A server that ends sooner after it became healthy counts against ``local.max_restarts_per_minute``."""
 
 
 @dataclass(slots=True, kw_only=True)
@@ -58,7 +60,7 @@ class Member:
 
     @property
     def phase(self) -> ServerPhase:
-        """The state as a reading tells it."""
+        """The state as a sample tells it."""
         if self.leaving:
             return "draining"
         if self.out or self.health.state == "unhealthy":
@@ -374,7 +376,7 @@ class Fleet:
 
     def _lost(self, member: Member) -> None:
         lived_s = math.inf if member.healthy_s is None else time.monotonic() - member.healthy_s
-        self.dead[member.name] = member.healthy_s is None or lived_s < self._settings.local.min_uptime_s
+        self.dead[member.name] = member.healthy_s is None or lived_s < _MIN_UPTIME_S
         self.on_lost()
 
     def _set_targets(self) -> None:

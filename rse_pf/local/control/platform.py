@@ -51,6 +51,8 @@ Event = Mapping[str, Any]
 
 _LOOPBACK = "127.0.0.1"
 _LAST_EVENTS = 50
+_LOG_FILE_BYTES = 64 << 20
+"""A log that has grown longer is set aside, in place of the one set aside before."""
 
 
 class LocalPlatform:
@@ -71,7 +73,7 @@ class LocalPlatform:
         compress: float = 1.0,
         rebalance: bool = True,
         data: bool | None = None,
-        on_reading: Callable[[Mapping[str, Any]], None] | None = None,
+        on_sample: Callable[[Mapping[str, Any]], None] | None = None,
     ) -> None:
         """Describe a platform; nothing is started.
 
@@ -90,7 +92,7 @@ class LocalPlatform:
             compress: Periods, idle time, warm-up and grace are shorter by this factor; for experiments.
             rebalance: Whether crowded servers hand robots over, if *elastic*.
             data: Whether robots get the data service under ``/data/``; None means ``data.enabled``.
-            on_reading: Called with each reading of the monitor, which runs then even if not *elastic*.
+            on_sample: Called with each sample of the monitor, which runs then even if not *elastic*.
         """
         self.events: list[Event] = []
         self.url = ""
@@ -107,7 +109,7 @@ class LocalPlatform:
         self._wanted_port = settings.local.port if port is None else port
         self._settings_file = settings_file(self.state)
         self._status: asyncio.Server | None = None
-        self._monitored = elastic or on_reading is not None
+        self._monitored = elastic or on_sample is not None
         self.backend_servers = LocalBackendServers(
             self._server_settings,
             folder=self.state,
@@ -150,7 +152,7 @@ class LocalPlatform:
             rebalance=rebalance,
             tell=self._tell,
             changed=self._write_state,
-            on_reading=on_reading,
+            on_sample=on_sample,
         )
 
     @property
@@ -164,10 +166,10 @@ class LocalPlatform:
         return self.load_balancer.port
 
     @property
-    def reading(self) -> dict[str, Any] | None:
-        """The newest reading of the monitor; None before the first."""
-        reading = self._control.reading
-        return None if reading is None else reading.document()
+    def sample(self) -> dict[str, Any] | None:
+        """The newest sample of the monitor; None before the first."""
+        sample = self._control.sample
+        return None if sample is None else sample.document()
 
     async def __aenter__(self) -> LocalPlatform:
         """Start everything, or adopt what an earlier control plane left running.
@@ -203,7 +205,7 @@ class LocalPlatform:
         """End everything that was started."""
         await self._end()
 
-    def issue_token(self, robot: str, life_s: float | None = None) -> str:
+    def issue_token(self, robot: str, ttl_s: float | None = None) -> str:
         """Return a token for *robot*, good from now; raises UsageError for a name that is none."""
         if self._key is None:
             raise UsageError("the platform has not started", hint="enter it with async with")
@@ -212,7 +214,7 @@ class LocalPlatform:
             now=time.time(),
             token_id=secrets.token_hex(8),
             settings=self.settings.auth,
-            life_s=life_s,
+            ttl_s=ttl_s,
         )
 
     async def status(self) -> list[dict[str, Any]]:
@@ -222,7 +224,7 @@ class LocalPlatform:
 
     def status_document(self) -> dict[str, Any]:
         """Return everything the control plane knows, as plain JSON values."""
-        mark, reading = self.load_balancer.mark, self.reading
+        mark, sample = self.load_balancer.mark, self.sample
         servers = [
             {
                 "name": member.name,
@@ -233,7 +235,7 @@ class LocalPlatform:
             }
             for member in self._fleet.members.values()
         ]
-        read = {each["name"]: each for each in ([] if reading is None else reading["servers"])}
+        read = {each["name"]: each for each in ([] if sample is None else sample["servers"])}
         return {
             "platform": self.name,
             "url": self.url,
@@ -245,7 +247,7 @@ class LocalPlatform:
             },
             "servers": [{**read.get(str(each["name"]), {}), **each} for each in servers],
             "data_servers": self.data_servers.document(),
-            "reading": reading,
+            "sample": sample,
             "policy": self._control.document(),
             "events": [dict(event) for event in self.events[-_LAST_EVENTS:]],
         }
@@ -387,7 +389,7 @@ class LocalPlatform:
         self.url = front_door_url(self.settings, self.port)
         self._status = await serve_status(self.status_document, token)
         self._fleet.keep(self._chronicle.watch())
-        self._fleet.keep(keep_short(self.state, self.settings.local.log_file_bytes))
+        self._fleet.keep(keep_short(self.state, _LOG_FILE_BYTES))
         if self._monitored:
             self._control.start()
         self._write_state()

@@ -28,7 +28,7 @@ from rse_pf.local.balancer.envoy_config import Target
 from rse_pf.local.processes import ProcessMark, ended, is_alive, last_line, mark_of, send_signal, spawn
 from rse_pf.local.state import ServerState
 
-__all__ = ["DataServerProcess", "LocalDataServers"]
+__all__ = ["NICENESS", "DataServerProcess", "LocalDataServers"]
 
 _RSE_PF = (sys.executable, "-m", "rse_pf.cli.main")
 _LOOPBACK = "127.0.0.1"
@@ -36,6 +36,8 @@ _LOOK_AGAIN_S = 0.01
 _ASK_S = 1.0
 _READY, _ALIVE = "/data/readyz", "/data/healthz"
 _FIRST_PAUSE_S, _MAX_PAUSE_S = 0.1, 5.0
+NICENESS = 10
+"""Of the data server: on one machine poses go first."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -225,7 +227,7 @@ class LocalDataServers:
             [*self._command, "--port", str(self._port)],
             log=self._log, folder=self._folder, dies_with_parent=self._dies_with_parent,
         )  # fmt: skip
-        run_as_batch(process.pid, self._settings.local.data_nice)
+        run_as_batch(process.pid, NICENESS)
         self._process, self._mark = process, mark_of(process.pid)
         self._tell("data-server-start", name=self._name, pid=process.pid)
         try:

@@ -14,7 +14,6 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from rse_pf.config import ServiceSettings
 from rse_pf.errors import BadRequest, LimitExceeded, MissingExtra
 from rse_pf.geometry import Array as Matrix
 from rse_pf.geometry import pose_difference, transform
@@ -32,6 +31,8 @@ _STEP_M, _STEP_RAD = 1e-4, 1e-4
 """The solver ends when a step is smaller than both."""
 _POOR = 0.2
 """Mean distance, as a share of the reach, above which surfaces do not fit, whatever was gained."""
+MAX_POINTS = 1_000_000
+"""Of one cloud."""
 
 
 class IcpOptions(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
@@ -161,7 +162,7 @@ def align(
     )
 
 
-def register(registry: Registry, settings: ServiceSettings) -> None:
+def register(registry: Registry) -> None:
     """Add ``icp`` to *registry*."""
 
     @registry.service("icp")
@@ -169,10 +170,8 @@ def register(registry: Registry, settings: ServiceSettings) -> None:
         """Refine the pose between two overlapping point clouds."""
         target = reshaped("target", request.target, 3)
         source = reshaped("source", request.source, 3)
-        if max(len(target), len(source)) > settings.max_cloud_points:
-            raise LimitExceeded(
-                f"a cloud has more than {settings.max_cloud_points} points", hint="thin it to voxels first"
-            )
+        if max(len(target), len(source)) > MAX_POINTS:
+            raise LimitExceeded(f"a cloud has more than {MAX_POINTS} points", hint="thin it to voxels first")
         guess = np.asarray(request.T_target_source, dtype=np.float64)
         if guess.size != 16 or not _is_rigid(guess.reshape(4, 4)):
             raise BadRequest("T_target_source is not a rigid motion", hint="send 16 numbers, row-major")

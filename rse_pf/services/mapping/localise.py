@@ -12,7 +12,6 @@ from typing import Literal
 import msgspec
 import numpy as np
 
-from rse_pf.config import ServiceSettings
 from rse_pf.errors import BadRequest, PnpError
 from rse_pf.geometry import Array as Matrix
 from rse_pf.geometry import Camera, inverse, pose_difference, transform
@@ -135,14 +134,14 @@ def locate(
     )
 
 
-def register(registry: Registry, settings: ServiceSettings) -> None:
+def register(registry: Registry) -> None:
     """Add ``localise`` to *registry*."""
 
     @registry.service("localise")
     def localise(request: LocaliseRequest) -> LocaliseReply:
         """Find the camera's pose in a map."""
         view = view_of(request.camera, request.pixels, request.descriptors)
-        _, index = opened_map(request.map, settings.max_map_keyframes)
+        _, index = opened_map(request.map)
         found = locate(index, view, request.options, within=request.within)
         return LocaliseReply(
             verdict=found.verdict,

@@ -8,12 +8,12 @@ from __future__ import annotations
 
 import msgspec
 
-from rse_pf.config import ServiceSettings
 from rse_pf.errors import BadRequest, LimitExceeded
 from rse_pf.maps.format import MapVersion, decode_map, encode_map
 from rse_pf.service import Registry
 from rse_pf.services.mapping.map_merge import Merged, MergeOptions, join_maps
 from rse_pf.services.mapping.optimise import Report, silent
+from rse_pf.services.mapping.place import MAX_KEYFRAMES
 
 __all__ = ["MergeReply", "MergeRequest", "NotJoined", "Refusal", "merge_maps", "register"]
 
@@ -53,7 +53,7 @@ class MergeReply(msgspec.Struct, frozen=True, kw_only=True):
     cost_after: float
 
 
-def merge_maps(request: MergeRequest, settings: ServiceSettings, *, report: Report = silent) -> MergeReply:
+def merge_maps(request: MergeRequest, *, report: Report = silent) -> MergeReply:
     """Answer *request*, telling *report* of the progress; it may raise Cancelled to end the work."""
     if not request.maps:
         raise BadRequest("no map was sent", hint="send one or more")
@@ -61,22 +61,22 @@ def merge_maps(request: MergeRequest, settings: ServiceSettings, *, report: Repo
     for data in request.maps:
         versions.append(decode_map(data))
         count = sum(len(version.keyframes) for version in versions)
-        if count > settings.max_map_keyframes:
+        if count > MAX_KEYFRAMES:
             raise LimitExceeded(
-                f"{count} keyframes are above {settings.max_map_keyframes}", hint="merge fewer maps at once"
+                f"{count} keyframes are above {MAX_KEYFRAMES}", hint="merge fewer maps at once"
             )
     if not all(version.keyframes for version in versions):
         raise BadRequest("a map has no keyframes", hint="leave it out")
     return _reply(join_maps(versions, request.options, report=report))
 
 
-def register(registry: Registry, settings: ServiceSettings) -> None:
+def register(registry: Registry) -> None:
     """Add ``merge`` to *registry*."""
 
     @registry.service("merge", kind="long")
     def merge(request: MergeRequest, *, report: Report = silent) -> MergeReply:
         """Make one map of several robots' maps, or close the loops of one."""
-        return merge_maps(request, settings, report=report)
+        return merge_maps(request, report=report)
 
 
 def _reply(merged: Merged) -> MergeReply:

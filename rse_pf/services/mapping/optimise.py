@@ -14,7 +14,6 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from rse_pf.config import ServiceSettings
 from rse_pf.errors import BadRequest, LimitExceeded, MissingExtra
 from rse_pf.geometry import Array
 from rse_pf.service import Registry
@@ -32,6 +31,8 @@ Report = Callable[[float, str], None]
 
 _ANCHOR_SIGMA = 1e-6
 _RELATIVE_CHANGE = 1e-7
+MAX_EDGES = 100_000
+"""Of one pose graph."""
 
 
 def silent(done: float, what: str) -> None:
@@ -142,16 +143,16 @@ def robust_cost(graph: PoseGraph, T_world_pose: Array, cauchy: float) -> float:
     return float(squares.sum())
 
 
-def register(registry: Registry, settings: ServiceSettings) -> None:
+def register(registry: Registry) -> None:
     """Add ``optimise`` to *registry*."""
 
     @registry.service("optimise", kind="long")
     def optimise(request: OptimiseRequest, *, report: Report = silent) -> OptimiseReply:
         """Fit the poses of a pose graph to its edges."""
         graph = read_g2o(request.g2o)
-        if len(graph.a) > settings.max_graph_edges:
+        if len(graph.a) > MAX_EDGES:
             raise LimitExceeded(
-                f"{len(graph.a)} edges are above {settings.max_graph_edges}", hint="send a part of the graph"
+                f"{len(graph.a)} edges are above {MAX_EDGES}", hint="send a part of the graph"
             )
         options = request.options or OptimiseOptions()
         found = optimise_graph(graph, options, report=report)

@@ -15,7 +15,6 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from rse_pf.config import ServiceSettings
 from rse_pf.errors import BadRequest, LimitExceeded
 from rse_pf.geometry import Camera
 from rse_pf.maps.format import Keyframe, MapVersion, decode_map
@@ -31,6 +30,7 @@ from rse_pf.services.mapping.relative_pose import StepOptions, View, pose_of_vie
 from rse_pf.wire.arrays import Array, reshaped
 
 __all__ = [
+    "MAX_KEYFRAMES",
     "Candidate",
     "PlaceIndex",
     "PlaceReply",
@@ -44,6 +44,8 @@ __all__ = [
 WORDS = 32
 SEED = 20
 _OPENED_MAPS = 2
+MAX_KEYFRAMES = 2000
+"""Of the maps of one request, in all."""
 
 
 class Within(msgspec.Struct, frozen=True, kw_only=True):
@@ -132,12 +134,12 @@ class PlaceIndex:
 
 
 @functools.lru_cache(maxsize=_OPENED_MAPS)
-def opened_map(data: bytes, max_keyframes: int) -> tuple[MapVersion, PlaceIndex]:
+def opened_map(data: bytes) -> tuple[MapVersion, PlaceIndex]:
     """Return the map of *data* and its index; a pure function whose last answers are kept."""
     version = decode_map(data)
-    if not 1 <= len(version.keyframes) <= max_keyframes:
+    if not 1 <= len(version.keyframes) <= MAX_KEYFRAMES:
         raise LimitExceeded(
-            f"a map of {len(version.keyframes)} keyframes is not within 1..{max_keyframes}",
+            f"a map of {len(version.keyframes)} keyframes is not within 1..{MAX_KEYFRAMES}",
             hint="ask a part of the map",
         )
     return version, PlaceIndex(version.keyframes)
@@ -149,7 +151,7 @@ def view_of(camera: Camera, pixels: Array, descriptors: bytes) -> View:
     return View(camera=camera, pixels=rows, descriptors=descriptors_of(descriptors, len(rows)))
 
 
-def register(registry: Registry, settings: ServiceSettings) -> None:
+def register(registry: Registry) -> None:
     """Add ``place`` to *registry*."""
 
     @registry.service("place")
@@ -160,7 +162,7 @@ def register(registry: Registry, settings: ServiceSettings) -> None:
                 f"candidates = {request.candidates} is not within 1..100", hint="5 to 10 are enough"
             )
         view = view_of(request.camera, request.pixels, request.descriptors)
-        _, index = opened_map(request.map, settings.max_map_keyframes)
+        _, index = opened_map(request.map)
         rows = index.nearest(view.descriptors, request.candidates, index.rows_within(request.within))
         found = [_candidate(index.keyframes[row], score, view, request.check) for row, score in rows]
         if request.check:

@@ -15,7 +15,6 @@ from dataclasses import dataclass
 import msgspec
 import numpy as np
 
-from rse_pf.config import ServiceSettings
 from rse_pf.errors import BadRequest, LimitExceeded
 from rse_pf.geometry import Array
 from rse_pf.service import Registry
@@ -45,6 +44,8 @@ _FOLDS = 5
 _CALIBRATION_GRID_M = 0.5
 
 Survey = tuple[tuple[float, float, float], Mapping[str, float]]
+MAX_FINGERPRINTS = 5000
+"""Of one request."""
 
 
 class AccessPointReading(msgspec.Struct, frozen=True, kw_only=True):
@@ -167,15 +168,15 @@ class Locator:
         )
 
 
-def register(registry: Registry, settings: ServiceSettings) -> None:
+def register(registry: Registry) -> None:
     """Add ``wifi`` to *registry*."""
 
     @registry.service("wifi")
     def wifi(request: WifiRequest) -> WifiReply:
         """Locate a robot by the access points it hears."""
-        if len(request.survey) > settings.max_fingerprints:
+        if len(request.survey) > MAX_FINGERPRINTS:
             raise LimitExceeded(
-                f"{len(request.survey)} fingerprints are above {settings.max_fingerprints}",
+                f"{len(request.survey)} fingerprints are above {MAX_FINGERPRINTS}",
                 hint="send those near the robot's last position",
             )
         for each in (request.scan, *request.survey):

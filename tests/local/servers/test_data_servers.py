@@ -13,7 +13,7 @@ import pytest
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import ConfigurationError
 from rse_pf.local.processes import is_alive
-from rse_pf.local.servers.data_servers import LocalDataServers
+from rse_pf.local.servers.data_servers import NICENESS, LocalDataServers
 
 pytestmark = pytest.mark.system
 
@@ -102,7 +102,7 @@ def test_a_server_steps_back_behind_the_poses(tmp_path: Path) -> None:
         mine, policy = os.sched_getscheduler(0), os.sched_getscheduler(server.pid)
         await box.servers.stop(10.0)
 
-        assert its == max(ours, PlatformSettings().local.data_nice) > 0
+        assert its == max(ours, NICENESS) > 0
         assert policy == {os.SCHED_OTHER: os.SCHED_BATCH}.get(mine, mine)
 
     asyncio.run(run())

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rse_pf.config import ServiceSettings
 from rse_pf.errors import Cancelled, MissingExtra
 from rse_pf.geometry import Array, exp_se3, inverse, pose_difference
 from rse_pf.maps.format import MapVersion, decode_map, encode_map
@@ -168,7 +167,7 @@ def median_distance(points: Array, others: Array) -> float:
 def test_the_service_takes_bytes_and_accounts_for_every_map() -> None:
     maps, _ = two_robots()
 
-    reply = merge_maps(MergeRequest(maps=[encode_map(each) for each in maps]), ServiceSettings())
+    reply = merge_maps(MergeRequest(maps=[encode_map(each) for each in maps]))
 
     assert reply.joined == [0, 1]
     assert reply.not_joined == []
