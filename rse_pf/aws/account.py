@@ -1,7 +1,6 @@
-"""An operator's AWS account: credentials looked for first, then calls with names that a person understands.
+"""The operator's AWS account: clients of one region, and calls whose errors are sentences with a hint.
 
-Promises an answer in seconds: without credentials it says so at once, and no call outlasts what
-`rse_pf.aws.clients` allows.
+Missing credentials are reported at once; no call lasts longer than `rse_pf.aws.clients` allows.
 """
 
 from __future__ import annotations
@@ -9,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from rse_pf.aws.clients import make_client, patiently
+from rse_pf.aws.clients import error_code, make_client, with_retries
 from rse_pf.errors import ConfigurationError, MissingExtra
 
 __all__ = ["Account", "open_account"]
@@ -22,7 +21,7 @@ _ABSENT = (
 
 
 class Account:
-    """Clients of one region, made when they are first asked."""
+    """The clients of one region; each is made when it is first used."""
 
     def __init__(self, region: str, make: Callable[[str, str], Any] = make_client) -> None:
         self.region = region
@@ -30,7 +29,7 @@ class Account:
         self._clients: dict[str, Any] = {}
 
     def client(self, service: str) -> Any:
-        """Return the client of a service; raises ConfigurationError when there is none in the region."""
+        """Return the client of a service; raises ConfigurationError when the region has no such service."""
         from botocore.exceptions import BotoCoreError
 
         if service not in self._clients:
@@ -38,40 +37,40 @@ class Account:
                 self._clients[service] = self._make(service, self.region)
             except (BotoCoreError, ValueError) as error:
                 raise ConfigurationError(
-                    f"no {service} in cloud.region = {self.region!r}: {error}", hint="mend it in cdk.json"
+                    f"no {service} in cloud.region = {self.region!r}: {error}", hint="correct it in cdk.json"
                 ) from error
         return self._clients[service]
 
     def find(self, service: str, method: str, **arguments: Any) -> dict[str, Any] | None:
-        """Return the answer of one call, or None when what it names is not there.
+        """Return the answer of one call, or None when what it names does not exist.
 
         Raises:
-            ConfigurationError: AWS refused.
+            ConfigurationError: AWS refused.  The error holds no argument and no text of AWS, which may
+                repeat an argument.
             StoreError: AWS does not answer.
         """
         from botocore.exceptions import ClientError
 
         call = getattr(self.client(service), method)
         try:
-            found: dict[str, Any] = patiently(lambda: call(**arguments))
+            found: dict[str, Any] = with_retries(lambda: call(**arguments))
         except ClientError as error:
-            code = error.response.get("Error", {}).get("Code", "")
+            code = error_code(error)
             if code in _ABSENT:
                 return None
             raise ConfigurationError(
                 f"AWS refuses {service} {method}: {code}",
                 hint="look at your account's permissions, or sign in again",
-            ) from error
+            ) from None
         return found
 
     def pages(self, service: str, method: str, rows: str, **arguments: Any) -> list[Any]:
-        """Return *rows* of every page of a call; none when what it names is not there.  Raises as `find`."""
+        """Return *rows* of every page of a call; none if what it names does not exist.  Raises as `find`."""
         client = self.client(service)
         if not client.can_paginate(method):
             return list((self.find(service, method, **arguments) or {}).get(rows, ()))
         found: list[Any] = []
-        paging = client.get_paginator(method)
-        token_in, token_out = _tokens(paging)
+        token_in, token_out = _page_tokens(client.get_paginator(method))
         while True:
             page = self.find(service, method, **arguments) or {}
             found += page.get(rows, ())
@@ -79,9 +78,25 @@ class Account:
                 return found
             arguments[token_in] = page[token_out]
 
+    def resource(self, stack: str, kind: str, prefix: str) -> str:
+        """Return the physical id of a stack's resource; its logical id begins with *prefix*.
+
+        Raises:
+            ConfigurationError: There is no such stack or resource, or AWS refused.
+            StoreError: AWS does not answer.
+        """
+        rows = self.pages("cloudformation", "list_stack_resources", "StackResourceSummaries", StackName=stack)
+        for row in rows:
+            if row["ResourceType"] == kind and row["LogicalResourceId"].startswith(prefix):
+                return str(row["PhysicalResourceId"])
+        raise ConfigurationError(
+            f"there is no {prefix} in the stack {stack} in {self.region}",
+            hint="deploy it: npx cdk deploy --all",
+        )
+
 
 def open_account(region: str) -> Account:
-    """Return the account of whoever runs this.
+    """Return the account whose credentials boto3 finds.
 
     Raises:
         MissingExtra: boto3 is not installed.
@@ -101,8 +116,8 @@ def open_account(region: str) -> Account:
     return Account(region)
 
 
-def _tokens(paging: Any) -> tuple[str, str]:
-    """Return what a call's token is called going in and coming out."""
-    config = paging._pagination_cfg
+def _page_tokens(paginator: Any) -> tuple[str, str]:
+    """Return the names of a call's page token, as an argument and in the answer."""
+    config = paginator._pagination_cfg  # botocore publishes them nowhere else
     into, out = config["input_token"], config["output_token"]
     return (into, out) if isinstance(into, str) else (into[0], out[0])

@@ -1,25 +1,26 @@
-"""Make AWS clients that give up in time, and call them with bounded patience.
+"""Make AWS clients with short timeouts, and retry their calls within a bounded time.
 
-A call is tried at most three times, and no try begins that could end later than ten seconds after the first.
-Promises to retry only what may succeed later: a lost connection, a throttled or failing service.
+A call is attempted at most three times, and no attempt begins that could end later than ten seconds after the
+first began.  Only errors that may be temporary are retried: lost connections, throttling, failing services.
 """
 
 from __future__ import annotations
 
+import functools
 import time
 from collections.abc import Callable
 from typing import Any, TypeVar
 
 from rse_pf.errors import ConfigurationError, MissingExtra, StoreError
 
-__all__ = ["MAX_S", "MAX_TRIES", "ask", "make_client", "patiently", "status_of"]
+__all__ = ["MAX_S", "MAX_TRIES", "call_api", "error_code", "make_client", "status_of", "with_retries"]
 
 MAX_TRIES = 3
 MAX_S = 10.0
 _CONNECT_S, _READ_S = 1.0, 3.5
 _FIRST_PAUSE_S = 0.1
 _THROTTLED = 429
-_LATER = frozenset(
+_TEMPORARY = frozenset(
     {
         "Throttling", "ThrottlingException", "ThrottledException", "RequestThrottled",
         "EC2ThrottledException", "RequestThrottledException", "TooManyRequestsException",
@@ -28,18 +29,20 @@ _LATER = frozenset(
         "TransactionInProgressException", "RequestTimeout", "RequestTimeoutException",
     }
 )  # fmt: skip
-"""What services of AWS call "come again", most of them with status 400."""
+"""Error codes of AWS that ask for a retry; most of them come with status 400."""
 
 T = TypeVar("T")
 
 
 def make_client(service: str, region: str) -> Any:
-    """Return a boto3 client without retries of its own; raises MissingExtra."""
+    """Return a client of botocore without retries of its own; raises MissingExtra."""
     try:
-        import boto3
+        import botocore.session
         from botocore.config import Config
     except ImportError as error:
         raise MissingExtra("boto3", "aws") from error
+    session = botocore.session.get_session()
+    session.register_component("data_loader", _loader())
     config = Config(
         connect_timeout=_CONNECT_S,
         read_timeout=_READ_S,
@@ -47,19 +50,27 @@ def make_client(service: str, region: str) -> Any:
         signature_version="s3v4" if service == "s3" else None,
         s3={"addressing_style": "virtual"} if service == "s3" else None,
     )
-    return boto3.session.Session().client(service, region_name=region, config=config)
+    return session.create_client(service, region_name=region, config=config)
 
 
-def patiently(
+@functools.cache
+def _loader() -> Any:
+    """Return the API descriptions that all clients share: each takes 10 MB and 0.1 s to read."""
+    from botocore.loaders import create_loader
+
+    return create_loader()
+
+
+def with_retries(
     call: Callable[[], T],
     *,
     clock: Callable[[], float] = time.monotonic,
-    rest: Callable[[float], None] = time.sleep,
+    sleep: Callable[[float], None] = time.sleep,
 ) -> T:
-    """Return what *call* returns, after at most three tries within ten seconds.
+    """Return what *call* returns, after at most `MAX_TRIES` attempts within `MAX_S` seconds.
 
     Raises:
-        ClientError: AWS refused; `status_of` says how.
+        ClientError: AWS refused; `status_of` and `error_code` say how.
         StoreError: AWS could not be reached.
     """
     from botocore.exceptions import BotoCoreError, ClientError
@@ -70,27 +81,26 @@ def patiently(
             return call()
         except (BotoCoreError, ClientError) as error:
             last: Exception = error
-        if isinstance(last, ClientError) and not _may_pass(last):
+        if isinstance(last, ClientError) and not _is_temporary(last):
             raise last
         if not left or clock() - began + pause_s + _CONNECT_S + _READ_S > MAX_S:
             break
-        rest(pause_s)
+        sleep(pause_s)
         pause_s *= 2
     raise StoreError(
         f"AWS does not answer: {last}", hint="look at the endpoints of the VPC and at status.aws.amazon.com"
     ) from last
 
 
-def ask(client: Any, method: str, **arguments: Any) -> dict[str, Any]:
-    """Return the answer of one call, patiently; raises StoreError, or ConfigurationError when refused."""
+def call_api(client: Any, method: str, **arguments: Any) -> dict[str, Any]:
+    """Return the answer of one call with retries; raises StoreError, or ConfigurationError when refused."""
     from botocore.exceptions import ClientError
 
     try:
-        found: dict[str, Any] = patiently(lambda: getattr(client, method)(**arguments))
+        found: dict[str, Any] = with_retries(lambda: getattr(client, method)(**arguments))
     except ClientError as error:
-        code = error.response.get("Error", {}).get("Code", "")
         raise ConfigurationError(
-            f"AWS refuses {method}: {code}", hint="look at the role's policy in the template"
+            f"AWS refuses {method}: {error_code(error)}", hint="look at the role's policy in the template"
         ) from error
     return found
 
@@ -100,6 +110,10 @@ def status_of(error: Any) -> int:
     return int(error.response.get("ResponseMetadata", {}).get("HTTPStatusCode", 0))
 
 
-def _may_pass(error: Any) -> bool:
-    code = error.response.get("Error", {}).get("Code", "")
-    return status_of(error) >= 500 or status_of(error) == _THROTTLED or code in _LATER
+def error_code(error: Any) -> str:
+    """Return the AWS error code of a ClientError, such as ``AccessDenied``; empty when it has none."""
+    return str(error.response.get("Error", {}).get("Code", ""))
+
+
+def _is_temporary(error: Any) -> bool:
+    return status_of(error) >= 500 or status_of(error) == _THROTTLED or error_code(error) in _TEMPORARY

@@ -189,11 +189,14 @@ def _cost(args: argparse.Namespace, settings: PlatformSettings) -> int:
 
 def _status(args: argparse.Namespace, settings: PlatformSettings) -> int:
     from rse_pf.aws.account import open_account
-    from rse_pf.aws.fleet.fleet import look_at
+    from rse_pf.aws.fleet.group import read_group
 
     account = open_account(settings.cloud.region)
-    fleet = look_at(account, settings, now=datetime.now(timezone.utc))
-    print(f"{len(fleet.servers)} servers, wanted {fleet.wanted} of {fleet.least} to {fleet.most}")
+    fleet = read_group(account, settings, now=datetime.now(timezone.utc))
+    print(
+        f"{len(fleet.servers)} servers, wanted {fleet.wanted_servers}"
+        f" of {fleet.min_servers} to {fleet.max_servers}"
+    )
     for each in fleet.servers:
         health = ", ".join(each.targets) or "in no target group"
         robots = "robots: not told" if each.robots is None else f"{each.robots:g} robots"
@@ -207,7 +210,7 @@ def _status(args: argparse.Namespace, settings: PlatformSettings) -> int:
     for name, state in sorted(fleet.alarms.items()):
         hint = f"  docs/operations.md#{name}" if state == "ALARM" else ""
         print(f"  alarm {name:<12} {state}{hint}")
-    return 0 if fleet.is_well else 1
+    return 0 if fleet.is_healthy else 1
 
 
 def _leftovers(args: argparse.Namespace, settings: PlatformSettings) -> int:

@@ -1,4 +1,4 @@
-"""An emulator of AWS in this process, for the code that talks to it."""
+"""An emulated AWS in this process."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""An operator's account: no credentials is said at once, refusals by name, and what is absent is None."""
+"""An operator's account: missing credentials, refusals with their code, and None for what does not exist."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ WITHIN_S = 8.0
 
 
 @pytest.fixture
-def nobody(monkeypatch: pytest.MonkeyPatch, tmp_path: Any) -> None:
+def signed_out(monkeypatch: pytest.MonkeyPatch, tmp_path: Any) -> None:
     """A person who never signed in."""
     for name in ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY", "AWS_SESSION_TOKEN", "AWS_PROFILE"):
         monkeypatch.delenv(name, raising=False)
@@ -22,7 +22,7 @@ def nobody(monkeypatch: pytest.MonkeyPatch, tmp_path: Any) -> None:
     monkeypatch.setenv("AWS_CONFIG_FILE", str(tmp_path / "none"))
 
 
-def test_without_credentials_it_is_said_in_seconds(nobody: None) -> None:
+def test_missing_credentials_are_reported_within_seconds(signed_out: None) -> None:
     pytest.importorskip("boto3", reason="the dev extra is not installed")
     began = time.monotonic()
 
@@ -31,10 +31,10 @@ def test_without_credentials_it_is_said_in_seconds(nobody: None) -> None:
 
     assert told.value.message == "no AWS credentials"
     assert "aws sso login" in told.value.hint
-    assert time.monotonic() - began < WITHIN_S, "the instance metadata service was waited for"
+    assert time.monotonic() - began < WITHIN_S, "the instance metadata service was asked"
 
 
-def test_a_profile_that_is_not_there_is_said(nobody: None, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_profile_is_reported(signed_out: None, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("boto3", reason="the dev extra is not installed")
     monkeypatch.setenv("AWS_PROFILE", "forgotten")
 
@@ -42,7 +42,7 @@ def test_a_profile_that_is_not_there_is_said(nobody: None, monkeypatch: pytest.M
         open_account("ap-northeast-2")
 
 
-def test_what_is_not_there_is_none_and_has_no_pages(region: str) -> None:
+def test_what_does_not_exist_is_none_and_has_no_pages(region: str) -> None:
     account = open_account(region)
 
     assert account.find("ssm", "get_parameter", Name="/nothing") is None
@@ -77,7 +77,7 @@ def test_a_refusal_names_the_call_and_the_code() -> None:
     assert told.value.message == "AWS refuses ssm get_parameter: AccessDeniedException"
 
 
-def test_a_region_without_name_is_a_mistake_in_the_settings() -> None:
+def test_an_invalid_region_is_a_configuration_error() -> None:
     pytest.importorskip("boto3", reason="the dev extra is not installed")
 
     with pytest.raises(ConfigurationError, match=r"cloud\.region"):

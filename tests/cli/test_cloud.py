@@ -11,7 +11,7 @@ import pytest
 
 from rse_pf.aws.account import Account
 from rse_pf.aws.clients import make_client
-from rse_pf.aws.fleet.fleet import AutoScalingGroup, Server
+from rse_pf.aws.fleet.group import AutoScalingGroup, Server
 from rse_pf.cli import cloud
 from rse_pf.cli.cloud import check_tools
 from rse_pf.cli.main import main
@@ -222,7 +222,7 @@ def test_a_node_that_the_cdk_no_longer_supports_is_caught(
 
 def show(monkeypatch: pytest.MonkeyPatch, fleet: AutoScalingGroup) -> None:
     monkeypatch.setattr("rse_pf.aws.account.open_account", lambda region: Account(region))
-    monkeypatch.setattr("rse_pf.aws.fleet.fleet.look_at", lambda *args, **named: fleet)
+    monkeypatch.setattr("rse_pf.aws.fleet.group.read_group", lambda *args, **named: fleet)
 
 
 def server(name: str, **changes: Any) -> Server:
@@ -235,7 +235,9 @@ def test_the_status_of_a_well_fleet(
 ) -> None:
     show(
         monkeypatch,
-        AutoScalingGroup(least=1, wanted=1, most=4, servers=(server("i-1"),), alarms={"idle": "OK"}),
+        AutoScalingGroup(
+            min_servers=1, wanted_servers=1, max_servers=4, servers=(server("i-1"),), alarms={"idle": "OK"}
+        ),
     )
 
     assert main(["cloud", "status"]) == 0
@@ -250,7 +252,9 @@ def test_servers_that_told_no_robots_are_not_counted_as_empty(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     both = (server("i-1"), server("i-2", robots=None))
-    show(monkeypatch, AutoScalingGroup(least=1, wanted=2, most=4, servers=both, alarms={}))
+    show(
+        monkeypatch, AutoScalingGroup(min_servers=1, wanted_servers=2, max_servers=4, servers=both, alarms={})
+    )
 
     assert main(["cloud", "status"]) == 0
 
@@ -263,7 +267,9 @@ def test_the_status_of_an_ill_fleet_leads_to_the_runbook(
     ill = server("i-1", targets=("unhealthy",), robots=None)
     show(
         monkeypatch,
-        AutoScalingGroup(least=1, wanted=1, most=4, servers=(ill,), alarms={"unhealthy": "ALARM"}),
+        AutoScalingGroup(
+            min_servers=1, wanted_servers=1, max_servers=4, servers=(ill,), alarms={"unhealthy": "ALARM"}
+        ),
     )
 
     assert main(["cloud", "status"]) == 1

@@ -42,7 +42,7 @@ def agent_of(s3: Any, folder: Path) -> Agent:
     machine = FakeMachine()
     return Agent(
         machine, cloudwatch=None, autoscaling=FakeScaling(machine), artifacts=S3Store(s3, "artifacts"),
-        post=AgentConfig(group="g", hook="h", keys_name="keys.json", keys_file=folder / "keys.json"),
+        config=AgentConfig(group="g", hook="h", keys_name="keys.json", keys_file=folder / "keys.json"),
         settings=PlatformSettings(), log=lambda event, **fields: None,
     )  # fmt: skip
 
@@ -58,7 +58,7 @@ def watching(agent: Agent) -> Iterator[None]:
 
     def watch() -> None:
         with contextlib.suppress(Done):
-            agent.watch_control(rest)
+            agent.watch_access_control(rest)
 
     thread = threading.Thread(target=watch, daemon=True)
     thread.start()
@@ -124,7 +124,7 @@ def test_two_operators_at_once_lose_nobody(
     """The other one disables a robot between this command's read and its write."""
     said(capsys, "token", "init", "--cloud")
     other, swap = AccessControlStore(S3Store(cloud, "artifacts")), S3Store.compare_and_swap
-    waiting = [lambda: other.change_denied(lambda d: d.with_robot("default", "robot-2", 1.0))]
+    waiting = [lambda: other.change_deny_list(lambda d: d.with_robot("default", "robot-2", 1.0))]
 
     def late(self: S3Store, name: str, expected: bytes | None, data: bytes) -> None:
         if waiting:
@@ -134,7 +134,7 @@ def test_two_operators_at_once_lose_nobody(
     monkeypatch.setattr(S3Store, "compare_and_swap", late)
     said(capsys, "robot", "disable", "robot-1", "--cloud")
 
-    assert {each.robot for each in other.denied().disabled} == {"robot-1", "robot-2"}
+    assert {each.robot for each in other.deny_list().disabled} == {"robot-1", "robot-2"}
 
 
 def problem_of(trust: TrustStore, token: str) -> str:
@@ -161,8 +161,8 @@ def test_one_look_of_the_agent_and_one_of_the_server_are_enough(
 
     def known() -> list[str]:
         agent.fetch_keys()
-        agent.fetch_control()
-        trust.look()
+        agent.fetch_access_control()
+        trust.refresh()
         assert trust.problem == ""
         return [problem_of(trust, token) for token in tokens]
 
@@ -194,7 +194,7 @@ def test_a_live_socket_ends_within_two_seconds_of_the_command(
     (tmp_path / "machine").mkdir()
     server, agent = GuardedServer(tmp_path / "machine", workers=1), agent_of(cloud, tmp_path / "machine")
     agent.fetch_keys()
-    agent.fetch_control()
+    agent.fetch_access_control()
     token = asyncio.run(key.token())
     if how == "all-of":  # by the whole second: only a token of an earlier one is meant
         token = said(capsys, "token", "issue", "robot-1", "--cloud").strip()

@@ -116,7 +116,7 @@ def _listed(value: str | list[str]) -> list[str]:
 
 def test_what_the_commands_look_for_is_what_the_stacks_call_it(assembly: Assembly) -> None:
     from rse_pf.auth.trust_store import DENY_NAME, ROBOTS_NAME
-    from rse_pf.aws.fleet.fleet import GROUP
+    from rse_pf.aws.fleet.group import GROUP
     from rse_pf.aws.money.costs import interface_endpoints
     from rse_pf.aws.storage.key_store import DATA_STACK, KEYS_NAME
     from stacks import backend_stack

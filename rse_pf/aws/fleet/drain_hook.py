@@ -1,7 +1,6 @@
-"""Leave a group in order: the server drains, then the lifecycle hook is completed.
+"""Take an instance out of its group without losing robots: drain the server, then complete the hook.
 
-The group has decided; this only makes sure that no robot pays for it.  Promises to complete the hook in any
-case and well before its own timeout, also when no server runs any more.
+The lifecycle hook is completed in any case and well before its own timeout, even if no server is running.
 """
 
 from __future__ import annotations
@@ -9,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from rse_pf.aws.clients import ask
+from rse_pf.aws.clients import call_api
 from rse_pf.aws.fleet.instance import Machine
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import Disconnected
@@ -17,9 +16,9 @@ from rse_pf.scaling.health import time_to_notice_s
 
 __all__ = ["leave_group", "wait_before_move_s"]
 
-_LOOK_S = 0.5
-_SPARE_S = 15.0
-"""Kept of the hook's time for the call that completes it, with its repeats."""
+_POLL_S = 0.5
+_RESERVE_S = 15.0
+"""Kept of the hook's time for the call that completes it, with its retries."""
 
 
 def wait_before_move_s(settings: PlatformSettings) -> float:
@@ -35,25 +34,25 @@ def leave_group(
     hook: str,
     settings: PlatformSettings,
     clock: Callable[[], float],
-    rest: Callable[[float], None],
+    sleep: Callable[[float], None],
     before_end: Callable[[], None] = lambda: None,
 ) -> bool:
-    """Drain the server, complete *hook* of *group*; return whether the server left in time.
+    """Drain the server, then complete *hook* of *group*; return whether the server ended in time.
 
-    *before_end* is called when the server is gone and raises nothing; the instance ends after the hook.
+    *before_end* is called after the server has ended and must not raise; the hook ends the instance.
     """
-    until = clock() + settings.cloud.drain_s - _SPARE_S
-    gone = False
+    until = clock() + settings.cloud.drain_s - _RESERVE_S
+    has_ended = False
     try:
         machine.drain(min(wait_before_move_s(settings), settings.cloud.drain_s / 3))
         while clock() < until:
             machine.page()
-            rest(_LOOK_S)
+            sleep(_POLL_S)
     except Disconnected:
-        gone = True
+        has_ended = True
     before_end()
-    ask(
+    call_api(
         autoscaling, "complete_lifecycle_action", AutoScalingGroupName=group, LifecycleHookName=hook,
         InstanceId=machine.instance_id(), LifecycleActionResult="CONTINUE",
     )  # fmt: skip
-    return gone
+    return has_ended

@@ -1,6 +1,6 @@
-"""Ask the machine that this process runs on: its name and what its group wants of it (IMDSv2), its server.
+"""Query this EC2 instance (IMDSv2) and the control port of its backend server.
 
-Promises link-local and loopback addresses only, and short timeouts.
+Only link-local and loopback addresses are used, with short timeouts.
 """
 
 from __future__ import annotations
@@ -17,29 +17,29 @@ from rse_pf.errors import Disconnected, UsageError
 __all__ = ["Instance", "Machine", "ServerControl"]
 
 _IMDS = "http://169.254.169.254/latest/"
-_TOKEN_S = "60"
+_TOKEN_TTL_S = "60"
 _TIMEOUT_S = 2.0
 _NOT_FOUND = 404
 
 
 class Machine(Protocol):
-    """What the agent needs of an instance and its server; tests play it."""
+    """What the agent needs of an instance and its backend server."""
 
     def instance_id(self) -> str:
-        """Return the instance's id."""
+        """Return the instance's id; raises Disconnected."""
 
     def is_leaving(self) -> bool:
-        """Whether the group has decided to end this instance."""
+        """Return whether the group is ending this instance; raises Disconnected."""
 
     def page(self) -> str:
         """Return the server's /metrics; raises Disconnected when no server runs."""
 
     def drain(self, wait_s: float) -> None:
-        """Ask the server to leave; raises Disconnected when no server runs."""
+        """Tell the server to drain after *wait_s*; raises Disconnected when no server runs."""
 
 
 class ServerControl:
-    """The control port of the backend server on this machine; questions carry what is in *token_file*."""
+    """The control port of the backend server on this machine; requests carry the token in *token_file*."""
 
     def __init__(self, port: int, token_file: Path | None = None) -> None:
         self._base = f"http://127.0.0.1:{port}"
@@ -50,7 +50,7 @@ class ServerControl:
         return self._ask("/metrics", "GET")
 
     def drain(self, wait_s: float) -> None:
-        """Order the drain; raises Disconnected."""
+        """Tell the server to drain after *wait_s*; raises Disconnected."""
         self._ask(f"/drain?wait={wait_s:g}", "POST")
 
     def _ask(self, target: str, method: str) -> str:
@@ -58,9 +58,9 @@ class ServerControl:
         if self._token_file is not None:
             try:
                 headers["Authorization"] = bearer(read_control_token(self._token_file))
-            except UsageError as error:  # it is made before the server starts: no server runs
+            except UsageError as error:  # the token is made before the server starts, so no server runs
                 raise Disconnected(str(error)) from error
-        return _asked(urllib.request.Request(f"{self._base}{target}", method=method, headers=headers))
+        return _ask(f"{self._base}{target}", method, headers)
 
 
 class Instance(ServerControl):
@@ -71,28 +71,28 @@ class Instance(ServerControl):
         return self._metadata("instance-id") or ""
 
     def is_leaving(self) -> bool:
-        """Whether the lifecycle state that the group aims at is the end; raises Disconnected."""
+        """Return whether the target lifecycle state is ``Terminated``; raises Disconnected."""
         return self._metadata("autoscaling/target-lifecycle-state") == "Terminated"
 
     def _metadata(self, path: str) -> str | None:
-        life = {"X-aws-ec2-metadata-token-ttl-seconds": _TOKEN_S}
-        token = _asked(urllib.request.Request(f"{_IMDS}api/token", method="PUT", headers=life))
-        ask = urllib.request.Request(f"{_IMDS}meta-data/{path}", headers={"X-aws-ec2-metadata-token": token})
+        ttl = {"X-aws-ec2-metadata-token-ttl-seconds": _TOKEN_TTL_S}
+        token = {"X-aws-ec2-metadata-token": _ask(f"{_IMDS}api/token", "PUT", ttl)}
         try:
-            return _asked(ask)
+            return _ask(f"{_IMDS}meta-data/{path}", "GET", token)
         except FileNotFoundError:
             return None
 
 
-def _asked(request: urllib.request.Request) -> str:
+def _ask(url: str, method: str, headers: dict[str, str]) -> str:
+    request = urllib.request.Request(url, method=method, headers=headers)
     try:
         with urllib.request.urlopen(request, timeout=_TIMEOUT_S) as answer:
             text: bytes = answer.read()
     except urllib.error.HTTPError as error:
         with error:
             if error.code == _NOT_FOUND:
-                raise FileNotFoundError(request.full_url) from error
-            raise Disconnected(f"{request.full_url} answers {error.code}") from error
+                raise FileNotFoundError(url) from error
+            raise Disconnected(f"{url} answers {error.code}") from error
     except (OSError, http.client.HTTPException) as error:
-        raise Disconnected(f"{request.full_url} does not answer: {error}") from error
+        raise Disconnected(f"{url} does not answer: {error}") from error
     return text.decode()

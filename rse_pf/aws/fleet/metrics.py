@@ -1,7 +1,7 @@
-"""Turn a server's own metrics page into what CloudWatch's alarms and dashboard read.
+"""Convert a server's Prometheus page into the metrics that CloudWatch's alarms and dashboard read.
 
-Pure: text in, data out.  A counter that fell was reset by a restart, and counts from zero again.  Promises
-the names of `rse_pf.scaling.alarms`, the dimensions of `dimensions_of`, and no robot's name.
+Pure functions.  A counter that fell was reset by a restart and counts from zero again.  Metric names are
+those of `rse_pf.scaling.alarms`; no robot's name is published.
 """
 
 from __future__ import annotations
@@ -15,20 +15,20 @@ from typing import Any
 __all__ = ["ROBOTS", "ServerMetrics", "datums", "dimensions_of", "read_page"]
 
 ROBOTS = "Robots"
-"""The one metric that is told for each server, too."""
+"""The only metric that is also published for each server."""
 
 _LINE = re.compile(r"^rse_pf_(\w+?)(?:\{(.*)\})? (\S+)$", flags=re.M)
 _LABEL = re.compile(r'(\w+)="([^"]*)"')
 _INF = "+Inf"
 _BEYOND = 2.0
-"""An answer slower than the last bound is told as twice that bound."""
+"""An answer slower than the last bound counts as twice that bound."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ServerMetrics:
-    """One look at a server: gauges as they are, counters since its start.
+    """One sample of a server: gauges as they are, counters since its start.
 
-    ``answers`` maps an upper bound in milliseconds to the answers that took at most so long.
+    ``answers`` maps an upper bound in milliseconds to the number of answers that took at most that long.
     """
 
     robots: float = 0.0
@@ -41,7 +41,7 @@ class ServerMetrics:
 
 
 def read_page(text: str) -> ServerMetrics:
-    """Return the reading on a page of /metrics, in Prometheus' text format."""
+    """Return the sample in a page of /metrics, in Prometheus' text format."""
     totals: Counter[str] = Counter()
     answers: Counter[float] = Counter()
     bounds_ms: list[float] = []
@@ -68,13 +68,13 @@ def read_page(text: str) -> ServerMetrics:
 
 
 def dimensions_of(group: str, server: str = "") -> list[dict[str, str]]:
-    """Return the dimensions of what is told for a group or, where *server* is an instance, for it alone."""
+    """Return the dimensions of a group's metric or, where *server* is an instance id, of that instance's."""
     named = {"AutoScalingGroupName": group, **({"InstanceId": server} if server else {})}
     return [{"Name": name, "Value": value} for name, value in named.items()]
 
 
 def datums(before: ServerMetrics, now: ServerMetrics, group: str, server: str) -> list[dict[str, Any]]:
-    """Return the MetricData of one period between two looks of the instance *server*, for PutMetricData."""
+    """Return the MetricData for PutMetricData: what instance *server* did between two samples."""
     values = {
         ROBOTS: (now.robots, "Count"),
         "InFlight": (now.in_flight, "Count"),
@@ -105,7 +105,7 @@ def datums(before: ServerMetrics, now: ServerMetrics, group: str, server: str) -
 
 
 def _answers_between(before: Mapping[float, float], now: Mapping[float, float]) -> dict[float, float]:
-    """Return how many answers fell between each bound and the one below; empty slots are left out."""
+    """Return how many answers lie between each bound and the one below; empty intervals are left out."""
     slots, below = {}, 0.0
     restarted = any(now.get(bound, 0.0) < count for bound, count in before.items())
     for bound in sorted(now):

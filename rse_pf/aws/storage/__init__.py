@@ -1,9 +1,8 @@
-"""What AWS keeps: objects in S3, keys and secrets, archived audit logs.
+"""What AWS keeps: objects in S3, signing keys, archived audit logs.
 
-Everything that outlives a server belongs here; instances belong to `fleet`.
+Everything that must survive a server belongs here; instances belong to `fleet`.
 """
 
 from rse_pf.aws.storage.s3_store import S3Store, open_bucket
-from rse_pf.aws.storage.secrets import read_secret, write_secret
 
-__all__ = ["S3Store", "open_bucket", "read_secret", "write_secret"]
+__all__ = ["S3Store", "open_bucket"]

@@ -1,8 +1,7 @@
-"""Read the audit logs of a cloud back: pieces in a bucket become the files that `rse_pf.audit.verify` judges.
+"""Fetch the audit logs of a cloud: pieces in a bucket become the files that `rse_pf.audit.verify` checks.
 
-Each server's chains are found by the name of its instance: ``INSTANCE`` is the server's own, ``INSTANCE_WHO``
-another writer's beside it.  Promises to ask for reading alone, and to leave out nothing but the second copy
-of a line.
+A chain is named after its instance: ``INSTANCE`` is the backend server's own, ``INSTANCE_WHO`` belongs to
+another writer on that instance.  The bucket is only read; every line is kept, except repeated ones.
 """
 
 from __future__ import annotations
@@ -17,12 +16,10 @@ from rse_pf.aws.account import Account
 from rse_pf.aws.storage.audit_ship import DIGEST_LETTERS
 from rse_pf.aws.storage.s3_store import S3Store
 from rse_pf.config.resource_names import AUDIT_PREFIX, DATA_STACK
-from rse_pf.errors import ConfigurationError
 from rse_pf.object_store import ObjectStore
 
 __all__ = ["fetch_audit", "open_audit_archive"]
 
-_BUCKET = "AuditLogs"
 _PIECE = re.compile(
     rf"{AUDIT_PREFIX}/(?P<instance>[A-Za-z0-9_-]{{1,64}})/"
     rf"(?P<who>[A-Za-z0-9_-]{{1,64}})\.(?P<first>\d{{12}})\.(?P<digest>[0-9a-f]{{{DIGEST_LETTERS}}})\.jsonl"
@@ -31,16 +28,7 @@ _PIECE = re.compile(
 
 def open_audit_archive(account: Account) -> S3Store:
     """Return the bucket of the audit logs in *account*; raises ConfigurationError if there is none."""
-    rows = account.pages(
-        "cloudformation", "list_stack_resources", "StackResourceSummaries", StackName=DATA_STACK
-    )
-    for row in rows:
-        if row["ResourceType"] == "AWS::S3::Bucket" and row["LogicalResourceId"].startswith(_BUCKET):
-            return S3Store(account.client("s3"), row["PhysicalResourceId"])
-    raise ConfigurationError(
-        f"there is no bucket of audit logs in the stack {DATA_STACK} in {account.region}",
-        hint="deploy it: npx cdk deploy --all",
-    )
+    return S3Store(account.client("s3"), account.resource(DATA_STACK, "AWS::S3::Bucket", "AuditLogs"))
 
 
 def fetch_audit(store: ObjectStore, folder: Path) -> list[str]:
@@ -54,7 +42,7 @@ def fetch_audit(store: ObjectStore, folder: Path) -> list[str]:
     for info in store.list(f"{AUDIT_PREFIX}/"):
         match = _PIECE.fullmatch(info.name)
         if match is None:
-            problems.append(f"{info.name} is no piece of a log")
+            problems.append(f"{info.name} is not a piece of an audit log")
             continue
         instance, who = match["instance"], match["who"]
         chain = who if who == instance else f"{instance}_{who}"[:64]
@@ -65,13 +53,13 @@ def fetch_audit(store: ObjectStore, folder: Path) -> list[str]:
         for first, name in sorted(pieces):
             data = store.get(name)
             if hashlib.sha256(data).hexdigest()[:DIGEST_LETTERS] != name.rsplit(".", 2)[1]:
-                problems.append(f"{name} was changed: its bytes are not those that its name vouches for")
+                problems.append(f"{name} was changed: its bytes do not have the digest in its name")
             _write(folder, chain, first, list(_unseen(data, seen)))
     return problems
 
 
 def _unseen(data: bytes, seen: set[bytes]) -> Iterator[bytes]:
-    """Yield the lines that no piece before had: an agent that lost its marks carried some of them twice."""
+    """Yield the lines that no earlier piece had: an agent that lost its marks uploads some lines twice."""
     for line in _lines(data):
         digest = hashlib.sha256(line).digest()
         if digest not in seen:

@@ -1,9 +1,9 @@
-"""Carry a server's audit log to a bucket while it is written, for a log must outlive its machine.
+"""Upload a server's audit log to a bucket while it is written, so that it survives the machine.
 
-What is new in each chain goes as a piece of its own, ``audit/INSTANCE/WHO.FIRST.DIGEST.jsonl``: FIRST is the
-number of its first entry, DIGEST the beginning of its sha256.  Promises to write each name once and to read
-and delete nothing there, to hold back no entry that looks wrong, and that after any crash pieces may overlap
-but never lack an entry; `rse_pf.aws.storage.audit_archive` puts them together again.
+The new entries of each chain become one object, a piece, ``audit/INSTANCE/WHO.FIRST.DIGEST.jsonl``: FIRST is
+the number of its first entry, DIGEST the beginning of its sha256.  Each name is written once; nothing in the
+bucket is read or deleted.  Entries that look wrong are uploaded, too.  After a crash pieces may overlap, but
+no entry is missing; `rse_pf.aws.storage.audit_archive` joins them again.
 """
 
 from __future__ import annotations
@@ -17,23 +17,24 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import BinaryIO
 
-from rse_pf.audit.chain import GENESIS, Chain, Entry, Head, head_word
-from rse_pf.audit.log import files_of, names_in
+from rse_pf.audit.chain import GENESIS, Chain, Entry, Head, parse_head
+from rse_pf.audit.log import chain_names, files_of
 from rse_pf.config.resource_names import AUDIT_PREFIX
 from rse_pf.errors import Conflict
+from rse_pf.files import replace_json
 from rse_pf.object_store import ObjectStore
 
 __all__ = ["DIGEST_LETTERS", "Shipper", "piece_name"]
 
 DIGEST_LETTERS = 32
 _MAX_BYTES = 1 << 23
-"""Of a piece: uploaded in a second, and two of them fit into the memory that an agent may take."""
-_LOOKS = 3
+"""Of one piece: it uploads in about a second, and the agent holds at most two of them in memory."""
+_MAX_ATTEMPTS = 3
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Mark:
-    """How far a chain was carried: the file, the byte behind the last one, and the head there."""
+    """How far a chain was uploaded: the file, the offset after the last byte, and the chain's head there."""
 
     inode: int = 0
     offset: int = 0
@@ -49,7 +50,7 @@ class _Piece:
 
 
 class Shipper:
-    """Carries the chains in one folder."""
+    """Uploads the chains in one folder."""
 
     def __init__(
         self,
@@ -60,14 +61,14 @@ class Shipper:
         instance: Callable[[], str],
         on_broken: Callable[[str, str], None],
     ) -> None:
-        """Describe a shipper; nothing is read.
+        """Make a shipper; nothing is read.
 
         Args:
             folder: Where the logs are written.
-            store: The bucket; only writes of new names are asked of it.
-            marks_file: Remembers how far each chain was carried.
-            instance: Tells the name of this machine.
-            on_broken: Gets a chain and a sentence, when an entry does not follow the one before.
+            store: The bucket; the shipper only writes new names.
+            marks_file: Where it keeps how far each chain was uploaded.
+            instance: Returns the name of this machine.
+            on_broken: Gets a chain and a problem when an entry does not follow the previous one.
         """
         self._folder = folder
         self._store = store
@@ -76,19 +77,19 @@ class Shipper:
         self._on_broken = on_broken
 
     def ship(self) -> int:
-        """Carry what is new; return the number of pieces.
+        """Upload new entries; return the number of pieces.
 
         Raises:
-            StoreError: The bucket did not take a piece: it is carried at the next call.
+            StoreError: The bucket refused a piece, which the next call uploads.
             OSError: A log cannot be read.
         """
         marks, count = self._marks(), 0
-        for who in names_in(self._folder):
+        for who in chain_names(self._folder):
             for piece in _pieces(self._folder, who, marks.get(who, _Mark())):
                 if piece.problem:
                     self._on_broken(who, piece.problem)
                 name = piece_name(self._instance(), who, piece.first, piece.data)
-                with contextlib.suppress(Conflict):  # the same bytes arrived, but their mark was lost
+                with contextlib.suppress(Conflict):  # the same bytes arrived before, and their mark was lost
                     self._store.compare_and_swap(name, None, piece.data)
                 marks[who] = piece.after
                 self._remember(marks)
@@ -96,7 +97,7 @@ class Shipper:
         return count
 
     def _marks(self) -> dict[str, _Mark]:
-        """Return the marks; where they cannot be read everything is carried once more."""
+        """Return the marks; when they cannot be read, everything is uploaded again."""
         try:
             rows = json.loads(self._marks_file.read_text(encoding="utf-8"))
             return {str(who): _Mark(**row) for who, row in rows.items()}
@@ -104,28 +105,26 @@ class Shipper:
             return {}
 
     def _remember(self, marks: dict[str, _Mark]) -> None:
-        temporary = self._marks_file.with_name(f".{self._marks_file.name}.new")
-        temporary.write_text(json.dumps({who: asdict(mark) for who, mark in marks.items()}))
-        os.replace(temporary, self._marks_file)
+        replace_json(self._marks_file, {who: asdict(mark) for who, mark in marks.items()})
 
 
 def piece_name(instance: str, who: str, first: int, data: bytes) -> str:
-    """Return the name of a piece: whoever changes the bytes belies the name."""
+    """Return the name of a piece, which holds the digest of its bytes."""
     digest = hashlib.sha256(data).hexdigest()[:DIGEST_LETTERS]
     return f"{AUDIT_PREFIX}/{instance}/{who}.{first:012d}.{digest}.jsonl"
 
 
 def _pieces(folder: Path, who: str, mark: _Mark) -> Iterator[_Piece]:
-    """Yield what lies behind *mark*; no piece spans two files, only the newest file may still grow."""
+    """Yield what follows *mark*; a piece is part of one file, and only the newest file may still grow."""
     with contextlib.ExitStack() as stack:
         files = _opened(folder, who, stack)
         inodes = [os.fstat(file.fileno()).st_ino for file in files]
         if mark.inode in inodes and os.fstat(files[inodes.index(mark.inode)].fileno()).st_size < mark.offset:
-            mark = _Mark()  # it was cut: what is left is carried again, and its head does not fit
+            mark = _Mark()  # the file was truncated: the rest is uploaded again, and its head does not match
         begin = inodes.index(mark.inode) if mark.inode in inodes else 0
         if mark.inode not in inodes:
             mark = _Mark()
-        head = head_word(mark.head) or GENESIS
+        head = parse_head(mark.head) or GENESIS
         for number in range(begin, len(files)):
             offset = mark.offset if inodes[number] == mark.inode else 0
             while data := _next(files[number], offset, is_whole=number + 1 < len(files)):
@@ -135,9 +134,9 @@ def _pieces(folder: Path, who: str, mark: _Mark) -> Iterator[_Piece]:
 
 
 def _opened(folder: Path, who: str, stack: contextlib.ExitStack) -> list[BinaryIO]:
-    """Return the files of a chain, oldest first; nothing if they are being moved all the time."""
-    for _ in range(_LOOKS):
-        with contextlib.suppress(FileNotFoundError):  # it was set aside this very moment
+    """Return the files of a chain, oldest first; none if they were rotated during every attempt."""
+    for _ in range(_MAX_ATTEMPTS):
+        with contextlib.suppress(FileNotFoundError):  # it was rotated meanwhile
             files: list[BinaryIO] = [stack.enter_context(path.open("rb")) for path in files_of(folder, who)]
             there = [path.stat().st_ino for path in files_of(folder, who)]
             if there == [os.fstat(file.fileno()).st_ino for file in files]:
@@ -146,7 +145,7 @@ def _opened(folder: Path, who: str, stack: contextlib.ExitStack) -> list[BinaryI
 
 
 def _next(file: BinaryIO, offset: int, *, is_whole: bool) -> bytes:
-    """Return at most a piece; up to a whole line, unless the file is over and ends within one."""
+    """Return at most one piece of whole lines; the last line of a finished file may be incomplete."""
     data = os.pread(file.fileno(), _MAX_BYTES, offset)
     is_end = len(data) < _MAX_BYTES
     cut = data.rfind(b"\n") + 1
@@ -154,9 +153,9 @@ def _next(file: BinaryIO, offset: int, *, is_whole: bool) -> bytes:
 
 
 def _read(data: bytes, head: Head) -> tuple[int, Head, str]:
-    """Return the first number in *data*, the head behind it, and the first thing that is wrong."""
+    """Return the first entry number in *data*, the head after it, and the first problem."""
     chain, first, problem = Chain(head), 0, ""
-    for line in data.split(b"\n")[:-1]:  # what a crash tore off is no entry, and the next one says so
+    for line in data.split(b"\n")[:-1]:  # an incomplete line is no entry; the next entry shows the gap
         found = chain.add(line + b"\n")
         if isinstance(found, str):
             problem = problem or found

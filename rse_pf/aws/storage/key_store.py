@@ -1,27 +1,25 @@
-"""Where a cloud's keys are: private halves in one secret, public halves as a JWKS in the artifact bucket.
+"""The signing keys of a cloud: private keys in one secret, public keys as a JWKS in the artifact bucket.
 
 Two keys overlap in a rotation: servers learn the new one before anything is signed with it, and the old one
-stays until its last token is over.  Promises to print no private half, and to publish only what is stored.
+stays until its last token has expired.  No private key is in an error message or a log line, and a public key
+is published only after its private key is stored.  `rse-pf token --cloud` reads the secret; servers never do.
 """
 
 from __future__ import annotations
 
 import json
 from dataclasses import dataclass
-from typing import Any
 
 from rse_pf.auth.tokens import KeySet, SigningKey
 from rse_pf.auth.trust_store import AccessControlStore
 from rse_pf.aws.account import Account
 from rse_pf.aws.storage.s3_store import S3Store
-from rse_pf.aws.storage.secrets import read_secret, write_secret
 from rse_pf.config import PlatformSettings
 from rse_pf.config.resource_names import DATA_STACK, KEYS_NAME
 from rse_pf.errors import ConfigurationError, NotFound, UsageError
 
 __all__ = ["DATA_STACK", "KEYS_NAME", "KeyRing", "KeyStore", "open_key_store", "spread_s"]
 
-_SECRET, _BUCKET = "SigningKey", "Artifacts"
 _MAKE_ONE = "make one with rse-pf token init --cloud"
 
 
@@ -53,12 +51,12 @@ class KeyRing:
         return cls(keys=made) if made else None
 
     def to_json(self) -> str:
-        """Return the ring with its private halves; for the secret alone."""
+        """Return the ring with its private keys, for the secret only."""
         rows = [{"jwk": json.loads(key.to_json()), "from_s": from_s} for key, from_s in self.keys]
         return json.dumps({"keys": rows})
 
     def key_set(self) -> KeySet:
-        """Return the public halves."""
+        """Return the public keys."""
         halves = {key.key_id: key.key_set().get(key.key_id) for key, _ in self.keys}
         return KeySet({name: half for name, half in halves.items() if half is not None})
 
@@ -71,23 +69,23 @@ class KeyRing:
         """Return the newest key and *key*, which signs once every server knows it.
 
         Raises:
-            ConfigurationError: The rotation before this one is not over yet.
+            ConfigurationError: The previous rotation is not over yet.
         """
         _, from_s = self.keys[-1]
         old_tokens_over = from_s + settings.auth.token_ttl_s + settings.auth.leeway_s
         if len(self.keys) > 1 and now < old_tokens_over:
             raise ConfigurationError(
-                f"tokens of the key before are good for {old_tokens_over - now:.0f} s more",
+                f"tokens of the previous key are valid for {old_tokens_over - now:.0f} s more",
                 hint="wait, or end them at once with rse-pf token retire --cloud",
             )
         return KeyRing(keys=(self.keys[-1], (key, now + spread_s(settings))))
 
     def retired(self, *, now: float, force: bool = False) -> KeyRing:
-        """Return the newest key alone, signing from *now*: the others are trusted no longer.
+        """Return a ring of the newest key only, which signs from *now* on; servers stop trusting the others.
 
         Raises:
-            ConfigurationError: There is no other key; or not every server knows the newest yet and *force* is
-                not given: robots with good tokens would be refused.
+            ConfigurationError: There is no other key; or not every server knows the newest key yet, so that
+                robots with valid tokens would be refused, and *force* is false.
         """
         if len(self.keys) == 1:
             raise ConfigurationError(
@@ -98,7 +96,7 @@ class KeyRing:
         if now < from_s and not force:
             raise ConfigurationError(
                 f"for {from_s - now:.0f} s more servers may not know key {key.key_id} and refuse robots",
-                hint="wait; if the key before was stolen, add --force",
+                hint="wait; if the previous key was stolen, add --force",
             )
         return KeyRing(keys=((key, min(from_s, now)),))
 
@@ -106,17 +104,19 @@ class KeyRing:
 class KeyStore:
     """The secret and the bucket of one deployment."""
 
-    def __init__(self, secrets: Any, secret: str, bucket: S3Store) -> None:
-        self._secrets = secrets
+    def __init__(self, account: Account, *, secret: str, bucket: str) -> None:
+        self._account = account
         self._secret = secret
-        self._bucket = bucket
+        self._bucket = S3Store(account.client("s3"), bucket)
 
     def read(self) -> KeyRing | None:
-        """Return the ring; None if no key was made yet."""
-        try:
-            return KeyRing.from_json(read_secret(self._secrets, self._secret))
-        except NotFound:
-            return None
+        """Return the ring; None if no key was made yet.
+
+        Raises:
+            ConfigurationError: AWS refused, or the secret holds broken keys.
+        """
+        found = self._account.find("secretsmanager", "get_secret_value", SecretId=self._secret)
+        return None if found is None else KeyRing.from_json(found["SecretString"])
 
     def ring(self) -> KeyRing:
         """Return the ring; raises ConfigurationError if there is none."""
@@ -126,34 +126,31 @@ class KeyStore:
         return found
 
     def write(self, ring: KeyRing) -> None:
-        """Store *ring*, then publish its public half; after a crash between the two, `publish` mends it."""
-        write_secret(self._secrets, self._secret, ring.to_json())
+        """Store *ring*, then publish its public keys; after a crash between the two, call `publish`.
+
+        Raises:
+            NotFound: There is no such secret.
+            ConfigurationError: AWS refused.
+        """
+        secret = {"SecretId": self._secret, "SecretString": ring.to_json()}
+        if self._account.find("secretsmanager", "put_secret_value", **secret) is None:
+            raise NotFound(f"no secret named {self._secret!r}", hint=f"deploy {DATA_STACK} first")
         self.publish(ring)
 
-    def control_room(self) -> AccessControlStore:
-        """Return the room beside the public keys, which servers look into every few hundred milliseconds."""
+    def access_control_store(self) -> AccessControlStore:
+        """Return the roster and the deny list beside the public keys, which agents fetch repeatedly."""
         return AccessControlStore(self._bucket)
 
     def publish(self, ring: KeyRing) -> None:
-        """Write the public half, which servers fetch within `spread_s`, and furnish the control room."""
-        self.control_room().create_missing()
+        """Write the public keys, which servers fetch within `spread_s`; create roster and deny list."""
+        self.access_control_store().create_missing()
         self._bucket.put(KEYS_NAME, ring.key_set().to_json().encode())
 
 
 def open_key_store(account: Account) -> KeyStore:
     """Return the store of the deployment in *account*; raises ConfigurationError if there is none."""
-    found = account.pages(
-        "cloudformation", "list_stack_resources", "StackResourceSummaries", StackName=DATA_STACK
+    return KeyStore(
+        account,
+        secret=account.resource(DATA_STACK, "AWS::SecretsManager::Secret", "SigningKey"),
+        bucket=account.resource(DATA_STACK, "AWS::S3::Bucket", "Artifacts"),
     )
-    names = {
-        word: row["PhysicalResourceId"]
-        for row in found
-        for word, kind in ((_SECRET, "AWS::SecretsManager::Secret"), (_BUCKET, "AWS::S3::Bucket"))
-        if row["LogicalResourceId"].startswith(word) and row["ResourceType"] == kind
-    }
-    if len(names) < 2:
-        raise ConfigurationError(
-            f"there is no stack {DATA_STACK} in {account.region}", hint="deploy it: npx cdk deploy --all"
-        )
-    bucket = S3Store(account.client("s3"), names[_BUCKET])
-    return KeyStore(account.client("secretsmanager"), names[_SECRET], bucket)

@@ -1,8 +1,8 @@
-"""Keep objects in one S3 bucket, under the same contract as a folder or the memory.
+"""An object store in one S3 bucket, with the contract of `rse_pf.object_store.ObjectStore`.
 
-Swaps are S3's own conditional writes, so two servers never both win.  A presigned address fixes name, length
-and sha256 of what may be stored, so a robot uploads by itself and nothing else.  Promises no listing of names
-that are not ours, and no call that lasts longer than `rse_pf.aws.clients` allows.
+A compare-and-swap is a conditional write of S3, so only one of two servers succeeds.  A presigned URL fixes
+name, length and sha256 of what may be stored, so a robot can upload exactly these bytes with it.  Names that
+the platform would not write are not listed; no call lasts longer than `rse_pf.aws.clients` allows.
 """
 
 from __future__ import annotations
@@ -12,18 +12,18 @@ import contextlib
 from collections.abc import Iterator
 from typing import Any
 
-from rse_pf.aws.clients import make_client, patiently, status_of
+from rse_pf.aws.clients import error_code, make_client, status_of, with_retries
 from rse_pf.errors import Conflict, NotFound, StoreError, StoreFull
 from rse_pf.object_store import ObjectInfo, check_name
 
 __all__ = ["S3Store", "open_bucket"]
 
-_MISSING, _CHANGED, _RACED, _OUTSIDE = 404, 412, 409, 416
+_NOT_FOUND, _PRECONDITION_FAILED, _CONFLICT, _RANGE_OUTSIDE = 404, 412, 409, 416
 _FULL = {"QuotaExceeded", "EntityTooLarge", "InsufficientStorage"}
 
 
 def open_bucket(bucket: str, region: str) -> S3Store:
-    """Return the store in *bucket*; raises MissingExtra.  Nothing is asked of AWS yet."""
+    """Return the store in *bucket* without a call to AWS; raises MissingExtra."""
     return S3Store(make_client("s3", region), bucket)
 
 
@@ -53,9 +53,9 @@ class S3Store:
 
         with _as_store_errors(name):
             try:
-                return patiently(piece)
+                return with_retries(piece)
             except ClientError as error:
-                if status_of(error) == _OUTSIDE:
+                if status_of(error) == _RANGE_OUTSIDE:
                     return b""
                 raise
 
@@ -74,7 +74,7 @@ class S3Store:
         while True:
             page = self._ask(prefix, "list_objects_v2", Prefix=prefix, **more)
             for each in page.get("Contents", ()):
-                with contextlib.suppress(StoreError):  # somebody else's name is no object of ours
+                with contextlib.suppress(StoreError):  # a name that the platform did not write
                     yield ObjectInfo(name=check_name(each["Key"]), size=int(each["Size"]))
             if not page.get("IsTruncated"):
                 return
@@ -88,7 +88,7 @@ class S3Store:
     def compare_and_swap(self, name: str, expected: bytes | None, data: bytes) -> None:
         """Replace the object if it still holds *expected* (None: is missing); raises Conflict.
 
-        When the answer to a write that won is lost, the repeated write finds its own data and has won, too.
+        When the answer to a successful write is lost, the retry finds its own data and succeeds, too.
         """
         check_name(name)
         condition = {"IfNoneMatch": "*"}
@@ -102,14 +102,14 @@ class S3Store:
             condition = {"IfMatch": tag}
         self._write(name, data, **condition)
 
-    def presigned_put(self, name: str, *, size: int, sha256: str, life_s: int) -> tuple[str, dict[str, str]]:
-        """Return an address and the headers with which exactly these bytes may be PUT there.
+    def presigned_put(self, name: str, *, size: int, sha256: str, ttl_s: int) -> tuple[str, dict[str, str]]:
+        """Return a URL and the headers with which exactly these bytes may be PUT there.
 
         Args:
             name: Name of the object.
             size: Its length in bytes.
             sha256: Its digest in hex; S3 refuses other bytes.
-            life_s: The address is good for so long.
+            ttl_s: The address is good for so long.
         """
         checksum = base64.b64encode(bytes.fromhex(sha256)).decode()
         url = self._client.generate_presigned_url(
@@ -118,14 +118,14 @@ class S3Store:
                 "Bucket": self._bucket, "Key": check_name(name), "ContentLength": size,
                 "ChecksumSHA256": checksum,
             },
-            ExpiresIn=life_s,
+            ExpiresIn=ttl_s,
         )  # fmt: skip
         return str(url), {"Content-Length": str(size), "x-amz-checksum-sha256": checksum}
 
-    def presigned_get(self, name: str, *, life_s: int) -> str:
-        """Return an address from which the object may be read for *life_s* seconds."""
+    def presigned_get(self, name: str, *, ttl_s: int) -> str:
+        """Return an address from which the object may be read for *ttl_s* seconds."""
         place = {"Bucket": self._bucket, "Key": check_name(name)}
-        return str(self._client.generate_presigned_url("get_object", Params=place, ExpiresIn=life_s))
+        return str(self._client.generate_presigned_url("get_object", Params=place, ExpiresIn=ttl_s))
 
     def _read(self, name: str) -> tuple[bytes, str]:
         def whole() -> tuple[bytes, str]:
@@ -134,7 +134,7 @@ class S3Store:
 
         check_name(name)
         with _as_store_errors(name):
-            return patiently(whole)
+            return with_retries(whole)
 
     def _write(self, name: str, data: bytes, **condition: str) -> None:
         tries = 0
@@ -146,14 +146,14 @@ class S3Store:
 
         try:
             with _as_store_errors(name):
-                patiently(write)
+                with_retries(write)
         except Conflict:
             if tries == 1 or self.get(name) != data:
                 raise
 
     def _ask(self, name: str, method: str, **arguments: Any) -> dict[str, Any]:
         with _as_store_errors(name):
-            found: dict[str, Any] = patiently(
+            found: dict[str, Any] = with_retries(
                 lambda: getattr(self._client, method)(Bucket=self._bucket, **arguments)
             )
         return found
@@ -166,19 +166,22 @@ def _as_store_errors(name: str) -> Iterator[None]:
     try:
         yield
     except ClientError as error:
-        code = error.response.get("Error", {}).get("Code", "")
+        code = error_code(error)
         if code == "NoSuchBucket":
-            raise StoreError("the bucket does not exist", hint="look at data.store") from error
-        if status_of(error) == _MISSING:
+            raise StoreError(
+                "the bucket does not exist",
+                hint="correct data.store, or deploy RsePf-Data",
+            ) from error
+        if status_of(error) == _NOT_FOUND:
             raise NotFound(f"no object named {name!r}") from error
-        if status_of(error) in (_CHANGED, _RACED):
+        if status_of(error) in (_PRECONDITION_FAILED, _CONFLICT):
             raise _conflict(name) from error
         if code in _FULL:
-            raise StoreFull(f"no room for {name!r}", hint="free some space") from error
+            raise StoreFull(f"no space for {name!r}", hint="free some space") from error
         raise StoreError(
-            f"{name!r}: S3 says {code}", hint="look at the role's policy and the bucket's"
+            f"S3 refuses {name!r}: {code}", hint="look at the role's policy and the bucket's"
         ) from error
 
 
 def _conflict(name: str) -> Conflict:
-    return Conflict(f"{name!r} was changed meanwhile", hint="read it again and retry")
+    return Conflict(f"{name!r} was changed by another writer", hint="read it again and retry")

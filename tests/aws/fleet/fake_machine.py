@@ -1,4 +1,4 @@
-"""An instance that tests play: its server, its lifecycle, and its time."""
+"""A fake instance: its server, its lifecycle, and its time."""
 
 from __future__ import annotations
 
@@ -8,21 +8,21 @@ from rse_pf.errors import Disconnected
 
 
 class FakeMachine:
-    """A machine whose server leaves ``leaves_after_s`` after its drain, when it runs at all."""
+    """A machine whose server ends ``ends_after_s`` after its drain, when it runs at all."""
 
-    def __init__(self, *, runs: bool = True, leaves_after_s: float = 20.0) -> None:
+    def __init__(self, *, runs: bool = True, ends_after_s: float = 20.0) -> None:
         self.now_s = 100.0
         self.runs = runs
         self.leaving = False
         self.text = ""
         self.waits: list[float] = []
-        self._leaves_after_s = leaves_after_s
-        self._gone_at_s = float("inf")
+        self._ends_after_s = ends_after_s
+        self._ended_at_s = float("inf")
 
     def clock(self) -> float:
         return self.now_s
 
-    def rest(self, seconds: float) -> None:
+    def sleep(self, seconds: float) -> None:
         self.now_s += seconds
 
     def instance_id(self) -> str:
@@ -32,14 +32,14 @@ class FakeMachine:
         return self.leaving
 
     def page(self) -> str:
-        if not self.runs or self.now_s >= self._gone_at_s:
+        if not self.runs or self.now_s >= self._ended_at_s:
             raise Disconnected("no server")
         return self.text
 
     def drain(self, wait_s: float) -> None:
         self.page()
         self.waits.append(wait_s)
-        self._gone_at_s = self.now_s + self._leaves_after_s
+        self._ended_at_s = self.now_s + self._ends_after_s
 
 
 class FakeScaling:

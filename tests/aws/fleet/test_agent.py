@@ -1,4 +1,4 @@
-"""The agent's duties: numbers in every period, keys when they change, the drain once."""
+"""The agent's tasks: metrics in every period, keys when they change, the drain once."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ KEYS = SigningKey.from_seed(b"k" * 32, "test-key").key_set().to_json().encode()
 PAGE = 'rse_pf_requests_total{{result="ok",service="pnp"}} {requests}\nrse_pf_robots {robots}\n'
 
 
-class Stand:
+class AgentSetup:
     """An agent with everything around it."""
 
     def __init__(self, folder: Path, cloudwatch: Any) -> None:
@@ -38,12 +38,12 @@ class Stand:
         self.audit, self.archive = folder / "audit", MemoryStore()
         shipper = Shipper(
             self.audit, self.archive, marks_file=folder / "shipped.json", instance=self.machine.instance_id,
-            on_broken=lambda who, why: self.log.append(("broken", {"who": who})),
+            on_broken=lambda chain, problem: self.log.append(("broken", {"chain": chain})),
         )  # fmt: skip
         self.agent = Agent(
             self.machine, cloudwatch=cloudwatch, autoscaling=self.scaling, artifacts=self.artifacts,
-            post=AgentConfig(group="rse-pf", hook="drain", keys_name="keys.json", keys_file=self.file),
-            settings=PlatformSettings(), clock=self.machine.clock, rest=self.machine.rest,
+            config=AgentConfig(group="rse-pf", hook="drain", keys_name="keys.json", keys_file=self.file),
+            settings=PlatformSettings(), clock=self.machine.clock, sleep=self.machine.sleep,
             log=lambda event, **fields: self.log.append((event, fields)), shipper=shipper,
         )  # fmt: skip
 
@@ -64,28 +64,28 @@ class Stand:
 
 
 class Counting:
-    """CloudWatch that remembers."""
+    """A CloudWatch that remembers what was published."""
 
     def __init__(self) -> None:
-        self.told: list[dict[str, Any]] = []
+        self.published: list[dict[str, Any]] = []
 
     def put_metric_data(self, **arguments: Any) -> dict[str, Any]:
-        self.told.append(arguments)
+        self.published.append(arguments)
         return {}
 
 
 @pytest.fixture
-def stand(tmp_path: Path) -> Stand:
-    return Stand(tmp_path, Counting())
+def setup(tmp_path: Path) -> AgentSetup:
+    return AgentSetup(tmp_path, Counting())
 
 
-def test_the_emulator_takes_the_numbers_under_the_alarms_names(tmp_path: Path, region: str) -> None:
+def test_the_emulator_accepts_the_metrics_under_the_names_of_the_alarms(tmp_path: Path, region: str) -> None:
     cloudwatch = make_client("cloudwatch", region)
-    stand = Stand(tmp_path, cloudwatch)
+    setup = AgentSetup(tmp_path, cloudwatch)
     for requests in (10, 17):
-        stand.machine.text = PAGE.format(requests=requests, robots=3)
-        stand.agent.step()
-        stand.machine.rest(60.0)
+        setup.machine.text = PAGE.format(requests=requests, robots=3)
+        setup.agent.step()
+        setup.machine.sleep(60.0)
 
     now = datetime.now(timezone.utc)
 
@@ -97,104 +97,104 @@ def test_the_emulator_takes_the_numbers_under_the_alarms_names(tmp_path: Path, r
         )  # fmt: skip
         return sum(point[statistic] for point in found["Datapoints"])
 
-    assert total("Requests", "Sum") == 7, "what came before the agent is not this period's"
+    assert total("Requests", "Sum") == 7, "counts from before the agent's start were published"
     assert total("Robots", "Maximum") == 3
-    assert "failed" not in stand.events()
+    assert "failed" not in setup.events()
 
 
-def test_numbers_are_told_once_in_a_period(tmp_path: Path) -> None:
+def test_metrics_are_published_once_per_period(tmp_path: Path) -> None:
     counting = Counting()
-    stand = Stand(tmp_path, counting)
-    stand.machine.text = PAGE.format(requests=0, robots=0)
+    setup = AgentSetup(tmp_path, counting)
+    setup.machine.text = PAGE.format(requests=0, robots=0)
 
-    for _ in range(24):  # two minutes of looks
-        stand.agent.step()
-        stand.machine.rest(5.0)
+    for _ in range(24):  # two minutes of steps
+        setup.agent.step()
+        setup.machine.sleep(5.0)
 
-    assert len(counting.told) == 2
-    assert {each["Namespace"] for each in counting.told} == {NAMESPACE}
+    assert len(counting.published) == 2
+    assert {each["Namespace"] for each in counting.published} == {NAMESPACE}
 
 
-def test_without_keys_robots_are_refused_and_one_line_says_so(stand: Stand) -> None:
+def test_without_keys_robots_are_refused_and_one_line_says_so(setup: AgentSetup) -> None:
     for _ in range(3):
-        stand.agent.step()
-        stand.machine.rest(60.0)
+        setup.agent.step()
+        setup.machine.sleep(60.0)
 
-    assert stand.file.read_text() == '{"keys":[]}\n'
-    assert stand.events().count("no-keys") == 1
-
-
-def test_keys_are_written_when_they_appear_and_when_they_change(stand: Stand) -> None:
-    stand.agent.fetch_keys()
-    stand.artifacts.put("keys.json", KEYS)
-    stand.agent.fetch_keys()
-    first = stand.file.stat().st_ino
-    stand.agent.fetch_keys()
-
-    assert stand.file.read_bytes() == KEYS
-    assert stand.file.stat().st_ino == first, "written again without a change"
-    assert stand.events() == ["no-keys", "keys"]
+    assert setup.file.read_text() == '{"keys":[]}\n'
+    assert setup.events().count("no-keys") == 1
 
 
-def test_what_is_no_key_set_does_not_replace_the_keys(stand: Stand) -> None:
-    stand.artifacts.put("keys.json", KEYS)
-    stand.agent.fetch_keys()
-    stand.artifacts.put("keys.json", b"<html>sorry</html>")
-    stand.agent.step()
+def test_keys_are_written_when_they_appear_and_when_they_change(setup: AgentSetup) -> None:
+    setup.agent.fetch_keys()
+    setup.artifacts.put("keys.json", KEYS)
+    setup.agent.fetch_keys()
+    first = setup.file.stat().st_ino
+    setup.agent.fetch_keys()
 
-    assert stand.file.read_bytes() == KEYS
-    assert ("failed", "keys") in [(event, fields.get("duty")) for event, fields in stand.log]
-
-
-def test_keys_that_vanish_from_the_bucket_stay_on_the_server(stand: Stand) -> None:
-    stand.artifacts.put("keys.json", KEYS)
-    stand.agent.fetch_keys()
-    stand.artifacts.delete("keys.json")
-    stand.agent.fetch_keys()
-
-    assert stand.file.read_bytes() == KEYS
+    assert setup.file.read_bytes() == KEYS
+    assert setup.file.stat().st_ino == first, "written again without a change"
+    assert setup.events() == ["no-keys", "keys"]
 
 
-def test_a_leaving_instance_drains_once_and_tells_nothing_more(tmp_path: Path) -> None:
+def test_an_invalid_key_set_does_not_replace_the_keys(setup: AgentSetup) -> None:
+    setup.artifacts.put("keys.json", KEYS)
+    setup.agent.fetch_keys()
+    setup.artifacts.put("keys.json", b"<html>sorry</html>")
+    setup.agent.step()
+
+    assert setup.file.read_bytes() == KEYS
+    assert ("failed", "keys") in [(event, fields.get("task")) for event, fields in setup.log]
+
+
+def test_keys_that_vanish_from_the_bucket_stay_on_the_server(setup: AgentSetup) -> None:
+    setup.artifacts.put("keys.json", KEYS)
+    setup.agent.fetch_keys()
+    setup.artifacts.delete("keys.json")
+    setup.agent.fetch_keys()
+
+    assert setup.file.read_bytes() == KEYS
+
+
+def test_a_terminating_instance_drains_once_and_publishes_nothing_more(tmp_path: Path) -> None:
     counting = Counting()
-    stand = Stand(tmp_path, counting)
-    stand.machine.leaving = True
+    setup = AgentSetup(tmp_path, counting)
+    setup.machine.leaving = True
 
     for _ in range(30):
-        stand.agent.step()
-        stand.machine.rest(5.0)
+        setup.agent.step()
+        setup.machine.sleep(5.0)
 
-    assert len(stand.scaling.completed) == 1
-    assert len(stand.machine.waits) == 1
-    assert counting.told == []
+    assert len(setup.scaling.completed) == 1
+    assert len(setup.machine.waits) == 1
+    assert counting.published == []
 
 
-def test_a_refused_hook_is_tried_again(stand: Stand) -> None:
+def test_a_refused_hook_is_retried(setup: AgentSetup) -> None:
     class Refusing:
         def complete_lifecycle_action(self, **arguments: Any) -> None:
             from botocore.exceptions import ClientError
 
             raise ClientError({"Error": {"Code": "ValidationError"}}, "CompleteLifecycleAction")
 
-    stand.machine.leaving = True
-    stand.agent._autoscaling, working = Refusing(), stand.scaling
-    stand.agent.step()
-    assert not stand.agent.has_left
-    stand.agent._autoscaling = working
-    stand.agent.step()
+    setup.machine.leaving = True
+    setup.agent._autoscaling, working = Refusing(), setup.scaling
+    setup.agent.step()
+    assert not setup.agent.has_left
+    setup.agent._autoscaling = working
+    setup.agent.step()
 
-    assert stand.agent.has_left
+    assert setup.agent.has_left
     assert len(working.completed) == 1
 
 
-def test_a_server_that_is_down_fails_one_duty_alone(stand: Stand) -> None:
-    stand.machine.runs = False
-    stand.artifacts.put("keys.json", KEYS)
+def test_a_server_that_is_down_fails_one_task_only(setup: AgentSetup) -> None:
+    setup.machine.runs = False
+    setup.artifacts.put("keys.json", KEYS)
 
-    stand.agent.step()
+    setup.agent.step()
 
-    assert stand.file.read_bytes() == KEYS
-    assert [fields["duty"] for event, fields in stand.log if event == "failed"] == ["metrics"]
+    assert setup.file.read_bytes() == KEYS
+    assert [fields["task"] for event, fields in setup.log if event == "failed"] == ["metrics"]
 
 
 def test_a_missing_settings_file_is_two_lines(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -204,28 +204,30 @@ def test_a_missing_settings_file_is_two_lines(tmp_path: Path, capsys: pytest.Cap
     assert len(capsys.readouterr().err.splitlines()) == 2
 
 
-def test_the_control_room_is_fetched_beside_the_keys_when_it_changes(stand: Stand) -> None:
-    room = AccessControlStore(stand.artifacts)
-    stand.agent.fetch_control()
-    assert not (stand.file.parent / DENY_NAME).exists()
+def test_the_deny_list_is_fetched_beside_the_keys_when_it_changes(setup: AgentSetup) -> None:
+    room = AccessControlStore(setup.artifacts)
+    setup.agent.fetch_access_control()
+    assert not (setup.file.parent / DENY_NAME).exists()
 
-    room.change_denied(lambda denied: denied.with_robot("default", "r", 1.0))
-    stand.agent.fetch_control()
-    stand.agent.fetch_control()
+    room.change_deny_list(lambda denied: denied.with_robot("default", "r", 1.0))
+    setup.agent.fetch_access_control()
+    setup.agent.fetch_access_control()
 
-    assert (stand.file.parent / DENY_NAME).read_bytes() == stand.artifacts.get(DENY_NAME)
-    assert stand.events() == ["control"]
+    assert (setup.file.parent / DENY_NAME).read_bytes() == setup.artifacts.get(DENY_NAME)
+    assert setup.events() == ["access-control"]
 
 
-@pytest.mark.parametrize("harm", ["nonsense", "gone"])
-def test_a_control_room_that_was_spoilt_changes_nothing_on_the_machine(stand: Stand, harm: str) -> None:
-    AccessControlStore(stand.artifacts).change_denied(lambda denied: denied.with_robot("default", "r", 1.0))
-    stand.agent.fetch_control()
-    good = (stand.file.parent / DENY_NAME).read_bytes()
-    if harm == "gone":
-        stand.artifacts.delete(DENY_NAME)
+@pytest.mark.parametrize("harm", ["invalid", "missing"])
+def test_an_invalid_or_missing_deny_list_changes_nothing_on_the_machine(setup: AgentSetup, harm: str) -> None:
+    AccessControlStore(setup.artifacts).change_deny_list(
+        lambda denied: denied.with_robot("default", "r", 1.0)
+    )
+    setup.agent.fetch_access_control()
+    good = (setup.file.parent / DENY_NAME).read_bytes()
+    if harm == "missing":
+        setup.artifacts.delete(DENY_NAME)
     else:
-        stand.artifacts.put(DENY_NAME, b"nonsense")
+        setup.artifacts.put(DENY_NAME, b"nonsense")
 
     class Enough(Exception):
         pass
@@ -234,61 +236,61 @@ def test_a_control_room_that_was_spoilt_changes_nothing_on_the_machine(stand: St
         raise Enough
 
     with pytest.raises(Enough):
-        stand.agent.watch_control(stop)
+        setup.agent.watch_access_control(stop)
 
-    assert (stand.file.parent / DENY_NAME).read_bytes() == good
-    assert stand.events() == ["control"] + ["failed"] * (harm == "nonsense")
-
-
-def test_the_audit_log_is_sent_in_its_own_period_and_only_when_something_is_new(stand: Stand) -> None:
-    stand.note("first")
-    stand.agent.step()
-    assert stand.archived() == 1
-    stand.note("second")
-    stand.agent.step()
-    assert stand.archived() == 1, "not before its time"
-    stand.machine.rest(60.0)
-    stand.agent.step()
-    stand.machine.rest(60.0)
-    stand.agent.step()
-
-    assert stand.archived() == 2
-    assert stand.events().count("shipped") == 2
+    assert (setup.file.parent / DENY_NAME).read_bytes() == good
+    assert setup.events() == ["access-control"] + ["failed"] * (harm == "invalid")
 
 
-def test_what_a_server_writes_while_it_leaves_is_sent_before_the_hook_is_completed(tmp_path: Path) -> None:
-    stand = Stand(tmp_path, Counting())
-    stand.note("lived")
-    stand.machine.leaving = True
-    drain, complete = stand.machine.drain, stand.scaling.complete_lifecycle_action
+def test_the_audit_log_is_uploaded_in_its_own_period_and_only_new_entries(setup: AgentSetup) -> None:
+    setup.note("first")
+    setup.agent.step()
+    assert setup.archived() == 1
+    setup.note("second")
+    setup.agent.step()
+    assert setup.archived() == 1, "not before its time"
+    setup.machine.sleep(60.0)
+    setup.agent.step()
+    setup.machine.sleep(60.0)
+    setup.agent.step()
+
+    assert setup.archived() == 2
+    assert setup.events().count("shipped") == 2
+
+
+def test_what_a_server_logs_while_it_drains_is_uploaded_before_the_hook_is_completed(tmp_path: Path) -> None:
+    setup = AgentSetup(tmp_path, Counting())
+    setup.note("lived")
+    setup.machine.leaving = True
+    drain, complete = setup.machine.drain, setup.scaling.complete_lifecycle_action
     safe: list[int] = []
 
     def drained(wait_s: float) -> None:
-        stand.note("drained")
+        setup.note("drained")
         drain(wait_s)
 
     def completed(**arguments: Any) -> dict[str, Any]:
-        safe.append(stand.archived())
+        safe.append(setup.archived())
         return complete(**arguments)
 
-    stand.machine.drain = drained  # type: ignore[method-assign]
-    stand.scaling.complete_lifecycle_action = completed  # type: ignore[method-assign]
-    stand.agent.step()
+    setup.machine.drain = drained  # type: ignore[method-assign]
+    setup.scaling.complete_lifecycle_action = completed  # type: ignore[method-assign]
+    setup.agent.step()
 
     assert safe == [2]
-    assert stand.agent.has_left
+    assert setup.agent.has_left
 
 
-def test_a_bucket_that_is_away_keeps_no_instance_from_leaving(
-    stand: Stand, monkeypatch: pytest.MonkeyPatch
+def test_an_unreachable_bucket_keeps_no_instance_from_terminating(
+    setup: AgentSetup, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def away(*_: Any) -> None:
         raise StoreError("AWS does not answer")
 
-    monkeypatch.setattr(stand.archive, "compare_and_swap", away)
-    stand.note("lived")
-    stand.machine.leaving = True
-    stand.agent.step()
+    monkeypatch.setattr(setup.archive, "compare_and_swap", away)
+    setup.note("lived")
+    setup.machine.leaving = True
+    setup.agent.step()
 
-    assert len(stand.scaling.completed) == 1
-    assert [fields["duty"] for event, fields in stand.log if event == "failed"].count("audit") == 3
+    assert len(setup.scaling.completed) == 1
+    assert [fields["task"] for event, fields in setup.log if event == "failed"].count("audit") == 3

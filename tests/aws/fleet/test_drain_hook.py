@@ -16,12 +16,12 @@ SETTINGS = PlatformSettings()
 def leave(machine: FakeMachine, scaling: object, settings: PlatformSettings = SETTINGS) -> bool:
     return leave_group(
         machine, scaling, group="rse-pf", hook="drain", settings=settings, clock=machine.clock,
-        rest=machine.rest,
+        sleep=machine.sleep,
     )  # fmt: skip
 
 
-def test_the_hook_is_completed_once_the_server_is_gone() -> None:
-    machine = FakeMachine(leaves_after_s=20.0)
+def test_the_hook_is_completed_once_the_server_has_ended() -> None:
+    machine = FakeMachine(ends_after_s=20.0)
     scaling = FakeScaling(machine)
 
     assert leave(machine, scaling)
@@ -34,14 +34,14 @@ def test_the_hook_is_completed_once_the_server_is_gone() -> None:
     }  # fmt: skip
 
 
-def test_a_server_that_does_not_leave_is_left_behind_before_the_hook_times_out() -> None:
-    machine = FakeMachine(leaves_after_s=1e9)
+def test_the_hook_is_completed_before_its_timeout_when_the_server_does_not_end() -> None:
+    machine = FakeMachine(ends_after_s=1e9)
     scaling = FakeScaling(machine)
 
     assert not leave(machine, scaling)
 
     ((at_s, _),) = scaling.completed
-    assert at_s - 100.0 <= SETTINGS.cloud.drain_s - 10.0, "no time for the call and its repeats"
+    assert at_s - 100.0 <= SETTINGS.cloud.drain_s - 10.0, "no time for the call and its retries"
 
 
 def test_without_a_server_the_hook_is_completed_at_once() -> None:
@@ -52,7 +52,7 @@ def test_without_a_server_the_hook_is_completed_at_once() -> None:
     assert [at_s for at_s, _ in scaling.completed] == [100.0]
 
 
-def test_the_load_balancer_hears_of_it_before_a_robot_is_moved() -> None:
+def test_robots_move_only_after_the_load_balancer_has_noticed() -> None:
     machine = FakeMachine()
 
     leave(machine, FakeScaling(machine))
@@ -72,7 +72,7 @@ def test_the_whole_drain_fits_into_the_hook_by_default() -> None:
     assert longest_s < SETTINGS.cloud.drain_s - 15.0
 
 
-def test_aws_knows_the_call_and_its_arguments() -> None:
+def test_the_call_and_its_arguments_match_the_api_of_aws() -> None:
     client = boto3.session.Session().client(
         "autoscaling", region_name="ap-northeast-2", aws_access_key_id="a", aws_secret_access_key="b"
     )

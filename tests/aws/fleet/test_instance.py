@@ -1,4 +1,4 @@
-"""The agent's questions to its own server: they carry the token; without one no server runs."""
+"""The agent's requests to its own server: they carry the token; without a token no server runs."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class _Port(BaseHTTPRequestHandler):
 
 @pytest.fixture
 def port() -> Iterator[int]:
-    """A control port that admits everybody and remembers them."""
+    """A control port that accepts every request and remembers it."""
     _Port.heard.clear()
     with HTTPServer(("127.0.0.1", 0), _Port) as server:
         thread = threading.Thread(target=server.serve_forever, args=(0.01,))
@@ -44,7 +44,7 @@ def port() -> Iterator[int]:
 
 
 @pytest.mark.system
-def test_numbers_and_drain_are_asked_for_with_the_token_of_that_moment(port: int, tmp_path: Path) -> None:
+def test_metrics_and_drain_are_requested_with_the_current_token(port: int, tmp_path: Path) -> None:
     file = tmp_path / "control.token"
     control = ServerControl(port, file)
     first = ensure_control_token(file, seed=b"a" * 32)
@@ -58,23 +58,21 @@ def test_numbers_and_drain_are_asked_for_with_the_token_of_that_moment(port: int
 
 
 @pytest.mark.system
-def test_without_a_token_file_none_is_carried(port: int) -> None:
+def test_without_a_token_file_no_token_is_sent(port: int) -> None:
     ServerControl(port).page()
 
     assert _Port.heard == [("GET", "/metrics", None)]
 
 
 @pytest.mark.system
-def test_a_missing_token_is_a_server_that_does_not_run(port: int, tmp_path: Path) -> None:
+def test_a_missing_token_means_that_no_server_runs(port: int, tmp_path: Path) -> None:
     with pytest.raises(Disconnected, match="cannot read the control token"):
         ServerControl(port, tmp_path / "none").page()
 
     assert _Port.heard == []
 
 
-def test_the_unit_makes_the_token_before_it_asks_anybody(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_unit_makes_the_token_before_any_request(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     class Nobody(Disconnected):
         pass
 

@@ -1,4 +1,4 @@
-"""What CloudWatch is told comes from the server's own page, and fits the alarms by name."""
+"""CloudWatch gets the numbers of the server's own page, under the names that the alarms use."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def named(found: list[dict[str, Any]]) -> dict[str, Any]:
     return {each["MetricName"]: each for each in found}
 
 
-def test_a_real_page_is_read_whole() -> None:
+def test_a_page_of_a_real_server_is_read_completely() -> None:
     text = page(
         [("pnp", 0.0004), ("pnp", 0.015), ("echo", 9.0)], robots=3.0, in_flight=2.0, queue_oldest_s=0.25
     )
@@ -38,7 +38,7 @@ def test_a_real_page_is_read_whole() -> None:
     assert reading.answers[10_000.0] == 3.0
 
 
-def test_counters_are_told_as_what_came_since_the_last_look() -> None:
+def test_counters_are_published_as_the_increase_since_the_last_sample() -> None:
     before = ServerMetrics(requests=100, bytes_in=10, answers={1.0: 90, 2.0: 100})
     now = ServerMetrics(requests=130, bytes_in=15, robots=4, answers={1.0: 95, 2.0: 130})
 
@@ -64,7 +64,7 @@ def test_a_restarted_server_counts_from_zero_again() -> None:
     assert told["AnswerMs"]["Counts"] == [7]
 
 
-def test_no_answers_are_no_answer_times() -> None:
+def test_without_answers_no_answer_times_are_published() -> None:
     assert "AnswerMs" not in named(datums(ServerMetrics(), ServerMetrics(), "group", "i-1"))
 
 

@@ -1,4 +1,4 @@
-"""The audit log on its way out of a machine: nothing is lost, nothing is written twice, harm is told."""
+"""The upload of audit logs: nothing is lost, nothing is written twice, changes are detected."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import pytest
 
 from rse_pf.audit.log import AuditLog, files_of
 from rse_pf.audit.verify import Verdict, check_folder
+from rse_pf.aws.account import Account
 from rse_pf.aws.clients import make_client
 from rse_pf.aws.storage.audit_archive import fetch_audit, open_audit_archive
 from rse_pf.aws.storage.audit_ship import Shipper, piece_name
@@ -26,31 +27,31 @@ class WriteOnly(MemoryStore):
 
     def __init__(self) -> None:
         super().__init__()
-        self.is_away = False
+        self.is_down = False
         self.writes = 0
 
     def compare_and_swap(self, name: str, expected: bytes | None, data: bytes) -> None:
-        if self.is_away:
+        if self.is_down:
             raise StoreError("AWS does not answer")
         assert expected is None
         super().compare_and_swap(name, None, data)
         self.writes += 1
 
 
-class Stand:
+class ShipperSetup:
     """A folder with a log, its shipper, its bucket."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder / "audit"
         self.bucket = WriteOnly()
-        self.told: list[tuple[str, str]] = []
+        self.problems: list[tuple[str, str]] = []
         self.marks = folder / "shipped.json"
         self.shipper = self.made()
 
     def made(self) -> Shipper:
         return Shipper(
             self.folder, self.bucket, marks_file=self.marks, instance=lambda: INSTANCE,
-            on_broken=lambda who, why: self.told.append((who, why)),
+            on_broken=lambda chain, problem: self.problems.append((chain, problem)),
         )  # fmt: skip
 
     def write(self, count: int, who: str = INSTANCE) -> None:
@@ -71,178 +72,182 @@ class Stand:
 
 
 @pytest.fixture
-def stand(tmp_path: Path) -> Stand:
-    return Stand(tmp_path)
+def setup(tmp_path: Path) -> ShipperSetup:
+    return ShipperSetup(tmp_path)
 
 
-def test_what_arrives_is_what_was_written_over_many_files_and_looks(stand: Stand, tmp_path: Path) -> None:
+def test_the_bucket_gets_what_was_written_over_many_files_and_uploads(
+    setup: ShipperSetup, tmp_path: Path
+) -> None:
     for count in (1, 0, 30, 3):
-        stand.write(count)
-        stand.shipper.ship()
-    assert len(files_of(stand.folder, INSTANCE)) > 3
+        setup.write(count)
+        setup.shipper.ship()
+    assert len(files_of(setup.folder, INSTANCE)) > 3
 
-    (verdict,) = stand.verdicts(tmp_path / "fetched").values()
+    (verdict,) = setup.verdicts(tmp_path / "fetched").values()
 
-    assert (verdict.problem, verdict.head) == ("", stand.here()[INSTANCE].head)
-    assert verdict.entries == stand.here()[INSTANCE].entries
-    assert stand.told == []
-
-
-def test_a_look_at_nothing_new_writes_nothing(stand: Stand) -> None:
-    stand.write(2)
-    assert stand.shipper.ship() == 1
-    writes = stand.bucket.writes
-
-    assert stand.shipper.ship() == 0
-    assert stand.made().ship() == 0, "the marks outlive the agent"
-    assert stand.bucket.writes == writes
+    assert (verdict.problem, verdict.head) == ("", setup.here()[INSTANCE].head)
+    assert verdict.entries == setup.here()[INSTANCE].entries
+    assert setup.problems == []
 
 
-def test_a_bucket_that_is_away_gets_everything_when_it_is_back(stand: Stand, tmp_path: Path) -> None:
-    stand.write(3)
-    stand.shipper.ship()
-    stand.bucket.is_away = True
-    stand.write(20)
+def test_without_new_entries_nothing_is_uploaded(setup: ShipperSetup) -> None:
+    setup.write(2)
+    assert setup.shipper.ship() == 1
+    writes = setup.bucket.writes
+
+    assert setup.shipper.ship() == 0
+    assert setup.made().ship() == 0, "the marks survive the agent"
+    assert setup.bucket.writes == writes
+
+
+def test_an_unreachable_bucket_gets_everything_when_it_is_back(setup: ShipperSetup, tmp_path: Path) -> None:
+    setup.write(3)
+    setup.shipper.ship()
+    setup.bucket.is_down = True
+    setup.write(20)
     with pytest.raises(StoreError):
-        stand.shipper.ship()
-    stand.bucket.is_away = False
-    stand.shipper.ship()
+        setup.shipper.ship()
+    setup.bucket.is_down = False
+    setup.shipper.ship()
 
-    (verdict,) = stand.verdicts(tmp_path / "fetched").values()
-    assert (verdict.problem, verdict.head) == ("", stand.here()[INSTANCE].head)
+    (verdict,) = setup.verdicts(tmp_path / "fetched").values()
+    assert (verdict.problem, verdict.head) == ("", setup.here()[INSTANCE].head)
 
 
 @pytest.mark.parametrize("more", [0, 25])
-def test_lost_marks_send_it_again_and_the_reader_takes_each_entry_once(
-    stand: Stand, tmp_path: Path, more: int
+def test_after_lost_marks_all_is_uploaded_again_and_each_entry_is_read_once(
+    setup: ShipperSetup, tmp_path: Path, more: int
 ) -> None:
-    stand.write(10)
-    stand.shipper.ship()
-    stand.marks.unlink()
-    stand.write(more)
-    stand.shipper.ship()
+    setup.write(10)
+    setup.shipper.ship()
+    setup.marks.unlink()
+    setup.write(more)
+    setup.shipper.ship()
 
-    (verdict,) = stand.verdicts(tmp_path / "fetched").values()
-    assert (verdict.problem, verdict.entries) == ("", stand.here()[INSTANCE].entries)
-    assert stand.told == []
+    (verdict,) = setup.verdicts(tmp_path / "fetched").values()
+    assert (verdict.problem, verdict.entries) == ("", setup.here()[INSTANCE].entries)
+    assert setup.problems == []
 
 
-def test_the_chains_of_two_writers_on_two_machines_stay_apart(stand: Stand, tmp_path: Path) -> None:
-    stand.write(4)
-    stand.write(5, who="data")
-    stand.shipper.ship()
-    other = Stand(tmp_path / "other")
-    other.bucket = stand.bucket
+def test_the_chains_of_two_writers_on_two_machines_stay_apart(setup: ShipperSetup, tmp_path: Path) -> None:
+    setup.write(4)
+    setup.write(5, who="data")
+    setup.shipper.ship()
+    other = ShipperSetup(tmp_path / "other")
+    other.bucket = setup.bucket
     other.write(6, who="data")
     Shipper(
-        other.folder, stand.bucket, marks_file=other.marks, instance=lambda: "i-2",
-        on_broken=lambda who, why: None,
+        other.folder, setup.bucket, marks_file=other.marks, instance=lambda: "i-2",
+        on_broken=lambda chain, problem: None,
     ).ship()  # fmt: skip
 
-    found = stand.verdicts(tmp_path / "fetched")
+    found = setup.verdicts(tmp_path / "fetched")
 
     assert {who: verdict.problem for who, verdict in found.items()} == {
         INSTANCE: "", f"{INSTANCE}_data": "", "i-2_data": "",
     }  # fmt: skip
 
 
-def test_a_line_that_a_crash_tore_off_does_not_break_the_chain(stand: Stand, tmp_path: Path) -> None:
-    stand.write(2)
-    stand.shipper.ship()
-    current = stand.folder / f"{INSTANCE}.jsonl"
+def test_a_line_cut_by_a_crash_does_not_break_the_chain(setup: ShipperSetup, tmp_path: Path) -> None:
+    setup.write(2)
+    setup.shipper.ship()
+    current = setup.folder / f"{INSTANCE}.jsonl"
     with current.open("ab") as file:
         file.write(b'{"seq":3,"ti')
-    stand.shipper.ship()
-    stand.write(2)
-    stand.shipper.ship()
-    assert stand.here()[INSTANCE].problem == ""
+    setup.shipper.ship()
+    setup.write(2)
+    setup.shipper.ship()
+    assert setup.here()[INSTANCE].problem == ""
 
-    (verdict,) = stand.verdicts(tmp_path / "fetched").values()
-    assert (verdict.problem, verdict.head) == ("", stand.here()[INSTANCE].head)
-    assert stand.told == []
+    (verdict,) = setup.verdicts(tmp_path / "fetched").values()
+    assert (verdict.problem, verdict.head) == ("", setup.here()[INSTANCE].head)
+    assert setup.problems == []
 
 
-def test_half_a_line_waits_for_its_other_half(stand: Stand) -> None:
-    stand.write(1)
-    current = stand.folder / f"{INSTANCE}.jsonl"
+def test_an_incomplete_line_is_uploaded_when_it_is_complete(setup: ShipperSetup) -> None:
+    setup.write(1)
+    current = setup.folder / f"{INSTANCE}.jsonl"
     whole = current.read_bytes()
     current.write_bytes(whole[:-10])
-    assert stand.shipper.ship() == 0
+    assert setup.shipper.ship() == 0
     current.write_bytes(whole)
 
-    assert stand.shipper.ship() == 1
-    (name,) = [each.name for each in stand.bucket.list()]
+    assert setup.shipper.ship() == 1
+    (name,) = [each.name for each in setup.bucket.list()]
     assert name == piece_name(INSTANCE, INSTANCE, 1, whole)
 
 
-def test_an_entry_that_was_changed_before_it_was_sent_is_told_and_sent(stand: Stand, tmp_path: Path) -> None:
-    stand.write(3)
-    current = stand.folder / f"{INSTANCE}.jsonl"
+def test_an_entry_changed_before_its_upload_is_reported_and_uploaded(
+    setup: ShipperSetup, tmp_path: Path
+) -> None:
+    setup.write(3)
+    current = setup.folder / f"{INSTANCE}.jsonl"
     current.write_bytes(current.read_bytes().replace(b"robot-1", b"robot-9"))
 
-    stand.shipper.ship()
+    setup.shipper.ship()
 
-    assert stand.told == [(INSTANCE, "entry 2 was changed: its hash is not that of what it says")]
-    (verdict,) = stand.verdicts(tmp_path / "fetched").values()
+    assert setup.problems == [(INSTANCE, "entry 2 was changed: its hash is not that of what it says")]
+    (verdict,) = setup.verdicts(tmp_path / "fetched").values()
     assert verdict.problem.startswith("entry 2 was changed")
 
 
-def test_a_log_that_was_written_anew_after_it_was_sent_is_told(stand: Stand, tmp_path: Path) -> None:
-    stand.write(5)
-    stand.shipper.ship()
-    (stand.folder / f"{INSTANCE}.jsonl").unlink()
-    log = AuditLog(stand.folder, INSTANCE, wall_clock=lambda: 2e9, max_bytes=SMALL, sync_s=0.0).open()
+def test_a_log_rewritten_after_its_upload_is_detected(setup: ShipperSetup, tmp_path: Path) -> None:
+    setup.write(5)
+    setup.shipper.ship()
+    (setup.folder / f"{INSTANCE}.jsonl").unlink()
+    log = AuditLog(setup.folder, INSTANCE, wall_clock=lambda: 2e9, max_bytes=SMALL, sync_s=0.0).open()
     log.record("nothing.happened")
     log.close()
-    stand.shipper.ship()
+    setup.shipper.ship()
 
-    assert stand.here()[INSTANCE].problem == "", "on the machine nothing shows"
-    (verdict,) = stand.verdicts(tmp_path / "fetched").values()
+    assert setup.here()[INSTANCE].problem == "", "on the machine nothing shows"
+    (verdict,) = setup.verdicts(tmp_path / "fetched").values()
     assert "entry 6 is missing" in verdict.problem or "entry 2 is missing" in verdict.problem
 
 
-def test_a_file_that_was_cut_after_it_was_sent_is_told(stand: Stand, tmp_path: Path) -> None:
-    stand.write(5)
-    stand.shipper.ship()
-    current = stand.folder / f"{INSTANCE}.jsonl"
+def test_a_file_truncated_after_its_upload_is_detected(setup: ShipperSetup, tmp_path: Path) -> None:
+    setup.write(5)
+    setup.shipper.ship()
+    current = setup.folder / f"{INSTANCE}.jsonl"
     current.write_bytes(b"".join(current.read_bytes().splitlines(keepends=True)[:2]))
-    stand.write(1)
-    stand.shipper.ship()
+    setup.write(1)
+    setup.shipper.ship()
 
-    assert stand.here()[INSTANCE].problem == ""
-    assert next(iter(stand.verdicts(tmp_path / "fetched").values())).problem != ""
+    assert setup.here()[INSTANCE].problem == ""
+    assert next(iter(setup.verdicts(tmp_path / "fetched").values())).problem != ""
 
 
-def test_a_piece_that_is_not_there_is_a_missing_entry(stand: Stand, tmp_path: Path) -> None:
+def test_a_missing_piece_is_a_missing_entry(setup: ShipperSetup, tmp_path: Path) -> None:
     for _ in range(3):
-        stand.write(1)
-        stand.shipper.ship()
-    names = [each.name for each in stand.bucket.list()]
-    stand.bucket.delete(names[1])
+        setup.write(1)
+        setup.shipper.ship()
+    names = [each.name for each in setup.bucket.list()]
+    setup.bucket.delete(names[1])
 
-    (verdict,) = stand.verdicts(tmp_path / "fetched").values()
+    (verdict,) = setup.verdicts(tmp_path / "fetched").values()
 
     assert verdict.problem.startswith("entry 2 is missing")
 
 
-def test_a_piece_whose_bytes_were_changed_belies_its_name(stand: Stand, tmp_path: Path) -> None:
-    stand.write(2)
-    stand.shipper.ship()
-    (name,) = [each.name for each in stand.bucket.list()]
-    stand.bucket.put(name, b"")
+def test_a_piece_whose_bytes_were_changed_is_reported(setup: ShipperSetup, tmp_path: Path) -> None:
+    setup.write(2)
+    setup.shipper.ship()
+    (name,) = [each.name for each in setup.bucket.list()]
+    setup.bucket.put(name, b"")
 
-    problems = fetch_audit(stand.bucket, tmp_path / "fetched")
+    problems = fetch_audit(setup.bucket, tmp_path / "fetched")
 
-    assert problems == [f"{name} was changed: its bytes are not those that its name vouches for"]
+    assert problems == [f"{name} was changed: its bytes do not have the digest in its name"]
 
 
-def test_what_is_no_piece_is_told_and_leaves_the_folder_alone(tmp_path: Path) -> None:
+def test_a_foreign_object_is_reported_and_writes_nothing(tmp_path: Path) -> None:
     bucket = MemoryStore()
     bucket.put("audit/i-1/..evil.jsonl".replace("..", "x."), b"x\n")
 
     problems = fetch_audit(bucket, tmp_path / "fetched")
 
-    assert problems == ["audit/i-1/x.evil.jsonl is no piece of a log"]
+    assert problems == ["audit/i-1/x.evil.jsonl is not a piece of an audit log"]
     assert list((tmp_path / "fetched").iterdir()) == []
 
 
@@ -266,15 +271,15 @@ def locked(region: str) -> Any:
 
 
 def test_pieces_in_a_locked_bucket_are_kept_and_read_back(locked: Any, tmp_path: Path) -> None:
-    stand = Stand(tmp_path)
-    stand.write(8)
+    setup = ShipperSetup(tmp_path)
+    setup.write(8)
     bucket = S3Store(locked, "audit-logs")
     shipper = Shipper(
-        stand.folder, bucket, marks_file=stand.marks, instance=lambda: INSTANCE,
-        on_broken=lambda who, why: None,
+        setup.folder, bucket, marks_file=setup.marks, instance=lambda: INSTANCE,
+        on_broken=lambda chain, problem: None,
     )  # fmt: skip
     shipper.ship()
-    stand.marks.unlink()
+    setup.marks.unlink()
     shipper.ship()
 
     versions = locked.list_object_versions(Bucket="audit-logs")["Versions"]
@@ -283,16 +288,18 @@ def test_pieces_in_a_locked_bucket_are_kept_and_read_back(locked: Any, tmp_path:
     assert held["ObjectLockMode"] == "GOVERNANCE"
     assert fetch_audit(bucket, tmp_path / "fetched") == []
     (verdict,) = check_folder(tmp_path / "fetched")
-    assert (verdict.problem, verdict.head) == ("", stand.here()[INSTANCE].head)
+    assert (verdict.problem, verdict.head) == ("", setup.here()[INSTANCE].head)
 
 
 def test_a_deployment_without_the_bucket_says_to_deploy() -> None:
-    class NoStack:
-        region = "r"
+    class NoLogs:
+        def can_paginate(self, method: str) -> bool:
+            return False
 
-        def pages(self, *words: str, **more: str) -> list[Any]:
-            return [{"LogicalResourceId": "Artifacts1", "ResourceType": "AWS::S3::Bucket"}]
+        def list_stack_resources(self, **_: str) -> dict[str, Any]:
+            row = {"LogicalResourceId": "Artifacts1", "ResourceType": "AWS::S3::Bucket"}
+            return {"StackResourceSummaries": [row]}
 
     with pytest.raises(ConfigurationError) as told:
-        open_audit_archive(NoStack())  # type: ignore[arg-type]
+        open_audit_archive(Account("r", lambda service, region: NoLogs()))
     assert "cdk deploy" in told.value.hint

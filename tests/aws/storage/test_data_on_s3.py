@@ -44,11 +44,11 @@ def bucket_in(region: str) -> S3Store:
 
 
 def client_of(door: FrontDoor, service: Service, **options: Any) -> DataClient:
-    chosen = DataOptions(first_pause_s=0.01, longest_pause_s=0.05, random=random.Random(2), **options)
+    chosen = DataOptions(first_pause_s=0.01, max_pause_s=0.05, random=random.Random(2), **options)
     return DataClient(door.url, service.token, chosen)
 
 
-def test_large_objects_go_straight_to_the_bucket_and_come_straight_back(s3_server: str) -> None:
+def test_large_objects_travel_directly_between_robot_and_bucket(s3_server: str) -> None:
     store = bucket_in("ap-northeast-2")
     service = Service(small_settings(max_object_bytes=1_000_000, quota_bytes=2_000_000), store)
     door = FrontDoor(service)
@@ -70,7 +70,7 @@ def test_large_objects_go_straight_to_the_bucket_and_come_straight_back(s3_serve
 @pytest.mark.parametrize(
     ("tries", "largest"), [(1, 3000), pytest.param(clients.MAX_TRIES, 300_000, marks=pytest.mark.slow)]
 )
-def test_an_s3_that_fails_three_times_in_ten_loses_nothing_that_was_acknowledged(
+def test_an_s3_that_fails_three_times_in_ten_loses_nothing_acknowledged(
     region: str, monkeypatch: pytest.MonkeyPatch, tries: int, largest: int
 ) -> None:
     """With one try of the service every failure reaches the robot; with as many as it makes, few do."""

@@ -1,4 +1,4 @@
-"""Keys of a cloud: made once, rotated without a gap, retired at once; private halves stay in the secret."""
+"""Keys of a cloud: made once, rotated without a gap, retired at once; private keys stay in the secret."""
 
 from __future__ import annotations
 
@@ -7,14 +7,14 @@ from collections.abc import Callable
 from typing import Any
 
 import pytest
+from botocore.exceptions import ClientError
 
 from rse_pf.auth.tokens import SigningKey, verify_token
 from rse_pf.aws.account import Account
 from rse_pf.aws.clients import make_client
 from rse_pf.aws.storage.key_store import KEYS_NAME, KeyRing, KeyStore, open_key_store, spread_s
-from rse_pf.aws.storage.s3_store import S3Store
 from rse_pf.config import PlatformSettings
-from rse_pf.errors import ConfigurationError, Unauthorized
+from rse_pf.errors import ConfigurationError, NotFound, Unauthorized
 
 SETTINGS = PlatformSettings()
 AUTH = SETTINGS.auth
@@ -40,32 +40,58 @@ def is_trusted(token: str, by: KeyRing, now: float) -> bool:
 @pytest.fixture
 def store(region: str) -> KeyStore:
     """The secret and the bucket, as CloudFormation leaves them: the secret holds random letters."""
-    s3 = make_client("s3", region)
-    s3.create_bucket(Bucket="artifacts", CreateBucketConfiguration={"LocationConstraint": region})
-    secrets = make_client("secretsmanager", region)
-    secrets.create_secret(Name="signing-key", SecretString='x"{R3:)k')
-    return KeyStore(secrets, "signing-key", S3Store(s3, "artifacts"))
+    account = Account(region)
+    account.client("s3").create_bucket(
+        Bucket="artifacts", CreateBucketConfiguration={"LocationConstraint": region}
+    )
+    account.client("secretsmanager").create_secret(Name="signing-key", SecretString='x"{R3:)k')
+    return KeyStore(account, secret="signing-key", bucket="artifacts")
 
 
-def test_what_cloudformation_put_into_the_secret_is_no_key(store: KeyStore) -> None:
+def test_the_secret_that_cloudformation_made_holds_no_key(store: KeyStore) -> None:
     assert store.read() is None
     with pytest.raises(ConfigurationError) as told:
         store.ring()
     assert told.value.hint == "make one with rse-pf token init --cloud"
 
 
-def test_what_is_written_is_read_and_its_public_half_is_in_the_bucket(region: str, store: KeyStore) -> None:
+def test_a_written_ring_is_read_back_and_its_public_keys_are_in_the_bucket(
+    region: str, store: KeyStore
+) -> None:
     store.write(ring("a", "b"))
 
     assert store.ring().to_json() == ring("a", "b").to_json()
     published = make_client("s3", region).get_object(Bucket="artifacts", Key=KEYS_NAME)["Body"].read()
     rows = json.loads(published)["keys"]
     assert [row["kid"] for row in rows] == ["a", "b"]
-    assert all(set(row) == {"kty", "crv", "kid", "x"} for row in rows), "no private half is published"
+    assert all(set(row) == {"kty", "crv", "kid", "x"} for row in rows), "a private key is published"
+
+
+def test_a_missing_secret_is_not_found_and_the_error_holds_no_private_key(region: str) -> None:
+    with pytest.raises(NotFound) as told:
+        KeyStore(Account(region), secret="nothing", bucket="artifacts").write(ring("a"))
+
+    assert json.loads(key("a").to_json())["d"] not in told.value.report()
+    assert told.value.__cause__ is None
+
+
+def test_a_refused_secret_is_an_error_without_the_private_key(region: str) -> None:
+    class Refusing:
+        def put_secret_value(self, *, SecretString: str, **_: Any) -> None:
+            answer = {"Error": {"Code": "AccessDeniedException", "Message": SecretString}}
+            raise ClientError(answer, "PutSecretValue")
+
+    account = Account(region, lambda name, at: Refusing())
+
+    with pytest.raises(ConfigurationError) as told:
+        KeyStore(account, secret="signing-key", bucket="artifacts").write(ring("a"))
+
+    assert told.value.message == "AWS refuses secretsmanager put_secret_value: AccessDeniedException"
+    assert told.value.__cause__ is None
 
 
 @pytest.mark.parametrize("text", ['{"keys": [{"jwk": {}, "from_s": 1}]}', '{"keys": [7]}', '{"keys": 7}'])
-def test_broken_keys_are_not_taken_for_none(text: str) -> None:
+def test_broken_keys_are_an_error_and_not_a_missing_ring(text: str) -> None:
     with pytest.raises(ConfigurationError):
         KeyRing.from_json(text)
 
@@ -78,7 +104,7 @@ def test_a_new_key_signs_only_when_every_server_knows_it() -> None:
     assert rotated.signer(knows_s).key_id == "b"
 
 
-def test_tokens_are_good_all_through_a_rotation() -> None:
+def test_tokens_are_valid_throughout_a_rotation() -> None:
     before = ring("a")
     rotated = before.rotated(key("b"), now=BORN_S, settings=SETTINGS)
     for at_s in range(0, 2 * AUTH.token_ttl_s, 30):
@@ -90,7 +116,7 @@ def test_tokens_are_good_all_through_a_rotation() -> None:
         assert is_trusted(token, rotated, now + AUTH.token_ttl_s), at_s
 
 
-def test_the_old_key_stays_until_its_last_token_is_over() -> None:
+def test_the_old_key_stays_until_its_last_token_has_expired() -> None:
     rotated = ring("a").rotated(key("b"), now=BORN_S, settings=SETTINGS)
     over_s = BORN_S + spread_s(SETTINGS) + AUTH.token_ttl_s + AUTH.leeway_s
 
@@ -102,7 +128,7 @@ def test_the_old_key_stays_until_its_last_token_is_over() -> None:
     ]
 
 
-def test_a_retired_key_is_trusted_no_longer_and_the_other_signs_at_once() -> None:
+def test_a_retired_key_is_no_longer_trusted_and_the_other_signs_at_once() -> None:
     rotated = ring("a").rotated(key("b"), now=BORN_S, settings=SETTINGS)
     stolen = key("a").issue("robot-1", now=BORN_S, token_id="t", settings=AUTH)
 
@@ -112,7 +138,7 @@ def test_a_retired_key_is_trusted_no_longer_and_the_other_signs_at_once() -> Non
     assert retired.signer(BORN_S + 1).key_id == "b"
 
 
-def test_a_key_is_not_retired_while_servers_may_not_know_the_next() -> None:
+def test_a_key_cannot_be_retired_while_servers_may_not_know_the_next() -> None:
     rotated = ring("a").rotated(key("b"), now=BORN_S, settings=SETTINGS)
 
     with pytest.raises(ConfigurationError) as told:
@@ -123,7 +149,7 @@ def test_a_key_is_not_retired_while_servers_may_not_know_the_next() -> None:
     assert rotated.retired(now=BORN_S + spread_s(SETTINGS)).keys[0][0].key_id == "b"
 
 
-def test_the_only_key_is_not_retired() -> None:
+def test_the_only_key_cannot_be_retired() -> None:
     with pytest.raises(ConfigurationError):
         ring("a").retired(now=BORN_S)
 
@@ -148,7 +174,7 @@ def beside(region: str, formation: Formation) -> Account:
     return Account(region, lambda name, at: formation if name == "cloudformation" else make(name, at))
 
 
-def test_the_deployments_own_names_are_found_through_its_stack(region: str, store: KeyStore) -> None:
+def test_secret_and_bucket_are_found_through_the_stack(region: str, store: KeyStore) -> None:
     account = beside(
         region,
         Formation(

@@ -1,4 +1,4 @@
-"""What S3 adds to the contract of every store: patience, lost answers, presigned addresses."""
+"""What S3 adds to the contract of every store: retries, lost answers, presigned URLs."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from botocore.exceptions import ClientError, ConnectTimeoutError
 
-from rse_pf.aws.clients import MAX_S, MAX_TRIES, make_client, patiently
+from rse_pf.aws.clients import MAX_S, MAX_TRIES, make_client, with_retries
 from rse_pf.aws.storage import S3Store, open_bucket
 from rse_pf.errors import Conflict, NotFound, StoreError
 
@@ -28,7 +28,7 @@ def refusal(code: str, status: int) -> ClientError:
 
 
 class Clock:
-    """Time that passes only when a call or a rest takes it."""
+    """Time that passes only in a call or a sleep."""
 
     def __init__(self) -> None:
         self.now_s = 0.0
@@ -42,17 +42,19 @@ class Clock:
 
         return call
 
-    def rest(self, seconds: float) -> None:
+    def sleep(self, seconds: float) -> None:
         self.now_s += seconds
 
 
 @pytest.mark.parametrize(("takes_s", "tries"), [(0.01, 3), (1.0, 3), (4.5, 2)])
-def test_a_service_that_fails_is_asked_three_times_within_ten_seconds(takes_s: float, tries: int) -> None:
+def test_a_failing_service_is_called_at_most_three_times_within_ten_seconds(
+    takes_s: float, tries: int
+) -> None:
     clock = Clock()
     lost = ConnectTimeoutError(endpoint_url="https://s3")
 
     with pytest.raises(StoreError, match="does not answer"):
-        patiently(clock.fail(lost, takes_s), clock=lambda: clock.now_s, rest=clock.rest)
+        with_retries(clock.fail(lost, takes_s), clock=lambda: clock.now_s, sleep=clock.sleep)
 
     assert clock.tries == tries <= MAX_TRIES
     assert clock.now_s <= MAX_S
@@ -71,16 +73,16 @@ def test_a_service_that_fails_is_asked_three_times_within_ten_seconds(takes_s: f
         ("LimitExceededException", 400, 1),
     ],
 )
-def test_only_what_may_pass_is_tried_again(code: str, status: int, tries: int) -> None:
+def test_only_temporary_errors_are_retried(code: str, status: int, tries: int) -> None:
     clock = Clock()
 
     with pytest.raises((ClientError, StoreError)):
-        patiently(clock.fail(refusal(code, status), 0.0), clock=lambda: clock.now_s, rest=clock.rest)
+        with_retries(clock.fail(refusal(code, status), 0.0), clock=lambda: clock.now_s, sleep=clock.sleep)
 
     assert clock.tries == tries
 
 
-def test_clients_of_aws_try_once_themselves(region: str) -> None:
+def test_clients_do_not_retry_themselves(region: str) -> None:
     config = make_client("s3", region).meta.config
 
     assert config.retries["total_max_attempts"] == 1
@@ -113,7 +115,7 @@ def test_a_swap_whose_answer_was_lost_is_no_conflict(store: S3Store, region: str
     assert store.get("head") == b"mine"
 
 
-def test_a_swap_that_another_won_in_between_is_a_conflict(store: S3Store, region: str) -> None:
+def test_a_swap_after_another_writers_swap_is_a_conflict(store: S3Store, region: str) -> None:
     client = make_client("s3", region)
 
     class Overtaken(Lossy):
@@ -127,39 +129,50 @@ def test_a_swap_that_another_won_in_between_is_a_conflict(store: S3Store, region
     assert store.get("head") == b"theirs"
 
 
-def test_more_names_than_a_page_holds_are_all_listed(store: S3Store, region: str) -> None:
-    client = make_client("s3", region)
-    for number in range(1003):
-        client.put_object(Bucket="maps", Key=f"maps/{number:04d}", Body=b"")
-    client.put_object(Bucket="maps", Key="maps/not ours", Body=b"")
+def test_all_pages_of_a_listing_are_read_and_foreign_names_left_out(store: S3Store, region: str) -> None:
+    class SmallPages:
+        """A client whose listings come in pages of ten."""
 
-    assert [info.name for info in store.list("maps/")] == [f"maps/{number:04d}" for number in range(1003)]
+        def __init__(self) -> None:
+            self.pages = 0
+
+        def list_objects_v2(self, **arguments: Any) -> Any:
+            self.pages += 1
+            return client.list_objects_v2(**arguments, MaxKeys=10)
+
+    client, small = make_client("s3", region), SmallPages()
+    names = [f"maps/{number:04d}" for number in range(33)]
+    for name in (*names, "maps/not ours"):
+        client.put_object(Bucket="maps", Key=name, Body=b"")
+
+    assert [info.name for info in S3Store(small, "maps").list("maps/")] == names
+    assert small.pages == 4
 
 
-def test_a_presigned_address_fixes_name_length_and_digest(store: S3Store) -> None:
+def test_a_presigned_url_fixes_name_length_and_digest(store: S3Store) -> None:
     data = b"keyframe"
 
     url, headers = store.presigned_put(
-        "maps/a", size=len(data), sha256=hashlib.sha256(data).hexdigest(), life_s=60
+        "maps/a", size=len(data), sha256=hashlib.sha256(data).hexdigest(), ttl_s=60
     )
 
     query = urllib.parse.parse_qs(urllib.parse.urlsplit(url).query)
     signed = query["X-Amz-SignedHeaders"][0].split(";")
     assert set(headers) == {"Content-Length", "x-amz-checksum-sha256"}
-    assert {name.lower() for name in headers} <= set(signed), "a header that is not signed binds nobody"
+    assert {name.lower() for name in headers} <= set(signed), "a header that is not signed may be changed"
     assert query["X-Amz-Algorithm"] == ["AWS4-HMAC-SHA256"]
     assert query["X-Amz-Expires"] == ["60"]
     assert urllib.parse.urlsplit(url).path.endswith("/maps/a")
 
 
-def test_a_presigned_name_is_checked_too(store: S3Store) -> None:
+def test_names_of_presigned_urls_are_checked(store: S3Store) -> None:
     with pytest.raises(StoreError, match="is not a name"):
-        store.presigned_put("../x", size=1, sha256="00" * 32, life_s=60)
+        store.presigned_put("../x", size=1, sha256="00" * 32, ttl_s=60)
     with pytest.raises(StoreError, match="is not a name"):
-        store.presigned_get("../x", life_s=60)
+        store.presigned_get("../x", ttl_s=60)
 
 
-def test_a_missing_bucket_is_said_so(region: str) -> None:
+def test_a_missing_bucket_is_a_store_error(region: str) -> None:
     with pytest.raises(StoreError, match="bucket does not exist") as told:
         open_bucket("nowhere", region).get("a")
 

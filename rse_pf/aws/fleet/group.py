@@ -1,6 +1,6 @@
-"""Look at a fleet that runs: its servers, what the load balancer thinks of them, alarms, and robots.
+"""Read the state of the Auto Scaling group: its servers, their target health, alarms, and robots.
 
-Promises to change nothing, and to say when nobody told a number instead of calling it zero.
+Nothing is changed.  A number that no agent published is None, never zero.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from rse_pf.config.resource_names import GROUP
 from rse_pf.errors import ConfigurationError
 from rse_pf.scaling.alarms import NAMESPACE
 
-__all__ = ["GROUP", "AutoScalingGroup", "Server", "look_at"]
+__all__ = ["GROUP", "AutoScalingGroup", "Server", "read_group"]
 
 _ALARMS = "rse-pf-"
 _PERIODS = 3
@@ -23,7 +23,7 @@ _PERIODS = 3
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Server:
-    """One instance; ``targets`` is its health in each target group, ``robots`` is None if it did not tell."""
+    """One instance; ``targets`` is its health in each target group, ``robots`` is None if unknown."""
 
     name: str
     zone: str
@@ -36,33 +36,29 @@ class Server:
 class AutoScalingGroup:
     """Everything `rse-pf cloud status` shows."""
 
-    least: int
-    wanted: int
-    most: int
+    min_servers: int
+    wanted_servers: int
+    max_servers: int
     servers: tuple[Server, ...]
     alarms: dict[str, str]
 
     @property
     def robots(self) -> tuple[float, ...]:
-        """How many robots each server has that told it."""
+        """The robots of each server whose number is known."""
         return tuple(each.robots for each in self.servers if each.robots is not None)
 
     @property
-    def is_well(self) -> bool:
-        """Whether every wanted server is there, and healthy wherever it is asked."""
-        good = [
-            each
-            for each in self.servers
-            if each.targets and each.state == "InService" and set(each.targets) == {"healthy"}
-        ]
-        return len(good) >= self.wanted
+    def is_healthy(self) -> bool:
+        """Whether as many servers as wanted are in service, and healthy in every target group."""
+        healthy = [s for s in self.servers if s.state == "InService" and set(s.targets) == {"healthy"}]
+        return len(healthy) >= self.wanted_servers
 
 
-def look_at(account: Account, settings: PlatformSettings, *, now: datetime) -> AutoScalingGroup:
-    """Return how the fleet is at *now*, in UTC.
+def read_group(account: Account, settings: PlatformSettings, *, now: datetime) -> AutoScalingGroup:
+    """Return the state of the group at *now*, in UTC.
 
     Raises:
-        ConfigurationError: There is no fleet in the region, or AWS refused.
+        ConfigurationError: There is no group in the region, or AWS refused.
         StoreError: AWS does not answer.
     """
     found = account.pages(
@@ -73,21 +69,21 @@ def look_at(account: Account, settings: PlatformSettings, *, now: datetime) -> A
             f"no platform runs in {account.region}", hint="deploy it: npx cdk deploy --all"
         )
     group = found[0]
-    health = _health(account, group["TargetGroupARNs"])
+    health = [_target_health(account, arn) for arn in group["TargetGroupARNs"]]
     names = [each["InstanceId"] for each in group["Instances"]]
-    told = _robots(account, names, settings.scaling.period_s, now)
+    robots = _robots(account, names, settings.scaling.period_s, now)
     alarms = account.pages("cloudwatch", "describe_alarms", "MetricAlarms", AlarmNamePrefix=_ALARMS)
     return AutoScalingGroup(
-        least=group["MinSize"],
-        wanted=group["DesiredCapacity"],
-        most=group["MaxSize"],
+        min_servers=group["MinSize"],
+        wanted_servers=group["DesiredCapacity"],
+        max_servers=group["MaxSize"],
         servers=tuple(
             Server(
                 name=each["InstanceId"],
                 zone=each["AvailabilityZone"],
                 state=each["LifecycleState"],
                 targets=tuple(one.get(each["InstanceId"], "absent") for one in health),
-                robots=told.get(each["InstanceId"]),
+                robots=robots.get(each["InstanceId"]),
             )
             for each in sorted(group["Instances"], key=lambda one: str(one["InstanceId"]))
         ),
@@ -95,20 +91,16 @@ def look_at(account: Account, settings: PlatformSettings, *, now: datetime) -> A
     )
 
 
-def _health(account: Account, target_groups: list[str]) -> list[dict[str, str]]:
-    """Return, for each target group, what it says of each instance."""
-    made = []
-    for arn in target_groups:
-        found = account.find("elbv2", "describe_target_health", TargetGroupArn=arn) or {}
-        rows = found.get("TargetHealthDescriptions", ())
-        made.append({row["Target"]["Id"]: row["TargetHealth"]["State"] for row in rows})
-    return made
+def _target_health(account: Account, arn: str) -> dict[str, str]:
+    """Return the health of each instance in one target group."""
+    rows = account.pages("elbv2", "describe_target_health", "TargetHealthDescriptions", TargetGroupArn=arn)
+    return {row["Target"]["Id"]: row["TargetHealth"]["State"] for row in rows}
 
 
 def _robots(account: Account, servers: list[str], period_s: int, now: datetime) -> dict[str, float]:
-    """Return the newest value of each server in the last periods that are over; absent is absent.
+    """Return the newest value of each server within the last complete periods; unknown ones are left out.
 
-    The period that runs is left out: half of the servers may not have told theirs yet.
+    The current period is left out: some agents may not have published theirs yet.
     """
     end = datetime.fromtimestamp(now.timestamp() // period_s * period_s, now.tzinfo)
     queries = [
