@@ -1,9 +1,9 @@
 """Robot tokens: issue, verify; Ed25519-signed JWTs after the RFC 8725 profile.
 
 A key set maps ``kid`` to a public key; the algorithm is fixed, never read from a token.  A robot that is
-enrolled signs its own tokens, and then its name, tenant, scopes and quotas come from the roster.  Promises
-never to read a clock (the library's own checks are off; ``now`` is an argument) and to tell a caller
-only `Unauthorized`, whatever the cause; the cause is in ``__cause__`` and ``reason`` for the log.
+enrolled signs its own tokens; its tenant, scopes and quotas then come from the roster.  The time is an
+argument (the library's own time checks are off).  A caller only sees `Unauthorized`, whatever the cause;
+`token_problem` returns the cause for the log.
 """
 
 from __future__ import annotations
@@ -30,16 +30,26 @@ from rse_pf.errors import MissingExtra, Unauthorized, UsageError
 if TYPE_CHECKING:
     from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey, Ed25519PublicKey
 
-__all__ = ["Claims", "KeySet", "SigningKey", "claims_problem", "token_problem", "verify_token"]
+__all__ = [
+    "Claims",
+    "KeySet",
+    "SigningKey",
+    "claims_problem",
+    "token_problem",
+    "unverified_parts",
+    "verify_token",
+]
 
 _ALGORITHM = "EdDSA"
 _TYPE = "robot+jwt"
 _REQUIRED = ("iss", "aud", "sub", "exp", "iat", "jti")
+_MAX_TOKEN_BYTES = 4096
+"""A longer token is refused unread."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Claims:
-    """What a verified token says; a robot's identity comes from here alone."""
+    """The claims of a verified token, the only source of a robot's identity."""
 
     robot: str
     token_id: str
@@ -51,12 +61,12 @@ class Claims:
     quotas: tuple[tuple[str, float], ...] = ()
 
     def quota(self, name: str) -> float | None:
-        """Return what the roster limits this robot to, None if it says nothing (see `enrolment.QUOTAS`)."""
+        """Return the robot's quota in the roster, None if there is none; see `rse_pf.auth.roster.QUOTAS`."""
         return dict(self.quotas).get(name)
 
 
 class SigningKey:
-    """The private half: issues tokens; lives in one file of mode 0600, or in a secret."""
+    """A private key, which issues tokens; stored in one file of mode 0600, or in a secret."""
 
     def __init__(self, private: Ed25519PrivateKey, key_id: str) -> None:
         self._private = private
@@ -74,7 +84,7 @@ class SigningKey:
         return cls(private, key_id_of(_b64(private.public_key().public_bytes_raw())))
 
     @classmethod
-    def from_json(cls, text: str) -> SigningKey:
+    def from_json(cls, text: str | bytes) -> SigningKey:
         """Return the key that `to_json` wrote; raises UsageError."""
         try:
             document = json.loads(text)
@@ -87,7 +97,7 @@ class SigningKey:
         return json.dumps({**self._public_jwk(), "d": _b64(self._private.private_bytes_raw())})
 
     def key_set(self) -> KeySet:
-        """Return the public half, as servers hold it."""
+        """Return the public half as a key set."""
         return KeySet({self.key_id: self._private.public_key()})
 
     def issue(
@@ -97,26 +107,32 @@ class SigningKey:
         now: float,
         token_id: str,
         settings: AuthSettings,
-        life_s: float | None = None,
+        ttl_s: float | None = None,
         scopes: tuple[str, ...] = (),
         tenant: str = "default",
     ) -> str:
-        """Return a token for *robot* that is good from *now* (Unix seconds) for *life_s*."""
+        """Return a token for *robot* that is valid from *now* (Unix seconds) for *ttl_s*."""
         check_robot(robot)
         check_tenant(tenant)
         check_scopes(scopes)
         if not 0 < len(token_id) <= 64:
-            raise UsageError("a token id has 1 to 64 letters", hint="leave it to rse-pf token issue")
-        life = settings.token_ttl_s if life_s is None else life_s
-        if not 0 < life <= settings.token_ttl_s:
+            raise UsageError("a token id has 1 to 64 characters", hint="leave it to rse-pf token issue")
+        ttl_s = settings.token_ttl_s if ttl_s is None else ttl_s
+        if not 0 < ttl_s <= settings.token_ttl_s:
             raise UsageError(
-                f"a life of {life:g} s is not within {settings.token_ttl_s} s",
-                hint="ask for a shorter life",
+                f"a time to live of {ttl_s:g} s is not within {settings.token_ttl_s} s",
+                hint="choose a shorter time to live",
             )
         claims = {
-            "iss": settings.issuer, "aud": settings.audience, "sub": robot, "tenant": tenant,
-            "iat": int(now), "exp": int(now + life), "jti": token_id, "scope": " ".join(scopes),
-        }  # fmt: skip
+            "iss": settings.issuer,
+            "aud": settings.audience,
+            "sub": robot,
+            "tenant": tenant,
+            "iat": int(now),
+            "exp": int(now + ttl_s),
+            "jti": token_id,
+            "scope": " ".join(scopes),
+        }
         headers = {"kid": self.key_id, "typ": _TYPE}
         token: str = _jwt().encode(claims, self._private, algorithm=_ALGORITHM, headers=headers)
         return token
@@ -134,7 +150,7 @@ class SigningKey:
 
 
 class KeySet:
-    """Whom a server trusts: keys that may sign, robots that are enrolled, less what is denied."""
+    """The keys and enrolled robots that a server trusts, less the tokens and robots that are denied."""
 
     def __init__(
         self,
@@ -151,7 +167,7 @@ class KeySet:
         self._not_before = {(each.tenant, each.robot): each.at_s for each in denied.not_before}
 
     def with_access_control(self, roster: Roster, denied: DenyList) -> KeySet:
-        """Return the same platform keys under what the control room says."""
+        """Return the same platform keys with another roster and deny list."""
         return KeySet(self._keys, roster=roster, denied=denied)
 
     @classmethod
@@ -189,15 +205,15 @@ class KeySet:
         return key
 
     def knows(self, key_id: str) -> bool:
-        """Return whether `get` would find the key; without making it, for ten thousand sockets at once."""
+        """Return whether `get` would find the key, without the cost of creating it."""
         return key_id in (self._robots if key_id.startswith(ROBOT_KEY) else self._keys)
 
     def robot_of(self, key_id: str) -> EnrolledRobot | None:
-        """Return the enrolled robot whose key *key_id* is."""
+        """Return the enrolled robot whose key is *key_id*."""
         return self._robots.get(key_id)
 
     def denies(self, claims: Claims) -> str:
-        """Return why *claims* are refused although they are signed; empty if they are not."""
+        """Return why *claims* are denied although their signature is valid; empty if they are not."""
         robot = (claims.tenant, claims.robot)
         if robot in self._disabled:
             return "disabled"
@@ -207,29 +223,29 @@ class KeySet:
 
 
 def verify_token(token: str, *, keys: KeySet, now: float, settings: AuthSettings) -> Claims:
-    """Return the claims of a good *token*.
+    """Return the claims of a valid *token*.
 
     Args:
-        token: As it stood behind ``Bearer``.
-        keys: Who may sign.
+        token: The part of the header after ``Bearer``.
+        keys: Keys that may sign.
         now: Unix seconds.
-        settings: Issuer, audience, longest life, leeway.
+        settings: Issuer, audience, maximum time to live, leeway.
 
     Raises:
-        Unauthorized: Always the same words; ``__cause__`` holds the reason, for the log.
+        Unauthorized: Always with the same message; see `token_problem` for the cause.
     """
     try:
         return _checked(token, keys, now, settings)
-    except _Refused as refused:
+    except _TokenRefused as refused:
         raise Unauthorized(
             "the token is missing or not valid", hint="issue one with rse-pf token issue ROBOT"
         ) from refused
 
 
 def claims_problem(claims: Claims, keys: KeySet) -> str:
-    """Return why *claims* that were verified once no longer stand under *keys*; empty if they do.
+    """Return why *claims* that were verified earlier are no longer valid under *keys*; empty if they are.
 
-    Whoever lives on them, as a socket does, has to go then.  Their end in time is not looked at.
+    A connection that was authenticated by them must be closed then.  Expiry is not checked.
     """
     if not keys.knows(claims.key_id):
         return "unknown-key"
@@ -239,30 +255,42 @@ def claims_problem(claims: Claims, keys: KeySet) -> str:
     return keys.denies(claims)
 
 
+def unverified_parts(token: str) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Return header and claims of *token* without any verification; raises UsageError."""
+    try:
+        first, second, _ = token.split(".")
+        header, claims = json.loads(_unb64(first)), json.loads(_unb64(second))
+        if isinstance(header, dict) and isinstance(claims, dict):
+            return header, claims
+    except (ValueError, RecursionError):
+        pass
+    raise UsageError("this is not a token", hint="paste what rse-pf token issue printed")
+
+
 def token_problem(error: Unauthorized) -> str:
-    """Return the constant reason behind *error*, for the log and for nobody else."""
-    return str(error.__cause__) if isinstance(error.__cause__, _Refused) else "unknown"
+    """Return the cause of *error*, one of a fixed set of words; for the log only."""
+    return str(error.__cause__) if isinstance(error.__cause__, _TokenRefused) else "unknown"
 
 
-class _Refused(ValueError):
-    """Why a token is refused; one of a closed list of words."""
+class _TokenRefused(ValueError):
+    """Why a token is refused; one of a fixed set of words."""
 
 
 def _checked(token: str, keys: KeySet, now: float, settings: AuthSettings) -> Claims:
     jwt = _jwt()
-    if not token or len(token) > settings.max_token_bytes or not token.isascii():
-        raise _Refused("missing-or-too-long")
+    if not token or len(token) > _MAX_TOKEN_BYTES or not token.isascii():
+        raise _TokenRefused("missing-or-too-long")
     if not _is_canonical(token):
-        raise _Refused("malformed")
+        raise _TokenRefused("malformed")
     try:
         header = jwt.get_unverified_header(token)
     except (jwt.PyJWTError, RecursionError) as error:
-        raise _Refused("malformed") from error
+        raise _TokenRefused("malformed") from error
     if header.get("alg") != _ALGORITHM or header.get("typ") != _TYPE or "crit" in header:
-        raise _Refused("wrong-algorithm-or-type")
+        raise _TokenRefused("wrong-algorithm-or-type")
     key = keys.get(header.get("kid"))
     if key is None:
-        raise _Refused("unknown-key")
+        raise _TokenRefused("unknown-key")
     try:
         claims: dict[str, Any] = jwt.decode(
             token,
@@ -271,41 +299,44 @@ def _checked(token: str, keys: KeySet, now: float, settings: AuthSettings) -> Cl
             audience=settings.audience,
             issuer=settings.issuer,
             options={
-                "require": list(_REQUIRED), "verify_exp": False, "verify_iat": False, "verify_nbf": False,
+                "require": list(_REQUIRED),
+                "verify_exp": False,
+                "verify_iat": False,
+                "verify_nbf": False,
             },
-        )  # fmt: skip
-    except jwt.PyJWTError as error:
-        raise _Refused("bad-signature-or-claims") from error
-    told = _timed(claims, str(header["kid"]), now, settings)
-    enrolled = keys.robot_of(told.key_id)
-    if enrolled is not None:
-        if enrolled.robot != told.robot:
-            raise _Refused("wrong-robot")
-        told = replace(
-            told, tenant=enrolled.tenant, scopes=enrolled.scopes, quotas=tuple(enrolled.quotas.items())
         )
-    denied = keys.denies(told)
+    except jwt.PyJWTError as error:
+        raise _TokenRefused("bad-signature-or-claims") from error
+    verified = _checked_times(claims, str(header["kid"]), now, settings)
+    enrolled = keys.robot_of(verified.key_id)
+    if enrolled is not None:
+        if enrolled.robot != verified.robot:
+            raise _TokenRefused("wrong-robot")
+        verified = replace(
+            verified, tenant=enrolled.tenant, scopes=enrolled.scopes, quotas=tuple(enrolled.quotas.items())
+        )
+    denied = keys.denies(verified)
     if denied:
-        raise _Refused(denied)
-    return told
+        raise _TokenRefused(denied)
+    return verified
 
 
-def _timed(claims: dict[str, Any], key_id: str, now: float, settings: AuthSettings) -> Claims:
+def _checked_times(claims: dict[str, Any], key_id: str, now: float, settings: AuthSettings) -> Claims:
     issued, expires, starts = (claims.get(name) for name in ("iat", "exp", "nbf"))
     for stamp in (issued, expires, 0 if starts is None else starts):
         if isinstance(stamp, bool) or not isinstance(stamp, (int, float)) or not 0 <= stamp < 1e11:
-            raise _Refused("bad-time")
+            raise _TokenRefused("bad-time")
     assert isinstance(issued, (int, float))
     assert isinstance(expires, (int, float))
     if expires - issued > settings.token_ttl_s:
-        raise _Refused("life-too-long")
+        raise _TokenRefused("ttl-too-long")
     if now > expires + settings.leeway_s:
-        raise _Refused("expired")
+        raise _TokenRefused("expired")
     if issued > now + settings.leeway_s or (starts is not None and starts > now + settings.leeway_s):
-        raise _Refused("not-yet-valid")
+        raise _TokenRefused("not-yet-valid")
     robot, token_id = claims["sub"], claims["jti"]
     if not all(isinstance(word, str) and 0 < len(word) <= 64 for word in (robot, token_id)):
-        raise _Refused("bad-subject")
+        raise _TokenRefused("bad-subject")
     return Claims(
         robot=robot,
         token_id=token_id,
@@ -318,7 +349,7 @@ def _timed(claims: dict[str, Any], key_id: str, now: float, settings: AuthSettin
 
 
 def _is_canonical(token: str) -> bool:
-    """Refuse base64 whose unused last bits are set: two spellings of one token."""
+    """Return whether no unused bits of the base64 are set, so that a token has one encoding only."""
     parts = token.split(".")
     if len(parts) != 3:
         return False

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 __all__ = ["Backlog", "is_long_outage", "send_order"]
 
 _SHORT_QUEUE_MS = 50.0
-"""A server is loaded if a command queued for longer; equals the default of its ``queue_target_ms``."""
+"""A server is loaded if a command queued for longer; equals its ``QUEUE_TARGET_S``."""
 _LONG_OUTAGE_SHARE = 0.5
 """An outage is long if it took more than this share of a frame's time."""
 

@@ -65,6 +65,8 @@ _MAX_TRIES_AFTER_LOSS = 2
 _RETRY_BURST = 5.0
 _PINGS_PER_STALL_TIMEOUT = 3.0
 _MAX_DEADLINE_MS = 3.6e6
+RETRY_SHARE = 0.1
+"""Retries after busy, as a share of the commands.  Source: Google SRE book, ch. 21."""
 
 
 @dataclass(slots=True, kw_only=True)
@@ -172,7 +174,7 @@ class ClientSession:
         self._next_id += 1
         self._sequence[stream] = command.seq
         self._pending[command.id] = pending
-        self._retry_tokens = min(_RETRY_BURST, self._retry_tokens + self.settings.retry_percent / 100)
+        self._retry_tokens = min(_RETRY_BURST, self._retry_tokens + RETRY_SHARE)
         if self.current is not None and self._may_send(
             command, self.current, self._capacity(self.current, now)
         ):

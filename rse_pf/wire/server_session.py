@@ -73,6 +73,8 @@ CLOSE_REVOKED = 4403
 CLOSE_UNSUPPORTED = 4406
 CLOSE_REPLACED = 4409
 CLOSE_RATE = 4429
+_BAD_MESSAGE_BYTES = 65_536
+"""An undecodable message counts once more for so many bytes."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -270,7 +272,7 @@ class ServerSession:
         return [Submit(command)]
 
     def _count_bad_message(self, error: ProtocolError, size_bytes: int) -> list[Decision]:
-        self.bad_messages += 1 + size_bytes // self._limits.bad_message_bytes
+        self.bad_messages += 1 + size_bytes // _BAD_MESSAGE_BYTES
         sent = self._send(self._failure(error))
         if self.bad_messages > self._limits.max_bad_messages:
             return [sent, *self._close(CLOSE_PROTOCOL, "too many bad messages")]

@@ -78,9 +78,9 @@ def test_every_setting_is_read_or_waits_on_the_list(sources: Mapping[str, str]) 
 
 
 def test_an_unread_setting_is_caught(sources: Mapping[str, str]) -> None:
-    text = sources["rse_pf/auth/tokens.py"].replace("settings.max_token_bytes", "4096")
+    text = sources["rse_pf/auth/tokens.py"].replace("settings.leeway_s", "30")
 
-    assert ("auth", "max_token_bytes") in unread({**sources, "rse_pf/auth/tokens.py": text})
+    assert ("auth", "leeway_s") in unread({**sources, "rse_pf/auth/tokens.py": text})
 
 
 def test_the_same_name_in_another_group_is_not_taken_for_a_reader() -> None:

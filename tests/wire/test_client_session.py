@@ -10,6 +10,7 @@ from rse_pf.config import SessionSettings
 from rse_pf.errors import BadMessage, LimitExceeded, ProtocolError
 from rse_pf.wire import Command, Failure, Hello, Limits, Move, Ping, Pong, Result, Welcome, make_codec
 from rse_pf.wire.client_session import (
+    RETRY_SHARE,
     Answered,
     ClientSession,
     ConnectionLost,
@@ -244,8 +245,8 @@ def test_retries_after_busy_stay_within_their_budget():
         final += codes(events) == {command.id: "busy"}
 
     assert final == 400
-    assert retries <= 5 + 400 * SETTINGS.retry_percent / 100 + 1
-    assert retries >= 400 * SETTINGS.retry_percent / 100
+    assert retries <= 5 + 400 * RETRY_SHARE + 1
+    assert retries >= 400 * RETRY_SHARE
 
 
 def test_a_lost_worker_is_tried_twice_more_and_then_believed():

@@ -1,7 +1,7 @@
-"""Say who asks too much: a robot's rate with its strikes, a source's handshakes, sockets without a token yet.
+"""Limit the messages of each robot, the handshakes of each address, and the sockets without a token.
 
-Readings of the clock and names go in, verdicts come out.  Promises no input or output, no clock, memory that
-strangers cannot make grow, and that whoever keeps to its rate is never refused.
+Times and names go in, decisions come out.  The memory is bounded whatever strangers send, and a robot that
+keeps to its rate is never refused.
 """
 
 from __future__ import annotations
@@ -15,41 +15,43 @@ from typing import Generic, TypeVar
 from rse_pf.config import ServingSettings, SessionSettings
 from rse_pf.wire.rate_limit import TokenBucket
 
-__all__ = ["TokenBucket", "CutOff", "PendingHandshakes", "RobotRates", "SourceRates", "TooFast"]
+__all__ = ["CutOff", "PendingHandshakes", "RobotRates", "SourceRates", "TokenBucket", "TooFast"]
 
 _MAX_NAMES = 20000
-"""Names kept at a time; whoever had no reason to be remembered is forgotten first."""
+"""Robots or addresses remembered at a time; those that did nothing wrong are forgotten first."""
 _MIN_RETRY_MS = 1.0
 
 Key = TypeVar("Key", bound=Hashable)
 Value = TypeVar("Value")
+_MAX_VIOLATIONS, _VIOLATIONS_WINDOW_S = 3, 10.0
+"""A violation is ``session.command_burst`` refusals; so many within the window close the socket with 4429."""
 
 
 @dataclass(frozen=True, slots=True)
 class TooFast:
-    """Refuse this one; after *retry_after_ms* there is room for another."""
+    """Refuse this message; after *retry_after_ms* another one is allowed."""
 
     retry_after_ms: float
 
 
 @dataclass(frozen=True, slots=True)
 class CutOff:
-    """End the socket: this robot does not listen to refusals."""
+    """End the connection: this robot ignores refusals."""
 
 
 @dataclass(slots=True)
 class _Robot:
     bucket: TokenBucket
     refused: int = 0
-    strikes: deque[float] = field(default_factory=deque)
-    rests_until: float = -math.inf
+    violations: deque[float] = field(default_factory=deque)
+    banned_until: float = -math.inf
 
 
 class RobotRates:
     """The rate of each robot, over all of its sockets of one worker.
 
-    A strike is ``command_burst`` refusals: a robot a little above its rate is told so for ever, one far
-    above it is cut off within a second and rests for ``rest_s``.
+    A violation is ``session.command_burst`` refusals: a robot a little above its rate gets refusals only, one
+    far above it is cut off within a second and banned for ``session.rate_ban_s``.
     """
 
     def __init__(self, limits: SessionSettings) -> None:
@@ -71,32 +73,32 @@ class RobotRates:
         wait_s = known.bucket.take(now)
         if wait_s == 0.0:
             return None
-        if self._strikes(known, now) >= self._limits.max_rate_violations:
-            known.strikes.clear()
-            known.rests_until = now + self._limits.rate_ban_s
+        if self._violations(known, now) >= _MAX_VIOLATIONS:
+            known.violations.clear()
+            known.banned_until = now + self._limits.rate_ban_s
             return CutOff()
         return TooFast(max(_MIN_RETRY_MS, wait_s * 1e3))
 
-    def rest(self, robot: tuple[str, str], now: float) -> None:
-        """Let *robot*, cut off at *now* (s), rest before it may come in again."""
+    def ban(self, robot: tuple[str, str], now: float) -> None:
+        """Refuse the handshakes of *robot*, cut off at *now* (s), for ``session.rate_ban_s``."""
         known = self._robots.get(robot)
         if known is None:
             known = self._robots[robot] = self._new(now)
-        known.rests_until = now + self._limits.rate_ban_s
+        known.banned_until = now + self._limits.rate_ban_s
 
-    def rests_s(self, robot: tuple[str, str], now: float) -> float:
-        """Return for how many seconds more *robot*, cut off before, is not let in."""
+    def banned_s(self, robot: tuple[str, str], now: float) -> float:
+        """Return for how many seconds more *robot* is banned, 0 if it is not."""
         known = self._robots.get(robot)
-        return 0.0 if known is None else max(0.0, known.rests_until - now)
+        return 0.0 if known is None else max(0.0, known.banned_until - now)
 
-    def _strikes(self, known: _Robot, now: float) -> int:
+    def _violations(self, known: _Robot, now: float) -> int:
         known.refused += 1
         if known.refused >= self._limits.command_burst:
             known.refused = 0
-            known.strikes.append(now)
-        while known.strikes and now - known.strikes[0] > self._limits.rate_window_s:
-            known.strikes.popleft()
-        return len(known.strikes)
+            known.violations.append(now)
+        while known.violations and now - known.violations[0] > _VIOLATIONS_WINDOW_S:
+            known.violations.popleft()
+        return len(known.violations)
 
     def _new(self, now: float) -> _Robot:
         if len(self._robots) >= _MAX_NAMES:
@@ -104,14 +106,14 @@ class RobotRates:
                 {
                     name: each
                     for name, each in self._robots.items()
-                    if each.strikes or each.rests_until > now or not each.bucket.is_full(now)
+                    if each.violations or each.banned_until > now or not each.bucket.is_full(now)
                 }
             )
         return _Robot(TokenBucket(self._limits.max_commands_per_s, float(self._limits.command_burst)))
 
 
 class SourceRates:
-    """Handshakes of each address in a second; judged before any token is read."""
+    """The rate of handshakes of each address; judged before any token is read."""
 
     def __init__(self, serving: ServingSettings) -> None:
         self._serving = serving
@@ -143,14 +145,14 @@ class SourceRates:
 
 
 class PendingHandshakes(Generic[Key]):
-    """Sockets that have not shown a token yet; when there are too many, the one that waited longest leaves.
+    """Sockets that have not sent a token yet; when there are too many, the one that waited longest is cut.
 
-    A robot shows its token in milliseconds, so the longest wait is the least likely to become one.  (Were the
-    newest to leave, a few silent sockets would lock the robots out.)
+    A robot sends its token within milliseconds, so the socket that waited longest is least likely to be one.
+    If the newest were cut instead, a few silent sockets would lock the robots out.
     """
 
-    def __init__(self, most: int, max_per_source: int) -> None:
-        self._most = most
+    def __init__(self, max_sockets: int, max_per_source: int) -> None:
+        self._max_sockets = max_sockets
         self._max_per_source = max_per_source
         self._sources: dict[Key, str] = {}
         self._of_source: dict[str, dict[Key, None]] = {}
@@ -160,21 +162,21 @@ class PendingHandshakes(Generic[Key]):
         return len(self._sources)
 
     def enter(self, key: Key, source: str) -> Key | None:
-        """Take one more; return who has to leave for it, if anybody."""
+        """Add *key*; return the one to cut for it, if there are too many."""
         self._sources[key] = source
         own = self._of_source.setdefault(source, {})
         own[key] = None
         leaving: Key | None = None
         if self._max_per_source and len(own) > self._max_per_source:
             leaving = next(iter(own))
-        elif len(self._sources) > self._most:
+        elif len(self._sources) > self._max_sockets:
             leaving = next(iter(self._sources))
         if leaving is not None:
             self.leave(leaving)
         return leaving
 
     def leave(self, key: Key) -> None:
-        """Forget one that showed a token, or is gone."""
+        """Forget one that sent a token, or is gone."""
         source = self._sources.pop(key, None)
         if source is None:
             return
@@ -185,5 +187,5 @@ class PendingHandshakes(Generic[Key]):
 
 
 def _half(names: dict[Key, Value]) -> dict[Key, Value]:
-    """Return the younger ones, at most half of the names that are kept: to forget must stay rare."""
+    """Return the newer names, at most half of `_MAX_NAMES`, so that forgetting stays rare."""
     return dict(list(names.items())[-_MAX_NAMES // 2 :])

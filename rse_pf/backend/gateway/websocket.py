@@ -1,7 +1,8 @@
-"""The robots' sockets of one worker: picows on uvloop, between the supervisor's descriptors and the core.
+"""The robots' sockets of one worker: picows on uvloop, between the supervisor's descriptors and the
+dispatcher.
 
-The only file that knows picows.  Promises that no text of ours or of an exception reaches a stranger
-at the door, that a reader who stays slow is cut, and that the first CLOSE frame is the last one read.
+Only this file knows picows.  The text of an exception never reaches a robot, a robot that reads too slowly is
+cut off, and nothing behind the first CLOSE frame is read.
 """
 
 from __future__ import annotations
@@ -10,16 +11,17 @@ import asyncio
 import socket
 from collections.abc import Callable
 from functools import partial
-from typing import Any, Protocol
+from typing import Any
 
+from rse_pf.backend.gateway.audit_recorder import AuditRecorder
 from rse_pf.backend.gateway.connection import RobotConnection
-from rse_pf.backend.gateway.decoder_thread import DecoderThread
 from rse_pf.backend.gateway.dispatcher import Dispatcher
 from rse_pf.backend.gateway.frames import CloseBorder
 from rse_pf.backend.gateway.handshake import HEALTH, Accepted, HandshakePolicy, Rejected
-from rse_pf.backend.gateway.rate_limits import PendingHandshakes, SourceRates
+from rse_pf.backend.gateway.rate_limits import PendingHandshakes, RobotRates, SourceRates
 from rse_pf.backend.log import JsonLog
-from rse_pf.backend.ports import Handle
+from rse_pf.backend.metrics import Metrics
+from rse_pf.backend.ports import Clocks, Handle
 from rse_pf.config import ServingSettings, SessionSettings
 from rse_pf.errors import MissingExtra
 
@@ -28,20 +30,15 @@ __all__ = ["RobotSockets"]
 _MAX_CLOSE_REASON_BYTES = 123
 _TOO_LONG = b"HTTP/1.1 431 Request Header Fields Too Large\r\nConnection: close\r\nContent-Length: 0\r\n\r\n"
 _MAX_READ_BYTES = 16384
-"""At once: of the smallest frames this holds thousands, and the other robots wait while they are walked."""
+"""Bytes read at once: thousands of the smallest frames fit in, and the other robots wait meanwhile."""
 _LINGER_S = 2.0
-"""Time a robot has to read our CLOSE and to end its side; then the connection is cut."""
+"""Time that a robot has to read the CLOSE frame and to end its side; then the socket is cut."""
+_READ_BUFFER_BYTES = 2048
+"""The first read buffer of a socket; it grows with the messages."""
 
 
-class Judged(Protocol):
-    """Gets every verdict of the door."""
-
-    def __call__(self, verdict: Accepted | Rejected, source: str, authorization: str) -> None:
-        """Take one verdict, of the address *source*."""
-
-
-class _Quiet:
-    """The logger picows gets: it would make one logger object for each socket otherwise."""
+class _NoLogger:
+    """The logger that picows gets; otherwise it would make one for each socket."""
 
     def isEnabledFor(self, level: int) -> bool:
         return False
@@ -51,35 +48,34 @@ class _Quiet:
     debug = info = warning = error = exception = log
 
 
-class _Arrival:
+class PendingSocket:
     """A socket until its handshake is judged."""
 
-    __slots__ = ("_is_cut", "_transport", "number", "peer", "room", "source")
+    __slots__ = ("_is_cut", "_left_bytes", "_transport", "number", "peer", "source")
 
-    def __init__(self, peer: str, room: int, number: int = 0) -> None:
+    def __init__(self, peer: str, max_head_bytes: int, number: int = 0) -> None:
         self.peer = self.source = peer
         self.number = number
-        self.room = room
-        """Bytes that the head of its handshake may still have."""
+        self._left_bytes = max_head_bytes
         self._transport: Any = None
         self._is_cut = False
 
-    def made(self, transport: Any) -> None:
-        """Know the transport, which may be too late to matter."""
+    def connected(self, transport: Any) -> None:
+        """Know the transport; the socket may have been cut before."""
         self._transport = transport
         if self._is_cut:
             transport.abort()
 
     def cut(self) -> None:
-        """End the socket without a word."""
+        """End the socket without an answer."""
         self._is_cut = True
         if self._transport is not None:
             self._transport.abort()
 
     def is_too_long(self, size: int) -> bool:
-        """Take *size* more bytes of the head; answer one that is too long."""
-        self.room -= size
-        if self.room < 0 and not self._is_cut:
+        """Count *size* more bytes of the request head; answer one that is too long."""
+        self._left_bytes -= size
+        if self._left_bytes < 0 and not self._is_cut:
             self._is_cut = True
             self._transport.write(_TOO_LONG)
             self._transport.close()
@@ -88,33 +84,38 @@ class _Arrival:
 
 
 class RobotSockets:
-    """Takes accepted sockets and gives the core a `RobotConnection` for each robot that may come in."""
+    """Takes accepted sockets, and connects each robot whose handshake is accepted to the dispatcher."""
 
     def __init__(
         self,
         *,
-        core: Dispatcher,
-        door: HandshakePolicy,
+        dispatcher: Dispatcher,
+        handshake: HandshakePolicy,
+        rates: RobotRates,
+        metrics: Metrics,
+        clocks: Clocks,
         serving: ServingSettings,
         session: SessionSettings,
         max_robots: int,
         workers: int,
         new_name: Callable[[], str],
-        judged: Judged,
+        recorder: AuditRecorder,
         log: JsonLog,
         loop: asyncio.AbstractEventLoop,
     ) -> None:
-        self._core = core
-        core.reading = DecoderThread(serving, call_soon_threadsafe=loop.call_soon_threadsafe)
-        self._door = door
+        self._dispatcher = dispatcher
+        self._handshake = handshake
+        self._rates = rates
+        self._metrics = metrics
+        self._clocks = clocks
         self._max_robots = max_robots
         self._sources = SourceRates(serving)
         per_source = 0 if serving.trusted_proxies else serving.max_unauthenticated_per_source
-        self._waiting: PendingHandshakes[_Arrival] = PendingHandshakes(
+        self._pending: PendingHandshakes[PendingSocket] = PendingHandshakes(
             -(-serving.max_unauthenticated // workers), -(-per_source // workers)
         )
         self._new_name = new_name
-        self._judged = judged
+        self._recorder = recorder
         self._log = log
         self._loop = loop
         self._serving = serving
@@ -124,9 +125,9 @@ class RobotSockets:
         self._protocol = _protocol_type(picows)
         self._listener = _listener_type(picows, loop, serving)
         self._arguments = (
-            _Quiet(), True, serving.handshake_timeout_s,
+            _NoLogger(), True, serving.handshake_timeout_s,
             False, 20.0, 20.0, picows.WSAutoPingStrategy.PING_WHEN_IDLE, False,
-            session.max_message_bytes, None, serving.read_buffer_bytes,
+            session.max_message_bytes, None, _READ_BUFFER_BYTES,
         )  # fmt: skip
 
     def take(self, fd: int, ended: Callable[[], None], number: int) -> None:
@@ -135,43 +136,45 @@ class RobotSockets:
         accepted.setblocking(False)
         # The kernel would keep megabytes for a reader who is slow, and tell nobody.
         accepted.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, self._serving.write_buffer_bytes)
-        arrival = _Arrival(_peer(accepted), self._serving.max_handshake_bytes, number)
-        leaving = self._waiting.enter(arrival, arrival.peer)
-        if leaving is not None:
-            self._core.metrics.closed["unauthenticated"] += 1
-            leaving.cut()
+        pending = PendingSocket(_peer(accepted), self._serving.max_handshake_bytes, number)
+        surplus = self._pending.enter(pending, pending.peer)
+        if surplus is not None:
+            self._metrics.closed["unauthenticated"] += 1
+            surplus.cut()
 
         def gone() -> None:
-            self._waiting.leave(arrival)
+            self._pending.leave(pending)
             ended()
 
-        task = self._loop.create_task(self._serve(accepted, arrival, gone))
+        task = self._loop.create_task(self._serve(accepted, pending, gone))
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
 
-    async def _serve(self, accepted: socket.socket, arrival: _Arrival, ended: Callable[[], None]) -> None:
-        judge = partial(self._judge, arrival)
+    async def _serve(
+        self, accepted: socket.socket, pending: PendingSocket, ended: Callable[[], None]
+    ) -> None:
+        judge = partial(self._judge, pending)
         try:
             await self._connect_accepted_socket(
                 self._loop,
-                lambda: self._protocol(arrival, ended, None, None, False, judge, *self._arguments),
+                lambda: self._protocol(pending, ended, None, None, False, judge, *self._arguments),
                 accepted,
             )
         except OSError:
             accepted.close()
             ended()
 
-    def _judge(self, arrival: _Arrival, request: Any) -> Any:
-        """Answer a handshake; picows would send an exception's text, so none may leave."""
-        self._waiting.leave(arrival)
+    def _judge(self, pending: PendingSocket, request: Any) -> Any:
+        """Answer a handshake; picows would send the text of an exception, so none may pass."""
+        self._pending.leave(pending)
         try:
-            verdict = self._verdict(arrival, request)
-            self._judged(verdict, arrival.source, request.headers.get("Authorization", ""))
+            verdict = self._verdict(pending, request)
+            self._recorder.judged(verdict, pending.source, request.headers.get("Authorization", ""))
         except Exception as error:  # noqa: BLE001  see above
-            self._log.error("defect", at="door", traceback=repr(error))
-            verdict = self._door.defect
+            self._log.error("defect", at="handshake", traceback=repr(error))
+            verdict = self._handshake.defect
         if isinstance(verdict, Rejected):
-            self._core.metrics.handshakes[verdict.result] += 1
+            self._metrics.handshakes[verdict.result] += 1
             kinds = self._picows.WSUpgradeResponse
             if verdict.result == HEALTH:
                 response = kinds.create_ok_response(verdict.body, dict(verdict.headers))
@@ -179,36 +182,36 @@ class RobotSockets:
                 self._log.info("refused", result=verdict.result, reason=verdict.reason)
                 response = kinds.create_error_response(verdict.status, verdict.body, dict(verdict.headers))
             return self._picows.WSUpgradeResponseWithListener(response, None)
-        self._core.metrics.handshakes["ok"] += 1
+        self._metrics.handshakes["ok"] += 1
         chosen = {"Sec-WebSocket-Protocol": verdict.subprotocol} if verdict.subprotocol else None
         response = self._picows.WSUpgradeResponse.create_101_response(chosen)
         return self._picows.WSUpgradeResponseWithListener(
-            response, self._listener(self._core, verdict, arrival.number)
+            response, self._listener(self._dispatcher, self._metrics, verdict, pending.number)
         )
 
-    def _verdict(self, arrival: _Arrival, request: Any) -> Accepted | Rejected:
-        headers, now = request.headers, self._core.clocks.monotonic()
-        source = arrival.source = self._sources.source(
-            arrival.peer, ",".join(headers.getall("X-Forwarded-For", []))
+    def _verdict(self, pending: PendingSocket, request: Any) -> Accepted | Rejected:
+        headers, now = request.headers, self._clocks.monotonic()
+        source = pending.source = self._sources.source(
+            pending.peer, ",".join(headers.getall("X-Forwarded-For", []))
         )
         if self._sources.wait_s(source, now) > 0:
-            return self._door.too_fast
+            return self._handshake.too_fast
         connection = [word.strip().lower() for word in ",".join(headers.getall("Connection", [])).split(",")]
         if "upgrade" in connection:
             headers["Connection"] = "upgrade"
         offered = ",".join(headers.getall("Sec-WebSocket-Protocol", [])).split(",")
-        verdict = self._door.judge(
+        verdict = self._handshake.judge(
             path=bytes(request.path),
             authorization=headers.get("Authorization", ""),
             offered=[word.strip() for word in offered],
-            is_full=len(self._core.connections) >= self._max_robots,
+            is_full=len(self._dispatcher.connections) >= self._max_robots,
             anonymous=self._new_name(),
-            now_s=self._core.clocks.wall(),
+            now_s=self._clocks.wall(),
         )
         if not isinstance(verdict, Accepted):
             return verdict
-        rests_s = self._core.rates.rests_s((verdict.tenant, verdict.robot), now)
-        return self._door.too_fast if rests_s > 0 else verdict
+        banned_s = self._rates.banned_s((verdict.tenant, verdict.robot), now)
+        return self._handshake.too_fast if banned_s > 0 else verdict
 
 
 def _peer(accepted: socket.socket) -> str:
@@ -233,29 +236,29 @@ def _protocol_type(picows: Any) -> Any:
     connection_made = base.connection_made
 
     class Protocol(base):  # type: ignore[misc, valid-type]
-        """Hands picows nothing behind the first CLOSE, and tells when the socket is gone."""
+        """Passes nothing behind the first CLOSE to picows, and tells when the socket is gone."""
 
-        def __init__(self, arrival: _Arrival, ended: Callable[[], None], *arguments: Any) -> None:
+        def __init__(self, pending: PendingSocket, ended: Callable[[], None], *arguments: Any) -> None:
             super().__init__(*arguments)
-            self._arrival = arrival
+            self._pending = pending
             self._ended = ended
             self._border = CloseBorder()
-            self._room = memoryview(b"")
+            self._buffer = memoryview(b"")
 
         def connection_made(self, transport: Any) -> None:
             connection_made(self, transport)
-            self._arrival.made(transport)
+            self._pending.connected(transport)
 
         def get_buffer(self, hint: int) -> memoryview:
-            self._room = get_buffer(self, hint)[:_MAX_READ_BYTES]
-            return self._room
+            self._buffer = get_buffer(self, hint)[:_MAX_READ_BYTES]
+            return self._buffer
 
         def buffer_updated(self, n: int) -> None:
-            if not self._border.is_upgraded and self._arrival.is_too_long(n):
+            if not self._border.is_upgraded and self._pending.is_too_long(n):
                 return
             if self.transport is not None and self.transport.is_close_frame_sent:
                 return
-            wanted = self._border.wanted(self._room[:n])
+            wanted = self._border.wanted(self._buffer[:n])
             if wanted:
                 buffer_updated(self, wanted)
 
@@ -272,11 +275,12 @@ def _listener_type(picows: Any, loop: asyncio.AbstractEventLoop, serving: Servin
     kinds = picows.WSMsgType
 
     class Listener(picows.WSListener):  # type: ignore[misc]
-        """One robot's socket: frames to the core, and the core's `Wire`."""
+        """One robot's socket: passes frames to its connection, and is the connection's `Wire`."""
 
-        def __init__(self, core: Dispatcher, admitted: Accepted, number: int) -> None:
-            self._core = core
-            self._admitted = admitted
+        def __init__(self, dispatcher: Dispatcher, metrics: Metrics, accepted: Accepted, number: int) -> None:
+            self._dispatcher = dispatcher
+            self._metrics = metrics
+            self._accepted = accepted
             self._number = number
             self._transport: Any = None
             self._connection: RobotConnection | None = None
@@ -287,7 +291,7 @@ def _listener_type(picows: Any, loop: asyncio.AbstractEventLoop, serving: Servin
             self._transport = transport
             high = serving.write_buffer_bytes
             transport.underlying_transport.set_write_buffer_limits(high=high, low=high // 4)
-            self._connection = self._core.connect(self, self._admitted, self._number)
+            self._connection = self._dispatcher.connect(self, self._accepted, self._number)
 
         def on_ws_frame(self, transport: Any, frame: Any) -> None:
             if self._connection is not None:
@@ -305,7 +309,7 @@ def _listener_type(picows: Any, loop: asyncio.AbstractEventLoop, serving: Servin
         def pause_writing(self) -> None:
             if self._cut is None:
                 self._cut = loop.call_later(serving.slow_reader_timeout_s, self._cut_off)
-                # Who does not read its answers is not heard: they would be made for nobody.
+                # The commands of a robot that does not read its answers are not read either.
                 self.hold()
 
         def resume_writing(self) -> None:
@@ -341,7 +345,7 @@ def _listener_type(picows: Any, loop: asyncio.AbstractEventLoop, serving: Servin
             loop.call_later(_LINGER_S, self._transport.disconnect, False)
 
         def _cut_off(self) -> None:
-            self._core.metrics.closed["slow-reader"] += 1
+            self._metrics.closed["slow-reader"] += 1
             self._transport.disconnect(False)
 
     return Listener

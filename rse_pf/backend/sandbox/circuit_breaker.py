@@ -1,7 +1,7 @@
 """Decide which requests and services are not run again after crashes.
 
 A request that crashed ``poison_crashes`` sandboxes is poison.  A service that crashed ``breaker_crashes`` of
-them within ``breaker_window_s`` is refused for ``breaker_open_s``: its circuit breaker is open.  Time is an
+them within `WINDOW_S` is refused for ``breaker_open_s``: its circuit breaker is open.  Time is an
 argument, and memory is bounded whatever robots send.
 """
 
@@ -15,6 +15,8 @@ from rse_pf.config import ServiceSettings
 __all__ = ["CircuitBreaker"]
 
 _MAX_DIGESTS = 10_000
+WINDOW_S = 30.0
+"""``services.breaker_crashes`` within this open the circuit breaker."""
 
 
 class CircuitBreaker:
@@ -40,7 +42,7 @@ class CircuitBreaker:
         crashes = self._crashes_of_service.setdefault(service, deque(maxlen=self._settings.breaker_crashes))
         crashes.append(now)
         full = len(crashes) == self._settings.breaker_crashes
-        if full and now - crashes[0] <= self._settings.breaker_window_s:
+        if full and now - crashes[0] <= WINDOW_S:
             self._open_until[service] = now + self._settings.breaker_open_s
             crashes.clear()
 

@@ -43,6 +43,8 @@ __all__ = [
 
 _MAX_TRIES = 2
 _BUSY_RETRY_MS = 1000.0
+_DEADLINE_FACTOR = 2.0
+"""A sandbox is killed when a command takes this many deadlines."""
 
 
 @dataclass(eq=False, slots=True)
@@ -189,7 +191,6 @@ class SandboxPolicy:
         self.counts: Counter[str] = Counter()
         self._kinds = kinds
         self._settings = settings.services
-        self._max_waiting = settings.serving.max_queue_per_robot
         self._max_sandboxes = max_sandboxes
         self._keeps_snapshots = keeps_snapshots
         self._breaker = CircuitBreaker(settings.services)
@@ -214,6 +215,11 @@ class SandboxPolicy:
         """When `tick` is due next; infinite if nothing is waited for."""
         times = (min(each.kill_s, each.late_s, each.release_s) for each in self._sandboxes.values())
         return min(times, default=math.inf)
+
+    def waiting_of(self, robot: str) -> int:
+        """Return how many commands of *robot* wait."""
+        sandbox = self._by_robot.get(robot)
+        return 0 if sandbox is None else len(sandbox.waiting)
 
     def open_services(self, now: float) -> list[str]:
         """Return the services whose circuit breaker is open, sorted."""
@@ -247,10 +253,6 @@ class SandboxPolicy:
                 f"all {self._max_sandboxes} sandboxes of this server are in use",
                 hint="try again later",
                 retry_after_ms=_BUSY_RETRY_MS,
-            )
-        if refusal is None and sandbox is not None and len(sandbox.waiting) >= self._max_waiting:
-            refusal = Busy(
-                "too many commands of this robot wait", hint="wait for answers", retry_after_ms=_BUSY_RETRY_MS
             )
         if refusal is not None:
             self._answer(call, refusal)
@@ -462,7 +464,7 @@ class SandboxPolicy:
             sandbox.running, queued.started_s = call, now
             sandbox.late_s = queued.deadline_s
             allowed_s = queued.deadline_s - queued.received_s
-            sandbox.kill_s = queued.received_s + allowed_s * self._settings.deadline_factor
+            sandbox.kill_s = queued.received_s + allowed_s * _DEADLINE_FACTOR
             if self._keeps_state(call) and call.service not in sandbox.snapshots:
                 sandbox.state = "loading"
                 self._actions.append(LoadSnapshot(sandbox.number, call))

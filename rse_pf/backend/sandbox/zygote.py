@@ -30,6 +30,8 @@ _MAX_MESSAGE = 1 << 20
 _GO = b"g"
 _SLOTS = 500
 """User ids of one zygote; the next zygote's begin after them."""
+_FIRST_UID = 1_000_000
+"""Sandboxes of a server that runs as root get user ids from here."""
 
 
 def main(arguments: list[str]) -> None:
@@ -48,7 +50,7 @@ class _Zygote:
             for each in config["services"]
         }
         _warm_up({service.language for service in services.values()})
-        self._first_uid = config["first_uid"] + os.getpid() * _SLOTS if os.getuid() == 0 else None
+        self._first_uid = _FIRST_UID + os.getpid() * _SLOTS if os.getuid() == 0 else None
         self._plan = SandboxPlan(
             services=services,
             memory_bytes=config["memory_bytes"],

@@ -92,7 +92,7 @@ class ZygoteClient:
                 for s in self._services
             ],
             "memory_bytes": limits.memory_bytes, "scratch_bytes": limits.scratch_bytes,
-            "first_uid": limits.first_uid, "max_bytes": self._settings.session.max_inflated_bytes,
+            "max_bytes": self._settings.session.max_inflated_bytes,
         }  # fmt: skip
         # No credentials, and no threads of the linear algebra library: it will be forked.
         variables = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "PYTHONDONTWRITEBYTECODE": "1"}

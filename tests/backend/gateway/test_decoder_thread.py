@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from rse_pf.backend.gateway.connection import RobotConnection
+from rse_pf.backend.gateway.connection import BAD_MESSAGE_PAUSE_S, RobotConnection
 from rse_pf.backend.gateway.decoder_thread import DecoderThread, refusal_unread
 from rse_pf.backend.gateway.rate_limits import RobotRates
 from rse_pf.config import PlatformSettings
@@ -152,7 +152,7 @@ def test_a_small_bomb_is_inflated_elsewhere_and_its_robot_is_read_more_rarely(lo
 
     assert answers_at_once == 1, "only the welcome"
     assert wire.sent[-1].code == "too-large"
-    assert wire.pauses == [SETTINGS.session.bad_message_pause_s]
+    assert wire.pauses == [BAD_MESSAGE_PAUSE_S]
 
 
 def test_three_long_bombs_end_the_socket_and_the_robot_rests(loop, reading):
@@ -168,7 +168,7 @@ def test_three_long_bombs_end_the_socket_and_the_robot_rests(loop, reading):
         loop.turn()
 
     assert wire.closed == (4400, "too many bad messages")
-    assert wire.pauses == pytest.approx([5 * limits.bad_message_pause_s, 10 * limits.bad_message_pause_s])
+    assert wire.pauses == pytest.approx([5 * BAD_MESSAGE_PAUSE_S, 10 * BAD_MESSAGE_PAUSE_S])
     assert core.rates.rests_s(("default", "r"), 50.0) == limits.rate_ban_s
     assert core.rates.rests_s(("default", "r2"), 50.0) == 0
 

@@ -8,19 +8,17 @@ from hypothesis import strategies as st
 
 from rse_pf.backend.gateway import rate_limits as limits
 from rse_pf.backend.gateway.rate_limits import (
-    TokenBucket,
     CutOff,
     PendingHandshakes,
     RobotRates,
     SourceRates,
+    TokenBucket,
     TooFast,
 )
 from rse_pf.config import ServingSettings, SessionSettings
 
 ROBOT = ("default", "r")
-LIMITS = SessionSettings(
-    max_commands_per_s=20.0, command_burst=40, max_rate_violations=3, rate_window_s=10.0, rate_ban_s=5.0
-)
+LIMITS = SessionSettings(max_commands_per_s=20.0, command_burst=40, rate_ban_s=5.0)
 
 
 def judged(rates: RobotRates, per_s: float, seconds: float, robot: tuple[str, str] = ROBOT) -> list[object]:

@@ -6,7 +6,7 @@ from rse_pf.backend.sandbox.circuit_breaker import CircuitBreaker
 from rse_pf.config import PlatformSettings
 
 SETTINGS = PlatformSettings.from_dict(
-    {"services": {"poison_crashes": 2, "breaker_crashes": 3, "breaker_window_s": 30, "breaker_open_s": 60}}
+    {"services": {"poison_crashes": 2, "breaker_crashes": 3, "breaker_open_s": 60}}
 ).services
 
 

@@ -11,7 +11,7 @@ from rse_pf.backend.scheduling.scheduler import QueuedCommand, Scheduler
 from rse_pf.config import ServingSettings
 from rse_pf.wire import Command
 
-SETTINGS = ServingSettings(queue_target_ms=50.0, queue_interval_ms=100.0, max_queue_per_robot=4)
+SETTINGS = ServingSettings(max_queue_per_robot=4)
 
 
 def job(
