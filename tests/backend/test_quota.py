@@ -9,7 +9,7 @@ import msgspec
 import pytest
 
 from rse_pf.auth.tokens import Claims
-from rse_pf.backend.jobs.process import kept
+from rse_pf.backend.jobs.process import store_reply
 from rse_pf.backend.object_refs import ObjectRefs
 from rse_pf.backend.quota import check_room, quota_bytes, store_within
 from rse_pf.config import PlatformSettings
@@ -73,8 +73,8 @@ def test_a_large_reply_of_a_robot_without_room_is_refused_with_the_reason():
 
 
 def test_a_jobs_process_stores_its_reply_and_sends_only_small_ones_along(tmp_path):
-    small = kept(["done", 5.0, REPLY], order(f"dir:{tmp_path}"))
-    large = kept(["done", 5.0, REPLY], order(f"dir:{tmp_path}", inline_bytes=100))
+    small = store_reply(["done", 5.0, REPLY], order(f"dir:{tmp_path}"))
+    large = store_reply(["done", 5.0, REPLY], order(f"dir:{tmp_path}", inline_bytes=100))
 
     assert small == ["stored", 5.0, digest_of(REPLY), len(REPLY), REPLY]
     assert large == ["stored", 5.0, digest_of(REPLY), len(REPLY), None]
@@ -82,11 +82,11 @@ def test_a_jobs_process_stores_its_reply_and_sends_only_small_ones_along(tmp_pat
 
 
 def test_a_jobs_process_refuses_what_is_too_large_or_beyond_the_quota(tmp_path):
-    assert kept(["done", 5.0, bytes(5000)], order(f"dir:{tmp_path}"))[:2] == ["failed", "too-large"]
-    assert kept(["done", 5.0, bytes(1001)], order(f"dir:{tmp_path}"))[:2] == ["failed", "quota"]
+    assert store_reply(["done", 5.0, bytes(5000)], order(f"dir:{tmp_path}"))[:2] == ["failed", "too-large"]
+    assert store_reply(["done", 5.0, bytes(1001)], order(f"dir:{tmp_path}"))[:2] == ["failed", "quota"]
     assert list(DirectoryStore(tmp_path).list()) == []
 
 
 def test_a_store_of_the_worker_alone_and_a_failure_are_left_to_the_worker():
-    assert kept(["done", 5.0, REPLY], order("memory:")) == ["done", 5.0, REPLY]
-    assert kept(["failed", "c", "m", "h"], order("memory:")) == ["failed", "c", "m", "h"]
+    assert store_reply(["done", 5.0, REPLY], order("memory:")) == ["done", 5.0, REPLY]
+    assert store_reply(["failed", "c", "m", "h"], order("memory:")) == ["failed", "c", "m", "h"]

@@ -1,7 +1,6 @@
-"""Whose job comes next, and whose must make room: robots take turns, however many jobs one of them asks for.
+"""Decide whose job runs next and whose is displaced: robots take turns, however many jobs they ask for.
 
-Pure.  Promises that a robot which asks for one job waits for at most one job of each other robot that came
-before it, and that nobody waits for ever because others keep coming.
+Pure.  A robot that asks for one job waits for at most one job of each robot that asked before it.
 """
 
 from __future__ import annotations
@@ -9,53 +8,53 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 
-__all__ = ["FairQueue", "Who", "who_makes_room"]
+__all__ = ["FairQueue", "RobotId", "job_to_displace"]
 
-Who = tuple[str, str]
+RobotId = tuple[str, str]
 """Tenant and robot."""
 
 
 class FairQueue:
-    """Those who wait for a turn: robots in a ring, and each robot's tickets in the order of asking."""
+    """Waiting tickets: robots take turns, and each robot's tickets keep their order."""
 
     def __init__(self) -> None:
-        self._tickets: dict[Who, list[object]] = {}
+        self._tickets: dict[RobotId, list[object]] = {}
 
-    def join(self, ticket: object, who: Who) -> None:
-        """Let *who* wait under *ticket*; a robot that did not wait comes last."""
-        self._tickets.setdefault(who, []).append(ticket)
+    def add(self, ticket: object, robot: RobotId) -> None:
+        """Add *ticket* of *robot*; a robot that had none takes the last turn."""
+        self._tickets.setdefault(robot, []).append(ticket)
 
     def first(self) -> object | None:
-        """Return the ticket whose turn is next."""
+        """Return the ticket whose turn it is, None if there is none."""
         return next(iter(self._tickets.values()))[0] if self._tickets else None
 
-    def served(self, ticket: object) -> None:
-        """Note that *ticket* got its turn: its robot goes behind all others."""
-        who = self.leave(ticket)
-        if who in self._tickets:
-            self._tickets[who] = self._tickets.pop(who)
+    def serve(self, ticket: object) -> None:
+        """Remove *ticket* because it was served: its robot goes behind all others."""
+        robot = self.remove(ticket)
+        if robot in self._tickets:
+            self._tickets[robot] = self._tickets.pop(robot)
 
-    def leave(self, ticket: object) -> Who | None:
-        """Forget *ticket*, if it waits, and return whose it was; it costs its robot nothing."""
-        for who, tickets in self._tickets.items():
+    def remove(self, ticket: object) -> RobotId | None:
+        """Remove *ticket*, if it waits, and return its robot, which keeps its turn."""
+        for robot, tickets in self._tickets.items():
             if ticket in tickets:
                 tickets.remove(ticket)
                 if not tickets:
-                    del self._tickets[who]
-                return who
+                    del self._tickets[robot]
+                return robot
         return None
 
 
-def who_makes_room(jobs: Sequence[tuple[Who, bool]], newcomer: Who) -> int | None:
-    """Return which of *jobs* must make room for one more of *newcomer*; None if it has to come again.
+def job_to_displace(jobs: Sequence[tuple[RobotId, bool]], newcomer: RobotId) -> int | None:
+    """Return which of *jobs* is displaced by one more of *newcomer*; None if the newcomer is refused.
 
-    It is the newest that waits of the robot with the most jobs, if that has at least two more than the
-    newcomer: with one, it would only change who is the last.
+    It is the newest waiting job of the robot with the most jobs, if that robot has at least two more than
+    the newcomer: with one, the two would only change places.
 
     Args:
-        jobs: Each job's robot and whether it still waits, in the order of asking.
-        newcomer: Who asks.
+        jobs: Each job's robot and whether it still waits, oldest first.
+        newcomer: Robot of the new job.
     """
-    count = Counter(who for who, _ in jobs)
-    rows = [row for row, (who, waits) in enumerate(jobs) if waits and count[who] > count[newcomer] + 1]
+    count = Counter(robot for robot, _ in jobs)
+    rows = [row for row, (robot, waits) in enumerate(jobs) if waits and count[robot] > count[newcomer] + 1]
     return max(rows, key=lambda row: (count[jobs[row][0]], row), default=None)

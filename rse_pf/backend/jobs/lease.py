@@ -1,8 +1,7 @@
-"""Who works on a job, as one record in the object store that changes by compare-and-swap only.
+"""The lease of a job: one record in the object store that changes by compare-and-swap only.
 
-The owner renews the record; whoever else wants the job watches it with a clock of its own: clocks of two
-machines are never compared.  Promises no clock, no thread and no process, and that of two who want the same
-job one gets it.
+The owner renews the record; others who wait for the job watch it with their own clocks, so that the clocks of
+two machines are never compared.  Of two processes that take the same job one succeeds.  Time is an argument.
 """
 
 from __future__ import annotations
@@ -25,7 +24,7 @@ __all__ = [
     "Verdict",
     "decode_record",
     "encode_record",
-    "is_over",
+    "is_expired",
     "job_key",
     "marked",
     "record_name",
@@ -34,14 +33,14 @@ __all__ = [
 ]  # fmt: skip
 
 MAX_TRIES = 3
-"""A job whose servers died so often is not tried again: it may have been the cause."""
+"""A job whose servers crashed this often is not run again: it may be the cause."""
 
 State = Literal["running", "given-up", "done", "failed", "swept"]
 Verdict = Literal["take", "follow", "done", "failed", "poison"]
 
 
 class JobRecord(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """One job.  ``beat`` counts renewals; ``reply`` is the sha256 of what it came to."""
+    """One job.  ``beat`` counts renewals; ``reply`` is the sha256 of its result."""
 
     state: State
     owner: str
@@ -50,7 +49,7 @@ class JobRecord(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     share: float = 0.0
     what: str = ""
     cancel: bool = False
-    """Somebody who watches wants it to end."""
+    """A follower asks the owner to end it."""
     reply: str = ""
     reply_bytes: int = 0
     compute_ms: float = 0.0
@@ -59,7 +58,7 @@ class JobRecord(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     message: str = ""
     hint: str = ""
     marked_s: float = 0.0
-    """Unix time when a sweep first saw the record as it is; 0 if none did since its owner last wrote."""
+    """Unix time when a garbage collection first saw the record as it is; 0 after each write of its owner."""
 
 
 encode_record = msgspec.json.Encoder().encode
@@ -75,17 +74,17 @@ def decode_record(name: str, data: bytes) -> JobRecord:
 
 
 def marked(record: JobRecord, now: float) -> JobRecord:
-    """Return *record* as a sweep leaves it when it sees it first; *now* is Unix time."""
+    """Return *record* with the time when a garbage collection first saw it; *now* is Unix time."""
     return msgspec.structs.replace(record, marked_s=now)
 
 
-def is_over(record: JobRecord, now: float, life_s: float) -> bool:
-    """Return whether nobody has touched *record* for *life_s* since a sweep marked it."""
-    return record.marked_s > 0 and now - record.marked_s >= life_s
+def is_expired(record: JobRecord, now: float, ttl_s: float) -> bool:
+    """Return whether *record* is unchanged for *ttl_s* since it was marked."""
+    return record.marked_s > 0 and now - record.marked_s >= ttl_s
 
 
 def tombstone(now: float) -> JobRecord:
-    """Return what stands in the place of a record that is about to go."""
+    """Return the record that replaces one which is about to be deleted."""
     return JobRecord(state="swept", owner="", marked_s=now)
 
 
@@ -93,7 +92,7 @@ def job_key(service: str, payload: Any, settings: str) -> str:
     """Return the digest of a service's name, its inputs (large ones by digest) and the server's settings.
 
     Raises:
-        BadRequest: The payload has no one encoding.
+        BadRequest: The payload cannot be encoded.
     """
     try:
         plain = msgspec.msgpack.encode(
@@ -105,19 +104,19 @@ def job_key(service: str, payload: Any, settings: str) -> str:
 
 
 def record_name(tenant: str, robot: str, key: str) -> str:
-    """Return where the record of a robot's job lives: ``jobs/TENANT/ROBOT/KEY``."""
+    """Return the object name of the record of a robot's job: ``jobs/TENANT/ROBOT/KEY``."""
     return f"jobs/{name_segment(tenant)}/{name_segment(robot)}/{key}"
 
 
 def verdict_on(record: JobRecord | None, *, unchanged_s: float, lease_s: float, is_watched: bool) -> Verdict:
-    """Return what to do about a job that a robot wants.
+    """Return what to do about a job that a robot asked for.
 
     Args:
-        record: As it stands in the store; None if nobody ever worked on it.
+        record: As it stands in the store; None if there is none.
         unchanged_s: For how long this process has seen it unchanged.
-        lease_s: After so long without a renewal its owner is taken for dead.
-        is_watched: Whether this process waits for the very run that the record tells of; the failure of
-            an earlier run is tried again.
+        lease_s: After this time without a renewal the owner is considered dead.
+        is_watched: Whether this process waits for the run that the record describes; the failure of an
+            earlier run is tried again.
     """
     if record is None or record.state == "given-up":
         return "take"
@@ -126,7 +125,7 @@ def verdict_on(record: JobRecord | None, *, unchanged_s: float, lease_s: float, 
     if record.state == "failed":
         return "failed" if is_watched else "take"
     if unchanged_s < lease_s:
-        return "follow"  # who sweeps is about to remove the record, or who works renews it
+        return "follow"  # the owner renews the record, or a collector is about to delete it
     if record.state == "swept":
         return "take"
     return "take" if record.tries < MAX_TRIES else "poison"
@@ -139,15 +138,15 @@ class _Seen:
 
 
 class JobLease:
-    """One process's view of one job's record, and its hold on it."""
+    """One process's view of the record of one job, and its lease on it."""
 
     def __init__(self, store: ObjectStore, name: str, owner: str, clock: Callable[[], float]) -> None:
-        """Touch nothing yet.
+        """Read nothing yet.
 
         Args:
-            store: Shared by all who may work on the job.
-            name: Of the record.
-            owner: Unique to this process and this job.
+            store: Shared by all servers.
+            name: Object name of the record.
+            owner: Name that is unique to this process and this job.
             clock: Seconds, monotonic.
         """
         self.record: JobRecord | None = None
@@ -160,12 +159,12 @@ class JobLease:
 
     @property
     def unchanged_s(self) -> float:
-        """For how long the record has stood as it does."""
+        """For how long the record is unchanged, in seconds."""
         return self._clock() - self._seen.since
 
     @property
     def is_ours(self) -> bool:
-        """Whether this process holds the job, as far as it has looked."""
+        """Whether this process held the lease when it last read the record."""
         return self.record is not None and self.record.owner == self._owner
 
     def look(self) -> JobRecord | None:
@@ -180,16 +179,16 @@ class JobLease:
         return self.record
 
     def take(self) -> bool:
-        """Become the owner; False if somebody was quicker.
+        """Become the owner; False if another process did first.
 
-        A run whose owner died counts as a try, one that was given up or failed in an orderly way does not.
+        A run whose owner crashed counts as a try; one that was given up or that failed does not.
         """
         before = self.record
         tries = before.tries + 1 if before is not None and before.state == "running" else 1
         return self._swap(JobRecord(state="running", owner=self._owner, tries=tries))
 
     def renew(self, share: float, what: str) -> bool:
-        """Say that the owner lives and how far it is; False if the job was taken or cancelled meanwhile."""
+        """Renew the lease with the progress; False if the job was taken or cancelled meanwhile."""
         assert self.record is not None
         beat = msgspec.structs.replace(
             self.record, beat=self.record.beat + 1, share=share, what=what, marked_s=0.0
@@ -197,14 +196,14 @@ class JobLease:
         return self._swap(beat) and not beat.cancel
 
     def end(self, record: JobRecord) -> bool:
-        """Replace our hold by what became of the job; False if it is not ours any longer."""
+        """Replace the lease by the outcome of the job; False if it is no longer ours."""
         while self.is_ours:
             if self._swap(msgspec.structs.replace(record, owner=self._owner)):
                 return True
         return False
 
     def ask_to_cancel(self) -> None:
-        """Let the owner know that the robot takes the job back."""
+        """Tell the owner that the robot cancelled the job."""
         while self.record is not None and self.record.state == "running" and not self.record.cancel:
             if self._swap(msgspec.structs.replace(self.record, cancel=True)):
                 return

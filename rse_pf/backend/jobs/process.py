@@ -1,16 +1,18 @@
-"""The inside of one job: a process of its own that steps back behind everything else, works once and ends.
+"""The process of one job: the worker starts it with `JobProcess`, it runs one command and ends.
 
-It talks with its worker over one socket: an order in; progress, then one answer out.  Promises to run at
-the lowest priority there is, to stay within its memory, and not to outlive its worker.  It reads its inputs
-and stores its reply itself: a worker has robots to answer.
+Over one socket it receives an order, sends progress and then one answer.  It runs at the lowest priority,
+within its memory limit, and does not outlive its worker.  It reads its inputs and stores its reply itself, so
+that the worker can serve robots meanwhile.
 """
 
 from __future__ import annotations
 
 import contextlib
+import os
 import resource
 import select
 import socket
+import subprocess
 import sys
 import time
 import traceback
@@ -20,6 +22,7 @@ from typing import Any
 import msgspec
 
 from rse_pf.backend.job_store import is_shared, open_job_store
+from rse_pf.backend.jobs.runner import JobRequest
 from rse_pf.backend.object_refs import named_in, resolve
 from rse_pf.backend.quota import check_room, store_within
 from rse_pf.backend.sandbox.ipc import encode_message, receive
@@ -32,39 +35,94 @@ from rse_pf.services.loading import load_services
 from rse_pf.wire import Command, Failure, Result
 from rse_pf.wire.arrays import binary_encode_hook
 
-__all__ = ["kept", "main"]
+__all__ = ["JobProcess", "main", "spawner", "store_reply"]
 
-_REPORT_PAUSE_S = 0.5
+_REPORT_INTERVAL_S = 0.5
 _STORE_TRIES = 3
+_ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
+
+
+class JobProcess:
+    """A started process and the socket to it.
+
+    It uses one thread for linear algebra, so that the same inputs give the same result.
+    """
+
+    def __init__(self, order: dict[str, Any]) -> None:
+        self.connection, theirs = socket.socketpair()
+        with theirs:
+            self._process = subprocess.Popen(
+                [sys.executable, "-m", "rse_pf.backend.jobs.process", str(theirs.fileno())],
+                pass_fds=(theirs.fileno(),), stdin=subprocess.DEVNULL, env={**os.environ, **_ONE_THREAD},
+            )  # fmt: skip
+        run_when_idle(self._process.pid)
+        try:
+            self.connection.sendall(encode_message(order))
+        except OSError:
+            return  # it has ended, which the next read shows
+
+    @property
+    def pid(self) -> int:
+        """Process id."""
+        return self._process.pid
+
+    def kill(self) -> None:
+        """Kill and reap it."""
+        self._process.kill()
+        self._process.wait()
+        self.connection.close()
+
+    def wait(self) -> int:
+        """Wait for its end and return the exit code; negative for a signal."""
+        return self._process.wait()
+
+
+def spawner(services: str, settings: PlatformSettings) -> Callable[[JobRequest], JobProcess]:
+    """Return a function that starts the process of a job; *services* is ``module:function``."""
+    plain = settings.to_dict()
+
+    def start(request: JobRequest) -> JobProcess:
+        return JobProcess(
+            {
+                "worker": os.getpid(), "services": services, "settings": plain,
+                "memory_bytes": settings.serving.max_job_memory_bytes, "service": request.service,
+                "payload": request.payload, "tenant": request.tenant, "robot": request.robot,
+                "quota_bytes": request.quota_bytes, "inline_bytes": settings.session.max_message_bytes // 2,
+            }
+        )  # fmt: skip
+
+    return start
 
 
 def main(arguments: list[str]) -> None:
-    """Do the one job that the worker orders over the socket with this number."""
+    """Run the one job that the worker orders over the socket with this number."""
     with socket.socket(fileno=int(arguments[0])) as worker:
         order = receive(worker)
         if order is None or not die_with_parent(order["worker"]):
             return
-        _step_back()
+        _lower_priority()
         resource.setrlimit(resource.RLIMIT_DATA, (order["memory_bytes"],) * 2)
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-        with contextlib.suppress(OSError):  # a worker that does not wait any longer is no defect
-            worker.sendall(encode_message(kept(_work(order, _Reporter(worker, time.monotonic)), order)))
+        with contextlib.suppress(OSError):  # the worker may have gone
+            worker.sendall(
+                encode_message(store_reply(_work(order, _Reporter(worker, time.monotonic)), order))
+            )
 
 
 class _Reporter:
-    """Tells the worker how far the job is, and hears from it that nobody wants it any longer."""
+    """Sends progress to the worker; raises Cancelled when the worker has sent anything."""
 
     def __init__(self, worker: socket.socket, clock: Callable[[], float]) -> None:
         self._worker = worker
         self._clock = clock
-        self._told_s = float("-inf")
+        self._reported_s = float("-inf")
 
     def __call__(self, done: float, what: str) -> None:
         if select.select([self._worker], [], [], 0)[0]:
-            raise Cancelled("the robot took the command back")
+            raise Cancelled("the robot cancelled the command")
         now = self._clock()
-        if now - self._told_s >= _REPORT_PAUSE_S:
-            self._told_s = now
+        if now - self._reported_s >= _REPORT_INTERVAL_S:
+            self._reported_s = now
             self._worker.sendall(encode_message(["progress", float(done), str(what)[:200]]))
 
 
@@ -80,7 +138,7 @@ def _work(order: dict[str, Any], report: Callable[[float, str], None]) -> list[A
     try:
         settings = PlatformSettings.from_dict(order["settings"])
         registry = load_services(order["services"], settings)
-        _look_for_room(order, settings)
+        _check_quota(order, settings)
         payload = _resolved(command.payload, registry.get(command.service).request_type, order, settings)
         command = msgspec.structs.replace(command, payload=payload)
         answer = dispatch(registry, command, time.monotonic, on_defect=on_defect, report=report)
@@ -93,39 +151,39 @@ def _work(order: dict[str, Any], report: Callable[[float, str], None]) -> list[A
         answer = failure_of(
             Crashed(f"the job needs more than {megabytes:.0f} MB of memory", hint="send less at once")
         )
-    return _told(answer)
+    return _encode_answer(answer)
 
 
 def _resolved(
     payload: Any, request_type: type[Any], order: dict[str, Any], settings: PlatformSettings
 ) -> Any:
-    """Return the payload with the robot's own objects in the place of their names."""
+    """Return the payload with the robot's objects in place of their names."""
     if not named_in(request_type, payload):
         return payload
     store = open_job_store(settings)
     return resolve(request_type, payload, order["tenant"], order["robot"], store, settings=settings.serving)
 
 
-def _look_for_room(order: dict[str, Any], settings: PlatformSettings) -> None:
-    """Raise QuotaExceeded before the work, not after it, where its result has no place."""
+def _check_quota(order: dict[str, Any], settings: PlatformSettings) -> None:
+    """Raise QuotaExceeded before the work if its result cannot be stored."""
     if is_shared(settings):
         store = open_job_store(settings)
-        with contextlib.suppress(StoreError):  # whether it can keep the result shows when there is one
+        with contextlib.suppress(StoreError):  # the store is tried again when there is a result
             check_room(store, order["tenant"], order["robot"], 1, order["quota_bytes"])
 
 
-def kept(told: list[Any], order: dict[str, Any]) -> list[Any]:
-    """Store the reply here, where it disturbs nobody, and tell its name; small ones go along."""
+def store_reply(answer: list[Any], order: dict[str, Any]) -> list[Any]:
+    """Store the reply from this process and answer with its name, and with the reply if it is small."""
     settings = PlatformSettings.from_dict(order["settings"])
-    if told[0] != "done" or not is_shared(settings):
-        return told
-    _, compute_ms, reply = told
+    if answer[0] != "done" or not is_shared(settings):
+        return answer
+    _, compute_ms, reply = answer
     try:
         if len(reply) > settings.data.max_object_bytes:
             raise LimitExceeded(f"a reply of {len(reply)} bytes is too large", hint="ask for less")
         digest = _stored(reply, order, open_job_store(settings))
     except RsePfError as error:
-        return _told(failure_of(error))
+        return _encode_answer(failure_of(error))
     return ["stored", compute_ms, digest, len(reply), reply if len(reply) <= order["inline_bytes"] else None]
 
 
@@ -136,18 +194,18 @@ def _stored(reply: bytes, order: dict[str, Any], store: ObjectStore) -> str:
     return store_within(store, order["tenant"], order["robot"], reply, order["quota_bytes"])
 
 
-def _told(answer: Result | Failure) -> list[Any]:
+def _encode_answer(answer: Result | Failure) -> list[Any]:
     if isinstance(answer, Failure):
         return ["failed", answer.code, answer.message, answer.hint]
     try:
         reply = msgspec.msgpack.encode(answer.reply, enc_hook=binary_encode_hook)
     except (BadMessage, TypeError, ValueError, OverflowError) as error:
-        return ["failed", "internal", f"the reply does not travel: {str(error)[:150]}", ""]
+        return ["failed", "internal", f"the reply cannot be encoded: {str(error)[:150]}", ""]
     return ["done", answer.compute_ms, reply]
 
 
-def _step_back() -> None:
-    """Run only when nothing else wants to; be the first to go when memory is short."""
+def _lower_priority() -> None:
+    """Run only when the processors are idle; be killed first when memory is short."""
     run_when_idle(0)
     with contextlib.suppress(OSError), open("/proc/self/oom_score_adj", "w", encoding="ascii") as file:
         file.write("1000")

@@ -1,8 +1,7 @@
-"""One wanted job, from the first look at its record to its outcome: follow it, do it, or return its result.
+"""One job, from the first read of its record to its outcome: follow it, run it, or return its result.
 
-Runs in a thread of the worker, because all it does is wait: for the store, for a turn, for the job's process.
-Promises that a process which it started is gone when it returns, and that a job ends the same way whoever
-works on it.
+Runs in a thread of the worker, because it only waits: for the store, for a slot, for the job's process.  A
+process that it started has ended when it returns.
 """
 
 from __future__ import annotations
@@ -38,12 +37,12 @@ from rse_pf.object_store import ObjectStore, digest_of, object_name
 __all__ = ["JobContext", "JobOutcome", "JobRequest", "JobSignals", "Process", "run_job"]
 
 _POLL_SHARE = 0.5
-"""Of the time between two renewals: how often one who follows looks."""
-_PATIENCE_S = 0.6
-"""A job that is told to end and does not is killed after this."""
+"""Share of the time between two renewals after which a follower reads the record again."""
+_KILL_AFTER_S = 0.6
+"""A cancelled job that does not end is killed after this."""
 _READ_BYTES = 1 << 18
 _STORE_TRIES = 3
-WAITS, STARTS = "waits for its turn", "starts"
+WAITING, STARTING = "waits for its turn", "starts"
 
 
 class Process(Protocol):
@@ -52,10 +51,10 @@ class Process(Protocol):
     connection: socket.socket
 
     def kill(self) -> None:
-        """End it, whatever it does, and reap it."""
+        """Kill and reap it."""
 
     def wait(self) -> int:
-        """Return how it ended, once it did; negative for a signal."""
+        """Wait for its end and return the exit code; negative for a signal."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -68,7 +67,7 @@ class JobRequest:
     robot: str
     key: str
     quota_bytes: float
-    """Of all that the robot stores, its results among it."""
+    """Limit of all that the robot stores, its results included."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -79,11 +78,11 @@ class JobContext:
     slots: JobSlots
     settings: ServingSettings
     quota_bytes: float
-    """Of a robot whose token says nothing of it."""
+    """Quota of a robot whose token has none."""
     max_bytes: int
-    """Of a reply."""
+    """Limit of a reply."""
     inline_bytes: int
-    """Larger replies are named only."""
+    """Larger replies are answered with the name of their object."""
     server_id: str
     start: Callable[[JobRequest], Process]
     clock: Callable[[], float]
@@ -91,22 +90,22 @@ class JobContext:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class JobOutcome:
-    """What became of a job: a reply under its digest, an error, or neither: it was given up."""
+    """How a job ended: a reply under its digest, an error, or neither: it was given up."""
 
     object: str = ""
     reply: bytes | None = None
-    """MessagePack; None if it is too large for a message."""
+    """MessagePack; None if it is larger than ``inline_bytes``."""
     compute_ms: float = 0.0
     error: RsePfError | None = None
 
     @property
     def is_given_up(self) -> bool:
-        """Whether another server should go on."""
+        """Whether another server should take the job."""
         return not self.object and self.error is None
 
 
 class JobSignals:
-    """What the worker tells the thread of a job; each can only be set."""
+    """What the worker signals to the thread of a job; signals are never cleared."""
 
     def __init__(self) -> None:
         self.cancelled = False
@@ -115,17 +114,17 @@ class JobSignals:
         self._lock = threading.Lock()
 
     def cancel(self) -> None:
-        """The robot takes the job back."""
+        """The robot cancelled the job."""
         self.cancelled = True
         self._wake()
 
     def give_up(self) -> None:
-        """The server leaves."""
+        """The server drains."""
         self.giving_up = True
         self._wake()
 
-    def rest(self, seconds: float, *others: socket.socket) -> bool:
-        """Wait until something happens, at most so long; return whether the job is still wanted here."""
+    def wait(self, seconds: float, *others: socket.socket) -> bool:
+        """Wait for a signal or for bytes on *others*; return False if a signal was set."""
         watched: list[Any] = [self._fd, *others]
         ready, _, _ = select.select(watched, [], [], max(0.0, seconds))
         if self._fd in ready:
@@ -133,7 +132,7 @@ class JobSignals:
         return not (self.cancelled or self.giving_up)
 
     def close(self) -> None:
-        """Forget it; later signals are lost."""
+        """Free the descriptor; later signals are ignored."""
         with self._lock:
             os.close(self._fd)
             self._fd = -1
@@ -148,27 +147,27 @@ Tell = Callable[[float, str], None]
 
 
 def run_job(
-    wanted: JobRequest, context: JobContext, signals: JobSignals, tell: Tell, owner: str
+    request: JobRequest, context: JobContext, signals: JobSignals, tell: Tell, owner: str
 ) -> JobOutcome:
-    """Return what became of the job; blocks until then.
+    """Run or follow the job and return its outcome; blocks until then.
 
     Args:
-        wanted: The job.
+        request: The job.
         context: Of the worker.
-        signals: Set by the worker's loop.
-        tell: Told the share that is done, and what; called in this thread.
-        owner: Unique to this process and this call.
+        signals: Set by the event loop of the worker.
+        tell: Called in this thread with the share that is done, and what is being done.
+        owner: Name that is unique to this process and this call.
     """
-    name = record_name(wanted.tenant, wanted.robot, wanted.key)
+    name = record_name(request.tenant, request.robot, request.key)
     lease = JobLease(context.store, name, owner, context.clock)
     try:
-        return _pursue(wanted, context, signals, tell, lease)
+        return _follow_or_run(request, context, signals, tell, lease)
     except RsePfError as error:
         return JobOutcome(error=error)
 
 
-def _pursue(
-    wanted: JobRequest, context: JobContext, signals: JobSignals, tell: Tell, lease: JobLease
+def _follow_or_run(
+    request: JobRequest, context: JobContext, signals: JobSignals, tell: Tell, lease: JobLease
 ) -> JobOutcome:
     serving = context.settings
     while True:
@@ -183,31 +182,31 @@ def _pursue(
         )
         if verdict == "follow" and record is not None:
             tell(record.share, record.what)
-            signals.rest(serving.job_heartbeat_s * _POLL_SHARE)
+            signals.wait(serving.job_heartbeat_s * _POLL_SHARE)
             continue
         if verdict == "failed" and record is not None:
             return JobOutcome(error=error_from_code(record.code, record.message, hint=record.hint))
         if verdict == "poison":
             return JobOutcome(error=_poison())
         if verdict == "done" and record is not None:
-            stored = _stored(wanted, context, record)
+            stored = _stored_outcome(request, context, record)
             if stored is not None:
                 return stored
-        tell(0.0, WAITS)
-        if not context.slots.acquire((wanted.tenant, wanted.robot), signals.rest):
+        tell(0.0, WAITING)
+        if not context.slots.acquire((request.tenant, request.robot), signals.wait):
             continue
         try:
             if lease.take():
-                outcome = _Run(wanted, context, signals, tell, lease).work()
+                outcome = _JobRun(request, context, signals, tell, lease).work()
                 if outcome is not None:
                     return outcome
         finally:
             context.slots.release()
 
 
-def _stored(wanted: JobRequest, context: JobContext, record: JobRecord) -> JobOutcome | None:
-    """Return the result that *record* names; None if it is gone and has to be made again."""
-    name = object_name(wanted.tenant, wanted.robot, record.reply)
+def _stored_outcome(request: JobRequest, context: JobContext, record: JobRecord) -> JobOutcome | None:
+    """Return the result that *record* names; None if it was deleted and must be computed again."""
+    name = object_name(request.tenant, request.robot, record.reply)
     try:
         if record.reply_bytes > context.inline_bytes:
             context.store.head(name)
@@ -219,74 +218,72 @@ def _stored(wanted: JobRequest, context: JobContext, record: JobRecord) -> JobOu
     return JobOutcome(object=record.reply, reply=reply, compute_ms=record.compute_ms)
 
 
-class _Run:
-    """The work on a job that is ours."""
+class _JobRun:
+    """The run of a job whose lease this worker holds."""
 
     def __init__(
-        self, wanted: JobRequest, context: JobContext, signals: JobSignals, tell: Tell, lease: JobLease
+        self, request: JobRequest, context: JobContext, signals: JobSignals, tell: Tell, lease: JobLease
     ) -> None:
-        self._wanted = wanted
+        self._request = request
         self._context = context
         self._signals = signals
         self._tell = tell
         self._lease = lease
-        self._share, self._what = 0.0, STARTS
+        self._done, self._what = 0.0, STARTING
         self._frames = FrameReader(context.max_bytes)
         self._end: list[Any] | None = None
         self._is_over = False
 
     def work(self) -> JobOutcome | None:
-        """Return the outcome; None if another server took the job from us."""
-        self._tell(0.0, STARTS)
-        process = self._context.start(self._wanted)
+        """Return the outcome; None if another server took the job."""
+        self._tell(0.0, STARTING)
+        process = self._context.start(self._request)
         try:
-            why = self._attend(process)
+            why = self._supervise(process)
         finally:
-            process.kill()  # what it had to say it has said
+            process.kill()  # all its messages have been read
         if why == "lost":
             return None
         if why == "given-up":
-            self._leave(JobRecord(state="given-up", owner=""))
+            self._end_lease(JobRecord(state="given-up", owner=""))
             return JobOutcome()
         if why == "cancelled":
             return self._failed(_cancelled())
         if why == "late":
-            longest_s = self._context.settings.max_job_s
-            return self._failed(
-                Expired(f"the job took longer than {longest_s:g} s", hint="send less at once")
-            )
+            max_s = self._context.settings.max_job_s
+            return self._failed(Expired(f"the job took longer than {max_s:g} s", hint="send less at once"))
         code = process.wait()
         if self._end is None:
             return self._failed(_crashed(code))
         if self._end[0] == "stored":
-            return self._stored(*self._end[1:])
+            return self._report_stored(*self._end[1:])
         if self._end[0] == "done":
-            return self._done(*self._end[1:])
+            return self._store_reply(*self._end[1:])
         return self._failed(error_from_code(str(self._end[1]), str(self._end[2]), hint=str(self._end[3])))
 
-    def _attend(self, process: Process) -> Literal["over", "lost", "given-up", "cancelled", "late"]:
-        """Listen to the process and renew the lease until one of them ends it."""
+    def _supervise(self, process: Process) -> Literal["over", "lost", "given-up", "cancelled", "late"]:
+        """Read from the process and renew the lease until the run ends."""
         serving, clock, signals = self._context.settings, self._context.clock, self._signals
         began = renewed = clock()
-        next_beat, killed_s = began + serving.job_heartbeat_s, float("inf")
+        next_heartbeat, killed_s = began + serving.job_heartbeat_s, float("inf")
         while not self._is_over:
             now = clock()
             if signals.giving_up:
                 return "given-up"
             if self._is_cancelled and killed_s == float("inf"):
-                _order_to_end(process)
-                killed_s = now + _PATIENCE_S
+                _send_cancel(process)
+                killed_s = now + _KILL_AFTER_S
             if now >= killed_s:
                 return "cancelled"
             if now - began >= serving.max_job_s:
                 return "late"
-            if now >= next_beat:
-                next_beat = now + serving.job_heartbeat_s
+            if now >= next_heartbeat:
+                next_heartbeat = now + serving.job_heartbeat_s
                 if self._renew():
                     renewed = clock()
                 elif not self._lease.is_ours or clock() - renewed >= serving.job_lease_s:
                     return "lost"
-            signals.rest(min(next_beat, killed_s) - clock(), process.connection)
+            signals.wait(min(next_heartbeat, killed_s) - clock(), process.connection)
             self._read(process)
         return "cancelled" if self._is_cancelled and self._end is None else "over"
 
@@ -296,9 +293,9 @@ class _Run:
         return self._signals.cancelled or (record is not None and self._lease.is_ours and record.cancel)
 
     def _renew(self) -> bool:
-        """A store that fails for a while costs us nothing; one that fails for a whole lease, the job."""
+        """Return whether the lease was renewed; a store that fails for less than a lease does no harm."""
         try:
-            return self._lease.renew(self._share, self._what)
+            return self._lease.renew(self._done, self._what)
         except StoreError:
             return False
 
@@ -313,28 +310,28 @@ class _Run:
         try:
             for message in self._frames.feed(data):
                 if message[0] == "progress":
-                    self._share, self._what = float(message[1]), str(message[2])
-                    self._tell(self._share, self._what)
+                    self._done, self._what = float(message[1]), str(message[2])
+                    self._tell(self._done, self._what)
                 else:
                     self._end, self._is_over = message, True
         except LimitExceeded as error:
             self._end, self._is_over = ["failed", error.code, error.message, "ask for less"], True
 
-    def _done(self, compute_ms: float, reply: bytes) -> JobOutcome:
-        """Make the reply durable before anybody hears of it, as the process could not."""
-        context, wanted, digest = self._context, self._wanted, digest_of(reply)
+    def _store_reply(self, compute_ms: float, reply: bytes) -> JobOutcome:
+        """Store the reply before it is reported; used where the process has no access to the store."""
+        context, request, digest = self._context, self._request, digest_of(reply)
         try:
-            self._patiently(
-                lambda: store_within(context.store, wanted.tenant, wanted.robot, reply, wanted.quota_bytes)
+            self._retrying(
+                lambda: store_within(context.store, request.tenant, request.robot, reply, request.quota_bytes)
             )
         except QuotaExceeded as error:
             return self._failed(error)
         inline = reply if len(reply) <= context.inline_bytes else None
-        return self._stored(compute_ms, digest, len(reply), inline)
+        return self._report_stored(compute_ms, digest, len(reply), inline)
 
-    def _stored(self, compute_ms: float, digest: str, size: int, reply: bytes | None) -> JobOutcome:
-        """Tell everybody where the durable reply is; *reply* itself if it is small."""
-        self._leave(
+    def _report_stored(self, compute_ms: float, digest: str, size: int, reply: bytes | None) -> JobOutcome:
+        """Write to the record where the stored reply is; return it, too, if *reply* is small."""
+        self._end_lease(
             JobRecord(
                 state="done", owner="", reply=digest, reply_bytes=size, compute_ms=compute_ms,
                 server=self._context.server_id,
@@ -343,16 +340,16 @@ class _Run:
         return JobOutcome(object=digest, reply=reply, compute_ms=compute_ms)
 
     def _failed(self, error: RsePfError) -> JobOutcome:
-        self._leave(
+        self._end_lease(
             JobRecord(state="failed", owner="", code=error.code, message=error.message, hint=error.hint)
         )
         return JobOutcome(error=error)
 
-    def _leave(self, record: JobRecord) -> None:
-        self._patiently(lambda: self._lease.end(record))
+    def _end_lease(self, record: JobRecord) -> None:
+        self._retrying(lambda: self._lease.end(record))
 
     @staticmethod
-    def _patiently(act: Callable[[], object]) -> None:
+    def _retrying(act: Callable[[], object]) -> None:
         for _ in range(_STORE_TRIES - 1):
             try:
                 act()
@@ -362,26 +359,26 @@ class _Run:
         act()
 
 
-def _order_to_end(process: Process) -> None:
+def _send_cancel(process: Process) -> None:
     try:
         process.connection.sendall(encode_message(["cancel"]))
     except OSError:
-        return  # it is gone, and reading says so
+        return  # it has ended, which the next read shows
 
 
 def _cancelled() -> RsePfError:
-    return Cancelled("the robot took the command back")
+    return Cancelled("the robot cancelled the command")
 
 
 def _crashed(code: int) -> RsePfError:
     how = f"exit code {code}"
     if code < 0:
         how = signal.Signals(-code).name if -code in set(signal.Signals) else f"signal {-code}"
-    return Crashed(f"the job's process ended: {how}", hint="the server's log has what it said last")
+    return Crashed(f"the job's process ended: {how}", hint="the server's log has what it printed last")
 
 
 def _poison() -> RsePfError:
     return Poison(
-        f"{MAX_TRIES} servers died while they worked on this job",
+        f"{MAX_TRIES} servers crashed while they ran this job",
         hint="send less at once; tell the operator",
     )

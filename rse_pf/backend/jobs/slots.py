@@ -1,7 +1,6 @@
-"""Turns to run a job, shared by all workers of a server: a pipe with one byte for each turn.
+"""Slots to run a job, shared by all workers of a server: a pipe with one byte for each free slot.
 
-Within a worker robots take turns (`job_turns`).  Promises that a turn which was taken comes back only by
-`release`, or with the end of the server.
+Within a worker robots take turns (`fair_queue`).  A slot is freed by `release`, or by the end of the server.
 
 Source:
     The jobserver of GNU make.
@@ -13,15 +12,15 @@ import os
 import threading
 from collections.abc import Callable
 
-from rse_pf.backend.jobs.fair_queue import FairQueue, Who
+from rse_pf.backend.jobs.fair_queue import FairQueue, RobotId
 
 __all__ = ["JobSlots", "make_pipe"]
 
-_LOOK_AGAIN_S = 0.1
+_POLL_S = 0.1
 
 
 def make_pipe(count: int) -> tuple[int, int]:
-    """Return both ends of a pipe that holds *count* turns."""
+    """Return both ends of a pipe that holds *count* slots."""
     ours, theirs = os.pipe()
     os.set_blocking(ours, False)
     os.write(theirs, b"j" * count)
@@ -29,39 +28,39 @@ def make_pipe(count: int) -> tuple[int, int]:
 
 
 class JobSlots:
-    """The turns as one worker sees them; used by its threads."""
+    """The slots as one worker sees them; used by its threads."""
 
     def __init__(self, pipe: tuple[int, int]) -> None:
         self._read, self._write = pipe
-        self._line = FairQueue()
+        self._queue = FairQueue()
         self._lock = threading.Lock()
 
-    def acquire(self, who: Who, rest: Callable[[float], bool]) -> bool:
-        """Wait for a turn of *who*; False if *rest*, which waits so many seconds, says that it is off."""
+    def acquire(self, robot: RobotId, wait: Callable[[float], bool]) -> bool:
+        """Wait for a slot for *robot*; False if *wait*, called with seconds to wait, returned False."""
         ticket = object()
         with self._lock:
-            self._line.join(ticket, who)
+            self._queue.add(ticket, robot)
         try:
             while not self._take(ticket):
-                if not rest(_LOOK_AGAIN_S):
+                if not wait(_POLL_S):
                     return False
             return True
         finally:
             with self._lock:
-                self._line.leave(ticket)
+                self._queue.remove(ticket)
 
     def release(self) -> None:
-        """Give a turn back."""
+        """Free a slot."""
         os.write(self._write, b"j")
 
     def _take(self, ticket: object) -> bool:
         with self._lock:
-            if self._line.first() is not ticket:
+            if self._queue.first() is not ticket:
                 return False
             try:
                 taken = bool(os.read(self._read, 1))
             except BlockingIOError:
                 return False
             if taken:
-                self._line.served(ticket)
+                self._queue.serve(ticket)
             return taken

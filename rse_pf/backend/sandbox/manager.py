@@ -110,6 +110,10 @@ class SandboxManager:
         """Commands that wait or run."""
         return self._policy.held
 
+    def waiting_of(self, robot: str) -> int:
+        """Return how many commands of *robot* wait."""
+        return self._policy.waiting_of(robot)
+
     def report(self) -> dict[str, Any]:
         """Return what /readyz and /metrics show of this worker's sandboxes."""
         return {

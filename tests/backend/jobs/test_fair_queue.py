@@ -5,7 +5,7 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rse_pf.backend.jobs.fair_queue import FairQueue, Who, who_makes_room
+from rse_pf.backend.jobs.fair_queue import FairQueue, RobotId, job_to_displace
 
 A, B, C = ("default", "a"), ("default", "b"), ("default", "c")
 
@@ -16,7 +16,7 @@ def order(line: FairQueue, count: int) -> str:
     for _ in range(count):
         ticket = line.first()
         assert isinstance(ticket, str)
-        line.served(ticket)
+        line.serve(ticket)
         served += ticket[0]
     return served
 
@@ -24,9 +24,9 @@ def order(line: FairQueue, count: int) -> str:
 def test_a_robot_with_twenty_jobs_gets_every_other_turn_while_another_waits():
     line = FairQueue()
     for number in range(20):
-        line.join(f"a{number}", A)
+        line.add(f"a{number}", A)
     for number in range(3):
-        line.join(f"b{number}", B)
+        line.add(f"b{number}", B)
 
     assert order(line, 23) == "ab" * 3 + "a" * 17
     assert line.first() is None
@@ -35,12 +35,12 @@ def test_a_robot_with_twenty_jobs_gets_every_other_turn_while_another_waits():
 def test_one_robots_jobs_run_in_the_order_of_asking():
     line = FairQueue()
     for number in range(3):
-        line.join(number, A)
+        line.add(number, A)
 
     seen = []
     while (ticket := line.first()) is not None:
         seen.append(ticket)
-        line.served(ticket)
+        line.serve(ticket)
 
     assert seen == [0, 1, 2]
 
@@ -48,12 +48,12 @@ def test_one_robots_jobs_run_in_the_order_of_asking():
 def test_who_comes_late_waits_for_one_turn_of_each_other_and_makes_up_for_nothing():
     line = FairQueue()
     for number in range(9):
-        line.join(f"a{number}", A)
-        line.join(f"b{number}", B)
+        line.add(f"a{number}", A)
+        line.add(f"b{number}", B)
     assert order(line, 5) == "ababa"
 
     for number in range(3):
-        line.join(f"c{number}", C)
+        line.add(f"c{number}", C)
 
     assert order(line, 6) == "bacbac"
 
@@ -61,38 +61,38 @@ def test_who_comes_late_waits_for_one_turn_of_each_other_and_makes_up_for_nothin
 def test_tickets_that_leave_cost_their_robot_no_turn():
     line = FairQueue()
     for number in range(9):
-        line.join(f"a{number}", A)
+        line.add(f"a{number}", A)
     for number in range(8):
-        line.leave(f"a{number}")
-    line.leave("a0")
-    line.join("b0", B)
-    line.join("b1", B)
+        line.remove(f"a{number}")
+    line.remove("a0")
+    line.add("b0", B)
+    line.add("b1", B)
 
     assert order(line, 3) == "abb"
 
 
 def test_new_robots_that_keep_coming_do_not_starve_one_that_waits():
     line = FairQueue()
-    line.join("a0", A)
-    line.join("a1", A)
+    line.add("a0", A)
+    line.add("a1", A)
     served = ""
     for number in range(5):
-        line.join(f"n{number}", ("default", f"n{number}"))
+        line.add(f"n{number}", ("default", f"n{number}"))
         served += order(line, 1)
 
     assert served.count("a") == 2
 
 
 @given(st.lists(st.sampled_from([A, B, C]), max_size=30))
-def test_while_two_robots_wait_neither_gets_two_turns_more(comers: list[Who]):
+def test_while_two_robots_wait_neither_gets_two_turns_more(comers: list[RobotId]):
     line = FairQueue()
     left = dict.fromkeys((A, B, C), 0)
     for number, who in enumerate(comers):
-        line.join((who, number), who)
+        line.add((who, number), who)
         left[who] += 1
     turns = dict.fromkeys(left, 0)
     while (ticket := line.first()) is not None:
-        line.served(ticket)
+        line.serve(ticket)
         who = ticket[0]  # type: ignore[index]
         turns[who] += 1
         left[who] -= 1
@@ -103,12 +103,12 @@ def test_while_two_robots_wait_neither_gets_two_turns_more(comers: list[Who]):
 def test_the_newest_waiting_job_of_who_has_most_makes_room():
     jobs = [(A, False), (A, True), (B, True), (A, True), (B, True), (B, False)]
 
-    assert who_makes_room(jobs, C) == 4
-    assert who_makes_room([*jobs, (A, True)], C) == 6
+    assert job_to_displace(jobs, C) == 4
+    assert job_to_displace([*jobs, (A, True)], C) == 6
 
 
 def test_nobody_makes_room_for_who_has_as_many_or_one_less():
-    assert who_makes_room([(A, True), (A, True)], A) is None
-    assert who_makes_room([(A, True), (A, True), (B, True)], B) is None
-    assert who_makes_room([(A, True)], B) is None
-    assert who_makes_room([(A, False), (A, False), (A, False)], B) is None
+    assert job_to_displace([(A, True), (A, True)], A) is None
+    assert job_to_displace([(A, True), (A, True), (B, True)], B) is None
+    assert job_to_displace([(A, True)], B) is None
+    assert job_to_displace([(A, False), (A, False), (A, False)], B) is None

@@ -20,7 +20,7 @@ from rse_pf.backend.jobs.manager import JobManager
 from rse_pf.backend.jobs.runner import JobContext, JobRequest
 from rse_pf.backend.jobs.slots import JobSlots, make_pipe
 from rse_pf.backend.log import JsonLog
-from rse_pf.backend.sandbox.child import encoded
+from rse_pf.backend.sandbox.ipc import encode_message
 from rse_pf.backend.scheduling.scheduler import QueuedCommand
 from rse_pf.config import PlatformSettings
 from rse_pf.object_store import MemoryStore
@@ -37,7 +37,7 @@ class FakeProcess:
         self.connection, self._theirs = socket.socketpair()
 
     def say(self, *message: Any) -> None:
-        self._theirs.sendall(encoded(list(message)))
+        self._theirs.sendall(encode_message(list(message)))
 
     def done(self, value: int = 1) -> None:
         self.say("done", 5.0, msgspec.msgpack.encode({"value": value}))

@@ -23,7 +23,7 @@ class Bench:
 
     def another(self) -> RecordCollector:
         return RecordCollector(
-            self.store, life_s=LIFE_S, clock=lambda: self.now, wall_clock=lambda: self.now
+            self.store, ttl_s=LIFE_S, clock=lambda: self.now, wall_clock=lambda: self.now
         )  # fmt: skip
 
     def lease(self) -> JobLease:
@@ -34,7 +34,7 @@ class Bench:
     def after(self, seconds: float) -> int:
         """Let time pass, sweep with a fresh eye, and return how many records went."""
         self.now += seconds
-        return self.another().turn()
+        return self.another().collect()
 
     @property
     def names(self) -> list[str]:
@@ -124,12 +124,12 @@ def test_a_few_at_a_time_and_listed_once_an_hour():
     for name in names:
         put(bench.store, JobRecord(state="done", owner="", marked_s=1.0), name)
 
-    assert bench.sweep.turn() == 64
-    assert bench.sweep.turn() == 36
+    assert bench.sweep.collect() == 64
+    assert bench.sweep.collect() == 36
     put(bench.store, JobRecord(state="done", owner="", marked_s=1.0))
-    assert bench.sweep.turn() == 0
+    assert bench.sweep.collect() == 0
     bench.now += 3600
-    assert bench.sweep.turn() == 1
+    assert bench.sweep.collect() == 1
 
 
 def test_a_store_that_fails_and_a_record_of_nonsense_are_left_for_later():
@@ -137,9 +137,9 @@ def test_a_store_that_fails_and_a_record_of_nonsense_are_left_for_later():
         def list(self, prefix: str = ""):
             raise StoreError("gone")
 
-    assert Bench(Gone()).sweep.turn() == 0
+    assert Bench(Gone()).sweep.collect() == 0
     bench = Bench()
     bench.store.put("jobs/default/robot-0/0", b"nonsense")
     put(bench.store, JobRecord(state="done", owner="", marked_s=1.0))
-    assert bench.sweep.turn() == 1
+    assert bench.sweep.collect() == 1
     assert bench.names == ["jobs/default/robot-0/0"]

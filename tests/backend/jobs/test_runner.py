@@ -14,7 +14,7 @@ import pytest
 from rse_pf.backend.jobs.lease import JobLease, JobRecord, record_name
 from rse_pf.backend.jobs.runner import JobContext, JobOutcome, JobRequest, JobSignals, run_job
 from rse_pf.backend.jobs.slots import JobSlots, make_pipe
-from rse_pf.backend.sandbox.child import encoded
+from rse_pf.backend.sandbox.ipc import encode_message
 from rse_pf.config import ServingSettings
 from rse_pf.errors import Conflict, StoreError
 from rse_pf.object_store import MemoryStore, digest_of, object_name
@@ -37,7 +37,7 @@ class FakeProcess:
         self.killed = threading.Event()
         self._code = code
         for message in script:
-            self.theirs.sendall(encoded(message))
+            self.theirs.sendall(encode_message(message))
         if ends:
             self.theirs.close()
 
@@ -273,7 +273,7 @@ class Faulty(MemoryStore):
 
 
 def test_a_store_that_fails_for_a_moment_costs_no_job(bench):
-    bench.store = Faulty(2, lambda: bench.processes[0].theirs.sendall(encoded(DONE)))
+    bench.store = Faulty(2, lambda: bench.processes[0].theirs.sendall(encode_message(DONE)))
 
     assert code(bench.run(lambda: FakeProcess([], ends=False))) == "ok"
     assert bench.store.failures == 0

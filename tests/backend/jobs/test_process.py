@@ -7,7 +7,7 @@ import time
 
 import pytest
 
-from rse_pf.backend.jobs.spawn import JobProcess
+from rse_pf.backend.jobs.process import JobProcess
 
 pytestmark = pytest.mark.system
 
