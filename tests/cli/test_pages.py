@@ -46,9 +46,9 @@ def page(repository: Path, name: str) -> str:
 
 
 def commands(text: str) -> list[str]:
-    """Return the commands in the blocks of a page, without their remarks."""
+    """Return the commands in the blocks of a page, without comments and redirections."""
     lines = [line for language, block in BLOCK.findall(text) if not language for line in block.splitlines()]
-    return [line.partition(" #")[0].strip() for line in lines if line.strip()]
+    return [line.partition(" #")[0].partition(" > ")[0].strip() for line in lines if line.strip()]
 
 
 def parser_of(verb: str) -> Parser:

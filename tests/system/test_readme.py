@@ -18,7 +18,8 @@ pytestmark = pytest.mark.system
 
 def blocks(repository: Path, language: str) -> list[str]:
     text = (repository / "README.md").read_text(encoding="utf-8")
-    return re.findall(rf"```{language}\n(.*?)```", text, flags=re.DOTALL)
+    found = re.findall(r"^```(\w*)\n(.*?)^```", text, flags=re.DOTALL | re.MULTILINE)
+    return [block for kind, block in found if kind == language]
 
 
 def test_the_robot_in_ten_lines_gets_its_pose(repository, tmp_path, capsys):
