@@ -80,7 +80,7 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
     if args.action == "stop":
         from rse_pf.local.shutdown import stop_platform
 
-        stopped = stop_platform(folder, settings.local.stop_timeout_s)
+        stopped = stop_platform(folder)
         print(f"platform {args.name!r} {'is stopped' if stopped else 'was not running'}")
         return 0
     if args.action != "start":

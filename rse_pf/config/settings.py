@@ -143,7 +143,6 @@ class ScalingSettings:
     warm_up_s: int = setting(60, unit="s", doc="a new server's CPU does not count for this long", low=0)
     max_robots_per_server: int = setting(0, unit="robots", source="paper, Sect. 3.1", doc="add a server above this many robots each; 0 is off", low=0)
     max_queue_ms: float = setting(0.0, unit="ms", doc="add a server above this queue delay; 0 is off", low=0)
-    rebalance_percent: float = setting(20.0, unit="%", doc="crowded servers hand robots over until all are within this of even", low=0, high=100)
     moves_per_s: float = setting(20.0, unit="robots/s", doc="robots that one server asks to move each second when it is crowded", low=0.1)
 
 
@@ -161,7 +160,6 @@ class DataSettings:
     max_uploads: int = setting(32, doc="bodies received at once; more are told to come again", low=1)
     upload_ttl_s: int = setting(86400, unit="s", doc="an unfinished upload is forgotten after this", low=60)
     body_timeout_s: float = setting(10.0, unit="s", doc="longest silence within a body", low=0.1)
-    min_body_bytes_per_s: int = setting(1024, unit="bytes/s", doc="a slower body is refused", low=1)
     presigned_url_ttl_s: int = setting(300, unit="s", doc="a signed address of the bucket is good for so long", low=10, high=300)
     background_bytes_per_s: int = setting(262144, unit="bytes/s", doc="keyframes a robot sends beside its live poses", low=1024)
     max_spool_bytes: int = setting(1073741824, unit="bytes", doc="keyframes a robot keeps on its disk while offline", low=1024)
@@ -177,7 +175,6 @@ class AuthSettings:
     token_ttl_s: int = setting(900, unit="s", doc="life of a robot token", source="RFC 8725; short-lived", low=10, high=900)
     leeway_s: int = setting(30, unit="s", doc="clock difference that is forgiven", low=0, high=300)
     required: bool = setting(True, doc="robots without a token are refused")
-    audit_heads_s: float = setting(60.0, unit="s", doc="time between two looks of the control plane at the heads of the other audit logs", low=0.1)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -205,7 +202,6 @@ class LocalSettings:
     servers: int = setting(2, unit="servers", doc="backend servers at the start", low=1, high=64)
     workers: int = setting(1, doc="worker processes of each local server", low=1, high=64)
     start_timeout_s: float = setting(20.0, unit="s", doc="a server that is not ready by then failed", low=1)
-    stop_timeout_s: float = setting(10.0, unit="s", doc="a process that does not leave by then is killed", low=0.5)
     warm_standby: bool = setting(True, doc="keep one more process warm, about 60 MB, that becomes the next server at once", source="warm pools of AWS Auto Scaling")
     max_restarts_per_minute: int = setting(5, unit="servers", doc="replacements of servers that died young, in any minute", low=1)
     certificate: str = setting("", doc="file of the front door's certificate chain (PEM); with it robots dial wss://")

@@ -1,7 +1,7 @@
 """Run the data service: one process, uvicorn, a socket that is announced when all is ready.
 
 Promises to sweep up what a crash left behind before the first request, and to leave on SIGTERM and SIGINT
-with what it is doing done, at most `local.stop_timeout_s` later.
+with what it is doing done, at most `_STOP_TIMEOUT_S` seconds later.
 """
 
 from __future__ import annotations
@@ -31,6 +31,7 @@ __all__ = ["KeysFile", "serve_data"]
 
 _SWEEP_S = 3600.0
 _BACKLOG = 1024
+_STOP_TIMEOUT_S = 10
 
 
 class KeysFile:
@@ -83,7 +84,7 @@ def serve_data(
     config = uvicorn.Config(
         app, http=OneRequestProtocol, ws="none", lifespan="off", access_log=False, log_level="warning",
         backlog=_BACKLOG, server_header=False, date_header=False, proxy_headers=False,
-        timeout_keep_alive=30, timeout_graceful_shutdown=int(settings.local.stop_timeout_s),
+        timeout_keep_alive=30, timeout_graceful_shutdown=_STOP_TIMEOUT_S,
     )  # fmt: skip
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, _stay)  # uvicorn sends itself the signal again when it is done

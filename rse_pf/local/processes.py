@@ -19,9 +19,21 @@ from pathlib import Path
 
 from rse_pf.linux import die_with_parent
 
-__all__ = ["ProcessMark", "ended", "is_alive", "last_line", "mark_of", "send_signal", "spawn", "wait_ended"]
+__all__ = [
+    "STOP_TIMEOUT_S",
+    "ProcessMark",
+    "ended",
+    "is_alive",
+    "last_line",
+    "mark_of",
+    "send_signal",
+    "spawn",
+    "wait_ended",
+]
 
 _TAIL_BYTES = 8192
+STOP_TIMEOUT_S = 10.0
+"""A process that has not ended so long after it was asked to is killed."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -1,7 +1,6 @@
 """End a local platform from outside its control plane, also one whose control plane was killed.
 
-Promises to signal only processes that the state file names by pid and time of birth, and to leave
-nothing of them running.
+Only processes whose id and start time are in the state file are signalled, and none of them is left.
 """
 
 from __future__ import annotations
@@ -9,13 +8,13 @@ from __future__ import annotations
 import signal
 from pathlib import Path
 
-from rse_pf.local.processes import is_alive, send_signal, wait_ended
+from rse_pf.local.processes import STOP_TIMEOUT_S, is_alive, send_signal, wait_ended
 from rse_pf.local.state import read_state, remove_state
 
 __all__ = ["stop_platform"]
 
 
-def stop_platform(folder: Path, timeout_s: float) -> bool:
+def stop_platform(folder: Path, timeout_s: float = STOP_TIMEOUT_S) -> bool:
     """End the platform in *folder*, waiting *timeout_s* for each step; return whether anything ran.
 
     The control plane is asked first and ends its servers itself; then whatever is left is ended here.

@@ -11,25 +11,25 @@ import heapq
 import math
 from collections.abc import Mapping
 
-from rse_pf.config import ScalingSettings
+__all__ = ["MARGIN", "moves", "share"]
 
-__all__ = ["moves", "share"]
+MARGIN = 0.2
+"""Crowded servers hand robots over until all are within this share of even."""
 
 
-def moves(robots: Mapping[str, int], settings: ScalingSettings) -> dict[str, int]:
+def moves(robots: Mapping[str, int], margin: float = MARGIN) -> dict[str, int]:
     """Return how many robots each crowded server hands over; empty if none has to.
 
     Even is ``total / servers``.  When the robots that move land on the least crowded servers, all end within
-    ``scaling.rebalance_percent`` of even, or at the whole numbers around even where the margin holds none.
+    *margin* of even, or at the whole numbers around even where the margin holds none.
 
     Args:
         robots: Robots of each server that may take and give, by name; none may be negative.
-        settings: The margin.
+        margin: A share of even.
     """
     if len(robots) < 2:
         return {}
     total, servers = sum(robots.values()), len(robots)
-    margin = settings.rebalance_percent / 100
     lowest, highest = _lowest(total, servers, margin), _highest(total, servers, margin)
     missing = sum(max(0, lowest - n) for n in robots.values())
     given = {name: n - highest for name, n in robots.items() if n > highest}
@@ -42,7 +42,7 @@ def moves(robots: Mapping[str, int], settings: ScalingSettings) -> dict[str, int
     return given
 
 
-def share(mine: int, total: int, servers: int, settings: ScalingSettings) -> int:
+def share(mine: int, total: int, servers: int, margin: float = MARGIN) -> int:
     """Return how many of its *mine* robots one server hands over, knowing only the sums.
 
     It must assume that every other server but one is as crowded as itself, and that this one misses all that
@@ -52,11 +52,10 @@ def share(mine: int, total: int, servers: int, settings: ScalingSettings) -> int
         mine: Robots of this server.
         total: Robots of all servers, this one included.
         servers: How many take and give, this one included.
-        settings: The margin.
+        margin: A share of even.
     """
     if servers < 2:
         return 0
-    margin = settings.rebalance_percent / 100
     return max(0, mine - _highest(total, servers, margin / (servers - 1)))
 
 

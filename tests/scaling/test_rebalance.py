@@ -9,10 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rse_pf.config import ScalingSettings
-from rse_pf.scaling.rebalance import moves, share
+from rse_pf.scaling.rebalance import MARGIN, moves, share
 
-SETTINGS = ScalingSettings()
 fleets = st.lists(st.integers(0, 400), min_size=2, max_size=12).map(
     lambda counts: {f"server-{i + 1}": n for i, n in enumerate(counts)}
 )
@@ -36,50 +34,49 @@ def even_range(robots: dict[str, int], percent: float) -> tuple[int, int]:
 def test_a_new_server_gets_its_share_after_a_scale_out() -> None:
     robots = {"server-1": 50, "server-2": 50, "server-3": 0}
 
-    handed = moves(robots, SETTINGS)
+    handed = moves(robots)
 
     assert handed == {"server-1": 14, "server-2": 13} or handed == {"server-1": 13, "server-2": 14}
 
 
 def test_nothing_moves_within_a_fifth_of_even() -> None:
-    assert moves({"server-1": 40, "server-2": 60}, SETTINGS) == {}
-    assert moves({"server-1": 39, "server-2": 61}, SETTINGS) == {"server-2": 1}
+    assert moves({"server-1": 40, "server-2": 60}) == {}
+    assert moves({"server-1": 39, "server-2": 61}) == {"server-2": 1}
 
 
 @pytest.mark.parametrize("robots", [{}, {"server-1": 100}, {"server-1": 0, "server-2": 0}])
 def test_nobody_to_move_or_nowhere_to_go_means_no_moves(robots: dict[str, int]) -> None:
-    assert moves(robots, SETTINGS) == {}
+    assert moves(robots) == {}
 
 
 def test_one_robot_more_than_the_others_is_even() -> None:
-    assert moves({"server-1": 2, "server-2": 1}, SETTINGS) == {}
-    assert moves({"server-1": 2, "server-2": 0}, SETTINGS) == {"server-1": 1}
+    assert moves({"server-1": 2, "server-2": 1}) == {}
+    assert moves({"server-1": 2, "server-2": 0}) == {"server-1": 1}
 
 
 @given(fleets, st.floats(0, 100))
 def test_all_end_within_the_margin_in_one_round_and_then_nothing_moves(
     robots: dict[str, int], percent: float
 ) -> None:
-    settings = ScalingSettings(rebalance_percent=percent)
     low, high = even_range(robots, percent)
 
-    handed = moves(robots, settings)
+    handed = moves(robots, percent / 100)
     after = settled(robots, handed)
 
     assert sum(after.values()) == sum(robots.values())
     assert all(0 < n <= robots[name] for name, n in handed.items())
     assert low <= min(after.values())
     assert max(after.values()) <= high
-    assert moves(after, settings) == {}
+    assert moves(after, percent / 100) == {}
 
 
 @given(fleets)
 def test_no_more_robots_move_than_must(robots: dict[str, int]) -> None:
-    low, high = even_range(robots, SETTINGS.rebalance_percent)
+    low, high = even_range(robots, 100 * MARGIN)
     must_leave = sum(max(0, n - high) for n in robots.values())
     must_arrive = sum(max(0, low - n) for n in robots.values())
 
-    assert sum(moves(robots, SETTINGS).values()) == max(must_leave, must_arrive)
+    assert sum(moves(robots).values()) == max(must_leave, must_arrive)
 
 
 @given(fleets, st.integers(0, 2**32))
@@ -88,7 +85,7 @@ def test_it_converges_when_each_robot_goes_to_the_better_of_two_random_servers(
 ) -> None:
     draw, now = random.Random(seed), dict(robots)
     for _ in range(200):
-        handed = moves(now, SETTINGS)
+        handed = moves(now)
         if not handed:
             break
         for name, n in handed.items():
@@ -98,33 +95,33 @@ def test_it_converges_when_each_robot_goes_to_the_better_of_two_random_servers(
                     now[name] -= 1
                     now[better] += 1
 
-    assert moves(now, SETTINGS) == {}
+    assert moves(now) == {}
     assert sum(now.values()) == sum(robots.values())
 
 
 @given(st.integers(0, 500), st.integers(0, 500))
 def test_of_two_servers_each_knows_as_much_as_the_control_plane(a: int, b: int) -> None:
-    handed = moves({"a": a, "b": b}, SETTINGS)
+    handed = moves({"a": a, "b": b})
 
     # Whole numbers: the lower border may ask for one robot more than the upper one.
-    assert 0 <= handed.get("a", 0) - share(a, a + b, 2, SETTINGS) <= 1
-    assert 0 <= handed.get("b", 0) - share(b, a + b, 2, SETTINGS) <= 1
+    assert 0 <= handed.get("a", 0) - share(a, a + b, 2) <= 1
+    assert 0 <= handed.get("b", 0) - share(b, a + b, 2) <= 1
 
 
 @given(fleets)
 def test_servers_that_know_only_the_sums_fill_up_an_empty_one_and_then_stop(robots: dict[str, int]) -> None:
     total, servers = sum(robots.values()), len(robots)
-    handed = {name: share(n, total, servers, SETTINGS) for name, n in robots.items()}
+    handed = {name: share(n, total, servers) for name, n in robots.items()}
 
     after = settled(robots, handed)
 
-    assert all(share(n, total, servers, SETTINGS) == 0 for n in after.values())
+    assert all(share(n, total, servers) == 0 for n in after.values())
     even = total / servers
     assert min(after.values()) >= math.floor(even - 0.2 * even - (servers - 1) - 1e-9)
 
 
 def test_one_server_alone_hands_nothing_over() -> None:
-    assert share(100, 100, 1, SETTINGS) == 0
+    assert share(100, 100, 1) == 0
 
 
 @pytest.mark.parametrize("servers", [2, 3, 5, 8])
@@ -132,6 +129,6 @@ def test_an_empty_server_beside_full_ones_gets_four_fifths_of_even_whoever_decid
     robots = {"new": 0} | {f"server-{i}": 100 * servers for i in range(servers - 1)}
     total = sum(robots.values())
 
-    after = settled(robots, {name: share(n, total, servers, SETTINGS) for name, n in robots.items()})
+    after = settled(robots, {name: share(n, total, servers) for name, n in robots.items()})
 
     assert min(after.values()) >= 0.8 * total / servers - (servers - 1)

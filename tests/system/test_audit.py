@@ -14,7 +14,7 @@ import pytest
 from guarded_server import GuardedServer
 
 from rse_pf.audit.chain import Entry
-from rse_pf.audit.log import audit_folder, files_of, names_in
+from rse_pf.audit.log import audit_folder, chain_names, files_of
 from rse_pf.audit.verify import check_folder, entries_of
 from rse_pf.cli.main import main
 from rse_pf.config import PlatformSettings
@@ -54,7 +54,7 @@ async def test_a_server_records_who_came_in_and_who_was_refused_and_no_token(tmp
         audit, good = tmp_path / "audit", server.token("robot-1")
         assert (await server.handshake(b"Bearer " + good.encode()))[0] == 101
         assert (await server.handshake(b"Bearer " + good[:-4].encode() + b"AAAA"))[0] == 401
-        server.room.change_denied(lambda denied: denied.with_robot("default", "robot-1", time.time()))
+        server.room.change_deny_list(lambda denied: denied.with_robot("default", "robot-1", time.time()))
 
         def tokens() -> list[str]:
             return [entry.action for entry in entries(audit, "guarded") if entry.action.startswith("auth")]
@@ -101,21 +101,14 @@ async def test_a_platform_records_its_deeds_its_robots_its_operator_and_the_head
 ):
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
     state = tmp_path / "rse-pf" / "audited"
-    settings = PlatformSettings.from_dict({"auth": {"audit_heads_s": 0.1}})
     audit = audit_folder(state)
-    async with LocalPlatform(settings, state=state, servers=1, port=0, data=True) as cloud:
+    async with LocalPlatform(PlatformSettings(), state=state, servers=1, port=0, data=True) as cloud:
         from client_sdk import connect
 
         async with connect(cloud.url, token=cloud.issue_token("robot-1")):
             pass
         assert await asyncio.to_thread(main, ["robot", "disable", "robot-7", "--name", "audited"]) == 0
-        (server,) = [who for who in names_in(audit) if who.startswith("server-")]
-
-        def heads() -> set[str]:
-            told = [entry.detail for entry in entries(audit, "control-plane") if entry.action == "log.heads"]
-            return {name for detail in told for name in detail}
-
-        await until(lambda: {server, "operator"} <= heads(), heads)
+        (server,) = [who for who in chain_names(audit) if who.startswith("server-")]
         assert main(["audit", "verify", "--name", "audited"]) == 0
 
     assert {entry.subject for entry in entries(audit, server) if entry.action == "auth.accepted"} == {
@@ -124,6 +117,8 @@ async def test_a_platform_records_its_deeds_its_robots_its_operator_and_the_head
     assert [(entry.action, entry.subject) for entry in entries(audit, "operator")] == [
         ("robot.disabled", "robot-7")
     ]
+    told = [entry.detail for entry in entries(audit, "control-plane") if entry.action == "log.heads"]
+    assert {server, "operator"} <= {name for detail in told for name in detail}
     deeds = {entry.action for entry in entries(audit, "control-plane")}
     assert {"platform.platform-ready", "platform.server-ready", "platform.over"} <= deeds
     assert {verdict.problem for verdict in check_folder(audit)} == {""}

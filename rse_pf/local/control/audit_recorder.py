@@ -15,7 +15,6 @@ from typing import Any
 
 from rse_pf.audit.chain import HEADS, Note, Value
 from rse_pf.audit.log import AuditLog, audit_folder, chain_names, newest_head
-from rse_pf.config import AuthSettings
 
 __all__ = ["PlatformAudit"]
 
@@ -23,19 +22,19 @@ _WHO = "control-plane"
 _MAX_HEADS = 50
 """In one entry."""
 _WAIT_S = 2.0
+HEADS_S = 60.0
+"""Time between two looks at the heads of the other audit logs."""
 
 
 class PlatformAudit:
     """The log of one control plane, between `open` and `close`."""
 
-    def __init__(self, state: Path, settings: AuthSettings) -> None:
+    def __init__(self, state: Path, heads_s: float = HEADS_S) -> None:
         self.folder = audit_folder(state)
-        self._settings = settings
+        self._heads_s = heads_s
         self._is_open = False
         self._told: dict[str, str] = {}
-        self._log = AuditLog(
-            self.folder, _WHO, wall_clock=time.time,
-        )  # fmt: skip
+        self._log = AuditLog(self.folder, _WHO, wall_clock=time.time)
 
     def open(self) -> None:
         """Begin to record; raises ConfigurationError."""
@@ -52,7 +51,7 @@ class PlatformAudit:
     async def watch(self) -> None:
         """Record the heads of the other chains again and again, until cancelled."""
         while True:
-            await asyncio.sleep(self._settings.audit_heads_s)
+            await asyncio.sleep(self._heads_s)
             await asyncio.to_thread(self.look)
 
     def look(self) -> None:
