@@ -139,7 +139,8 @@ class JobManager:
 
     def waiting_of(self, robot: str) -> int:
         """Return how many commands of *robot* have no answer yet."""
-        return sum(len(entry.waiters) for entry in self._entries.values() if entry.request.robot == robot)
+        entries = [entry for entry in self._entries.values() if entry.request.robot == robot]
+        return sum(len(entry.waiters) + len(entry.resubmitted) for entry in entries)
 
     def withdraw(self, connection: Any, identity: int) -> None:
         """Cancel one command; its job ends unless another command waits for it."""

@@ -75,7 +75,7 @@ class SandboxManager:
         """
         self._policy = SandboxPolicy(
             {service.name: service.kind for service in services},
-            settings,
+            settings.services,
             max_sandboxes=max_sandboxes,
             keeps_snapshots=store is not None,
         )

@@ -22,7 +22,7 @@ from typing import Any, Literal
 from rse_pf.backend.sandbox.circuit_breaker import CircuitBreaker
 from rse_pf.backend.sandbox.ipc import encode_message
 from rse_pf.backend.scheduling.scheduler import QueuedCommand
-from rse_pf.config import PlatformSettings
+from rse_pf.config import ServiceSettings
 from rse_pf.errors import Busy, Conflict, Expired, Poison, RsePfError, StoreError, WorkerLost
 from rse_pf.service import Kind
 
@@ -175,7 +175,7 @@ class SandboxPolicy:
     def __init__(
         self,
         kinds: Mapping[str, Kind],
-        settings: PlatformSettings,
+        settings: ServiceSettings,
         *,
         max_sandboxes: int,
         keeps_snapshots: bool,
@@ -190,10 +190,10 @@ class SandboxPolicy:
         """
         self.counts: Counter[str] = Counter()
         self._kinds = kinds
-        self._settings = settings.services
+        self._settings = settings
         self._max_sandboxes = max_sandboxes
         self._keeps_snapshots = keeps_snapshots
-        self._breaker = CircuitBreaker(settings.services)
+        self._breaker = CircuitBreaker(settings)
         self._sandboxes: dict[int, _Sandbox] = {}
         self._by_robot: dict[str, _Sandbox] = {}
         self._connections: Counter[str] = Counter()

@@ -36,7 +36,9 @@ def make_policy(*, max_sandboxes: int = 4, keeps_snapshots: bool = True, **servi
         **services,
     }  # fmt: skip
     settings = PlatformSettings.from_dict({"services": limits})
-    policy = SandboxPolicy(KINDS, settings, max_sandboxes=max_sandboxes, keeps_snapshots=keeps_snapshots)
+    policy = SandboxPolicy(
+        KINDS, settings.services, max_sandboxes=max_sandboxes, keeps_snapshots=keeps_snapshots
+    )
     for robot in "abc":
         policy.connected(robot)
     return policy
