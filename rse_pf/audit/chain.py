@@ -1,9 +1,8 @@
-"""What was done, by whom and when, as a chain in which nothing can be changed, moved or left out unseen.
+"""The hash chain of the audit log: what was done, by whom and when, protected against unnoticed changes.
 
-Each entry names the hash of the one before it.  Promises no clock and no file (`rse_pf.audit.log` has
-them), that an entry is bounded and never holds a token, and that `Chain` names the first entry that is
-wrong.  What it cannot see by itself is an end that was cut off or written anew: for that, heads are kept
-elsewhere.
+Each entry holds the hash of the previous one, has a bounded size and never contains a token.  `Chain` reports
+the first entry that was changed, moved or removed.  A truncated or rewritten end is only detected by a head
+that is stored elsewhere.  Files and clocks are in `rse_pf.audit.log`.
 
 Source: S. Haber, W. S. Stornetta, "How to time-stamp a digital document", 1991 (linking).
 """
@@ -17,6 +16,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import msgspec
+
+from rse_pf.wire.rate_limit import TokenBucket
 
 __all__ = [
     "CONTINUED",
@@ -39,13 +40,13 @@ __all__ = [
 Value = str | int | float | bool | None
 
 CONTINUED, GAP, HEADS = "log.continued", "log.gap", "log.heads"
-"""Actions of the log itself: a new file of the same chain, entries that were lost, heads of other chains."""
+"""Actions of the log itself: a new file of the chain, lost entries, heads of other chains."""
 
-_MAX_LETTERS, _MAX_DETAILS, _MAX_NUMBER = 200, 64, 2**53
+_MAX_CHARACTERS, _MAX_DETAILS, _MAX_NUMBER = 200, 64, 2**53
 _TOKEN = re.compile(r"eyJ[\w-]{5,}\.[\w.-]+")
 _encode = msgspec.json.Encoder(order="sorted").encode
-"""Keys in order, no space, UTF-8: with the same text, every reader makes the same bytes."""
-_HEAD_WORD = re.compile(r"(\d{1,15}):([0-9a-f]{64})")
+"""Canonical JSON: keys in order, no spaces, UTF-8."""
+_HEAD = re.compile(r"(\d{1,15}):([0-9a-f]{64})")
 REFUSALS_PER_S = 2.0
 REFUSAL_BURST = 50
 """Refused tokens that one writer records one by one, in the long run and at once; the rest are counted."""
@@ -63,12 +64,12 @@ class Head:
 
 
 GENESIS = Head(0, "0" * 64)
-"""What the first entry of a chain follows."""
+"""The head before the first entry of a chain."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Note:
-    """Something to be recorded.  ``time`` is in Unix seconds; names and reasons alone, nothing secret."""
+    """An action to be recorded, without secrets; ``time`` is in Unix seconds."""
 
     time: float
     actor: str
@@ -91,14 +92,14 @@ class Entry(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
 
     @property
     def head(self) -> Head:
-        """The head of a chain that ends here."""
+        """The head of a chain that ends with this entry."""
         return Head(self.seq, self.hash)
 
 
 def next_entry(head: Head, note: Note) -> Entry:
-    """Return *note* as the entry after *head*; long words are cut, what looks like a token is hidden."""
+    """Return *note* as the entry after *head*; long strings are cut, what looks like a token is masked."""
     details = list(note.detail.items())[:_MAX_DETAILS]
-    open_entry = Entry(
+    unsealed = Entry(
         seq=head.seq + 1,
         time=round(float(note.time), 3),
         actor=_safe(note.actor),
@@ -108,65 +109,59 @@ def next_entry(head: Head, note: Note) -> Entry:
         previous=head.hash,
         hash="",
     )
-    return msgspec.structs.replace(open_entry, hash=_hash_of(open_entry))
+    return msgspec.structs.replace(unsealed, hash=_hash_of(unsealed))
 
 
 def line_of(entry: Entry) -> bytes:
-    """Return the one way to write *entry*: canonical JSON and a newline."""
-    return _canonical(msgspec.structs.asdict(entry)) + b"\n"
+    """Return *entry* as canonical JSON with a newline."""
+    return _encode(msgspec.structs.asdict(entry)) + b"\n"
 
 
 def parse_head(text: str) -> Head | None:
-    """Return the head that ``str`` made *text* of; None if it is none."""
-    found = _HEAD_WORD.fullmatch(text)
+    """Return the head whose string form is *text*, None if it is not one."""
+    found = _HEAD.fullmatch(text)
     return None if found is None else Head(int(found[1]), found[2])
 
 
 class Chain:
-    """Reads the lines of one chain, in order, and knows whether each follows the one before."""
+    """Check that each line of a chain follows the previous one."""
 
     def __init__(self, head: Head | None = GENESIS) -> None:
-        """Begin behind *head*; None believes what the first entry says."""
+        """Start after *head*; None accepts any first entry."""
         self.head = head
 
     def add(self, line: bytes) -> Entry | str:
-        """Return the entry in *line*, or what is wrong with it; a wrong line is not gone past."""
+        """Return the entry in *line*, or what is wrong with it; a wrong line does not advance the chain."""
         number = "this entry" if self.head is None else f"entry {self.head.seq + 1}"
         try:
             entry = msgspec.json.decode(line, type=Entry)
-            is_written_so = line_of(entry) == line
+            is_canonical = line_of(entry) == line
         except (msgspec.DecodeError, UnicodeDecodeError, ValueError, RecursionError):
             return f"{number} is not readable: the line was changed"
-        if not is_written_so or entry.hash != _hash_of(entry):
-            return f"{number} was changed: its hash is not that of what it says"
+        if not is_canonical or entry.hash != _hash_of(entry):
+            return f"{number} was changed: its hash does not match its content"
         if self.head is not None and (entry.seq, entry.previous) != (self.head.seq + 1, self.head.hash):
-            return f"{number} is missing or was changed: entry {entry.seq} stands in its place"
+            return f"{number} is missing or was changed: entry {entry.seq} is in its place"
         self.head = entry.head
         return entry
 
 
 class RefusalLimiter:
-    """How many refusals are written one by one; the rest are counted, so that a flood fills no disk."""
+    """Decide which refusals are recorded one by one; the rest is counted, so that a flood fills no disk."""
 
-    def __init__(self, per_s: float = REFUSALS_PER_S, burst: float = REFUSAL_BURST) -> None:
+    def __init__(self, per_s: float, burst: float) -> None:
         self.counted: dict[str, int] = {}
-        self._per_s = per_s
-        self._burst = burst
-        self._room = burst
-        self._at_s = float("-inf")
+        self._bucket = TokenBucket(per_s, burst)
 
     def take(self, reason: str, now_s: float) -> bool:
-        """Return whether this one is written; if not, it is counted under *reason*."""
-        self._room = min(self._burst, self._room + max(0.0, now_s - self._at_s) * self._per_s)
-        self._at_s = max(now_s, self._at_s)
-        if self._room >= 1:
-            self._room -= 1
+        """Return whether to record this refusal; otherwise it is counted under *reason*."""
+        if not self._bucket.take(now_s):
             return True
         self.counted[reason] = self.counted.get(reason, 0) + 1
         return False
 
     def summary(self) -> dict[str, int]:
-        """Return and forget what was counted."""
+        """Return the counts since the last summary, and reset them."""
         counted, self.counted = self.counted, {}
         return counted
 
@@ -177,15 +172,11 @@ def _plain(value: Value) -> Value:
 
 
 def _safe(text: str) -> str:
-    shown = text[: 4 * _MAX_LETTERS].encode("utf-8", "replace").decode()
-    return _TOKEN.sub("(a token)", shown)[:_MAX_LETTERS]
+    shown = text[: 4 * _MAX_CHARACTERS].encode("utf-8", "replace").decode()
+    return _TOKEN.sub("(a token)", shown)[:_MAX_CHARACTERS]
 
 
 def _hash_of(entry: Entry) -> str:
     fields = msgspec.structs.asdict(entry)
     del fields["hash"]
-    return hashlib.sha256(_canonical(fields)).hexdigest()
-
-
-def _canonical(fields: Mapping[str, object]) -> bytes:
-    return _encode(fields)
+    return hashlib.sha256(_encode(fields)).hexdigest()

@@ -1,8 +1,8 @@
-"""Write an audit log to a folder, and read what is there.
+"""The files of the audit log: write one chain, and read any.
 
-One chain has one writer: ``WHO.jsonl``, whose older files are ``WHO.FIRST.jsonl``.  Promises that `record`
-never waits for a disk, that what `flush` returned from is on it, that no entry is rewritten, and that a
-chain goes on where a crash broke off, naming what was there.
+One chain has one writer.  It writes ``WHO.jsonl``; its older files are ``WHO.FIRST.jsonl``.  Recording never
+waits for a disk; entries are durable when `AuditLog.flush` returns.  After a crash the chain continues
+with an entry that says how its last file ended.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ import re
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
+from enum import Enum, auto
 from pathlib import Path
 
 from rse_pf.audit.chain import (
@@ -45,19 +46,41 @@ __all__ = [
 
 _FILE = re.compile(r"(?P<who>[A-Za-z0-9_-]{1,64})(\.(?P<first>\d{12}))?\.jsonl")
 _UNSAFE = re.compile(r"[^A-Za-z0-9_-]")
-_MAX_HELD = 20_000
+_MAX_BUFFERED = 20_000
 _MAX_ENTRY_BYTES = 1 << 18
-"""Longer than any entry: 64 details of two words of 200 letters, each letter six bytes at worst."""
-_WAIT_S = 5.0
-_LOOK_AGAIN_S = 0.01
+"""Above the size of any entry: 64 details of two strings of 200 characters, six bytes each at worst."""
+_LOCK_TIMEOUT_S = 5.0
+_LOCK_POLL_S = 0.01
 MAX_FILE_BYTES = 16 << 20
 """A file that has grown longer is set aside, and the chain goes on in the next."""
 SYNC_S = 0.1
 """An entry is on the disk after this."""
 
 
+class _Ending(Enum):
+    """How the current file of a chain ends."""
+
+    EMPTY = auto()
+    """It is missing or empty: the writer stopped between two files."""
+    COMPLETE = auto()
+    TORN = auto()
+    """The last line is incomplete."""
+    TORN_FIRST_LINE = auto()
+    """The only line is incomplete."""
+    UNREADABLE = auto()
+    """The last complete line is not an entry."""
+
+
+_REASONS = {
+    _Ending.EMPTY: "interrupted",
+    _Ending.TORN: "torn",
+    _Ending.TORN_FIRST_LINE: "torn",
+    _Ending.UNREADABLE: "unreadable",
+}
+
+
 class AuditLog:
-    """The one writer of the chain *who* in *folder*."""
+    """The only writer of the chain *who* in *folder*."""
 
     def __init__(
         self,
@@ -67,17 +90,19 @@ class AuditLog:
         wall_clock: Callable[[], float],
         max_bytes: int = MAX_FILE_BYTES,
         sync_s: float = SYNC_S,
+        max_buffered: int = _MAX_BUFFERED,
         on_problem: Callable[[str], None] = lambda problem: None,
     ) -> None:
-        """Describe a log; nothing is opened.
+        """Describe a log; nothing is opened yet.
 
         Args:
-            folder: Made if it is not there, with mode 0700.
+            folder: Created with mode 0700 if it is missing.
             who: Names the writer; letters that a file name may not have become ``_``.
             wall_clock: Unix seconds.
             max_bytes: A file that has grown longer is set aside, and the chain goes on in the next.
             sync_s: How long an entry may wait for the disk.
-            on_problem: Gets a sentence, once, when writing fails.
+            max_buffered: How many entries may wait for the disk; further ones are dropped and counted.
+            on_problem: Called once with a sentence when writing fails.
         """
         self.who = _UNSAFE.sub("_", who)[:64]
         self.head = GENESIS
@@ -86,21 +111,22 @@ class AuditLog:
         self._wall_clock = wall_clock
         self._max_bytes = max_bytes
         self._sync_s = sync_s
+        self._max_buffered = max_buffered
         self.on_problem = on_problem
         self._failed = False
-        self._held: list[Note] = []
-        self._guard, self._writing = threading.Lock(), threading.Lock()
-        self._wake, self._over = threading.Event(), threading.Event()
+        self._buffered: list[Note] = []
+        self._buffer_lock, self._writing = threading.Lock(), threading.Lock()
+        self._wake, self._closed = threading.Event(), threading.Event()
         self._thread: threading.Thread | None = None
         self._lock = self._fd = -1
         self._size = 0
         self._first = 1
 
     def open(self, wait_s: float = 0.0) -> AuditLog:
-        """Take the log, and continue its chain.
+        """Lock the log, and continue its chain.
 
         Raises:
-            ConfigurationError: The folder cannot be used, or another process writes this log, also after
+            ConfigurationError: The folder cannot be used, or another process still writes this log after
                 *wait_s*.
         """
         try:
@@ -124,12 +150,12 @@ class AuditLog:
     def record(
         self, action: str, subject: str = "", *, actor: str = "", at_s: float | None = None, **detail: Value
     ) -> None:
-        """Hold an entry for the next flush; what does not fit into memory is counted.
+        """Buffer an entry for the next flush; entries beyond the buffer's limit are dropped and counted.
 
         Args:
             action: What was done, as ``room.verb``.
-            subject: To whom or to what.
-            actor: Who did it; this writer, if empty.
+            subject: The object of the action.
+            actor: Who did it; empty for this writer.
             at_s: Unix seconds; now, if None.
             **detail: Names, numbers and reasons.
         """
@@ -137,20 +163,20 @@ class AuditLog:
         self.add([Note(time=when, actor=actor or self.who, action=action, subject=subject, detail=detail)])
 
     def add(self, notes: Iterable[Note]) -> None:
-        """Hold several."""
-        with self._guard:
+        """Buffer several entries."""
+        with self._buffer_lock:
             for note in notes:
-                if len(self._held) >= _MAX_HELD:
+                if len(self._buffered) >= self._max_buffered:
                     self.dropped += 1
                 else:
-                    self._held.append(note)
+                    self._buffered.append(note)
         self._wake.set()
 
     def flush(self) -> None:
-        """Write what is held and wait until it is on the disk; on failure it is held on."""
+        """Write the buffered entries and wait until they are on the disk; on failure they stay buffered."""
         with self._writing:
-            with self._guard:
-                notes, self._held = self._held, []
+            with self._buffer_lock:
+                notes, self._buffered = self._buffered, []
                 dropped, self.dropped = self.dropped, 0
             if dropped:
                 now = self._wall_clock()
@@ -161,17 +187,17 @@ class AuditLog:
                 self._write(notes)
                 self._failed = False
             except OSError as error:
-                with self._guard:
-                    self._held = [note for note in notes if note.action != GAP] + self._held
-                    self.dropped += dropped + max(0, len(self._held) - _MAX_HELD)
-                    del self._held[_MAX_HELD:]
+                with self._buffer_lock:
+                    self._buffered = [note for note in notes if note.action != GAP] + self._buffered
+                    self.dropped += dropped + max(0, len(self._buffered) - self._max_buffered)
+                    del self._buffered[self._max_buffered :]
                 if not self._failed:
                     self._failed = True
                     self.on_problem(f"the audit log of {self.who} cannot be written: {error.strerror}")
 
     def close(self) -> None:
-        """Write what is held, and let go of the log."""
-        self._over.set()
+        """Write the buffered entries, and unlock the log."""
+        self._closed.set()
         self._wake.set()
         if self._thread is not None:
             self._thread.join()
@@ -193,33 +219,30 @@ class AuditLog:
                         f"another process writes the audit log {self.who} in {self._folder}",
                         hint="give each server a name or a folder of its own",
                     ) from error
-            time.sleep(_LOOK_AGAIN_S)  # a lock with a time limit: flock has none of its own
+            time.sleep(_LOCK_POLL_S)  # flock has no time limit of its own
 
     def _continue(self) -> None:
-        """Find the head, and set aside a file that a crash left in the middle of a line."""
+        """Find the head of the chain, and rename a current file that cannot be continued."""
         current = self._current
         older = [path for path in files_of(self._folder, self.who) if path != current]
         last = next((entry for path in reversed(older) if (entry := _last_entry(path)) is not None), None)
         if last is not None:
             self.head = last.head
         self._first = self.head.seq + 1
-        reason = "interrupted" if older else ""
-        if current.exists():
-            found, is_whole = _last_entry(current), _ends_whole(current)
-            if found is not None and is_whole:
-                self.head, self._first, reason = found.head, _first_seq(current, found), ""
-            elif found is not None:
-                self.head, reason = found.head, "torn"
-                self._set_aside(_first_seq(current, found))
-            elif current.stat().st_size and _is_one_line(current):
-                reason = "torn"
-                current.replace(_free(self._folder / f"{self.who}.{self._first:012d}.torn"))
-            elif current.stat().st_size:
-                reason = "unreadable"  # it stays in the chain, so that nobody overlooks it
-                self._set_aside(self._first)
+        ending = _ending_of(current)
+        newest = _last_entry(current) if ending in (_Ending.COMPLETE, _Ending.TORN) else None
+        if newest is not None:
+            self.head, self._first = newest.head, _first_seq(current, newest)
+        if ending in (
+            _Ending.TORN,
+            _Ending.UNREADABLE,
+        ):  # an unreadable file stays in the chain, to be noticed
+            self._set_aside(self._first)
+        elif ending is _Ending.TORN_FIRST_LINE:
+            current.replace(_free(self._folder / f"{self.who}.{self._first:012d}.torn"))
         self._open_file()
-        if reason:
-            self._say_continued(reason)
+        if ending is not _Ending.COMPLETE and (older or ending is not _Ending.EMPTY):
+            self._record_continued(_REASONS[ending])
 
     def _write(self, notes: list[Note]) -> None:
         head, lines = self.head, []
@@ -235,21 +258,23 @@ class AuditLog:
             os.fsync(self._fd)
         except OSError:
             with contextlib.suppress(OSError):
-                os.ftruncate(self._fd, self._size)  # nobody was told that these are written
+                os.ftruncate(self._fd, self._size)  # these entries were not reported as written
             raise
         self.head, self._size = head, self._size + len(data)
         if self._size > self._max_bytes:
             os.close(self._fd)
             self._set_aside(self._first)
             self._open_file()
-            self._say_continued("rotated")
+            self._record_continued("rotated")
 
-    def _say_continued(self, reason: str) -> None:
+    def _record_continued(self, reason: str) -> None:
         self._first = self.head.seq + 1
         note = Note(
-            time=self._wall_clock(), actor=self.who, action=CONTINUED,
+            time=self._wall_clock(),
+            actor=self.who,
+            action=CONTINUED,
             detail={"reason": reason, "head": str(self.head)},
-        )  # fmt: skip
+        )
         entry = next_entry(self.head, note)
         os.write(self._fd, line_of(entry))
         os.fsync(self._fd)
@@ -257,7 +282,7 @@ class AuditLog:
 
     def _set_aside(self, first: int) -> None:
         while (place := self._folder / f"{self.who}.{first:012d}.jsonl").exists():
-            first += 1  # only where a chain is broken already
+            first += 1  # only if the chain is broken already
         self._current.replace(place)
 
     def _open_file(self) -> None:
@@ -276,27 +301,27 @@ class AuditLog:
         return self._folder / f"{self.who}.jsonl"
 
     def _write_on(self) -> None:
-        while not self._over.is_set():
+        while not self._closed.is_set():
             self._wake.wait()
-            self._over.wait(self._sync_s)
+            self._closed.wait(self._sync_s)
             self._wake.clear()
             self.flush()
             if self._failed:
-                self._wake.set()  # try again, at the same pace
+                self._wake.set()  # retry after the same interval
 
 
 def record_once(
     folder: Path, who: str, action: str, subject: str = "", *, wall_clock: Callable[[], float],
     max_bytes: int = MAX_FILE_BYTES, **detail: Value,
 ) -> None:  # fmt: skip
-    """Open the log, write one entry, and close it: for commands of an operator; raises ConfigurationError."""
-    log = AuditLog(folder, who, wall_clock=wall_clock, max_bytes=max_bytes, sync_s=0.0).open(_WAIT_S)
+    """Open the log, write one entry and close it; raises ConfigurationError."""
+    log = AuditLog(folder, who, wall_clock=wall_clock, max_bytes=max_bytes, sync_s=0.0).open(_LOCK_TIMEOUT_S)
     log.add([Note(time=wall_clock(), actor=who, action=action, subject=subject, detail=detail)])
     log.close()
 
 
 def audit_folder(state: Path) -> Path:
-    """Return where the platform whose files lie in *state* keeps its audit logs."""
+    """Return the folder of the audit logs of the platform with the state folder *state*."""
     return state / "audit"
 
 
@@ -317,16 +342,16 @@ def files_of(folder: Path, who: str) -> list[Path]:
 
 
 def lines_of(path: Path) -> Iterator[bytes]:
-    """Yield the lines of a file with their newlines; the last one may have none, a huge one is cut."""
+    """Yield the lines of a file with their newlines; the last may lack it, an overlong one is split."""
     with path.open("rb") as file:
         while line := file.readline(_MAX_ENTRY_BYTES):
             yield line
 
 
 def newest_head(folder: Path, who: str) -> Head | None:
-    """Return the head of a chain that may be written meanwhile; None if it has no entry."""
+    """Return the head of a chain that may still be written; None if it has no entry."""
     for path in reversed(files_of(folder, who)):
-        with contextlib.suppress(OSError):  # it was set aside this very moment
+        with contextlib.suppress(OSError):  # the file was renamed meanwhile
             entry = _last_entry(path)
             if entry is not None:
                 return entry.head
@@ -334,7 +359,7 @@ def newest_head(folder: Path, who: str) -> Head | None:
 
 
 def _last_entry(path: Path) -> Entry | None:
-    """Return the last whole entry near the end of a file."""
+    """Return the last complete entry of a file, None if there is none near its end."""
     with path.open("rb") as file:
         size = file.seek(0, os.SEEK_END)
         file.seek(max(0, size - _MAX_ENTRY_BYTES))
@@ -348,16 +373,15 @@ def _first_seq(path: Path, last: Entry) -> int:
     return first.seq if isinstance(first, Entry) else last.seq
 
 
-def _ends_whole(path: Path) -> bool:
+def _ending_of(path: Path) -> _Ending:
+    if not path.exists() or not path.stat().st_size:
+        return _Ending.EMPTY
+    if _last_entry(path) is None:
+        has_line = any(line.endswith(b"\n") for line in lines_of(path))
+        return _Ending.UNREADABLE if has_line else _Ending.TORN_FIRST_LINE
     with path.open("rb") as file:
-        if not file.seek(0, os.SEEK_END):
-            return True
         file.seek(-1, os.SEEK_END)
-        return file.read() == b"\n"
-
-
-def _is_one_line(path: Path) -> bool:
-    return not any(line.endswith(b"\n") for line in lines_of(path))
+        return _Ending.COMPLETE if file.read() == b"\n" else _Ending.TORN
 
 
 def _free(path: Path) -> Path:

@@ -1,6 +1,6 @@
-"""Judge the audit logs in a folder: is every chain whole, and does it hold the heads that others recorded?
+"""Verify the audit logs in a folder: every chain is complete, and holds the heads recorded elsewhere.
 
-Promises to change nothing, and to say in one sentence which file and which entry is the first that is wrong.
+Nothing is changed.  A verdict names in one sentence the file and the first entry that is wrong.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ __all__ = ["Verdict", "check_chain", "check_folder", "entries_of"]
 
 @dataclass(slots=True, kw_only=True)
 class Verdict:
-    """What was found in one chain.  ``problem`` is empty if all is well."""
+    """The result for one chain; ``problem`` is empty if it is intact."""
 
     who: str
     entries: int = 0
@@ -31,12 +31,12 @@ class Verdict:
 
 
 def check_chain(who: str, files: Sequence[Path], *, from_genesis: bool = True) -> Verdict:
-    """Return what is true of the chain in *files*, oldest first, up to its first wrong entry.
+    """Verify the chain in *files*, oldest first, up to its first wrong entry.
 
     Args:
         who: Its name.
-        files: As `files_of` gives them.
-        from_genesis: Whether it has to begin with entry 1.
+        files: In the order of `files_of`.
+        from_genesis: Whether the chain must begin with entry 1.
     """
     verdict = Verdict(who=who)
     chain = Chain(GENESIS if from_genesis else None)
@@ -56,7 +56,7 @@ def check_chain(who: str, files: Sequence[Path], *, from_genesis: bool = True) -
                 verdict.problem = f"entry {found.seq} does not say that the file before it was torn"
                 return verdict
             is_torn = False
-            _take(verdict, found)
+            _count(verdict, found)
     if is_torn:
         verdict.problem = f"ended in the middle of a line, {verdict.entries} whole entries good"
     return verdict
@@ -66,8 +66,8 @@ def check_folder(folder: Path, *, known: Mapping[str, Head] | None = None) -> li
     """Return a verdict for each chain in *folder*.
 
     Args:
-        folder: Where the logs lie.
-        known: Heads that somebody kept elsewhere, by name of the chain.
+        folder: Folder of the logs.
+        known: Heads that were stored elsewhere, by name of the chain.
 
     Raises:
         OSError: A file cannot be read.
@@ -78,7 +78,7 @@ def check_folder(folder: Path, *, known: Mapping[str, Head] | None = None) -> li
         for teller in verdicts.values()
         for name, head, seq in teller.claims
     ]
-    claims += [(name, head, "the head kept elsewhere") for name, head in (known or {}).items()]
+    claims += [(name, head, "the head stored elsewhere") for name, head in (known or {}).items()]
     for name, head, teller in claims:
         verdict = verdicts.setdefault(name, Verdict(who=name, file=f"{name}.jsonl"))
         if not verdict.problem and verdict.hashes.get(head.seq) != head.hash:
@@ -90,7 +90,7 @@ def check_folder(folder: Path, *, known: Mapping[str, Head] | None = None) -> li
 
 
 def entries_of(files: Sequence[Path]) -> Iterator[Entry]:
-    """Yield what can be read, whether the chain is whole or not."""
+    """Yield the readable entries, also of a broken chain."""
     for path in files:
         for line in lines_of(path):
             found = Chain(None).add(line)
@@ -98,9 +98,9 @@ def entries_of(files: Sequence[Path]) -> Iterator[Entry]:
                 yield found
 
 
-def _take(verdict: Verdict, entry: Entry) -> None:
+def _count(verdict: Verdict, entry: Entry) -> None:
     if verdict.entries == 0 and entry.seq > 1:
-        verdict.notes.append(f"begins with entry {entry.seq}; earlier ones are not looked at")
+        verdict.notes.append(f"begins with entry {entry.seq}; earlier ones are not checked")
     verdict.entries += 1
     verdict.head = entry.head
     verdict.hashes[entry.seq] = entry.hash

@@ -1,8 +1,6 @@
-"""A robot's own key: it never leaves the robot, and signs the robot's short tokens.
+"""A robot's own private key, which never leaves the robot and signs the robot's short-lived tokens.
 
-    async with connect(url, token=RobotKey("robot.key", "robot-1").token) as robot: ...
-
-Promises to make nothing that lives longer than a token may, and to read one file that only its owner can.
+async with connect(url, token=RobotKey("robot.key", "robot-1").token) as robot: ...
 """
 
 from __future__ import annotations
@@ -33,13 +31,13 @@ class RobotKey:
         settings: AuthSettings | None = None,
         clock: Callable[[], float] = time.time,
     ) -> None:
-        """Remember where the key is; it is read for each token, so a new file counts at once.
+        """Store the path; the file is read for each token, so a replaced key takes effect at once.
 
         Args:
             path: The private key, mode 0600.
             robot: The name under which the robot was enrolled.
-            settings: Issuer, audience and life; None means the defaults.
-            clock: Unix seconds; the platform forgives ``auth.leeway_s`` of difference.
+            settings: Issuer, audience and time to live; None means the defaults.
+            clock: Unix seconds; the platform tolerates ``auth.leeway_s`` of difference.
         """
         self._path = Path(path)
         self._robot = robot
@@ -47,9 +45,9 @@ class RobotKey:
         self._clock = clock
 
     async def token(self) -> str:
-        """Return a fresh token; raises UsageError if the file holds no key of its owner alone."""
-        hint = "make one with rse-pf robot keygen"
-        key = SigningKey.from_json(read_private_file(self._path, "the key", hint=hint))
+        """Return a fresh token; raises UsageError if the file holds no key, or others may read it."""
+        data = read_private_file(self._path, "the key", hint="make one with rse-pf robot keygen")
+        key = SigningKey.from_json(data.decode("utf-8", "replace"))
         token_id = secrets.token_hex(_ID_BYTES)
         return key.issue(self._robot, now=self._clock(), token_id=token_id, settings=self._settings)
 
@@ -58,13 +56,12 @@ def make_robot_key(path: Path) -> str:
     """Write a new private key to *path*, which must not exist, and return its public half as a JWK.
 
     Raises:
-        UsageError: There is a file already, or none can be made.
+        UsageError: The file exists or cannot be written.
     """
     key = SigningKey.of_robot(secrets.token_bytes(_SEED_BYTES))
     try:
         create_private_file(path, key.to_json())
-    except FileExistsError as error:
-        raise UsageError(f"there is a file {path} already", hint="name another with --out") from error
     except OSError as error:
-        raise UsageError(f"cannot write {path}: {error.strerror}", hint="name another with --out") from error
+        problem = "exists already" if isinstance(error, FileExistsError) else error.strerror
+        raise UsageError(f"cannot write {path}: {problem}", hint="name another file with --out") from error
     return key.public_json()

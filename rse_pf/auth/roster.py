@@ -1,7 +1,7 @@
-"""Which robots hold keys of their own, and which tokens and robots are refused: the control room's values.
+"""Which robots have keys of their own (the roster), and which tokens and robots are refused (the deny list).
 
-An operator writes them, every server reads them; `rse_pf.auth.trust_store` moves them.  Promises no clock,
-no store and no secret: public keys, names and times alone.
+An operator writes both, every server reads both; `rse_pf.auth.trust_store` stores and loads them.  They hold
+public keys, names and times, no secrets.
 """
 
 from __future__ import annotations
@@ -28,16 +28,16 @@ __all__ = [
     "check_scopes",
     "check_tenant",
     "from_json",
-    "holds",
     "key_id_of",
     "public_key_of",
+    "scopes_allow",
     "to_json",
 ]
 
 ROBOT_KEY = "robot:"
-"""Key ids of robots' own keys begin so; no platform key may."""
+"""Prefix of the key ids of robots' own keys; no platform key may have it."""
 QUOTAS = ("data_bytes",)
-"""What an operator may limit for one robot; the settings hold for whoever has no quota."""
+"""What an operator may limit for one robot; without a quota the settings apply."""
 
 _SCOPE = re.compile(
     r"services:(?:\*|[A-Za-z0-9][A-Za-z0-9._-]{0,63})"
@@ -45,14 +45,14 @@ _SCOPE = re.compile(
     r"|maps:(?:\*|read|write)(?:/[a-z0-9][a-z0-9-]{0,63})?"
 )
 _X = re.compile(r"[A-Za-z0-9_-]{43}")
-_MAX_LETTERS, _MAX_SCOPES = 64, 64
+_MAX_CHARACTERS, _MAX_SCOPES = 64, 64
 
 _T = TypeVar("_T", bound=msgspec.Struct)
-Word = Annotated[str, msgspec.Meta(min_length=1, max_length=_MAX_LETTERS)]
+Word = Annotated[str, msgspec.Meta(min_length=1, max_length=_MAX_CHARACTERS)]
 
 
 class _Value(msgspec.Struct, frozen=True, kw_only=True):
-    """Unknown fields are ignored, so that a newer operator may say more."""
+    """Unknown fields are ignored, for compatibility with newer versions of the operator's commands."""
 
 
 class EnrolledRobot(_Value, frozen=True, kw_only=True):
@@ -77,27 +77,27 @@ class Roster(_Value, frozen=True, kw_only=True):
     robots: tuple[EnrolledRobot, ...] = ()
 
     def enrolled(self, robot: EnrolledRobot) -> Roster:
-        """Return the roster with *robot*, instead of what that name of that tenant had before.
+        """Return the roster with *robot*, which replaces an entry of the same tenant and name.
 
         Raises:
-            UsageError: Another robot holds this key.
+            UsageError: Another robot has this key.
         """
         others = tuple(r for r in self.robots if (r.tenant, r.robot) != (robot.tenant, robot.robot))
         for other in others:
             if other.x == robot.x:
                 raise UsageError(
-                    f"robot {other.robot!r} of tenant {other.tenant!r} holds this key already",
+                    f"robot {other.robot!r} of tenant {other.tenant!r} has this key already",
                     hint="make one key for each robot: rse-pf robot keygen",
                 )
         return Roster(robots=(*others, robot))
 
     def find(self, tenant: str, robot: str) -> EnrolledRobot | None:
-        """Return the robot called so."""
+        """Return the entry of this tenant and name, None if there is none."""
         return next((r for r in self.robots if (r.tenant, r.robot) == (tenant, robot)), None)
 
 
 class RevokedToken(_Value, frozen=True, kw_only=True):
-    """One token that is refused until its own end."""
+    """One token that is refused until it expires."""
 
     tenant: str
     robot: str
@@ -106,7 +106,7 @@ class RevokedToken(_Value, frozen=True, kw_only=True):
 
 
 class DisabledRobot(_Value, frozen=True, kw_only=True):
-    """A robot that is refused whatever it shows."""
+    """A robot that is refused with any token."""
 
     tenant: str
     robot: str
@@ -122,23 +122,23 @@ class NotBefore(_Value, frozen=True, kw_only=True):
 
 
 class DenyList(_Value, frozen=True, kw_only=True):
-    """Who is refused, although the signature is good."""
+    """Tokens and robots that are refused although the signature is valid."""
 
     tokens: tuple[RevokedToken, ...] = ()
     disabled: tuple[DisabledRobot, ...] = ()
     not_before: tuple[NotBefore, ...] = ()
 
-    def pruned(self, *, now: float, longest_s: float) -> DenyList:
-        """Return the list without what time has done: tokens that are over anyway.
+    def pruned(self, *, now: float, max_token_s: float) -> DenyList:
+        """Return the list without the entries that only concern expired tokens.
 
         Args:
             now: Unix seconds.
-            longest_s: No token is good for longer than that after it was issued, leeway included.
+            max_token_s: The longest time for which a token is valid, leeway included.
         """
         return DenyList(
-            tokens=tuple(each for each in self.tokens if each.expires_s + longest_s >= now),
+            tokens=tuple(each for each in self.tokens if each.expires_s + max_token_s >= now),
             disabled=self.disabled,
-            not_before=tuple(each for each in self.not_before if each.at_s + longest_s >= now),
+            not_before=tuple(each for each in self.not_before if each.at_s + max_token_s >= now),
         )
 
     def with_token(self, tenant: str, robot: str, token_id: str, expires_s: float) -> DenyList:
@@ -146,12 +146,10 @@ class DenyList(_Value, frozen=True, kw_only=True):
         fresh = RevokedToken(tenant=tenant, robot=robot, id=token_id, expires_s=expires_s)
         return msgspec.structs.replace(self, tokens=(*(t for t in self.tokens if t != fresh), fresh))
 
-    def with_all_tokens(self, tenant: str, robot: str, at_s: float) -> DenyList:
-        """Return the list that refuses every token which *robot* was issued before *at_s*; never an earlier
-        time than before.
-        """
+    def with_tokens_before(self, tenant: str, robot: str, at_s: float) -> DenyList:
+        """Return the list that refuses tokens of *robot* issued before *at_s*; a later time is kept."""
         others = tuple(n for n in self.not_before if (n.tenant, n.robot) != (tenant, robot))
-        earlier = [n.at_s for n in self.not_before if (n.tenant, n.robot) == (tenant, robot)]
+        earlier = [n.at_s for n in self.not_before if n not in others]
         fresh = NotBefore(tenant=tenant, robot=robot, at_s=max([at_s, *earlier]))
         return msgspec.structs.replace(self, not_before=(*others, fresh))
 
@@ -178,8 +176,8 @@ def from_json(data: bytes | str, kind: type[_T]) -> _T:
         return msgspec.json.decode(data, type=kind)
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         raise ConfigurationError(
-            f"the control room holds no {kind.__name__}: {str(error)[:150]}",
-            hint="restore the version before; rse-pf robot and rse-pf token revoke write it",
+            f"the access control store holds no valid {kind.__name__}: {str(error)[:150]}",
+            hint="restore its previous version; rse-pf robot and rse-pf token revoke write it",
         ) from error
 
 
@@ -201,23 +199,23 @@ def key_id_of(x: str) -> str:
 
 def public_key_of(text: str) -> str:
     """Return ``x`` of a public JWK; raises UsageError, above all for a private key."""
-    hint = "give what rse-pf robot keygen printed"
+    hint = "give the public key that rse-pf robot keygen printed"
     try:
         jwk = json.loads(text)
         kind, curve, x = jwk["kty"], jwk["crv"], jwk["x"]
     except (ValueError, KeyError, TypeError, RecursionError) as error:
-        raise UsageError("this is no public key", hint=hint) from error
+        raise UsageError("this is not a public key", hint=hint) from error
     if "d" in jwk:
-        raise UsageError("this is a private key; it never leaves its robot", hint=hint)
+        raise UsageError("this is a private key; it must never leave its robot", hint=hint)
     if (kind, curve) != ("OKP", "Ed25519") or not isinstance(x, str) or not _X.fullmatch(x):
-        raise UsageError("this is no public Ed25519 key", hint=hint)
+        raise UsageError("this is not a public Ed25519 key", hint=hint)
     return x
 
 
-def holds(scopes: tuple[str, ...], right: str, name: str = "") -> bool:
-    """Return whether *scopes* allow *right*, as ``services:pnp`` or ``maps:write``, on what is called *name*.
+def scopes_allow(scopes: tuple[str, ...], right: str, name: str = "") -> bool:
+    """Return whether *scopes* allow *right*, such as ``services:pnp`` or ``maps:write``, on object *name*.
 
-    No scope at all allows everything; any scope makes the list complete.
+    An empty list allows everything; otherwise only what is listed is allowed.
     """
     if not scopes:
         return True
@@ -227,25 +225,29 @@ def holds(scopes: tuple[str, ...], right: str, name: str = "") -> bool:
 
 
 def check_robot(name: str) -> str:
-    """Return *name*, or raise UsageError: it cannot name a robot."""
-    if not 0 < len(name) <= _MAX_LETTERS or not name.isprintable():
-        raise UsageError(f"{name[:80]!r} is no name for a robot", hint="use 1 to 64 printable letters")
-    return name
+    """Return *name*; raises UsageError if it cannot be the name of a robot."""
+    return _checked_name(name, "robot")
 
 
 def check_tenant(name: str) -> str:
-    """Return *name*, or raise UsageError: it cannot name a tenant."""
-    if not 0 < len(name) <= _MAX_LETTERS or not name.isprintable():
-        raise UsageError(f"{name[:80]!r} is no name for a tenant", hint="use 1 to 64 printable letters")
+    """Return *name*; raises UsageError if it cannot be the name of a tenant."""
+    return _checked_name(name, "tenant")
+
+
+def _checked_name(name: str, what: str) -> str:
+    if not 0 < len(name) <= _MAX_CHARACTERS or not name.isprintable():
+        raise UsageError(
+            f"{name[:80]!r} is not a valid name for a {what}", hint="use 1 to 64 printable characters"
+        )
     return name
 
 
 def check_scopes(scopes: tuple[str, ...]) -> tuple[str, ...]:
-    """Return *scopes*, or raise UsageError: one of them is none."""
+    """Return *scopes*; raises UsageError if one of them is invalid, or if there are too many."""
     for scope in scopes:
         if not _SCOPE.fullmatch(scope):
             raise UsageError(
-                f"{scope[:80]!r} is no scope",
+                f"{scope[:80]!r} is not a scope",
                 hint="write services:NAME, data:read, data:write, maps:read, maps:write or maps:write/MAP; "
                 "* stands for all of an area",
             )
@@ -255,10 +257,10 @@ def check_scopes(scopes: tuple[str, ...]) -> tuple[str, ...]:
 
 
 def check_quotas(quotas: dict[str, float]) -> dict[str, float]:
-    """Return *quotas*, or raise UsageError: a name or a number that means nothing."""
-    for name, most in quotas.items():
+    """Return *quotas*; raises UsageError for an unknown name or an invalid number."""
+    for name, limit in quotas.items():
         if name not in QUOTAS:
-            raise UsageError(f"{name[:80]!r} is no quota", hint=f"known are {', '.join(QUOTAS)}")
-        if not (math.isfinite(most) and most > 0):
-            raise UsageError(f"the quota {name} = {most:g} is not above 0", hint="disable the robot instead")
+            raise UsageError(f"{name[:80]!r} is not a quota", hint=f"known are {', '.join(QUOTAS)}")
+        if not (math.isfinite(limit) and limit > 0):
+            raise UsageError(f"the quota {name} = {limit:g} is not above 0", hint="disable the robot instead")
     return quotas

@@ -1,8 +1,8 @@
-"""The control room: where an operator's decisions lie beside the public keys, and how servers learn of them.
+"""Where an operator's decisions are stored beside the public keys, and how servers load them.
 
-Two objects in a store, changed by compare-and-swap alone: ``control/robots.json`` and ``control/deny.json``.
-On one machine they lie in the folder of ``keys.json``, in a cloud in its bucket.  Promises that a reader
-which knew a list once never knows less because a read failed, and no thread and no timer.
+`AccessControlStore` holds two objects, changed by compare-and-swap only: ``control/robots.json`` and
+``control/deny.json``.  On one machine they lie in the folder of ``keys.json``, in a cloud in its bucket.
+`TrustStore` is a server's view of keys, robots and denials.  When a read fails, it keeps what it knew.
 """
 
 from __future__ import annotations
@@ -27,37 +27,37 @@ __all__ = [
     "key_set_from_snapshot",
 ]
 
-_TRIES = 20
+_MAX_ATTEMPTS = 20
 
 _T = TypeVar("_T", Roster, DenyList)
 REFRESH_S = 0.5
-"""Time between two looks at the deny-list and the roster: a revoked robot is disconnected within 2 s."""
+"""Pause between two reads of the deny list and the roster: a revoked robot is disconnected within 2 s."""
 
 
 class AccessControlStore:
-    """The two objects of one platform."""
+    """The roster and the deny list of one platform."""
 
     def __init__(self, store: ObjectStore) -> None:
         self._store = store
 
     def roster(self) -> Roster:
-        """Return who is enrolled; nobody if nothing was ever written."""
+        """Return the enrolled robots; an empty roster if none was ever written."""
         return self._read(ROBOTS_NAME, Roster)[0]
 
-    def denied(self) -> DenyList:
-        """Return who is refused; nobody if nothing was ever written."""
+    def deny_list(self) -> DenyList:
+        """Return the denied tokens and robots; an empty list if none was ever written."""
         return self._read(DENY_NAME, DenyList)[0]
 
     def change_roster(self, edit: Callable[[Roster], Roster]) -> None:
-        """Apply *edit* to the newest roster; raises Conflict when others write all the time."""
+        """Apply *edit* to the current roster; raises Conflict if others keep changing it."""
         self._change(ROBOTS_NAME, Roster, edit)
 
     def change_deny_list(self, edit: Callable[[DenyList], DenyList]) -> None:
-        """Apply *edit* to the newest deny-list; raises Conflict when others write all the time."""
+        """Apply *edit* to the current deny list; raises Conflict if others keep changing it."""
         self._change(DENY_NAME, DenyList, edit)
 
     def create_missing(self) -> None:
-        """Write empty objects where there are none, so that a reader can tell "empty" from "forbidden"."""
+        """Write empty objects where there are none, so that readers can tell "empty" from "forbidden"."""
         self.change_roster(lambda roster: roster)
         self.change_deny_list(lambda denied: denied)
 
@@ -69,42 +69,41 @@ class AccessControlStore:
         return from_json(data, kind), data
 
     def _change(self, name: str, kind: type[_T], edit: Callable[[_T], _T]) -> None:
-        for attempt in range(_TRIES):
+        for attempt in range(1, _MAX_ATTEMPTS + 1):
             value, data = self._read(name, kind)
-            fresh = to_json(edit(value))
-            if fresh == data:
-                return
+            changed = to_json(edit(value))
             try:
-                self._store.compare_and_swap(name, data, fresh)
+                if changed != data:
+                    self._store.compare_and_swap(name, data, changed)
                 return
             except Conflict:
-                if attempt + 1 == _TRIES:
+                if attempt == _MAX_ATTEMPTS:
                     raise
 
 
 class TrustStore:
-    """What one server knows of keys, robots and denials; `look` learns what is new.  Blocking.
+    """The keys, robots and denials that one server knows; `refresh` loads what changed.  Blocking.
 
-    ``text`` is all of it as JSON for a server's other processes, see `key_set_from_snapshot`.
+    ``snapshot`` is all of it as JSON, for a server's other processes; see `key_set_from_snapshot`.
     """
 
     def __init__(self, keys_file: Path) -> None:
-        """Know nothing yet.
+        """Store the path; nothing is read yet.
 
         Args:
-            keys_file: The JWKS; the control room lies in the same folder.
+            keys_file: The JWKS; roster and deny list lie in the folder ``control`` beside it.
         """
         self.keys: KeySet | None = None
-        self.text = ""
+        self.snapshot = ""
         self.problem = ""
-        """Why the last look learned nothing of some object; empty if it could read all."""
+        """What the last `refresh` could not read; empty if it could read everything."""
         self._keys_file = keys_file
         self._store = DirectoryStore(keys_file.parent)
         self._parts: dict[str, str] = {}
         self._found: set[str] = set()
 
-    def look(self) -> bool:
-        """Read what there is; return whether it changed.  What cannot be read stays as it was known."""
+    def refresh(self) -> bool:
+        """Read everything; return whether it changed.  A part that cannot be read stays as it was known."""
         self.problem = ""
         parts = dict(self._parts)
         for name, read in (
@@ -113,40 +112,38 @@ class TrustStore:
             ("denied", lambda: self._read(DENY_NAME, DenyList)),
         ):
             try:
-                text = read()
+                parts[name] = read()
+                self._found.add(name)
             except NotFound as error:
-                if name == "keys" or name in self._found:  # what was there once has not become empty
+                if name == "keys" or name in self._found:  # a part that existed cannot have become empty
                     self.problem = f"{name}: {error.message}"
                 else:
                     parts[name] = "{}"
-                continue
             except (RsePfError, OSError, UnicodeDecodeError) as error:
                 self.problem = f"{name}: {error}"[:200]
-                continue
-            parts[name] = text
-            self._found.add(name)
         if parts == self._parts or len(parts) < 3:
             return False
-        self._parts = parts
-        self.text = json.dumps(parts)
-        self.keys = key_set_from_snapshot(self.text)
+        self._parts, self.snapshot = parts, json.dumps(parts)
+        self.keys = key_set_from_snapshot(self.snapshot)
         return True
 
-    def first(self) -> None:
-        """Look for the first time; raises ConfigurationError if anything that is there cannot be read."""
-        self.look()
+    def load(self) -> KeySet:
+        """Read everything for the first time; raises ConfigurationError if an existing part is unreadable."""
+        self.refresh()
         if self.problem or self.keys is None:
             raise ConfigurationError(
-                f"who may come in is not known: {self.problem}",
-                hint=f"look at {self._keys_file} and the folder control beside it",
+                f"cannot read the keys, the roster or the deny list: {self.problem}",
+                hint=f"check {self._keys_file} and the folder control beside it",
             )
+        return self.keys
 
     def _read_keys(self) -> str:
         try:
             text = self._keys_file.read_text(encoding="utf-8")
         except FileNotFoundError as error:
             raise NotFound(f"there is no file {self._keys_file.name}") from error
-        KeySet.from_json(text)
+        if text != self._parts.get("keys"):
+            KeySet.from_json(text)
         return text
 
     def _read(self, name: str, kind: type[Roster] | type[DenyList]) -> str:
@@ -155,8 +152,8 @@ class TrustStore:
         return data.decode()
 
 
-def key_set_from_snapshot(text: str) -> KeySet:
-    """Return what the ``text`` of a `TrustStore` says; raises UsageError or ConfigurationError."""
-    parts = json.loads(text)
+def key_set_from_snapshot(snapshot: str) -> KeySet:
+    """Return the keys in the ``snapshot`` of a `TrustStore`; raises UsageError or ConfigurationError."""
+    parts = json.loads(snapshot)
     roster = from_json(parts["robots"], Roster)
     return KeySet.from_json(parts["keys"]).with_access_control(roster, from_json(parts["denied"], DenyList))

@@ -1,10 +1,10 @@
-"""Read the audit log of a platform, or check that nobody changed it.
+"""Show the audit log of a platform, or verify that it was not changed.
 
-Servers, the control plane, the data service and operators' commands write one chain each: who came in or
-was refused, who was revoked, what was started and stopped, how maps changed.  verify prints a line for each
-chain, and exits with 1 if an entry was changed, moved, added or lost.  A head that you keep elsewhere also
-betrays an end that was cut off: give it back with --head.  --cloud reads what the servers of the deployment
-on AWS have sent to its bucket; --out keeps the files, to be shown again without asking AWS.
+Servers, the control plane, the data service and operators' commands write one chain each: robots accepted,
+refused and revoked, servers started and stopped, maps changed.  verify prints a line for each chain, and
+exits with 1 if an entry was changed, moved, added or lost.  To detect truncation as well, store a chain's
+head elsewhere and pass it with --head.  --cloud reads what the servers of the deployment on AWS have sent to
+its bucket; --out keeps the files, so that they can be shown again without AWS.
 
 examples:
   rse-pf audit verify
@@ -29,8 +29,8 @@ from collections.abc import Iterable, Sequence
 from datetime import datetime, timezone
 from pathlib import Path
 
-from rse_pf.audit.chain import Entry, Head, head_word
-from rse_pf.audit.log import audit_folder, files_of, names_in
+from rse_pf.audit.chain import Entry, Head, parse_head
+from rse_pf.audit.log import audit_folder, chain_names, files_of
 from rse_pf.audit.verify import Verdict, check_chain, check_folder, entries_of
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import UsageError
@@ -38,7 +38,7 @@ from rse_pf.errors import UsageError
 __all__ = ["add_arguments", "run"]
 
 _NAME = "default"
-_TRIES, _AGAIN_S = 5, 0.2
+_MAX_ATTEMPTS, _RETRY_PAUSE_S = 5, 0.2
 _PLAIN = re.compile(r"[!-~]+")
 
 
@@ -55,9 +55,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--only", metavar="WORD", help="show: only actions with this word in them")
     parser.add_argument("--json", action="store_true", help="show: one JSON object for each entry")
     parser.add_argument(
-        "--head", action="append", default=[], metavar="WHO=SEQ:HASH",
-        help="verify: this head, kept elsewhere, must be in the chain of WHO",
-    )  # fmt: skip
+        "--head",
+        action="append",
+        default=[],
+        metavar="WHO=SEQ:HASH",
+        help="verify: this head, stored elsewhere, must be in the chain of WHO",
+    )
 
 
 def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
@@ -70,19 +73,19 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
 
 
 def _run_in_cloud(args: argparse.Namespace, settings: PlatformSettings) -> int:
-    """Fetch what the bucket holds, and go on as with any folder."""
+    """Fetch the logs in the bucket, and show or verify them as in any folder."""
     from rse_pf.aws.account import open_account
     from rse_pf.aws.storage.audit_archive import fetch_audit, open_audit_archive
 
     if args.files:
-        raise UsageError("--cloud and files are two places", hint="leave one of them out")
+        raise UsageError("--cloud and files exclude each other", hint="leave one of them out")
     if args.out is not None and args.out.exists() and any(args.out.iterdir()):
         raise UsageError(f"{args.out} is not empty", hint="name a new folder")
     archive = open_audit_archive(open_account(settings.cloud.region))
     with tempfile.TemporaryDirectory() as temporary:
         args.files = [args.out or Path(temporary)]
         problems = fetch_audit(archive, args.files[0])
-        if not names_in(args.files[0]) and not problems:
+        if not chain_names(args.files[0]) and not problems:
             raise UsageError(
                 "the bucket holds no audit log yet", hint="servers send the first within cloud.audit_ship_s"
             )
@@ -90,7 +93,7 @@ def _run_in_cloud(args: argparse.Namespace, settings: PlatformSettings) -> int:
 
 
 def _run_on(args: argparse.Namespace, problems: Sequence[str]) -> int:
-    """Show or verify what lies on this machine; *problems* were found on the way to it."""
+    """Show or verify files on this machine; *problems* were found while fetching them."""
     for problem in problems:
         print(f"BROKEN: {problem}", file=sys.stderr if args.action == "show" else None)
     is_folder = not args.files or (len(args.files) == 1 and args.files[0].is_dir())
@@ -109,8 +112,8 @@ def _show(args: argparse.Namespace, folder: Path | None) -> int:
     if args.head:
         raise UsageError("--head is for verify", hint="see rse-pf audit --help")
     if args.last is not None and args.last < 1:
-        raise UsageError(f"--last {args.last} shows nothing", hint="give 1 or more")
-    chains = [args.files] if folder is None else [files_of(folder, who) for who in names_in(folder)]
+        raise UsageError(f"--last {args.last} shows no entry", hint="give 1 or more")
+    chains = [args.files] if folder is None else [files_of(folder, who) for who in chain_names(folder)]
     found = ((path[-1].name.partition(".")[0], entry) for path in chains for entry in entries_of(path))
     wanted = ((who, entry) for who, entry in found if args.only is None or args.only in entry.action)
     shown = sorted(wanted, key=lambda each: (each[1].time, each[0], each[1].seq))
@@ -127,28 +130,28 @@ def _verify(args: argparse.Namespace, folder: Path | None) -> int:
         first = args.files[0]
         verdicts = [check_chain(first.name.partition(".")[0], args.files, from_genesis=False)]
     else:
-        verdicts = _settled(folder, known)
+        verdicts = _check_live(folder, known)
     for verdict in verdicts:
-        _tell(verdict)
+        _print_verdict(verdict)
     return int(any(verdict.problem for verdict in verdicts))
 
 
-def _settled(folder: Path, known: dict[str, Head]) -> list[Verdict]:
-    """Check while writers go on: a line that is being written, a file that moves, are looked at again."""
-    for attempt in range(_TRIES):
+def _check_live(folder: Path, known: dict[str, Head]) -> list[Verdict]:
+    """Check logs that may still be written; a line or a rename in progress is checked again."""
+    for attempt in range(_MAX_ATTEMPTS):
         try:
             verdicts = check_folder(folder, known=known)
         except FileNotFoundError:
-            if attempt + 1 == _TRIES:
+            if attempt + 1 == _MAX_ATTEMPTS:
                 raise
         else:
-            if not any(verdict.problem for verdict in verdicts) or attempt + 1 == _TRIES:
+            if not any(verdict.problem for verdict in verdicts) or attempt + 1 == _MAX_ATTEMPTS:
                 break
-        time.sleep(_AGAIN_S)  # a writer is in the middle of a line, and does not say when it is over
+        time.sleep(_RETRY_PAUSE_S)  # a writer is in the middle of a line; there is no event to wait for
     return verdicts
 
 
-def _tell(verdict: Verdict) -> None:
+def _print_verdict(verdict: Verdict) -> None:
     if verdict.problem:
         print(f"{verdict.who}: BROKEN in {verdict.file}: {verdict.problem}")
         return
@@ -160,9 +163,11 @@ def _heads(words: Sequence[str]) -> dict[str, Head]:
     heads = {}
     for word in words:
         who, _, rest = word.partition("=")
-        head = head_word(rest)
+        head = parse_head(rest)
         if head is None or not who:
-            raise UsageError(f"{word[:80]!r} is no head", hint="copy it from a line of rse-pf audit verify")
+            raise UsageError(
+                f"{word[:80]!r} is not a head", hint="copy it from a line of rse-pf audit verify"
+            )
         heads[who] = head
     return heads
 
@@ -171,7 +176,7 @@ def _folder(args: argparse.Namespace) -> Path:
     from rse_pf.local.state import state_folder
 
     folder: Path = args.files[0] if args.files else audit_folder(state_folder(args.name, os.environ))
-    if not folder.is_dir() or not names_in(folder):
+    if not folder.is_dir() or not chain_names(folder):
         raise UsageError(
             f"there is no audit log in {folder}", hint="start rse-pf local, or name a folder or files"
         )

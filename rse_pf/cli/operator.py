@@ -1,6 +1,6 @@
-"""Record in a platform's audit log what an operator did by a command.
+"""Record an operator's commands in the audit log of a platform.
 
-Promises never to undo or hide what was done: if it cannot be recorded, one line says so.
+A command that cannot be recorded is not undone; one line on standard error reports it.
 """
 
 from __future__ import annotations
@@ -25,17 +25,22 @@ def record(state: Path, action: str, subject: str, **detail: Value) -> None:
     """Record *action* on *subject* in the platform whose files lie in *state*."""
     try:
         record_once(
-            audit_folder(state), _WHO, action, subject, wall_clock=time.time,
-            user=_user(), **detail,
-        )  # fmt: skip
+            audit_folder(state),
+            _WHO,
+            action,
+            subject,
+            wall_clock=time.time,
+            user=_user(),
+            **detail,
+        )
     except ConfigurationError as error:
-        print(f"this is done, but not in the audit log: {error}", file=sys.stderr)
+        print(f"the command succeeded, but is missing in the audit log: {error}", file=sys.stderr)
 
 
 def record_map_change(
     settings: PlatformSettings, action: str, name: str, *, version: str, number: int
 ) -> None:
-    """Record how a map changed, if its store lies in the folder of a platform that keeps an audit log."""
+    """Record a change of a map, if its store lies in the folder of a platform with an audit log."""
     place = settings.data.store
     state = Path(place.removeprefix(_DIRECTORY)).absolute().parent
     if place.startswith(_DIRECTORY) and audit_folder(state).is_dir():
@@ -45,5 +50,5 @@ def record_map_change(
 def _user() -> str:
     try:
         return getpass.getuser()
-    except (KeyError, OSError):  # a number without a name
+    except (KeyError, OSError):  # a user id without a name
         return "unknown"

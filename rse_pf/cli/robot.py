@@ -1,8 +1,9 @@
-"""Enrol robots that hold keys of their own, and shut robots out or let them in again.
+"""Enrol robots that have keys of their own, and disable or enable robots.
 
-A robot makes its key itself and keeps it; what it gives away is the public half.  Enrolled, it signs its own
-short tokens.  Every server of the platform knows within 2 s; --cloud means the deployment on AWS.  remove
-forgets its key, so nothing that the robot signs is good; disable also refuses what rse-pf token issue made.
+A robot creates its own key and keeps the private half; the operator enrols the public half.  An enrolled
+robot signs its own short-lived tokens.  Every change reaches all servers of the platform within 2 s; --cloud
+means the deployment on AWS.  remove deletes the public key, so tokens signed by the robot are refused;
+disable refuses all tokens of the robot, also those of rse-pf token issue.
 
 examples:
   rse-pf robot keygen --out robot.key > robot.json
@@ -39,7 +40,7 @@ from rse_pf.cli.operator import record
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import UsageError
 
-__all__ = ["add_arguments", "add_place", "control_room", "longest_s", "note", "run"]
+__all__ = ["add_arguments", "add_place", "max_token_s", "open_access_control", "record_action", "run"]
 
 _DEFAULT = "default"
 _ACTIONS = ("keygen", "enrol", "list", "disable", "enable", "remove")
@@ -48,19 +49,30 @@ _ACTIONS = ("keygen", "enrol", "list", "disable", "enable", "remove")
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument("action", choices=_ACTIONS, help="what to do")
-    parser.add_argument("robot", nargs="?", metavar="ROBOT", help="its name, as its tokens and logs show it")
-    parser.add_argument("--out", type=Path, metavar="FILE", help="keygen: where the private key goes")
     parser.add_argument(
-        "--public-key", type=Path, metavar="FILE", help="enrol: what keygen printed; - reads it"
+        "robot", nargs="?", metavar="ROBOT", help="name of the robot, as in its tokens and logs"
+    )
+    parser.add_argument("--out", type=Path, metavar="FILE", help="keygen: file for the private key")
+    parser.add_argument(
+        "--public-key",
+        type=Path,
+        metavar="FILE",
+        help="enrol: the public key that keygen printed; - reads standard input",
     )
     parser.add_argument(
-        "--scope", action="append", default=[], metavar="SCOPE",
-        help="enrol: allow this alone, as services:pnp or maps:read; again for more (default: everything)",
-    )  # fmt: skip
+        "--scope",
+        action="append",
+        default=[],
+        metavar="SCOPE",
+        help="enrol: allow only this, such as services:pnp or maps:read; repeatable (default: everything)",
+    )
     parser.add_argument(
-        "--quota", action="append", default=[], metavar="NAME=N",
-        help="enrol: data_bytes, all that it may store (default: data.quota_bytes)",
-    )  # fmt: skip
+        "--quota",
+        action="append",
+        default=[],
+        metavar="NAME=N",
+        help="enrol: data_bytes, how much it may store (default: data.quota_bytes)",
+    )
     parser.add_argument("--json", action="store_true", help="list: as JSON")
     add_place(parser)
 
@@ -80,37 +92,37 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
 
         print(make_robot_key(args.out))
         return 0
-    room, now = open_access_control(args, settings), time.time()
+    access, now = open_access_control(args, settings), time.time()
     if args.action == "list":
-        return _list(args, room)
+        return _list(args, access)
     robot, tenant = check_robot(args.robot), check_tenant(args.tenant)
-    longest = longest_s(settings)
+    longest = max_token_s(settings)
     if args.action == "enrol":
-        return _enrol(args, room, now, settings)
+        return _enrol(args, access, now, settings)
     if args.action == "remove":
-        return _remove(args, room, settings)
+        return _remove(args, access, settings)
     if args.action == "disable":
-        room.change_deny_list(
-            lambda denied: denied.pruned(now=now, longest_s=longest).with_robot(tenant, robot, now)
+        access.change_deny_list(
+            lambda denied: denied.pruned(now=now, max_token_s=longest).with_robot(tenant, robot, now)
         )
-        note(args, settings, "robot.disabled", robot, tenant=tenant)
-        print(f"robot {robot!r} is disabled: its connections end within 2 s, and no token of it is taken")
+        record_action(args, settings, "robot.disabled", robot, tenant=tenant)
+        print(f"robot {robot!r} is disabled: its connections end within 2 s, and all its tokens are refused")
         return 0
-    if not room.deny_list().is_disabled(tenant, robot):
+    if not access.deny_list().is_disabled(tenant, robot):
         raise UsageError(f"robot {robot!r} is not disabled", hint="rse-pf robot list shows who is")
 
     def enabled(denied: DenyList) -> DenyList:
-        kept = denied.pruned(now=now, longest_s=longest).without_robot(tenant, robot)
-        return kept.with_all_tokens(tenant, robot, float(int(now)))
+        kept = denied.pruned(now=now, max_token_s=longest).without_robot(tenant, robot)
+        return kept.with_tokens_before(tenant, robot, float(int(now)))
 
-    room.change_deny_list(enabled)
-    note(args, settings, "robot.enabled", robot, tenant=tenant)
-    print(f"robot {robot!r} may come in again, with tokens that are made from now on")
+    access.change_deny_list(enabled)
+    record_action(args, settings, "robot.enabled", robot, tenant=tenant)
+    print(f"robot {robot!r} is enabled again, for tokens issued from now on")
     return 0
 
 
 def open_access_control(args: argparse.Namespace, settings: PlatformSettings) -> AccessControlStore:
-    """Return the control room of the platform that *args* name; raises UsageError if there is none."""
+    """Return the access control store of the platform in *args*; raises UsageError if there is none."""
     if args.cloud:
         from rse_pf.aws.account import open_account
         from rse_pf.aws.storage.key_store import open_key_store
@@ -126,23 +138,23 @@ def open_access_control(args: argparse.Namespace, settings: PlatformSettings) ->
     return AccessControlStore(DirectoryStore(folder))
 
 
-def note(
+def record_action(
     args: argparse.Namespace, settings: PlatformSettings, action: str, subject: str, **detail: Value
 ) -> None:
-    """Record what was done in the audit log of a local platform; in a cloud the bucket keeps all versions."""
+    """Record an action in the audit log of a local platform; in a cloud the bucket keeps all versions."""
     if not args.cloud:
         from rse_pf.local.state import state_folder
 
         record(state_folder(args.name, os.environ), action, subject, **detail)
 
 
-def longest_s(settings: PlatformSettings) -> float:
-    """Return how long after it was issued a token may be good at most."""
+def max_token_s(settings: PlatformSettings) -> float:
+    """Return the longest time for which a token may be valid after it was issued, in seconds."""
     return float(settings.auth.token_ttl_s + settings.auth.leeway_s)
 
 
 def _check(args: argparse.Namespace) -> None:
-    """Refuse words that the action does not take."""
+    """Raise UsageError for arguments that the action does not take."""
     named = args.action in ("enrol", "disable", "enable", "remove")
     if named != (args.robot is not None):
         what = "needs the name of a robot" if named else "names no robot"
@@ -151,13 +163,16 @@ def _check(args: argparse.Namespace) -> None:
         raise UsageError("--out belongs to keygen, which needs it", hint="for example: --out robot.key")
     if (args.action == "enrol") != (args.public_key is not None):
         raise UsageError(
-            "--public-key belongs to enrol, which needs it", hint="give the file with what keygen printed"
+            "--public-key belongs to enrol, which needs it",
+            hint="name the file with the public key that keygen printed",
         )
     if args.action != "enrol" and (args.scope or args.quota):
         raise UsageError("--scope and --quota are for enrol", hint="enrol the robot again to change them")
 
 
-def _enrol(args: argparse.Namespace, room: AccessControlStore, now: float, settings: PlatformSettings) -> int:
+def _enrol(
+    args: argparse.Namespace, access: AccessControlStore, now: float, settings: PlatformSettings
+) -> int:
     robot = EnrolledRobot(
         robot=args.robot,
         tenant=args.tenant,
@@ -166,24 +181,26 @@ def _enrol(args: argparse.Namespace, room: AccessControlStore, now: float, setti
         quotas=check_quotas(dict(_quota(each) for each in args.quota)),
         enrolled_s=round(now, 3),
     )
-    room.change_roster(lambda roster: roster.enrolled(robot))
+    access.change_roster(lambda roster: roster.enrolled(robot))
     allowed = " ".join(robot.scopes) or "everything"
-    note(args, settings, "robot.enrolled", robot.robot, tenant=robot.tenant, key=robot.key_id, scopes=allowed)
+    record_action(
+        args, settings, "robot.enrolled", robot.robot, tenant=robot.tenant, key=robot.key_id, scopes=allowed
+    )
     print(f"robot {robot.robot!r} is enrolled with {robot.key_id}; it may use {allowed}")
     return 0
 
 
-def _remove(args: argparse.Namespace, room: AccessControlStore, settings: PlatformSettings) -> int:
-    found = room.roster().find(args.tenant, args.robot)
+def _remove(args: argparse.Namespace, access: AccessControlStore, settings: PlatformSettings) -> int:
+    found = access.roster().find(args.tenant, args.robot)
     if found is None:
         raise UsageError(f"robot {args.robot!r} is not enrolled", hint="rse-pf robot list shows who is")
 
     def without(roster: Roster) -> Roster:
         return Roster(robots=tuple(each for each in roster.robots if each.x != found.x))
 
-    room.change_roster(without)
-    note(args, settings, "robot.removed", args.robot, tenant=args.tenant, key=found.key_id)
-    print(f"robot {args.robot!r} is enrolled no more: what {found.key_id} signed is refused within 2 s")
+    access.change_roster(without)
+    record_action(args, settings, "robot.removed", args.robot, tenant=args.tenant, key=found.key_id)
+    print(f"robot {args.robot!r} is removed: tokens signed by {found.key_id} are refused within 2 s")
     return 0
 
 
@@ -193,7 +210,9 @@ def _text(path: Path) -> str:
     try:
         return path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
-        raise UsageError(f"cannot read {path}", hint="give the file with what keygen printed") from error
+        raise UsageError(
+            f"cannot read {path}", hint="name the file with the public key that keygen printed"
+        ) from error
 
 
 def _quota(text: str) -> tuple[str, float]:
@@ -201,11 +220,11 @@ def _quota(text: str) -> tuple[str, float]:
     try:
         return name, float(number)
     except ValueError as error:
-        raise UsageError(f"{text[:80]!r} is no quota", hint="for example: data_bytes=1e9") from error
+        raise UsageError(f"{text[:80]!r} is not a quota", hint="for example: data_bytes=1e9") from error
 
 
-def _list(args: argparse.Namespace, room: AccessControlStore) -> int:
-    roster, denied = room.roster(), room.deny_list()
+def _list(args: argparse.Namespace, access: AccessControlStore) -> int:
+    roster, denied = access.roster(), access.deny_list()
     rows = [_row(robot, denied) for robot in roster.robots if robot.tenant == args.tenant]
     for each in denied.disabled:
         if each.tenant == args.tenant and roster.find(each.tenant, each.robot) is None:
@@ -216,13 +235,17 @@ def _list(args: argparse.Namespace, room: AccessControlStore) -> int:
     for row in rows:
         print(f"{row['robot']}  {row['state']}  {row['key']}  {' '.join(row['scopes'])}".rstrip())
     if not rows:
-        print("no robot is enrolled or disabled; others come in with tokens of rse-pf token issue")
+        print("no robot is enrolled or disabled; other robots use tokens of rse-pf token issue")
     return 0
 
 
 def _row(robot: EnrolledRobot, denied: DenyList) -> dict[str, Any]:
     state = "disabled" if denied.is_disabled(robot.tenant, robot.robot) else "enrolled"
     return {
-        "robot": robot.robot, "state": state, "key": robot.key_id, "scopes": list(robot.scopes),
-        "quotas": robot.quotas, "enrolled_s": robot.enrolled_s,
-    }  # fmt: skip
+        "robot": robot.robot,
+        "state": state,
+        "key": robot.key_id,
+        "scopes": list(robot.scopes),
+        "quotas": robot.quotas,
+        "enrolled_s": robot.enrolled_s,
+    }

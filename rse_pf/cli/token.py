@@ -1,15 +1,15 @@
-"""Issue a token for a robot, look into one, revoke it; make and change the keys that sign.
+"""Issue, inspect and revoke robots' tokens; create and rotate the keys that sign them.
 
-A token is signed with the key of a platform that rse-pf local made, with --key FILE, or with --cloud by the
-key in the deployment's secret.  inspect needs no secret: it shows what the token says, and whether the
-platform's public keys vouch for it and nobody revoked it.  revoke ends one token, or with --all-of every
-token that a robot was given until now; live connections end within 2 s.  rotate-keys makes a new key;
-tokens of the one before stay good until their end.  init, rotate and retire are for --cloud: the first key,
-one more that takes over when every server knows it, and the end of the one before.
+A token is signed with the key of a platform that rse-pf local created, with --key FILE, or with --cloud by
+the key in the deployment's secret.  inspect needs no secret: it shows the claims of a token, and whether it
+is valid under the platform's public keys and deny list.  revoke revokes one token, or with --all-of every
+token issued to a robot until now; live connections end within 2 s.  rotate-keys creates a new key; tokens of
+the previous one stay valid until they expire.  init, rotate and retire are for --cloud: they create the first
+key, create a further one that signs once every server knows it, and remove the previous one.
 
 examples:
   rse-pf token issue robot-1
-  rse-pf token issue robot-1 --life 60
+  rse-pf token issue robot-1 --ttl 60
   rse-pf token issue robot-1 --scope services:pnp --scope maps:read
   rse-pf token inspect "$TOKEN"
   rse-pf token revoke "$TOKEN"
@@ -22,7 +22,6 @@ examples:
 from __future__ import annotations
 
 import argparse
-import base64
 import json
 import os
 import secrets
@@ -32,11 +31,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rse_pf.auth.roster import check_robot, check_tenant
-from rse_pf.auth.tokens import KeySet, SigningKey
+from rse_pf.auth.tokens import KeySet, SigningKey, unverified_parts
 from rse_pf.auth.trust_store import AccessControlStore
-from rse_pf.cli.robot import add_place, control_room, longest_s, note
+from rse_pf.cli.robot import add_place, max_token_s, open_access_control, record_action
 from rse_pf.config import PlatformSettings, load_settings
 from rse_pf.errors import ConfigurationError, Unauthorized, UsageError
+from rse_pf.files import OWNER_ONLY, replace_file
 
 if TYPE_CHECKING:
     from rse_pf.aws.storage.key_store import KeyStore
@@ -51,27 +51,35 @@ _SEED_BYTES = 32
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
-    life_s = PlatformSettings().auth.token_ttl_s
+    ttl_s = PlatformSettings().auth.token_ttl_s
     parser.add_argument("action", choices=("issue", "inspect", "revoke", *_KEY_ACTIONS), help="what to do")
     parser.add_argument(
-        "subject", nargs="?", metavar="ROBOT|TOKEN", help="name of the robot; or the token, - reads it"
+        "subject",
+        nargs="?",
+        metavar="ROBOT|TOKEN",
+        help="name of the robot; or the token, - reads standard input",
     )
     add_place(parser)
     parser.add_argument(
-        "--scope", action="append", default=[], metavar="SCOPE",
-        help="issue: allow this alone, as services:pnp or maps:read; again for more (default: everything)",
-    )  # fmt: skip
-    parser.add_argument("--all-of", metavar="ROBOT", help="revoke: every token of this robot until now")
+        "--scope",
+        action="append",
+        default=[],
+        metavar="SCOPE",
+        help="issue: allow only this, such as services:pnp or maps:read; repeatable (default: everything)",
+    )
+    parser.add_argument(
+        "--all-of", metavar="ROBOT", help="revoke: every token issued to this robot until now"
+    )
     parser.add_argument("--key", type=Path, metavar="FILE", help="issue: sign with this key")
     parser.add_argument(
-        "--life",
+        "--ttl",
         type=float,
         metavar="S",
-        help=f"issue: life in seconds (auth.token_ttl_s, default {life_s})",
+        help=f"issue: time to live in seconds (auth.token_ttl_s, default {ttl_s})",
     )
     parser.add_argument("--keys", type=Path, metavar="FILE", help="inspect: verify with this JWKS")
     parser.add_argument(
-        "--force", action="store_true", help="retire: even if servers do not know the new key yet"
+        "--force", action="store_true", help="retire: also if servers may not know the new key yet"
     )
 
 
@@ -96,8 +104,8 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
         if args.keys is not None:
             raise UsageError("--keys only checks tokens", hint="name the signing key with --key")
         return _issue(args, chosen)
-    if args.key is not None or args.life is not None:
-        raise UsageError("--key and --life are for issue only", hint="check a token with --keys JWKS")
+    if args.key is not None or args.ttl is not None:
+        raise UsageError("--key and --ttl are for issue only", hint="check a token with --keys JWKS")
     return _inspect(args, chosen)
 
 
@@ -108,12 +116,12 @@ def _issue(args: argparse.Namespace, settings: PlatformSettings) -> int:
         now=now,
         token_id=token_id,
         settings=settings.auth,
-        life_s=args.life,
+        ttl_s=args.ttl,
         scopes=tuple(args.scope),
         tenant=check_tenant(args.tenant),
     )
     if args.key is None:
-        note(args, settings, "token.issued", args.subject, tenant=args.tenant, token=token_id)
+        record_action(args, settings, "token.issued", args.subject, tenant=args.tenant, token=token_id)
     print(token)
     return 0
 
@@ -123,38 +131,40 @@ def _revoke(args: argparse.Namespace, settings: PlatformSettings) -> int:
         raise UsageError(
             "rse-pf token revoke needs a token, or --all-of ROBOT", hint="a token or - comes last"
         )
-    now, longest = time.time(), longest_s(settings)
+    now, longest = time.time(), max_token_s(settings)
     if args.all_of is not None:
         robot, tenant = check_robot(args.all_of), check_tenant(args.tenant)
-        from_s = float(int(now) + 1)  # a token says when it was issued in whole seconds, rounded down
-        control_room(args, settings).change_deny_list(
-            lambda denied: denied.pruned(now=now, longest_s=longest).with_all_tokens(tenant, robot, from_s)
+        from_s = float(int(now) + 1)  # tokens hold their time of issue in whole seconds, rounded down
+        open_access_control(args, settings).change_deny_list(
+            lambda denied: denied.pruned(now=now, max_token_s=longest).with_tokens_before(
+                tenant, robot, from_s
+            )
         )
-        note(args, settings, "token.revoked-all", robot, tenant=tenant)
-        print(f"every token of {robot!r} until now is revoked; one issued in a second is good again")
+        record_action(args, settings, "token.revoked-all", robot, tenant=tenant)
+        print(f"every token of {robot!r} until now is revoked; tokens issued after one second are valid")
         return 0
-    header, claims = _parts(_token(args.subject))
+    header, claims = unverified_parts(_token(args.subject))
     name, token_id, over = claims.get("sub"), claims.get("jti"), claims.get("exp")
     if not isinstance(name, str) or not isinstance(token_id, str) or not isinstance(over, (int, float)):
         raise UsageError(
-            "this token lacks sub, jti or exp: no server takes it", hint="there is nothing to do"
+            "this token lacks sub, jti or exp: no server accepts it", hint="there is nothing to do"
         )
     if over + settings.auth.leeway_s < now:
-        raise UsageError("this token is over already", hint="there is nothing to do")
-    room = control_room(args, settings)
-    tenant = _tenant_of(room, header, claims)
+        raise UsageError("this token has expired already", hint="there is nothing to do")
+    access = open_access_control(args, settings)
+    tenant = _tenant_of(access, header, claims)
     until_s = min(float(over), now + longest)
-    room.change_deny_list(
-        lambda denied: denied.pruned(now=now, longest_s=longest).with_token(tenant, name, token_id, until_s)
+    access.change_deny_list(
+        lambda denied: denied.pruned(now=now, max_token_s=longest).with_token(tenant, name, token_id, until_s)
     )
-    note(args, settings, "token.revoked", name, tenant=tenant, token=token_id)
+    record_action(args, settings, "token.revoked", name, tenant=tenant, token=token_id)
     print(f"token {token_id} of {name!r} is revoked: its connections end within 2 s")
     return 0
 
 
-def _tenant_of(room: AccessControlStore, header: dict[str, Any], claims: dict[str, Any]) -> str:
-    """Return whose robot a token names; for one that its robot signed, the roster knows."""
-    enrolled = [each for each in room.roster().robots if each.key_id == header.get("kid")]
+def _tenant_of(access: AccessControlStore, header: dict[str, Any], claims: dict[str, Any]) -> str:
+    """Return the tenant of a token's robot: the roster's if the robot signed it, else the token's."""
+    enrolled = [each for each in access.roster().robots if each.key_id == header.get("kid")]
     return enrolled[0].tenant if enrolled else str(claims.get("tenant", "default"))
 
 
@@ -174,7 +184,7 @@ def _change_keys(args: argparse.Namespace, settings: PlatformSettings) -> int:
     if not args.cloud or args.subject is not None:
         raise UsageError(
             f"rse-pf token {args.action} is for a cloud, and names no robot",
-            hint=f"write rse-pf token {args.action} --cloud; rse-pf local makes its own key",
+            hint=f"write rse-pf token {args.action} --cloud; rse-pf local creates its own key",
         )
     store, now = _key_store(settings), time.time()
     new = SigningKey.from_seed(secrets.token_bytes(_SEED_BYTES), secrets.token_hex(8))
@@ -186,15 +196,15 @@ def _change_keys(args: argparse.Namespace, settings: PlatformSettings) -> int:
     if args.action == "retire":
         ring = store.ring().retired(now=now, force=args.force)
         store.write(ring)
-        print(f"key {ring.keys[0][0].key_id} alone is trusted; servers know it in {spread_s(settings):g} s")
+        print(f"only key {ring.keys[0][0].key_id} is trusted; servers know in {spread_s(settings):g} s")
         return 0
     there = store.read()
-    if there is not None:  # perhaps it was never published
+    if there is not None:  # it may never have been published
         store.publish(there)
-        print(f"key {there.signer(now).key_id} is there already; its public half is published again")
+        print(f"key {there.signer(now).key_id} exists already; its public half is published again")
         return 0
     store.write(KeyRing(keys=((new, now),)))
-    print(f"key {new.key_id} is made; servers know it in {spread_s(settings):g} s")
+    print(f"key {new.key_id} is created; servers know it in {spread_s(settings):g} s")
     return 0
 
 
@@ -207,19 +217,11 @@ def _rotate_local(args: argparse.Namespace, settings: PlatformSettings) -> int:
     new = SigningKey.from_seed(secrets.token_bytes(_SEED_BYTES), secrets.token_hex(8))
     halves = {key.key_id: key.key_set().get(key.key_id) for key in (new, old)}
     public = KeySet({name: half for name, half in halves.items() if half is not None})
-    _replace(key_set_file(folder), public.to_json(), 0o644)
-    _replace(key_file(folder), new.to_json(), 0o600)
-    note(args, settings, "key.rotated", new.key_id, before=old.key_id)
-    print(f"key {new.key_id} signs from now on; tokens of {old.key_id} are good until their end")
+    replace_file(key_set_file(folder), public.to_json(), mode=0o644)
+    replace_file(key_file(folder), new.to_json(), mode=OWNER_ONLY)
+    record_action(args, settings, "key.rotated", new.key_id, before=old.key_id)
+    print(f"key {new.key_id} signs from now on; tokens of {old.key_id} are valid until they expire")
     return 0
-
-
-def _replace(file: Path, text: str, mode: int) -> None:
-    temporary = file.with_name(f".{file.name}.new")
-    temporary.unlink(missing_ok=True)
-    with open(os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode), "w") as out:
-        out.write(text)
-    temporary.replace(file)
 
 
 def _key_store(settings: PlatformSettings) -> KeyStore:
@@ -231,7 +233,7 @@ def _key_store(settings: PlatformSettings) -> KeyStore:
 
 def _inspect(args: argparse.Namespace, settings: PlatformSettings) -> int:
     token = _token(args.subject)
-    header, claims = _parts(token)
+    header, claims = unverified_parts(token)
     now = time.time()
     verdict, code = _verdict(token, _keys(args, settings), now, settings)
     told = {"header": header, "claims": claims, "seconds_left": _left(claims, now), "verified": verdict}
@@ -249,24 +251,11 @@ def _left(claims: dict[str, Any], now: float) -> int | None:
     return round(over - now) if known and over is not None else None
 
 
-def _parts(token: str) -> tuple[dict[str, Any], dict[str, Any]]:
-    parts = token.split(".")
-    try:
-        if len(parts) != 3:
-            raise ValueError("not three parts")
-        header, claims = (json.loads(_unb64(part)) for part in parts[:2])
-    except (ValueError, RecursionError) as error:
-        raise UsageError("this is no token", hint="paste what rse-pf token issue printed") from error
-    if not isinstance(header, dict) or not isinstance(claims, dict):
-        raise UsageError("this is no token", hint="paste what rse-pf token issue printed")
-    return header, claims
-
-
 def _verdict(token: str, keys: Any, now: float, settings: PlatformSettings) -> tuple[str, int]:
     from rse_pf.auth.tokens import token_problem, verify_token
 
     if keys is None:
-        return "unknown: no public keys at hand; name them with --keys", 0
+        return "unknown: no public keys found; name them with --keys", 0
     try:
         verify_token(token, keys=keys, now=now, settings=settings.auth)
     except Unauthorized as error:
@@ -275,13 +264,13 @@ def _verdict(token: str, keys: Any, now: float, settings: PlatformSettings) -> t
 
 
 def _keys(args: argparse.Namespace, settings: PlatformSettings) -> Any:
-    """Return the public keys that were named, or the platform's, under its control room; None if none."""
+    """Return the named or the platform's public keys with roster and deny list; None if there are none."""
     from rse_pf.local.firewall import key_set_file
     from rse_pf.object_store import DirectoryStore
 
     if args.cloud:
         store = _key_store(settings)
-        return _governed(store.ring().key_set(), store.control_room())
+        return _governed(store.ring().key_set(), store.access_control_store())
     path = args.keys if args.keys is not None else key_set_file(_folder(args.name))
     try:
         keys = KeySet.from_json(path.read_text(encoding="utf-8"))
@@ -294,8 +283,8 @@ def _keys(args: argparse.Namespace, settings: PlatformSettings) -> Any:
         raise ConfigurationError(f"cannot read {path}", hint="name a JWKS with --keys") from error
 
 
-def _governed(keys: KeySet, room: AccessControlStore) -> KeySet:
-    return keys.with_access_control(room.roster(), room.deny_list())
+def _governed(keys: KeySet, access: AccessControlStore) -> KeySet:
+    return keys.with_access_control(access.roster(), access.deny_list())
 
 
 def _of_platform(name: str) -> PlatformSettings | None:
@@ -309,7 +298,3 @@ def _folder(name: str) -> Path:
     from rse_pf.local.state import state_folder
 
     return state_folder(name, os.environ)
-
-
-def _unb64(text: str) -> bytes:
-    return base64.b64decode(text + "=" * (-len(text) % 4), altchars=b"-_", validate=True)

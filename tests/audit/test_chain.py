@@ -9,7 +9,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rse_pf.audit.chain import GENESIS, Chain, Entry, Head, Note, Refusals, chained, head_word, line_of
+from rse_pf.audit.chain import (
+    GENESIS,
+    Chain,
+    Entry,
+    Head,
+    Note,
+    RefusalLimiter,
+    line_of,
+    next_entry,
+    parse_head,
+)
 
 A_TOKEN = "eyJhbGciOiJFZERTQSJ9.eyJzdWIiOiJyb2JvdC0xIn0.c2lnbmF0dXJl"
 
@@ -19,7 +29,7 @@ values = st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_s
 def log_of(n: int) -> list[bytes]:
     head, lines = GENESIS, []
     for number in range(n):
-        entry = chained(
+        entry = next_entry(
             head,
             Note(
                 time=1e9 + number, actor="server-1", action="auth.accepted", subject=f"robot-{number}",
@@ -62,7 +72,7 @@ def test_a_dropped_entry_is_found_where_it_stood():
     row, why = first_wrong(lines[:2] + lines[3:]) or (-1, "")
 
     assert row == 2
-    assert why == "entry 3 is missing or was changed: entry 4 stands in its place"
+    assert why == "entry 3 is missing or was changed: entry 4 is in its place"
 
 
 def test_two_swapped_entries_are_found():
@@ -75,7 +85,7 @@ def test_two_swapped_entries_are_found():
 def test_an_inserted_entry_is_found_even_if_it_fits_the_one_before():
     lines = log_of(4)
     before = Head(2, json.loads(lines[1])["hash"])
-    forged = line_of(chained(before, Note(time=1.0, actor="nobody", action="token.revoked")))
+    forged = line_of(next_entry(before, Note(time=1.0, actor="nobody", action="token.revoked")))
 
     assert (first_wrong([*lines[:2], forged, *lines[2:]]) or (-1,))[0] == 3
 
@@ -83,7 +93,7 @@ def test_an_inserted_entry_is_found_even_if_it_fits_the_one_before():
 def test_an_entry_that_was_changed_and_hashed_anew_breaks_the_next():
     lines = log_of(4)
     before = Head(1, json.loads(lines[0])["hash"])
-    lines[1] = line_of(chained(before, Note(time=1.0, actor="server-1", action="auth.accepted")))
+    lines[1] = line_of(next_entry(before, Note(time=1.0, actor="server-1", action="auth.accepted")))
 
     assert (first_wrong(lines) or (-1,))[0] == 2
 
@@ -107,7 +117,7 @@ def test_what_is_no_entry_is_said_to_be_none(line: bytes):
     time=st.floats(0, 1e11),
 )
 def test_whatever_is_noted_becomes_a_bounded_line_that_reads_back(actor, action, subject, detail, time):
-    entry = chained(GENESIS, Note(time=time, actor=actor, action=action, subject=subject, detail=detail))
+    entry = next_entry(GENESIS, Note(time=time, actor=actor, action=action, subject=subject, detail=detail))
 
     assert Chain().add(line_of(entry)) == entry
     assert len(line_of(entry)) < 1 << 18
@@ -115,7 +125,7 @@ def test_whatever_is_noted_becomes_a_bounded_line_that_reads_back(actor, action,
 
 def test_lone_surrogates_and_numbers_that_json_lacks_are_written_readably():
     detail = {"a": "\ud800", "b": math.inf, "c": math.nan, "d": 2**80}
-    entry = chained(GENESIS, Note(time=1.0, actor="s", action="x", detail=detail))
+    entry = next_entry(GENESIS, Note(time=1.0, actor="s", action="x", detail=detail))
 
     assert isinstance(Chain().add(line_of(entry)), Entry)
 
@@ -126,22 +136,22 @@ def test_a_token_never_reaches_the_log():
         detail={"reason": f"bad: {A_TOKEN}", A_TOKEN: 1},
     )  # fmt: skip
 
-    line = line_of(chained(GENESIS, note)).decode()
+    line = line_of(next_entry(GENESIS, note)).decode()
 
     assert "eyJ" not in line
     assert line.count("(a token)") == 5
 
 
 def test_a_head_is_a_word_that_can_be_kept_elsewhere():
-    head = chained(GENESIS, Note(time=1.0, actor="s", action="x")).head
+    head = next_entry(GENESIS, Note(time=1.0, actor="s", action="x")).head
 
-    assert head_word(str(head)) == head
-    assert head_word("17:xyz") is None
-    assert head_word(f"-1:{'0' * 64}") is None
+    assert parse_head(str(head)) == head
+    assert parse_head("17:xyz") is None
+    assert parse_head(f"-1:{'0' * 64}") is None
 
 
 def test_a_flood_of_refusals_is_counted_and_not_written():
-    refusals = Refusals(per_s=2.0, burst=10.0)
+    refusals = RefusalLimiter(per_s=2.0, burst=10.0)
 
     written = sum(refusals.take("bad-signature", 100.0 + row / 1000) for row in range(5000))
 

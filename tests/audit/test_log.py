@@ -7,24 +7,19 @@ import os
 import subprocess
 import sys
 import threading
-from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from rse_pf.audit.chain import HEADS, Head
-from rse_pf.audit.log import AuditLog, files_of, names_in, newest_head, record_once
+from rse_pf.audit.log import AuditLog, chain_names, files_of, newest_head, record_once
 from rse_pf.audit.verify import check_chain, check_folder, entries_of
 from rse_pf.errors import ConfigurationError
 
 
-def log_in(
-    folder: Path, who: str = "server-1", *, max_bytes: int = 1 << 20,
-    on_problem: Callable[[str], None] = lambda problem: None,
-) -> AuditLog:  # fmt: skip
-    return AuditLog(
-        folder, who, wall_clock=lambda: 1e9, max_bytes=max_bytes, sync_s=0.001, on_problem=on_problem
-    )
+def log_in(folder: Path, who: str = "server-1", *, max_bytes: int = 1 << 20, **options: Any) -> AuditLog:
+    return AuditLog(folder, who, wall_clock=lambda: 1e9, max_bytes=max_bytes, sync_s=0.001, **options)
 
 
 def write(folder: Path, n: int, who: str = "server-1", max_bytes: int = 1 << 20) -> None:
@@ -132,7 +127,7 @@ def test_a_log_with_a_changed_end_stays_broken_when_its_writer_goes_on(tmp_path:
 
     write(tmp_path, 2)
 
-    assert problem_of(tmp_path) == "entry 4 was changed: its hash is not that of what it says"
+    assert problem_of(tmp_path) == "entry 4 was changed: its hash does not match its content"
 
 
 def test_a_crash_between_two_files_leaves_a_chain_that_goes_on(tmp_path: Path):
@@ -157,7 +152,7 @@ def test_one_chain_has_one_writer(tmp_path: Path):
 def test_names_of_servers_cannot_leave_the_folder(tmp_path: Path):
     write(tmp_path / "audit", 1, who="../../etc/x y")
 
-    assert names_in(tmp_path / "audit") == ["______etc_x_y"]
+    assert chain_names(tmp_path / "audit") == ["______etc_x_y"]
     assert {path.name for path in tmp_path.iterdir()} == {"audit"}
 
 
@@ -208,9 +203,8 @@ def test_a_full_disk_loses_nothing_that_fits_into_memory_and_leaves_no_torn_line
     assert verdict.problem == ""
 
 
-def test_what_memory_cannot_hold_is_told_as_a_gap(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("rse_pf.audit.log._MAX_HELD", 100)
-    log = log_in(tmp_path).open()
+def test_entries_dropped_for_lack_of_memory_are_recorded_as_a_gap(tmp_path: Path):
+    log = log_in(tmp_path, max_buffered=100).open()
     for _ in range(150):
         log.record("x")
     log.close()
@@ -245,7 +239,7 @@ def test_a_chain_that_was_written_anew_is_found_by_a_head_kept_elsewhere(tmp_pat
 
     (verdict,) = check_folder(tmp_path, known={"server-1": Head(head.seq, "f" * 64)})
 
-    assert verdict.problem == "entry 5 was changed: the head kept elsewhere names another"
+    assert verdict.problem == "entry 5 was changed: the head stored elsewhere names another"
 
 
 def test_some_files_of_a_chain_can_be_checked_alone(tmp_path: Path):

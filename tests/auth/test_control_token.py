@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from rse_pf.auth.control_token import bearer, ensure_control_token, is_carried, read_control_token
+from rse_pf.auth.control_token import bearer, carries_token, ensure_control_token, read_control_token
 from rse_pf.errors import UsageError
 
 TOKEN = "0123456789abcdef" * 4
@@ -22,7 +22,7 @@ def written(folder: Path, text: bytes, mode: int = 0o600) -> Path:
 
 @pytest.mark.parametrize("header", [bearer(TOKEN), f"bearer {TOKEN}"])
 def test_who_carries_the_token_is_admitted(header: str) -> None:
-    assert is_carried(header, TOKEN)
+    assert carries_token(header, TOKEN)
 
 
 @pytest.mark.parametrize(
@@ -33,7 +33,7 @@ def test_who_carries_the_token_is_admitted(header: str) -> None:
     ],
 )  # fmt: skip
 def test_everybody_else_is_not(header: str) -> None:
-    assert not is_carried(header, TOKEN)
+    assert not carries_token(header, TOKEN)
 
 
 def test_a_token_is_made_once_and_is_its_owners_alone(tmp_path: Path) -> None:

@@ -17,12 +17,12 @@ from rse_pf.auth.roster import (
     check_quotas,
     check_scopes,
     from_json,
-    holds,
     key_id_of,
     public_key_of,
+    scopes_allow,
     to_json,
 )
-from rse_pf.auth.tokens import Claims, KeySet, SigningKey, standing_problem, token_problem, verify_token
+from rse_pf.auth.tokens import Claims, KeySet, SigningKey, claims_problem, token_problem, verify_token
 from rse_pf.config import AuthSettings
 from rse_pf.errors import ConfigurationError, Unauthorized, UsageError
 
@@ -41,7 +41,7 @@ ROSTER = Roster(robots=(ENROLLED,))
 
 
 def trusted(denied: DenyList | None = None, roster: Roster = ROSTER) -> KeySet:
-    return PLATFORM.key_set().governed_by(roster, denied or DenyList())
+    return PLATFORM.key_set().with_access_control(roster, denied or DenyList())
 
 
 def token(key: SigningKey = ROBOT, robot: str = "robot-1", token_id: str = "t", **more: object) -> str:
@@ -77,7 +77,7 @@ def test_a_key_that_is_not_enrolled_is_unknown():
 
 def test_a_robots_key_id_cannot_name_a_key_of_the_platform():
     forger = SigningKey.from_seed(b"f" * 32, ROBOT.key_id)
-    keys = KeySet.from_json(forger.key_set().to_json()).governed_by(Roster(), DenyList())
+    keys = KeySet.from_json(forger.key_set().to_json()).with_access_control(Roster(), DenyList())
 
     assert problem(token(forger), keys) == "unknown-key"
 
@@ -94,15 +94,15 @@ def test_the_key_id_is_the_thumbprint_of_rfc_7638():
     [
         (DenyList().with_robot("lab", "robot-1", 0.0), "disabled"),
         (DenyList().with_token("lab", "robot-1", "t", NOW_S + 900), "revoked"),
-        (DenyList().with_all_tokens("lab", "robot-1", NOW_S + 1), "issued-too-early"),
+        (DenyList().with_tokens_before("lab", "robot-1", NOW_S + 1), "issued-too-early"),
     ],
 )
 def test_what_is_denied_is_refused_and_ends_what_lives_on_it(denied: DenyList, reason: str):
     claims = verified(token(), trusted())
 
     assert problem(token(), trusted(denied)) == reason
-    assert standing_problem(claims, trusted()) == ""
-    assert standing_problem(claims, trusted(denied)) == reason
+    assert claims_problem(claims, trusted()) == ""
+    assert claims_problem(claims, trusted(denied)) == reason
 
 
 @pytest.mark.parametrize(
@@ -112,7 +112,7 @@ def test_what_is_denied_is_refused_and_ends_what_lives_on_it(denied: DenyList, r
         DenyList().with_robot("lab", "robot-2", 0.0),
         DenyList().with_token("lab", "robot-1", "u", NOW_S + 900),
         DenyList().with_token("lab", "robot-2", "t", NOW_S + 900),
-        DenyList().with_all_tokens("lab", "robot-1", NOW_S),
+        DenyList().with_tokens_before("lab", "robot-1", NOW_S),
         DenyList().with_robot("lab", "robot-1", 0.0).without_robot("lab", "robot-1"),
     ],
 )
@@ -124,22 +124,22 @@ def test_a_robot_that_is_no_longer_enrolled_or_has_a_new_key_loses_its_sockets()
     claims = verified(token(), trusted())
     other = EnrolledRobot(robot="robot-2", tenant="lab", x=ENROLLED.x)
 
-    assert standing_problem(claims, trusted(roster=Roster())) == "unknown-key"
-    assert standing_problem(claims, trusted(roster=Roster(robots=(other,)))) == "wrong-robot"
-    assert standing_problem(replace(claims, key_id="p1"), KeySet({})) == "unknown-key"
+    assert claims_problem(claims, trusted(roster=Roster())) == "unknown-key"
+    assert claims_problem(claims, trusted(roster=Roster(robots=(other,)))) == "wrong-robot"
+    assert claims_problem(replace(claims, key_id="p1"), KeySet({})) == "unknown-key"
 
 
 def test_time_takes_out_of_the_list_only_what_no_server_would_take_anyway():
-    denied = DenyList().with_token("d", "r", "t", 1000.0).with_all_tokens("d", "r", 500.0)
+    denied = DenyList().with_token("d", "r", "t", 1000.0).with_tokens_before("d", "r", 500.0)
     denied = denied.with_robot("d", "s", 1.0)
 
-    assert denied.pruned(now=1400.0, longest_s=930.0) == denied
-    later = denied.pruned(now=5000.0, longest_s=930.0)
+    assert denied.pruned(now=1400.0, max_token_s=930.0) == denied
+    later = denied.pruned(now=5000.0, max_token_s=930.0)
     assert (later.tokens, later.not_before, later.disabled) == ((), (), denied.disabled)
 
 
 def test_a_later_revocation_never_forgives_an_earlier_one():
-    denied = DenyList().with_all_tokens("d", "r", 500.0).with_all_tokens("d", "r", 400.0)
+    denied = DenyList().with_tokens_before("d", "r", 500.0).with_tokens_before("d", "r", 400.0)
 
     assert [each.at_s for each in denied.not_before] == [500.0]
 
@@ -154,7 +154,7 @@ def test_a_name_has_one_key_and_a_key_one_name():
     fresh = EnrolledRobot(robot="robot-1", tenant="lab", x="A" * 43)
 
     assert ROSTER.enrolled(fresh).robots == (fresh,)
-    with pytest.raises(UsageError, match="holds this key already"):
+    with pytest.raises(UsageError, match="has this key already"):
         ROSTER.enrolled(EnrolledRobot(robot="robot-2", tenant="lab", x=ENROLLED.x))
 
 
@@ -190,7 +190,7 @@ def test_nonsense_is_our_error_and_no_other(data: bytes):
     ],
 )
 def test_scopes_allow_what_they_say_and_nothing_else(scopes, right, name, allowed):
-    assert holds(scopes, right, name) is allowed
+    assert scopes_allow(scopes, right, name) is allowed
     assert check_scopes(scopes) == scopes
 
 
@@ -198,7 +198,7 @@ def test_scopes_allow_what_they_say_and_nothing_else(scopes, right, name, allowe
     "scope", ["pnp", "services:", "services:a b", "maps:write/", "data:read/x", "*", "a:b"]
 )
 def test_what_is_no_scope_is_refused_before_it_is_stored(scope: str):
-    with pytest.raises(UsageError, match="is no scope"):
+    with pytest.raises(UsageError, match="is not a scope"):
         check_scopes((scope,))
 
 
@@ -215,5 +215,5 @@ def test_a_private_key_is_not_taken_for_a_public_one():
 
 @pytest.mark.parametrize("text", ["", "[]", "{}", json.dumps({"kty": "OKP", "crv": "Ed25519", "x": "short"})])
 def test_what_is_no_public_key_is_refused(text: str):
-    with pytest.raises(UsageError, match="no public"):
+    with pytest.raises(UsageError, match="not a public"):
         public_key_of(text)

@@ -56,7 +56,7 @@ def without(name: str) -> dict[str, Any]:
 
 
 def test_a_good_token_says_who_the_robot_is() -> None:
-    token = issue(scopes=("services:pnp", "maps:*"), tenant="lab", life_s=60.0)
+    token = issue(scopes=("services:pnp", "maps:*"), tenant="lab", ttl_s=60.0)
 
     assert verify_token(token, keys=KEYS, now=NOW + 1, settings=SETTINGS) == Claims(
         robot="robot-7", token_id="t1", issued_s=NOW, expires_s=NOW + 60, key_id="key-1", tenant="lab",
@@ -142,7 +142,7 @@ def test_every_refusal_is_in_the_same_words() -> None:
 def test_the_log_gets_one_of_a_closed_list_of_reasons() -> None:
     assert {refused(forge()) for forge in FORGED.values()} == {
         "missing-or-too-long", "malformed", "wrong-algorithm-or-type", "unknown-key",
-        "bad-signature-or-claims", "bad-time", "life-too-long", "expired", "not-yet-valid", "bad-subject",
+        "bad-signature-or-claims", "bad-time", "ttl-too-long", "expired", "not-yet-valid", "bad-subject",
     }  # fmt: skip
 
 
@@ -192,7 +192,7 @@ def test_time_is_an_argument_and_the_machines_clock_never_decides(now: float) ->
 
 
 def test_the_leeway_is_kept_to_the_second() -> None:
-    token = issue(life_s=60.0)
+    token = issue(ttl_s=60.0)
 
     verify_token(token, keys=KEYS, now=NOW + 60 + SETTINGS.leeway_s, settings=SETTINGS)
     verify_token(token, keys=KEYS, now=NOW - SETTINGS.leeway_s, settings=SETTINGS)
@@ -207,15 +207,15 @@ def test_not_before_has_the_same_leeway() -> None:
     assert refused(token, now=NOW - 1) == "not-yet-valid"
 
 
-@pytest.mark.parametrize("life_s", [0.0, -1.0, SETTINGS.token_ttl_s + 1.0, float("nan"), float("inf")])
-def test_a_life_outside_the_settings_is_not_issued(life_s: float) -> None:
-    with pytest.raises(UsageError, match="a life of"):
-        issue(life_s=life_s)
+@pytest.mark.parametrize("ttl_s", [0.0, -1.0, SETTINGS.token_ttl_s + 1.0, float("nan"), float("inf")])
+def test_a_life_outside_the_settings_is_not_issued(ttl_s: float) -> None:
+    with pytest.raises(UsageError, match="a time to live of"):
+        issue(ttl_s=ttl_s)
 
 
 @pytest.mark.parametrize("robot", ["", "r" * 65, "a\nb", "\x1b[31m"])
 def test_a_name_that_could_harm_a_log_is_not_issued(robot: str) -> None:
-    with pytest.raises(UsageError, match="no name for a robot"):
+    with pytest.raises(UsageError, match="not a valid name for a robot"):
         KEY.issue(robot, now=NOW, token_id="t", settings=SETTINGS)
 
 

@@ -9,7 +9,7 @@ import pytest
 
 from rse_pf.auth.roster import DenyList, EnrolledRobot
 from rse_pf.auth.tokens import Claims, SigningKey
-from rse_pf.auth.trust_store import DENY_NAME, AccessControlStore, TrustStore, key_set_of
+from rse_pf.auth.trust_store import DENY_NAME, AccessControlStore, TrustStore, key_set_from_snapshot
 from rse_pf.errors import ConfigurationError, Conflict
 from rse_pf.object_store import DirectoryStore, MemoryStore
 
@@ -47,7 +47,9 @@ class Racing(MemoryStore):
             if self.races:
                 self.races -= 1
                 other = AccessControlStore(_Quiet(self))
-                other.change_denied(lambda denied: denied.with_robot("default", f"other-{self.races}", 1.0))
+                other.change_deny_list(
+                    lambda denied: denied.with_robot("default", f"other-{self.races}", 1.0)
+                )
 
 
 class _Quiet:
@@ -66,59 +68,59 @@ class _Quiet:
 def test_two_operators_at_once_lose_nothing():
     store = Racing(races=3)
 
-    AccessControlStore(store).change_denied(with_robot)
+    AccessControlStore(store).change_deny_list(with_robot)
 
-    assert {each.robot for each in AccessControlStore(store).denied().disabled} == {
+    assert {each.robot for each in AccessControlStore(store).deny_list().disabled} == {
         "r", "other-0", "other-1", "other-2",
     }  # fmt: skip
 
 
 def test_endless_races_end_with_an_error():
     with pytest.raises(Conflict):
-        AccessControlStore(Racing(races=1000)).change_denied(with_robot)
+        AccessControlStore(Racing(races=1000)).change_deny_list(with_robot)
 
 
 def test_an_empty_room_is_furnished_once_and_not_emptied():
     store = MemoryStore()
     room = AccessControlStore(store)
-    room.furnish()
-    room.change_denied(with_robot)
-    room.furnish()
+    room.create_missing()
+    room.change_deny_list(with_robot)
+    room.create_missing()
 
-    assert room.denied().is_disabled("default", "r")
+    assert room.deny_list().is_disabled("default", "r")
     assert room.roster().robots == ()
 
 
 def test_a_platform_without_a_room_trusts_its_keys(keys_file: Path):
     trust = TrustStore(keys_file)
-    trust.first()
+    trust.load()
 
     assert trust.keys is not None
     assert trust.keys.denies(CLAIMS) == ""
-    assert trust.look() is False
+    assert trust.refresh() is False
     assert trust.problem == ""
 
 
 def test_what_is_new_is_seen_and_travels_as_text(keys_file: Path, room: AccessControlStore):
     trust = TrustStore(keys_file)
-    trust.first()
-    room.change_denied(with_robot)
+    trust.load()
+    room.change_deny_list(with_robot)
     room.change_roster(lambda roster: roster.enrolled(EnrolledRobot(robot="n", x="A" * 43)))
 
-    assert trust.look() is True
-    keys = key_set_of(trust.text)
+    assert trust.refresh() is True
+    keys = key_set_from_snapshot(trust.snapshot)
     assert keys.denies(CLAIMS) == "disabled"
     assert keys.robot_of(EnrolledRobot(robot="n", x="A" * 43).key_id) is not None
-    assert trust.look() is False
+    assert trust.refresh() is False
 
 
 @pytest.mark.parametrize("harm", ["nonsense", "empty", "gone", "folder"])
 def test_a_list_that_cannot_be_read_any_more_stays_as_it_was_known(
     keys_file: Path, room: AccessControlStore, harm: str
 ):
-    room.change_denied(with_robot)
+    room.change_deny_list(with_robot)
     trust = TrustStore(keys_file)
-    trust.first()
+    trust.load()
     file = keys_file.parent / DENY_NAME
     if harm in ("gone", "folder"):
         file.unlink()
@@ -127,7 +129,7 @@ def test_a_list_that_cannot_be_read_any_more_stays_as_it_was_known(
     else:
         file.write_bytes(b"{" if harm == "nonsense" else b"")
 
-    assert trust.look() is False
+    assert trust.refresh() is False
     assert trust.problem
     assert trust.keys is not None
     assert trust.keys.denies(CLAIMS) == "disabled"
@@ -137,11 +139,11 @@ def test_keys_that_vanish_stay_known_and_new_denials_are_still_seen(
     keys_file: Path, room: AccessControlStore
 ):
     trust = TrustStore(keys_file)
-    trust.first()
+    trust.load()
     keys_file.unlink()
-    room.change_denied(with_robot)
+    room.change_deny_list(with_robot)
 
-    assert trust.look() is True
+    assert trust.refresh() is True
     assert trust.keys is not None
     assert trust.keys.get("p1") is not None
     assert trust.keys.denies(CLAIMS) == "disabled"
@@ -152,14 +154,16 @@ def test_a_server_that_never_knew_a_list_refuses_to_begin_without(keys_file: Pat
     (keys_file.parent / "control").mkdir()
     (keys_file.parent / name).write_text("nonsense")
 
-    with pytest.raises(ConfigurationError, match="who may come in") as caught:
-        TrustStore(keys_file).first()
+    with pytest.raises(
+        ConfigurationError, match="cannot read the keys, the roster or the deny list"
+    ) as caught:
+        TrustStore(keys_file).load()
 
     assert str(keys_file) in caught.value.hint
 
 
 def test_the_text_holds_no_private_half(keys_file: Path):
     trust = TrustStore(keys_file)
-    trust.first()
+    trust.load()
 
-    assert "d" not in json.loads(json.loads(trust.text)["keys"])["keys"][0]
+    assert "d" not in json.loads(json.loads(trust.snapshot)["keys"])["keys"][0]

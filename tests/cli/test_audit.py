@@ -43,7 +43,7 @@ def test_verify_names_file_entry_and_what_is_wrong(folder: Path, capsys: pytest.
     assert main(["audit", "verify", str(folder)]) == 1
 
     assert capsys.readouterr().out.splitlines()[1] == (
-        "server-1: BROKEN in server-1.jsonl: entry 1 was changed: its hash is not that of what it says"
+        "server-1: BROKEN in server-1.jsonl: entry 1 was changed: its hash does not match its content"
     )
 
 
@@ -67,7 +67,7 @@ def test_a_head_that_was_kept_elsewhere_betrays_a_cut_end(folder: Path, capsys: 
 
     assert main(["audit", "verify", str(folder), "--head", f"server-1={head}"]) == 1
 
-    assert "entry 2 is missing: the head kept elsewhere has seen it" in capsys.readouterr().out
+    assert "entry 2 is missing: the head stored elsewhere has seen it" in capsys.readouterr().out
 
 
 def test_show_prints_all_chains_in_the_order_of_time(folder: Path, capsys: pytest.CaptureFixture[str]):

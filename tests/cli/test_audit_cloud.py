@@ -91,7 +91,7 @@ def test_show_prints_all_servers_in_order_and_keeps_the_files(two_servers: Any, 
     ("words", "first"),
     [
         (["verify", "--cloud"], "holds no audit log yet"),
-        (["verify", "somewhere", "--cloud"], "two places"),
+        (["verify", "somewhere", "--cloud"], "exclude each other"),
         (["verify", "--out", "x"], "--out is for --cloud"),
         (["show", "--cloud", "--out", "full"], "not empty"),
     ],

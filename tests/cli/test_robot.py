@@ -52,7 +52,7 @@ def trusted(folder: Path) -> KeySet:
     """Return what a server of the platform would trust."""
     room = AccessControlStore(DirectoryStore(folder))
     keys = KeySet.from_json(key_set_file(folder).read_text())
-    return keys.governed_by(room.roster(), room.denied())
+    return keys.with_access_control(room.roster(), room.deny_list())
 
 
 def problem(folder: Path, token: str) -> str:
@@ -192,9 +192,9 @@ def test_a_roster_that_is_empty_says_so(capsys: Capture, platform: Path) -> None
         ("robot enrol --public-key x.json", "needs the name"),
         ("robot enrol robot-1 --public-key missing.json", "cannot read"),
         ("robot enrol robot-1 --public-key private.json", "private key"),
-        ("robot enrol robot-1 --public-key public.json --scope pnp", "is no scope"),
-        ("robot enrol robot-1 --public-key public.json --quota x=1", "is no quota"),
-        ("robot enrol robot-1 --public-key public.json --quota data_bytes", "is no quota"),
+        ("robot enrol robot-1 --public-key public.json --scope pnp", "is not a scope"),
+        ("robot enrol robot-1 --public-key public.json --quota x=1", "is not a quota"),
+        ("robot enrol robot-1 --public-key public.json --quota data_bytes", "is not a quota"),
         ("robot disable", "needs the name"),
         ("robot disable robot-1 --scope services:pnp", "--scope"),
         ("robot enable robot-1", "is not disabled"),
@@ -203,9 +203,9 @@ def test_a_roster_that_is_empty_says_so(capsys: Capture, platform: Path) -> None
         ("robot keygen", "--out"),
         ("robot keygen --out nowhere/robot.key", "cannot write"),
         ("token revoke", "needs a token"),
-        ("token revoke x.y.z", "no token"),
+        ("token revoke x.y.z", "not a token"),
         ("token revoke x --all-of robot-1", "needs a token"),
-        ("token issue robot-1 --scope pnp", "is no scope"),
+        ("token issue robot-1 --scope pnp", "is not a scope"),
         ("token issue robot-1 --all-of robot-1", "--all-of"),
         ("token rotate-keys robot-1", "names no robot"),
     ],

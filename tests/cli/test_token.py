@@ -30,7 +30,7 @@ def inspected(capsys: pytest.CaptureFixture[str], *words: str) -> tuple[int, dic
 def test_an_issued_token_is_verified_by_the_platforms_public_keys(
     capsys: pytest.CaptureFixture[str], platform: Path
 ) -> None:
-    code, told = inspected(capsys, issued(capsys, "--life", "60"))
+    code, told = inspected(capsys, issued(capsys, "--ttl", "60"))
 
     assert code == 0
     assert told["verified"] == "yes"
@@ -98,7 +98,7 @@ def test_a_token_follows_the_settings_that_its_platform_was_started_with(
 def test_a_longer_life_than_the_settings_allow_is_refused(
     capsys: pytest.CaptureFixture[str], platform: Path
 ) -> None:
-    assert main(["token", "issue", "robot-1", "--life", "901"]) == 2
+    assert main(["token", "issue", "robot-1", "--ttl", "901"]) == 2
     assert "901 s is not within 900 s" in capsys.readouterr().err
 
 
@@ -134,7 +134,7 @@ def test_init_again_keeps_the_key_and_publishes_it_again(
     assert main(["token", "init", "--cloud"]) == 0
 
     assert published(cloud) == before
-    assert "there already" in capsys.readouterr().out
+    assert "exists already" in capsys.readouterr().out
 
 
 def test_a_rotation_publishes_both_keys_and_signs_with_the_old_one_until_servers_know(
