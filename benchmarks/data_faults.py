@@ -35,13 +35,14 @@ from typing import Any
 import numpy as np
 from windows import poses
 
-from client_sdk.transfer.background_upload import UploadRate
 from client_sdk.transfer.data_client import DataClient, DataOptions
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import RsePfError
 from rse_pf.experiments.load.swarm import Swarm, SwarmOptions
+from rse_pf.local.control.control_plane import ControlOptions
 from rse_pf.local.control.platform import LocalPlatform
 from rse_pf.object_store import DirectoryStore, digest_of
+from rse_pf.wire.rate_limit import TokenBucket
 
 MIB = 1 << 20
 UPLOADERS = 4
@@ -72,10 +73,10 @@ def upload_all(
         part_bytes = size // 4 if not bytes_per_s else 64 * 1024
         options = DataOptions(part_bytes=part_bytes, first_pause_s=0.05, random=random.Random(row))
         client = DataClient(url, tokens[row], options)
-        pace = UploadRate(bytes_per_s, time.monotonic()) if bytes_per_s else None
+        pace = TokenBucket(bytes_per_s, burst=0.0) if bytes_per_s else None
         for number in numbers[row::UPLOADERS]:
             if pace is not None:
-                time.sleep(pace.wait_s(size, time.monotonic()))  # the pace is what is measured
+                time.sleep(pace.spend(size, time.monotonic()))  # the pace is what is measured
             began = time.monotonic()
             digest = client.upload(content(number, size))
             with lock:
@@ -175,7 +176,7 @@ async def run(args: argparse.Namespace) -> dict[str, Any]:
     """Return every figure of the table."""
     size, settings = args.size_kib * 1024, PlatformSettings()
     with tempfile.TemporaryDirectory() as folder:
-        cloud = LocalPlatform(settings, state=Path(folder), port=0, servers=2, data=True, elastic=True)
+        cloud = LocalPlatform(settings, state=Path(folder), port=0, servers=2, data=True, control=ControlOptions(elastic=True))
         async with cloud:
             began = time.monotonic()
             options = SwarmOptions(robots=args.robots, fps=args.fps, join_every_s=0.02)

@@ -339,6 +339,7 @@ async def _settled(server: Server, most: int) -> None:
 
 async def state(folder: Path, kills: int = 5) -> list[Row]:
     """Kill the server of a counter five times, behind the load balancer; its count must not go back."""
+    from rse_pf.local.control.control_plane import ControlOptions
     from rse_pf.local.control.platform import LocalPlatform
     from rse_pf.local.faults.faults import signal_tree
     from rse_pf.local.state import read_state
@@ -350,7 +351,7 @@ async def state(folder: Path, kills: int = 5) -> list[Row]:
     failures: list[str] = []
     place = folder / "platform"
     async with (
-        LocalPlatform(chosen, state=place, servers=2, port=0, name="bench", elastic=True) as cloud,
+        LocalPlatform(chosen, state=place, servers=2, port=0, name="bench", control=ControlOptions(elastic=True)) as cloud,
         connect(cloud.url, token=cloud.issue_token("counter")) as robot,
     ):
         for _ in range(kills):

@@ -53,9 +53,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--announce", type=Path, metavar="FILE", help="write pids and ports to FILE when all is ready"
     )
-    parser.add_argument(
-        "--audit", type=Path, metavar="DIR", help="record accepted and refused robots in DIR"
-    )
+    parser.add_argument("--audit", type=Path, metavar="DIR", help="record accepted and refused robots in DIR")
     parser.add_argument(
         "--services", type=Path, metavar="DIR", help="run the services installed in DIR (services.folder)"
     )

@@ -1,55 +1,39 @@
-"""A server that is not one yet: it has imported what `rse-pf serve` needs, and waits to be told which it is.
+"""A warm standby: it has imported what `rse-pf serve` needs, and becomes a server when it gets its arguments.
 
-Started by the local platform as ``python -m rse_pf.cli.standby``; it says a word when all is imported, and
-one JSON line on its standard input names the arguments and the log.  It imports slowly, a quarter of a core
-at most, because servers work beside it.  Promises to listen nowhere and to hold no key before it is told,
-not to dawdle once it is, and to go when nobody is left who could tell it.
+Started by the local platform as ``python -m rse_pf.cli.standby``.  It imports in a thread of low priority,
+because servers work beside it, and prints a line when it is warm.  One JSON line on its standard input holds
+the arguments and the log of the server; from then on it works at full priority.  It ends when that input
+ends without a line.
 """
 
 from __future__ import annotations
 
 import importlib
-import importlib.abc
 import json
 import os
-import select
 import sys
-import time
+import threading
 
 __all__ = ["main"]
 
-_MAX_S = 0.01
-"""Of work without a rest, where one module does not take longer."""
-_REST = 3.0
-"""Rest so many times as long as was worked."""
-
-
-class _Rests(importlib.abc.MetaPathFinder):
-    """Finds no module; whoever looks for one is held back a little, until the order is there."""
-
-    def __init__(self) -> None:
-        self._worked_s = time.process_time()
-        self._is_wanted = False
-
-    def find_spec(self, fullname: str, path: object, target: object = None) -> None:
-        worked_s = time.process_time() - self._worked_s
-        if worked_s > _MAX_S and not self._is_wanted:
-            self._is_wanted = bool(select.select([0], [], [], _REST * worked_s)[0])
-            self._worked_s = time.process_time()
+_MODULES = (
+    "numpy", "jwt", "cryptography.hazmat.primitives.asymmetric.ed25519", "uvloop", "picows",
+    "prometheus_client", "rse_pf.cli.main", "rse_pf.cli.serve", "rse_pf.backend.supervisor",
+)  # fmt: skip
+"""In the order of their imports, so that the thread can stop between any two of them."""
+_NICENESS = 10
 
 
 def main() -> int:
-    """Wait for the order, then be that server."""
-    rests = _Rests()
-    sys.meta_path.insert(0, rests)
-    front = importlib.import_module("rse_pf.cli.main")
-    importlib.import_module("rse_pf.cli.serve")
-    importlib.import_module("rse_pf.backend.supervisor").warm_up()
-    sys.meta_path.remove(rests)
-    print("warm", flush=True)
+    """Import, wait for the arguments of a server, and run it; return its exit code."""
+    ordered = threading.Event()
+    importer = threading.Thread(target=_import_slowly, args=(ordered,), daemon=True)
+    importer.start()
     line = sys.stdin.buffer.readline()
     if not line.endswith(b"\n"):
         return 0
+    ordered.set()
+    importer.join()
     order = json.loads(line)
     log = os.open(order["log"], os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_APPEND, 0o666)
     nothing = os.open(os.devnull, os.O_RDONLY)
@@ -57,8 +41,19 @@ def main() -> int:
         os.dup2(ours, standard)
     os.close(nothing)
     os.close(log)
-    code: int = front.main(order["arguments"])
+    code: int = importlib.import_module("rse_pf.cli.main").main(order["arguments"])
     return code
+
+
+def _import_slowly(ordered: threading.Event) -> None:
+    """Import until all is imported or the order has come.  Linux keeps a niceness for each thread."""
+    os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICENESS)
+    for name in _MODULES:
+        if ordered.is_set():
+            return
+        importlib.import_module(name)
+    importlib.import_module("rse_pf.backend.supervisor").warm_up()
+    print("warm", flush=True)
 
 
 if __name__ == "__main__":

@@ -15,6 +15,7 @@ from rse_pf.auth.control_token import bearer, read_control_token
 from rse_pf.config import PlatformSettings
 from rse_pf.local.balancer.envoy_config import ADMIN_SOCKET
 from rse_pf.local.control.platform import LocalPlatform
+from rse_pf.local.state import read_state
 
 pytestmark = pytest.mark.system
 
@@ -129,7 +130,7 @@ def test_a_control_port_tells_its_health_to_all_and_the_rest_to_who_carries_its_
     async def scan() -> tuple[Any, int, int]:
         async with LocalPlatform(PlatformSettings(), state=folder, port=0, servers=1) as cloud:
             (server,) = cloud.servers
-            status_port = cloud._status.sockets[0].getsockname()[1] if cloud._status else 0
+            status_port = getattr(read_state(folder), "status_port", 0)
             unasked = await asyncio.to_thread(status_of, status_port, "/status")
             mode = stat.S_IMODE((folder / "control.token").stat().st_mode)
             return await asyncio.to_thread(knock, server.control_port), unasked, mode

@@ -22,9 +22,11 @@ from client_sdk import connect
 from rse_pf.auth.control_token import bearer, read_control_token
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import ConfigurationError, UsageError
+from rse_pf.local.control.control_plane import ControlOptions
 from rse_pf.local.control.platform import LocalPlatform
 from rse_pf.local.processes import is_alive, mark_of, send_signal, wait_ended
 from rse_pf.local.state import read_state
+from rse_pf.scaling.rebalance import MARGIN
 
 pytestmark = pytest.mark.system
 
@@ -39,15 +41,15 @@ class News:
 
     def __init__(self) -> None:
         self.events: list[Mapping[str, Any]] = []
-        self.readings: list[Mapping[str, Any]] = []
+        self.samples: list[Mapping[str, Any]] = []
         self._more = asyncio.Condition()
 
     def event(self, told: Mapping[str, Any]) -> None:
         self.events.append(told)
         self._notify()
 
-    def reading(self, told: Mapping[str, Any]) -> None:
-        self.readings.append(told)
+    def sample(self, told: Mapping[str, Any]) -> None:
+        self.samples.append(told)
         self._notify()
 
     async def until(self, condition: Callable[[], Any]) -> Any:
@@ -83,9 +85,12 @@ class News:
 
 
 def platform(folder: Path, news: News, **options: Any) -> LocalPlatform:
-    chosen = {"settings": SETTINGS, "servers": 2, "port": 0, "elastic": True, **options}
+    chosen = {"settings": SETTINGS, "servers": 2, "port": 0, **options}
+    names = ("elastic", "compress", "rebalance")
+    given: dict[str, Any] = {name: chosen.pop(name) for name in names if name in chosen}
+    control = ControlOptions(**{"elastic": True, "on_sample": news.sample, **given})
     return LocalPlatform(
-        chosen.pop("settings"), state=folder, on_event=news.event, on_reading=news.reading, **chosen
+        chosen.pop("settings"), state=folder, on_event=news.event, control=control, **chosen
     )
 
 
@@ -161,16 +166,16 @@ def test_the_process_that_waits_warm_is_the_replacement_and_the_next_one_follows
     async def run() -> None:
         news = News()
         async with platform(tmp_path / "a", news) as cloud:
-            spare = (await news.heard("spare-started"))["pid"]
+            standby = (await news.heard("standby-started"))["pid"]
             async with asking(cloud) as tally:
                 cloud.kill("server-1")
                 await news.heard("server-healthy", server="server-3")
-                assert cloud.backend_servers.marks["server-3"].pid == spare
+                assert cloud.backend_servers.marks["server-3"].pid == standby
                 told = await news.heard("server-ready", server="server-3")
-                assert told["pid"] == spare
+                assert told["pid"] == standby
             check(tally)
             started = await news.until(
-                lambda: [told["pid"] for told in news.events if told["event"] == "spare-started"][1:]
+                lambda: [told["pid"] for told in news.events if told["event"] == "standby-started"][1:]
             )
             mark = mark_of(started[0])
         assert mark is not None
@@ -228,12 +233,12 @@ def test_robots_that_are_there_already_spread_over_a_new_server(tmp_path: Path) 
         async with platform(tmp_path / "a", news, servers=1) as cloud, asking(cloud, 12, 0.2) as tally:
             await cloud.grow(1, "more of them")
             await news.heard("rebalance", server="server-1")
-            await news.until(lambda: is_even(news.readings[-1]))
+            await news.until(lambda: is_even(news.samples[-1]))
         check(tally)
 
-    def is_even(reading: Mapping[str, Any]) -> bool:
-        robots = [server["robots"] for server in reading["servers"]]
-        return sum(robots) == 12 and max(robots) <= 6 * (1 + SETTINGS.scaling.rebalance_percent / 100)
+    def is_even(sample: Mapping[str, Any]) -> bool:
+        robots = [server["robots"] for server in sample["servers"]]
+        return sum(robots) == 12 and max(robots) <= 6 * (1 + MARGIN)
 
     asyncio.run(run())
 
@@ -256,8 +261,8 @@ def test_load_makes_it_grow_and_rest_makes_it_shrink(tmp_path: Path) -> None:
             assert grown["reason"].startswith("CPU at")
             assert shrunk["reason"].startswith("idle")
             assert len(cloud.servers) == 1
-            assert cloud.reading is not None
-            seen = [reading["cpu_percent"] for reading in news.readings[: news.readings.index(cloud.reading)]]
+            assert cloud.sample is not None
+            seen = [sample["cpu_percent"] for sample in news.samples[: news.samples.index(cloud.sample)]]
             assert max(each for each in seen if each is not None) >= settings.scaling.busy_cpu_percent
 
     asyncio.run(run())
@@ -278,8 +283,8 @@ def test_new_servers_that_all_crash_are_started_slowly_and_old_ones_serve_on(tmp
             broken.touch()
             cloud.kill("server-1")
             await news.heard("crash-loop")
-            readings = len(news.readings)
-            await news.until(lambda: len(news.readings) >= readings + 2)
+            samples = len(news.samples)
+            await news.until(lambda: len(news.samples) >= samples + 2)
             launched = [told["server"] for told in news.events if told["event"] == "server-launched"]
             assert launched == ["server-1", "server-2", "server-3", "server-4"]
             failed = news.find("server-failed", server="server-3")
@@ -316,7 +321,7 @@ def test_without_elastic_nothing_is_replaced_but_drain_and_grow_can_be_asked_for
                 await cloud.drain("server-1")
             assert await cloud.grow(1, "asked") == ["server-2"]
             assert (await cloud.drain("server-1", reason="asked"))["clean"]
-            assert cloud.reading is None
+            assert cloud.sample is None
             document = cloud.status_document()
             assert [server["name"] for server in document["servers"]] == ["server-2"]
             with pytest.raises(UsageError, match="no server named 'server-1'"):
@@ -328,10 +333,11 @@ def test_without_elastic_nothing_is_replaced_but_drain_and_grow_can_be_asked_for
 CONTROL_PLANE = """
 import asyncio
 from pathlib import Path
+from rse_pf.local.control.control_plane import ControlOptions
 from rse_pf.local.control.platform import LocalPlatform
 from rse_pf.config import PlatformSettings
 async def run():
-    options = dict(servers=2, port=0, state=Path("a"), adoptable=True, elastic=True)
+    options = dict(servers=2, port=0, state=Path("a"), adoptable=True, control=ControlOptions(elastic=True))
     async with LocalPlatform(PlatformSettings(), **options) as cloud:
         print(cloud.url, cloud.issue_token("robot-0"), flush=True)
         await asyncio.Event().wait()

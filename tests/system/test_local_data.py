@@ -18,6 +18,7 @@ import client_sdk
 from client_sdk.transfer.data_client import DataClient, DataOptions
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import ConnectError, RsePfError
+from rse_pf.local.control.control_plane import ControlOptions
 from rse_pf.local.control.platform import LocalPlatform
 from rse_pf.local.control.status import data_url, platform_status, status_table
 from rse_pf.local.faults import faults
@@ -76,7 +77,7 @@ def test_a_robot_stores_through_the_front_door_what_its_services_can_read(
 
     async def run() -> list[int]:
         cloud = LocalPlatform(
-            SETTINGS, servers=1, port=0, state=tmp_path / "a", data=True, elastic=True, on_event=events
+            SETTINGS, servers=1, port=0, state=tmp_path / "a", data=True, control=ControlOptions(elastic=True), on_event=events
         )
         async with cloud:
             robot = client(cloud)

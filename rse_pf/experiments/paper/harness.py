@@ -1,7 +1,7 @@
-"""The stage of an experiment: a local platform, its robots, and every record written while they play.
+"""The harness of an experiment: a local platform, its robots, and every record of them while they run.
 
-`Harness` opens the record files before anything runs, so that a killed run still tells its story.  Promises
-that nothing it started is left running, and that no secret stays in the folder of results.
+`Harness` opens the record files before anything starts, so that a killed run leaves its events.  When it
+ends, nothing that it started is running, and no key is left in the folder of results.
 """
 
 from __future__ import annotations
@@ -17,35 +17,38 @@ from types import TracebackType
 from typing import Any
 
 from rse_pf.config import PlatformSettings
-from rse_pf.errors import CommandFailed
+from rse_pf.errors import CommandFailed, UsageError
 from rse_pf.experiments.load.swarm import Swarm, SwarmOptions, SwarmResult
-from rse_pf.experiments.paper.result_folder import policy_of
 from rse_pf.experiments.results.records import (
     COMMANDS,
     EVENTS,
     SAMPLES,
-    RecordedSample,
+    EventLog,
+    Records,
     SampleLog,
-    reading_of,
+    sample_from_document,
+    write_commands,
 )
-from rse_pf.experiments.results.report import EventLog, write_commands
+from rse_pf.experiments.results.result_folder import remove_keys
+from rse_pf.local.control.control_plane import ControlOptions
+from rse_pf.local.control.monitor import MonitorSample
 from rse_pf.local.control.platform import LocalPlatform
 
-__all__ = [
-    "Harness",
-    "generator_facts",
-    "watch",
-]
+__all__ = ["Harness", "event_details", "generator_event", "generator_of", "policy_parameters"]
+
+_SERVER_CHANGES = {
+    "grow", "shrink", "replace", "server-launched", "server-healthy", "server-gone", "phase",
+}  # fmt: skip
 
 
 class Harness:
-    """A platform under observation; ``async with`` starts and ends it."""
+    """A platform whose events and samples are recorded; ``async with`` starts and ends it."""
 
     def __init__(
         self,
         folder: Path,
         settings: PlatformSettings,
-        asked: Mapping[str, Any],
+        parameters: Mapping[str, Any],
         *,
         elastic: bool = True,
         compress: float = 1.0,
@@ -55,56 +58,51 @@ class Harness:
         """Describe a run; nothing is started.
 
         Args:
-            folder: Where the records go; it is there and empty.
-            settings: Of the platform.
-            asked: What the first event says of this run.
+            folder: Folder of the records; it exists and is empty.
+            settings: Settings of the platform.
+            parameters: Parameters of this run, for its first event.
             elastic: Whether monitor and scale modifier act.
-            compress: By how much their periods are shortened.
-            rebalance: Whether crowded servers hand robots over.
-            servers: How many to begin with; None means the settings' number.
+            compress: Factor by which their periods are shortened.
+            rebalance: Whether robots migrate from crowded servers.
+            servers: Number of servers at the start; None means that of the settings.
         """
         self.folder = folder
         self.settings = settings
         self.origin_s = 0.0
         self.events: list[dict[str, Any]] = []
-        self.readings: list[RecordedSample] = []
+        self.samples: list[MonitorSample] = []
         self.link: Any = None
-        self._asked = dict(asked)
-        self._compress = compress
-        self._options = {"elastic": elastic, "compress": compress, "rebalance": rebalance, "servers": servers}
+        self._parameters = {**parameters, **policy_parameters(settings, compress)}
+        self._servers = servers
+        self._control = ControlOptions(
+            elastic=elastic, compress=compress, rebalance=rebalance, on_sample=self._on_sample
+        )
         self._stack = AsyncExitStack()
-        self._news = asyncio.Event()
-        self._event_log: EventLog | None = None
-        self._sample_log: SampleLog | None = None
-        self._cloud: LocalPlatform | None = None
-
-    @property
-    def cloud(self) -> LocalPlatform:
-        """The platform."""
-        assert self._cloud is not None, "entered with async with"
-        return self._cloud
+        self._changed = asyncio.Event()
+        self._event_log: EventLog
+        self._sample_log: SampleLog
+        self.platform: LocalPlatform
 
     async def __aenter__(self) -> Harness:
         """Open the records and start the platform; raises what LocalPlatform raises."""
         self.origin_s = time.monotonic()
-        files = [
+        events, samples = (
             self._stack.enter_context((self.folder / name).open("w", newline="", encoding="utf-8"))
             for name in (EVENTS, SAMPLES)
-        ]
-        self._event_log, self._sample_log = EventLog(files[0]), SampleLog(files[1])
-        policy = policy_of(self.settings, self._compress)
-        self.tell("experiment", **self._asked, **policy, origin_s=self.origin_s)
-        cloud = LocalPlatform(
+        )
+        self._event_log, self._sample_log = EventLog(events), SampleLog(samples)
+        self.log("experiment", **self._parameters, origin_s=self.origin_s)
+        platform = LocalPlatform(
             self.settings,
             state=self.folder / "platform",
             port=0,
             name="experiment",
-            on_event=self._heard,
-            on_reading=self._read,
-            **self._options,  # type: ignore[arg-type]
+            on_event=lambda event: self.log(str(event["event"]), **event_details(event)),
+            servers=self._servers,
+            control=self._control,
         )
         try:
-            self._cloud = await self._stack.enter_async_context(cloud)
+            self.platform = await self._stack.enter_async_context(platform)
         except BaseException:
             await self._stack.aclose()
             raise
@@ -113,107 +111,126 @@ class Harness:
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """End the platform, close the records, remove the keys."""
+        """End the platform, close the records, delete the keys."""
         await self._stack.aclose()
-        for secret in ("key.json", "keys.json"):
-            (self.folder / "platform" / secret).unlink(missing_ok=True)
+        remove_keys(self.folder / "platform")
 
     def now(self) -> float:
-        """Return seconds since the run began."""
+        """Return seconds since the start of the run."""
         return time.monotonic() - self.origin_s
 
-    def tell(self, action: str, **details: Any) -> None:
-        """Write an event."""
-        self._note(self.now(), action, details)
+    def log(self, action: str, **details: Any) -> None:
+        """Record an event that happens now."""
+        self._record(self.now(), action, details)
 
     def swarm(self, options: SwarmOptions) -> Swarm:
-        """Return the robots of this run; enter them with ``async with``."""
+        """Return the robots of this run; start them with ``async with``."""
         return Swarm(
             options,
-            url=self.cloud.url,
-            token_of=self.cloud.issue_token,
+            url=self.platform.url,
+            token_of=self.platform.issue_token,
             session=self.settings.session,
-            on_event=self._heard_robot,
+            on_event=lambda event: self._record(
+                float(event.get("time", self.now())), str(event["event"]), event_details(event)
+            ),
             origin=self.origin_s,
         )
 
-    async def until(self, condition: Callable[[], bool], within_s: float) -> bool:
-        """Wait until *condition* holds, looked at after each event and reading; return whether it did."""
-        end = time.monotonic() + within_s
+    async def wait_for(self, condition: Callable[[], bool], timeout_s: float) -> bool:
+        """Wait until *condition* holds, evaluated after each event and sample; return whether it did."""
+        end = time.monotonic() + timeout_s
         while not condition():
             left = end - time.monotonic()
             if left <= 0:
                 return False
-            self._news.clear()
+            self._changed.clear()
             try:
-                await asyncio.wait_for(self._news.wait(), min(left, 1.0))
+                await asyncio.wait_for(self._changed.wait(), min(left, 1.0))
             except asyncio.TimeoutError:
                 continue
         return True
 
-    async def settled(self, quiet_s: float, within_s: float) -> bool:
-        """Wait until no server came, went or was asked for during *quiet_s*; return whether that was so."""
-        moves = {"grow", "shrink", "replace", "server-launched", "server-healthy", "server-gone", "phase"}
+    async def run_for(self, seconds: float) -> None:
+        """Let the run go on for *seconds*."""
+        await self.wait_for(lambda: False, seconds)
+
+    async def wait_quiet(self, quiet_s: float, timeout_s: float) -> bool:
+        """Wait until the number of servers was not changed for *quiet_s*; return whether that happened."""
 
         def quiet() -> bool:
-            last = max((each["time"] for each in self.events if each["action"] in moves), default=0.0)
-            return self.now() - last >= quiet_s
+            times = (each["time"] for each in self.events if each["action"] in _SERVER_CHANGES)
+            return self.now() - max(times, default=0.0) >= quiet_s
 
-        return await self.until(quiet, within_s)
+        return await self.wait_for(quiet, timeout_s)
 
-    def happened(self, action: str, since_s: float) -> list[dict[str, Any]]:
+    def events_since(self, action: str, since_s: float) -> list[dict[str, Any]]:
         """Return the events *action* since *since_s*."""
         return [each for each in self.events if each["action"] == action and each["time"] >= since_s]
 
     def busiest(self) -> Any:
-        """Return the server with the most robots, as `LocalPlatform.servers` has it."""
-        robots = {each.server: each.robots for each in self.readings[-1].servers} if self.readings else {}
-        servers = self.cloud.servers
+        """Return the server with the most robots, an entry of `LocalPlatform.servers`."""
+        robots = {each.name: each.robots for each in self.samples[-1].servers} if self.samples else {}
+        servers = self.platform.servers
         if not servers:
             raise CommandFailed("no server is left", hint=f"look at {self.folder / 'platform'}/*.log")
         return max(servers, key=lambda server: (robots.get(server.name, 0), server.name))
 
     def kill(self, watch_s: float) -> str:
-        """Send SIGKILL to the pid of the busiest server, and log it; return its name."""
+        """Send SIGKILL to the busiest server and record the fault; return its name."""
         victim = self.busiest()
-        self.tell("fault", fault="kill -9", server=victim.name, pid=victim.pid, watch_s=watch_s)
+        self.log("fault", fault="kill -9", server=victim.name, pid=victim.pid, watch_s=watch_s)
         os.kill(victim.pid, signal.SIGKILL)
         return str(victim.name)
 
-    async def close_books(self, result: SwarmResult) -> None:
-        """Write the robots' commands, and what the generator says of itself; nobody waits meanwhile."""
+    async def save_result(self, result: SwarmResult) -> None:
+        """Write the commands of the robots and the figures of the load generator."""
         await asyncio.to_thread(write_commands, self.folder / COMMANDS, result.commands)
-        self.tell("generator", **generator_facts(result))
+        self.log("generator", **generator_event(result))
 
-    def _note(self, time_s: float, action: str, details: Mapping[str, Any]) -> None:
+    def _record(self, time_s: float, action: str, details: Mapping[str, Any]) -> None:
         self.events.append({"time": time_s, "action": action, **details})
-        if self._event_log is not None:
-            self._event_log.write(time_s, action, **details)
-        self._news.set()
+        self._event_log.write(time_s, action, **details)
+        self._changed.set()
 
-    def _heard_robot(self, event: Mapping[str, Any]) -> None:
-        """Write what a robot saw, at the time it saw it."""
-        details = {name: value for name, value in event.items() if name not in ("event", "time", "action")}
-        self._note(float(event.get("time", self.now())), str(event["event"]), details)
-
-    def _heard(self, event: Mapping[str, Any]) -> None:
-        details = {name: value for name, value in event.items() if name not in ("event", "time", "action")}
-        self.tell(str(event["event"]), **details)
-
-    def _read(self, told: Mapping[str, Any]) -> None:
-        reading = reading_of(told, self.origin_s)
-        self.readings.append(reading)
-        if self._sample_log is not None:
-            self._sample_log.write(reading)
-        self._news.set()
+    def _on_sample(self, document: Mapping[str, Any]) -> None:
+        sample = sample_from_document(document, self.origin_s)
+        self.samples.append(sample)
+        self._sample_log.write(sample)
+        self._changed.set()
 
 
-def generator_facts(result: SwarmResult) -> dict[str, Any]:
-    """Return what the robots' processes say of themselves."""
-    told = ("cpu_s", "wall_s", "wrong_poses", "reconnects", "resent", "moves", "twice", "late_sends")
-    return {name: getattr(result, name) for name in told}
+def event_details(event: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the fields of an event of platform or swarm but for its name and time."""
+    return {name: value for name, value in event.items() if name not in ("event", "time", "action")}
 
 
-async def watch(stage: Harness, seconds: float) -> None:
-    """Let the run go on for *seconds*."""
-    await stage.until(lambda: False, seconds)
+def generator_event(result: SwarmResult) -> dict[str, Any]:
+    """Return the figures of the load generator, for the event ``generator``."""
+    same = ("cpu_s", "wall_s", "wrong_poses", "reconnects", "resent", "moves")
+    return {
+        **{name: getattr(result, name) for name in same},
+        "twice": result.duplicates,
+        "late_sends": result.late_sends_ms_p99,
+    }
+
+
+def generator_of(records: Records) -> dict[str, Any]:
+    """Return the figures of the load generator of a run; raises UsageError if the run did not end."""
+    for event in records.events:
+        if event["action"] == "generator":
+            return event_details(event)
+    raise UsageError("the events hold no figures of the load generator", hint="run the experiment again")
+
+
+def policy_parameters(settings: PlatformSettings, compress: float) -> dict[str, Any]:
+    """Return the parameters of the scaling policy, with its periods after compression."""
+    scaling = settings.scaling
+    return {
+        "min_servers": scaling.min_servers,
+        "max_servers_allowed": scaling.max_servers,
+        "busy_cpu_percent": scaling.busy_cpu_percent,
+        "busy_periods": scaling.busy_periods,
+        "period_s": scaling.period_s / compress,
+        "idle_s": scaling.idle_s / compress,
+        "size": settings.serving.emulated_cores,
+    }

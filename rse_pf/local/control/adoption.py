@@ -1,7 +1,7 @@
 """Take over the servers and the balancer of a control plane that was killed, while they serve robots.
 
-Whoever is in the state file, by pid and time of birth, is known again under its name.  Promises to kill and
-to restart nothing that runs, and that the front door stays where it was.
+A process in the state file that still runs, by its id and start time, keeps its name.  Nothing that runs is
+killed or restarted, and the balancer keeps its port.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ async def adopt(
         backend_servers: Likewise.
         load_balancer: Not launched; serves on its old port afterwards.
         tell: Gets the event ``adopted``: servers, balancer, and which settings digest each server runs.
-        end: Monotonic time at which patience ends.
+        end: Monotonic time of the deadline.
 
     Raises:
         ConfigurationError: The balancer is gone and does not come back, or no server gets robots.
@@ -98,7 +98,7 @@ async def adopt_data(
         load_balancer.set_data_targets([data_servers.target])
         return
     if left is not None:
-        send_signal(left.process, signal.SIGKILL)  # it had not announced itself, and nobody knows its port
+        send_signal(left.process, signal.SIGKILL)  # it had not announced itself: its port is unknown
     if wanted:
         await data_servers.start(0 if left is None else left.port)
 
@@ -120,11 +120,6 @@ async def _until_one_is_healthy(members: list[Member], end: float) -> None:
 
 
 async def _digest(port: ControlPort) -> str | None:
-    """Return which settings the server runs with; None if it does not answer."""
-    try:
-        told = (await port.ask("/status", timeout_s=_ASK_S)).document()
-    except ConnectionError:
-        return None
-    finally:
-        port.close()
-    return str(told.get("settings", "")) or None
+    """Return the digest of the server's settings; None if it does not answer."""
+    reply = await port.ask_once("/status", timeout_s=_ASK_S)
+    return None if reply is None else str(reply.document().get("settings", "")) or None

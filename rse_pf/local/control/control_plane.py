@@ -1,8 +1,8 @@
-"""The control plane of a local platform: look at the servers, decide, act; the loop around the boxes.
+"""The control plane of a local platform: monitor the servers, decide, act.
 
-Health checks, readings, the scale modifier, the hand-over of robots and the return of a lost balancer run
-here, in one event loop and without threads of their own.  Promises that robots are served on when it is gone,
-and that its own lateness is never held against a server.
+Health checks, samples, the scale modifier, the rebalancing of robots and the restart of a lost balancer run
+here, in one event loop without threads.  Robots are served without it, too, and a check that the control
+plane itself delayed does not count against a server.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ import math
 import os
 import time
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from typing import Any
 
 from rse_pf.config import PlatformSettings, ScalingSettings
@@ -23,26 +24,41 @@ from rse_pf.local.control.monitor import (
     MonitorSample,
     Observed,
     Periods,
-    ServerReading,
+    ServerSample,
     capacity_cores,
-    reading_every_s,
-    reading_of,
-    server_reading,
+    monitor_sample,
+    sample_interval_s,
+    server_sample,
 )
 from rse_pf.local.control.rebalancer import Order, Rebalancer
 from rse_pf.local.control.scale_modifier import LocalScaleModifier
 from rse_pf.local.servers.control_client import ControlPort, ControlPortReply
 from rse_pf.scaling.health import LOCAL_INTERVAL_S, LOCAL_TIMEOUT_S, observe
 
-__all__ = ["ControlPlane"]
+__all__ = ["ControlOptions", "ControlPlane"]
 
 _ASK_S = 2.0
 _STATUS_SHARE = 0.5
 _LATE_SHARE = 0.5
-"""A check whose deadline was noticed later than this share of it says more about us than about the server."""
+"""A check that ends later than its deadline by this share of it was delayed by the control plane itself."""
 _LEAVING = frozenset({"draining", "leaving"})
 _MAX_PAUSE_S = 8.0
-_SPARE_EVERY_S = 1.0
+_STANDBY_EVERY_S = 1.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ControlOptions:
+    """What a control plane does by itself.
+
+    With ``elastic``, monitor and scale modifier run, and what breaks is replaced; with ``rebalance``, robots
+    of crowded servers are asked to move, too.  Periods, idle time, warm-up and grace are shorter by the factor
+    ``compress``, for experiments.  ``on_sample`` gets each sample of the monitor, which runs then in any case.
+    """
+
+    elastic: bool = False
+    rebalance: bool = True
+    compress: float = 1.0
+    on_sample: Callable[[Mapping[str, Any]], None] | None = None
 
 
 class ControlPlane:
@@ -54,65 +70,67 @@ class ControlPlane:
         load_balancer: EnvoyLoadBalancer,
         settings: PlatformSettings,
         scaling: ScalingSettings,
+        options: ControlOptions,
         *,
-        elastic: bool,
-        compress: float,
-        rebalance: bool,
         tell: Callable[..., None],
         changed: Callable[[], None],
-        on_reading: Callable[[Mapping[str, Any]], None] | None,
     ) -> None:
-        self.reading: MonitorSample | None = None
+        self.sample: MonitorSample | None = None
         self.hold = False
         self.modifier = LocalScaleModifier(
             fleet,
             scaling,
             max_restarts_per_minute=settings.local.max_restarts_per_minute,
-            compress=compress,
+            compress=options.compress,
             tell=tell,
         )
         self._fleet = fleet
         self._load_balancer = load_balancer
         self._settings = settings
-        self._elastic = elastic
-        self._compress = compress
+        self._elastic = options.elastic
+        self._compress = options.compress
+        self._is_idle = not options.elastic and options.on_sample is None
         self._tell = tell
         self._changed = changed
-        self._on_reading = on_reading
-        period_s = scaling.period_s / compress
-        self._every_s = reading_every_s(period_s)
+        self._on_sample = options.on_sample
+        period_s = scaling.period_s / options.compress
+        self._every_s = sample_interval_s(period_s)
         self._periods = Periods(period_s, keep=scaling.idle_s // scaling.period_s + scaling.busy_periods + 1)
-        self._rebalancer = Rebalancer(scaling) if elastic and rebalance else None
+        self._rebalancer = Rebalancer(scaling) if options.elastic and options.rebalance else None
         self._before: dict[str, Observed] = {}
         self._ports: dict[str, ControlPort] = {}
         self._cores = len(os.sched_getaffinity(0))
 
-    def attend(self) -> None:
+    def start_checks(self) -> None:
         """Check the health of every server from its announcement on."""
+        if self._is_idle:
+            return
         self._fleet.on_ready = lambda member: self._fleet.keep(self._check_on(member))
 
     def start(self) -> None:
-        """Begin to read, and to decide if elastic."""
+        """Start the monitor, and the scale modifier if elastic."""
+        if self._is_idle:
+            return
         self._fleet.on_healthy = self.watch_spread
-        self._fleet.keep(self._read_on())
+        self._fleet.keep(self._monitor())
         if self._elastic:
             self._fleet.on_lost = self._soon
-            self._fleet.keep(self._keep_balancer())
-            self._fleet.keep(self._keep_spare())
+            self._fleet.keep(self._watch_balancer())
+            self._fleet.keep(self._keep_standby())
             self._soon()
 
-    async def _keep_spare(self) -> None:
-        """After every launch, once all is calm, prepare the next one."""
+    async def _keep_standby(self) -> None:
+        """Start a standby after every launch, once no server is starting."""
         while self._elastic:
-            await asyncio.sleep(_SPARE_EVERY_S)
-            self._fleet.warm_spare()
+            await asyncio.sleep(_STANDBY_EVERY_S)
+            self._fleet.start_standby()
 
     def stop(self) -> None:
-        """Act no more, whatever was about to happen."""
+        """Take no further action."""
         self._elastic = False
 
     def watch_spread(self) -> None:
-        """Look whether robots are spread evenly, for a while."""
+        """Watch for half a minute whether robots are spread evenly."""
         if self._rebalancer is not None:
             self._rebalancer.watch(time.monotonic())
 
@@ -128,7 +146,7 @@ class ControlPlane:
     # --- health ----------------------------------------------------------------------------------
 
     async def _check_on(self, member: Member) -> None:
-        """Ask */readyz* of one server again and again, as the balancer does."""
+        """Ask one server for */readyz* periodically, as the balancer does."""
         assert member.server is not None
         port = self._fleet.control(member.server)
         try:
@@ -156,7 +174,7 @@ class ControlPlane:
         return reply.status == 200
 
     def _judge(self, member: Member, ok: bool) -> None:
-        """Count *ok*; the rule's clock runs faster where time is compressed, so that the grace is shorter."""
+        """Count *ok*; the clock is compressed, too, so that the grace period is shorter."""
         health = member.health
         now_s = time.monotonic() * self._compress
         member.health = observe(health, ok, self._settings.health, now_s=now_s)
@@ -165,38 +183,38 @@ class ControlPlane:
             self._tell("server-unhealthy", server=member.name, reason=f"{failed} checks in a row failed")
             self._soon()
 
-    # --- readings --------------------------------------------------------------------------------
+    # --- samples --------------------------------------------------------------------------------
 
-    async def _read_on(self) -> None:
+    async def _monitor(self) -> None:
         try:
             while True:
                 now_s = time.monotonic()
                 await asyncio.sleep((math.floor(now_s / self._every_s) + 1) * self._every_s - now_s)
-                self._take(await self._read())
+                self._take(await self._sample_all())
         finally:
             for port in self._ports.values():
                 port.close()
 
-    def _take(self, reading: MonitorSample) -> None:
-        self.reading = reading
-        if self._on_reading is not None:
-            self._on_reading(reading.document())
-        self._act(period_over=self._periods.add(reading))
-        self._even_out(reading)
+    def _take(self, sample: MonitorSample) -> None:
+        self.sample = sample
+        if self._on_sample is not None:
+            self._on_sample(sample.document())
+        self._act(period_over=self._periods.add(sample))
+        self._rebalance(sample)
 
-    async def _read(self) -> MonitorSample:
+    async def _sample_all(self) -> MonitorSample:
         members = list(self._fleet.members.values())
         stats, servers = await asyncio.gather(
-            self._load_balancer.stats(), asyncio.gather(*(self._read_one(member) for member in members))
+            self._load_balancer.stats(), asyncio.gather(*(self._monitore(member) for member in members))
         )
         there = set(self._fleet.members)
         for gone in set(self._ports) - there:
             self._ports.pop(gone).close()
             self._before.pop(gone, None)
         in_balancer = frozenset(name for name, target in stats.items() if target.healthy)
-        return reading_of(time.monotonic(), [each for each in servers if each.name in there], in_balancer)
+        return monitor_sample(time.monotonic(), [each for each in servers if each.name in there], in_balancer)
 
-    async def _read_one(self, member: Member) -> ServerReading:
+    async def _monitore(self, member: Member) -> ServerSample:
         server = member.server
         observed = None
         if server is not None:
@@ -209,9 +227,9 @@ class ControlPlane:
                 if reply.status == 200 and "cpu_s" in told:
                     observed = Observed(at_s=time.monotonic(), status=told)
             except ConnectionError:
-                pass  # a server that does not answer has no numbers; its health is judged elsewhere
+                pass  # a server that does not answer has no numbers; `_check_on` judges its health
         workers = 1 if server is None else len(server.workers)
-        reading = server_reading(
+        sample = server_sample(
             self._before.get(member.name),
             observed,
             name=member.name,
@@ -222,8 +240,8 @@ class ControlPlane:
         )
         if observed is not None:
             self._before[member.name] = observed
-            member.robots = reading.robots
-        return reading
+            member.robots = sample.robots
+        return sample
 
     # --- actions ---------------------------------------------------------------------------------
 
@@ -237,46 +255,42 @@ class ControlPlane:
             samples = self._periods.samples(now_s)
             self.modifier.act(samples, now_s=now_s, period_over=period_over, hold=self.hold)
 
-    def _even_out(self, reading: MonitorSample) -> None:
+    def _rebalance(self, sample: MonitorSample) -> None:
         if self._rebalancer is None or self.hold:
             return
-        robots = {each.name: each.robots for each in reading.servers if each.state == "healthy"}
-        for order in self._rebalancer.orders(robots, reading.time):
+        robots = {each.name: each.robots for each in sample.servers if each.state == "healthy"}
+        for order in self._rebalancer.orders(robots, sample.time):
             self._fleet.keep(self._move(order))
 
     async def _move(self, order: Order) -> None:
         member = self._fleet.members.get(order.server)
         if member is None or member.server is None:
             return
-        port = self._fleet.control(member.server)
-        try:
-            target = f"/move?robots={order.robots}&spread_s={order.spread_s:g}"
-            reply = await port.ask(target, timeout_s=_ASK_S, method="POST")
-        except ConnectionError:
-            return  # the next reading asks again
-        finally:
-            port.close()
+        target = f"/move?robots={order.robots}&spread_s={order.spread_s:g}"
+        reply = await self._fleet.control(member.server).ask_once(target, timeout_s=_ASK_S, method="POST")
+        if reply is None or reply.status >= 300:
+            return  # the next sample asks again
         told = reply.document()
-        if reply.status < 300 and told.get("robots"):
+        if told.get("robots"):
             self._tell("rebalance", server=order.server, robots=told["robots"], spread_s=told["spread_s"])
 
     # --- the balancer ----------------------------------------------------------------------------
 
-    async def _keep_balancer(self) -> None:
-        """Bring the balancer back on its port whenever it is gone."""
+    async def _watch_balancer(self) -> None:
+        """Restart the balancer on its port whenever it has ended."""
         while True:
             why = await self._load_balancer.wait_over()
             began_s = time.monotonic()
             mark = self._load_balancer.mark
             self._tell("balancer-gone", pid=None if mark is None else mark.pid, reason=why)
-            await self._bring_balancer_back()
+            await self._restart_balancer()
             seconds = round(time.monotonic() - began_s, 3)
             self._changed()
             mark = self._load_balancer.mark
             self._tell("balancer-back", seconds=seconds, pid=None if mark is None else mark.pid)
             self.watch_spread()
 
-    async def _bring_balancer_back(self) -> None:
+    async def _restart_balancer(self) -> None:
         pause_s = LOCAL_INTERVAL_S
         while True:
             self._load_balancer.launch()

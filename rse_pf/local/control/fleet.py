@@ -8,7 +8,6 @@ it hears of it, and that a name is never used twice.
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import dataclasses
 import math
 import signal
@@ -22,6 +21,7 @@ from rse_pf.errors import ConfigurationError, UsageError
 from rse_pf.local.balancer.load_balancer import EnvoyLoadBalancer
 from rse_pf.local.control.monitor import ServerPhase
 from rse_pf.local.control.scale_modifier import ServerHealth
+from rse_pf.local.processes import STOP_TIMEOUT_S
 from rse_pf.local.servers.backend_servers import BackendServer, LocalBackendServers
 from rse_pf.local.servers.control_client import ControlPort
 from rse_pf.scaling.health import Health, time_to_notice_s
@@ -188,12 +188,15 @@ class Fleet:
                 )
             await asyncio.sleep(_PAUSE_S)  # the balancer itself may be gone, and come back
 
-    def warm_spare(self) -> None:
-        """Prepare for the next launch, unless a server started lately: its neighbours have enough to do."""
+    def start_standby(self) -> None:
+        """Start a standby for the next launch, unless a server started less than 3 s ago."""
         calm_since_s = time.monotonic() - _CALM_S
         ready = (member.healthy_s for member in self.members.values())
-        if all(at is not None and at <= calm_since_s for at in ready) and self._backend_servers.warm_spare():
-            self._tell("spare-started", pid=self._backend_servers.spare_pid)
+        if (
+            all(at is not None and at <= calm_since_s for at in ready)
+            and self._backend_servers.start_standby()
+        ):
+            self._tell("standby-started", pid=self._backend_servers.standby_pid)
 
     def start(self, member: Member) -> None:
         """Bring *member* up in the background; its failure is an event and a loss."""
@@ -274,20 +277,17 @@ class Fleet:
         """Wait until the balancer has dropped it, let it move its robots, and wait until it has left."""
         serving, session = self._settings.serving, self._settings.session
         notice_s = time_to_notice_s(self._settings.health, local=True)
-        if await self._load_balancer.wait_gone(member.name, self._settings.local.stop_timeout_s):
+        if await self._load_balancer.wait_gone(member.name, STOP_TIMEOUT_S):
             self._tell("server-out", server=member.name)
         server = member.server
-        asked = False
+        reply = None
         if server is not None:
-            port = self.control(server)
-            with contextlib.suppress(ConnectionError):
-                asked = (await port.ask("/drain?wait=0", timeout_s=_ASK_S, method="POST")).status == 202
-            port.close()
-        patience_s = serving.drain_within_ms / 1e3 + session.answer_timeout_s
-        patience_s = patience_s + self._settings.local.stop_timeout_s if asked else notice_s
+            reply = await self.control(server).ask_once("/drain?wait=0", timeout_s=_ASK_S, method="POST")
+        asked = reply is not None and reply.status == 202
+        drain_s = serving.drain_within_ms / 1e3 + session.answer_timeout_s + STOP_TIMEOUT_S
         clean = True
         try:
-            await asyncio.wait_for(member.over.wait(), patience_s)
+            await asyncio.wait_for(member.over.wait(), drain_s if asked else notice_s)
         except asyncio.TimeoutError:
             clean = False
             self._backend_servers.send(member.name, signal.SIGKILL)
@@ -363,8 +363,8 @@ class Fleet:
         self._tell("server-gone", server=server.name, pid=server.pid, exit_code=code)
         if unasked:
             self._lost(member)
-        patience_s = self._settings.local.stop_timeout_s
-        if not member.leaving and await self._load_balancer.wait_gone(server.name, patience_s):
+        timeout_s = STOP_TIMEOUT_S
+        if not member.leaving and await self._load_balancer.wait_gone(server.name, timeout_s):
             self._tell("server-out", server=server.name)
 
     def _forget(self, member: Member) -> None:

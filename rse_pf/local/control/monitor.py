@@ -1,8 +1,8 @@
-"""The monitor box on one machine: what every server does, as readings, and whole periods as samples.
+"""The monitor box on one machine: what every server does, as samples, and whole periods as samples.
 
-A `MonitorSample` comes about once a second; `Periods` adds readings up to the
+A `MonitorSample` comes about once a second; `Periods` adds samples up to the
 `rse_pf.scaling.policy.Sample`s that the policy judges, by the rule with which a report can be checked
-later: a reading speaks for the time since the one before it, and belongs to the period in which the middle
+later: a sample speaks for the time since the one before it, and belongs to the period in which the middle
 of that time lies.  The functions here are pure: promises no clock, no socket, and that a server which does
 not answer has no numbers rather than zeros.
 """
@@ -21,11 +21,11 @@ __all__ = [
     "MonitorSample",
     "Observed",
     "Periods",
-    "ServerReading",
+    "ServerSample",
     "capacity_cores",
-    "reading_every_s",
-    "reading_of",
-    "server_reading",
+    "sample_interval_s",
+    "monitor_sample",
+    "server_sample",
 ]
 
 ServerPhase = Literal["starting", "healthy", "unhealthy", "draining"]
@@ -44,7 +44,7 @@ class Observed:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class ServerReading:
+class ServerSample:
     """One server.  Counts are of this interval; CPU is relative to its size, None when it did not answer."""
 
     name: str
@@ -74,15 +74,15 @@ class MonitorSample:
     queue_ms: float
     bytes_in: int
     bytes_out: int
-    servers: tuple[ServerReading, ...]
+    servers: tuple[ServerSample, ...]
 
     def document(self) -> dict[str, Any]:
-        """Return the reading as plain JSON values."""
+        """Return the sample as plain JSON values."""
         return {**asdict(self), "servers": [asdict(server) for server in self.servers]}
 
 
-def reading_every_s(period_s: float) -> float:
-    """Return the time between readings: a whole part of the period, near 1 s, and never below 0.25 s."""
+def sample_interval_s(period_s: float) -> float:
+    """Return the time between samples: a whole part of the period, near 1 s, and never below 0.25 s."""
     return max(period_s / math.ceil(period_s / _MAX_S), _MIN_S)
 
 
@@ -93,7 +93,7 @@ def capacity_cores(serving: ServingSettings, workers: int, machine_cores: int) -
     return float(min(workers, machine_cores))
 
 
-def server_reading(
+def server_sample(
     before: Observed | None,
     now: Observed | None,
     *,
@@ -102,12 +102,12 @@ def server_reading(
     state: ServerPhase,
     warming: bool,
     capacity: float,
-) -> ServerReading:
+) -> ServerSample:
     """Return what a server did between *before* and *now*; None means that it did not answer.
 
     Args:
         before: Its last answer.
-        now: Its answer of this reading.
+        now: Its answer of this sample.
         name: Of the server.
         pid: Of its supervisor.
         state: As the platform sees it.
@@ -115,7 +115,7 @@ def server_reading(
         capacity: CPU seconds per second that are 100 %.
     """
     if now is None:
-        return ServerReading(name=name, pid=pid, state=state, warming=warming)
+        return ServerSample(name=name, pid=pid, state=state, warming=warming)
     told = now.status
     then: Mapping[str, Any] = {} if before is None else before.status
 
@@ -126,7 +126,7 @@ def server_reading(
     if before is not None and now.at_s > before.at_s:
         spent_s = float(told["cpu_s"]) - float(then["cpu_s"])
         cpu_percent = round(100.0 * max(spent_s, 0.0) / (capacity * (now.at_s - before.at_s)), 2)
-    return ServerReading(
+    return ServerSample(
         name=name,
         pid=pid,
         state=state,
@@ -142,8 +142,10 @@ def server_reading(
     )
 
 
-def reading_of(time_s: float, servers: Sequence[ServerReading], in_balancer: frozenset[str]) -> MonitorSample:
-    """Return the reading of all *servers*; *in_balancer* are those the balancer sends robots to."""
+def monitor_sample(
+    time_s: float, servers: Sequence[ServerSample], in_balancer: frozenset[str]
+) -> MonitorSample:
+    """Return the sample of all *servers*; *in_balancer* are those the balancer sends robots to."""
     known = [each.cpu_percent for each in servers if each.cpu_percent is not None and not each.warming]
     return MonitorSample(
         time=time_s,
@@ -160,7 +162,7 @@ def reading_of(time_s: float, servers: Sequence[ServerReading], in_balancer: fro
 
 
 class Periods:
-    """Readings, added up to samples of whole periods of the readings' clock; the newest are kept."""
+    """Readings, added up to samples of whole periods of the samples' clock; the newest are kept."""
 
     def __init__(self, period_s: float, keep: int) -> None:
         self._period_s = period_s
@@ -168,17 +170,17 @@ class Periods:
         self._sums: dict[int, _Sums] = {}
         self._before_s: float | None = None
 
-    def add(self, reading: MonitorSample) -> bool:
-        """Take *reading* in; return whether a period ended since the one before it."""
-        before_s, self._before_s = self._before_s, reading.time
-        if before_s is None or reading.time <= before_s:
+    def add(self, sample: MonitorSample) -> bool:
+        """Take *sample* in; return whether a period ended since the one before it."""
+        before_s, self._before_s = self._before_s, sample.time
+        if before_s is None or sample.time <= before_s:
             return False
-        since_s = reading.time - before_s
-        period = math.floor((reading.time - since_s / 2) / self._period_s)
-        self._sums.setdefault(period, _Sums()).add(reading, since_s)
+        since_s = sample.time - before_s
+        period = math.floor((sample.time - since_s / 2) / self._period_s)
+        self._sums.setdefault(period, _Sums()).add(sample, since_s)
         for old in sorted(self._sums)[: -self._keep]:
             del self._sums[old]
-        return math.floor(reading.time / self._period_s) > math.floor(before_s / self._period_s)
+        return math.floor(sample.time / self._period_s) > math.floor(before_s / self._period_s)
 
     def samples(self, now_s: float) -> tuple[Sample, ...]:
         """Return the samples of the periods that have ended by *now_s*, oldest first."""
@@ -200,13 +202,13 @@ class _Sums:
         self._requests = 0
         self._queue_ms = 0.0
 
-    def add(self, reading: MonitorSample, since_s: float) -> None:
-        self._requests += reading.requests
-        self._queue_ms = max(self._queue_ms, reading.queue_ms)
-        if reading.cpu_percent is not None:
+    def add(self, sample: MonitorSample, since_s: float) -> None:
+        self._requests += sample.requests
+        self._queue_ms = max(self._queue_ms, sample.queue_ms)
+        if sample.cpu_percent is not None:
             self.known_s += since_s
-            self._cpu += since_s * reading.cpu_percent
-            self._robots += since_s * reading.robots / reading.servers_count
+            self._cpu += since_s * sample.cpu_percent
+            self._robots += since_s * sample.robots / sample.servers_count
 
     def sample(self, start_s: float) -> Sample:
         return Sample(

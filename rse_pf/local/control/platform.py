@@ -1,8 +1,8 @@
 """The whole platform on one machine: a real load balancer in front of real backend servers.
 
-``async with LocalPlatform(settings, state=folder) as cloud`` is everything that a demo, an experiment or a
-test needs.  Promises that nothing it started is left running, however the block ends, unless it was told
-to be adoptable and was killed with SIGKILL; and that it grows, shrinks and heals itself only if elastic.
+``async with LocalPlatform(settings, state=folder) as platform`` is all that a demo, an experiment or a test
+needs.  Nothing that it started is left running, however the block ends, unless the platform is adoptable and
+was killed with SIGKILL.  It grows, shrinks and replaces servers by itself only if it is elastic.
 """
 
 from __future__ import annotations
@@ -10,7 +10,6 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import dataclasses
-import json
 import os
 import secrets
 import signal
@@ -23,15 +22,17 @@ from typing import Any
 from rse_pf.auth.control_token import ensure_control_token
 from rse_pf.auth.tokens import SigningKey
 from rse_pf.config import PlatformSettings, ScalingSettings
+from rse_pf.config.placement import ServerPlacement
 from rse_pf.errors import ConfigurationError, UsageError
+from rse_pf.files import replace_json
 from rse_pf.local.balancer.load_balancer import EnvoyLoadBalancer
 from rse_pf.local.control.adoption import adopt, adopt_data
 from rse_pf.local.control.audit_recorder import PlatformAudit
-from rse_pf.local.control.control_plane import ControlPlane
+from rse_pf.local.control.control_plane import ControlOptions, ControlPlane
 from rse_pf.local.control.fleet import Fleet
 from rse_pf.local.control.status_api import serve_status
 from rse_pf.local.firewall import check_front_door, ensure_key, front_door_url, key_file, key_set_file
-from rse_pf.local.processes import ProcessMark, is_alive, mark_of, send_signal
+from rse_pf.local.processes import STOP_TIMEOUT_S, ProcessMark, is_alive, mark_of, send_signal
 from rse_pf.local.servers.backend_servers import RSE_PF, BackendServer, LocalBackendServers
 from rse_pf.local.servers.data_servers import LocalDataServers
 from rse_pf.local.servers.log_rotation import keep_short
@@ -66,94 +67,75 @@ class LocalPlatform:
         servers: int | None = None,
         port: int | None = None,
         name: str | None = None,
+        data: bool | None = None,
         adoptable: bool = False,
+        control: ControlOptions | None = None,
         on_event: Callable[[Event], None] | None = None,
         program: Sequence[str] = RSE_PF,
-        elastic: bool = False,
-        compress: float = 1.0,
-        rebalance: bool = True,
-        data: bool | None = None,
-        on_sample: Callable[[Mapping[str, Any]], None] | None = None,
     ) -> None:
         """Describe a platform; nothing is started.
 
         Args:
-            settings: For the front door and for every server.
-            state: Folder of keys, logs and ``platform.json``; made with mode 0700.
-            servers: How many; None means ``local.servers``.  Asked for fewer than ``scaling.min_servers`` or
-                more than ``scaling.max_servers``, the scale modifier takes this number for its bound.
-            port: Of the front door, 0 takes a free one; None means ``local.port``.
-            name: What people call this platform; None means the name of the folder.
-            adoptable: Whether servers and balancer outlive a control plane that is killed, and whether those
+            settings: For the load balancer and for every server.
+            state: Folder of keys, logs and ``platform.json``; created with mode 0700.
+            servers: How many servers start; None means ``local.servers``.  The scale modifier takes this number
+                for its bound if it is below ``scaling.min_servers`` or above ``scaling.max_servers``.
+            port: Port that robots connect to, 0 takes a free one; None means ``local.port``.
+            name: Name of this platform for people; None means the name of the folder.
+            data: Whether robots get the data service under ``/data/``; None means ``data.enabled``.
+            adoptable: Whether servers and balancer survive a control plane that is killed, and whether those
                 of an earlier one in *state* are adopted.
+            control: What the control plane does by itself; None means nothing.
             on_event: Called with each event, at once.
             program: The command that ``serve`` follows.
-            elastic: Whether monitor and scale modifier run, and what breaks is replaced.
-            compress: Periods, idle time, warm-up and grace are shorter by this factor; for experiments.
-            rebalance: Whether crowded servers hand robots over, if *elastic*.
-            data: Whether robots get the data service under ``/data/``; None means ``data.enabled``.
-            on_sample: Called with each sample of the monitor, which runs then even if not *elastic*.
         """
+        control = control or ControlOptions()
         self.events: list[Event] = []
         self.url = ""
         self.name = name or state.name
         self.state = state.absolute()
         self.settings = settings
-        self._server_settings = _for_servers(settings, self.state)
+        self._placement = _local_placement(settings, self.state)
         self._count = settings.local.servers if servers is None else servers
+        self._wanted_port = settings.local.port if port is None else port
+        self._has_data = settings.data.enabled if data is None else data
         self._adoptable = adoptable
         self._on_event = on_event
         self._lock = PlatformLock(self.state)
-        self._chronicle = PlatformAudit(self.state, settings.auth)
+        self._audit = PlatformAudit(self.state)
         self._key: SigningKey | None = None
-        self._wanted_port = settings.local.port if port is None else port
-        self._settings_file = settings_file(self.state)
         self._status: asyncio.Server | None = None
-        self._monitored = elastic or on_sample is not None
         self.backend_servers = LocalBackendServers(
-            self._server_settings,
             folder=self.state,
-            settings_file=self._settings_file,
+            settings_file=settings_file(self.state),
             keys_file=key_set_file(self.state),
             control_token_file=control_token_file(self.state),
             dies_with_parent=not adoptable,
+            warm_standby=settings.local.warm_standby,
             program=program,
         )
         self.load_balancer = EnvoyLoadBalancer(
-            self.settings, folder=self.state, port=self._wanted_port, dies_with_parent=not adoptable
+            settings, folder=self.state, port=self._wanted_port, dies_with_parent=not adoptable
         )
-        self._has_data = settings.data.enabled if data is None else data
         self.data_servers = LocalDataServers(
-            self._server_settings,
+            settings,
             folder=self.state,
-            settings_file=self._settings_file,
+            settings_file=settings_file(self.state),
             keys_file=key_set_file(self.state),
-            store=self._server_settings.data.store,
+            store=self._placement.store,
             dies_with_parent=not adoptable,
-            replaces=elastic,
+            replaces=control.elastic,
             program=program,
             tell=self._data_changed,
         )
         self._fleet = Fleet(
-            self.backend_servers,
-            self.load_balancer,
-            self._server_settings,
-            compress=compress,
-            tell=self._tell,
-            changed=self._write_state,
-        )
+            self.backend_servers, self.load_balancer, settings,
+            compress=control.compress, tell=self._tell, changed=self._write_state,
+        )  # fmt: skip
         self._control = ControlPlane(
-            self._fleet,
-            self.load_balancer,
-            self._server_settings,
-            _bounds(settings.scaling, self._count),
-            elastic=elastic,
-            compress=compress,
-            rebalance=rebalance,
-            tell=self._tell,
-            changed=self._write_state,
-            on_sample=on_sample,
-        )
+            self._fleet, self.load_balancer, settings, _bounds(settings.scaling, self._count), control,
+            tell=self._tell, changed=self._write_state,
+        )  # fmt: skip
 
     @property
     def servers(self) -> tuple[BackendServer, ...]:
@@ -162,7 +144,7 @@ class LocalPlatform:
 
     @property
     def port(self) -> int:
-        """Port of the front door."""
+        """The port that robots connect to."""
         return self.load_balancer.port
 
     @property
@@ -180,14 +162,14 @@ class LocalPlatform:
         """
         began = time.monotonic()
         if self._count < 1:
-            raise UsageError(f"a platform of {self._count} servers serves nobody", hint="start at least 1")
+            raise UsageError(f"a platform of {self._count} servers is empty", hint="start at least 1")
         self._make_folder()
         self._lock.take(self.name)
         try:
             left = self._leftovers()
             if left is None:
                 check_front_door(self.settings.serving.host, self._wanted_port)
-            self._chronicle.open()
+            self._audit.open()
         except ConfigurationError:
             self._lock.release()
             raise
@@ -218,7 +200,7 @@ class LocalPlatform:
         )
 
     async def status(self) -> list[dict[str, Any]]:
-        """Return what each server says of itself; one that does not answer is left out."""
+        """Return the /status page of each server; one that does not answer is left out."""
         told = await asyncio.gather(*(self.backend_servers.status(server) for server in self.servers))
         return [status for status in told if status is not None]
 
@@ -252,7 +234,7 @@ class LocalPlatform:
             "events": [dict(event) for event in self.events[-_LAST_EVENTS:]],
         }
 
-    # --- what an operator asks for ---------------------------------------------------------------
+    # --- operations ------------------------------------------------------------------------------
 
     async def grow(self, n: int, reason: str) -> list[str]:
         """Launch *n* servers and wait until robots are sent to them; return their names.
@@ -348,7 +330,7 @@ class LocalPlatform:
         members = [self._fleet.members[name] for name in names if name in self._fleet.members]
         await self._fleet.until_healthy(members, 2 * self.settings.local.start_timeout_s)
 
-    # --- the beginning -------------------------------------------------------------------------
+    # --- start -----------------------------------------------------------------------------------
 
     def _make_folder(self) -> None:
         try:
@@ -361,7 +343,7 @@ class LocalPlatform:
             ) from error
 
     def _leftovers(self) -> PlatformState | None:
-        """Return what an earlier control plane says of processes that still run; None if none does."""
+        """Return the state that an earlier control plane left; None if none of its processes still runs."""
         state = read_state(self.state)
         if state is None or not any(map(is_alive, state.processes())):
             return None
@@ -375,10 +357,8 @@ class LocalPlatform:
     async def _start(self, left: PlatformState | None, end: float) -> None:
         self._key = ensure_key(self.state, seed=secrets.token_bytes(32), key_id=secrets.token_hex(4))
         token = ensure_control_token(control_token_file(self.state), seed=secrets.token_bytes(32))
-        document = {"context": {"rse-pf": self.settings.to_dict()}}
-        self._settings_file.write_text(json.dumps(document, indent=1), encoding="utf-8")
-        if self._monitored:
-            self._control.attend()
+        replace_json(settings_file(self.state), self._placement.document(self.settings), indent=1)
+        self._control.start_checks()
         if left is None:
             await self._begin(end)
         else:
@@ -388,10 +368,9 @@ class LocalPlatform:
             )
         self.url = front_door_url(self.settings, self.port)
         self._status = await serve_status(self.status_document, token)
-        self._fleet.keep(self._chronicle.watch())
+        self._fleet.keep(self._audit.watch())
         self._fleet.keep(keep_short(self.state, _LOG_FILE_BYTES))
-        if self._monitored:
-            self._control.start()
+        self._control.start()
         self._write_state()
 
     async def _begin(self, end: float) -> None:
@@ -411,7 +390,7 @@ class LocalPlatform:
             control_plane=control_plane,
             url=self.url,
             settings_digest=self.settings.digest(),
-            settings_file=str(self._settings_file),
+            settings_file=str(settings_file(self.state)),
             key_file=str(key_file(self.state)),
             control_token_file=str(control_token_file(self.state)),
             servers=tuple(
@@ -437,11 +416,11 @@ class LocalPlatform:
             return ServerState(name=name, process=mark)
         return ServerState(name=name, process=mark, port=server.port, control_port=server.control_port)
 
-    # --- the end -------------------------------------------------------------------------------
+    # --- stop ------------------------------------------------------------------------------------
 
     async def _end(self) -> None:
-        """Robots first hear their servers say goodbye; whatever fails or is cut short, all is killed."""
-        timeout_s = self.settings.local.stop_timeout_s
+        """Let the servers close their robots' connections first; kill what is left, whatever fails."""
+        timeout_s = STOP_TIMEOUT_S
         try:
             self._control.stop()
             await self._fleet.close()
@@ -454,39 +433,44 @@ class LocalPlatform:
             self.data_servers.kill_all()
             self.load_balancer.kill()
             self._fleet.members.clear()
-            with contextlib.suppress(OSError):  # the folder may have been removed under our feet
+            with contextlib.suppress(OSError):  # the folder may have been removed meanwhile
                 remove_state(self.state)
-                if not self._adoptable:  # nobody can come back to this platform: nor may its tokens
+                if not self._adoptable:  # no one can adopt this platform: its tokens are worthless
                     key_file(self.state).unlink(missing_ok=True)
                     control_token_file(self.state).unlink(missing_ok=True)
-            self._chronicle.close()
+            self._audit.close()
             self._lock.release()
         self._tell("platform-gone")
 
     def _tell(self, event: str, **details: Any) -> None:
         told = {"event": event, **details}
         self.events.append(told)
-        self._chronicle.take(told)
+        self._audit.take(told)
         if self._on_event is not None:
             self._on_event(told)
 
 
 def _bounds(scaling: ScalingSettings, count: int) -> ScalingSettings:
-    """Return the bounds of the scale modifier; whoever asks for *count* servers gets them."""
-    least, most = min(scaling.min_servers, count), max(scaling.max_servers, count)
-    return dataclasses.replace(scaling, min_servers=least, max_servers=most)
+    """Return *scaling* with bounds that allow *count* servers."""
+    return dataclasses.replace(
+        scaling, min_servers=min(scaling.min_servers, count), max_servers=max(scaling.max_servers, count)
+    )
 
 
-def _for_servers(settings: PlatformSettings, state: Path) -> PlatformSettings:
-    """Return the settings of every local server: loopback, ephemeral ports, workers as on this machine.
+def _local_placement(settings: PlatformSettings, state: Path) -> ServerPlacement:
+    """Return the placement of every local server: loopback, free ports, the workers of this machine.
 
-    Objects of servers that come and go lie in the platform's folder, if they were to lie in memory.
+    Servers come and go, so objects are in the folder of the platform if they were to be in memory.
     """
-    address = {"host": _LOOPBACK, "port": 0, "control_host": _LOOPBACK, "control_port": 0}
     store = settings.data.store
-    return settings.replace(
-        serving={**address, "workers": settings.local.workers},
-        data={"store": f"dir:{state / 'objects'}" if store == "memory:" else store},
+    return ServerPlacement.of(
+        settings,
+        host=_LOOPBACK,
+        port=0,
+        control_host=_LOOPBACK,
+        control_port=0,
+        workers=settings.local.workers,
+        store=f"dir:{state / 'objects'}" if store == "memory:" else store,
     )
 
 

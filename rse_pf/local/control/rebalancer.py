@@ -19,7 +19,7 @@ __all__ = ["Order", "Rebalancer"]
 _WATCH_S = 30.0
 _SETTLE_S = 1.5
 _STEADY_SHARE = 0.1
-"""Of all robots; numbers that change by more from one reading to the next are not acted on."""
+"""Of all robots; numbers that change by more from one sample to the next are not acted on."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -52,7 +52,7 @@ class Rebalancer:
         rate = self._settings.moves_per_s
         found = tuple(
             Order(server=name, robots=count, spread_s=round(count / rate, 3))
-            for name, count in moves(robots, self._settings).items()
+            for name, count in moves(robots).items()
             if count > 0
         )
         if found:
@@ -61,6 +61,6 @@ class Rebalancer:
 
 
 def _steady(before: Mapping[str, int], now: Mapping[str, int]) -> bool:
-    """Return whether the same servers carry about the same robots as a reading ago."""
+    """Return whether the same servers carry about the same robots as a sample ago."""
     changed = sum(abs(count - before.get(name, 0)) for name, count in now.items())
     return before.keys() == now.keys() and changed <= max(2.0, _STEADY_SHARE * sum(now.values()))

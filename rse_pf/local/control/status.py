@@ -1,7 +1,7 @@
-"""What runs, told by the running processes themselves: the table of ``rse-pf local status``.
+"""The processes of a platform as they are now: the table of ``rse-pf local status``.
 
-Needs no control plane: who runs is in the state file, and each server answers on its control port.  Promises
-to start and to change nothing, and that a server which is stopped or cut off costs at most the patience.
+Works without the control plane: the state file names the processes, and each server answers on its control
+port.  Nothing is changed, and a server that is stopped or cut off delays the answer by the timeout at most.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from rse_pf.local.state import PlatformState, ServerState
 
 __all__ = ["data_url", "platform_status", "status_table"]
 
-_PATIENCE_S = 0.5
+_TIMEOUT_S = 0.5
 _COLUMNS = ("server", "pid", "state", "robots", "CPU %", "requests/s", "queue")
 
 
@@ -28,7 +28,7 @@ async def platform_status(state: PlatformState, *, sample_s: float) -> dict[str,
     """Return what runs; CPU (% of the server's size) and requests are those of *sample_s* seconds.
 
     Raises:
-        UsageError: The control ports ask for a token, and its file is gone or not for us to read.
+        UsageError: The control ports require a token, and its file cannot be read.
     """
     file = state.control_token_file
     token = read_control_token(Path(file)) if file else None
@@ -74,7 +74,7 @@ def status_table(status: Mapping[str, Any]) -> str:
 
 
 def data_url(url: str) -> str:
-    """Return where the data service answers, by the address *url* of the robots' door."""
+    """Return the address of the data service, from the address *url* that robots connect to."""
     parts = urlsplit(url)
     return f"{'https' if parts.scheme == 'wss' else 'http'}://{parts.netloc}/data/"
 
@@ -87,13 +87,9 @@ async def _data_server(server: ServerState) -> dict[str, Any]:
         return {**known, "state": "stopped"}
     if not server.port:
         return {**known, "state": "starting"}
-    port = ControlPort(server.port)
-    try:
-        reply = await port.ask("/data/readyz", timeout_s=_PATIENCE_S)
-    except ConnectionError:
+    reply = await ControlPort(server.port).ask_once("/data/readyz", timeout_s=_TIMEOUT_S)
+    if reply is None:
         return {**known, "state": "silent"}
-    finally:
-        port.close()
     return {**known, "state": "ready" if reply.status == 200 else "not ready"}
 
 
@@ -128,7 +124,7 @@ async def _server(server: ServerState, token: str | None, sample_s: float) -> di
 
 
 async def _ask(port: ControlPort) -> dict[str, Any]:
-    reply = await port.ask("/status", timeout_s=_PATIENCE_S)
+    reply = await port.ask("/status", timeout_s=_TIMEOUT_S)
     told = reply.document()
     if reply.status != 200 or "workers" not in told:
         raise ConnectionError(f"the control port answers {reply.status}")

@@ -1,7 +1,7 @@
 """What the control plane knows, as JSON at ``GET /status`` on a loopback port, for people and scripts.
 
-Promises to change nothing, to name no secret, to answer who does not carry the token or is a browser's page
-of another origin with nothing, and that a slow or broken asker costs at most its own connection.
+A request without the token, or from a web page of another origin, is refused.  A slow or malformed request
+ends its own connection only.
 """
 
 from __future__ import annotations
@@ -11,25 +11,25 @@ import json
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from rse_pf.auth.control_token import is_carried
+from rse_pf.auth.control_token import carries_token
 
 __all__ = ["serve_status"]
 
 _LOOPBACK = "127.0.0.1"
-_PATIENCE_S = 5.0
+_TIMEOUT_S = 5.0
 _MAX_HEAD_BYTES = 16384
 
 
 async def serve_status(document: Callable[[], Mapping[str, Any]], token: str) -> asyncio.Server:
-    """Listen on a free port; who carries *token* is answered with what *document* returns then."""
+    """Listen on a free port; a request with *token* is answered with what *document* returns then."""
 
     async def talk(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         try:
-            head = await asyncio.wait_for(reader.readuntil(b"\r\n\r\n"), _PATIENCE_S)
+            head = await asyncio.wait_for(reader.readuntil(b"\r\n\r\n"), _TIMEOUT_S)
             writer.write(_answer(head.decode("latin-1"), document, token))
-            await asyncio.wait_for(writer.drain(), _PATIENCE_S)
+            await asyncio.wait_for(writer.drain(), _TIMEOUT_S)
         except (OSError, ValueError, EOFError, asyncio.LimitOverrunError, asyncio.TimeoutError):
-            pass  # a stranger's broken request ends its own connection, and only that
+            pass  # a malformed request ends its own connection only
         finally:
             writer.close()
 
@@ -42,7 +42,7 @@ def _answer(head: str, document: Callable[[], Mapping[str, Any]], token: str) ->
     headers = {
         name.strip().lower(): value.strip() for name, _, value in (line.partition(":") for line in lines)
     }
-    if not is_carried(headers.get("authorization", ""), token):
+    if not carries_token(headers.get("authorization", ""), token):
         return _page("401 Unauthorized\r\nWWW-Authenticate: Bearer", {"code": "unauthorized"})
     if "origin" in headers:
         return _page("403 Forbidden", {"code": "forbidden"})

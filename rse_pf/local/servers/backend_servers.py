@@ -1,13 +1,12 @@
 """The backend servers box on one machine: ``rse-pf serve`` processes, the command that EC2 runs too.
 
-Starts, ends and kills them.  Promises to decide nothing (how many, and when, is the caller's matter),
-and to signal only processes that it knows by pid and time of birth.
+Starts, ends and kills them; the caller decides how many and when.  Only processes whose id and start time are
+known are signalled.
 """
 
 from __future__ import annotations
 
 import asyncio
-import http.client
 import json
 import signal
 import subprocess
@@ -19,8 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from rse_pf.audit.log import audit_folder
-from rse_pf.auth.control_token import bearer, read_control_token
-from rse_pf.config import PlatformSettings
+from rse_pf.auth.control_token import read_control_token
 from rse_pf.errors import ConfigurationError
 from rse_pf.local.balancer.envoy_config import Target
 from rse_pf.local.processes import ProcessMark, ended, is_alive, last_line, mark_of, send_signal, spawn
@@ -32,7 +30,6 @@ __all__ = ["RSE_PF", "BackendServer", "LocalBackendServers"]
 RSE_PF = (sys.executable, "-m", "rse_pf.cli.main")
 """The program; ``serve`` and its options follow."""
 
-_LOOPBACK = "127.0.0.1"
 _LOOK_AGAIN_S = 0.01
 _ASK_S = 1.0
 
@@ -61,16 +58,15 @@ class LocalBackendServers:
 
     def __init__(
         self,
-        settings: PlatformSettings,
         *,
         folder: Path,
         settings_file: Path,
         keys_file: Path,
         control_token_file: Path | None = None,
         dies_with_parent: bool = True,
+        warm_standby: bool = False,
         program: Sequence[str] = RSE_PF,
     ) -> None:
-        self._settings = settings
         self._folder = folder
         self._settings_file = settings_file
         self._keys_file = keys_file
@@ -80,9 +76,9 @@ class LocalBackendServers:
         self._program = tuple(program)
         self._processes: dict[str, subprocess.Popen[bytes]] = {}
         self._marks: dict[str, ProcessMark] = {}
-        self._spare: WarmStandby | None = None
-        if self._program == RSE_PF and settings.local.warm_standby:
-            self._spare = WarmStandby(folder, dies_with_parent=dies_with_parent)
+        self._standby: WarmStandby | None = None
+        if warm_standby and self._program == RSE_PF:
+            self._standby = WarmStandby(folder, dies_with_parent=dies_with_parent)
 
     @property
     def marks(self) -> dict[str, ProcessMark]:
@@ -92,18 +88,13 @@ class LocalBackendServers:
     def launch(self, name: str) -> None:
         """Start the process of server *name*, and return before it listens."""
         self._announce(name).unlink(missing_ok=True)
-        serving = self._settings.serving
         command = ["serve", "--settings", str(self._settings_file), "--server-id", name]
-        # Where it runs is said beside the settings, whose digest is then the same on every machine.
-        command += ["--host", serving.host, "--port", str(serving.port), "--workers", str(serving.workers)]
-        command += ["--control-host", serving.control_host, "--control-port", str(serving.control_port)]
-        command += ["--store", self._settings.data.store]
         command += ["--keys", str(self._keys_file), "--announce", str(self._announce(name))]
         command += ["--audit", str(audit_folder(self._folder))]
         if self._control_token_file is not None:
             command += ["--control-token", str(self._control_token_file)]
         log = self._log(name)
-        process = None if self._spare is None else self._spare.take(command, log)
+        process = None if self._standby is None else self._standby.take(command, log)
         if process is None:
             command = [*self._program, *command]
             process = spawn(command, log=log, folder=self._folder, dies_with_parent=self._dies_with_parent)
@@ -112,20 +103,20 @@ class LocalBackendServers:
         if mark is not None:
             self._marks[name] = mark
 
-    def warm_spare(self) -> bool:
-        """Let one more process wait, warm, to become the next server; return whether one was started."""
-        return self._spare is not None and self._spare.warm()
+    def start_standby(self) -> bool:
+        """Start one more process that becomes the next server, unless there is one; return whether it did."""
+        return self._standby is not None and self._standby.warm()
 
     @property
-    def spare_pid(self) -> int | None:
-        """Of the process that waits to become a server, if there is one."""
-        return None if self._spare is None else self._spare.pid
+    def standby_pid(self) -> int | None:
+        """The id of the standby process; None if there is none."""
+        return None if self._standby is None else self._standby.pid
 
     async def wait_warm(self, timeout_s: float) -> None:
-        """Wait until a process waits warm, for a launch that is in no hurry; not where there is none."""
+        """Wait until the standby is warm, at most *timeout_s*; return at once if this platform has none."""
         end = time.monotonic() + timeout_s
-        self.warm_spare()
-        while self._spare is not None and not self._spare.is_warm and time.monotonic() < end:
+        self.start_standby()
+        while self._standby is not None and not self._standby.is_warm and time.monotonic() < end:
             await asyncio.sleep(_LOOK_AGAIN_S)
 
     def adopt(self, name: str, mark: ProcessMark) -> None:
@@ -160,16 +151,17 @@ class LocalBackendServers:
         )  # fmt: skip
 
     def control(self, port: int) -> ControlPort:
-        """Return the control port *port* of one of these servers, with what must be carried to it.
+        """Return a client of the control port *port* of one of these servers, with its token.
 
         Raises:
-            UsageError: The token's file is gone, or is none.
+            UsageError: The file of the token is missing, or holds none.
         """
         return ControlPort(port, self._token())
 
     async def status(self, server: BackendServer) -> dict[str, Any] | None:
         """Return what the server says of itself on its control port; None when it does not answer."""
-        return await asyncio.to_thread(_ask_status, server.control_port, self._token())
+        reply = await self.control(server.control_port).ask_once("/status", timeout_s=_ASK_S)
+        return None if reply is None or reply.status != 200 else reply.document()
 
     async def wait_over(self, name: str) -> int | None:
         """Wait until the process of *name* has ended; return its exit code, negative for a signal.
@@ -206,8 +198,8 @@ class LocalBackendServers:
 
     def kill_all(self) -> None:
         """End what is left, at once, and reap it."""
-        if self._spare is not None:
-            self._spare.close()
+        if self._standby is not None:
+            self._standby.close()
         for name in {**self._marks, **self._processes}:
             self.send(name, signal.SIGKILL)
         for name in {**self._marks, **self._processes}:
@@ -235,17 +227,3 @@ class LocalBackendServers:
         return ConfigurationError(
             f"{name} {what}{': ' if last else ''}{last}", hint=f"its log is {self._log(name)}"
         )
-
-
-def _ask_status(port: int, token: str | None) -> dict[str, Any] | None:
-    headers = {} if token is None else {"Authorization": bearer(token)}
-    connection = http.client.HTTPConnection(_LOOPBACK, port, timeout=_ASK_S)
-    try:
-        connection.request("GET", "/status", headers=headers)
-        answer = connection.getresponse()
-        status: dict[str, Any] | None = json.loads(answer.read()) if answer.status == 200 else None
-    except (OSError, ValueError, http.client.HTTPException):
-        return None
-    finally:
-        connection.close()
-    return status

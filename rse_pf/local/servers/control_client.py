@@ -1,7 +1,7 @@
-"""Ask a server's control port over one connection that stays open: health checks must cost next to nothing.
+"""Ask a server's control port over one connection that stays open, so that health checks cost little.
 
-Promises a deadline on every question, one kind of error for everything that may go wrong, and that a late
-answer is never taken for the answer to a later question.
+Every request has a deadline, and every failure is a ConnectionError.  A late reply is never taken for the
+reply to a later request.
 """
 
 from __future__ import annotations
@@ -37,9 +37,9 @@ class ControlPortReply:
 
 
 class ControlPort:
-    """One control port on this machine; connects with the first question, and anew after a failure.
+    """One control port on this machine; connects with the first request, and again after a failure.
 
-    Each question carries *token*, if the port has one.
+    Each request carries *token*, if the port requires one.
     """
 
     def __init__(self, port: int, token: str | None = None) -> None:
@@ -49,15 +49,15 @@ class ControlPort:
             self._headers += f"Authorization: {bearer(token)}\r\n"
         self._reader: asyncio.StreamReader | None = None
         self._writer: asyncio.StreamWriter | None = None
-        self._turn = asyncio.Lock()
+        self._lock = asyncio.Lock()
 
     async def ask(self, target: str, *, timeout_s: float, method: str = "GET") -> ControlPortReply:
-        """Return the answer to *target*.
+        """Return the reply to a request for *target*.
 
         Raises:
-            ConnectionError: Nobody listens, the answer is no HTTP, or it took longer than *timeout_s*.
+            ConnectionError: Nobody listens, the reply is no HTTP, or it took longer than *timeout_s*.
         """
-        async with self._turn:
+        async with self._lock:
             try:
                 return await asyncio.wait_for(self._exchange(method, target), timeout_s)
             except (OSError, EOFError, ValueError, asyncio.LimitOverrunError, asyncio.TimeoutError) as error:
@@ -69,8 +69,19 @@ class ControlPort:
                 self.close()
                 raise
 
+    async def ask_once(
+        self, target: str, *, timeout_s: float, method: str = "GET"
+    ) -> ControlPortReply | None:
+        """Return the reply to one request, None if there is none in time, and close the connection."""
+        try:
+            return await self.ask(target, timeout_s=timeout_s, method=method)
+        except ConnectionError:
+            return None
+        finally:
+            self.close()
+
     def close(self) -> None:
-        """Give the connection up."""
+        """Close the connection."""
         if self._writer is not None:
             self._writer.transport.abort()
         self._reader = self._writer = None

@@ -1,15 +1,12 @@
 """The data servers box on one machine: an ``rse-pf data`` process, started, watched and replaced.
 
-A replacement takes the port of the one before, so the load balancer's configuration never changes.
-Promises to keep no state of its own (objects are in the store, tokens' keys in a file), and that one which
-answers nobody any more is ended and replaced like one that died.
+A replacement takes the port of the process before it, so the load balancer's configuration does not change.
+A process that answers no health check any more is killed and replaced like one that died.
 """
 
 from __future__ import annotations
 
 import asyncio
-import contextlib
-import http.client
 import json
 import signal
 import subprocess
@@ -26,6 +23,7 @@ from rse_pf.errors import ConfigurationError
 from rse_pf.linux import run_as_batch
 from rse_pf.local.balancer.envoy_config import Target
 from rse_pf.local.processes import ProcessMark, ended, is_alive, last_line, mark_of, send_signal, spawn
+from rse_pf.local.servers.control_client import ControlPort
 from rse_pf.local.state import ServerState
 
 __all__ = ["NICENESS", "DataServerProcess", "LocalDataServers"]
@@ -159,7 +157,7 @@ class LocalDataServers:
 
     async def is_ready(self) -> bool:
         """Return whether the service answers and its store does."""
-        return self._port > 0 and await asyncio.to_thread(_ask, self._port, _READY)
+        return self._port > 0 and await self._answers(_READY)
 
     def send(self, number: signal.Signals) -> bool:
         """Signal the process; return False if it is gone."""
@@ -214,12 +212,16 @@ class LocalDataServers:
         try:
             while not over.done():
                 await asyncio.wait({over}, timeout=_ASK_S)
-                silent = 0 if await asyncio.to_thread(_ask, self._port, _ALIVE) else silent + 1
+                silent = 0 if await self._answers(_ALIVE) else silent + 1
                 if silent > self._settings.health.unhealthy_checks and self._replaces and not over.done():
                     self._tell("data-server-silent", name=self._name, pid=mark.pid)
                     send_signal(mark, signal.SIGKILL)
         finally:
             over.cancel()
+
+    async def _answers(self, path: str) -> bool:
+        reply = await ControlPort(self._port).ask_once(path, timeout_s=_ASK_S)
+        return reply is not None and reply.status == 200
 
     async def _launch(self) -> DataServerProcess:
         self._announce.unlink(missing_ok=True)
@@ -270,13 +272,3 @@ class LocalDataServers:
         return ConfigurationError(
             f"{self._name} {what}{': ' if last else ''}{last}", hint=f"its log is {self._log}"
         )
-
-
-def _ask(port: int, path: str) -> bool:
-    connection = http.client.HTTPConnection(_LOOPBACK, port, timeout=_ASK_S)
-    with contextlib.closing(connection):
-        try:
-            connection.request("GET", path)
-            return connection.getresponse().status == 200
-        except (OSError, http.client.HTTPException):
-            return False

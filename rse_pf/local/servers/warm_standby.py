@@ -1,7 +1,7 @@
-"""Keep one server process warm: importing is most of a server's start, and comes at the worst moment.
+"""Keep one server process warm: its imports take most of the time that a server needs to start.
 
-A replacement is wanted when a server has died and its neighbour works for two.  Promises that a spare never
-outlives the platform, and that a launch without one works just the same, only later.
+A replacement starts when a server has died and the others do its work.  The standby ends with the platform.
+A launch works without it too, only more slowly.
 
 Source:
     Warm pools of AWS Auto Scaling.
@@ -18,16 +18,16 @@ from pathlib import Path
 
 from rse_pf.local.processes import spawn
 
-__all__ = ["SPARE", "WarmStandby"]
+__all__ = ["STANDBY", "WarmStandby"]
 
-SPARE = (sys.executable, "-m", "rse_pf.cli.standby")
-"""The program; it waits for its arguments."""
+STANDBY = (sys.executable, "-m", "rse_pf.cli.standby")
+"""The program; it reads its arguments from standard input."""
 
 
 class WarmStandby:
-    """At most one process that waits for its turn."""
+    """At most one process that has imported what a server needs."""
 
-    def __init__(self, folder: Path, *, dies_with_parent: bool, program: Sequence[str] = SPARE) -> None:
+    def __init__(self, folder: Path, *, dies_with_parent: bool, program: Sequence[str] = STANDBY) -> None:
         self._folder = folder
         self._dies_with_parent = dies_with_parent
         self._program = tuple(program)
@@ -35,33 +35,33 @@ class WarmStandby:
 
     @property
     def pid(self) -> int | None:
-        """Of the process that waits, if there is one."""
+        """The id of the standby process; None if there is none."""
         return None if self._process is None or self._process.poll() is not None else self._process.pid
 
     @property
     def is_warm(self) -> bool:
-        """Whether the one that waits has said so."""
+        """Whether the standby has imported everything."""
         with contextlib.suppress(OSError):
             return self.pid is not None and self._log.stat().st_size > 0
         return False
 
     @property
     def _log(self) -> Path:
-        return self._folder / "spare.log"
+        return self._folder / "standby.log"
 
     def warm(self) -> bool:
-        """Start one, unless one waits already; return whether one was started."""
-        waits = self.pid is not None
-        if not waits:
-            self.close()
-            self._process = spawn(
-                self._program, log=self._log, folder=self._folder,
-                dies_with_parent=self._dies_with_parent, stdin=subprocess.PIPE,
-            )  # fmt: skip
-        return not waits
+        """Start a standby unless there is one; return whether one was started."""
+        if self.pid is not None:
+            return False
+        self.close()
+        self._process = spawn(
+            self._program, log=self._log, folder=self._folder,
+            dies_with_parent=self._dies_with_parent, stdin=subprocess.PIPE,
+        )  # fmt: skip
+        return True
 
     def take(self, arguments: Sequence[str], log: Path) -> subprocess.Popen[bytes] | None:
-        """Let the one that waits go on with *arguments* and write to *log*; None if there is none."""
+        """Turn the standby into the program of *arguments*, which writes to *log*; None if there is none."""
         process = self._process if self.pid is not None else None
         if process is None or process.stdin is None:
             return None
@@ -69,14 +69,14 @@ class WarmStandby:
         try:
             process.stdin.write(order.encode() + b"\n")
             process.stdin.close()
-        except OSError:  # it died this moment
+        except OSError:  # it has just died
             self.close()
             return None
         self._process = None
         return process
 
     def close(self) -> None:
-        """End the one that waits, if any, and reap it."""
+        """End the standby, if there is one, and reap it."""
         process, self._process = self._process, None
         if process is not None:
             process.kill()

@@ -9,11 +9,11 @@ from rse_pf.local.control.monitor import (
     MonitorSample,
     Observed,
     Periods,
-    ServerReading,
+    ServerSample,
     capacity_cores,
-    reading_every_s,
-    reading_of,
-    server_reading,
+    monitor_sample,
+    sample_interval_s,
+    server_sample,
 )
 
 STATUS = {
@@ -32,19 +32,21 @@ def observed(at_s: float, **more: float) -> Observed:
     return Observed(at_s=at_s, status={name: value + more.get(name, 0) for name, value in STATUS.items()})
 
 
-def one(before: Observed | None, now: Observed | None, capacity: float = 1.0) -> ServerReading:
-    return server_reading(
+def one(before: Observed | None, now: Observed | None, capacity: float = 1.0) -> ServerSample:
+    return server_sample(
         before, now, name="server-1", pid=5, state="healthy", warming=False, capacity=capacity
     )
 
 
-def server(name: str, cpu_percent: float | None, *, state: str = "healthy", **more: object) -> ServerReading:
-    return ServerReading(name=name, pid=1, state=state, cpu_percent=cpu_percent, **more)  # type: ignore[arg-type]
+def server(name: str, cpu_percent: float | None, *, state: str = "healthy", **more: object) -> ServerSample:
+    return ServerSample(name=name, pid=1, state=state, cpu_percent=cpu_percent, **more)  # type: ignore[arg-type]
 
 
-def reading(time_s: float, cpu_percent: float | None, *, requests: int = 0, robots: int = 0) -> MonitorSample:
+def sample_of(
+    time_s: float, cpu_percent: float | None, *, requests: int = 0, robots: int = 0
+) -> MonitorSample:
     servers = [server("server-1", cpu_percent, requests=requests, robots=robots)]
-    return reading_of(time_s, servers, frozenset({"server-1"}))
+    return monitor_sample(time_s, servers, frozenset({"server-1"}))
 
 
 def test_cpu_is_relative_to_the_size_and_to_the_time_between_two_answers() -> None:
@@ -62,7 +64,7 @@ def test_counts_are_those_of_the_interval_and_levels_are_those_of_now() -> None:
 
 def test_a_first_answer_has_no_cpu_and_no_answer_has_no_numbers() -> None:
     assert one(None, observed(100.0)).cpu_percent is None
-    assert one(observed(100.0), None) == ServerReading(name="server-1", pid=5, state="healthy")
+    assert one(observed(100.0), None) == ServerSample(name="server-1", pid=5, state="healthy")
 
 
 @pytest.mark.parametrize(
@@ -77,31 +79,31 @@ def test_a_server_has_the_emulated_size_of_its_workers_or_their_cores(
 def test_the_mean_leaves_out_who_warms_up_and_who_does_not_answer() -> None:
     servers = [server("a", 80.0), server("b", 40.0), server("c", 0.0, warming=True), server("d", None)]
 
-    assert reading_of(1.0, servers, frozenset()).cpu_percent == 60.0
-    assert reading_of(1.0, servers[2:], frozenset()).cpu_percent is None
+    assert monitor_sample(1.0, servers, frozenset()).cpu_percent == 60.0
+    assert monitor_sample(1.0, servers[2:], frozenset()).cpu_percent is None
 
 
 def test_healthy_is_who_passes_our_checks_and_gets_robots_from_the_balancer() -> None:
     servers = [server("a", 1.0), server("b", 1.0), server("c", 1.0, state="draining")]
 
-    assert reading_of(1.0, servers, frozenset({"a", "c"})).healthy_servers == 1
+    assert monitor_sample(1.0, servers, frozenset({"a", "c"})).healthy_servers == 1
 
 
 @pytest.mark.parametrize(("period_s", "every_s"), [(60.0, 1.0), (2.0, 1.0), (2.5, 2.5 / 3), (0.1, 0.25)])
 def test_readings_divide_a_period(period_s: float, every_s: float) -> None:
-    assert reading_every_s(period_s) == pytest.approx(every_s)
+    assert sample_interval_s(period_s) == pytest.approx(every_s)
 
 
 def test_a_sample_is_the_mean_over_time_of_one_period_and_the_sum_of_its_requests() -> None:
     periods = Periods(10.0, keep=4)
     over = [
-        periods.add(reading(time_s, cpu, requests=count, robots=4))
+        periods.add(sample_of(time_s, cpu, requests=count, robots=4))
         for time_s, cpu, count in ((100.0, 50.0, 9), (102.0, 10.0, 1), (110.01, 90.0, 2), (111.0, 70.0, 4))
     ]
 
     (sample,) = periods.samples(111.0)
 
-    assert over == [False, False, True, False], "the first reading speaks for no time"
+    assert over == [False, False, True, False], "the first sample speaks for no time"
     assert sample.start_s == 100.0
     assert sample.cpu_percent == pytest.approx((2.0 * 10.0 + 8.01 * 90.0) / 10.01)
     assert (sample.requests, sample.robots_per_server) == (3, pytest.approx(4.0))
@@ -110,7 +112,7 @@ def test_a_sample_is_the_mean_over_time_of_one_period_and_the_sum_of_its_request
 def test_a_period_that_goes_on_or_was_hardly_watched_gives_no_sample() -> None:
     periods = Periods(10.0, keep=4)
     for time_s in (106.0, 109.9, 111.0, 119.0):
-        periods.add(reading(time_s, 50.0))
+        periods.add(sample_of(time_s, 50.0))
 
     assert periods.samples(119.0) == ()
     assert [sample.start_s for sample in periods.samples(120.0)] == [110.0]
@@ -119,7 +121,7 @@ def test_a_period_that_goes_on_or_was_hardly_watched_gives_no_sample() -> None:
 def test_a_period_in_which_nobody_answered_gives_no_sample() -> None:
     periods = Periods(10.0, keep=4)
     for time_s in (100.0, 110.0, 120.0):
-        periods.add(reading(time_s, None))
+        periods.add(sample_of(time_s, None))
 
     assert periods.samples(120.0) == ()
 
@@ -127,6 +129,6 @@ def test_a_period_in_which_nobody_answered_gives_no_sample() -> None:
 def test_only_the_newest_periods_are_kept() -> None:
     periods = Periods(10.0, keep=3)
     for number in range(9):
-        periods.add(reading(100.0 + 10.0 * number, 50.0))
+        periods.add(sample_of(100.0 + 10.0 * number, 50.0))
 
     assert [sample.start_s for sample in periods.samples(180.0)] == [150.0, 160.0, 170.0]

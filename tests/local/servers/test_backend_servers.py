@@ -10,7 +10,6 @@ from typing import Any
 
 import pytest
 
-from rse_pf.config import PlatformSettings
 from rse_pf.errors import ConfigurationError
 from rse_pf.local.processes import is_alive
 from rse_pf.local.servers.backend_servers import LocalBackendServers
@@ -38,7 +37,6 @@ signal.pause()
 
 def servers(folder: Path, script: str) -> LocalBackendServers:
     return LocalBackendServers(
-        PlatformSettings(),
         folder=folder,
         settings_file=folder / "settings.json",
         keys_file=folder / "keys.json",
