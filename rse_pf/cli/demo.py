@@ -1,7 +1,7 @@
-"""Let robots build point-cloud maps through the PnP service, all on this machine.
+"""Run robots that build point-cloud maps with the PnP service, all on this machine.
 
 Without --data, robots drive through a rendered world whose true poses are known.  With --merge each robot
-starts in a world of its own, and at the end their maps become one.
+starts in a world frame of its own, and at the end their maps are merged into one.
 
 examples:
   rse-pf demo --out out
@@ -31,7 +31,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--data", "--recording", type=Path, metavar="DIR", help="a recording in TUM layout, or NYU Depth V2"
     )
     parser.add_argument(
-        "--robots", type=int, help="how many robots share it (default: 3; with --data and no --merge: 1)"
+        "--robots",
+        type=int,
+        help="number of robots that share the recording (default: 3; with --data and no --merge: 1)",
     )
     parser.add_argument(
         "--rate", type=float, default=5.0, metavar="HZ", help="frames per second (default: 5)"
@@ -43,21 +45,23 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--codec",
         choices=("zlib", "json", "bin"),
         default="zlib",
-        help="encoding (default: zlib, the paper's)",
+        help="encoding (default: zlib, as in the paper)",
     )
-    parser.add_argument("--out", type=Path, default=Path("out"), metavar="DIR", help="results (default: out)")
     parser.add_argument(
-        "--frames", type=int, help="frames of each robot in the rendered world (default: 80, to merge: 150)"
+        "--out", type=Path, default=Path("out"), metavar="DIR", help="folder of results (default: out)"
     )
-    parser.add_argument("--seed", type=int, default=0, help="another rendered world (default: 0)")
+    parser.add_argument(
+        "--frames", type=int, help="frames per robot in the rendered world (default: 80, with --merge: 150)"
+    )
+    parser.add_argument("--seed", type=int, default=0, help="seed of the rendered world (default: 0)")
     parser.add_argument(
         "--frontend", choices=("standard", "wide-baseline"), default="standard",
-        help="wide-baseline: for views that lie 0.4 to 0.8 m apart, such as NYU's",
+        help="wide-baseline: for frames that are 0.4 to 0.8 m apart, such as those of NYU",
     )  # fmt: skip
     parser.add_argument(
         "--merge",
         action="store_true",
-        help="end with one map of all robots; of one robot, with its loops closed",
+        help="merge the maps of all robots at the end; of one robot, close its loops",
     )
     parser.add_argument("--quiet", action="store_true", help="no progress bars")
 
@@ -70,14 +74,14 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
     if not 1 <= robots <= _MAX_ROBOTS:
         raise UsageError(f"--robots {robots} is not within 1..{_MAX_ROBOTS}", hint="choose fewer robots")
     if not (math.isfinite(args.rate) and 0.1 <= args.rate <= 60):
-        raise UsageError(f"--rate {args.rate:g} is not within 0.1..60 Hz", hint="the paper has 5")
+        raise UsageError(f"--rate {args.rate:g} is not within 0.1..60 Hz", hint="the paper uses 5")
     if args.frames is not None and not 2 <= args.frames <= 2000:
         raise UsageError(f"--frames {args.frames} is not within 2..2000", hint="80 is a path of 5.5 m")
     if args.seed < 0:
         raise UsageError(f"--seed {args.seed} is below 0", hint="choose 0 or more")
     if args.merge:
         for package, extra in _MERGE_NEEDS.items():
-            if importlib.util.find_spec(package) is None:  # better now than after the drive
+            if importlib.util.find_spec(package) is None:  # before the drive, not after it
                 raise MissingExtra(package, extra)
     from rse_pf.experiments.demo.run import DemoOptions, run_demo
 

@@ -1,8 +1,8 @@
-"""Work with the maps that robots share: look at them, merge them, find a camera in them, go back.
+"""Work with the maps that robots share: show them, merge them, localise images in them, roll them back.
 
 Works on the store itself (--store, by default data.store; rse-pf local keeps its own in STATE/objects).  A
-VERSION is head, or six or more digits of an id; show --all lists the ids.  rollback lets the head name an
-earlier version and deletes nothing.  Each action has a page of its own: rse-pf map merge --help.
+VERSION is head, or six or more digits of an id; show --all lists the ids.  rollback sets the head to an
+earlier version and deletes nothing.  Each action has its own help page: rse-pf map merge --help.
 
 examples:
   rse-pf map list --store dir:objects
@@ -19,11 +19,15 @@ from __future__ import annotations
 import argparse
 import contextlib
 import json
+import re
+import sys
 import threading
 import time
 from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 import numpy as np
@@ -31,24 +35,38 @@ import numpy as np
 from rse_pf.cli.data import open_any_store
 from rse_pf.cli.operator import record_map_change
 from rse_pf.config import PlatformSettings
-from rse_pf.errors import NotFound, UsageError
+from rse_pf.errors import CommandFailed, NotFound, UsageError
 from rse_pf.files import replace_file
+from rse_pf.geometry import Camera, rotation_angle_deg, to_quaternion
 from rse_pf.maps.export import FORMATS, export_map
+from rse_pf.maps.format import MapVersion
 from rse_pf.maps.registry import MapRecord, MapRegistry, difference
+
+if TYPE_CHECKING:
+    from rse_pf.services.mapping.localise import Location
+    from rse_pf.services.mapping.merge import MergeReply
+    from rse_pf.services.mapping.relative_pose import View
 
 __all__ = ["add_arguments", "run"]
 
 _SHORT = 12
 _MAX_VALUE = 80
+_FRAME_RANGE = re.compile(r"(?P<folder>.+):(?P<first>\d+)(-(?P<last>\d+))?")
 _ACTIONS = {
     "list": ("list the maps", "list"),
-    "show": ("show a version: what is in it, and where it came from", "show kitchen --png kitchen.png"),
-    "view": ("draw a version, or walk around in it in the browser", "view kitchen --out kitchen.png"),
-    "merge": ("make one map of several, or close the loops of one", "merge robot-1 robot-2 --into kitchen"),
-    "localise": ("find where frames were taken in a map", "localise kitchen frame.png"),
-    "diff": ("show what differs between two versions", "diff kitchen 3f9bd1 head"),
-    "rollback": ("let the head name an earlier version", "rollback kitchen 3f9bd1"),
-    "export": ("write a version for another program", "export kitchen --format ply --out kitchen.ply"),
+    "show": ("show the contents and the origin of a version", "show kitchen --png kitchen.png"),
+    "view": ("draw a version as an image, or show it in the browser", "view kitchen --out kitchen.png"),
+    "merge": (
+        "merge several maps into one, or close the loops of one map",
+        "merge robot-1 robot-2 --into kitchen",
+    ),
+    "localise": ("estimate the camera poses of images in a map", "localise kitchen frame.png"),
+    "diff": ("show the differences between two versions", "diff kitchen 3f9bd1 head"),
+    "rollback": ("set the head to an earlier version", "rollback kitchen 3f9bd1"),
+    "export": (
+        "write a version in the format of another program",
+        "export kitchen --format ply --out kitchen.ply",
+    ),
 }
 """Name, one line of help, and an example."""
 
@@ -57,8 +75,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the actions and their options."""
     actions = parser.add_subparsers(dest="action", required=True, metavar="ACTION")
     common = argparse.ArgumentParser(add_help=False)
-    common.add_argument("--store", help="where the maps are: dir:PATH or s3:BUCKET (default: data.store)")
-    common.add_argument("--tenant", default="default", help="whose maps (default: %(default)s)")
+    common.add_argument("--store", help="store of the maps: dir:PATH or s3:BUCKET (default: data.store)")
+    common.add_argument(
+        "--tenant", default="default", help="tenant that owns the maps (default: %(default)s)"
+    )
     common.add_argument("--json", action="store_true", help="print JSON")
     made = {
         name: actions.add_parser(
@@ -75,40 +95,42 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
             "version", nargs="?", default="head", metavar="VERSION", help="default: %(default)s"
         )
     made["show"].add_argument("--all", action="store_true", help="list every version")
-    made["show"].add_argument("--png", type=Path, metavar="FILE", help="draw the map there")
-    made["view"].add_argument("--out", type=Path, metavar="FILE", help="the picture (default: MAP.png)")
+    made["show"].add_argument("--png", type=Path, metavar="FILE", help="write an image of the map")
+    made["view"].add_argument("--out", type=Path, metavar="FILE", help="the image (default: MAP.png)")
     made["view"].add_argument(
         "--browser",
         action="store_true",
-        help='walk around in it in the browser (extra "view"); Ctrl-C ends it',
+        help='show it in the browser (extra "view"); Ctrl-C ends it',
     )
-    made["view"].add_argument("--port", type=int, default=8080, help="of the browser's page (default: 8080)")
+    made["view"].add_argument("--port", type=int, default=8080, help="port of the page (default: 8080)")
     made["diff"].add_argument("before", metavar="BEFORE", help="a version")
     made["diff"].add_argument(
         "after", nargs="?", default="head", metavar="AFTER", help="default: %(default)s"
     )
     made["rollback"].add_argument("version", metavar="VERSION", help="the version to go back to")
-    made["export"].add_argument("--format", choices=tuple(FORMATS), required=True, help="which program's")
-    made["export"].add_argument("--out", type=Path, required=True, metavar="FILE", help="where to")
-    made["export"].add_argument("--robot", help="tum: this robot's keyframes only")
+    made["export"].add_argument("--format", choices=tuple(FORMATS), required=True, help="the format")
+    made["export"].add_argument("--out", type=Path, required=True, metavar="FILE", help="the file to write")
+    made["export"].add_argument("--robot", help="tum: only the keyframes of this robot")
     merge, localise = made["merge"], made["localise"]
     merge.add_argument(
-        "names", nargs="+", metavar="MAP", help="MAP or MAP@VERSION; the first one's world is kept; "
-        "of one map alone the loops are closed",
-    )  # fmt: skip
+        "names",
+        nargs="+",
+        metavar="MAP",
+        help="MAP or MAP@VERSION; the world frame of the first is kept; a single map gets its loops closed",
+    )
     merge.add_argument("--into", required=True, metavar="NAME", help="the map that gets a new version")
-    merge.add_argument("--note", default="", help="what is written beside the version")
+    merge.add_argument("--note", default="", help="note of the new version")
     localise.add_argument(
         "frames",
         nargs="+",
         metavar="FRAME",
         help="an image, a recording, RECORDING:ROW or RECORDING:FIRST-LAST",
     )
-    localise.add_argument("--every", type=int, default=1, metavar="N", help="only every n-th of them")
+    localise.add_argument("--every", type=int, default=1, metavar="N", help="only every n-th frame")
     localise.add_argument(
         "--camera",
         metavar="FX,FY,CX,CY",
-        help="of images, pixels (default: the map's, if the size is the same)",
+        help="camera of images, pixels (default: the camera of the map with the same image size)",
     )
 
 
@@ -116,35 +138,24 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
     """Do one action and return the exit code."""
     chosen = settings if args.store is None else settings.replace(data={"store": args.store})
     if chosen.data.store == "memory:":
-        raise UsageError("maps in memory belong to another process", hint="name --store dir:PATH")
+        raise UsageError("a store in memory belongs to another process", hint="name --store dir:PATH")
 
-    def told(action: str, name: str, record: MapRecord) -> None:
-        record_map_change(chosen, action, name, version=record.id, number=record.number)
+    def record(action: str, name: str, made: MapRecord) -> None:
+        record_map_change(chosen, action, name, version=made.id, number=made.number)
 
     max_bytes = 4 * chosen.data.max_object_bytes
-    maps = MapRegistry(open_any_store(chosen), args.tenant, max_bytes=max_bytes, told=told)
-    if args.action in ("merge", "localise"):
-        return _work(args, maps)
+    maps = MapRegistry(open_any_store(chosen), args.tenant, max_bytes=max_bytes, on_change=record)
     actions = {
         "list": _list,
         "show": _show,
         "view": _view,
+        "merge": _merge,
+        "localise": _localise,
         "diff": _diff,
         "rollback": _rollback,
         "export": _export,
     }
-    actions[args.action](args, maps)
-    return 0
-
-
-def _work(args: argparse.Namespace, maps: MapRegistry) -> int:
-    from rse_pf.cli import map_work
-
-    if args.action == "merge":
-        return map_work.merge_into(args, maps)
-    if args.every < 1:
-        raise UsageError(f"--every {args.every} is below 1", hint="1 takes every frame")
-    return map_work.localise_frames(args, maps)
+    return actions[args.action](args, maps) or 0
 
 
 def _list(args: argparse.Namespace, maps: MapRegistry) -> None:
@@ -155,18 +166,18 @@ def _list(args: argparse.Namespace, maps: MapRegistry) -> None:
     if not heads:
         print("no maps")
     for name, head in heads.items():
-        print(f"{name:<24} {_line(head)}")
+        print(f"{name:<24} {_record_line(head)}")
 
 
 def _show(args: argparse.Namespace, maps: MapRegistry) -> None:
     if args.all:
-        head = _id_of_head(args, maps)
+        head = _id_of_head(args.name, maps)
         records = maps.versions(args.name)
         if args.json:
             _print_json([{**_fields(record), "head": record.id == head} for record in records])
             return
         for record in records:
-            print(f"{'*' if record.id == head else ' '} {_line(record)}")
+            print(f"{'*' if record.id == head else ' '} {_record_line(record)}")
         return
     record = maps.record(args.name, args.version)
     version = maps.load(args.name, record.id)
@@ -198,7 +209,7 @@ def _view(args: argparse.Namespace, maps: MapRegistry) -> None:
 
         version = maps.load(args.name, record.id)
         with contextlib.suppress(KeyboardInterrupt):
-            browse_map(version, args.port, _say_page, threading.Event())
+            browse_map(version, args.port, _print_address, threading.Event())
         return
     args.png = args.out or Path(f"{args.name}.png")
     _draw(args, maps, record)
@@ -208,8 +219,77 @@ def _view(args: argparse.Namespace, maps: MapRegistry) -> None:
         print(f"{args.png}: {args.name}, version {record.number}")
 
 
-def _say_page(url: str) -> None:
+def _print_address(url: str) -> None:
     print(f"{url}  (Ctrl-C ends it)", flush=True)
+
+
+def _merge(args: argparse.Namespace, maps: MapRegistry) -> int:
+    """Merge maps into the next version of one; the exit code is 1 if any was not joined."""
+    from rse_pf.services.mapping.merge import MergeRequest, merge_maps
+
+    names = [_version_of(word) for word in args.names]
+    records = [maps.record(*each) for each in names]
+    parent = _id_of_head(args.into, maps)
+    request = MergeRequest(
+        maps=[maps.data(name, record.id) for (name, _), record in zip(names, records, strict=True)]
+    )
+    began = time.perf_counter()
+    reply = merge_maps(request, report=_progress(sys.stderr))
+    seconds = round(time.perf_counter() - began, 3)
+    not_joined = [(args.names[each.map], each.reason) for each in reply.not_joined]
+    if len(args.names) > 1 and len(reply.joined) < 2:
+        reasons = "; ".join(f"{name}: {reason}" for name, reason in not_joined)
+        raise CommandFailed(
+            f"no two of these maps can be joined, so nothing was written: {reasons}",
+            hint="record frames at places that another robot has seen, then merge again",
+        )
+    joined = [args.names[row] for row in reply.joined]
+    made = maps.commit(
+        args.into, reply.map, parent=parent, author="rse-pf map merge", created_s=time.time(),
+        note=args.note or f"merged {', '.join(joined)}",
+    )  # fmt: skip
+    refused = _refused(args.names, reply)
+    if args.json:
+        _print_json(
+            {"name": args.into, "id": made.id, "number": made.number, "joined": joined,
+             "not_joined": [{"map": name, "reason": reason} for name, reason in not_joined],
+             "refused": refused, "links": reply.merges, "loops": reply.loops, "seconds": seconds}
+        )  # fmt: skip
+        return 1 if not_joined else 0
+    print(f"{args.into} is now version {made.number}, {made.id[:12]}: {made.keyframes} keyframes, "
+          f"{made.points} points, {reply.merges} links between maps, {reply.loops} loops")  # fmt: skip
+    print(f"joined      {', '.join(joined)}")
+    for name, reason in not_joined:
+        print(f"not joined  {name}: {reason}")
+    for each in refused:
+        reasons = ", ".join(f"{count} {reason}" for reason, count in each["reasons"].items())
+        print(f"refused     {each['between']}: {reasons}")
+    return 1 if not_joined else 0
+
+
+def _localise(args: argparse.Namespace, maps: MapRegistry) -> int:
+    """Estimate the pose of each frame and print a line for it; the exit code is 1 if none has a pose."""
+    from rse_pf.services.mapping.localise import locate
+    from rse_pf.services.mapping.place import opened_map
+
+    if args.every < 1:
+        raise UsageError(f"--every {args.every} is below 1", hint="1 takes every frame")
+    name, version = _version_of(args.name)
+    data = maps.data(name, version)
+    version_map, index = opened_map(data)
+    frames = [each for word in args.frames for each in _frames(word, args.every)]
+    found: list[dict[str, Any]] = []
+    for each in frames:
+        location = locate(index, _view_of(each, version_map, args.camera))
+        found.append(_found(each.label, location))
+        if not args.json:
+            print(_location_line(found[-1]), flush=True)
+    good = sum(each["verdict"] == "ok" for each in found)
+    if args.json:
+        _print_json(found)
+    else:
+        print(f"{good} of {len(found)} found")
+    return 0 if good else 1
 
 
 def _diff(args: argparse.Namespace, maps: MapRegistry) -> None:
@@ -234,7 +314,7 @@ def _rollback(args: argparse.Namespace, maps: MapRegistry) -> None:
 
 def _export(args: argparse.Namespace, maps: MapRegistry) -> None:
     if not args.out.absolute().parent.is_dir():
-        raise UsageError(f"there is no folder {args.out.absolute().parent}", hint="make it")
+        raise UsageError(f"there is no folder {args.out.absolute().parent}", hint="create it")
     data = export_map(maps.load(args.name, args.version), args.format, args.robot)
     replace_file(args.out, data)
     if args.json:
@@ -244,32 +324,160 @@ def _export(args: argparse.Namespace, maps: MapRegistry) -> None:
 
 
 def _draw(args: argparse.Namespace, maps: MapRegistry, record: MapRecord) -> None:
-    from rse_pf.experiments.plots.map_image import PathOfRobot, draw_map
+    from rse_pf.experiments.plots.map_image import RobotPath, draw_map
 
     if not args.png.absolute().parent.is_dir():
-        raise UsageError(f"there is no folder {args.png.absolute().parent}", hint="make it")
+        raise UsageError(f"there is no folder {args.png.absolute().parent}", hint="create it")
     version = maps.load(args.name, record.id)
     if not version.keyframes:
         raise UsageError("a map without keyframes cannot be drawn", hint="export its cloud as ply")
     robots = []
     for robot in record.robots:
         own = sorted((k for k in version.keyframes if k.robot == robot), key=lambda k: k.timestamp_s)
-        robots.append(PathOfRobot(name=robot, T_world_camera=np.stack([k.T_world_camera for k in own])))
+        robots.append(RobotPath(name=robot, T_world_camera=np.stack([k.T_world_camera for k in own])))
     caption = f"{args.name}, version {record.number}: {record.keyframes} keyframes, {record.points:,} points"
     draw_map(args.png, version.points, version.colours, robots, caption)
 
 
-def _id_of_head(args: argparse.Namespace, maps: MapRegistry) -> str | None:
+def _id_of_head(name: str, maps: MapRegistry) -> str | None:
     try:
-        return maps.head(args.name).id
+        return maps.head(name).id
     except NotFound:
         return None
 
 
-def _line(record: MapRecord) -> str:
+def _version_of(word: str) -> tuple[str, str]:
+    """Return name and version of ``MAP`` or ``MAP@VERSION``."""
+    name, _, version = word.partition("@")
+    return name, version or "head"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _NamedFrame:
+    """A frame to localise: a row of a recording, or (row None) an image."""
+
+    label: str
+    path: Path
+    row: int | None
+
+
+def _frames(word: str, every: int) -> Iterator[_NamedFrame]:
+    path = Path(word)
+    if path.is_file():
+        yield _NamedFrame(label=word, path=path, row=None)
+        return
+    first, last = 0, -1
+    match = None if path.is_dir() else _FRAME_RANGE.fullmatch(word)
+    if match is not None:
+        path = Path(match["folder"])
+        first = int(match["first"])
+        last = int(match["last"] or first)
+    if not path.exists():
+        raise UsageError(
+            f"there is no image or recording {word}",
+            hint="name an image, a recording, or RECORDING:FIRST-LAST",
+        )
+    from client_sdk.datasets import open_dataset
+
+    count = len(open_dataset(path))
+    if match is not None and not first <= last < count:
+        raise UsageError(
+            f"{path} has the frames 0 to {count - 1}, not {word.rpartition(':')[2]}",
+            hint="count frames from 0",
+        )
+    for row in range(first, count if last < 0 else last + 1, every):
+        yield _NamedFrame(label=f"{path.name}:{row}", path=path, row=row)
+
+
+def _view_of(named: _NamedFrame, version: MapVersion, camera: str | None) -> View:
+    from client_sdk.datasets import open_dataset, read_colour
+    from client_sdk.frontend import Frame, FrontEndOptions, extract
+    from rse_pf.services.mapping.relative_pose import View
+
+    if named.row is not None:
+        recording = open_dataset(named.path)
+        frame = recording.read(recording.rows[named.row])
+    else:
+        rgb = read_colour(named.path)
+        height, width = rgb.shape[:2]
+        lens = _lens(camera, width, height) if camera else _lens_of_map(version, width, height, named.label)
+        nothing = np.zeros((height, width), dtype=np.float32)
+        frame = Frame(timestamp_s=0.0, rgb=rgb, depth_m=nothing, camera=lens)
+    features = extract(frame, FrontEndOptions())
+    return View(camera=frame.camera, pixels=features.pixels, descriptors=features.descriptors)
+
+
+def _lens(numbers: str, width: int, height: int) -> Camera:
+    try:
+        fx, fy, cx, cy = (float(each) for each in numbers.split(","))
+    except ValueError as error:
+        raise UsageError(
+            f"--camera {numbers} is not four numbers", hint="write fx,fy,cx,cy in pixels"
+        ) from error
+    return Camera(fx=fx, fy=fy, cx=cx, cy=cy, width=width, height=height)
+
+
+def _lens_of_map(version: MapVersion, width: int, height: int, label: str) -> Camera:
+    """Return the camera of a keyframe with the same image size, which likely took the image."""
+    for keyframe in version.keyframes:
+        if (keyframe.camera.width, keyframe.camera.height) == (width, height):
+            return keyframe.camera
+    raise UsageError(
+        f"{label} is {width}x{height} px, and no camera of the map has that size",
+        hint="name it: --camera fx,fy,cx,cy",
+    )
+
+
+def _found(label: str, location: Location) -> dict[str, Any]:
+    T = location.T_map_camera
+    return {
+        "frame": label, "verdict": location.verdict, "reason": location.reason, "inliers": location.inliers,
+        "rmse_px": round(location.rmse_px, 3), "keyframes": list(location.keyframes),
+        "position_m": None if T is None else [round(float(x), 4) + 0.0 for x in T[:3, 3]],
+        "quaternion_xyzw": None if T is None else [round(float(x), 6) for x in to_quaternion(T[:3, :3])],
+        "turned_deg": None if T is None else round(rotation_angle_deg(T[:3, :3]), 2),
+    }  # fmt: skip
+
+
+def _location_line(found: dict[str, Any]) -> str:
+    start = f"{found['frame']:<24} {found['verdict']:<4}"
+    if found["position_m"] is None:
+        return f"{start}  {found['reason']}, {found['inliers']} inliers"
+    x, y, z = found["position_m"]
+    reason = f" ({found['reason']})" if found["reason"] else ""
+    keyframes = ", ".join(str(each) for each in found["keyframes"])
+    return (
+        f"{start}  x {x:7.3f}  y {y:7.3f}  z {z:7.3f} m, turned {found['turned_deg']:6.2f} deg; "
+        f"{found['inliers']} inliers, {found['rmse_px']:.2f} px, keyframes {keyframes}{reason}"
+    )
+
+
+def _refused(names: Sequence[str], reply: MergeReply) -> list[dict[str, Any]]:
+    """Return the counts of pairs of keyframes that were not linked, by their maps and reasons."""
+    pairs: dict[str, dict[str, int]] = {}
+    for each in reply.refused:
+        between = " and ".join(dict.fromkeys(names[row] for row in each.maps))
+        if len(set(each.maps)) == 1:
+            between = f"within {between}"
+        pairs.setdefault(between, {})[each.reason] = each.count
+    return [{"between": between, "reasons": reasons} for between, reasons in pairs.items()]
+
+
+def _progress(screen: Any) -> Any:
+    """Return a callback that rewrites one line of a terminal, and prints nothing to a file or pipe."""
+
+    def report(done: float, what: str) -> None:
+        if screen.isatty():
+            end = "\n" if done >= 1.0 else ""
+            print(f"\r\033[K{100 * done:3.0f} %  {what}", end=end, file=screen, flush=True)
+
+    return report
+
+
+def _record_line(record: MapRecord) -> str:
     counts = f"{record.keyframes} keyframes, {record.edges} edges, {record.points} points"
-    told = (f"{record.number:>4}", record.id[:_SHORT], _when(record.created_s), counts, record.note)
-    return "  ".join(told).rstrip()
+    columns = (f"{record.number:>4}", record.id[:_SHORT], _when(record.created_s), counts, record.note)
+    return "  ".join(columns).rstrip()
 
 
 def _fields(record: MapRecord) -> dict[str, Any]:

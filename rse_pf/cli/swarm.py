@@ -1,7 +1,7 @@
-"""Load a platform with many robots that solve real PnP problems, and measure what they see.
+"""Load a platform with many robots that send real PnP problems, and measure their round trips.
 
-Send times are fixed beforehand and latency counts from them, so that a stall is never left out. Without
---name or --url a platform is started for the run; Ctrl-C leaves nothing running.
+Send times are fixed before the run and latency counts from them, so that stalls are part of it. Without
+--name or --url a platform is started for the run; Ctrl-C ends everything that was started.
 
 examples:
   rse-pf swarm --robots 20 --seconds 10
@@ -24,7 +24,7 @@ from rse_pf.config import PlatformSettings, load_settings
 from rse_pf.errors import UsageError
 
 if TYPE_CHECKING:
-    from rse_pf.experiments.load.run import Platform
+    from rse_pf.experiments.load.run import TargetPlatform
 
 __all__ = ["add_arguments", "run"]
 
@@ -34,19 +34,37 @@ _MAX_S = 86400.0
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     add = parser.add_argument
-    add("--robots", type=int, default=10, help="how many (default: 10)")
-    add("--fps", type=float, default=5.0, help="frames per second of each (default: 5, the paper's)")
-    add("--join-every", type=float, default=0.0, metavar="S", help="seconds between two robots (default: 0)")
-    add("--seconds", type=float, default=20.0, metavar="S", help="time after all have joined (default: 20)")
-    add("--matches", type=int, default=200, help="matches of a frame (default: 200)")
-    add("--codec", default="zlib", help="zlib (default, the paper's), json or bin")
+    add("--robots", type=int, default=10, help="number of robots (default: 10)")
+    add(
+        "--fps", type=float, default=5.0, help="frames per second of each robot (default: 5, as in the paper)"
+    )
+    add(
+        "--join-every",
+        type=float,
+        default=0.0,
+        metavar="S",
+        help="time between two robots that join (default: 0)",
+    )
+    add(
+        "--seconds",
+        type=float,
+        default=20.0,
+        metavar="S",
+        help="duration after all have joined (default: 20)",
+    )
+    add("--matches", type=int, default=200, help="matches per frame (default: 200)")
+    add("--codec", default="zlib", help="zlib (default, as in the paper), json or bin")
     add("--service", default="pnp", help="pnp (default) or echo")
-    add("--link", metavar="PROFILE", help="a network in between: none, paper, wifi-bad or lte")
-    add("--deadline", type=float, default=5.0, metavar="S", help="an answer is of use so long (default: 5)")
-    add("--latest-only", action="store_true", help="let the platform skip frames that a newer one overtook")
+    add("--link", metavar="PROFILE", help="emulate a network: none, paper, wifi-bad or lte")
+    add("--deadline", type=float, default=5.0, metavar="S", help="deadline of each command (default: 5)")
+    add(
+        "--latest-only",
+        action="store_true",
+        help="let the platform skip a frame when a newer one has arrived",
+    )
     add("--processes", type=int, default=1, help="processes of the generator (default: 1)")
-    add("--seed", type=int, default=0, help="other problems, jitter and cuts (default: 0)")
-    add("--servers", type=int, help="of the platform that is started (default: local.servers)")
+    add("--seed", type=int, default=0, help="seed of problems, jitter and link cuts (default: 0)")
+    add("--servers", type=int, help="servers of the platform that is started (default: local.servers)")
     add("--name", help="use the platform that rse-pf local runs under this name")
     add("--url", help="use the platform at this address, with --token-from")
     add("--token-from", metavar="NAME", help="with --url: sign tokens with the key of this local platform")
@@ -60,7 +78,9 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
     from rse_pf.experiments.load.swarm import SwarmOptions
 
     if not (math.isfinite(args.seconds) and 0 < args.seconds <= _MAX_S):
-        raise UsageError(f"--seconds {args.seconds:g} is not within 0..{_MAX_S:g}", hint="20 is plenty")
+        raise UsageError(
+            f"--seconds {args.seconds:g} is not within 0..{_MAX_S:g}", hint="20 is enough for percentiles"
+        )
     options = SwarmOptions(
         robots=args.robots,
         fps=args.fps,
@@ -77,7 +97,9 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
     platform = _platform(args, settings)
     if args.servers is not None:
         if platform is not None:
-            raise UsageError("--servers is for a platform of its own", hint="leave out --name and --url")
+            raise UsageError(
+                "--servers needs a platform that is started for the run", hint="leave out --name and --url"
+            )
         settings = settings.replace(local={"servers": args.servers})
     return run_swarm(
         SwarmRun(options=options, seconds=args.seconds, out=args.out, platform=platform, quiet=args.quiet),
@@ -85,20 +107,22 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
     )
 
 
-def _platform(args: argparse.Namespace, settings: PlatformSettings) -> Platform | None:
-    from rse_pf.experiments.load.run import Platform
+def _platform(args: argparse.Namespace, settings: PlatformSettings) -> TargetPlatform | None:
+    from rse_pf.experiments.load.run import TargetPlatform
     from rse_pf.local.firewall import key_file, read_key
     from rse_pf.local.state import read_state, settings_file, state_folder
 
     name = args.token_from if args.url is not None else args.name
     if args.url is not None and args.name is not None:
-        raise UsageError("--name and --url both say where", hint="choose one")
+        raise UsageError("--name and --url exclude each other", hint="use one of them")
     if args.url is None and args.token_from is not None:
-        raise UsageError("--token-from is for --url", hint="--name alone finds address and key")
+        raise UsageError("--token-from needs --url", hint="use --name alone: it finds address and key")
     if args.url is not None and urlsplit(args.url).scheme not in ("ws", "wss"):
         raise UsageError(f"{args.url!r} is not a WebSocket address", hint="write ws://HOST:PORT/ws")
     if args.url is not None and name is None:
-        raise UsageError("--url alone gives no tokens", hint="name a local platform with --token-from")
+        raise UsageError(
+            "--url needs --token-from for tokens", hint="name a local platform with --token-from"
+        )
     if name is None:
         return None
     folder = state_folder(name, os.environ)
@@ -107,10 +131,10 @@ def _platform(args: argparse.Namespace, settings: PlatformSettings) -> Platform 
     if not url:
         raise UsageError(f"no platform {name!r} is running", hint=f"start it: rse-pf local --name {name}")
     key = read_key(key_file(folder))
-    told = settings_file(folder)
-    auth = (load_settings(told) if told.exists() and args.settings is None else settings).auth
+    file = settings_file(folder)
+    auth = (load_settings(file) if file.exists() and args.settings is None else settings).auth
 
     def token_of(robot: str) -> str:
         return key.issue(robot, now=time.time(), token_id=secrets.token_hex(8), settings=auth)
 
-    return Platform(url, token_of)
+    return TargetPlatform(url, token_of)

@@ -1,4 +1,4 @@
-"""rse-pf map: what a person sees of a store's maps, and what it writes."""
+"""rse-pf map: what each action prints, writes and refuses."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""What a robot of the demo keeps for others: its keyframes, and at the end its map.
+"""The keyframes of a robot in the demo, and the map that it commits at the end.
 
-A keyframe is handed over as it is made (it goes to the data service in the background, behind live poses) and
-kept for the map that the robot commits.  Promises to hold features and poses only, never an image.
+Each keyframe is uploaded to the data service in the background, after live poses, and kept for the map.  A
+keyframe holds features and a pose, never an image.
 """
 
 from __future__ import annotations
@@ -17,30 +17,26 @@ from client_sdk.frontend import FrontEndOptions, TrackedFrame, extract
 from client_sdk.transfer.background_upload import BackgroundUploader
 from client_sdk.transfer.data_client import DataClient
 from rse_pf.config import DataSettings
-from rse_pf.experiments.demo.merge_client import commit
+from rse_pf.experiments.demo.merge import commit
 from rse_pf.maps.format import Keyframe, MapVersion, encode_map
 
-__all__ = ["MAP_FILE", "KeyframeKeeper", "KeyframeUploads", "Others"]
+__all__ = ["KeyframeCollector", "KeyframeSink", "KeyframeUploads"]
 
-MAP_FILE = "map.rsemap"
-"""Name of a robot's map in its folder: what `rse_pf.maps.format.encode_map` returns."""
-
-
-_LEFT_S = 30.0
+_UPLOAD_TIMEOUT_S = 30.0
 
 
-class Others(Protocol):
-    """Where keyframes and the map go."""
+class KeyframeSink(Protocol):
+    """Receives the keyframes and the map of a robot."""
 
     def keyframe(self, data: bytes) -> None:
-        """Take an encoded map of one keyframe; must not wait."""
+        """Take an encoded map of one keyframe; must not block."""
 
     def finish(self, robot: str, data: bytes) -> int:
-        """Take the robot's whole map; return how many keyframes have arrived."""
+        """Take the whole map of the robot; return how many keyframes have arrived."""
 
 
 class KeyframeUploads:
-    """The way to the data service: keyframes in the background, the map at the end."""
+    """Uploads to the data service: keyframes in the background, the map at the end."""
 
     def __init__(
         self,
@@ -50,7 +46,7 @@ class KeyframeUploads:
         settings: DataSettings,
         is_busy: Callable[[], bool],
     ) -> None:
-        """Begin to send; *is_busy* says that a live pose is on its way and keyframes have to wait."""
+        """Begin to upload; while *is_busy* (a live pose is on its way) keyframes wait."""
         self._client = DataClient(url, token)
         self._background = BackgroundUploader(DataClient(url, token), spool, settings, is_busy=is_busy)
         self._background.start()
@@ -60,39 +56,39 @@ class KeyframeUploads:
         self._background.add(data)
 
     def finish(self, robot: str, data: bytes) -> int:
-        """Wait for the keyframes, commit the map under the robot's name, and hang up."""
+        """Wait for the keyframes, commit the map under the name of the robot, and close the connections."""
         try:
-            self._background.wait_sent(_LEFT_S)
-            commit(self._client, robot, data, "the drive of a demo")
+            self._background.wait_sent(_UPLOAD_TIMEOUT_S)
+            commit(self._client, robot, data, "a drive of the demo")
         finally:
             self._background.close()
             self._client.close()
         return self._background.sent
 
 
-class KeyframeKeeper:
-    """Collects the keyframes of one robot's drive."""
+class KeyframeCollector:
+    """Collects the keyframes of one robot."""
 
-    def __init__(self, robot: str, options: FrontEndOptions, others: Others | None = None) -> None:
-        """Remember what to do.
+    def __init__(self, robot: str, options: FrontEndOptions, sink: KeyframeSink | None = None) -> None:
+        """Start without keyframes.
 
         Args:
-            robot: Its name, which its keyframes carry.
-            options: Those of its tracker: the features are found again in the same way.
-            others: Gets each keyframe, encoded as a map of one, and the map.
+            robot: Name of the robot, which its keyframes carry.
+            options: Options of its tracker: features are extracted again with the same ones.
+            sink: Receives each keyframe, encoded as a map of one, and the map.
         """
         self.uploaded = 0
         """Keyframes that have arrived, once the map was shared."""
         self._robot = robot
         self._options = options
-        self._others = others
+        self._sink = sink
         self._keyframes: list[Keyframe] = []
 
     def __len__(self) -> int:
         return len(self._keyframes)
 
-    def see(self, tracked: TrackedFrame) -> None:
-        """Keep *tracked* if it is a keyframe."""
+    def add(self, tracked: TrackedFrame) -> None:
+        """Add *tracked* if it is a keyframe."""
         if not tracked.keyframe or tracked.T_world_camera is None:
             return
         found = extract(tracked.frame, self._options)
@@ -107,8 +103,8 @@ class KeyframeKeeper:
             points_camera=found.points_camera.astype(np.float32),
         )
         self._keyframes.append(keyframe)
-        if self._others is not None:
-            self._others.keyframe(encode_map(MapVersion(keyframes=(keyframe,))))
+        if self._sink is not None:
+            self._sink.keyframe(encode_map(MapVersion(keyframes=(keyframe,))))
 
     def encoded_map(self, points: npt.NDArray[np.float32], colours: npt.NDArray[np.uint8]) -> bytes:
         """Return the robot's map with its cloud, ``(n, 3)`` metres and ``(n, 3)`` uint8."""
@@ -121,10 +117,10 @@ class KeyframeKeeper:
         return encode_map(version)
 
     def share(self, data: bytes) -> None:
-        """Hand the whole map over; blocks until the others have it.
+        """Send the whole map to the sink, and wait until it has arrived.
 
         Raises:
-            RsePfError: They do not take it.
+            RsePfError: The sink refused it.
         """
-        if self._others is not None:
-            self.uploaded = self._others.finish(self._robot, data)
+        if self._sink is not None:
+            self.uploaded = self._sink.finish(self._robot, data)

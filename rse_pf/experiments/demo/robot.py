@@ -1,7 +1,7 @@
-"""One robot of the demo, in a process of its own: frames in, a map and its records out.
+"""One robot of the demo, in a process of its own: it tracks frames and writes its map and its records.
 
-It is what a user's robot would be: the public SDK, a token, and nothing of the platform.  Promises
-to talk to its parent through one pipe only, and to leave its files even if frames were lost.
+Like a user's robot it uses the public SDK and a token, and nothing of the platform.  It writes its files even
+if frames were lost.
 """
 
 from __future__ import annotations
@@ -20,20 +20,22 @@ from client_sdk.frontend import Frame, FrontEndOptions, PoseQuery, TrackedFrame,
 from client_sdk.mapping import MapOptions, PointMap, Trajectory, write_ply, write_trajectory
 from rse_pf.config import DataSettings, SessionSettings
 from rse_pf.errors import RsePfError
-from rse_pf.experiments.demo.keyframes import MAP_FILE, KeyframeKeeper, KeyframeUploads
+from rse_pf.experiments.child_process import ChildFailed, ChildReady
+from rse_pf.experiments.demo.keyframes import KeyframeCollector, KeyframeUploads
+from rse_pf.experiments.demo.merge import MAP_FILE
 from rse_pf.experiments.demo.parent_pipe import ParentPipe
-from rse_pf.experiments.results.report import CommandRecord
+from rse_pf.experiments.results.records import CommandRecord
 from rse_pf.geometry import Array
 from rse_pf.pnp import PnpOptions
 
-__all__ = ["Failed", "Finished", "Progress", "Ready", "RobotSpec", "run_robot"]
+__all__ = ["FrameDone", "RobotFinished", "RobotSpec", "run_robot"]
 
-_PRUNE_READINGS = 2
+_MIN_READINGS = 2
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RobotSpec:
-    """What the parent tells a robot before it starts."""
+    """What a robot does; the parent gives it at the start."""
 
     name: str
     number: int
@@ -48,36 +50,22 @@ class RobotSpec:
     frontend: FrontEndOptions
     session: SessionSettings
     merge: bool = False
-    """Whether it keeps its keyframes and starts in a world of its own, not at its true pose."""
+    """Whether it keeps its keyframes and starts in a world frame of its own, not at its true pose."""
     data_settings: DataSettings | None = None
-    """How it uploads keyframes and map to the data service; None if the platform has none."""
+    """Settings of uploads to the data service; None if the platform has none."""
 
 
 @dataclass(frozen=True, slots=True)
-class Ready:
-    """The robot has its frames and is connected."""
-
-    frames: int
-
-
-@dataclass(frozen=True, slots=True)
-class Progress:
-    """A frame is loaded, or (while playing) done."""
+class FrameDone:
+    """From the robot: a frame was loaded or, after the start, tracked."""
 
     frames: int
     lost: bool = False
 
 
-@dataclass(frozen=True, slots=True)
-class Failed:
-    """The robot cannot go on."""
-
-    report: str
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Finished:
-    """What a robot leaves to its parent; its map and trajectory are in its folder."""
+class RobotFinished:
+    """From the robot: its figures at the end; its map and trajectory are in its folder."""
 
     frames: int
     lost_frames: int
@@ -95,24 +83,24 @@ class Finished:
 
 
 @dataclass(slots=True)
-class _Diary:
-    """What the robot writes down as it goes."""
+class _Drive:
+    """The records of the robot while it drives."""
 
     commands: list[CommandRecord] = field(default_factory=list)
     tracked: list[TrackedFrame] = field(default_factory=list)
     weak_poses: int = 0
     asking: bool = False
-    """Whether a live pose is on its way: keyframes wait."""
+    """Whether a pose is requested at this moment: keyframes wait."""
 
 
 def run_robot(spec: RobotSpec, pipe: Connection) -> None:
-    """Load the frames, connect, wait for the start, play; the entry point of the process."""
-    parent = ParentPipe(pipe)
+    """Load the frames, connect, wait for the start, track; the entry point of the process."""
+    parent = ParentPipe(pipe, spec.name)
     parent.listen()
     try:
         asyncio.run(_run(spec, parent))
     except RsePfError as error:
-        parent.send(Failed(error.report()))
+        parent.send(ChildFailed(error.report()))
     except KeyboardInterrupt:
         pass
 
@@ -126,45 +114,45 @@ async def _run(spec: RobotSpec, pipe: ParentPipe) -> None:
         return await asyncio.to_thread(pipe.fresh_token)
 
     async with connect(spec.url, token=token, codec=spec.codec, settings=spec.session) as robot:
-        pipe.send(Ready(len(frames)))
+        pipe.send(ChildReady(len(frames)))
         began = await asyncio.to_thread(pipe.wait_start)
         start = np.eye(4) if truth is None or spec.merge else truth.T_world_camera[0]
         tracker = Tracker(spec.frontend, T_world_start=start)
         point_map = PointMap(MapOptions())
-        diary = _Diary()
-        keeper = _keeper(spec, pipe.token, lambda: diary.asking)
+        drive = _Drive()
+        collector = _collector(spec, pipe.token, lambda: drive.asking)
         first_s = time.monotonic()
         for row, frame in enumerate(frames):
             planned = began + (row + spec.number / spec.robots) / spec.rate_hz
             await asyncio.sleep(max(0.0, planned - time.monotonic()))
-            done = await _track(robot, tracker, frame, planned, began, spec, diary)
+            done = await _track(robot, tracker, frame, planned, began, spec, drive)
             if done.T_world_camera is not None:
                 await asyncio.to_thread(point_map.add, frame, done.T_world_camera)
-                if keeper is not None:
-                    await asyncio.to_thread(keeper.see, done)
-            diary.tracked.append(done)
-            pipe.send(Progress(row + 1, done.lost))
+                if collector is not None:
+                    await asyncio.to_thread(collector.add, done)
+            drive.tracked.append(done)
+            pipe.send(FrameDone(row + 1, done.lost))
         took_s = time.monotonic() - first_s
-        trajectory = _trajectory(diary.tracked)
-        await asyncio.to_thread(_write, spec.folder, point_map, trajectory, keeper)
+        trajectory = _trajectory(drive.tracked)
+        await asyncio.to_thread(_write, spec.folder, point_map, trajectory, collector)
         pipe.send(
-            Finished(
+            RobotFinished(
                 frames=tracker.frames,
                 lost_frames=tracker.lost_frames,
                 keyframes=tracker.keyframes,
-                weak_poses=diary.weak_poses,
+                weak_poses=drive.weak_poses,
                 map_points=len(point_map),
                 fps=tracker.frames / max(took_s, 1e-9),
-                matches=[done.matches for done in diary.tracked[1:]],
-                inliers=[done.inliers for done in diary.tracked[1:]],
-                commands=diary.commands,
+                matches=[done.matches for done in drive.tracked[1:]],
+                inliers=[done.inliers for done in drive.tracked[1:]],
+                commands=drive.commands,
                 trajectory=trajectory,
                 truth=truth,
                 truth_kind=truth_kind,
                 stats={
                     "reconnects": robot.stats.reconnects,
                     "resent": robot.stats.resent,
-                    "keyframes_uploaded": 0 if keeper is None else keeper.uploaded,
+                    "keyframes_uploaded": 0 if collector is None else collector.uploaded,
                 },
             )
         )
@@ -177,23 +165,23 @@ async def _track(
     planned: float,
     began: float,
     spec: RobotSpec,
-    diary: _Diary,
+    drive: _Drive,
 ) -> TrackedFrame:
-    """Ask the cloud until the frame has a pose or is lost."""
+    """Request poses from the platform until the frame has one or is lost."""
     step = await asyncio.to_thread(tracker.prepare, frame)
     while isinstance(step, PoseQuery):
-        T_camera_world, inliers = await _solve(robot, step, planned, began, spec, diary)
+        T_camera_world, inliers = await _solve(robot, step, planned, began, spec, drive)
         step = await asyncio.to_thread(tracker.accept, step, T_camera_world, inliers)
     return step
 
 
 async def _solve(
-    robot: Any, query: PoseQuery, planned: float, began: float, spec: RobotSpec, diary: _Diary
+    robot: Any, query: PoseQuery, planned: float, began: float, spec: RobotSpec, drive: _Drive
 ) -> tuple[Array | None, int]:
     options = PnpOptions(inlier_px=query.inlier_px, max_iterations=query.max_iterations)
     sent = time.monotonic()
     record = CommandRecord(
-        id=len(diary.commands) + 1,
+        id=len(drive.commands) + 1,
         robot=spec.name,
         planned=round(planned - began, 6),
         sent=round(sent - began, 6),
@@ -201,7 +189,7 @@ async def _solve(
         server="",
         code="",
     )
-    diary.asking = True
+    drive.asking = True
     try:
         answer = await robot.solve_pnp(
             query.correspondences.points_world,
@@ -212,11 +200,11 @@ async def _solve(
             keep=True,
         )
     except RsePfError as error:
-        diary.commands.append(replace(record, answered=_since(began), code=error.code))
+        drive.commands.append(replace(record, answered=_since(began), code=error.code))
         return None, 0
     finally:
-        diary.asking = False
-    diary.commands.append(
+        drive.asking = False
+    drive.commands.append(
         replace(
             record,
             answered=_since(began),
@@ -231,7 +219,7 @@ async def _solve(
             down_ms=answer.down_ms,
         )
     )
-    diary.weak_poses += answer.solution.verdict == "weak"
+    drive.weak_poses += answer.solution.verdict == "weak"
     return answer.solution.T_camera_world, len(answer.solution.inliers)
 
 
@@ -240,7 +228,7 @@ def _since(began: float) -> float:
 
 
 def _load(spec: RobotSpec, pipe: ParentPipe) -> tuple[Any, Trajectory | None, str]:
-    """Return frames, truth and what kind of truth it is; rendered frames are made beforehand."""
+    """Return the frames, the true trajectory and its kind; the world is rendered before the start."""
     if spec.data is not None:
         from client_sdk.datasets import open_dataset
 
@@ -252,7 +240,7 @@ def _load(spec: RobotSpec, pipe: ParentPipe) -> tuple[Any, Trajectory | None, st
     frames: list[Frame] = []
     for frame in render_frames(spec.number, spec.robots, spec.frames, spec.seed):
         frames.append(frame)
-        pipe.send(Progress(len(frames)))
+        pipe.send(FrameDone(len(frames)))
     return frames, truth, "ground truth"
 
 
@@ -265,20 +253,24 @@ def _trajectory(tracked: Iterable[TrackedFrame]) -> Trajectory:
     )
 
 
-def _keeper(spec: RobotSpec, token: Callable[[], str], is_busy: Callable[[], bool]) -> KeyframeKeeper | None:
+def _collector(
+    spec: RobotSpec, token: Callable[[], str], is_busy: Callable[[], bool]
+) -> KeyframeCollector | None:
     if not spec.merge:
         return None
     if spec.data_settings is None:
-        return KeyframeKeeper(spec.name, spec.frontend)
+        return KeyframeCollector(spec.name, spec.frontend)
     uploads = KeyframeUploads(spec.url, token, spec.folder / "spool", spec.data_settings, is_busy)
-    return KeyframeKeeper(spec.name, spec.frontend, uploads)
+    return KeyframeCollector(spec.name, spec.frontend, uploads)
 
 
-def _write(folder: Path, point_map: PointMap, trajectory: Trajectory, keeper: KeyframeKeeper | None) -> None:
-    points, colours = point_map.points(min_readings=_PRUNE_READINGS)
+def _write(
+    folder: Path, point_map: PointMap, trajectory: Trajectory, collector: KeyframeCollector | None
+) -> None:
+    points, colours = point_map.points(min_readings=_MIN_READINGS)
     write_ply(folder / "map.ply", points, colours)
     write_trajectory(folder / "trajectory.txt", trajectory)
-    if keeper is not None:
-        data = keeper.encoded_map(points, colours)
+    if collector is not None:
+        data = collector.encoded_map(points, colours)
         (folder / MAP_FILE).write_bytes(data)
-        keeper.share(data)
+        collector.share(data)

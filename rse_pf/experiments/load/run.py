@@ -1,13 +1,12 @@
-"""One run of a swarm from the command line: play for a while, show how it goes, write every record.
+"""One run of ``rse-pf swarm``: run the robots for a time, show progress, write the records and a report.
 
-Leaves ``commands.csv``, ``events.jsonl`` and ``report.json``; the report is computed from the commands and
-the generator's own account.  Promises to leave nothing running, and no key in the folder of results.
+Writes ``commands.csv``, ``events.jsonl`` and ``report.json``; the report is computed from the commands and
+the figures of the load generator.  The folder of results holds no key.
 """
 
 from __future__ import annotations
 
 import asyncio
-import os
 import shutil
 import sys
 import tempfile
@@ -21,33 +20,30 @@ from typing import Any
 import numpy as np
 
 from rse_pf.config import PlatformSettings
-from rse_pf.errors import RsePfError, UsageError
 from rse_pf.experiments.load.swarm import Swarm, SwarmOptions, SwarmResult
-from rse_pf.experiments.load.swarm_process import Rows
-from rse_pf.experiments.results.report import (
-    CommandRecord,
-    EventLog,
+from rse_pf.experiments.load.swarm_process import ResultRows
+from rse_pf.experiments.results.records import COMMANDS, EVENTS, CommandRecord, EventLog, write_commands
+from rse_pf.experiments.results.result_folder import (
     environment,
-    percentiles,
-    summarise,
-    write_commands,
+    fresh_folder,
+    load_average,
     write_json,
 )
+from rse_pf.experiments.results.summary import answered_percent, percentiles, summarise
 from rse_pf.local.control.platform import LocalPlatform
 
-__all__ = ["FAST_MS", "Platform", "SwarmRun", "report_of", "run_swarm"]
+__all__ = ["FAST_MS", "SwarmRun", "TargetPlatform", "report_of", "run_swarm"]
 
 FAST_MS = 150.0
-"""An answer within this is in time: below the paper's mean round trip of 156.36 ms."""
+"""Limit for "answered in time": below the paper's mean round trip of 156.36 ms."""
 
 _JOIN_S = 30.0
 _SHOW_EVERY_S = 1.0
-_FILES = ("commands.csv", "events.jsonl", "report.json")
 
 
 @dataclass(frozen=True, slots=True)
-class Platform:
-    """One that runs already: its address, and who issues tokens."""
+class TargetPlatform:
+    """A platform that runs already: its address, and the function that issues tokens for it."""
 
     url: str
     token_of: Callable[[str], str]
@@ -55,45 +51,43 @@ class Platform:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SwarmRun:
-    """What the command line says; ``platform`` None starts one for the run."""
+    """Options of the command line; ``platform`` None starts one for the run."""
 
     options: SwarmOptions
     seconds: float
     out: Path
-    platform: Platform | None = None
+    platform: TargetPlatform | None = None
     quiet: bool = False
 
 
 def run_swarm(run: SwarmRun, settings: PlatformSettings) -> int:
-    """Run it and return the exit code: 0 if every command came to an end, once, with a right pose."""
-    folder = _folder(run.out)
+    """Run the swarm; return 0 if every command was answered or failed, once, and all poses were right."""
+    folder = fresh_folder(run.out)
     before = environment(settings)
-    with (folder / "events.jsonl").open("w", encoding="utf-8") as file:
-        result = asyncio.run(_play(run, settings, EventLog(file)))
-    write_commands(folder / "commands.csv", result.commands)
+    with (folder / EVENTS).open("w", encoding="utf-8") as file:
+        result = asyncio.run(_run(run, settings, EventLog(file)))
+    write_commands(folder / COMMANDS, result.commands)
     report = report_of(run, result, before)
     write_json(folder / "report.json", report)
     print(_table(report, folder))
     commands = report["commands"]
-    return 1 if commands["lost"] or result.twice or result.wrong_poses or not commands["answered"] else 0
+    return 1 if commands["lost"] or result.duplicates or result.wrong_poses or not commands["answered"] else 0
 
 
 def report_of(run: SwarmRun, result: SwarmResult, before: Mapping[str, Any]) -> dict[str, Any]:
     """Return the report of a run.
 
-    Frames per second of a robot are its answers over the time from its first planned to its last.
+    The frame rate of a robot is its answers over the time between its first and last planned command.
     """
-    answered = [command for command in result.commands if command.code == "ok"]
-    in_time = sum((command.round_trip_ms or 0.0) <= FAST_MS for command in answered)
     sent = max(1, len(result.commands))
     return {
         **summarise(result.commands),
-        "answered_percent": round(100.0 * len(answered) / sent, 3),
-        "answered_in_time_percent": round(100.0 * in_time / sent, 3),
+        "answered_percent": answered_percent(result.commands) or 0.0,
+        "answered_in_time_percent": answered_percent(result.commands, FAST_MS) or 0.0,
         "in_time_ms": FAST_MS,
         "fps_per_robot": percentiles(_frame_rates(result.commands, run.options.fps)),
         "wrong_poses": result.wrong_poses,
-        "twice": result.twice,
+        "twice": result.duplicates,
         "reconnects": result.reconnects,
         "resent": result.resent,
         "moves": result.moves,
@@ -102,23 +96,23 @@ def report_of(run: SwarmRun, result: SwarmResult, before: Mapping[str, Any]) -> 
             "wall_s": result.wall_s,
             "cpu_percent": round(100.0 * result.cpu_s / max(result.wall_s, 1e-9), 2),
             "cpu_us_per_command": round(1e6 * result.cpu_s / sent, 1),
-            "late_sends_ms_p99": result.late_sends,
-            "load_average_after": [round(value, 2) for value in os.getloadavg()],
+            "late_sends_ms_p99": result.late_sends_ms_p99,
+            "load_average_after": load_average(),
         },
         "asked": {**asdict(run.options), "seconds": run.seconds},
         "environment": dict(before),
     }
 
 
-async def _play(run: SwarmRun, settings: PlatformSettings, events: EventLog) -> SwarmResult:
+async def _run(run: SwarmRun, settings: PlatformSettings, events: EventLog) -> SwarmResult:
     origin = time.monotonic()
 
-    def tell(event: Mapping[str, Any]) -> None:
+    def record(event: Mapping[str, Any]) -> None:
         details = {key: value for key, value in event.items() if key not in ("event", "time")}
         events.write(float(event.get("time", time.monotonic() - origin)), str(event["event"]), **details)
 
-    def tell_platform(event: Mapping[str, Any]) -> None:
-        tell({key: value for key, value in event.items() if key != "time"})
+    def record_platform(event: Mapping[str, Any]) -> None:
+        record({key: value for key, value in event.items() if key != "time"})
 
     options = run.options
     async with AsyncExitStack() as stack:
@@ -127,18 +121,18 @@ async def _play(run: SwarmRun, settings: PlatformSettings, events: EventLog) -> 
             _say(run, "starting the platform")
             state = Path(tempfile.mkdtemp(prefix="rse-pf-swarm-"))
             stack.callback(shutil.rmtree, state, ignore_errors=True)
-            cloud = await stack.enter_async_context(
-                LocalPlatform(settings, state=state, port=0, name="swarm", on_event=tell_platform)
+            local = await stack.enter_async_context(
+                LocalPlatform(settings, state=state, port=0, name="swarm", on_event=record_platform)
             )
-            platform = Platform(cloud.url, cloud.issue_token)
-        _say(run, f"{options.robots} robots ask {platform.url} {options.fps:g} times a second each")
+            platform = TargetPlatform(local.url, local.issue_token)
+        _say(run, f"{options.robots} robots send {options.fps:g} commands per second each to {platform.url}")
         swarm = await stack.enter_async_context(
             Swarm(
                 options,
                 url=platform.url,
                 token_of=platform.token_of,
                 session=settings.session,
-                on_event=tell,
+                on_event=record,
                 origin=origin,
             )
         )
@@ -151,7 +145,7 @@ async def _play(run: SwarmRun, settings: PlatformSettings, events: EventLog) -> 
 
 
 async def _show(run: SwarmRun, swarm: Swarm) -> None:
-    """Print a line a second: what was answered since the last."""
+    """Print one line per second: what was answered since the last line."""
     seen, last_s = 0, time.monotonic()
     while not run.quiet:
         await asyncio.sleep(_SHOW_EVERY_S)
@@ -165,10 +159,10 @@ async def _show(run: SwarmRun, swarm: Swarm) -> None:
         _say(run, line)
 
 
-def _round_trips_ms(rows: Rows) -> np.ndarray[Any, np.dtype[np.float64]]:
-    table = np.array(rows.numbers).reshape(-1, Rows.WIDTH)
-    good = np.array([code == "ok" for code in rows.codes], dtype=np.bool_)
-    trips: np.ndarray[Any, np.dtype[np.float64]] = 1e3 * (table[good, 4] - table[good, 2])
+def _round_trips_ms(rows: ResultRows) -> np.ndarray[Any, np.dtype[np.float64]]:
+    table = np.array(rows.numbers).reshape(-1, ResultRows.WIDTH)
+    answered = np.array([code == "ok" for code in rows.codes], dtype=np.bool_)
+    trips: np.ndarray[Any, np.dtype[np.float64]] = 1e3 * (table[answered, 4] - table[answered, 2])
     return trips
 
 
@@ -191,8 +185,8 @@ def _table(report: Mapping[str, Any], folder: Path) -> str:
         ("round trip", f"p50 {_ms(trip['p50'])}, p95 {_ms(trip['p95'])}, p99 {_ms(trip['p99'])}"),
         ("frames per second", f"{report['fps_per_robot']['mean'] or 0.0:.2f} per robot"),
         ("wrong poses", f"{report['wrong_poses']}"),
-        ("reconnects", f"{report['reconnects']}, {report['resent']} resent, {report['moves']} moves"),
-        ("generator", f"{own['cpu_percent']:.0f} % of a core, p99 {_ms(own['late_sends_ms_p99'])} late"),
+        ("reconnects", f"{report['reconnects']} ({report['resent']} resent), {report['moves']} migrations"),
+        ("load generator", f"{own['cpu_percent']:.0f} % of a core, late p99 {_ms(own['late_sends_ms_p99'])}"),
         ("records", str(folder)),
     ]  # fmt: skip
     return "\n".join(f"{name:<18} {value}" for name, value in rows)
@@ -205,19 +199,3 @@ def _ms(value: float | None) -> str:
 def _say(run: SwarmRun, text: str) -> None:
     if not run.quiet:
         print(text, file=sys.stderr, flush=True)
-
-
-def _folder(folder: Path) -> Path:
-    """Make *folder*; only the records of an earlier run are replaced."""
-    if folder.exists() and not folder.is_dir():
-        raise UsageError(f"{folder} is a file", hint="name a folder with --out")
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        strangers = [each.name for each in folder.iterdir() if each.name not in _FILES]
-        if strangers:
-            raise UsageError(f"{folder} holds other files", hint="name an empty folder with --out")
-        for name in _FILES:
-            (folder / name).unlink(missing_ok=True)
-    except OSError as error:
-        raise RsePfError(f"cannot write {folder}: {error.strerror}", hint="name another --out") from error
-    return folder.resolve()

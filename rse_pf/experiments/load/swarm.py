@@ -1,15 +1,13 @@
-"""Many robots that load a platform: `Swarm` starts them in processes of their own and collects what they saw.
+"""The load generator: `Swarm` runs many robots in child processes and collects their records.
 
-`SwarmResult.commands` has one record a command, by the robots' clocks; ``round_trip_ms`` counts from the time
-at which the command was *planned*, so a stall of platform or generator is never left out.  Promises to run no
-robot in the caller's loop, and to leave no process behind.
+``round_trip_ms`` counts from the time at which a command was *planned*, so that a stall of the platform or of
+the generator is part of it.
 """
 
 from __future__ import annotations
 
 import asyncio
 import math
-import multiprocessing
 import time
 from array import array
 from collections import Counter
@@ -24,41 +22,45 @@ import numpy as np
 
 from rse_pf.config import SessionSettings
 from rse_pf.errors import CommandFailed, UsageError
+from rse_pf.experiments.child_process import (
+    ChildFailed,
+    ChildReady,
+    IssuedToken,
+    TokenRequest,
+    end_process,
+    start_process,
+)
 from rse_pf.experiments.load.swarm_process import (
-    Begin,
-    Ended,
-    Failed,
-    Finish,
-    Happened,
-    Joined,
-    Leave,
-    Ready,
-    Rows,
+    FinishOrder,
+    LeaveOrder,
+    ResultRows,
+    RobotJoined,
+    StartOrder,
+    SwarmEnded,
+    SwarmEvent,
     SwarmSpec,
-    Token,
-    TokenWanted,
     run_swarm_process,
 )
-from rse_pf.experiments.results.report import CommandRecord
+from rse_pf.experiments.results.records import CommandRecord
 from rse_pf.local.faults.network_emulator import LinkProcess, profile_named
 from rse_pf.wire import CODECS
 
-__all__ = ["SERVICES", "Swarm", "SwarmOptions", "SwarmResult"]
+__all__ = ["SERVICES", "Swarm", "SwarmOptions", "SwarmResult", "records_of"]
 
 SERVICES = ("pnp", "echo")
-"""What the robots can ask, and know the answers of."""
+"""Services that the robots can call, because their true answers are known."""
 
 _READY_TIMEOUT_S = 60.0
 _END_TIMEOUT_S = 30.0
 _HEAD_START_S = 0.2
-_MAX_ROBOTS, _MAX_PROCESSES, _FASTEST_FPS, _MAX_MATCHES = 5000, 16, 200.0, 5000
+_MAX_ROBOTS, _MAX_PROCESSES, _MAX_FPS, _MAX_MATCHES = 5000, 16, 200.0, 5000
 
 Event = Mapping[str, Any]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SwarmOptions:
-    """How many robots do what; raises UsageError for what is none.
+    """Number of robots and what they do; raises UsageError for a value out of range.
 
     Robot k connects ``k * join_every_s`` after the start.  ``keep`` asks the platform to answer every
     frame, not only the newest.  ``link`` is the name of a profile of `rse_pf.local.faults.network_emulator`.
@@ -81,7 +83,7 @@ class SwarmOptions:
     def __post_init__(self) -> None:
         """Check every field."""
         _within("robots", self.robots, 1, _MAX_ROBOTS)
-        _within("fps", self.fps, 0.01, _FASTEST_FPS)
+        _within("fps", self.fps, 0.01, _MAX_FPS)
         _within("matches", self.matches, 4, _MAX_MATCHES)
         _within("outliers", self.outliers, 0.0, 0.9)
         _within("seed", self.seed, 0, 2**31)
@@ -97,11 +99,11 @@ class SwarmOptions:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SwarmResult:
-    """What the robots saw, and what it cost to make them.
+    """The commands of all robots, and the cost of generating them.
 
-    ``cpu_s`` is the processor time of all generating processes during ``wall_s``; ``twice`` counts
-    answers that were delivered twice; ``late_sends`` is by how many ms (p99) the generator itself
-    sent after the planned time.
+    ``cpu_s`` is the CPU time of all processes of the generator during ``wall_s``; ``duplicates`` counts
+    answers that were delivered twice; ``late_sends_ms_p99`` is the delay of the generator itself between
+    the planned and the real send time.
     """
 
     commands: list[CommandRecord]
@@ -111,20 +113,20 @@ class SwarmResult:
     reconnects: int
     resent: int
     moves: int
-    twice: int
+    duplicates: int
     link: str | None
-    late_sends: float
+    late_sends_ms_p99: float
 
 
 @dataclass(slots=True, eq=False)
 class _Child:
-    """A process of robots as its parent sees it."""
+    """A process of robots, in its parent."""
 
     process: Any
     pipe: Connection
     numbers: tuple[int, ...]
     ready: bool = False
-    ended: Ended | None = None
+    ended: SwarmEnded | None = None
 
 
 class Swarm:
@@ -143,17 +145,17 @@ class Swarm:
         """Describe the robots; nothing is started.
 
         Args:
-            options: How many do what.
-            url: Of the platform; with a link, what the link leads to.
-            token_of: Returns a token for a robot; called here whenever one dials.
-            session: The robots' limits and patience.
-            on_event: Hears of joins, lost links and moves; ``time`` as in the records.
+            options: Number of robots and what they do.
+            url: Address of the platform; an emulated link leads there.
+            token_of: Returns a token for a robot; called in this process whenever a robot connects.
+            session: Limits and timeouts of the robots.
+            on_event: Called with each join, lost link and migration; ``time`` as in the records.
             origin: The `time.monotonic` that is 0 in all records; None means the start.
         """
         self.options = options
         self.joined: set[str] = set()
         self.left: set[str] = set()
-        self.rows: list[Rows] = []
+        self.rows: list[ResultRows] = []
         self.link: LinkProcess | None = None
         self._url = url
         self._token_of = token_of
@@ -167,10 +169,10 @@ class Swarm:
         self._problem: CommandFailed | None = None
 
     async def __aenter__(self) -> Swarm:
-        """Start the processes and the link; returns when their payloads are encoded.
+        """Start the processes and the link; returns when the payloads are encoded.
 
         Raises:
-            CommandFailed: A process did not come up.
+            CommandFailed: A process did not start.
         """
         try:
             await self._launch()
@@ -189,46 +191,46 @@ class Swarm:
         await self._end()
 
     async def start(self) -> None:
-        """Begin to join: robot k connects ``k * join_every_s`` from now."""
+        """Let the robots connect: robot k does ``k * join_every_s`` from now."""
         self._start_s = time.monotonic() + _HEAD_START_S
         if self._origin_s is None:
             self._origin_s = self._start_s
         for child in self._children:
-            child.pipe.send(Begin(self._start_s, self._origin_s))
+            child.pipe.send(StartOrder(self._start_s, self._origin_s))
 
     async def wait_joined(self, timeout_s: float) -> None:
-        """Return when every robot is connected and sends; raises CommandFailed when that takes longer."""
+        """Wait until every robot is connected and sends; raises CommandFailed after *timeout_s*."""
         wanted = self.options.robots
         await self._until(lambda: len(self.joined) >= wanted, timeout_s, "join")
 
     async def wait_answered(self, count: int, timeout_s: float) -> None:
-        """Return when *count* more commands than now have ended; raises CommandFailed if that is too late."""
+        """Wait until *count* more commands have ended; raises CommandFailed after *timeout_s*."""
         wanted = count + sum(map(len, self.rows))
         await self._until(lambda: sum(map(len, self.rows)) >= wanted, timeout_s, f"answer {count} times")
 
     async def leave(self, n: int | None = None) -> None:
-        """Have *n* robots, the youngest, or all stop and disconnect; returns when they have."""
+        """Disconnect the *n* robots that joined last, or all; returns when they have disconnected."""
         count = len(self._staying) if n is None else min(n, len(self._staying))
         leaving = set(self._staying[len(self._staying) - count :])
         self._staying = [number for number in self._staying if number not in leaving]
         for child in self._children:
-            child.pipe.send(Leave(tuple(sorted(leaving & set(child.numbers)))))
+            child.pipe.send(LeaveOrder(tuple(sorted(leaving & set(child.numbers)))))
         names = {self._name(number) for number in leaving}
         await self._until(lambda: names <= self.left, self.options.deadline_s + _END_TIMEOUT_S, "leave")
 
     async def finish(self, grace_s: float = 5.0) -> SwarmResult:
-        """Stop sending, wait up to *grace_s* for answers, end the processes; what is open then is lost."""
+        """Stop sending, wait up to *grace_s* for answers, end the processes; open commands count as lost."""
         for child in self._children:
-            child.pipe.send(Finish(grace_s))
+            child.pipe.send(FinishOrder(grace_s))
         await self._until(
             lambda: all(child.ended is not None for child in self._children), grace_s + _END_TIMEOUT_S, "end"
         )
         wall_s = time.monotonic() - self._start_s
         return self._result(wall_s, [child.ended for child in self._children if child.ended is not None])
 
-    def _result(self, wall_s: float, ended: Iterable[Ended]) -> SwarmResult:
+    def _result(self, wall_s: float, ended: Iterable[SwarmEnded]) -> SwarmResult:
         last = list(ended)
-        commands = [command for rows in self.rows for command in _records(rows, self.options.robot_prefix)]
+        commands = [command for rows in self.rows for command in records_of(rows, self.options.robot_prefix)]
         late_ms = [1e3 * (command.sent - command.planned) for command in commands]
         counts = Counter((command.robot, command.id) for command in commands)
         return SwarmResult(
@@ -239,9 +241,9 @@ class Swarm:
             reconnects=sum(each.reconnects for each in last),
             resent=sum(each.resent for each in last),
             moves=sum(each.moves for each in last),
-            twice=sum(each.twice for each in last) + sum(count - 1 for count in counts.values()),
+            duplicates=sum(each.duplicates for each in last) + sum(count - 1 for count in counts.values()),
             link=self.options.link,
-            late_sends=round(float(np.percentile(late_ms, 99)), 3) if late_ms else 0.0,
+            late_sends_ms_p99=round(float(np.percentile(late_ms, 99)), 3) if late_ms else 0.0,
         )
 
     async def _launch(self) -> None:
@@ -252,20 +254,15 @@ class Swarm:
             link = LinkProcess(profile, parts.hostname or "", port, seed=self.options.seed)
             self.link = await link.__aenter__()
             url = parts._replace(netloc=f"127.0.0.1:{self.link.port}").geturl()
-        context = multiprocessing.get_context("spawn")
         count = min(self.options.processes, self.options.robots)
         loop = asyncio.get_running_loop()
         for share in range(count):
             numbers = tuple(range(share, self.options.robots, count))
-            mine, theirs = context.Pipe()
-            process = context.Process(
-                target=run_swarm_process, args=(self._spec(numbers, url), theirs), name="swarm", daemon=True
-            )
-            child = _Child(process, mine, numbers)
-            await asyncio.to_thread(process.start)
-            theirs.close()
+            spec = self._spec(numbers, url)
+            process, pipe = await asyncio.to_thread(start_process, run_swarm_process, spec, "swarm")
+            child = _Child(process, pipe, numbers)
             self._children.append(child)
-            loop.add_reader(mine.fileno(), self._hear, child)
+            loop.add_reader(pipe.fileno(), self._receive, child)
 
     def _spec(self, numbers: tuple[int, ...], url: str) -> SwarmSpec:
         o = self.options
@@ -278,36 +275,35 @@ class Swarm:
     def _name(self, number: int) -> str:
         return f"{self.options.robot_prefix}-{number + 1}"
 
-    def _hear(self, child: _Child) -> None:
+    def _receive(self, child: _Child) -> None:
         try:
             while child.pipe.poll():
-                self._about(child, child.pipe.recv())
+                self._handle(child, child.pipe.recv())
         except (EOFError, OSError):
             asyncio.get_running_loop().remove_reader(child.pipe.fileno())
             if child.ended is None and self._problem is None:
                 self._problem = CommandFailed(
-                    "a process of the swarm ended early", hint="is there enough memory?"
+                    "a process of the swarm ended early", hint="check the memory of this machine"
                 )
         self._changed.set()
 
-    def _about(self, child: _Child, message: Any) -> None:
-        if isinstance(message, Rows):
+    def _handle(self, child: _Child, message: Any) -> None:
+        if isinstance(message, ResultRows):
             self.rows.append(message)
-        elif isinstance(message, TokenWanted):
-            child.pipe.send(Token(message.robot, self._token_of(message.robot)))
-        elif isinstance(message, Happened):
+        elif isinstance(message, TokenRequest):
+            child.pipe.send(IssuedToken(message.robot, self._token_of(message.robot)))
+        elif isinstance(message, SwarmEvent):
             if message.event["event"] == "robot-left":
                 self.left.add(message.event["robot"])
             if self._on_event is not None:
                 self._on_event(message.event)
-        elif isinstance(message, Joined):
+        elif isinstance(message, RobotJoined):
             self.joined.add(message.robot)
-        elif isinstance(message, Ready):
+        elif isinstance(message, ChildReady):
             child.ready = True
-        elif isinstance(message, Failed):
-            what, _, hint = message.report.partition("\n  hint: ")
-            self._problem = CommandFailed(f"the swarm failed: {what}", hint=hint)
-        elif isinstance(message, Ended):
+        elif isinstance(message, ChildFailed):
+            self._problem = message.error("the swarm failed")
+        elif isinstance(message, SwarmEnded):
             child.ended = message
 
     async def _until(self, condition: Callable[[], bool], timeout_s: float, what: str) -> None:
@@ -320,7 +316,7 @@ class Swarm:
                 raise CommandFailed(
                     f"the robots did not {what} within {timeout_s:g} s ({len(self.joined)} of "
                     f"{self.options.robots} had joined)",
-                    hint="does the platform run, and does it accept their tokens?",
+                    hint="check that the platform runs and accepts their tokens",
                 )
             self._changed.clear()
             try:
@@ -332,22 +328,19 @@ class Swarm:
         loop = asyncio.get_running_loop()
         for child in self._children:
             loop.remove_reader(child.pipe.fileno())
-            child.pipe.close()
         for child in self._children:
-            await asyncio.to_thread(child.process.join, _HEAD_START_S if child.ended is None else 5.0)
-            if child.process.is_alive():
-                child.process.kill()
-                await asyncio.to_thread(child.process.join)
+            timeout_s = _HEAD_START_S if child.ended is None else 5.0
+            await asyncio.to_thread(end_process, child.process, child.pipe, timeout_s)
         self._children.clear()
         link, self.link = self.link, None
         if link is not None:
             await link.__aexit__(None, None, None)
 
 
-def _records(rows: Rows, prefix: str) -> Iterator[CommandRecord]:
-    """Return the records of *rows*; a command without a code was never answered."""
+def records_of(rows: ResultRows, prefix: str) -> Iterator[CommandRecord]:
+    """Return the records of *rows* of robots with *prefix*; a command without a code was never answered."""
     for place, (server, code) in enumerate(zip(rows.servers, rows.codes, strict=True)):
-        row: array[float] = rows.numbers[place * Rows.WIDTH : (place + 1) * Rows.WIDTH]
+        row: array[float] = rows.numbers[place * ResultRows.WIDTH : (place + 1) * ResultRows.WIDTH]
         number, identity, planned, sent, answered, size, up_ms, queue_ms, compute_ms, down_ms = row
         yield CommandRecord(
             id=int(identity),
@@ -372,4 +365,6 @@ def _known(value: float, digits: int) -> float | None:
 
 def _within(name: str, value: float, low: float, high: float) -> None:
     if not low <= value <= high:
-        raise UsageError(f"{name} = {value:g} is not within {low:g}..{high:g}", hint="choose another")
+        raise UsageError(
+            f"{name} = {value:g} is not within {low:g}..{high:g}", hint=f"choose {name} within that range"
+        )

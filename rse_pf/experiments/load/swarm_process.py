@@ -1,8 +1,7 @@
-"""Many robots in one process: the real SDK, prepared payloads, and send times that were fixed beforehand.
+"""Many robots in one process: the real SDK, encoded payloads, and send times that are fixed before the run.
 
-The load is open: a late answer delays no command, and every latency counts from the planned time, so that a
-stall is seen by all the commands that fell into it.  Promises to talk to its parent through one pipe only,
-and to check every pose against the truth.
+The load is open: a late answer delays no command, and every latency counts from the planned time, so that all
+commands that were planned during a stall include it.  Every pose is compared with the true one.
 """
 
 from __future__ import annotations
@@ -23,27 +22,28 @@ import numpy as np
 
 from rse_pf.config import SessionSettings
 from rse_pf.errors import RsePfError
+from rse_pf.experiments.child_process import ChildFailed, ChildReady, IssuedToken, TokenRequest
 from rse_pf.geometry import Array
 from rse_pf.wire import Result, make_codec
 from rse_pf.wire.client_session import Answered
-from rse_pf.wire.preencoded import PreencodedCommand, prepare
+from rse_pf.wire.preencoded import PreencodedCommand, preencode
 
 __all__ = [
-    "Begin", "Ended", "Failed", "Finish", "Happened", "Joined", "Leave", "Problem", "Ready", "Rows",
-    "SwarmSpec", "Token", "TokenWanted", "is_right", "make_payloads", "planned_s", "run_swarm_process",
+    "FinishOrder", "LeaveOrder", "ResultRows", "RobotJoined", "SolvedPayload", "StartOrder", "SwarmEnded",
+    "SwarmEvent", "SwarmSpec", "is_right", "make_payloads", "planned_s", "run_swarm_process",
 ]  # fmt: skip
 
 _POOL = 64
 _ROWS = 256
-_REPORT_EVERY_S = 0.5
+_FLUSH_EVERY_S = 0.5
 _PHASE = (math.sqrt(5.0) - 1.0) / 2.0
 _POSE_M, _POSE_RAD = 0.05, math.radians(1.0)
-"""A pose farther from the truth is wrong; of 200 matches it is within a centimetre or two."""
+"""A pose with a larger error is wrong; with 200 matches the error is one or two centimetres."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SwarmSpec:
-    """What a process of robots is told; ``numbers`` are its robots among all ``robots``."""
+    """The robots of a process and what they do; ``numbers`` are its robots among all ``robots``."""
 
     numbers: tuple[int, ...]
     robots: int
@@ -62,83 +62,56 @@ class SwarmSpec:
 
 
 @dataclass(frozen=True, slots=True)
-class Begin:
-    """Parent: robot k connects at ``start_s`` + k * ``join_every_s``; records count from ``origin_s``."""
+class StartOrder:
+    """From the parent: robot k connects at ``start_s + k * join_every_s``; ``origin_s`` is 0 in records."""
 
     start_s: float
     origin_s: float
 
 
 @dataclass(frozen=True, slots=True)
-class Leave:
-    """Parent: these robots stop sending, wait for their answers and disconnect."""
+class LeaveOrder:
+    """From the parent: these robots stop sending, wait for their answers and disconnect."""
 
     numbers: tuple[int, ...]
 
 
 @dataclass(frozen=True, slots=True)
-class Finish:
-    """Parent: all stop sending, wait up to ``grace_s`` for answers, and the process ends."""
+class FinishOrder:
+    """From the parent: all robots stop sending, wait up to ``grace_s`` for answers, and the process ends."""
 
     grace_s: float
 
 
 @dataclass(frozen=True, slots=True)
-class Token:
-    """Parent: a token that was wanted."""
-
-    robot: str
-    token: str
-
-
-@dataclass(frozen=True, slots=True)
-class TokenWanted:
-    """Process: a robot dials."""
+class RobotJoined:
+    """From the process: a robot is connected and has sent its first command."""
 
     robot: str
 
 
 @dataclass(frozen=True, slots=True)
-class Ready:
-    """Process: payloads are encoded."""
-
-
-@dataclass(frozen=True, slots=True)
-class Joined:
-    """Process: a robot is connected and has sent its first command."""
-
-    robot: str
-
-
-@dataclass(frozen=True, slots=True)
-class Happened:
-    """Process: something that belongs in the events of the run; ``time`` as in the records."""
+class SwarmEvent:
+    """From the process: an event of the run; ``time`` as in the records."""
 
     event: dict[str, Any]
 
 
-@dataclass(frozen=True, slots=True)
-class Failed:
-    """Process: it cannot go on."""
-
-    report: str
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Ended:
-    """Process: its last word."""
+class SwarmEnded:
+    """From the process: its robots have ended; ``duplicates`` counts answers that were delivered twice."""
 
     cpu_s: float
     wrong_poses: int
     reconnects: int
     resent: int
     moves: int
-    twice: int
+    duplicates: int
 
 
 @dataclass(slots=True)
-class Rows:
-    """Finished commands in columns, which are small in memory and on the pipe; NaN stands for none.
+class ResultRows:
+    """Commands that have ended, as columns, which are small in memory and on the pipe; NaN stands for none.
 
     Columns of ``numbers``, row after row: robot, id, planned, sent, answered, bytes, up, queue, compute
     and down; seconds from the origin, then milliseconds.
@@ -155,15 +128,15 @@ class Rows:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Problem:
-    """A prepared payload and what its answer must say."""
+class SolvedPayload:
+    """An encoded payload and the true answer: a pose, or the numbers of an echo."""
 
     payload: PreencodedCommand
     T_camera_world: Array | None = None
     echo: list[float] | None = None
 
 
-def make_payloads(spec: SwarmSpec) -> list[Problem]:
+def make_payloads(spec: SwarmSpec) -> list[SolvedPayload]:
     """Return a pool of seeded problems with known answers, encoded for the codec of *spec*."""
     from rse_pf.pnp.problems import make_problem
     from rse_pf.services.pnp import make_request
@@ -171,18 +144,18 @@ def make_payloads(spec: SwarmSpec) -> list[Problem]:
     codec = make_codec(spec.codec, spec.session)
     if spec.service == "echo":
         numbers = np.random.default_rng(spec.seed).integers(0, 1000, (_POOL, max(1, spec.matches)))
-        return [Problem(payload=prepare(codec, {"value": row}), echo=row) for row in numbers.tolist()]
+        return [SolvedPayload(payload=preencode(codec, {"value": row}), echo=row) for row in numbers.tolist()]
     pool = []
     for number in range(_POOL):
         problem = make_problem(seed=spec.seed + number, n=spec.matches, outlier_ratio=spec.outliers)
         request = make_request(
             problem.points_world, problem.pixels, problem.camera, binary=spec.codec == "bin"
         )
-        pool.append(Problem(payload=prepare(codec, request), T_camera_world=problem.T_camera_world))
+        pool.append(SolvedPayload(payload=preencode(codec, request), T_camera_world=problem.T_camera_world))
     return pool
 
 
-def is_right(problem: Problem, reply: Any) -> bool:
+def is_right(problem: SolvedPayload, reply: Any) -> bool:
     """Return whether a reply agrees with the truth: 5 cm and 1 degree for a pose."""
     try:
         if problem.T_camera_world is None:
@@ -203,35 +176,35 @@ def planned_s(spec: SwarmSpec, number: int, start_s: float, frame: int) -> float
 
 
 def run_swarm_process(spec: SwarmSpec, pipe: Connection) -> None:
-    """Play the robots of *spec* until the parent says enough; the entry point of the process."""
+    """Run the robots of *spec* until the parent ends them; the entry point of the process."""
     try:
         asyncio.run(_Process(spec, pipe).run())
     except RsePfError as error:
-        _tell(pipe, Failed(error.report()))
+        _send(pipe, ChildFailed(error.report()))
     except KeyboardInterrupt:
         pass
     finally:
         pipe.close()
 
 
-def _tell(pipe: Connection, message: Any) -> None:
+def _send(pipe: Connection, message: Any) -> None:
     try:
         pipe.send(message)
     except OSError:
-        return  # the parent is gone, and soon so are we
+        return  # the parent has ended, and this process ends soon
 
 
 class _Process:
-    """All robots of a process, and their one book."""
+    """All robots of a process, and the rows of their commands."""
 
     def __init__(self, spec: SwarmSpec, pipe: Connection) -> None:
         self.spec = spec
         self.origin_s = 0.0
         self.wrong_poses = 0
-        self.pool: list[Problem] = []
-        self.rows = Rows()
+        self.pool: list[SolvedPayload] = []
+        self.rows = ResultRows()
         self._pipe = pipe
-        self._robots = {number: _Player(self, number) for number in spec.numbers}
+        self._robots = {number: _Robot(self, number) for number in spec.numbers}
         self._tokens: dict[str, asyncio.Future[str]] = {}
         self._tasks: set[asyncio.Task[None]] = set()
         self._over = asyncio.Event()
@@ -239,42 +212,42 @@ class _Process:
         self._cpu_s = 0.0
 
     async def run(self) -> None:
-        """Encode, obey, and leave the last word."""
+        """Encode the payloads, follow the orders of the parent, and report the end."""
         self.pool = await asyncio.to_thread(make_payloads, self.spec)
         gc.collect()
         gc.freeze()
         loop = asyncio.get_running_loop()
-        loop.add_reader(self._pipe.fileno(), self._hear)
-        self.tell(Ready())
-        reporting = asyncio.create_task(self._report())
+        loop.add_reader(self._pipe.fileno(), self._receive)
+        self.send(ChildReady())
+        flushing = asyncio.create_task(self._flush_often())
         await self._over.wait()
         if self._grace_s is not None:
-            await asyncio.gather(*(player.stop(self._grace_s) for player in self._robots.values()))
+            await asyncio.gather(*(robot.stop(self._grace_s) for robot in self._robots.values()))
             cpu_s = time.process_time() - self._cpu_s
-            await asyncio.gather(*(player.close() for player in self._robots.values()))
+            await asyncio.gather(*(robot.close() for robot in self._robots.values()))
             self._flush()
-            self.tell(self._last_word(cpu_s))
-        reporting.cancel()
+            self.send(self._ended(cpu_s))
+        flushing.cancel()
         for task in list(self._tasks):
             task.cancel()
-        await asyncio.gather(reporting, *self._tasks, return_exceptions=True)
+        await asyncio.gather(flushing, *self._tasks, return_exceptions=True)
         loop.remove_reader(self._pipe.fileno())
 
-    def tell(self, message: Any) -> None:
+    def send(self, message: Any) -> None:
         """Send a message to the parent."""
-        _tell(self._pipe, message)
+        _send(self._pipe, message)
 
-    def happened(self, event: str, **details: Any) -> None:
-        """Tell an event, with its time."""
+    def report(self, event: str, **details: Any) -> None:
+        """Report an event, with its time."""
         now_s = round(time.monotonic() - self.origin_s, 4)
-        self.tell(Happened({"event": event, "time": now_s, **details}))
+        self.send(SwarmEvent({"event": event, "time": now_s, **details}))
 
     async def token(self, robot: str) -> str:
         """Return a fresh token from the parent."""
         future = self._tokens.get(robot)
         if future is None or future.done():
             future = self._tokens[robot] = asyncio.get_running_loop().create_future()
-            self.tell(TokenWanted(robot))
+            self.send(TokenRequest(robot))
         return await future
 
     def spawn(self, work: Any) -> None:
@@ -284,103 +257,103 @@ class _Process:
         task.add_done_callback(self._tasks.discard)
 
     def write(self, row: tuple[float, ...], server: str, code: str) -> None:
-        """Note a command that came to its end."""
+        """Add the row of a command that has ended."""
         self.rows.numbers.extend(row)
         self.rows.servers.append(server)
         self.rows.codes.append(code)
         if len(self.rows) >= _ROWS:
             self._flush()
 
-    def _hear(self) -> None:
+    def _receive(self) -> None:
         try:
             while self._pipe.poll():
-                self._obey(self._pipe.recv())
+                self._follow(self._pipe.recv())
         except (EOFError, OSError):
             asyncio.get_running_loop().remove_reader(self._pipe.fileno())
             self._over.set()
 
-    def _obey(self, order: Any) -> None:
-        if isinstance(order, Begin):
+    def _follow(self, order: Any) -> None:
+        if isinstance(order, StartOrder):
             self.origin_s = order.origin_s
             self._cpu_s = time.process_time()
-            for player in self._robots.values():
-                self.spawn(player.join(order.start_s))
-        elif isinstance(order, Leave):
+            for robot in self._robots.values():
+                self.spawn(robot.join(order.start_s))
+        elif isinstance(order, LeaveOrder):
             for number in order.numbers:
                 self.spawn(self._robots[number].leave())
-        elif isinstance(order, Token):
+        elif isinstance(order, IssuedToken):
             future = self._tokens.pop(order.robot, None)
             if future is not None and not future.done():
                 future.set_result(order.token)
-        elif isinstance(order, Finish):
+        elif isinstance(order, FinishOrder):
             self._grace_s = order.grace_s
             self._over.set()
 
-    async def _report(self) -> None:
+    async def _flush_often(self) -> None:
         while True:
-            await asyncio.sleep(_REPORT_EVERY_S)
+            await asyncio.sleep(_FLUSH_EVERY_S)
             self._flush()
 
     def _flush(self) -> None:
         if len(self.rows):
-            self.tell(self.rows)
-            self.rows = Rows()
+            self.send(self.rows)
+            self.rows = ResultRows()
 
-    def _last_word(self, cpu_s: float) -> Ended:
-        stats = [player.robot.stats for player in self._robots.values() if player.robot is not None]
-        return Ended(
+    def _ended(self, cpu_s: float) -> SwarmEnded:
+        stats = [robot.client.stats for robot in self._robots.values() if robot.client is not None]
+        return SwarmEnded(
             cpu_s=cpu_s,
             wrong_poses=self.wrong_poses,
             reconnects=sum(each.reconnects for each in stats),
             resent=sum(each.resent for each in stats),
             moves=sum(each.moves for each in stats),
-            twice=sum(each.twice for each in stats),
+            duplicates=sum(each.duplicates for each in stats),
         )
 
 
-class _Player:
-    """One robot: joins, sends on time, leaves."""
+class _Robot:
+    """One robot: it connects, sends each command at its time, and disconnects."""
 
     def __init__(self, process: _Process, number: int) -> None:
-        self.robot: Any = None
+        self.client: Any = None
         self.name = f"{process.spec.prefix}-{number + 1}"
         self._process = process
         self._number = number
         self._waiting: dict[int, tuple[float, float]] = {}
         self._idle = asyncio.Event()
         self._next: asyncio.TimerHandle | None = None
-        self._stopped = False
+        self._stopping = False
         self._has_joined = False
         self._ids = itertools.count(1)
 
     async def join(self, start_s: float) -> None:
-        """Connect when it is this robot's turn, however long that takes, and begin to send."""
+        """Connect at the time of this robot, retry until that works, and begin to send."""
         from client_sdk import connect
 
         process, spec = self._process, self._process.spec
         await asyncio.sleep(max(0.0, start_s + self._number * spec.join_every_s - time.monotonic()))
         jitter = random.Random(f"{spec.seed}/{self.name}")
-        while not self._stopped:
-            self.robot = connect(
+        while not self._stopping:
+            self.client = connect(
                 spec.url, token=self._token, codec=spec.codec, settings=spec.session,
                 on_change=self._changed, random=jitter,
             )  # fmt: skip
             try:
-                await self.robot
+                await self.client
                 break
             except RsePfError as error:
-                process.happened("join-failed", robot=self.name, code=error.code, why=error.message)
+                process.report("join-failed", robot=self.name, code=error.code, why=error.message)
                 await asyncio.sleep(spec.session.reconnect_max_s)
         first = planned_s(spec, self._number, start_s, 0)
         missed = max(0, math.ceil((time.monotonic() - first) * spec.fps))
-        if self._stopped:
+        if self._stopping:
             await self.close()
         else:
             self._plan(start_s, missed)
 
     async def stop(self, grace_s: float) -> None:
-        """Send nothing more, and wait for what is on its way."""
-        self._stopped = True
+        """Stop sending, and wait for the answers to what was sent."""
+        self._stopping = True
         if self._next is not None:
             self._next.cancel()
         if self._waiting:
@@ -396,12 +369,12 @@ class _Player:
         """Stop, then disconnect."""
         await self.stop(self._process.spec.deadline_s)
         await self.close()
-        self._process.happened("robot-left", robot=self.name)
+        self._process.report("robot-left", robot=self.name)
 
     async def close(self) -> None:
         """Disconnect."""
-        if self.robot is not None:
-            await self.robot.close()
+        if self.client is not None:
+            await self.client.close()
 
     def _plan(self, start_s: float, frame: int) -> None:
         planned = planned_s(self._process.spec, self._number, start_s, frame)
@@ -415,8 +388,8 @@ class _Player:
         identity = next(self._ids)
         sent = time.monotonic()
         try:
-            self.robot.post(
-                spec.service, problem.payload, functools.partial(self._ended, identity, problem),
+            self.client.post(
+                spec.service, problem.payload, functools.partial(self._answered, identity, problem),
                 deadline_s=max(0.0, spec.deadline_s - (sent - planned)), stream="pose", keep=spec.keep,
             )  # fmt: skip
         except RsePfError as error:
@@ -426,13 +399,13 @@ class _Player:
         self._waiting[identity] = (planned, sent)
         if not self._has_joined:
             self._has_joined = True
-            process.tell(Joined(self.name))
-            process.happened("robot-joined", robot=self.name, server=self.robot.stats.server)
+            process.send(RobotJoined(self.name))
+            process.report("robot-joined", robot=self.name, server=self.client.stats.server)
 
-    def _ended(self, identity: int, problem: Problem, event: Answered) -> None:
+    def _answered(self, identity: int, problem: SolvedPayload, event: Answered) -> None:
         times = self._waiting.pop(identity, None)
         if times is None:
-            return  # the robot has left, and written it off as lost
+            return  # the robot has left, and the command counts as lost
         self._write(identity, *times, event, time.monotonic())
         if isinstance(event.answer, Result) and not is_right(problem, event.answer.reply):
             self._process.wrong_poses += 1
@@ -479,5 +452,5 @@ class _Player:
         return await self._process.token(self.name)
 
     def _changed(self, what: str, why: str) -> None:
-        told = {"reason": why} if what == "link-lost" else {"server": why}
-        self._process.happened(what, robot=self.name, **told)
+        details = {"reason": why} if what == "link-lost" else {"server": why}
+        self._process.report(what, robot=self.name, **details)

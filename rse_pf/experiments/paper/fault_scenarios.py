@@ -1,7 +1,7 @@
-"""The faults, each as a short story played on a stage while robots ask on.
+"""The faults that `rse-pf experiment robustness` injects while robots send commands.
 
-A scenario makes its fault, logs it with the pid or name of what was hit, and waits until its consequences are
-over or its patience is.  Promises to judge nothing: that is `rse_pf.experiments.paper.robustness_report`.
+A scenario injects its fault, records it with the pid or name of the target, and waits until its consequences
+are over or a timeout has passed.  The figures are computed in `rse_pf.experiments.paper.robustness_report`.
 """
 
 from __future__ import annotations
@@ -14,173 +14,173 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from rse_pf.experiments.paper.harness import Harness, watch
+from rse_pf.experiments.paper.harness import Harness
 
 __all__ = ["SCENARIOS", "Scenario"]
 
-_PATIENCE_S = 30.0
+_TIMEOUT_S = 30.0
 _AFTER_S = 6.0
 _RANDOM_EVERY_S = 3.0
-_LOOK_S = 0.1
+_POLL_S = 0.1
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Scenario:
-    """One fault: what it needs, and how it is played.
+    """One fault, with the number of servers and the link that it needs.
 
-    ``play(stage, seconds, seed)`` gets the length that its fault lasts and the seed of its choices; None
+    ``inject(harness, seconds, seed)`` gets the duration of the fault and the seed of random choices; None
     means that the platform itself is a child process, see `rse_pf.experiments.paper.control_plane_fault`.
     """
 
-    play: Callable[[Harness, float, int], Awaitable[None]] | None = None
+    inject: Callable[[Harness, float, int], Awaitable[None]] | None = None
     seconds: float = 0.0
     servers: int = 2
     needs_link: bool = False
     slow: bool = False
 
 
-async def _kill(stage: Harness, seconds: float, seed: int) -> None:
-    began = stage.now()
-    stage.kill(_AFTER_S)
-    await _replaced(stage, began)
-    await watch(stage, _AFTER_S)
+async def _kill(harness: Harness, seconds: float, seed: int) -> None:
+    began = harness.now()
+    harness.kill(_AFTER_S)
+    await _replaced(harness, began)
+    await harness.run_for(_AFTER_S)
 
 
-async def _stop(stage: Harness, seconds: float, seed: int) -> None:
-    victim, began = stage.busiest(), stage.now()
-    stage.tell("fault", fault="SIGSTOP", server=victim.name, pid=victim.pid, watch_s=10.0)
-    stage.cloud.pause(victim.name)
-    await _replaced(stage, began)
-    await watch(stage, _AFTER_S)
+async def _stop(harness: Harness, seconds: float, seed: int) -> None:
+    victim, began = harness.busiest(), harness.now()
+    harness.log("fault", fault="SIGSTOP", server=victim.name, pid=victim.pid, watch_s=10.0)
+    harness.platform.pause(victim.name)
+    await _replaced(harness, began)
+    await harness.run_for(_AFTER_S)
 
 
-async def _balancer(stage: Harness, seconds: float, seed: int) -> None:
-    began = stage.now()
-    mark = stage.cloud.load_balancer.mark
-    stage.tell("fault", fault="kill -9 of the balancer", pid=None if mark is None else mark.pid, watch_s=8.0)
-    stage.cloud.kill_balancer()
-    await stage.until(lambda: bool(stage.happened("balancer-back", began)), _PATIENCE_S)
-    await watch(stage, _AFTER_S)
+async def _balancer(harness: Harness, seconds: float, seed: int) -> None:
+    began = harness.now()
+    mark = harness.platform.load_balancer.mark
+    harness.log("fault", fault="kill -9 of the balancer", pid=None if mark is None else mark.pid, watch_s=8.0)
+    harness.platform.kill_balancer()
+    await harness.wait_for(lambda: bool(harness.events_since("balancer-back", began)), _TIMEOUT_S)
+    await harness.run_for(_AFTER_S)
 
 
-async def _scale_in(stage: Harness, seconds: float, seed: int) -> None:
-    victim = stage.busiest()
-    stage.tell("fault", fault="scale-in", server=victim.name, pid=victim.pid, watch_s=10.0)
-    await stage.cloud.drain(victim.name, reason="experiment: scale-in under load")
-    await watch(stage, _AFTER_S)
+async def _scale_in(harness: Harness, seconds: float, seed: int) -> None:
+    victim = harness.busiest()
+    harness.log("fault", fault="scale-in", server=victim.name, pid=victim.pid, watch_s=10.0)
+    await harness.platform.drain(victim.name, reason="experiment: scale-in under load")
+    await harness.run_for(_AFTER_S)
 
 
-async def _roll(stage: Harness, seconds: float, seed: int) -> None:
-    began = stage.now()
-    stage.tell("fault", fault="rolling replacement", watch_s=60.0)
-    await stage.cloud.roll()
-    stage.tell("rolled", seconds=round(stage.now() - began, 3))
-    await watch(stage, _AFTER_S)
+async def _roll(harness: Harness, seconds: float, seed: int) -> None:
+    began = harness.now()
+    harness.log("fault", fault="rolling replacement", watch_s=60.0)
+    await harness.platform.roll()
+    harness.log("rolled", seconds=round(harness.now() - began, 3))
+    await harness.run_for(_AFTER_S)
 
 
-async def _scale_out(stage: Harness, seconds: float, seed: int) -> None:
-    began = stage.now()
-    stage.tell("fault", fault="scale-out with everybody connected", watch_s=20.0)
-    await stage.cloud.grow(1, "experiment: scale-out with everybody connected")
-    await stage.until(lambda: bool(stage.happened("server-healthy", began)), _PATIENCE_S)
-    await watch(stage, 17.0)
+async def _scale_out(harness: Harness, seconds: float, seed: int) -> None:
+    began = harness.now()
+    harness.log("fault", fault="scale-out with all robots connected", watch_s=20.0)
+    await harness.platform.grow(1, "experiment: scale-out with all robots connected")
+    await harness.wait_for(lambda: bool(harness.events_since("server-healthy", began)), _TIMEOUT_S)
+    await harness.run_for(17.0)
 
 
-async def _wifi(stage: Harness, seconds: float, seed: int) -> None:
-    link: Any = stage.link
-    stage.tell("fault", fault="link cut", seconds=seconds, watch_s=seconds + 10.0)
+async def _wifi(harness: Harness, seconds: float, seed: int) -> None:
+    link: Any = harness.link
+    harness.log("fault", fault="link cut", seconds=seconds, watch_s=seconds + 10.0)
     await link.cut()
-    looking = asyncio.ensure_future(_tell_when_empty(stage))
+    polling = asyncio.ensure_future(_log_when_empty(harness))
     try:
-        await watch(stage, seconds)
+        await harness.run_for(seconds)
     finally:
-        looking.cancel()
-        await asyncio.gather(looking, return_exceptions=True)
+        polling.cancel()
+        await asyncio.gather(polling, return_exceptions=True)
     await link.heal()
-    stage.tell("healed")
-    await watch(stage, _AFTER_S)
+    harness.log("healed")
+    await harness.run_for(_AFTER_S)
 
 
-async def _tell_when_empty(stage: Harness) -> None:
-    """Log when no server has a robot any more; a reading a second would be too coarse for that."""
+async def _log_when_empty(harness: Harness) -> None:
+    """Record when no server has a robot any more, more precisely than the samples of the monitor."""
     while True:
-        told = await stage.cloud.status()
-        if len(told) == len(stage.cloud.servers) and not any(status["robots"] for status in told):
-            stage.tell("servers-empty")
+        servers = await harness.platform.status()
+        if len(servers) == len(harness.platform.servers) and not any(each["robots"] for each in servers):
+            harness.log("servers-empty")
             return
-        await asyncio.sleep(_LOOK_S)
+        await asyncio.sleep(_POLL_S)
 
 
-async def _random(stage: Harness, seconds: float, seed: int) -> None:
-    """Fault after fault, drawn from *seed*; the next waits until two healthy servers are left to be hit."""
-    choice, end = random.Random(seed), stage.now() + seconds
-    _resources(stage, "before")
-    while stage.now() < end:
-        await stage.until(lambda: stage.readings[-1].healthy_servers >= 2, _PATIENCE_S)
-        await _one_of_many(stage, choice.choice(("kill", "stop", "balancer", "scale-in")))
-        await watch(stage, _RANDOM_EVERY_S)
-    await stage.settled(5.0, _PATIENCE_S)
-    await watch(stage, 5.0)
-    _resources(stage, "after")
+async def _random(harness: Harness, seconds: float, seed: int) -> None:
+    """Inject faults drawn from *seed*, one after the other; each waits until two servers are healthy."""
+    choice, end = random.Random(seed), harness.now() + seconds
+    _resources(harness, "before")
+    while harness.now() < end:
+        await harness.wait_for(lambda: harness.samples[-1].healthy_servers >= 2, _TIMEOUT_S)
+        await _random_fault(harness, choice.choice(("kill", "stop", "balancer", "scale-in")))
+        await harness.run_for(_RANDOM_EVERY_S)
+    await harness.wait_quiet(5.0, _TIMEOUT_S)
+    await harness.run_for(5.0)
+    _resources(harness, "after")
 
 
-async def _one_of_many(stage: Harness, kind: str) -> None:
+async def _random_fault(harness: Harness, kind: str) -> None:
     if kind == "kill":
-        stage.kill(_AFTER_S)
+        harness.kill(_AFTER_S)
     elif kind == "stop":
-        victim = stage.busiest()
-        stage.tell("fault", fault="SIGSTOP", server=victim.name, pid=victim.pid, watch_s=_AFTER_S)
-        stage.cloud.pause(victim.name)
+        victim = harness.busiest()
+        harness.log("fault", fault="SIGSTOP", server=victim.name, pid=victim.pid, watch_s=_AFTER_S)
+        harness.platform.pause(victim.name)
     elif kind == "balancer":
-        began = stage.now()
-        stage.tell("fault", fault="kill -9 of the balancer", watch_s=_AFTER_S)
-        stage.cloud.kill_balancer()
-        await stage.until(lambda: bool(stage.happened("balancer-back", began)), _PATIENCE_S)
+        began = harness.now()
+        harness.log("fault", fault="kill -9 of the balancer", watch_s=_AFTER_S)
+        harness.platform.kill_balancer()
+        await harness.wait_for(lambda: bool(harness.events_since("balancer-back", began)), _TIMEOUT_S)
     else:
-        began, victim = stage.now(), stage.busiest()
-        stage.tell("fault", fault="scale-in", server=victim.name, pid=victim.pid, watch_s=_AFTER_S)
-        await stage.cloud.grow(1, "experiment: before a scale-in")
-        if await stage.until(lambda: bool(stage.happened("server-healthy", began)), _PATIENCE_S):
-            await stage.cloud.drain(victim.name, reason="experiment: scale-in under load")
+        began, victim = harness.now(), harness.busiest()
+        harness.log("fault", fault="scale-in", server=victim.name, pid=victim.pid, watch_s=_AFTER_S)
+        await harness.platform.grow(1, "experiment: before a scale-in")
+        if await harness.wait_for(lambda: bool(harness.events_since("server-healthy", began)), _TIMEOUT_S):
+            await harness.platform.drain(victim.name, reason="experiment: scale-in under load")
 
 
-async def _replaced(stage: Harness, began: float) -> None:
+async def _replaced(harness: Harness, began: float) -> None:
     """Wait until a server that was launched after *began* is healthy."""
 
     def replaced() -> bool:
-        new = {each["server"] for each in stage.happened("server-launched", began)}
-        return any(each["server"] in new for each in stage.happened("server-healthy", began))
+        new = {each["server"] for each in harness.events_since("server-launched", began)}
+        return any(each["server"] in new for each in harness.events_since("server-healthy", began))
 
-    await stage.until(replaced, _PATIENCE_S)
+    await harness.wait_for(replaced, _TIMEOUT_S)
 
 
-def _resources(stage: Harness, when: str) -> None:
-    """Log resident memory and open descriptors of the servers' supervisors, which is where leaks gather."""
-    pids = [server.pid for server in stage.cloud.servers]
-    pids += [worker for server in stage.cloud.servers for worker in server.workers]
+def _resources(harness: Harness, when: str) -> None:
+    """Record resident memory and open file descriptors of supervisors and workers of all servers."""
+    pids = [server.pid for server in harness.platform.servers]
+    pids += [worker for server in harness.platform.servers for worker in server.workers]
     page = os.sysconf("SC_PAGE_SIZE")
     memory, descriptors, processes = 0, 0, 0
     for pid in pids:
         try:
             resident = int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * page
             opened = len(os.listdir(f"/proc/{pid}/fd"))
-        except OSError:  # it left while we looked
+        except OSError:  # the process has ended meanwhile
             continue
         memory, descriptors, processes = memory + resident, descriptors + opened, processes + 1
-    stage.tell(
+    harness.log(
         "resources", when=when, memory_bytes=memory, descriptors=descriptors, processes=max(processes, 1)
     )
 
 
 SCENARIOS: dict[str, Scenario] = {
-    "kill": Scenario(play=_kill),
-    "stop": Scenario(play=_stop),
-    "balancer": Scenario(play=_balancer),
+    "kill": Scenario(inject=_kill),
+    "stop": Scenario(inject=_stop),
+    "balancer": Scenario(inject=_balancer),
     "control-plane": Scenario(seconds=30.0),
-    "wifi": Scenario(play=_wifi, seconds=30.0, needs_link=True),
-    "scale-in": Scenario(play=_scale_in, servers=3),
-    "roll": Scenario(play=_roll),
-    "scale-out": Scenario(play=_scale_out),
-    "random": Scenario(play=_random, seconds=600.0, servers=3, slow=True),
+    "wifi": Scenario(inject=_wifi, seconds=30.0, needs_link=True),
+    "scale-in": Scenario(inject=_scale_in, servers=3),
+    "roll": Scenario(inject=_roll),
+    "scale-out": Scenario(inject=_scale_out),
+    "random": Scenario(inject=_random, seconds=600.0, servers=3, slow=True),
 }
-"""Every fault by its name on the command line; the control plane's is played by a file of its own."""
+"""Every fault by its name on the command line."""

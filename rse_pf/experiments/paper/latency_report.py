@@ -1,32 +1,34 @@
-"""Judge a latency run by its raw records: the paper's 156.36 ms taken apart by the robots' own clocks.
+"""Figures and report of a latency run: the round trip of the paper, split by the clocks of the robots.
 
-Up and down come from the four stamps of pings and answers; queue and compute are the server's.  Promises
-means where the paper has means, percentiles beside them, and no figure that the records do not carry.
+Up and down come from the four time stamps of pings and answers; queue and compute are the server's.  Means
+stand where the paper gives means, percentiles beside them.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
-from rse_pf.experiments.results.records import Records, asked_of, summary_of
-from rse_pf.experiments.results.report import PAPER, ROUND_TRIP_PARTS, CommandRecord
+from rse_pf.experiments.results.markdown import about_run, number, page, slashed, table, three
+from rse_pf.experiments.results.records import CommandRecord, Records, parameters_of
+from rse_pf.experiments.results.summary import PAPER, ROUND_TRIP_PARTS, answered_percent, summary_of
 
-__all__ = ["judge_latency"]
+__all__ = ["latency_figures", "latency_page"]
 
 
-def judge_latency(records: Records) -> dict[str, Any]:
-    """Return round trip, its parts and the frame rate; raises UsageError if nothing says what was asked."""
-    asked = asked_of(records)
+def latency_figures(records: Records) -> dict[str, Any]:
+    """Return round trip, its parts and the frame rate.
+
+    Raises:
+        UsageError: The events do not hold the parameters of the run.
+    """
+    link_ms = float(parameters_of(records).get("link_round_trip_ms") or 0.0)
     summary = summary_of(records)
     trip = summary["round_trip_ms"]
-    known = {name: summary[name]["mean"] for name in ROUND_TRIP_PARTS}
-    rest = None
-    if trip["mean"] is not None and all(value is not None for value in known.values()):
-        rest = round(trip["mean"] - sum(known.values()), 3)
-    link_ms = float(asked.get("link_round_trip_ms") or 0.0)
+    parts = [summary[name]["mean"] for name in ROUND_TRIP_PARTS]
     return {
         "commands": summary["commands"],
         "failures_by_code": summary["failures_by_code"],
@@ -34,43 +36,63 @@ def judge_latency(records: Records) -> dict[str, Any]:
         "payload_bytes": summary["payload_bytes"],
         "round_trip_ms": trip,
         **{name: summary[name] for name in ROUND_TRIP_PARTS},
-        "rest_ms_mean": rest,
-        "over_the_link_ms_p50": None if trip["p50"] is None else round(trip["p50"] - link_ms, 3),
-        "answered_within_150_ms_percent": _within(records.commands, 150.0),
-        "fps_per_robot": _fps(records.commands),
+        "rest_ms_mean": _difference(trip["mean"], None if None in parts else sum(parts)),
+        "over_the_link_ms_p50": _difference(trip["p50"], link_ms),
+        "answered_within_150_ms_percent": answered_percent(records.commands, 150.0),
+        "fps_per_robot": _frame_rates(records.commands),
         "against_paper": {
-            "round_trip_ms": None
-            if trip["mean"] is None
-            else round(trip["mean"] - PAPER["round_trip_ms"], 3),
-            "compute_ms": (
-                None if known["compute_ms"] is None else round(known["compute_ms"] - PAPER["compute_ms"], 3)
-            ),
+            name: _difference(summary[name]["mean"], PAPER[name]) for name in ("round_trip_ms", "compute_ms")
         },
     }
 
 
-def _within(commands: Sequence[CommandRecord], limit_ms: float) -> float | None:
-    if not commands:
-        return None
-    good = sum(
-        each.code == "ok" and each.round_trip_ms is not None and each.round_trip_ms <= limit_ms
-        for each in commands
+def latency_page(report: Mapping[str, Any]) -> str:
+    """Return ``report.md``."""
+    paper, trip, link = report["paper"], report["round_trip_ms"], report["asked"]["link"]
+    transmission = paper["round_trip_ms"] - paper["compute_ms"]
+    rows = [
+        ["round trip, mean ms", number(trip["mean"]), f"{paper['round_trip_ms']} (abstract: 153)"],
+        ["round trip p50 / p95 / p99 ms", three(trip), "not given"],
+        ["up, mean ms", number(report["up_ms"]["mean"]), f"up and down: {transmission:.2f} (near 130)"],
+        ["queue, mean ms", number(report["queue_ms"]["mean"]), "not given"],
+        ["compute, mean ms", number(report["compute_ms"]["mean"]), paper["compute_ms"]],
+        ["down, mean ms", number(report["down_ms"]["mean"]), ""],
+        ["in the robot, mean ms", number(report["rest_ms_mean"]), ""],
+        ["round trip p50 minus the delay of the link, ms", number(report["over_the_link_ms_p50"]), ""],
+        ["answered within 150 ms, %", number(report["answered_within_150_ms_percent"]), ""],
+        [
+            "frames per second, mean / slowest robot",
+            slashed(report["fps_per_robot"], "mean", "least"),
+            "near 5",
+        ],
+        ["lost / failed", slashed(report["commands"], "lost", "failed"), "not given"],
+    ]
+    return page(
+        "# RSE-PF experiment: latency (the paper's Sect. 6.2)",
+        f"{report['asked']['robots']} robots x {report['asked']['fps']:g} fps, "
+        + (f"link profile `{link}`." if link else "no emulated link between robots and platform."),
+        table(["figure", "here", "the paper"], rows),
+        "The paper gives two means: 153 ms in the abstract and the conclusion, 156.36 ms in Sect. 6.2.",
+        about_run(report),
     )
-    return round(100.0 * good / len(commands), 3)
 
 
-def _fps(commands: Sequence[CommandRecord]) -> dict[str, float | None]:
-    """Return answers a second over the time that each robot asked: the mean and the least of all robots."""
-    by_robot: dict[str, list[CommandRecord]] = {}
+def _difference(value: float | None, other: float | None) -> float | None:
+    return None if value is None or other is None else round(value - other, 3)
+
+
+def _frame_rates(commands: Sequence[CommandRecord]) -> dict[str, float | None]:
+    """Return mean and minimum over the robots of answers per second, while they sent."""
+    by_robot: dict[str, list[CommandRecord]] = defaultdict(list)
     for command in commands:
-        by_robot.setdefault(command.robot, []).append(command)
+        by_robot[command.robot].append(command)
     rates = []
     for own in by_robot.values():
         planned = [each.planned for each in own]
-        asked_s = max(planned) - min(planned)
-        if asked_s > 0:  # n frames span n - 1 intervals
-            good = sum(each.code == "ok" for each in own)
-            rates.append(good * (len(own) - 1) / len(own) / asked_s)
+        sending_s = max(planned) - min(planned)
+        if sending_s > 0:  # n frames span n - 1 intervals
+            answered = sum(each.code == "ok" for each in own)
+            rates.append(answered * (len(own) - 1) / len(own) / sending_s)
     if not rates:
         return {"mean": None, "least": None}
     return {"mean": round(float(np.mean(rates)), 3), "least": round(min(rates), 3)}

@@ -1,14 +1,13 @@
-"""The paper's Fig. 7 again: robots build their clouds through the platform, and their errors are measured.
+"""The mapping experiment (the paper's Fig. 7): robots build point clouds, and their errors are measured.
 
-It is the demo's run (real servers, real balancer, a process for each robot) with the true paths written
-beside the estimated ones, so that anybody can compute the errors again.  Promises no figure of its own.
+It runs the demo (real servers, a real load balancer, a process per robot) and writes the true trajectories
+beside the estimated ones, so that the errors can be computed again.
 """
 
 from __future__ import annotations
 
 import csv
 import json
-import os
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from itertools import pairwise
@@ -18,26 +17,19 @@ from typing import Any
 from client_sdk.mapping import Trajectory, write_trajectory
 from rse_pf.config import PlatformSettings
 from rse_pf.experiments.demo.run import DemoOptions, run_demo
-from rse_pf.experiments.paper.mapping_report import judge_map
-from rse_pf.experiments.paper.result_folder import finish_report, policy_of
-from rse_pf.experiments.results.markdown import map_markdown
-from rse_pf.experiments.results.records import (
-    EVENTS,
-    SAMPLES,
-    RecordedSample,
-    SampleLog,
-    ServerSample,
-    asked_of,
-    read_records,
-)
-from rse_pf.experiments.results.report import PAPER
+from rse_pf.experiments.paper.harness import policy_parameters
+from rse_pf.experiments.paper.mapping_report import map_figures, map_page
+from rse_pf.experiments.results.records import EVENTS, SAMPLES, SampleLog, read_records, run_sample
+from rse_pf.experiments.results.result_folder import finish_report, load_average
+from rse_pf.experiments.results.summary import PAPER
+from rse_pf.local.control.monitor import MonitorSample, ServerSample
 
 __all__ = ["MapRunOptions", "run_map"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MapRunOptions:
-    """What the command line says; *data* None is the rendered world."""
+    """Options of the command line; *data* None means the rendered world."""
 
     out: Path
     robots: int = 3
@@ -49,8 +41,8 @@ class MapRunOptions:
 
 
 def run_map(options: MapRunOptions, settings: PlatformSettings) -> int:
-    """Let the robots map, judge their files, write the report; return the exit code."""
-    load_before = [round(value, 2) for value in os.getloadavg()]
+    """Run the demo, compute the figures from its files, write the report; return the exit code."""
+    load_before = load_average()
     demo = DemoOptions(
         data=options.data,
         robots=options.robots,
@@ -65,18 +57,14 @@ def run_map(options: MapRunOptions, settings: PlatformSettings) -> int:
     folder = options.out.resolve()
     frames = _write_truth(options, folder)
     _complete_records(options, settings, folder, frames)
-    records = read_records(folder)
     asked = {**asdict(options), "out": options.out.name, "data": options.data and options.data.name}
-    body = {"experiment": "map", "asked": asked, **judge_map(records), "paper": PAPER}
-    report = finish_report(folder, body, settings, load_before)
-    (folder / "report.md").write_text(map_markdown(report), encoding="utf-8")
-    print((folder / "report.md").read_text(encoding="utf-8"))
-    assert asked_of(records)["kind"] == "map"
+    report = {"experiment": "map", "asked": asked, **map_figures(read_records(folder)), "paper": PAPER}
+    print(finish_report(folder, report, map_page, settings, load_before))
     return code
 
 
 def _write_truth(options: MapRunOptions, folder: Path) -> dict[str, int]:
-    """Write each robot's true path, if there is one; return how many frames each had."""
+    """Write the true trajectory of each robot, if it is known; return the number of frames of each."""
     frames = {}
     for number in range(options.robots):
         name = f"robot-{number + 1}"
@@ -101,7 +89,7 @@ def _truth(options: MapRunOptions, number: int) -> tuple[Trajectory | None, int]
 def _complete_records(
     options: MapRunOptions, settings: PlatformSettings, folder: Path, frames: dict[str, int]
 ) -> None:
-    """Put what was asked before the demo's events, and its samples into the form of a monitor's."""
+    """Write the parameters before the events of the demo, and its samples in the format of the monitor."""
     first = {
         "time": 0.0,
         "action": "experiment",
@@ -109,33 +97,33 @@ def _complete_records(
         "robots": options.robots,
         "fps": options.fps,
         "frames": frames,
-        **policy_of(settings, 1.0),
+        **policy_parameters(settings, 1.0),
     }
     events = (folder / EVENTS).read_text(encoding="utf-8")
     (folder / EVENTS).write_text(json.dumps(first) + "\n" + events, encoding="utf-8")
     with (folder / SAMPLES).open(newline="", encoding="utf-8") as file:
-        readings = list(_readings(list(csv.DictReader(file))))
+        samples = list(_samples(list(csv.DictReader(file))))
     with (folder / SAMPLES).open("w", newline="", encoding="utf-8") as file:
         log = SampleLog(file)
-        for reading in readings:
-            log.write(reading)
+        for sample in samples:
+            log.write(sample)
 
 
-def _readings(rows: list[dict[str, Any]]) -> Iterator[RecordedSample]:
-    """Yield a reading for each moment but the first: CPU is what was used since the one before."""
+def _samples(rows: list[dict[str, Any]]) -> Iterator[MonitorSample]:
+    """Yield a sample for each time but the first, with the CPU that was used since the one before."""
     moments: dict[str, dict[str, dict[str, Any]]] = {}
     for row in rows:
         moments.setdefault(row["time"], {})[row["server"]] = row
     for (time_before, before), (time_s, now) in pairwise(moments.items()):
         took_s = max(float(time_s) - float(time_before), 1e-9)
-        servers = tuple(_server(row, before[name], took_s) for name, row in now.items() if name in before)
-        yield RecordedSample(time=float(time_s), healthy_servers=len(servers), servers=servers)
+        servers = [_server(row, before[name], took_s) for name, row in now.items() if name in before]
+        yield run_sample(float(time_s), len(servers), servers)
 
 
 def _server(row: dict[str, Any], before: dict[str, Any], took_s: float) -> ServerSample:
     used_s = float(row["cpu_s"]) - float(before["cpu_s"])
     return ServerSample(
-        server=row["server"],
+        name=row["server"],
         pid=int(row["pid"]),
         state="healthy",
         robots=int(row["robots"]),

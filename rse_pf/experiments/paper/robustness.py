@@ -1,7 +1,7 @@
-"""Section 6.2's robustness again, fault by fault: each on a platform of its own, under real PnP load.
+"""The robustness experiment: the paper's Sect. 6.2 fault by fault, each on a platform of its own.
 
-Promises that every fault is a real one (a signal, a cut link), that each run's records stay in a folder of
-their own, and that a missed bar is printed as missed.
+Every fault is a real one (a signal, a cut link), under real PnP load; the records of each run stay in a
+folder of their own, and a missed target is reported as missed.
 """
 
 from __future__ import annotations
@@ -15,27 +15,26 @@ from typing import Any
 
 from rse_pf.config import PlatformSettings
 from rse_pf.experiments.load.swarm import SwarmOptions
-from rse_pf.experiments.paper.control_plane_fault import play_control_plane
-from rse_pf.experiments.paper.fault_scenarios import SCENARIOS, Scenario
-from rse_pf.experiments.paper.harness import Harness, watch
-from rse_pf.experiments.paper.result_folder import finish_report, fresh_folder, generator_of
-from rse_pf.experiments.paper.robustness_report import judge_scenario
+from rse_pf.experiments.paper.control_plane_fault import run_control_plane_fault
+from rse_pf.experiments.paper.fault_scenarios import SCENARIOS
+from rse_pf.experiments.paper.harness import Harness, generator_of
+from rse_pf.experiments.paper.robustness_report import missed_bars, robustness_figures, robustness_page
 from rse_pf.experiments.plots.figures import draw_robustness, require_matplotlib
-from rse_pf.experiments.results.markdown import robustness_markdown
 from rse_pf.experiments.results.records import read_records
-from rse_pf.experiments.results.report import PAPER
+from rse_pf.experiments.results.result_folder import finish_report, fresh_folder, load_average
+from rse_pf.experiments.results.summary import PAPER
 
-__all__ = ["RobustnessOptions", "chosen_scenarios", "run_robustness"]
+__all__ = ["RobustnessOptions", "run_robustness"]
 
-PICTURE = "robustness.png"
-_LEAD_S = 4.0
-_JOIN_S = 60.0
+FIGURE = "robustness.png"
+_BEFORE_FAULT_S = 4.0
+_JOIN_TIMEOUT_S = 60.0
 _NO_DELAY = "none"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RobustnessOptions:
-    """What the command line says; *speed* shortens how long a fault lasts, nothing else."""
+    """Options of the command line; *speed* shortens the duration of the faults, nothing else."""
 
     out: Path
     robots: int = 100
@@ -47,67 +46,49 @@ class RobustnessOptions:
     seed: int = 0
 
 
-def chosen_scenarios(only: tuple[str, ...]) -> dict[str, Scenario]:
-    """Return what *only* names, or all but the slow ones."""
-    if only:
-        return {name: SCENARIOS[name] for name in only}
-    return {name: scenario for name, scenario in SCENARIOS.items() if not scenario.slow}
-
-
 def run_robustness(options: RobustnessOptions, settings: PlatformSettings) -> int:
-    """Run the faults, write records, report and picture; return 1 if a command was lost or answered twice."""
+    """Run the faults, write records, report and figure; return 1 if a command was lost or duplicated."""
     require_matplotlib()
-    # One server must be able to carry the robots of another one: give it a worker for each of two cores.
+    # One server must be able to serve the robots of another one: give it a worker for each of two cores.
     settings = settings.replace(local={"workers": max(settings.local.workers, min(2, os.cpu_count() or 1))})
-    folder = fresh_folder(options.out, (PICTURE,))
-    load_before = [round(value, 2) for value in os.getloadavg()]
-    names: dict[str, tuple[str, Scenario]] = {}
-    for scenario, what in chosen_scenarios(options.only).items():
+    folder = fresh_folder(options.out, [FIGURE])
+    load_before = load_average()
+    runs: dict[str, dict[str, Any]] = {}
+    for scenario in options.only or [name for name, each in SCENARIOS.items() if not each.slow]:
         for turn in range(options.repeat):
             name = scenario if options.repeat == 1 else f"{scenario}-{turn + 1}"
-            names[name] = (scenario, what)
-    rows: dict[str, dict[str, Any]] = {}
-    for turn, (name, (scenario, what)) in enumerate(names.items()):
-        part = folder / name
-        part.mkdir()
-        asyncio.run(_run(options, settings, part, scenario, what, options.seed + turn))
-        rows[name] = judge_scenario(read_records(part))
-        print(_line(name, rows[name]), flush=True)
-    records = {name: read_records(folder / name) for name in rows}
-    asked = {**asdict(options), "out": options.out.name}
-    body = {
+            (folder / name).mkdir()
+            asyncio.run(_run(options, settings, folder / name, scenario, options.seed + len(runs)))
+            runs[name] = robustness_figures(read_records(folder / name))
+            print(_line(name, runs[name]), flush=True)
+    records = {name: read_records(folder / name) for name in runs}
+    report = {
         "experiment": "robustness",
-        "asked": asked,
-        "runs": rows,
+        "asked": {**asdict(options), "out": options.out.name},
+        "runs": runs,
         "generator": {name: generator_of(each) for name, each in records.items()},
         "paper": PAPER,
     }
-    report = finish_report(folder, body, settings, load_before)
-    (folder / "report.md").write_text(robustness_markdown(report), encoding="utf-8")
-    draw_robustness(folder / PICTURE, records, rows)
-    print(f"wrote {PICTURE}, report.json, report.md and the raw records to {options.out}")
-    return int(any(row["commands"]["lost"] or row["commands"]["twice"] for row in rows.values()))
+    finish_report(folder, report, robustness_page, settings, load_before)
+    draw_robustness(folder / FIGURE, records, runs)
+    print(f"wrote {FIGURE}, report.json, report.md and the raw records to {options.out}")
+    return int(any(run["commands"]["lost"] or run["commands"]["twice"] for run in runs.values()))
 
 
 async def _run(
-    options: RobustnessOptions,
-    settings: PlatformSettings,
-    folder: Path,
-    name: str,
-    scenario: Scenario,
-    seed: int,
+    options: RobustnessOptions, settings: PlatformSettings, folder: Path, name: str, seed: int
 ) -> None:
+    scenario, session = SCENARIOS[name], settings.session
     seconds = scenario.seconds / options.speed
-    if scenario.needs_link:  # a cut must outlast the robots' patience to be one
-        session = settings.session
+    if scenario.needs_link:  # a cut must last longer than the ping timeout of the robots
         seconds = max(seconds, 2 * (session.ping_interval_s + session.ping_timeout_s))
-    asked = {
+    parameters = {
         "kind": "robustness",
         "scenario": name,
         "robots": options.robots,
         "fps": options.fps,
         "seconds": seconds,
-        "deadline_s": settings.session.answer_timeout_s,
+        "deadline_s": session.answer_timeout_s,
         "seed": seed,
     }
     robots = SwarmOptions(
@@ -115,30 +96,29 @@ async def _run(
         fps=options.fps,
         codec=options.codec,
         seed=options.seed,
-        deadline_s=settings.session.answer_timeout_s,
+        deadline_s=session.answer_timeout_s,
         link=_NO_DELAY if scenario.needs_link else None,
     )
-    if scenario.play is None:
-        await play_control_plane(folder, settings, asked, robots, seconds)
+    if scenario.inject is None:
+        await run_control_plane_fault(folder, settings, parameters, robots, seconds)
         return
     async with (
-        Harness(folder, settings, asked, servers=scenario.servers) as stage,
-        stage.swarm(robots) as swarm,
+        Harness(folder, settings, parameters, servers=scenario.servers) as harness,
+        harness.swarm(robots) as swarm,
     ):
-        stage.link = swarm.link
+        harness.link = swarm.link
         await swarm.start()
-        await swarm.wait_joined(_JOIN_S)
-        stage.tell("joined")
-        await watch(stage, _LEAD_S)
-        await scenario.play(stage, seconds, seed)
-        await stage.close_books(await swarm.finish())
+        await swarm.wait_joined(_JOIN_TIMEOUT_S)
+        harness.log("joined")
+        await harness.run_for(_BEFORE_FAULT_S)
+        await scenario.inject(harness, seconds, seed)
+        await harness.save_result(await swarm.finish())
 
 
-def _line(name: str, row: Mapping[str, Any]) -> str:
-    missed = [what for what, bar in row["bars"].items() if not bar["held"]]
-    commands, gap = row["commands"], row["gap_s"]
-    verdict = f"missed {', '.join(missed)}" if missed else "every bar held"
+def _line(name: str, run: Mapping[str, Any]) -> str:
+    commands, outage, missed = run["commands"], run["gap_s"], missed_bars(run)
     return (
-        f"{name:<15} {commands['sent']} sent, {commands['lost']} lost, {commands['twice']} twice, "
-        f"{commands['failed']} failed; gap p50 {gap['p50']} s, p99 {gap['p99']} s: {verdict}"
+        f"{name:<15} {commands['sent']} commands, {commands['lost']} lost, {commands['twice']} twice, "
+        f"{commands['failed']} failed; outage p50 {outage['p50']} s, p99 {outage['p99']} s; "
+        + (f"missed targets: {', '.join(missed)}" if missed else "all targets met")
     )

@@ -1,7 +1,7 @@
-"""Judge one fault by the raw records of its run, and hold the figures against the bars they must meet.
+"""Figures and report of a robustness run: the outages around one fault, against the targets in `BARS`.
 
-Promises to know nothing but the records: who was hit, when, and for how long robots heard nothing, all
-come from the commands and events.  A figure that could not be measured misses its bar.
+Everything is computed from the records alone: which robots were affected, when, and for how long they had
+no answer.  A figure that could not be measured misses its target.
 """
 
 from __future__ import annotations
@@ -9,12 +9,14 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from rse_pf.experiments.paper.elasticity_report import crashes
-from rse_pf.experiments.results.outages import gap_figures, robots_on
-from rse_pf.experiments.results.records import Event, RecordedSample, Records, asked_of, summary_of
-from rse_pf.experiments.results.report import CommandRecord, percentiles
+from rse_pf.experiments.paper.elasticity_report import crashes, slowest_replacement_s
+from rse_pf.experiments.results.markdown import about_run, failures, number, page, slashed, table
+from rse_pf.experiments.results.outages import outage_figures, robots_on
+from rse_pf.experiments.results.records import CommandRecord, Event, Records, parameters_of
+from rse_pf.experiments.results.summary import answered_percent, percentiles, summary_of
+from rse_pf.local.control.monitor import MonitorSample
 
-__all__ = ["BARS", "evened_out_s", "judge_scenario"]
+__all__ = ["BARS", "evened_out_s", "missed_bars", "robustness_figures", "robustness_page"]
 
 _NO_LOSS = {"commands/lost": (0, "<="), "commands/twice": (0, "<=")}
 _NO_FAILURE = {**_NO_LOSS, "commands/failed": (0, "<=")}
@@ -46,36 +48,34 @@ BARS: dict[str, dict[str, tuple[float, str]]] = {
         "descriptors_percent": (5.0, "<="),
     },
 }
-"""What each figure of each scenario must reach; the issue's table."""
+"""The target of each figure of each scenario; ``bars`` of the report."""
 
 _EVEN = 0.2
 _CLOCK_S = 0.05  # between the decision to deliver and the time stamp in the record
 
 
-def judge_scenario(records: Records) -> dict[str, Any]:
-    """Return the figures of one fault's run, and each bar with ``held``.
+def robustness_figures(records: Records) -> dict[str, Any]:
+    """Return the figures of the run of one fault, and for each target whether it was met (``held``).
 
     Raises:
-        UsageError: The events do not say what was asked.
+        UsageError: The events do not hold the parameters of the run.
     """
-    asked = asked_of(records)
-    scenario = str(asked["scenario"])
+    scenario = str(parameters_of(records)["scenario"])
     summary = summary_of(records)
     faults = [event for event in records.events if event["action"] == "fault"]
     found = crashes(records.events)
-    replaced = [each["replaced_in_s"] for each in found]
     figures: dict[str, Any] = {
         "scenario": scenario,
         "commands": summary["commands"],
         "failures_by_code": summary["failures_by_code"],
         "wrong_poses": summary["wrong_poses"],
-        "answered_percent": _percent(records.commands, None),
-        "answered_within_1_s_percent": _percent(records.commands, 1000.0),
+        "answered_percent": answered_percent(records.commands),
+        "answered_within_1_s_percent": answered_percent(records.commands, 1000.0),
         "round_trip_ms": summary["round_trip_ms"],
-        "gap_s": _gap(records, faults),
+        "gap_s": _outages(records, faults),
         "out_of_rotation_s": _out_of_rotation_s(records.events, faults),
         "crashes": len(found),
-        "replaced_in_s": max(replaced) if replaced and None not in replaced else None,
+        "replaced_in_s": slowest_replacement_s(found),
         "drains": sum(event["action"] == "drain-over" for event in records.events),
         "balancer_back_s": _after(records.events, "balancer-gone", "balancer-back"),
         **_scenario_figures(scenario, records, faults),
@@ -84,26 +84,78 @@ def judge_scenario(records: Records) -> dict[str, Any]:
     return {**figures, "bars": {name: _bar(figures, name, *bar) for name, bar in bars.items()}}
 
 
-def evened_out_s(readings: Sequence[RecordedSample], since_s: float) -> float | None:
-    """Return when, after *since_s*, robots per healthy server came within 20 % of even, for good.
+def missed_bars(figures: Mapping[str, Any]) -> list[str]:
+    """Return the figures that missed their targets."""
+    return [name for name, bar in figures["bars"].items() if not bar["held"]]
 
-    Seconds after *since_s*; None if they never did.  Source: the issue's table, scale-out row.
+
+def robustness_page(report: Mapping[str, Any]) -> str:
+    """Return ``report.md``: a table of figures, and each target with whether it was met."""
+    runs: Mapping[str, Mapping[str, Any]] = report["runs"]
+    rows = [
+        [
+            name,
+            *(run["commands"][count] for count in ("sent", "lost", "twice")),
+            failures(run),
+            slashed(run["gap_s"], "p50", "p99"),
+            number(run["out_of_rotation_s"]),
+            number(run["replaced_in_s"]),
+            _other_figures(run),
+        ]
+        for name, run in runs.items()
+    ]
+    bars = [
+        [name, what, number(bar["value"]), bar["bar"], "met" if bar["held"] else "**missed**"]
+        for name, run in runs.items()
+        for what, bar in run["bars"].items()
+    ]
+    head = (
+        "fault, sent, lost, twice, failed, outage p50 / p99 s, out of rotation s, replaced s, other figures"
+    )
+    return page(
+        "# RSE-PF experiment: robustness",
+        f"{report['asked']['robots']} robots x {report['asked']['fps']:g} fps, real PnP problems; "
+        f"{sum(row[-1] == 'met' for row in bars)} of {len(bars)} targets met.",
+        table(head.split(", "), rows),
+        table(["fault", "figure", "measured", "target", ""], bars),
+        "Outage: the longest time between two answers, of the robots on the affected server (of all "
+        "robots where the fault affects all). At 5 fps it is 0.2 s without any fault.",
+        about_run(report),
+    )
+
+
+def evened_out_s(samples: Sequence[MonitorSample], since_s: float) -> float | None:
+    """Return the time until the robots per healthy server were within 20 % of their mean, and stayed so.
+
+    Seconds after *since_s*; None if that never happened.
     """
     reached = None
-    for reading in readings:
-        if reading.time < since_s:
+    for sample in samples:
+        if sample.time < since_s:
             continue
-        counts = [each.robots for each in reading.servers if each.state == "healthy"]
+        counts = [each.robots for each in sample.servers if each.state == "healthy"]
         if not sum(counts):
-            continue  # nobody is connected any more: nothing to share out
+            continue  # no robot is connected any more
         mean = sum(counts) / len(counts)
-        # A whole robot is the finest step there is.
+        # The share of a server changes by whole robots.
         even = all(abs(count - mean) <= max(_EVEN * mean, 1.0) for count in counts)
         if not even:
             reached = None
         elif reached is None:
-            reached = round(reading.time - since_s, 3)
+            reached = round(sample.time - since_s, 3)
     return reached
+
+
+def _other_figures(run: Mapping[str, Any]) -> str:
+    names = (
+        "adopted", "not_adopted", "balancer_back_s", "evened_out_s", "stale_as_fresh", "server_noticed_s",
+        "memory_percent", "descriptors_percent",
+    )  # fmt: skip
+    shown = [f"{name} {run[name]}" for name in names if run.get(name) is not None]
+    if "noticed_s" in run:
+        shown.append(f"noticed by robots after at most {number(run['noticed_s']['max'])} s")
+        shown.append(f"first answer after the heal p99 {number(run['first_answer_after_heal_s']['p99'])} s")
+    return ", ".join(shown)
 
 
 def _scenario_figures(scenario: str, records: Records, faults: Sequence[Event]) -> dict[str, Any]:
@@ -114,14 +166,14 @@ def _scenario_figures(scenario: str, records: Records, faults: Sequence[Event]) 
     if scenario == "scale-out":
         new = [event for event in records.events if event["action"] == "server-healthy"]
         since = [float(event["time"]) for event in new if faults and event["time"] >= faults[0]["time"]]
-        return {"evened_out_s": evened_out_s(records.readings, since[-1]) if since else None}
+        return {"evened_out_s": evened_out_s(records.samples, since[-1]) if since else None}
     if scenario == "random":
         return _growth(records.events)
     return {}
 
 
-def _gap(records: Records, faults: Sequence[Event]) -> dict[str, Any]:
-    """Return the silences of the robots that a fault hit; of several faults, each robot's worst counts."""
+def _outages(records: Records, faults: Sequence[Event]) -> dict[str, Any]:
+    """Return the outages of the robots that a fault affected; of several faults, the worst of each robot."""
     if not faults:
         return {"robots": 0, "p50": None, "p99": None, "max": None}
     everyone = {command.robot for command in records.commands}
@@ -130,11 +182,11 @@ def _gap(records: Records, faults: Sequence[Event]) -> dict[str, Any]:
         server = fault.get("server")
         hit |= everyone if server is None else robots_on(records.commands, str(server), float(fault["time"]))
     start_s, end_s = float(faults[0]["time"]), float(faults[-1]["time"]) + float(faults[-1]["watch_s"])
-    return gap_figures(records.commands, hit, start_s=start_s, end_s=end_s)
+    return outage_figures(records.commands, hit, start_s=start_s, end_s=end_s)
 
 
 def _out_of_rotation_s(events: Sequence[Event], faults: Sequence[Event]) -> float | None:
-    """Return the slowest time from a server's fault until the balancer sent nobody to it."""
+    """Return the longest time from the fault of a server until the load balancer sent no robot to it."""
     times = []
     for fault in faults:
         if fault.get("server") is None:
@@ -153,7 +205,7 @@ def _out_of_rotation_s(events: Sequence[Event], faults: Sequence[Event]) -> floa
 
 
 def _adoption(events: Sequence[Event]) -> dict[str, Any]:
-    """Compare the processes that ran before the control plane was killed with those it found again."""
+    """Compare the processes before the control plane was killed with those that it adopted."""
     ran: dict[str, set[int]] = {"before": set(), "after": set()}
     for event in events:
         if event["action"] == "processes":
@@ -166,37 +218,38 @@ def _adoption(events: Sequence[Event]) -> dict[str, Any]:
 
 
 def _cut(records: Records, faults: Sequence[Event]) -> dict[str, Any]:
-    """Return what a silent link did: who noticed when, and the first answers after it healed."""
+    """Return the figures of a cut link: when both sides noticed, and the first answers after it healed."""
     healed = [float(event["time"]) for event in records.events if event["action"] == "healed"]
     noticed: dict[str, float] = {}
     for event in records.events:
         if event["action"] == "link-lost" and faults and event["time"] >= faults[0]["time"]:
             noticed.setdefault(str(event["robot"]), float(event["time"]) - float(faults[0]["time"]))
     first = _first_answers(records.commands, healed[0]) if healed else []
-    deadline_s = float(asked_of(records)["deadline_s"]) + _CLOCK_S
+    deadline_s = float(parameters_of(records)["deadline_s"]) + _CLOCK_S
     stale = sum(
         each.code == "ok" and each.answered is not None and each.answered - each.sent > deadline_s
         for each in records.commands
     )
-    figures = {
-        name: percentiles(values) for name, values in (("noticed", list(noticed.values())), ("first", first))
-    }
-    shown = {name: {key: value[key] for key in ("n", "p50", "p99", "max")} for name, value in figures.items()}
     return {
-        "noticed_s": shown["noticed"],
+        "noticed_s": _spread(list(noticed.values())),
         "server_noticed_s": _after(records.events, "fault", "servers-empty")
-        or _emptied_s(records.readings, faults),
-        "first_answer_after_heal_s": shown["first"],
+        or _emptied_s(records.samples, faults),
+        "first_answer_after_heal_s": _spread(first),
         "stale_as_fresh": stale,
     }
 
 
-def _emptied_s(readings: Sequence[RecordedSample], faults: Sequence[Event]) -> float | None:
-    """Return how long after the fault the servers had let go of every robot; None if they never did."""
-    for reading in readings:
-        after = bool(faults) and reading.time >= faults[0]["time"]
-        if after and reading.servers and not any(each.robots for each in reading.servers):
-            return round(reading.time - float(faults[0]["time"]), 3)
+def _spread(values: Sequence[float]) -> dict[str, Any]:
+    figures = percentiles(values)
+    return {name: figures[name] for name in ("n", "p50", "p99", "max")}
+
+
+def _emptied_s(samples: Sequence[MonitorSample], faults: Sequence[Event]) -> float | None:
+    """Return the time from the fault until no server had a robot; None if that never happened."""
+    for sample in samples:
+        after = bool(faults) and sample.time >= faults[0]["time"]
+        if after and sample.servers and not any(each.robots for each in sample.servers):
+            return round(sample.time - float(faults[0]["time"]), 3)
     return None
 
 
@@ -210,7 +263,7 @@ def _first_answers(commands: Sequence[CommandRecord], healed_s: float) -> list[f
 
 
 def _growth(events: Sequence[Event]) -> dict[str, Any]:
-    """Return by how much memory and descriptors of a process grew, in percent of the beginning."""
+    """Return the growth of memory and file descriptors per process, in percent of the start."""
     seen = {str(event["when"]): event for event in events if event["action"] == "resources"}
     if not {"before", "after"} <= set(seen):
         return {"memory_percent": None, "descriptors_percent": None}
@@ -224,7 +277,7 @@ def _growth(events: Sequence[Event]) -> dict[str, Any]:
 
 
 def _after(events: Sequence[Event], first: str, then: str) -> float | None:
-    """Return the slowest time from an event *first* to the next event *then*."""
+    """Return the longest time from an event *first* to the next event *then*."""
     waits, began = [], None
     for event in events:
         if event["action"] == first and began is None:
@@ -233,18 +286,6 @@ def _after(events: Sequence[Event], first: str, then: str) -> float | None:
             waits.append(float(event["time"]) - began)
             began = None
     return round(max(waits), 3) if waits and began is None else None
-
-
-def _percent(commands: Sequence[CommandRecord], limit_ms: float | None) -> float | None:
-    if not commands:
-        return None
-    good = {
-        (each.robot, each.id)
-        for each in commands
-        if each.code == "ok"
-        and (limit_ms is None or (each.round_trip_ms is not None and each.round_trip_ms <= limit_ms))
-    }
-    return round(100.0 * len(good) / len({(each.robot, each.id) for each in commands}), 3)
 
 
 def _bar(figures: Mapping[str, Any], name: str, bar: float, sense: str) -> dict[str, Any]:

@@ -1,7 +1,7 @@
-"""Recompute a report from its raw records, and hold the laws that no honest run breaks.
+"""Check a report against its raw records, and the records against the invariants of every run.
 
-Promises never to take a figure from ``report.json``: it reads the commands, events and readings, judges them
-again, and only then compares.  An edited record and an edited report both show.
+No figure is taken from ``report.json``: the figures are computed again from commands, events and samples,
+and only then compared, so that an edited record and an edited report both show.
 """
 
 from __future__ import annotations
@@ -13,49 +13,58 @@ from pathlib import Path
 from typing import Any
 
 from rse_pf.errors import UsageError
-from rse_pf.experiments.paper.elasticity_report import judge_elasticity, unjustified_scale_outs
-from rse_pf.experiments.paper.latency_report import judge_latency
-from rse_pf.experiments.paper.mapping_report import judge_map
-from rse_pf.experiments.paper.robustness_report import judge_scenario
-from rse_pf.experiments.results.records import EVENTS, Records, asked_of, read_records
+from rse_pf.experiments.paper.elasticity_report import elasticity_figures, unjustified_scale_outs
+from rse_pf.experiments.paper.latency_report import latency_figures
+from rse_pf.experiments.paper.mapping_report import map_figures
+from rse_pf.experiments.paper.robustness_report import robustness_figures
+from rse_pf.experiments.results.records import (
+    COMMANDS,
+    EVENTS,
+    Records,
+    parameters_of,
+    read_records,
+)
 
-__all__ = ["Discrepancy", "broken_laws", "judge_folder", "run_folders", "verify"]
+__all__ = ["FigureCheck", "broken_invariants", "figures_of", "run_folders", "verify"]
 
 _CLOCK_MS = 0.01
-_SHOWN = 60
+_MAX_SHOWN = 60
+_HINT = "name the --out of an experiment"
 
-JUDGES: dict[str, Callable[[Records], dict[str, Any]]] = {
-    "elasticity": judge_elasticity,
-    "latency": judge_latency,
-    "robustness": judge_scenario,
-    "map": judge_map,
+FIGURES: dict[str, Callable[[Records], dict[str, Any]]] = {
+    "elasticity": elasticity_figures,
+    "latency": latency_figures,
+    "robustness": robustness_figures,
+    "map": map_figures,
 }
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Discrepancy:
-    """One line of the verdict."""
+class FigureCheck:
+    """One line of the result; ``agrees`` is None for a figure whose records are not kept."""
 
     what: str
-    agrees: bool
+    agrees: bool | None
     detail: str = ""
 
     def __str__(self) -> str:
         """Return the line as it is printed."""
-        return f"{'agrees ' if self.agrees else 'DIFFERS'}  {self.what}  {self.detail}".rstrip()
+        outcome = "skipped" if self.agrees is None else "agrees" if self.agrees else "DIFFERS"
+        return f"{outcome:<7}  {self.what}  {self.detail}".rstrip()
 
 
-def judge_folder(folder: Path) -> dict[str, Any]:
-    """Return what the records in *folder* say; raises UsageError for a folder that is no run."""
-    records = read_records(folder)
-    kind = str(asked_of(records).get("kind"))
-    if kind not in JUDGES:
-        raise UsageError(f"{folder}: {kind!r} is no experiment", hint=f"known are {', '.join(JUDGES)}")
-    return JUDGES[kind](records)
+def figures_of(records: Records) -> dict[str, Any]:
+    """Return the figures of a run; raises UsageError for a run of no known experiment."""
+    kind = str(parameters_of(records).get("kind"))
+    if kind not in FIGURES:
+        raise UsageError(
+            f"{records.folder}: there is no experiment {kind!r}", hint=f"known are {', '.join(FIGURES)}"
+        )
+    return FIGURES[kind](records)
 
 
 def run_folders(folder: Path) -> dict[str, Path]:
-    """Return the runs of an experiment by the name its report has for them; one run is named ``""``.
+    """Return the runs of an experiment by their names in its report; a single run is named ``""``.
 
     Raises:
         UsageError: There is no run.
@@ -64,42 +73,42 @@ def run_folders(folder: Path) -> dict[str, Path]:
         return {"": folder}
     parts = {part.parent.name: part.parent for part in sorted(folder.glob(f"*/{EVENTS}"))}
     if not parts:
-        raise UsageError(f"{folder} holds no run", hint="name the --out of an experiment")
+        raise UsageError(f"{folder} holds no run", hint=_HINT)
     return parts
 
 
-def verify(folder: Path) -> list[Discrepancy]:
-    """Return a finding for each figure of each run in *folder*, and for each law.
+def verify(folder: Path) -> list[FigureCheck]:
+    """Return a check of each figure and invariant of each run in *folder*, or in the experiments below it.
+
+    A run without ``commands.csv`` whose ``commands.sha256`` is kept is checked as far as its events and
+    samples go.
 
     Raises:
         UsageError: The folder holds no run, or a record or the report cannot be read.
     """
+    if not (folder / "report.json").exists():
+        parts = [report.parent for report in sorted(folder.glob("*/report.json"))]
+        if parts:
+            return [_prefixed(part.name, check) for part in parts for check in verify(part)]
     report = _read_report(folder)
-    found: list[Discrepancy] = []
+    found: list[FigureCheck] = []
     runs = run_folders(folder)
     for name, part in runs.items():
-        told = report if not name else report.get("runs", {}).get(name)
-        prefix = f"{name}: " if name else ""
-        if not isinstance(told, dict):
-            found.append(Discrepancy(what=f"{prefix}run", agrees=False, detail="is not in the report"))
-            continue
-        judged = json.loads(json.dumps(judge_folder(part)))
-        found += [_compare(prefix, told, path, value) for path, value in _leaves(judged)]
-        found += [
-            Discrepancy(what=f"{prefix}law: {law}", agrees=not broken, detail=broken)
-            for law, broken in broken_laws(read_records(part)).items()
-        ]
+        reported = report if not name else report.get("runs", {}).get(name)
+        if isinstance(reported, dict):
+            found += [_prefixed(name, check) for check in _verify_run(part, reported)]
+        else:
+            found.append(FigureCheck(what=f"{name}: run", agrees=False, detail="is not in the report"))
     if "" not in runs:
         for name in sorted(set(report.get("runs", {})) - set(runs)):
-            found.append(Discrepancy(what=f"{name}: run", agrees=False, detail="has no records"))
+            found.append(FigureCheck(what=f"{name}: run", agrees=False, detail="has no records"))
     return found
 
 
-def broken_laws(records: Records) -> dict[str, str]:
-    """Return every law and what breaks it; an empty text is a law that holds."""
-    judged = JUDGES[str(asked_of(records)["kind"])](records)
-    commands = judged["commands"]
-    laws = {
+def broken_invariants(records: Records) -> dict[str, str]:
+    """Return each invariant of a run with what breaks it; an empty text for one that holds."""
+    commands = figures_of(records)["commands"]
+    invariants = {
         "every command came to an end": _if(commands["lost"], f"{commands['lost']} lost"),
         "no answer was delivered twice": _if(commands["twice"], f"{commands['twice']} twice"),
         "every command is counted once": _if(
@@ -107,26 +116,51 @@ def broken_laws(records: Records) -> dict[str, str]:
             f"{commands['sent']} sent, {commands['answered']} answered, {commands['failed']} failed, "
             f"{commands['lost']} lost",
         ),
-        "no command is answered before it is sent, and a round trip is what its time stamps say": _clocks(
-            records
+        "no command is answered before it is sent, and a round trip is what its time stamps say": (
+            _wrong_round_trip(records)
         ),
     }
-    if asked_of(records)["kind"] == "elasticity":
+    if parameters_of(records)["kind"] == "elasticity":
         wrong = unjustified_scale_outs(records)
-        laws["every scale-out follows the required busy samples"] = "; ".join(wrong)
-    return laws
+        invariants["every scale-out follows the required busy samples"] = "; ".join(wrong)
+    return invariants
 
 
-def _clocks(records: Records) -> str:
-    asks_late = asked_of(records)["kind"] == "map"  # a mapping robot plans frames, not commands
+def _verify_run(folder: Path, reported: Mapping[str, Any]) -> Iterator[FigureCheck]:
+    kept = any((folder / name).exists() for name in (COMMANDS, f"{COMMANDS}.gz"))
+    partial = not kept and (folder / "commands.sha256").exists()
+    records = read_records(folder, without_commands=partial)
+    figures = json.loads(json.dumps(figures_of(records)))
+    for path, value in _leaves(figures):
+        if partial and path[0] in _FROM_COMMANDS:
+            yield FigureCheck(what="/".join(path), agrees=None, detail=f"{COMMANDS} is not kept here")
+        else:
+            yield _compare(reported, path, value)
+    for name, broken in broken_invariants(records).items():
+        if not partial or "scale-out" in name:
+            yield FigureCheck(what=f"invariant: {name}", agrees=not broken, detail=broken)
+
+
+_FROM_COMMANDS = {
+    "commands", "failures_by_code", "round_trip_ms", "phases", "queue_ms", "compute_ms", "commands_by_server",
+}  # fmt: skip
+"""Figures of an elasticity run that only its commands give."""
+
+
+def _prefixed(name: str, check: FigureCheck) -> FigureCheck:
+    what = f"{name}: {check.what}" if name else check.what
+    return FigureCheck(what=what, agrees=check.agrees, detail=check.detail)
+
+
+def _wrong_round_trip(records: Records) -> str:
+    mapping = parameters_of(records)["kind"] == "map"  # a mapping robot plans frames, not commands
     for command in records.commands:
         if command.code != "ok" or command.answered is None or command.round_trip_ms is None:
             continue
-        begun = command.sent if asks_late else command.planned
-        trip_ms = 1000.0 * (command.answered - begun)
-        wrong = trip_ms < command.round_trip_ms - _CLOCK_MS
-        if not asks_late:  # else the robot's own work lies between
-            wrong = abs(trip_ms - command.round_trip_ms) > _CLOCK_MS
+        trip_ms = 1000.0 * (command.answered - (command.sent if mapping else command.planned))
+        over_ms = trip_ms - command.round_trip_ms
+        # A mapping robot does work of its own between the round trip and the time stamp.
+        wrong = over_ms < -_CLOCK_MS if mapping else abs(over_ms) > _CLOCK_MS
         if command.answered < command.sent or wrong:
             return (
                 f"command {command.id} of {command.robot}: planned {command.planned}, sent {command.sent}, "
@@ -135,20 +169,22 @@ def _clocks(records: Records) -> str:
     return ""
 
 
-def _compare(prefix: str, told: Mapping[str, Any], path: tuple[str, ...], value: Any) -> Discrepancy:
-    what, missing = prefix + "/".join(path), object()
-    here: Any = told
+def _compare(reported: Mapping[str, Any], path: tuple[str, ...], value: Any) -> FigureCheck:
+    what, missing = "/".join(path), object()
+    there: Any = reported
     for step in path:
-        here = here.get(step, missing) if isinstance(here, dict) else missing
-    if here is missing:
-        return Discrepancy(what=what, agrees=False, detail="is not in the report")
-    if here == value:
-        return Discrepancy(what=what, agrees=True, detail=_short(value))
-    return Discrepancy(what=what, agrees=False, detail=f"report {_short(here)}, records {_short(value)}")
+        there = there.get(step, missing) if isinstance(there, dict) else missing
+    if there is missing:
+        return FigureCheck(what=what, agrees=False, detail="is not in the report")
+    if there == value:
+        return FigureCheck(what=what, agrees=True, detail=_short(value))
+    return FigureCheck(what=what, agrees=False, detail=f"report {_short(there)}, records {_short(value)}")
 
 
-def _leaves(judged: Mapping[str, Any], before: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
-    for name, value in judged.items():
+def _leaves(
+    figures: Mapping[str, Any], before: tuple[str, ...] = ()
+) -> Iterator[tuple[tuple[str, ...], Any]]:
+    for name, value in figures.items():
         path = (*before, name)
         if isinstance(value, dict) and value:
             yield from _leaves(value, path)
@@ -161,17 +197,17 @@ def _read_report(folder: Path) -> dict[str, Any]:
     try:
         report = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
-        raise UsageError(f"cannot read {path}: {error}", hint="name the --out of an experiment") from error
+        raise UsageError(f"cannot read {path}: {error}", hint=_HINT) from error
     if not isinstance(report, dict):
-        raise UsageError(f"{path} is not a report", hint="name the --out of an experiment")
+        raise UsageError(f"{path} is not a report", hint=_HINT)
     return report
 
 
 def _short(value: Any) -> str:
     text = json.dumps(value)
-    if isinstance(value, list) and len(text) > _SHOWN:
+    if isinstance(value, list) and len(text) > _MAX_SHOWN:
         return f"{len(value)} entries"
-    return text if len(text) <= _SHOWN else text[: _SHOWN - 3] + "..."
+    return text if len(text) <= _MAX_SHOWN else text[: _MAX_SHOWN - 3] + "..."
 
 
 def _if(broken: Any, text: str) -> str:

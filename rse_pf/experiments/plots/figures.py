@@ -1,7 +1,6 @@
-"""The experiments' pictures, with the paper's axes and the paper's numbers beside ours.
+"""The figures of the experiments, with the axes of the paper and its numbers beside the measured ones.
 
-The only file that draws with matplotlib; each function takes records or figures and writes one PNG.
-Promises no window, no font of its own, and nothing in a picture that is not in the records.
+Each function takes records or figures of a report and writes one PNG; no window opens.
 """
 
 from __future__ import annotations
@@ -13,34 +12,33 @@ from typing import Any
 import numpy as np
 
 from rse_pf.errors import MissingExtra
-from rse_pf.experiments.results.records import RecordedSample, Records, asked_of
-from rse_pf.experiments.results.report import PAPER, ROUND_TRIP_PARTS, CommandRecord
+from rse_pf.experiments.results.records import CommandRecord, Records, parameters_of
+from rse_pf.experiments.results.summary import PAPER, ROUND_TRIP_PARTS
 
 __all__ = ["draw_elasticity", "draw_latency", "draw_robustness", "require_matplotlib"]
 
 _BLUE, _ORANGE, _GREEN, _RED, _GREY = "#1f5fa8", "#d9822b", "#3a8f4d", "#c0392b", "#8a8f98"
 _PARTS_COLOURS = {"up_ms": "#7aa6d6", "queue_ms": _ORANGE, "compute_ms": _GREEN, "down_ms": _BLUE}
 _PARTS_NAMES = {"up_ms": "up", "queue_ms": "queue", "compute_ms": "compute", "down_ms": "down"}
-_TRANSMISSION = "transmission, the paper's: not split"
+_TRANSMISSION = "transmission (the paper does not split it)"
 _BINS = 80
-_MAX_PERCENT = 170.0  # an emulated size bounds what is begun, not what is spent: peaks go beyond 100 %
+_MAX_PERCENT = 170.0  # emulated cores limit what is started, not what is used: peaks exceed 100 %
 _DPI = 130
 
 
 def require_matplotlib() -> None:
-    """Raise MissingExtra unless pictures can be drawn; asked before a run, not after it."""
+    """Raise MissingExtra unless figures can be drawn; called before a run, not after it."""
     _pyplot()
 
 
 def draw_elasticity(path: Path, runs: Mapping[str, Records]) -> None:
-    """Draw the paper's Fig. 8 and, below it, what the robots felt; a column for each run.
+    """Draw the paper's Fig. 8 and, below it, round trips and robots per server; a column for each run.
 
     Args:
-        path: The PNG.
+        path: Path of the PNG.
         runs: Records of elasticity runs by caption, such as "with rebalancing".
     """
-    pyplot = _pyplot()
-    figure, axes = pyplot.subplots(
+    figure, axes = _pyplot().subplots(
         3,
         len(runs),
         figsize=(9.5 * len(runs) if len(runs) == 1 else 7.0 * len(runs), 9.0),
@@ -51,25 +49,22 @@ def draw_elasticity(path: Path, runs: Mapping[str, Records]) -> None:
         height_ratios=(1.25, 1.0, 0.8),
     )
     for column, (caption, records) in enumerate(runs.items()):
-        asked = asked_of(records)
-        _servers(axes[0][column], records, asked)
+        parameters = parameters_of(records)
+        _servers(axes[0][column], records, parameters)
         _round_trips(axes[1][column], records)
         _robots(axes[2][column], records)
         axes[0][column].set_title(
-            f"{caption}: {asked['robots']} robots x {asked['fps']:g} fps, a robot every "
-            f"{asked['join_every_s']:.3g} s, speed {asked['speed']:g}",
+            f"{caption}: {parameters['robots']} robots x {parameters['fps']:g} fps, one joins every "
+            f"{parameters['join_every_s']:.3g} s, speed {parameters['speed']:g}",
             fontsize=10,
         )
         axes[2][column].set_xlabel("time, s")
-    figure.suptitle("RSE-PF, elasticity (axes of the paper's Fig. 8)", fontsize=12)
-    figure.savefig(path, dpi=_DPI)
-    pyplot.close(figure)
+    _save(figure, path, "RSE-PF, elasticity (axes of the paper's Fig. 8)")
 
 
 def draw_latency(path: Path, figures: Mapping[str, Any], caption: str) -> None:
-    """Draw the mean round trip as stacked bars, the paper's and ours, and ours as a distribution."""
-    pyplot = _pyplot()
-    figure, (bars, shares) = pyplot.subplots(
+    """Draw the mean round trip of the paper and of the run as stacked bars, and percentiles of the run."""
+    figure, (bars, shares) = _pyplot().subplots(
         1, 2, figsize=(10.5, 4.8), layout="constrained", width_ratios=(1.1, 1.0)
     )
     _stacked_bars(bars, figures)
@@ -82,65 +77,61 @@ def draw_latency(path: Path, figures: Mapping[str, Any], caption: str) -> None:
     shares.text(
         PAPER["round_trip_ms"],
         1.01,
-        "the paper's mean",
+        "mean of the paper",
         color=_RED,
         fontsize=8,
         ha="center",
         transform=shares.get_xaxis_transform(),
     )
-    shares.set_xlim(0, 1.18 * max(*values, PAPER["round_trip_ms"]))
-    shares.set_xlabel("round trip, ms (the paper has the mean only)")
+    limit = 1.18 * max(*values, PAPER["round_trip_ms"])
+    shares.set(xlim=(0, limit), xlabel="round trip, ms (the paper gives the mean only)")
     _plain(bars, shares)
-    figure.suptitle(caption, fontsize=11)
-    figure.savefig(path, dpi=_DPI)
-    pyplot.close(figure)
+    _save(figure, path, caption)
 
 
 def draw_robustness(path: Path, runs: Mapping[str, Records], rows: Mapping[str, Mapping[str, Any]]) -> None:
-    """Draw, fault by fault, the round trips around it, each command a dot, and whether its bars held."""
-    pyplot = _pyplot()
+    """Draw for each fault the round trips of its commands, and whether its targets were met."""
     columns = 1 if len(runs) == 1 else 2
     lines = -(-len(runs) // columns)
-    figure, axes = pyplot.subplots(
+    figure, axes = _pyplot().subplots(
         lines, columns, figsize=(6.4 * columns, 2.7 * lines), squeeze=False, layout="constrained"
     )
     for axis, (name, records) in zip(axes.flat, runs.items(), strict=False):
         _fault(axis, name, records, rows[name])
     for axis in list(axes.flat)[len(runs) :]:
         axis.set_visible(False)
-    figure.suptitle("RSE-PF, robustness: each dot a command", fontsize=11)
-    figure.savefig(path, dpi=_DPI)
-    pyplot.close(figure)
+    _save(
+        figure,
+        path,
+        "RSE-PF, robustness: each dot is a command, a line the start (red) or end (green) of a fault",
+    )
 
 
 # --- elasticity ------------------------------------------------------------------------------
 
 
-def _servers(axis: Any, records: Records, asked: Mapping[str, Any]) -> None:
-    known = [(r.time, r.cpu_percent) for r in records.readings if r.cpu_percent is not None]
+def _servers(axis: Any, records: Records, parameters: Mapping[str, Any]) -> None:
+    known = [(r.time, r.cpu_percent) for r in records.samples if r.cpu_percent is not None]
     times, cpu = zip(*known, strict=True) if known else ((), ())
     axis.plot(times, cpu, color=_GREY, linewidth=0.8, alpha=0.55)
-    axis.plot(
-        times, _smooth(times, cpu, float(asked["period_s"])), color=_BLUE, label="mean CPU", linewidth=1.6
-    )
-    limit = float(asked["busy_cpu_percent"])
+    means = _period_means(times, cpu, float(parameters["period_s"]))
+    axis.plot(times, means, color=_BLUE, label="mean CPU", linewidth=1.6)
+    limit = float(parameters["busy_cpu_percent"])
     axis.axhline(limit, color=_RED, linestyle="--", linewidth=1, label=f"{limit:g} %, as in the paper")
     axis.set_ylim(0, min(max(125.0, max(cpu, default=0.0) * 1.2), _MAX_PERCENT))
     axis.set_ylabel("mean CPU utilization, %", color=_BLUE)
     count = axis.twinx()
     count.step(
-        [r.time for r in records.readings],
-        [r.healthy_servers for r in records.readings],
+        [r.time for r in records.samples],
+        [r.healthy_servers for r in records.samples],
         where="post",
         color=_ORANGE,
         linewidth=1.8,
         label="healthy servers",
     )
-    most = max((r.healthy_servers for r in records.readings), default=1)
-    count.set_ylim(0, 1.3 * most + 1)
+    count.set_ylim(0, 1.3 * max((r.healthy_servers for r in records.samples), default=1) + 1)
     count.yaxis.get_major_locator().set_params(integer=True)
     count.set_ylabel("healthy server count", color=_ORANGE)
-    count.spines["top"].set_visible(False)
     marks = {
         "grow": ("^", _GREEN, "scale out"),
         "shrink": ("v", _GREY, "scale in"),
@@ -155,11 +146,12 @@ def _servers(axis: Any, records: Records, asked: Mapping[str, Any]) -> None:
     _phase_lines(axis, records)
     handles = [*axis.get_legend_handles_labels()[0], *count.get_legend_handles_labels()[0]]
     axis.legend(handles=handles, fontsize=7.5, ncols=3, loc="upper center", framealpha=0.9)
+    count.spines["top"].set_visible(False)
     _plain(axis)
 
 
 def _round_trips(axis: Any, records: Records) -> None:
-    """Draw percentiles over bins of planned time, and the median robot's own p99."""
+    """Draw percentiles over bins of planned time, and the largest median of a single robot."""
     done = [each for each in records.commands if each.code == "ok" and each.round_trip_ms is not None]
     edges, bins = _binned(done, records.commands)
     middle = (edges[:-1] + edges[1:]) / 2
@@ -167,18 +159,17 @@ def _round_trips(axis: Any, records: Records) -> None:
         values = [np.percentile([c.round_trip_ms or 0.0 for c in b], percent) if b else np.nan for b in bins]
         axis.plot(middle, values, color=colour, linewidth=width, label=f"all robots, p{percent}")
     worst = [_worst_robot(b) for b in bins]
-    axis.plot(middle, worst, color=_RED, linewidth=0.8, alpha=0.7, label="the robot worst off, its p50")
+    axis.plot(middle, worst, color=_RED, linewidth=0.8, alpha=0.7, label="slowest robot, p50")
     failed = [each.planned for each in records.commands if each.code not in ("ok", "")]
     if failed:
         counts, _ = np.histogram(failed, edges)
-        rug = axis.twinx()
-        rug.bar(middle, counts, width=np.diff(edges), color=_RED, alpha=0.15, label="failures")
-        rug.set_ylabel("failures", color=_RED, fontsize=8)
-        rug.set_ylim(0, 4 * max(counts.max(), 1))
-        rug.set_yticks([0, int(counts.max())])
-        rug.spines["top"].set_visible(False)
+        bars = axis.twinx()
+        bars.bar(middle, counts, width=np.diff(edges), color=_RED, alpha=0.15, label="failures")
+        bars.set(ylim=(0, 4 * max(counts.max(), 1)), yticks=[0, int(counts.max())])
+        bars.set_ylabel("failures", color=_RED, fontsize=8)
+        bars.spines["top"].set_visible(False)
     axis.axhline(
-        PAPER["round_trip_ms"], color=_GREY, linestyle=":", linewidth=1, label="paper's mean, 156 ms"
+        PAPER["round_trip_ms"], color=_GREY, linestyle=":", linewidth=1, label="mean of the paper, 156 ms"
     )
     _log_ms(axis, [c.round_trip_ms or 0.0 for c in done])
     axis.set_ylabel("round trip, ms")
@@ -188,16 +179,13 @@ def _round_trips(axis: Any, records: Records) -> None:
 
 
 def _robots(axis: Any, records: Records) -> None:
-    names = sorted(
-        {each.server for reading in records.readings for each in reading.servers}, key=_server_number
-    )
+    by_server = [{each.name: each.robots for each in sample.servers} for sample in records.samples]
+    names = sorted({name for robots in by_server for name in robots}, key=_server_number)
+    times = [sample.time for sample in records.samples]
     for name in names:
-        known = [(r.time, _robots_of(r, name)) for r in records.readings]
-        times = [time_s for time_s, _ in known]
-        axis.plot(times, [np.nan if n is None else n for _, n in known], linewidth=1.3, label=name)
-    axis.set_ylabel("robots on each server")
-    most = max((each.robots for r in records.readings for each in r.servers), default=1)
-    axis.set_ylim(0, 1.45 * max(most, 1))
+        axis.plot(times, [robots.get(name, np.nan) for robots in by_server], linewidth=1.3, label=name)
+    most = max((count for robots in by_server for count in robots.values()), default=1)
+    axis.set(ylabel="robots on each server", ylim=(0, 1.45 * max(most, 1)))
     if names:
         axis.legend(fontsize=7, ncols=min(5, len(names)), loc="upper center", framealpha=0.9)
     _phase_lines(axis, records)
@@ -210,13 +198,6 @@ def _phase_lines(axis: Any, records: Records) -> None:
             axis.axvline(event["time"], color=_GREY, linewidth=0.6, linestyle=":")
 
 
-def _robots_of(reading: RecordedSample, name: str) -> int | None:
-    for each in reading.servers:
-        if each.server == name:
-            return each.robots
-    return None
-
-
 def _server_number(name: str) -> tuple[int, str]:
     tail = name.rpartition("-")[2]
     return (int(tail) if tail.isdigit() else 0, name)
@@ -225,7 +206,7 @@ def _server_number(name: str) -> tuple[int, str]:
 def _binned(
     commands: Sequence[CommandRecord], among: Sequence[CommandRecord]
 ) -> tuple[Any, list[list[CommandRecord]]]:
-    """Return the edges of equal bins over all of *among*, and which of *commands* fall into each."""
+    """Return the edges of equal bins over the times of *among*, and the *commands* in each bin."""
     planned = [each.planned for each in among] or [0.0, 1.0]
     edges = np.linspace(min(planned), max(planned) + 1e-6, _BINS + 1)
     bins: list[list[CommandRecord]] = [[] for _ in range(_BINS)]
@@ -242,8 +223,8 @@ def _worst_robot(commands: Sequence[CommandRecord]) -> float:
     return max((float(np.median(values)) for values in by_robot.values()), default=float("nan"))
 
 
-def _smooth(times: Sequence[float], values: Sequence[float], period_s: float) -> list[float]:
-    """Return, at each time, the mean of the period before it: what the monitor averages."""
+def _period_means(times: Sequence[float], values: Sequence[float], period_s: float) -> list[float]:
+    """Return at each time the mean over the period before it, as the monitor computes it."""
     at, known = np.array(times), np.array(values)
     return [float(known[(at > t - period_s) & (at <= t)].mean()) for t in times]
 
@@ -266,14 +247,12 @@ def _stacked_bars(axis: Any, figures: Mapping[str, Any]) -> None:
             _inside(axis, 1, bottom + mean / 2, f"{mean:.1f}", colour="white")
         bottom += mean
     rest = max((figures["round_trip_ms"]["mean"] or 0.0) - bottom, 0.0)
-    axis.bar(1, rest, bottom=bottom, color=_GREY, width=0.55, label=f"the robot's own, {rest:.1f} ms")
+    axis.bar(1, rest, bottom=bottom, color=_GREY, width=0.55, label=f"in the robot, {rest:.1f} ms")
     totals = (PAPER["round_trip_ms"], bottom + rest)
     for place, total in enumerate(totals):
         axis.text(place, total + 2, f"{total:.1f} ms", ha="center", fontweight="bold", fontsize=10)
-    axis.set_xticks([0, 1], ["the paper\nShenzhen to Seoul", "here\nlink profile"])
-    axis.set_ylim(0, 1.15 * max(totals))
-    axis.set_xlim(-0.5, 2.4)
-    axis.set_ylabel("mean round trip, ms")
+    axis.set_xticks([0, 1], ["the paper\nShenzhen to Seoul", "here\nemulated link"])
+    axis.set(xlim=(-0.5, 2.4), ylim=(0, 1.15 * max(totals)), ylabel="mean round trip, ms")
     axis.legend(fontsize=8, loc="center right", frameon=False)
 
 
@@ -304,28 +283,26 @@ def _fault(axis: Any, name: str, records: Records, row: Mapping[str, Any]) -> No
     for event in records.events:
         if event["action"] in ("fault", "healed", "control-plane-back"):
             axis.axvline(event["time"], color=_RED if event["action"] == "fault" else _GREEN, linewidth=1)
-    bars = row.get("bars", {})
-    held = all(bar["held"] for bar in bars.values())
-    gap = row["gap_s"]["p99"]
-    told = "" if gap is None else f"gap p99 {gap:.2f} s, "
-    commands = row["commands"]
+    met = all(bar["held"] for bar in row.get("bars", {}).values())
+    outage_s, commands = row["gap_s"]["p99"], row["commands"]
+    outage = "" if outage_s is None else f"outage p99 {outage_s:.2f} s, "
+    verdict = "all targets met" if met else "a target missed"
     axis.set_title(
-        f"{name}: {told}{commands['lost']} lost, {commands['failed']} failed: "
-        f"{'all bars held' if held else 'a bar missed'}",
+        f"{name}: {outage}{commands['lost']} lost, {commands['failed']} failed; {verdict}",
         fontsize=9,
-        color="black" if held else _RED,
+        color="black" if met else _RED,
     )
     _log_ms(axis, [each.round_trip_ms or 0.0 for each in answered])
     axis.set_ylabel("round trip, ms", fontsize=8)
-    axis.set_xlabel("planned at, s", fontsize=8)
+    axis.set_xlabel("planned time, s", fontsize=8)
     axis.tick_params(labelsize=8)
     _plain(axis)
 
 
 def _log_ms(axis: Any, values: Sequence[float]) -> None:
-    """Scale *axis* from 1 ms to well above the largest value, so that a legend finds room."""
-    axis.set_yscale("log")
-    axis.set_ylim(max(min(values, default=1.0) / 2, 0.3), max(4 * max(values, default=1.0), 1000.0))
+    """Scale *axis* logarithmically, with space for a legend above the largest value."""
+    low, high = min(values, default=1.0), max(values, default=1.0)
+    axis.set(yscale="log", ylim=(max(low / 2, 0.3), max(4 * high, 1000.0)))
     axis.yaxis.set_major_formatter("{x:g}")
 
 
@@ -333,6 +310,12 @@ def _plain(*axes: Any) -> None:
     for axis in axes:
         axis.grid(alpha=0.25, linewidth=0.5)
         axis.spines["top"].set_visible(False)
+
+
+def _save(figure: Any, path: Path, title: str) -> None:
+    figure.suptitle(title, fontsize=11)
+    figure.savefig(path, dpi=_DPI)
+    _pyplot().close(figure)
 
 
 def _pyplot() -> Any:

@@ -1,7 +1,6 @@
-"""The paper's Fig. 7 as a picture: a coloured point cloud with the path of its camera.
+"""The image of a map (the paper's Fig. 7): a coloured point cloud with the paths of its cameras.
 
-Drawn with Pillow alone, because matplotlib and its fonts would be a fifth of what the demo
-installs.  Promises to draw what is in the map and nothing else.
+Drawn with Pillow alone, because matplotlib and its fonts would be a fifth of what the demo installs.
 """
 
 from __future__ import annotations
@@ -17,28 +16,28 @@ import numpy.typing as npt
 from rse_pf.errors import MissingExtra
 from rse_pf.geometry import Array
 
-__all__ = ["COLOURS", "PathOfRobot", "draw_map"]
+__all__ = ["COLOURS", "RobotPath", "draw_map"]
 
 _WIDTH, _HEIGHT, _CAPTION, _MARGIN = 1600, 900, 64, 40
 _BACKGROUND, _INK, _WHITE = (228, 231, 236), (30, 34, 42), (255, 255, 255)
-"""Not white: white walls and tables must be told from places that nobody saw."""
+"""Not white, so that white surfaces differ from places without points."""
 COLOURS = ((0, 114, 178), (213, 94, 0), (0, 158, 115), (204, 121, 167), (230, 159, 0), (86, 180, 233))
-"""Apart for colour-blind eyes, too; Okabe and Ito 2008."""
+"""Distinct for colour-blind readers as well; Okabe and Ito 2008."""
 _MAX_LABELS = 8
-"""More robots than this have their names in the legend only."""
+"""With more robots the names are in the legend only."""
 _FOCAL = 1.35
 _CAMERA_EVERY_M = 0.5
 _SCALES_M = (1.0, 0.5, 2.0, 0.2, 5.0, 0.1, 10.0, 20.0, 50.0, 100.0, 0.05, 0.02, 0.01)
 _SCALE_PX = (80.0, 400.0)
 _LONG_SCENE = 1.25
-"""Longer than wide by this, a scene lies across the picture."""
+"""A scene that is longer than wide by this ratio is seen from its side."""
 _CEILING_M = 0.7
-"""Points this far above the camera hide the room from an observer above; they are not drawn."""
+"""Points this far above the highest camera are a ceiling and are not drawn."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class PathOfRobot:
-    """Where a robot's camera went: ``T_world_camera`` ``(n, 4, 4)``, in order."""
+class RobotPath:
+    """The path of a robot: ``T_world_camera`` ``(n, 4, 4)``, the poses of its camera in order."""
 
     name: str
     T_world_camera: Array
@@ -48,10 +47,10 @@ def draw_map(
     path: Path,
     points_world: npt.NDArray[np.floating[Any]],
     colours: npt.NDArray[np.uint8],
-    robots: list[PathOfRobot],
+    robots: list[RobotPath],
     caption: str,
 ) -> None:
-    """Write a PNG that shows ``(n, 3)`` points from obliquely above, with the robots' paths.
+    """Write a PNG that shows ``(n, 3)`` points obliquely from above, with the paths of the robots.
 
     Raises:
         MissingExtra: Pillow is not installed.
@@ -80,9 +79,9 @@ def draw_map(
 
 
 class _Observer:
-    """A pinhole camera that looks down on the scene from its most telling side."""
+    """A pinhole camera that looks down on the scene from the side of its robots."""
 
-    def __init__(self, points: Array, robots: list[PathOfRobot], up: Array) -> None:
+    def __init__(self, points: Array, robots: list[RobotPath], up: Array) -> None:
         low, high = (np.percentile(points, q, axis=0) if len(points) else np.zeros(3) for q in (2, 98))
         self.centre = (low + high) / 2
         forward = self._side(points, robots, up)
@@ -100,13 +99,13 @@ class _Observer:
         )
         if len(shown):
             low_px, high_px = np.percentile(self._flat(shown), (0.5, 99.5), axis=0)
-            room = np.array([_WIDTH - 2 * _MARGIN, _HEIGHT - 2 * _CAPTION - _MARGIN])
-            self.scale = float((room / np.maximum(high_px - low_px, 1e-9)).min())
+            available = np.array([_WIDTH - 2 * _MARGIN, _HEIGHT - 2 * _CAPTION - _MARGIN])
+            self.scale = float((available / np.maximum(high_px - low_px, 1e-9)).min())
             self.shift = np.array([_WIDTH / 2, _HEIGHT / 2]) - self.scale * (high_px + low_px) / 2
 
     @staticmethod
-    def _side(points: Array, robots: list[PathOfRobot], up: Array) -> Array:
-        """Look the way the robots looked on average, or across the scene if it is much longer than wide."""
+    def _side(points: Array, robots: list[RobotPath], up: Array) -> Array:
+        """Return the mean viewing direction of the robots, or the short axis of a long scene, level."""
         looks = np.concatenate([robot.T_world_camera[:, :3, 2] for robot in robots])
         mean = looks.mean(axis=0) if len(looks) else np.zeros(3)
         level = np.eye(3) - np.outer(up, up)
@@ -128,7 +127,7 @@ class _Observer:
         return depth
 
     def project(self, points: Array) -> Array:
-        """Return the picture's ``(n, 2)`` pixels."""
+        """Return the ``(n, 2)`` pixels of the image."""
         return self._flat(points) + self.shift
 
     def _flat(self, points: Array) -> Array:
@@ -139,7 +138,7 @@ class _Observer:
 
 
 def _splat(view: _Observer, points: Array, colours: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
-    """Paint the points, nearest on top, each as a small square."""
+    """Draw the points, nearest on top, each as a small square."""
     picture = np.empty((_HEIGHT, _WIDTH, 3), dtype=np.uint8)
     picture[:] = _BACKGROUND
     if not len(points):
@@ -157,13 +156,13 @@ def _splat(view: _Observer, points: Array, colours: npt.NDArray[np.uint8]) -> np
 
 
 def _splat_size(pixels: npt.NDArray[np.int64]) -> int:
-    """Choose squares just large enough to close the gaps between neighbours."""
+    """Return the size of squares that just closes the gaps between neighbours."""
     spread = np.percentile(pixels, 98, axis=0) - np.percentile(pixels, 2, axis=0)
     each = float(spread[0] * spread[1]) / max(1, len(pixels))
     return int(np.clip(round(math.sqrt(2.5 * each)), 1, 4))
 
 
-def _draw_path(draw: Any, view: _Observer, robot: PathOfRobot, colour: tuple[int, int, int]) -> None:
+def _draw_path(draw: Any, view: _Observer, robot: RobotPath, colour: tuple[int, int, int]) -> None:
     if not len(robot.T_world_camera):
         return
     line = [(float(x), float(y)) for x, y in view.project(robot.T_world_camera[:, :3, 3])]
@@ -173,8 +172,8 @@ def _draw_path(draw: Any, view: _Observer, robot: PathOfRobot, colour: tuple[int
         _draw_camera(draw, view, pose, colour)
 
 
-def _draw_ends(draw: Any, view: _Observer, robot: PathOfRobot, colour: tuple[int, int, int]) -> None:
-    """Draw start and end; the ring is so wide that another robot's start within it leaves it in sight."""
+def _draw_ends(draw: Any, view: _Observer, robot: RobotPath, colour: tuple[int, int, int]) -> None:
+    """Draw start and end; the ring is wide enough to show around the start of another robot."""
     if not len(robot.T_world_camera):
         return
     (x0, y0), (x1, y1) = view.project(robot.T_world_camera[[0, -1], :3, 3])
@@ -183,8 +182,8 @@ def _draw_ends(draw: Any, view: _Observer, robot: PathOfRobot, colour: tuple[int
     draw.ellipse([x0 - 9, y0 - 9, x0 + 9, y0 + 9], fill=colour, outline=_WHITE, width=3)
 
 
-def _label_places(view: _Observer, robots: list[PathOfRobot]) -> list[tuple[float, float]]:
-    """Return for each robot a place beside its path, as far from the other paths as there is one."""
+def _label_places(view: _Observer, robots: list[RobotPath]) -> list[tuple[float, float]]:
+    """Return for each robot the place beside its path that is farthest from the other paths."""
     lines = [view.project(robot.T_world_camera[:, :3, 3]) for robot in robots]
     places = []
     for number, line in enumerate(lines):
@@ -207,7 +206,7 @@ def _label_places(view: _Observer, robots: list[PathOfRobot]) -> list[tuple[floa
     return places
 
 
-def _draw_legend(draw: Any, robots: list[PathOfRobot], font: Any, max_px: float) -> None:
+def _draw_legend(draw: Any, robots: list[RobotPath], font: Any, max_px: float) -> None:
     """Draw one line of names; those that do not fit are counted."""
     left, y = _MARGIN, _HEIGHT - 34
     for number, robot in enumerate(robots):
@@ -222,7 +221,7 @@ def _draw_legend(draw: Any, robots: list[PathOfRobot], font: Any, max_px: float)
 
 
 def _fitting(draw: Any, text: str, font: Any, max_px: float) -> str:
-    """Return *text*, cut where it is wider than there is room."""
+    """Return *text*, cut to *max_px*."""
     if draw.textlength(text, font=font) <= max_px:
         return text
     while text and draw.textlength(f"{text} ...", font=font) > max_px:
@@ -231,7 +230,7 @@ def _fitting(draw: Any, text: str, font: Any, max_px: float) -> str:
 
 
 def _spaced(poses: Array) -> list[Array]:
-    """Return the first pose and every one that lies far enough from the last chosen."""
+    """Return the first pose, and each that is far enough from the last one returned."""
     chosen = [poses[0]]
     for pose in poses[1:]:
         if np.linalg.norm(pose[:3, 3] - chosen[-1][:3, 3]) >= _CAMERA_EVERY_M:
@@ -249,7 +248,7 @@ def _draw_camera(draw: Any, view: _Observer, T_world_camera: Array, colour: tupl
 
 
 def _draw_scale(draw: Any, view: _Observer, font: Any) -> float:
-    """Draw one metre (or a round number of them) as it looks at the scene's centre; return its left end."""
+    """Draw a bar of a round length, as long as it appears at the centre; return its left end."""
     ends = view.project(np.stack([view.centre, view.centre + view.axis_x]))
     one_px = max(float(np.linalg.norm(ends[1] - ends[0])), 1e-9)
     metres = next((m for m in _SCALES_M if _SCALE_PX[0] <= m * one_px <= _SCALE_PX[1]), 1.0)
@@ -262,7 +261,7 @@ def _draw_scale(draw: Any, view: _Observer, font: Any) -> float:
     return right - length - 16 - float(draw.textlength(label, font=font))
 
 
-def _up(robots: list[PathOfRobot]) -> Array:
+def _up(robots: list[RobotPath]) -> Array:
     """Return the mean upward direction of the cameras: their -y axes."""
     if not sum(len(robot.T_world_camera) for robot in robots):
         return np.array([0.0, -1.0, 0.0])
@@ -272,7 +271,7 @@ def _up(robots: list[PathOfRobot]) -> Array:
 
 
 def _below_ceiling(
-    points: npt.NDArray[np.floating[Any]], robots: list[PathOfRobot], up: Array
+    points: npt.NDArray[np.floating[Any]], robots: list[RobotPath], up: Array
 ) -> npt.NDArray[np.bool_]:
     heights = points @ up
     cameras = np.concatenate([robot.T_world_camera[:, :3, 3] for robot in robots]) @ up

@@ -1,6 +1,6 @@
-"""A map in the browser, to walk around in: its cloud, and the cameras of its keyframes by robot.
+"""A map in the browser: its cloud, and the cameras of its keyframes by robot.
 
-Needs the extra "view" (viser).  Promises to listen on this machine only, and to end with its caller.
+Needs the extra "view" (viser).  The page is served on this machine only, until the caller ends it.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _CAMERA_M = 0.08
 def browse_map(
     version: MapVersion,
     port: int,
-    tell: Callable[[str], None],
+    on_address: Callable[[str], None],
     until: threading.Event,
     viser: Any = None,
 ) -> None:
@@ -34,14 +34,14 @@ def browse_map(
 
     Args:
         version: The map; clouds of more than a million points are thinned.
-        port: Of the page on this machine; another one is taken if it is in use.
-        tell: Gets the address of the page.
-        until: Ends it.
+        port: Port of the page on this machine; another one is used if it is taken.
+        on_address: Called with the address of the page.
+        until: Ends the page when it is set.
         viser: The package; None means the installed one.
 
     Raises:
         MissingExtra: viser is not installed.
-        UsageError: *port* is none.
+        UsageError: *port* is not a port number.
     """
     if not 1 <= port <= 65535:
         raise UsageError(f"port {port} is not within 1..65535", hint="leave --port out")
@@ -49,7 +49,7 @@ def browse_map(
     server = package.ViserServer(host=_HOST, port=port, verbose=False)
     try:
         _draw(server, version)
-        tell(f"http://{_HOST}:{server.get_port()}")
+        on_address(f"http://{_HOST}:{server.get_port()}")
         until.wait()
     finally:
         server.stop()

@@ -1,10 +1,11 @@
-"""How good a merged map is: where its robots went in it, and how far that is from the truth.
+"""The accuracy of a merged map: the trajectories of its robots in it, and their errors against the truth.
 
-Promises to use the truth for scores alone, and to say what was left out of them.
+The truth is used for errors alone; a report says which robots were left out of them.
 """
 
 from __future__ import annotations
 
+from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -13,17 +14,18 @@ import numpy as np
 
 from client_sdk.mapping import Trajectory
 from rse_pf.errors import UsageError
+from rse_pf.experiments.results.markdown import table
 from rse_pf.experiments.results.trajectory_error import align, associate
 from rse_pf.geometry import Array, inverse, pose_difference
 from rse_pf.maps.format import MapVersion
 from rse_pf.services.mapping.merge import MergeReply
 
-__all__ = ["JoinedRobot", "joined_robots", "merge_section", "merged_lines", "merged_rows", "move_frames"]
+__all__ = ["JoinedRobot", "joined_robots", "merge_section", "merged_lines", "merged_table", "move_frames"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class JoinedRobot:
-    """A robot in the merged map: its path in its own world, and in that of the map."""
+    """A robot in the merged map: its trajectory in its own world frame, and in that of the map."""
 
     name: str
     own: Trajectory
@@ -39,19 +41,19 @@ def joined_robots(
     reply: MergeReply,
     merged: MapVersion,
 ) -> list[JoinedRobot]:
-    """Return the robots that were joined, with every frame's pose in the merged map.
+    """Return the robots that were joined, with the pose of every frame in the merged map.
 
     Args:
-        names: Of the robots, in the order in which their maps were sent.
-        paths: All their frames, each in its robot's own world.
-        truths: Their true paths, in one common world, where known.
+        names: Names of the robots, in the order in which their maps were sent.
+        paths: Poses of all frames, each in the world frame of its robot.
+        truths: True poses, in one common world frame, where known.
         versions: The maps that were sent.
-        reply: What the merge service said.
-        merged: The map of *reply*; its provenance says whose keyframe is whose.
+        reply: Reply of the merge service.
+        merged: The map of *reply*; its provenance says which robot each keyframe is from.
     """
     poses: dict[tuple[int, int], Array] = {
-        (int(whose), int(number)): keyframe.T_world_camera
-        for (whose, number), keyframe in zip(merged.provenance["from"], merged.keyframes, strict=True)
+        (int(owner), int(number)): keyframe.T_world_camera
+        for (owner, number), keyframe in zip(merged.provenance["from"], merged.keyframes, strict=True)
     }
     robots = []
     for row in reply.joined:
@@ -69,14 +71,14 @@ def joined_robots(
 def move_frames(path: Trajectory, stamps_s: Array, T_before: Array, T_after: Array) -> Trajectory:
     """Return *path* after its keyframes moved.
 
-    A frame between two keyframes takes a part of the correction of each, by its place in time between
-    them; a frame outside follows the nearest keyframe.
+    A frame between two keyframes gets their corrections interpolated by time; a frame outside gets that of
+    the nearest keyframe.
 
     Args:
-        path: ``n`` poses ``T_world_camera``, in the world of *T_before*.
-        stamps_s: ``(k,)``, ascending, of the keyframes.
-        T_before: ``(k, 4, 4)``.
-        T_after: ``(k, 4, 4)``, in another world.
+        path: ``n`` poses ``T_world_camera``, in the world frame of *T_before*.
+        stamps_s: ``(k,)``, time stamps of the keyframes, ascending.
+        T_before: ``(k, 4, 4)``, poses of the keyframes before.
+        T_after: ``(k, 4, 4)``, poses of the keyframes after, in another world frame.
     """
     corrections = T_after @ np.array([inverse(each) for each in T_before])
     after = np.clip(np.searchsorted(stamps_s, path.timestamps_s, side="right"), 0, len(stamps_s) - 1)
@@ -95,15 +97,14 @@ def merge_section(
     robots: Sequence[JoinedRobot],
     reply: MergeReply,
     merged: MapVersion,
-    how: Mapping[str, Any],
+    origin: Mapping[str, Any],
 ) -> dict[str, Any]:
     """Return ``merged`` of ``report.json``.
 
-    ``ate_cm`` is over all frames of the joined robots after one rigid alignment to the truth.  Before the
-    merge no robot knows where the others are, so ``ate_before_cm`` aligns every robot to the truth by itself:
-    it holds their drift, and no error of how they lie to each other.  For ``ate_stiff_cm`` every map lies
-    where the merge laid it, but is not bent.
-    ``origins`` is how far a robot's first pose is off, seen from the first robot's.
+    ``ate_cm`` is over all frames of the joined robots after one rigid alignment to the truth.
+    ``ate_before_cm`` aligns every robot by itself, because before the merge their relative poses are unknown:
+    it holds their drift alone.  ``ate_stiff_cm`` moves every map rigidly to where the merge put it.
+    ``origins`` is the error of each robot's first pose relative to the first robot's.
     """
     return {
         "joined": [names[row] for row in reply.joined],
@@ -118,12 +119,12 @@ def merge_section(
         "points": len(merged.points),
         "frames": sum(len(robot.own) for robot in robots),
         **_errors(robots),
-        **how,
+        **origin,
     }
 
 
 def merged_lines(section: Mapping[str, Any]) -> str:
-    """Return what a person sees of ``merged``; each line ends with a newline."""
+    """Return the lines that the terminal shows of ``merged``; each ends with a newline."""
     joined = section["joined"]
     what = (
         f"{section['links_between_robots']} links between them and {section['loops']} loops"
@@ -132,52 +133,47 @@ def merged_lines(section: Mapping[str, Any]) -> str:
     )
     lines = [f"merged {', '.join(joined)}: {section['keyframes']} keyframes, {what}"]
     if section["ate_cm"] is not None:
-        alone = ", every robot aligned to the truth by itself" if len(joined) > 1 else ""
+        alone = ", each robot aligned to the truth by itself" if len(joined) > 1 else ""
         lines.append(
             f"ATE {section['ate_cm']:.2f} cm in the merged map "
             f"(before: {section['ate_before_cm']:.2f} cm{alone})"
         )
     lines += [f"{each['robot']} not joined: {each['reason']}" for each in section["not_joined"]]
-    refused = sum(each["count"] for each in section["refused"])
-    if refused:
-        reasons: dict[str, int] = {}
-        for each in section["refused"]:
-            reasons[each["reason"]] = reasons.get(each["reason"], 0) + each["count"]
-        told = ", ".join(f"{count} {reason}" for reason, count in sorted(reasons.items()))
-        lines.append(f"{refused} pairs of keyframes make no link ({told})")
+    reasons = Counter[str]()
+    for each in section["refused"]:
+        reasons[each["reason"]] += each["count"]
+    if reasons:
+        counts = ", ".join(f"{count} {reason}" for reason, count in sorted(reasons.items()))
+        lines.append(f"{reasons.total()} pairs of keyframes were not linked ({counts})")
     return "".join(f"{line}\n" for line in lines)
 
 
-def merged_rows(section: Mapping[str, Any] | None) -> list[str]:
-    """Return the lines of ``report.md`` about a merged map; none where there was no merge."""
-    if section is None:
-        return []
+def merged_table(section: Mapping[str, Any]) -> list[str]:
+    """Return the table of ``report.md`` about a merged map."""
+    rejected: dict[str, list[str]] = defaultdict(list)
+    for each in section["refused"]:
+        one, other = each["robots"]
+        pair = f"within {one}" if one == other else f"between {one} and {other}"
+        rejected[pair].append(f"{each['count']} {each['reason']}")
+    errors = [
+        (what, "-" if section[name] is None else f"{section[name]:.2f}")
+        for what, name in (
+            ("ATE cm", "ate_cm"),
+            ("ATE cm before the merge, each robot aligned to the truth by itself", "ate_before_cm"),
+            ("ATE cm of the maps moved rigidly, not optimised", "ate_stiff_cm"),
+        )
+    ]
+    counts = [str(section[name]) for name in ("keyframes", "links_between_robots", "loops")]
     rows = [
         ("joined", ", ".join(section["joined"])),
         ("not joined", "; ".join(f"{e['robot']}: {e['reason']}" for e in section["not_joined"]) or "-"),
-        ("keyframes / links between robots / loops",
-         f"{section['keyframes']} / {section['links_between_robots']} / {section['loops']}"),
-        ("ATE cm", _two(section["ate_cm"])),
-        ("ATE cm before, every robot aligned to the truth by itself", _two(section["ate_before_cm"])),
-        ("ATE cm of the maps laid beside each other, not bent", _two(section["ate_stiff_cm"])),
-        *((f"origin of {e['robot']} off", f"{e['cm']:.1f} cm, {e['deg']:.2f} deg")
-          for e in section["origins"]),
-        *(("refused " + between, reasons) for between, reasons in _refused_by_pair(section).items()),
+        ("keyframes / links between robots / loops", " / ".join(counts)),
+        *errors,
+        *((f"error of the origin of {each['robot']}", f"{each['cm']:.1f} cm, {each['deg']:.2f} deg")
+          for each in section["origins"]),
+        *((f"not linked {pair}", ", ".join(reasons)) for pair, reasons in rejected.items()),
     ]  # fmt: skip
-    return ["| merged map | |", "|---|---|", *(f"| {what} | {value} |" for what, value in rows), ""]
-
-
-def _refused_by_pair(section: Mapping[str, Any]) -> dict[str, str]:
-    pairs: dict[str, list[str]] = {}
-    for each in section["refused"]:
-        one, other = each["robots"]
-        between = f"within {one}" if one == other else f"between {one} and {other}"
-        pairs.setdefault(between, []).append(f"{each['count']} {each['reason']}")
-    return {between: ", ".join(told) for between, told in pairs.items()}
-
-
-def _two(value: float | None) -> str:
-    return "-" if value is None else f"{value:.2f}"
+    return table(["merged map", ""], rows)
 
 
 def _errors(robots: Sequence[JoinedRobot]) -> dict[str, Any]:
@@ -190,7 +186,7 @@ def _errors(robots: Sequence[JoinedRobot]) -> dict[str, Any]:
         np.concatenate([truth[:, :3, 3] for _, _, truth in known]),
     )
     stiff = _residuals(
-        np.concatenate([(_laid(own, merged) @ own)[:, :3, 3] for own, merged, _ in known]),
+        np.concatenate([(_rigid_motion(own, merged) @ own)[:, :3, 3] for own, merged, _ in known]),
         np.concatenate([truth[:, :3, 3] for _, _, truth in known]),
     )
     before = np.concatenate([_residuals(own[:, :3, 3], truth[:, :3, 3]) for own, _, truth in known])
@@ -212,18 +208,18 @@ def _matched(robot: JoinedRobot) -> tuple[Array, Array, Array] | None:
     if robot.truth is None:
         return None
     try:
-        mine, theirs = associate(robot.merged, robot.truth, 0.02)
+        rows, truth_rows = associate(robot.merged, robot.truth, 0.02)
     except UsageError:
         return None
     return (
-        robot.own.T_world_camera[mine],
-        robot.merged.T_world_camera[mine],
-        robot.truth.T_world_camera[theirs],
+        robot.own.T_world_camera[rows],
+        robot.merged.T_world_camera[rows],
+        robot.truth.T_world_camera[truth_rows],
     )
 
 
-def _laid(own: Array, merged: Array) -> Array:
-    """Return the rigid motion that brings whole poses ``(n, 4, 4)`` closest: mean rotation, then shift."""
+def _rigid_motion(own: Array, merged: Array) -> Array:
+    """Return the rigid motion that brings poses ``(n, 4, 4)`` closest: mean rotation, then translation."""
     U, _, Vt = np.linalg.svd((merged[:, :3, :3] @ np.swapaxes(own[:, :3, :3], 1, 2)).sum(axis=0))
     T = np.eye(4)
     T[:3, :3] = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt

@@ -1,47 +1,47 @@
-"""Silence around a fault: for how long the robots of the server that was hit went without an answer.
+"""Outages of robots around a fault: for how long the robots of the affected server had no answer.
 
-From the records alone.  Promises to judge only robots whose last answer before the fault came from that
-server, and to count a robot that never heard again until the run's end, not to leave it out.
+Computed from the records alone.  Only robots whose last answer before the fault came from the affected
+server count; a robot that got no further answer until the end of the run counts as well.
 """
 
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Sequence
 from itertools import pairwise
 from typing import Any
 
-from rse_pf.experiments.results.report import CommandRecord, percentiles
+from rse_pf.experiments.results.records import CommandRecord
+from rse_pf.experiments.results.summary import percentiles
 
-__all__ = ["gap_figures", "longest_silences", "robots_on"]
+__all__ = ["longest_outages", "outage_figures", "robots_on"]
 
 
-def robots_on(commands: Iterable[CommandRecord], server: str, at_s: float) -> set[str]:
+def robots_on(commands: Sequence[CommandRecord], server: str, at_s: float) -> set[str]:
     """Return the robots whose last answer before *at_s* came from *server*."""
     last: dict[str, tuple[float, str]] = {}
-    for command in _answered(commands):
-        assert command.answered is not None
-        if command.answered <= at_s:
+    for command in commands:
+        if command.code == "ok" and command.answered is not None and command.answered <= at_s:
             last[command.robot] = max(last.get(command.robot, (-1.0, "")), (command.answered, command.server))
     return {robot for robot, (_, name) in last.items() if name == server}
 
 
-def longest_silences(
+def longest_outages(
     commands: Sequence[CommandRecord],
     robots: Collection[str],
     *,
     start_s: float,
     end_s: float,
 ) -> dict[str, float]:
-    """Return each robot's longest time between two answers that touches ``[start_s, end_s]``, in seconds.
+    """Return the longest time between two answers of each robot that overlaps ``[start_s, end_s]``.
 
-    A robot that asked on, but heard nothing more, was silent until the last time it asked; one that
-    left in peace was not.
+    In seconds.  For a robot that sent commands after its last answer, the outage ends with its last
+    command; for a robot that stopped sending there is none.
 
     Args:
         commands: All commands of the run.
-        robots: Whom to judge.
-        start_s: The fault, seconds since the run began.
+        robots: The robots to look at.
+        start_s: Time of the fault, seconds since the start of the run.
         end_s: When its consequences must be over.
     """
     times: dict[str, list[float]] = defaultdict(list)
@@ -51,14 +51,14 @@ def longest_silences(
             planned[command.robot] = max(planned[command.robot], command.planned)
             if command.code == "ok" and command.answered is not None:
                 times[command.robot].append(command.answered)
-    silences = {}
+    outages = {}
     for robot in robots:
         moments = sorted(times[robot])
         if moments and planned[robot] > moments[-1]:
             moments.append(planned[robot])
         if not moments:
             moments = [start_s, max(planned[robot], start_s)]
-        silences[robot] = max(
+        outages[robot] = max(
             (
                 later - earlier
                 for earlier, later in pairwise(moments)
@@ -66,17 +66,13 @@ def longest_silences(
             ),
             default=0.0,
         )
-    return silences
+    return outages
 
 
-def gap_figures(
+def outage_figures(
     commands: Sequence[CommandRecord], robots: Collection[str], *, start_s: float, end_s: float
 ) -> dict[str, Any]:
-    """Return how many robots were hit, and p50, p99 and the largest of their silences in seconds."""
-    silences = longest_silences(commands, robots, start_s=start_s, end_s=end_s)
-    figures = percentiles(list(silences.values()))
-    return {"robots": len(silences), "p50": figures["p50"], "p99": figures["p99"], "max": figures["max"]}
-
-
-def _answered(commands: Iterable[CommandRecord]) -> Iterable[CommandRecord]:
-    return (command for command in commands if command.code == "ok" and command.answered is not None)
+    """Return how many robots were affected, and p50, p99 and maximum of their outages in seconds."""
+    outages = longest_outages(commands, robots, start_s=start_s, end_s=end_s)
+    figures = percentiles(list(outages.values()))
+    return {"robots": len(outages), "p50": figures["p50"], "p99": figures["p99"], "max": figures["max"]}

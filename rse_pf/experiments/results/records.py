@@ -1,200 +1,220 @@
-"""Raw records of an experiment: events and the monitor's readings, written as they come, read back to judge.
+"""The raw records of a run: commands, events and samples of the monitor, written as they come and read back.
 
-``samples.csv`` has a row for each server of each reading, ``events.jsonl`` a line for each event; the first
-event, ``experiment``, says what was asked.  Promises that what is read back equals what was written, and
-that nothing here is computed: sums and percentiles belong to whoever judges.
+``commands.csv`` has one line per command, ``events.jsonl`` one line per event, and ``samples.csv`` one line
+per server of each sample.  The first event, ``experiment``, holds the parameters of the run.  What is read
+back equals what was written; nothing here is computed.
 """
 
 from __future__ import annotations
 
 import csv
+import gzip
 import json
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, fields, replace
 from itertools import groupby
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any, TextIO, TypeVar
+
+import msgspec
 
 from rse_pf.errors import UsageError
-from rse_pf.experiments.results.report import CommandRecord, read_commands, summarise
+from rse_pf.local.control.monitor import MonitorSample, ServerSample, monitor_sample
 
 __all__ = [
     "COMMANDS",
     "EVENTS",
     "SAMPLES",
-    "RecordedSample",
+    "CommandRecord",
+    "Event",
+    "EventLog",
     "Records",
     "SampleLog",
-    "ServerSample",
-    "asked_of",
+    "parameters_of",
+    "read_commands",
     "read_records",
     "read_samples",
-    "reading_of",
-    "summary_of",
+    "run_sample",
+    "sample_from_document",
+    "write_commands",
 ]
 
 COMMANDS, EVENTS, SAMPLES = "commands.csv", "events.jsonl", "samples.csv"
-_WRONG = (OSError, ValueError, KeyError, TypeError, AttributeError)
+_MALFORMED = (OSError, ValueError, KeyError, TypeError, AttributeError)
+_HINT = "name the folder of a run"
 
 Event = Mapping[str, Any]
+T = TypeVar("T")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class ServerSample:
-    """One server in one reading.  ``cpu_percent`` is relative to its size; None when it did not answer."""
+class CommandRecord:
+    """One command, by the clock of its robot (seconds since the start of the run).
 
+    ``code`` is ``ok`` for a result, the code of a failure, or empty when no final answer came.
+    ``source`` is ``cloud`` or ``robot``.
+    """
+
+    id: int
+    robot: str
+    planned: float
+    sent: float
+    answered: float | None
     server: str
-    pid: int
-    state: str
-    robots: int = 0
-    cpu_percent: float | None = None
-    requests: int = 0
-    queue: int = 0
-    queue_ms: float = 0.0
-    in_flight: int = 0
-    bytes_in: int = 0
-    bytes_out: int = 0
-    warming: bool = False
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RecordedSample:
-    """All servers at one time, seconds since the run began."""
-
-    time: float
-    healthy_servers: int
-    servers: tuple[ServerSample, ...] = ()
-
-    @property
-    def cpu_percent(self) -> float | None:
-        """Return the mean over servers past their warm-up that answered; None if there is none."""
-        known = [
-            each.cpu_percent for each in self.servers if each.cpu_percent is not None and not each.warming
-        ]
-        return sum(known) / len(known) if known else None
+    code: str
+    source: str = "cloud"
+    payload_bytes: int = 0
+    round_trip_ms: float | None = None
+    up_ms: float | None = None
+    queue_ms: float | None = None
+    compute_ms: float | None = None
+    down_ms: float | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Records:
-    """Everything a run left behind, in time's order."""
+    """All records of a run, in the order of time."""
 
     commands: Sequence[CommandRecord]
     events: Sequence[Event]
-    readings: Sequence[RecordedSample]
+    samples: Sequence[MonitorSample]
     folder: Path = Path()
 
 
-_NAMES = [field.name for field in fields(ServerSample)]
+_COMMAND_COLUMNS = [field.name for field in fields(CommandRecord)]
+_SERVER_COLUMNS = ["server", *(field.name for field in fields(ServerSample) if field.name != "name")]
+
+
+class EventLog:
+    """Events as JSON lines, each flushed at once, so that the events of a killed run are kept."""
+
+    def __init__(self, file: TextIO) -> None:
+        self._file = file
+
+    def write(self, time_s: float, action: str, **details: Any) -> None:
+        """Append one event, *time_s* seconds after the start of the run."""
+        self._file.write(json.dumps({"time": round(time_s, 4), "action": action, **details}) + "\n")
+        self._file.flush()
 
 
 class SampleLog:
-    """The monitor's readings as CSV lines, written as they come."""
+    """Samples of the monitor as CSV lines, each flushed at once."""
 
     def __init__(self, file: TextIO) -> None:
         self._file = file
         self._writer = csv.writer(file)
-        self._writer.writerow(["time", "healthy_servers", *_NAMES])
+        self._writer.writerow(["time", "healthy_servers", *_SERVER_COLUMNS])
 
-    def write(self, reading: RecordedSample) -> None:
-        """Append one reading; one without servers is one row without a name."""
-        head = [reading.time, reading.healthy_servers]
-        for each in reading.servers:
-            values = [getattr(each, name) for name in _NAMES]
-            self._writer.writerow([*head, *(_spelt(value) for value in values)])
-        if not reading.servers:
-            self._writer.writerow([*head, *("" for _ in _NAMES)])
+    def write(self, sample: MonitorSample) -> None:
+        """Append one sample; a sample without servers is one row whose server columns are empty."""
+        head = [sample.time, sample.healthy_servers]
+        for name, *values in (asdict(server).values() for server in sample.servers):
+            self._writer.writerow([*head, name, *(_csv_value(value) for value in values)])
+        if not sample.servers:
+            self._writer.writerow([*head, *("" for _ in _SERVER_COLUMNS)])
         self._file.flush()
 
 
-def reading_of(told: Mapping[str, Any], origin_s: float) -> RecordedSample:
-    """Return a monitor's reading, whose time is monotonic, as seconds since *origin_s*."""
-    servers = tuple(
-        ServerSample(
-            server=str(each["name"]),
-            **{name: each[name] for name in _NAMES if name != "server" and each.get(name) is not None},
-        )
-        for each in told["servers"]
-    )
-    healthy = int(told["healthy_servers"])
-    return RecordedSample(time=round(told["time"] - origin_s, 4), healthy_servers=healthy, servers=servers)
+def run_sample(time_s: float, healthy_servers: int, servers: Sequence[ServerSample] = ()) -> MonitorSample:
+    """Return a sample of *servers* at *time_s*, seconds since the start of the run."""
+    return replace(monitor_sample(time_s, servers, frozenset()), healthy_servers=healthy_servers)
 
 
-def read_records(folder: Path) -> Records:
+def sample_from_document(document: Mapping[str, Any], origin_s: float) -> MonitorSample:
+    """Return a sample of the monitor, whose time is monotonic, with its time counted from *origin_s*."""
+    servers = msgspec.convert(document["servers"], tuple[ServerSample, ...])
+    return run_sample(round(document["time"] - origin_s, 4), int(document["healthy_servers"]), servers)
+
+
+def write_commands(path: Path, commands: Iterable[CommandRecord]) -> None:
+    """Write ``commands.csv``."""
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(_COMMAND_COLUMNS)
+        for command in commands:
+            writer.writerow([_csv_value(value) for value in asdict(command).values()])
+
+
+def read_records(folder: Path, *, without_commands: bool = False) -> Records:
     """Return the records of the run in *folder*.
 
+    Args:
+        folder: The folder of one run.
+        without_commands: Whether ``commands.csv`` is not kept there; the records then hold no commands.
+
     Raises:
-        UsageError: A file is missing, or is not what `SampleLog` and `EventLog` write.
+        UsageError: A file is missing or malformed.
     """
     return Records(
-        commands=read_commands(folder / COMMANDS),
+        commands=[] if without_commands else read_commands(folder / COMMANDS),
         events=_read_events(folder / EVENTS),
-        readings=read_samples(folder / SAMPLES),
+        samples=read_samples(folder / SAMPLES),
         folder=folder,
     )
 
 
-def asked_of(records: Records) -> dict[str, Any]:
-    """Return what the run's first event says was asked of it; raises UsageError if there is none."""
+def parameters_of(records: Records) -> dict[str, Any]:
+    """Return the parameters of the run, which its first event holds; raises UsageError without one."""
     for event in records.events:
         if event["action"] == "experiment":
             return {name: value for name, value in event.items() if name not in ("time", "action")}
-    raise UsageError("the events do not say which experiment this was", hint=f"look into {EVENTS}")
+    raise UsageError(
+        "the events do not say which experiment this was", hint=f"check the first line of {EVENTS}"
+    )
 
 
-def summary_of(records: Records) -> dict[str, Any]:
-    """Return `summarise` of the commands, with what the robots' processes saw besides: second answers.
+def read_commands(path: Path) -> list[CommandRecord]:
+    """Return what `write_commands` wrote; raises UsageError."""
+    return _read(path, lambda rows: map(_command, rows))
 
-    A second answer has no row of its own; the generator's event counts what reached a caller twice, and the
-    poses that were far from the truth.
-    """
-    summary = summarise(records.commands)
-    told = [event for event in records.events if event["action"] == "generator"]
-    twice = sum(int(event.get("twice", 0)) for event in told)
-    summary["commands"]["twice"] = max(summary["commands"]["twice"], twice)
-    summary["wrong_poses"] = sum(int(event.get("wrong_poses", 0)) for event in told)
-    return summary
+
+def read_samples(path: Path) -> list[MonitorSample]:
+    """Return what `SampleLog` wrote; raises UsageError."""
+    return _read(path, _samples)
 
 
 def _read_events(path: Path) -> list[Event]:
     try:
         events = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines() if line]
-        for event in events:
-            float(event["time"])
-            str(event["action"])
-    except _WRONG as error:
-        raise UsageError(f"cannot read {path}: {error}", hint="name the folder of a run") from error
-    return sorted(events, key=lambda event: float(event["time"]))
+        return sorted(
+            ({**event, "action": str(event["action"])} for event in events),
+            key=lambda event: float(event["time"]),
+        )
+    except _MALFORMED as error:
+        raise UsageError(f"cannot read {path}: {error}", hint=_HINT) from error
 
 
-def read_samples(path: Path) -> list[RecordedSample]:
-    """Return what `SampleLog` wrote; raises UsageError."""
+def _read(path: Path, parse: Callable[[Iterable[Mapping[str, str]]], Iterable[T]]) -> list[T]:
+    """Return what *parse* makes of the rows of a CSV file, or of its compressed copy ``.gz`` beside it."""
+    compressed = path.with_name(f"{path.name}.gz")
     try:
-        with path.open(newline="", encoding="utf-8") as file:
-            return list(_readings(csv.DictReader(file)))
-    except _WRONG as error:
-        raise UsageError(f"cannot read {path}: {error}", hint="name the folder of a run") from error
+        with (
+            gzip.open(compressed, "rt", newline="", encoding="utf-8")
+            if compressed.exists() and not path.exists()
+            else path.open(newline="", encoding="utf-8")
+        ) as file:
+            return list(parse(csv.DictReader(file)))
+    except _MALFORMED as error:
+        raise UsageError(f"cannot read {path}: {error}", hint=_HINT) from error
 
 
-def _readings(rows: Iterator[Mapping[str, str]] | csv.DictReader[str]) -> Iterator[RecordedSample]:
+def _samples(rows: Iterable[Mapping[str, str]]) -> Iterator[MonitorSample]:
     for (time_s, healthy), group in groupby(rows, key=lambda row: (row["time"], row["healthy_servers"])):
-        servers = tuple(_server(row) for row in group if row["server"])
-        yield RecordedSample(time=float(time_s), healthy_servers=int(healthy), servers=servers)
+        yield run_sample(float(time_s), int(healthy), [_server(row) for row in group if row["server"]])
 
 
 def _server(row: Mapping[str, str]) -> ServerSample:
-    counts = ("pid", "robots", "requests", "queue", "in_flight", "bytes_in", "bytes_out")
-    whole = {name: int(float(row[name])) for name in counts}
-    return ServerSample(
-        server=row["server"],
-        state=row["state"],
-        cpu_percent=float(row["cpu_percent"]) if row["cpu_percent"] else None,
-        queue_ms=float(row["queue_ms"]),
-        warming=row["warming"] == "1",
-        **whole,
-    )
+    known = {name: row[name] or None for name in _SERVER_COLUMNS if name != "server"}
+    return msgspec.convert({"name": row["server"], **known}, ServerSample, strict=False)
 
 
-def _spelt(value: Any) -> Any:
+def _command(row: Mapping[str, str]) -> CommandRecord:
+    text = ("server", "code")
+    known = {name: row[name] if name in text else row[name] or None for name in _COMMAND_COLUMNS}
+    return msgspec.convert(known, CommandRecord, strict=False)
+
+
+def _csv_value(value: Any) -> Any:
     if value is None:
         return ""
     return int(value) if isinstance(value, bool) else value

@@ -1,11 +1,11 @@
-"""How far an estimated trajectory is from the true one: ATE and RPE as the field defines them.
+"""Errors of an estimated trajectory against the true one: ATE and RPE as the TUM benchmark defines them.
 
-Promises to give the figures of the TUM benchmark's definitions, to change neither trajectory,
-and to read no files.
+Pure functions: they change neither trajectory and read no files.
 """
 
 from __future__ import annotations
 
+import contextlib
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,10 +21,8 @@ __all__ = [
     "absolute_error",
     "align",
     "associate",
-    "ate_cm",
     "relative_error",
-    "rpe_cm",
-    "rpe_deg",
+    "trajectory_figures",
 ]
 
 MAX_STAMP_DIFFERENCE_S = 0.02
@@ -64,8 +62,8 @@ def absolute_error(
     """Return the absolute trajectory error after a rigid alignment of the estimate.
 
     Args:
-        estimate: Poses to judge.
-        truth: Poses to judge by, in any frame.
+        estimate: Poses to evaluate.
+        truth: True poses, in any frame.
         with_scale: Also estimate a scale (Sim(3)), as for one camera without depth.
         max_difference_s: Largest difference of the time stamps of a pair.
 
@@ -75,8 +73,8 @@ def absolute_error(
     Source:
         Sturm et al., IROS 2012, eq. 3; alignment after Umeyama, PAMI 1991.
     """
-    mine, theirs = associate(estimate, truth, max_difference_s)
-    positions, wanted = estimate.positions[mine], truth.positions[theirs]
+    rows, truth_rows = associate(estimate, truth, max_difference_s)
+    positions, wanted = estimate.positions[rows], truth.positions[truth_rows]
     scale, T_truth_estimate = align(positions, wanted, with_scale=with_scale)
     moved = scale * positions @ T_truth_estimate[:3, :3].T + T_truth_estimate[:3, 3]
     distances = np.linalg.norm(moved - wanted, axis=1)
@@ -84,7 +82,7 @@ def absolute_error(
         rmse_m=_rms(distances),
         median_m=float(np.median(distances)),
         max_m=float(distances.max()),
-        matched=len(mine),
+        matched=len(rows),
         scale=scale,
         T_truth_estimate=T_truth_estimate,
     )
@@ -101,11 +99,11 @@ def relative_error(
     Source:
         Sturm et al., IROS 2012, eqs. 1 and 2, with a step of one frame.
     """
-    mine, theirs = associate(estimate, truth, max_difference_s)
-    mine_poses, true_poses = estimate.T_world_camera[mine], truth.T_world_camera[theirs]
+    rows, truth_rows = associate(estimate, truth, max_difference_s)
+    poses, true_poses = estimate.T_world_camera[rows], truth.T_world_camera[truth_rows]
     distances, angles = [], []
-    for row in range(len(mine) - 1):
-        moved = inverse(mine_poses[row]) @ mine_poses[row + 1]
+    for row in range(len(rows) - 1):
+        moved = inverse(poses[row]) @ poses[row + 1]
         truly = inverse(true_poses[row]) @ true_poses[row + 1]
         error = inverse(truly) @ moved
         distances.append(np.linalg.norm(error[:3, 3]))
@@ -119,19 +117,24 @@ def relative_error(
     )
 
 
-def ate_cm(estimate: Trajectory, truth: Trajectory) -> float:
-    """Return the rmse of the absolute trajectory error after rigid alignment, in cm."""
-    return 100.0 * absolute_error(estimate, truth).rmse_m
+def trajectory_figures(estimate: Trajectory, truth: Trajectory | None) -> dict[str, float | None]:
+    """Return ``path_m``, ``ate_cm``, ``rpe_cm`` and ``rpe_deg``, rounded for a report.
 
-
-def rpe_cm(estimate: Trajectory, truth: Trajectory) -> float:
-    """Return the rmse of the translation error of consecutive poses, in cm."""
-    return 100.0 * relative_error(estimate, truth).rmse_m
-
-
-def rpe_deg(estimate: Trajectory, truth: Trajectory) -> float:
-    """Return the rmse of the rotation error of consecutive poses, in degrees."""
-    return relative_error(estimate, truth).rmse_deg
+    The errors are None without a truth, or where fewer than three poses match it in time.
+    """
+    figures: dict[str, float | None] = {
+        "path_m": round(estimate.length_m, 3),
+        "ate_cm": None,
+        "rpe_cm": None,
+        "rpe_deg": None,
+    }
+    if truth is not None:
+        with contextlib.suppress(UsageError):
+            relative = relative_error(estimate, truth)
+            figures["ate_cm"] = round(100 * absolute_error(estimate, truth).rmse_m, 4)
+            figures["rpe_cm"] = round(100 * relative.rmse_m, 4)
+            figures["rpe_deg"] = round(relative.rmse_deg, 4)
+    return figures
 
 
 def associate(

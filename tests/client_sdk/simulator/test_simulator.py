@@ -15,7 +15,7 @@ from client_sdk.simulator import SIMULATED_CAMERA, render_frames, true_trajector
 from client_sdk.simulator.camera import Painter, add_depth_noise
 from client_sdk.simulator.world import DEPTH_M, HEIGHT_M, ROOM_M, make_world
 from rse_pf.errors import UsageError
-from rse_pf.experiments.results.trajectory_error import ate_cm
+from rse_pf.experiments.results.trajectory_error import absolute_error
 from rse_pf.geometry import pose_difference, transform
 from rse_pf.pnp import PnpOptions, solve_pnp
 
@@ -140,4 +140,7 @@ def test_the_world_can_be_tracked(robot: int, robots: int, seed: int):
         poses.append(step.T_world_camera)
 
     assert tracker.lost_frames == 0
-    assert ate_cm(Trajectory(truth.timestamps_s, np.array(poses)), truth) <= 2.0 * truth.length_m
+    assert (
+        100 * absolute_error(Trajectory(truth.timestamps_s, np.array(poses)), truth).rmse_m
+        <= 2.0 * truth.length_m
+    )

@@ -1,4 +1,4 @@
-"""The end of a demo: the robots' files become one map, and what was not joined stays out of it."""
+"""The end of a demo: the maps of the robots become one map, without those that could not be joined."""
 
 from __future__ import annotations
 
@@ -9,13 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from client_sdk.frontend import Frame, FrontEndOptions, TrackedFrame
 from client_sdk.mapping import Trajectory, read_ply, read_trajectory
-from rse_pf.config import ServiceSettings
 from rse_pf.errors import CommandFailed
-from rse_pf.experiments.demo.keyframes import MAP_FILE, KeyframeKeeper
-from rse_pf.experiments.demo.merge import MERGED_MAP, write_merged
-from rse_pf.geometry import Camera
+from rse_pf.experiments.demo.merge import MAP_FILE, MERGED_MAP, print_tenths, write_merged
 from rse_pf.maps.format import MapVersion, decode_map, encode_map
 from rse_pf.services.mapping.merge import MergeReply, MergeRequest, merge_maps
 from rse_pf.services.synthetic_maps import make_world
@@ -24,7 +20,6 @@ for package in ("faiss", "gtsam", "PIL", "cv2"):
     pytest.importorskip(package, reason="the extras maps, local and vision are needed")
 
 WORLD = make_world(1)
-CAMERA = Camera(fx=200.0, fy=200.0, cx=159.5, cy=119.5, width=320, height=240)
 
 
 def demo_folder(folder: Path, maps: list[MapVersion]) -> list[Trajectory]:
@@ -50,7 +45,7 @@ def demo_folder(folder: Path, maps: list[MapVersion]) -> list[Trajectory]:
 
 
 def merge_here(maps: Sequence[bytes]) -> tuple[MergeReply, dict[str, Any]]:
-    return merge_maps(MergeRequest(maps=list(maps)), ServiceSettings()), {"merged_by": "this test"}
+    return merge_maps(MergeRequest(maps=list(maps))), {"merged_by": "this test"}
 
 
 def merge(folder: Path, paths: list[Trajectory], truths: list[Trajectory | None]) -> dict[str, Any]:
@@ -87,50 +82,21 @@ def test_a_robot_without_keyframes_is_named(tmp_path: Path) -> None:
     a, _ = WORLD.walk("robot-1", np.linspace(0.0, 0.2, 4), seed=1)
     paths = demo_folder(tmp_path, [a, MapVersion(keyframes=())])
 
-    with pytest.raises(CommandFailed, match="robot-2 made no keyframe"):
+    with pytest.raises(CommandFailed, match="robot-2 has no keyframe"):
         merge(tmp_path, paths, [None, None])
 
 
-def tracked(*, keyframe: bool, seed: int = 0) -> TrackedFrame:
-    rgb = np.kron(np.random.default_rng(seed).integers(0, 256, (24, 32, 3)), np.ones((10, 10, 1))).astype(
-        np.uint8
-    )
-    frame = Frame(timestamp_s=1.5, rgb=rgb, depth_m=np.full((240, 320), 2.0, np.float32), camera=CAMERA)
-    return TrackedFrame(frame=frame, T_world_camera=np.eye(4), keyframe=keyframe, inliers=9, matches=9)
+def test_progress_is_a_line_for_each_tenth_and_never_goes_back():
+    printed: list[str] = []
+    report = print_tenths(printed.append)
 
+    report(0.0, "waits for its turn")
+    report(0.0, "starts")
+    for step in range(100):
+        report(0.1 + 0.007 * step, f"pair {step}")
+    report(0.2, "pair 14 again, elsewhere")
+    report(1.0, "merged")
 
-class Listener:
-    """Stands in for the data service."""
-
-    def __init__(self) -> None:
-        self.handed: list[bytes] = []
-        self.maps: dict[str, bytes] = {}
-
-    def keyframe(self, data: bytes) -> None:
-        self.handed.append(data)
-
-    def finish(self, robot: str, data: bytes) -> int:
-        self.maps[robot] = data
-        return len(self.handed)
-
-
-def test_a_robot_keeps_its_keyframes_and_hands_each_over_once() -> None:
-    others = Listener()
-    keeper = KeyframeKeeper("robot-1", FrontEndOptions(), others)
-
-    for step in (tracked(keyframe=True), tracked(keyframe=False, seed=1), tracked(keyframe=True, seed=2)):
-        keeper.see(step)
-
-    assert len(keeper) == len(others.handed) == 2
-    version = decode_map(keeper.encoded_map(np.zeros((1, 3), np.float32), np.zeros((1, 3), np.uint8)))
-    assert [each.id for each in version.keyframes] == [0, 1]
-    assert version.provenance["robot"] == "robot-1"
-    (sent,) = decode_map(others.handed[1]).keyframes
-    assert len(sent.pixels) > 50
-    np.testing.assert_array_equal(sent.descriptors, version.keyframes[1].descriptors)
-    np.testing.assert_allclose(sent.points_camera[:, 2], 2.0, atol=1e-4)
-
-    whole = encode_map(version)
-    keeper.share(whole)
-    assert others.maps == {"robot-1": whole}
-    assert keeper.uploaded == 2
+    assert printed[0] == "merging the maps: 0 %, waits for its turn"
+    assert [int(line.split()[3]) for line in printed] == [0, 10, 20, 30, 40, 50, 60, 70, 100]
+    assert printed[-1] == "merging the maps: 100 %, merged"

@@ -1,4 +1,4 @@
-"""A demo robot's pipe: tokens and the start are told apart, from any thread, and a gone parent is noticed."""
+"""The pipe of a demo robot: tokens and start time on any thread, and the end of the parent."""
 
 from __future__ import annotations
 
@@ -12,19 +12,20 @@ from multiprocessing.connection import Connection
 import pytest
 
 from rse_pf.errors import Disconnected
-from rse_pf.experiments.demo.parent_pipe import ParentPipe, TokenWanted
+from rse_pf.experiments.child_process import IssuedToken, TokenRequest
+from rse_pf.experiments.demo.parent_pipe import ParentPipe
 
 
 def pair(clock: list[float]) -> tuple[ParentPipe, Connection]:
     mine, theirs = multiprocessing.Pipe()
-    robot = ParentPipe(mine, clock=lambda: clock[0])
+    robot = ParentPipe(mine, "robot-1", clock=lambda: clock[0])
     robot.listen()
     return robot, theirs
 
 
 @contextlib.contextmanager
 def workers(parent: Connection) -> Iterator[ThreadPoolExecutor]:
-    """Give threads, and hang up at the end so that none waits for ever."""
+    """Give threads, and close the pipe at the end so that none waits for ever."""
     with ThreadPoolExecutor() as pool:
         try:
             yield pool
@@ -35,8 +36,8 @@ def workers(parent: Connection) -> Iterator[ThreadPoolExecutor]:
 def answer(parent: Connection, count: int) -> None:
     """Answer *count* questions with token-1, token-2, ..."""
     for number in range(1, count + 1):
-        assert isinstance(parent.recv(), TokenWanted)
-        parent.send(f"token-{number}")
+        assert parent.recv() == TokenRequest("robot-1")
+        parent.send(IssuedToken("robot-1", f"token-{number}"))
 
 
 def test_a_token_that_comes_before_the_start_is_not_taken_for_it() -> None:

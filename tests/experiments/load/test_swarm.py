@@ -1,4 +1,4 @@
-"""The swarm's plan, its payloads and its books; `tests/system/test_swarm.py` plays it."""
+"""Send times, payloads and records of the load generator; `tests/system/test_swarm.py` runs it."""
 
 from __future__ import annotations
 
@@ -11,10 +11,9 @@ import pytest
 from rse_pf.config import SessionSettings
 from rse_pf.errors import UsageError
 from rse_pf.experiments.load.run import SwarmRun, report_of
-from rse_pf.experiments.load.swarm import SwarmOptions, SwarmResult
-from rse_pf.experiments.load.swarm import _records as records_of
-from rse_pf.experiments.load.swarm_process import Rows, SwarmSpec, is_right, make_payloads, planned_s
-from rse_pf.experiments.results.report import CommandRecord
+from rse_pf.experiments.load.swarm import SwarmOptions, SwarmResult, records_of
+from rse_pf.experiments.load.swarm_process import ResultRows, SwarmSpec, is_right, make_payloads, planned_s
+from rse_pf.experiments.results.records import CommandRecord
 from rse_pf.geometry import exp_se3
 from rse_pf.pnp import solve_pnp
 from rse_pf.services.pnp import PnpReply, PnpRequest
@@ -92,8 +91,8 @@ def test_equal_seeds_make_equal_payloads() -> None:
     assert payloads(1) != payloads(100)
 
 
-def rows() -> Rows:
-    told = Rows()
+def rows() -> ResultRows:
+    told = ResultRows()
     nan = math.nan
     for row, server, code in (
         ((4, 1, 1.0, 1.01, 1.13, 3500, 1.5, 0.25, 2.0, 3.0), "server-1", "ok"),
@@ -117,8 +116,8 @@ def test_the_round_trip_counts_from_the_planned_time() -> None:
 
 def result(commands: list[CommandRecord]) -> SwarmResult:
     return SwarmResult(
-        commands=commands, cpu_s=2.0, wall_s=10.0, wrong_poses=0, reconnects=0, resent=0, moves=0, twice=0,
-        link=None, late_sends=0.5,
+        commands=commands, cpu_s=2.0, wall_s=10.0, wrong_poses=0, reconnects=0, resent=0, moves=0,
+        duplicates=0,        link=None, late_sends_ms_p99=0.5,
     )  # fmt: skip
 
 

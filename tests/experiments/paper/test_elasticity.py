@@ -1,19 +1,19 @@
-"""An elasticity run is judged by its records: counts, recovery, and the law of busy samples."""
+"""Figures of an elasticity run: counts, replacements, and the check of every scale-out."""
 
 from __future__ import annotations
 
 import pytest
 
 from rse_pf.errors import UsageError
-from rse_pf.experiments.paper.elasticity import Cost
+from rse_pf.experiments.paper.elasticity import CpuCost
 from rse_pf.experiments.paper.elasticity_report import (
     busy_periods_before,
     crashes,
-    judge_elasticity,
+    elasticity_figures,
     unjustified_scale_outs,
 )
-from rse_pf.experiments.results.records import RecordedSample, Records, ServerSample
-from rse_pf.experiments.results.report import CommandRecord
+from rse_pf.experiments.results.records import CommandRecord, Records, run_sample
+from rse_pf.local.control.monitor import ServerSample
 
 ASKED = {
     "time": 0.0, "action": "experiment", "kind": "elasticity", "min_servers": 2, "period_s": 2.0,
@@ -24,7 +24,7 @@ ASKED = {
 def reading(time_s, *cpu_percents, healthy=None, warming=()):
     servers = tuple(
         ServerSample(
-            server=f"server-{n + 1}",
+            name=f"server-{n + 1}",
             pid=100 + n,
             state="healthy",
             robots=10,
@@ -33,8 +33,8 @@ def reading(time_s, *cpu_percents, healthy=None, warming=()):
         )
         for n, cpu in enumerate(cpu_percents)
     )
-    return RecordedSample(
-        time=time_s, healthy_servers=len(servers) if healthy is None else healthy, servers=servers
+    return run_sample(
+        time_s=time_s, healthy_servers=len(servers) if healthy is None else healthy, servers=servers
     )
 
 
@@ -46,8 +46,8 @@ def grow(time_s, reason="CPU at 80 %"):
     return event(time_s, "grow", servers=1, reason=reason)
 
 
-def run(events=(), readings=(), commands=()):
-    return Records(commands=list(commands), events=[ASKED, *events], readings=list(readings))
+def run(events=(), samples=(), commands=()):
+    return Records(commands=list(commands), events=[ASKED, *events], samples=list(samples))
 
 
 BUSY = [reading(t / 2, 80.0, 80.0) for t in range(1, 20)]
@@ -55,13 +55,13 @@ BUSY = [reading(t / 2, 80.0, 80.0) for t in range(1, 20)]
 
 
 def test_counts_scale_events_but_not_the_filling_of_a_gap():
-    judged = judge_elasticity(
+    judged = elasticity_figures(
         run(
             events=[
                 grow(4.0), grow(5.0, "fewer than scaling.min_servers"), event(9.0, "shrink", servers=1),
                 event(9.1, "shrink", servers=1),
             ],
-            readings=[reading(1.0, 10, 10), reading(5.0, 10, 10, 10, 10), reading(9.9, 1, 1)],
+            samples=[reading(1.0, 10, 10), reading(5.0, 10, 10, 10, 10), reading(9.9, 1, 1)],
         )
     )  # fmt: skip
 
@@ -100,13 +100,13 @@ def test_two_crashes_need_two_replacements():
     ]
 
     assert [each["replaced_in_s"] for each in crashes(events)] == [2.0, None]
-    assert judge_elasticity(run(events=events))["replaced_in_s"] is None
+    assert elasticity_figures(run(events=events))["replaced_in_s"] is None
 
 
 def test_a_drained_server_did_not_crash():
     events = [event(1.0, "drain-start", server="server-1"), event(2.0, "server-gone", server="server-1")]
 
-    assert judge_elasticity(run(events=events))["crashes"] == 0
+    assert elasticity_figures(run(events=events))["crashes"] == 0
 
 
 def test_periods_are_those_of_the_monitors_clock():
@@ -120,19 +120,19 @@ def test_periods_are_those_of_the_monitors_clock():
 
 
 def test_a_scale_out_after_busy_periods_is_lawful():
-    assert unjustified_scale_outs(run(events=[grow(4.05)], readings=BUSY)) == []
+    assert unjustified_scale_outs(run(events=[grow(4.05)], samples=BUSY)) == []
 
 
 def test_a_scale_out_without_enough_busy_periods_is_told():
     calm = [reading(t / 2, 80.0 if t > 4 else 40.0) for t in range(1, 20)]
 
-    wrong = unjustified_scale_outs(run(events=[grow(4.05)], readings=calm))
+    wrong = unjustified_scale_outs(run(events=[grow(4.05)], samples=calm))
 
     assert wrong == ["at 4.05 s: 40.0 %, 80.0 % before it, 70 % is required"]
 
 
 def test_a_scale_out_without_readings_is_told():
-    assert "none" in unjustified_scale_outs(run(events=[grow(30.0)], readings=BUSY))[0]
+    assert "none" in unjustified_scale_outs(run(events=[grow(30.0)], samples=BUSY))[0]
 
 
 def test_phases_split_the_commands_by_plan():
@@ -142,7 +142,7 @@ def test_phases_split_the_commands_by_plan():
             code="ok", round_trip_ms=10.0,
         )  # fmt: skip
 
-    judged = judge_elasticity(
+    judged = elasticity_figures(
         run(
             events=[event(0.0, "phase", phase="joining"), event(5.0, "phase", phase="full")],
             commands=[command(1, 1.0), command(2, 4.9), command(3, 5.0)],
@@ -155,13 +155,13 @@ def test_phases_split_the_commands_by_plan():
 
 def test_a_run_that_does_not_say_what_was_asked_is_no_run():
     with pytest.raises(UsageError, match="which experiment"):
-        judge_elasticity(Records(commands=[], events=[], readings=[]))
+        elasticity_figures(Records(commands=[], events=[], samples=[]))
 
 
 def test_the_size_is_such_that_the_fleet_needs_five_servers_at_the_limit():
-    cost = Cost(command_s=0.002, idle_s_per_s=0.01, commands=400)
+    cost = CpuCost(command_s=0.002, idle_s_per_s=0.01, commands=400)
 
-    size = cost.size(commands_per_s=500.0, busy_percent=70.0)
+    size = cost.emulated_cores(commands_per_s=500.0, busy_percent=70.0)
 
     cpu_percent_of_five = 100.0 * (500.0 * 0.002 + 5 * 0.01) / (5 * size)
     assert cpu_percent_of_five == pytest.approx(70.0, abs=0.05)

@@ -1,12 +1,11 @@
-"""A round trip is taken apart by the robots' own clocks and set beside the paper's."""
+"""Figures of a latency run: the parts of the round trip beside those of the paper."""
 
 from __future__ import annotations
 
 import pytest
 
-from rse_pf.experiments.paper.latency_report import judge_latency
-from rse_pf.experiments.results.records import Records
-from rse_pf.experiments.results.report import CommandRecord
+from rse_pf.experiments.paper.latency_report import latency_figures
+from rse_pf.experiments.results.records import CommandRecord, Records
 
 ASKED = {"time": 0.0, "action": "experiment", "kind": "latency", "link_round_trip_ms": 130.0}
 
@@ -21,7 +20,7 @@ def command(number, robot="robot-1", **more):
 
 
 def judge(commands):
-    return judge_latency(Records(commands=commands, events=[ASKED], readings=[]))
+    return latency_figures(Records(commands=commands, events=[ASKED], samples=[]))
 
 
 def test_the_parts_and_the_rest_make_the_round_trip():

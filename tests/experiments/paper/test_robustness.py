@@ -1,12 +1,12 @@
-"""A fault is judged by its records: who was hit, for how long, and which bars were missed."""
+"""Figures of a fault: the affected robots, their outages, and the missed targets."""
 
 from __future__ import annotations
 
 import pytest
 
-from rse_pf.experiments.paper.robustness_report import BARS, evened_out_s, judge_scenario
-from rse_pf.experiments.results.records import RecordedSample, Records, ServerSample
-from rse_pf.experiments.results.report import CommandRecord
+from rse_pf.experiments.paper.robustness_report import BARS, evened_out_s, robustness_figures, robustness_page
+from rse_pf.experiments.results.records import CommandRecord, Records, run_sample
+from rse_pf.local.control.monitor import ServerSample
 
 
 def event(time_s, action, **details):
@@ -37,8 +37,8 @@ def steady(robot, server, start_s, end_s, *, silent=(0.0, 0.0), other=None):
     return commands
 
 
-def run(scenario, events, commands, readings=()):
-    return Records(commands=commands, events=[asked(scenario), *events], readings=list(readings))
+def run(scenario, events, commands, samples=()):
+    return Records(commands=commands, events=[asked(scenario), *events], samples=list(samples))
 
 
 KILL = [
@@ -57,7 +57,7 @@ def unanswered(answered, code):
 
 
 def test_a_kill_that_was_survived_holds_every_bar():
-    judged = judge_scenario(run("kill", KILL, [*HIT, *OTHER]))
+    judged = robustness_figures(run("kill", KILL, [*HIT, *OTHER]))
 
     assert judged["gap_s"]["robots"] == 1
     assert judged["gap_s"]["p99"] == pytest.approx(1.0)
@@ -79,13 +79,13 @@ def test_a_kill_that_was_survived_holds_every_bar():
     ],
 )
 def test_each_bar_of_a_kill_is_missed_by_what_breaks_it(events, commands, missed):
-    bars = judge_scenario(run("kill", events, commands))["bars"]
+    bars = robustness_figures(run("kill", events, commands))["bars"]
 
     assert [name for name, bar in bars.items() if not bar["held"]] == [missed]
 
 
 def test_a_figure_that_was_not_measured_misses_its_bar():
-    bars = judge_scenario(run("kill", [], OTHER))["bars"]
+    bars = robustness_figures(run("kill", [], OTHER))["bars"]
 
     assert not bars["replaced_in_s"]["held"]
     assert not bars["gap_s/p99"]["held"]
@@ -96,7 +96,7 @@ def test_a_fault_of_the_balancer_hits_every_robot():
     commands = [*steady("a", "server-1", 0, 9, silent=(4, 5)), *steady("b", "server-2", 0, 9, silent=(4, 6))]
     events = [fault, event(4.1, "balancer-gone"), event(4.6, "balancer-back")]
 
-    judged = judge_scenario(run("balancer", events, commands))
+    judged = robustness_figures(run("balancer", events, commands))
 
     assert judged["gap_s"]["robots"] == 2
     assert judged["gap_s"]["max"] == pytest.approx(2.2)
@@ -113,7 +113,7 @@ def test_adoption_compares_the_processes_before_and_after(after, not_adopted):
         event(8.1, "processes", when="after", pids=after),
     ]
 
-    judged = judge_scenario(run("control-plane", events, OTHER))
+    judged = robustness_figures(run("control-plane", events, OTHER))
 
     assert judged["not_adopted"] == not_adopted
     assert judged["control_plane_down_s"] == pytest.approx(4.0)
@@ -133,7 +133,7 @@ def test_a_cut_is_judged_on_both_sides_and_by_the_first_answers_after_it():
     )  # fmt: skip
     commands = [*steady("robot-1", "server-1", 0, 4), *steady("robot-1", "server-1", 11, 13), stale]
 
-    judged = judge_scenario(run("wifi", events, commands, readings))
+    judged = robustness_figures(run("wifi", events, commands, readings))
 
     assert judged["server_noticed_s"] == pytest.approx(5.1)
     assert judged["noticed_s"]["max"] == pytest.approx(4.5)
@@ -142,15 +142,15 @@ def test_a_cut_is_judged_on_both_sides_and_by_the_first_answers_after_it():
     assert not judged["bars"]["stale_as_fresh"]["held"]
 
     looked = run("wifi", [*events[:2], event(9.02, "servers-empty"), events[2]], commands, readings)
-    assert judge_scenario(looked)["server_noticed_s"] == pytest.approx(5.02)
+    assert robustness_figures(looked)["server_noticed_s"] == pytest.approx(5.02)
 
 
 def robots(time_s, *counts):
     servers = tuple(
-        ServerSample(server=f"server-{n + 1}", pid=n, state="healthy", robots=count)
+        ServerSample(name=f"server-{n + 1}", pid=n, state="healthy", robots=count)
         for n, count in enumerate(counts)
     )
-    return RecordedSample(time=time_s, healthy_servers=len(servers), servers=servers)
+    return run_sample(time_s=time_s, healthy_servers=len(servers), servers=servers)
 
 
 def test_even_means_within_a_fifth_of_the_mean_and_staying_so():
@@ -166,7 +166,7 @@ def test_growth_of_memory_is_that_of_one_process():
         event(9.0, "resources", when="after", memory_bytes=330, descriptors=30, processes=3),
     ]
 
-    judged = judge_scenario(run("random", events, OTHER))
+    judged = robustness_figures(run("random", events, OTHER))
 
     assert (judged["memory_percent"], judged["descriptors_percent"]) == (10.0, 0.0)
     assert not judged["bars"]["memory_percent"]["held"]
@@ -175,3 +175,26 @@ def test_growth_of_memory_is_that_of_one_process():
 
 def test_every_scenario_asks_that_nothing_is_lost_or_answered_twice():
     assert all({"commands/lost", "commands/twice"} <= set(bars) for bars in BARS.values())
+
+
+def test_a_missed_bar_reads_as_missed():
+    counts = {"sent": 10, "answered": 9, "failed": 1, "lost": 0, "twice": 0}
+    bars = {
+        "gap_s/p99": {"value": 1.5, "bar": "<= 1", "held": False},
+        "commands/lost": {"value": 0, "bar": "<= 0", "held": True},
+    }
+    run = {
+        "commands": counts, "failures_by_code": {"busy": 1}, "gap_s": {"p50": 0.4, "p99": 1.5},
+        "out_of_rotation_s": None, "replaced_in_s": 3.0, "bars": bars,
+    }  # fmt: skip
+    around = {
+        "load_average": [0], "load_average_after": [0], "cores": 2, "system": "s", "python": "3",
+        "versions": {}, "settings_digest": "d",
+    }  # fmt: skip
+
+    page = robustness_page({"asked": {"robots": 1, "fps": 5.0}, "runs": {"kill": run}, "environment": around})
+
+    assert "| kill | gap_s/p99 | 1.5 | <= 1 | **missed** |" in page
+    assert "| kill | commands/lost | 0 | <= 0 | met |" in page
+    assert "1 of 2 targets met" in page
+    assert "(busy 1)" in page

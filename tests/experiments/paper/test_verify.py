@@ -1,4 +1,4 @@
-"""A report is recomputed from its records; an edited record, an edited report and a broken law all show."""
+"""A report is computed again from its records; edited records, edited reports and broken invariants show."""
 
 from __future__ import annotations
 
@@ -9,16 +9,17 @@ from dataclasses import replace
 import pytest
 
 from rse_pf.errors import UsageError
-from rse_pf.experiments.paper.verify import broken_laws, judge_folder, run_folders, verify
+from rse_pf.experiments.paper.verify import broken_invariants, figures_of, run_folders, verify
 from rse_pf.experiments.results.records import (
-    RecordedSample,
+    CommandRecord,
+    EventLog,
     SampleLog,
-    ServerSample,
     read_records,
-    read_samples,
-    reading_of,
+    run_sample,
+    write_commands,
 )
-from rse_pf.experiments.results.report import CommandRecord, EventLog, write_commands, write_json
+from rse_pf.experiments.results.result_folder import write_json
+from rse_pf.local.control.monitor import ServerSample
 
 ORIGIN_S = 1000.0
 
@@ -33,7 +34,7 @@ def command(number, planned, **more):
 
 
 def server(cpu, name="server-1"):
-    return ServerSample(server=name, pid=7, state="healthy", robots=3, cpu_percent=cpu)
+    return ServerSample(name=name, pid=7, state="healthy", robots=3, cpu_percent=cpu)
 
 
 @pytest.fixture
@@ -55,16 +56,14 @@ def run(tmp_path):
         for step in range(1, 20):
             cpu = 90.0 if step > 4 else 30.0
             log.write(
-                RecordedSample(
-                    time=step / 2, healthy_servers=1, servers=(server(cpu), server(cpu, "server-2"))
-                )
+                run_sample(time_s=step / 2, healthy_servers=1, servers=(server(cpu), server(cpu, "server-2")))
             )
     write_report(tmp_path)
     return tmp_path
 
 
 def write_report(folder):
-    write_json(folder / "report.json", {"experiment": "elasticity", **judge_folder(folder)})
+    write_json(folder / "report.json", {"experiment": "elasticity", **figures_of(read_records(folder))})
 
 
 def differing(folder):
@@ -83,7 +82,7 @@ def test_a_true_report_agrees_in_every_figure(run):
     assert all(finding.agrees for finding in findings)
     names = {finding.what for finding in findings}
     assert {"scale_outs", "commands/lost", "round_trip_ms/p99", "cpu_percent_series"} <= names
-    assert "law: every scale-out follows the required busy samples" in names
+    assert "invariant: every scale-out follows the required busy samples" in names
 
 
 def test_an_edited_report_differs(run):
@@ -123,7 +122,7 @@ def test_a_round_trip_that_its_time_stamps_deny_breaks_a_law(run):
     write_report(run)
 
     assert differing(run) == [
-        "law: no command is answered before it is sent, and a round trip is what its time stamps say"
+        "invariant: no command is answered before it is sent, and a round trip is what its time stamps say"
     ]
 
 
@@ -138,14 +137,14 @@ def test_a_scale_out_that_the_samples_do_not_justify_breaks_the_law(run):
     (run / "samples.csv").write_text(text.replace("90.0", "60.0"))
     write_report(run)
 
-    assert differing(run) == ["law: every scale-out follows the required busy samples"]
+    assert differing(run) == ["invariant: every scale-out follows the required busy samples"]
 
 
 def test_a_scale_out_before_enough_busy_periods_breaks_the_law(run):
     edit(run / "events.jsonl", '"time": 6.05', '"time": 4.05')
     write_report(run)
 
-    assert differing(run) == ["law: every scale-out follows the required busy samples"]
+    assert differing(run) == ["invariant: every scale-out follows the required busy samples"]
 
 
 def test_a_lost_command_and_a_second_answer_break_laws(run):
@@ -155,7 +154,7 @@ def test_a_lost_command_and_a_second_answer_break_laws(run):
     write_commands(run / "commands.csv", [lost, *records.commands[1:], again])
     write_report(run)
 
-    broken = {name for name, what in broken_laws(read_records(run)).items() if what}
+    broken = {name for name, what in broken_invariants(read_records(run)).items() if what}
     assert broken == {"every command came to an end", "no answer was delivered twice"}
 
 
@@ -166,7 +165,7 @@ def test_every_run_of_a_folder_is_verified_by_its_name(run, tmp_path):
         (whole / name).mkdir()
         for file in ("commands.csv", "events.jsonl", "samples.csv"):
             (whole / name / file).write_bytes((run / file).read_bytes())
-    runs = {name: judge_folder(part) for name, part in run_folders(whole).items()}
+    runs = {name: figures_of(read_records(part)) for name, part in run_folders(whole).items()}
     write_json(whole / "report.json", {"runs": {**runs, "third": runs["first"]}})
     edit(whole / "second" / "samples.csv", "90.0", "10.0")
 
@@ -186,31 +185,11 @@ def test_a_damaged_file_is_one_line_not_a_traceback(run, name):
         verify(run)
 
 
-def test_what_the_monitor_says_comes_back_from_the_file_unchanged(tmp_path):
-    full = {
-        "name": "server-1", "pid": 7, "state": "healthy", "robots": 2, "cpu_percent": 71.25, "requests": 5,
-        "queue": 1, "queue_ms": 0.5, "in_flight": 1, "bytes_in": 10, "bytes_out": 20, "warming": True,
-        "something": "new",
-    }  # fmt: skip
-    silent = {"name": "server-2", "pid": 8, "state": "starting", "cpu_percent": None}
-    told = {"time": ORIGIN_S + 1.5, "healthy_servers": 1, "servers": [full, silent]}
-    readings = [reading_of(told, ORIGIN_S), RecordedSample(time=2.0, healthy_servers=0)]
-
-    with (tmp_path / "samples.csv").open("w", newline="") as file:
-        log = SampleLog(file)
-        for reading in readings:
-            log.write(reading)
-
-    assert read_samples(tmp_path / "samples.csv") == readings
-    assert readings[0].time == 1.5
-    assert readings[0].servers[0].warming is True
-
-
 def test_answers_that_reached_a_caller_twice_are_the_generators_to_tell(run):
     with (run / "events.jsonl").open("a") as file:
         EventLog(file).write(10.0, "generator", twice=2, wrong_poses=1)
 
-    assert differing(run) == ["commands/twice", "wrong_poses", "law: no answer was delivered twice"]
+    assert differing(run) == ["commands/twice", "wrong_poses", "invariant: no answer was delivered twice"]
 
 
 def test_packed_commands_are_read_like_plain_ones(run):

@@ -1,4 +1,4 @@
-"""Pictures are drawn from records of any kind, whole or poor; a missing extra is named before a run."""
+"""Figures are drawn from complete and empty records; a missing extra is named before a run."""
 
 from __future__ import annotations
 
@@ -8,16 +8,16 @@ import sys
 import pytest
 
 from rse_pf.errors import MissingExtra
-from rse_pf.experiments.paper.latency_report import judge_latency
-from rse_pf.experiments.paper.robustness_report import judge_scenario
+from rse_pf.experiments.paper.latency_report import latency_figures
+from rse_pf.experiments.paper.robustness_report import robustness_figures
 from rse_pf.experiments.plots.figures import (
     draw_elasticity,
     draw_latency,
     draw_robustness,
     require_matplotlib,
 )
-from rse_pf.experiments.results.records import RecordedSample, Records, ServerSample
-from rse_pf.experiments.results.report import CommandRecord
+from rse_pf.experiments.results.records import CommandRecord, Records, run_sample
+from rse_pf.local.control.monitor import ServerSample
 
 PNG = b"\x89PNG\r\n\x1a\n"
 ASKED = {
@@ -42,11 +42,10 @@ def fleet(seconds=60):
         servers = 2 if step < 14 or step > 56 else 3
         load = min(step, 20) * 10 if step < 45 else 1
         readings.append(
-            RecordedSample(
-                time=float(step), healthy_servers=servers - (30 <= step < 33),
+            run_sample(time_s=float(step), healthy_servers=servers - (30 <= step < 33),
                 servers=tuple(
                     ServerSample(
-                        server=f"server-{n + 1}", pid=n, state="healthy", robots=9 // servers,
+                        name=f"server-{n + 1}", pid=n, state="healthy", robots=9 // servers,
                         cpu_percent=load / servers + 6 * math.sin(step + n),
                     )
                     for n in range(servers)
@@ -65,10 +64,10 @@ def fleet(seconds=60):
                 up_ms=2.0, queue_ms=1.0, compute_ms=slow - 6, down_ms=2.0,
             )
         )  # fmt: skip
-    return Records(commands=commands, events=events, readings=readings)
+    return Records(commands=commands, events=events, samples=readings)
 
 
-EMPTY = Records(commands=[], events=[ASKED], readings=[])
+EMPTY = Records(commands=[], events=[ASKED], samples=[])
 
 
 def is_drawn(path):
@@ -86,7 +85,7 @@ def test_draws_elasticity_of_one_run_two_runs_and_an_empty_one(tmp_path, runs):
 
 @pytest.mark.parametrize("records", [fleet(), EMPTY])
 def test_draws_latency_beside_the_papers_even_if_nothing_was_answered(tmp_path, records):
-    draw_latency(tmp_path / "latency.png", judge_latency(records), "a caption")
+    draw_latency(tmp_path / "latency.png", latency_figures(records), "a caption")
 
     assert is_drawn(tmp_path / "latency.png")
 
@@ -94,7 +93,7 @@ def test_draws_latency_beside_the_papers_even_if_nothing_was_answered(tmp_path, 
 @pytest.mark.parametrize("count", [1, 3])
 def test_draws_every_fault(tmp_path, count):
     runs = {f"kill-{n}": fleet() for n in range(count)}
-    rows = {name: judge_scenario(records) for name, records in runs.items()}
+    rows = {name: robustness_figures(records) for name, records in runs.items()}
 
     draw_robustness(tmp_path / "faults.png", runs, rows)
 

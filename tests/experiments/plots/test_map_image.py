@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rse_pf.experiments.plots.map_image import _BACKGROUND, COLOURS, PathOfRobot, draw_map
+from rse_pf.experiments.plots.map_image import _BACKGROUND, COLOURS, RobotPath, draw_map
 
 image = pytest.importorskip("PIL.Image")
 
@@ -14,7 +14,7 @@ def draw(tmp_path, points, colours):
     poses = np.tile(np.eye(4), (5, 1, 1))
     poses[:, 2, 3] = np.linspace(0.0, 1.0, 5)
     path = tmp_path / "map.png"
-    draw_map(path, points, colours, [PathOfRobot(name="robot-1", T_world_camera=poses)], "a caption")
+    draw_map(path, points, colours, [RobotPath(name="robot-1", T_world_camera=poses)], "a caption")
     with image.open(path) as picture:
         return np.asarray(picture.convert("RGB"))
 

@@ -11,7 +11,7 @@ from rse_pf.experiments.results.map_error import (
     joined_robots,
     merge_section,
     merged_lines,
-    merged_rows,
+    merged_table,
     move_frames,
 )
 from rse_pf.geometry import exp_se3, inverse
@@ -160,14 +160,14 @@ def test_a_person_is_told_who_was_left_out_and_why() -> None:
     path = circle(np.linspace(0, 0.4, 20))
     made = section([robot("robot-1", path, path, path), robot("robot-3", path, path, path)])
 
-    told, table = merged_lines(made), "\n".join(merged_rows(made))
+    told, table = merged_lines(made), "\n".join(merged_table(made))
 
     assert made["joined"] == ["robot-1", "robot-3"]
     assert made["not_joined"] == [{"robot": "robot-2", "reason": "fewer than 3 views agree"}]
     assert "robot-2 not joined: fewer than 3 views agree\n" in told
-    assert "9 pairs of keyframes make no link (2 inconsistent, 7 no-matches)" in told
-    assert "| refused between robot-1 and robot-2 | 7 no-matches |" in table
-    assert "| refused within robot-1 | 2 inconsistent |" in table
+    assert "9 pairs of keyframes were not linked (2 inconsistent, 7 no-matches)" in told
+    assert "| not linked between robot-1 and robot-2 | 7 no-matches |" in table
+    assert "| not linked within robot-1 | 2 inconsistent |" in table
 
 
 def test_the_origins_are_seen_from_the_first_robot() -> None:

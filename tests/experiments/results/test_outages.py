@@ -1,11 +1,11 @@
-"""Silence around a fault is counted for whom it hit, and for nobody else."""
+"""Outages around a fault count for the affected robots, and for no others."""
 
 from __future__ import annotations
 
 import pytest
 
-from rse_pf.experiments.results.outages import gap_figures, longest_silences, robots_on
-from rse_pf.experiments.results.report import CommandRecord
+from rse_pf.experiments.results.outages import longest_outages, outage_figures, robots_on
+from rse_pf.experiments.results.records import CommandRecord
 
 
 def answers(robot, server, times, *, planned=None, code="ok"):
@@ -52,7 +52,7 @@ def test_a_failure_is_no_answer_of_a_server():
 def test_the_gap_is_the_longest_silence_that_touches_the_fault():
     commands = answers("r", "a", [0.0, 3.0, 3.2, 3.4, 4.9, 5.1, 9.0])
 
-    silences = longest_silences(commands, {"r"}, start_s=3.5, end_s=6.0)
+    silences = longest_outages(commands, {"r"}, start_s=3.5, end_s=6.0)
 
     assert silences == {"r": pytest.approx(3.9)}
 
@@ -60,7 +60,7 @@ def test_the_gap_is_the_longest_silence_that_touches_the_fault():
 def test_a_silence_before_the_fault_or_after_the_watch_does_not_count():
     commands = answers("r", "a", [0.0, 3.0, 3.2, 3.4, 3.9, 4.1, 4.3, 9.0])
 
-    silences = longest_silences(commands, {"r"}, start_s=3.5, end_s=4.2)
+    silences = longest_outages(commands, {"r"}, start_s=3.5, end_s=4.2)
 
     assert silences["r"] == pytest.approx(0.5)
 
@@ -68,17 +68,17 @@ def test_a_silence_before_the_fault_or_after_the_watch_does_not_count():
 def test_a_robot_that_never_hears_again_was_silent_until_it_last_asked():
     commands = [*answers("r", "a", [1.0, 1.2]), *asked_in_vain("r", [1.4, 8.0])]
 
-    assert longest_silences(commands, {"r"}, start_s=1.3, end_s=3.0)["r"] == pytest.approx(6.8)
+    assert longest_outages(commands, {"r"}, start_s=1.3, end_s=3.0)["r"] == pytest.approx(6.8)
 
 
 def test_failures_do_not_end_a_silence():
     commands = [*answers("r", "a", [1.0, 4.0]), *asked_in_vain("r", [1.5], code="busy")]
 
-    assert longest_silences(commands, {"r"}, start_s=1.1, end_s=3.0)["r"] == pytest.approx(3.0)
+    assert longest_outages(commands, {"r"}, start_s=1.1, end_s=3.0)["r"] == pytest.approx(3.0)
 
 
 def test_a_robot_that_was_never_answered_is_counted_not_left_out():
-    figures = gap_figures(asked_in_vain("r", [1.0, 7.0]), {"r"}, start_s=1.0, end_s=3.0)
+    figures = outage_figures(asked_in_vain("r", [1.0, 7.0]), {"r"}, start_s=1.0, end_s=3.0)
 
     assert figures == {"robots": 1, "p50": 6.0, "p99": 6.0, "max": 6.0}
 
@@ -86,4 +86,4 @@ def test_a_robot_that_was_never_answered_is_counted_not_left_out():
 def test_robots_that_were_not_hit_do_not_soften_the_percentiles():
     commands = [*answers("hit", "a", [1.0, 3.0]), *answers("other", "b", [1.0, 1.2, 1.4, 3.0])]
 
-    assert gap_figures(commands, {"hit"}, start_s=1.1, end_s=2.0)["p50"] == pytest.approx(2.0)
+    assert outage_figures(commands, {"hit"}, start_s=1.1, end_s=2.0)["p50"] == pytest.approx(2.0)

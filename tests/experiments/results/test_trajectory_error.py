@@ -13,10 +13,8 @@ from rse_pf.experiments.results.trajectory_error import (
     absolute_error,
     align,
     associate,
-    ate_cm,
     relative_error,
-    rpe_cm,
-    rpe_deg,
+    trajectory_figures,
 )
 from rse_pf.geometry import exp_se3, inverse
 
@@ -40,9 +38,9 @@ def test_another_world_frame_is_no_error():
     truth = wander(1)
     estimate = moved(truth, exp_se3([1, 2, 3, 0.5, -1, 2]))
 
-    assert ate_cm(estimate, truth) == pytest.approx(0.0, abs=1e-9)
-    assert rpe_cm(estimate, truth) == pytest.approx(0.0, abs=1e-9)
-    assert rpe_deg(estimate, truth) == pytest.approx(0.0, abs=1e-6)
+    assert absolute_error(estimate, truth).rmse_m == pytest.approx(0.0, abs=1e-9)
+    assert relative_error(estimate, truth).rmse_m == pytest.approx(0.0, abs=1e-9)
+    assert relative_error(estimate, truth).rmse_deg == pytest.approx(0.0, abs=1e-6)
 
 
 def test_a_known_error_is_measured():
@@ -51,8 +49,13 @@ def test_a_known_error_is_measured():
     estimate = Trajectory(np.arange(4.0), truth.T_world_camera.copy())
     estimate.T_world_camera[:, 2, 3] = [0.1, -0.1, 0.1, -0.1]  # a saddle: no alignment mends it
 
-    assert ate_cm(estimate, truth) == pytest.approx(10.0)
-    assert rpe_cm(estimate, truth) == pytest.approx(20.0)
+    figures = trajectory_figures(estimate, truth)
+    assert figures == {
+        "path_m": pytest.approx(6.03, abs=0.01),
+        "ate_cm": 10.0,
+        "rpe_cm": 20.0,
+        "rpe_deg": 0.0,
+    }
     assert absolute_error(estimate, truth).max_m == pytest.approx(0.1)
 
 
@@ -94,14 +97,15 @@ def test_poses_meet_by_time_and_not_by_row():
 
     np.testing.assert_array_equal(mine, np.arange(10))
     np.testing.assert_array_equal(theirs, np.arange(5, 35, 3))
-    assert ate_cm(estimate, truth) == pytest.approx(0.0, abs=1e-9)
+    assert absolute_error(estimate, truth).rmse_m == pytest.approx(0.0, abs=1e-9)
 
 
 def test_clocks_that_do_not_meet_are_told():
     truth = wander(5)
     estimate = Trajectory(truth.timestamps_s + 0.05, truth.T_world_camera)
     with pytest.raises(UsageError, match="0 poses match"):
-        ate_cm(estimate, truth)
+        absolute_error(estimate, truth)
+    assert trajectory_figures(estimate, truth)["ate_cm"] is None
 
 
 @pytest.mark.data

@@ -1,4 +1,4 @@
-"""rse-pf map merge, localise and view: what is written, what is said, and what is refused."""
+"""rse-pf map: the actions that need the extras for maps: merge, localise and view."""
 
 from __future__ import annotations
 

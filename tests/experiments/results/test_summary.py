@@ -1,22 +1,11 @@
-"""The report is computed from the raw records alone, and counts what others hide."""
+"""The summary of a run is computed from its raw records alone."""
 
 from __future__ import annotations
 
-import io
-import json
 from dataclasses import replace
 
-import pytest
-
-from rse_pf.errors import UsageError
-from rse_pf.experiments.results.report import (
-    CommandRecord,
-    EventLog,
-    percentiles,
-    read_commands,
-    summarise,
-    write_commands,
-)
+from rse_pf.experiments.results.records import CommandRecord
+from rse_pf.experiments.results.summary import percentiles, summarise
 
 GOOD = CommandRecord(
     id=1, robot="robot-1", planned=0.0, sent=0.01, answered=0.05, server="a", code="ok",
@@ -63,23 +52,3 @@ def test_an_empty_run_has_no_percentiles():
 def test_percentiles_are_those_of_the_values():
     assert percentiles([1.0, 2.0, 3.0, 4.0, 5.0])["p50"] == 3.0
     assert percentiles(list(map(float, range(101))))["p95"] == 95.0
-
-
-def test_records_survive_the_file(tmp_path):
-    commands = [GOOD, replace(GOOD, id=2, code="", answered=None, round_trip_ms=None)]
-    write_commands(tmp_path / "commands.csv", commands)
-    assert read_commands(tmp_path / "commands.csv") == commands
-
-
-def test_a_broken_file_is_one_line_with_a_hint(tmp_path):
-    (tmp_path / "commands.csv").write_text("id,robot\nx,y\n")
-    with pytest.raises(UsageError, match="cannot read"):
-        read_commands(tmp_path / "commands.csv")
-    with pytest.raises(UsageError, match="cannot read"):
-        read_commands(tmp_path / "nothing.csv")
-
-
-def test_events_are_lines_of_json_written_at_once():
-    file = io.StringIO()
-    EventLog(file).write(1.5, "server-killed", server="a", pid=7)
-    assert json.loads(file.getvalue()) == {"time": 1.5, "action": "server-killed", "server": "a", "pid": 7}

@@ -1,4 +1,4 @@
-"""The demo's folder and report, without running it."""
+"""The report of the demo, without running it."""
 
 from __future__ import annotations
 
@@ -8,11 +8,9 @@ import numpy as np
 import pytest
 
 from client_sdk.mapping import Trajectory
-from rse_pf.errors import UsageError
-from rse_pf.experiments.demo.report import as_markdown, closing_lines, make_report
-from rse_pf.experiments.demo.robot import Finished
-from rse_pf.experiments.demo.run import _fresh_folder
-from rse_pf.experiments.results.report import CommandRecord
+from rse_pf.experiments.demo.report import closing_lines, demo_page, make_report
+from rse_pf.experiments.demo.robot import RobotFinished
+from rse_pf.experiments.results.records import CommandRecord
 
 COMMAND = CommandRecord(
     id=1, robot="robot-1", planned=0.0, sent=0.0, answered=0.01, server="a", code="ok",
@@ -27,8 +25,8 @@ def walk(wrong_m: float = 0.0) -> Trajectory:
     return Trajectory(np.arange(10) / 5.0, poses)
 
 
-def finished(truth: Trajectory | None) -> Finished:
-    return Finished(
+def finished(truth: Trajectory | None) -> RobotFinished:
+    return RobotFinished(
         frames=10, lost_frames=1, keyframes=2, weak_poses=0, map_points=5, fps=4.9, matches=[300, 310],
         inliers=[290, 300], commands=[COMMAND], trajectory=walk(0.01), truth=truth, truth_kind="ground truth",
     )  # fmt: skip
@@ -64,7 +62,7 @@ def test_has_the_fields_that_others_read():
 
 
 def test_the_markdown_puts_our_figures_beside_the_papers():
-    text = as_markdown(report(walk()))
+    text = demo_page(report(walk()))
     assert "| round trip, mean ms | 9.0 | 156.36 |" in text
     assert "29.82" in text
 
@@ -74,25 +72,3 @@ def test_the_last_line_names_the_files(tmp_path):
     assert str(tmp_path) in last
     assert "map.ply" in last
     assert "report.md" in last
-
-
-def test_an_earlier_run_is_replaced(tmp_path):
-    (tmp_path / "events.jsonl").write_text("")
-    (tmp_path / "robot-1").mkdir()
-    (tmp_path / "report.json").write_text("{}")
-    _fresh_folder(tmp_path)
-    assert not (tmp_path / "robot-1").exists()
-    assert not (tmp_path / "report.json").exists()
-
-
-def test_a_folder_with_other_files_is_not_touched(tmp_path):
-    (tmp_path / "thesis.tex").write_text("years of work")
-    with pytest.raises(UsageError, match="other files"):
-        _fresh_folder(tmp_path)
-    assert (tmp_path / "thesis.tex").read_text() == "years of work"
-
-
-def test_a_file_is_no_folder(tmp_path):
-    (tmp_path / "x").write_text("")
-    with pytest.raises(UsageError, match="is a file"):
-        _fresh_folder(tmp_path / "x")

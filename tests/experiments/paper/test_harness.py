@@ -1,0 +1,24 @@
+"""What an experiment records besides its commands: the policy, and the figures of the load generator."""
+
+from __future__ import annotations
+
+import pytest
+
+from rse_pf.config import PlatformSettings
+from rse_pf.errors import UsageError
+from rse_pf.experiments.paper.harness import generator_of, policy_parameters
+from rse_pf.experiments.results.records import Records
+
+
+def test_compression_shortens_periods_but_no_threshold():
+    full, fast = policy_parameters(PlatformSettings(), 1.0), policy_parameters(PlatformSettings(), 30.0)
+
+    assert (fast["period_s"], fast["idle_s"]) == (full["period_s"] / 30, full["idle_s"] / 30)
+    assert {name: fast[name] for name in fast if name not in ("period_s", "idle_s")} == {
+        name: full[name] for name in full if name not in ("period_s", "idle_s")
+    }
+
+
+def test_a_run_that_did_not_end_has_no_generator():
+    with pytest.raises(UsageError, match="generator"):
+        generator_of(Records(commands=[], events=[], samples=[]))

@@ -1,0 +1,67 @@
+"""Records are read back as they were written; a malformed file is one line with a hint."""
+
+from __future__ import annotations
+
+import io
+import json
+from dataclasses import replace
+
+import pytest
+
+from rse_pf.errors import UsageError
+from rse_pf.experiments.results.records import (
+    CommandRecord,
+    EventLog,
+    SampleLog,
+    read_commands,
+    read_samples,
+    run_sample,
+    sample_from_document,
+    write_commands,
+)
+
+ORIGIN_S = 1000.0
+GOOD = CommandRecord(
+    id=1, robot="robot-1", planned=0.0, sent=0.01, answered=0.05, server="a", code="ok",
+    payload_bytes=100, round_trip_ms=40.0, compute_ms=3.0,
+)  # fmt: skip
+
+
+def test_records_survive_the_file(tmp_path):
+    commands = [GOOD, replace(GOOD, id=2, code="", answered=None, round_trip_ms=None)]
+    write_commands(tmp_path / "commands.csv", commands)
+    assert read_commands(tmp_path / "commands.csv") == commands
+
+
+def test_a_broken_file_is_one_line_with_a_hint(tmp_path):
+    (tmp_path / "commands.csv").write_text("id,robot\nx,y\n")
+    with pytest.raises(UsageError, match="cannot read"):
+        read_commands(tmp_path / "commands.csv")
+    with pytest.raises(UsageError, match="cannot read"):
+        read_commands(tmp_path / "nothing.csv")
+
+
+def test_events_are_lines_of_json_written_at_once():
+    file = io.StringIO()
+    EventLog(file).write(1.5, "server-killed", server="a", pid=7)
+    assert json.loads(file.getvalue()) == {"time": 1.5, "action": "server-killed", "server": "a", "pid": 7}
+
+
+def test_what_the_monitor_says_comes_back_from_the_file_unchanged(tmp_path):
+    full = {
+        "name": "server-1", "pid": 7, "state": "healthy", "robots": 2, "cpu_percent": 71.25, "requests": 5,
+        "queue": 1, "queue_ms": 0.5, "in_flight": 1, "bytes_in": 10, "bytes_out": 20, "warming": True,
+        "something": "new",
+    }  # fmt: skip
+    silent = {"name": "server-2", "pid": 8, "state": "starting", "cpu_percent": None}
+    told = {"time": ORIGIN_S + 1.5, "healthy_servers": 1, "servers": [full, silent]}
+    readings = [sample_from_document(told, ORIGIN_S), run_sample(time_s=2.0, healthy_servers=0)]
+
+    with (tmp_path / "samples.csv").open("w", newline="") as file:
+        log = SampleLog(file)
+        for reading in readings:
+            log.write(reading)
+
+    assert read_samples(tmp_path / "samples.csv") == readings
+    assert readings[0].time == 1.5
+    assert readings[0].servers[0].warming is True
