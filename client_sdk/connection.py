@@ -51,8 +51,8 @@ OnChange = Callable[[str, str], None] | None
 
 _FIRST_TRIES = 4
 _MIN_TICK_S = 0.001
+# How long a server that was stopped may take to accept a connection attempt that was given up.
 _LATE_WELCOME_S = 60.0
-"""How long a server that was stopped may take to accept a connection attempt that was given up."""
 _CHECK_RUNNING = "is the platform running? start it with rse-pf local start"
 _CHECK_ADDRESS = "is it an RSE-PF server?"
 

@@ -1,8 +1,7 @@
-"""What a robot does before it asks the cloud for a pose: features, matches, and when to ask.
+"""The robot's visual front end: features, matches, and the queries for poses that are sent to the cloud.
 
-The last part is `Tracker`, a state machine without I/O: frames go in, pose queries come out,
-answers go in, tracked frames come out.  Promises not to touch a network or a clock, to ask for
-one pose at a time, and to give out exactly the rounded numbers that travel.
+`Tracker` is a state machine without input or output: frames and answers go in, pose queries and tracked
+frames come out.  There is one query at a time.  Its numbers are rounded exactly as they are sent.
 """
 
 from __future__ import annotations
@@ -25,6 +24,7 @@ __all__ = [
     "TrackedFrame",
     "Tracker",
     "extract",
+    "load_opencv",
     "match",
     "round_for_wire",
 ]
@@ -55,7 +55,7 @@ class Frame:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FrontEndOptions:
-    """How a robot finds and matches features, and which poses it believes.
+    """How a robot finds and matches features, and which poses it accepts.
 
     Defaults: measured on the red-kitchen recording at 5 and 10 Hz (ATE 4 to 5 cm).
     """
@@ -73,13 +73,13 @@ class FrontEndOptions:
     max_iterations: int = 1000
     min_inliers: int = 12
     max_jump_m: float = 0.5
-    """Largest believable motion from one frame to the next."""
+    """The largest plausible motion from one frame to the next."""
     keyframe_m: float = 0.2
     keyframe_deg: float = 12.0
     keyframe_inliers: int = 120
     """A frame with fewer inliers becomes a keyframe even if the robot hardly moved."""
     chain: Literal["frame", "keyframe"] = "frame"
-    """Match against the last good frame, or against the last keyframe; the other one is the retry."""
+    """Match against the last good frame, or against the last keyframe; the other one is used for the retry."""
 
     def __post_init__(self) -> None:
         if self.min_inliers < 4 or self.max_matches < self.min_inliers or self.features < self.min_inliers:
@@ -121,7 +121,7 @@ class Features:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Correspondences:
-    """Points of a reference view, seen in another one; rounded as they travel.
+    """Points of a reference view, seen in another one; rounded as they are sent.
 
     ``points_world`` ``(n, 3)``: metres, in the frame of the *reference camera*, which is the
     world of this one query.  ``pixels`` ``(n, 2)``: row *i* observes point *i*.
@@ -143,7 +143,7 @@ def extract(frame: Frame, options: FrontEndOptions) -> Features:
     Source:
         Rublee et al., ICCV 2011; scale 1.2, 8 levels, FAST threshold 10.
     """
-    cv2 = _opencv()
+    cv2 = load_opencv()
     orb = cv2.ORB_create(nfeatures=options.features, scaleFactor=1.2, nlevels=8, fastThreshold=10)
     gray = cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY)
     keypoints, descriptors = orb.detectAndCompute(gray, None)
@@ -168,7 +168,7 @@ def match(reference: Features, frame: Features, options: FrontEndOptions) -> Cor
     known = np.flatnonzero(np.isfinite(reference.points_camera[:, 2]))
     if not len(known) or len(frame.pixels) < 2:
         return Correspondences(points_world=np.empty((0, 3)), pixels=np.empty((0, 2)))
-    cv2 = _opencv()
+    cv2 = load_opencv()
     distances, neighbours = cv2.batchDistance(
         reference.descriptors[known], frame.descriptors, cv2.CV_32S, normType=cv2.NORM_HAMMING, K=2
     )
@@ -193,9 +193,9 @@ def round_for_wire(points_world: Array, pixels: Array) -> tuple[Array, Array]:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class PoseQuery:
-    """One question for the PnP service: where is this camera in the reference camera's frame?
+    """One query for the PnP service: the pose of this camera in the reference camera's frame.
 
-    Solve with ``correspondences``, ``camera``, ``inlier_px`` and ``max_iterations``, then hand the
+    Solve with ``correspondences``, ``camera``, ``inlier_px`` and ``max_iterations``, then pass the
     answer to `Tracker.accept`.
     """
 
@@ -209,7 +209,7 @@ class PoseQuery:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class TrackedFrame:
-    """What became of one frame; a lost one has no pose and must not be drawn."""
+    """The result for one frame; a lost one has no pose and must not be drawn."""
 
     frame: Frame
     T_world_camera: Array | None
@@ -242,9 +242,9 @@ class Tracker:
             step = tracker.accept(step, T_camera_world, inliers)
         # step is now the TrackedFrame
 
-    A frame is matched against the last good frame; a pose with too few inliers, or that jumps, is
-    asked for once more against the last keyframe, and then the frame is lost: counted, never drawn,
-    and never matched against.
+    A frame is matched against the last good frame.  If the pose has too few inliers or jumps, it is
+    queried once more against the last keyframe.  If that fails, too, the frame is lost: it is
+    counted, and later frames are not matched against it.
     """
 
     def __init__(self, options: FrontEndOptions | None = None, T_world_start: Array | None = None) -> None:
@@ -252,7 +252,7 @@ class Tracker:
         self.frames = 0
         """Frames prepared so far."""
         self.lost_frames = 0
-        """Frames without an accepted pose, whatever the reason."""
+        """Frames without an accepted pose, for any reason."""
         self.keyframes = 0
         self._T_world_start = np.eye(4) if T_world_start is None else T_world_start
         self._last: _View | None = None
@@ -264,10 +264,10 @@ class Tracker:
         self._to_try: list[Literal["frame", "keyframe"]] = []
 
     def prepare(self, frame: Frame) -> PoseQuery | TrackedFrame:
-        """Take the next frame; return a query, or at once what became of the frame.
+        """Take the next frame; return a query, or the result for the frame if none is needed.
 
-        The first frame with enough features is the start and needs no query; a frame that matches
-        nothing is lost without one.
+        The first frame with enough features is the start and needs no query; a frame without enough
+        matches is lost without one.
 
         Raises:
             UsageError: The last query was not answered yet.
@@ -292,7 +292,7 @@ class Tracker:
     def accept(
         self, query: PoseQuery, T_camera_world: Array | None, inliers: int = 0
     ) -> PoseQuery | TrackedFrame:
-        """Take the answer to *query*; return another query, or what became of the frame.
+        """Take the answer to *query*; return another query, or the result for the frame.
 
         Args:
             query: The query that `prepare` or `accept` returned last.
@@ -309,7 +309,7 @@ class Tracker:
         matches = len(query.correspondences)
         if T_camera_world is not None and inliers >= self.options.min_inliers:
             T_world_camera = self._view(query.against).T_world_camera @ inverse(T_camera_world)
-            if self._is_believable(T_world_camera):
+            if self._is_plausible(T_world_camera):
                 keyframe = self._is_keyframe(T_world_camera, inliers)
                 return self._keep(T_world_camera, inliers=inliers, matches=matches, keyframe=keyframe)
         return self._next_query(matches)
@@ -332,7 +332,7 @@ class Tracker:
                 return self._query
         return self._lose(matches)
 
-    def _is_believable(self, T_world_camera: Array) -> bool:
+    def _is_plausible(self, T_world_camera: Array) -> bool:
         last = self._view("frame").T_world_camera
         limit_m = self.options.max_jump_m * (1 + self._lost_in_a_row)
         moved_m = float(np.linalg.norm(T_world_camera[:3, 3] - last[:3, 3]))
@@ -401,7 +401,8 @@ def _depth_at(depth_m: npt.NDArray[np.float32], pixels: Array, options: FrontEnd
     return found
 
 
-def _opencv() -> Any:
+def load_opencv() -> Any:
+    """Return the module ``cv2``; raises MissingExtra."""
     try:
         import cv2
     except ImportError as error:

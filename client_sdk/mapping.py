@@ -1,7 +1,6 @@
-"""Point-cloud maps and trajectories of one robot, in memory and in the files that others read.
+"""Point-cloud maps and trajectories of one robot, in memory and in files (PLY, TUM).
 
-Promises that adding a frame costs the same however large the map has grown, that the memory of
-a map is bounded, and not to touch a network, an image library or a clock.
+The time to add a frame does not depend on the size of the map, and the memory of a map is bounded.
 """
 
 from __future__ import annotations
@@ -30,15 +29,15 @@ __all__ = [
 ]
 
 _EMPTY = -1
+# Voxels on either side of the origin: three signed indices of 21 bits fill one int64 key.
 _REACH = 1 << 20
-"""Voxels on either side of the origin: three signed indices of 21 bits fill one int64 key."""
 
 _VERTEX = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("red", "u1"), ("green", "u1"), ("blue", "u1")])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MapOptions:
-    """How dense a map is and which readings it believes."""
+    """The density of a map, and which depth readings are used."""
 
     voxel_m: float = 0.015
     min_depth_m: float = 0.3
@@ -46,9 +45,9 @@ class MapOptions:
     every_px: int = 2
     """Take every n-th row and column of a frame."""
     edge_percent: float = 5.0
-    """Skip a reading whose neighbours differ by more of its depth: it flies between two surfaces."""
+    """Skip a reading whose neighbours differ by more of its depth: it lies between two surfaces."""
     max_points: int = 4_000_000
-    """New voxels are refused beyond this; a point costs about 60 to 120 bytes."""
+    """No voxels are added beyond this; a point takes about 60 to 120 bytes."""
 
     def __post_init__(self) -> None:
         if not 0.001 <= self.voxel_m <= 1.0:
@@ -73,9 +72,9 @@ class PointMap:
     def __init__(self, options: MapOptions | None = None) -> None:
         self.options = options or MapOptions()
         self.refused_points = 0
-        """Voxels that found the map full."""
+        """Voxels that were not added because the map was full."""
         self.probes = 0
-        """Hash-table slots looked at so far, growth included: the work done, for tests."""
+        """Hash-table slots read so far, including growth; a measure of the work for tests."""
         self._size = 0
         self._slot_keys: npt.NDArray[np.int64] = np.full(4096, _EMPTY, dtype=np.int64)
         self._slot_rows: npt.NDArray[np.int32] = np.zeros(4096, dtype=np.int32)
@@ -87,12 +86,12 @@ class PointMap:
         return self._size
 
     def add(self, frame: Frame, T_world_camera: Array) -> int:
-        """Join *frame*, seen from *T_world_camera*, into the map; return the points used."""
+        """Add *frame*, seen from *T_world_camera*, to the map; return the number of points used."""
         points, colours = frame_points(frame, self.options)
         return self.add_points(transform(T_world_camera, points), colours)
 
     def add_points(self, points_world: Array, colours: npt.NDArray[np.uint8]) -> int:
-        """Join ``(n, 3)`` points in metres and ``(n, 3)`` uint8 colours; return how many were used."""
+        """Add ``(n, 3)`` points in metres and ``(n, 3)`` uint8 colours; return how many were used."""
         index = np.floor(points_world / self.options.voxel_m)
         inside = (np.abs(index) < _REACH).all(axis=1)
         index = index[inside].astype(np.int64) + _REACH
@@ -127,7 +126,7 @@ class PointMap:
 
     def _rows_of(self, keys: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
         """Return the row of each distinct key, making new ones; -1 where the map is full."""
-        self._make_room(len(keys))
+        self._grow(len(keys))
         slots = self._find_slots(keys)
         is_new = self._slot_keys[slots] == _EMPTY
         fits = np.cumsum(is_new) <= self.options.max_points - self._size
@@ -160,13 +159,13 @@ class PointMap:
         waiting = np.arange(len(keys))
         while len(waiting):
             slots = self._find_slots(keys[waiting])
-            # Two new keys may ask for one slot; the last one written wins, the others search on.
+            # Two new keys may ask for one slot; the last one written wins, the others continue the search.
             self._slot_keys[slots] = keys[waiting]
             won = self._slot_keys[slots] == keys[waiting]
             self._slot_rows[slots[won]] = rows[waiting[won]]
             waiting = waiting[~won]
 
-    def _make_room(self, more: int) -> None:
+    def _grow(self, more: int) -> None:
         wanted = min(self._size + more, self.options.max_points)
         if wanted > len(self._counts):
             capacity = min(max(2 * len(self._counts), wanted), self.options.max_points)

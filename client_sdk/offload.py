@@ -14,8 +14,8 @@ from rse_pf.service import Registry
 
 __all__ = ["CloudFirst", "Plan", "gains_from_cloud"]
 
+# A fallback begins this many of the robot's own solving times before the deadline.
 _MARGIN = 2.0
-"""A fallback begins this many of the robot's own solving times before the deadline."""
 
 _RECOVERABLE = frozenset(
     {

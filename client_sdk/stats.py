@@ -10,11 +10,11 @@ from random import Random
 
 __all__ = ["Percentiles", "Stats", "StatsKeeper"]
 
+# Number of commands of a run, drawn uniformly, from which percentiles are computed.
 _SAMPLE_SIZE = 2048
-"""Number of commands of a run, drawn uniformly, from which percentiles are computed."""
 
+# Number of the last round trips from which the next one is predicted.
 _RECENT = 32
-"""Number of the last round trips from which the next one is predicted."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -1,7 +1,6 @@
-"""What NYU Depth V2 needs beyond other data sets: its raw depth, its registration, its .mat file.
+"""The formats of NYU Depth V2: raw depth, registration, and the labelled .mat file, which needs h5py.
 
-Promises to work on arrays and named files alone, to need h5py for the labelled file only, and not
-to undistort images (`client_sdk.datasets.recordings` does that, before registration).
+Images are not undistorted here; `client_sdk.datasets.recordings` does that before registration.
 
 Source:
     Silberman et al., ECCV 2012; the calibration is the one shipped with the data set's toolbox.
@@ -77,8 +76,8 @@ class RawFile(NamedTuple):
 def T_colour_depth() -> Array:
     """Return the pose of the depth camera in the colour camera's frame, metres.
 
-    The toolbox keeps minus its rotation and the opposite translation; dividing by a negative z
-    hides that.  This is the same map with points in front of the camera.
+    The toolbox stores minus the rotation and the opposite translation, which cancels when it divides
+    by a negative z.  This is the same map with points in front of the camera.
     """
     T = np.eye(4)
     T[:3, :3] = [
@@ -115,7 +114,7 @@ def register_depth(depth_m: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
 def raw_files(folder: Path, prefix: str) -> list[RawFile]:
     """Return the images ``prefix-SECONDS-TICKS.p?m`` of a raw dump by time; empty ones are left out.
 
-    The published dump holds some files that were cut short; a frame without its bytes is no frame.
+    The published dump holds some truncated files.
     """
     found = []
     for path in folder.glob(f"{prefix}-*.p[gp]m"):
@@ -128,7 +127,7 @@ def raw_files(folder: Path, prefix: str) -> list[RawFile]:
 def read_pnm(path: Path) -> npt.NDArray[Any]:
     """Return the pixels of a binary PPM ``(h, w, 3)`` uint8 or a 16-bit PGM ``(h, w)`` uint16.
 
-    The 16-bit files of the raw dump are *little* endian, against the format's own rule.
+    The 16-bit files of the raw dump are *little* endian, contrary to the format.
 
     Raises:
         UsageError: The file cannot be read or is of another kind.
@@ -146,14 +145,14 @@ def read_pnm(path: Path) -> npt.NDArray[Any]:
         if len(body) >= width * height * colours * kind.itemsize:
             pixels = np.frombuffer(body, dtype=kind, count=width * height * colours)
             return pixels.reshape((height, width, 3) if colours == 3 else (height, width))
-    raise UsageError(f"{path} is not a whole PPM or PGM image", hint="unpack the dump again")
+    raise UsageError(f"{path} is not a complete PPM or PGM image", hint="unpack the dump again")
 
 
 class LabelledFile:
     """The labelled ``.mat`` file (HDF5), one image at a time.
 
     MATLAB stores columns first, so HDF5 shows ``images`` as ``(n, 3, w, h)`` and depths as
-    ``(n, w, h)``.  ``rawDepths`` (0 = no reading) are preferred; ``depths`` have their holes painted.
+    ``(n, w, h)``.  ``rawDepths`` (0 = no reading) are preferred, because ``depths`` have their holes filled in.
     """
 
     def __init__(self, path: Path) -> None:
@@ -163,7 +162,7 @@ class LabelledFile:
         """Return the rows of one scene, of all without a *scene*.
 
         Raises:
-            UsageError: The file is no labelled file, or holds no such scene.
+            UsageError: The file is not the labelled file, or holds no such scene.
             MissingExtra: h5py is not installed.
         """
         with self._open() as file:

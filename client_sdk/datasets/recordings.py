@@ -1,7 +1,7 @@
 """RGB-D recordings as frames: TUM folders, NYU Depth V2 (labelled file or raw dump).
 
-Whatever the source, a `Frame` comes out undistorted, registered, in metres, red first.  Promises to
-read an image only when its frame is asked for, and to say in one line what is wrong with a path.
+Every `Frame` is undistorted and registered, with depth in metres and colours in the order red, green, blue.
+An image is read only when its frame is needed.  A path that cannot be used is reported in one line.
 """
 
 from __future__ import annotations
@@ -17,26 +17,26 @@ import numpy as np
 import numpy.typing as npt
 
 from client_sdk.datasets import nyu
-from client_sdk.frontend import Frame
+from client_sdk.frontend import Frame, load_opencv
 from client_sdk.mapping import Trajectory, read_trajectory
-from rse_pf.errors import InvalidCamera, MissingExtra, UsageError
+from rse_pf.errors import InvalidCamera, UsageError
 from rse_pf.geometry import Camera
 
 __all__ = ["Dataset", "associate_stamps", "open_dataset", "read_colour"]
 
 _MAX_STAMP_DIFFERENCE_S = 0.02
+# The raw dump's two streams run freely; the nearest images are at most half a period apart.
 _MAX_RAW_STAMP_DIFFERENCE_S = 0.05
-"""The raw dump's two streams run freely; the nearest images are at most half a period apart."""
 
 _Distortion = tuple[float, ...]
 
+# Intrinsics of the TUM benchmark by folder name; the last is its default for unnamed cameras.
 _FREIBURG: dict[str, tuple[float, float, float, float, _Distortion]] = {
     "freiburg1": (517.3, 516.5, 318.6, 255.3, (0.2624, -0.9531, -0.0054, 0.0026, 1.1633)),
     "freiburg2": (520.9, 521.0, 325.1, 249.7, (0.2312, -0.7849, -0.0033, -0.0001, 0.9172)),
     "freiburg3": (535.4, 539.2, 320.1, 247.6, ()),
     "": (525.0, 525.0, 319.5, 239.5, ()),
 }
-"""Intrinsics of the TUM benchmark by folder name; the last is its default for unnamed cameras."""
 _FREIBURG_DEPTH_SCALE = 5000.0
 
 
@@ -52,7 +52,7 @@ class Dataset:
     """"reference": poses that came with the source, an estimate."""
     rows: tuple[int, ...]
     read: Callable[[int], Frame]
-    """Reads one of *rows*; row *i* has time stamp ``timestamps_s[i]`` of this very dataset."""
+    """Read one of *rows*; row *i* has the time stamp ``timestamps_s[i]`` of this dataset."""
 
     def __len__(self) -> int:
         return len(self.rows)
@@ -65,10 +65,10 @@ class Dataset:
         if not (math.isfinite(rate_hz) and rate_hz > 0):
             raise UsageError(f"rate {rate_hz:g} is not above 0", hint="name frames per second, such as 5")
         kept: list[int] = []
-        for place, timestamp_s in enumerate(self.timestamps_s):
-            # A microsecond is forgiven: the stamps are decimal fractions.
+        for index, timestamp_s in enumerate(self.timestamps_s):
+            # A tolerance of one microsecond, because the stamps are decimal fractions.
             if not kept or timestamp_s - self.timestamps_s[kept[-1]] >= 1.0 / rate_hz - 1e-6:
-                kept.append(place)
+                kept.append(index)
         return self._only(kept)
 
     def share(self, robot: int, robots: int) -> Dataset:
@@ -78,16 +78,16 @@ class Dataset:
         size = math.ceil(len(self) / robots)
         return self._only(range(len(self))[robot * size : (robot + 1) * size])
 
-    def _only(self, places: Sequence[int]) -> Dataset:
+    def _only(self, indices: Sequence[int]) -> Dataset:
         return replace(
             self,
-            timestamps_s=tuple(self.timestamps_s[place] for place in places),
-            rows=tuple(self.rows[place] for place in places),
+            timestamps_s=tuple(self.timestamps_s[index] for index in indices),
+            rows=tuple(self.rows[index] for index in indices),
         )
 
 
 def open_dataset(path: Path, *, scene: str | None = None) -> Dataset:
-    """Find out what *path* is and return its frames; images are read later.
+    """Detect the format of *path* and return its frames; images are read later.
 
     Accepts a folder in TUM layout (``rgb.txt``, ``depth.txt``, with or without ``intrinsics.json``),
     a raw NYU Depth V2 folder (``r-*.ppm``, ``d-*.pgm``), or its labelled ``.mat`` file, of which
@@ -104,17 +104,17 @@ def open_dataset(path: Path, *, scene: str | None = None) -> Dataset:
     if not path.is_dir():
         raise UsageError(f"no folder {path}", hint="name a folder in TUM layout: rgb.txt, depth.txt, images")
     if scene is not None:
-        raise UsageError(f"{path} has no scenes", hint="a scene picks from the labelled .mat file only")
+        raise UsageError(f"{path} has no scenes", hint="name scenes for the labelled .mat file only")
     if not (path / "rgb.txt").exists() and any(path.glob("d-*.pgm")):
         return _open_raw(path)
     return _open_tum(path)
 
 
 def read_colour(path: Path) -> npt.NDArray[np.uint8]:
-    """Return a colour image ``(h, w, 3)``, red first, as it is in its file.
+    """Return the colour image of a file, ``(h, w, 3)``, in the order red, green, blue.
 
     Raises:
-        UsageError: It is no image.
+        UsageError: The file is not an image.
         MissingExtra: OpenCV is not installed.
     """
     return _read_image(path, is_depth=False)
@@ -125,7 +125,7 @@ def associate_stamps(
 ) -> list[tuple[int, int]]:
     """Return ``(row of first, row of second)`` pairs, nearest in time, each row at most once.
 
-    Both must ascend.  Of several that want one partner, the nearest gets it.
+    Both must ascend.  If several rows are nearest to one partner, the closest of them gets it.
     """
     wanted: dict[int, tuple[float, int]] = {}
     stamps = np.asarray(second, dtype=np.float64)
@@ -160,7 +160,7 @@ def _open_tum(folder: Path) -> Dataset:
         rgb = _read_image(folder / colours[colour_row][1], is_depth=False)
         png = _read_image(folder / depths[depth_row][1], is_depth=True)
         depth_m = png.astype(np.float32) / np.float32(depth_scale)
-        depth_m[png == np.iinfo(png.dtype).max] = 0.0  # how some recorders write "no reading"
+        depth_m[png == np.iinfo(png.dtype).max] = 0.0  # some recorders write "no reading" so
         _check_metres(depth_m, folder)
         return Frame(
             timestamp_s=colours[colour_row][0],
@@ -288,7 +288,7 @@ def _open_raw(folder: Path) -> Dataset:
 
 
 def _open_labelled(path: Path, scene: str | None) -> Dataset:
-    """Return the labelled images, one second apart: the file keeps no times of its own."""
+    """Return the labelled images, one second apart, because the file holds no time stamps."""
     file = nyu.LabelledFile(path)
     rows = file.rows(scene)
 
@@ -311,13 +311,13 @@ def _open_labelled(path: Path, scene: str | None) -> Dataset:
 
 
 class _Undistortion:
-    """Maps images of a distorted lens to the pinhole camera of the same intrinsics."""
+    """Map images of a distorted lens to the pinhole camera of the same intrinsics."""
 
     def __init__(self, camera: Camera, distortion: _Distortion) -> None:
         self._maps: tuple[Any, Any] | None = None
         if any(distortion):
             size = (camera.width, camera.height)
-            cv2 = _opencv()
+            cv2 = load_opencv()
             self._maps = cv2.initUndistortRectifyMap(
                 camera.matrix, np.array(distortion), None, camera.matrix, size, cv2.CV_32FC1
             )
@@ -330,16 +330,16 @@ class _Undistortion:
         return depth_m if self._maps is None else self._remap(depth_m, "INTER_NEAREST")
 
     def _remap(self, image: npt.NDArray[Any], interpolation: str) -> npt.NDArray[Any]:
-        cv2 = _opencv()
+        cv2 = load_opencv()
         assert self._maps is not None
         mapped: npt.NDArray[Any] = cv2.remap(image, *self._maps, getattr(cv2, interpolation))
         return mapped
 
 
 def _read_image(path: Path, *, is_depth: bool) -> npt.NDArray[Any]:
-    cv2 = _opencv()
+    cv2 = load_opencv()
     image = None
-    if path.is_file():  # OpenCV would print a warning of its own
+    if path.is_file():  # OpenCV would print a warning otherwise
         image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED if is_depth else cv2.IMREAD_COLOR)
     if image is None:
         raise UsageError(f"cannot read the image {path}", hint="unpack the recording again")
@@ -353,11 +353,3 @@ def _read_image(path: Path, *, is_depth: bool) -> npt.NDArray[Any]:
         )
     depth: npt.NDArray[Any] = image
     return depth
-
-
-def _opencv() -> Any:
-    try:
-        import cv2
-    except ImportError as error:
-        raise MissingExtra("opencv-python-headless", "vision") from error
-    return cv2

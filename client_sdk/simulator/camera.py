@@ -1,7 +1,7 @@
-"""A depth camera for the rendered world: draws faces, then adds the flaws of a Kinect.
+"""A depth camera for the rendered world: it draws faces, then adds the noise of a Kinect.
 
-Promises pure numpy, the same image for the same world, pose and random generator, and about a
-tenth of a second for an image of 640x480 on one core.
+The camera is written in numpy alone.  The same world, pose and random generator give the same image; one of
+640x480 pixels takes about a tenth of a second on one core.
 
 Source:
     Depth noise after Nguyen, Izadi and Lovell, 3DIMPVT 2012, eq. 3 (axial); textures by mip maps
@@ -20,14 +20,14 @@ __all__ = ["Painter", "add_depth_noise", "add_image_noise"]
 
 _Image = npt.NDArray[np.float32]
 _NEAR_M = 0.05
+# Baseline times focal length of a Kinect: disparity in px = this / depth in m.
 _DISPARITY_M_PX = 0.075 * 580.0
-"""Baseline times focal length of a Kinect: disparity in px = this / depth in m."""
 _DISPARITY_STEPS = 8.0
 _GRAZING_COSINE = 0.10
 
 
 class Painter:
-    """Draws one world as one camera sees it."""
+    """Draw one world as one camera sees it."""
 
     def __init__(self, world: World, camera: Camera) -> None:
         self._faces, self._camera = world.faces, camera
@@ -53,7 +53,7 @@ class Painter:
     def draw(self, T_world_camera: Array) -> tuple[_Image, _Image, _Image]:
         """Return colour ``(h, w, 3)`` 0..255, depth ``(h, w)`` in metres and the cosine of incidence.
 
-        All three are exact: without noise.  Depth is 0 where the ray leaves the world.
+        All three are without noise.  Depth is 0 where the ray leaves the world.
         """
         rotation = T_world_camera[:3, :3].astype(np.float32)
         rays = np.tensordot(rotation, self._rays_camera, axes=1)
@@ -88,7 +88,7 @@ class Painter:
     def _rasterise(
         self, T_world_camera: Array, rays: _Image, origin: _Image
     ) -> tuple[_Image, npt.NDArray[np.int32]]:
-        """Return depth and face number of each pixel; a face is tried inside its outline's box only."""
+        """Return depth and face number of each pixel; each face is tested only inside its bounding box."""
         depth_m = np.full(rays.shape[1:], np.inf, dtype=np.float32)
         ids = np.full(rays.shape[1:], -1, dtype=np.int32)
         with np.errstate(divide="ignore"):

@@ -1,7 +1,7 @@
-"""A world to drive through for robots without a recording: rendered frames with exact poses.
+"""Rendered frames with exact poses, for robots without a recording.
 
-Robots follow one loop through three furnished rooms; each starts at its own place on it, so their
-maps overlap.  Promises pure numpy (no image library), and the same frames for the same arguments.
+Robots follow one loop through three furnished rooms; each starts at a different point of it, so their maps
+overlap.  The same arguments give the same frames.  No image library is needed.
 """
 
 from __future__ import annotations
@@ -25,37 +25,16 @@ STEP_M = 0.068
 """Distance between frames: a robot that drives at 0.34 m/s."""
 SIMULATED_CAMERA = Camera(fx=525.0, fy=525.0, cx=319.5, cy=239.5, width=640, height=480)
 
+# Corners of the loop: through both doors, around the tables of the outer rooms, and back.
 _WAYPOINTS_M = (
-    (5.0, 2.05),
-    (6.4, 1.75),
-    (7.5, 1.65),
-    (8.6, 1.75),
-    (10.0, 2.05),
-    (11.3, 1.35),
-    (12.5, 1.0),
-    (13.6, 1.4),
-    (13.95, 2.3),
-    (13.6, 3.2),
-    (12.5, 3.45),
-    (11.3, 3.2),
-    (10.0, 2.55),
-    (8.6, 2.8),
-    (7.5, 2.9),
-    (6.4, 2.8),
-    (5.0, 2.55),
-    (3.7, 3.2),
-    (2.5, 3.45),
-    (1.4, 3.2),
-    (1.05, 2.3),
-    (1.4, 1.4),
-    (2.5, 1.0),
-    (3.7, 1.35),
-)
-"""Corners of the loop: through both doors, around the tables of the outer rooms, and back."""
+    (5.0, 2.05), (6.4, 1.75), (7.5, 1.65), (8.6, 1.75), (10.0, 2.05), (11.3, 1.35), (12.5, 1.0), (13.6, 1.4),
+    (13.95, 2.3), (13.6, 3.2), (12.5, 3.45), (11.3, 3.2), (10.0, 2.55), (8.6, 2.8), (7.5, 2.9), (6.4, 2.8),
+    (5.0, 2.55), (3.7, 3.2), (2.5, 3.45), (1.4, 3.2), (1.05, 2.3), (1.4, 1.4), (2.5, 1.0), (3.7, 1.35),
+)  # fmt: skip
 
 
 def render_frames(robot: int, robots: int, frames: int, seed: int) -> Iterator[Frame]:
-    """Yield what robot 0, 1, ... of *robots* sees on its way; frame *i* is at ``true_trajectory[i]``.
+    """Yield the frames of robot 0, 1, ... of *robots*; frame *i* is seen from ``true_trajectory[i]``.
 
     Raises:
         UsageError: The robot is not one of *robots*, or there are no frames.
@@ -106,8 +85,8 @@ def _loop() -> tuple[Array, float]:
 def _resample(corners: Array, step_m: float) -> tuple[Array, float]:
     closed = np.vstack((corners, corners[:1]))
     along = np.concatenate(([0.0], np.cumsum(np.linalg.norm(np.diff(closed, axis=0), axis=1))))
-    places = np.linspace(0.0, along[-1], round(along[-1] / step_m), endpoint=False)
-    points = np.column_stack([np.interp(places, along, closed[:, axis]) for axis in range(2)])
+    positions = np.linspace(0.0, along[-1], round(along[-1] / step_m), endpoint=False)
+    points = np.column_stack([np.interp(positions, along, closed[:, axis]) for axis in range(2)])
     return points, float(along[-1])
 
 

@@ -1,12 +1,11 @@
 """The rendered world: three furnished rooms in a row, as textured rectangles.
 
 Everything is axis-aligned; z is up, metres; the rooms fill ``x 0..15, y 0..4.6, z 0..2.6``.
-Promises the same world for the same seed, and to draw nothing (`client_sdk.simulator.camera` does).
+The same seed gives the same world; `client_sdk.simulator.camera` draws it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -23,12 +22,12 @@ _Image = npt.NDArray[np.float32]
 _Colour = tuple[int, int, int]
 
 _OAK, _WALNUT, _WHITE, _CREAM = (196, 150, 98), (104, 66, 40), (244, 242, 236), (250, 244, 226)
+# Background and print of the wallpaper of each room.
 _PAPERS: tuple[tuple[_Colour, _Colour], ...] = (
     ((232, 222, 202), (150, 120, 92)),
     ((196, 214, 200), (74, 112, 104)),
     ((214, 218, 232), (92, 104, 150)),
 )
-"""Background and print of the wallpaper of each room."""
 _POSTERS: tuple[tuple[_Colour, _Colour], ...] = (
     ((246, 232, 200), (176, 58, 40)),
     ((236, 240, 242), (28, 72, 110)),
@@ -90,21 +89,13 @@ class _Builder:
             others = [other for other in range(3) if other != axis]
             for sign, offset in ((-1, low[axis]), (1, high[axis])):
                 self.faces.append(
-                    Face(
-                        axis,
-                        offset,
-                        sign,
-                        (low[others[0]], low[others[1]]),
-                        (high[others[0]], high[others[1]]),
-                        *skin,
-                        *colours,
-                        room,
-                    )
-                )
+                    Face(axis, offset, sign, (low[others[0]], low[others[1]]),
+                         (high[others[0]], high[others[1]]), *skin, *colours, room)
+                )  # fmt: skip
 
 
 def make_world(seed: int) -> World:
-    """Return the world of *seed*: its rooms stay, its textures and pictures change."""
+    """Return the world of *seed*: the rooms are fixed, textures and pictures depend on the seed."""
     build = _Builder(np.random.default_rng([seed, 11]))
     floor = build.texture(_planks(build.rng))
     ceiling = build.texture(0.5 + 0.25 * _noise(build.rng, 1024, 4, 120, 0.6))
@@ -148,12 +139,9 @@ def _door_frame(build: _Builder, door: int, wood: int) -> None:
     build.box((x - half, left - 0.06, 0), (x + half, left + 0.02, _DOOR_HEIGHT_M), door, skin, colours)
     build.box((x - half, right - 0.02, 0), (x + half, right + 0.06, _DOOR_HEIGHT_M), door, skin, colours)
     build.box(
-        (x - half, left - 0.06, _DOOR_HEIGHT_M - 0.02),
-        (x + half, right + 0.06, _DOOR_HEIGHT_M + 0.06),
-        door,
-        skin,
-        colours,
-    )
+        (x - half, left - 0.06, _DOOR_HEIGHT_M - 0.02), (x + half, right + 0.06, _DOOR_HEIGHT_M + 0.06),
+        door, skin, colours,
+    )  # fmt: skip
 
 
 def _furnish(build: _Builder, room: int, wood: int, cloth: int) -> None:
@@ -173,7 +161,7 @@ def _furnish(build: _Builder, room: int, wood: int, cloth: int) -> None:
         _shelf(build, room, (x + 3.0, 0.0), (x + 4.5, 0.3), wood)
         build.box((x + 1.4, DEPTH_M - 0.72, 0), (x + 3.2, DEPTH_M, 0.42), room, fabric, colours)
         build.box((x + 1.4, DEPTH_M - 0.2, 0.42), (x + 3.2, DEPTH_M, 0.84), room, fabric, colours)
-    for number in range(3):  # things that stand about
+    for number in range(3):  # small boxes on the sideboard
         side = float(build.rng.uniform(0.12, 0.24))
         left = x + (0.62, 1.05, 1.5)[number] + (2.5 if room == 1 else 0.0)
         y, z = (DEPTH_M - 0.4, 0.8) if room == 1 else (0.06, 0.86)
@@ -233,14 +221,6 @@ def _noise(rng: np.random.Generator, n: int, low: float, high: float, power: flo
     image = np.fft.irfft2(np.fft.rfft2(rng.standard_normal((n, n))) * weight, s=(n, n))
     scaled: _Image = (image / (2.5 * image.std())).astype(np.float32)
     return scaled
-
-
-_MOTIFS: tuple[Callable[[_Image, _Image], _Image], ...] = (
-    lambda a, b: np.sqrt(a * a + 3.2 * b * b),
-    lambda a, b: np.abs(a) + np.abs(b),
-    lambda a, b: np.maximum(np.abs(a), 2.2 * np.abs(b)),
-)
-"""Leaf, diamond and ribbon: below 1 inside, in units of their size."""
 
 
 def _wallpaper(rng: np.random.Generator, room: int) -> _Image:

@@ -13,8 +13,8 @@ import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Protocol
 
+from client_sdk.transfer.data_client import DataClient
 from rse_pf.config import DataSettings
 from rse_pf.errors import BadRequest, LimitExceeded, RsePfError, UsageError
 from rse_pf.files import replace_file
@@ -27,22 +27,12 @@ _RETRY_PAUSE_S = 5.0
 _BUSY_POLL_S = 0.05
 
 
-class Uploads(Protocol):
-    """A client that uploads one object at a time, such as `DataClient`."""
-
-    def upload(self, source: Path, progress: Callable[[int, int], None] | None = None) -> str:
-        """Store a file and return its digest; report bytes done and in total after each part."""
-
-    def close(self) -> None:
-        """Close the connection."""
-
-
 class BackgroundUploader:
     """Keep keyframes in a folder until a thread has uploaded them, oldest first."""
 
     def __init__(
         self,
-        uploads: Uploads,
+        uploads: DataClient,
         folder: Path,
         settings: DataSettings,
         *,
