@@ -117,9 +117,9 @@ def merge_isolation(snapshots: Iterable[Mapping[str, Any] | None]) -> dict[str, 
     for each in told:
         counts.update(each["counts"])
     return {
-        "environments": sum(each["environments"] for each in told),
-        "missing_walls": sorted({wall for each in told for wall in each["missing_walls"]}),
-        "quarantined": sorted({service for each in told for service in each["quarantined"]}),
+        "sandboxes": sum(each["sandboxes"] for each in told),
+        "missing_isolation": sorted({name for each in told for name in each["missing_isolation"]}),
+        "open_breakers": sorted({service for each in told for service in each["open_breakers"]}),
         "counts": dict(counts),
     }
 

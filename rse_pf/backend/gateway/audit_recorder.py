@@ -1,8 +1,8 @@
-"""What a backend server records of its door: who came in, who was refused, whose socket lost its standing.
+"""Record the authentication of robots: accepted and refused handshakes, renewals, and revoked connections.
 
-`AuditRecorder` collects in a worker, `ServerAudit` writes in the supervisor, the one writer of the server's
-log. Promises that a handshake waits for nothing, that a flood of refusals is counted instead of written,
-and that a name which nobody verified is called so.
+`AuditRecorder` collects notes in a worker; `ServerAudit` writes them in the supervisor, the only writer of
+the server's log.  A handshake never waits for the log, a flood of refusals is counted instead of written, and
+what an unverified token says is recorded as claimed.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ from rse_pf.backend.ports import Clocks, Handle, Loop
 
 __all__ = ["AuditRecorder", "ServerAudit", "open_records"]
 
-_MAX_IN_A_MESSAGE = 500
-"""Entries that travel together; the channel's longest line is 1 MiB."""
+_MAX_NOTES = 500
+"""Notes in one message; a line of the channel may have 1 MiB."""
 _SUM_UP_S = 10.0
 _UNAUTHORIZED = 401
 _MAX_CLAIM = 64
@@ -34,7 +34,7 @@ _W = TypeVar("_W")
 
 
 class AuditRecorder:
-    """Notes of one worker, sent to the supervisor in batches."""
+    """The notes of one worker, sent to the supervisor in batches."""
 
     def __init__(
         self,
@@ -49,7 +49,7 @@ class AuditRecorder:
         Args:
             clocks: Monotonic for the rate, wall for the entries.
             loop: For the time of the next batch.
-            tell: Says something to the supervisor; None: nothing is recorded.
+            tell: Sends a message to the supervisor; None: nothing is recorded.
             refusals: How many refusals are recorded one by one; None means the default.
         """
         self._clocks = clocks
@@ -61,25 +61,25 @@ class AuditRecorder:
         self._sum: Handle | None = None
 
     def judged(self, verdict: Accepted | Rejected, source: str, authorization: str) -> None:
-        """Take what the door said to the address *source*."""
+        """Record the verdict on a handshake from the address *source*."""
         if isinstance(verdict, Accepted):
             if verdict.claims is not None:
                 self._note("auth.accepted", _subject(verdict.claims), **_of(verdict.claims), source=source)
-        elif verdict.status == _UNAUTHORIZED and self._may_tell(verdict.reason):
+        elif verdict.status == _UNAUTHORIZED and self._may_record(verdict.reason):
             self._note("auth.refused", "", reason=verdict.reason, source=source, **_claimed(authorization))
 
     def renewed(self, before: Claims, claims: Claims) -> None:
-        """Take the fresh token of a live socket; the same token again is no news."""
+        """Record the fresh token of a live connection; the same token again is not recorded."""
         if claims.token_id != before.token_id:
             self._note("auth.renewed", _subject(claims), **_of(claims))
 
     def renewal_refused(self, before: Claims | None, reason: str) -> None:
-        """Take that a live socket showed a token that is not good."""
-        if self._may_tell(reason):
+        """Record that the fresh token of a live connection was refused."""
+        if self._may_record(reason):
             self._note("auth.renewal-refused", "" if before is None else _subject(before), reason=reason)
 
     def cut_off(self, claims: Claims, reason: str) -> None:
-        """Take that a live socket was ended because its token no longer stands."""
+        """Record that a live connection was ended because its token is no longer valid."""
         self._note("auth.cut-off", _subject(claims), **_of(claims), reason=reason)
 
     def flush(self) -> None:
@@ -87,7 +87,7 @@ class AuditRecorder:
         self._sum_up()
         self._send()
 
-    def _may_tell(self, reason: str) -> bool:
+    def _may_record(self, reason: str) -> bool:
         if self._tell is None:
             return False
         may = self._refusals.take(reason, self._clocks.monotonic())
@@ -113,8 +113,8 @@ class AuditRecorder:
         self._next = None
         held, self._held = self._held, []
         if self._tell is not None:
-            for first in range(0, len(held), _MAX_IN_A_MESSAGE):
-                self._tell(event="audit", notes=held[first : first + _MAX_IN_A_MESSAGE])
+            for first in range(0, len(held), _MAX_NOTES):
+                self._tell(event="audit", notes=held[first : first + _MAX_NOTES])
 
 
 class ServerAudit:
@@ -129,7 +129,7 @@ class ServerAudit:
         return self._log is not None
 
     def complain_to(self, say: Callable[[str], None]) -> None:
-        """Tell *say*, by any thread, when the log cannot be written."""
+        """Call *say*, from any thread, when the log cannot be written."""
         if self._log is not None:
             self._log.on_problem = say
 
@@ -172,8 +172,8 @@ def open_records(folder: Path | None, server_id: str) -> ServerAudit:
     )  # fmt: skip
 
 
-class _Shown(msgspec.Struct):
-    """What a token that nobody verified says of itself."""
+class _Claimed(msgspec.Struct):
+    """The claims of a token that nobody verified."""
 
     sub: str = ""
     jti: str = ""
@@ -184,10 +184,10 @@ def _claimed(authorization: str) -> Mapping[str, str]:
     if len(parts) != 3:
         return {}
     try:
-        shown = msgspec.json.decode(base64.urlsafe_b64decode(parts[1] + "=="), type=_Shown)
+        claimed = msgspec.json.decode(base64.urlsafe_b64decode(parts[1] + "=="), type=_Claimed)
     except (ValueError, msgspec.MsgspecError, RecursionError):
         return {}
-    return {"claimed_robot": shown.sub[:_MAX_CLAIM], "claimed_token": shown.jti[:_MAX_CLAIM]}
+    return {"claimed_robot": claimed.sub[:_MAX_CLAIM], "claimed_token": claimed.jti[:_MAX_CLAIM]}
 
 
 def _subject(claims: Claims) -> str:

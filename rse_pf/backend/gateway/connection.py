@@ -1,179 +1,263 @@
-"""One robot's socket inside a worker: frames in, what its session decided out, everything else to the core.
+"""One robot's connection inside a worker: frames come in, and what its session decides goes out.
 
-Promises to know no socket library and no clock but the core's, and that a socket which closes takes nothing
-more.
+Commands go to a `CommandHandler`, which the dispatcher is, and come back through `RobotConnection.answer`.
+The connection knows no socket library, and takes nothing more once it is closing.
 """
 
 from __future__ import annotations
 
 from collections import deque
-from typing import TYPE_CHECKING
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
 
-from rse_pf.auth.roster import holds
-from rse_pf.backend.gateway.decoder_thread import DecoderThread, refusal_unread
+from rse_pf.auth.tokens import Claims
+from rse_pf.backend.gateway.admission import Admission
+from rse_pf.backend.gateway.decoder_thread import DecoderThread
 from rse_pf.backend.gateway.frames import CloseSocket, FrameAssembler, Received, SendPong
+from rse_pf.backend.gateway.handshake import Accepted
+from rse_pf.backend.metrics import Metrics
 from rse_pf.backend.ports import Wire
+from rse_pf.config import SessionSettings
+from rse_pf.errors import ProtocolError
+from rse_pf.wire import Codec, Command
+from rse_pf.wire.messages import FromRobot
 from rse_pf.wire.server_session import Decision, Renewal, Send, ServerSession, Submit, Withdraw
 
-if TYPE_CHECKING:
-    from rse_pf.auth.tokens import Claims
-    from rse_pf.backend.gateway.dispatcher import Dispatcher
-    from rse_pf.errors import ProtocolError
-    from rse_pf.wire.messages import FromRobot
+__all__ = ["CommandHandler", "ConnectionContext", "RobotConnection"]
 
-__all__ = ["RobotConnection"]
+_BAD_MESSAGE_PAUSE_S = 0.1
+"""After an undecodable message its socket is not read for this, times their number."""
+
+
+class CommandHandler(Protocol):
+    """What a connection needs of the dispatcher."""
+
+    def refuses_unread(self, connection: RobotConnection, data: bytes, now: float) -> bool:
+        """Refuse the message *data* before it is decoded; False if it must be decoded."""
+
+    def refuses_long(self, connection: RobotConnection, data: bytes) -> bool:
+        """Refuse a message that is too long for the event loop; False if the decoder thread may take it."""
+
+    def submit(self, connection: RobotConnection, command: Command, size_bytes: int, now: float) -> None:
+        """Take one command."""
+
+    def withdraw(self, connection: RobotConnection, command_id: int) -> None:
+        """Cancel a long command."""
+
+    def renew(self, connection: RobotConnection, token: str) -> None:
+        """Judge a fresh token."""
+
+    def opened(self, connection: RobotConnection, now: float) -> None:
+        """Take that the robot said Hello."""
+
+    def disconnect(self, connection: RobotConnection) -> None:
+        """Take that the socket ended."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ConnectionContext:
+    """What all connections of a worker share."""
+
+    settings: SessionSettings
+    handler: CommandHandler
+    monotonic: Callable[[], float]
+    metrics: Metrics
+    decoder: DecoderThread
+    admission: Admission
 
 
 class RobotConnection:
-    """One robot's socket between its handshake and its end."""
+    """One robot's connection between its handshake and its end."""
 
     __slots__ = (
-        "_behind", "_core", "_wire", "allowed_s", "assembler", "claims", "expires_s", "last_heard_s",
-        "moving_until_s", "number", "opened_s", "robot", "session", "tenant",
+        "_assembler", "_context", "_deferred", "_wire", "allowed_s", "claims", "expires_s", "is_connected",
+        "last_heard_s", "moving_until_s", "number", "opened_s", "robot", "session", "tenant",
     )  # fmt: skip
 
     def __init__(
         self,
-        core: Dispatcher,
+        context: ConnectionContext,
         wire: Wire,
         session: ServerSession | None,
-        robot: str,
+        accepted: Accepted,
+        *,
         now: float,
         expires_s: float | None,
+        number: int = 0,
     ) -> None:
-        self.robot = robot
-        self.tenant = "default"
+        """Know the robot; its session waits for a Hello.
+
+        Args:
+            context: What all connections share.
+            wire: The socket.
+            session: The rules of the protocol; None echoes messages, for the conformance test of WebSocket.
+            accepted: What the handshake says of the robot.
+            now: Seconds, monotonic, as all times here.
+            expires_s: When the robot's token ends; None never.
+            number: Which socket of the server this is, in the order of acceptance.
+        """
+        self.robot, self.tenant = accepted.robot, accepted.tenant
+        self.claims: Claims | None = accepted.claims
+        """What the robot's token says; None where no token is required."""
         self.session = session
-        self.assembler = FrameAssembler(core.settings.session)
+        self.number = number
         self.opened_s = self.last_heard_s = now
         self.expires_s = expires_s
         self.allowed_s: float | None = None
-        """What the last command allowed, from its arrival to its deadline."""
-        self.claims: Claims | None = None
-        """What the robot's token says; None where no token is asked for."""
-        self.number = 0
-        """Which socket of the server this is, in the order of acceptance."""
+        """Time that the last command had, from its arrival to its deadline."""
         self.moving_until_s = float("-inf")
-        self._core = core
+        self.is_connected = True
+        """Whether the socket still exists."""
+        self._context = context
         self._wire = wire
-        self._behind: deque[tuple[Received, float]] | None = None
-        """What arrived while a long message is read elsewhere; None: nothing is."""
+        self._assembler = FrameAssembler(context.settings)
+        self._deferred: deque[tuple[Received, float]] | None = None
+        """Messages that arrived while the decoder thread has one of this robot; None if it has none."""
 
-    def frame(self, opcode: int, fin: bool, rsv: bool, payload: bytes) -> None:
-        """Take one unmasked frame."""
-        now = self._core.clocks.monotonic()
-        decision = self.assembler.receive(opcode, fin, rsv, payload, now)
-        if isinstance(decision, Received):
-            self._message(decision, now)
-        elif isinstance(decision, SendPong):
-            self._wire.send_pong(decision.data)
-        elif isinstance(decision, CloseSocket):
-            self._core.metrics.closed[f"frames-{decision.code}"] += 1
-            self._wire.close(decision.code, decision.reason)
+    @property
+    def is_closing(self) -> bool:
+        """Whether a close frame was sent or received, so that nothing more is read or written."""
+        return self._assembler.closed
 
-    def ended(self) -> None:
-        """Note that the socket is gone."""
-        self._core.disconnect(self)
+    @property
+    def is_opening(self) -> bool:
+        """Whether the robot has not said Hello yet."""
+        return self.session is not None and self.session.state == "opening"
 
     @property
     def may_move(self) -> bool:
         """Whether the robot said Hello and can be asked to leave for another server."""
-        return self.session is not None and self.session.state == "open" and not self.assembler.closed
+        return self.session is not None and self.session.state == "open" and not self._assembler.closed
 
-    def may_use(self, service: str) -> bool:
-        """Whether the scopes of the robot's token allow *service*."""
-        return self.claims is None or holds(self.claims.scopes, f"services:{service}")
+    @property
+    def hears_progress(self) -> bool:
+        """Whether the robot is still connected and understands progress messages."""
+        return self.is_connected and self.session is not None and self.session.hears_progress
+
+    @property
+    def codec(self) -> Codec:
+        """The codec of the session; a connection that only echoes has none."""
+        assert self.session is not None
+        return self.session.codec
+
+    def frame(self, opcode: int, fin: bool, rsv: bool, payload: bytes) -> None:
+        """Take one unmasked frame."""
+        now = self._context.monotonic()
+        decision = self._assembler.receive(opcode, fin, rsv, payload, now)
+        if isinstance(decision, Received):
+            self._take(decision, now)
+        elif isinstance(decision, SendPong):
+            self._wire.send_pong(decision.data)
+        elif isinstance(decision, CloseSocket):
+            self._context.metrics.closed[f"frames-{decision.code}"] += 1
+            self._wire.close(decision.code, decision.reason)
+
+    def answer(self, data: bytes) -> None:
+        """Write the final answer to a command; does nothing if the socket is gone."""
+        if self.is_connected and self.session is not None:
+            self.session.in_flight -= 1
+            self.write(data)
+
+    def write(self, data: bytes) -> None:
+        """Write one message, unless the connection is closing."""
+        if not self._assembler.closed:
+            self._context.metrics.bytes_out += len(data)
+            self._wire.send(data, self.session is not None and self.session.codec.is_text)
 
     def move(self, reason: str, within_ms: float, now: float) -> None:
         """Ask the robot to leave for another server."""
         if self.session is not None:
             self.moving_until_s = now + within_ms / 1e3
-            self.apply(self.session.move(reason, within_ms), now)
+            self._execute(self.session.move(reason, within_ms), now)
 
-    def apply(self, decisions: list[Decision], now: float, size_bytes: int = 0) -> None:
-        """Do what the session decided."""
-        for decision in decisions:
-            if isinstance(decision, Submit):
-                self._core.submit(self, decision.command, size_bytes, now)
-            elif isinstance(decision, Renewal):
-                self._core.renew(self, decision.token)
-            elif isinstance(decision, Send):
-                self.write(decision.data)
-            elif isinstance(decision, Withdraw):
-                self._core.withdraw(self, decision.id)
-            else:
-                self.close(decision.code, decision.reason)
-
-    def write(self, data: bytes) -> None:
-        """Write one message, unless the socket is closing."""
-        if self.assembler.closed:
-            return
-        self._core.metrics.bytes_out += len(data)
-        self._wire.send(data, self.session is not None and self.session.codec.is_text)
+    def renewed(self, token_s: float | None, now: float) -> None:
+        """Tell the robot for how many seconds its fresh token is valid; None: it was refused."""
+        if self.session is not None:
+            self._execute(self.session.renewed(token_s), now)
 
     def close(self, code: int, reason: str) -> None:
         """Close the socket and take nothing more from it."""
-        self._core.metrics.closed[reason] += 1
-        self.assembler.closed = True
+        self._context.metrics.closed[reason] += 1
+        self._assembler.closed = True
         self._wire.close(code, reason)
 
-    def _message(self, received: Received, now: float) -> None:
+    def ended(self) -> None:
+        """Note that the socket is gone."""
+        self.is_connected = False
+        self._context.handler.disconnect(self)
+
+    def _take(self, received: Received, now: float) -> None:
+        """Take one whole message: defer, echo, refuse, decode at once, or pass to the decoder thread."""
         self.last_heard_s = now
-        if self._behind is not None:
-            self._behind.append((received, now))
+        context, session, data = self._context, self.session, received.data
+        if self._deferred is not None:
+            self._deferred.append((received, now))
             return
-        self._core.metrics.bytes_in += len(received.data)
-        session = self.session
+        context.metrics.bytes_in += len(data)
         if session is None:
-            self._core.metrics.bytes_out += len(received.data)
-            self._wire.send(received.data, received.is_text)
+            context.metrics.bytes_out += len(data)
+            self._wire.send(data, received.is_text)
             return
-        if session.state == "open" and self._core.refuses_unread(self, session.codec, received.data, now):
+        if session.state == "open" and context.handler.refuses_unread(self, data, now):
             return
-        reading, was, bad = self._core.reading, session.state, session.bad_messages
-        if reading is None:
-            self._received(session.receive(received.data, now), len(received.data), now, was, bad)
-            return
-        if len(received.data) <= reading.short_bytes:
-            decisions = session.receive_short(received.data, now, reading.short_inflated_bytes)
-            if decisions is not None:
-                self._received(decisions, len(received.data), now, was, bad)
-                return
-        self._read_elsewhere(reading, session, received.data, now)
+        state, bad_messages = session.state, session.bad_messages
+        decoder, decisions = context.decoder, None
+        if len(data) <= decoder.short_bytes:
+            decisions = session.receive_short(data, now, decoder.short_inflated_bytes)
+        if decisions is not None:
+            self._follow(decisions, len(data), now, state, bad_messages)
+        elif not context.handler.refuses_long(self, data):
+            self._decode_in_thread(session, data, now)
 
-    def _read_elsewhere(
-        self, reading: DecoderThread, session: ServerSession, data: bytes, now: float
-    ) -> None:
-        was, bad = session.state, session.bad_messages
+    def _decode_in_thread(self, session: ServerSession, data: bytes, now: float) -> None:
+        state, bad_messages = session.state, session.bad_messages
 
-        def done(read: FromRobot | ProtocolError) -> None:
-            behind, self._behind = self._behind, None
-            if not self.assembler.closed and self in self._core.connections:
-                self._received(session.take(read, now, len(data)), len(data), now, was, bad)
-            for each, arrived in behind or ():
-                if not self.assembler.closed:
-                    self._message(each, arrived)
+        def decoded(message: FromRobot | ProtocolError) -> None:
+            deferred, self._deferred = self._deferred, None
+            if self.is_connected and not self._assembler.closed:
+                self._follow(session.take(message, now, len(data)), len(data), now, state, bad_messages)
+            for received, arrived in deferred or ():
+                if not self._assembler.closed:
+                    self._take(received, arrived)
             self._wire.read_on()
 
-        if not reading.begin(session.codec, data, suspicion=bad, done=done):
-            self._core.metrics.shed["unread"] += 1
-            self.write(refusal_unread(session.codec, data, self._core.server_id))
-            return
-        self._behind = deque()
+        self._deferred = deque()
         self._wire.hold()
+        self._context.decoder.begin(session.codec, data, suspicion=bad_messages, done=decoded)
 
-    def _received(self, decisions: list[Decision], size_bytes: int, now: float, was: str, bad: int) -> None:
-        session = self.session
-        self.apply(decisions, now, size_bytes)
+    def _follow(
+        self, decisions: list[Decision], size_bytes: int, now: float, state: str, bad_messages: int
+    ) -> None:
+        """Execute what the session decided about one message; it was in *state* before."""
+        self._execute(decisions, now, size_bytes)
+        session, context = self.session, self._context
         if session is None:
             return
-        if session.bad_messages > self._core.settings.session.max_bad_messages:
-            self._core.rates.rest((self.tenant, self.robot), now)
-        if self.assembler.closed:
-            return
-        if session.bad_messages > bad:
-            # To refuse costs as much as to read: who sends garbage is read more and more rarely.
-            self._core.metrics.shed["bad-message"] += 1
-            self._wire.pause(session.bad_messages * self._core.settings.session.bad_message_pause_s)
-        if was == "opening" and session.state == "open":
-            self._core.welcomed(self, now)
+        if session.bad_messages > bad_messages:
+            self._limit_bad_messages(session, now)
+        elif state == "opening" and session.state == "open" and not self._assembler.closed:
+            context.handler.opened(self, now)
+
+    def _limit_bad_messages(self, session: ServerSession, now: float) -> None:
+        """Read the connection more and more rarely: refusing a bad message costs as much as reading it."""
+        context = self._context
+        if session.bad_messages > context.settings.max_bad_messages:
+            context.admission.rates.ban((self.tenant, self.robot), now)
+        if not self._assembler.closed:
+            context.metrics.shed["bad-message"] += 1
+            self._wire.pause(session.bad_messages * _BAD_MESSAGE_PAUSE_S)
+
+    def _execute(self, decisions: list[Decision], now: float, size_bytes: int = 0) -> None:
+        handler = self._context.handler
+        for decision in decisions:
+            if isinstance(decision, Submit):
+                handler.submit(self, decision.command, size_bytes, now)
+            elif isinstance(decision, Send):
+                self.write(decision.data)
+            elif isinstance(decision, Renewal):
+                handler.renew(self, decision.token)
+            elif isinstance(decision, Withdraw):
+                handler.withdraw(self, decision.id)
+            else:
+                self.close(decision.code, decision.reason)

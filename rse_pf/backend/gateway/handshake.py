@@ -1,7 +1,7 @@
-"""Judge a WebSocket handshake: path, room, token and sub-protocol, before anything is accepted.
+"""Judge a WebSocket handshake: path, capacity, token and sub-protocol, before anything is accepted.
 
-Every refusal has a fixed body; the cause of a refused token goes to the log alone.  Promises no
-socket and no clock: what a robot sent and the time come in, `Accepted` or `Rejected` goes out.
+Every rejection has a fixed body; the cause of a rejected token goes to the log only.  What a robot sent and
+the time come in, `Accepted` or `Rejected` goes out.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from rse_pf.auth.tokens import Claims, KeySet, token_problem, verify_token
 from rse_pf.config import PlatformSettings
@@ -20,14 +20,14 @@ from rse_pf.wire import SUBPROTOCOLS, codec_for
 __all__ = ["HEALTH", "Accepted", "HandshakePolicy", "Rejected"]
 
 HEALTH = "health"
-"""Result of who asked for no WebSocket, but whether robots are served."""
+"""Result of a request for the health page."""
 
 _RETRY_AFTER_S = 2
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Accepted:
-    """A robot that may upgrade.  ``expires_s`` is Unix time; None never expires."""
+    """A robot that may upgrade to WebSocket.  ``expires_s`` is Unix time; None never expires."""
 
     robot: str
     codec: str
@@ -48,7 +48,7 @@ class Rejected:
     headers: Mapping[str, str] = field(default_factory=dict)
 
 
-def _refusal(status: int, code: str, message: str, hint: str, **headers: str) -> Rejected:
+def _rejection(status: int, code: str, message: str, hint: str, **headers: str) -> Rejected:
     body = json.dumps({"code": code, "message": message, "hint": hint}, separators=(",", ":")).encode()
     return _answer(status, body, code, **headers)
 
@@ -61,7 +61,7 @@ def _answer(status: int, body: bytes, result: str, **headers: str) -> Rejected:
 
 
 class HandshakePolicy:
-    """The rules of one worker's front door."""
+    """The rules of one worker for handshakes."""
 
     def __init__(
         self, settings: PlatformSettings, keys: KeySet | None, *, conformance_echo: bool = False
@@ -73,22 +73,22 @@ class HandshakePolicy:
         self._path = path.encode()
         self._health_path = HEALTH_PATH.encode()
         self._healthy = _answer(200, b'{"status":"ok"}', HEALTH)
-        self.defect = _refusal(500, "internal", "the handshake failed", "try again")
-        self._not_found = _refusal(404, "not-found", "nothing is served here", f"connect to {path}")
-        self._full = _refusal(
-            503, "full", "this server has no room for another robot", "try again later",
+        self.defect = _rejection(500, "internal", "the handshake failed", "try again")
+        self._not_found = _rejection(404, "not-found", "nothing is served here", f"connect to {path}")
+        self._full = _rejection(
+            503, "full", "this server serves as many robots as it may", "try again later",
             Retry_After=str(_RETRY_AFTER_S),
         )  # fmt: skip
-        rest_s = settings.session.rate_ban_s
-        self.too_fast = _refusal(
+        ban_s = settings.session.rate_ban_s
+        self.too_fast = _rejection(
             429, "quota", "too many messages, or handshakes of this address", "wait, and slow down",
-            Retry_After=str(max(1, math.ceil(rest_s))),
+            Retry_After=str(max(1, math.ceil(ban_s))),
         )  # fmt: skip
-        self._no_token = _refusal(
+        self._no_token = _rejection(
             401, "unauthorized", "the token is missing or not valid",
             "issue one with rse-pf token issue ROBOT", WWW_Authenticate="Bearer",
         )  # fmt: skip
-        self._no_subprotocol = _refusal(
+        self._no_subprotocol = _rejection(
             400, "unsupported", "no sub-protocol that this server speaks was offered",
             f"offer one of {', '.join(SUBPROTOCOLS.values())}",
         )  # fmt: skip
@@ -103,7 +103,7 @@ class HandshakePolicy:
         anonymous: str,
         now_s: float,
     ) -> Accepted | Rejected:
-        """Return who may come in, or the answer that turns them away.
+        """Return which robot is accepted, or the HTTP answer that rejects it.
 
         Args:
             path: As requested, with its query.
@@ -121,8 +121,7 @@ class HandshakePolicy:
             return self._not_found
         if is_full:
             return self._full
-        robot, tenant, expires_s = anonymous, "default", None
-        claims = None
+        robot, tenant, expires_s, claims = anonymous, "default", None, None
         if self.keys is not None:
             scheme, _, token = authorization.partition(" ")
             try:
@@ -130,7 +129,7 @@ class HandshakePolicy:
                     raise Unauthorized("no bearer token")
                 claims = verify_token(token.strip(), keys=self.keys, now=now_s, settings=self._settings.auth)
             except Unauthorized as error:
-                return _because(self._no_token, token_problem(error))
+                return replace(self._no_token, reason=token_problem(error))
             robot, tenant = claims.robot, claims.tenant
             expires_s = self.ends_s(claims, now_s)
         codec = codec_for(offered)
@@ -142,25 +141,15 @@ class HandshakePolicy:
         )  # fmt: skip
 
     def ends_s(self, claims: Claims, now_s: float) -> float:
-        """Return when a socket on *claims* ends, in Unix seconds; one within the leeway lives to its end."""
+        """Return when a connection with *claims* ends, in Unix seconds; an expired token has its leeway."""
         leeway_s = self._settings.auth.leeway_s
         return claims.expires_s if now_s < claims.expires_s else claims.expires_s + leeway_s
 
     def renewed(self, token: str, now_s: float) -> Claims | str:
-        """Return the claims of a fresh token, or, for the log alone, why it is refused."""
+        """Return the claims of a fresh token, or why it is refused, which goes to the log only."""
         if self.keys is None:
             return "no-keys"
         try:
             return verify_token(token, keys=self.keys, now=now_s, settings=self._settings.auth)
         except Unauthorized as error:
             return token_problem(error)
-
-
-def _because(refusal: Rejected, reason: str) -> Rejected:
-    return Rejected(
-        status=refusal.status,
-        body=refusal.body,
-        result=refusal.result,
-        reason=reason,
-        headers=refusal.headers,
-    )

@@ -1,33 +1,30 @@
-"""When a worker gives a socket up: no Hello in time, a token that is over, or silence.
+"""Decide when a worker closes an idle connection: no Hello in time, or no message for too long.
 
-Silence is the robot's, not the worker's: what the worker slept does not count, and nobody is given up before
-what the kernel holds of him was read.  A socket is so noticed within a tick of its limit, which is far below
-what `session.ping_timeout_s` allows.  Promises no clock and no loop: times go in, closes come out.
+Only the robot's silence counts.  Time in which the worker itself did not run is not counted, and a connection
+is closed only after the sockets were read once more.  It is noticed within one tick of its limit, which is
+far below ``session.ping_timeout_s``.  Times go in and closes come out: there is no clock and no loop here.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import TYPE_CHECKING
 
+from rse_pf.backend.gateway.connection import RobotConnection
 from rse_pf.config import SessionSettings
-from rse_pf.wire.server_session import CLOSE_GOING_AWAY, CLOSE_PROTOCOL, CLOSE_TOKEN_OVER
+from rse_pf.wire.server_session import CLOSE_GOING_AWAY, CLOSE_PROTOCOL
 
-if TYPE_CHECKING:
-    from rse_pf.backend.gateway.connection import RobotConnection
+__all__ = ["IdleTimeouts", "max_silence_s"]
 
-__all__ = ["IdleTimeouts", "longest_silence_s"]
-
-_SLOWEST_TICK_S = 0.25
+_MAX_TICK_S = 0.25
 _TICKS_PER_LIMIT = 4
-_READING_S = 0.001
+_READ_S = 0.001
 """A loop that has a timer to wait for, however short, reads its sockets before."""
-_SLEPT_S = 1.0
-"""A tick that comes later than this was not late but away: stopped, swapped out, or on a frozen machine."""
+_STOPPED_S = 1.0
+"""A tick that is later than this was not delayed by work: the process was stopped, swapped out or frozen."""
 
 
-def longest_silence_s(settings: SessionSettings) -> float:
-    """Return how long a robot may say nothing: it pings in time, and its ping may take a while."""
+def max_silence_s(settings: SessionSettings) -> float:
+    """Return how long a robot may send nothing: its ping interval, and the time a ping may take."""
     return settings.ping_interval_s + settings.ping_timeout_s
 
 
@@ -35,9 +32,9 @@ class IdleTimeouts:
     """Looks at all connections of a worker, again and again."""
 
     def __init__(self, settings: SessionSettings, now: float) -> None:
-        self._settings = settings
-        self._silence_s = longest_silence_s(settings)
-        self._tick_s = min(_SLOWEST_TICK_S, settings.hello_timeout_s / _TICKS_PER_LIMIT)
+        self._hello_s = settings.hello_timeout_s
+        self._max_silence_s = max_silence_s(settings)
+        self._tick_s = min(_MAX_TICK_S, settings.hello_timeout_s / _TICKS_PER_LIMIT)
         self._next_s = now + self._tick_s
         self._suspects: set[RobotConnection] = set()
 
@@ -46,33 +43,25 @@ class IdleTimeouts:
         return self._next_s - now
 
     def look(self, connections: Iterable[RobotConnection], now: float) -> None:
-        """Close what is to be closed at *now*, and note whom to look at again once the sockets were read."""
-        slept_s = now - self._next_s
+        """Close what is idle at *now*, and note what to look at again once the sockets were read."""
+        late_s = now - self._next_s
         suspects: set[RobotConnection] = set()
         for connection in list(connections):
-            if connection.session is None or connection.assembler.closed:
+            if connection.session is None or connection.is_closing:
                 continue
-            if slept_s >= _SLEPT_S:
-                connection.last_heard_s = min(now, connection.last_heard_s + slept_s)
-                connection.opened_s = min(now, connection.opened_s + slept_s)
-            if connection.expires_s is not None and now >= connection.expires_s:
-                connection.close(CLOSE_TOKEN_OVER, "token-over")
-            elif self._is_mute(connection, now):
-                if connection in self._suspects:
-                    _give_up(connection)
-                else:
-                    suspects.add(connection)
+            if late_s >= _STOPPED_S:
+                connection.last_heard_s = min(now, connection.last_heard_s + late_s)
+                connection.opened_s = min(now, connection.opened_s + late_s)
+            is_opening = connection.is_opening
+            if is_opening and now - connection.opened_s < self._hello_s:
+                continue
+            if not is_opening and now - connection.last_heard_s < self._max_silence_s:
+                continue
+            if connection not in self._suspects:
+                suspects.add(connection)
+            elif is_opening:
+                connection.close(CLOSE_PROTOCOL, "no-hello")
+            else:
+                connection.close(CLOSE_GOING_AWAY, "silent")
         self._suspects = suspects
-        self._next_s = now + (_READING_S if suspects else self._tick_s)
-
-    def _is_mute(self, connection: RobotConnection, now: float) -> bool:
-        if connection.session is not None and connection.session.state == "opening":
-            return now - connection.opened_s >= self._settings.hello_timeout_s
-        return now - connection.last_heard_s >= self._silence_s
-
-
-def _give_up(connection: RobotConnection) -> None:
-    if connection.session is not None and connection.session.state == "opening":
-        connection.close(CLOSE_PROTOCOL, "no-hello")
-    else:
-        connection.close(CLOSE_GOING_AWAY, "silent")
+        self._next_s = now + (_READ_S if suspects else self._tick_s)

@@ -1,25 +1,18 @@
 """Ask some of a crowded server's robots to move to another server, spread over time.
 
-`plan` says when each worker asks its next robot; `Migration` does it in a worker.  Promises never more asks
-in a second than the settings allow, no robot asked twice while its first ask is still good, and to read
-neither a clock nor a source of randomness that it was not given.
+`plan` says when each worker asks its next robot; `Migration` does it in a worker.  No more robots are asked
+in a second than the settings allow, and no robot is asked again while it still has time to move.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from typing import Protocol
+from functools import partial
 
 from rse_pf.backend.gateway.connection import RobotConnection
+from rse_pf.backend.ports import Loop
 
 __all__ = ["Migration", "plan"]
-
-
-class Timers(Protocol):
-    """What `Migration` needs of an event loop."""
-
-    def call_later(self, delay: float, callback: Callable[..., object], *args: object) -> object:
-        """Call *callback* in *delay* seconds."""
 
 
 def plan(
@@ -27,13 +20,13 @@ def plan(
 ) -> list[list[float]]:
     """Return for each worker after how many seconds it asks one robot each, in order.
 
-    The most loaded worker asks next.  Each ask has a time slot of its own and comes at a random time within
-    it, so that neither robots nor servers keep step.
+    The most loaded worker asks next.  Each request to move comes at a random time within a time slot of its
+    own, so that neither robots nor servers act at the same time.
 
     Args:
         loads: Robots of each worker.
         robots: How many shall move; at most all are asked.
-        spread_s: Time the whole hand-over takes, longer if *moves_per_s* demands it.
+        spread_s: Time the whole migration takes, longer if *moves_per_s* demands it.
         moves_per_s: Slots in a second, at most.
         random: Uniform numbers in ``[0, 1)``.
     """
@@ -49,13 +42,13 @@ def plan(
 
 
 class Migration:
-    """The asks of one worker."""
+    """The requests to move of one worker."""
 
     def __init__(
         self,
         connections: Iterable[RobotConnection],
         *,
-        timers: Timers,
+        loop: Loop,
         now: Callable[[], float],
         choose: Callable[[Sequence[RobotConnection]], RobotConnection],
     ) -> None:
@@ -63,30 +56,30 @@ class Migration:
 
         Args:
             connections: The live ones of this worker, now and later.
-            timers: The event loop.
+            loop: Event loop of the worker.
             now: The worker's monotonic clock, s.
             choose: Picks one, at random.
         """
         self.asked = 0
         self._connections = connections
-        self._timers = timers
+        self._loop = loop
         self._now = now
         self._choose = choose
-        self._good_until: dict[RobotConnection, float] = {}
+        self._asked_until: dict[RobotConnection, float] = {}
 
     def begin(self, delays_s: Iterable[float], within_ms: float) -> None:
         """Ask one robot after each of *delays_s*; each gets *within_ms* to leave."""
         for delay_s in delays_s:
-            self._timers.call_later(delay_s, self._ask_one, within_ms)
+            self._loop.call_later(delay_s, partial(self._ask_one, within_ms))
 
     def _ask_one(self, within_ms: float) -> None:
         now = self._now()
         present = list(self._connections)
-        self._good_until = {each: self._good_until.get(each, 0.0) for each in present}
-        candidates = [each for each in present if each.may_move and self._good_until[each] <= now]
+        self._asked_until = {each: self._asked_until.get(each, 0.0) for each in present}
+        candidates = [each for each in present if each.may_move and self._asked_until[each] <= now]
         if not candidates:
             return
         chosen = self._choose(candidates)
-        self._good_until[chosen] = now + within_ms / 1e3
+        self._asked_until[chosen] = now + within_ms / 1e3
         self.asked += 1
         chosen.move("rebalance", within_ms, now)

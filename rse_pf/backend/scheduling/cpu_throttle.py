@@ -1,47 +1,62 @@
-"""Emulate a server of a fixed size: a bucket of CPU seconds gates the start of commands.
+"""Emulate a server with fewer cores: a bucket of CPU seconds delays the start of commands.
 
-A server of size S may use S CPU seconds per second; the bucket is drained by what the process
-really used, so the gate is honest whatever the work was.  Promises never to sleep or read a clock:
-the caller asks, and waits as long as it is told.
+A server of ``serving.emulated_cores`` may use that many CPU seconds per second.  The bucket is drained by
+what the process really used, so the emulation holds whatever the work was.  Nothing here sleeps: the caller
+asks, and sets a timer for the time it is told.
 """
 
 from __future__ import annotations
 
-__all__ = ["MIN_WAIT_S", "CpuThrottle"]
+from collections.abc import Callable
+
+__all__ = ["MIN_WAIT_S", "CpuThrottle", "NoThrottle"]
 
 MIN_WAIT_S = 0.002
 """Measured: with shorter waits, the waiting itself used up the budget of a small server."""
+_BURST_S = 0.02
+_BATCH_S = 0.01
+"""Refusals of this time are written together: one at a time, each costs three times as much."""
 
 
 class CpuThrottle:
-    """The bucket of one worker; ``size`` 0 means no gate."""
+    """The bucket of one worker."""
 
-    __slots__ = ("_at", "_burst_s", "_cpu_s", "_level_s", "_size")
+    __slots__ = ("_at", "_burst_s", "_cores", "_cpu", "_cpu_s", "_level_s", "batch_s")
 
-    def __init__(self, size: float, burst_s: float, *, now: float, cpu_s: float) -> None:
-        self._size = size
-        self._burst_s = burst_s
-        self._level_s = burst_s
-        self._at = now
-        self._cpu_s = cpu_s
-
-    @property
-    def is_on(self) -> bool:
-        """Whether this server emulates a size at all."""
-        return self._size > 0
-
-    def wait_s(self, now: float, cpu_s: float) -> float:
-        """Return 0 if a command may start at *now*, else how long to wait before asking again.
+    def __init__(
+        self, cores: float, *, now: float, cpu: Callable[[], float], burst_s: float = _BURST_S
+    ) -> None:
+        """Begin with a full bucket.
 
         Args:
+            cores: CPU seconds per second, above 0.
             now: Seconds, monotonic.
-            cpu_s: CPU seconds that the process has used since it began.
+            cpu: Returns the CPU seconds that the process has used.
+            burst_s: Size of the bucket, CPU seconds.
         """
-        if not self.is_on:
-            return 0.0
-        earned = (now - self._at) * self._size
-        self._level_s = min(self._burst_s, self._level_s + earned - (cpu_s - self._cpu_s))
+        self.batch_s = _BATCH_S
+        """While a server has no budget and is behind, its refusals wait this long for each other."""
+        self._cores = cores
+        self._burst_s = self._level_s = burst_s
+        self._at = now
+        self._cpu = cpu
+        self._cpu_s = cpu()
+
+    def wait_s(self, now: float) -> float:
+        """Return 0 if a command may start at *now* (s, monotonic), else how long to wait before asking
+        again."""
+        cpu_s = self._cpu()
+        earned_s = (now - self._at) * self._cores
+        self._level_s = min(self._burst_s, self._level_s + earned_s - (cpu_s - self._cpu_s))
         self._at, self._cpu_s = now, cpu_s
-        if self._level_s >= 0:
-            return 0.0
-        return max(MIN_WAIT_S, -self._level_s / self._size)
+        return 0.0 if self._level_s >= 0 else max(MIN_WAIT_S, -self._level_s / self._cores)
+
+
+class NoThrottle:
+    """A server that uses the cores it has."""
+
+    batch_s = 0.0
+
+    def wait_s(self, now: float) -> float:
+        """Return 0: every command may start at once."""
+        return 0.0

@@ -15,28 +15,36 @@ import secrets
 import signal
 import socket
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from rse_pf.auth.tokens import KeySet
 from rse_pf.auth.trust_store import key_set_from_snapshot
+from rse_pf.backend.gateway.admission import Admission
+from rse_pf.backend.gateway.answers import Answers
 from rse_pf.backend.gateway.audit_recorder import AuditRecorder
+from rse_pf.backend.gateway.connection import RobotConnection
+from rse_pf.backend.gateway.decoder_thread import DecoderThread
 from rse_pf.backend.gateway.dispatcher import Dispatcher
 from rse_pf.backend.gateway.handshake import HandshakePolicy
 from rse_pf.backend.gateway.migration import Migration
+from rse_pf.backend.gateway.queues import NoJobs, NoSandboxes
 from rse_pf.backend.gateway.token_watch import TokenWatch
 from rse_pf.backend.gateway.websocket import RobotSockets
 from rse_pf.backend.job_store import open_job_store
 from rse_pf.backend.jobs.manager import JobManager
+from rse_pf.backend.jobs.process import spawner
 from rse_pf.backend.jobs.runner import JobContext
 from rse_pf.backend.jobs.slots import JobSlots
-from rse_pf.backend.jobs.spawn import spawner
 from rse_pf.backend.log import JsonLog
+from rse_pf.backend.metrics import Metrics
 from rse_pf.backend.object_refs import ObjectRefs
 from rse_pf.backend.ports import Clocks
 from rse_pf.backend.sandbox.manager import SandboxManager
+from rse_pf.backend.scheduling.cpu_throttle import CpuThrottle, NoThrottle
+from rse_pf.backend.scheduling.scheduler import Scheduler
 from rse_pf.backend.supervisor.orders import (
     DrainOrder,
     LeaveOrder,
@@ -50,7 +58,7 @@ from rse_pf.backend.supervisor.orders import (
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import MissingExtra
 from rse_pf.linux import die_with_parent, set_process_name
-from rse_pf.services.custom.installed import installed_services, published_services
+from rse_pf.services.custom.installed import InstalledService, installed_services, published_services
 from rse_pf.services.loading import load_services
 
 __all__ = ["NUMBER_BYTES", "WorkerPlan", "event_loop_maker", "run_worker"]
@@ -119,64 +127,94 @@ class _Worker:
         self._flushing = False
         self._tasks: set[asyncio.Task[None]] = set()
         self._log = JsonLog(level=settings.serving.log_level, server=plan.server_id, wall_clock=time.time)
-        self._core = Dispatcher(
-            settings=settings,
-            registry=load_services(plan.services, settings),
+        registry = load_services(plan.services, settings)
+        chosen = settings.services
+        installed = installed_services(Path(chosen.folder)) if chosen.folder else []
+        installed += published_services() if chosen.published else []
+        clocks = Clocks(monotonic=time.monotonic, wall=time.time, cpu=time.process_time)
+        metrics, connections = Metrics(), set[RobotConnection]()
+        store = None if settings.data.store == _PRIVATE_STORE else open_job_store(settings)
+        answers = Answers(
+            registry=registry,
+            services=frozenset(service.name for service in (*registry, *installed)),
+            objects=ObjectRefs(store, settings.serving, settings.data.quota_bytes),
             server_id=plan.server_id,
-            clocks=Clocks(monotonic=time.monotonic, wall=time.time, cpu=time.process_time),
+            max_message_bytes=settings.session.max_message_bytes,
+            clocks=clocks,
+            metrics=metrics,
+            log=self._log,
+        )
+        handshake = HandshakePolicy(settings, plan.keys, conformance_echo=plan.conformance_echo)
+        self._recorder = AuditRecorder(clocks, loop=loop, tell=self._say if plan.audit else None)
+        self._token_watch = TokenWatch(
+            connections,
+            handshake,
+            clocks=clocks,
             loop=loop,
             log=self._log,
+            metrics=metrics,
+            tell=self._say,
+            recorder=self._recorder,
+        )
+        admission = Admission(settings.session, settings.serving)
+        cores = settings.serving.emulated_cores
+        self._dispatcher = Dispatcher(
+            settings=settings,
+            registry=registry,
+            server_id=plan.server_id,
+            clocks=clocks,
+            loop=loop,
+            log=self._log,
+            metrics=metrics,
+            connections=connections,
             new_session_id=lambda: secrets.token_hex(8),
-            rest=time.sleep,
+            admission=admission,
+            scheduler=Scheduler(settings.serving),
+            throttle=CpuThrottle(cores, now=time.monotonic(), cpu=clocks.cpu) if cores else NoThrottle(),
+            decoder=DecoderThread(loop.call_soon_threadsafe),
+            answers=answers,
+            sandboxes=self._sandboxes(plan, installed, answers)
+            if chosen.folder or chosen.published
+            else NoSandboxes(),
+            jobs=self._jobs(plan, answers) if settings.serving.max_running_jobs else NoJobs(),
+            token_watch=self._token_watch,
         )
-        if settings.data.store != _PRIVATE_STORE:
-            self._core.objects = ObjectRefs(
-                open_job_store(settings), settings.serving, settings.data.quota_bytes
-            )
-        if settings.services.folder or settings.services.published:
-            self._core.environments = self._environments(settings, plan.server_id, plan.workers)
-        if settings.serving.max_running_jobs:
-            self._core.jobs = self._jobs(settings, plan)
-        self._migration = Migration(
-            self._core.connections, timers=loop, now=time.monotonic, choose=secrets.choice
-        )
+        self._migration = Migration(connections, loop=loop, now=time.monotonic, choose=secrets.choice)
         self._index, self._workers, self._named = plan.index, plan.workers, 0
-        door = HandshakePolicy(settings, plan.keys, conformance_echo=plan.conformance_echo)
-        self._witness = AuditRecorder(self._core.clocks, loop=loop, tell=self._say if plan.audit else None)
-        self._standing = self._core.standing = TokenWatch(
-            self._core, door, loop=loop, log=self._log, tell=self._say, witness=self._witness
-        )
         self._sockets = RobotSockets(
-            core=self._core,
-            door=door,
+            dispatcher=self._dispatcher,
+            handshake=handshake,
+            rates=admission.rates,
+            metrics=metrics,
+            clocks=clocks,
             serving=settings.serving,
             session=settings.session,
             max_robots=-(-settings.serving.max_robots // self._workers),
             workers=self._workers,
             new_name=self._new_name,
-            judged=self._witness.judged,
+            recorder=self._recorder,
             log=self._log,
             loop=loop,
         )
 
-    def _environments(self, settings: PlatformSettings, server: str, workers: int) -> SandboxManager:
-        chosen = settings.services
-        services = installed_services(Path(chosen.folder)) if chosen.folder else []
-        services += published_services() if chosen.published else []
+    def _sandboxes(
+        self, plan: WorkerPlan, services: Sequence[InstalledService], answers: Answers
+    ) -> SandboxManager:
+        settings = plan.settings
         return SandboxManager(
             services,
             settings=settings,
-            max_sandboxes=-(-settings.services.max_sandboxes // workers),
-            server_id=server,
+            max_sandboxes=-(-settings.services.max_sandboxes // plan.workers),
+            server_id=plan.server_id,
             store=open_job_store(settings),
             monotonic=time.monotonic,
             loop=self._loop,
             log=self._log,
-            answer=self._core.answer_isolated,
+            answer=answers.send_message,
         )
 
-    def _jobs(self, settings: PlatformSettings, plan: WorkerPlan) -> JobManager:
-        session = settings.session
+    def _jobs(self, plan: WorkerPlan, answers: Answers) -> JobManager:
+        settings = plan.settings
         read, write = plan.job_slots
         context = JobContext(
             store=open_job_store(settings),
@@ -184,14 +222,14 @@ class _Worker:
             settings=settings.serving,
             quota_bytes=settings.data.quota_bytes,
             max_bytes=settings.data.max_object_bytes,
-            inline_bytes=session.max_message_bytes // 2,
+            inline_bytes=settings.session.max_message_bytes // 2,
             server_id=plan.server_id,
             start=spawner(plan.services, settings),
             clock=time.monotonic,
         )
         return JobManager(
-            context, settings=settings, loop=self._loop, log=self._log, answer=self._core.answer_isolated,
-            progress=self._core.progress, new_owner=lambda: f"{plan.server_id}-{secrets.token_hex(8)}",
+            context, settings=settings, loop=self._loop, log=self._log, answer=answers.send_message,
+            progress=answers.send_progress, new_owner=lambda: f"{plan.server_id}-{secrets.token_hex(8)}",
         )  # fmt: skip
 
     async def run(self) -> None:
@@ -207,7 +245,7 @@ class _Worker:
             if isinstance(order, LeaveOrder):
                 await self._leave(order.held_s)
                 break
-        self._witness.flush()
+        self._recorder.flush()
         self._log.close()
         os._exit(0)  # nobody waits for the sockets and threads that are left
 
@@ -216,32 +254,32 @@ class _Worker:
             case ReportOrder():
                 self._say(event="report", report=self._report())
             case DrainOrder():
-                self._core.move_all("drain", order.within_ms)
+                self._dispatcher.move_all("drain", order.within_ms)
                 self._keep(self._tell_when_empty())
             case MigrateOrder():
                 self._migration.begin(order.delays_s, order.within_ms)
             case TrustOrder():
-                self._standing.trust(key_set_from_snapshot(order.snapshot))
+                self._token_watch.trust(key_set_from_snapshot(order.snapshot))
             case ReplaceOrder():
-                self._standing.replace(order.number)
+                self._token_watch.replace(order.number)
 
     def _report(self) -> dict[str, Any]:
-        report = self._core.snapshot()
+        report = self._dispatcher.snapshot()
         report["gauges"]["moved"] = float(self._migration.asked)
         return report
 
     async def _tell_when_empty(self) -> None:
-        while self._core.connections:
+        while self._dispatcher.connections:
             await asyncio.sleep(_POLL_S)
         self._say(event="empty")
 
     async def _leave(self, held_s: float) -> None:
         until = time.monotonic() + held_s
-        while self._core.held and time.monotonic() < until:
+        while self._dispatcher.held and time.monotonic() < until:
             await asyncio.sleep(_POLL_S)
-        self._core.close_all()
+        self._dispatcher.close_all()
         until = time.monotonic() + _CLOSE_TIMEOUT_S
-        while self._core.connections and time.monotonic() < until:
+        while self._dispatcher.connections and time.monotonic() < until:
             await asyncio.sleep(_POLL_S)
 
     def _take_sockets(self) -> None:

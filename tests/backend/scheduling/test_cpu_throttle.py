@@ -1,47 +1,57 @@
-"""A server of a fixed size uses its size of CPU, and no more."""
+"""An emulated server uses as much CPU as its cores have, and no more."""
 
 from __future__ import annotations
 
 import pytest
 
-from rse_pf.backend.scheduling.cpu_throttle import MIN_WAIT_S, CpuThrottle
+from rse_pf.backend.scheduling.cpu_throttle import MIN_WAIT_S, CpuThrottle, NoThrottle
 
 
-def test_size_zero_is_no_gate():
-    assert CpuThrottle(0.0, 0.02, now=0.0, cpu_s=0.0).wait_s(1.0, 100.0) == 0.0
+class Process:
+    """A process whose clocks a test moves, and its throttle."""
+
+    def __init__(self, cores: float, burst_s: float = 0.02) -> None:
+        self.now = self.cpu_s = 0.0
+        self._throttle = CpuThrottle(cores, now=0.0, cpu=lambda: self.cpu_s, burst_s=burst_s)
+
+    def wait_s(self, now: float, cpu_s: float) -> float:
+        self.now, self.cpu_s = now, cpu_s
+        return self._throttle.wait_s(now)
+
+
+def test_a_server_that_emulates_nothing_never_waits():
+    assert NoThrottle().wait_s(1.0) == 0.0
 
 
 def test_a_burst_passes_and_a_debt_waits():
-    gate = CpuThrottle(0.5, 0.02, now=0.0, cpu_s=0.0)
+    process = Process(0.5)
 
-    assert gate.wait_s(0.0, 0.02) == 0.0
-    assert gate.wait_s(0.0, 0.03) == pytest.approx(0.01 / 0.5)
-    assert gate.wait_s(0.02, 0.03) == 0.0
+    assert process.wait_s(0.0, 0.02) == 0.0
+    assert process.wait_s(0.0, 0.03) == pytest.approx(0.01 / 0.5)
+    assert process.wait_s(0.02, 0.03) == 0.0
 
 
-def test_rest_earns_no_more_than_the_burst():
-    gate = CpuThrottle(0.5, 0.02, now=0.0, cpu_s=0.0)
+def test_an_idle_server_saves_no_more_than_the_burst():
+    process = Process(0.5)
 
-    assert gate.wait_s(1000.0, 0.0) == 0.0
-    assert gate.wait_s(1000.0, 0.03) == pytest.approx(0.02)
+    assert process.wait_s(1000.0, 0.0) == 0.0
+    assert process.wait_s(1000.0, 0.03) == pytest.approx(0.02)
 
 
 def test_waits_are_never_so_short_that_waiting_is_the_work():
-    gate = CpuThrottle(1.0, 0.001, now=0.0, cpu_s=0.0)
-
-    assert gate.wait_s(0.0, 0.0010001) == MIN_WAIT_S
+    assert Process(1.0, burst_s=0.001).wait_s(0.0, 0.0010001) == MIN_WAIT_S
 
 
-@pytest.mark.parametrize("size", [0.1, 0.25, 1.0])
-def test_work_without_end_uses_exactly_the_size(size):
-    gate = CpuThrottle(size, 0.02, now=0.0, cpu_s=0.0)
+@pytest.mark.parametrize("cores", [0.1, 0.25, 1.0])
+def test_work_without_end_uses_exactly_the_emulated_cores(cores):
+    process = Process(cores)
     now = cpu_s = 0.0
 
     while now < 20.0:
-        wait_s = gate.wait_s(now, cpu_s)
+        wait_s = process.wait_s(now, cpu_s)
         if wait_s:
             now += wait_s
         else:
             now, cpu_s = now + 0.005, cpu_s + 0.005
 
-    assert cpu_s / now == pytest.approx(size, rel=0.02)
+    assert cpu_s / now == pytest.approx(cores, rel=0.02)

@@ -6,18 +6,12 @@ import random
 from collections import Counter, deque
 
 import pytest
+from backend.scheduling.admitted import AdmittedScheduler, fall_behind, measure_turns, queued
 
-from rse_pf.backend.scheduling.scheduler import QueuedCommand, Scheduler
+from rse_pf.backend.scheduling.scheduler import INLINE_BYTES, QueuedCommand, Scheduler
 from rse_pf.config import ServingSettings
-from rse_pf.wire import Command
 
 SETTINGS = ServingSettings(max_queue_per_robot=4)
-
-
-def job(
-    robot: str, identity: int = 0, *, at: float = 0.0, within: float = 10.0, **command: object
-) -> QueuedCommand:
-    return QueuedCommand(robot, robot, Command(id=identity, service="work", **command), 100, at, at + within)
 
 
 def run_order(scheduler: Scheduler, count: int) -> list[tuple[str, int]]:
@@ -31,11 +25,11 @@ def run_order(scheduler: Scheduler, count: int) -> list[tuple[str, int]]:
 
 
 def test_robots_take_turns_however_much_one_of_them_asks():
-    scheduler = Scheduler(SETTINGS)
+    scheduler = AdmittedScheduler(SETTINGS)
     for identity in range(4):
-        scheduler.submit(job("flood", identity), 0.0)
-    scheduler.submit(job("a", 1), 0.0)
-    scheduler.submit(job("b", 1), 0.0)
+        scheduler.submit(queued("flood", identity), 0.0)
+    scheduler.submit(queued("a", 1), 0.0)
+    scheduler.submit(queued("b", 1), 0.0)
 
     assert run_order(scheduler, 6) == [
         ("flood", 0), ("a", 1), ("b", 1), ("flood", 1), ("flood", 2), ("flood", 3),
@@ -43,9 +37,9 @@ def test_robots_take_turns_however_much_one_of_them_asks():
 
 
 def test_one_robot_never_has_two_commands_running():
-    scheduler = Scheduler(SETTINGS)
-    scheduler.submit(job("a", 1), 0.0)
-    scheduler.submit(job("a", 2), 0.0)
+    scheduler = AdmittedScheduler(SETTINGS)
+    scheduler.submit(queued("a", 1), 0.0)
+    scheduler.submit(queued("a", 2), 0.0)
     first, _ = scheduler.start(0.0)
 
     assert scheduler.start(0.0) == (None, [])
@@ -57,23 +51,23 @@ def test_one_robot_never_has_two_commands_running():
 
 
 def test_the_newest_frame_takes_the_place_of_the_one_that_waits():
-    scheduler = Scheduler(SETTINGS)
-    scheduler.submit(job("a", 1, stream="cam", seq=1), 0.0)
+    scheduler = AdmittedScheduler(SETTINGS)
+    scheduler.submit(queued("a", 1, stream="cam", seq=1), 0.0)
 
-    (refusal,) = scheduler.submit(job("a", 2, stream="cam", seq=2), 0.0)
+    (refusal,) = scheduler.submit(queued("a", 2, stream="cam", seq=2), 0.0)
 
-    assert (refusal.job.command.id, refusal.error.code) == (1, "stale")
+    assert (refusal.queued.command.id, refusal.error.code) == (1, "stale")
     assert run_order(scheduler, 1) == [("a", 2)]
     assert scheduler.waiting == 0
 
 
 def test_an_older_frame_does_not_replace_a_newer_one():
-    scheduler = Scheduler(SETTINGS)
-    scheduler.submit(job("a", 2, stream="cam", seq=2), 0.0)
+    scheduler = AdmittedScheduler(SETTINGS)
+    scheduler.submit(queued("a", 2, stream="cam", seq=2), 0.0)
 
-    (refusal,) = scheduler.submit(job("a", 1, stream="cam", seq=1), 0.0)
+    (refusal,) = scheduler.submit(queued("a", 1, stream="cam", seq=1), 0.0)
 
-    assert (refusal.job.command.id, refusal.error.code) == (1, "stale")
+    assert (refusal.queued.command.id, refusal.error.code) == (1, "stale")
     assert run_order(scheduler, 1) == [("a", 2)]
 
 
@@ -87,64 +81,64 @@ def test_an_older_frame_does_not_replace_a_newer_one():
     ],
 )
 def test_kept_frames_other_streams_and_no_stream_are_not_replaced(first, second):
-    scheduler = Scheduler(SETTINGS)
+    scheduler = AdmittedScheduler(SETTINGS)
 
-    assert scheduler.submit(job("a", 1, **first), 0.0) == []
-    assert scheduler.submit(job("a", 2, **second), 0.0) == []
+    assert scheduler.submit(queued("a", 1, **first), 0.0) == []
+    assert scheduler.submit(queued("a", 2, **second), 0.0) == []
     assert run_order(scheduler, 2) == [("a", 1), ("a", 2)]
 
 
 def test_streams_of_two_robots_do_not_meet():
-    scheduler = Scheduler(SETTINGS)
-    scheduler.submit(job("a", 1, stream="cam"), 0.0)
+    scheduler = AdmittedScheduler(SETTINGS)
+    scheduler.submit(queued("a", 1, stream="cam"), 0.0)
 
-    assert scheduler.submit(job("b", 2, stream="cam", seq=5), 0.0) == []
+    assert scheduler.submit(queued("b", 2, stream="cam", seq=5), 0.0) == []
 
 
 def test_an_expired_command_costs_no_compute():
-    scheduler = Scheduler(SETTINGS)
-    scheduler.submit(job("a", 1, within=0.03), 0.0)
-    scheduler.submit(job("b", 2), 0.0)
+    scheduler = AdmittedScheduler(SETTINGS)
+    scheduler.submit(queued("a", 1, within=0.03), 0.0)
+    scheduler.submit(queued("b", 2), 0.0)
 
     started, refusals = scheduler.start(0.04)
 
     assert started is not None
     assert started.command.id == 2
-    assert [(r.job.command.id, r.error.code) for r in refusals] == [(1, "expired")]
+    assert [(r.queued.command.id, r.error.code) for r in refusals] == [(1, "expired")]
 
 
 def test_a_command_without_time_is_expired_at_once():
-    (refusal,) = Scheduler(SETTINGS).submit(job("a", within=0.0), 0.0)
+    (refusal,) = AdmittedScheduler(SETTINGS).submit(queued("a", within=0.0), 0.0)
 
     assert refusal.error.code == "expired"
 
 
 def test_expired_commands_are_answered_although_nothing_starts():
-    scheduler = Scheduler(SETTINGS)
-    scheduler.submit(job("a", 1), 0.0)
+    scheduler = AdmittedScheduler(SETTINGS)
+    scheduler.submit(queued("a", 1), 0.0)
     scheduler.start(0.0)
-    scheduler.submit(job("a", 2, within=0.02), 0.0)
+    scheduler.submit(queued("a", 2, within=0.02), 0.0)
 
     assert [r.error.code for r in scheduler.sweep(0.03)] == ["expired"]
     assert scheduler.waiting == 0
 
 
 def test_one_robot_waits_with_a_bound():
-    scheduler = Scheduler(SETTINGS)
+    scheduler = AdmittedScheduler(SETTINGS)
     for identity in range(4):
-        scheduler.submit(job("a", identity), 0.0)
+        scheduler.submit(queued("a", identity), 0.0)
 
-    (refusal,) = scheduler.submit(job("a", 9), 0.0)
+    (refusal,) = scheduler.submit(queued("a", 9), 0.0)
 
     assert refusal.error.code == "busy"
     assert refusal.error.retry_after_ms is not None
-    assert scheduler.submit(job("b", 1), 0.0) == []
+    assert scheduler.submit(queued("b", 1), 0.0) == []
 
 
 def test_a_connection_that_ends_takes_its_waiting_commands_along():
-    scheduler = Scheduler(SETTINGS)
-    scheduler.submit(job("a", 1), 0.0)
-    scheduler.submit(job("b", 2), 0.0)
+    scheduler = AdmittedScheduler(SETTINGS)
+    scheduler.submit(queued("a", 1), 0.0)
+    scheduler.submit(queued("b", 2), 0.0)
 
     assert [j.command.id for j in scheduler.leave("a")] == [1]
     assert run_order(scheduler, 1) == [("b", 2)]
@@ -152,17 +146,17 @@ def test_a_connection_that_ends_takes_its_waiting_commands_along():
 
 
 def test_only_a_small_cheap_command_that_is_alone_runs_inline():
-    scheduler = Scheduler(SETTINGS)
-    scheduler.submit(job("a", 1), 0.0)
+    scheduler = AdmittedScheduler(SETTINGS)
+    scheduler.submit(queued("a", 1), 0.0)
     scheduler.start(0.0)
 
-    assert scheduler.runs_inline(cheap=True, size_bytes=100, inline_bytes=100)
-    assert not scheduler.runs_inline(cheap=True, size_bytes=101, inline_bytes=100)
-    assert not scheduler.runs_inline(cheap=False, size_bytes=1, inline_bytes=100)
-    scheduler.submit(job("b", 1), 0.0)
-    assert not scheduler.runs_inline(cheap=True, size_bytes=1, inline_bytes=100)
+    assert scheduler.runs_inline(cheap=True, size_bytes=INLINE_BYTES)
+    assert not scheduler.runs_inline(cheap=True, size_bytes=INLINE_BYTES + 1)
+    assert not scheduler.runs_inline(cheap=False, size_bytes=1)
+    scheduler.submit(queued("b", 1), 0.0)
+    assert not scheduler.runs_inline(cheap=True, size_bytes=1)
     scheduler.start(0.0)
-    assert not scheduler.runs_inline(cheap=True, size_bytes=1, inline_bytes=100)
+    assert not scheduler.runs_inline(cheap=True, size_bytes=1)
 
 
 WORK_S, DEADLINE_S, SWEEP_S, SECONDS = 0.005, 0.25, 0.025, 10.0
@@ -202,7 +196,7 @@ def simulate(
         nonlocal i
         while i < len(arrivals) and arrivals[i][0] <= until:
             at, robot = arrivals[i]
-            gone = queue.submit(job(robot, i, at=at, within=DEADLINE_S), at)
+            gone = queue.submit(queued(robot, i, at=at, within=DEADLINE_S), at)
             refused.extend([0.0] * len(gone))
             i += 1
         return i
@@ -211,9 +205,9 @@ def simulate(
         arrive(now)
         if now - swept >= SWEEP_S:
             swept = now
-            refused.extend(now - r.job.received_s for r in queue.sweep(now))
+            refused.extend(now - r.queued.received_s for r in queue.sweep(now))
         started, gone = queue.start(now)
-        refused.extend(now - r.job.received_s for r in gone)
+        refused.extend(now - r.queued.received_s for r in gone)
         if started is None:
             now = arrivals[i][0] if i < len(arrivals) else SECONDS
             continue
@@ -240,7 +234,7 @@ def poisson(rate: float, robots: int, seed: int) -> list[tuple[float, str]]:
 def test_goodput_holds_under_overload(load, robots):
     arrivals = poisson(load * CAPACITY, robots, seed=load)
 
-    good, late, refused = simulate(Scheduler(ServingSettings()), arrivals, random.Random(1))
+    good, late, refused = simulate(AdmittedScheduler(ServingSettings()), arrivals, random.Random(1))
 
     assert len(good) >= 0.95 * CAPACITY * SECONDS
     assert late <= 0.02 * len(good)
@@ -258,7 +252,7 @@ def test_a_plain_bounded_queue_would_collapse_under_the_same_load(load):
 
 def test_nothing_is_shed_below_capacity():
     good, late, refused = simulate(
-        Scheduler(ServingSettings()), poisson(0.7 * CAPACITY, 40, 3), random.Random(1)
+        AdmittedScheduler(ServingSettings()), poisson(0.7 * CAPACITY, 40, 3), random.Random(1)
     )
 
     assert late == 0
@@ -268,17 +262,17 @@ def test_nothing_is_shed_below_capacity():
 def test_a_burst_shorter_than_the_interval_is_served_whole():
     burst = [(0.001 * k, f"r{k}") for k in range(28)]
 
-    good, late, refused = simulate(Scheduler(ServingSettings()), burst, random.Random(1))
+    good, late, refused = simulate(AdmittedScheduler(ServingSettings()), burst, random.Random(1))
 
     assert (len(good), late, refused) == (28, 0, [])
 
 
 def test_one_robot_may_wait_for_a_slow_command_of_another():
-    scheduler = Scheduler(SETTINGS)
-    scheduler.submit(job("slow"), 0.0)
+    scheduler = AdmittedScheduler(SETTINGS)
+    scheduler.submit(queued("slow"), 0.0)
     slow, _ = scheduler.start(0.0)
     assert slow is not None
-    scheduler.submit(job("a", at=0.01), 0.01)
+    scheduler.submit(queued("a", at=0.01), 0.01)
 
     refusals = [r for k in range(1, 12) for r in scheduler.sweep(0.025 * k)]
     scheduler.done(slow, 0.3)
@@ -290,13 +284,13 @@ def test_one_robot_may_wait_for_a_slow_command_of_another():
 
 
 def test_slow_services_below_capacity_are_not_shed():
-    scheduler = Scheduler(SETTINGS)
+    scheduler = AdmittedScheduler(SETTINGS)
     refused, now, i = [], 0.0, 0
     arrivals = sorted((1.0 * k + 0.1 * robot, f"r{robot}") for k in range(10) for robot in range(3))
     while i < len(arrivals) or scheduler.waiting:
         while i < len(arrivals) and arrivals[i][0] <= now:
             at, robot = arrivals[i]
-            refused += scheduler.submit(job(robot, i, at=at, within=5.0), at)
+            refused += scheduler.submit(queued(robot, i, at=at, within=5.0), at)
             i += 1
         refused += scheduler.sweep(now)
         started, gone = scheduler.start(now)
@@ -313,7 +307,7 @@ def test_slow_services_below_capacity_are_not_shed():
 def test_no_robot_starves_under_overload():
     arrivals = poisson(5 * CAPACITY, 40, seed=9)
 
-    good, _, _ = simulate(Scheduler(ServingSettings()), arrivals, random.Random(1))
+    good, _, _ = simulate(AdmittedScheduler(ServingSettings()), arrivals, random.Random(1))
 
     served = Counter(each.robot for each in good)
     assert len(served) == 40
@@ -324,7 +318,7 @@ def test_a_flooding_robot_takes_nothing_from_the_others():
     calm = poisson(0.4 * CAPACITY, 20, seed=5)
     flood = [(at, "flood") for at, _ in poisson(10 * CAPACITY, 1, seed=6)]
 
-    good, _, _ = simulate(Scheduler(ServingSettings()), sorted(calm + flood), random.Random(1))
+    good, _, _ = simulate(AdmittedScheduler(ServingSettings()), sorted(calm + flood), random.Random(1))
 
     served = Counter(each.robot for each in good)
     calm_served = sum(count for robot, count in served.items() if robot != "flood")
@@ -332,10 +326,10 @@ def test_a_flooding_robot_takes_nothing_from_the_others():
 
 
 def test_the_server_stops_shedding_when_the_load_is_over():
-    scheduler = Scheduler(SETTINGS)
+    scheduler = AdmittedScheduler(SETTINGS)
     for second in range(3):
         for robot in range(400):
-            scheduler.submit(job(f"r{robot}", at=second, within=0.4), float(second))
+            scheduler.submit(queued(f"r{robot}", at=second, within=0.4), float(second))
         scheduler.sweep(second + 0.06)
         scheduler.sweep(second + 0.2)
     assert scheduler.is_behind
@@ -351,81 +345,84 @@ def test_the_server_stops_shedding_when_the_load_is_over():
 
 
 def test_nothing_is_refused_unread_before_the_server_is_behind():
-    scheduler = Scheduler(SETTINGS)
+    scheduler = AdmittedScheduler(SETTINGS)
     for i in range(50):
-        scheduler.submit(job(f"r{i}"), 0.0)
+        scheduler.submit(queued(f"r{i}"), 0.0)
 
     assert scheduler.refuse_unread("new", 0.05, 0.0) is None
 
 
-def test_who_can_wait_is_let_in_where_who_cannot_is_refused():
-    scheduler = Scheduler(SETTINGS)
-    scheduler.is_behind, scheduler._turn_s, scheduler._judged_s = True, 0.01, 0.0
+def test_a_command_that_can_wait_is_admitted_where_a_hurried_one_is_refused():
+    scheduler = AdmittedScheduler(SETTINGS)
+    fall_behind(scheduler, turn_s=0.01)
     for i in range(50):
-        scheduler.submit(job(f"r{i}", within=5.0), 0.0)
+        scheduler.submit(queued(f"r{i}", within=5.0), 0.0)
     assert scheduler.waiting == 50
 
     assert scheduler.refuse_unread("new", 0.25, 0.01) is not None
-    assert scheduler.submit(job("hurried", within=0.25), 0.01)[0].error.code == "busy"
+    assert scheduler.submit(queued("hurried", within=0.25), 0.01)[0].error.code == "busy"
     assert scheduler.refuse_unread("new", 5.0, 0.01) is None
-    assert scheduler.submit(job("patient", within=5.0), 0.01) == []
-    scheduler._judged_s = 3.6
-    assert scheduler.sweep(3.4) == [], "five seconds but the reserve"
-    assert len(scheduler.sweep(3.6)) == 50, "all but the one whose turn it is"
+    assert scheduler.submit(queued("unhurried", within=5.0), 0.01) == []
+    assert scheduler.sweep(3.4) == [], "five seconds without the reserve"
+    assert scheduler.refuse_unread("new", 0.25, 3.45) is not None, "so it is still behind"
+    assert len(scheduler.sweep(3.52)) == 50, "all but the one whose turn it is"
 
 
-def test_a_robots_own_waiting_commands_count_as_rounds():
-    scheduler = Scheduler(SETTINGS)
-    scheduler.is_behind, scheduler._turn_s, scheduler._judged_s = True, 0.02, 0.0
+def test_the_waiting_commands_of_a_robot_itself_count_as_rounds():
+    scheduler = AdmittedScheduler(SETTINGS)
+    fall_behind(scheduler, turn_s=0.02)
     for number in range(3):
         for i in range(60):
-            scheduler.submit(job(f"r{i}", number, within=5.0), 0.0)
+            scheduler.submit(queued(f"r{i}", number, within=5.0), 0.0)
 
-    assert scheduler.submit(job("r0", 3, within=5.0), 0.0), "it would wait for all, more than it can spare"
-    assert scheduler.submit(job("new", within=5.0), 0.0) == [], "it waits for one round"
-
-
-def test_behind_only_a_short_queue_lets_another_robot_in():
-    scheduler = Scheduler(SETTINGS)
-    scheduler.submit(job("a"), 0.0)
-    scheduler.is_behind, scheduler._judged_s = True, 0.0
-
-    scheduler._turn_s = 0.024
-    assert scheduler.refuse_unread("new", 0.05, 0.01) is None
-    assert scheduler.refuse_unread("a", 0.05, 0.01) is not None
-    scheduler._turn_s = 0.026
-    assert scheduler.refuse_unread("new", 0.05, 0.01) is not None
+    assert scheduler.submit(queued("r0", 3, within=5.0), 0.0), "it would wait for all, more than it can spare"
+    assert scheduler.submit(queued("new", within=5.0), 0.0) == [], "it waits for one round"
 
 
-def test_a_frame_that_may_replace_a_waiting_one_is_always_read():
-    scheduler = Scheduler(SETTINGS)
-    scheduler.submit(job("a", 1, stream="cam", seq=1), 0.0)
-    scheduler.submit(job("b", 1), 0.0)
-    scheduler.is_behind, scheduler._turn_s, scheduler._judged_s = True, 1.0, 0.0
-
-    assert scheduler.refuse_unread("a", 0.05, 0.01) is None
-    assert scheduler.refuse_unread("b", 0.05, 0.01) is not None
+def behind_with_one_waiting(turn_s: float) -> AdmittedScheduler:
+    scheduler = AdmittedScheduler(SETTINGS)
+    fall_behind(scheduler, turn_s=turn_s)
+    scheduler.submit(queued("a"), 0.0)
+    return scheduler
 
 
-def test_what_cannot_be_had_in_half_of_its_time_is_refused_at_the_door():
-    scheduler = Scheduler(SETTINGS)
-    scheduler._turn_s = 0.1
+def test_a_server_that_is_behind_admits_another_robot_only_to_a_short_queue():
+    assert behind_with_one_waiting(0.024).refuse_unread("new", 0.05, 0.01) is None
+    assert behind_with_one_waiting(0.024).refuse_unread("a", 0.05, 0.01) is not None
+    assert behind_with_one_waiting(0.026).refuse_unread("new", 0.05, 0.01) is not None
+
+
+def test_a_frame_that_may_replace_a_waiting_one_is_always_decoded():
+    scheduler = AdmittedScheduler(SETTINGS)
+    measure_turns(scheduler, 1.0, -1.0)
+    scheduler.submit(queued("a", 1, stream="cam", seq=1), 0.0)
+    scheduler.submit(queued("b", 1), 0.0)
+    assert scheduler.sweep(0.06) == scheduler.sweep(0.2) == []
+    assert scheduler.is_behind
+
+    assert scheduler.refuse_unread("a", 0.05, 0.21) is None
+    assert scheduler.refuse_unread("b", 0.05, 0.21) is not None
+
+
+def test_a_command_whose_turn_would_come_after_half_of_its_time_is_refused_at_once():
+    scheduler = AdmittedScheduler(SETTINGS)
+    measure_turns(scheduler, 0.1, 0.0)
     for i in range(4):
-        scheduler.submit(job(f"r{i}"), 0.0)
+        scheduler.submit(queued(f"r{i}"), 0.0)
 
-    (refusal,) = scheduler.submit(job("short", within=0.25), 0.0)
+    (refusal,) = scheduler.submit(queued("short", within=0.25), 0.0)
 
     assert refusal.error.code == "busy"
     assert refusal.error.retry_after_ms is not None
-    assert scheduler.submit(job("long", within=5.0), 0.0) == []
+    assert scheduler.submit(queued("long", within=5.0), 0.0) == []
 
 
 def test_a_server_that_refuses_half_of_its_commands_stays_behind_however_short_the_queue():
-    scheduler = Scheduler(SETTINGS)
-    scheduler.is_behind, scheduler._turn_s = True, 0.1
+    scheduler = AdmittedScheduler(SETTINGS)
+    fall_behind(scheduler, turn_s=0.1)
     for step in range(20):
         now = step * 0.05
-        scheduler.submit(job(f"in-{step}", at=now), now)
+        scheduler.submit(queued(f"in-{step}", at=now), now)
         assert scheduler.refuse_unread("out", 0.05, now) is not None
         started, _ = scheduler.start(now)
         assert started is not None
@@ -435,14 +432,14 @@ def test_a_server_that_refuses_half_of_its_commands_stays_behind_however_short_t
 
 
 def test_one_long_pause_does_not_make_the_server_refuse_for_ever():
-    scheduler = Scheduler(SETTINGS)
+    scheduler = AdmittedScheduler(SETTINGS)
+    fall_behind(scheduler, turn_s=3.0)
     now, refused = 0.0, 0
-    scheduler._turn_s, scheduler.is_behind = 3.0, True
     for step in range(400):
         now = step * 0.02
         for robot in ("a", "b"):
             if scheduler.refuse_unread(robot, 0.05, now) is None:
-                refused += bool(scheduler.submit(job(f"{robot}{step}", at=now), now)) and step > 300
+                refused += bool(scheduler.submit(queued(f"{robot}{step}", at=now), now)) and step > 300
             else:
                 refused += step > 300
         for later in (now + 0.005, now + 0.01):
@@ -454,17 +451,19 @@ def test_one_long_pause_does_not_make_the_server_refuse_for_ever():
     assert not scheduler.is_behind
 
 
-def test_a_lone_solver_thread_lends_its_work_to_the_loop_only_while_behind():
-    alone, pair = Scheduler(SETTINGS), Scheduler(ServingSettings(solver_threads=2))
-    small = Scheduler(ServingSettings(solver_threads=2, emulated_cores=0.25))
-    for scheduler in (alone, pair, small):
-        scheduler.submit(job("a"), 0.0)
-        scheduler.submit(job("b"), 0.0)
+def test_a_single_solver_thread_leaves_its_work_to_the_loop_only_while_behind():
+    settings = (
+        SETTINGS,
+        ServingSettings(solver_threads=2),
+        ServingSettings(solver_threads=2, emulated_cores=0.25),
+    )
+    for serving, is_serial in zip(settings, (True, False, True), strict=True):
+        scheduler = AdmittedScheduler(serving)
+        scheduler.submit(queued("a"), 0.0)
+        scheduler.submit(queued("b"), 0.0)
         scheduler.start(0.0)
-        assert not scheduler.runs_inline(cheap=True, size_bytes=1, inline_bytes=10)
-        scheduler.is_behind = True
+        assert not scheduler.runs_inline(cheap=True, size_bytes=1)
+        fall_behind(scheduler, now=1.0)
 
-    assert alone.runs_inline(cheap=True, size_bytes=1, inline_bytes=10)
-    assert not alone.runs_inline(cheap=False, size_bytes=1, inline_bytes=10)
-    assert not pair.runs_inline(cheap=True, size_bytes=1, inline_bytes=10)
-    assert small.runs_inline(cheap=True, size_bytes=1, inline_bytes=10)
+        assert scheduler.runs_inline(cheap=True, size_bytes=1) is is_serial
+        assert not scheduler.runs_inline(cheap=False, size_bytes=1)

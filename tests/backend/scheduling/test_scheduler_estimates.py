@@ -1,23 +1,18 @@
-"""What the scheduler believes of its own speed, and how long a command will wait."""
+"""How the scheduler measures its own speed, and how long it expects a command to wait."""
 
 from __future__ import annotations
 
 import pytest
+from backend.scheduling.admitted import AdmittedScheduler, measure_turns, queued
 
-from rse_pf.backend.scheduling.scheduler import QueuedCommand, Scheduler
 from rse_pf.config import ServingSettings
-from rse_pf.wire import Command
 
 SETTINGS = ServingSettings()
 
 
-def job(robot: str, identity: int = 0, *, at: float = 0.0, within: float = 60.0) -> QueuedCommand:
-    return QueuedCommand(robot, robot, Command(id=identity, service="work", keep=True), 100, at, at + within)
-
-
 def test_a_process_that_did_not_run_for_a_moment_refuses_nobody_who_has_time():
     """A second without the processor in the middle of a round of 50 robots, who have five seconds each."""
-    scheduler = Scheduler(SETTINGS)
+    scheduler = AdmittedScheduler(SETTINGS)
     now = 0.0
 
     def serve(count: int) -> None:
@@ -30,26 +25,26 @@ def test_a_process_that_did_not_run_for_a_moment_refuses_nobody_who_has_time():
             scheduler.done(started, now)
 
     for robot in range(50):
-        assert scheduler.submit(job(f"r{robot}", at=now, within=5.0), now) == []
+        assert scheduler.submit(queued(f"r{robot}", at=now, within=5.0), now) == []
     serve(25)
     now += 1.0
     serve(1)
     for robot in range(26):
-        assert scheduler.submit(job(f"r{robot}", at=now, within=5.0), now) == []
+        assert scheduler.submit(queued(f"r{robot}", at=now, within=5.0), now) == []
     serve(50)
 
 
 @pytest.mark.parametrize("service_s", [0.05, 0.5])
 def test_a_service_that_became_slow_is_believed_within_a_few_commands(service_s):
-    scheduler = Scheduler(SETTINGS)
+    scheduler = AdmittedScheduler(SETTINGS)
     now, turns = 0.0, []
     for number in range(40):
         for robot in ("a", "b"):
-            scheduler.submit(job(f"{robot}{number}", at=now, within=1e3), now)
+            scheduler.submit(queued(f"{robot}{number}", at=now, within=1e3), now)
         while (started := scheduler.start(now)[0]) is not None:
             now += 0.002 if number < 10 else service_s
             scheduler.done(started, now)
-            turns.append(scheduler._turn_s)
+            turns.append(scheduler.turn_s)
 
     assert turns[18] < 0.01
     assert turns[60] > 0.5 * service_s
@@ -57,13 +52,13 @@ def test_a_service_that_became_slow_is_believed_within_a_few_commands(service_s)
 
 def test_a_robot_with_many_waiting_is_told_the_whole_queue_at_most():
     """Half of the robots came from a server that died, with six commands each; the others have one."""
-    scheduler = Scheduler(SETTINGS)
-    scheduler._turn_s = 0.01
+    scheduler = AdmittedScheduler(SETTINGS)
+    measure_turns(scheduler, 0.01, 0.0)
     for robot in range(50):
         for number in range(6 if robot < 25 else 1):
-            scheduler.submit(job(f"r{robot}", number), 0.0)
+            assert scheduler.submit(queued(f"r{robot}", number, within=60.0), 0.0) == []
 
     assert scheduler.waiting == 175
-    assert scheduler._ahead_s(scheduler._robots["r0"]) == pytest.approx(1.76)
-    assert scheduler._ahead_s(scheduler._robots["r30"]) == pytest.approx(1.0)
-    assert scheduler._ahead_s(None) == pytest.approx(0.5)
+    assert scheduler.delay_unread_s("r0") == pytest.approx(1.76)
+    assert scheduler.delay_unread_s("r30") == pytest.approx(1.0)
+    assert scheduler.delay_unread_s("new") == pytest.approx(0.5)

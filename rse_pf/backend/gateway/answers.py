@@ -1,0 +1,192 @@
+"""Encode the answers to commands, write them to the robots' connections, count them and log them.
+
+Every admitted command is answered here exactly once, whether the scheduler, a sandbox or a job computed it.
+Neither a payload nor a token reaches the log.
+"""
+
+from __future__ import annotations
+
+import traceback
+from dataclasses import dataclass
+
+import msgspec
+
+from rse_pf.backend.gateway.admission import UnreadRefusal
+from rse_pf.backend.gateway.connection import RobotConnection
+from rse_pf.backend.log import JsonLog
+from rse_pf.backend.metrics import Metrics
+from rse_pf.backend.object_refs import ObjectRefs
+from rse_pf.backend.ports import Clocks
+from rse_pf.backend.scheduling.scheduler import QueuedCommand, RefusedCommand
+from rse_pf.errors import Busy, InternalError, LimitExceeded, RsePfError
+from rse_pf.service import Registry, Service, dispatch, failure_of
+from rse_pf.wire import Command, Failure, Progress, Result
+from rse_pf.wire.envelope import Envelope, encode_refusal
+
+__all__ = ["Answer", "Answers"]
+
+_UNKNOWN = "unknown"
+_FREQUENT = ("ok", Busy.code, "stale")
+"""Results that come hundreds of times a second: counted, and logged for developers only."""
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """The final answer to a command, and its bytes."""
+
+    queued: QueuedCommand
+    message: Result | Failure
+    data: bytes
+
+
+class Answers:
+    """Makes and sends the answers of one worker."""
+
+    def __init__(
+        self,
+        *,
+        registry: Registry,
+        services: frozenset[str],
+        objects: ObjectRefs,
+        server_id: str,
+        max_message_bytes: int,
+        clocks: Clocks,
+        metrics: Metrics,
+        log: JsonLog,
+    ) -> None:
+        """Keep what answers are made of.
+
+        Args:
+            registry: The services that `compute` calls.
+            services: Names of all services of this server, installed ones included; others share one label.
+            objects: Puts stored objects into payloads, and large replies into the store.
+            server_id: Goes into answers.
+            max_message_bytes: Longest answer on the wire.
+            clocks: Of the worker.
+            metrics: Of the worker.
+            log: Of the worker.
+        """
+        self._registry = registry
+        self._services = services
+        self._objects = objects
+        self._server_id = server_id
+        self._max_message_bytes = max_message_bytes
+        self._clocks = clocks
+        self._metrics = metrics
+        self._log = log
+
+    def blocks(self, command: Command, service: Service) -> bool:
+        """Return whether `compute` would have to wait for the store."""
+        return self._objects.named_by(command, service)
+
+    def compute(self, queued: QueuedCommand) -> Answer:
+        """Call the service and encode its answer; runs in the loop or in a thread, and touches nothing
+        shared."""
+        monotonic, command = self._clocks.monotonic, queued.command
+        started = monotonic()
+        try:
+            command = self._objects.put_in(command, self._registry, queued.owner)
+        except RsePfError as error:
+            return self._encoded(queued, failure_of(error, command, server=self._server_id))
+        message = dispatch(
+            self._registry, command, monotonic, server=self._server_id, on_defect=self._log_defect
+        )
+        if isinstance(message, Result):
+            message = msgspec.structs.replace(
+                message,
+                queue_ms=(started - queued.received_s) * 1e3,
+                received_s=queued.received_s,
+                sent_s=monotonic(),
+            )
+        answer = self._encoded(queued, message)
+        kept = self._objects.kept(message, answer.message, queued.owner)
+        return answer if kept is answer.message else self._encoded(queued, kept)
+
+    def send(self, answer: Answer, now: float) -> None:
+        """Write *answer*, unless its robot is gone; count and log it in any case."""
+        queued, message = answer.queued, answer.message
+        code = "ok" if isinstance(message, Result) else message.code
+        service = self.label(queued.command.service)
+        self._metrics.answered(service, code, now - queued.received_s)
+        connection: RobotConnection = queued.owner
+        connection.answer(answer.data)
+        level, write = ("debug", self._log.debug) if code in _FREQUENT else ("info", self._log.info)
+        if self._log.writes(level):
+            write(
+                "command", robot=queued.robot, service=service, id=queued.command.id,
+                trace=queued.command.trace, code=code,
+                queue_ms=round((queued.started_s or now) * 1e3 - queued.received_s * 1e3, 3),
+                compute_ms=round(message.compute_ms, 3) if isinstance(message, Result) else 0.0,
+                bytes_in=queued.size_bytes, bytes_out=len(answer.data),
+            )  # fmt: skip
+
+    def send_message(self, queued: QueuedCommand, message: Result | Failure) -> None:
+        """Send what a sandbox or a job answered."""
+        now = self._clocks.monotonic()
+        if isinstance(message, Result):
+            queue_ms = (queued.started_s - queued.received_s) * 1e3
+            message = msgspec.structs.replace(
+                message, queue_ms=queue_ms, received_s=queued.received_s, sent_s=now
+            )
+        self.send(self._encoded(queued, message), now)
+
+    def send_refusal(self, refusal: RefusedCommand, now: float) -> None:
+        """Answer a command that ends without compute."""
+        self._metrics.shed[refusal.reason] += 1
+        queued = refusal.queued
+        failure = failure_of(refusal.error, queued.command, server=self._server_id)
+        self.send(Answer(queued, failure, queued.owner.session.codec.encode(failure)), now)
+
+    def send_unread_refusal(
+        self, connection: RobotConnection, envelope: Envelope | None, refusal: UnreadRefusal, size_bytes: int
+    ) -> None:
+        """Answer a message that is not decoded; without *envelope* nobody knows which command it was."""
+        self._metrics.shed[refusal.reason] += 1
+        failure = Failure(
+            id=None if envelope is None else envelope.id, code=Busy.code, message=refusal.message,
+            hint=refusal.hint, retry_after_ms=refusal.retry_after_ms, server=self._server_id,
+        )  # fmt: skip
+        data = encode_refusal(connection.codec, failure)
+        connection.write(data)
+        if envelope is None:
+            return
+        self._metrics.answered(self.label(envelope.service), Busy.code, 0.0)
+        if self._log.writes("debug"):
+            self._log.debug(
+                "command", robot=connection.robot, service=self.label(envelope.service), id=envelope.id,
+                trace="", code=Busy.code, queue_ms=0.0, compute_ms=0.0, bytes_in=size_bytes,
+                bytes_out=len(data),
+            )  # fmt: skip
+
+    def send_progress(self, connection: RobotConnection, progress: Progress) -> None:
+        """Tell a robot that understands it how far its long command is."""
+        if connection.hears_progress:
+            connection.write(connection.codec.encode(progress))
+
+    def label(self, service: str) -> str:
+        """Return the name of *service* for metrics and log, the same for all that this server does not
+        offer."""
+        return service if service in self._services else _UNKNOWN
+
+    def _encoded(self, queued: QueuedCommand, message: Result | Failure) -> Answer:
+        codec, command = queued.owner.session.codec, queued.command
+        try:
+            data = codec.encode(message)
+        except Exception as error:  # noqa: BLE001  the reply of a service may hold anything
+            self._log_defect(command, error)
+            defect = InternalError(f"the reply of {command.service!r} cannot be encoded")
+            message = failure_of(defect, command, server=self._server_id)
+            return Answer(queued, message, codec.encode(message))
+        if len(data) <= self._max_message_bytes:
+            return Answer(queued, message, data)
+        if isinstance(message, Result) and message.object and message.reply is not None:
+            return self._encoded(queued, msgspec.structs.replace(message, reply=None))
+        too_large = LimitExceeded(
+            f"the reply has {len(data)} bytes, above {self._max_message_bytes}", hint="ask for less"
+        )
+        message = failure_of(too_large, command, server=self._server_id)
+        return Answer(queued, message, codec.encode(message))
+
+    def _log_defect(self, command: Command, error: BaseException) -> None:
+        text = "".join(traceback.format_exception(type(error), error, error.__traceback__))
+        self._log.error("defect", service=command.service, id=command.id, trace=command.trace, traceback=text)

@@ -1,0 +1,59 @@
+"""The scheduler behind the admission step, as the dispatcher uses them, and ways to bring it into a state."""
+
+from __future__ import annotations
+
+from rse_pf.backend.gateway.admission import Admission, UnreadRefusal
+from rse_pf.backend.scheduling.scheduler import QueuedCommand, RefusedCommand, Scheduler
+from rse_pf.config import ServingSettings, SessionSettings
+from rse_pf.wire import Command
+
+
+def queued(
+    robot: str, identity: int = 0, *, at: float = 0.0, within: float = 10.0, **command: object
+) -> QueuedCommand:
+    """Return a command of *robot* that arrives at *at* and has *within* seconds."""
+    return QueuedCommand(robot, robot, Command(id=identity, service="work", **command), 100, at, at + within)
+
+
+class AdmittedScheduler(Scheduler):
+    """Queues what is admitted."""
+
+    def __init__(self, settings: ServingSettings) -> None:
+        super().__init__(settings)
+        self._admission = Admission(SessionSettings(), settings)
+
+    def submit(self, command: QueuedCommand, now: float = 0.0) -> list[RefusedCommand]:
+        refusal = self._admission.judge(command, None, self.backlog(command), self.max_delay_s)
+        if refusal is None:
+            return super().submit(command)
+        if refusal.reason == "behind":
+            self.note_refused(now)
+        return [refusal]
+
+    def refuse_unread(self, robot: str, allowed_s: float, now: float) -> UnreadRefusal | None:
+        if not self.is_behind:
+            return None
+        refusal = self._admission.judge_delay(allowed_s, self.delay_unread_s(robot), self.max_delay_s)
+        if refusal is not None:
+            self.note_refused(now)
+        return refusal
+
+
+def measure_turns(scheduler: Scheduler, turn_s: float, until_s: float) -> None:
+    """Start a command every *turn_s* until the average has converged; the last at *until_s*."""
+    for step in range(200):
+        now = until_s - (199 - step) * turn_s
+        Scheduler.submit(scheduler, queued("turns", at=now - 0.001))
+        started, _ = scheduler.start(now)
+        assert started is not None
+        scheduler.done(started, now)
+
+
+def fall_behind(scheduler: Scheduler, *, turn_s: float = 0.0, now: float = 0.0) -> None:
+    """Let *scheduler* measure *turn_s* between two starts and fall behind at *now*, with an empty queue."""
+    if turn_s:
+        measure_turns(scheduler, turn_s, now - 1.0)
+    Scheduler.submit(scheduler, queued("late", at=now - 0.5))
+    assert scheduler.sweep(now - 0.2) == scheduler.sweep(now) == []
+    scheduler.leave("late")
+    assert scheduler.is_behind
