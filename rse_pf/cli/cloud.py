@@ -58,6 +58,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     made["cost"].add_argument(
         "--hours-per-day", type=float, default=24.0, metavar="H", help="hours at work (default: %(default)s)"
     )
+    made["cost"].add_argument(
+        "--prices", type=Path, metavar="FILE", help="JSON file of prices to use in place of ours, all or some"
+    )
 
 
 def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
@@ -144,6 +147,7 @@ def _has_files(folder: Path) -> bool:
 
 def _cost(args: argparse.Namespace, settings: PlatformSettings) -> int:
     from rse_pf.aws.money.costs import HOURS, NOT_INCLUDED, Load, compare
+    from rse_pf.aws.money.prices import load_prices
 
     if not 1 <= args.robots <= _MAX_ROBOTS:
         raise UsageError(f"--robots is not within 1 and {_MAX_ROBOTS}", hint="name how many robots there are")
@@ -152,18 +156,19 @@ def _cost(args: argparse.Namespace, settings: PlatformSettings) -> int:
             "--fps or --hours-per-day is out of range", hint="up to 1000 a second, up to 24 hours"
         )
     load = Load(robots=args.robots, fps=args.fps, hours_per_day=args.hours_per_day)
-    costs = compare(settings, load)
-    most, at_once = settings.scaling.max_servers, settings.cloud.lambda_concurrency
+    prices, cloud = load_prices(args.prices), settings.cloud
+    costs = compare(settings, prices, load)
+    most, executions = settings.scaling.max_servers, cloud.lambda_concurrency
     rows = [
-        ("USD a month", "EC2 fleet", "Lambda"),
-        ("nobody asks", f"{costs.floor_usd:.2f}", "0.00"),
-        ("this load", f"{costs.fleet_usd:.2f}", f"{costs.lambda_usd:.2f}"),
-        ("needs", f"{costs.servers} servers", f"{costs.at_once:.1f} at once"),
-        ("may have", f"{most} servers", f"{at_once} at once"),
+        (f"{prices.currency} a month", "EC2 fleet", "Lambda"),
+        ("idle", f"{costs.floor:.2f}", "0.00"),
+        ("this load", f"{costs.fleet:.2f}", f"{costs.serverless:.2f}"),
+        ("needs", f"{costs.servers} servers", f"{costs.executions:.1f} executions"),
+        ("may have", f"{most} servers", f"{executions} executions"),
     ]
     print(
         f"{load.robots} robots, {load.fps:g} commands/s each, {load.hours_per_day:g} h a day: "
-        f"{load.commands_per_s:g} commands/s of {settings.prices.command_cpu_ms:g} ms\n"
+        f"{load.commands_per_s:g} commands/s of {prices.command_cpu_ms:g} ms\n"
     )
     for name, fleet, function in rows:
         print(f"{name:<12}{fleet:>14}{function:>16}")
@@ -173,16 +178,15 @@ def _cost(args: argparse.Namespace, settings: PlatformSettings) -> int:
         if rate is not None
         else f"\nthe Lambda is cheaper up to {most} servers"
     )
-    if costs.servers > most or costs.at_once > at_once:
+    if costs.servers > most or costs.executions > executions:
         print("more than scaling.max_servers or cloud.lambda_concurrency allows: robots would be refused")
-    prices, cloud = settings.prices, settings.cloud
-    print(f"\nprices: {prices.as_of} (settings, group prices); a month has {HOURS:g} h")
+    print(f"\nprices of {prices.as_of}, {prices.region}: {prices.source}; a month has {HOURS:g} h")
     for what, of, wanted in (
         ("cloud.region", prices.region, cloud.region),
         ("cloud.instance_type", prices.instance_type, cloud.instance_type),
     ):
         if of != wanted:
-            print(f"WRONG PRICES: they are for {of}, and {what} is {wanted}: lay your own over group prices")
+            print(f"WRONG PRICES: they are for {of}, and {what} is {wanted}: give yours with --prices")
     print(f"not included: {NOT_INCLUDED}")
     return 0
 

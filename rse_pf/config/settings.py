@@ -28,7 +28,6 @@ __all__ = [
     "LocalSettings",
     "PlatformSettings",
     "PnpSettings",
-    "PriceSettings",
     "ScalingSettings",
     "ServiceSettings",
     "ServingSettings",
@@ -37,8 +36,6 @@ __all__ = [
     "setting_rows",
     "settings_page",
 ]
-
-_LIST = "AWS list prices as remembered on that date; checked against no page"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -232,26 +229,6 @@ class CloudSettings:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class PriceSettings:
-    """What AWS asks for, for `rse-pf cloud cost`: one dated table for one region, without taxes. Lay your own over it."""
-
-    as_of: str = setting("2025-06, Seoul, from memory", doc="when and where these prices held, and who read them", source=_LIST)
-    region: str = setting("ap-northeast-2", doc="region for which these prices held")
-    instance_type: str = setting("c7i.large", doc="type of server for which they held")
-    server_hour_usd: float = setting(0.1008, unit="USD/h", doc="one prices.instance_type, on demand", source=_LIST, low=0)
-    server_vcpus: int = setting(2, doc="vCPUs of one prices.instance_type", source=_LIST, low=1)
-    server_month_usd: float = setting(3.13, unit="USD/month", doc="beside the hours of a server: 8 GB of gp3, seven detailed metrics, one of ours", source=_LIST, low=0)
-    balancer_hour_usd: float = setting(0.0325, unit="USD/h", doc="the load balancer with two public addresses", source=_LIST, low=0)
-    balancer_unit_hour_usd: float = setting(0.008, unit="USD/h", doc="one capacity unit: 3000 sockets, or 1 GB an hour", source=_LIST, low=0)
-    endpoint_hour_usd: float = setting(0.013, unit="USD/h", doc="one interface endpoint in one zone", source=_LIST, low=0)
-    fixed_month_usd: float = setting(9.1, unit="USD/month", doc="WAF with one rule, alarms, our metrics, one secret", source=_LIST, low=0)
-    lambda_million_usd: float = setting(0.2, unit="USD", doc="a million executions", source=_LIST, low=0)
-    lambda_gb_s_usd: float = setting(0.0000166667, unit="USD", doc="a gigabyte of memory for a second, x86-64", source=_LIST, low=0)
-    command_cpu_ms: float = setting(1.5, unit="ms", doc="CPU of one PnP command on a server or in the Lambda", source="benchmarks/handler.py: 1.2 ms, plus the socket", low=0.01)
-    command_bytes: int = setting(3467, unit="bytes", doc="one PnP command on the wire: 200 matches, zlib", source="measured", low=1)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class PlatformSettings:
     """All settings; contradictions are refused when the object is made."""
 
@@ -265,7 +242,6 @@ class PlatformSettings:
     services: ServiceSettings = field(default_factory=ServiceSettings)
     local: LocalSettings = field(default_factory=LocalSettings)
     cloud: CloudSettings = field(default_factory=CloudSettings)
-    prices: PriceSettings = field(default_factory=PriceSettings)
 
     def __post_init__(self) -> None:
         for row in setting_rows(self):

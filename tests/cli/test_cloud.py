@@ -52,24 +52,25 @@ def test_the_costs_are_a_table_with_crossing_floor_date_and_what_is_left_out(
 
     page = capsys.readouterr().out
     rows = {line[:12].strip(): line[12:].split() for line in page.splitlines() if line[:1].islower()}
-    assert float(rows["nobody asks"][0]) > 0
-    assert rows["nobody asks"][1] == "0.00"
+    assert float(rows["idle"][0]) > 0
+    assert rows["idle"][1] == "0.00"
     assert float(rows["this load"][0]) > float(rows["this load"][1]), "20 robots leave servers idle"
     assert "the fleet is cheaper from" in page
-    assert "2025-06, Seoul, from memory" in page
+    assert "prices of 2025-06, ap-northeast-2: AWS list prices, from memory" in page
     assert "not included: taxes" in page
     assert "100 commands/s" in page
 
 
-def test_the_prices_follow_the_settings(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
-    chosen = {"context": {"rse-pf": {"prices": {"lambda_million_usd": 1e6, "as_of": "today"}}}}
-    (tmp_path / "mine.json").write_text(json.dumps(chosen), encoding="utf-8")
+def test_a_file_of_prices_replaces_ours(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    chosen = {"lambda_per_million": 1e6, "as_of": "today", "currency": "EUR"}
+    (tmp_path / "prices.json").write_text(json.dumps(chosen), encoding="utf-8")
 
-    assert main(["cloud", "--settings", "mine.json", "cost", "--robots", "1", "--fps", "1"]) == 0
+    assert main(["cloud", "cost", "--prices", "prices.json", "--robots", "1", "--fps", "1"]) == 0
 
     page = capsys.readouterr().out
-    assert "prices: today" in page
-    assert f"{730 * 3600}." in page, "a dollar for each command"
+    assert "prices of today" in page
+    assert "EUR a month" in page
+    assert f"{730 * 3600}." in page, "one for each command"
 
 
 @pytest.mark.parametrize(

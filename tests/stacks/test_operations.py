@@ -13,6 +13,7 @@ import pytest
 from rse_pf.aws.account import Account
 from rse_pf.aws.clients import make_client
 from rse_pf.aws.money.costs import Load, compare
+from rse_pf.aws.money.prices import load_prices
 from rse_pf.cli.main import main
 from rse_pf.config import PlatformSettings
 
@@ -131,16 +132,16 @@ def test_what_runs_here_runs_in_the_order_of_the_page(
 def test_the_floor_on_the_page_is_the_floor_of_the_prices(page: str) -> None:
     nobody = Load(robots=1, fps=1e-9)
     settings = PlatformSettings()
-    floor = compare(settings, nobody).floor_usd
-    full = compare(settings.replace(cloud={"endpoints": "full"}), nobody).floor_usd
-    prices = settings.prices
+    floor = compare(settings, load_prices(), nobody).floor
+    full = compare(settings.replace(cloud={"endpoints": "full"}), load_prices(), nobody).floor
+    prices = load_prices()
 
     assert f"about **{floor:.0f} USD**" in page
     assert f"`full` adds {full - floor:.0f}." in page
     parts = (
-        prices.server_hour_usd * 730 * settings.scaling.min_servers,
-        prices.endpoint_hour_usd * 730 * 6,
-        prices.balancer_hour_usd * 730,
+        prices.server_per_hour * 730 * settings.scaling.min_servers,
+        prices.endpoint_per_hour * 730 * 6,
+        prices.balancer_per_hour * 730,
     )
     words = "two `c7i.large` {:.0f}, interface endpoints {:.0f}, the load balancer {:.0f}, the rest {:.0f}."
     assert words.format(*parts, floor - sum(parts)) in " ".join(page.split())

@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 from rse_pf.aws.account import Account
 from rse_pf.aws.money.leftovers import living_stacks
+from rse_pf.aws.money.prices import load_prices
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import ConfigurationError
 
@@ -105,7 +106,7 @@ def _instance_type(account: Account, settings: PlatformSettings) -> Check:
 
 def _vcpus(account: Account, settings: PlatformSettings) -> Check:
     # An instance that drains stands beside the one that follows it.
-    needed = (settings.scaling.max_servers + 1) * settings.prices.server_vcpus
+    needed = (settings.scaling.max_servers + 1) * load_prices().server_vcpus
     return _enough(
         account, _VCPUS, needed, "vCPUs of on-demand instances for scaling.max_servers and one more"
     )
