@@ -42,8 +42,8 @@ from rse_pf.services.mapping.map_merge import (
     Atlas,
     Merged,
     MergeOptions,
-    Proposals,
-    join_maps,
+    LoopProposals,
+    merge_versions,
     propose_links,
 )
 from rse_pf.services.mapping.optimise import Report, optimise_graph
@@ -132,10 +132,10 @@ def cloud_distances(
     return float(np.median(distances)), float((distances < 0.05).mean())
 
 
-def planted(share: float, seed: int) -> Callable[[Atlas, MergeOptions, Report], Proposals]:
+def planted(share: float, seed: int) -> Callable[[Atlas, MergeOptions, Report], LoopProposals]:
     """Return a proposer that replaces a share of the measured links by wrong ones."""
 
-    def propose(atlas: Atlas, options: MergeOptions, report: Report) -> Proposals:
+    def propose(atlas: Atlas, options: MergeOptions, report: Report) -> LoopProposals:
         found = propose_links(atlas, options, report)
         rng = np.random.default_rng(seed)
         links = list(found.links)
@@ -144,7 +144,7 @@ def planted(share: float, seed: int) -> Callable[[Atlas, MergeOptions, Report], 
             links[k] = LoopClosure(
                 a=links[k].a, b=links[k].b, T_a_b=links[k].T_a_b @ off, information=links[k].information
             )
-        return Proposals(links=tuple(links), failed=found.failed)
+        return LoopProposals(links=tuple(links), failed=found.failed)
 
     return propose
 
@@ -187,19 +187,19 @@ def merge_rows(recordings: Path) -> dict[str, Any]:
     robots = robots_of(recordings)
     versions = [run.version for run in robots.runs]
     begin = time.perf_counter()
-    merged = join_maps(versions)
+    merged = merge_versions(versions)
     seconds = time.perf_counter() - begin
     median_m, share = cloud_distances(robots, merged)
     by_positions_m, share_by_positions = cloud_distances(robots, merged, by_positions=True)
     clean = robots.ate_m(joined_poses(robots.runs, merged))
     wrong = [
-        robots.ate_m(joined_poses(robots.runs, join_maps(versions, propose=planted(0.1, seed))))
+        robots.ate_m(joined_poses(robots.runs, merge_versions(versions, propose=planted(0.1, seed))))
         for seed in range(5)
     ]
     alone = robots_of(recordings, cuts=((0, 250),))
     alone_versions = [run.version for run in alone.runs]
-    without = join_maps(alone_versions, MergeOptions(close_loops=False))
-    closed = join_maps(alone_versions)
+    without = merge_versions(alone_versions, MergeOptions(close_loops=False))
+    closed = merge_versions(alone_versions)
     return {
         "keyframes": [len(version.keyframes) for version in versions],
         "merge_links": merged.merges,

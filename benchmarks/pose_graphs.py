@@ -28,7 +28,7 @@ from benchmarks.map_recordings import ate_m
 from benchmarks.map_services import robots_of
 from rse_pf.geometry import Array
 from rse_pf.services.mapping import map_merge as join
-from rse_pf.services.mapping.map_merge import join_maps
+from rse_pf.services.mapping.map_merge import merge_versions
 from rse_pf.services.mapping.optimise import Optimised, OptimiseOptions, optimise_graph, robust_cost
 from rse_pf.services.mapping.pose_graph import PoseGraph, write_g2o
 from rse_pf.services.synthetic_maps import make_sphere
@@ -48,7 +48,7 @@ def kitchen_graph(recordings: Path) -> tuple[PoseGraph, Array]:
 
     join.optimise_graph, before = watch, join.optimise_graph
     try:
-        merged = join_maps([run.version for run in robots.runs])
+        merged = merge_versions([run.version for run in robots.runs])
     finally:
         join.optimise_graph = before
     truth = {

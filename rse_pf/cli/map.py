@@ -270,13 +270,13 @@ def _merge(args: argparse.Namespace, maps: MapRegistry) -> int:
 def _localise(args: argparse.Namespace, maps: MapRegistry) -> int:
     """Estimate the pose of each frame and print a line for it; the exit code is 1 if none has a pose."""
     from rse_pf.services.mapping.localise import locate
-    from rse_pf.services.mapping.place import opened_map
+    from rse_pf.services.mapping.place import open_map
 
     if args.every < 1:
         raise UsageError(f"--every {args.every} is below 1", hint="1 takes every frame")
     name, version = _version_of(args.name)
     data = maps.data(name, version)
-    version_map, index = opened_map(data)
+    version_map, index = open_map(data)
     frames = [each for word in args.frames for each in _frames(word, args.every)]
     found: list[dict[str, Any]] = []
     for each in frames:

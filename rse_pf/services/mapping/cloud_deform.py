@@ -1,7 +1,4 @@
-"""Clouds of maps whose keyframes were moved: the points follow the keyframe that saw them.
-
-Promises to lose no colour, and to thin only what falls into one voxel of another map's point.
-"""
+"""Deform the clouds of maps whose keyframes were moved: each point follows the keyframe that observed it."""
 
 from __future__ import annotations
 
@@ -13,23 +10,23 @@ import numpy.typing as npt
 from rse_pf.geometry import Array, inverse, transform
 from rse_pf.maps.format import Keyframe, MapVersion
 
-__all__ = ["moved_points"]
+__all__ = ["deform_clouds"]
 
 Points = npt.NDArray[np.float32]
 Colours = npt.NDArray[np.uint8]
 
 _VOXEL_M = 0.01
-_NEAREST_M, _FARTHEST_M = 0.2, 6.0
+_MIN_DEPTH_M, _MAX_DEPTH_M = 0.2, 6.0
 
 
-def moved_points(
+def deform_clouds(
     versions: Sequence[MapVersion],
     of_map: npt.NDArray[np.int64],
     keyframes: Sequence[Keyframe],
     T_world_camera: Array,
     rows: npt.NDArray[np.int64],
 ) -> tuple[Points, Colours]:
-    """Return the clouds of the maps of *rows*, each point moved as its keyframe was.
+    """Return the clouds of the maps of *rows* with each point moved like its keyframe, one point per voxel.
 
     Args:
         versions: The maps, with clouds in their own worlds.
@@ -44,43 +41,43 @@ def moved_points(
         if not len(version.points):
             continue
         own = [int(row) for row in rows if of_map[row] == which]
-        seen_by = _seer(np.asarray(version.points, dtype=np.float64), [keyframes[row] for row in own])
+        observer = _observer_of(np.asarray(version.points, dtype=np.float64), [keyframes[row] for row in own])
         moved = np.empty((len(version.points), 3))
         for place, row in enumerate(own):
-            mine = seen_by == place
+            mine = observer == place
             correction = T_world_camera[row] @ inverse(keyframes[row].T_world_camera)
             moved[mine] = transform(correction, version.points[mine].astype(np.float64))
         clouds.append(moved)
         colours.append(version.colours)
     if not clouds:
         return np.empty((0, 3), dtype=np.float32), np.empty((0, 3), dtype=np.uint8)
-    return _thinned(np.concatenate(clouds), np.concatenate(colours))
+    return _thin(np.concatenate(clouds), np.concatenate(colours))
 
 
-def _seer(points: Array, keyframes: Sequence[Keyframe]) -> npt.NDArray[np.int64]:
-    """Return for each point the keyframe that saw it from the least depth, else the nearest one."""
+def _observer_of(points: Array, keyframes: Sequence[Keyframe]) -> npt.NDArray[np.int64]:
+    """Return for each point the keyframe that observed it at the smallest depth, else the nearest one."""
     best = np.full(len(points), np.inf)
-    seer = np.zeros(len(points), dtype=np.int64)
+    observer = np.zeros(len(points), dtype=np.int64)
     for place, keyframe in enumerate(keyframes):
         seen = transform(inverse(keyframe.T_world_camera), points)
         depth = seen[:, 2]
-        ahead = np.where(depth > _NEAREST_M, depth, 1.0)
+        ahead = np.where(depth > _MIN_DEPTH_M, depth, 1.0)
         camera = keyframe.camera
         u = camera.fx * seen[:, 0] / ahead + camera.cx
         v = camera.fy * seen[:, 1] / ahead + camera.cy
         inside = (
-            (depth > _NEAREST_M) & (depth < _FARTHEST_M)
+            (depth > _MIN_DEPTH_M) & (depth < _MAX_DEPTH_M)
             & (u >= 0) & (v >= 0) & (u < camera.width) & (v < camera.height)
         )  # fmt: skip
-        # A point that no keyframe holds in its image still follows the nearest one.
+        # A point outside of every image follows the nearest keyframe.
         cost = np.where(inside, depth, 1e3 + np.linalg.norm(seen, axis=1))
         nearer = cost < best
-        best[nearer], seer[nearer] = cost[nearer], place
-    return seer
+        best[nearer], observer[nearer] = cost[nearer], place
+    return observer
 
 
-def _thinned(points: Array, colours: Colours) -> tuple[Points, Colours]:
-    """Return the mean of the points of each voxel, with the colour of its first."""
+def _thin(points: Array, colours: Colours) -> tuple[Points, Colours]:
+    """Return the mean of the points of each voxel, with the colour of the first."""
     _, first, group = np.unique(
         np.floor(points / _VOXEL_M).astype(np.int64), axis=0, return_index=True, return_inverse=True
     )

@@ -1,7 +1,4 @@
-"""Binary descriptors: matching two views, and one vector for a whole view.
-
-Promises determinism, one thread, and not to know where descriptors come from.
-"""
+"""Binary descriptors: matches of two views, and one vector for a whole view; deterministic, one thread."""
 
 from __future__ import annotations
 
@@ -18,12 +15,12 @@ __all__ = ["Descriptors", "descriptors_of", "hamming_matches", "load_faiss", "tr
 Descriptors = npt.NDArray[np.uint8]
 
 BYTES = 32
-_TRAINING = 20_000
-_ROUNDS = 12
+_MAX_TRAINING = 20_000
+_KMEANS_ITERATIONS = 12
 
 
 def descriptors_of(data: bytes, rows: int) -> Descriptors:
-    """Return ``(rows, 32)`` uint8 descriptors of their raw bytes; raises BadRequest."""
+    """Return raw bytes as ``(rows, 32)`` uint8 descriptors; raises BadRequest."""
     if len(data) != BYTES * rows:
         raise BadRequest(
             f"{len(data)} bytes are not {rows} descriptors of {BYTES} bytes", hint="send one for each pixel"
@@ -58,20 +55,20 @@ def hamming_matches(
 def train_words(views: Sequence[Descriptors], words: int, seed: int) -> npt.NDArray[np.float32]:
     """Return ``(k, 256)`` cluster centres of the descriptors' bits (-1, 1); ``k <= words``.
 
-    Trained from these views alone, so that a vocabulary belongs to one map version and no data of
-    others is in it.  Deterministic for a *seed*.
+    Trained from these views alone, so that a vocabulary belongs to one map version and holds no data of
+    others.  Deterministic for a *seed*.
     """
-    everything = np.concatenate([np.asarray(view, dtype=np.uint8) for view in views]) if views else None
-    if everything is None or not len(everything):
+    stacked = np.concatenate([np.asarray(view, dtype=np.uint8) for view in views]) if views else None
+    if stacked is None or not len(stacked):
         raise BadRequest("the map holds no descriptors", hint="upload keyframes with their descriptors")
     rng = np.random.default_rng(seed)
-    if len(everything) > _TRAINING:
-        everything = everything[np.sort(rng.choice(len(everything), _TRAINING, replace=False))]
-    k = int(min(words, len(everything)))
+    if len(stacked) > _MAX_TRAINING:
+        stacked = stacked[np.sort(rng.choice(len(stacked), _MAX_TRAINING, replace=False))]
+    k = int(min(words, len(stacked)))
     kmeans = load_faiss().Kmeans(
-        8 * BYTES, k, niter=_ROUNDS, seed=seed, verbose=False, min_points_per_centroid=1
+        8 * BYTES, k, niter=_KMEANS_ITERATIONS, seed=seed, verbose=False, min_points_per_centroid=1
     )
-    kmeans.train(_bits(everything))
+    kmeans.train(_bits(stacked))
     centres: npt.NDArray[np.float32] = np.asarray(kmeans.centroids, dtype=np.float32)
     return centres
 
@@ -86,7 +83,7 @@ def view_vector(view: Descriptors, words: npt.NDArray[np.float32]) -> npt.NDArra
     sums = np.zeros_like(words)
     if len(view):
         bits = _bits(view)
-        # Nearest centre: |b - c|^2 without the |b|^2 that all share.
+        # Nearest centre: |b - c|^2 without the constant |b|^2.
         nearest = np.argmin((words**2).sum(axis=1) - 2.0 * (bits @ words.T), axis=1)
         np.add.at(sums, nearest, bits - words[nearest])
         sums = np.sign(sums) * np.sqrt(np.abs(sums))
@@ -97,7 +94,7 @@ def view_vector(view: Descriptors, words: npt.NDArray[np.float32]) -> npt.NDArra
 
 
 def load_faiss() -> Any:
-    """Return faiss, held to one thread; raises MissingExtra."""
+    """Return faiss, limited to one thread; raises MissingExtra."""
     try:
         import faiss
     except ImportError as error:

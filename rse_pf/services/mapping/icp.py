@@ -1,7 +1,7 @@
-"""The alignment service: two overlapping clouds and a first guess in, the pose between them out.
+"""The alignment service: from two overlapping clouds and an initial guess to the pose between them.
 
-Promises never to call a pose ok that fits worse than the guess it began with, that overlaps too
-little, or that the surfaces leave free to slide; the answer then is the guess, with the reason.
+A pose that fits worse than the guess, overlaps too little, or is not constrained by the surfaces is refused;
+the answer is then the guess, with the reason.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ __all__ = ["Alignment", "IcpOptions", "IcpReply", "IcpRequest", "align", "regist
 
 _MIN_POINTS = 100
 _NEIGHBOURS = 20
-_GAIN = 0.02
-"""A pose must fit better than the guess by this share, unless it hardly moved."""
-_STILL_M, _STILL_DEG = 0.002, 0.1
+_MIN_GAIN = 0.02
+"""A pose must fit better than the guess by this share, unless it is almost equal to it."""
+_UNMOVED_M, _UNMOVED_DEG = 0.002, 0.1
 _STEP_M, _STEP_RAD = 1e-4, 1e-4
 """The solver ends when a step is smaller than both."""
-_POOR = 0.2
-"""Mean distance, as a share of the reach, above which surfaces do not fit, whatever was gained."""
+_MAX_MISFIT = 0.2
+"""Mean distance, as a share of the reach, above which surfaces do not fit."""
 MAX_POINTS = 1_000_000
 """Of one cloud."""
 
@@ -106,14 +106,14 @@ def align(
 ) -> Alignment:
     """Refine the pose of *source* in the frame of *target*; deterministic, one thread.
 
-    Generalised ICP with a shrinking reach.  The judge is not the solver: it is the mean distance of
-    the thinned source points to the planes of their nearest target points, each counted as *reach_m*
-    at most, so that points which lose their partner make an answer worse, not better.
+    Generalised ICP with a decreasing reach.  The fit is not measured by the solver but by the mean
+    distance of the thinned source points to the planes of their nearest target points, each limited to
+    *reach_m*, so that points without correspondence make the fit worse.
 
     Args:
         target: ``(n, 3)`` metres.
         source: ``(m, 3)`` metres.
-        T_target_source: ``(4, 4)``, the first guess.
+        T_target_source: ``(4, 4)``, the initial guess.
         options: ``None`` means the defaults.
 
     Raises:
@@ -131,14 +131,14 @@ def align(
     source_cloud, _ = gicp.preprocess_points(
         np.ascontiguousarray(source), options.voxel_m, num_neighbors=_NEIGHBOURS, num_threads=1
     )
-    fewest = min(target_cloud.size(), source_cloud.size())
-    if fewest < _MIN_POINTS:
+    count = min(target_cloud.size(), source_cloud.size())
+    if count < _MIN_POINTS:
         raise BadRequest(
-            f"{fewest} points are left of a cloud thinned to {options.voxel_m:g} m, not {_MIN_POINTS}",
+            f"{count} points are left of a cloud thinned to {options.voxel_m:g} m, not {_MIN_POINTS}",
             hint="send more points, in metres, or a smaller voxel_m",
         )
-    judge = _Judge(target_cloud, target_tree, source_cloud, options.reach_m)
-    before = judge(T_target_source)
+    fit = _FitMeasure(target_cloud, target_tree, source_cloud, options.reach_m)
+    before = fit(T_target_source)
     pose, iterations, converged = T_target_source, 0, False
     for reach_m in (options.reach_m, max(options.reach_m / 3.0, 2.0 * options.voxel_m)):
         found = gicp.align(
@@ -148,9 +148,9 @@ def align(
         )  # fmt: skip
         pose, converged = np.asarray(found.T_target_source), bool(found.converged)
         iterations += int(found.iterations)
-    after = judge(pose) if np.isfinite(pose).all() else _Fit(0.0, math.inf)
+    after = fit(pose) if np.isfinite(pose).all() else _Fit(0.0, math.inf)
     reason = "" if converged else "not-converged"
-    reason = reason or _refusal(T_target_source, pose, before, after, judge.freedom(pose), options)
+    reason = reason or _refusal(T_target_source, pose, before, after, fit.constraint(pose), options)
     return Alignment(
         T_target_source=T_target_source if reason else pose,
         verdict="refused" if reason else "ok",
@@ -193,8 +193,8 @@ class _Fit:
     misfit_m: float
 
 
-class _Judge:
-    """Says how well a pose fits, by distances to planes, without the solver's own weights."""
+class _FitMeasure:
+    """Measures how well a pose fits, by distances to planes, without the weights of the solver."""
 
     def __init__(self, target: Any, tree: Any, source: Any, reach_m: float) -> None:
         self._points = np.asarray(target.points())[:, :3]
@@ -207,8 +207,8 @@ class _Judge:
         misfit = np.where(near, distance, self._reach_m)
         return _Fit(float(near.mean()), float(misfit.mean()))
 
-    def freedom(self, T_target_source: Matrix) -> float:
-        """Return the smallest share of the surfaces that holds one direction of motion.
+    def constraint(self, T_target_source: Matrix) -> float:
+        """Return how well the surfaces constrain the direction of motion that they constrain least.
 
         The smallest eigenvalue of the mean outer product of ``(normal, lever x normal)``, with the
         lever in units of the cloud's own size: 0 where the clouds may slide or turn freely.
@@ -235,25 +235,25 @@ class _Judge:
         return near, distance, moved, normals
 
 
-_SLIDING = 0.004
-"""Smallest eigenvalue below which surfaces do not hold a pose; a plane has 0, a corner about 0.1."""
+_MIN_CONSTRAINT = 0.004
+"""Smallest eigenvalue at which surfaces constrain a pose; a plane has 0, a corner about 0.1."""
 
 
 def _refusal(
-    guess: Matrix, pose: Matrix, before: _Fit, after: _Fit, freedom: float, options: IcpOptions
+    guess: Matrix, pose: Matrix, before: _Fit, after: _Fit, constraint: float, options: IcpOptions
 ) -> str:
     if after.overlap < options.min_overlap:
         return "little-overlap"
-    if after.misfit_m > _POOR * options.reach_m:
+    if after.misfit_m > _MAX_MISFIT * options.reach_m:
         return "poor-fit"
-    if freedom < _SLIDING:
+    if constraint < _MIN_CONSTRAINT:
         return "sliding"
     moved_m, turned_deg = pose_difference(pose, guess)
     if moved_m > options.max_motion_m or turned_deg > options.max_motion_deg:
         return "jumped"
-    if moved_m <= _STILL_M and turned_deg <= _STILL_DEG:
-        return "" if after.misfit_m <= before.misfit_m * (1.0 + _GAIN) else "worse"
-    return "" if after.misfit_m < before.misfit_m * (1.0 - _GAIN) else "worse"
+    if moved_m <= _UNMOVED_M and turned_deg <= _UNMOVED_DEG:
+        return "" if after.misfit_m <= before.misfit_m * (1.0 + _MIN_GAIN) else "worse"
+    return "" if after.misfit_m < before.misfit_m * (1.0 - _MIN_GAIN) else "worse"
 
 
 def _is_rigid(T: Matrix) -> bool:

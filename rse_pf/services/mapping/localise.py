@@ -1,7 +1,6 @@
-"""The localisation service: one view and a map in, the camera's pose in that map out.
+"""The localisation service: from one view and a map to the pose of the camera in that map.
 
-Promises never to call a pose ok that few matches speak for or that two keyframes disagree about, and
-to ask the map alone: no memory of earlier views.
+A pose with few inliers, or on which two keyframes disagree, is not ok.  Earlier views are not used.
 """
 
 from __future__ import annotations
@@ -17,8 +16,8 @@ from rse_pf.geometry import Array as Matrix
 from rse_pf.geometry import Camera, inverse, pose_difference, transform
 from rse_pf.pnp import PnpOptions, PnpSolution, solve_pnp
 from rse_pf.service import Registry
-from rse_pf.services.mapping.place import PlaceIndex, Within, opened_map, view_of
-from rse_pf.services.mapping.relative_pose import StepOptions, View, matched_points
+from rse_pf.services.mapping.place import PlaceIndex, Within, open_map, view_of
+from rse_pf.services.mapping.relative_pose import RelativePoseOptions, View, matched_points
 from rse_pf.wire.arrays import Array
 
 __all__ = ["LocaliseOptions", "LocaliseReply", "LocaliseRequest", "Location", "locate", "register"]
@@ -75,12 +74,12 @@ class LocaliseReply(msgspec.Struct, frozen=True, kw_only=True):
     inliers: int = 0
     rmse_px: float = 0.0
     keyframes: list[int] = []
-    """Ids of the keyframes whose points carry the pose, best first."""
+    """Ids of the keyframes that support the pose, best first."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Location:
-    """What `locate` found; the fields are those of `LocaliseReply`."""
+    """The result of `locate`; the fields are those of `LocaliseReply`."""
 
     verdict: Literal["ok", "weak", "lost"]
     reason: str
@@ -91,7 +90,7 @@ class Location:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Vote:
+class _CandidatePose:
     row: int
     points_map: Matrix
     pixels: Matrix
@@ -103,8 +102,8 @@ def locate(
 ) -> Location:
     """Find the pose of *view* among the keyframes of *index*.
 
-    Candidates by place recognition, a pose from each by PnP; the best one is solved once more with
-    the points of all candidates that agree with it.
+    Place recognition gives candidates, PnP a pose from each; the best one is solved again with the points
+    of all candidates that agree with it.
 
     Raises:
         MissingExtra: faiss or the solver is not installed.
@@ -113,24 +112,26 @@ def locate(
     rows = index.nearest(view.descriptors, options.candidates, index.rows_within(within))
     if not rows:
         return Location(verdict="lost", reason="no-candidates")
-    votes = [vote for row, _ in rows if (vote := _vote(index, row, view, options)) is not None]
-    if not votes:
+    candidates = [
+        candidate for row, _ in rows if (candidate := _candidate_pose(index, row, view, options)) is not None
+    ]
+    if not candidates:
         return Location(verdict="lost", reason="no-pose")
-    votes.sort(key=lambda vote: -len(vote.solution.inliers))
-    best = votes[0]
-    agreeing = [vote for vote in votes if _agrees(vote, best, options)]
-    solution = _joint(agreeing, view, options) or best.solution
+    candidates.sort(key=lambda candidate: -len(candidate.solution.inliers))
+    best = candidates[0]
+    agreeing = [candidate for candidate in candidates if _agrees(candidate, best, options)]
+    solution = _solve_jointly(agreeing, view, options) or best.solution
     count = len(best.solution.inliers)
     if count < options.min_inliers // 2:
         return Location(verdict="lost", reason="few-inliers", inliers=count)
-    reason = _doubt(votes, agreeing, solution, options)
+    reason = _weakness(candidates, agreeing, solution, options)
     return Location(
         verdict="weak" if reason else "ok",
         reason=reason,
         T_map_camera=inverse(solution.T_camera_world),
         inliers=count,
         rmse_px=solution.rmse_px,
-        keyframes=tuple(index.keyframes[vote.row].id for vote in agreeing),
+        keyframes=tuple(index.keyframes[candidate.row].id for candidate in agreeing),
     )
 
 
@@ -141,7 +142,7 @@ def register(registry: Registry) -> None:
     def localise(request: LocaliseRequest) -> LocaliseReply:
         """Find the camera's pose in a map."""
         view = view_of(request.camera, request.pixels, request.descriptors)
-        _, index = opened_map(request.map)
+        _, index = open_map(request.map)
         found = locate(index, view, request.options, within=request.within)
         return LocaliseReply(
             verdict=found.verdict,
@@ -153,38 +154,47 @@ def register(registry: Registry) -> None:
         )
 
 
-def _vote(index: PlaceIndex, row: int, view: View, options: LocaliseOptions) -> _Vote | None:
+def _candidate_pose(
+    index: PlaceIndex, row: int, view: View, options: LocaliseOptions
+) -> _CandidatePose | None:
     keyframe = index.keyframes[row]
-    points, rows, columns = matched_points(keyframe, view, StepOptions(inlier_px=options.inlier_px))
+    points, rows, columns = matched_points(keyframe, view, RelativePoseOptions(inlier_px=options.inlier_px))
     if len(rows) < options.min_inliers // 2:
         return None
     points_map = transform(keyframe.T_world_camera, points)
-    solution = _solved(points_map, view.pixels[columns], view, options)
-    return None if solution is None else _Vote(row, points_map, view.pixels[columns], solution)
+    solution = _solve(points_map, view.pixels[columns], view, options)
+    return None if solution is None else _CandidatePose(row, points_map, view.pixels[columns], solution)
 
 
-def _joint(votes: list[_Vote], view: View, options: LocaliseOptions) -> PnpSolution | None:
-    """Solve with the inliers of all *votes* together."""
-    points = np.concatenate([vote.points_map[vote.solution.inliers] for vote in votes])
-    pixels = np.concatenate([vote.pixels[vote.solution.inliers] for vote in votes])
-    return _solved(points, pixels, view, options)
+def _solve_jointly(
+    candidates: list[_CandidatePose], view: View, options: LocaliseOptions
+) -> PnpSolution | None:
+    """Solve with the inliers of all *candidates* together."""
+    points = np.concatenate([candidate.points_map[candidate.solution.inliers] for candidate in candidates])
+    pixels = np.concatenate([candidate.pixels[candidate.solution.inliers] for candidate in candidates])
+    return _solve(points, pixels, view, options)
 
 
-def _solved(points: Matrix, pixels: Matrix, view: View, options: LocaliseOptions) -> PnpSolution | None:
+def _solve(points: Matrix, pixels: Matrix, view: View, options: LocaliseOptions) -> PnpSolution | None:
     try:
         return solve_pnp(points, pixels, view.camera, PnpOptions(inlier_px=options.inlier_px))
     except PnpError:
         return None
 
 
-def _agrees(vote: _Vote, best: _Vote, options: LocaliseOptions) -> bool:
+def _agrees(candidate: _CandidatePose, best: _CandidatePose, options: LocaliseOptions) -> bool:
     metres, degrees = pose_difference(
-        inverse(vote.solution.T_camera_world), inverse(best.solution.T_camera_world)
+        inverse(candidate.solution.T_camera_world), inverse(best.solution.T_camera_world)
     )
     return metres <= options.agree_m and degrees <= options.agree_deg
 
 
-def _doubt(votes: list[_Vote], agreeing: list[_Vote], solution: PnpSolution, options: LocaliseOptions) -> str:
+def _weakness(
+    candidates: list[_CandidatePose],
+    agreeing: list[_CandidatePose],
+    solution: PnpSolution,
+    options: LocaliseOptions,
+) -> str:
     best = agreeing[0]
     if len(best.solution.inliers) < options.min_inliers:
         return "few-inliers"
@@ -193,6 +203,8 @@ def _doubt(votes: list[_Vote], agreeing: list[_Vote], solution: PnpSolution, opt
     if solution.verdict != "ok":
         return solution.reason
     rival = max(options.min_inliers, len(best.solution.inliers) // 2)
-    if any(vote not in agreeing and len(vote.solution.inliers) >= rival for vote in votes):
+    if any(
+        candidate not in agreeing and len(candidate.solution.inliers) >= rival for candidate in candidates
+    ):
         return "keyframes-disagree"
     return ""

@@ -1,7 +1,6 @@
-"""Which measured steps between keyframes agree with each other: the judge of loops and merges.
+"""Decide which measured relative poses (links) between keyframes agree: loops within and between maps.
 
-Promises that its verdict does not depend on where two robots' origins are believed to be: only steps
-and odometry are compared.
+Only links and odometry are compared, so the decision does not depend on the world frames of the maps.
 """
 
 from __future__ import annotations
@@ -20,13 +19,13 @@ __all__ = ["LoopClosure", "OdometryNoise", "consistent", "largest_clique", "pair
 
 _CHI2_3_99 = 11.345
 """99 % of the squared Mahalanobis norms of a 3-vector lie below."""
-_MAX_STEPS = 200_000
-"""Branches of the clique search; beyond, the best clique so far is taken."""
+_MAX_BRANCHES = 200_000
+"""Limit of the clique search; beyond it the best clique so far is returned."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class OdometryNoise:
-    """How odometry drifts: standard deviations for each axis over one keyframe step (a random walk)."""
+    """Drift of odometry: standard deviations for each axis from one keyframe to the next (a random walk)."""
 
     step_m: float = 0.02
     step_deg: float = 0.7
@@ -34,7 +33,7 @@ class OdometryNoise:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class LoopClosure:
-    """A measured step between two keyframes (row numbers of one list)."""
+    """A measured relative pose of two keyframes (row numbers of one list)."""
 
     a: int
     b: int
@@ -54,8 +53,8 @@ def consistent(
 
     Args:
         links: All between the same two trajectories (or within one).
-        T_world_camera: ``(n, 4, 4)``, odometry of each trajectory in a frame of its own.
-        order: ``(n,)``, each keyframe's place along its trajectory, in keyframe steps.
+        T_world_camera: ``(n, 4, 4)``, odometry of each trajectory in its own frame.
+        order: ``(n,)``, index of each keyframe along its trajectory.
         noise: Of the odometry.
 
     Source:
@@ -71,11 +70,11 @@ def pairwise_consistency(
     order: npt.NDArray[np.int64],
     noise: OdometryNoise,
 ) -> npt.NDArray[np.bool_]:
-    """Return the ``(m, m)`` matrix of which two links agree; the diagonal is False.
+    """Return the ``(m, m)`` matrix of pairs of links that agree; the diagonal is False.
 
     The round trip a1 -> b1 -> b2 -> a2 -> a1 should be the identity; translation and rotation are
-    tested apart, at 99 %, against the noise of both links and of the odometry between them, with
-    rotation noise at the lever of the way it swings.
+    tested separately, at 99 %, against the noise of both links and of the odometry between them;
+    rotation noise acts on translation with the length of the path as its lever.
     """
     m = len(links)
     if m == 0:
@@ -114,13 +113,13 @@ def largest_clique(agree: npt.NDArray[np.bool_]) -> npt.NDArray[np.int64]:
     neighbours = [frozenset(np.flatnonzero(row).tolist()) for row in agree]
     by_degree = sorted(range(len(neighbours)), key=lambda row: (-len(neighbours[row]), row))
     best: list[int] = []
-    left = _MAX_STEPS
+    left = _MAX_BRANCHES
 
     def grow(clique: list[int], rows: list[int]) -> None:
         nonlocal best, left
         if len(clique) > len(best):
             best = list(clique)
-        coloured = _coloured(rows, neighbours)
+        coloured = _colour(rows, neighbours)
         for place in range(len(coloured) - 1, -1, -1):
             row, colours = coloured[place]
             if len(clique) + colours <= len(best) or left <= 0:
@@ -133,7 +132,7 @@ def largest_clique(agree: npt.NDArray[np.bool_]) -> npt.NDArray[np.int64]:
     return np.array(sorted(best), dtype=np.int64)
 
 
-def _coloured(rows: list[int], neighbours: list[frozenset[int]]) -> list[tuple[int, int]]:
+def _colour(rows: list[int], neighbours: list[frozenset[int]]) -> list[tuple[int, int]]:
     """Return rows with how many colours those up to each need: no clique in them is larger."""
     classes: list[list[int]] = []
     for row in rows:

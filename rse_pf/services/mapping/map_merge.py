@@ -1,6 +1,6 @@
-"""Joining maps: propose loops, judge them, place the maps, optimise, move the clouds along.
+"""Merge maps: propose loop closures, select consistent ones, align the maps, optimise, deform the clouds.
 
-Promises to be a pure function of the maps and the options; `merge` is its face on the wire.
+A pure function of the maps and the options; `merge` is the service.
 """
 
 from __future__ import annotations
@@ -17,17 +17,17 @@ import numpy.typing as npt
 from rse_pf.errors import BadRequest
 from rse_pf.geometry import Array, inverse
 from rse_pf.maps.format import Edge, Keyframe, MapVersion
-from rse_pf.services.mapping.cloud_deform import moved_points
+from rse_pf.services.mapping.cloud_deform import deform_clouds
 from rse_pf.services.mapping.loop_consistency import LoopClosure, OdometryNoise, consistent
-from rse_pf.services.mapping.optimise import OptimiseOptions, Report, optimise_graph, silent
+from rse_pf.services.mapping.optimise import OptimiseOptions, Report, ignore_progress, optimise_graph
 from rse_pf.services.mapping.place import PlaceIndex
 from rse_pf.services.mapping.pose_graph import PoseGraph
-from rse_pf.services.mapping.relative_pose import StepOptions, measure_step
+from rse_pf.services.mapping.relative_pose import RelativePoseOptions, measure_relative_pose
 
-__all__ = ["Atlas", "MergeOptions", "Merged", "Proposals", "join_maps", "propose_links"]
+__all__ = ["Atlas", "LoopProposals", "MergeOptions", "MergedMap", "merge_versions", "propose_links"]
 
-_NEAR = 3
-"""Keyframes of one robot that are closer along its way than this are no loop."""
+_MIN_LOOP_LENGTH = 3
+"""Keyframes of one robot that are closer than this along its trajectory are not a loop."""
 
 
 class MergeOptions(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
@@ -59,13 +59,13 @@ class MergeOptions(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Atlas:
-    """The keyframes of all maps in one list, each map still in its own world."""
+    """The keyframes of all maps in one list, each map in its own world frame."""
 
     keyframes: tuple[Keyframe, ...]
     of_map: npt.NDArray[np.int64]
     """``(n,)``: the map of each keyframe."""
     order: npt.NDArray[np.int64]
-    """``(n,)``: each keyframe's place along the way of its robot."""
+    """``(n,)``: index of each keyframe along the trajectory of its robot."""
     T_world_camera: Array
     """``(n, 4, 4)``."""
     row_of: Mapping[tuple[int, int], int]
@@ -89,16 +89,16 @@ class Atlas:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Proposals:
-    """Links that PnP measured, and how many keyframe pairs of two maps failed for which reason."""
+class LoopProposals:
+    """Links that PnP measured, and the number of keyframe pairs of two maps that failed, by reason."""
 
     links: tuple[LoopClosure, ...]
     failed: Counter[tuple[int, int, str]]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Merged:
-    """What `join_maps` made: the map, who is in it, who is not and why, what was refused."""
+class MergedMap:
+    """The result of `merge_versions`: the map, the joined and not joined maps, and the refused links."""
 
     version: MapVersion
     joined: tuple[int, ...]
@@ -110,20 +110,20 @@ class Merged:
     cost_after: float
 
 
-def join_maps(
+def merge_versions(
     versions: Sequence[MapVersion],
     options: MergeOptions | None = None,
     *,
-    report: Report = silent,
-    propose: Callable[[Atlas, MergeOptions, Report], Proposals] | None = None,
-) -> Merged:
-    """Join *versions* into one map in the world of the first.
+    report: Report = ignore_progress,
+    propose: Callable[[Atlas, MergeOptions, Report], LoopProposals] | None = None,
+) -> MergedMap:
+    """Merge *versions* into one map in the world frame of the first.
 
     Args:
         versions: Maps with at least one keyframe each.
         options: ``None`` means the defaults.
-        report: Told of progress; may raise Cancelled.
-        propose: Finds links; `propose_links` unless a test brings its own.
+        report: Called with the progress; may raise Cancelled.
+        propose: Proposes links; None means `propose_links`.
 
     Raises:
         MissingExtra: faiss, gtsam or a solver is not installed.
@@ -132,7 +132,7 @@ def join_maps(
     options = options or MergeOptions()
     atlas = Atlas.of(versions)
     proposals = (propose or propose_links)(atlas, options, report)
-    accepted, refused = _judge(atlas, proposals, options)
+    accepted, refused = _select_consistent(atlas, proposals, options)
     report(0.8, f"{len(accepted)} of {len(proposals.links)} links agree")
     placed, joined = _place(atlas, accepted, len(versions))
     kept = [link for link in accepted if {int(atlas.of_map[link.a]), int(atlas.of_map[link.b])} <= joined]
@@ -146,11 +146,11 @@ def join_maps(
     version = _version(atlas, versions, poses, rows, odometry, kept)
     report(1.0, "merged")
     merges = sum(atlas.of_map[link.a] != atlas.of_map[link.b] for link in kept)
-    return Merged(
+    return MergedMap(
         version=version,
         joined=tuple(sorted(joined)),
         not_joined=tuple(
-            (which, _why_not(which, joined, proposals, refused, options))
+            (which, _reason_not_joined(which, joined, proposals, refused, options))
             for which in range(len(versions)) if which not in joined
         ),
         refused=refused,
@@ -161,27 +161,29 @@ def join_maps(
     )  # fmt: skip
 
 
-def propose_links(atlas: Atlas, options: MergeOptions, report: Report = silent) -> Proposals:
-    """Measure the steps between keyframes that place recognition takes for the same place."""
+def propose_links(atlas: Atlas, options: MergeOptions, report: Report = ignore_progress) -> LoopProposals:
+    """Measure the relative poses of keyframes that place recognition considers the same place."""
     index = PlaceIndex(atlas.keyframes)
     pairs = _candidate_pairs(atlas, index, options)
-    step_options = StepOptions(min_inliers=options.min_inliers, min_inlier_ratio=options.min_inlier_ratio)
+    pose_options = RelativePoseOptions(
+        min_inliers=options.min_inliers, min_inlier_ratio=options.min_inlier_ratio
+    )
     links: list[LoopClosure] = []
     failed: Counter[tuple[int, int, str]] = Counter()
     for done, (a, b) in enumerate(pairs):
         if done % 16 == 0:
             report(0.1 + 0.7 * done / len(pairs), f"{done} of {len(pairs)} keyframe pairs")
-        step = measure_step(atlas.keyframes[a], atlas.keyframes[b], step_options)
-        if isinstance(step, str):
-            failed[_named(_pair(atlas, a, b), step)] += 1
+        measured = measure_relative_pose(atlas.keyframes[a], atlas.keyframes[b], pose_options)
+        if isinstance(measured, str):
+            failed[_failure_key(_pair(atlas, a, b), measured)] += 1
         else:
             links.append(
                 LoopClosure(
-                    a=a, b=b, T_a_b=step.T_a_b, information=step.information,
-                    inliers=step.inliers, matches=step.matches,
+                    a=a, b=b, T_a_b=measured.T_a_b, information=measured.information,
+                    inliers=measured.inliers, matches=measured.matches,
                 )
             )  # fmt: skip
-    return Proposals(links=tuple(links), failed=failed)
+    return LoopProposals(links=tuple(links), failed=failed)
 
 
 def _candidate_pairs(atlas: Atlas, index: PlaceIndex, options: MergeOptions) -> list[tuple[int, int]]:
@@ -194,16 +196,16 @@ def _candidate_pairs(atlas: Atlas, index: PlaceIndex, options: MergeOptions) -> 
                 continue
             allowed = every[atlas.of_map == which]
             if own:
-                allowed = allowed[np.abs(atlas.order[allowed] - atlas.order[a]) >= _NEAR]
+                allowed = allowed[np.abs(atlas.order[allowed] - atlas.order[a]) >= _MIN_LOOP_LENGTH]
             for b, _ in index.nearest_to(index.vectors[a], options.candidates, allowed):
                 pairs.add((min(a, b), max(a, b)))
     return sorted(pairs)
 
 
-def _judge(
-    atlas: Atlas, proposals: Proposals, options: MergeOptions
+def _select_consistent(
+    atlas: Atlas, proposals: LoopProposals, options: MergeOptions
 ) -> tuple[list[LoopClosure], Counter[tuple[int, int, str]]]:
-    """Return the links that agree, two maps at a time, and why the others were refused."""
+    """Return the links that agree, for each pair of maps, and the reasons for refusing the others."""
     refused = Counter(proposals.failed)
     groups: dict[tuple[int, int], list[LoopClosure]] = {}
     for link in proposals.links:
@@ -212,41 +214,41 @@ def _judge(
     noise = OdometryNoise()
     for pair, links in sorted(groups.items()):
         if pair[0] == pair[1]:
-            # The odometry itself is a witness: a link of no motion at the middle of nothing.
+            # Within one map a loop must also agree with the odometry.
             links = [link for link in links if _fits_odometry(atlas, link, noise)]
-            refused[_named(pair, "against-odometry")] += len(groups[pair]) - len(links)
+            refused[_failure_key(pair, "against-odometry")] += len(groups[pair]) - len(links)
         rows = consistent(links, atlas.T_world_camera, atlas.order, noise)
         if pair[0] != pair[1] and len(rows) < options.min_links:
-            refused[_named(pair, "too-few-agree")] += len(links)
+            refused[_failure_key(pair, "too-few-agree")] += len(links)
             continue
         accepted += [links[row] for row in rows]
-        refused[_named(pair, "inconsistent")] += len(links) - len(rows)
+        refused[_failure_key(pair, "inconsistent")] += len(links) - len(rows)
     return accepted, Counter({key: count for key, count in refused.items() if count})
 
 
 def _fits_odometry(atlas: Atlas, link: LoopClosure, noise: OdometryNoise) -> bool:
-    """Say whether a loop lies within what odometry may have drifted, three sigma."""
+    """Return whether a loop differs from odometry by at most three sigma of its drift."""
     predicted = inverse(atlas.T_world_camera[link.a]) @ atlas.T_world_camera[link.b]
     off = inverse(link.T_a_b) @ predicted
     walked = abs(int(atlas.order[link.a] - atlas.order[link.b])) + 2
     rad = 3.0 * math.sqrt(3.0 * walked) * math.radians(noise.step_deg)
-    metres = 3.0 * math.sqrt(3.0 * walked) * noise.step_m + rad * _reach_m(atlas, link)
+    metres = 3.0 * math.sqrt(3.0 * walked) * noise.step_m + rad * _lever_m(atlas, link)
     turned = math.acos(min(1.0, max(-1.0, (np.trace(off[:3, :3]) - 1.0) / 2.0)))
     return bool(np.linalg.norm(off[:3, 3]) <= metres and turned <= rad)
 
 
-def _reach_m(atlas: Atlas, link: LoopClosure) -> float:
-    """Return how far the way between a link's ends strays from its end: the lever of a turn."""
+def _lever_m(atlas: Atlas, link: LoopClosure) -> float:
+    """Return the largest distance of the path between a link's ends from its end: the lever of rotations."""
     low, high = sorted((link.a, link.b))
     way = atlas.T_world_camera[low : high + 1, :3, 3]
     return float(np.linalg.norm(way - way[-1], axis=1).max())
 
 
 def _place(atlas: Atlas, links: Sequence[LoopClosure], maps: int) -> tuple[Array, set[int]]:
-    """Bring every map that is connected to map 0 into its world; best-supported pairs first.
+    """Transform every map that is connected to map 0 into its world frame, pairs with most links first.
 
-    The pose of a map is the one, among those that the links of a pair propose, which the others
-    differ from least: a median, so that no average has to be taken of rotations.
+    The pose of a map is the median of those that the links of a pair propose: the one that differs least
+    from the others, so that rotations need no average.
     """
     placed = atlas.T_world_camera.copy()
     joined = {0}
@@ -287,20 +289,20 @@ def _median_pose(poses: list[Array]) -> Array:
 def _odometry(
     atlas: Atlas, versions: Sequence[MapVersion], joined: set[int]
 ) -> list[tuple[LoopClosure, str]]:
-    """Return the maps' own edges; consecutive keyframes without one get the step of their poses."""
+    """Return the edges of the maps; consecutive keyframes without one get their relative pose."""
     edges: list[tuple[LoopClosure, str]] = []
-    have: set[tuple[int, int]] = set()
+    known: set[tuple[int, int]] = set()
     for which in sorted(joined):
         for edge in versions[which].edges:
             a, b = atlas.row_of[which, edge.a], atlas.row_of[which, edge.b]
             edges.append((LoopClosure(a=a, b=b, T_a_b=edge.T_a_b, information=edge.information), edge.kind))
-            have.add((min(a, b), max(a, b)))
+            known.add((min(a, b), max(a, b)))
     noise = OdometryNoise()
     spread = np.array([noise.step_m] * 3 + [math.radians(noise.step_deg)] * 3)
     for a in range(len(atlas.keyframes) - 1):
         b = a + 1
         same = atlas.of_map[a] == atlas.of_map[b] and atlas.keyframes[a].robot == atlas.keyframes[b].robot
-        if same and int(atlas.of_map[a]) in joined and (a, b) not in have:
+        if same and int(atlas.of_map[a]) in joined and (a, b) not in known:
             T_a_b = inverse(atlas.T_world_camera[a]) @ atlas.T_world_camera[b]
             edges.append((LoopClosure(a=a, b=b, T_a_b=T_a_b, information=np.diag(spread**-2.0)), "odometry"))
     return edges
@@ -335,14 +337,14 @@ def _version(
     odometry: Sequence[tuple[LoopClosure, str]],
     links: Sequence[LoopClosure],
 ) -> MapVersion:
-    """Return the merged map; ids are row numbers, provenance tells which map and id they came from."""
+    """Return the merged map; ids are row numbers, the provenance has the original map and id of each."""
     place = {int(row): number for number, row in enumerate(rows)}
     keyframes = tuple(
         replace(atlas.keyframes[row], id=place[row], T_world_camera=poses[row]) for row in place
     )
     edges = [(link, kind) for link, kind in odometry]
     edges += [(link, "loop" if atlas.of_map[link.a] == atlas.of_map[link.b] else "merge") for link in links]
-    points, colours = moved_points(versions, atlas.of_map, atlas.keyframes, poses, rows)
+    points, colours = deform_clouds(versions, atlas.of_map, atlas.keyframes, poses, rows)
     return MapVersion(
         keyframes=keyframes,
         edges=tuple(
@@ -362,10 +364,10 @@ def _version(
     )  # fmt: skip
 
 
-def _why_not(
+def _reason_not_joined(
     which: int,
     joined: set[int],
-    proposals: Proposals,
+    proposals: LoopProposals,
     refused: Mapping[tuple[int, int, str], int],
     options: MergeOptions,
 ) -> str:
@@ -373,10 +375,10 @@ def _why_not(
     for (one, other, reason), count in refused.items():
         if which in (one, other) and one != other:
             tried[reason] += count
-    told = ", ".join(f"{count} {reason}" for reason, count in sorted(tried.items()) if count)
+    reasons = ", ".join(f"{count} {reason}" for reason, count in sorted(tried.items()) if count)
     return (
         f"fewer than {options.min_links} views shared with maps {sorted(joined)} agree "
-        f"({told or 'no candidates'})"
+        f"({reasons or 'no candidates'})"
     )
 
 
@@ -385,5 +387,5 @@ def _pair(atlas: Atlas, a: int, b: int) -> tuple[int, int]:
     return min(one, other), max(one, other)
 
 
-def _named(pair: tuple[int, int], reason: str) -> tuple[int, int, str]:
+def _failure_key(pair: tuple[int, int], reason: str) -> tuple[int, int, str]:
     return pair[0], pair[1], reason

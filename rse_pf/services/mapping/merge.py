@@ -1,7 +1,6 @@
-"""The merge service: maps of several robots in, one map out, and what was joined or refused and why.
+"""The merge service: from the maps of several robots to one map, with what was joined or refused and why.
 
-Promises that a map which shares no view with the others is left out and named, never placed by
-guess, and that the same maps give the same result.
+A map that shares no view with the others is left out and named.  The same maps give the same result.
 """
 
 from __future__ import annotations
@@ -11,8 +10,8 @@ import msgspec
 from rse_pf.errors import BadRequest, LimitExceeded
 from rse_pf.maps.format import MapVersion, decode_map, encode_map
 from rse_pf.service import Registry
-from rse_pf.services.mapping.map_merge import Merged, MergeOptions, join_maps
-from rse_pf.services.mapping.optimise import Report, silent
+from rse_pf.services.mapping.map_merge import MergedMap, MergeOptions, merge_versions
+from rse_pf.services.mapping.optimise import Report, ignore_progress
 from rse_pf.services.mapping.place import MAX_KEYFRAMES
 
 __all__ = ["MergeReply", "MergeRequest", "NotJoined", "Refusal", "merge_maps", "register"]
@@ -53,8 +52,8 @@ class MergeReply(msgspec.Struct, frozen=True, kw_only=True):
     cost_after: float
 
 
-def merge_maps(request: MergeRequest, *, report: Report = silent) -> MergeReply:
-    """Answer *request*, telling *report* of the progress; it may raise Cancelled to end the work."""
+def merge_maps(request: MergeRequest, *, report: Report = ignore_progress) -> MergeReply:
+    """Answer *request*; *report* is told the progress and may raise Cancelled to end the work."""
     if not request.maps:
         raise BadRequest("no map was sent", hint="send one or more")
     versions: list[MapVersion] = []
@@ -67,19 +66,19 @@ def merge_maps(request: MergeRequest, *, report: Report = silent) -> MergeReply:
             )
     if not all(version.keyframes for version in versions):
         raise BadRequest("a map has no keyframes", hint="leave it out")
-    return _reply(join_maps(versions, request.options, report=report))
+    return _reply(merge_versions(versions, request.options, report=report))
 
 
 def register(registry: Registry) -> None:
     """Add ``merge`` to *registry*."""
 
     @registry.service("merge", kind="long")
-    def merge(request: MergeRequest, *, report: Report = silent) -> MergeReply:
+    def merge(request: MergeRequest, *, report: Report = ignore_progress) -> MergeReply:
         """Make one map of several robots' maps, or close the loops of one."""
         return merge_maps(request, report=report)
 
 
-def _reply(merged: Merged) -> MergeReply:
+def _reply(merged: MergedMap) -> MergeReply:
     return MergeReply(
         map=encode_map(merged.version),
         joined=list(merged.joined),

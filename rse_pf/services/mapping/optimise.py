@@ -1,7 +1,6 @@
-"""The pose-graph service: a graph in, the graph whose poses fit its edges best out.
+"""The pose-graph service: from a pose graph to the poses that fit its edges best.
 
-Promises the same answer for the same request, that the answer never fits worse than the start, and
-to move nothing but poses.
+The same request has the same answer, which never fits worse than the given poses.
 """
 
 from __future__ import annotations
@@ -20,23 +19,30 @@ from rse_pf.service import Registry
 from rse_pf.services.mapping.pose_graph import PoseGraph, components, read_g2o, write_g2o
 
 __all__ = [
-    "OptimiseOptions", "OptimiseReply", "OptimiseRequest", "Optimised", "Report", "optimise_graph",
-    "register", "robust_cost", "silent",
+    "OptimiseOptions",
+    "OptimiseReply",
+    "OptimiseRequest",
+    "OptimisedGraph",
+    "Report",
+    "ignore_progress",
+    "optimise_graph",
+    "register",
+    "robust_cost",
 ]  # fmt: skip
 
 Rows = npt.NDArray[np.int64]
 
 Report = Callable[[float, str], None]
-"""Told the share that is done (0..1) and what was done; raises `errors.Cancelled` to end the work."""
+"""Called with the share that is done (0..1) and what is being done; raises Cancelled to end the work."""
 
 _ANCHOR_SIGMA = 1e-6
 _RELATIVE_CHANGE = 1e-7
 MAX_EDGES = 100_000
-"""Of one pose graph."""
+"""Limit of one pose graph."""
 
 
-def silent(done: float, what: str) -> None:
-    """Hear a report and let the work go on."""
+def ignore_progress(done: float, what: str) -> None:
+    """Do nothing with the progress."""
 
 
 class OptimiseOptions(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
@@ -78,11 +84,11 @@ class OptimiseReply(msgspec.Struct, frozen=True, kw_only=True):
     cost_after: float
     components: int
     doubted: list[tuple[int, int]]
-    """Loop edges, as pairs of ids, whose residual lies beyond the kernel's width three times over."""
+    """Loop edges, as pairs of ids, whose residual is more than three times the width of the kernel."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Optimised:
+class OptimisedGraph:
     """Poses ``(n, 4, 4)`` with the robust cost before and after."""
 
     T_world_pose: Array
@@ -92,14 +98,14 @@ class Optimised:
 
 
 def optimise_graph(
-    graph: PoseGraph, options: OptimiseOptions | None = None, *, report: Report = silent
-) -> Optimised:
+    graph: PoseGraph, options: OptimiseOptions | None = None, *, report: Report = ignore_progress
+) -> OptimisedGraph:
     """Return the poses of *graph* that fit its edges best.
 
     Minimises ``sum of squares of odometry + sum of cauchy**2 log(1 + squares / cauchy**2)`` of the
     other edges by Levenberg-Marquardt, once from the given poses and once from poses whose rotations
     the chordal relaxation found, and keeps the better.  The pose with the smallest row number of each
-    connected part stays where it is.
+    connected component stays fixed.
 
     Raises:
         MissingExtra: gtsam is not installed.
@@ -116,7 +122,7 @@ def optimise_graph(
     cost_before = robust_cost(graph, graph.T_world_pose, options.cauchy)
     best, best_cost = graph.T_world_pose, cost_before
     if not len(graph.a):
-        return Optimised(
+        return OptimisedGraph(
             T_world_pose=best, cost_before=0.0, cost_after=0.0, components=len(anchors)
         )  # fmt: skip
     report(0.0, "from the given poses")
@@ -130,7 +136,7 @@ def optimise_graph(
         if np.isfinite(found).all() and cost < best_cost:
             best, best_cost = found, cost
     report(1.0, "optimised")
-    return Optimised(
+    return OptimisedGraph(
         T_world_pose=best, cost_before=cost_before, cost_after=best_cost, components=len(anchors)
     )  # fmt: skip
 
@@ -147,7 +153,7 @@ def register(registry: Registry) -> None:
     """Add ``optimise`` to *registry*."""
 
     @registry.service("optimise", kind="long")
-    def optimise(request: OptimiseRequest, *, report: Report = silent) -> OptimiseReply:
+    def optimise(request: OptimiseRequest, *, report: Report = ignore_progress) -> OptimiseReply:
         """Fit the poses of a pose graph to its edges."""
         graph = read_g2o(request.g2o)
         if len(graph.a) > MAX_EDGES:
@@ -170,7 +176,7 @@ def register(registry: Registry) -> None:
 
 
 def _factors(gtsam: Any, graph: PoseGraph, anchors: Rows, cauchy: float) -> Any:
-    """Return the graph in gtsam's words; its twists are (phi, rho)."""
+    """Return the graph for gtsam, whose twists are (phi, rho)."""
     swap = [3, 4, 5, 0, 1, 2]
     factors = gtsam.NonlinearFactorGraph()
     tight = gtsam.noiseModel.Isotropic.Sigma(6, _ANCHOR_SIGMA)
@@ -200,12 +206,12 @@ def _minimise(
 
 
 def _chordal(gtsam: Any, graph: PoseGraph, anchors: Rows) -> Array | None:
-    """Return poses from the chordal relaxation of the rotations, or None where it cannot be had."""
+    """Return poses from the chordal relaxation of the rotations, None if there is none."""
     if len(anchors) > 1:
         return None
     try:
         values = gtsam.InitializePose3.initialize(_factors(gtsam, graph, anchors, 0.0))
-    except RuntimeError:  # gtsam's word for a graph without loops: nothing to relax
+    except RuntimeError:  # raised for a graph without loops
         return None
     poses = np.array([values.atPose3(row).matrix() for row in range(len(graph.T_world_pose))])
     return poses if np.isfinite(poses).all() else None

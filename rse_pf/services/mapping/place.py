@@ -1,9 +1,7 @@
-"""The place service: which keyframes of a map show what this view shows.
+"""The place service: find the keyframes of a map that show the same place as a view.
 
-Promises that the vocabulary comes from the very map version that is asked, seeded, that the same
-request gives the same candidates, and that a prior only narrows the search.
-
-A map that was asked lately is kept opened, which changes the time of an answer and nothing else.
+The vocabulary is trained, with a fixed seed, from the map of the request alone, so that the same request has
+the same answer.  A prior only narrows the search.  The index of recently used maps is cached.
 """
 
 from __future__ import annotations
@@ -26,7 +24,7 @@ from rse_pf.services.mapping.descriptors import (
     train_words,
     view_vector,
 )
-from rse_pf.services.mapping.relative_pose import StepOptions, View, pose_of_view
+from rse_pf.services.mapping.relative_pose import RelativePoseOptions, View, pose_of_view
 from rse_pf.wire.arrays import Array, reshaped
 
 __all__ = [
@@ -36,16 +34,16 @@ __all__ = [
     "PlaceReply",
     "PlaceRequest",
     "Within",
-    "opened_map",
+    "open_map",
     "register",
     "view_of",
 ]
 
 WORDS = 32
 SEED = 20
-_OPENED_MAPS = 2
+_CACHED_MAPS = 2
 MAX_KEYFRAMES = 2000
-"""Of the maps of one request, in all."""
+"""Limit of all maps of one request together."""
 
 
 class Within(msgspec.Struct, frozen=True, kw_only=True):
@@ -69,7 +67,7 @@ class PlaceRequest(msgspec.Struct, frozen=True, kw_only=True):
     descriptors: bytes
     candidates: int = 5
     check: bool = True
-    """Check each candidate by PnP and put those that pass first."""
+    """Whether each candidate is checked by PnP; the candidates are then sorted by inliers."""
     within: Within | None = None
 
 
@@ -92,7 +90,7 @@ class PlaceReply(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class PlaceIndex:
-    """The keyframes of some maps, ready to be asked; immutable."""
+    """An index of keyframes by their descriptors; immutable."""
 
     def __init__(self, keyframes: Sequence[Keyframe], *, words: int = WORDS, seed: int = SEED) -> None:
         self.keyframes = tuple(keyframes)
@@ -133,20 +131,20 @@ class PlaceIndex:
         return np.flatnonzero(np.linalg.norm(places - centre, axis=1) <= within.radius_m).astype(np.int64)
 
 
-@functools.lru_cache(maxsize=_OPENED_MAPS)
-def opened_map(data: bytes) -> tuple[MapVersion, PlaceIndex]:
-    """Return the map of *data* and its index; a pure function whose last answers are kept."""
+@functools.lru_cache(maxsize=_CACHED_MAPS)
+def open_map(data: bytes) -> tuple[MapVersion, PlaceIndex]:
+    """Return the map of *data* and its index; the last results are cached."""
     version = decode_map(data)
     if not 1 <= len(version.keyframes) <= MAX_KEYFRAMES:
         raise LimitExceeded(
             f"a map of {len(version.keyframes)} keyframes is not within 1..{MAX_KEYFRAMES}",
-            hint="ask a part of the map",
+            hint="send a part of the map",
         )
     return version, PlaceIndex(version.keyframes)
 
 
 def view_of(camera: Camera, pixels: Array, descriptors: bytes) -> View:
-    """Return what travelled as a view; raises BadRequest."""
+    """Return the view of a request; raises BadRequest."""
     rows = reshaped("pixels", pixels, 2)
     return View(camera=camera, pixels=rows, descriptors=descriptors_of(descriptors, len(rows)))
 
@@ -162,7 +160,7 @@ def register(registry: Registry) -> None:
                 f"candidates = {request.candidates} is not within 1..100", hint="5 to 10 are enough"
             )
         view = view_of(request.camera, request.pixels, request.descriptors)
-        _, index = opened_map(request.map)
+        _, index = open_map(request.map)
         rows = index.nearest(view.descriptors, request.candidates, index.rows_within(request.within))
         found = [_candidate(index.keyframes[row], score, view, request.check) for row, score in rows]
         if request.check:
@@ -173,6 +171,6 @@ def register(registry: Registry) -> None:
 def _candidate(keyframe: Keyframe, score: float, view: View, check: bool) -> Candidate:
     inliers = None
     if check:
-        pose = pose_of_view(keyframe, view, StepOptions())
+        pose = pose_of_view(keyframe, view, RelativePoseOptions())
         inliers = 0 if isinstance(pose, str) else len(pose[0].inliers)
     return Candidate(keyframe=keyframe.id, robot=keyframe.robot, score=score, inliers=inliers)

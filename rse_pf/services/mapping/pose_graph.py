@@ -1,6 +1,6 @@
-"""Pose graphs: poses, measured steps between them, their misfit, and the g2o text that others read.
+"""Pose graphs: poses, measured relative poses between them, their misfit, and their g2o text.
 
-Promises that a graph is checked once, where it is made, and not to need anything but numpy.
+A graph is validated once, in its constructor.
 
 Residual of edge *k* between poses *a* and *b*: ``log(inverse(T_a_b) @ inverse(T_world_a) @ T_world_b)``,
 a twist ``(rho metres, phi radians)``; ``information`` is the inverse covariance of that twist.
@@ -31,15 +31,15 @@ class PoseGraph:
 
     Attributes:
         T_world_pose: ``(n, 4, 4)``, metres.
-        a, b: ``(m,)`` row numbers of the poses that an edge joins.
-        T_a_b: ``(m, 4, 4)``, the measured steps.
+        a, b: ``(m,)`` row numbers of the poses that an edge connects.
+        T_a_b: ``(m, 4, 4)``, the measured relative poses.
         information: ``(m, 6, 6)``, symmetric, positive definite, of the twist (metres, radians).
-        robust: ``(m,)``, whether an edge may be an error (loops and merges) or not (odometry).
-        ids: ``(n,)``, what the poses are called outside.
+        robust: ``(m,)``, whether an edge may be an outlier (loops and merges) or not (odometry).
+        ids: ``(n,)``, the names of the poses in a file or request.
 
     Raises:
-        BadRequest: Shapes do not fit, an edge joins a pose to itself or to none, a number is not
-            finite, a rotation is none, or an information matrix is not positive definite.
+        BadRequest: Shapes do not agree, an edge connects a pose to itself or to an unknown one, a number is
+            not finite, a matrix is not a rotation, or an information matrix is not positive definite.
     """
 
     T_world_pose: Array
@@ -58,13 +58,13 @@ class PoseGraph:
             and self.T_a_b.shape == (m, 4, 4) and self.information.shape == (m, 6, 6)
         )  # fmt: skip
         if not shapes:
-            raise BadRequest("the parts of the pose graph do not fit", hint="send one row for each edge")
+            raise BadRequest("the shapes of the pose graph do not agree", hint="send one row for each edge")
         if m and (min(self.a.min(), self.b.min()) < 0 or max(self.a.max(), self.b.max()) >= n):
             raise BadRequest(f"an edge names a pose that is not one of 0..{n - 1}", hint="send all poses")
         if (self.a == self.b).any():
-            raise BadRequest("an edge joins a pose to itself", hint="leave it out")
+            raise BadRequest("an edge connects a pose to itself", hint="leave it out")
         if len(np.unique(self.ids)) != n:
-            raise BadRequest("two poses have one id", hint="number them anew")
+            raise BadRequest("two poses have one id", hint="give each pose its own id")
         _check_rigid("a pose", self.T_world_pose)
         _check_rigid("an edge", self.T_a_b)
         if not _is_positive_definite(self.information):
@@ -108,7 +108,7 @@ def inverses(T_a_b: Array) -> Array:
 
 
 def log_se3(T: Array) -> Array:
-    """Return the ``(m, 6)`` twists ``(rho, phi)`` of ``(m, 4, 4)`` poses; `exp_se3` undoes it.
+    """Return the ``(m, 6)`` twists ``(rho, phi)`` of ``(m, 4, 4)`` poses; the inverse of `exp_se3`.
 
     Source:
         Barfoot, State Estimation for Robotics (2017), eqs. 7.18 and 7.36.
@@ -132,7 +132,7 @@ def log_se3(T: Array) -> Array:
 
 
 def components(n: int, a: npt.NDArray[np.int64], b: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
-    """Return for each of *n* poses the smallest row number that edges connect it to."""
+    """Return for each of *n* poses the smallest row number of its connected component."""
     root = list(range(n))
 
     def find(i: int) -> int:
@@ -150,17 +150,17 @@ def components(n: int, a: npt.NDArray[np.int64], b: npt.NDArray[np.int64]) -> np
 def write_g2o(graph: PoseGraph) -> str:
     """Return *graph* as g2o text (``VERTEX_SE3:QUAT``, ``EDGE_SE3:QUAT``).
 
-    g2o measures rotations by the vector part of a quaternion, so its information matrices are
-    written for ``phi / 2``.
+    The rotation error of g2o is the vector part of a quaternion, so the information matrices are written
+    for ``phi / 2``.
     """
     lines = []
     for name, T in zip(graph.ids.tolist(), graph.T_world_pose, strict=True):
-        lines.append(f"VERTEX_SE3:QUAT {name} {_numbers(_seven(T))}")
-    back = np.linalg.inv(_FROM_G2O)
+        lines.append(f"VERTEX_SE3:QUAT {name} {_join(_pose_numbers(T))}")
+    to_g2o = np.linalg.inv(_FROM_G2O)
     for k, (a, b) in enumerate(zip(graph.a.tolist(), graph.b.tolist(), strict=True)):
-        information = (back @ graph.information[k] @ back)[_UPPER]
+        information = (to_g2o @ graph.information[k] @ to_g2o)[_UPPER]
         ends = f"{graph.ids[a]} {graph.ids[b]}"
-        lines.append(f"EDGE_SE3:QUAT {ends} {_numbers(_seven(graph.T_a_b[k]))} {_numbers(information)}")
+        lines.append(f"EDGE_SE3:QUAT {ends} {_join(_pose_numbers(graph.T_a_b[k]))} {_join(information)}")
     return "\n".join(lines) + "\n"
 
 
@@ -168,8 +168,8 @@ def read_g2o(text: str) -> PoseGraph:
     """Return the graph of g2o *text*; edges between consecutive ids are odometry.
 
     Raises:
-        BadRequest: A line is not one of ``VERTEX_SE3:QUAT``, ``EDGE_SE3:QUAT`` and ``FIX``, or does
-            not hold the numbers it should; the line is named.
+        BadRequest: A line is not one of ``VERTEX_SE3:QUAT``, ``EDGE_SE3:QUAT`` and ``FIX``, or has the wrong
+            numbers; the message has the line number.
     """
     vertices: dict[int, Array] = {}
     edges: list[tuple[int, int, Array, Array]] = []
@@ -212,11 +212,11 @@ def _lines(text: str) -> Iterator[tuple[int, str, list[str]]]:
             yield number, words[0], words[1:]
 
 
-def _seven(T: Array) -> Array:
+def _pose_numbers(T: Array) -> Array:
     return np.concatenate([T[:3, 3], to_quaternion(T[:3, :3])])
 
 
-def _numbers(values: Array) -> str:
+def _join(values: Array) -> str:
     return " ".join(f"{value:.17g}" for value in values)
 
 
@@ -266,7 +266,7 @@ def _check_rigid(what: str, T: Array) -> None:
     rotation = T[:, :3, :3]
     off = np.abs(rotation @ np.swapaxes(rotation, 1, 2) - np.eye(3)).max()
     if off > 1e-4 or np.linalg.det(rotation).min() < 0:
-        raise BadRequest(f"{what} holds a matrix that is no rotation", hint="orthonormalise it")
+        raise BadRequest(f"{what} has a matrix that is not a rotation", hint="orthonormalise it")
 
 
 def _is_positive_definite(information: Array) -> bool:

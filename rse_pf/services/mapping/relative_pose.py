@@ -1,7 +1,4 @@
-"""The measured step between two views: matches, PnP, and how far it can be trusted.
-
-Promises never to return a step that too few matches agree with.
-"""
+"""The relative pose of two keyframes: matches, PnP and the covariance; none with too few inliers."""
 
 from __future__ import annotations
 
@@ -19,12 +16,20 @@ from rse_pf.services.mapping.descriptors import Descriptors, hamming_matches
 
 Rows = npt.NDArray[np.int64]
 
-__all__ = ["RelativePose", "StepOptions", "View", "adjoint", "matched_points", "measure_step", "pose_of_view"]
+__all__ = [
+    "RelativePose",
+    "RelativePoseOptions",
+    "View",
+    "adjoint",
+    "matched_points",
+    "measure_relative_pose",
+    "pose_of_view",
+]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class StepOptions:
-    """How to match and what to believe; defaults as measured on the red-kitchen recording."""
+class RelativePoseOptions:
+    """Limits of matches and inliers; the defaults were measured on the red-kitchen recording."""
 
     ratio: float = 0.75
     inlier_px: float = 3.0
@@ -33,12 +38,12 @@ class StepOptions:
     min_inlier_ratio: float = 0.5
     floor_m: float = 0.02
     floor_deg: float = 0.7
-    """Standard deviations that no step goes below, for each axis: depth and calibration err together."""
+    """Smallest standard deviations for each axis: errors of depth and calibration are correlated."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class View:
-    """What a camera saw: ``(n, 2)`` undistorted pixels with their ``(n, 32)`` descriptors."""
+    """A camera image: ``(n, 2)`` undistorted pixels with their ``(n, 32)`` descriptors."""
 
     camera: Camera
     pixels: Array
@@ -47,7 +52,7 @@ class View:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class RelativePose:
-    """``T_a_b`` between two keyframes, its ``(6, 6)`` information, and the matches behind it."""
+    """``T_a_b`` between two keyframes, its ``(6, 6)`` information, and the number of inliers and matches."""
 
     T_a_b: Array
     information: Array
@@ -55,11 +60,11 @@ class RelativePose:
     matches: int
 
 
-def measure_step(a: Keyframe, b: Keyframe, options: StepOptions) -> RelativePose | str:
-    """Return the step from keyframe *a* to *b*, from points of *a* in the image of *b*.
+def measure_relative_pose(a: Keyframe, b: Keyframe, options: RelativePoseOptions) -> RelativePose | str:
+    """Return the pose of keyframe *b* relative to *a*, from points of *a* in the image of *b*.
 
     Returns:
-        The step; or, where there is none, the reason: "no-matches", "no-pose", "few-inliers",
+        The relative pose, or the reason why there is none: "no-matches", "no-pose", "few-inliers",
         "low-inlier-ratio".
     """
     view = View(camera=b.camera, pixels=np.asarray(b.pixels, dtype=np.float64), descriptors=b.descriptors)
@@ -74,13 +79,15 @@ def measure_step(a: Keyframe, b: Keyframe, options: StepOptions) -> RelativePose
         return "low-inlier-ratio"
     T_b_a = solution.T_camera_world
     # T_b_a true = exp(xi) T_b_a, so inverse(T_a_b) T_a_b true = exp(-xi): the same covariance.
-    covariance = solution.covariance + _floor(options)
+    covariance = solution.covariance + _min_covariance(options)
     information = np.linalg.inv(covariance).astype(np.float64)
     return RelativePose(T_a_b=inverse(T_b_a), information=information, inliers=count, matches=matches)
 
 
-def pose_of_view(reference: Keyframe, view: View, options: StepOptions) -> tuple[PnpSolution, int] | str:
-    """Return ``T_view_reference`` as PnP finds it with the number of matches, or why there is none."""
+def pose_of_view(
+    reference: Keyframe, view: View, options: RelativePoseOptions
+) -> tuple[PnpSolution, int] | str:
+    """Return ``T_view_reference`` by PnP with the number of matches, or the reason why there is none."""
     points, rows, columns = matched_points(reference, view, options)
     if len(rows) < max(4, options.min_inliers // 2):
         return "no-matches"
@@ -93,7 +100,7 @@ def pose_of_view(reference: Keyframe, view: View, options: StepOptions) -> tuple
     return solution, len(rows)
 
 
-def matched_points(reference: Keyframe, view: View, options: StepOptions) -> tuple[Array, Rows, Rows]:
+def matched_points(reference: Keyframe, view: View, options: RelativePoseOptions) -> tuple[Array, Rows, Rows]:
     """Return the reference's ``(k, 3)`` matched points (its camera frame), and both row numbers."""
     known = np.flatnonzero(np.isfinite(reference.points_camera).all(axis=1))
     rows, columns = hamming_matches(reference.descriptors[known], view.descriptors, options.ratio)
@@ -110,5 +117,5 @@ def adjoint(T: Array) -> Array:
     return result
 
 
-def _floor(options: StepOptions) -> Array:
+def _min_covariance(options: RelativePoseOptions) -> Array:
     return np.diag([options.floor_m**2] * 3 + [math.radians(options.floor_deg) ** 2] * 3)

@@ -1,7 +1,7 @@
-"""The wifi service: a scan of access points and a survey in, a position with its uncertainty out.
+"""The wifi service: from a scan of access points and a survey to a position with its uncertainty.
 
-Promises to be told no hardware address: identifiers are keyed hashes that `fingerprint_of` makes on
-the robot, and networks whose owner opted out by ``_nomap`` never leave it.
+No hardware address leaves the robot: identifiers are keyed hashes that `fingerprint_of` computes there, and
+networks whose owner opted out by ``_nomap`` are left out.
 """
 
 from __future__ import annotations
@@ -34,11 +34,11 @@ __all__ = [
 
 _OPTED_OUT = "_nomap"
 _MAC = re.compile(r"^(?:[0-9a-fA-F]{2}[:\-.]?){5}[0-9a-fA-F]{2}$")
-_WEAKEST_DBM, _STRONGEST_DBM = -120.0, 0.0
+_MIN_DBM, _MAX_DBM = -120.0, 0.0
 _ONE_SIGMA = 0.68
 _TEMPERS = np.array([0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0])
-_CAUTIOUS = 0.4
-"""The power where a survey is too small to calibrate it."""
+_DEFAULT_TEMPER = 0.4
+"""The exponent where a survey is too small to calibrate it."""
 _MIN_HELD_OUT = 30
 _FOLDS = 5
 _CALIBRATION_GRID_M = 0.5
@@ -111,14 +111,14 @@ class Position:
 def fingerprint_of(
     readings: Iterable[AccessPointReading], key: bytes, position: tuple[float, float, float] | None = None
 ) -> Fingerprint:
-    """Return what a robot may send of *readings*; run on the robot.
+    """Return the fingerprint of *readings* without hardware addresses; run it on the robot.
 
     Leaves out networks whose name ends in ``_nomap``, locally administered addresses (phones that
     share their connection change them) and impossible strengths.  Addresses become keyed hashes: with
-    the team's *key* two robots name an access point alike, without it the name leads nowhere.
+    the team's *key* two robots give an access point the same name; without the key it cannot be traced.
 
     Raises:
-        BadRequest: *key* is shorter than 16 bytes, or an address is none.
+        BadRequest: *key* is shorter than 16 bytes, or an address is not valid.
     """
     if len(key) < 16:
         raise BadRequest(f"the key has {len(key)} bytes, not 16 or more", hint="make a random key per team")
@@ -128,20 +128,20 @@ def fingerprint_of(
             raise BadRequest("an address is not six bytes of hexadecimal", hint="send aa:bb:cc:dd:ee:ff")
         address = bytes.fromhex(re.sub(r"[^0-9a-fA-F]", "", reading.mac))
         local = bool(address[0] & 0x02)
-        audible = _WEAKEST_DBM <= reading.rssi_dbm <= _STRONGEST_DBM
+        audible = _MIN_DBM <= reading.rssi_dbm <= _MAX_DBM
         if not reading.ssid.endswith(_OPTED_OUT) and not local and audible:
             kept[hashlib.blake2b(address, key=key[:64], digest_size=8).hexdigest()] = reading.rssi_dbm
     return Fingerprint(rssi_dbm=kept, position=position)
 
 
 class Locator:
-    """A survey, ready to place scans; immutable.
+    """A survey that locates scans; immutable.
 
-    The posterior over a grid around the surveyed places: for each access point that is heard, a
-    Gaussian of the model's mean and variance there; prior uniform.  Access points err together (walls,
-    bodies), which a product of their likelihoods does not know, so the product is tempered by the
-    power at which, of the survey's own places with a fifth of them held out at a time, 68 in 100 lie
-    within their stated radius.
+    The posterior over a grid around the surveyed positions: for each received access point a Gaussian
+    with the mean and variance of the model there, and a uniform prior.  The errors of access points are
+    correlated (walls, people), which a product of their likelihoods ignores; therefore the product is
+    tempered by an exponent, chosen so that in a five-fold cross-validation of the survey 68 % of the
+    positions lie within their stated radius.
 
     Source:
         Ferris, Haehnel and Fox, Gaussian processes for signal strength-based location estimation,
@@ -153,14 +153,14 @@ class Locator:
         model = fit_signals(survey)
         self._grid = _grid(model.places, self._options.grid_m, self._options.reach_m)
         self._fields = {name: field.predict(self._grid) for name, field in model.fields.items()}
-        self.temper = _calibrated(survey, model, self._options)
+        self.temper = _calibrate_temper(survey, model, self._options)
 
     def position_of(self, scan: Mapping[str, float]) -> Position | str:
-        """Return the position of *scan* (dBm by access point), or why there is none."""
+        """Return the position of *scan* (dBm by access point), or the reason why there is none."""
         known = sorted(name for name in scan if name in self._fields)
         if len(known) < self._options.min_common:
             return f"{len(known)} known access points are fewer than {self._options.min_common}"
-        mean, sigma_m = _summed(self._grid, _log_likelihood(scan, self._fields), self.temper)
+        mean, sigma_m = _posterior(self._grid, _log_likelihood(scan, self._fields), self.temper)
         return Position(
             mean=(float(mean[0]), float(mean[1]), float(mean[2])),
             sigma_m=max(sigma_m, 0.3 * self._options.grid_m),
@@ -180,8 +180,8 @@ def register(registry: Registry) -> None:
                 hint="send those near the robot's last position",
             )
         for each in (request.scan, *request.survey):
-            _refuse_addresses(each)
-        survey = [(_placed(each), each.rssi_dbm) for each in request.survey]
+            _check_fingerprint(each)
+        survey = [(_position_of(each), each.rssi_dbm) for each in request.survey]
         found = Locator(survey, request.options).position_of(request.scan.rssi_dbm)
         if isinstance(found, str):
             return WifiReply(found=False, reason=found)
@@ -200,8 +200,8 @@ def _log_likelihood(scan: Mapping[str, float], fields: Mapping[str, tuple[Array,
     return total
 
 
-def _summed(grid: Array, log_likelihood: Array, temper: float) -> tuple[Array, float]:
-    """Return the posterior's mean place and the radius about it that holds 68 %."""
+def _posterior(grid: Array, log_likelihood: Array, temper: float) -> tuple[Array, float]:
+    """Return the mean of the posterior and the radius around it that holds 68 %."""
     weight = np.exp(temper * (log_likelihood - log_likelihood.max()))
     weight /= weight.sum()
     mean = weight @ grid
@@ -209,8 +209,8 @@ def _summed(grid: Array, log_likelihood: Array, temper: float) -> tuple[Array, f
     return mean, _quantile(distance, weight, _ONE_SIGMA)
 
 
-def _calibrated(survey: Sequence[Survey], model: SignalModel, options: WifiOptions) -> float:
-    """Return the power at which held-out places lie within their radius 68 times in 100."""
+def _calibrate_temper(survey: Sequence[Survey], model: SignalModel, options: WifiOptions) -> float:
+    """Return the exponent at which 68 % of the held-out positions lie within their radius."""
     grid = _grid(model.places, max(options.grid_m, _CALIBRATION_GRID_M), options.reach_m)
     inside = np.zeros(len(_TEMPERS))
     count = 0
@@ -225,23 +225,23 @@ def _calibrated(survey: Sequence[Survey], model: SignalModel, options: WifiOptio
             log_likelihood = _log_likelihood(scan, fields)
             count += 1
             for number, temper in enumerate(_TEMPERS):
-                mean, sigma_m = _summed(grid, log_likelihood, temper)
+                mean, sigma_m = _posterior(grid, log_likelihood, temper)
                 inside[number] += math.hypot(mean[0] - place[0], mean[1] - place[1]) <= sigma_m
     if count < _MIN_HELD_OUT:
-        return _CAUTIOUS
-    # More power, smaller radius: the share inside falls as the power grows.
+        return _DEFAULT_TEMPER
+    # A larger exponent makes the radius smaller, so the share inside falls.
     share = np.minimum.accumulate(inside / count)
     return float(np.interp(-_ONE_SIGMA, -share, _TEMPERS))
 
 
-def _refuse_addresses(fingerprint: Fingerprint) -> None:
+def _check_fingerprint(fingerprint: Fingerprint) -> None:
     if any(_MAC.match(name) for name in fingerprint.rssi_dbm):
         raise BadRequest("a fingerprint names a hardware address", hint="send what fingerprint_of returns")
-    if not all(_WEAKEST_DBM <= value <= _STRONGEST_DBM for value in fingerprint.rssi_dbm.values()):
+    if not all(_MIN_DBM <= value <= _MAX_DBM for value in fingerprint.rssi_dbm.values()):
         raise BadRequest("a strength is not within -120..0 dBm", hint="send dBm")
 
 
-def _placed(fingerprint: Fingerprint) -> tuple[float, float, float]:
+def _position_of(fingerprint: Fingerprint) -> tuple[float, float, float]:
     position = fingerprint.position
     if position is None or not all(math.isfinite(value) and abs(value) < 1e5 for value in position):
         raise BadRequest("a fingerprint of the survey has no position", hint="send metres, map frame")
@@ -249,7 +249,7 @@ def _placed(fingerprint: Fingerprint) -> tuple[float, float, float]:
 
 
 def _grid(places: Array, grid_m: float, reach_m: float) -> Array:
-    """Return ``(g, 3)`` grid points within reach of surveyed places, at the height of the nearest."""
+    """Return ``(g, 3)`` grid points within reach of surveyed positions, at the height of the nearest one."""
     low = places[:, :2].min(axis=0) - reach_m
     high = places[:, :2].max(axis=0) + reach_m
     pitch = max(grid_m, math.sqrt(float(np.prod(high - low)) / 40_000.0))

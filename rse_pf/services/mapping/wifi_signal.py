@@ -1,6 +1,6 @@
-"""How strong each access point is where: a path-loss trend and a Gaussian process about it.
+"""Signal strength of access points over space: a path-loss trend and a Gaussian process of its residuals.
 
-Promises that an uncertainty grows away from what was surveyed, and to learn its noise from the survey.
+The uncertainty grows with the distance from surveyed positions; the noise is estimated from the survey.
 """
 
 from __future__ import annotations
@@ -22,23 +22,23 @@ __all__ = ["SignalField", "SignalModel", "fit_signals"]
 _MIN_READINGS = 5
 _LENGTHS_M = (2.0, 4.0, 8.0, 16.0)
 _SHARES = (0.1, 0.3, 0.5, 0.7, 0.85)
-"""Tried shares of the variance about the trend that are smooth in space; the rest is noise."""
+"""Candidate shares of the residual variance that are smooth in space; the rest is noise."""
 _FLOOR_DBM2 = 1.0
 _NEAR_M = 1.0
 _MAX_READINGS = 400
-"""Readings of one access point that the process uses, evenly chosen: its cost is cubic."""
+"""Readings of one access point in the Gaussian process, evenly chosen: its cost is cubic."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class SignalField:
-    """One access point: trend ``c0 - c1 log10(distance to source)`` and a process about it."""
+    """One access point: trend ``c0 - c1 log10(distance to source)`` and a process of its residuals (dBm)."""
 
     source: Array
     trend: Array
     places: Array
-    about: Array
+    residuals: Array
     rows: Rows
-    """Which survey rows the readings came from."""
+    """Survey rows of the readings."""
     weights: Array
     inverse: Array
     signal_dbm2: float
@@ -53,19 +53,19 @@ class SignalField:
         return mean, np.maximum(variance, 0.0) + self.noise_dbm2
 
     def without(self, held_out: Rows) -> SignalField | None:
-        """Return the field with the readings at *held_out* survey rows forgotten, parameters kept."""
+        """Return the field without the readings at *held_out* survey rows, with the same parameters."""
         kept = ~np.isin(self.rows, held_out)
         if kept.sum() < _MIN_READINGS:
             return None
         return _conditioned(
-            self.places[kept], self.about[kept], self.rows[kept], self.source, self.trend,
+            self.places[kept], self.residuals[kept], self.rows[kept], self.source, self.trend,
             self.signal_dbm2, self.noise_dbm2, self.length_m,
         )  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class SignalModel:
-    """The fields by access point, and the ``(n, 3)`` places that were surveyed."""
+    """The fields by access point, and the ``(n, 3)`` surveyed positions in metres."""
 
     fields: Mapping[str, SignalField]
     places: Array
@@ -106,32 +106,32 @@ def _fit(all_places: Array, rows: Rows, dbm: Array) -> SignalField:
     source = _source(places, dbm)
     columns = _trend(places, source)
     trend = np.linalg.lstsq(columns, dbm, rcond=None)[0].astype(np.float64)
-    about = dbm - columns @ trend
-    total = max(float(about.var()), _FLOOR_DBM2) * len(about) / max(1, len(about) - 4)
+    residuals = dbm - columns @ trend
+    total = max(float(residuals.var()), _FLOOR_DBM2) * len(residuals) / max(1, len(residuals) - 4)
     best: tuple[float, float, float] = (-math.inf, 0.0, 0.0)
     for length_m in _LENGTHS_M:
         for share in _SHARES:
-            likelihood = _log_likelihood(places, about, share * total, (1.0 - share) * total, length_m)
+            likelihood = _log_likelihood(places, residuals, share * total, (1.0 - share) * total, length_m)
             best = max(best, (likelihood, length_m, share))
     _, length_m, share = best
     noise = max((1.0 - share) * total, _FLOOR_DBM2)
-    return _conditioned(places, about, rows, source, trend, share * total, noise, length_m)
+    return _conditioned(places, residuals, rows, source, trend, share * total, noise, length_m)
 
 
 def _conditioned(
-    places: Array, about: Array, rows: Rows, source: Array, trend: Array, signal: float, noise: float,
+    places: Array, residuals: Array, rows: Rows, source: Array, trend: Array, signal: float, noise: float,
     length_m: float,
 ) -> SignalField:  # fmt: skip
     covariance = _kernel(places, places, signal, length_m) + noise * np.eye(len(places))
     inverse = np.linalg.inv(covariance).astype(np.float64)
     return SignalField(
-        source=source, trend=trend, places=places, about=about, rows=rows, weights=inverse @ about,
-        inverse=inverse, signal_dbm2=signal, noise_dbm2=noise, length_m=length_m,
+        source=source, trend=trend, places=places, residuals=residuals, rows=rows,
+        weights=inverse @ residuals, inverse=inverse, signal_dbm2=signal, noise_dbm2=noise, length_m=length_m,
     )  # fmt: skip
 
 
 def _source(places: Array, dbm: Array) -> Array:
-    """Return where the access point seems to be: the trial position whose trend fits best."""
+    """Return the estimated position of the access point: the grid point whose trend fits best."""
     low, high = places.min(axis=0) - 5.0, places.max(axis=0) + 5.0
     axes = [np.linspace(low[axis], high[axis], 24) for axis in (0, 1)]
     height = float(places[np.argmax(dbm), 2])
@@ -168,8 +168,8 @@ def _kernel(a: Array, b: Array, signal: float, length_m: float) -> Array:
     return kernel
 
 
-def _log_likelihood(places: Array, about: Array, signal: float, noise: float, length_m: float) -> float:
+def _log_likelihood(places: Array, residuals: Array, signal: float, noise: float, length_m: float) -> float:
     noise = max(noise, _FLOOR_DBM2)
     factor = np.linalg.cholesky(_kernel(places, places, signal, length_m) + noise * np.eye(len(places)))
-    half = np.linalg.solve(factor, about)
+    half = np.linalg.solve(factor, residuals)
     return -0.5 * float(half @ half) - float(np.log(np.diag(factor)).sum())

@@ -11,10 +11,10 @@ from rse_pf.maps.format import MapVersion, decode_map, encode_map
 from rse_pf.services.mapping.loop_consistency import LoopClosure, OdometryNoise, consistent, largest_clique
 from rse_pf.services.mapping.map_merge import (
     Atlas,
+    LoopProposals,
     Merged,
     MergeOptions,
-    Proposals,
-    join_maps,
+    merge_versions,
     propose_links,
 )
 from rse_pf.services.mapping.merge import MergeRequest, merge_maps
@@ -46,7 +46,7 @@ def rmse_m(merged: Merged, truth: Array) -> float:
 def test_two_maps_that_share_views_become_one() -> None:
     maps, truths = two_robots()
 
-    merged = join_maps(maps)
+    merged = merge_versions(maps)
 
     assert merged.joined == (0, 1)
     assert merged.merges >= 3
@@ -61,14 +61,14 @@ def test_two_maps_that_share_views_become_one() -> None:
 def test_the_same_maps_give_the_same_map() -> None:
     maps, _ = two_robots()
 
-    assert encode_map(join_maps(maps).version) == encode_map(join_maps(maps).version)
+    assert encode_map(merge_versions(maps).version) == encode_map(merge_versions(maps).version)
 
 
 def test_maps_that_share_no_view_are_not_joined_and_the_reason_is_told() -> None:
     here, _ = WORLD.walk("a", np.linspace(0.0, 0.3, 8), seed=1)
     elsewhere, _ = make_world(2).walk("b", np.linspace(0.0, 0.3, 8), seed=2)
 
-    merged = join_maps([here, elsewhere])
+    merged = merge_versions([here, elsewhere])
 
     assert merged.joined == (0,)
     assert merged.merges == 0
@@ -81,14 +81,14 @@ def test_maps_that_share_no_view_are_not_joined_and_the_reason_is_told() -> None
 def planted(share: float, seed: int):  # type: ignore[no-untyped-def]
     """Return a proposer that turns a share of the links into wrong ones, and counts them."""
 
-    def propose(atlas: Atlas, options: MergeOptions, report: Report) -> Proposals:
+    def propose(atlas: Atlas, options: MergeOptions, report: Report) -> LoopProposals:
         found = propose_links(atlas, options, report)
         rng = np.random.default_rng(seed)
         links = list(found.links)
         for k in rng.choice(len(links), max(1, round(share * len(links))), replace=False).tolist():
             wrong = links[k].T_a_b @ exp_se3(rng.uniform(-1, 1, 6) * [1.5, 1.5, 1.5, 1, 1, 1])
             links[k] = LoopClosure(a=links[k].a, b=links[k].b, T_a_b=wrong, information=links[k].information)
-        return Proposals(links=tuple(links), failed=found.failed)
+        return LoopProposals(links=tuple(links), failed=found.failed)
 
     return propose
 
@@ -98,7 +98,7 @@ def test_planted_wrong_loops_are_refused_and_do_not_bend_the_map(seed: int) -> N
     maps, truths = two_robots()
     truth = np.concatenate(truths)
 
-    clean, wrong = join_maps(maps), join_maps(maps, propose=planted(0.1, seed))
+    clean, wrong = merge_versions(maps), merge_versions(maps, propose=planted(0.1, seed))
 
     assert wrong.joined == (0, 1)
     assert rmse_m(wrong, truth) <= max(1.1 * rmse_m(clean, truth), rmse_m(clean, truth) + 0.005)
@@ -119,12 +119,12 @@ JUDGED = ("inconsistent", "against-odometry")
 def test_a_single_wrong_link_joins_nothing() -> None:
     maps, _ = two_robots()
 
-    def propose(atlas: Atlas, options: MergeOptions, report: Report) -> Proposals:
+    def propose(atlas: Atlas, options: MergeOptions, report: Report) -> LoopProposals:
         links = propose_links(atlas, options, report)
         across = [link for link in links.links if (link.a < 13) != (link.b < 13)]
-        return Proposals(links=tuple(across[:1]), failed=links.failed)
+        return LoopProposals(links=tuple(across[:1]), failed=links.failed)
 
-    merged = join_maps(maps, propose=propose)
+    merged = merge_versions(maps, propose=propose)
 
     assert merged.joined == (0,)
     assert "too-few-agree" in merged.not_joined[0][1]
@@ -133,8 +133,8 @@ def test_a_single_wrong_link_joins_nothing() -> None:
 def test_closing_the_loop_of_one_robot_brings_its_ends_together() -> None:
     version, truth = WORLD.walk("a", np.linspace(0.0, 1.1, 30), seed=4, drift_m=0.02, drift_deg=0.7)
 
-    without = join_maps([version], MergeOptions(close_loops=False))
-    merged = join_maps([version])
+    without = merge_versions([version], MergeOptions(close_loops=False))
+    merged = merge_versions([version])
 
     assert without.loops == 0
     assert merged.loops >= 1
@@ -153,7 +153,7 @@ def test_points_follow_the_keyframes_that_saw_them() -> None:
     T_first_world = inverse(truth[0])
     true_points = WORLD.points @ T_first_world[:3, :3].T + T_first_world[:3, 3]
 
-    merged = join_maps([version])
+    merged = merge_versions([version])
 
     assert median_distance(merged.version.points, true_points) < 0.8 * median_distance(cloud, true_points)
 
@@ -185,7 +185,7 @@ def test_a_merge_can_be_cancelled_half_way() -> None:
             raise Cancelled("the robot left")
 
     with pytest.raises(Cancelled):
-        join_maps(maps, report=stop)
+        merge_versions(maps, report=stop)
     assert heard == sorted(heard)
 
 
@@ -235,4 +235,4 @@ def test_without_the_extra_the_answer_says_what_to_install(monkeypatch: pytest.M
     monkeypatch.setitem(sys.modules, "faiss", None)
 
     with pytest.raises(MissingExtra, match="faiss"):
-        join_maps(two_robots()[0])
+        merge_versions(two_robots()[0])

@@ -15,7 +15,7 @@ from benchmarks.map_services import (
     planted,
     robots_of,
 )
-from rse_pf.services.mapping.map_merge import MergeOptions, join_maps
+from rse_pf.services.mapping.map_merge import MergeOptions, merge_versions
 
 pytestmark = [pytest.mark.data, pytest.mark.slow]
 
@@ -26,7 +26,7 @@ for package in ("faiss", "gtsam", "cv2", "poselib"):
 def test_three_robots_become_one_map_within_the_bar(recordings: Path) -> None:
     robots = robots_of(recordings)
 
-    merged = join_maps([robot.version for robot in robots.runs])
+    merged = merge_versions([robot.version for robot in robots.runs])
 
     assert merged.joined == (0, 1, 2)
     assert robots.ate_m(joined_poses(robots.runs, merged)) <= 0.045
@@ -43,8 +43,8 @@ def test_wrong_loops_change_the_error_by_less_than_a_tenth(recordings: Path, see
     robots = robots_of(recordings)
     versions = [robot.version for robot in robots.runs]
 
-    clean = robots.ate_m(joined_poses(robots.runs, join_maps(versions)))
-    merged = join_maps(versions, propose=planted(0.1, seed))
+    clean = robots.ate_m(joined_poses(robots.runs, merge_versions(versions)))
+    merged = merge_versions(versions, propose=planted(0.1, seed))
 
     assert merged.joined == (0, 1, 2)
     assert robots.ate_m(joined_poses(robots.runs, merged)) <= 1.1 * clean
@@ -54,8 +54,8 @@ def test_closing_loops_makes_one_robot_better(recordings: Path) -> None:
     robots = robots_of(recordings, cuts=((0, 250),))
     versions = [robot.version for robot in robots.runs]
 
-    without = join_maps(versions, MergeOptions(close_loops=False))
-    merged = join_maps(versions)
+    without = merge_versions(versions, MergeOptions(close_loops=False))
+    merged = merge_versions(versions)
 
     ate_m = robots.ate_m(joined_poses(robots.runs, merged))
     assert merged.loops >= 3
@@ -67,7 +67,7 @@ def test_two_recordings_that_share_no_view_stay_apart(recordings: Path) -> None:
     kitchen = robots_of(recordings, cuts=((0, 84),)).runs[0]
     desk = robots_of(recordings, cuts=((0, 10),), name="tum_fr1_xyz_start").runs[0]
 
-    merged = join_maps([kitchen.version, desk.version])
+    merged = merge_versions([kitchen.version, desk.version])
 
     assert merged.joined == (0,)
     assert merged.not_joined[0][0] == 1
