@@ -1,4 +1,4 @@
-"""Check what this machine needs to run the platform, and say how to mend what it lacks.
+"""Check what this machine needs to run the platform, and say how to fix what it lacks.
 
 Each line is ok, warn or fail; a failure is something that rse-pf local or rse-pf demo cannot do without.
 
@@ -69,14 +69,14 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
     for finding in check_machine(settings):
         print(finding, flush=True)
         failed += finding.grade == "fail"
-    print(f"\n{failed} to mend first" if failed else "\nready: rse-pf local, or rse-pf demo")
+    print(f"\n{failed} to fix first" if failed else "\nready: rse-pf local, or rse-pf demo")
     return 1 if failed else 0
 
 
 def check_machine(settings: PlatformSettings) -> Iterator[Finding]:
-    """Yield what is found, in the order in which it should be mended."""
+    """Yield what is found, in the order in which it should be fixed."""
     checks: tuple[Callable[[PlatformSettings], Iterator[Finding]], ...] = (
-        _system, _extras, _engines, _balancer, _front_door, _open_files, _size,
+        _system, _extras, _engines, _balancer, _listener, _open_files, _size,
     )  # fmt: skip
     for check in checks:
         yield from check(settings)
@@ -135,18 +135,18 @@ def _balancer(settings: PlatformSettings) -> Iterator[Finding]:
         yield Finding(grade="ok", what=f"Envoy {parts[1] if len(parts) > 1 else ''} runs")
 
 
-def _front_door(settings: PlatformSettings) -> Iterator[Finding]:
-    from rse_pf.local.firewall import check_front_door
+def _listener(settings: PlatformSettings) -> Iterator[Finding]:
+    from rse_pf.local.firewall import check_listener
 
-    door = f"{settings.serving.host}:{settings.local.port}"
+    address = f"{settings.serving.host}:{settings.local.port}"
     try:
-        check_front_door(settings.serving.host, settings.local.port)
+        check_listener(settings.serving.host, settings.local.port)
     except ConfigurationError as error:
         yield Finding(
-            grade="warn", what=f"front door {door}: {error.message}", fix="rse-pf local stop, or --port 0"
+            grade="warn", what=f"listener {address}: {error.message}", fix="rse-pf local stop, or --port 0"
         )
     else:
-        yield Finding(grade="ok", what=f"front door {door} is free")
+        yield Finding(grade="ok", what=f"listener {address} is free")
 
 
 def _open_files(settings: PlatformSettings) -> Iterator[Finding]:

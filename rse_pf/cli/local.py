@@ -1,7 +1,7 @@
 """Run the platform on this machine until Ctrl-C: a load balancer, and backend servers behind it.
 
 Each is a process of its own; Ctrl-C, a closed terminal and rse-pf local stop leave nothing running.  The
-platform grows, shrinks and replaces what breaks; the other actions look at it, or break it on purpose.
+platform grows, shrinks and replaces what breaks.  The other actions show its state, or inject a fault.
 
 examples:
   rse-pf local --servers 2
@@ -15,6 +15,8 @@ from __future__ import annotations
 
 import argparse
 import asyncio
+import collections
+import functools
 import json
 import math
 import os
@@ -42,11 +44,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "action", nargs="?", choices=_ACTIONS, default="start", help="what to do (default: start)"
     )
-    parser.add_argument("server", nargs="?", metavar="SERVER", help="whom to kill, pause, resume, slow, ...")
+    parser.add_argument(
+        "server", nargs="?", metavar="SERVER", help="the server to kill, pause, resume, slow, ..."
+    )
     parser.add_argument("--json", action="store_true", help="status: as JSON")
     parser.add_argument(
         "--for", dest="for_s", type=float, metavar="S",
-        help="pause, slow, partition: over after S seconds (else: pause stays, the others until Ctrl-C)",
+        help="pause, slow, partition: end after S seconds (without: pause stays, the others end with Ctrl-C)",
     )  # fmt: skip
     parser.add_argument("--percent", type=float, metavar="P", help="slow: leave the server P %% of its time")
     parser.add_argument(
@@ -58,21 +62,23 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     parser.add_argument(
         "--port", type=int, metavar="P",
-        help=f"front door; 0 takes a free one (local.port, default {defaults.port})",
+        help=f"port that robots connect to; 0 takes a free one (local.port, default {defaults.port})",
     )  # fmt: skip
     parser.add_argument(
-        "--no-data", action="store_true", help="do without the data service (large data by HTTP under /data/)"
+        "--no-data", action="store_true", help="start no data service (large data by HTTP under /data/)"
     )
     parser.add_argument(
         "--services", metavar="DIR", help="also run the services installed there (rse-pf service install)"
     )
     parser.add_argument(
-        "--accept-weak-isolation", action="store_true", help="run them even where the kernel lacks a wall"
+        "--accept-weak-isolation",
+        action="store_true",
+        help="run them even if the kernel lacks a kind of isolation",
     )
 
 
 def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
-    """Start, stop, look, or break."""
+    """Start or stop a platform, show its state, or inject a fault."""
     from rse_pf.local.state import state_folder
 
     _check(args)
@@ -92,19 +98,19 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
 
 
 def _with_services(settings: PlatformSettings, args: argparse.Namespace) -> PlatformSettings:
-    """Return *settings* with what the options say of installed services; a changed one is refused here."""
-    told: dict[str, Any] = {"accept_weak_isolation": True} if args.accept_weak_isolation else {}
+    """Return *settings* with the options for installed services; raises UsageError for a damaged service."""
+    changes: dict[str, Any] = {"accept_weak_isolation": True} if args.accept_weak_isolation else {}
     if args.services is not None:
         from rse_pf.services.custom.installed import installed_services
 
         folder = Path(args.services).absolute()
         installed_services(folder)
-        told["folder"] = str(folder)
-    return settings.replace(services=told)
+        changes["folder"] = str(folder)
+    return settings.replace(services=changes)
 
 
 def _check(args: argparse.Namespace) -> None:
-    """Refuse words that the action does not take."""
+    """Raise UsageError for options that the action does not take."""
     if args.action in _FAULTS and args.server is None:
         raise UsageError(
             f"rse-pf local {args.action} needs a server", hint="rse-pf local status shows their names"
@@ -136,7 +142,7 @@ def _on_running(args: argparse.Namespace, folder: Any) -> int:
         return 0
     server = faults.find_server(state, args.server)
     signal.pthread_sigmask(signal.SIG_BLOCK, _STOPPERS)
-    wait = _Patience(args.for_s)
+    wait = functools.partial(_wait, math.inf if args.for_s is None else time.monotonic() + args.for_s)
     if args.action == "slow":
         print(f"{server.name} has {args.percent:g} % of its time; Ctrl-C ends that", flush=True)
         faults.slow_down(server.process, args.percent, wait)
@@ -158,21 +164,17 @@ def _on_running(args: argparse.Namespace, folder: Any) -> int:
     return 0
 
 
-class _Patience:
-    """Waits, but not beyond the time that ``--for`` gave, nor beyond Ctrl-C."""
-
-    def __init__(self, for_s: float | None) -> None:
-        self._end = math.inf if for_s is None else time.monotonic() + for_s
-
-    def __call__(self, seconds: float) -> bool:
-        left_s = min(seconds, max(0.0, self._end - time.monotonic()))
-        if math.isinf(left_s):
-            signal.sigwait(_STOPPERS)
-            return True
-        return signal.sigtimedwait(_STOPPERS, left_s) is not None or time.monotonic() >= self._end
+def _wait(end_s: float, seconds: float) -> bool:
+    """Wait *seconds*, but not past *end_s* (monotonic) or a signal; return whether one of these came."""
+    left_s = min(seconds, max(0.0, end_s - time.monotonic()))
+    if math.isinf(left_s):
+        signal.sigwait(_STOPPERS)
+        return True
+    return signal.sigtimedwait(_STOPPERS, left_s) is not None or time.monotonic() >= end_s
 
 
 async def _foreground(name: str, folder: Any, settings: PlatformSettings, *, data: bool) -> int:
+    from rse_pf.local.control.control_plane import ControlOptions
     from rse_pf.local.control.platform import LocalPlatform
 
     stopped = asyncio.Event()
@@ -189,13 +191,19 @@ async def _foreground(name: str, folder: Any, settings: PlatformSettings, *, dat
     ready = False
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         loop.add_signal_handler(number, leave)
-    cloud = LocalPlatform(
-        settings, state=folder, name=name, adoptable=True, elastic=True, data=data, on_event=_show
+    platform = LocalPlatform(
+        settings,
+        state=folder,
+        name=name,
+        adoptable=True,
+        data=data,
+        on_event=_show,
+        control=ControlOptions(elastic=True),
     )
     try:
-        async with cloud:
+        async with platform:
             ready = True
-            _welcome(cloud, name)
+            _welcome(platform, name)
             await stopped.wait()
             print("\nstopping", flush=True)
     except asyncio.CancelledError:
@@ -204,52 +212,42 @@ async def _foreground(name: str, folder: Any, settings: PlatformSettings, *, dat
     return 0
 
 
-def _welcome(cloud: Any, name: str) -> None:
+def _welcome(platform: Any, name: str) -> None:
     from rse_pf.local.control.status import data_url
 
     which = "" if name == DEFAULT_NAME else f" --name {name}"
-    large = f"large data goes to {data_url(cloud.url)}\n" if cloud.data_servers.is_running() else ""
+    large = f"large data goes to {data_url(platform.url)}\n" if platform.data_servers.is_running() else ""
     print(
-        f"\nrobots connect to  {cloud.url}\n{large}"
+        f"\nrobots connect to  {platform.url}\n{large}"
         f"a robot's token    rse-pf token issue robot-1{which}\n"
         f"to stop            Ctrl-C, or rse-pf local stop{which}\n"
-        f"logs and state     {cloud.state}\n",
+        f"logs and state     {platform.state}\n",
         flush=True,
     )
 
 
 def _show(event: Any) -> None:
-    words = _WORDS.get(event["event"])
-    if words is not None:
-        print(words.format_map(_Told(event)), flush=True)
+    text = _TEXTS.get(event["event"])
+    if text is not None:
+        values = {key: ", ".join(map(str, value)) if isinstance(value, list) else value for key, value in event.items()}
+        print(text.format_map(collections.defaultdict(lambda: "-", values)), flush=True)
 
 
-class _Told(dict[str, Any]):
-    """An event; a list is told as words, and what it does not tell is a dash."""
-
-    def __getitem__(self, key: str) -> Any:
-        value = super().__getitem__(key)
-        return ", ".join(map(str, value)) if isinstance(value, list) else value
-
-    def __missing__(self, key: str) -> str:
-        return "-"
-
-
-_WORDS = {
-    "adopted": "took over what an earlier control plane left: {servers}",
+_TEXTS = {
+    "adopted": "adopted from an earlier control plane: {servers}",
     "balancer-back": "the load balancer is back after {seconds} s",
-    "balancer-failed": "the load balancer does not come back: {reason}",
-    "balancer-gone": "the load balancer is gone: {reason}",
-    "crash-loop": "servers die young: the next one starts in {wait_s} s",
+    "balancer-failed": "the load balancer does not start: {reason}",
+    "balancer-gone": "the load balancer ended: {reason}",
+    "crash-loop": "servers end too soon after their start: the next one starts in {wait_s} s",
     "data-server-down": "data server {name} ended ({code})",
     "data-server-failed": "data server {name} does not start: {error}",
-    "data-server-silent": "data server {name} answers nobody and is ended",
+    "data-server-silent": "data server {name} does not answer and is killed",
     "data-server-up": "data server {name} is ready (pid {pid})",
     "drain-over": "{server} has left after {seconds} s",
-    "drain-start": "{server} leaves ({reason}); its robots move",
+    "drain-start": "{server} drains ({reason}); its robots move",
     "grow": "{servers} more: {reason}",
     "platform-ready": "the platform is ready after {seconds:.1f} s",
-    "rebalance": "{server} hands {robots} robots over",
+    "rebalance": "{robots} robots of {server} are asked to move",
     "replace": "{server} is replaced by {by}: {reason}",
     "server-failed": "{server} did not start: {reason}",
     "server-gone": "{server} ended (exit code {exit_code})",
@@ -257,4 +255,4 @@ _WORDS = {
     "server-unhealthy": "{server} is unhealthy: {reason}",
     "shrink": "{servers} less: {reason}",
 }
-"""What an event is to a person."""
+"""The line for each event; an event without a line is not shown."""

@@ -1,7 +1,6 @@
-"""The firewall box on one machine: the front door is on loopback, and nobody passes without a token.
+"""The firewall box on one machine: a listener on loopback only, and the key that signs robots' tokens.
 
-Keeps the signing key in a file that only its owner can read.  Promises to show the private half to
-nobody else, and never to open a port itself.
+The private key is in a file that only its owner can read.
 """
 
 from __future__ import annotations
@@ -15,28 +14,28 @@ from rse_pf.config.placement import is_loopback
 from rse_pf.errors import ConfigurationError, UsageError
 from rse_pf.files import OWNER_ONLY, read_private_file, replace_file
 
-__all__ = ["check_front_door", "ensure_key", "front_door_url", "key_file", "key_set_file", "read_key"]
+__all__ = ["check_listener", "ensure_key", "key_file", "key_set_file", "read_key", "robots_url"]
 
 
 def key_file(folder: Path) -> Path:
-    """Return where the platform in *folder* keeps its private key."""
+    """Return the file of the private key of the platform in *folder*."""
     return folder / "key.json"
 
 
 def key_set_file(folder: Path) -> Path:
-    """Return where its servers find the public half, a JWKS."""
+    """Return the file of the public keys of the platform in *folder*, a JWKS, for its servers."""
     return folder / "keys.json"
 
 
-def front_door_url(settings: PlatformSettings, port: int) -> str:
-    """Return the address that robots dial, ``ws://`` or with a certificate ``wss://``."""
+def robots_url(settings: PlatformSettings, port: int) -> str:
+    """Return the address that robots connect to: ``ws://``, or ``wss://`` if there is a certificate."""
     host = f"[{settings.serving.host}]" if ":" in settings.serving.host else settings.serving.host
     scheme = "wss" if settings.local.certificate else "ws"
     return f"{scheme}://{host}:{port}{settings.serving.path}"
 
 
-def check_front_door(host: str, port: int) -> None:
-    """Refuse a front door that is open to other machines, or whose port is taken.
+def check_listener(host: str, port: int) -> None:
+    """Refuse a listener that other machines could reach, or whose port is taken.
 
     Raises:
         ConfigurationError: *host* is not a loopback address, or something listens on *port*.

@@ -1,7 +1,6 @@
-"""Know a process for certain: its pid with the time it began, so that a re-used pid is never signalled.
+"""Identify a process by its pid and its start time, so that a re-used pid is never signalled.
 
-Promises to signal through a process handle that was checked after it was opened, and to raise nothing
-for a process that is gone.
+Signals go through a process handle that is checked after it was opened.  A process that is gone is no error.
 """
 
 from __future__ import annotations
@@ -61,7 +60,7 @@ def is_alive(mark: ProcessMark) -> bool:
 
 
 def send_signal(mark: ProcessMark, number: signal.Signals) -> bool:
-    """Signal that very process; return False, and signal nobody, if it is gone."""
+    """Signal that very process; return False, and signal none, if it is gone."""
     with _handle(mark) as handle:
         if handle is None:
             return False
@@ -133,7 +132,7 @@ def spawn(
 
 
 def last_line(log: Path) -> str:
-    """Return the last line of *log* that says something, shortened to 300 letters."""
+    """Return the last line of *log* that is not empty and no hint, shortened to 300 letters."""
     try:
         with log.open("rb") as file:
             file.seek(max(0, log.stat().st_size - _TAIL_BYTES))

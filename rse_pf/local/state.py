@@ -1,8 +1,7 @@
-"""Where a local platform keeps its files, and what it tells other commands about itself.
+"""The folder of a local platform, and its state file ``platform.json`` for other commands.
 
-One folder per platform name under ``$XDG_STATE_HOME/rse-pf``; ``platform.json`` appears with the first
-process and goes with the last.  Promises to hold no secret (key and token have files of their own) and that
-every write is whole.
+There is one folder per platform name under ``$XDG_STATE_HOME/rse-pf``.  The state file exists while a process
+of the platform runs, and holds no secret: key and token have files of their own.
 """
 
 from __future__ import annotations
@@ -48,7 +47,7 @@ class ServerState:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PlatformState:
-    """A platform that runs; ``url`` is empty until the front door is open.
+    """A platform that runs; ``url`` is empty until robots can connect.
 
     ``status_port`` is where the control plane answers ``GET /status``, ``launched`` the highest number that
     a server's name ever had; ``control_token_file`` is empty if the control ports ask for no token.
@@ -80,7 +79,7 @@ class PlatformState:
 
 
 class PlatformLock:
-    """At most one control plane per folder; Linux gives the lock back however its holder ends."""
+    """At most one control plane per folder; Linux releases the lock however its holder ends."""
 
     def __init__(self, folder: Path) -> None:
         self._path = folder / _LOCK
@@ -100,7 +99,7 @@ class PlatformLock:
         self._fd = fd
 
     def release(self) -> None:
-        """Give the lock back."""
+        """Release the lock."""
         if self._fd >= 0:
             os.close(self._fd)
             self._fd = -1
@@ -110,7 +109,7 @@ def state_folder(name: str, environment: Mapping[str, str]) -> Path:
     """Return the folder of the platform called *name*; it need not exist.
 
     Raises:
-        UsageError: The name is not made of 1 to 32 small letters, digits and hyphens.
+        UsageError: The name is not made of 1 to 32 lower-case letters, digits and hyphens.
     """
     if not _NAME.fullmatch(name):
         raise UsageError(
@@ -123,17 +122,17 @@ def state_folder(name: str, environment: Mapping[str, str]) -> Path:
 
 
 def control_token_file(folder: Path) -> Path:
-    """Return where the platform in *folder* keeps the token of its control ports."""
+    """Return the file of the token of the control ports."""
     return folder / "control.token"
 
 
 def settings_file(folder: Path) -> Path:
-    """Return where the platform in *folder* writes the settings that its servers read."""
+    """Return the file of the settings that the servers read."""
     return folder / "settings.json"
 
 
 def read_state(folder: Path) -> PlatformState | None:
-    """Return what the platform in *folder* says of itself; None if there is none.
+    """Return the state of the platform in *folder*; None if it does not run.
 
     Raises:
         ConfigurationError: The file is there, but is not readable.
@@ -150,7 +149,7 @@ def read_state(folder: Path) -> PlatformState | None:
 
 
 def remove_state(folder: Path) -> None:
-    """Remove the file, but neither key nor logs."""
+    """Remove the state file, but neither key nor logs."""
     (folder / _FILE).unlink(missing_ok=True)
 
 

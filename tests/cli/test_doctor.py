@@ -43,8 +43,8 @@ def test_a_taken_front_door_is_a_warning() -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         found = findings(SETTINGS.replace(local={"port": taken.getsockname()[1]}))
 
-    assert only("front door", found).grade == "warn"
-    assert "--port 0" in only("front door", found).fix
+    assert only("listener", found).grade == "warn"
+    assert "--port 0" in only("listener", found).fix
 
 
 def test_a_missing_required_extra_fails_and_an_optional_one_warns(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -108,12 +108,12 @@ def test_the_exit_code_is_1_only_if_something_required_failed(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], grade: str, code: int
 ) -> None:
     def found(_: PlatformSettings) -> Iterator[Finding]:
-        yield Finding(grade=grade, what="a thing", fix="mend it")
+        yield Finding(grade=grade, what="a thing", fix="repair it")
 
     monkeypatch.setattr(doctor, "check_machine", found)
 
     assert main(["doctor"]) == code
-    assert capsys.readouterr().out.startswith(f"{grade:<4}  a thing\n      fix: mend it\n")
+    assert capsys.readouterr().out.startswith(f"{grade:<4}  a thing\n      fix: repair it\n")
 
 
 def test_the_doctor_runs_as_a_program() -> None:

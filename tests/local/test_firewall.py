@@ -10,7 +10,7 @@ import pytest
 from rse_pf.auth.tokens import KeySet, SigningKey, verify_token
 from rse_pf.config import AuthSettings
 from rse_pf.errors import ConfigurationError, UsageError
-from rse_pf.local.firewall import check_front_door, ensure_key, key_file, key_set_file, read_key
+from rse_pf.local.firewall import check_listener, ensure_key, key_file, key_set_file, read_key
 
 SEED = b"s" * 32
 
@@ -18,7 +18,7 @@ SEED = b"s" * 32
 @pytest.mark.parametrize("host", ["0.0.0.0", "192.0.2.1", "::", "example.org"])
 def test_a_door_that_others_can_reach_is_refused(host: str) -> None:
     with pytest.raises(ConfigurationError, match="other machines"):
-        check_front_door(host, 0)
+        check_listener(host, 0)
 
 
 @pytest.mark.system
@@ -26,9 +26,9 @@ def test_a_taken_port_is_refused_and_a_free_one_is_not() -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
         with pytest.raises(ConfigurationError, match=f":{port}: Address already in use"):
-            check_front_door("127.0.0.1", port)
+            check_listener("127.0.0.1", port)
 
-    check_front_door("127.0.0.1", port)
+    check_listener("127.0.0.1", port)
 
 
 def test_the_key_is_its_owners_alone_and_the_public_half_verifies(tmp_path: Path) -> None:

@@ -1,7 +1,7 @@
-"""Write down what Envoy is told: one front door, two clusters, endpoint files that change alone.
+"""The configuration of Envoy: one listener, two clusters, and endpoint files, the only part that changes.
 
-Pure.  Promises that every value which differs from Envoy's default has its reason beside it; most were
-found by measuring what robots notice when servers come, go, stall and die.
+Every value that differs from Envoy's default has its reason beside it; most were found by measuring what
+robots notice when servers start, drain, stall and crash.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ __all__ = ["ADMIN_SOCKET", "CLUSTER", "DATA_CLUSTER", "Target", "endpoints", "en
 
 CLUSTER = "backend-servers"
 ADMIN_SOCKET = "admin.sock"
-"""In the balancer's folder: whoever reaches the admin page can end the balancer, so no port leads there."""
+"""In the balancer's folder.  The admin page can end the balancer, so it is not on a port."""
 DATA_CLUSTER = "data-servers"
 _DATA_PATH = "/data/"
 _DATA_READY = "/data/readyz"
@@ -54,8 +54,8 @@ def envoy_config(
     """Return the static configuration.
 
     Args:
-        settings: Front door address and path, health checks, handshake limit.
-        port: Of the front door; 0 takes a free one.
+        settings: Address and path of the listener, health checks, handshake limit.
+        port: Of the listener; 0 takes a free one.
         endpoints_file: What `endpoints` returned, as JSON; replaced by rename, never written in place.
         data_endpoints_file: The same for the data servers; without targets ``/data/`` is answered with 503.
     """
@@ -64,7 +64,7 @@ def envoy_config(
         "admin": {"address": {"pipe": {"path": ADMIN_SOCKET, "mode": 0o600}}},
         "overload_manager": _max_connections(_MAX_CONNECTIONS),
         "static_resources": {
-            "listeners": [_front_door(settings, port)],
+            "listeners": [_listener(settings, port)],
             "clusters": [
                 _cluster(settings, CLUSTER, endpoints_file, READY_PATH, panic_percent=0),
                 # One data server, and its successor on the same port: better asked in vain than not asked.
@@ -97,7 +97,7 @@ def endpoints(targets: Sequence[Target], cluster: str = CLUSTER) -> dict[str, An
     }
 
 
-def _front_door(settings: PlatformSettings, port: int) -> dict[str, Any]:
+def _listener(settings: PlatformSettings, port: int) -> dict[str, Any]:
     manager = {
         "@type": f"{_TYPES}.extensions.filters.network.http_connection_manager.v3.HttpConnectionManager",
         "stat_prefix": "robots",
@@ -106,7 +106,7 @@ def _front_door(settings: PlatformSettings, port: int) -> dict[str, Any]:
         "stream_idle_timeout": "0s",
         "request_timeout": "0s",
         "common_http_protocol_options": {
-            # Without a request: silent ones end like slow handshakes.  An open WebSocket is a request.
+            # For connections without a request; an open WebSocket is a request.
             "idle_timeout": _seconds(settings.serving.handshake_timeout_s),
             "max_headers_count": _MAX_HEADERS,
             "headers_with_underscores_action": "REJECT_REQUEST",
@@ -117,7 +117,7 @@ def _front_door(settings: PlatformSettings, port: int) -> dict[str, Any]:
         "max_request_headers_kb": settings.serving.max_handshake_bytes // 1024,
         # Whatever a robot says of its own address is dropped; servers read what stands here instead.
         "use_remote_address": True,
-        # Who knocks need not know what opens: no name of the software, no time that a server took.
+        # Strangers need to know neither the software nor how long a server took.
         "server_header_transformation": "PASS_THROUGH",
         "xff_num_trusted_hops": 0,
         "normalize_path": True,
@@ -148,14 +148,14 @@ def _front_door(settings: PlatformSettings, port: int) -> dict[str, Any]:
 
 
 def _tls(settings: PlatformSettings) -> dict[str, Any]:
-    """Return the transport of the front door: nothing, or TLS 1.2 and 1.3 with authenticated ciphers only."""
+    """Return the transport of the listener: none, or TLS 1.2 and 1.3 with authenticated ciphers only."""
     local = settings.local
     if not local.certificate:
         return {}
     files = {"certificate_chain": local.certificate, "private_key": local.private_key}
     context = {
         "@type": f"{_TYPES}.extensions.transport_sockets.tls.v3.DownstreamTlsContext",
-        # A ticket would let who stole it resume a session for hours; a robot dials seldom.
+        # A stolen ticket would resume a session for hours, and a robot connects seldom.
         "disable_stateless_session_resumption": True,
         "common_tls_context": {
             "tls_params": {
@@ -178,7 +178,7 @@ def _kernel_buffer(name: int, settings: PlatformSettings) -> dict[str, Any]:
 
 
 def _unread_timeout(settings: PlatformSettings) -> dict[str, Any]:
-    """End a connection whose robot takes nothing: with what it did not read, Envoy would keep it for ever."""
+    """End a connection whose robot reads nothing: Envoy would keep it, with all that is unread, for ever."""
     session = settings.session
     max_ms = int(2e3 * (session.ping_interval_s + session.ping_timeout_s))
     return {"level": _IPPROTO_TCP, "name": _TCP_USER_TIMEOUT, "int_value": max_ms, "state": "STATE_PREBIND"}
@@ -212,18 +212,18 @@ def _virtual_host(settings: PlatformSettings) -> dict[str, Any]:
         "host_selection_retry_max_attempts": "8",
     }
     route = {"cluster": CLUSTER, "timeout": "0s", "idle_timeout": "0s", "retry_policy": retry}
-    # A large upload takes as long as it takes, unless nobody says anything; the data server is stricter.
-    # No retries: the robot knows whether a part arrived, and goes on from there.
+    # A large upload has no time limit while bytes flow; the data server is stricter.
+    # No retries: the robot knows whether a part arrived, and resumes there.
     idle = _seconds(3 * settings.data.body_timeout_s)
     data_route = {"cluster": DATA_CLUSTER, "timeout": "0s", "idle_timeout": idle}
-    patience = _seconds(settings.serving.handshake_timeout_s)
+    timeout = _seconds(settings.serving.handshake_timeout_s)
     return {
         "name": "platform",
         "domains": ["*"],
         "routes": [
             {"match": {"path": settings.serving.path}, "route": route},
-            {"match": {"path": HEALTH_PATH}, "route": {**route, "timeout": patience}},
-            # Each would ask the store; the balancer's own checks do not come through the door.
+            {"match": {"path": HEALTH_PATH}, "route": {**route, "timeout": timeout}},
+            # Each would ask the store; the balancer's own checks do not pass the listener.
             {"match": {"path": _DATA_READY}, "direct_response": {"status": 404}},
             {"match": {"prefix": _DATA_PATH}, "route": data_route},
         ],
@@ -274,7 +274,8 @@ def _cluster(
 
 
 def _address(host: str, port: int) -> dict[str, Any]:
-    return {"socket_address": {"address": host, "port_value": port}}
+    address = _LOOPBACK if host == "localhost" else host  # Envoy resolves no names here
+    return {"socket_address": {"address": address, "port_value": port}}
 
 
 def _endpoint_address(port: int) -> dict[str, Any]:

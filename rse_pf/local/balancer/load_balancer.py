@@ -1,7 +1,7 @@
-"""The load balancer box on one machine: a real Envoy, started once and never restarted while it lives.
+"""The load balancer box on one machine: a real Envoy, which is never restarted while it runs.
 
-Only its endpoint file changes, by atomic rename, so open sockets stay open whatever the targets do.
-Promises to decide nothing: who is a target is said by the caller, who is healthy by Envoy's checks.
+Only its endpoint file changes, by atomic rename, so open sockets stay open whatever the targets do.  The
+caller chooses the targets; Envoy's own checks decide which of them are healthy.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ def envoy_binary() -> str:
 
 
 class EnvoyLoadBalancer:
-    """One Envoy.  ``port`` is 0 before `wait_live`; its admin page is a socket file that only we may open."""
+    """One Envoy.  ``port`` is 0 before `wait_live`; its admin page is a socket file for this user only."""
 
     def __init__(
         self, settings: PlatformSettings, *, folder: Path, port: int, dies_with_parent: bool = True
@@ -76,7 +76,7 @@ class EnvoyLoadBalancer:
     def launch(self) -> None:
         """Start the process without targets, and return before it listens.
 
-        One that ran before comes back on the same port, with the targets that it had.
+        After an earlier one, it takes the same port and the same targets.
         """
         binary = envoy_binary()
         if self.mark is None:
@@ -103,10 +103,10 @@ class EnvoyLoadBalancer:
         self.mark, self.port = mark, port
 
     async def wait_live(self, timeout_s: float) -> None:
-        """Wait until the front door is open; sets ``port``.
+        """Wait until Envoy listens; sets ``port``.
 
         Raises:
-            ConfigurationError: Envoy ended, or did not open the door in time.
+            ConfigurationError: Envoy ended, or did not listen in time.
         """
 
         async def live() -> bool:
@@ -179,7 +179,7 @@ class EnvoyLoadBalancer:
         if self.mark is not None:
             send_signal(self.mark, signal.SIGKILL)
         if self._process is not None:
-            self._process.kill()  # no mark: it ended before it could be told from others
+            self._process.kill()  # no mark: it ended before it could be identified
             self._process.wait()
 
     def _targets(self, page: Mapping[str, Any]) -> dict[str, TargetStats]:

@@ -30,7 +30,7 @@ async def adopt(
     fleet: Fleet,
     backend_servers: LocalBackendServers,
     load_balancer: EnvoyLoadBalancer,
-    tell: Callable[..., None],
+    emit: Callable[..., None],
     end: float,
 ) -> None:
     """Adopt what of *state* still runs, launch what is missing, and wait until one server gets robots.
@@ -40,7 +40,7 @@ async def adopt(
         fleet: Empty; knows the servers afterwards.
         backend_servers: Likewise.
         load_balancer: Not launched; serves on its old port afterwards.
-        tell: Gets the event ``adopted``: servers, balancer, and which settings digest each server runs.
+        emit: Gets the event ``adopted``: servers, balancer, and which settings digest each server runs.
         end: Monotonic time of the deadline.
 
     Raises:
@@ -61,7 +61,7 @@ async def adopt(
         for server in state.servers
         if server.port
     }
-    tell(
+    emit(
         "adopted",
         servers=[member.name for member in members],
         balancer=kept,

@@ -1,8 +1,7 @@
-"""The control plane's own audit log: what it started, stopped and moved, and how far the other logs had come.
+"""The control plane's own audit log: what it started, stopped and moved, and the heads of the other logs.
 
-Every event of the platform becomes an entry; the heads of the other chains become entries, too, so that an
-end that was cut off one of them shows.  Promises never to hold the control plane up, and that a platform
-whose log cannot be written goes on.
+Every event of the platform becomes an entry.  The heads of the other chains become entries, too, which shows
+if the end of one of them is removed.  A log that cannot be written neither delays nor ends the platform.
 """
 
 from __future__ import annotations
@@ -33,7 +32,7 @@ class PlatformAudit:
         self.folder = audit_folder(state)
         self._heads_s = heads_s
         self._is_open = False
-        self._told: dict[str, str] = {}
+        self._recorded: dict[str, str] = {}
         self._log = AuditLog(self.folder, _WHO, wall_clock=time.time)
 
     def open(self) -> None:
@@ -41,7 +40,7 @@ class PlatformAudit:
         self._log.open(_WAIT_S).start()
         self._is_open = True
 
-    def take(self, event: Mapping[str, Any]) -> None:
+    def record(self, event: Mapping[str, Any]) -> None:
         """Record one event of the platform."""
         if self._is_open:
             detail = {name: _value(value) for name, value in event.items() if name not in ("event", "server")}
@@ -49,18 +48,18 @@ class PlatformAudit:
             self._add(f"platform.{event['event']}", subject, detail)
 
     async def watch(self) -> None:
-        """Record the heads of the other chains again and again, until cancelled."""
+        """Record the heads of the other chains periodically, until cancelled."""
         while True:
             await asyncio.sleep(self._heads_s)
-            await asyncio.to_thread(self.look)
+            await asyncio.to_thread(self.record_heads)
 
-    def look(self) -> None:
+    def record_heads(self) -> None:
         """Record the heads of the other chains that have grown."""
         grown: dict[str, Value] = {}
         for who in chain_names(self.folder):
             head = None if who == _WHO else newest_head(self.folder, who)
-            if head is not None and self._told.get(who) != str(head):
-                grown[who] = self._told[who] = str(head)
+            if head is not None and self._recorded.get(who) != str(head):
+                grown[who] = self._recorded[who] = str(head)
         names = list(grown)
         for first in range(0, len(names), _MAX_HEADS):
             some = names[first : first + _MAX_HEADS]
@@ -70,7 +69,7 @@ class PlatformAudit:
         """Record the last heads and the end."""
         if self._is_open:
             self._is_open = False
-            self.look()
+            self.record_heads()
             self._add("platform.over", "", {})
             self._log.close()
 

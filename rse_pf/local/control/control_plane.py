@@ -30,7 +30,7 @@ from rse_pf.local.control.monitor import (
     sample_interval_s,
     server_sample,
 )
-from rse_pf.local.control.rebalancer import Order, Rebalancer
+from rse_pf.local.control.rebalancer import MoveRequest, Rebalancer
 from rse_pf.local.control.scale_modifier import LocalScaleModifier
 from rse_pf.local.servers.control_client import ControlPort, ControlPortReply
 from rse_pf.scaling.health import LOCAL_INTERVAL_S, LOCAL_TIMEOUT_S, observe
@@ -50,9 +50,10 @@ _STANDBY_EVERY_S = 1.0
 class ControlOptions:
     """What a control plane does by itself.
 
-    With ``elastic``, monitor and scale modifier run, and what breaks is replaced; with ``rebalance``, robots
-    of crowded servers are asked to move, too.  Periods, idle time, warm-up and grace are shorter by the factor
-    ``compress``, for experiments.  ``on_sample`` gets each sample of the monitor, which runs then in any case.
+    With ``elastic``, monitor and scale modifier run, and what breaks is replaced; with ``rebalance``, too,
+    robots of crowded servers are asked to move.  ``compress`` is the factor by which periods, idle time,
+    warm-up and grace are shorter, for experiments.  ``on_sample`` gets each sample of the monitor, which
+    then runs in any case.
     """
 
     elastic: bool = False
@@ -72,7 +73,7 @@ class ControlPlane:
         scaling: ScalingSettings,
         options: ControlOptions,
         *,
-        tell: Callable[..., None],
+        emit: Callable[..., None],
         changed: Callable[[], None],
     ) -> None:
         self.sample: MonitorSample | None = None
@@ -82,7 +83,7 @@ class ControlPlane:
             scaling,
             max_restarts_per_minute=settings.local.max_restarts_per_minute,
             compress=options.compress,
-            tell=tell,
+            emit=emit,
         )
         self._fleet = fleet
         self._load_balancer = load_balancer
@@ -90,7 +91,7 @@ class ControlPlane:
         self._elastic = options.elastic
         self._compress = options.compress
         self._is_idle = not options.elastic and options.on_sample is None
-        self._tell = tell
+        self._emit = emit
         self._changed = changed
         self._on_sample = options.on_sample
         period_s = scaling.period_s / options.compress
@@ -180,7 +181,7 @@ class ControlPlane:
         member.health = observe(health, ok, self._settings.health, now_s=now_s)
         if member.health.state == "unhealthy" and health.state != "unhealthy":
             failed = self._settings.health.unhealthy_checks
-            self._tell("server-unhealthy", server=member.name, reason=f"{failed} checks in a row failed")
+            self._emit("server-unhealthy", server=member.name, reason=f"{failed} checks in a row failed")
             self._soon()
 
     # --- samples --------------------------------------------------------------------------------
@@ -259,20 +260,20 @@ class ControlPlane:
         if self._rebalancer is None or self.hold:
             return
         robots = {each.name: each.robots for each in sample.servers if each.state == "healthy"}
-        for order in self._rebalancer.orders(robots, sample.time):
-            self._fleet.keep(self._move(order))
+        for request in self._rebalancer.requests(robots, sample.time):
+            self._fleet.keep(self._move(request))
 
-    async def _move(self, order: Order) -> None:
-        member = self._fleet.members.get(order.server)
+    async def _move(self, request: MoveRequest) -> None:
+        member = self._fleet.members.get(request.server)
         if member is None or member.server is None:
             return
-        target = f"/move?robots={order.robots}&spread_s={order.spread_s:g}"
+        target = f"/move?robots={request.robots}&spread_s={request.spread_s:g}"
         reply = await self._fleet.control(member.server).ask_once(target, timeout_s=_ASK_S, method="POST")
         if reply is None or reply.status >= 300:
             return  # the next sample asks again
         told = reply.document()
         if told.get("robots"):
-            self._tell("rebalance", server=order.server, robots=told["robots"], spread_s=told["spread_s"])
+            self._emit("rebalance", server=request.server, robots=told["robots"], spread_s=told["spread_s"])
 
     # --- the balancer ----------------------------------------------------------------------------
 
@@ -282,12 +283,12 @@ class ControlPlane:
             why = await self._load_balancer.wait_over()
             began_s = time.monotonic()
             mark = self._load_balancer.mark
-            self._tell("balancer-gone", pid=None if mark is None else mark.pid, reason=why)
+            self._emit("balancer-gone", pid=None if mark is None else mark.pid, reason=why)
             await self._restart_balancer()
             seconds = round(time.monotonic() - began_s, 3)
             self._changed()
             mark = self._load_balancer.mark
-            self._tell("balancer-back", seconds=seconds, pid=None if mark is None else mark.pid)
+            self._emit("balancer-back", seconds=seconds, pid=None if mark is None else mark.pid)
             self.watch_spread()
 
     async def _restart_balancer(self) -> None:
@@ -298,6 +299,6 @@ class ControlPlane:
                 await self._load_balancer.wait_live(self._settings.local.start_timeout_s)
                 return
             except ConfigurationError as error:
-                self._tell("balancer-failed", reason=str(error), wait_s=pause_s)
+                self._emit("balancer-failed", reason=str(error), wait_s=pause_s)
             await asyncio.sleep(pause_s)
             pause_s = min(2 * pause_s, _MAX_PAUSE_S)

@@ -1,8 +1,8 @@
 """The servers of one local platform in operation, each from its launch until its process is gone.
 
-Knows who may get robots, tells every change as an event, and carries out what others decide: launch, drain,
-replace.  Promises to decide nothing by itself, that a leaving server is out of the balancer's targets before
-it hears of it, and that a name is never used twice.
+The fleet knows which servers may get robots, emits every change as an event, and carries out what others
+decide: launch, drain, replace.  A server that is to drain is removed from the balancer's targets before it is
+asked to, and a name is never used twice.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ _MIN_UPTIME_S = 10.0
 
 @dataclass(slots=True, kw_only=True)
 class Member:
-    """One server.  ``leaving`` drains; ``out`` was given up and is killed.
+    """One server.  ``leaving``: it drains; ``out``: it was replaced and is killed.
 
     Times are monotonic seconds; those of ``health`` are compressed with the rest.
     """
@@ -60,7 +60,7 @@ class Member:
 
     @property
     def phase(self) -> ServerPhase:
-        """The state as a sample tells it."""
+        """The state as it is in a sample."""
         if self.leaving:
             return "draining"
         if self.out or self.health.state == "unhealthy":
@@ -78,7 +78,7 @@ class Fleet:
         settings: PlatformSettings,
         *,
         compress: float,
-        tell: Callable[..., None],
+        emit: Callable[..., None],
         changed: Callable[[], None],
     ) -> None:
         self.members: dict[str, Member] = {}
@@ -89,7 +89,7 @@ class Fleet:
         self._settings = settings
         self._compress = compress
         self._warm_up_s = settings.scaling.warm_up_s / compress
-        self._tell = tell
+        self._emit = emit
         self._changed = changed
         self._tasks: set[asyncio.Task[Any]] = set()
         self._still_targets: set[str] = set()
@@ -114,7 +114,7 @@ class Fleet:
         return self.members[name]
 
     def control(self, server: BackendServer) -> ControlPort:
-        """Return the control port of *server*, with what must be carried to it."""
+        """Return a client of the control port of *server*."""
         return self._backend_servers.control(server.control_port)
 
     def is_warming(self, member: Member, now_s: float) -> bool:
@@ -140,7 +140,7 @@ class Fleet:
         self.members[name] = member
         mark = self._backend_servers.marks.get(name)
         self._changed()
-        self._tell("server-launched", server=name, pid=None if mark is None else mark.pid)
+        self._emit("server-launched", server=name, pid=None if mark is None else mark.pid)
         return member
 
     def adopt(self, name: str, *, now_s: float, is_target: bool) -> Member:
@@ -169,13 +169,13 @@ class Fleet:
             server = await self._backend_servers.wait_ready(member.name, timeout_s)
         except ConfigurationError:
             code = await self._give_up(member)
-            self._tell("server-gone", server=member.name, pid=None, exit_code=code)
+            self._emit("server-gone", server=member.name, pid=None, exit_code=code)
             raise
         member.server = server
         self._still_targets.discard(member.name)
         self._set_targets()
         self.keep(self._watch(member, server))
-        self._tell("server-ready", server=member.name, pid=server.pid, port=server.port)
+        self._emit("server-ready", server=member.name, pid=server.pid, port=server.port)
         self.on_ready(member)
         while not member.over.is_set() and not member.leaving and not member.out:
             left_s = min(end - time.monotonic(), _LOOK_UP_S)
@@ -186,7 +186,7 @@ class Fleet:
                 raise ConfigurationError(
                     f"the load balancer found {member.name} unhealthy", hint=f"its log is {server.log}"
                 )
-            await asyncio.sleep(_PAUSE_S)  # the balancer itself may be gone, and come back
+            await asyncio.sleep(_PAUSE_S)  # the balancer itself may be restarting
 
     def start_standby(self) -> None:
         """Start a standby for the next launch, unless a server started less than 3 s ago."""
@@ -196,7 +196,7 @@ class Fleet:
             all(at is not None and at <= calm_since_s for at in ready)
             and self._backend_servers.start_standby()
         ):
-            self._tell("standby-started", pid=self._backend_servers.standby_pid)
+            self._emit("standby-started", pid=self._backend_servers.standby_pid)
 
     def start(self, member: Member) -> None:
         """Bring *member* up in the background; its failure is an event and a loss."""
@@ -216,7 +216,7 @@ class Fleet:
                     f"{member.name} did not become healthy", hint=f"look at the log {member.name}.log"
                 )
 
-    # --- what others decide: rse_pf.local.control.scale_modifier.Servers --------------------------------
+    # --- the protocol rse_pf.local.control.scale_modifier.Servers ----------------------------------------
 
     def standing(self, now_s: float) -> ServerHealth:
         """Return the servers as the policy counts them."""
@@ -265,20 +265,20 @@ class Fleet:
         self.start(new)
         return new.name
 
-    # --- the end of one server -------------------------------------------------------------------
+    # --- drain -----------------------------------------------------------------------------------
 
     def begin_drain(self, member: Member, reason: str) -> None:
         """Send *member* no new robots."""
         member.leaving = True
         self._set_targets()
-        self._tell("drain-start", server=member.name, reason=reason)
+        self._emit("drain-start", server=member.name, reason=reason)
 
     async def finish_drain(self, member: Member, began_s: float) -> dict[str, Any]:
         """Wait until the balancer has dropped it, let it move its robots, and wait until it has left."""
         serving, session = self._settings.serving, self._settings.session
         notice_s = time_to_notice_s(self._settings.health, local=True)
         if await self._load_balancer.wait_gone(member.name, STOP_TIMEOUT_S):
-            self._tell("server-out", server=member.name)
+            self._emit("server-out", server=member.name)
         server = member.server
         reply = None
         if server is not None:
@@ -295,13 +295,13 @@ class Fleet:
         report = {
             "server": member.name, "seconds": round(time.monotonic() - began_s, 3), "clean": asked and clean,
         }  # fmt: skip
-        self._tell("drain-over", **report)
+        self._emit("drain-over", **report)
         return report
 
     def leaves_by_itself(self, member: Member) -> None:
-        """Note that *member* drains although nobody here asked: its robots are safe, its place is free.
+        """Note that *member* drains although this control plane did not ask: it is replaced.
 
-        An earlier control plane that asked an adopted one to leave wanted one server less.
+        An adopted server is not: the earlier control plane that asked it wanted one server less.
         """
         if not member.leaving:
             self.begin_drain(member, "the server was told to leave")
@@ -318,7 +318,7 @@ class Fleet:
     async def close(self) -> None:
         """End everything that still waits; no process is touched.
 
-        Cancels again until it is so: `asyncio.wait_for` before Python 3.12 loses a cancellation that comes
+        Cancels until none is left: `asyncio.wait_for` before Python 3.12 loses a cancellation that comes
         together with the result.
         """
         while self._tasks:
@@ -332,8 +332,8 @@ class Fleet:
         try:
             await self.bring_up(member, self._settings.local.start_timeout_s)
         except ConfigurationError as error:
-            self._tell("server-failed", server=member.name, reason=str(error))
-            if member.server is not None:  # announced, but never healthy in the balancer: its watcher goes on
+            self._emit("server-failed", server=member.name, reason=str(error))
+            if member.server is not None:  # announced, but never healthy: `_watch` handles its end
                 self._backend_servers.send(member.name, signal.SIGKILL)
             elif not member.out and not member.leaving:
                 self._lost(member)
@@ -345,27 +345,27 @@ class Fleet:
         return code
 
     def _now_healthy(self, member: Member, server: BackendServer) -> None:
-        """The balancer's checks are ours, by the same counting rule."""
+        """Note that the balancer found *member* healthy, by the same rule as `observe`."""
         member.healthy_s = time.monotonic()
         if member.health.state == "starting":
             member.health = dataclasses.replace(member.health, state="healthy")
         member.replaces_living = False
         member.healthy.set()
-        self._tell("server-healthy", server=member.name, pid=server.pid)
+        self._emit("server-healthy", server=member.name, pid=server.pid)
         self.on_healthy()
 
     async def _watch(self, member: Member, server: BackendServer) -> None:
-        """Notice the end of a server: nobody may be sent to it, or find it in the list."""
+        """Wait for the end of a server, and remove it from the targets and the members."""
         code = await self._backend_servers.wait_over(server.name)
         unasked = not member.leaving and not member.out
         self._forget(member)
         self._set_targets()
-        self._tell("server-gone", server=server.name, pid=server.pid, exit_code=code)
+        self._emit("server-gone", server=server.name, pid=server.pid, exit_code=code)
         if unasked:
             self._lost(member)
         timeout_s = STOP_TIMEOUT_S
         if not member.leaving and await self._load_balancer.wait_gone(server.name, timeout_s):
-            self._tell("server-out", server=server.name)
+            self._emit("server-out", server=server.name)
 
     def _forget(self, member: Member) -> None:
         self._backend_servers.forget(member.name)

@@ -1,9 +1,9 @@
-"""The monitor box on one machine: what every server does, as samples, and whole periods as samples.
+"""The monitor box on one machine: samples of all servers, and their means over whole periods.
 
-A `MonitorSample` comes about once a second; `Periods` adds samples up to the
+A `MonitorSample` is taken about once a second; `Periods` adds them up to the
 `rse_pf.scaling.policy.Sample`s that the policy judges, by the rule with which a report can be checked
 later: a sample speaks for the time since the one before it, and belongs to the period in which the middle
-of that time lies.  The functions here are pure: promises no clock, no socket, and that a server which does
+of that time lies.  The functions here are pure: they use no clock and no socket, and a server that does
 not answer has no numbers rather than zeros.
 """
 
@@ -23,8 +23,8 @@ __all__ = [
     "Periods",
     "ServerSample",
     "capacity_cores",
-    "sample_interval_s",
     "monitor_sample",
+    "sample_interval_s",
     "server_sample",
 ]
 

@@ -31,11 +31,11 @@ from rse_pf.local.control.audit_recorder import PlatformAudit
 from rse_pf.local.control.control_plane import ControlOptions, ControlPlane
 from rse_pf.local.control.fleet import Fleet
 from rse_pf.local.control.status_api import serve_status
-from rse_pf.local.firewall import check_front_door, ensure_key, front_door_url, key_file, key_set_file
+from rse_pf.local.firewall import check_listener, ensure_key, key_file, key_set_file, robots_url
 from rse_pf.local.processes import STOP_TIMEOUT_S, ProcessMark, is_alive, mark_of, send_signal
 from rse_pf.local.servers.backend_servers import RSE_PF, BackendServer, LocalBackendServers
 from rse_pf.local.servers.data_servers import LocalDataServers
-from rse_pf.local.servers.log_rotation import keep_short
+from rse_pf.local.servers.log_rotation import rotate_logs
 from rse_pf.local.state import (
     PlatformLock,
     PlatformState,
@@ -78,8 +78,8 @@ class LocalPlatform:
         Args:
             settings: For the load balancer and for every server.
             state: Folder of keys, logs and ``platform.json``; created with mode 0700.
-            servers: How many servers start; None means ``local.servers``.  The scale modifier takes this number
-                for its bound if it is below ``scaling.min_servers`` or above ``scaling.max_servers``.
+            servers: How many servers start; None means ``local.servers``.  A number outside
+                ``scaling.min_servers`` and ``scaling.max_servers`` is a bound of the scale modifier, too.
             port: Port that robots connect to, 0 takes a free one; None means ``local.port``.
             name: Name of this platform for people; None means the name of the folder.
             data: Whether robots get the data service under ``/data/``; None means ``data.enabled``.
@@ -126,15 +126,15 @@ class LocalPlatform:
             dies_with_parent=not adoptable,
             replaces=control.elastic,
             program=program,
-            tell=self._data_changed,
+            emit=self._data_changed,
         )
         self._fleet = Fleet(
             self.backend_servers, self.load_balancer, settings,
-            compress=control.compress, tell=self._tell, changed=self._write_state,
+            compress=control.compress, emit=self._emit, changed=self._write_state,
         )  # fmt: skip
         self._control = ControlPlane(
             self._fleet, self.load_balancer, settings, _bounds(settings.scaling, self._count), control,
-            tell=self._tell, changed=self._write_state,
+            emit=self._emit, changed=self._write_state,
         )  # fmt: skip
 
     @property
@@ -168,7 +168,7 @@ class LocalPlatform:
         try:
             left = self._leftovers()
             if left is None:
-                check_front_door(self.settings.serving.host, self._wanted_port)
+                check_listener(self.settings.serving.host, self._wanted_port)
             self._audit.open()
         except ConfigurationError:
             self._lock.release()
@@ -178,7 +178,7 @@ class LocalPlatform:
         except BaseException:
             await self._end()
             raise
-        self._tell("platform-ready", url=self.url, seconds=round(time.monotonic() - began, 3))
+        self._emit("platform-ready", url=self.url, seconds=round(time.monotonic() - began, 3))
         return self
 
     async def __aexit__(
@@ -201,8 +201,8 @@ class LocalPlatform:
 
     async def status(self) -> list[dict[str, Any]]:
         """Return the /status page of each server; one that does not answer is left out."""
-        told = await asyncio.gather(*(self.backend_servers.status(server) for server in self.servers))
-        return [status for status in told if status is not None]
+        pages = await asyncio.gather(*(self.backend_servers.status(server) for server in self.servers))
+        return [page for page in pages if page is not None]
 
     def status_document(self) -> dict[str, Any]:
         """Return everything the control plane knows, as plain JSON values."""
@@ -243,7 +243,7 @@ class LocalPlatform:
             ConfigurationError: One of them did not become healthy.
         """
         names = list(self._fleet.grow(n, reason))
-        self._tell("grow", servers=n, names=names, reason=reason)
+        self._emit("grow", servers=n, names=names, reason=reason)
         await self._until_healthy(names)
         return names
 
@@ -273,7 +273,7 @@ class LocalPlatform:
         """
         self._fleet.member(name)
         new = self._fleet.put_in_place_of(name, reason)
-        self._tell("replace", servers=1, server=name, by=new, reason=reason)
+        self._emit("replace", servers=1, server=name, by=new, reason=reason)
         await self._until_healthy([new])
         return new
 
@@ -301,22 +301,22 @@ class LocalPlatform:
         """End *name* with SIGKILL, as a crash would; raises UsageError for a name that is none."""
         self._fleet.member(name)
         self.backend_servers.send(name, signal.SIGKILL)
-        self._tell("server-killed", server=name)
+        self._emit("server-killed", server=name)
 
     def pause(self, name: str) -> None:
         """Stop all processes of *name* with SIGSTOP, as a hang would; raises UsageError."""
         self._signal_all(name, signal.SIGSTOP)
-        self._tell("server-paused", server=name)
+        self._emit("server-paused", server=name)
 
     def resume(self, name: str) -> None:
         """Let a paused server go on; raises UsageError."""
         self._signal_all(name, signal.SIGCONT)
-        self._tell("server-resumed", server=name)
+        self._emit("server-resumed", server=name)
 
     def kill_balancer(self) -> None:
         """End the balancer with SIGKILL, which cuts every socket; an elastic platform brings it back."""
         mark = self.load_balancer.mark
-        self._tell("balancer-killed", pid=None if mark is None else mark.pid)
+        self._emit("balancer-killed", pid=None if mark is None else mark.pid)
         if mark is not None:
             send_signal(mark, signal.SIGKILL)
 
@@ -363,13 +363,13 @@ class LocalPlatform:
             await self._begin(end)
         else:
             await _all(
-                adopt(left, self._fleet, self.backend_servers, self.load_balancer, self._tell, end),
+                adopt(left, self._fleet, self.backend_servers, self.load_balancer, self._emit, end),
                 adopt_data(left, self.data_servers, self.load_balancer, wanted=self._has_data),
             )
-        self.url = front_door_url(self.settings, self.port)
+        self.url = robots_url(self.settings, self.port)
         self._status = await serve_status(self.status_document, token)
         self._fleet.keep(self._audit.watch())
-        self._fleet.keep(keep_short(self.state, _LOG_FILE_BYTES))
+        self._fleet.keep(rotate_logs(self.state, _LOG_FILE_BYTES))
         self._control.start()
         self._write_state()
 
@@ -404,7 +404,7 @@ class LocalPlatform:
         ).write(self.state)
 
     def _data_changed(self, event: str, **details: Any) -> None:
-        self._tell(event, **details)
+        self._emit(event, **details)
         if event == "data-server-up":
             self.load_balancer.set_data_targets([self.data_servers.target])
         self._write_state()
@@ -440,14 +440,14 @@ class LocalPlatform:
                     control_token_file(self.state).unlink(missing_ok=True)
             self._audit.close()
             self._lock.release()
-        self._tell("platform-gone")
+        self._emit("platform-gone")
 
-    def _tell(self, event: str, **details: Any) -> None:
-        told = {"event": event, **details}
-        self.events.append(told)
-        self._audit.take(told)
+    def _emit(self, event: str, **details: Any) -> None:
+        entry = {"event": event, **details}
+        self.events.append(entry)
+        self._audit.record(entry)
         if self._on_event is not None:
-            self._on_event(told)
+            self._on_event(entry)
 
 
 def _bounds(scaling: ScalingSettings, count: int) -> ScalingSettings:
@@ -475,7 +475,7 @@ def _local_placement(settings: PlatformSettings, state: Path) -> ServerPlacement
 
 
 async def _all(*works: Any) -> None:
-    """Wait for all, or for the first failure, after which none of them goes on."""
+    """Wait for all of *works*; after the first failure, cancel the others."""
     tasks = [asyncio.ensure_future(work) for work in works]
     try:
         await asyncio.gather(*tasks)

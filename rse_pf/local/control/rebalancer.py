@@ -1,8 +1,7 @@
-"""When crowded servers are asked to hand robots over: after servers came or everybody came back, for a while.
+"""When robots of crowded servers are asked to move: for half a minute after servers or robots came back.
 
-How many is said by `rse_pf.scaling.rebalance.moves`; here is only the patience: nobody is asked while the
-numbers still change, and an order is not repeated before its robots had time to move and be counted where
-they went.  Promises no clock: time is an argument.
+`rse_pf.scaling.rebalance.moves` says how many.  None is asked while the numbers still change, and a request
+is not repeated before its robots had time to move and to be counted on their new server.
 """
 
 from __future__ import annotations
@@ -14,7 +13,7 @@ from dataclasses import dataclass
 from rse_pf.config import ScalingSettings
 from rse_pf.scaling.rebalance import moves
 
-__all__ = ["Order", "Rebalancer"]
+__all__ = ["MoveRequest", "Rebalancer"]
 
 _WATCH_S = 30.0
 _SETTLE_S = 1.5
@@ -23,7 +22,7 @@ _STEADY_SHARE = 0.1
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Order:
+class MoveRequest:
     """Ask *server* to let *robots* of its robots move, spread over *spread_s*."""
 
     server: str
@@ -41,17 +40,17 @@ class Rebalancer:
         self._before: Mapping[str, int] = {}
 
     def watch(self, now_s: float) -> None:
-        """Look at the spread from now on, for half a minute."""
+        """Watch the spread from now on, for half a minute."""
         self._until_s = now_s + _WATCH_S
 
-    def orders(self, robots: Mapping[str, int], now_s: float) -> tuple[Order, ...]:
-        """Return whom to ask now; *robots* are those of each healthy server, by name."""
+    def requests(self, robots: Mapping[str, int], now_s: float) -> tuple[MoveRequest, ...]:
+        """Return the requests to make now; *robots* has the robots of each healthy server, by name."""
         before, self._before = self._before, dict(robots)
         if not self._quiet_until_s <= now_s <= self._until_s or not _steady(before, robots):
             return ()
         rate = self._settings.moves_per_s
         found = tuple(
-            Order(server=name, robots=count, spread_s=round(count / rate, 3))
+            MoveRequest(server=name, robots=count, spread_s=round(count / rate, 3))
             for name, count in moves(robots).items()
             if count > 0
         )

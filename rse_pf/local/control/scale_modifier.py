@@ -1,9 +1,9 @@
-"""The scale modifier box on one machine: turn what the policy decides into what is done to servers.
+"""The scale modifier box on one machine: carry out what the policy decides.
 
-Three rules stand between the policy and the processes: a server that died is replaced at once, servers
-that die young are not started for ever (a crash loop), and servers that live but fail their checks are never
-replaced all at once, because then the fault is rather the monitor's or the machine's.  Promises no clock and
-no process of its own: time is an argument, and the effects belong to whoever is `Servers`.
+The policy names the servers to replace; three rules here say when.  A server that died is replaced at once.
+Replacements of servers that died soon after their start are limited in number per minute (a crash loop).
+Servers that run but fail their checks are never replaced all at once: then the fault is more likely in the
+monitor or the machine.  Time is an argument, and the effects are those of `Servers`.
 """
 
 from __future__ import annotations
@@ -26,7 +26,8 @@ class ServerHealth:
     """The servers as they stand.
 
     ``servers`` counts all that are or should be there: those that start, serve, failed or died, but not
-    those that leave.  ``broken`` live and failed their checks; ``dead`` ended unasked, and whether young.
+    those that drain.  ``broken`` run but failed their checks; ``dead`` ended unasked, each with whether that
+    was soon after its start.
     ``replacing`` are replacements of broken ones that do not serve yet.
     """
 
@@ -84,16 +85,16 @@ class LocalScaleModifier:
         *,
         max_restarts_per_minute: int,
         compress: float = 1.0,
-        tell: Callable[..., None],
+        emit: Callable[..., None],
     ) -> None:
         self._servers = servers
         self._settings = settings
         self._restarts_per_minute = max_restarts_per_minute
         self._compress = compress
-        self._tell = tell
+        self._emit = emit
         self._acted_s = -math.inf
         self._starts: list[float] = []
-        self._looping = False
+        self._in_crash_loop = False
         self._last: Action | None = None
 
     def act(
@@ -106,10 +107,10 @@ class LocalScaleModifier:
             now_s: The clock of the samples.
             period_over: Whether the newest period is complete; between periods nothing is grown or shrunk,
                 unless servers are missing.
-            hold: Only replace: somebody else changes the number of servers just now.
+            hold: Only replace: an operator is changing the number of servers.
         """
         self._starts = [start for start in self._starts if now_s - start < _MINUTE_S]
-        self._looping = self._looping and bool(self._starts)
+        self._in_crash_loop = self._in_crash_loop and bool(self._starts)
         standing = self._servers.standing(now_s)
         fleet = FleetState(
             servers=standing.servers,
@@ -143,26 +144,26 @@ class LocalScaleModifier:
             "min_servers": scaling.min_servers,
             "max_servers": scaling.max_servers,
             "compress": self._compress,
-            "crash_loop": self._looping,
+            "crash_loop": self._in_crash_loop,
             "last_action": last,
         }
 
     def _scale(self, action: Action) -> None:
         if action.kind == "grow":
             names = self._servers.grow(action.servers, action.reason)
-            self._tell("grow", servers=len(names), names=list(names), reason=action.reason)
+            self._emit("grow", servers=len(names), names=list(names), reason=action.reason)
             self._last = action
         elif action.kind == "shrink":
             name = self._servers.shrink(action.reason)
             if name is not None:
-                self._tell("shrink", servers=1, names=[name], reason=action.reason)
+                self._emit("shrink", servers=1, names=[name], reason=action.reason)
                 self._last = action
 
     def _replace(self, standing: ServerHealth, now_s: float) -> None:
         for name, young in standing.dead.items():
             at_s = may_start_s(self._starts, now_s=now_s, per_minute=self._restarts_per_minute)
             if young and at_s > now_s:
-                self._tell_loop(name, at_s - now_s)
+                self._report_crash_loop(name, at_s - now_s)
             else:
                 self._put(name, "it ended", now_s)
         for name in replace_now(standing.broken, healthy=standing.healthy, replacing=standing.replacing):
@@ -171,11 +172,11 @@ class LocalScaleModifier:
     def _put(self, name: str, reason: str, now_s: float) -> None:
         self._starts.append(now_s)
         new = self._servers.put_in_place_of(name, reason)
-        self._tell("replace", servers=1, server=name, by=new, names=[name], reason=reason)
+        self._emit("replace", servers=1, server=name, by=new, names=[name], reason=reason)
         self._last = Action(kind="replace", servers=1, names=(name,), reason=reason)
 
-    def _tell_loop(self, name: str, wait_s: float) -> None:
-        """Say it once, however often the wait is looked at."""
-        if not self._looping:
-            self._tell("crash-loop", server=name, wait_s=round(wait_s, 3), reason="servers die young")
-        self._looping = True
+    def _report_crash_loop(self, name: str, wait_s: float) -> None:
+        """Emit one event for each crash loop."""
+        if not self._in_crash_loop:
+            self._emit("crash-loop", server=name, wait_s=round(wait_s, 3), reason="servers end too soon")
+        self._in_crash_loop = True

@@ -1,8 +1,8 @@
-"""Break a running platform on purpose: kill, stop, slow down or cut off one of its processes.
+"""Inject faults into a running platform: kill, stop, slow down or cut off one of its processes.
 
-Works from the state file alone, so also while the control plane is dead.  Promises to signal only processes
-that the file names by pid and time of birth and what these started, and that a server which is slowed or cut
-off is whole again when the block ends, also if we are killed inside `cut_off`.
+Needs only the state file, so it works while the control plane is dead.  Only processes whose id and start
+time are in that file, and their children, are signalled.  A server that was slowed or cut off is whole again
+when the call ends, also if this process is killed inside `cut_off`.
 """
 
 from __future__ import annotations

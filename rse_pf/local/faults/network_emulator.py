@@ -1,7 +1,7 @@
 """A network link in user space: delay, jitter, a rate and cuts between robots and a server, without root.
 
 `EmulatedLink` relays TCP on loopback; `LinkProcess` does so in a process of its own, so that a busy robot
-does not stretch the link.  Promises to keep the order of bytes, to lose none, and that a cut is silent:
+does not stretch the link.  Bytes keep their order and none is lost.  A cut is silent:
 sockets stay open, and what was sent meanwhile arrives after it heals, when TCP would have sent it again.
 """
 
@@ -168,7 +168,7 @@ class EmulatedLink:
         await asyncio.sleep(0)
 
     def cut(self, cause: str = "asked") -> None:
-        """Let nothing through, either way, and say so to nobody."""
+        """Drop everything in both directions, without closing a connection."""
         self._cutting.add(cause)
         self.cuts += not self.is_cut
         self.is_cut = True
@@ -335,7 +335,7 @@ class _Way:
 
 
 class _End(asyncio.Protocol):
-    """One socket: what it says goes *out*."""
+    """One socket: what it sends goes to *out*."""
 
     out: _Way
     back: _Way

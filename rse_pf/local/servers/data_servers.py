@@ -50,7 +50,7 @@ class DataServerProcess:
 
 
 class LocalDataServers:
-    """The data service of one platform: one process with a name, and its successors."""
+    """The data service of one platform: one process with a name, and its replacements."""
 
     def __init__(
         self,
@@ -64,7 +64,7 @@ class LocalDataServers:
         dies_with_parent: bool = True,
         replaces: bool = True,
         program: Sequence[str] = _RSE_PF,
-        tell: Callable[..., None] = lambda event, **details: None,
+        emit: Callable[..., None] = lambda event, **details: None,
     ) -> None:
         """Remember what to start.
 
@@ -76,9 +76,9 @@ class LocalDataServers:
             store: Overrides ``data.store``; a platform whose store is ``memory:`` names a folder here.
             name: Of the process, in log and events.
             dies_with_parent: Whether the process ends when this one does.
-            replaces: Whether one that ends or hangs gets a successor; else its end is told, and that is all.
+            replaces: Whether one that ends or hangs is replaced; else only the event is emitted.
             program: What to run; ``data`` and its options follow.
-            tell: Gets ``data-server-start`` with name and pid, ``data-server-up`` with port, too,
+            emit: Gets ``data-server-start`` with name and pid, ``data-server-up`` with port, too,
                 ``data-server-down`` with name and code, ``data-server-silent`` and ``data-server-failed``.
         """
         self._settings = settings
@@ -86,7 +86,7 @@ class LocalDataServers:
         self._name = name
         self._dies_with_parent = dies_with_parent
         self._replaces = replaces
-        self._tell = tell
+        self._emit = emit
         self._port = 0
         self._process: subprocess.Popen[bytes] | None = None
         self._mark: ProcessMark | None = None
@@ -99,7 +99,7 @@ class LocalDataServers:
 
     @property
     def name(self) -> str:
-        """What people call it."""
+        """Name of the process in log and events."""
         return self._name
 
     @property
@@ -109,7 +109,7 @@ class LocalDataServers:
 
     @property
     def port(self) -> int:
-        """Where it listens, and its successors will; 0 before the first start."""
+        """The port of the process and of its replacements; 0 before the first start."""
         return self._port
 
     @property
@@ -119,7 +119,7 @@ class LocalDataServers:
 
     @property
     def state(self) -> ServerState | None:
-        """What the state file says of it; None if there is none."""
+        """The entry of the state file; None if there is no process."""
         mark = self._mark
         return None if mark is None else ServerState(name=self._name, process=mark, port=self._port)
 
@@ -145,7 +145,7 @@ class LocalDataServers:
         except ConfigurationError:
             if not port:
                 raise
-            self._port = 0  # somebody took it meanwhile
+            self._port = 0  # another program has it now
             server = await self._launch()
         self._watching = asyncio.create_task(self._watch())
         return server
@@ -164,7 +164,7 @@ class LocalDataServers:
         return self._mark is not None and send_signal(self._mark, number)
 
     async def forget(self) -> None:
-        """Stop watching and leave the process to whoever adopts it."""
+        """Stop watching, and leave the process running."""
         if self._watching is not None:
             self._watching.cancel()
             await asyncio.gather(self._watching, return_exceptions=True)
@@ -191,30 +191,30 @@ class LocalDataServers:
         pause_s = _FIRST_PAUSE_S
         while True:
             if self._mark is not None:
-                await self._until_over(self._mark)
+                await self._wait_ended(self._mark)
             code = None if self._process is None else self._process.wait()
-            self._tell("data-server-down", name=self._name, code=code)
+            self._emit("data-server-down", name=self._name, code=code)
             if not self._replaces:
                 return
             try:
                 await self._launch()
                 pause_s = _FIRST_PAUSE_S
             except ConfigurationError as error:
-                self._tell("data-server-failed", name=self._name, error=str(error))
+                self._emit("data-server-failed", name=self._name, error=str(error))
                 await asyncio.sleep(pause_s)
                 pause_s = min(2 * pause_s, _MAX_PAUSE_S)
-                self._port = 0  # whatever holds the old one may hold it for ever
+                self._port = 0  # another program may hold the old port
 
-    async def _until_over(self, mark: ProcessMark) -> None:
-        """Wait until the process has ended; end it when it leaves too many questions unanswered."""
+    async def _wait_ended(self, mark: ProcessMark) -> None:
+        """Wait until the process has ended; kill it when it fails too many health checks."""
         over = asyncio.ensure_future(ended(mark))
-        silent = 0
+        failed = 0
         try:
             while not over.done():
                 await asyncio.wait({over}, timeout=_ASK_S)
-                silent = 0 if await self._answers(_ALIVE) else silent + 1
-                if silent > self._settings.health.unhealthy_checks and self._replaces and not over.done():
-                    self._tell("data-server-silent", name=self._name, pid=mark.pid)
+                failed = 0 if await self._answers(_ALIVE) else failed + 1
+                if failed > self._settings.health.unhealthy_checks and self._replaces and not over.done():
+                    self._emit("data-server-silent", name=self._name, pid=mark.pid)
                     send_signal(mark, signal.SIGKILL)
         finally:
             over.cancel()
@@ -231,7 +231,7 @@ class LocalDataServers:
         )  # fmt: skip
         run_as_batch(process.pid, NICENESS)
         self._process, self._mark = process, mark_of(process.pid)
-        self._tell("data-server-start", name=self._name, pid=process.pid)
+        self._emit("data-server-start", name=self._name, pid=process.pid)
         try:
             server = await self._announced(process)
         except (ConfigurationError, asyncio.CancelledError):
@@ -239,7 +239,7 @@ class LocalDataServers:
             process.wait()
             raise
         self._port = server.port
-        self._tell("data-server-up", name=self._name, pid=server.pid, port=server.port)
+        self._emit("data-server-up", name=self._name, pid=server.pid, port=server.port)
         return server
 
     async def _announced(self, process: subprocess.Popen[bytes]) -> DataServerProcess:

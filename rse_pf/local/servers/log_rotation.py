@@ -1,7 +1,7 @@
-"""Keep the logs of a local platform from filling the disk: what has grown too long begins anew.
+"""Rotate the logs of a local platform, so that they do not fill the disk.
 
-Promises that the newest lines stay, in the file or in its one predecessor ``NAME.log.1``, and that a process
-which writes to the log notices nothing.
+The newest lines stay, in the log or in its one predecessor ``NAME.log.1``.  The process that writes to the
+log is not disturbed.
 
 Source:
     copytruncate of logrotate(8): the writer, which only appends, keeps its descriptor.
@@ -15,26 +15,26 @@ import os
 import shutil
 from pathlib import Path
 
-__all__ = ["keep_short", "turn_over"]
+__all__ = ["rotate_logs", "rotate_long_logs"]
 
-_LOOK_EVERY_S = 5.0
+_EVERY_S = 5.0
 
 
-async def keep_short(folder: Path, max_bytes: int) -> None:
-    """Look at the logs of *folder* again and again, until cancelled."""
+async def rotate_logs(folder: Path, max_bytes: int) -> None:
+    """Rotate the logs of *folder* periodically, until cancelled."""
     while True:
-        await asyncio.to_thread(turn_over, folder, max_bytes)
-        await asyncio.sleep(_LOOK_EVERY_S)
+        await asyncio.to_thread(rotate_long_logs, folder, max_bytes)
+        await asyncio.sleep(_EVERY_S)
 
 
-def turn_over(folder: Path, max_bytes: int) -> list[Path]:
-    """Let every ``*.log`` of *folder* that is longer than *max_bytes* begin anew; return those logs.
+def rotate_long_logs(folder: Path, max_bytes: int) -> list[Path]:
+    """Rotate every ``*.log`` of *folder* that is longer than *max_bytes*; return those logs.
 
     A line that is written between the copy and the cut is lost.
     """
     longer: list[Path] = []
     for log in sorted(folder.glob("*.log")):
-        with contextlib.suppress(OSError):  # it went away, or there is no room for a copy: the next look
+        with contextlib.suppress(OSError):  # it is gone, or the disk is full: try again next time
             if log.stat().st_size > max_bytes:
                 copy = log.with_name(f"{log.name}.1")
                 shutil.copyfile(log, copy)

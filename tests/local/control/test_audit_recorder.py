@@ -36,12 +36,12 @@ def test_the_heads_of_the_other_logs_are_recorded_again_and_again_when_they_grew
     assert actions(tmp_path) == ["log.heads", "log.heads", "platform.over"]
 
 
-def test_what_is_told_before_it_opens_is_not_recorded(tmp_path: Path) -> None:
+def test_an_event_before_the_log_is_open_is_not_recorded(tmp_path: Path) -> None:
     audit = PlatformAudit(tmp_path)
 
-    audit.take({"event": "server-ready", "server": "server-1"})
+    audit.record({"event": "server-ready", "server": "server-1"})
     audit.open()
-    audit.take({"event": "server-ready", "server": "server-1", "ports": [1, 2]})
+    audit.record({"event": "server-ready", "server": "server-1", "ports": [1, 2]})
     audit.close()
 
     assert actions(tmp_path) == ["platform.server-ready", "platform.over"]

@@ -93,7 +93,7 @@ class World:
             self.balancer,  # type: ignore[arg-type]
             SETTINGS,
             compress=1.0,
-            tell=lambda event, **details: self.events.append({"event": event, **details}),
+            emit=lambda event, **details: self.events.append({"event": event, **details}),
             changed=lambda: None,
         )
 

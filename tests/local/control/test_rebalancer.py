@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from rse_pf.config import ScalingSettings
-from rse_pf.local.control.rebalancer import Order, Rebalancer
+from rse_pf.local.control.rebalancer import MoveRequest, Rebalancer
 
 SCALING = ScalingSettings(moves_per_s=20.0)
 UNEVEN = {"server-1": 50, "server-2": 50, "server-3": 0}
@@ -12,7 +12,7 @@ UNEVEN = {"server-1": 50, "server-2": 50, "server-3": 0}
 def watching(robots: dict[str, int], since_s: float = 100.0) -> Rebalancer:
     """Return one that watches since *since_s*, and has seen *robots* just before."""
     rebalancer = Rebalancer(SCALING)
-    rebalancer.orders(robots, since_s - 1.0)
+    rebalancer.requests(robots, since_s - 1.0)
     rebalancer.watch(since_s)
     return rebalancer
 
@@ -20,21 +20,21 @@ def watching(robots: dict[str, int], since_s: float = 100.0) -> Rebalancer:
 def test_nobody_is_asked_before_something_happened() -> None:
     rebalancer = Rebalancer(SCALING)
 
-    assert [rebalancer.orders(UNEVEN, time_s) for time_s in (100.0, 101.0, 102.0)] == [()] * 3
+    assert [rebalancer.requests(UNEVEN, time_s) for time_s in (100.0, 101.0, 102.0)] == [()] * 3
 
 
 def test_nobody_is_asked_while_the_numbers_still_change() -> None:
     rebalancer = watching({"server-1": 80, "server-2": 20, "server-3": 0})
 
-    assert rebalancer.orders(UNEVEN, 100.0) == (), "robots are still on their way"
-    assert rebalancer.orders({**UNEVEN, "server-4": 0}, 101.0) == (), "a server has just come"
-    assert rebalancer.orders({**UNEVEN, "server-4": 2}, 102.0) != ()
+    assert rebalancer.requests(UNEVEN, 100.0) == (), "robots are still on their way"
+    assert rebalancer.requests({**UNEVEN, "server-4": 0}, 101.0) == (), "a server has just come"
+    assert rebalancer.requests({**UNEVEN, "server-4": 2}, 102.0) != ()
 
 
 def test_crowded_servers_are_asked_at_the_rate_that_is_allowed() -> None:
     rebalancer = watching(UNEVEN)
 
-    orders = rebalancer.orders(UNEVEN, 100.5)
+    orders = rebalancer.requests(UNEVEN, 100.5)
 
     assert {order.server for order in orders} == {"server-1", "server-2"}
     assert all(order.robots > 0 and order.spread_s == order.robots / 20.0 for order in orders)
@@ -42,17 +42,17 @@ def test_crowded_servers_are_asked_at_the_rate_that_is_allowed() -> None:
 
 def test_an_order_is_not_repeated_before_its_robots_had_time_to_move_and_then_it_is() -> None:
     rebalancer = watching(UNEVEN)
-    longest_s = max(order.spread_s for order in rebalancer.orders(UNEVEN, 100.0))
+    longest_s = max(order.spread_s for order in rebalancer.requests(UNEVEN, 100.0))
 
-    assert rebalancer.orders(UNEVEN, 100.0 + longest_s) == ()
-    assert rebalancer.orders(UNEVEN, 100.0 + longest_s + 2.0) != ()
+    assert rebalancer.requests(UNEVEN, 100.0 + longest_s) == ()
+    assert rebalancer.requests(UNEVEN, 100.0 + longest_s + 2.0) != ()
 
 
 def test_even_servers_and_an_old_event_ask_nobody() -> None:
     even = {"server-1": 5, "server-2": 5}
-    assert watching(even).orders(even, 101.0) == ()
+    assert watching(even).requests(even, 101.0) == ()
 
     rebalancer = watching(UNEVEN)
-    assert rebalancer.orders(UNEVEN, 131.0) == ()
+    assert rebalancer.requests(UNEVEN, 131.0) == ()
     rebalancer.watch(131.0)
-    assert isinstance(rebalancer.orders(UNEVEN, 131.0)[0], Order)
+    assert isinstance(rebalancer.requests(UNEVEN, 131.0)[0], MoveRequest)

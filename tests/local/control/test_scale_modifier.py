@@ -48,10 +48,10 @@ class FakeServers:
 def made(standing: ServerHealth) -> tuple[LocalScaleModifier, FakeServers, list[Mapping[str, Any]]]:
     servers, told = FakeServers(standing), []
 
-    def tell(event: str, **details: Any) -> None:
+    def emit(event: str, **details: Any) -> None:
         told.append({"event": event, **details})
 
-    return LocalScaleModifier(servers, SCALING, max_restarts_per_minute=5, tell=tell), servers, told
+    return LocalScaleModifier(servers, SCALING, max_restarts_per_minute=5, emit=emit), servers, told
 
 
 def samples(count: int, cpu_percent: float, requests: int = 1) -> list[Sample]:

@@ -44,7 +44,7 @@ class Box:
             PlatformSettings().replace(local={"start_timeout_s": 15.0}, health=health),
             folder=folder, settings_file=folder / "s", keys_file=folder / "k", store="dir:objects",
             replaces=replaces, program=(sys.executable, "-W", "ignore", "-c", program),
-            tell=lambda event, **_: self.told.put_nowait(event),
+            emit=lambda event, **_: self.told.put_nowait(event),
         )  # fmt: skip
 
     async def next(self) -> str:

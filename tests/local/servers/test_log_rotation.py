@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from rse_pf.local.processes import spawn
-from rse_pf.local.servers.log_rotation import turn_over
+from rse_pf.local.servers.log_rotation import rotate_long_logs
 
 
 def test_a_long_log_begins_anew_and_its_lines_stay_in_its_predecessor(tmp_path: Path) -> None:
@@ -18,19 +18,19 @@ def test_a_long_log_begins_anew_and_its_lines_stay_in_its_predecessor(tmp_path: 
     short.write_text("few\n")
     other.write_text("x" * 1000)
 
-    assert turn_over(tmp_path, 100) == [long]
+    assert rotate_long_logs(tmp_path, 100) == [long]
 
     assert long.read_text() == ""
     assert (tmp_path / "server-1.log.1").read_text() == "old\n" * 100
     assert (short.read_text(), len(other.read_text())) == ("few\n", 1000)
-    assert turn_over(tmp_path, 100) == []
+    assert rotate_long_logs(tmp_path, 100) == []
 
 
 def test_a_predecessor_is_replaced_so_that_two_files_are_all(tmp_path: Path) -> None:
     log = tmp_path / "server-1.log"
     for word in ("first", "second", "third"):
         log.write_text(word * 50)
-        turn_over(tmp_path, 100)
+        rotate_long_logs(tmp_path, 100)
 
     assert sorted(path.name for path in tmp_path.iterdir()) == ["server-1.log", "server-1.log.1"]
     assert (tmp_path / "server-1.log.1").read_text() == "third" * 50
@@ -51,7 +51,7 @@ def test_a_process_goes_on_writing_at_the_new_beginning(tmp_path: Path) -> None:
     )
     while not (tmp_path / "wrote").exists():
         assert process.poll() is None
-    turn_over(tmp_path, 100)
+    rotate_long_logs(tmp_path, 100)
     go.touch()
     assert process.wait(10) == 0
 
@@ -63,6 +63,6 @@ def test_a_predecessor_is_as_private_as_the_log(tmp_path: Path, mode: int) -> No
     log = tmp_path / "server-1.log"
     log.write_text("x" * 200)
     log.chmod(mode)
-    turn_over(tmp_path, 100)
+    rotate_long_logs(tmp_path, 100)
 
     assert (tmp_path / "server-1.log.1").stat().st_mode & 0o777 == mode
