@@ -68,9 +68,9 @@ docs: ## write the generated pages anew
 	@$(BIN)/python scripts/asyncapi.py
 	@$(BIN)/python scripts/architecture.py
 
-fuzz: ## strangers' bytes for FUZZ_S seconds a target (600), guided by coverage where atheris runs
+fuzz: ## fuzz each target for FUZZ_S seconds (600), with atheris where it is installed, else Hypothesis
 	@$(SETUP) dev
-	@engine=mutations; $(BIN)/python -c 'import atheris' 2>/dev/null && engine=atheris; \
+	@engine=hypothesis; $(BIN)/python -c 'import atheris' 2>/dev/null && engine=atheris; \
 	for each in codec frames stream geometry; do echo "== $$each ($$engine)"; \
 	  $(BIN)/python -m fuzz $$each --engine $$engine --seconds $${FUZZ_S:-600} || exit 1; done
 

@@ -1,1 +1,1 @@
-"""Fuzzing of everything that a stranger's bytes reach; see docs/security.md. Not part of the package."""
+"""Fuzzing of everything that reads bytes from outside; see docs/security.md. Not part of the package."""

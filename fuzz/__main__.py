@@ -1,7 +1,7 @@
 """Fuzz one target: ``python -m fuzz codec --seconds 60``.
 
-With atheris (coverage finds the way) where it is asked for, else with seeded mutations.  Ends with an exit
-code other than 0 and the input in a file when something is found.  Promises to write nowhere else.
+The engine is atheris (guided by coverage) or Hypothesis.  A failure ends with an exit code other than 0 and
+the input in a file.
 """
 
 from __future__ import annotations
@@ -17,55 +17,60 @@ from pathlib import Path
 
 from fuzz.meter import MAX_MIB, MAX_MS, Meter
 
+_INPUTS_PER_SEED = 500
+
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run one target and print what it cost."""
+    """Run one target and print the cost of its inputs."""
     parser = argparse.ArgumentParser(prog="python -m fuzz", description=__doc__)
     parser.add_argument("target", choices=["codec", "frames", "stream", "geometry"])
     parser.add_argument("--seconds", type=float, default=60.0)
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--engine", choices=["mutations", "atheris"], default="mutations")
-    parser.add_argument("--found", type=Path, default=Path("out/fuzz"), help="where findings are written")
-    parser.add_argument("--replay", type=Path, help="try this one input, and say what it cost")
+    parser.add_argument("--engine", choices=["hypothesis", "atheris"], default="hypothesis")
+    parser.add_argument("--found", type=Path, default=Path("out/fuzz"), help="folder of inputs that failed")
+    parser.add_argument("--replay", type=Path, help="run this one input and print its cost")
     options = parser.parse_args(arguments)
     if options.replay:
-        return _replayed(options)
+        return _replay(options)
     if options.engine == "atheris":
         _with_atheris(options)
-    return _with_mutations(options)
+    return _with_hypothesis(options)
 
 
-def _with_mutations(options: argparse.Namespace) -> int:
-    from fuzz.mutations import mutations
-    from fuzz.samples import LONGEST, samples
+def _with_hypothesis(options: argparse.Namespace) -> int:
+    from fuzz.damage import run_damaged
     from fuzz.targets import TARGETS
 
     meter, run = Meter(), TARGETS[options.target]
-    inputs = 0
-    end = time.monotonic() + options.seconds
-    for data in mutations(samples(options.target), seed=options.seed, longest=LONGEST):
-        if time.monotonic() > end:
-            break
-        inputs += 1
+    inputs, last = 0, b""
+
+    def one_input(data: bytes) -> None:
+        nonlocal inputs, last
+        inputs, last = inputs + 1, data
+        run(data, meter)
+
+    end, seed = time.monotonic() + options.seconds, options.seed
+    while time.monotonic() < end:
         try:
-            run(data, meter)
-        except Exception:  # noqa: BLE001  whatever escapes is what we look for
-            print(f"{options.target}: {_kept(options.found, data)} after {inputs} inputs")
+            run_damaged(options.target, one_input, first=seed, inputs=_INPUTS_PER_SEED)
+        except Exception:  # noqa: BLE001  any error is a failure of the target
+            print(f"{options.target}: {_kept(options.found, last)} failed after {inputs} inputs")
             traceback.print_exc()
             return 1
+        seed += 1
     load = os.getloadavg()[0]
-    print(f"{options.target}: {inputs} inputs in {options.seconds:g} s, load {load:.1f}, nothing found")
+    print(f"{options.target}: {inputs} inputs in {options.seconds:g} s, load {load:.1f}, no failures")
     print(f"  {meter.line()}")
-    bars = {"slowest_ms": (meter.worst_ms, MAX_MS), "max_mib": (meter.worst_mib, MAX_MIB)}
-    missed = {name: round(worst, 2) for name, (worst, most) in bars.items() if worst > most}
-    if options.target == "codec" and missed:
-        print(f"  above the bars of {MAX_MS:g} ms and {MAX_MIB:g} MiB: {json.dumps(missed)}")
+    limits = {"slowest_ms": (meter.worst_ms, MAX_MS), "max_mib": (meter.worst_mib, MAX_MIB)}
+    exceeded = {name: round(worst, 2) for name, (worst, limit) in limits.items() if worst > limit}
+    if options.target == "codec" and exceeded:
+        print(f"  above the limits of {MAX_MS:g} ms and {MAX_MIB:g} MiB: {json.dumps(exceeded)}")
         for data in (meter.slowest, meter.largest):
             print(f"  {_kept(options.found, data)}")
     return 0
 
 
-def _replayed(options: argparse.Namespace) -> int:
+def _replay(options: argparse.Namespace) -> int:
     from fuzz.targets import TARGETS
 
     meter = Meter()
@@ -87,7 +92,7 @@ def _with_atheris(options: argparse.Namespace) -> None:
 
     with atheris.instrument_imports(include=["rse_pf"]):
         from fuzz.targets import TARGETS
-    from fuzz.samples import CORPUS, LONGEST, samples
+    from fuzz.samples import CORPUS, MAX_INPUT_BYTES, samples
 
     meter, run = Meter(), TARGETS[options.target]
     folder = options.found / f"{options.target}-corpus"
@@ -102,7 +107,7 @@ def _with_atheris(options: argparse.Namespace) -> None:
             print(meter.line(), file=sys.stderr)
 
     command = [
-        sys.argv[0], f"-max_total_time={options.seconds:.0f}", f"-seed={options.seed}", f"-max_len={LONGEST}",
+        sys.argv[0], f"-max_total_time={options.seconds:.0f}", f"-seed={options.seed}", f"-max_len={MAX_INPUT_BYTES}",
         f"-artifact_prefix={options.found}/", "-timeout=10", "-rss_limit_mb=1024", "-print_final_stats=1",
         str(folder), str(CORPUS / options.target),
     ]  # fmt: skip

@@ -1,7 +1,7 @@
-"""What the dearest message cost: processor time and memory of single calls.
+"""CPU time and memory of the most expensive message.
 
-Promises that a pause of the machine is not taken for cost: processor time is counted, not the clock's, and a
-call that looks dear is tried again before it is believed.
+CPU time of the thread is measured, not elapsed time, and an expensive call is repeated before it counts, so
+that a pause of the machine is not taken for cost.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _TRIES = 3
 
 @dataclass(slots=True)
 class Meter:
-    """The worst of many calls, with the bytes that caused it."""
+    """The most expensive of many calls, with their inputs."""
 
     calls: int = 0
     worst_ms: float = 0.0

@@ -1,7 +1,7 @@
-"""What fuzzing starts from: well-formed messages, frames and problems, the kept corpus, and dear messages.
+"""Initial inputs of fuzzing: well-formed messages, frames and problems, the corpus, and expensive messages.
 
-`DEAR` are messages within every size limit that were built to cost as much as they can.  Promises that what
-is made here is the same on every machine.
+`EXPENSIVE` are messages within every size limit that were built to cost as much as possible.  All inputs are
+the same on every machine.
 """
 
 from __future__ import annotations
@@ -16,16 +16,16 @@ from rse_pf.pnp.problems import DEGENERATE, KINECT, make_degenerate, make_proble
 from rse_pf.services.pnp import make_request
 from rse_pf.wire import Cancel, Command, Failure, Hello, Ping, Result, make_codec
 
-__all__ = ["CORPUS", "DEAR", "LONGEST", "samples"]
+__all__ = ["CORPUS", "EXPENSIVE", "MAX_INPUT_BYTES", "samples"]
 
 CORPUS = Path(__file__).parent / "corpus"
-LONGEST = 262_144
-"""``session.max_message_bytes``: more never reaches a decoder."""
+MAX_INPUT_BYTES = 262_144
+"""``session.max_message_bytes``: longer messages never reach a decoder."""
 
 
 @cache
 def samples(target: str) -> tuple[bytes, ...]:
-    """Return the inputs that *target* starts from, the kept corpus last."""
+    """Return the initial inputs of *target*, its corpus last."""
     kept = [file.read_bytes() for file in sorted((CORPUS / target).glob("*"))]
     return (*_MADE[target](), *kept)
 
@@ -99,7 +99,7 @@ def _deflated(payload: bytes) -> tuple[str, bytes]:
 
 
 def _text(size: int) -> bytes:
-    """Return letters that deflate well, but not so well that they are a bomb."""
+    """Return letters that deflate well, but below the limit for a compression bomb."""
     return b"".join(b"%06d%s" % (k, b"a" * 100) for k in range(size // 106))
 
 
@@ -108,7 +108,7 @@ _PACKED_KEYS = b"".join(b"\xa5k%04x\1" % k for k in range(14_900))
 _KEYS = b",".join(b'"k%d":%d' % (i, i + 1000) for i in range(_COUNT))
 _NUMBERED = b"".join(b"\xcd%c%c\x90" % divmod(i, 256) for i in range(_COUNT))
 
-DEAR: dict[str, tuple[str, bytes]] = {
+EXPENSIVE: dict[str, tuple[str, bytes]] = {
     "empty lists": ("bin", _array(b"\x90", 262_000)),
     "empty maps": ("bin", _array(b"\x80", 262_000)),
     "small integers": ("bin", _array(b"\x01", 262_000)),

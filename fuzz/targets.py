@@ -1,7 +1,7 @@
-"""What must hold for any bytes at all: one function for each place that a stranger's bytes reach.
+"""The fuzz targets: one function for each part of the product that reads bytes from outside.
 
-A target takes bytes and returns; it raises `Finding`, or whatever escaped, when the product is wrong.
-Promises to be deterministic and to touch no socket, file or clock but the processor's.
+A target takes any bytes and returns; it raises `TargetFailure`, or the error that escaped, when the product
+is wrong.  Targets are deterministic and use no socket and no file.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from rse_pf.services.builtin import builtin_services
 from rse_pf.wire import Command, Failure, Result, make_codec
 from rse_pf.wire.envelope import peek
 
-__all__ = ["TARGETS", "Finding", "Target", "codec", "framed", "frames", "geometry", "stream"]
+__all__ = ["TARGETS", "TargetFailure", "Target", "codec", "framed", "frames", "geometry", "stream"]
 
 Target = Callable[[bytes, Meter], None]
 
@@ -44,32 +44,32 @@ _REGISTRY = builtin_services(PLATFORM)
 _SERVICES: tuple[Service, ...] = tuple(_REGISTRY)
 
 
-class Finding(AssertionError):
-    """The product did what it promises not to do."""
+class TargetFailure(AssertionError):
+    """The product violates one of its rules."""
 
 
 def codec(data: bytes, meter: Meter) -> None:
-    """The first byte chooses the codec, the rest is the message; the fourth choice deflates it first.
+    """Check the codec that the first byte selects with the rest as message; the fourth choice deflates it first.
 
-    Only errors of the protocol leave; what is understood can be said again; a payload becomes a request of
-    a service or an error of ours.
+    Only protocol errors are raised; a decoded message survives encoding and decoding; a payload gives a
+    request of a service or one of our errors.
     """
     if not data:
         return
     kind, body = data[0] % 4, data[1:]
-    spoken = _MADE[_CODECS[kind]]
+    chosen = _MADE[_CODECS[kind]]
     if kind == 3:
         body = zlib.compress(body, 1)
-    meter.call(lambda sent: peek(spoken, sent), body, ProtocolError)
-    # A robot reads what its own server says: nobody promises that to be cheap.
-    for decode, counted in ((spoken.decode_from_robot, meter), (spoken.decode_from_server, Meter())):
+    meter.call(lambda sent: peek(chosen, sent), body, ProtocolError)
+    # A robot trusts its server: the cost of decoding the server's messages is not limited.
+    for decode, counted in ((chosen.decode_from_robot, meter), (chosen.decode_from_server, Meter())):
         message = counted.call(decode, body, ProtocolError)
         if message is None:
             continue
-        again = spoken.encode(message)
-        # What is said by us may be longer than what strangers may say.
-        if len(again) <= PLATFORM.session.max_message_bytes and spoken.encode(decode(again)) != again:
-            raise Finding(f"a {type(message).__name__} is not what it was after a second journey")
+        again = chosen.encode(message)
+        # An encoded message may be longer than the limit for received ones.
+        if len(again) <= PLATFORM.session.max_message_bytes and chosen.encode(decode(again)) != again:
+            raise TargetFailure(f"a {type(message).__name__} changed when it was encoded and decoded again")
         if isinstance(message, Command) and len(body) < _SHORT:
             _as_requests(message.payload)
 
@@ -79,7 +79,7 @@ def _as_requests(payload: Any) -> None:
         try:
             request_of(payload, service)
         except InternalError as error:
-            raise Finding(f"{service.name} calls a payload a defect") from error
+            raise TargetFailure(f"{service.name} calls a payload a defect") from error
         except RsePfError:
             continue
 
@@ -101,15 +101,15 @@ def framed(data: bytes) -> list[tuple[int, bool, bool, bytes, float]]:
 
 
 def frames(data: bytes, meter: Meter) -> None:
-    """Any frames give messages of allowed size, pongs at an allowed rate, or one close with a code."""
+    """Check that any frames give messages of allowed size, pongs at an allowed rate, or one close code."""
     limits = NARROW if data[:1] < b"\x80" else PLATFORM.session
     sent = framed(data)
 
-    def conversation(_: bytes) -> list[FrameDecision | None]:
+    def receive_all(_: bytes) -> list[FrameDecision | None]:
         assembler = FrameAssembler(limits)
         return [assembler.receive(*frame) for frame in sent]
 
-    decisions = meter.call(conversation, data, ProtocolError)
+    decisions = meter.call(receive_all, data, ProtocolError)
     parts, opened, pongs, over = list[bytes](), 0, list[float](), False
     for (opcode, fin, rsv, payload, now), decision in zip(sent, decisions, strict=True):
         if over:
@@ -151,7 +151,7 @@ def _check_message(
 
 
 def stream(data: bytes, meter: Meter) -> None:
-    """The end of a conversation is found at the same byte, wherever the network cut the stream."""
+    """Check that the close frame is found at the same byte for any fragmentation of the stream."""
     if len(data) < 2:
         return
     step, body = data[0] % 23 + 1, data[1:]
@@ -166,7 +166,7 @@ def stream(data: bytes, meter: Meter) -> None:
 
 
 def geometry(data: bytes, meter: Meter) -> None:
-    """Any numbers give a pose that is a motion, or a typed failure; never a defect, nor a line that is ok."""
+    """Check that any numbers give a rigid pose or a typed failure, and that points on a line are not ok."""
     if len(data) < 8:
         return
     engine = ("poselib", "opencv", None)[data[0] % 3]
@@ -189,7 +189,7 @@ def geometry(data: bytes, meter: Meter) -> None:
 
 
 def check_pose(answer: Result, points: np.ndarray) -> None:
-    """Raise `Finding` unless the pose is a motion, and unless no line and no single point is called ok."""
+    """Raise `TargetFailure` unless the pose is a motion, and unless no line and no single point is called ok."""
     reply = answer.reply
     T = np.asarray(reply.T_camera_world).reshape(4, 4)
     _expect(bool(np.isfinite(T).all() and np.isfinite(reply.covariance).all()), "a pose that is not finite")
@@ -215,7 +215,7 @@ def _numbers(kind: int, data: bytes, count: int) -> list[float]:
 
 def _expect(holds: bool, otherwise: str) -> None:
     if not holds:
-        raise Finding(otherwise)
+        raise TargetFailure(otherwise)
 
 
 TARGETS: dict[str, Target] = {"codec": codec, "frames": frames, "stream": stream, "geometry": geometry}

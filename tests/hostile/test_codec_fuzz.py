@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import subprocess
 import sys
 from pathlib import Path
@@ -10,9 +9,9 @@ from pathlib import Path
 import msgspec
 import pytest
 
+from fuzz.damage import run_damaged
 from fuzz.meter import MAX_MIB, MAX_MS, Meter
-from fuzz.mutations import mutations
-from fuzz.samples import CORPUS, LONGEST, samples
+from fuzz.samples import CORPUS, MAX_INPUT_BYTES
 from fuzz.targets import TARGETS
 from rse_pf.wire import codec
 
@@ -22,8 +21,7 @@ _SLOW_MACHINE = 3.0
 
 def fuzzed(target: str, *, seed: int, inputs: int) -> Meter:
     meter, run = Meter(), TARGETS[target]
-    for data in itertools.islice(mutations(samples(target), seed=seed, longest=LONGEST), inputs):
-        run(data, meter)
+    run_damaged(target, lambda data: run(data, meter), first=seed, inputs=inputs)
     return meter
 
 
@@ -38,11 +36,13 @@ def test_thousands_of_damaged_messages_give_a_message_or_a_protocol_error() -> N
 
 def test_equal_seeds_give_equal_inputs_and_others_do_not() -> None:
     def inputs(seed: int) -> list[bytes]:
-        return list(itertools.islice(mutations(samples("codec"), seed=seed, longest=LONGEST), 300))
+        seen: list[bytes] = []
+        run_damaged("codec", seen.append, first=seed, inputs=200)
+        return seen
 
     assert inputs(1) == inputs(1)
     assert inputs(1) != inputs(2)
-    assert all(len(data) <= LONGEST for data in inputs(1))
+    assert all(len(data) <= MAX_INPUT_BYTES for data in inputs(1))
 
 
 def test_a_decoder_that_lets_a_foreign_error_out_is_found(monkeypatch: pytest.MonkeyPatch) -> None:

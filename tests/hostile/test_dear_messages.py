@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 
 from fuzz.meter import MAX_MIB, MAX_MS, Meter
-from fuzz.samples import DEAR, LONGEST
+from fuzz.samples import EXPENSIVE, MAX_INPUT_BYTES
 from rse_pf.config import SessionSettings
 from rse_pf.errors import ProtocolError
 from rse_pf.pnp.problems import KINECT, make_problem
@@ -17,10 +17,10 @@ from rse_pf.wire import CODECS, Command, make_codec
 _SLOW_MACHINE = 6.0
 
 
-@pytest.mark.parametrize("name", DEAR)
+@pytest.mark.parametrize("name", EXPENSIVE)
 def test_the_dearest_message_that_we_can_think_of_is_cheap(name: str) -> None:
-    speaks, data = DEAR[name]
-    assert len(data) <= LONGEST
+    speaks, data = EXPENSIVE[name]
+    assert len(data) <= MAX_INPUT_BYTES
     meter = Meter()
 
     for _ in range(2):

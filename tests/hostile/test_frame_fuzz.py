@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable
 from typing import Any
 
@@ -10,18 +9,16 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from fuzz.damage import run_damaged
 from fuzz.meter import Meter
-from fuzz.mutations import mutations
-from fuzz.samples import LONGEST, samples
-from fuzz.targets import TARGETS, Finding
+from fuzz.targets import TARGETS, TargetFailure
 from rse_pf.backend.gateway import frames as frame_layer
 from rse_pf.backend.gateway.frames import CloseBorder, FrameAssembler
 
 
 def fuzzed(target: str, *, seed: int, inputs: int) -> Meter:
     meter, run = Meter(), TARGETS[target]
-    for data in itertools.islice(mutations(samples(target), seed=seed, longest=LONGEST), inputs):
-        run(data, meter)
+    run_damaged(target, lambda data: run(data, meter), first=seed, inputs=inputs)
     return meter
 
 
@@ -73,5 +70,5 @@ def test_a_wrong_frame_layer_is_found(name: str, monkeypatch: pytest.MonkeyPatch
     target, kind, method, wrong = WRONG[name]
     monkeypatch.setattr(kind, method, wrong)
 
-    with pytest.raises(Finding):
+    with pytest.raises(TargetFailure):
         fuzzed(target, seed=5, inputs=1000)
