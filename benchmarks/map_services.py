@@ -40,9 +40,9 @@ from rse_pf.services.mapping.localise import locate
 from rse_pf.services.mapping.loop_consistency import LoopClosure
 from rse_pf.services.mapping.map_merge import (
     Atlas,
-    Merged,
-    MergeOptions,
     LoopProposals,
+    MergedMap,
+    MergeOptions,
     merge_versions,
     propose_links,
 )
@@ -85,7 +85,7 @@ def robots_of(
     return Robots(dataset=dataset, runs=runs, truth=truth)
 
 
-def joined_poses(runs: Sequence[Run], merged: Merged) -> Array:
+def joined_poses(runs: Sequence[Run], merged: MergedMap) -> Array:
     """Return the poses of all frames in the merged map's world."""
     parts = []
     first = 0
@@ -97,7 +97,7 @@ def joined_poses(runs: Sequence[Run], merged: Merged) -> Array:
     return np.concatenate(parts)
 
 
-def origin_errors(robots: Robots, merged: Merged) -> list[tuple[float, float]]:
+def origin_errors(robots: Robots, merged: MergedMap) -> list[tuple[float, float]]:
     """Return for each other robot how far its start is off in the first one's frame (m, deg)."""
     poses = joined_poses(robots.runs, merged)
     starts = np.cumsum([0] + [len(run.rows) for run in robots.runs])[:-1]
@@ -110,7 +110,7 @@ def origin_errors(robots: Robots, merged: Merged) -> list[tuple[float, float]]:
 
 
 def cloud_distances(
-    robots: Robots, merged: Merged, every: int = 5, *, by_positions: bool = False
+    robots: Robots, merged: MergedMap, every: int = 5, *, by_positions: bool = False
 ) -> tuple[float, float]:
     """Return the median distance (m) of the merged cloud to the true one, and the share under 5 cm.
 
@@ -217,7 +217,7 @@ def merge_rows(recordings: Path) -> dict[str, Any]:
     }
 
 
-def _located_in_merged(robots: Robots, merged: Merged) -> dict[str, float]:
+def _located_in_merged(robots: Robots, merged: MergedMap) -> dict[str, float]:
     """Locate every fifth frame in the merged map, whose poses are estimates, aligned to the truth."""
     T_truth_merged = _alignment_of_poses(joined_poses(robots.runs, merged), robots.truth)
     rows = [row for run in robots.runs for row in run.rows]

@@ -29,7 +29,7 @@ from benchmarks.map_services import robots_of
 from rse_pf.geometry import Array
 from rse_pf.services.mapping import map_merge as join
 from rse_pf.services.mapping.map_merge import merge_versions
-from rse_pf.services.mapping.optimise import Optimised, OptimiseOptions, optimise_graph, robust_cost
+from rse_pf.services.mapping.optimise import OptimisedGraph, OptimiseOptions, optimise_graph, robust_cost
 from rse_pf.services.mapping.pose_graph import PoseGraph, write_g2o
 from rse_pf.services.synthetic_maps import make_sphere
 
@@ -42,7 +42,7 @@ def kitchen_graph(recordings: Path) -> tuple[PoseGraph, Array]:
     robots = robots_of(recordings)
     seen: list[PoseGraph] = []
 
-    def watch(graph: PoseGraph, options: OptimiseOptions | None = None, **others: Any) -> Optimised:
+    def watch(graph: PoseGraph, options: OptimiseOptions | None = None, **others: Any) -> OptimisedGraph:
         seen.append(graph)
         return optimise_graph(graph, options, **others)
 

@@ -11,11 +11,11 @@ __all__ = ["builtin_services"]
 
 
 def builtin_services(settings: PlatformSettings) -> Registry:
-    """Return a registry with the platform's own services, set up after *settings*."""
+    """Return a registry with the platform's own services, configured by *settings*."""
     registry = Registry()
     pnp.register(registry, settings.pnp)
     echo.register(registry)
-    # Extras are looked for when a command comes: a server without them answers missing-extra.
+    # Optional packages are imported by the first command: a server without them answers missing-extra.
     for each in (icp, place, localise, merge, optimise, wifi):
         each.register(registry)
     return registry

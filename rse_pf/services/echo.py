@@ -1,4 +1,4 @@
-"""The echo service: the platform's own cost, without any computation."""
+"""The echo service: measures the cost of the platform, without any computation."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Make the registry of a process from its name, ``module:function``.
-
-Promises to import nothing but that module.
-"""
+"""Load the registry of services from its name, ``module:function``."""
 
 from __future__ import annotations
 
@@ -16,7 +13,7 @@ __all__ = ["load_services"]
 
 
 def load_services(name: str, settings: PlatformSettings) -> Registry:
-    """Return the registry that ``module:function`` makes of *settings*; raises ConfigurationError."""
+    """Return the registry that ``module:function`` returns for *settings*; raises ConfigurationError."""
     module, _, function = name.partition(":")
     try:
         make: Callable[[PlatformSettings], Registry] = getattr(importlib.import_module(module), function)

@@ -1,6 +1,6 @@
-"""The perspective-n-point service: matches of one frame in, one camera pose with evidence out.
+"""The perspective-n-point service: from the matches of one frame to one camera pose with its evidence.
 
-Promises statelessness in the paper's sense (Sect. 3.3): the request holds all that is needed.
+It is stateless in the sense of the paper (Sect. 3.3): the request holds all that is needed.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ class PnpReply(msgspec.Struct, frozen=True, kw_only=True):
 
     @classmethod
     def of(cls, solution: PnpSolution) -> PnpReply:
-        """Return *solution* as it travels."""
+        """Return *solution* as a reply."""
         return cls(
             T_camera_world=solution.T_camera_world.ravel(),
             inliers=solution.inliers.astype(np.uint32),
@@ -67,7 +67,7 @@ class PnpReply(msgspec.Struct, frozen=True, kw_only=True):
         )
 
     def solution(self) -> PnpSolution:
-        """Return the reply as the solver's own type."""
+        """Return the reply as the solver's type."""
         covariance = np.zeros((6, 6))
         covariance[_UPPER] = self.covariance
         covariance.T[_UPPER] = self.covariance

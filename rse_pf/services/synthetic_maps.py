@@ -1,6 +1,6 @@
-"""Seeded problems with known answers for the map services; tests and benchmarks share them.
+"""Seeded problems with known answers for the map services, shared by tests and benchmarks.
 
-Promises the same problem for the same arguments, and that every noise is an argument.
+The same arguments give the same problem; every noise is an argument.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ _CAMERA = Camera(fx=525.0, fy=525.0, cx=319.5, cy=239.5, width=640, height=480)
 def make_sphere(
     seed: int, *, rings: int = 50, per_ring: int = 50, noise_m: float = 0.02, noise_rad: float = 0.01
 ) -> tuple[PoseGraph, Array]:
-    """Return a pose graph on a sphere of 10 m, drifted from its start, and its ``(n, 4, 4)`` true poses.
+    """Return a pose graph on a sphere of 10 m, with drift, and its ``(n, 4, 4)`` true poses.
 
-    A camera spirals from pole to pole and looks inwards; it measures the step to the next pose and to
+    A camera spirals from pole to pole and looks inwards; it measures the relative pose to the next one and to
     the one a turn later.  Source: the sphere of Kuemmerle et al., g2o, ICRA 2011.
     """
     rng = np.random.default_rng(seed)
@@ -71,7 +71,7 @@ class Building:
 
     Strength = power - 10 exponent log10(distance) - 4 dB for each wall between - shadowing - noise;
     shadowing is fixed in space (correlated over ``shadow_length_m``), noise is new for each scan.
-    Readings below ``deaf_dbm`` are not heard.
+    Readings below ``min_dbm`` are not received.
     """
 
     access_points: Array
@@ -82,11 +82,11 @@ class Building:
     exponent: float = 2.7
     power_dbm: float = -38.0
     wall_db: float = 4.0
-    deaf_dbm: float = -90.0
+    min_dbm: float = -90.0
 
     def scan(self, place: Array, rng: np.random.Generator) -> list[AccessPointReading]:
-        """Return what a radio at *place* ``(3,)`` hears once."""
-        heard = []
+        """Return one scan of a radio at *place* ``(3,)``, metres."""
+        readings = []
         for number, source in enumerate(self.access_points):
             distance = math.sqrt(float(((place - source) ** 2).sum()) + 1.0)
             dbm = self.power_dbm - 10.0 * self.exponent * math.log10(distance)
@@ -94,10 +94,10 @@ class Building:
             wave = np.cos(self.waves[number] @ place[:2] + self.phases[number])
             dbm += self.shadow_db * math.sqrt(2.0 / len(wave)) * float(wave.sum())
             dbm += float(rng.normal()) * self.noise_db
-            if dbm > self.deaf_dbm:
+            if dbm > self.min_dbm:
                 mac = f"00:16:3e:00:00:{number:02x}"
-                heard.append(AccessPointReading(mac=mac, ssid="hall", rssi_dbm=min(dbm, 0.0)))
-        return heard
+                readings.append(AccessPointReading(mac=mac, ssid="hall", rssi_dbm=min(dbm, 0.0)))
+        return readings
 
 
 def make_building(
@@ -126,7 +126,7 @@ def make_building(
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class SyntheticWorld:
-    """Points with descriptors on the walls of a square hall, and robots that walk around in it."""
+    """Points with descriptors on the walls of a square hall, and the maps of robots in it."""
 
     points: Array
     descriptors: npt.NDArray[np.uint8]
@@ -145,7 +145,7 @@ class SyntheticWorld:
         self, number: int, robot: str, T_true: Array, T_world_camera: Array, rng: np.random.Generator,
         *, noise_px: float = 0.5, depth_noise: float = 0.005,
     ) -> Keyframe:  # fmt: skip
-        """Return what a camera at *T_true* sees, filed under the pose *T_world_camera*."""
+        """Return the keyframe of a camera at *T_true*, with the estimated pose *T_world_camera*."""
         seen = transform(inverse(T_true), self.points)
         ahead = np.flatnonzero(seen[:, 2] > 0.3)
         pixels = _CAMERA.project(seen[ahead])
@@ -163,7 +163,7 @@ class SyntheticWorld:
     def walk(
         self, robot: str, turns: Array, seed: int, *, drift_m: float = 0.01, drift_deg: float = 0.3
     ) -> tuple[MapVersion, Array]:
-        """Return a robot's map, in its own drifting world, and its ``(n, 4, 4)`` true poses."""
+        """Return a robot's map, in its own drifting world frame, and its ``(n, 4, 4)`` true poses."""
         rng = np.random.default_rng(seed)
         truth = np.array([self.pose(turn) for turn in turns])
         spread = np.array([drift_m] * 3 + [math.radians(drift_deg)] * 3)

@@ -1,8 +1,8 @@
 """Services in Lua: one LuaJIT virtual machine per robot, as in the paper (Sect. 5.2, Figs. 3 and 4).
 
 A script returns a function of one table, or a table with ``serve`` and maybe ``snapshot`` and ``restore``.
-It may require ``json``, ``zlib`` and ``ffi``, and load shared libraries of its own folder.  Promises that the
-machine sees nothing of Python but these; the walls around the process are what isolates it, not Lua.
+It may require ``json``, ``zlib`` and ``ffi``, and load shared libraries of its own folder.  It sees nothing
+else of Python; the sandbox isolates it, not Lua.
 """
 
 from __future__ import annotations
@@ -64,28 +64,28 @@ class LuaRuntime:
             setup = self._lua.execute(f"return function(...) {_SETUP} end".encode())
             folder = str(service.folder).encode()
             self._pcall = setup(self._decode, self._encode, _inflate, zlib.compress, folder)
-            made = self._lua.execute(service.entry_path.read_bytes(), name=b"=" + service.entry.encode())
+            returned = self._lua.execute(service.entry_path.read_bytes(), name=b"=" + service.entry.encode())
         except (lupa.LuaError, OSError, ValueError) as error:
             raise ConfigurationError(
-                f"{service.name} cannot be loaded: {_first_line(error)}", hint="mend the script"
+                f"{service.name} cannot be loaded: {_first_line(error)}", hint="fix the script"
             ) from error
         self._functions: dict[str, Any] = {}
-        if lupa.lua_type(made) == "function":
-            self._functions["serve"] = made
-        elif lupa.lua_type(made) == "table":
-            self._functions = {_text(key): value for key, value in made.items()}
+        if lupa.lua_type(returned) == "function":
+            self._functions["serve"] = returned
+        elif lupa.lua_type(returned) == "table":
+            self._functions = {_text(key): value for key, value in returned.items()}
         if lupa.lua_type(self._functions.get("serve")) != "function":
             raise ConfigurationError(
                 f"{service.entry} returns neither a function nor a table with serve",
                 hint="end the script with: return function(request) ... end",
             )
-        self._raw = bool(self._functions.get("takes_text"))
+        self._takes_text = bool(self._functions.get("takes_text"))
         self.has_snapshots = {"snapshot", "restore"} <= set(self._functions)
 
     def call(self, payload: Any) -> Any:
         """Return the reply to *payload*; a script with ``takes_text`` gets and returns JSON text."""
-        if self._raw:
-            return self._parsed(self._run("serve", msgspec.json.encode(_plain(payload))))
+        if self._takes_text:
+            return self._parse(self._run("serve", msgspec.json.encode(_plain(payload))))
         return self._from_lua(self._run("serve", self._to_lua(payload)))
 
     def snapshot(self) -> bytes:
@@ -98,32 +98,34 @@ class LuaRuntime:
 
     def _run(self, function: str, *arguments: Any) -> Any:
         try:
-            told = self._pcall(self._functions[function], *arguments)
-        except self._lupa.LuaError as error:  # out of memory: pcall does not hold that
+            result = self._pcall(self._functions[function], *arguments)
+        except self._lupa.LuaError as error:  # out of memory, which pcall does not catch
             raise InternalError(f"{self._name}: {_first_line(error)}") from error
-        done, value = (*told, None)[:2] if isinstance(told, tuple) else (told, None)
+        done, value = (*result, None)[:2] if isinstance(result, tuple) else (result, None)
         if not done:
             raise self._failure(value)
         return value
 
-    def _failure(self, raised: Any) -> RsePfError:
+    def _failure(self, error: Any) -> RsePfError:
         """``error({code = "bad-request", message = "..."})`` is a typed failure, all else a defect."""
-        if isinstance(raised, RsePfError):
-            return raised
-        if self._lupa.lua_type(raised) == "table":
-            told = self._from_lua(raised)
-            if isinstance(told, Mapping) and "message" in told:
-                return error_from_code(str(told.get("code", "failed")), f"{self._name}: {told['message']}")
-        return InternalError(f"{self._name}: {_text(raised)[:300]}")
+        if isinstance(error, RsePfError):
+            return error
+        if self._lupa.lua_type(error) == "table":
+            result = self._from_lua(error)
+            if isinstance(result, Mapping) and "message" in result:
+                return error_from_code(
+                    str(result.get("code", "failed")), f"{self._name}: {result['message']}"
+                )
+        return InternalError(f"{self._name}: {_text(error)[:300]}")
 
-    def _parsed(self, text: Any) -> Any:
+    def _parse(self, text: Any) -> Any:
         try:
             return msgspec.json.decode(text)
         except (msgspec.DecodeError, TypeError) as error:
-            raise CommandFailed(f"{self._name} replied with something that is no JSON: {error}") from error
+            raise CommandFailed(f"{self._name} replied with text that is not JSON: {error}") from error
 
     def _to_lua(self, value: Any) -> Any:
-        value = _in_bytes(value)
+        value = _encode_text(value)
         return self._lua.table_from(value, recursive=True) if isinstance(value, dict | list) else value
 
     def _from_lua(self, value: Any) -> Any:
@@ -134,7 +136,7 @@ class LuaRuntime:
                 return _text(value)
             raise CommandFailed(f"{self._name} replied with a {self._lupa.lua_type(value)}")
         length = len(value)
-        if length and sum(1 for _ in value.keys()) == length:  # noqa: SIM118  a Lua table is no mapping
+        if length and sum(1 for _ in value.keys()) == length:  # noqa: SIM118  a Lua table is not a mapping
             return [self._from_lua(value[i]) for i in range(1, length + 1)]
         return {_text(key): self._from_lua(each) for key, each in value.items()}
 
@@ -158,16 +160,16 @@ def _plain(value: Any) -> Any:
     return value
 
 
-def _in_bytes(value: Any) -> Any:
-    """Return *value* with every text as bytes, which is what Lua's strings are."""
+def _encode_text(value: Any) -> Any:
+    """Return *value* with all text as bytes, like the strings of Lua."""
     if isinstance(value, str):
         return value.encode()
     if isinstance(value, np.ndarray):
         return value.tolist()
     if isinstance(value, Mapping):
-        return {str(key).encode(): _in_bytes(each) for key, each in value.items()}
+        return {str(key).encode(): _encode_text(each) for key, each in value.items()}
     if isinstance(value, list | tuple):
-        return [_in_bytes(each) for each in value]
+        return [_encode_text(each) for each in value]
     return value
 
 
@@ -180,7 +182,7 @@ def _inflate(data: bytes) -> bytes:
 
 
 def _no_attributes(thing: object, name: object, setting: bool) -> object:
-    raise AttributeError(f"{name!r} is not for scripts")
+    raise AttributeError(f"{name!r} is not available to scripts")
 
 
 def _first_line(error: BaseException) -> str:

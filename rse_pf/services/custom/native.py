@@ -1,7 +1,7 @@
-"""Services in C and C++: a shared library behind the C interface of ``include/rse_pf_service.h``.
+"""Services in C and C++: a shared library with the C interface of ``include/rse_pf_service.h``.
 
-Promises to check the interface's version before anything is called, to copy what the library passes out
-and give it back at once, and to say which function a library lacks.
+The version of the interface is checked before any other call.  Memory that the library returns is copied and
+freed at once.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from rse_pf.wire.arrays import json_encode_hook
 __all__ = ["INCLUDE_FOLDER", "NativeRuntime"]
 
 INCLUDE_FOLDER = Path(__file__).parent / "include"
-"""Where ``rse_pf_service.h`` and ``rse_pf_service.hpp`` lie."""
+"""Folder of ``rse_pf_service.h`` and ``rse_pf_service.hpp``."""
 
 _ABI = 1
 _FLOAT64, _TEXT = 1, 2
@@ -54,12 +54,12 @@ class NativeRuntime:
                 f"{service.name}: the library cannot be loaded: {error}",
                 hint="build it on a system like the server's, and install what it links to",
             ) from error
-        self._abi()
+        self._check_abi()
         self._call_arrays = self._find("rse_pf_service_call_arrays")
         self._call_bytes = self._find("rse_pf_service_call")
         if self._call_arrays is None and self._call_bytes is None:
-            raise self._lacks("rse_pf_service_call_arrays or rse_pf_service_call")
-        self._free = self._need("rse_pf_service_free", result=None)
+            raise self._missing_export("rse_pf_service_call_arrays or rse_pf_service_call")
+        self._free = self._require("rse_pf_service_free", result=None)
         self._error = self._find("rse_pf_service_error")
         if self._error is not None:
             self._error.restype = ctypes.c_char_p
@@ -67,13 +67,15 @@ class NativeRuntime:
         self._restore = self._find("rse_pf_service_restore")
         self.has_snapshots = self._snapshot is not None and self._restore is not None
         self._state = ctypes.c_void_p()
-        code = self._need("rse_pf_service_open")(str(scratch).encode(), ctypes.byref(self._state))
+        code = self._require("rse_pf_service_open")(str(scratch).encode(), ctypes.byref(self._state))
         if code != 0:
             raise ConfigurationError(f"{service.name}: rse_pf_service_open returned {code}")
 
     def call(self, payload: Any) -> Any:
         """Return the reply to *payload*."""
-        return self._by_bytes(payload) if self._call_arrays is None else self._by_arrays(payload)
+        return (
+            self._call_with_bytes(payload) if self._call_arrays is None else self._call_with_arrays(payload)
+        )
 
     def snapshot(self) -> bytes:
         """Return the library's state."""
@@ -81,32 +83,32 @@ class NativeRuntime:
         return self._bytes_of(self._snapshot, self._state)
 
     def restore(self, data: bytes) -> None:
-        """Let the library go on from *data*."""
+        """Restore the library's state from *data*."""
         assert self._restore is not None
         self._check(self._restore(self._state, data, ctypes.c_uint64(len(data))))
 
-    def _by_bytes(self, payload: Any) -> Any:
+    def _call_with_bytes(self, payload: Any) -> Any:
         assert self._call_bytes is not None
         request = msgspec.json.encode(payload, enc_hook=json_encode_hook)
         reply = self._bytes_of(self._call_bytes, self._state, request, ctypes.c_uint64(len(request)))
         try:
             return msgspec.json.decode(reply)
         except msgspec.DecodeError as error:
-            raise CommandFailed(f"{self._name} replied with something that is no JSON: {error}") from error
+            raise CommandFailed(f"{self._name} replied with text that is not JSON: {error}") from error
 
-    def _by_arrays(self, payload: Any) -> Any:
+    def _call_with_arrays(self, payload: Any) -> Any:
         assert self._call_arrays is not None
-        request, kept = _fields(payload)
+        request, buffers = _encode_fields(payload)
         reply, count = ctypes.POINTER(_Field)(), ctypes.c_uint32()
         code = self._call_arrays(
             self._state, request, ctypes.c_uint32(len(request)), ctypes.byref(reply), ctypes.byref(count)
         )
-        del kept  # the request's memory was needed until here
+        del buffers  # the library reads the request's memory until here
         self._check(code)
         try:
             if count.value > _MAX_FIELDS:
                 raise CommandFailed(f"{self._name} replied with {count.value} fields")
-            return dict(_value(reply[i], self._name) for i in range(count.value))
+            return dict(_decode_field(reply[i], self._name) for i in range(count.value))
         finally:
             self._free(self._state, reply)
 
@@ -115,7 +117,7 @@ class NativeRuntime:
         self._check(function(*arguments, ctypes.byref(data), ctypes.byref(size)))
         try:
             if size.value > _MAX_BYTES:
-                raise CommandFailed(f"{self._name} passed out {size.value} bytes")
+                raise CommandFailed(f"{self._name} returned {size.value} bytes")
             return ctypes.string_at(data, size.value)
         finally:
             self._free(self._state, data)
@@ -124,12 +126,12 @@ class NativeRuntime:
         if code == 0:
             return
         text = self._error(self._state) if self._error is not None else None
-        told = (text or b"").decode("utf-8", "replace")[:500]
+        reason = (text or b"").decode("utf-8", "replace")[:500]
         kind = _ERRORS.get(code, CommandFailed)
-        raise kind(f"{self._name}: {told or f'returned {code}'}")
+        raise kind(f"{self._name}: {reason or f'returned {code}'}")
 
-    def _abi(self) -> None:
-        function = self._need("rse_pf_service_abi", result=ctypes.c_uint32)
+    def _check_abi(self) -> None:
+        function = self._require("rse_pf_service_abi", result=ctypes.c_uint32)
         if (version := function()) != _ABI:
             raise ConfigurationError(
                 f"{self._name} was built for interface {version}, this server has {_ABI}",
@@ -139,54 +141,54 @@ class NativeRuntime:
     def _find(self, name: str) -> Any:
         return getattr(self._library, name, None)
 
-    def _need(self, name: str, result: Any = ctypes.c_int) -> Any:
+    def _require(self, name: str, result: Any = ctypes.c_int) -> Any:
         function = self._find(name)
         if function is None:
-            raise self._lacks(name)
+            raise self._missing_export(name)
         function.restype = result
         return function
 
-    def _lacks(self, name: str) -> ConfigurationError:
+    def _missing_export(self, name: str) -> ConfigurationError:
         return ConfigurationError(
             f"{self._name}: the library does not export {name}", hint="see rse_pf_service.h"
         )
 
 
-def _fields(payload: Any) -> tuple[Any, list[Any]]:
-    """Return *payload* as the array of fields that the library reads, and what keeps its memory."""
+def _encode_fields(payload: Any) -> tuple[Any, list[Any]]:
+    """Return *payload* as an array of C fields, and the buffers that they point to."""
     if not isinstance(payload, Mapping):
         raise BadRequest("the request is not an object of fields", hint='send {"name": value}')
-    made, kept = (_Field * len(payload))(), []
-    for field, (name, value) in zip(made, payload.items(), strict=True):
+    fields, buffers = (_Field * len(payload))(), []
+    for field, (name, value) in zip(fields, payload.items(), strict=True):
         field.name = str(name).encode()
         if isinstance(value, str):
             data: Any = value.encode()
             field.type, field.count = _TEXT, len(data)
             field.data = ctypes.cast(ctypes.c_char_p(data), ctypes.c_void_p)
-            kept.append(data)
+            buffers.append(data)
             continue
-        array = _numbers(str(name), value)
+        array = _as_array(str(name), value)
         field.type, field.rank, field.count = _FLOAT64, array.ndim, array.size
         field.shape[: array.ndim] = array.shape
         field.data = array.ctypes.data
-        kept.append(array)
-    return made, kept
+        buffers.append(array)
+    return fields, buffers
 
 
-def _numbers(name: str, value: Any) -> Any:
+def _as_array(name: str, value: Any) -> Any:
     try:
         array = np.ascontiguousarray(value, dtype=np.float64)
     except (TypeError, ValueError) as error:
         raise BadRequest(
-            f"field {name!r} is neither numbers nor a text", hint="send a number, a text, or lists of numbers"
+            f"field {name!r} is neither numbers nor text", hint="send a number, text, or lists of numbers"
         ) from error
-    array = array.reshape(np.shape(value))  # ascontiguousarray makes a number a list of one
+    array = array.reshape(np.shape(value))  # ascontiguousarray makes a number an array of one
     if array.ndim > _MAX_RANK or not np.isfinite(array).all():
         raise BadRequest(f"field {name!r} has more than {_MAX_RANK} axes, or a number that is not finite")
     return array
 
 
-def _value(field: Any, service: str) -> tuple[str, Any]:
+def _decode_field(field: Any, service: str) -> tuple[str, Any]:
     name = field.name.decode("utf-8", "replace")
     if field.count * (8 if field.type == _FLOAT64 else 1) > _MAX_BYTES:
         raise CommandFailed(f"{service}: reply field {name!r} is too large")

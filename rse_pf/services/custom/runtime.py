@@ -1,8 +1,7 @@
-"""Open an installed service and call it: one interface over Python, C/C++ and Lua.
+"""Load an installed service and call it: one interface for Python, C/C++ and Lua.
 
-Runs inside of an isolated environment, in `rse-pf service test`, and nowhere else.  Promises that what a
-service raises leaves as an error of `rse_pf.errors`, and that a payload reaches every language as it was
-sent: names, numbers, texts, lists and arrays.
+Used inside of sandboxes only.  A payload reaches every language as it was sent: names, numbers, text, lists
+and arrays.
 """
 
 from __future__ import annotations
@@ -23,7 +22,7 @@ __all__ = ["Runtime", "open_runtime"]
 
 
 class Runtime(Protocol):
-    """An opened service."""
+    """A loaded service."""
 
     has_snapshots: bool
 
@@ -31,14 +30,14 @@ class Runtime(Protocol):
         """Return the reply to *payload*: a struct, or plain values and arrays."""
 
     def snapshot(self) -> bytes:
-        """Return the state, so that `restore` can go on from it elsewhere."""
+        """Return the state, for `restore` in another process."""
 
     def restore(self, data: bytes) -> None:
-        """Take a state that `snapshot` returned."""
+        """Replace the state by one that `snapshot` returned."""
 
 
 def open_runtime(service: InstalledService, scratch: Path) -> Runtime:
-    """Load *service*; its files may be written below *scratch* only.
+    """Load *service*, which may write files below *scratch* only.
 
     Raises:
         ConfigurationError: It cannot be loaded; the message says why.
@@ -93,7 +92,7 @@ def _load_package(service: InstalledService) -> Any:
     except Exception as error:
         where = f"{type(error).__name__}: {error}"
         raise ConfigurationError(
-            f"{service.name} cannot be loaded: {where}", hint="mend the package"
+            f"{service.name} cannot be loaded: {where}", hint="fix the package"
         ) from error
 
 
@@ -101,7 +100,9 @@ def _load(service: InstalledService) -> Any:
     name = f"rse_pf_service_{service.name.replace('-', '_')}"
     spec = importlib.util.spec_from_file_location(name, service.entry_path)
     if spec is None or spec.loader is None:
-        raise ConfigurationError(f"{service.entry_path} is no Python file", hint="mend entry in service.json")
+        raise ConfigurationError(
+            f"{service.entry_path} is not a Python file", hint="correct entry in service.json"
+        )
     module = importlib.util.module_from_spec(spec)
     sys.modules[name] = module
     if str(service.folder) not in sys.path:
@@ -112,5 +113,7 @@ def _load(service: InstalledService) -> Any:
         raise
     except Exception as error:
         where = f"{type(error).__name__}: {error}"
-        raise ConfigurationError(f"{service.name} cannot be loaded: {where}", hint="mend it") from error
+        raise ConfigurationError(
+            f"{service.name} cannot be loaded: {where}", hint="fix the service"
+        ) from error
     return module

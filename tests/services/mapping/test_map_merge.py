@@ -12,13 +12,13 @@ from rse_pf.services.mapping.loop_consistency import LoopClosure, OdometryNoise,
 from rse_pf.services.mapping.map_merge import (
     Atlas,
     LoopProposals,
-    Merged,
+    MergedMap,
     MergeOptions,
     merge_versions,
     propose_links,
 )
 from rse_pf.services.mapping.merge import MergeRequest, merge_maps
-from rse_pf.services.mapping.optimise import Report, silent
+from rse_pf.services.mapping.optimise import Report, ignore_progress
 from rse_pf.services.synthetic_maps import make_world
 
 for package in ("faiss", "gtsam"):
@@ -34,7 +34,7 @@ def two_robots() -> tuple[list[MapVersion], list[Array]]:
     return [a, b], [truth_a, truth_b]
 
 
-def rmse_m(merged: Merged, truth: Array) -> float:
+def rmse_m(merged: MergedMap, truth: Array) -> float:
     """Return the rmse of keyframe positions, both in the frame of the first true pose."""
     estimate = np.array([each.T_world_camera for each in merged.version.keyframes])
     start = inverse(estimate[0])
@@ -102,7 +102,7 @@ def test_planted_wrong_loops_are_refused_and_do_not_bend_the_map(seed: int) -> N
 
     assert wrong.joined == (0, 1)
     assert rmse_m(wrong, truth) <= max(1.1 * rmse_m(clean, truth), rmse_m(clean, truth) + 0.005)
-    wrongs = planted(0.1, seed)(Atlas.of(maps), MergeOptions(), silent).links
+    wrongs = planted(0.1, seed)(Atlas.of(maps), MergeOptions(), ignore_progress).links
     rights = propose_links(Atlas.of(maps), MergeOptions()).links
     fakes = {
         w.T_a_b.tobytes() for w, r in zip(wrongs, rights, strict=True) if not np.array_equal(w.T_a_b, r.T_a_b)

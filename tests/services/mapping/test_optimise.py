@@ -178,7 +178,7 @@ def test_the_residual_of_a_true_edge_is_zero() -> None:
         ("VERTEX_SE2 0 0 0 0", "line 1"),
         ("VERTEX_SE3:QUAT 0 0 0 0 0 0 0 1\nEDGE_SE3:QUAT 0 1 1 0 0 0 0 0 1 " + "1 " * 21, "vertex 1"),
         ("VERTEX_SE3:QUAT 0 0 0 0 0 0 0 1\nEDGE_SE3:QUAT 0 0 1", "line 2"),
-        ("", "do not fit"),
+        ("", "do not agree"),
     ],
 )
 def test_bad_g2o_text_is_refused_and_the_place_is_named(text: str, complaint: str) -> None:
