@@ -18,7 +18,7 @@ from client_sdk.transfer.data_client import DataClient
 from rse_pf.config import DataSettings
 from rse_pf.errors import BadRequest, LimitExceeded, RsePfError, UsageError
 from rse_pf.files import replace_file
-from rse_pf.wire.rate_limit import TokenBucket
+from rse_pf.token_bucket import TokenBucket
 
 __all__ = ["BackgroundUploader"]
 

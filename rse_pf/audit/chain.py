@@ -17,7 +17,7 @@ from dataclasses import dataclass, field
 
 import msgspec
 
-from rse_pf.wire.rate_limit import TokenBucket
+from rse_pf.token_bucket import TokenBucket
 
 __all__ = [
     "CONTINUED",
@@ -44,8 +44,8 @@ CONTINUED, GAP, HEADS = "log.continued", "log.gap", "log.heads"
 
 _MAX_CHARACTERS, _MAX_DETAILS, _MAX_NUMBER = 200, 64, 2**53
 _TOKEN = re.compile(r"eyJ[\w-]{5,}\.[\w.-]+")
+# Canonical JSON: keys in order, no spaces, UTF-8.
 _encode = msgspec.json.Encoder(order="sorted").encode
-"""Canonical JSON: keys in order, no spaces, UTF-8."""
 _HEAD = re.compile(r"(\d{1,15}):([0-9a-f]{64})")
 REFUSALS_PER_S = 2.0
 REFUSAL_BURST = 50
@@ -149,7 +149,7 @@ class Chain:
 class RefusalLimiter:
     """Decide which refusals are recorded one by one; the rest is counted, so that a flood fills no disk."""
 
-    def __init__(self, per_s: float, burst: float) -> None:
+    def __init__(self, per_s: float = REFUSALS_PER_S, burst: float = REFUSAL_BURST) -> None:
         self.counted: dict[str, int] = {}
         self._bucket = TokenBucket(per_s, burst)
 

@@ -1,68 +1,18 @@
-"""Token buckets: the one by which a server measures a robot, and the robot's own, a little smaller.
+"""The rate limiter of a robot: a token bucket a little smaller than the one that the server applies.
 
 A robot that keeps to its own rate limiter is not refused by the server for its rate.
 """
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass, field
-
+from rse_pf.token_bucket import TokenBucket
 from rse_pf.wire.messages import Limits
 
-__all__ = ["RateLimiter", "TokenBucket"]
+__all__ = ["RateLimiter"]
 
+# Share of the server's limit that a robot uses: a network may deliver messages closer together than sent.
 _OWN_SHARE = 0.9
-"""Share of the server's limit that a robot uses: a network may deliver messages closer together than sent."""
 _UNLIMITED = 1 << 30
-
-
-@dataclass(slots=True)
-class TokenBucket:
-    """A bucket of *burst* tokens, refilled with *rate* tokens a second; it starts full.
-
-    Source:
-        Turner 1986, "New directions in communications".
-    """
-
-    rate: float
-    burst: float
-    left: float = field(init=False)
-    at: float = field(init=False, default=-math.inf)
-
-    def __post_init__(self) -> None:
-        """Fill the bucket."""
-        self.left = self.burst
-
-    def take(self, now: float) -> float:
-        """Take one token at *now* (s) and return 0, or return the seconds until one is available."""
-        wait_s = self.wait_s(now)
-        if not wait_s:
-            self.left -= 1.0
-        return wait_s
-
-    def wait_s(self, now: float) -> float:
-        """Return the seconds until one token is available, 0 if one is available at *now*."""
-        self.fill(now)
-        return 0.0 if self.left >= 1.0 else (1.0 - self.left) / self.rate
-
-    def spend(self, tokens: float, now: float) -> float:
-        """Take *tokens*, more than there are if need be; return the seconds until earlier debt is repaid."""
-        self.fill(now)
-        wait_s = max(0.0, -self.left) / self.rate
-        self.left -= tokens
-        return wait_s
-
-    def is_full(self, now: float) -> bool:
-        """Return whether all tokens that were taken have been refilled."""
-        self.fill(now)
-        return self.left >= self.burst
-
-    def fill(self, now: float) -> None:
-        """Add the tokens of the time until *now*."""
-        if now > self.at:
-            self.left = min(self.burst, self.left + (now - self.at) * self.rate)
-            self.at = now
 
 
 class RateLimiter:

@@ -13,7 +13,7 @@ from collections.abc import Iterator, Mapping
 import pytest
 
 ORDER = (
-    "rse_pf", "errors", "linux", "files", "geometry", "config",
+    "rse_pf", "errors", "linux", "files", "geometry", "token_bucket", "config",
     "wire", "scaling", "object_store", "maps", "auth", "audit", "service",
     "pnp", "services.mapping", "services.custom", "services",
     "aws", "aws.storage", "aws.fleet", "aws.money",
@@ -41,7 +41,18 @@ ONLY: dict[str, set[str]] = {
     "data_server": _BELOW - {"scaling"},
     "lambda_pnp": _BELOW - {"scaling", "aws"},
     "local": {"config", "scaling", "errors", "auth", "object_store", "audit", "linux", "files"},
-    "client_sdk": {"config", "errors", "files", "geometry", "maps", "wire", "service", "services", "pnp"},
+    "client_sdk": {
+        "config",
+        "errors",
+        "files",
+        "geometry",
+        "token_bucket",
+        "maps",
+        "wire",
+        "service",
+        "services",
+        "pnp",
+    },
     "stacks": {"config", "scaling", "errors"},
     "app": {"config", "errors", "stacks"},
     "experiments": _BELOW | LEAVES - {"stacks"},
@@ -60,7 +71,7 @@ PACKAGES: dict[str, tuple[str, ...]] = {
     "aiofastnet": ("rse_pf/backend/",),
     "uvloop": ("rse_pf/backend/",),
     "prometheus_client": ("rse_pf/backend/", "rse_pf/data_server/"),
-    "uvicorn": ("rse_pf/data_server/server.py", "rse_pf/data_server/one_request.py"),
+    "uvicorn": ("rse_pf/data_server/server.py",),
     "jwt": ("rse_pf/auth/tokens.py",),
     "cryptography": ("rse_pf/auth/tokens.py",),
     "boto3": ("rse_pf/aws/",),

@@ -6,9 +6,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rse_pf.config import SessionSettings
+from rse_pf.token_bucket import TokenBucket
 from rse_pf.wire import Command, Limits, Ping, Result, Welcome, make_codec
 from rse_pf.wire.client_session import Answered, ClientSession, ConnectionState
-from rse_pf.wire.rate_limit import RateLimiter, TokenBucket
+from rse_pf.wire.rate_limit import RateLimiter
 
 CODEC = make_codec("json")
 LIMITS = Limits(max_message_bytes=4096, max_in_flight=8, max_commands_per_s=20.0, command_burst=40)

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from typing import Generic, TypeVar
 
 from rse_pf.config import ServingSettings, SessionSettings
-from rse_pf.wire.rate_limit import TokenBucket
+from rse_pf.token_bucket import TokenBucket
 
 __all__ = ["CutOff", "PendingHandshakes", "RobotRates", "SourceRates", "TokenBucket", "TooFast"]
 

@@ -11,7 +11,7 @@ from pathlib import Path
 from client_sdk.transfer import BackgroundUploader
 from rse_pf.config import DataSettings
 from rse_pf.errors import BadRequest
-from rse_pf.wire.rate_limit import TokenBucket
+from rse_pf.token_bucket import TokenBucket
 
 
 def test_the_rate_limit_of_uploads_allows_no_burst_after_an_idle_time() -> None:
