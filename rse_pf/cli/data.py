@@ -49,7 +49,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
     """Serve until a signal ends it."""
     if args.openapi:
-        from rse_pf.data_server.openapi import openapi_page
+        from rse_pf.data_server.routes import openapi_page
 
         sys.stdout.write(openapi_page())
         return 0

@@ -1,10 +1,10 @@
 """The data servers box of Fig. 2: large data by HTTP (Sect. 5.2), and the maps that robots share.
 
-HTTP, uploads and quotas belong here; a process keeps nothing that another one could not find in the store.
+HTTP, uploads and quotas belong here; a process keeps no state that another one could not find in the store.
 """
 
 from rse_pf.data_server.app import DataServer
-from rse_pf.data_server.openapi import openapi
+from rse_pf.data_server.routes import openapi
 from rse_pf.data_server.server import serve_data
 
 __all__ = ["DataServer", "openapi", "serve_data"]

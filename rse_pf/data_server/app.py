@@ -1,21 +1,22 @@
-"""The data service as an ASGI application: find the route, ask for the token, answer.
+"""The data service as an ASGI application: find the route, check the token, call the handler, reply.
 
-Plain ASGI, because the whole of it is one table of routes and a body with limits; a framework would add
-a second way to say each.  Promises that whatever comes in, an answer with a code goes out, and that no
-token and no payload is logged.
+It is plain ASGI because it consists of one table of routes and bodies with limits; docs/design.md has the
+measurement of a framework.  Every request gets a reply with a status and, on failure, a code; no token and no
+payload is logged.
 """
 
 from __future__ import annotations
 
 import asyncio
+import dataclasses
 import time
 import uuid
-from collections.abc import AsyncIterator, Callable, Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from rse_pf.audit.chain import Note, RefusalLimiter
 from rse_pf.audit.log import AuditLog
-from rse_pf.auth.roster import holds
+from rse_pf.auth.roster import scopes_allow
 from rse_pf.auth.tokens import Claims, KeySet, token_problem, verify_token
 from rse_pf.config import PlatformSettings
 from rse_pf.data_server.handlers import Handler, Handlers
@@ -35,10 +36,10 @@ from rse_pf.object_store import ObjectStore
 
 __all__ = ["DataServer"]
 
-_NOBODY = Claims(robot="", token_id="", issued_s=0.0, expires_s=0.0, key_id="")
+_ANONYMOUS = Claims(robot="", token_id="", issued_s=0.0, expires_s=0.0, key_id="")
 _PROBES = ("/data/healthz", "/data/readyz")
-_COME_AGAIN_MS = 1000.0
-_TOO_SLOW = 408
+_RETRY_AFTER_MS = 1000.0
+_REQUEST_TIMEOUT = 408
 
 
 class DataServer:
@@ -55,16 +56,16 @@ class DataServer:
         wall_clock: Callable[[], float] = time.time,
         audit: AuditLog | None = None,
     ) -> None:
-        """Make the application.
+        """Make the application; nothing is read yet.
 
         Args:
             settings: Groups data and auth.
-            store: Where everything lives.
-            keys: Who may sign tokens, asked for each request; None refuses all.
+            store: Holds objects and maps.
+            keys: Returns the keys that may sign tokens, for each request; None refuses all.
             log: Gets one line for each request.
             clock: Monotonic seconds.
             wall_clock: Unix seconds.
-            audit: Gets refused tokens and changes of maps; None records nothing.
+            audit: Records refused tokens and changes of maps; None records nothing.
         """
         self._audit = audit
         self._refusals = RefusalLimiter()
@@ -73,52 +74,49 @@ class DataServer:
         self._log = log
         self._clock = clock
         self._wall_clock = wall_clock
-        self._bodies = 0
+        self._open_bodies = 0
         self.handlers = Handlers(store, settings.data, clock=clock, wall_clock=wall_clock, audit=audit)
-        self._routes = [(route.pattern, route, _handler(self.handlers, route)) for route in ROUTES]
+        self._routes = [(route.pattern, route, getattr(self.handlers, route.operation)) for route in ROUTES]
 
     async def __call__(self, scope: Mapping[str, Any], receive: Receive, send: Send) -> None:
-        """Answer one request."""
+        """Handle one request; raises BadRequest for another protocol."""
         if scope["type"] != "http":
-            raise BadRequest(f"{scope['type']} is not offered here", hint="speak HTTP")
+            raise BadRequest(f"{scope['type']} is not supported", hint="use HTTP")
         began = self._clock()
         request = HttpRequest(scope, receive, self._clock, self._settings.data)
-        said: dict[str, Any] = {"event": "request", "method": request.method}
+        line: dict[str, Any] = {"event": "request", "method": request.method}
         try:
-            reply = await self._answer(request, said)
+            reply = await self._reply(request, line)
             sent = await _send(reply, request, send)
         except Disconnected:
-            said["status"] = "left"
+            line["status"] = "disconnected"
         else:
-            said |= {"status": reply.status, "sent_bytes": sent}
-        said |= {
+            line |= {"status": reply.status, "sent_bytes": sent}
+        line |= {
             "received_bytes": request.received_bytes,
             "took_ms": round(1000 * (self._clock() - began), 2),
         }
         if request.path not in _PROBES:
-            self._log(said)
+            self._log(line)
 
-    async def _answer(self, request: HttpRequest, said: dict[str, Any]) -> HttpReply:
+    async def _reply(self, request: HttpRequest, line: dict[str, Any]) -> HttpReply:
         try:
-            reply = await self._handled(request, said)
+            reply = await self._handle(request, line)
         except Disconnected:
             raise
         except RsePfError as error:
-            said["code"] = error.code
+            line["code"] = error.code
             reply = failure_reply(error)
-        except Exception as error:  # noqa: BLE001 - the last wall: it becomes a 500 with an id for the log
+        except Exception as error:  # noqa: BLE001 - a defect: the reply is 500 with the id of its log line
             trace = uuid.uuid4().hex
-            said |= {"code": InternalError.code, "trace": trace, "error": repr(error)[:500]}
-            reply = failure_reply(InternalError("the data server failed", hint=f"its log has {trace}"))
-        if not request.over and (reply.status == _TOO_SLOW or not await self._drained(request)):
-            reply = HttpReply(
-                status=reply.status, body=reply.body, media_type=reply.media_type,
-                headers={**reply.headers, "Connection": "close"},
-            )  # fmt: skip
+            line |= {"code": InternalError.code, "trace": trace, "error": repr(error)[:500]}
+            reply = failure_reply(InternalError("the data server failed", hint=f"search its log for {trace}"))
+        if not request.is_complete and (reply.status == _REQUEST_TIMEOUT or not await self._drain(request)):
+            reply = dataclasses.replace(reply, headers={**reply.headers, "Connection": "close"})
         return reply
 
-    async def _drained(self, request: HttpRequest) -> bool:
-        """Read the rest of a small body, so that the robot hears us before the connection closes."""
+    async def _drain(self, request: HttpRequest) -> bool:
+        """Read the rest of a small body, so that the robot gets the reply before the connection closes."""
         try:
             return await request.drain(self._settings.data.part_bytes)
         except Disconnected:
@@ -126,55 +124,55 @@ class DataServer:
         except RsePfError:
             return False
 
-    async def _handled(self, request: HttpRequest, said: dict[str, Any]) -> HttpReply:
+    async def _handle(self, request: HttpRequest, line: dict[str, Any]) -> HttpReply:
         route, handler, path = self._find(request)
-        said["operation"] = route.operation
-        who = _NOBODY if route.scope is None else self._who(request, route.scope, path.get("name", ""), said)
+        line["operation"] = route.operation
+        claims = _ANONYMOUS
+        if route.scope is not None:
+            claims = self._claims(request, route.scope, path.get("name", ""), line)
         if route.body is None:
-            return await handler(request, who, path)
-        if self._bodies >= self._settings.data.max_uploads:
-            raise Busy("too many uploads at once", hint="come again", retry_after_ms=_COME_AGAIN_MS)
-        self._bodies += 1
+            return await handler(request, claims, path)
+        if self._open_bodies >= self._settings.data.max_uploads:
+            raise Busy("too many uploads at once", hint="retry later", retry_after_ms=_RETRY_AFTER_MS)
+        self._open_bodies += 1
         try:
-            return await handler(request, who, path)
+            return await handler(request, claims, path)
         finally:
-            self._bodies -= 1
+            self._open_bodies -= 1
 
     def _find(self, request: HttpRequest) -> tuple[Route, Handler, dict[str, str]]:
-        others = []
+        allowed = []
         for pattern, route, handler in self._routes:
             found = pattern.fullmatch(request.path)
             if found and route.method == request.method:
                 return route, handler, found.groupdict()
             if found:
-                others.append(route.method)
-        if others:
-            refused = MethodNotAllowed("this method is not offered here", hint=f"use {', '.join(others)}")
-            refused.allowed = ", ".join(others)
-            raise refused
-        raise NotFound("there is nothing here", hint="see /data/openapi.json")
+                allowed.append(route.method)
+        if allowed:
+            raise MethodNotAllowed(", ".join(allowed))
+        raise NotFound("no such path", hint="see /data/openapi.json")
 
-    def _who(self, request: HttpRequest, scope: str, name: str, said: dict[str, Any]) -> Claims:
+    def _claims(self, request: HttpRequest, scope: str, name: str, line: dict[str, Any]) -> Claims:
         kind, _, token = request.headers.get("authorization", "").partition(" ")
         keys = self._keys()
         if keys is None:
-            raise Busy("no keys have arrived yet", hint="come again", retry_after_ms=_COME_AGAIN_MS)
+            raise Busy("the service has no keys yet", hint="retry later", retry_after_ms=_RETRY_AFTER_MS)
         try:
-            who = verify_token(
+            claims = verify_token(
                 token.strip() if kind.lower() == "bearer" else "",
                 keys=keys, now=self._wall_clock(), settings=self._settings.auth,
             )  # fmt: skip
         except Unauthorized as error:
-            said["reason"] = token_problem(error)
-            self._record_refusal(said["reason"])
+            line["reason"] = token_problem(error)
+            self._record_refusal(line["reason"])
             raise
-        said["robot"] = who.robot
-        if not holds(who.scopes, scope, name):
-            raise Forbidden(f"this token does not hold the scope {scope}", hint="issue one that does")
-        return who
+        line["robot"] = claims.robot
+        if not scopes_allow(claims.scopes, scope, name):
+            raise Forbidden(f"this token does not have the scope {scope}", hint="issue another token")
+        return claims
 
     def record_counted(self) -> None:
-        """Record how many refusals were only counted since the last that was recorded."""
+        """Record how many refusals were counted, but not recorded one by one, since the last call."""
         counted = self._refusals.summary()
         if self._audit is not None and counted:
             now, who = self._wall_clock(), self._audit.who
@@ -186,13 +184,8 @@ class DataServer:
             self._audit.record("auth.refused", reason=reason)
 
 
-def _handler(handlers: Handlers, route: Route) -> Handler:
-    found: Handler = getattr(handlers, route.operation)
-    return found
-
-
 async def _send(reply: HttpReply, request: HttpRequest, send: Send) -> int:
-    """Send *reply*; return how many bytes of body went out."""
+    """Send *reply*; return how many bytes of body were sent."""
     body = reply.body
     headers = {"Content-Type": reply.media_type, "Cache-Control": "no-store", **reply.headers}
     if isinstance(body, bytes) and reply.status != 204:
@@ -200,19 +193,13 @@ async def _send(reply: HttpReply, request: HttpRequest, send: Send) -> int:
     raw = [(name.lower().encode("latin-1"), value.encode("latin-1")) for name, value in headers.items()]
     await send({"type": "http.response.start", "status": reply.status, "headers": raw})
     sent = 0
-    if request.method != "HEAD":
-        async for piece in _pieces(body):
+    if request.method == "HEAD":
+        body = b""
+    elif not isinstance(body, bytes):
+        async for piece in body:
             await send({"type": "http.response.body", "body": piece, "more_body": True})
             sent += len(piece)
-    await send({"type": "http.response.body", "body": b"", "more_body": False})
-    return sent
-
-
-async def _pieces(body: bytes | AsyncIterator[bytes]) -> AsyncIterator[bytes]:
-    if isinstance(body, bytes):
-        if body:
-            yield body
-        return
-    async for piece in body:
-        yield piece
-        await asyncio.sleep(0)  # a server whose send never waits must not starve the others
+            await asyncio.sleep(0)  # lets other requests run where sending never waits
+        body = b""
+    await send({"type": "http.response.body", "body": body, "more_body": False})
+    return sent + len(body)

@@ -1,6 +1,6 @@
-"""What each route of the data service does, in a thread where it waits for the store.
+"""The handlers of the data service, one for each route; calls of the store run in a thread.
 
-Promises that identity comes from the token alone, and that what belongs to others is not there.
+Tenant and robot come only from the token, and an object of another robot is reported as missing.
 """
 
 from __future__ import annotations
@@ -9,7 +9,6 @@ import asyncio
 import contextlib
 import time
 from collections.abc import AsyncIterator, Awaitable, Callable
-from dataclasses import asdict
 from typing import Any, TypeVar
 
 import msgspec
@@ -17,23 +16,23 @@ import msgspec
 from rse_pf.audit.log import AuditLog
 from rse_pf.auth.tokens import Claims
 from rse_pf.config import DataSettings
-from rse_pf.data_server.http import HttpReply, HttpRequest, failure_reply, json_reply, wanted_range
-from rse_pf.data_server.openapi import openapi_page
+from rse_pf.data_server.http import HttpReply, HttpRequest, failure_reply, json_reply, requested_range
 from rse_pf.data_server.routes import (
     BYTES,
     Commit,
-    Direct,
     MapName,
     MapPage,
     MapVersionInfo,
     MoveHead,
     ObjectPage,
+    PresignedPut,
     ServiceHealth,
     StoredObject,
     Upload,
     UploadBegin,
+    openapi_page,
 )
-from rse_pf.data_server.uploads import Objects, UploadState
+from rse_pf.data_server.uploads import Objects
 from rse_pf.errors import BadRequest, NotFound
 from rse_pf.maps.registry import MapRecord, MapRegistry
 from rse_pf.object_store import ObjectStore, PresigningStore, read_range
@@ -42,11 +41,12 @@ __all__ = ["Handler", "Handlers"]
 
 _T = TypeVar("_T")
 Handler = Callable[[HttpRequest, Claims, dict[str, str]], Awaitable[HttpReply]]
+"""Gets a request, the claims of its token, and the parameters of its path."""
 
 _PIECE_BYTES = 1 << 20
-_JSON_BYTES = 16384
-_NOTE_LETTERS = 500
-_PAGE = 1000
+_MAX_JSON_BYTES = 16384
+_MAX_NOTE_LETTERS = 500
+_MAX_PAGE = 1000
 _PROBE = "ready/probe"
 
 
@@ -69,166 +69,173 @@ class Handlers:
         self.objects = Objects(store, settings, clock, wall_clock)
         self._document = openapi_page().encode()
 
-    async def healthz(self, request: HttpRequest, who: Claims, path: dict[str, str]) -> HttpReply:
-        """Answer at once."""
+    async def healthz(self, request: HttpRequest, claims: Claims, path: dict[str, str]) -> HttpReply:
+        """Return 200."""
         return json_reply(200, ServiceHealth(status="ok"))
 
-    async def readyz(self, request: HttpRequest, who: Claims, path: dict[str, str]) -> HttpReply:
-        """Ask the store for something that is not there; any other failure means not ready."""
+    async def readyz(self, request: HttpRequest, claims: Claims, path: dict[str, str]) -> HttpReply:
+        """Ask the store for a missing object; any other error than NotFound means not ready."""
         with contextlib.suppress(NotFound):
             await asyncio.to_thread(self._store.head, _PROBE)
         return json_reply(200, ServiceHealth(status="ready"))
 
-    async def document(self, request: HttpRequest, who: Claims, path: dict[str, str]) -> HttpReply:
+    async def document(self, request: HttpRequest, claims: Claims, path: dict[str, str]) -> HttpReply:
         """Return the OpenAPI document."""
         return HttpReply(status=200, body=self._document)
 
-    async def list_objects(self, request: HttpRequest, who: Claims, path: dict[str, str]) -> HttpReply:
+    async def list_objects(self, request: HttpRequest, claims: Claims, path: dict[str, str]) -> HttpReply:
         """List a page of objects."""
-        text = request.query.get("limit", str(_PAGE))
+        text = request.query.get("limit", str(_MAX_PAGE))
         limit = int(text) if text.isdecimal() and text.isascii() and len(text) < 6 else 0
-        if not 1 <= limit <= _PAGE:
-            raise BadRequest(f"limit {text[:40]!r} is not in 1 to {_PAGE}", hint="leave it out")
-        found, more = await asyncio.to_thread(self.objects.list, who, request.query.get("after", ""), limit)
+        if not 1 <= limit <= _MAX_PAGE:
+            raise BadRequest(f"limit {text[:40]!r} is not in 1 to {_MAX_PAGE}", hint="leave it out")
+        found, more = await asyncio.to_thread(
+            self.objects.list, claims, request.query.get("after", ""), limit
+        )
         page = [StoredObject(digest=info.name.rpartition("/")[2], size=info.size) for info in found]
         return json_reply(200, ObjectPage(objects=page, next=page[-1].digest if more else None))
 
-    async def get_object(self, request: HttpRequest, who: Claims, path: dict[str, str]) -> HttpReply:
-        """Send an object or a range."""
-        info = await asyncio.to_thread(self.objects.head, who, path["digest"])
+    async def get_object(self, request: HttpRequest, claims: Claims, path: dict[str, str]) -> HttpReply:
+        """Return an object or a range of it."""
+        info = await asyncio.to_thread(self.objects.head, claims, path["digest"])
         return await self._content(request, info.name, info.size, path["digest"])
 
-    async def head_object(self, request: HttpRequest, who: Claims, path: dict[str, str]) -> HttpReply:
-        """Send the size alone."""
-        info = await asyncio.to_thread(self.objects.head, who, path["digest"])
+    async def head_object(self, request: HttpRequest, claims: Claims, path: dict[str, str]) -> HttpReply:
+        """Return the size."""
+        info = await asyncio.to_thread(self.objects.head, claims, path["digest"])
         headers = {**_content_headers(path["digest"]), "Content-Length": str(info.size)}
         return HttpReply(status=200, headers=headers, media_type=BYTES)
 
-    async def put_object(self, request: HttpRequest, who: Claims, path: dict[str, str]) -> HttpReply:
+    async def put_object(self, request: HttpRequest, claims: Claims, path: dict[str, str]) -> HttpReply:
         """Store a small object."""
-        self.objects.name(who, path["digest"])
+        self.objects.name(claims, path["digest"])
         data = await request.body(self._settings.part_bytes)
-        new = await asyncio.to_thread(self.objects.put, who, path["digest"], data)
+        new = await asyncio.to_thread(self.objects.put, claims, path["digest"], data)
         return json_reply(201 if new else 200, StoredObject(digest=path["digest"], size=len(data)))
 
-    async def delete_object(self, request: HttpRequest, who: Claims, path: dict[str, str]) -> HttpReply:
+    async def delete_object(self, request: HttpRequest, claims: Claims, path: dict[str, str]) -> HttpReply:
         """Remove an object."""
-        await asyncio.to_thread(self.objects.delete, who, path["digest"])
+        await asyncio.to_thread(self.objects.delete, claims, path["digest"])
         return HttpReply(status=204)
 
-    async def begin_upload(self, request: HttpRequest, who: Claims, path: dict[str, str]) -> HttpReply:
+    async def begin_upload(self, request: HttpRequest, claims: Claims, path: dict[str, str]) -> HttpReply:
         """Open an upload."""
         begin = await _json_body(request, UploadBegin)
         if begin.size < 1:
             raise BadRequest(f"a size of {begin.size} bytes needs no upload", hint="PUT the object")
-        state = await asyncio.to_thread(self.objects.begin, who, path["digest"], begin.size)
-        return _upload(200, state, await asyncio.to_thread(self._direct, who, state))
+        state = await asyncio.to_thread(self.objects.begin, claims, path["digest"], begin.size)
+        direct = await asyncio.to_thread(self._presigned_put, claims, state)
+        return _upload(200, msgspec.structs.replace(state, direct=direct))
 
-    def _direct(self, who: Claims, state: UploadState) -> Direct | None:
-        """Return where all bytes may go at once; None if some are here, or the store has no such place."""
-        store, life_s = self._store, self._settings.presigned_url_ttl_s
+    def _presigned_put(self, claims: Claims, state: Upload) -> PresignedPut | None:
+        """Return a URL for a direct upload; None if a part is stored, or the store presigns none."""
+        store, ttl_s = self._store, self._settings.presigned_url_ttl_s
         if state.offset or not isinstance(store, PresigningStore):
             return None
-        name = self.objects.name(who, state.digest)
-        url, headers = store.presigned_put(name, size=state.size, sha256=state.digest, life_s=life_s)
-        return Direct(url=url, headers=headers, life_s=life_s)
+        name = self.objects.name(claims, state.digest)
+        url, headers = store.presigned_put(name, size=state.size, sha256=state.digest, ttl_s=ttl_s)
+        return PresignedPut(url=url, headers=headers, life_s=ttl_s)
 
-    async def get_upload(self, request: HttpRequest, who: Claims, path: dict[str, str]) -> HttpReply:
-        """Tell how far an upload has come."""
-        return _upload(200, await asyncio.to_thread(self.objects.progress, who, path["digest"]))
+    async def get_upload(self, request: HttpRequest, claims: Claims, path: dict[str, str]) -> HttpReply:
+        """Return the state of an upload."""
+        return _upload(200, await asyncio.to_thread(self.objects.progress, claims, path["digest"]))
 
     head_upload = get_upload
 
-    async def append_part(self, request: HttpRequest, who: Claims, path: dict[str, str]) -> HttpReply:
+    async def append_part(self, request: HttpRequest, claims: Claims, path: dict[str, str]) -> HttpReply:
         """Store a part."""
         offset = request.header_number("Upload-Offset")
         if offset is None:
-            raise BadRequest("the header Upload-Offset is missing", hint="say where this part begins")
-        self.objects.name(who, path["digest"])
+            raise BadRequest("the header Upload-Offset is missing", hint="send the offset of this part")
+        self.objects.name(claims, path["digest"])
         data = await request.body(self._settings.part_bytes)
-        state = await asyncio.to_thread(self.objects.append, who, path["digest"], offset, data)
+        state = await asyncio.to_thread(self.objects.append, claims, path["digest"], offset, data)
         return _upload(201 if state.offset == state.size else 200, state)
 
-    async def abandon_upload(self, request: HttpRequest, who: Claims, path: dict[str, str]) -> HttpReply:
-        """Forget an upload."""
-        await asyncio.to_thread(self.objects.abandon, who, path["digest"])
+    async def abandon_upload(self, request: HttpRequest, claims: Claims, path: dict[str, str]) -> HttpReply:
+        """Remove an upload."""
+        await asyncio.to_thread(self.objects.abandon, claims, path["digest"])
         return HttpReply(status=204)
 
-    async def list_maps(self, request: HttpRequest, who: Claims, path: dict[str, str]) -> HttpReply:
+    async def list_maps(self, request: HttpRequest, claims: Claims, path: dict[str, str]) -> HttpReply:
         """List maps with their heads."""
-        maps = self._maps(who)
+        maps = self._maps(claims)
 
         def named() -> MapPage:
             return MapPage(maps=[MapName(name=name, head=maps.head(name).id) for name in maps.names()])
 
         return json_reply(200, await asyncio.to_thread(named))
 
-    async def list_versions(self, request: HttpRequest, who: Claims, path: dict[str, str]) -> HttpReply:
+    async def list_versions(self, request: HttpRequest, claims: Claims, path: dict[str, str]) -> HttpReply:
         """List versions."""
-        records = await asyncio.to_thread(self._maps(who).versions, path["name"])
+        records = await asyncio.to_thread(self._maps(claims).versions, path["name"])
         return json_reply(200, [MapVersionInfo(id=record.id, record=record) for record in records])
 
-    async def commit_version(self, request: HttpRequest, who: Claims, path: dict[str, str]) -> HttpReply:
+    async def commit_version(self, request: HttpRequest, claims: Claims, path: dict[str, str]) -> HttpReply:
         """Commit an object of this robot as a version."""
         commit = await _json_body(request, Commit)
-        if len(commit.note) > _NOTE_LETTERS:
+        if len(commit.note) > _MAX_NOTE_LETTERS:
             raise BadRequest(
-                f"the note has {len(commit.note)} letters, at most {_NOTE_LETTERS}", hint="shorten it"
+                f"the note has {len(commit.note)} letters, at most {_MAX_NOTE_LETTERS}", hint="shorten it"
             )
-        name = self.objects.name(who, commit.digest)
+        name = self.objects.name(claims, commit.digest)
 
         def work() -> MapRecord:
-            return self._maps(who).commit(
-                path["name"], self._store.get(name), parent=commit.parent, author=who.robot,
+            return self._maps(claims).commit(
+                path["name"], self._store.get(name), parent=commit.parent, author=claims.robot,
                 created_s=self._wall_clock(), note=commit.note,
             )  # fmt: skip
 
         return _version(201, await asyncio.to_thread(work))
 
-    async def show_version(self, request: HttpRequest, who: Claims, path: dict[str, str]) -> HttpReply:
+    async def show_version(self, request: HttpRequest, claims: Claims, path: dict[str, str]) -> HttpReply:
         """Show a version."""
-        return _version(200, await asyncio.to_thread(self._maps(who).record, path["name"], path["version"]))
+        return _version(
+            200, await asyncio.to_thread(self._maps(claims).record, path["name"], path["version"])
+        )
 
-    async def get_version(self, request: HttpRequest, who: Claims, path: dict[str, str]) -> HttpReply:
-        """Send the bytes of a version or a range of them."""
-        maps = self._maps(who)
+    async def get_version(self, request: HttpRequest, claims: Claims, path: dict[str, str]) -> HttpReply:
+        """Return the bytes of a version or a range of them."""
+        maps = self._maps(claims)
         record = await asyncio.to_thread(maps.record, path["name"], path["version"])
         return await self._content(request, maps.blob_name(path["name"], record), record.size, record.digest)
 
-    async def move_head(self, request: HttpRequest, who: Claims, path: dict[str, str]) -> HttpReply:
+    async def move_head(self, request: HttpRequest, claims: Claims, path: dict[str, str]) -> HttpReply:
         """Move a head."""
-        wanted = await _json_body(request, MoveHead)
+        move = await _json_body(request, MoveHead)
 
         def work() -> MapRecord:
-            return self._maps(who).move_head(path["name"], wanted.version, expected=wanted.expected)
+            return self._maps(claims).move_head(path["name"], move.version, expected=move.expected)
 
         return _version(200, await asyncio.to_thread(work))
 
-    def _maps(self, who: Claims) -> MapRegistry:
-        def told(action: str, name: str, record: MapRecord) -> None:
+    def _maps(self, claims: Claims) -> MapRegistry:
+        def record_change(action: str, name: str, record: MapRecord) -> None:
             if self._audit is not None:
-                subject = name if who.tenant == "default" else f"{who.tenant}/{name}"
-                self._audit.record(action, subject, actor=who.robot, version=record.id, number=record.number)
+                subject = name if claims.tenant == "default" else f"{claims.tenant}/{name}"
+                self._audit.record(
+                    action, subject, actor=claims.robot, version=record.id, number=record.number
+                )
 
         max_bytes = 4 * self._settings.max_object_bytes
-        return MapRegistry(self._store, who.tenant, max_bytes=max_bytes, told=told)
+        return MapRegistry(self._store, claims.tenant, max_bytes=max_bytes, on_change=record_change)
 
     async def _content(self, request: HttpRequest, name: str, size: int, digest: str) -> HttpReply:
-        store, life_s = self._store, self._settings.presigned_url_ttl_s
+        store, ttl_s = self._store, self._settings.presigned_url_ttl_s
         if request.headers.get("x-accept-direct") == "1" and isinstance(store, PresigningStore):
-            url = await asyncio.to_thread(store.presigned_get, name, life_s=life_s)
+            url = await asyncio.to_thread(store.presigned_get, name, ttl_s=ttl_s)
             return HttpReply(status=307, headers={"Location": url, **_content_headers(digest)})
         try:
-            wanted = wanted_range(request.headers.get("range"), size)
+            part = requested_range(request.headers.get("range"), size)
         except BadRequest as error:
             refused = failure_reply(error)
             return HttpReply(status=416, body=refused.body, headers={"Content-Range": f"bytes */{size}"})
-        start, end = wanted or (0, size)
+        start, end = part or (0, size)
         headers = {**_content_headers(digest), "Content-Length": str(end - start)}
-        if wanted:
+        if part:
             headers["Content-Range"] = f"bytes {start}-{end - 1}/{size}"
         return HttpReply(
-            status=206 if wanted else 200, body=self._pieces(name, start, end), headers=headers,
+            status=206 if part else 200, body=self._pieces(name, start, end), headers=headers,
             media_type=BYTES,
         )  # fmt: skip
 
@@ -250,8 +257,8 @@ def _content_headers(digest: str) -> dict[str, str]:
     }  # fmt: skip
 
 
-def _upload(status: int, state: UploadState, direct: Direct | None = None) -> HttpReply:
-    return json_reply(status, Upload(**asdict(state), direct=direct), Upload_Offset=str(state.offset))
+def _upload(status: int, state: Upload) -> HttpReply:
+    return json_reply(status, state, {"Upload-Offset": str(state.offset)})
 
 
 def _version(status: int, record: MapRecord) -> HttpReply:
@@ -259,8 +266,8 @@ def _version(status: int, record: MapRecord) -> HttpReply:
 
 
 async def _json_body(request: HttpRequest, kind: type[_T]) -> _T:
-    raw: Any = await request.body(_JSON_BYTES)
+    raw: Any = await request.body(_MAX_JSON_BYTES)
     try:
         return msgspec.json.decode(raw, type=kind)
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
-        raise BadRequest(f"the body is not understood: {error}", hint="see /data/openapi.json") from error
+        raise BadRequest(f"the body is invalid: {error}", hint="see /data/openapi.json") from error

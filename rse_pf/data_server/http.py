@@ -1,7 +1,7 @@
-"""HTTP as values: a request, a reply, a body with limits on its size, its silence and its slowness.
+"""HTTP requests and replies as values; a body has limits on its size, its pauses and its rate.
 
-Promises that an error leaves as a status, a code, a sentence and a hint, never as a traceback, and to
-hold no more of a body than the limit that it was given.
+An error is sent as a status, a code, a message and a hint, never as a traceback.  No more of a body than its
+limit is held in memory.
 """
 
 from __future__ import annotations
@@ -41,19 +41,21 @@ __all__ = [
     "Send",
     "failure_reply",
     "json_reply",
-    "wanted_range",
+    "requested_range",
 ]
 
 Receive = Callable[[], Awaitable[Mapping[str, Any]]]
 Send = Callable[[Mapping[str, Any]], Awaitable[None]]
-_BODY_GRACE_S = 5.0
-"""Then ``data.min_body_bytes_per_s`` applies."""
+_MIN_BODY_BYTES_PER_S, _BODY_GRACE_S = 1024, 5.0
+"""A body that has been slower than the first after the second is refused."""
 
 
 class MethodNotAllowed(BadRequest):
-    """The path is known, the method is not; *allowed* are."""
+    """The path has other methods than this one; *allowed* lists them."""
 
-    allowed = ""
+    def __init__(self, allowed: str) -> None:
+        super().__init__("the path does not support this method", hint=f"use {allowed}")
+        self.allowed = allowed
 
 
 _STATUS: dict[type[RsePfError], int] = {
@@ -66,7 +68,7 @@ _RANGE = re.compile(r"bytes=(\d{0,18})-(\d{0,18})")
 
 
 class HttpFailure(msgspec.Struct, frozen=True, kw_only=True):
-    """What went wrong: a stable code, a sentence, and what to do."""
+    """An error: a stable code, a message, and what to do."""
 
     code: str
     message: str
@@ -75,7 +77,7 @@ class HttpFailure(msgspec.Struct, frozen=True, kw_only=True):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class HttpReply:
-    """An answer; *body* is bytes, or pieces that are read while they are sent."""
+    """A reply; *body* is bytes, or pieces that are read while they are sent."""
 
     status: int
     body: bytes | AsyncIterator[bytes] = b""
@@ -96,7 +98,7 @@ class HttpRequest:
         }
         self.query = dict(parse_qsl(scope["query_string"].decode("latin-1"), keep_blank_values=True))
         self.received_bytes = 0
-        self.over = False
+        self.is_complete = False
         self._receive = receive
         self._clock = clock
         self._limits = limits
@@ -107,16 +109,16 @@ class HttpRequest:
         if text is None:
             return None
         if not re.fullmatch(r"[0-9]{1,18}", text):
-            raise BadRequest(f"{name}: {text[:40]!r} is no number of bytes", hint="send decimal digits")
+            raise BadRequest(f"{name}: {text[:40]!r} is not a number of bytes", hint="send decimal digits")
         return int(text)
 
     async def body(self, max_bytes: int) -> bytes:
         """Return the whole body.
 
         Raises:
-            LimitExceeded: It holds more than *max_bytes*.
-            Expired: It pauses for ``data.body_timeout_s`` or stays below ``data.min_body_bytes_per_s``.
-            Disconnected: The robot left in the middle.
+            LimitExceeded: It is longer than *max_bytes*.
+            Expired: It pauses for ``data.body_timeout_s`` or stays below `_MIN_BODY_BYTES_PER_S`.
+            Disconnected: The robot closed the connection before the end.
         """
         announced = self.header_number("content-length")
         if announced is not None and announced > max_bytes:
@@ -129,7 +131,7 @@ class HttpRequest:
         return bytes(held)
 
     async def drain(self, max_bytes: int) -> bool:
-        """Read what is left and forget it, so that the robot reads our answer; say whether all was read."""
+        """Read and discard the rest, so that the robot reads the reply; return whether all was read."""
         announced = self.header_number("content-length") or 0
         if announced > max_bytes:
             return False
@@ -140,32 +142,31 @@ class HttpRequest:
 
     async def _pieces(self) -> AsyncIterator[bytes]:
         began = self._clock()
-        while not self.over:
+        while not self.is_complete:
             try:
                 message = await asyncio.wait_for(self._receive(), self._limits.body_timeout_s)
             except asyncio.TimeoutError:
-                raise _too_slow(f"nothing came for {self._limits.body_timeout_s:g} s") from None
+                raise _too_slow(f"no data for {self._limits.body_timeout_s:g} s") from None
             if message["type"] == "http.disconnect":
-                self.over = True
-                raise Disconnected("the robot left within its request")
+                self.is_complete = True
+                raise Disconnected("the robot closed the connection within its request")
             piece: bytes = message.get("body", b"")
             self.received_bytes += len(piece)
-            self.over = not message.get("more_body", False)
+            self.is_complete = not message.get("more_body", False)
             yield piece
             lasted = self._clock() - began
-            lowest = self._limits.min_body_bytes_per_s
-            if not self.over and lasted > _BODY_GRACE_S and self.received_bytes < lowest * lasted:
+            lowest = _MIN_BODY_BYTES_PER_S
+            if not self.is_complete and lasted > _BODY_GRACE_S and self.received_bytes < lowest * lasted:
                 raise _too_slow(f"{self.received_bytes} bytes in {lasted:.1f} s; at least {lowest} a second")
 
 
-def json_reply(status: int, value: Any, **headers: str) -> HttpReply:
-    """Return *value* as JSON."""
-    named = {name.replace("_", "-"): text for name, text in headers.items()}
-    return HttpReply(status=status, body=msgspec.json.encode(value), headers=named)
+def json_reply(status: int, value: Any, headers: Mapping[str, str] | None = None) -> HttpReply:
+    """Return a reply whose body is *value* as JSON."""
+    return HttpReply(status=status, body=msgspec.json.encode(value), headers=headers or {})
 
 
 def failure_reply(error: RsePfError) -> HttpReply:
-    """Return the answer that *error* is."""
+    """Return the reply that reports *error*."""
     status = next((_STATUS[kind] for kind in type(error).__mro__ if kind in _STATUS), _INTERNAL)
     headers: dict[str, str] = {}
     if isinstance(error, MethodNotAllowed):
@@ -174,17 +175,16 @@ def failure_reply(error: RsePfError) -> HttpReply:
         headers["WWW-Authenticate"] = "Bearer"
     if error.retry_after_ms is not None:
         headers["Retry-After"] = str(max(1, round(error.retry_after_ms / 1000)))
-    said = HttpFailure(code=error.code, message=error.message, hint=error.hint)
-    return HttpReply(status=status, body=msgspec.json.encode(said), headers=headers)
+    return json_reply(status, HttpFailure(code=error.code, message=error.message, hint=error.hint), headers)
 
 
-def wanted_range(text: str | None, size: int) -> tuple[int, int] | None:
+def requested_range(text: str | None, size: int) -> tuple[int, int] | None:
     """Return ``(start, end)`` of one byte range, end excluded; None for the whole object.
 
-    What is no single range is ignored, as RFC 9110 Sect. 14.2 allows.
+    A header that is not one single range is ignored, as RFC 9110 Sect. 14.2 allows.
 
     Raises:
-        BadRequest: The range lies outside the object; whoever calls answers 416.
+        BadRequest: The range lies outside the object; the status is 416.
     """
     found = _RANGE.fullmatch(text.strip()) if text else None
     if found is None or found[1] == found[2] == "":
@@ -197,12 +197,14 @@ def wanted_range(text: str | None, size: int) -> tuple[int, int] | None:
         if found[2] and int(found[2]) < start:
             return None
     if start >= size or start >= end:
-        raise BadRequest(f"{text!r} lies outside of {size} bytes", hint="ask HEAD for the size")
+        raise BadRequest(f"{text!r} lies outside of {size} bytes", hint="HEAD returns the size")
     return start, end
 
 
-def _too_long(got: int, most: int) -> LimitExceeded:
-    return LimitExceeded(f"got {got} bytes, the limit is {most}", hint="send it in parts: PUT an upload")
+def _too_long(got: int, max_bytes: int) -> LimitExceeded:
+    return LimitExceeded(
+        f"got {got} bytes, the limit is {max_bytes}", hint="send the object in parts: PUT an upload"
+    )
 
 
 def _too_slow(what: str) -> Expired:

@@ -1,11 +1,13 @@
-"""The data service's routes as data: what may be asked, by whom, and what comes back.
+"""The HTTP interface of the data service: its routes, their JSON types, and its OpenAPI document.
 
-The dispatcher and the OpenAPI document both read this table, so neither can say what the other does not.
-Promises no input and no output here; `rse_pf.data_server.handlers` does what a route names.
+The application and the OpenAPI document both read the table `ROUTES`, so they cannot disagree.  Nothing is
+read or sent here; `rse_pf.data_server.handlers` has one method for each route.
 """
 
 from __future__ import annotations
 
+import functools
+import json
 import re
 from dataclasses import dataclass
 from typing import Any
@@ -24,11 +26,14 @@ __all__ = [
     "MapVersionInfo",
     "MoveHead",
     "ObjectPage",
+    "PresignedPut",
     "Route",
     "ServiceHealth",
     "StoredObject",
     "Upload",
     "UploadBegin",
+    "openapi",
+    "openapi_page",
 ]
 
 BYTES = "application/octet-stream"
@@ -42,20 +47,20 @@ class StoredObject(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class ObjectPage(msgspec.Struct, frozen=True, kw_only=True):
-    """Objects of this robot, sorted by digest; ask again with ``after`` = *next* unless it is null."""
+    """Objects of this robot, sorted by digest; the next page has ``after`` = *next*, unless it is null."""
 
     objects: list[StoredObject]
     next: str | None = None
 
 
 class UploadBegin(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """An object that will come in parts."""
+    """An object that will be sent in parts."""
 
     size: int
 
 
-class Direct(msgspec.Struct, frozen=True, kw_only=True):
-    """Where all bytes may be PUT at once, with exactly these headers and no token, for a short time."""
+class PresignedPut(msgspec.Struct, frozen=True, kw_only=True):
+    """A URL of the bucket for one PUT of all bytes, with exactly these headers and no token."""
 
     url: str
     headers: dict[str, str]
@@ -63,16 +68,16 @@ class Direct(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Upload(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """An upload: it is done, and durable, when *offset* is *size*.
+    """The state of an upload; the object is stored durably when *offset* is *size*.
 
-    Where *direct* is given the bytes may go straight to the bucket; begin the upload again afterwards.
+    With *direct* the robot may PUT the object directly to the bucket, and then begins the upload again.
     """
 
     digest: str
     size: int
     offset: int
     part_bytes: int
-    direct: Direct | None = None
+    direct: PresignedPut | None = None
 
 
 class MapName(msgspec.Struct, frozen=True, kw_only=True):
@@ -96,7 +101,7 @@ class MapVersionInfo(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Commit(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Make an uploaded object the next version; *parent* is the head as the robot knows it."""
+    """Make an uploaded object the next version; *parent* is the head that the robot last read."""
 
     digest: str
     parent: str | None = None
@@ -104,14 +109,14 @@ class Commit(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
 
 
 class MoveHead(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Let the head name *version*, if it still names *expected*."""
+    """Move the head to *version* if it still is *expected*."""
 
     version: str
     expected: str
 
 
 class ServiceHealth(msgspec.Struct, frozen=True, kw_only=True):
-    """How the service is."""
+    """The state of the service."""
 
     status: str
 
@@ -125,14 +130,15 @@ class Field:
     doc: str
     whole_number: bool = False
     required: bool = False
-    most: int | None = None
+    maximum: int | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Route:
-    """One thing that may be asked.
+    """One operation of the service.
 
-    *scope* None is open to all; *body* and *replies* hold a msgspec type, ``bytes``, or None for nothing.
+    A route whose *scope* is None needs no token; *body* and *replies* hold a msgspec type, ``bytes``, or None
+    for an empty body.
     """
 
     operation: str
@@ -146,7 +152,7 @@ class Route:
 
     @property
     def pattern(self) -> re.Pattern[str]:
-        """What a path must match as a whole; its groups are the parameters."""
+        """What the whole path must match; its groups are the path parameters."""
         return re.compile(re.sub(r"\\{(\w+)\\}", r"(?P<\1>[^/]*)", re.escape(self.path)))
 
 
@@ -156,10 +162,10 @@ _OFFSET = Field(
 )
 _DIRECT = Field(
     name="X-Accept-Direct", place="header",
-    doc="1: 307 with a signed address in Location will do, if the store has such", whole_number=True,
+    doc="1: the answer may be 307 with a presigned URL in Location", whole_number=True,
 )  # fmt: skip
-_AFTER = Field(name="after", place="query", doc="only objects behind this digest")
-_LIMIT = Field(name="limit", place="query", doc="at most so many", whole_number=True, most=1000)
+_AFTER = Field(name="after", place="query", doc="only objects with a greater digest")
+_LIMIT = Field(name="limit", place="query", doc="maximum number of objects", whole_number=True, maximum=1000)
 
 _BAD, _NOT_FOUND, _CONFLICT = {400: HttpFailure}, {404: HttpFailure}, {409: HttpFailure}
 _STORING = {408: HttpFailure, 413: HttpFailure, 503: HttpFailure, 507: HttpFailure}
@@ -169,11 +175,11 @@ _MAP, _VERSION = "/data/v1/maps/{name}/versions", "/data/v1/maps/{name}/versions
 ROUTES: tuple[Route, ...] = (
     Route(
         operation="healthz", method="GET", path="/data/healthz", scope=None,
-        doc="Say that the process lives", replies={200: ServiceHealth},
+        doc="Return 200 while the process is alive", replies={200: ServiceHealth},
     ),
     Route(
         operation="readyz", method="GET", path="/data/readyz", scope=None,
-        doc="Say whether the store answers", replies={200: ServiceHealth, 503: HttpFailure},
+        doc="Return 200 while the store answers", replies={200: ServiceHealth, 503: HttpFailure},
     ),
     Route(
         operation="document", method="GET", path="/data/openapi.json", scope=None,
@@ -194,7 +200,7 @@ ROUTES: tuple[Route, ...] = (
     ),
     Route(
         operation="put_object", method="PUT", path=_OBJECT, scope="data:write", body=bytes,
-        doc="Store an object of at most data.part_bytes; 201 means it is durable, 200 it was there",
+        doc="Store an object of at most data.part_bytes; 201 means that it is durable, 200 that it existed",
         replies={200: StoredObject, 201: StoredObject, **_BAD, **_NOT_FOUND, **_STORING},
     ),
     Route(
@@ -203,26 +209,26 @@ ROUTES: tuple[Route, ...] = (
     ),
     Route(
         operation="begin_upload", method="PUT", path=_UPLOAD, scope="data:write", body=UploadBegin,
-        doc="Begin an upload in parts, or learn how far it has come",
+        doc="Begin an upload in parts, or return the state of the open one",
         replies={200: Upload, **_BAD, **_NOT_FOUND, **_CONFLICT, **_STORING},
     ),
     Route(
         operation="get_upload", method="GET", path=_UPLOAD, scope="data:write",
-        doc="Learn how far an upload has come", replies={200: Upload, **_NOT_FOUND},
+        doc="Return the state of an upload", replies={200: Upload, **_NOT_FOUND},
     ),
     Route(
         operation="head_upload", method="HEAD", path=_UPLOAD, scope="data:write",
-        doc="Learn how far an upload has come, from the header Upload-Offset", replies={200: None, 404: None},
+        doc="Return the offset of an upload in the header Upload-Offset", replies={200: None, 404: None},
     ),
     Route(
         operation="append_part", method="PATCH", path=_UPLOAD, scope="data:write", fields=(_OFFSET,),
         body=bytes,
-        doc="Add a part; 201 means that it was the last and the object is durable",
+        doc="Add a part; 201 means that it was the last one and the object is durable",
         replies={200: Upload, 201: Upload, **_BAD, **_NOT_FOUND, **_CONFLICT, **_STORING},
     ),
     Route(
         operation="abandon_upload", method="DELETE", path=_UPLOAD, scope="data:write",
-        doc="Forget an upload and its parts", replies={204: None, **_NOT_FOUND},
+        doc="Remove an upload and its parts", replies={204: None, **_NOT_FOUND},
     ),
     Route(
         operation="list_maps", method="GET", path="/data/v1/maps", scope="maps:read",
@@ -240,7 +246,7 @@ ROUTES: tuple[Route, ...] = (
     ),
     Route(
         operation="show_version", method="GET", path=_VERSION, scope="maps:read",
-        doc="Return what is known of a version; head is the newest",
+        doc="Return the record of a version; head is the newest one",
         replies={200: MapVersionInfo, **_BAD, **_NOT_FOUND},
     ),
     Route(
@@ -255,4 +261,113 @@ ROUTES: tuple[Route, ...] = (
         replies={200: MapVersionInfo, **_BAD, **_NOT_FOUND, **_CONFLICT, **_STORING},
     ),
 )  # fmt: skip
-"""Everything that may be asked."""
+"""All routes; the handler of each is the method named *operation*."""
+
+_DIGEST = {"type": "string", "pattern": "^[0-9a-f]{64}$"}
+_PATH_SCHEMAS: dict[str, dict[str, Any]] = {
+    "digest": _DIGEST,
+    "name": {"type": "string", "pattern": "^[a-z0-9][a-z0-9-]{0,63}$"},
+    "version": {"type": "string", "pattern": "^(head|[0-9a-f]{6,64})$"},
+}
+_JSON = "application/json"
+_DESCRIPTIONS = {
+    307: "The object is at the presigned URL in Location; send no token there",
+    200: "Done", 201: "Stored durably", 204: "Done, no content", 206: "The requested range",
+    400: "Invalid request", 401: "No valid token", 403: "The token's scopes do not allow this",
+    404: "Does not exist, or belongs to another robot", 408: "The body was too slow",
+    409: "Changed by another request", 413: "Larger than a limit or the quota",
+    416: "The range is outside of the object", 503: "Unavailable; retry later",
+    507: "The disk is full; nothing was stored",
+}  # fmt: skip
+
+
+def openapi() -> dict[str, Any]:
+    """Return the document as JSON values, OpenAPI 3.1."""
+    types = {kind for route in ROUTES for kind in (route.body, *route.replies.values())} | {HttpFailure}
+    structs = sorted((kind for kind in types if _is_struct(kind)), key=lambda kind: kind.__name__)
+    listed = [kind for kind in types if kind not in (None, bytes, dict) and not _is_struct(kind)]
+    _, components = msgspec.json.schema_components(
+        [*structs, *listed], ref_template="#/components/schemas/{name}"
+    )
+    paths: dict[str, dict[str, Any]] = {}
+    for route in ROUTES:
+        paths.setdefault(route.path, {})[route.method.lower()] = _operation(route)
+    return {
+        "openapi": "3.1.0",
+        "info": {
+            "title": "RSE-PF data service",
+            "version": "1",
+            "description": "Images, keyframes, clouds and maps of robots, by HTTP (paper, Sect. 5.2).",
+        },
+        "paths": paths,
+        "components": {
+            "schemas": dict(sorted(components.items())),
+            "securitySchemes": {"robot": {"type": "http", "scheme": "bearer", "bearerFormat": "JWT"}},
+        },
+    }
+
+
+@functools.cache
+def openapi_page() -> str:
+    """Return ``docs/openapi.json``."""
+    return json.dumps(openapi(), indent=1, sort_keys=True) + "\n"
+
+
+def _operation(route: Route) -> dict[str, Any]:
+    replies = dict(route.replies)
+    if route.scope is not None:
+        failure = None if route.method == "HEAD" else HttpFailure
+        replies |= {401: failure, 403: failure, 503: failure}
+    made: dict[str, Any] = {
+        "operationId": route.operation,
+        "summary": route.doc,
+        "responses": {
+            str(status): _response(status, kind, route) for status, kind in sorted(replies.items())
+        },
+    }
+    parameters = [_path_parameter(name) for name in re.findall(r"{(\w+)}", route.path)]
+    parameters += [_parameter(field) for field in route.fields]
+    if parameters:
+        made["parameters"] = parameters
+    if route.body is not None:
+        made["requestBody"] = {"required": True, "content": _content(route.body)}
+    if route.scope is not None:
+        made["security"] = [{"robot": []}]
+        made["description"] = f"Token scope `{route.scope}`; a token without scopes may do everything."
+    return made
+
+
+def _response(status: int, kind: Any, route: Route) -> dict[str, Any]:
+    made: dict[str, Any] = {"description": _DESCRIPTIONS[status]}
+    if kind is not None:
+        made["content"] = _content(kind)
+    if route.operation == "head_upload" and status == 200:
+        made["headers"] = {"Upload-Offset": {"schema": {"type": "integer"}}}
+    return made
+
+
+def _content(kind: Any) -> dict[str, Any]:
+    if kind is bytes:
+        return {BYTES: {"schema": {"type": "string", "format": "binary"}}}
+    if kind is dict:
+        return {_JSON: {"schema": {"type": "object"}}}
+    (schema,), _ = msgspec.json.schema_components([kind], ref_template="#/components/schemas/{name}")
+    return {_JSON: {"schema": schema}}
+
+
+def _path_parameter(name: str) -> dict[str, Any]:
+    return {"name": name, "in": "path", "required": True, "schema": _PATH_SCHEMAS[name]}
+
+
+def _parameter(field: Field) -> dict[str, Any]:
+    schema: dict[str, Any] = {"type": "integer", "minimum": 0} if field.whole_number else {"type": "string"}
+    if field.maximum is not None:
+        schema |= {"minimum": 1, "maximum": field.maximum}
+    return {
+        "name": field.name, "in": field.place, "required": field.required, "description": field.doc,
+        "schema": schema,
+    }  # fmt: skip
+
+
+def _is_struct(kind: Any) -> bool:
+    return isinstance(kind, type) and issubclass(kind, msgspec.Struct)

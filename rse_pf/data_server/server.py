@@ -1,7 +1,7 @@
-"""Run the data service: one process, uvicorn, a socket that is announced when all is ready.
+"""Run the data service: one process, uvicorn, and a port that is announced when requests are answered.
 
-Promises to sweep up what a crash left behind before the first request, and to leave on SIGTERM and SIGINT
-with what it is doing done, at most `_STOP_TIMEOUT_S` seconds later.
+What a crash left behind is removed before the first request.  On SIGTERM and SIGINT the process completes the
+requests that it has and ends, at most `_STOP_TIMEOUT_S` seconds later.
 """
 
 from __future__ import annotations
@@ -35,18 +35,18 @@ _STOP_TIMEOUT_S = 10
 
 
 class KeysFile:
-    """The public keys in a file and the control room beside it, read again and again; see `TrustStore`."""
+    """The public keys in a file, with roster and deny list beside it, reread periodically by `TrustStore`."""
 
-    def __init__(self, path: Path, pause_s: float, clock: Callable[[], float] = time.monotonic) -> None:
+    def __init__(self, path: Path, refresh_s: float, clock: Callable[[], float] = time.monotonic) -> None:
         self._trust = TrustStore(path)
-        self._pause_s = pause_s
+        self._refresh_s = refresh_s
         self._clock = clock
-        self._looked = float("-inf")
+        self._refreshed_s = float("-inf")
 
     def __call__(self) -> KeySet | None:
         """Return the keys; None while there are none."""
-        if self._clock() - self._looked >= self._pause_s:
-            self._looked = self._clock()
+        if self._clock() - self._refreshed_s >= self._refresh_s:
+            self._refreshed_s = self._clock()
             self._trust.refresh()
         return self._trust.keys
 
@@ -59,13 +59,13 @@ def serve_data(
     announce: Path | None,
     audit: Path | None = None,
 ) -> int:
-    """Serve until a signal comes; return the exit code.
+    """Serve until a signal ends the process; return the exit code.
 
     Args:
         settings: Groups data, auth; ``data.port`` 0 takes a free one.
         store: Where objects and maps live.
-        keys: Who may sign tokens, asked for each request.
-        announce: Gets pid and port as JSON, by rename, when requests are answered.
+        keys: Returns the keys that may sign tokens, for each request.
+        announce: File that gets pid and port as JSON when requests are answered.
         audit: Folder of the audit log; None records nothing.
 
     Raises:
@@ -74,20 +74,18 @@ def serve_data(
     """
     try:
         import uvicorn
-
-        from rse_pf.data_server.one_request import OneRequestProtocol
     except ImportError as error:
         raise MissingExtra("uvicorn", "data") from error
     log = None if audit is None else _audit_log(audit, settings)
     app = DataServer(settings, store, keys=keys, log=_write_line, audit=log)
     listening = _listen(settings)
     config = uvicorn.Config(
-        app, http=OneRequestProtocol, ws="none", lifespan="off", access_log=False, log_level="warning",
+        app, http=_one_request_protocol(), ws="none", lifespan="off", access_log=False, log_level="warning",
         backlog=_BACKLOG, server_header=False, date_header=False, proxy_headers=False,
         timeout_keep_alive=30, timeout_graceful_shutdown=_STOP_TIMEOUT_S,
     )  # fmt: skip
     for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, _stay)  # uvicorn sends itself the signal again when it is done
+        signal.signal(number, _ignore)  # uvicorn repeats the signal to itself when it has ended
     try:
         asyncio.run(_run(uvicorn.Server(config), app, store, listening, settings, announce))
     finally:
@@ -97,19 +95,35 @@ def serve_data(
     return 0
 
 
+def _one_request_protocol() -> type[asyncio.Protocol]:
+    """Return uvicorn's HTTP/1.1 protocol with keep-alive and without pipelining.
+
+    Load balancers and our own clients wait for a response before the next request.  Bytes that follow a
+    request earlier than that are never taken for a request: they may be an attempt to make two readers
+    disagree about where a request ends (request smuggling).  The request is answered, then the connection is
+    closed.
+    """
+    from uvicorn.protocols.http.h11_impl import H11Protocol
+
+    class OneRequestProtocol(H11Protocol):
+        def on_response_complete(self) -> None:
+            if self.conn.trailing_data[0] and not self.transport.is_closing():
+                self.transport.close()  # after what was written, so that the robot gets its response
+            super().on_response_complete()
+
+    return OneRequestProtocol
+
+
 def _audit_log(folder: Path, settings: PlatformSettings) -> AuditLog:
     log = AuditLog(
-        folder, "data", wall_clock=time.time, on_problem=_say_problem,
+        folder, "data", wall_clock=time.time,
+        on_problem=lambda problem: _write_line({"event": "audit-failed", "error": problem}),
     ).open()  # fmt: skip
     log.start()
     return log
 
 
-def _say_problem(problem: str) -> None:
-    _write_line({"event": "audit", "error": problem})
-
-
-def _stay(number: int, frame: object) -> None:
+def _ignore(number: int, frame: object) -> None:
     """Let the process end by itself, with exit code 0."""
 
 
@@ -117,30 +131,33 @@ async def _run(
     server: Any, app: DataServer, store: ObjectStore, listening: socket.socket, settings: PlatformSettings,
     announce: Path | None,
 ) -> None:  # fmt: skip
+    port = listening.getsockname()[1]
     await asyncio.to_thread(_sweep, app, store, settings.data.upload_ttl_s)
-    sweeping = asyncio.create_task(_sweep_on(app, store, settings.data.upload_ttl_s))
+    sweeping = asyncio.create_task(_sweep_periodically(app, store, settings.data.upload_ttl_s))
     serving = asyncio.create_task(server.serve(sockets=[listening]))
     try:
         while not server.started and not serving.done():
             await asyncio.sleep(0.005)
         if announce is not None and server.started:
-            _announce(announce, listening.getsockname()[1])
-        _write_line({"event": "ready", "port": listening.getsockname()[1], "store": settings.data.store})
+            replace_json(announce, {"pid": os.getpid(), "port": port})
+        _write_line({"event": "ready", "port": port, "store": settings.data.store})
         await serving
     finally:
         sweeping.cancel()
 
 
-async def _sweep_on(app: DataServer, store: ObjectStore, life_s: float) -> None:
+async def _sweep_periodically(app: DataServer, store: ObjectStore, upload_ttl_s: float) -> None:
     while True:
         await asyncio.sleep(_SWEEP_S)
-        await asyncio.to_thread(_sweep, app, store, life_s)
+        await asyncio.to_thread(_sweep, app, store, upload_ttl_s)
 
 
-def _sweep(app: DataServer, store: ObjectStore, life_s: float) -> None:
+def _sweep(app: DataServer, store: ObjectStore, upload_ttl_s: float) -> None:
     try:
         uploads = app.handlers.objects.sweep()
-        files = store.sweep(now=time.time(), older_than_s=life_s) if isinstance(store, DirectoryStore) else 0
+        files = 0
+        if isinstance(store, DirectoryStore):
+            files = store.sweep(now=time.time(), older_than_s=upload_ttl_s)
     except StoreError as error:
         _write_line({"event": "sweep-failed", "error": str(error)})
         return
@@ -158,10 +175,6 @@ def _listen(settings: PlatformSettings) -> socket.socket:
         raise ConfigurationError(
             f"cannot listen on {host}:{port}: {error.strerror}", hint="choose another data.port"
         ) from error
-
-
-def _announce(path: Path, port: int) -> None:
-    replace_json(path, {"pid": os.getpid(), "port": port})
 
 
 def _write_line(fields: dict[str, Any]) -> None:

@@ -1,7 +1,7 @@
-"""Maps for other programs: PLY and PCD clouds, TUM trajectories, g2o pose graphs.
+"""Export maps for other programs: PLY and PCD clouds, TUM trajectories, g2o pose graphs.
 
-Promises the conventions of those programs: metres, little-endian, TUM's and g2o's quaternions end with w,
-information matrices by their upper triangle.
+Units are metres and binary data is little-endian; quaternions of TUM and g2o end with w; g2o gets the upper
+triangle of an information matrix.
 """
 
 from __future__ import annotations
@@ -33,14 +33,12 @@ def export_map(version: MapVersion, kind: str, robot: str | None = None) -> byte
         UsageError: There is no such format, or no such robot in the map.
     """
     if kind not in FORMATS:
-        raise UsageError(f"{kind!r} is no format of maps", hint=f"use one of {', '.join(FORMATS)}")
+        raise UsageError(f"{kind!r} is not a format of maps", hint=f"use one of {', '.join(FORMATS)}")
     return FORMATS[kind](version, robot)
 
 
 def _ply(version: MapVersion, robot: str | None) -> bytes:
-    rows = np.empty(
-        len(version.points), dtype=[("xyz", "<f4", (3,)), ("rgb", "u1", (3,))]
-    )  # packed: 15 bytes a vertex
+    rows = np.empty(len(version.points), dtype=[("xyz", "<f4", (3,)), ("rgb", "u1", (3,))])  # 15 bytes each
     rows["xyz"], rows["rgb"] = version.points, version.colours
     header = (
         "ply\nformat binary_little_endian 1.0\n"
@@ -95,4 +93,4 @@ def _numbers(values: npt.NDArray[np.float64]) -> str:
 FORMATS: dict[str, Callable[[MapVersion, str | None], bytes]] = {
     "ply": _ply, "pcd": _pcd, "tum": _tum, "g2o": _g2o,
 }  # fmt: skip
-"""What a map can be written as."""
+"""The formats of `export_map` by name."""

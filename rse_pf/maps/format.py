@@ -1,7 +1,7 @@
-"""Maps as values: keyframes, the steps between them, a cloud, and the bytes they travel as.
+"""Maps as values (keyframes, edges, a point cloud) and their encoding as bytes.
 
-Promises that whatever `decode_map` returns is whole and checked, that the same map gives the same
-bytes, and not to execute anything it reads (no pickle).
+`decode_map` returns complete and validated maps only and executes nothing it reads.  The same map always
+gives the same bytes.
 
 Format: ``RSEMAP1\\n``, then one MessagePack map, zlib-compressed; arrays are raw little-endian bytes.
 """
@@ -68,7 +68,7 @@ class Keyframe:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Edge:
-    """A measured step ``T_a_b`` between keyframes *a* and *b* (ids).
+    """A measured relative pose ``T_a_b`` between the keyframes with ids *a* and *b*.
 
     ``information`` is the ``(6, 6)`` inverse covariance of the twist (rho metres, phi radians) in
     ``log(inverse(T_a_b) @ inverse(T_world_a) @ T_world_b)``.
@@ -88,7 +88,7 @@ class Edge:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class MapVersion:
-    """A whole map: never changed, only followed by another version.
+    """A complete map: immutable, a change makes a new version.
 
     ``points`` ``(m, 3)`` float32 metres, world frame; ``colours`` ``(m, 3)`` uint8.
     """
@@ -102,10 +102,12 @@ class MapVersion:
     def __post_init__(self) -> None:
         ids = {keyframe.id for keyframe in self.keyframes}
         if len(ids) != len(self.keyframes):
-            raise BadRequest("two keyframes of a map have one id", hint="number them anew")
-        lost = next((edge for edge in self.edges if edge.a not in ids or edge.b not in ids), None)
-        if lost is not None:
-            raise BadRequest(f"edge {lost.a}-{lost.b} names a keyframe that is not there", hint="add it")
+            raise BadRequest("two keyframes of a map have one id", hint="assign unique ids")
+        dangling = next((edge for edge in self.edges if edge.a not in ids or edge.b not in ids), None)
+        if dangling is not None:
+            raise BadRequest(
+                f"edge {dangling.a}-{dangling.b} names a missing keyframe", hint="add the keyframe"
+            )
         m = len(self.points)
         if self.points.shape != (m, 3) or self.colours.shape != (m, 3) or not np.isfinite(self.points).all():
             raise BadRequest("points and colours of a map do not fit", hint="send (m, 3) of both")
@@ -166,17 +168,17 @@ def decode_map(data: bytes, max_bytes: int = _MAX_BYTES) -> MapVersion:
     """Return the map of *data*.
 
     Raises:
-        BadRequest: The bytes are no map, are damaged, or hold more than *max_bytes*.
+        BadRequest: The bytes are not a map, are damaged, or hold more than *max_bytes*.
     """
     if data[: len(_MAGIC)] != _MAGIC:
-        raise BadRequest("these bytes are no map", hint="send what encode_map returned")
+        raise BadRequest("these bytes are not a map", hint="send what encode_map returned")
     try:
         inflater = zlib.decompressobj()
         raw = inflater.decompress(data[len(_MAGIC) :], max_bytes)
         if not inflater.eof:
             raise BadRequest(
-                f"the map is cut short, or holds more than {max_bytes} bytes",
-                hint="send it whole, or thinned",
+                f"the map is truncated, or holds more than {max_bytes} bytes",
+                hint="send the complete map, or fewer points",
             )
         packed = msgspec.msgpack.decode(raw, type=_Map)
         return MapVersion(
@@ -220,4 +222,4 @@ def _check_pose(what: str, T: Array) -> None:
         raise BadRequest(f"{what} has no rigid pose", hint="send (4, 4) matrices of finite numbers")
     rotation = T[:3, :3]
     if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-4) or np.linalg.det(rotation) < 0:
-        raise BadRequest(f"{what} holds a matrix that is no rotation", hint="orthonormalise it")
+        raise BadRequest(f"{what} holds a matrix that is not a rotation", hint="orthonormalise it")

@@ -1,8 +1,8 @@
 """The map registry: versions that never change, a head that moves by compare-and-swap.
 
-A commit writes the map, then its record, then the head, each durable before the next; a crash between
-leaves the old head and, at most, bytes that nobody names.  Promises that every version a head or a
-parent names is whole, and that two robots never both move one head.
+A commit writes the map, then its record, then the head, each durable before the next; a crash in between
+leaves the old head and, at most, an object without a reference.  Every version that a head or a parent refers
+to is complete, and only one of two robots moves a head.
 
 Layout: ``maps/TENANT/NAME/blobs/DIGEST``, ``.../versions/ID`` (ID is the sha256 of the record), ``.../head``.
 """
@@ -19,7 +19,7 @@ import msgspec
 from rse_pf.errors import BadRequest, Conflict, NotFound, StoreError
 from rse_pf.object_store import ObjectStore, digest_of, name_segment
 
-if TYPE_CHECKING:  # numpy is a third of a data server's start, and only maps need it
+if TYPE_CHECKING:  # importing numpy takes a third of a data server's start, and only maps need it
     from rse_pf.geometry import Array
     from rse_pf.maps.format import MapVersion
 
@@ -29,11 +29,11 @@ _NAME = re.compile(r"[a-z0-9][a-z0-9-]{0,63}")
 _ID = re.compile(r"[0-9a-f]{64}")
 _MIN_ID = 6
 _MOVED_M, _MOVED_DEG = 1e-3, 0.05
-"""Closer than this a keyframe has not moved: below what rounding on the wire changes."""
+"""A keyframe that moved less has not moved: messages are rounded to more than this."""
 
 
 class MapRecord(msgspec.Struct, frozen=True, kw_only=True):
-    """What is known of a version without reading the map; its sha256 is the version's id."""
+    """What is stored about a version beside the map; the sha256 of the record is the version's id."""
 
     digest: str
     size: int
@@ -77,11 +77,11 @@ class MapRegistry:
         tenant: str = "default",
         *,
         max_bytes: int = 1 << 30,
-        told: Callable[[str, str, MapRecord], None] = lambda action, name, record: None,
+        on_change: Callable[[str, str, MapRecord], None] = lambda action, name, record: None,
     ) -> None:
-        """Look after the maps of *tenant*; *told* gets ``map.commit`` or ``map.head``, map and version."""
+        """Make a registry; *on_change* gets ``map.commit`` or ``map.head``, map and version."""
         self._store = store
-        self._told = told
+        self._on_change = on_change
         self._prefix = f"maps/{name_segment(tenant)}/"
         self._max_bytes = max_bytes
 
@@ -97,20 +97,18 @@ class MapRegistry:
 
         Args:
             name: Lower-case letters, digits and hyphens.
-            parent: The head as the caller knows it; None for the first version.
+            parent: The head that the caller last read; None for the first version.
             author: Who made it.
             created_s: Unix seconds.
             note: What was done.
 
         Raises:
-            BadRequest: *data* is no map.
-            Conflict: The head is not *parent*; read it, merge, commit again.
-            StoreError: The head is as it was.
+            BadRequest: *data* is not a map, or *name* not a valid name.
+            Conflict: The head is not *parent*: read it, merge, and commit again.
+            StoreError: The head did not change.
         """
-        from rse_pf.maps.format import decode_map
-
         base = self._base(name)
-        decoded = decode_map(data, self._max_bytes)
+        decoded = self._decode(data)
         before = self.record(name, parent) if parent is not None else None
         if self._head(name) != parent:
             raise _moved(name)
@@ -123,7 +121,7 @@ class MapRegistry:
         self._store.put(f"{base}blobs/{record.digest}", data)
         self._store.put(f"{base}versions/{record.id}", msgspec.json.encode(record))
         self._swap(name, parent, record.id)
-        self._told("map.commit", name, record)
+        self._on_change("map.commit", name, record)
         return record
 
     def head(self, name: str) -> MapRecord:
@@ -146,7 +144,7 @@ class MapRegistry:
         return msgspec.json.decode(raw, type=MapRecord)
 
     def versions(self, name: str) -> list[MapRecord]:
-        """Return all versions, oldest first; also those that the head has left, or never reached."""
+        """Return all versions, oldest first, including those that are not ancestors of the head."""
         prefix = f"{self._base(name)}versions/"
         ids = [info.name.removeprefix(prefix) for info in self._store.list(prefix)]
         if not ids:
@@ -175,12 +173,10 @@ class MapRegistry:
 
     def load(self, name: str, version: str = "head") -> MapVersion:
         """Return a version as a value."""
-        from rse_pf.maps.format import decode_map
-
-        return decode_map(self.data(name, version), self._max_bytes)
+        return self._decode(self.data(name, version))
 
     def move_head(self, name: str, version: str, *, expected: str) -> MapRecord:
-        """Let the head name an existing *version*, as a rollback does.
+        """Move the head to an existing *version*, as a rollback does.
 
         Raises:
             NotFound: There is no such version.
@@ -188,13 +184,18 @@ class MapRegistry:
         """
         record = self.record(name, version)
         self._swap(name, self.record(name, expected).id, record.id)
-        self._told("map.head", name, record)
+        self._on_change("map.head", name, record)
         return record
+
+    def _decode(self, data: bytes) -> MapVersion:
+        from rse_pf.maps.format import decode_map
+
+        return decode_map(data, self._max_bytes)
 
     def _base(self, name: str) -> str:
         if not _NAME.fullmatch(name):
             raise BadRequest(
-                f"{name[:80]!r} is no name of a map",
+                f"{name[:80]!r} is not a valid name of a map",
                 hint="use 1 to 64 lower-case letters, digits and hyphens",
             )
         return f"{self._prefix}{name}/"
@@ -224,7 +225,7 @@ class MapRegistry:
 
 
 def difference(before: MapVersion, after: MapVersion) -> MapDiff:
-    """Return what *after* changed; a keyframe moved if by more than 1 mm or 0.05 deg."""
+    """Return what *after* changed; a keyframe has moved if by more than 1 mm or 0.05 degrees."""
     old = {keyframe.id: keyframe.T_world_camera for keyframe in before.keyframes}
     new = {keyframe.id: keyframe.T_world_camera for keyframe in after.keyframes}
     moves = {each: _move(old[each], new[each]) for each in sorted(old.keys() & new.keys())}
@@ -253,4 +254,4 @@ def _move(before: Array, after: Array) -> tuple[float, float]:
 
 
 def _moved(name: str) -> Conflict:
-    return Conflict(f"the head of map {name!r} was moved meanwhile", hint="read it, merge, and commit again")
+    return Conflict(f"another commit moved the head of map {name!r}", hint="read it, merge, commit again")

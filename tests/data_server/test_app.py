@@ -1,4 +1,4 @@
-"""The data service's answers: who may see what, limits, ranges, and no way out of the store."""
+"""The data service's replies: access, limits, ranges, and names that stay inside the store."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def test_an_object_comes_back_as_it_was_stored(service: Service) -> None:
     assert service.ask("HEAD", OBJECT).body == b""
 
 
-def test_the_server_makes_the_name(service: Service) -> None:
+def test_the_server_makes_the_name_of_an_object(service: Service) -> None:
     service.ask("PUT", OBJECT, DATA, robot="../../etc", tenant="a/b")
 
     (info,) = service.store.list()
@@ -48,7 +48,7 @@ def test_bytes_with_another_digest_are_refused(service: Service) -> None:
 
 
 @pytest.mark.parametrize("method", ["GET", "HEAD"])
-def test_what_belongs_to_others_is_not_there(service: Service, method: str) -> None:
+def test_an_object_of_another_robot_is_reported_as_missing(service: Service, method: str) -> None:
     service.ask("PUT", OBJECT, DATA)
     missing = service.ask(method, f"/data/v1/objects/{'0' * 64}", robot="robot-2")
 
@@ -59,7 +59,7 @@ def test_what_belongs_to_others_is_not_there(service: Service, method: str) -> N
     assert service.ask("GET", "/data/v1/objects", robot="robot-2").json["objects"] == []
 
 
-def test_nobody_deletes_what_belongs_to_others(service: Service) -> None:
+def test_a_robot_cannot_delete_an_object_of_another(service: Service) -> None:
     service.ask("PUT", OBJECT, DATA)
 
     assert service.ask("DELETE", OBJECT, robot="robot-2").status == 204
@@ -69,7 +69,7 @@ def test_nobody_deletes_what_belongs_to_others(service: Service) -> None:
 
 
 @pytest.mark.parametrize("token", ["", "x", "a.b.c", "forged", "expired"])
-def test_a_bad_token_is_told_nothing(service: Service, token: str) -> None:
+def test_the_reply_to_an_invalid_token_gives_no_reason(service: Service, token: str) -> None:
     if token == "forged":
         token = SigningKey.from_seed(b"z" * 32, KEY.key_id).issue(
             "robot-1", now=service.wall, token_id="t", settings=service.settings.auth
@@ -85,7 +85,7 @@ def test_a_bad_token_is_told_nothing(service: Service, token: str) -> None:
     assert answer.headers["www-authenticate"] == "Bearer"
 
 
-def test_scopes_limit_a_token_and_none_does_not(service: Service) -> None:
+def test_scopes_limit_a_token_and_a_token_without_scopes_is_unlimited(service: Service) -> None:
     reader, writer = service.token(scopes=("data:read",)), service.token(scopes=("data:write",))
 
     assert service.ask("PUT", OBJECT, DATA, token=reader).status == 403
@@ -108,7 +108,7 @@ def test_scopes_limit_a_token_and_none_does_not(service: Service) -> None:
         ("lines=1-2", 200, DATA, None),
     ],
 )
-def test_a_range_is_answered(
+def test_a_range_is_returned(
     service: Service, asked: str, status: int, part: bytes, told: str | None
 ) -> None:
     service.ask("PUT", OBJECT, DATA)
@@ -120,7 +120,7 @@ def test_a_range_is_answered(
 
 
 @pytest.mark.parametrize("asked", ["bytes=1024-", "bytes=5000-6000", "bytes=-0"])
-def test_a_range_outside_is_refused_with_the_size(service: Service, asked: str) -> None:
+def test_a_range_outside_the_object_is_refused_with_the_size(service: Service, asked: str) -> None:
     service.ask("PUT", OBJECT, DATA)
 
     answer = service.ask("GET", OBJECT, headers={"range": asked})
@@ -160,7 +160,7 @@ def test_a_slow_body_is_refused(service: Service) -> None:
     assert service.now == 6.0
 
 
-def test_a_silent_body_is_refused() -> None:
+def test_a_stalled_body_is_refused() -> None:
     service = Service(small_settings(body_timeout_s=0.1), MemoryStore())
 
     answer = service.ask("PUT", OBJECT, [{"type": "http.request", "body": b"x", "more_body": True}])
@@ -168,16 +168,16 @@ def test_a_silent_body_is_refused() -> None:
     assert answer.status == 408
 
 
-def test_a_robot_that_leaves_in_the_middle_stores_nothing(service: Service) -> None:
+def test_a_robot_that_disconnects_within_a_body_stores_nothing(service: Service) -> None:
     cut = [{"type": "http.request", "body": DATA[:9], "more_body": True}, {"type": "http.disconnect"}]
 
     service.ask("PUT", OBJECT, cut)
 
     assert list(service.store.list()) == []
-    assert service.lines[-1]["status"] == "left"
+    assert service.lines[-1]["status"] == "disconnected"
 
 
-def test_the_quota_counts_what_is_stored_and_what_is_begun(service: Service) -> None:
+def test_the_quota_counts_objects_and_open_uploads(service: Service) -> None:
     for n in range(2):
         assert service.ask("PUT", f"/data/v1/uploads/{n:064d}", b'{"size": 20000}').status == 200
     for n in range(2):
@@ -208,7 +208,7 @@ class Failing(MemoryStore):
         return super().head(name)
 
 
-def test_a_full_disk_is_507_and_costs_no_quota() -> None:
+def test_a_full_disk_is_507_and_uses_no_quota() -> None:
     service = Service(small_settings(quota_bytes=1500), Failing())
 
     for _ in range(3):
@@ -217,7 +217,7 @@ def test_a_full_disk_is_507_and_costs_no_quota() -> None:
     assert service.ask("GET", "/data/readyz").status == 200
 
 
-def test_a_store_that_fails_means_not_ready_but_alive() -> None:
+def test_with_a_failing_store_the_service_is_alive_but_not_ready() -> None:
     store = Failing()
     store.error, store.reads = StoreError("gone"), False
     service = Service(small_settings(), store)
@@ -226,7 +226,7 @@ def test_a_store_that_fails_means_not_ready_but_alive() -> None:
     assert service.ask("GET", "/data/healthz", token="").status == 200
 
 
-def test_a_defect_is_a_500_that_tells_nothing(service: Service, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_defect_is_a_500_without_details(service: Service, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(service.store, "head", lambda name: 1 / 0)
 
     answer = service.ask("GET", OBJECT)
@@ -237,13 +237,13 @@ def test_a_defect_is_a_500_that_tells_nothing(service: Service, monkeypatch: pyt
     assert service.lines[-1]["trace"] in answer.json["hint"]
 
 
-def test_a_known_path_with_another_method_says_which_are_offered(service: Service) -> None:
+def test_a_wrong_method_is_405_with_the_allowed_ones(service: Service) -> None:
     answer = service.ask("POST", "/data/v1/objects")
 
     assert (answer.status, answer.headers["allow"]) == (405, "GET")
 
 
-def test_the_log_holds_neither_token_nor_payload(service: Service) -> None:
+def test_the_log_contains_neither_token_nor_payload(service: Service) -> None:
     service.ask("PUT", OBJECT, b"secret-payload")
 
     assert "secret-payload" not in str(service.lines)

@@ -1,4 +1,4 @@
-"""What the data service records: how maps change and by whom, and refused tokens within bounds."""
+"""The audit log of the data service: who changed which map, and a bounded number of refused tokens."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def test_the_map_of_another_tenant_is_named_with_it(recorded: Recorded) -> None:
     assert [entry.subject for entry in recorded.entries()] == ["acme/kitchen"]
 
 
-def test_what_changed_nothing_is_not_recorded(recorded: Recorded) -> None:
+def test_a_refused_change_is_not_recorded(recorded: Recorded) -> None:
     first = recorded.commit(1, None, robot="robot-1")
     body = json.dumps({"version": first, "expected": "0" * 64}).encode()
     assert recorded.ask("PUT", f"{MAPS}/head", body).status >= 400

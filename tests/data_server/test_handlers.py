@@ -19,7 +19,7 @@ def send(service: Service, seed: int, parent: str | None, robot: str = "robot-1"
     return service.ask("POST", f"{MAPS}/versions", json.dumps(body).encode(), robot=robot)
 
 
-def test_a_committed_map_is_there_for_the_whole_tenant(service: Service) -> None:
+def test_every_robot_of_the_tenant_sees_a_committed_map(service: Service) -> None:
     first = send(service, 1, None)
     second = send(service, 2, first.json["id"], robot="robot-2")
 
@@ -35,7 +35,7 @@ def test_a_committed_map_is_there_for_the_whole_tenant(service: Service) -> None
     assert service.ask("GET", "/data/v1/maps", tenant="other").json["maps"] == []
 
 
-def test_who_comes_second_is_told_and_changes_nothing(service: Service) -> None:
+def test_the_second_commit_on_one_head_is_a_conflict_and_changes_nothing(service: Service) -> None:
     first = send(service, 1, None)
     send(service, 2, first.json["id"])
 
@@ -43,7 +43,7 @@ def test_who_comes_second_is_told_and_changes_nothing(service: Service) -> None:
     assert service.ask("GET", f"{MAPS}/versions/head").json["record"]["note"] == "seed 2"
 
 
-def test_a_map_outlives_the_object_it_came_from(service: Service) -> None:
+def test_a_map_survives_the_deletion_of_its_object(service: Service) -> None:
     made = send(service, 1, None).json["record"]["digest"]
 
     service.ask("DELETE", f"/data/v1/objects/{made}")
@@ -51,7 +51,7 @@ def test_a_map_outlives_the_object_it_came_from(service: Service) -> None:
     assert digest_of(service.ask("GET", f"{MAPS}/versions/head/content").body) == made
 
 
-def test_a_rollback_is_a_move_of_the_head(service: Service) -> None:
+def test_a_rollback_moves_the_head(service: Service) -> None:
     first = send(service, 1, None).json["id"]
     second = send(service, 2, first).json["id"]
 
@@ -61,7 +61,7 @@ def test_a_rollback_is_a_move_of_the_head(service: Service) -> None:
     assert service.ask("GET", f"{MAPS}/versions/head").json["id"] == first
 
 
-def test_what_is_no_map_or_not_ones_own_object_is_refused(service: Service) -> None:
+def test_an_invalid_map_or_an_object_of_another_robot_is_refused(service: Service) -> None:
     service.ask("PUT", f"/data/v1/objects/{digest_of(b'x')}", b"x")
     body = json.dumps({"digest": digest_of(b"x")}).encode()
 
@@ -71,7 +71,7 @@ def test_what_is_no_map_or_not_ones_own_object_is_refused(service: Service) -> N
     assert service.ask("GET", "/data/v1/maps/none/versions").status == 404
 
 
-def test_more_bodies_than_allowed_are_told_to_come_again() -> None:
+def test_more_uploads_at_once_than_allowed_are_busy() -> None:
     service = Service(small_settings(max_uploads=1), MemoryStore())
     inner: list[Answer] = []
     body = iter([{"type": "http.request", "body": b"x", "more_body": False}])

@@ -1,4 +1,4 @@
-"""Uploads in parts: they resume, also elsewhere, and only the right bytes become an object."""
+"""Uploads in parts: any server resumes them, and only bytes with the right digest become an object."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def part(service: Service, start: int, end: int, data: bytes = DATA) -> Answer:
     return service.ask("PATCH", UPLOAD, data[start:end], headers={"upload-offset": str(start)})
 
 
-def test_parts_become_an_object_with_the_last_one(service: Service) -> None:
+def test_the_last_part_completes_the_object(service: Service) -> None:
     assert begin(service).json == {"digest": DIGEST, "size": 10_000, "offset": 0, "part_bytes": 4096}
 
     assert [part(service, *ends).status for ends in [(0, 4096), (4096, 8192)]] == [200, 200]
@@ -36,7 +36,7 @@ def test_parts_become_an_object_with_the_last_one(service: Service) -> None:
     assert [info.name for info in service.store.list("uploads/")] == []
 
 
-def test_another_server_goes_on_where_the_first_one_died(service: Service) -> None:
+def test_another_server_resumes_the_upload_of_a_killed_one(service: Service) -> None:
     begin(service)
     part(service, 0, 4096)
 
@@ -48,7 +48,7 @@ def test_another_server_goes_on_where_the_first_one_died(service: Service) -> No
     assert part(service, 8192, 10_000).status == 201
 
 
-def test_a_server_that_died_before_it_put_the_parts_together_is_made_up_for(service: Service) -> None:
+def test_an_upload_whose_server_was_killed_after_the_last_part_is_completed(service: Service) -> None:
     begin(service)
     part(service, 0, 4096)
     part(service, 4096, 8192)
@@ -60,7 +60,7 @@ def test_a_server_that_died_before_it_put_the_parts_together_is_made_up_for(serv
     assert service.ask("GET", OBJECT).body == DATA
 
 
-def test_a_part_in_the_wrong_place_is_a_conflict_that_says_where(service: Service) -> None:
+def test_a_part_at_the_wrong_offset_is_a_conflict_that_names_the_right_one(service: Service) -> None:
     begin(service)
     part(service, 0, 4096)
 
@@ -71,7 +71,7 @@ def test_a_part_in_the_wrong_place_is_a_conflict_that_says_where(service: Servic
     assert part(service, 4096, 8192).status == 200
 
 
-def test_wrong_bytes_never_become_an_object_and_are_forgotten(service: Service) -> None:
+def test_wrong_bytes_never_become_an_object_and_are_removed(service: Service) -> None:
     begin(service)
     wrong = b"x" * 10_000
     part(service, 0, 4096, wrong)
@@ -84,19 +84,21 @@ def test_wrong_bytes_never_become_an_object_and_are_forgotten(service: Service) 
 
 
 @pytest.mark.parametrize("size", [0, -1, 20_001])
-def test_a_size_that_cannot_be_is_refused(service: Service, size: int) -> None:
+def test_an_impossible_size_is_refused(service: Service, size: int) -> None:
     assert begin(service, size).status in (400, 413)
     assert list(service.store.list()) == []
 
 
-def test_more_than_was_announced_is_refused(service: Service) -> None:
+def test_more_bytes_than_announced_are_refused(service: Service) -> None:
     begin(service, 100)
 
     assert part(service, 0, 101).status == 400
     assert begin(service, 200).status == 409
 
 
-def test_parts_wait_for_no_disk_but_the_object_does(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_parts_are_not_flushed_to_the_disk_but_the_object_is(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     store, synced = DirectoryStore(tmp_path), []
     fsync = os.fsync
     monkeypatch.setattr(os, "fsync", lambda handle: synced.append(handle) or fsync(handle))
@@ -115,7 +117,7 @@ def test_parts_wait_for_no_disk_but_the_object_does(tmp_path: Path, monkeypatch:
     assert store.get(next(store.list("objects/")).name) == DATA
 
 
-def test_an_upload_goes_on_behind_a_part_that_a_crash_of_the_machine_cut(service: Service) -> None:
+def test_an_upload_resumes_after_a_part_that_a_crash_cut_short(service: Service) -> None:
     begin(service)
     part(service, 0, 4096)
     part(service, 4096, 8192)
@@ -132,7 +134,7 @@ def test_an_upload_goes_on_behind_a_part_that_a_crash_of_the_machine_cut(service
     assert service.ask("GET", OBJECT).body == DATA
 
 
-def test_an_upload_of_what_is_there_is_done_at_once(service: Service) -> None:
+def test_an_upload_of_an_existing_object_is_complete_at_once(service: Service) -> None:
     begin(service)
     for ends in [(0, 4096), (4096, 8192), (8192, 10_000)]:
         part(service, *ends)
@@ -141,7 +143,7 @@ def test_an_upload_of_what_is_there_is_done_at_once(service: Service) -> None:
     assert part(service, 0, 4096).status == 201
 
 
-def test_nobody_sees_or_continues_the_upload_of_another_robot(service: Service) -> None:
+def test_a_robot_cannot_see_or_continue_the_upload_of_another(service: Service) -> None:
     begin(service)
 
     assert service.ask("GET", UPLOAD, robot="robot-2").status == 404
@@ -151,7 +153,7 @@ def test_nobody_sees_or_continues_the_upload_of_another_robot(service: Service) 
     assert service.ask("GET", UPLOAD).status == 200
 
 
-def test_an_old_upload_and_parts_without_one_are_swept_up_and_a_young_one_is_not(service: Service) -> None:
+def test_old_uploads_and_orphaned_parts_are_removed_and_new_uploads_are_not(service: Service) -> None:
     begin(service)
     part(service, 0, 4096)
     service.store.put(f"uploads/default/robot-9/{DIGEST}/part-{0:015d}", b"left by a crash")
@@ -174,7 +176,7 @@ class SwallowsTheLast(MemoryStore):
     well = False
 
 
-def test_a_death_while_the_object_is_written_loses_no_part() -> None:
+def test_a_crash_while_the_object_is_written_loses_no_part() -> None:
     store = SwallowsTheLast()
     service = Service(small_settings(), store)
     begin(service)

@@ -1,4 +1,4 @@
-"""Stores that sign addresses: bytes go straight to the bucket, and the service only says where."""
+"""Stores with presigned URLs: robots and bucket exchange the bytes, the service only sends the URL."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ class Bucket(MemoryStore):
         super().__init__()
         self.signed: list[tuple[str, int, str, int]] = []
 
-    def presigned_put(self, name: str, *, size: int, sha256: str, life_s: int) -> tuple[str, dict[str, str]]:
-        self.signed.append((name, size, sha256, life_s))
+    def presigned_put(self, name: str, *, size: int, sha256: str, ttl_s: int) -> tuple[str, dict[str, str]]:
+        self.signed.append((name, size, sha256, ttl_s))
         return f"https://bucket/{name}?signed", {"Content-Length": str(size), "x-checksum": sha256}
 
-    def presigned_get(self, name: str, *, life_s: int) -> str:
-        return f"https://bucket/{name}?life={life_s}"
+    def presigned_get(self, name: str, *, ttl_s: int) -> str:
+        return f"https://bucket/{name}?life={ttl_s}"
 
 
 @pytest.fixture
@@ -42,7 +42,7 @@ def direct(bucket: Bucket) -> Service:
     return Service(small_settings(presigned_url_ttl_s=60), bucket)
 
 
-def test_an_upload_that_begins_may_go_straight_to_the_bucket(direct: Service, bucket: Bucket) -> None:
+def test_a_new_upload_gets_a_presigned_url(direct: Service, bucket: Bucket) -> None:
     told = direct.ask("PUT", f"/data/v1/uploads/{DIGEST}", BEGIN).json
 
     assert told["direct"]["url"] == f"https://bucket/{NAME}?signed"
@@ -51,7 +51,9 @@ def test_an_upload_that_begins_may_go_straight_to_the_bucket(direct: Service, bu
     assert bucket.signed == [(NAME, len(DATA), DIGEST, 60)], "name, length and digest are fixed"
 
 
-def test_what_came_straight_is_an_object_and_its_upload_is_over(direct: Service, bucket: Bucket) -> None:
+def test_after_a_direct_upload_the_object_exists_and_the_upload_is_closed(
+    direct: Service, bucket: Bucket
+) -> None:
     direct.ask("PUT", f"/data/v1/uploads/{DIGEST}", BEGIN)
     bucket.put(NAME, DATA)
 
@@ -62,7 +64,7 @@ def test_what_came_straight_is_an_object_and_its_upload_is_over(direct: Service,
     assert direct.ask("GET", f"/data/v1/objects/{DIGEST}").body == DATA
 
 
-def test_an_object_counts_once_however_it_came(bucket: Bucket) -> None:
+def test_an_object_counts_once_against_the_quota_however_it_was_uploaded(bucket: Bucket) -> None:
     service = Service(small_settings(quota_bytes=2 * len(DATA)), bucket)
     service.ask("PUT", f"/data/v1/uploads/{DIGEST}", BEGIN)
     bucket.put(NAME, DATA)
@@ -74,7 +76,7 @@ def test_an_object_counts_once_however_it_came(bucket: Bucket) -> None:
     assert (same_again, one_more) == (200, 413)
 
 
-def test_what_began_in_parts_goes_on_in_parts(direct: Service) -> None:
+def test_an_upload_begun_in_parts_continues_in_parts(direct: Service) -> None:
     direct.ask("PUT", f"/data/v1/uploads/{DIGEST}", BEGIN)
     direct.ask("PATCH", f"/data/v1/uploads/{DIGEST}", DATA[:4096], headers={"Upload-Offset": "0"})
 
@@ -83,14 +85,14 @@ def test_what_began_in_parts_goes_on_in_parts(direct: Service) -> None:
     assert (told["offset"], told.get("direct")) == (4096, None)
 
 
-def test_a_refused_size_gets_no_address(direct: Service, bucket: Bucket) -> None:
+def test_a_refused_size_gets_no_url(direct: Service, bucket: Bucket) -> None:
     size = direct.settings.data.max_object_bytes + 1
 
     assert direct.ask("PUT", f"/data/v1/uploads/{DIGEST}", json.dumps({"size": size}).encode()).status == 413
     assert bucket.signed == []
 
 
-def test_a_download_is_shown_the_way_only_if_it_asks_and_only_to_its_own(
+def test_a_download_is_redirected_only_on_request_and_only_to_own_objects(
     direct: Service, bucket: Bucket
 ) -> None:
     bucket.put(NAME, DATA)
@@ -105,7 +107,7 @@ def test_a_download_is_shown_the_way_only_if_it_asks_and_only_to_its_own(
     assert (foreign.status, "location" in foreign.headers) == (404, False)
 
 
-def test_a_store_without_addresses_carries_the_bytes_itself(service: Service) -> None:
+def test_a_store_without_presigned_urls_sends_the_bytes_itself(service: Service) -> None:
     service.store.put(NAME, DATA)
     other = digest_of(b"other")
 
@@ -113,7 +115,7 @@ def test_a_store_without_addresses_carries_the_bytes_itself(service: Service) ->
     assert service.ask("PUT", f"/data/v1/uploads/{other}", b'{"size": 5}').json.get("direct") is None
 
 
-def test_no_signed_address_is_logged(direct: Service, bucket: Bucket) -> None:
+def test_no_presigned_url_is_logged(direct: Service, bucket: Bucket) -> None:
     direct.ask("PUT", f"/data/v1/uploads/{DIGEST}", BEGIN)
     bucket.put(NAME, DATA)
     direct.ask("GET", f"/data/v1/objects/{DIGEST}", headers={"X-Accept-Direct": "1"})

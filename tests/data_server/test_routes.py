@@ -8,8 +8,7 @@ import pytest
 from fake_data_service import Service
 
 from rse_pf.data_server.handlers import Handlers
-from rse_pf.data_server.openapi import openapi, openapi_page
-from rse_pf.data_server.routes import ROUTES, Route
+from rse_pf.data_server.routes import ROUTES, Route, openapi, openapi_page
 
 
 def test_the_published_document_is_up_to_date(repository: Path) -> None:
@@ -18,13 +17,13 @@ def test_the_published_document_is_up_to_date(repository: Path) -> None:
     assert page == openapi_page(), "run rse-pf data --openapi > docs/openapi.json"
 
 
-def test_the_service_publishes_the_same_document_to_everybody(service: Service) -> None:
+def test_the_service_returns_the_same_document_without_a_token(service: Service) -> None:
     answer = service.ask("GET", "/data/openapi.json", token="")
 
     assert (answer.status, answer.json) == (200, openapi())
 
 
-def test_every_reference_leads_somewhere() -> None:
+def test_every_reference_in_the_document_has_a_target() -> None:
     document = openapi()
     text = openapi_page()
 
@@ -34,7 +33,7 @@ def test_every_reference_leads_somewhere() -> None:
 
 
 @pytest.mark.parametrize("route", ROUTES, ids=lambda route: route.operation)
-def test_each_route_has_a_handler_and_asks_for_a_token_as_it_says(service: Service, route: Route) -> None:
+def test_each_route_has_a_handler_and_requires_a_token_as_documented(service: Service, route: Route) -> None:
     path = route.path.format(digest="0" * 64, name="a", version="head")
 
     answer = service.ask(route.method, path, token="")

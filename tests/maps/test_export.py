@@ -1,0 +1,54 @@
+"""Exported files hold what the map holds, in the conventions of other programs."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from maps.sample_maps import make_map
+
+from rse_pf.errors import UsageError
+from rse_pf.geometry import transform
+from rse_pf.maps.export import export_map
+from rse_pf.services.mapping.pose_graph import read_g2o
+
+
+def test_the_g2o_file_holds_the_pose_graph_of_the_map() -> None:
+    version = make_map()
+
+    graph = read_g2o(export_map(version, "g2o").decode().replace("FIX 0\n", ""))
+
+    assert graph.ids.tolist() == [0, 10, 20, 30]
+    np.testing.assert_allclose(graph.T_a_b[1], version.edges[1].T_a_b, atol=1e-7)
+    np.testing.assert_allclose(graph.information[1], version.edges[1].information, atol=1e-6)
+    np.testing.assert_allclose(graph.T_world_pose[2], version.keyframes[2].T_world_camera, atol=1e-7)
+
+
+def test_the_clouds_hold_every_point_with_its_colour() -> None:
+    version = make_map()
+
+    head, _, body = export_map(version, "ply").partition(b"end_header\n")
+    rows = np.frombuffer(body, dtype=[("xyz", "<f4", (3,)), ("rgb", "u1", (3,))])
+    assert b"element vertex 20" in head
+    np.testing.assert_array_equal(rows["xyz"], version.points)
+    np.testing.assert_array_equal(rows["rgb"], version.colours)
+
+    head, _, body = export_map(version, "pcd").partition(b"DATA binary\n")
+    packed = np.frombuffer(body, dtype=[("xyz", "<f4", (3,)), ("rgb", "<u4")])
+    assert b"POINTS 20" in head
+    np.testing.assert_array_equal(packed["xyz"], version.points)
+    np.testing.assert_array_equal(packed["rgb"] >> 16, version.colours[:, 0])
+    np.testing.assert_array_equal(packed["rgb"] & 255, version.colours[:, 2])
+
+
+def test_the_trajectory_of_one_robot_is_sorted_by_time() -> None:
+    version = make_map()
+    rows = np.loadtxt(export_map(version, "tum", "robot-2").decode().splitlines())
+
+    np.testing.assert_allclose(rows[:, 0], [101.0, 103.0])
+    np.testing.assert_allclose(
+        rows[0, 1:4], transform(version.keyframes[1].T_world_camera, np.zeros((1, 3)))[0]
+    )
+    with pytest.raises(UsageError):
+        export_map(version, "tum", "robot-7")
+    with pytest.raises(UsageError):
+        export_map(version, "obj")
