@@ -8,16 +8,17 @@ exit codes (0 done, 1 failed, 2 called or set up wrongly, 130 interrupted), no t
 from __future__ import annotations
 
 import argparse
-import difflib
 import importlib
 import os
 import re
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
 from rse_pf.config import load_settings
+from rse_pf.config.renames import hint_for_old_option
+from rse_pf.config.validation import did_you_mean
 from rse_pf.errors import ConfigurationError, RsePfError, UsageError
 
 __all__ = ["VERBS", "Parser", "main"]
@@ -54,11 +55,12 @@ class Parser(argparse.ArgumentParser):
             known = [word.strip(" '\"") for word in choice["known"].split(",")]
             raise UsageError(
                 f"{self.prog}: {choice['word']!r} is not one of {', '.join(known)}",
-                hint=_did_you_mean(choice["word"], known, f"see {self.prog} --help"),
+                hint=did_you_mean(choice["word"], known, f"see {self.prog} --help"),
             )
+        option, page = _first_option(message), f"see {self.prog} --help"
         raise UsageError(
             f"{self.prog}: {message}",
-            hint=_did_you_mean(_first_option(message), self._options(), f"see {self.prog} --help"),
+            hint=hint_for_old_option(option) or did_you_mean(option, self._options(), page),
         )
 
     def _options(self) -> list[str]:
@@ -96,9 +98,7 @@ def _run(words: list[str]) -> int:
             f"{name} stands before the verb", hint="write rse-pf VERB OPTIONS; see rse-pf --help"
         )
     if name not in VERBS:
-        raise UsageError(
-            f"there is no verb {name!r}", hint=_did_you_mean(name, VERBS, f"known are {', '.join(VERBS)}")
-        )
+        raise UsageError(f"there is no verb {name!r}", hint=did_you_mean(name, VERBS))
     verb: Any = importlib.import_module(f"rse_pf.cli.{name}")
     parser = Parser(
         prog=f"rse-pf {name}",
@@ -142,11 +142,6 @@ def _version() -> str:
 def _report(error: RsePfError) -> int:
     print(error.report(), file=sys.stderr)
     return _EXIT_USAGE if isinstance(error, ConfigurationError) else _EXIT_FAILED
-
-
-def _did_you_mean(word: str, known: Iterable[str], otherwise: str) -> str:
-    close = difflib.get_close_matches(word, list(known), n=1) if word else []
-    return f"did you mean {close[0]}?" if close else otherwise
 
 
 def _first_option(message: str) -> str:

@@ -1,8 +1,10 @@
-"""Settings as data, their validation, the page that documents them, and names of cloud resources.
+"""The settings of the platform: one table, its checks, the file they come from and the page about them.
 
-Every number an operator may change belongs here; what reads it, and anything with a socket, does not.
+Numbers that an operator may change belong here; what uses them, and what opens a socket, does not.
 """
 
+from rse_pf.config.loading import load_settings
+from rse_pf.config.reference_page import settings_page
 from rse_pf.config.schema import SettingRow
 from rse_pf.config.settings import (
     AuthSettings,
@@ -16,9 +18,7 @@ from rse_pf.config.settings import (
     ServiceSettings,
     ServingSettings,
     SessionSettings,
-    load_settings,
     setting_rows,
-    settings_page,
 )
 
 __all__ = [

@@ -1,8 +1,7 @@
-"""Every port, path and threshold of the platform: default, unit, source and help, as data.
+"""Every port, path and threshold of the platform as one table: default, unit, range, source and help.
 
-``cdk.json`` -> ``context."rse-pf"`` holds overrides only; `load_settings` merges and checks them.
-Promises to import nothing above it, to read a file only in `load_settings`, and never to look
-at the environment.  The file is longer than its neighbours because it is one table.
+``context."rse-pf"`` of ``cdk.json`` holds overrides only.  Numbers that no operator changes are constants
+beside their use.  Nothing here reads a file or the environment.
 """
 
 from __future__ import annotations
@@ -13,11 +12,10 @@ import json
 import typing
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 from rse_pf.config.schema import SettingRow, setting
-from rse_pf.config.validation import WHERE, check_range, did_you_mean, typed
+from rse_pf.config.validation import WHERE, check_range, hint_for_unknown, typed
 from rse_pf.errors import SettingsError
 
 __all__ = [
@@ -32,9 +30,7 @@ __all__ = [
     "ServiceSettings",
     "ServingSettings",
     "SessionSettings",
-    "load_settings",
     "setting_rows",
-    "settings_page",
 ]
 
 
@@ -255,7 +251,7 @@ class PlatformSettings:
         made: dict[str, Any] = {}
         for name, values in overrides.items():
             if name not in groups:
-                raise SettingsError(f"unknown group {name!r}", hint=did_you_mean(name, groups))
+                raise SettingsError(f"unknown group {name!r}", hint=hint_for_unknown(name, groups))
             if not isinstance(values, Mapping):
                 raise SettingsError(
                     f"{name} must be an object of settings, got {type(values).__name__}",
@@ -331,68 +327,11 @@ def setting_rows(settings: PlatformSettings | None = None) -> Iterator[SettingRo
             )
 
 
-def settings_page() -> str:
-    """Return ``docs/settings.md``: every setting with default, unit, range, source and meaning."""
-    lines = [
-        "# Settings",
-        "",
-        "Written by `make docs` from `rse_pf/config/settings.py`; do not edit it here. Override a setting in `cdk.json`:",
-        '`{"context": {"rse-pf": {"scaling": {"max_servers": 4}}}}`. `rse-pf settings` shows what is in force.',
-    ]
-    group = ""
-    for row in setting_rows():
-        if row.group != group:
-            group = row.group
-            kind = typing.get_type_hints(PlatformSettings)[group]
-            lines += ["", f"## {group}", "", kind.__doc__, ""]
-            lines += ["| Setting | Default | Unit | Allowed | Source | Meaning |", "|---|---|---|---|---|---|"]
-        cells = (f"`{row.name}`", f"`{json.dumps(row.default)}`", row.unit, _allowed(row), row.source, row.doc)
-        lines.append("| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |")
-    return "\n".join(lines) + "\n"
-
-
-def _allowed(row: SettingRow) -> str:
-    if row.choices:
-        return ", ".join(f"`{choice}`" for choice in row.choices)
-    if row.low is None and row.high is None:
-        return ""
-    if row.high is None:
-        return f"from {row.low:.12g}"
-    return f"{row.low:.12g} to {row.high:.12g}" if row.low is not None else f"up to {row.high:.12g}"
-
-
-def load_settings(path: Path | None = None) -> PlatformSettings:
-    """Read ``context."rse-pf"`` of *path*, by default ``./cdk.json``, else the built-in defaults.
-
-    Raises:
-        SettingsError: The file is named but missing, is not JSON, or holds a bad setting.
-    """
-    chosen = path or Path("cdk.json")
-    if path is None and not chosen.exists():
-        return PlatformSettings()
-    try:
-        document = json.loads(chosen.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise SettingsError(
-            f"cannot read {chosen}: {error.strerror}", hint="name an existing file with --settings"
-        ) from error
-    except (ValueError, RecursionError) as error:
-        raise SettingsError(f"{chosen} is not JSON: {error}", hint="mend the file") from error
-    context = document.get("context", {}) if isinstance(document, dict) else None
-    overrides = context.get("rse-pf", {}) if isinstance(context, dict) else None
-    if not isinstance(overrides, dict):
-        raise SettingsError(
-            f'{chosen} has no object at context."rse-pf"',
-            hint='write {"context": {"rse-pf": {"scaling": {"max_servers": 4}}}}',
-        )
-    return PlatformSettings.from_dict(overrides)
-
-
 def _make_group(group: str, kind: type[Any], values: Mapping[str, Any]) -> Any:
     hints = typing.get_type_hints(kind)
     checked = {}
     for name, value in values.items():
         if name not in hints:
-            raise SettingsError(f"unknown setting {group}.{name}", hint=did_you_mean(name, hints))
+            raise SettingsError(f"unknown setting {group}.{name}", hint=hint_for_unknown(name, hints, group))
         checked[name] = typed(f"{group}.{name}", value, hints[name])
     return kind(**checked)

@@ -1,19 +1,19 @@
-"""Refuse a setting of the wrong type, out of its range, or in contradiction to another one.
+"""Refuse a setting that is unknown, of the wrong type or out of its range.
 
-The rows themselves are in `rse_pf.config.settings`.  Promises to name the setting, both numbers, and what
-to do.
+Every error names the setting, the value and its limit, and says what to do.
 """
 
 from __future__ import annotations
 
 import difflib
-from collections.abc import Mapping
+from collections.abc import Iterable
 from typing import Any
 
+from rse_pf.config.renames import hint_for_old_setting
 from rse_pf.config.schema import SettingRow
 from rse_pf.errors import SettingsError
 
-__all__ = ["WHERE", "check_range", "did_you_mean", "typed"]
+__all__ = ["WHERE", "check_range", "did_you_mean", "hint_for_unknown", "typed"]
 
 _LARGEST = 1e15
 WHERE = 'in cdk.json, context."rse-pf"'
@@ -22,12 +22,12 @@ WHERE = 'in cdk.json, context."rse-pf"'
 def typed(name: str, value: Any, kind: Any) -> Any:
     """Return *value* as *kind*, a whole number as a float where one is meant; raises SettingsError."""
     if kind in (int, float) and type(value) in (int, float) and not abs(value) <= _LARGEST:
-        raise SettingsError(f"{name} is not a finite number below {_LARGEST:g}", hint=f"mend it {WHERE}")
+        raise SettingsError(f"{name} is not a finite number below {_LARGEST:g}", hint=f"correct it {WHERE}")
     if kind is float and type(value) is int:
         return float(value)
     if type(value) is not kind:
         raise SettingsError(
-            f"{name} = {_shown(value)} is not of type {kind.__name__}", hint=f"mend it {WHERE}"
+            f"{name} = {_shown(value)} is not of type {kind.__name__}", hint=f"correct it {WHERE}"
         )
     return value
 
@@ -57,7 +57,14 @@ def check_range(row: SettingRow) -> None:
         )
 
 
-def did_you_mean(name: str, known: Mapping[str, Any]) -> str:
-    """Return a hint: the known name that is close to *name*, else all of them."""
+def hint_for_unknown(name: str, known: Iterable[str], group: str = "") -> str:
+    """Return what to write in place of *name*, which is unknown: its new name, or one close to it."""
+    full = f"{group}.{name}" if group else name
+    return hint_for_old_setting(full) or did_you_mean(name, known)
+
+
+def did_you_mean(name: str, known: Iterable[str], otherwise: str = "") -> str:
+    """Return a hint: the known name that is close to *name*, else *otherwise* or all of them."""
+    known = list(known)
     close = difflib.get_close_matches(name, known, n=1)
-    return f"did you mean {close[0]}?" if close else f"known are {', '.join(known)}"
+    return f"did you mean {close[0]}?" if close else otherwise or f"known are {', '.join(known)}"

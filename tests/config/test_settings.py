@@ -70,19 +70,19 @@ def test_a_contradiction_is_refused_with_both_numbers(overrides: dict[str, Any],
         ({"zzz": {}}, "unknown group 'zzz'", "known are serving, session"),
         ({"scaling": {"max_server": 1}}, "unknown setting scaling.max_server", "did you mean max_servers?"),
         ({"scaling": 3}, "scaling must be an object of settings, got int", '"scaling": {'),
-        ({"scaling": {"max_servers": "4"}}, "scaling.max_servers = '4' is not of type int", "mend"),
-        ({"scaling": {"max_servers": 4.0}}, "scaling.max_servers = 4.0 is not of type int", "mend"),
-        ({"scaling": {"max_servers": True}}, "scaling.max_servers = True is not of type int", "mend"),
-        ({"scaling": {"busy_cpu_percent": True}}, "is not of type float", "mend"),
-        ({"auth": {"required": 1}}, "auth.required = 1 is not of type bool", "mend"),
-        ({"auth": {"issuer": None}}, "auth.issuer = None is not of type str", "mend"),
+        ({"scaling": {"max_servers": "4"}}, "scaling.max_servers = '4' is not of type int", "correct it"),
+        ({"scaling": {"max_servers": 4.0}}, "scaling.max_servers = 4.0 is not of type int", "correct it"),
+        ({"scaling": {"max_servers": True}}, "scaling.max_servers = True is not of type int", "correct it"),
+        ({"scaling": {"busy_cpu_percent": True}}, "is not of type float", "correct it"),
+        ({"auth": {"required": 1}}, "auth.required = 1 is not of type bool", "correct it"),
+        ({"auth": {"issuer": None}}, "auth.issuer = None is not of type str", "correct it"),
         ({"scaling": {"busy_cpu_percent": 101}}, "busy_cpu_percent = 101.0 is above 100", "lower it"),
         ({"serving": {"port": -1}}, "serving.port = -1 is below 0", "raise it"),
         ({"serving": {"log_level": "loud"}}, "is not one of debug, info", "choose"),
-        ({"scaling": {"busy_cpu_percent": float("nan")}}, "not a finite number", "mend"),
-        ({"session": {"max_inflate_ratio": float("inf")}}, "not a finite number", "mend"),
-        ({"session": {"max_inflate_ratio": 10**400}}, "not a finite number", "mend"),
-        ({"serving": {"max_robots": 10**5000}}, "not a finite number", "mend"),
+        ({"scaling": {"busy_cpu_percent": float("nan")}}, "not a finite number", "correct it"),
+        ({"session": {"max_inflate_ratio": float("inf")}}, "not a finite number", "correct it"),
+        ({"session": {"max_inflate_ratio": 10**400}}, "not a finite number", "correct it"),
+        ({"serving": {"max_robots": 10**5000}}, "not a finite number", "correct it"),
     ],
 )
 def test_a_bad_setting_is_refused_with_a_hint(overrides: dict[str, Any], message: str, hint: str) -> None:
@@ -214,3 +214,21 @@ def test_any_overrides_give_settings_or_a_settings_error(overrides: dict[str, An
         return
     assert refusal.hint
     assert len(refusal.report()) < 1500
+
+
+@pytest.mark.parametrize(
+    ("overrides", "hint"),
+    [
+        ({"session": {"silence_s": 1.0}}, "session.silence_s was renamed: write session.stall_timeout_s"),
+        ({"cloud": {"lab": False}}, "cloud.lab was renamed: write cloud.allow_insecure"),
+        ({"local": {"young_s": 1.0}}, "local.young_s is a constant now: remove the line"),
+        ({"prices": {"command_cpu_ms": 2.0}}, "rse-pf cloud cost --prices FILE"),
+    ],
+)
+def test_a_setting_of_an_older_version_is_refused_with_its_new_name(
+    tmp_path: Path, overrides: dict[str, Any], hint: str
+) -> None:
+    with pytest.raises(SettingsError, match="unknown") as caught:
+        load_settings(write(tmp_path, {"context": {"rse-pf": overrides}}))
+
+    assert hint in caught.value.hint

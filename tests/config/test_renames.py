@@ -1,0 +1,41 @@
+"""The table of renames leads from names that are gone to names that exist."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+
+import pytest
+
+from rse_pf.config import setting_rows
+from rse_pf.config.renames import RENAMED_FILE, hint_for_old_option, hint_for_old_setting
+
+TABLE = json.loads(RENAMED_FILE.read_text(encoding="utf-8"))
+SETTINGS = {f"{row.group}.{row.name}" for row in setting_rows()}
+
+
+def test_no_old_setting_exists_and_every_new_one_does() -> None:
+    assert SETTINGS.isdisjoint(TABLE["settings"])
+    assert {new for new in TABLE["settings"].values() if new} <= SETTINGS
+
+
+@pytest.mark.parametrize("new", sorted(set(TABLE["imports"].values())))
+def test_every_new_module_exists(new: str) -> None:
+    assert importlib.util.find_spec(new) is not None
+
+
+@pytest.mark.parametrize(
+    ("hint", "words"),
+    [
+        (hint_for_old_setting("serving.size"), "write serving.emulated_cores"),
+        (hint_for_old_setting("serving.read_buffer_bytes"), "is a constant now: remove the line"),
+        (hint_for_old_option("--size"), "write --emulated-cores"),
+        (hint_for_old_option("--life"), "write --ttl"),
+    ],
+)
+def test_a_hint_says_what_to_write(hint: str, words: str) -> None:
+    assert words in hint
+
+
+def test_a_name_that_never_was_one_has_no_hint() -> None:
+    assert hint_for_old_setting("serving.sise") == hint_for_old_option("--sise") == ""
