@@ -22,7 +22,7 @@ def written(*events: tuple[str, str, dict], level: str = "info") -> list[str]:
         return lines.read().split("\n")[:-1]
 
 
-def test_a_line_tells_when_where_and_what():
+def test_a_line_has_time_level_server_and_event():
     (line,) = written(("info", "command", {"code": "ok", "id": 7}))
 
     assert json.loads(line) == {
@@ -39,7 +39,7 @@ def test_lines_below_the_level_are_not_written():
 
 
 @given(hostile=st.text(max_size=400))
-def test_a_hostile_word_stays_one_line_of_bounded_length(hostile):
+def test_a_hostile_string_stays_in_one_line_of_bounded_length(hostile):
     (line,) = written(("info", "command", {"trace": hostile}))
 
     assert json.loads(line)["trace"] == hostile[:256]

@@ -17,7 +17,7 @@ def worker(answers: list[tuple[str, str, float]], **gauges: float) -> dict:
     return metrics.snapshot()
 
 
-def test_workers_add_up_and_ages_are_the_worst():
+def test_counts_of_workers_are_added_and_ages_are_the_longest():
     merged = merge(
         [
             worker([("pnp", "ok", 0.003), ("pnp", "busy", 0.0)], queue_oldest_s=0.2),
@@ -32,7 +32,7 @@ def test_workers_add_up_and_ages_are_the_worst():
     assert merged["bytes"] == {"in": 20, "out": 0}
 
 
-def test_prometheus_reads_what_is_rendered():
+def test_prometheus_can_parse_the_rendered_text():
     text = render(
         merge([worker([("pnp", "ok", 0.001), ("pnp", "ok", 0.0011), ("pnp", "ok", 60.0)])])
     ).decode()

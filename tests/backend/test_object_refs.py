@@ -73,7 +73,7 @@ def resolved(
     return resolve(kind, payload, tenant, robot, store, settings=SERVING)
 
 
-def test_names_become_bytes_wherever_the_request_declares_bytes(store: Counting) -> None:
+def test_references_become_bytes_wherever_the_request_declares_bytes(store: Counting) -> None:
     payload = {
         "one": name(MAP),
         "many": [b"inline", name(OTHER)],
@@ -89,14 +89,14 @@ def test_names_become_bytes_wherever_the_request_declares_bytes(store: Counting)
     assert payload["one"] == name(MAP), "the payload of the robot is not changed"
 
 
-def test_elsewhere_a_name_is_just_data(store: Counting) -> None:
+def test_a_reference_elsewhere_stays_data(store: Counting) -> None:
     payload = {"free": name(MAP), "part": {"name": name(MAP)}}
 
     assert resolved(payload, store) == payload
     assert store.heads == store.gets == 0
 
 
-def test_each_object_is_read_once_however_often_it_is_named(store: Counting) -> None:
+def test_each_object_is_read_once_however_often_it_is_referred_to(store: Counting) -> None:
     found = resolved({"many": [name(MAP)] * 200}, store)
 
     assert found["many"] == [MAP] * 200
@@ -104,9 +104,7 @@ def test_each_object_is_read_once_however_often_it_is_named(store: Counting) -> 
 
 
 @pytest.mark.parametrize(("tenant", "robot"), [("lab", "robot-2"), ("other", "robot-1")])
-def test_what_belongs_to_others_looks_as_if_it_were_not_there(
-    store: Counting, tenant: str, robot: str
-) -> None:
+def test_an_object_of_another_robot_is_reported_as_missing(store: Counting, tenant: str, robot: str) -> None:
     with pytest.raises(NotFound) as foreign:
         resolved({"one": name(MAP)}, store, tenant=tenant, robot=robot)
     with pytest.raises(NotFound) as missing:
@@ -122,7 +120,7 @@ def test_what_belongs_to_others_looks_as_if_it_were_not_there(
         {"object": digest_of(MAP) + "\n"}, {"object": digest_of(MAP), "robot": "robot-2"},
     ],
 )  # fmt: skip
-def test_what_is_no_digest_names_nothing(store: Counting, wrong: dict[str, Any]) -> None:
+def test_a_reference_that_is_no_digest_is_refused(store: Counting, wrong: dict[str, Any]) -> None:
     with pytest.raises(BadRequest):
         resolved({"one": wrong}, store)
 
@@ -132,7 +130,7 @@ def test_what_is_no_digest_names_nothing(store: Counting, wrong: dict[str, Any])
 @pytest.mark.parametrize(
     ("limit", "reads"), [({"max_objects_per_command": 1}, 0), ({"max_object_bytes_per_command": len(MAP)}, 2)]
 )
-def test_more_than_a_command_may_name_is_refused_before_it_is_read(
+def test_more_than_a_command_may_refer_to_is_refused_before_it_is_read(
     store: Counting, limit: dict[str, Any], reads: int
 ) -> None:
     settings = PlatformSettings().replace(serving=limit).serving
@@ -144,7 +142,7 @@ def test_more_than_a_command_may_name_is_refused_before_it_is_read(
     assert (store.heads, store.gets) == (reads, 0)
 
 
-def test_bytes_that_changed_in_the_store_reach_no_service(store: Counting) -> None:
+def test_an_object_that_changed_in_the_store_reaches_no_service(store: Counting) -> None:
     store.put(object_name("lab", "robot-1", digest_of(MAP)), b"rotten")
 
     with pytest.raises(StoreError, match="digest"):
@@ -160,13 +158,13 @@ def test_a_store_that_fails_is_a_typed_failure() -> None:
         resolved({"one": name(MAP)}, Broken())
 
 
-def test_the_services_for_maps_take_objects_and_pnp_is_not_even_looked_at(store: Counting) -> None:
+def test_the_map_services_take_objects_and_pnp_takes_none(store: Counting) -> None:
     assert resolved({"maps": [name(MAP), name(OTHER)]}, store, MergeRequest)["maps"] == [MAP, OTHER]
     assert named_in(LocaliseRequest, {"map": name(MAP)}) == [digest_of(MAP)]
     assert not takes_objects(PnpRequest)
 
 
-def test_a_payload_of_nonsense_is_left_to_the_service_to_refuse(store: Counting) -> None:
+def test_an_invalid_payload_is_left_to_the_service_to_refuse(store: Counting) -> None:
     gate, registry = ObjectRefs(store, SERVING, 1e9), Registry()
 
     @registry.service("asked")

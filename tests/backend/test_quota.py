@@ -35,13 +35,13 @@ def order(store: str, **others: Any) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def test_a_robots_token_says_how_much_it_may_store_and_the_settings_where_it_does_not():
+def test_the_quota_is_that_of_the_token_or_else_of_the_settings():
     assert quota_bytes(claims(data_bytes=7.0), 10.0) == 7.0
     assert quota_bytes(claims(), 10.0) == 10.0
     assert quota_bytes(None, 10.0) == 10.0
 
 
-def test_what_fits_exactly_is_stored_one_byte_more_is_not_and_others_do_not_count():
+def test_an_object_that_fits_exactly_is_stored_and_one_byte_more_is_not():
     store = MemoryStore()
     store.put(object_name("default", "robot-2", "other"), bytes(500))
     store.put(object_name(*ROBOT, "own"), bytes(60))
@@ -56,7 +56,7 @@ def test_what_fits_exactly_is_stored_one_byte_more_is_not_and_others_do_not_coun
         check_room(store, *ROBOT, 1, 100)
 
 
-def test_a_large_reply_of_a_robot_without_room_is_refused_with_the_reason():
+def test_a_large_reply_beyond_the_quota_is_refused_with_the_reason():
     store, settings = MemoryStore(), PlatformSettings()
     gate = ObjectRefs(store, settings.serving, 100)
     answer, sent = Result(id=1, reply=bytes(500)), Failure(id=1, code="too-large", message="too large")

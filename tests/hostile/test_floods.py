@@ -98,7 +98,7 @@ def test_endless_frames_are_cut_off_at_the_limit(server, attack, code):
     assert counted(server, "closed", f"frames-{code}", 1)
 
 
-def test_a_robot_at_a_hundred_times_its_rate_is_told_cut_off_and_kept_out(server):
+def test_a_robot_at_a_hundred_times_its_rate_is_refused_cut_off_and_banned(server):
     async def attack(door: HandshakePolicy) -> Outcome:
         return await attacks.rate_flood(door, 2000.0, 1.5)
 
@@ -125,7 +125,7 @@ def test_every_bomb_is_refused_and_memory_stays(server):
     assert resident_mib(server) - before < 64
 
 
-def test_silent_connections_leave_for_newer_ones_and_after_their_time(server):
+def test_silent_connections_are_cut_for_newer_ones_and_after_their_time(server):
     async def attack(door: HandshakePolicy) -> Outcome:
         return await attacks.silent_connects(door, 100)
 
@@ -136,7 +136,7 @@ def test_silent_connections_leave_for_newer_ones_and_after_their_time(server):
     assert counted(server, "closed", "unauthenticated", 80)
 
 
-def test_slow_heads_are_cut_after_the_time_of_a_handshake(server):
+def test_slow_request_heads_are_cut_after_the_handshake_timeout(server):
     async def attack(door: HandshakePolicy) -> Outcome:
         return await attacks.slow_headers(door, 20, pause_s=0.2)
 
@@ -147,7 +147,7 @@ def test_slow_heads_are_cut_after_the_time_of_a_handshake(server):
     assert answered == 5
 
 
-def test_a_long_head_is_answered_with_431(server):
+def test_a_long_request_head_is_answered_with_431(server):
     async def knock() -> bytes:
         reader, writer = await HandshakePolicy(server.url).knock()
         writer.write(b"GET /ws HTTP/1.1\r\nHost: a\r\nX-Long: " + b"x" * 9000)
@@ -158,7 +158,7 @@ def test_a_long_head_is_answered_with_431(server):
     assert asyncio.run(knock()).startswith(b"HTTP/1.1 431 ")
 
 
-def test_equal_ids_and_streams_of_many_robots_never_meet(server):
+def test_equal_ids_and_streams_of_several_robots_are_kept_apart(server):
     async def run() -> list[tuple[int, object]]:
         door = HandshakePolicy(server.url)
         robots = [await door.enter(server.token(f"twin-{n}"), "bin") for n in range(20)]

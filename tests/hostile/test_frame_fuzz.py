@@ -23,7 +23,7 @@ def fuzzed(target: str, *, seed: int, inputs: int) -> Meter:
 
 
 @pytest.mark.parametrize(("target", "inputs"), [("frames", 5000), ("stream", 80)])
-def test_thousands_of_damaged_conversations_keep_the_rules(target: str, inputs: int) -> None:
+def test_thousands_of_damaged_streams_keep_the_rules(target: str, inputs: int) -> None:
     assert fuzzed(target, seed=5, inputs=inputs).worst_mib < 1.0
 
 
@@ -66,7 +66,7 @@ WRONG: dict[str, tuple[str, type[Any], str, Callable[..., Any]]] = {
 
 
 @pytest.mark.parametrize("name", WRONG)
-def test_a_wrong_frame_layer_is_found(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_defect_in_the_frame_layer_is_found(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     target, kind, method, wrong = WRONG[name]
     monkeypatch.setattr(kind, method, wrong)
 

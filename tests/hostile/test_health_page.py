@@ -28,7 +28,7 @@ def asked(port: int, path: str) -> tuple[int, list[str]]:
     return status, [name for name in headers if name.lower() == "server" or "envoy" in name.lower()]
 
 
-def test_without_a_server_the_door_says_that_robots_are_not_served(tmp_path: Path) -> None:
+def test_without_a_server_the_health_page_answers_that_robots_are_not_served(tmp_path: Path) -> None:
     async def run() -> dict[str, tuple[int, list[str]]]:
         balancer = EnvoyLoadBalancer(PlatformSettings(), folder=tmp_path, port=0)
         balancer.launch()

@@ -83,7 +83,7 @@ def listening(pids: list[int]) -> list[str]:
     return found
 
 
-def test_the_door_knows_three_paths_and_nothing_else_listens_to_the_world(tmp_path: Path) -> None:
+def test_the_public_port_has_three_paths_and_nothing_else_listens_publicly(tmp_path: Path) -> None:
     async def scan() -> tuple[dict[str, int], int, list[str], int, Any]:
         async with LocalPlatform(PlatformSettings(), state=tmp_path / "p", port=0, servers=1) as cloud:
             door = cloud.load_balancer.port
@@ -112,7 +112,7 @@ def test_the_door_knows_three_paths_and_nothing_else_listens_to_the_world(tmp_pa
     assert named == []
 
 
-def test_a_control_port_tells_its_health_to_all_and_the_rest_to_who_carries_its_token(tmp_path: Path) -> None:
+def test_a_control_port_answers_health_to_all_and_the_rest_only_with_its_token(tmp_path: Path) -> None:
     folder = tmp_path / "p"
 
     def knock(port: int) -> tuple[list[int], list[int], set[bytes], list[int], bytes]:

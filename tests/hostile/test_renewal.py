@@ -39,10 +39,10 @@ def test_a_session_passes_the_end_of_its_first_token_without_a_gap(tmp_path: Pat
 
         async def fresh() -> str:
             life_s = NEXT_LIFE_S if shown else FIRST_LIFE_S
-            shown.append(server.token("renews", life_s=life_s))
+            shown.append(server.token("renews", ttl_s=life_s))
             return shown[-1]
 
-        over = server.token("stays", life_s=FIRST_LIFE_S)
+        over = server.token("stays", ttl_s=FIRST_LIFE_S)
 
         async def the_same() -> str:
             return over

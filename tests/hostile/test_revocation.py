@@ -139,7 +139,7 @@ async def revoke_some(server: GuardedServer, robot_count: int, revoked_count: in
     assert '"defect"' not in server.log
 
 
-def test_revoked_robots_are_closed_within_two_seconds_and_stay_out_after_a_restart(
+def test_revoked_robots_are_closed_within_two_seconds_and_refused_after_a_restart(
     server: GuardedServer,
 ) -> None:
     asyncio.run(revoke_some(server, robot_count=6, revoked_count=2))
@@ -151,9 +151,9 @@ def test_of_a_hundred_robots_the_ten_that_are_revoked_are_closed_and_no_other(tm
         asyncio.run(revoke_some(fresh, robot_count=100, revoked_count=10))
 
 
-def test_a_socket_ends_with_its_token_to_the_second_and_not_before(server: GuardedServer) -> None:
+def test_a_socket_ends_within_a_second_of_its_token_and_not_before(server: GuardedServer) -> None:
     async def run() -> None:
-        async with robots(server, [server.token("short", life_s=3.0)]) as (socket,):
+        async with robots(server, [server.token("short", ttl_s=3.0)]) as (socket,):
             assert socket.token_s is not None
             expected = time.monotonic() + socket.token_s
             assert await socket.end(30.0) == CLOSE_TOKEN_OVER
@@ -167,14 +167,14 @@ def test_a_socket_ends_with_its_token_to_the_second_and_not_before(server: Guard
 def test_a_fresh_token_moves_the_end_of_the_socket_and_a_bad_one_does_not(server: GuardedServer) -> None:
     async def run() -> None:
         names = ["renews", "renews-2", "renews-3"]
-        async with robots(server, [server.token(name, life_s=3.0) for name in names]) as (socket, *wrong):
+        async with robots(server, [server.token(name, ttl_s=3.0) for name in names]) as (socket, *wrong):
             assert socket.token_s is not None
             first_end = time.monotonic() + socket.token_s
             for other, token in zip(wrong, ("x", server.token("another")), strict=True):
                 refusal = await other.ask(Renew(token=token))
                 assert isinstance(refusal, Failure)
                 assert (refusal.id, refusal.code) == (None, "unauthorized")
-            renewed = await socket.ask(Renew(token=server.token("renews", life_s=30.0)))
+            renewed = await socket.ask(Renew(token=server.token("renews", ttl_s=30.0)))
             assert isinstance(renewed, Renewed)
             assert 25.0 < renewed.token_s <= 30.0
             with pytest.raises(asyncio.TimeoutError):
@@ -197,7 +197,7 @@ def test_revoking_the_fresh_token_ends_the_socket_that_was_renewed_with_it(serve
 
 
 @pytest.mark.slow
-def test_a_run_outlives_its_tokens_without_a_gap_and_ends_when_its_robot_is_disabled(
+def test_a_session_outlives_its_tokens_without_a_gap_and_ends_when_its_robot_is_disabled(
     server: GuardedServer, tmp_path: Path
 ) -> None:
     public = make_robot_key(tmp_path / "robot.key")
@@ -274,7 +274,7 @@ def test_of_two_sockets_of_one_robot_one_lives(server: GuardedServer) -> None:
 
 @pytest.mark.slow
 @pytest.mark.timeout(600)
-def test_a_thousand_races_leave_one_live_session_each(server: GuardedServer) -> None:
+def test_each_of_a_thousand_races_leaves_one_live_session(server: GuardedServer) -> None:
     asyncio.run(races(server, 1000))
 
 

@@ -18,7 +18,7 @@ from rse_pf.auth.tokens import SigningKey, verify_token
 from rse_pf.config import AuthSettings, SessionSettings
 from rse_pf.errors import Unauthorized
 from rse_pf.wire import Command, Failure, Result, make_codec
-from rse_pf.wire.client_session import Answered, ClientLink, RobotSession, Welcomed
+from rse_pf.wire.client_session import Answered, ClientSession, ConnectionState, Welcomed
 from rse_pf.wire.server_session import Close, Send, ServerSession, Submit
 
 LIMITS = SessionSettings(max_in_flight=3, max_bad_messages=2)
@@ -35,7 +35,7 @@ picks = st.integers(0, 10**6)
 class Socket:
     """One connection: what is under way in each direction, and what its server still has to answer."""
 
-    def __init__(self, link: ClientLink, server: ServerSession) -> None:
+    def __init__(self, link: ConnectionState, server: ServerSession) -> None:
         self.link = link
         self.server = server
         self.up: deque[bytes] = deque()
@@ -49,7 +49,7 @@ class Platform(RuleBasedStateMachine):
 
     def __init__(self) -> None:
         super().__init__()
-        self.robot = RobotSession(codec=CODEC, settings=LIMITS, sdk="model")
+        self.robot = ClientSession(codec=CODEC, settings=LIMITS, sdk="model")
         self.now = 1000.0
         self.sockets: list[Socket] = []
         self.denied = DenyList()
@@ -64,7 +64,7 @@ class Platform(RuleBasedStateMachine):
         socket.is_open = False
         socket.up.clear()
         socket.down.clear()
-        self.robot.close_link(socket.link)
+        self.robot.close_connection(socket.link)
 
     def _note(self, events: list) -> None:
         for event in events:
@@ -87,7 +87,7 @@ class Platform(RuleBasedStateMachine):
             return
         self.issued += 1
         token = KEY.issue(ROBOT, now=self.now, token_id=f"t-{self.issued}", settings=AUTH)
-        keys = KEY.key_set().governed_by(Roster(), self.denied)
+        keys = KEY.key_set().with_access_control(Roster(), self.denied)
         try:
             claims = verify_token(token, keys=keys, now=self.now, settings=AUTH)
         except Unauthorized:
@@ -99,7 +99,7 @@ class Platform(RuleBasedStateMachine):
         server = ServerSession(
             codec=CODEC, robot=claims.robot, server=f"s-{self.issued}", session="x", limits=LIMITS
         )
-        self.sockets.append(Socket(self.robot.open_link(self.now), server))
+        self.sockets.append(Socket(self.robot.open_connection(self.now), server))
         self._note([])
         if greets:
             self.carry_up(1)
@@ -188,7 +188,7 @@ class Platform(RuleBasedStateMachine):
             self.now = min(end, max(self.robot.next_due(self.now), self.now + 1e-3))
             self._note(self.robot.due(self.now))
             for socket in self._open():
-                self._note(self.robot.tend(socket.link, self.now))
+                self._note(self.robot.check(socket.link, self.now))
                 if socket.link.lost:
                     self._close(socket)
 

@@ -136,7 +136,7 @@ def test_the_data_service_never_answers_twice(data_port: int) -> None:
     assert not [name for name, codes in answers.items() if codes and int(codes[0]) < 400]
 
 
-def test_the_data_service_keeps_a_connection_for_who_waits_for_answers(data_port: int) -> None:
+def test_the_data_service_keeps_a_connection_whose_client_waits_for_answers(data_port: int) -> None:
     async def run() -> list[bytes]:
         reader, writer = await asyncio.open_connection("127.0.0.1", data_port)
         codes = []
@@ -261,7 +261,7 @@ async def through_the_door(folder: Path, *, opens: bool) -> tuple[dict[str, Told
 
 
 @pytest.mark.parametrize("opens", [False, True])
-def test_what_passes_the_door_means_one_thing_and_nobody_gets_another_s_answer(
+def test_a_request_that_passes_the_load_balancer_is_read_alike_by_all_servers(
     tmp_path: Path, opens: bool
 ) -> None:
     told, _ = asyncio.run(through_the_door(tmp_path, opens=opens))

@@ -67,7 +67,7 @@ def test_a_command_comes_back_with_its_times(start_server, codec):
     assert result.queue_ms >= 0
 
 
-def test_the_door_answers_with_fixed_bodies(start_server):
+def test_rejected_handshakes_get_fixed_bodies(start_server):
     server = start_server(keys=True, serving={"max_robots": 1})
     good = {"Authorization": f"Bearer {server.token()}", "Sec_WebSocket_Protocol": SUBPROTOCOLS["bin"]}
     refused = [
@@ -98,7 +98,7 @@ def test_the_door_answers_with_fixed_bodies(start_server):
     assert json.loads(body)["code"] == "full"
 
 
-def test_a_connection_header_with_two_words_is_accepted(start_server):
+def test_a_connection_header_with_two_values_is_accepted(start_server):
     server = start_server()
 
     head, _ = handshake(
@@ -126,9 +126,9 @@ def test_sockets_are_spread_evenly_over_the_workers(start_server):
     assert sum(halved["robots_of_workers"]) >= 10
 
 
-def test_a_token_that_ends_ends_its_socket(start_server):
+def test_a_socket_ends_with_its_token(start_server):
     server = start_server(keys=True)
-    token = server.token("robot-9", life_s=2)
+    token = server.token("robot-9", ttl_s=2)
 
     async def run():
         async with server.robot(token=token) as robot:
@@ -139,7 +139,7 @@ def test_a_token_that_ends_ends_its_socket(start_server):
     assert ended - time.time() < 1.0
 
 
-def test_newer_frames_replace_the_one_that_waits(start_server):
+def test_a_newer_frame_replaces_the_one_that_waits(start_server):
     server = start_server()
 
     async def run():
@@ -158,7 +158,7 @@ def test_newer_frames_replace_the_one_that_waits(start_server):
     assert isinstance(answers[3], Result)
 
 
-def test_a_defect_is_a_failure_outside_and_a_traceback_inside(start_server):
+def test_a_defect_is_a_failure_for_the_robot_and_a_traceback_in_the_log(start_server):
     server = start_server()
 
     async def run():
@@ -202,7 +202,7 @@ def test_one_line_is_logged_for_a_command_and_no_secret(start_server):
     assert token not in server.text
 
 
-def test_what_went_well_is_told_by_numbers_and_logged_for_developers_only(start_server):
+def test_successful_commands_are_counted_and_logged_at_debug_level_only(start_server):
     server = start_server()
 
     async def run():
@@ -216,7 +216,7 @@ def test_what_went_well_is_told_by_numbers_and_logged_for_developers_only(start_
     assert server.status()["results"]["ok"] == 1
 
 
-def test_the_control_port_tells_health_and_numbers(start_server):
+def test_the_control_port_serves_health_status_and_metrics(start_server):
     server = start_server(serving={"workers": 2})
 
     async def run():
@@ -252,7 +252,7 @@ def test_the_control_port_tells_health_and_numbers(start_server):
     [([b"x" * 3000], 1009), ([b""] * 70, 1009), ([b"x" * 900] * 4, 1009)],
     ids=["oversize", "empty fragments", "fragments too big together"],
 )
-def test_too_large_and_too_many_fragments_are_cut(start_server, message, code):
+def test_messages_that_are_too_large_or_have_too_many_fragments_are_cut(start_server, message, code):
     server = start_server(session={"max_message_bytes": 2048})
 
     async def run():
@@ -311,7 +311,7 @@ def test_a_silent_robot_is_closed(start_server):
     assert asyncio.run(run()) == 1001
 
 
-def test_a_reader_that_does_not_read_is_cut(start_server):
+def test_a_robot_that_does_not_read_is_cut_off(start_server):
     server = start_server(serving={"slow_reader_timeout_s": 0.3}, session={"max_commands_per_s": 0.0})
 
     async def run():
@@ -327,7 +327,7 @@ def test_a_reader_that_does_not_read_is_cut(start_server):
 
 
 @pytest.mark.slow
-def test_a_server_of_a_fixed_size_uses_no_more_cpu(start_server):
+def test_an_emulated_server_uses_no_more_cpu_than_its_cores(start_server):
     server = start_server(serving={"emulated_cores": 0.25})
 
     async def run():

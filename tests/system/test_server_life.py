@@ -44,7 +44,7 @@ def test_a_drain_moves_the_robots_and_loses_nothing(start_server):
     assert server.process.wait(PROMPT_S) == 0
 
 
-def test_robots_that_stay_get_their_answers_before_the_socket_closes(start_server):
+def test_robots_that_do_not_move_get_their_answers_before_the_socket_closes(start_server):
     server = start_server(serving={"drain_within_ms": 100.0})
 
     async def run():
@@ -79,7 +79,7 @@ def test_a_draining_server_is_not_ready_but_still_accepts(start_server):
     assert seen["state"] == "draining"
 
 
-def test_a_robot_that_comes_during_the_move_is_told_to_move_as_well(start_server):
+def test_a_robot_that_connects_during_a_drain_is_told_to_move_as_well(start_server):
     server = start_server()
 
     async def run():
@@ -94,7 +94,7 @@ def test_a_robot_that_comes_during_the_move_is_told_to_move_as_well(start_server
 
 
 @pytest.mark.parametrize("second", [signal.SIGTERM, signal.SIGINT])
-def test_a_second_signal_leaves_at_once(start_server, gone, second):
+def test_a_second_signal_ends_the_server_at_once(start_server, gone, second):
     server = start_server(serving={"drain_wait_s": 600.0})
     server.process.send_signal(signal.SIGTERM)
     server.wait_for_log("drain")

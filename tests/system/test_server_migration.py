@@ -105,7 +105,7 @@ def test_robots_move_under_load_and_every_command_is_answered_once(start_server)
     assert (left["robots"], left["moved"], taken["robots"]) == (2, 4, 4)
 
 
-def test_the_ask_says_rebalance_and_how_long(start_server):
+def test_the_request_to_move_gives_the_reason_and_the_time(start_server):
     server = start_server()
 
     async def run():
@@ -123,14 +123,14 @@ def test_the_ask_says_rebalance_and_how_long(start_server):
 @pytest.mark.parametrize(
     "query", ["", "robots=x", "robots=-1", "robots=1&spread_s=nan", "robots=1&spread_s=-1", "robots=1e9"]
 )
-def test_a_bad_ask_is_refused(start_server, query):
+def test_a_bad_migration_request_is_refused(start_server, query):
     server = start_server()
 
     assert move(server, query)[0] == 400
     assert server.status()["moved"] == 0
 
 
-def test_the_status_tells_bytes_and_the_longest_wait(start_server):
+def test_the_status_shows_bytes_and_the_longest_wait(start_server):
     server = start_server()
 
     async def run():

@@ -25,7 +25,7 @@ from rse_pf.backend.ports import Clocks, Handle
 from rse_pf.config import ServingSettings, SessionSettings
 from rse_pf.errors import MissingExtra
 
-__all__ = ["RobotSockets"]
+__all__ = ["PendingSocket", "RobotSockets", "protocol_type"]
 
 _MAX_CLOSE_REASON_BYTES = 123
 _TOO_LONG = b"HTTP/1.1 431 Request Header Fields Too Large\r\nConnection: close\r\nContent-Length: 0\r\n\r\n"
@@ -122,7 +122,7 @@ class RobotSockets:
         self._tasks: set[asyncio.Task[None]] = set()
         picows, self._connect_accepted_socket = _libraries()
         self._picows = picows
-        self._protocol = _protocol_type(picows)
+        self._protocol = protocol_type(picows)
         self._listener = _listener_type(picows, loop, serving)
         self._arguments = (
             _NoLogger(), True, serving.handshake_timeout_s,
@@ -230,7 +230,8 @@ def _libraries() -> tuple[Any, Any]:
     return picows, aiofastnet.connect_accepted_socket
 
 
-def _protocol_type(picows: Any) -> Any:
+def protocol_type(picows: Any) -> Any:
+    """Return the subclass of picows' protocol that one robot's socket uses."""
     base = picows.WSProtocol
     get_buffer, buffer_updated, connection_lost = base.get_buffer, base.buffer_updated, base.connection_lost
     connection_made = base.connection_made

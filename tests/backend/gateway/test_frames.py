@@ -35,7 +35,7 @@ def test_one_frame_is_a_message():
     assert assembler().receive(BINARY, True, False, b"\xff", 0.0) == Received(b"\xff", False)
 
 
-def test_fragments_join_and_control_frames_may_stand_between_them():
+def test_fragments_are_joined_and_control_frames_may_stand_between_them():
     frames = assembler()
 
     assert frames.receive(TEXT, False, False, b"a", 0.0) is None
@@ -44,7 +44,7 @@ def test_fragments_join_and_control_frames_may_stand_between_them():
     assert frames.receive(CONTINUATION, True, False, b"b", 0.0) == Received(b"ab", True)
 
 
-def test_a_letter_may_be_cut_by_a_fragment_border():
+def test_a_character_may_be_split_between_fragments():
     frames = assembler()
     first, second = "é".encode()[:1], "é".encode()[1:]
 
@@ -94,7 +94,7 @@ def test_empty_fragments_count():
     assert decisions == [None, None, None, CloseSocket(1009, "too many fragments")]
 
 
-def test_fragments_together_keep_the_size_limit():
+def test_the_size_limit_holds_for_all_fragments_together():
     frames = assembler()
     frames.receive(BINARY, False, False, b"x" * 1500, 0.0)
 
@@ -109,7 +109,7 @@ def test_control_frames_have_a_rate_that_recovers():
     assert frames.receive(PING, True, False, b"", 5.5) == CloseSocket(1008, "too many control frames")
 
 
-def test_nothing_counts_behind_the_end():
+def test_frames_behind_a_close_are_ignored():
     frames = assembler()
     frames.receive(CLOSE, True, False, b"", 0.0)
 
@@ -149,7 +149,7 @@ def parsed(stream: bytes) -> list[bytes]:
 
 
 @given(sent=messages, cuts=st.lists(st.integers(0, 3000), max_size=20), junk=st.binary(max_size=40))
-def test_the_conversation_is_the_same_wherever_the_stream_is_cut(sent, cuts, junk):
+def test_the_stream_is_read_alike_wherever_it_is_cut(sent, cuts, junk):
     request = b"GET /ws HTTP/1.1\r\nHost: a\r\n\r\n"
     talk = stream_of(sent) + frame_bytes(CLOSE, True, b"")
     stream = request + talk + junk

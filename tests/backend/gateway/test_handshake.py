@@ -16,8 +16,8 @@ KEY = SigningKey.from_seed(b"d" * 32, "k1")
 NOW_S = 1_000_000.0
 
 
-def token(life_s: float = 100.0, now: float = NOW_S) -> str:
-    return KEY.issue("robot-1", now=now, token_id="t", settings=SETTINGS.auth, life_s=life_s)
+def token(ttl_s: float = 100.0, now: float = NOW_S) -> str:
+    return KEY.issue("robot-1", now=now, token_id="t", settings=SETTINGS.auth, ttl_s=ttl_s)
 
 
 def judge(door: HandshakePolicy | None = None, **changed: object) -> Accepted | Rejected:
@@ -28,13 +28,13 @@ def judge(door: HandshakePolicy | None = None, **changed: object) -> Accepted | 
     return (door or HandshakePolicy(SETTINGS, KEY.key_set())).judge(**asked)
 
 
-def test_a_good_token_names_the_robot_and_when_it_has_to_leave():
+def test_a_valid_token_gives_the_robot_and_the_end_of_its_connection():
     assert judge() == Accepted(
         robot="robot-1", codec="bin", subprotocol=SUBPROTOCOLS["bin"], expires_s=NOW_S + 100
     )
 
 
-def test_a_token_within_the_leeway_lives_until_the_leeway_ends():
+def test_a_connection_with_a_token_within_its_leeway_ends_with_the_leeway():
     verdict = judge(authorization=f"Bearer {token(10.0)}", now_s=NOW_S + 20)
 
     assert isinstance(verdict, Accepted)
@@ -45,7 +45,7 @@ def test_the_query_of_the_path_does_not_matter():
     assert isinstance(judge(path=b"/ws?x=1"), Accepted)
 
 
-def test_the_robots_first_choice_that_we_speak_is_taken():
+def test_the_first_offered_subprotocol_that_the_server_speaks_is_chosen():
     verdict = judge(offered=["chat", SUBPROTOCOLS["json"], SUBPROTOCOLS["bin"]])
 
     assert isinstance(verdict, Accepted)
@@ -63,7 +63,7 @@ def test_the_robots_first_choice_that_we_speak_is_taken():
         ({"offered": []}, 400, "unsupported"),
     ],
 )
-def test_others_are_turned_away(changed, status, result):
+def test_other_handshakes_are_rejected(changed, status, result):
     verdict = judge(**changed)
 
     assert isinstance(verdict, Rejected)
@@ -87,13 +87,13 @@ def test_all_causes_of_a_bad_token_get_the_same_bytes_but_the_log_knows():
     assert len({v.reason for v in verdicts}) == 4
 
 
-def test_without_keys_robots_are_anonymous_and_stay():
+def test_without_keys_robots_are_anonymous_and_never_expire():
     assert judge(HandshakePolicy(SETTINGS, None)) == Accepted(
         robot="anonymous-1", codec="bin", subprotocol=SUBPROTOCOLS["bin"], expires_s=None
     )
 
 
-def test_conformance_echo_asks_for_nothing():
+def test_the_conformance_echo_accepts_every_handshake():
     door = HandshakePolicy(SETTINGS, None, conformance_echo=True)
 
     assert judge(door, path=b"/", offered=[], authorization="") == Accepted(
@@ -101,7 +101,7 @@ def test_conformance_echo_asks_for_nothing():
     )
 
 
-def test_the_page_of_health_says_one_thing_to_everybody_also_when_the_server_is_full():
+def test_the_health_page_has_one_answer_also_when_the_server_is_full():
     answers = [
         judge(path=b"/healthz", authorization=each, is_full=full) for each in ("", "x") for full in (0, 1)
     ]

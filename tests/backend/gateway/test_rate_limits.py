@@ -1,4 +1,4 @@
-"""The pure cores of the limits: buckets, strikes, sources, and who has to leave the waiting room."""
+"""The rate of robots and addresses, bans, and pending handshakes."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def test_no_span_of_time_gives_more_than_burst_and_rate_together(gaps, rate, bur
 
 
 @given(gaps=st.lists(st.floats(0.0, 1.0), min_size=1, max_size=200), rate=st.floats(0.5, 50.0))
-def test_who_waits_as_long_as_told_is_served(gaps, rate):
+def test_a_caller_that_waits_as_long_as_told_is_served(gaps, rate):
     bucket, now = TokenBucket(rate, 2.0), 0.0
     for gap in gaps:
         now += gap
@@ -81,7 +81,7 @@ def test_ten_hertz_is_never_refused():
     assert judged(RobotRates(LIMITS), per_s=10.0, seconds=120.0) == [None] * 1200
 
 
-def test_a_robot_a_little_above_its_rate_is_told_when_to_come_again_and_never_cut_off():
+def test_a_robot_a_little_above_its_rate_is_told_when_to_try_again_and_never_cut_off():
     verdicts = judged(RobotRates(LIMITS), per_s=25.0, seconds=120.0)
     refused = [verdict for verdict in verdicts if isinstance(verdict, TooFast)]
 
@@ -90,15 +90,15 @@ def test_a_robot_a_little_above_its_rate_is_told_when_to_come_again_and_never_cu
     assert all(0 < verdict.retry_after_ms <= 50.0 for verdict in refused)
 
 
-def test_a_robot_at_a_hundred_times_its_rate_is_cut_off_within_half_a_second_and_rests():
+def test_a_robot_far_above_its_rate_is_cut_off_within_half_a_second_and_banned():
     rates = RobotRates(LIMITS)
     verdicts = judged(rates, per_s=500.0, seconds=0.5)
     cut_off = verdicts.index(CutOff())
 
     assert 40 + 3 * 40 <= cut_off <= 180
-    assert rates.rests_s(ROBOT, 100.0 + cut_off / 500) == pytest.approx(5.0)
-    assert rates.rests_s(ROBOT, 106.0) == 0.0
-    assert rates.rests_s(("default", "another"), 100.5) == 0.0
+    assert rates.banned_s(ROBOT, 100.0 + cut_off / 500) == pytest.approx(5.0)
+    assert rates.banned_s(ROBOT, 106.0) == 0.0
+    assert rates.banned_s(("default", "another"), 100.5) == 0.0
 
 
 def test_robots_have_buckets_of_their_own():
@@ -116,7 +116,7 @@ def test_zero_turns_the_rate_off():
     assert judged(rates, per_s=1000.0, seconds=1.0) == [None] * 1000
 
 
-def test_names_do_not_pile_up(monkeypatch):
+def test_the_number_of_remembered_names_is_bounded(monkeypatch):
     monkeypatch.setattr(limits, "_MAX_NAMES", 100)
     rates, sources = RobotRates(LIMITS), SourceRates(ServingSettings())
 
@@ -128,7 +128,7 @@ def test_names_do_not_pile_up(monkeypatch):
     assert len(sources._sources) <= 100
 
 
-def test_who_rests_is_not_forgotten_for_names_that_did_nothing(monkeypatch):
+def test_a_banned_robot_is_not_forgotten_for_names_that_did_nothing(monkeypatch):
     monkeypatch.setattr(limits, "_MAX_NAMES", 100)
     rates = RobotRates(LIMITS)
     judged(rates, per_s=500.0, seconds=0.5, robot="flood")
@@ -136,7 +136,7 @@ def test_who_rests_is_not_forgotten_for_names_that_did_nothing(monkeypatch):
     for k in range(40):
         rates.judge(f"r-{k}", 101.0 + k)
 
-    assert rates.rests_s("flood", 101.0) > 0
+    assert rates.banned_s("flood", 101.0) > 0
 
 
 @pytest.mark.parametrize(
@@ -150,7 +150,7 @@ def test_who_rests_is_not_forgotten_for_names_that_did_nothing(monkeypatch):
         (2, "10.0.0.9", "peer"),
     ],
 )
-def test_a_source_is_what_the_first_trusted_proxy_saw(trusted, told, source):
+def test_the_source_is_the_address_that_the_first_trusted_proxy_saw(trusted, told, source):
     assert SourceRates(ServingSettings(trusted_proxies=trusted)).source("peer", told) == source
 
 
@@ -162,45 +162,45 @@ def test_a_source_has_a_rate_of_handshakes():
     assert sources.wait_s("a", 1.2) == 0.0
 
 
-def test_the_longest_wait_leaves_for_the_newcomer():
-    room: PendingHandshakes[int] = PendingHandshakes(most=3, max_per_source=0)
+def test_the_pending_handshake_that_waited_longest_is_cut_for_a_new_one():
+    pending: PendingHandshakes[int] = PendingHandshakes(max_sockets=3, max_per_source=0)
 
-    assert [room.enter(k, "a") for k in range(5)] == [None, None, None, 0, 1]
-    assert len(room) == 3
-
-
-def test_a_source_that_has_too_many_loses_its_own():
-    room: PendingHandshakes[str] = PendingHandshakes(most=100, max_per_source=2)
-    room.enter("other", "b")
-
-    assert [room.enter(name, "a") for name in ("x", "y", "z")] == [None, None, "x"]
-    assert room.enter("other-2", "b") is None
+    assert [pending.enter(k, "a") for k in range(5)] == [None, None, None, 0, 1]
+    assert len(pending) == 3
 
 
-def test_who_showed_a_token_makes_room():
-    room: PendingHandshakes[int] = PendingHandshakes(most=2, max_per_source=2)
-    room.enter(1, "a")
-    room.enter(2, "a")
-    room.leave(1)
-    room.leave(1)
+def test_a_source_with_too_many_pending_handshakes_loses_its_own():
+    pending: PendingHandshakes[str] = PendingHandshakes(max_sockets=100, max_per_source=2)
+    pending.enter("other", "b")
 
-    assert room.enter(3, "a") is None
-    assert len(room) == 2
+    assert [pending.enter(name, "a") for name in ("x", "y", "z")] == [None, None, "x"]
+    assert pending.enter("other-2", "b") is None
+
+
+def test_a_handshake_that_sent_its_token_is_no_longer_pending():
+    pending: PendingHandshakes[int] = PendingHandshakes(max_sockets=2, max_per_source=2)
+    pending.enter(1, "a")
+    pending.enter(2, "a")
+    pending.leave(1)
+    pending.leave(1)
+
+    assert pending.enter(3, "a") is None
+    assert len(pending) == 2
 
 
 @given(steps=st.lists(st.tuples(st.booleans(), st.integers(0, 9), st.integers(0, 3)), max_size=200))
-def test_a_room_never_holds_more_than_it_may(steps):
-    room: PendingHandshakes[int] = PendingHandshakes(most=5, max_per_source=2)
+def test_pending_handshakes_never_exceed_their_limits(steps):
+    pending: PendingHandshakes[int] = PendingHandshakes(max_sockets=5, max_per_source=2)
     inside: dict[int, str] = {}
     for number, (enters, key, source) in enumerate(steps):
         if enters:
             inside[number] = str(source)
-            leaving = room.enter(number, str(source))
+            leaving = pending.enter(number, str(source))
             if leaving is not None:
                 del inside[leaving]
         elif inside:
             gone = list(inside)[key % len(inside)]
-            room.leave(gone)
+            pending.leave(gone)
             del inside[gone]
-        assert len(room) == len(inside) <= 5
+        assert len(pending) == len(inside) <= 5
         assert all(list(inside.values()).count(each) <= 2 for each in inside.values())

@@ -1,4 +1,4 @@
-"""What we rely on in picows, which does not promise it: held by version and by this test."""
+"""What the gateway relies on in picows beyond its documentation; the version is pinned, too."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ import logging
 
 from picows import picows
 
-from rse_pf.backend.gateway.websocket import _Arrival, _protocol_type
+from rse_pf.backend.gateway.websocket import PendingSocket, protocol_type
 
 
 def test_the_protocol_takes_the_fifteen_arguments_that_we_give_it():
     async def make() -> object:
-        return _protocol_type(picows)(
-            _Arrival("127.0.0.1", 8192), lambda: None, None, None, False, lambda request: None,
+        return protocol_type(picows)(
+            PendingSocket("127.0.0.1", 8192), lambda: None, None, None, False, lambda request: None,
             logging.getLogger("t"), True, 5.0, False, 20.0, 20.0, picows.WSAutoPingStrategy.PING_WHEN_IDLE,
             False, 1000, None, 2048,
         )  # fmt: skip

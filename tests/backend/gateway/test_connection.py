@@ -1,0 +1,125 @@
+"""A connection keeps the order of its messages, whichever of them the decoder thread gets."""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+from backend.gateway.worker_parts import WorkerParts, worker_parts
+from fakes import FakeWire
+
+from rse_pf.config import PlatformSettings
+from rse_pf.wire import Command, Failure, Ping, Pong, Result, make_codec
+
+SETTINGS = PlatformSettings()
+CODEC = make_codec("zlib")
+BOMB = zlib.compress(bytes(3_000_000), 9)
+LONG = CODEC.encode(Command(id=7, service="echo", payload={"value": list(range(20_000))}))
+PAUSE_S = 0.1
+
+
+@pytest.fixture
+def worker() -> Iterator[WorkerParts]:
+    with worker_parts(codec="zlib") as parts:
+        yield parts
+
+
+def short(number: int) -> Command:
+    return Command(id=number, service="echo", payload={"value": 1.5})
+
+
+def answered(wire: FakeWire) -> list[int | None]:
+    return [message.id for message in wire.sent if isinstance(message, (Result, Failure))]
+
+
+def test_messages_behind_a_long_one_wait_for_it_and_the_socket_is_not_read_meanwhile(worker: WorkerParts):
+    connection, wire = worker.join()
+
+    for message in (LONG, short(8), LONG, Ping(sent_s=1.0)):
+        worker.say(connection, message)
+    assert (answered(wire), wire.holds) == ([], 1)
+    worker.loop.run_until(lambda: any(isinstance(message, Pong) for message in wire.sent))
+    worker.loop.run_until(lambda: len(answered(wire)) == 3)
+
+    assert answered(wire) == [7, 8, 7]
+    assert wire.holds == 0
+
+
+def test_a_short_command_is_decoded_at_once(worker: WorkerParts):
+    connection, wire = worker.join()
+
+    worker.say(connection, Command(id=1, service="echo", payload={"value": [1.5] * 1000}))
+
+    assert answered(wire) == [1]
+    assert wire.holds == 0
+
+
+def test_a_small_bomb_is_inflated_by_the_thread_and_its_robot_is_read_more_rarely(worker: WorkerParts):
+    connection, wire = worker.join()
+    assert len(BOMB) < worker.decoder.short_bytes
+
+    worker.say(connection, BOMB)
+    assert answered(wire) == []
+    worker.loop.run_until(lambda: answered(wire))
+
+    assert wire.sent[-1].code == "too-large"
+    assert wire.pauses == [PAUSE_S]
+
+
+def test_three_long_bombs_close_the_connection_and_ban_the_robot(worker: WorkerParts):
+    connection, wire = worker.join()
+    limits, rates = SETTINGS.session, worker.admission.rates
+    bomb = zlib.compress(bytes(300_000_000), 9)[: limits.max_message_bytes]
+    assert len(bomb) == limits.max_message_bytes
+
+    for number in range(3):
+        assert wire.closed is None
+        assert rates.banned_s(("default", "r"), worker.loop.now) == 0
+        worker.say(connection, bomb)
+        worker.loop.run_until(lambda: len(answered(wire)) > number)  # noqa: B023  it is called at once
+
+    assert wire.closed == (4400, "too many bad messages")
+    assert wire.pauses == pytest.approx([5 * PAUSE_S, 10 * PAUSE_S])
+    assert rates.banned_s(("default", "r"), worker.loop.now) == limits.rate_ban_s
+    assert rates.banned_s(("default", "r2"), worker.loop.now) == 0
+
+
+def test_a_long_command_of_a_robot_that_left_meanwhile_is_dropped(worker: WorkerParts):
+    connection, wire = worker.join()
+
+    worker.say(connection, LONG)
+    connection.ended()
+    worker.loop.run_until(lambda: wire.holds == 0)
+
+    assert answered(wire) == []
+    assert worker.metrics.requests == {}
+
+
+def test_a_long_message_that_finds_the_decoder_full_is_refused_with_its_id():
+    settings = SETTINGS.replace(serving={"max_unread_bytes": 262144})
+    with worker_parts(codec="zlib", settings=settings) as worker:
+        connection, wire = worker.join()
+        worker.decoder.begin = lambda *_, **__: None  # type: ignore[method-assign]
+        worker.decoder.unread_bytes = 262144
+        worker.say(connection, LONG)
+
+    (refusal,) = [message for message in wire.sent if isinstance(message, Failure)]
+    assert (refusal.id, refusal.code) == (7, "busy")
+    assert refusal.retry_after_ms > 0
+    assert worker.metrics.shed["unread"] == 1
+
+
+def test_an_answer_is_written_once_and_only_while_the_socket_exists(worker: WorkerParts):
+    connection, wire = worker.join()
+    answer: Any = worker.codec.encode(Result(id=1, reply=None))
+    assert connection.session is not None
+    connection.session.in_flight = 2
+
+    connection.answer(answer)
+    connection.ended()
+    connection.answer(answer)
+
+    assert answered(wire) == [1]
+    assert connection.session.in_flight == 1

@@ -1,0 +1,155 @@
+"""The parts of one worker on a `FakeLoop`, put together as `rse_pf.backend.supervisor.worker` does it."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+from fakes import FakeLoop, FakeWire
+
+from rse_pf.auth.tokens import KeySet
+from rse_pf.backend.gateway.admission import Admission
+from rse_pf.backend.gateway.answers import Answers
+from rse_pf.backend.gateway.audit_recorder import AuditRecorder
+from rse_pf.backend.gateway.connection import RobotConnection
+from rse_pf.backend.gateway.decoder_thread import DecoderThread
+from rse_pf.backend.gateway.dispatcher import Dispatcher
+from rse_pf.backend.gateway.handshake import Accepted, HandshakePolicy
+from rse_pf.backend.gateway.queues import JobQueue, NoJobs, NoSandboxes, SandboxQueue
+from rse_pf.backend.gateway.token_watch import TokenWatch
+from rse_pf.backend.log import JsonLog
+from rse_pf.backend.metrics import Metrics
+from rse_pf.backend.object_refs import ObjectRefs
+from rse_pf.backend.ports import Clocks
+from rse_pf.backend.scheduling.cpu_throttle import CpuThrottle, NoThrottle
+from rse_pf.backend.scheduling.scheduler import Scheduler
+from rse_pf.config import PlatformSettings
+from rse_pf.object_store import MemoryStore
+from rse_pf.service import Registry
+from rse_pf.services import echo
+from rse_pf.wire import SUBPROTOCOLS, Codec, Hello, make_codec
+
+BINARY = 2
+UNIX_S = 1_000_000.0
+
+
+class WorkerParts:
+    """A dispatcher and everything around it; the Unix clock shows `UNIX_S` when the loop begins."""
+
+    def __init__(
+        self,
+        log: JsonLog,
+        *,
+        settings: PlatformSettings | None = None,
+        keys: KeySet | None = None,
+        codec: str = "bin",
+        register: Callable[[Registry], None] | None = None,
+        store: MemoryStore | None = None,
+        sandboxes: SandboxQueue | None = None,
+        jobs: JobQueue | None = None,
+        emulated_cores: float = 0.0,
+    ) -> None:
+        self.settings = settings or PlatformSettings()
+        self.loop = FakeLoop()
+        self.metrics = Metrics()
+        self.codec: Codec = make_codec(codec)
+        self.told: list[dict[str, Any]] = []
+        self.cpu_s = 0.0
+        began = self.loop.now
+        self.clocks = Clocks(
+            monotonic=lambda: self.loop.now,
+            wall=lambda: UNIX_S + self.loop.now - began,
+            cpu=lambda: self.cpu_s,
+        )
+        self.registry = Registry()
+        echo.register(self.registry)
+        if register is not None:
+            register(self.registry)
+        self.scheduler = Scheduler(self.settings.serving)
+        self.admission = Admission(self.settings.session, self.settings.serving)
+        self.handshake = HandshakePolicy(self.settings, keys)
+        self.decoder = DecoderThread(self.loop.call_soon_threadsafe)
+        self.answers = Answers(
+            registry=self.registry,
+            services=frozenset(service.name for service in self.registry),
+            objects=ObjectRefs(store, self.settings.serving, self.settings.data.quota_bytes),
+            server_id="s-1",
+            max_message_bytes=self.settings.session.max_message_bytes,
+            clocks=self.clocks,
+            metrics=self.metrics,
+            log=log,
+        )
+        connections: set[RobotConnection] = set()
+        self.token_watch = TokenWatch(
+            connections,
+            self.handshake,
+            clocks=self.clocks,
+            loop=self.loop,
+            log=log,
+            metrics=self.metrics,
+            tell=lambda **message: self.told.append(message),
+            recorder=AuditRecorder(self.clocks, loop=self.loop, tell=None),
+        )
+        throttle = CpuThrottle(emulated_cores, now=self.loop.now, cpu=self.clocks.cpu)
+        self.dispatcher = Dispatcher(
+            settings=self.settings,
+            registry=self.registry,
+            server_id="s-1",
+            clocks=self.clocks,
+            loop=self.loop,
+            log=log,
+            metrics=self.metrics,
+            connections=connections,
+            new_session_id=lambda: "session-1",
+            admission=self.admission,
+            scheduler=self.scheduler,
+            throttle=throttle if emulated_cores else NoThrottle(),
+            decoder=self.decoder,
+            answers=self.answers,
+            sandboxes=sandboxes or NoSandboxes(),
+            jobs=jobs or NoJobs(),
+            token_watch=self.token_watch,
+        )
+
+    def join(
+        self, robot: str = "r", *, expires_s: float | None = None, hello: bool = True
+    ) -> tuple[RobotConnection, FakeWire]:
+        """Connect *robot*, whose token expires at Unix time *expires_s*."""
+        accepted = Accepted(
+            robot=robot, codec=self.codec.name, subprotocol=SUBPROTOCOLS[self.codec.name], expires_s=expires_s
+        )
+        wire = FakeWire(self.codec)
+        connection = self.dispatcher.connect(wire, accepted)
+        if hello:
+            self.say(connection, Hello())
+        return connection, wire
+
+    def say(self, connection: RobotConnection, message: Any) -> None:
+        """Let *connection* receive *message*; bytes are sent as they are."""
+        data = message if isinstance(message, bytes) else self.codec.encode(message)
+        connection.frame(BINARY, True, False, data)
+
+
+@contextmanager
+def quiet_log() -> Iterator[JsonLog]:
+    """Yield a log whose lines go nowhere."""
+    fd = os.open(os.devnull, os.O_WRONLY)
+    log = JsonLog(level="error", server="s-1", wall_clock=lambda: 0.0, fd=fd)
+    try:
+        yield log
+    finally:
+        log.close()
+        os.close(fd)
+
+
+@contextmanager
+def worker_parts(**changes: Any) -> Iterator[WorkerParts]:
+    """Yield a worker that is closed at the end."""
+    with quiet_log() as log:
+        parts = WorkerParts(log, **changes)
+        try:
+            yield parts
+        finally:
+            parts.dispatcher.close_all()
