@@ -1,4 +1,4 @@
-"""A data service in this process: requests go in as ASGI calls, time stands still."""
+"""A data service in this process: requests are ASGI calls, and its clock is a variable."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ KEY = SigningKey.from_seed(b"k" * 32, "key-1")
 
 
 class Answer:
-    """What came back."""
+    """A response."""
 
     def __init__(self, status: int, headers: Mapping[str, str], body: bytes) -> None:
         self.status, self.headers, self.body = status, headers, body
@@ -30,7 +30,7 @@ class Answer:
 
 
 class Service:
-    """The application with a store and a clock of its own."""
+    """The application with its own store and clock."""
 
     def __init__(self, settings: PlatformSettings, store: ObjectStore) -> None:
         self.settings, self.store = settings, store
@@ -62,7 +62,7 @@ class Service:
         query: str = "",
         tenant: str = "default",
     ) -> Answer:
-        """Send one request, and insist on a well-formed answer."""
+        """Send one request and return its response, which must be well-formed."""
         if isinstance(body, bytes):
             messages = [{"type": "http.request", "body": body, "more_body": False}]
         else:
@@ -97,8 +97,8 @@ class Service:
         )
 
 
-class FrontDoor:
-    """The service on a port of this machine, for clients that speak HTTP; one request at a time."""
+class HttpServer:
+    """A service on a port of this machine, for HTTP clients; one request at a time.  A context manager."""
 
     def __init__(self, service: Service) -> None:
         lock = threading.Lock()
@@ -122,7 +122,7 @@ class FrontDoor:
             do_GET = do_PUT = do_PATCH = do_DELETE = do_POST = answer
 
             def log_message(self, *_: object) -> None:
-                """Stay silent."""
+                """Log nothing."""
 
         self._server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
         self._server.daemon_threads = True
@@ -130,7 +130,10 @@ class FrontDoor:
         self._thread.start()
         self.url = f"http://127.0.0.1:{self._server.server_address[1]}"
 
-    def close(self) -> None:
+    def __enter__(self) -> HttpServer:
+        return self
+
+    def __exit__(self, *_: object) -> None:
         self._server.shutdown()
         self._server.server_close()
         self._thread.join(10)

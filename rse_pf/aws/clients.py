@@ -13,12 +13,21 @@ from typing import Any, TypeVar
 
 from rse_pf.errors import ConfigurationError, MissingExtra, StoreError
 
-__all__ = ["MAX_S", "MAX_TRIES", "call_api", "error_code", "make_client", "status_of", "with_retries"]
+__all__ = [
+    "FIRST_PAUSE_S",
+    "MAX_S",
+    "MAX_TRIES",
+    "call_api",
+    "error_code",
+    "make_client",
+    "status_of",
+    "with_retries",
+]
 
 MAX_TRIES = 3
 MAX_S = 10.0
 _CONNECT_S, _READ_S = 1.0, 3.5
-_FIRST_PAUSE_S = 0.1
+FIRST_PAUSE_S = 0.1
 _THROTTLED = 429
 _TEMPORARY = frozenset(
     {
@@ -75,7 +84,7 @@ def with_retries(
     """
     from botocore.exceptions import BotoCoreError, ClientError
 
-    began, pause_s = clock(), _FIRST_PAUSE_S
+    began, pause_s = clock(), FIRST_PAUSE_S
     for left in range(MAX_TRIES - 1, -1, -1):
         try:
             return call()

@@ -1,14 +1,15 @@
-"""The data service on S3: bytes go straight to the bucket, and an S3 that fails loses nothing."""
+"""The data service on S3: direct transfers, and a failing S3 that loses nothing."""
 
 from __future__ import annotations
 
+import contextlib
 import random
 import threading
 from collections.abc import Iterator
 from typing import Any
 
 import pytest
-from fake_data_service import FrontDoor, Service, small_settings
+from fake_data_service import HttpServer, Service, small_settings
 
 from client_sdk.transfer.data_client import DataClient, DataOptions
 from rse_pf.aws import clients
@@ -24,7 +25,7 @@ LARGE = random.Random(5).randbytes(700_000)
 
 @pytest.fixture
 def s3_server(monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
-    """An emulator of S3 on a port of this machine, which boto3 asks instead of AWS."""
+    """An emulated S3 on a port of this machine, which boto3 calls instead of AWS."""
     server_of = pytest.importorskip("moto.server", reason="the infra extra is not installed")
     server = server_of.ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)
     server.start()
@@ -43,28 +44,44 @@ def bucket_in(region: str) -> S3Store:
     return open_bucket(BUCKET, region)
 
 
-def client_of(door: FrontDoor, service: Service, **options: Any) -> DataClient:
+def client_of(server: HttpServer, service: Service, **options: Any) -> DataClient:
     chosen = DataOptions(first_pause_s=0.01, max_pause_s=0.05, random=random.Random(2), **options)
-    return DataClient(door.url, service.token, chosen)
+    return DataClient(server.url, service.token, chosen)
 
 
 def test_large_objects_travel_directly_between_robot_and_bucket(s3_server: str) -> None:
     store = bucket_in("ap-northeast-2")
     service = Service(small_settings(max_object_bytes=1_000_000, quota_bytes=2_000_000), store)
-    door = FrontDoor(service)
-    robot = client_of(door, service)
     told: list[int] = []
 
-    digest = robot.upload(LARGE, lambda done, size: told.append(done))
+    with HttpServer(service) as server, contextlib.closing(client_of(server, service)) as robot:
+        digest = robot.upload(LARGE, lambda done, size: told.append(done))
 
-    assert store.get(object_name("default", "robot-1", digest)) == LARGE
-    assert robot.download(digest) == LARGE
+        assert store.get(object_name("default", "robot-1", digest)) == LARGE
+        assert robot.download(digest) == LARGE
     assert told[-1] == len(LARGE)
     assert list(store.list("uploads/")) == []
-    assert sum(line["received_bytes"] for line in service.lines) < 1000, "the service never saw them"
+    assert sum(line["received_bytes"] for line in service.lines) < 1000, "the service received the object"
     assert max(line["sent_bytes"] for line in service.lines) < 2000
-    robot.close()
-    door.close()
+
+
+class Body:
+    """What a response of botocore reads its body from."""
+
+    def stream(self, *_: Any, **__: Any) -> Iterator[bytes]:
+        yield b"<Error><Code>InternalError</Code><Message>no</Message></Error>"
+
+
+class WithoutPresigning:
+    """A store that presigns no URLs, so that every byte goes through the service."""
+
+    def __init__(self, store: S3Store) -> None:
+        self._store = store
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("presigned"):
+            raise AttributeError(name)
+        return getattr(self._store, name)
 
 
 @pytest.mark.parametrize(
@@ -73,10 +90,10 @@ def test_large_objects_travel_directly_between_robot_and_bucket(s3_server: str) 
 def test_an_s3_that_fails_three_times_in_ten_loses_nothing_acknowledged(
     region: str, monkeypatch: pytest.MonkeyPatch, tries: int, largest: int
 ) -> None:
-    """With one try of the service every failure reaches the robot; with as many as it makes, few do."""
+    """Without retries of the service every failure reaches the robot; with them, few do."""
     from botocore.awsrequest import AWSResponse
 
-    monkeypatch.setattr(clients, "_FIRST_PAUSE_S", 0.001)
+    monkeypatch.setattr(clients, "FIRST_PAUSE_S", 0.001)
     monkeypatch.setattr(clients, "MAX_TRIES", tries)
     chance, lock = random.Random(11), threading.Lock()
     asked = failed = 0
@@ -101,31 +118,24 @@ def test_an_s3_that_fails_three_times_in_ten_loses_nothing_acknowledged(
         """The emulator does what it was asked, too."""
         if not fails(FAILING_SHARE / 2 / (1 - FAILING_SHARE / 2)):
             return None
-        answer = AWSResponse(request.url, 500, {"content-type": "application/xml"}, None)
-        answer._content = b"<Error><Code>InternalError</Code><Message>no</Message></Error>"
-        return answer
+        return AWSResponse(request.url, 500, {"content-type": "application/xml"}, Body())
 
     plain = bucket_in(region)  # its client does not fail
-    store = open_bucket(BUCKET, region)
-    store._client.meta.events.register_first("before-call.s3", refuse)
-    store._client.meta.events.register_first("before-send.s3", lose_the_answer)
+    failing = make_client("s3", region)
+    failing.meta.events.register_first("before-call.s3", refuse)
+    failing.meta.events.register_first("before-send.s3", lose_the_answer)
     settings = small_settings(part_bytes=65536, max_object_bytes=1_000_000, quota_bytes=100_000_000)
-    service = Service(settings, store)
-    # Without signed addresses: every byte goes through the service and its failing store.
-    monkeypatch.setattr(type(service.app.handlers), "_direct", lambda *_: None)
-    door = FrontDoor(service)
-    robot = client_of(door, service)
+    service = Service(settings, WithoutPresigning(S3Store(failing, BUCKET)))
     contents = [random.Random(number).randbytes(3000) for number in range(UPLOADS)] + [LARGE[:largest]]
 
-    acknowledged = [robot.upload(content) for content in contents]
+    with HttpServer(service) as server, contextlib.closing(client_of(server, service)) as robot:
+        acknowledged = [robot.upload(content) for content in contents]
 
     assert failed > 0.2 * asked > 10
     assert acknowledged == [digest_of(content) for content in contents]
     refused = sum(line["status"] >= 500 for line in service.lines)
-    assert refused > UPLOADS / 4 or tries > 1, "the robot must have heard of failures"
+    assert refused > UPLOADS / 4 or tries > 1, "no failure reached the robot"
     for digest, content in zip(acknowledged, contents, strict=True):
         assert plain.get(object_name("default", "robot-1", digest)) == content
     names = {object_name("default", "robot-1", digest) for digest in acknowledged}
-    assert {info.name for info in plain.list("objects/")} == names, "no partial object"
-    robot.close()
-    door.close()
+    assert {info.name for info in plain.list("objects/")} == names, "a partial object is left"

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 import pytest
-from fake_data_service import FrontDoor, Service, small_settings
+from fake_data_service import HttpServer, Service, small_settings
 
 from client_sdk.transfer.data_client import DataClient, DataOptions
 from client_sdk.transfer.presigned import is_allowed
@@ -98,13 +98,12 @@ def connected(
     service: Service, sleep: Callable[[float], None] = lambda seconds: None
 ) -> Iterator[DataClient]:
     """A robot that calls *sleep* instead of sleeping."""
-    balancer = FrontDoor(service)
-    client = DataClient(balancer.url, service.token, DataOptions(sleep=sleep))
-    try:
-        yield client
-    finally:
-        client.close()
-        balancer.close()
+    with HttpServer(service) as server:
+        client = DataClient(server.url, service.token, DataOptions(sleep=sleep))
+        try:
+            yield client
+        finally:
+            client.close()
 
 
 @pytest.fixture
