@@ -131,11 +131,10 @@ class JobManager:
                 self._fail(queued, _too_many())
                 return
             entry = self._entries[name] = _Entry(request, JobSignals())
-            entry.waiters.append(_Waiter(queued))
             self._begin(entry)
-        else:
-            entry.waiters.append(_Waiter(queued))
-        self._send_progress(entry)
+        waiter = _Waiter(queued)
+        entry.waiters.append(waiter)
+        self._send_progress(entry, waiter)
 
     def waiting_of(self, robot: str) -> int:
         """Return how many commands of *robot* have no answer yet."""
@@ -224,24 +223,24 @@ class JobManager:
 
     def _on_progress(self, entry: _Entry, done: float, what: str) -> None:
         entry.done, entry.what = done, what
-        self._send_progress(entry)
-
-    def _send_progress(self, entry: _Entry) -> None:
-        now = self._context.clock()
         for waiter in entry.waiters:
-            wait_s = waiter.last_progress_s + _PROGRESS_INTERVAL_S - now
-            if wait_s <= 0:
-                waiter.last_progress_s = now
-                progress = Progress(id=waiter.queued.command.id, done=entry.done, what=entry.what)
-                self._progress(waiter.queued.owner, progress)
-            elif not waiter.is_progress_due:
-                waiter.is_progress_due = True
-                self._loop.call_later(wait_s, functools.partial(self._send_due_progress, entry, waiter))
+            self._send_progress(entry, waiter)
+
+    def _send_progress(self, entry: _Entry, waiter: _Waiter) -> None:
+        now = self._context.clock()
+        wait_s = waiter.last_progress_s + _PROGRESS_INTERVAL_S - now
+        if wait_s <= 0:
+            waiter.last_progress_s = now
+            progress = Progress(id=waiter.queued.command.id, done=entry.done, what=entry.what)
+            self._progress(waiter.queued.owner, progress)
+        elif not waiter.is_progress_due:
+            waiter.is_progress_due = True
+            self._loop.call_later(wait_s, functools.partial(self._send_due_progress, entry, waiter))
 
     def _send_due_progress(self, entry: _Entry, waiter: _Waiter) -> None:
         waiter.is_progress_due = False
         if waiter in entry.waiters:
-            self._send_progress(entry)
+            self._send_progress(entry, waiter)
 
     def _on_outcome(self, entry: _Entry, outcome: JobOutcome) -> None:
         request = entry.request

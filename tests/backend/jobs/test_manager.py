@@ -1,13 +1,12 @@
-"""Who waits for which job and what they are told, in a loop that turns when the test says so."""
+"""Which commands wait for which job, their progress and their answers, in a loop whose time stands still."""
 
 from __future__ import annotations
 
-import heapq
+import itertools
 import os
 import queue
 import socket
 import threading
-import time
 from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any
@@ -25,6 +24,7 @@ from rse_pf.backend.scheduling.scheduler import QueuedCommand
 from rse_pf.config import PlatformSettings
 from rse_pf.object_store import MemoryStore
 from rse_pf.wire import Command, Failure, Result
+from tests.fakes import FakeLoop
 
 WAIT_S = 20.0
 
@@ -51,16 +51,14 @@ class FakeProcess:
 
 
 class Bench:
-    """Jobs with everything around them; time stands still until `advance`."""
+    """A job manager with processes that do what the test says."""
 
     def __init__(self, **serving: Any) -> None:
         self.settings = PlatformSettings.from_dict({"serving": {"job_heartbeat_s": 0.05, **serving}})
-        self.now = 100.0
-        self.calls: queue.SimpleQueue[tuple[Callable[..., object], tuple[Any, ...]]] = queue.SimpleQueue()
+        self.loop = FakeLoop()
         self.started: queue.SimpleQueue[FakeProcess] = queue.SimpleQueue()
         self.answers: dict[int, Result | Failure] = {}
         self.progress: list[tuple[int, float, str]] = []
-        self._timers: list[tuple[float, int, Callable[[], object]]] = []
         self._fd = os.open(os.devnull, os.O_WRONLY)
         self.log = JsonLog(level="error", server="s", wall_clock=lambda: 0.0, fd=self._fd)
         self.store = MemoryStore()
@@ -68,10 +66,11 @@ class Bench:
             store=self.store, server_id="s",
             slots=JobSlots(make_pipe(self.settings.serving.max_running_jobs)),
             settings=self.settings.serving, quota_bytes=1e6, max_bytes=1000, inline_bytes=100,
-            start=self.start, clock=lambda: self.now,
+            start=self.start, clock=lambda: self.loop.now,
         )  # fmt: skip
         self.jobs = JobManager(
-            context, settings=self.settings, loop=self, log=self.log, new_owner=lambda: os.urandom(4).hex(),
+            context, settings=self.settings, loop=self.loop, log=self.log,
+            new_owner=lambda: os.urandom(4).hex(),
             answer=lambda job, answer: self.answers.__setitem__(job.command.id, answer),
             progress=lambda _, told: self.progress.append((told.id, told.done, told.what)),
         )  # fmt: skip
@@ -81,23 +80,9 @@ class Bench:
         self.started.put(process)
         return process
 
-    def call_soon_threadsafe(self, callback: Callable[..., object], *args: Any) -> None:
-        self.calls.put((callback, args))
-
-    def call_later(self, delay: float, callback: Callable[[], object]) -> None:
-        heapq.heappush(self._timers, (self.now + delay, len(self._timers), callback))
-
-    def advance(self, seconds: float) -> None:
-        self.now += seconds
-        while self._timers and self._timers[0][0] <= self.now:
-            heapq.heappop(self._timers)[2]()
-
-    def turn(self, until: Callable[[], bool]) -> None:
-        """Turn the loop until something is so."""
-        end = time.monotonic() + WAIT_S
-        while not until():
-            callback, args = self.calls.get(timeout=max(0.01, end - time.monotonic()))
-            callback(*args)
+    def run_until(self, condition: Callable[[], object]) -> None:
+        """Run the loop, while time stands still, until the threads of jobs made *condition* true."""
+        self.loop.run_until(condition, WAIT_S)
 
     def process(self) -> FakeProcess:
         """Return the process that started next."""
@@ -142,7 +127,7 @@ def test_who_asks_for_the_same_job_waits_for_the_same_run(make):
     ask(bench, owner, 2)
 
     process.done()
-    bench.turn(lambda: len(bench.answers) == 2)
+    bench.run_until(lambda: len(bench.answers) == 2)
 
     assert {each.reply["value"] for each in bench.answers.values()} == {1}
     assert len({each.object for each in bench.answers.values()}) == 1
@@ -174,7 +159,7 @@ def test_a_robot_that_fills_the_line_makes_room_for_another_and_asks_again(make)
     bench, greedy, modest = make(max_waiting_jobs=3), robot("greedy"), robot("modest")
     ask(bench, greedy, 0, value=0)
     bench.process()
-    bench.turn(lambda: bench.advance(0.5) or any(what == "starts" for _, _, what in bench.progress))
+    bench.run_until(lambda: bench.loop.advance(0.5) or any(what == "starts" for _, _, what in bench.progress))
     for identity in range(1, 4):
         ask(bench, greedy, identity, value=identity)
 
@@ -187,7 +172,7 @@ def test_a_robot_that_fills_the_line_makes_room_for_another_and_asks_again(make)
     ask(bench, modest, 12, value=12)
     assert code(bench.answers[12]) == "busy"
     ask(bench, greedy, 4, value=3)
-    bench.turn(lambda: 4 in bench.answers)
+    bench.run_until(lambda: 4 in bench.answers)
     assert code(bench.answers[4]) == "busy"
     assert set(bench.answers) == {2, 3, 4, 12}
 
@@ -199,14 +184,23 @@ def test_the_robot_is_told_at_once_then_at_most_twice_a_second_and_never_somethi
     process = bench.process()
     for step in range(5):
         process.say("progress", step / 10, f"step {step}")
-    bench.turn(lambda: bench.jobs._entries[next(iter(bench.jobs._entries))].what == "step 4")
-    assert len(bench.progress) == 1
+    others = itertools.count(2)
 
-    bench.advance(0.5)
+    def a_new_command_is_told_step_4() -> bool:
+        ask(bench, owner, next(others))
+        return bench.progress[-1][2] == "step 4"
 
-    assert bench.progress[1:] == [(1, 0.4, "step 4")]
-    bench.advance(10.0)
-    assert len(bench.progress) == 2
+    def progress_of_1() -> list[tuple[int, float, str]]:
+        return [each for each in bench.progress if each[0] == 1]
+
+    bench.run_until(a_new_command_is_told_step_4)
+    assert len(progress_of_1()) == 1
+
+    bench.loop.advance(0.5)
+
+    assert progress_of_1()[1:] == [(1, 0.4, "step 4")]
+    bench.loop.advance(10.0)
+    assert len(progress_of_1()) == 2
 
 
 def test_a_command_taken_back_leaves_the_job_to_those_who_still_wait(make):
@@ -218,7 +212,7 @@ def test_a_command_taken_back_leaves_the_job_to_those_who_still_wait(make):
     bench.jobs.withdraw(owner, 1)
     assert code(bench.answers[1]) == "cancelled"
     process.done()
-    bench.turn(lambda: 2 in bench.answers)
+    bench.run_until(lambda: 2 in bench.answers)
 
     assert code(bench.answers[2]) == "ok"
 
@@ -231,9 +225,9 @@ def test_the_last_command_taken_back_ends_the_job_and_who_asks_meanwhile_gets_a_
     ask(bench, owner, 2)
 
     process.say("failed", "cancelled", "the robot took the command back", "")
-    bench.turn(lambda: 1 in bench.answers)
+    bench.run_until(lambda: 1 in bench.answers)
     bench.process().done()
-    bench.turn(lambda: 2 in bench.answers)
+    bench.run_until(lambda: 2 in bench.answers)
 
     assert [code(bench.answers[identity]) for identity in (1, 2)] == ["cancelled", "ok"]
 
@@ -247,7 +241,7 @@ def test_nobody_takes_back_the_commands_of_others(make):
     bench.jobs.withdraw(robot("robot-2"), 1)
     assert bench.answers == {}
     process.done()
-    bench.turn(lambda: len(bench.answers) == 2)
+    bench.run_until(lambda: len(bench.answers) == 2)
 
     assert {code(answer) for answer in bench.answers.values()} == {"ok"}
 
@@ -262,7 +256,7 @@ def test_a_job_goes_on_without_its_robot_which_finds_it_when_it_comes_back(make)
     again = robot()
     ask(bench, again, 7)
     process.done()
-    bench.turn(lambda: 7 in bench.answers)
+    bench.run_until(lambda: 7 in bench.answers)
 
     assert list(bench.answers) == [7]
     assert bench.started.empty()
@@ -274,7 +268,7 @@ def test_a_leaving_server_answers_nothing_for_the_robot_asks_elsewhere(make):
     bench.process()
 
     bench.jobs.give_up()
-    bench.turn(lambda: bench.jobs.known == 0)
+    bench.run_until(lambda: bench.jobs.known == 0)
     ask(bench, owner, 2)
 
     assert bench.answers == {}
@@ -288,7 +282,7 @@ def test_the_end_of_a_job_is_when_old_records_go(make):
     ask(bench, owner, 1)
 
     bench.process().done()
-    bench.turn(lambda: 1 in bench.answers)
+    bench.run_until(lambda: 1 in bench.answers)
     for thread in threading.enumerate():
         if thread.name.startswith("job-"):
             thread.join(WAIT_S)
