@@ -15,7 +15,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from rse_pf.errors import ConfigurationError, UsageError
+from rse_pf.config import PlatformSettings, load_settings
+from rse_pf.errors import ConfigurationError, SettingsError, UsageError
 from rse_pf.files import replace_file
 from rse_pf.local.processes import ProcessMark
 
@@ -24,6 +25,7 @@ __all__ = [
     "PlatformState",
     "ServerState",
     "control_token_file",
+    "platform_settings",
     "read_state",
     "remove_state",
     "settings_file",
@@ -129,6 +131,22 @@ def control_token_file(folder: Path) -> Path:
 def settings_file(folder: Path) -> Path:
     """Return the file of the settings that the servers read."""
     return folder / "settings.json"
+
+
+def platform_settings(folder: Path) -> PlatformSettings | None:
+    """Return the settings that the platform in *folder* was started with; None if it never was started.
+
+    Raises:
+        ConfigurationError: The file is damaged, or of a version whose settings had other names.
+    """
+    file = settings_file(folder)
+    try:
+        return load_settings(file) if file.exists() else None
+    except SettingsError as error:
+        raise ConfigurationError(
+            f"{file} is not of this version: {error.message}",
+            hint=f"start the platform once with: rse-pf local --name {folder.name}",
+        ) from error
 
 
 def read_state(folder: Path) -> PlatformState | None:

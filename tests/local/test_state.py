@@ -13,8 +13,10 @@ from rse_pf.local.state import (
     PlatformLock,
     PlatformState,
     ServerState,
+    platform_settings,
     read_state,
     remove_state,
+    settings_file,
     state_folder,
 )
 
@@ -40,6 +42,50 @@ def test_what_is_written_is_read_again(tmp_path: Path) -> None:
     STATE.write(tmp_path)
 
     assert read_state(tmp_path) == STATE
+
+
+STATE_OF_0_1_0 = """{
+  "name": "default",
+  "control_plane": {"pid": 1, "began": "1@boot"},
+  "url": "ws://127.0.0.1:1/robots",
+  "settings_digest": "0123456789abcdef",
+  "settings_file": "settings.json",
+  "key_file": "key.json",
+  "control_token_file": "control.token",
+  "servers": [
+    {"name": "server-1", "process": {"pid": 2, "began": "2@boot"}, "port": 10, "control_port": 11}
+  ],
+  "data_server": {"name": "data-1", "process": {"pid": 4, "began": "4@boot"}, "port": 13, "control_port": 0},
+  "load_balancer": {"pid": 3, "began": "3@boot"},
+  "port": 12,
+  "status_port": 14,
+  "launched": 1
+}
+"""
+"""As version 0.1.0 wrote it, with other numbers."""
+
+
+def test_the_state_of_0_1_0_is_read_and_written_again_in_the_same_form(tmp_path: Path) -> None:
+    (tmp_path / "platform.json").write_text(STATE_OF_0_1_0)
+
+    state = read_state(tmp_path)
+
+    assert state is not None
+    assert state.processes() == (mark(2), mark(4), mark(3))
+    assert (state.status_port, state.launched, state.control_token_file) == (14, 1, "control.token")
+    state.write(tmp_path)
+    assert json.loads((tmp_path / "platform.json").read_text()) == json.loads(STATE_OF_0_1_0)
+
+
+def test_settings_of_0_1_0_are_refused_with_what_to_do(tmp_path: Path) -> None:
+    assert platform_settings(tmp_path) is None
+    old = {"context": {"rse-pf": {"serving": {"health_path": "/healthz", "backlog": 4096}}}}
+    settings_file(tmp_path).write_text(json.dumps(old))
+
+    with pytest.raises(ConfigurationError, match="is not of this version: .*serving") as told:
+        platform_settings(tmp_path)
+
+    assert told.value.hint == f"start the platform once with: rse-pf local --name {tmp_path.name}"
 
 
 def test_a_platform_that_only_begins_has_no_balancer_yet(tmp_path: Path) -> None:

@@ -89,9 +89,7 @@ def platform(folder: Path, news: News, **options: Any) -> LocalPlatform:
     names = ("elastic", "compress", "rebalance")
     given: dict[str, Any] = {name: chosen.pop(name) for name in names if name in chosen}
     control = ControlOptions(**{"elastic": True, "on_sample": news.sample, **given})
-    return LocalPlatform(
-        chosen.pop("settings"), state=folder, on_event=news.event, control=control, **chosen
-    )
+    return LocalPlatform(chosen.pop("settings"), state=folder, on_event=news.event, control=control, **chosen)
 
 
 class Tally:
@@ -162,10 +160,10 @@ def test_killed_and_stopped_servers_are_replaced_and_robots_lose_nothing(tmp_pat
     asyncio.run(run())
 
 
-def test_the_process_that_waits_warm_is_the_replacement_and_the_next_one_follows(tmp_path: Path) -> None:
+def test_the_warm_standby_is_the_replacement_and_the_next_one_follows(tmp_path: Path) -> None:
     async def run() -> None:
         news = News()
-        async with platform(tmp_path / "a", news) as cloud:
+        async with platform(tmp_path / "a", news, compress=6.0) as cloud:
             standby = (await news.heard("standby-started"))["pid"]
             async with asking(cloud) as tally:
                 cloud.kill("server-1")

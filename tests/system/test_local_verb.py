@@ -15,6 +15,8 @@ from pathlib import Path
 
 import pytest
 
+from rse_pf.auth.tokens import SigningKey
+from rse_pf.config import PlatformSettings
 from rse_pf.local.processes import ProcessMark, is_alive, send_signal, wait_ended
 from rse_pf.local.state import PlatformState, read_state
 
@@ -172,6 +174,30 @@ def test_without_a_control_plane_robots_are_served_status_works_and_stop_cleans_
     assert told.stdout == "platform 'default' is stopped\n"
     assert_gone(state)
     assert read_state(terminal.folder) is None
+
+
+def test_a_platform_of_0_1_0_keeps_its_key_and_its_robots_keep_their_tokens(terminal: Terminal) -> None:
+    key = SigningKey.from_seed(b"o" * 32, "9d6395a1")
+    token = key.issue("robot-1", now=time.time(), token_id="t", settings=PlatformSettings().auth)
+    old = {
+        "key.json": key.to_json(), "keys.json": key.key_set().to_json(), "control.token": "0f" * 32 + "\n",
+        "settings.json": json.dumps({"context": {"rse-pf": {"serving": {"health_path": "/healthz"}}}}),
+    }  # fmt: skip
+    assert json.loads(old["key.json"]).keys() == {"kty", "crv", "kid", "x", "d"}, "the form of 0.1.0"
+    terminal.folder.mkdir(parents=True)
+    for name, content in old.items():
+        (terminal.folder / name).write_text(content)
+        (terminal.folder / name).chmod(0o600)
+    refused = terminal.run("token", "issue", "robot-1")
+    assert refused.returncode == 2
+    assert "start the platform once with: rse-pf local --name default" in refused.stderr
+
+    terminal.platform()
+
+    inspected = terminal.run("token", "inspect", token)
+    assert json.loads(inspected.stdout)["verified"] == "yes", inspected.stderr
+    for name in ("key.json", "keys.json", "control.token"):
+        assert (terminal.folder / name).read_text() == old[name]
 
 
 def test_stop_signals_nobody_who_only_has_the_pid_of_a_server(terminal: Terminal) -> None:

@@ -88,6 +88,7 @@ class Fleet:
         self._load_balancer = load_balancer
         self._settings = settings
         self._compress = compress
+        self._calm_s = _CALM_S / compress
         self._warm_up_s = settings.scaling.warm_up_s / compress
         self._emit = emit
         self._changed = changed
@@ -190,7 +191,7 @@ class Fleet:
 
     def start_standby(self) -> None:
         """Start a standby for the next launch, unless a server started less than 3 s ago."""
-        calm_since_s = time.monotonic() - _CALM_S
+        calm_since_s = time.monotonic() - self._calm_s
         ready = (member.healthy_s for member in self.members.values())
         if (
             all(at is not None and at <= calm_since_s for at in ready)

@@ -111,7 +111,8 @@ async def _server(server: ServerState, token: str | None, sample_s: float) -> di
     finally:
         port.close()
     workers = len(second["workers"])
-    cores = second["emulated_cores"] * workers if second["emulated_cores"] else workers
+    emulated = second.get("emulated_cores", second.get("size", 0.0))  # "size" at 0.1.0
+    cores = emulated * workers if emulated else workers
     return {
         **known,
         **{key: second[key] for key in ("state", "robots", "queue", "queue_ms", "in_flight", "moved")},
