@@ -21,7 +21,7 @@ import pytest
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import CommandFailed
 from rse_pf.experiments.load.swarm import Swarm, SwarmOptions
-from rse_pf.experiments.results.report import summarise
+from rse_pf.experiments.results.summary import summarise
 from rse_pf.local.control.platform import LocalPlatform
 from rse_pf.local.processes import wait_ended
 
@@ -69,7 +69,7 @@ def test_robots_of_two_processes_get_right_poses_and_leave(tmp_path: Path) -> No
             assert not any(process.name == "swarm" for process in multiprocessing.active_children())
         figures = summarise(result.commands)["commands"]
         assert figures["sent"] == figures["answered"] >= 4 * 5
-        assert figures["lost"] == result.twice == result.wrong_poses == 0
+        assert figures["lost"] == result.duplicates == result.wrong_poses == 0
         robots = {f"robot-{number + 1}" for number in range(6)}
         assert {command.robot for command in result.commands} == robots
         assert {event["robot"] for event in heard if event["event"] == "robot-joined"} == robots
@@ -144,7 +144,7 @@ def test_a_herd_is_back_soon_after_the_balancer_was_killed_and_came_back(tmp_pat
                 result = await swarm.finish()
         figures = summarise(result.commands)
         assert figures["commands"]["lost"] == figures["commands"]["failed"] == 0, figures["failures_by_code"]
-        assert result.twice == result.wrong_poses == 0
+        assert result.duplicates == result.wrong_poses == 0
         assert result.reconnects >= robots
         back = sorted(event["time"] - killed_s for event in heard if event["event"] == "link-back")
         assert back[-1] < 10.0

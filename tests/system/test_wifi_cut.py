@@ -91,7 +91,7 @@ def test_both_sides_notice_a_cut_and_the_first_answers_come_soon_after_it(tmp_pa
         assert not late, "an answer after its deadline was delivered as fresh"
         assert {c.code for c in result.commands} == {"ok", "expired"}
         assert result.wrong_poses == 0
-        assert result.twice == 0
+        assert result.duplicates == 0
         assert result.reconnects >= ROBOTS
 
     asyncio.run(asyncio.wait_for(work(), 90))

@@ -109,7 +109,8 @@ async def _run(
             settings, port=0, state=folder / "platform", name="demo", on_event=record, data=options.merge
         ) as platform:
             pids = ", ".join(f"{server.name} {server.pid}" for server in platform.servers)
-            screen.print(f"running at {platform.url}: {pids} (try: kill -9 one of them, the robots go on)")
+            screen.print(f"running at {platform.url}: {pids}")
+            screen.print("kill -9 one of these processes: the robots continue on the other server")
             samples = asyncio.create_task(_sample(platform, folder / SAMPLES, now))
             robots = [
                 _start(options, settings, folder, platform.url, number) for number in range(options.robots)
