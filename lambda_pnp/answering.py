@@ -1,7 +1,6 @@
-"""From one HTTP event to one answer, with keys, settings and time as arguments.
+"""Answer one HTTP event, with keys, settings and time as arguments.
 
-Promises that nothing is decoded before the token is verified, and that whatever comes in, a typed failure or
-a result goes out.
+Nothing is decoded before the token is verified.  Every event gets a result or a typed failure.
 """
 
 from __future__ import annotations
@@ -16,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from lambda_pnp.keys import KeyCache, read_object
-from rse_pf.auth.roster import holds
+from rse_pf.auth.roster import scopes_allow
 from rse_pf.auth.tokens import verify_token
 from rse_pf.config import PlatformSettings, load_settings
 from rse_pf.errors import BadMessage, Expired, Forbidden, RsePfError, Unauthorized, UnsupportedProtocol
@@ -28,20 +27,20 @@ __all__ = ["Answering", "LambdaAnswer", "load_answering"]
 
 _ROOT = Path(__file__).resolve().parents[1]
 _SERVER = "lambda"
+# How long a revoked token may still be accepted; there is no connection that could be closed.
 _MAX_STALE_S = 30.0
-"""So long a revoked token may still be answered here; there is no socket that could be closed."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LambdaAnswer:
-    """One answer: HTTP status, sub-protocol (empty: a JSON body of the door) and the bytes."""
+    """One answer: HTTP status, content type and body."""
 
     status: int
     content_type: str
     body: bytes
 
     def as_http(self, *, init_ms: float, cold: bool) -> dict[str, Any]:
-        """Return what a Function URL wants; ``init_ms`` and ``cold`` travel as headers beside the bytes."""
+        """Return the response of a Function URL, with ``init_ms`` and ``cold`` as headers."""
         return {
             "statusCode": self.status,
             "headers": {
@@ -55,7 +54,7 @@ class LambdaAnswer:
 
 
 class Answering:
-    """Keys and settings of one function, and the one service it offers."""
+    """Keys and settings of one function, and the service that it offers."""
 
     def __init__(self, settings: PlatformSettings, keys: KeyCache) -> None:
         self._settings = settings
@@ -67,7 +66,7 @@ class Answering:
     def answer(
         self, event: Mapping[str, Any], *, now_s: float, left_ms: float, clock: Callable[[], float]
     ) -> LambdaAnswer:
-        """Answer *event*: Unix time *now_s*, *left_ms* before the function is cut, *clock* in seconds."""
+        """Answer *event* at Unix time *now_s*, with *left_ms* before the time-out; *clock* is in seconds."""
         arrived = clock()
         headers = {str(name).lower(): str(each) for name, each in (event.get("headers") or {}).items()}
         try:
@@ -78,52 +77,54 @@ class Answering:
             )  # fmt: skip
             codec = self._codec(headers.get("content-type", ""))
         except RsePfError as error:
-            return _turned_away(error)
+            return _rejected(error)
         try:
             message = codec.decode_from_robot(_body(event))
             if not isinstance(message, Command):
-                raise BadMessage("this is no command", hint="send commands only; there is no session here")
+                raise BadMessage(
+                    "this is not a command", hint="send commands only; this function has no sessions"
+                )
         except RsePfError as error:
-            return self._said(codec, failure_of(error, server=_SERVER))
+            return self._encoded(codec, failure_of(error, server=_SERVER))
         allowed_ms = self._settings.session.answer_timeout_s * 1e3
         allowed_ms = min(left_ms, allowed_ms if message.deadline_ms is None else message.deadline_ms)
         if (clock() - arrived) * 1e3 >= allowed_ms:
-            return self._said(codec, self._late(message))
-        if not holds(who.scopes, f"services:{message.service}"):
+            return self._encoded(codec, self._late(message))
+        if not scopes_allow(who.scopes, f"services:{message.service}"):
             forbidden = Forbidden(
                 f"this token does not hold the scope services:{message.service}", hint="issue one that does"
             )
-            return self._said(codec, failure_of(forbidden, message, server=_SERVER))
+            return self._encoded(codec, failure_of(forbidden, message, server=_SERVER))
         answer = dispatch(self._registry, message, clock, server=_SERVER)
         late = (clock() - arrived) * 1e3 > allowed_ms
-        return self._said(codec, self._late(message) if late else answer)
+        return self._encoded(codec, self._late(message) if late else answer)
 
     def _codec(self, content_type: str) -> Codec:
         subprotocol = content_type.partition(";")[0].strip().removeprefix("application/")
         name = codec_for([subprotocol])
         if name is None:
             raise UnsupportedProtocol(
-                "no sub-protocol that this function speaks was named",
+                "the request names no supported sub-protocol",
                 hint=f"set Content-Type to one of {', '.join(SUBPROTOCOLS.values())}",
             )
         return self._codecs[name]
 
     @staticmethod
     def _late(command: Command) -> Any:
-        error = Expired("the deadline passed before the answer was ready", hint="allow more time")
+        error = Expired("the deadline passed before the answer was ready", hint="set a longer deadline_s")
         return failure_of(error, command, server=_SERVER)
 
     @staticmethod
-    def _said(codec: Codec, message: Any) -> LambdaAnswer:
+    def _encoded(codec: Codec, message: Any) -> LambdaAnswer:
         return LambdaAnswer(
             status=200, content_type=f"application/{SUBPROTOCOLS[codec.name]}", body=codec.encode(message)
         )
 
 
-def _turned_away(error: RsePfError) -> LambdaAnswer:
-    told = {"code": error.code, "message": error.message, "hint": error.hint}
+def _rejected(error: RsePfError) -> LambdaAnswer:
+    body = {"code": error.code, "message": error.message, "hint": error.hint}
     status = 401 if isinstance(error, Unauthorized) else 400
-    return LambdaAnswer(status=status, content_type="application/json", body=json.dumps(told).encode())
+    return LambdaAnswer(status=status, content_type="application/json", body=json.dumps(body).encode())
 
 
 def _body(event: Mapping[str, Any]) -> bytes:
@@ -137,7 +138,7 @@ def _body(event: Mapping[str, Any]) -> bytes:
 
 
 def load_answering() -> Answering:
-    """Return what a cold start needs: the settings of the package, the keys of the artifact bucket."""
+    """Load what a cold start needs: the settings of the package, the keys of the artifact bucket."""
     settings = load_settings(_ROOT / "settings.json")
 
     def read() -> str:

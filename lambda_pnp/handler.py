@@ -1,7 +1,7 @@
 """Answer one command by HTTP, with the bytes of the WebSocket: token, decode, dispatch, encode.
 
-The token comes as ``Authorization: Bearer``, the sub-protocol as Content-Type.  Promises no state
-between calls but settings and keys, and the same typed failures as a backend server.
+The token is sent as ``Authorization: Bearer``, the sub-protocol as Content-Type.  Failures are the same as
+those of a backend server.  Only settings and keys are kept between calls.
 """
 
 from __future__ import annotations

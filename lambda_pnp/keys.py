@@ -1,8 +1,7 @@
-"""Read the public keys and the control room from the artifact bucket with the standard library alone.
+"""Read the public keys, the roster and the deny list from the artifact bucket, without an AWS SDK.
 
-The package stays small and imports fast without an AWS SDK.  A function may live for hours, so the keys are
-fetched again once in a period: a new key is learned, a retired one forgotten, a revoked token refused.
-Promises one signed GET at a time and no retry within it; a fetch that fails leaves everything as it was.
+The package stays small and its import fast.  A function may run for hours, so everything is fetched again
+once in a period.  Each fetch is one signed GET without retries; if it fails, the previous values are kept.
 """
 
 from __future__ import annotations
@@ -23,23 +22,23 @@ from rse_pf.errors import NotFound, RsePfError
 __all__ = ["KeyCache", "read_object", "signed_request"]
 
 _TIMEOUT_S = 3.0
-_AGAIN_S = 5.0
+_RETRY_PAUSE_S = 5.0
 _NOT_FOUND = 404
 _T = TypeVar("_T", Roster, DenyList)
 
 
 class KeyCache:
-    """The public keys, as old as a period at most while S3 answers."""
+    """The public keys, refreshed once in a period."""
 
     def __init__(
         self, read: Callable[[], str], period_s: float, *, read_control: Callable[[str], str] | None = None
     ) -> None:
-        """Know nothing yet.
+        """Describe the cache; nothing is fetched yet.
 
         Args:
             read: Returns the JWKS.
-            period_s: So old may everything become.
-            read_control: Returns ``robots.json`` or ``deny.json`` of the control room; raises NotFound.
+            period_s: Time between two fetches.
+            read_control: Returns ``robots.json`` or ``deny.json``; raises NotFound.
         """
         self._read = read
         self._read_control = read_control
@@ -52,19 +51,19 @@ class KeyCache:
         """Return the keys at *clock_s*, in monotonic seconds; empty if none could ever be fetched."""
         if self._due_s is None or clock_s >= self._due_s:
             try:
-                self._keys = KeySet.from_json(self._read()).governed_by(
-                    self._governor("robots.json", Roster), self._governor("deny.json", DenyList)
+                self._keys = KeySet.from_json(self._read()).with_access_control(
+                    self._access_control("robots.json", Roster), self._access_control("deny.json", DenyList)
                 )
                 self._due_s = clock_s + self._period_s
             except (OSError, RsePfError) as error:
-                self._due_s = clock_s + min(_AGAIN_S, self._period_s)
+                self._due_s = clock_s + min(_RETRY_PAUSE_S, self._period_s)
                 sys.stderr.write(
-                    f"no keys were fetched: {error}; is there a key? rse-pf token init --cloud\n"
+                    f"cannot fetch the keys: {error}; create them with rse-pf token init --cloud\n"
                 )
         return self._keys
 
-    def _governor(self, name: str, kind: type[_T]) -> _T:
-        """Return what the control room says; nothing only where nothing was ever written."""
+    def _access_control(self, name: str, kind: type[_T]) -> _T:
+        """Return the roster or deny list; empty only if it was never written."""
         if self._read_control is None:
             return kind()
         try:
@@ -78,7 +77,7 @@ class KeyCache:
 
 
 def read_object(environment: Mapping[str, str], now: datetime, control: str = "") -> str:
-    """Return the object that ``RSE_PF_KEYS`` (``BUCKET/NAME``) names, or *control* of the room beside it.
+    """Return the object that ``RSE_PF_KEYS`` (``BUCKET/NAME``) names, or *control* in the folder beside it.
 
     Raises:
         NotFound: There is no such object.

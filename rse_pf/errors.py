@@ -1,6 +1,6 @@
-"""Every error of the platform: one base class, stable wire codes, and a hint that is an action.
+"""The errors of the platform: one base class, stable wire codes, and a hint that is an action.
 
-Promises not to import anything, so that every other room may raise from here.
+This module imports nothing of the platform, so that every other one can use it.
 """
 
 from __future__ import annotations
@@ -68,16 +68,16 @@ class RsePfError(Exception):
         return _bare, (type(self), self.message), self.__dict__
 
     def report(self) -> str:
-        """Return the two lines that a person sees: what is wrong, and what to do."""
+        """Return the two lines shown to a user: what is wrong, and what to do."""
         first = f"{type(self).__name__}: {self.message}"
         return f"{first}\n  hint: {self.hint}" if self.hint else first
 
 
-# --- what the operator or the developer got wrong -------------------------------------------
+# --- mistakes of the operator or the developer -------------------------------------------
 
 
 class ConfigurationError(RsePfError):
-    """The platform was set up or called wrongly; nothing was started."""
+    """The configuration or the call is invalid; nothing was started."""
 
     code = "configuration"
 
@@ -103,17 +103,17 @@ class MissingExtra(ConfigurationError):
         super().__init__(f"{package} is not installed", hint=f"pip install 'rse-pf[{extra}]'")
 
 
-# --- the door --------------------------------------------------------------------------------
+# --- authentication --------------------------------------------------------------------------------
 
 
 class AuthError(RsePfError):
-    """A robot is not who it says, or may not do what it asks."""
+    """A robot cannot be authenticated or is not authorized."""
 
     code = "auth"
 
 
 class Unauthorized(AuthError):
-    """The token is missing, wrong or over; the cause is told to the server's log only."""
+    """The token is missing, wrong or expired; the cause is only in the server's log."""
 
     code = "unauthorized"
 
@@ -185,19 +185,19 @@ class UnknownService(CommandFailed):
 
 
 class Busy(CommandFailed):
-    """The server sheds load; try again after ``retry_after_ms``."""
+    """The server sheds load; retry after ``retry_after_ms``."""
 
     code = "busy"
 
 
 class QuotaExceeded(CommandFailed):
-    """This robot or tenant sends more than its share."""
+    """This robot or tenant exceeds its quota."""
 
     code = "quota"
 
 
 class Stale(CommandFailed):
-    """A newer frame of the same stream took this one's place."""
+    """A newer frame of the same stream replaced this one."""
 
     code = "stale"
 
@@ -209,7 +209,7 @@ class Expired(CommandFailed):
 
 
 class Cancelled(CommandFailed):
-    """The robot or the operator took the command back."""
+    """The robot or the operator cancelled the command."""
 
     code = "cancelled"
 
@@ -221,19 +221,19 @@ class WorkerLost(CommandFailed):
 
 
 class Crashed(CommandFailed):
-    """The process that worked on a long command died of it, or needed more memory than it may."""
+    """The process of a long command crashed, or exceeded its memory limit."""
 
     code = "crashed"
 
 
 class Poison(CommandFailed):
-    """This very request killed two environments and is not tried again."""
+    """This request crashed two sandboxes and is not tried again."""
 
     code = "poison"
 
 
 class InternalError(CommandFailed):
-    """A defect of the service or the server; the log has it under the trace id."""
+    """A defect of the service or the server; the log has the details under the trace id."""
 
     code = "internal"
 
@@ -242,7 +242,7 @@ class InternalError(CommandFailed):
 
 
 class PnpError(RsePfError):
-    """The correspondences give no pose that anybody should trust."""
+    """The correspondences give no reliable pose."""
 
     code = "pnp"
 
@@ -287,7 +287,7 @@ class NotFound(StoreError):
 
 
 class Conflict(StoreError):
-    """A compare-and-swap found another version than it expected."""
+    """A compare-and-swap found a version other than the expected one."""
 
     code = "conflict"
 
@@ -302,7 +302,7 @@ def _leaves(of: type[RsePfError]) -> dict[str, type[RsePfError]]:
     found = {of.code: of}
     for child in of.__subclasses__():
         for code, kind in _leaves(child).items():
-            found.setdefault(code, kind)  # a room's own kind of an error has no code of its own
+            found.setdefault(code, kind)  # a package's own subclass has no code of its own
     return found
 
 
@@ -316,7 +316,7 @@ def error_from_code(
 
 
 def _bare(kind: type[RsePfError], message: str) -> RsePfError:
-    """Return an error of *kind* past its own constructor, whose arguments do not travel."""
+    """Return an error of *kind* without calling its constructor, whose arguments are not sent."""
     error = kind.__new__(kind)
     RsePfError.__init__(error, message)
     return error

@@ -3,8 +3,6 @@
 Frames: *camera* looks along +z, x to the right, y down (the field's pinhole convention).
 A pose ``T_a_b`` is a ``(4, 4)`` float64 matrix that maps points of frame *b* into frame *a*.
 Lengths are metres, image coordinates are pixels with the first pixel's centre at (0, 0).
-
-Promises not to touch clocks, sockets or image libraries.
 """
 
 from __future__ import annotations
@@ -33,8 +31,8 @@ __all__ = [
 
 Array = npt.NDArray[np.float64]
 
+# No sensor of a robot is wider; a larger value is taken for a mistake in the unit.
 _MAX_IMAGE_PX = 16384
-"""No sensor that a robot carries is wider; larger is taken for a unit mistake."""
 
 
 class Camera(msgspec.Struct, frozen=True, kw_only=True):

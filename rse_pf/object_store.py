@@ -1,13 +1,14 @@
 """Objects: bytes under a name, in a folder, in memory, and (in `rse_pf.aws`) in S3.
 
-One contract for all stores: what `put` returned for is there, whole, whatever crashes next.
-Promises no knowledge of what the bytes mean, and that no name leaves the store's own folder.
+All stores follow one contract: once `put` returns, the object is complete and durable, whatever crashes
+next.  No name can refer to a file outside the folder of a store.
 """
 
 from __future__ import annotations
 
 import contextlib
 import errno
+import fcntl
 import hashlib
 import os
 import re
@@ -45,20 +46,20 @@ _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._=-]{0,127}(/[A-Za-z0-9][A-Za-z0-9._=
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ObjectInfo:
-    """What a store knows of an object without reading it."""
+    """Name and size of an object, known without reading it."""
 
     name: str
     size: int
 
 
 class ObjectStore(Protocol):
-    """Bytes by name.  Every method raises StoreError or one of its children, nothing else."""
+    """Bytes by name.  Every method raises only StoreError and its subclasses."""
 
     def get(self, name: str) -> bytes:
         """Return the object; raises NotFound."""
 
     def put(self, name: str, data: bytes) -> None:
-        """Store the object durably, whole or not at all; raises StoreFull."""
+        """Store the object durably and atomically; raises StoreFull."""
 
     def head(self, name: str) -> ObjectInfo:
         """Return size and name; raises NotFound."""
@@ -75,7 +76,7 @@ class ObjectStore(Protocol):
 
 @runtime_checkable
 class RangedStore(Protocol):
-    """A store that reads a piece of an object without reading the rest."""
+    """A store that can read a part of an object."""
 
     def get_range(self, name: str, start: int, length: int) -> bytes:
         """Return at most *length* bytes from *start* on; raises NotFound."""
@@ -83,32 +84,32 @@ class RangedStore(Protocol):
 
 @runtime_checkable
 class ScratchStore(Protocol):
-    """A store that need not wait for the disk where nothing is lost but time."""
+    """A store that can write without waiting for the disk."""
 
     def put_scratch(self, name: str, data: bytes) -> None:
-        """Store what outlives this process, but may be lost or cut short when the machine crashes."""
+        """Store an object that survives this process, but may be lost or truncated if the machine crashes."""
 
 
 @runtime_checkable
 class PresigningStore(Protocol):
-    """A store that others may be let into, for one object and a short time; the network is not asked."""
+    """A store that can sign URLs for one object and a limited time, without any request."""
 
-    def presigned_put(self, name: str, *, size: int, sha256: str, life_s: int) -> tuple[str, dict[str, str]]:
-        """Return an address and the headers with which exactly these bytes may be PUT there."""
+    def presigned_put(self, name: str, *, size: int, sha256: str, ttl_s: int) -> tuple[str, dict[str, str]]:
+        """Return a URL and the headers with which exactly these bytes can be PUT."""
 
-    def presigned_get(self, name: str, *, life_s: int) -> str:
-        """Return an address from which the object may be read."""
+    def presigned_get(self, name: str, *, ttl_s: int) -> str:
+        """Return a URL from which the object can be read."""
 
 
 def read_range(store: ObjectStore, name: str, start: int, length: int) -> bytes:
-    """Return at most *length* bytes of an object from *start* on, by the cheapest way of *store*."""
+    """Return at most *length* bytes of an object from *start* on, in the cheapest way."""
     if isinstance(store, RangedStore):
         return store.get_range(name, start, length)
     return store.get(name)[start : start + length]
 
 
 def put_scratch(store: ObjectStore, name: str, data: bytes) -> None:
-    """Store what a crash of the machine may lose or cut short, by the cheapest way of *store*."""
+    """Store an object that a crash of the machine may lose or truncate, in the cheapest way."""
     if isinstance(store, ScratchStore):
         store.put_scratch(name, data)
     else:
@@ -116,7 +117,7 @@ def put_scratch(store: ObjectStore, name: str, data: bytes) -> None:
 
 
 def name_segment(text: str) -> str:
-    """Return a segment of a name for any *text*; two texts never share one (sha256 if it is not plain)."""
+    """Return a segment of a name for any *text*; no two texts share one (the sha256 if it is not plain)."""
     if _PLAIN_SEGMENT.fullmatch(text):
         return text
     return "x=" + digest_of(text.encode("utf-8", "surrogatepass"))
@@ -133,7 +134,7 @@ def digest_of(data: bytes) -> str:
 
 
 def check_name(name: str) -> str:
-    """Return *name*, or raise StoreError: only plain path segments, at most ten."""
+    """Return *name*; raises StoreError unless it consists of at most ten plain path segments."""
     if not _NAME.fullmatch(name):
         raise StoreError(
             f"{name[:80]!r} is not a name of an object",
@@ -147,7 +148,7 @@ def open_store(
 ) -> ObjectStore:
     """Return the store at ``dir:PATH``, ``memory:``, or what *openers* know by kind, as ``s3:BUCKET``.
 
-    Whoever may use AWS passes ``{"s3": lambda bucket: open_bucket(bucket, region)}`` of `rse_pf.aws`.
+    For S3 pass ``{"s3": lambda bucket: open_bucket(bucket, region)}`` with `open_bucket` of `rse_pf.aws`.
     """
     kind, _, place = location.partition(":")
     if kind == "memory":
@@ -156,11 +157,11 @@ def open_store(
         return DirectoryStore(Path(place))
     if openers and kind in openers and place:
         return openers[kind](place)
-    raise UsageError(f"{location!r} names no store", hint="write dir:PATH, s3:BUCKET or memory:")
+    raise UsageError(f"{location!r} is not a store", hint="write dir:PATH, s3:BUCKET or memory:")
 
 
 class MemoryStore:
-    """Objects of one process; gone when it ends."""
+    """Objects in the memory of one process."""
 
     def __init__(self) -> None:
         self._objects: dict[str, bytes] = {}
@@ -175,7 +176,7 @@ class MemoryStore:
         return found
 
     def get_range(self, name: str, start: int, length: int) -> bytes:
-        """Return a piece of the object."""
+        """Return a part of the object."""
         return self.get(name)[start : start + length]
 
     def put(self, name: str, data: bytes) -> None:
@@ -221,7 +222,7 @@ class DirectoryStore:
             return _read(path)
 
     def get_range(self, name: str, start: int, length: int) -> bytes:
-        """Return a piece of the object."""
+        """Return a part of the object."""
         path = self._path(name)
         with _as_store_errors(name), _open(path) as file:
             file.seek(start)
@@ -232,14 +233,14 @@ class DirectoryStore:
         path = self._path(name)
         with _as_store_errors(name):
             _make_folder(path.parent)
-            self._write(path, data)
+            replace_file(path, data, mode=OWNER_ONLY, is_durable=True)
 
     def put_scratch(self, name: str, data: bytes) -> None:
-        """Store the object, whole, without waiting for the disk."""
+        """Store the object atomically, without waiting for the disk."""
         path = self._path(name)
         with _as_store_errors(name):
             _make_folder(path.parent)
-            self._write(path, data, is_durable=False)
+            replace_file(path, data, mode=OWNER_ONLY)
 
     def head(self, name: str) -> ObjectInfo:
         """Return size and name."""
@@ -273,9 +274,7 @@ class DirectoryStore:
             path.unlink(missing_ok=True)
 
     def compare_and_swap(self, name: str, expected: bytes | None, data: bytes) -> None:
-        """Replace the object if it still holds *expected*; a lock file keeps others out."""
-        import fcntl
-
+        """Replace the object if it still holds *expected*; a lock file excludes other writers."""
         path = self._path(name)
         with _as_store_errors(name):
             _make_folder(path.parent)
@@ -284,17 +283,17 @@ class DirectoryStore:
                 current = _read(path) if os.path.lexists(path) else None
                 if current != expected:
                     raise Conflict(f"{name!r} was changed meanwhile", hint="read it again and retry")
-                self._write(path, data)
+                replace_file(path, data, mode=OWNER_ONLY, is_durable=True)
 
     def sweep(self, *, now: float, older_than_s: float) -> int:
-        """Remove what writers that died left behind; return how many files.  *now* is Unix time."""
-        gone = 0
-        for path in self._folder.rglob(_LEFT_BEHIND):
+        """Remove the temporary files of writers that crashed and return their number; *now* is Unix time."""
+        removed = 0
+        for path in self._folder.rglob(f"{TEMPORARY_PREFIX}*"):
             with contextlib.suppress(FileNotFoundError):
                 if now - path.lstat().st_mtime > older_than_s:
                     path.unlink()
-                    gone += 1
-        return gone
+                    removed += 1
+        return removed
 
     def _path(self, name: str) -> Path:
         return self._folder / check_name(name)
@@ -305,7 +304,7 @@ class DirectoryStore:
 
 
 def _read(path: Path) -> bytes:
-    """Return a plain file's bytes; a link is no object, wherever it points."""
+    """Return the content of a regular file; a symbolic link is not an object."""
     with _open(path) as file:
         return file.read()
 
@@ -315,7 +314,7 @@ def _open(path: Path) -> BinaryIO:
 
 
 def _make_folder(folder: Path) -> None:
-    """Make *folder* and what is missing above it, each entry durable in its parent."""
+    """Create *folder* and its missing parents, each of them durably."""
     missing = []
     while not folder.is_dir():
         missing.append(folder)
@@ -340,5 +339,5 @@ def _as_store_errors(name: str) -> Iterator[None]:
         if error.errno == errno.ELOOP:
             raise NotFound(f"no object named {name!r}") from error
         if error.errno in (errno.ENOSPC, errno.EDQUOT):
-            raise StoreFull(f"no room for {name!r}", hint="free some space") from error
-        raise StoreError(f"{name!r}: {error.strerror}", hint="look at the store's folder") from error
+            raise StoreFull(f"no space left for {name!r}", hint="free some space") from error
+        raise StoreError(f"{name!r}: {error.strerror}", hint="check the folder of the store") from error

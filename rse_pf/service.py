@@ -1,9 +1,8 @@
 """How a service is written, registered and dispatched.
 
-A service is a function from one typed request to one typed reply; it has no ``self``, so it has
-nowhere to keep state.  `dispatch` is the only way a command reaches it, on a backend server, in the
-Lambda and on the robot itself.  Promises that whatever a service raises becomes a `Failure`, and
-that nothing of a traceback leaves with it.
+A service is a function from one typed request to one typed reply; it has no ``self`` and therefore keeps no
+state.  Every command reaches it through `dispatch`, on a backend server, in the Lambda and on the robot
+itself.  Whatever a service raises becomes a `Failure`, which holds nothing of the traceback.
 """
 
 from __future__ import annotations
@@ -31,7 +30,7 @@ __all__ = ["Kind", "Registry", "Report", "Service", "dispatch", "failure_of", "r
 Kind = Literal["stateless", "per_robot_state", "long"]
 
 Report = Callable[[float, str], None]
-"""Told the share that is done (0..1) and what was done; raises `errors.Cancelled` to end the work."""
+"""Called with the share that is done (0..1) and what was done; raises `Cancelled` to end the work."""
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
@@ -40,7 +39,7 @@ _REPORT = "report"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Service:
-    """A registered function with what the server must know about it."""
+    """A registered function, and what a server needs to know about it."""
 
     name: str
     function: Callable[..., Any]
@@ -48,9 +47,9 @@ class Service:
     reply_type: type[Any]
     kind: Kind = "stateless"
     cheap: bool = False
-    """Cheap services may run in the event loop when nothing waits."""
+    """Whether the service may run in the event loop when no command waits."""
     reports: bool = False
-    """Whether it takes ``report``: a long service that tells how far it is, and can be cancelled there."""
+    """Whether it takes ``report``: a long service that reports progress and can be cancelled then."""
 
     @property
     def summary(self) -> str:
@@ -67,7 +66,7 @@ class Registry:
     def service(
         self, name: str, *, kind: Kind = "stateless", cheap: bool = False
     ) -> Callable[[Function], Function]:
-        """Register the decorated function under *name*; a long one may take a keyword ``report``, too.
+        """Register the decorated function under *name*; a long one may also take a keyword ``report``.
 
         Raises:
             ConfigurationError: The name is taken, or the function is not annotated with one
@@ -122,31 +121,31 @@ def dispatch(
         registry: The services on offer.
         command: As decoded; its payload takes the service's request type here.
         clock: Seconds, monotonic; read before and after the service.
-        server: Name that goes into the answer.
-        on_defect: Told of exceptions that are not ours, for the server's log.
-        report: For a service that tells how far it is.
+        server: Name of the server in the answer.
+        on_defect: Called with unexpected exceptions of the service, for the server's log.
+        report: Passed to a service that reports progress.
     """
     started = clock()
     try:
         service = registry.get(command.service)
         request = request_of(command.payload, service)
-        told = {_REPORT: report} if service.reports and report is not None else {}
-        reply = service.function(request, **told)
+        options = {_REPORT: report} if service.reports and report is not None else {}
+        reply = service.function(request, **options)
     except RsePfError as error:
         return failure_of(error, command, server=server)
-    except (Exception, SystemExit) as error:  # noqa: BLE001  a service is foreign code
+    except (Exception, SystemExit) as error:  # noqa: BLE001  a service is untrusted code
         if on_defect is not None:
-            left = RuntimeError(f"the service called exit({error})")
-            on_defect(command, error if isinstance(error, Exception) else left)
+            exited = RuntimeError(f"the service called exit({error})")
+            on_defect(command, error if isinstance(error, Exception) else exited)
         defect = InternalError(
-            f"service {command.service!r} failed", hint="the server's log has it under this trace"
+            f"service {command.service!r} failed", hint="see the server's log under this trace id"
         )
         return failure_of(defect, command, server=server)
     return Result(id=command.id, reply=reply, server=server, compute_ms=(clock() - started) * 1e3)
 
 
 def failure_of(error: RsePfError, command: Command | None = None, *, server: str = "") -> Failure:
-    """Return *error* as the message that a robot gets."""
+    """Return *error* as the message to a robot."""
     return Failure(
         id=None if command is None else command.id,
         code=error.code,

@@ -1,7 +1,7 @@
 """Write ``docs/asyncapi.json``, the machine-readable protocol, from the message types.
 
-Promises that nothing in it is typed by hand twice: fields come from `rse_pf.wire.messages`,
-service payloads from the registry, ports and paths from the settings.
+Fields come from `rse_pf.wire.messages`, payloads from the registry of services, ports and paths from the
+settings.
 """
 
 from __future__ import annotations

@@ -278,7 +278,7 @@ def test_a_location_names_its_store(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("location", ["", "dir:", "ftp:x", "dir"])
 def test_a_location_without_a_store_is_a_usage_error(location: str) -> None:
-    with pytest.raises(UsageError, match="names no store"):
+    with pytest.raises(UsageError, match="is not a store"):
         open_store(location)
 
 
@@ -287,7 +287,7 @@ def test_a_kind_that_the_caller_can_open_is_opened() -> None:
 
     assert open_store("s3:maps", {"s3": lambda bucket: {"maps": store}[bucket]}) is store
     for location in ("s3:maps", "s3:"):
-        with pytest.raises(UsageError, match="names no store"):
+        with pytest.raises(UsageError, match="is not a store"):
             open_store(location)
 
 

@@ -47,8 +47,8 @@ __all__ = [
 _FILE = re.compile(r"(?P<who>[A-Za-z0-9_-]{1,64})(\.(?P<first>\d{12}))?\.jsonl")
 _UNSAFE = re.compile(r"[^A-Za-z0-9_-]")
 _MAX_BUFFERED = 20_000
+# Above the size of any entry: 64 details of two strings of 200 characters, six bytes each at worst.
 _MAX_ENTRY_BYTES = 1 << 18
-"""Above the size of any entry: 64 details of two strings of 200 characters, six bytes each at worst."""
 _LOCK_TIMEOUT_S = 5.0
 _LOCK_POLL_S = 0.01
 MAX_FILE_BYTES = 16 << 20

@@ -43,8 +43,8 @@ __all__ = [
 _ALGORITHM = "EdDSA"
 _TYPE = "robot+jwt"
 _REQUIRED = ("iss", "aud", "sub", "exp", "iat", "jti")
+# A longer token is refused unread.
 _MAX_TOKEN_BYTES = 4096
-"""A longer token is refused unread."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -1,8 +1,7 @@
 """Two robust PnP engines behind one contract: PoseLib, and the paper's ``solvePnPRansac``.
 
-An engine proposes a pose; whether anybody should believe it is decided in `rse_pf.pnp.solver`.
-Promises the same answer to the same question (fixed seeds, one thread), and that no library's
-own exception leaves.
+An engine proposes a pose; `rse_pf.pnp.solver` decides whether to accept it.  Engines are deterministic (fixed
+seeds, one thread) and raise no exceptions of their libraries.
 """
 
 from __future__ import annotations
@@ -19,8 +18,8 @@ from rse_pf.pnp.options import PnpOptions
 
 __all__ = ["ENGINES", "Engine", "available_engines", "engine_for"]
 
-_ROUNDS = 4
-"""Refinements of the opencv engine, each on the inliers that the one before left."""
+# Refinements of the opencv engine, each on the inliers of the previous one.
+_MAX_REFINEMENTS = 4
 
 Engine = Callable[[Array, Array, Camera, PnpOptions], "Array | None"]
 """``(points_world (n, 3), pixels (n, 2), camera, options)`` to ``(3, 4)`` [R | t], or None."""
@@ -109,13 +108,13 @@ def _opencv_engine() -> Engine:
             if not found or inliers is None or len(inliers) < 4:
                 return None
             rows = inliers[:, 0]
-            # EPnP, which ends solvePnPRansac, may fall into the wrong one of a plane's two minima.
+            # EPnP, which ends solvePnPRansac, may converge to the wrong one of a plane's two minima.
             found, better, shift = cv2.solvePnP(
                 points_world[rows], pixels[rows], matrix, None, flags=cv2.SOLVEPNP_SQPNP
             )
             if found:
                 rotation, translation = better, shift
-            for _round in range(_ROUNDS):
+            for _ in range(_MAX_REFINEMENTS):
                 rotation, translation = cv2.solvePnPRefineLM(
                     points_world[rows], pixels[rows], matrix, None, rotation, translation
                 )

@@ -1,7 +1,6 @@
-"""What speaks for and against a proposed pose: residuals, chance, geometry, covariance.
+"""Evidence for and against a proposed pose: residuals, probability of chance, geometry, covariance.
 
-Sums of products instead of tall matrices, because this runs for every frame.  Promises to change
-no pose, and to know nothing of engines.
+It is computed for every frame, and therefore from sums of products instead of tall matrices.
 """
 
 from __future__ import annotations
@@ -13,21 +12,28 @@ import numpy as np
 
 from rse_pf.geometry import Array, Camera
 
-__all__ = ["Shape", "inverse_of_information", "log10_false_alarms", "places", "slenderness", "view_of"]
+__all__ = [
+    "Shape",
+    "independent_inliers",
+    "inverse_of_information",
+    "log10_false_alarms",
+    "view_of",
+    "width_to_length",
+]
 
 U, V, ONE, Z_INV, ERROR2 = range(5)
 """Rows of a view: projected pixel, ones, 1/z in the camera's frame, and squared error, px^2."""
 
 _LOG10_E = math.log10(math.e)
 _SAMPLE, _POSES_OF_A_SAMPLE = 3, 4
-_SHARPEST_PX2 = 0.01
-"""No residual counts as smaller: the wire rounds, and luck with four points is no proof."""
+# Lower bound of a squared residual: messages are rounded, and four points may fit by luck.
+_MIN_ERROR2_PX2 = 0.01
 _KEPT_SHARE = 0.8
 _NEAR_M = 1e-6
-_STRAYS = 4.0
-_PLAINLY_WIDE = 0.15
+_OUTLIER_FACTOR = 4.0
+_CLEARLY_WIDE = 0.15
 _CELLS_ACROSS = 40
-_PLAINLY_MANY, _ENOUGH = 24, 32
+_MANY_CELLS, _FIRST_INLIERS = 24, 32
 
 
 @lru_cache(maxsize=64)
@@ -57,9 +63,9 @@ def _optics(camera: Camera) -> tuple[Array, Array]:
 
 
 def view_of(T_camera_world: Array, points_world: Array, pixels: Array, camera: Camera) -> Array:
-    """Return the ``(5, n)`` view of the points, among it their squared reprojection errors.
+    """Return the ``(5, n)`` view of the points; its last row holds the squared reprojection errors (px^2).
 
-    A point that is not before the camera has infinite error.
+    A point behind the camera has an infinite error.
     """
     project = _optics(camera)[0] @ T_camera_world
     homogeneous = project[:, :3] @ points_world.T
@@ -79,9 +85,9 @@ def view_of(T_camera_world: Array, points_world: Array, pixels: Array, camera: C
 
 
 def log10_false_alarms(n: int, inliers: int, largest_error2_px2: float, camera: Camera) -> float:
-    """Return log10 of how many poses of pure chance would have as many inliers, as close.
+    """Return log10 of the expected number of random poses with as many inliers at least as close.
 
-    Below 0, chance is no explanation; the smaller, the surer.
+    Below 0, chance is ruled out; the smaller, the more certain.
 
     Source:
         Moisan and Stival, IJCV 2004; for PnP: Moulon et al., ACCV 2012.
@@ -89,7 +95,7 @@ def log10_false_alarms(n: int, inliers: int, largest_error2_px2: float, camera: 
     if inliers <= _SAMPLE:
         return math.inf
     area = float(camera.width * camera.height)
-    share = min(1.0, math.pi * max(largest_error2_px2, _SHARPEST_PX2) / area)
+    share = min(1.0, math.pi * max(largest_error2_px2, _MIN_ERROR2_PX2) / area)
     log = (
         math.log(_POSES_OF_A_SAMPLE * (n - _SAMPLE))
         + _log_choose(n, inliers)
@@ -99,18 +105,18 @@ def log10_false_alarms(n: int, inliers: int, largest_error2_px2: float, camera: 
     return log * _LOG10_E
 
 
-def places(view: Array, camera: Camera) -> int:
+def independent_inliers(view: Array, camera: Camera) -> int:
     """Return how many of the inliers in *view* count as independent observations.
 
-    Twenty copies of one correspondence agree with each other under any pose that fits one of them.
-    Inliers in the same or in touching cells of the image (40 across) count once; where so many
-    cells are taken that this cannot matter, every inlier counts.
+    Copies of one correspondence all agree with any pose that fits one of them.  Inliers in the same or in
+    adjacent cells of the image (40 across) therefore count once; if very many cells are occupied, every
+    inlier counts.
     """
     scale = _CELLS_ACROSS / camera.width
-    if len(_cells(view[:ONE, :_ENOUGH], scale)) >= _PLAINLY_MANY:
+    if len(_cells(view[:ONE, :_FIRST_INLIERS], scale)) >= _MANY_CELLS:
         return int(view.shape[1])
     cells = _cells(view[:ONE], scale)
-    if len(cells) >= _PLAINLY_MANY:
+    if len(cells) >= _MANY_CELLS:
         return int(view.shape[1])
     alone: set[tuple[int, int]] = set()
     for u, v in sorted(cells):
@@ -125,10 +131,10 @@ def _cells(pixels: Array, scale: float) -> set[tuple[int, int]]:
 
 
 class Shape:
-    """How the inliers of a ``(5, k)`` view lie, and how firmly they hold the pose.
+    """The distribution of the inliers of a ``(5, k)`` view, and how well they constrain the pose.
 
-    ``thinness`` is width over length in the image: 0 on a line, 0 if they coincide; whatever lies
-    on one line in space lies on one line there.  ``radius_px`` is the root mean square distance
+    ``thinness`` is width over length in the image: 0 on a line, 0 if they coincide; points on one line
+    in space lie on one line there.  ``radius_px`` is the root mean square distance
     from their centre.  ``depth_variation`` is the standard deviation of 1/z over its mean.
     ``information`` is the ``(6, 6)`` J^T J by the twist (rho, phi) left of the pose.
     """
@@ -147,13 +153,15 @@ class Shape:
         mean_u, mean_v = u / k, v / k
         length2, width2 = _eigenvalues(uu - u * mean_u, uv - u * mean_v, vv - v * mean_v)
         self.radius_px = math.sqrt(max(0.0, length2 + width2) / k)
-        # No inlier lies further out than the corner of the image (or, outside it, than thrice the rms).
+        # No inlier lies further out than the corner of the image (or, outside it, than three times the rms).
         reach_u, reach_v = max(mean_u, camera.width - mean_u), max(mean_v, camera.height - mean_v)
-        spare = width2 - _STRAYS * max(reach_u * reach_u + reach_v * reach_v, 9.0 * self.radius_px**2)
-        if spare > _PLAINLY_WIDE**2 * length2:
-            self.thinness = math.sqrt(spare / length2)
+        margin = width2 - _OUTLIER_FACTOR * max(
+            reach_u * reach_u + reach_v * reach_v, 9.0 * self.radius_px**2
+        )
+        if margin > _CLEARLY_WIDE**2 * length2:
+            self.thinness = math.sqrt(margin / length2)
         else:
-            self.thinness = slenderness(view[:ONE].T)
+            self.thinness = width_to_length(view[:ONE].T)
 
 
 def inverse_of_information(information: Array, variance_px2: float) -> tuple[Array, list[float]]:
@@ -235,11 +243,11 @@ def _symmetric_inverse(
     )  # fmt: skip
 
 
-def slenderness(rows: Array) -> float:
+def width_to_length(rows: Array) -> float:
     """Return width over length of ``(n, 2 or 3)`` *rows*: 0 on a line, 0 if they coincide.
 
-    Width is the distance from the main axis that 80 % of the rows stay below, so a few strays
-    beside a line do not make it wide.
+    Width is the distance from the main axis that 80 % of the rows stay below, so that a few outliers
+    beside a line do not count.
     """
     centred = (rows - rows.mean(axis=0)).T
     radius2 = np.add.reduce(centred * centred, axis=0)

@@ -42,10 +42,10 @@ class PnpOptions(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class WeakLimits:
-    """Where a pose is called weak: fewer inliers, a smaller ratio, larger standard deviations.
+    """Limits below which a pose is weak: inliers, inlier ratio; above which: standard deviations.
 
-    Fewer places in the image than half of *inliers* are weak, too.  Three standard deviations are
-    0.1 m and 2 degrees, which is what our benchmarks call right.
+    Fewer independent inliers than half of *inliers* are weak, too.  Three standard deviations are 0.1 m
+    and 2 degrees, which the benchmarks use as the limit of a correct pose.
     """
 
     inliers: int = 12

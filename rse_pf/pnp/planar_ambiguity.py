@@ -1,6 +1,6 @@
-"""The second pose of a plane: under weak perspective, a plane and its mirror image look alike.
+"""The planar pose ambiguity: under weak perspective, a plane and its mirror image look alike.
 
-Promises to find that second pose or to say that there is none; the verdict is the solver's.
+This module finds the second pose; the solver decides what it means.
 """
 
 from __future__ import annotations
@@ -12,22 +12,28 @@ import numpy as np
 from rse_pf.geometry import Array, Camera, exp_se3, pose_difference, transform
 from rse_pf.pnp.evidence import ERROR2, view_of
 
-__all__ = ["twin_of"]
+__all__ = ["second_planar_pose"]
 
-_STEPS = 15
-_SETTLED = 1e-7
-_LARGEST_STEP = 10.0
-_APART_M, _APART_DEG = 0.05, 1.0
+_MAX_ITERATIONS = 15
+_CONVERGED = 1e-7
+_MAX_STEP = 10.0
+_DISTINCT_M, _DISTINCT_DEG = 0.05, 1.0
 
 
-def twin_of(
+def second_planar_pose(
     T_camera_world: Array, points_world: Array, pixels: Array, camera: Camera
 ) -> tuple[Array, float] | None:
-    """Return the other ``(4, 4)`` pose and its sum of squared errors (px^2), or None.
+    """Return the second ``(4, 4)`` pose and its sum of squared errors (px^2), or None.
 
-    The plane through the points is mirrored about the line of sight, and the pose that this gives
-    is refined.  None means that it fell back to *T_camera_world*, or fits nothing.  Points that fill space
-    have a twin too, but one that fits badly.
+    The plane through the points is mirrored about the line of sight, and the resulting pose is refined.
+    None means that the refinement failed or converged to *T_camera_world*.  Points that fill space have a
+    second pose as well, but its errors are large.
+
+    Args:
+        T_camera_world: ``(4, 4)``, the first pose.
+        points_world: ``(n, 3)``, metres, world frame.
+        pixels: ``(n, 2)``, undistorted pixels of the points.
+        camera: Intrinsics of the image.
 
     Source:
         Schweighofer and Pinz, PAMI 2006; Collins and Bartoli, IJCV 2014.
@@ -55,24 +61,24 @@ def twin_of(
 
 def _is_same(T_camera_world: Array, other: Array) -> bool:
     metres, degrees = pose_difference(T_camera_world, other)
-    return metres < _APART_M and degrees < _APART_DEG
+    return metres < _DISTINCT_M and degrees < _DISTINCT_DEG
 
 
 def _refined(pose: Array, points_world: Array, pixels: Array, camera: Camera) -> Array | None:
-    """Levenberg-Marquardt over all rows, left perturbation."""
+    """Refine *pose* by Levenberg-Marquardt over all rows, with a left perturbation; None if it fails."""
     damping = 1e-3
     points = transform(pose, points_world)
     cost = math.inf if points[:, 2].min() <= 1e-6 else _cost(points, pixels, camera)
     if not math.isfinite(cost):
         return None
-    for _ in range(_STEPS):
+    for _ in range(_MAX_ITERATIONS):
         normal, gradient = _normal_equations(points, pixels, camera)
         normal[np.diag_indices(6)] *= 1.0 + damping
         try:
             step = np.linalg.solve(normal, gradient)
         except np.linalg.LinAlgError:
             return None
-        if not float(np.abs(step).max()) < _LARGEST_STEP:
+        if not float(np.abs(step).max()) < _MAX_STEP:
             return None
         moved = exp_se3(step) @ pose
         points_moved = transform(moved, points_world)
@@ -80,9 +86,9 @@ def _refined(pose: Array, points_world: Array, pixels: Array, camera: Camera) ->
         if cost_moved > cost:
             damping *= 10.0
             continue
-        settled = cost - cost_moved < _SETTLED * cost
+        has_converged = cost - cost_moved < _CONVERGED * cost
         pose, points, cost, damping = moved, points_moved, cost_moved, damping / 10.0
-        if settled:
+        if has_converged:
             break
     return pose
 

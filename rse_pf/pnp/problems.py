@@ -1,7 +1,4 @@
-"""Seeded PnP problems with known poses: what tests and benchmarks are measured against.
-
-Promises that equal arguments give equal problems, and to use no generator but its own.
-"""
+"""Seeded PnP problems with known poses, for tests and benchmarks; equal arguments give equal problems."""
 
 from __future__ import annotations
 
@@ -17,7 +14,7 @@ __all__ = ["DEGENERATE", "KINECT", "PnpProblem", "make_degenerate", "make_proble
 KINECT = Camera(fx=518.86, fy=519.47, cx=325.58, cy=253.74, width=640, height=480)
 """The colour camera of NYU Depth V2 (its toolbox's calibration)."""
 
-_NEAREST_M, _FARTHEST_M, _BORDER_PX = 0.8, 6.0, 8.0
+_MIN_DEPTH_M, _MAX_DEPTH_M, _BORDER_PX = 0.8, 6.0, 8.0
 
 DEGENERATE = (
     "collinear", "noisy-collinear", "strayed-collinear", "coincident", "same-pixel", "line-of-sight",
@@ -28,7 +25,7 @@ DEGENERATE = (
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class PnpProblem:
-    """Correspondences and the pose that made them."""
+    """Correspondences and their true pose."""
 
     points_world: Array
     pixels: Array
@@ -57,7 +54,7 @@ def make_problem(
     T_camera_world = exp_se3(np.concatenate([rng.uniform(-2, 2, 3), rng.normal(size=3) * 0.6]))
     size = np.array([camera.width, camera.height], dtype=np.float64)
     exact = rng.uniform(_BORDER_PX, size - _BORDER_PX, (n, 2))
-    depth_m = rng.uniform(_NEAREST_M, _FARTHEST_M, n)
+    depth_m = rng.uniform(_MIN_DEPTH_M, _MAX_DEPTH_M, n)
     measured_m = depth_m
     if depth_noise:
         measured_m = depth_m + rng.normal(size=n) * (0.0012 + 0.0019 * (depth_m - 0.4) ** 2)
@@ -78,44 +75,45 @@ def make_degenerate(kind: str, *, seed: int, n: int = 100, camera: Camera = KINE
     rng = np.random.default_rng(seed)
     problem = make_problem(seed=seed, n=n, noise_px=0.5, outlier_ratio=0.0, camera=camera)
     T, points, pixels = problem.T_camera_world, problem.points_world, problem.pixels
-    if kind.endswith("collinear"):
-        start = rng.uniform([-1.0, -0.7, 2.0], [1.0, 0.7, 4.0])
-        direction = rng.normal(size=3) * [1.0, 1.0, 0.3]
-        along = np.linspace(-0.5, 0.5, n)[:, None] * direction / np.linalg.norm(direction)
-        line_camera = start + along
-        pixels = camera.project(line_camera)
-        points = transform(inverse(T), line_camera)
-        if kind != "collinear":
-            points = points + rng.normal(size=(n, 3)) * 0.005
-            pixels = pixels + rng.normal(size=(n, 2)) * 0.5
-        if kind == "strayed-collinear":
-            pixels[: n // 10] = rng.uniform(0, [camera.width, camera.height], (n // 10, 2))
-    elif kind == "coincident":
-        points = np.repeat(points[:1], n, axis=0)
-    elif kind == "same-pixel":
-        pixels = np.repeat(pixels[:1], n, axis=0)
-    elif kind == "line-of-sight":
-        ray = camera.back_project(pixels[:1], np.ones(1))
-        points = transform(inverse(T), ray * np.linspace(1, 5, n)[:, None])
-        pixels = pixels[:1] + rng.normal(size=(n, 2)) * 0.5
-    elif kind == "noise":
-        pixels = rng.uniform(0, [camera.width, camera.height], (n, 2))
-    elif kind == "behind":
-        T = np.diag([-1.0, -1.0, 1.0, 1.0]) @ T
-        points = transform(inverse(T), camera.back_project(pixels, -rng.uniform(1, 5, n)))
-    elif kind == "mirrored":
-        points = points * [-1.0, 1.0, 1.0]
-    elif kind == "corner":
-        pixels = rng.uniform(20.0, 25.0, (n, 2))
-        points = transform(inverse(T), camera.back_project(pixels, rng.uniform(1, 5, n)))
-    elif kind == "duplicated":
-        four = rng.integers(0, 4, n)
-        points, pixels = points[four], np.roll(pixels, 7, axis=0)[four] + rng.normal(size=(n, 2)) * 0.5
-    elif kind in ("nan", "infinite", "huge"):
-        points = points.copy()
-        points[rng.integers(n), 1] = {"nan": np.nan, "infinite": np.inf, "huge": 1e300}[kind]
-    else:
-        raise ValueError(f"unknown kind {kind!r}")
+    match kind:
+        case "collinear" | "noisy-collinear" | "strayed-collinear":
+            start = rng.uniform([-1.0, -0.7, 2.0], [1.0, 0.7, 4.0])
+            direction = rng.normal(size=3) * [1.0, 1.0, 0.3]
+            along = np.linspace(-0.5, 0.5, n)[:, None] * direction / np.linalg.norm(direction)
+            line_camera = start + along
+            pixels = camera.project(line_camera)
+            points = transform(inverse(T), line_camera)
+            if kind != "collinear":
+                points = points + rng.normal(size=(n, 3)) * 0.005
+                pixels = pixels + rng.normal(size=(n, 2)) * 0.5
+            if kind == "strayed-collinear":
+                pixels[: n // 10] = rng.uniform(0, [camera.width, camera.height], (n // 10, 2))
+        case "coincident":
+            points = np.repeat(points[:1], n, axis=0)
+        case "same-pixel":
+            pixels = np.repeat(pixels[:1], n, axis=0)
+        case "line-of-sight":
+            ray = camera.back_project(pixels[:1], np.ones(1))
+            points = transform(inverse(T), ray * np.linspace(1, 5, n)[:, None])
+            pixels = pixels[:1] + rng.normal(size=(n, 2)) * 0.5
+        case "noise":
+            pixels = rng.uniform(0, [camera.width, camera.height], (n, 2))
+        case "behind":
+            T = np.diag([-1.0, -1.0, 1.0, 1.0]) @ T
+            points = transform(inverse(T), camera.back_project(pixels, -rng.uniform(1, 5, n)))
+        case "mirrored":
+            points = points * [-1.0, 1.0, 1.0]
+        case "corner":
+            pixels = rng.uniform(20.0, 25.0, (n, 2))
+            points = transform(inverse(T), camera.back_project(pixels, rng.uniform(1, 5, n)))
+        case "duplicated":
+            four = rng.integers(0, 4, n)
+            points, pixels = points[four], np.roll(pixels, 7, axis=0)[four] + rng.normal(size=(n, 2)) * 0.5
+        case "nan" | "infinite" | "huge":
+            points = points.copy()
+            points[rng.integers(n), 1] = {"nan": np.nan, "infinite": np.inf, "huge": 1e300}[kind]
+        case _:
+            raise ValueError(f"unknown kind {kind!r}")
     return PnpProblem(
         points_world=points, pixels=pixels, camera=camera, T_camera_world=T,
         is_inlier=np.zeros(n, dtype=np.bool_),

@@ -1,7 +1,4 @@
-"""`solve_pnp`: one camera pose with its evidence, or a typed error; never a pose that is a guess.
-
-Promises determinism, no threads, and no state.
-"""
+"""`solve_pnp`: one camera pose with its evidence, or a typed error if there is no reliable pose."""
 
 from __future__ import annotations
 
@@ -17,25 +14,25 @@ from rse_pf.geometry import Array, Camera
 from rse_pf.pnp import evidence
 from rse_pf.pnp.engines import Engine, engine_for
 from rse_pf.pnp.options import PnpOptions, WeakLimits
-from rse_pf.pnp.planar_ambiguity import twin_of
+from rse_pf.pnp.planar_ambiguity import second_planar_pose
 
 __all__ = ["PnpSolution", "solve_pnp"]
 
-_LARGEST = 1e6
-_CHANCE = -5.0
-"""log10 of the false alarms at which chance is ruled out."""
+_MAX_ABS = 1e6
+# log10 of the false alarms at which chance is ruled out.
+_MAX_LOG10_FALSE_ALARMS = -5.0
 _COLLINEAR, _NEARLY_COLLINEAR = 0.02, 0.1
+# Variation of 1/z below which a plane may have two poses.
 _WEAK_PERSPECTIVE = 0.08
-"""Variation of 1/z below which a plane may have two poses."""
+# Differences of squared error, in units of the noise, that tell two poses apart: not, hardly.
 _SAME_FIT, _SIMILAR_FIT = 9.0, 40.0
-"""Differences of squared error, in units of the noise, that tell two poses apart: not, hardly."""
 _NOISE_FLOOR_PX2 = 0.01
+# Enough where half of the matches agree: a whole world that is mirrored, not a part of it.
 _MIRROR_ITERATIONS = 50
-"""Enough where half of the matches agree: a whole world that is mirrored, not a part of it."""
 
 
 class PnpSolution(msgspec.Struct, frozen=True, kw_only=True, eq=False):
-    """A pose and what speaks for it.
+    """A pose and its evidence.
 
     Attributes:
         T_camera_world: ``(4, 4)``, maps world points (metres) into the camera's frame.
@@ -110,15 +107,15 @@ def solve_pnp(
         raise _no_pose(points_world, pixels, count, options)
     view = view.take(inliers, axis=1)
     error2 = view[evidence.ERROR2]
-    seen = evidence.places(view, camera)
-    if _is_chance(n - (count - seen), seen, options.inlier_px**2, camera):
-        _refuse_chance(points_world, pixels, camera, options, count, seen, float(error2.max()))
+    independent = evidence.independent_inliers(view, camera)
+    if _is_chance(n - (count - independent), independent, options.inlier_px**2, camera):
+        _refuse_chance(points_world, pixels, camera, options, count, independent, float(error2.max()))
     shape = evidence.Shape(view, camera)
     _refuse_degenerate(shape, options)
     squares = float(np.add.reduce(error2))
     variance = max(squares / max(1, 2 * count - 6), _NOISE_FLOOR_PX2)
     covariance, variances = _covariance(shape.information, variance)
-    reason = _weakness(count, seen, n, shape, variances, weak)
+    reason = _weakness(count, independent, n, shape, variances, weak)
     if shape.depth_variation < _WEAK_PERSPECTIVE:
         found = _ambiguity(T_camera_world, points_world[inliers], pixels[inliers], camera, squares, variance)
         reason = found or reason
@@ -138,12 +135,12 @@ def solve_pnp(
 def _checked(points_world: Array, pixels: Array) -> tuple[Array, Array]:
     try:
         points = np.ascontiguousarray(points_world, dtype=np.float64)
-        seen = np.ascontiguousarray(pixels, dtype=np.float64)
+        pixels = np.ascontiguousarray(pixels, dtype=np.float64)
     except (TypeError, ValueError) as error:
         raise BadRequest("points and pixels must be numbers", hint="send (n, 3) and (n, 2)") from error
-    if points.ndim != 2 or seen.ndim != 2 or points.shape[1] != 3 or seen.shape != (len(points), 2):
+    if points.ndim != 2 or pixels.ndim != 2 or points.shape[1] != 3 or pixels.shape != (len(points), 2):
         raise BadRequest(
-            f"points {points.shape} and pixels {seen.shape} are not (n, 3) and (n, 2)",
+            f"points {points.shape} and pixels {pixels.shape} are not (n, 3) and (n, 2)",
             hint="send one pixel for each point",
         )
     if len(points) < 4:
@@ -151,24 +148,20 @@ def _checked(points_world: Array, pixels: Array) -> tuple[Array, Array]:
             f"got {len(points)} correspondences, a pose needs at least 4",
             hint="loosen the matcher, or skip this frame",
         )
-    # vdot of a row of numbers with itself is their sum of squares; it overflows without a warning.
-    if not np.vdot(points, points) < _LARGEST**2 and not (np.abs(points) <= _LARGEST).all():
-        raise _absurd("points_world")
-    if not np.vdot(seen, seen) < _LARGEST**2 and not (np.abs(seen) <= _LARGEST).all():
-        raise _absurd("pixels")
-    return points, seen
-
-
-def _absurd(name: str) -> BadRequest:
-    return BadRequest(
-        f"{name} holds a number that is not finite or is beyond {_LARGEST:g}", hint="leave such rows out"
-    )
+    for name, rows in (("points_world", points), ("pixels", pixels)):
+        # vdot of a row of numbers with itself is their sum of squares; it overflows without a warning.
+        if not np.vdot(rows, rows) < _MAX_ABS**2 and not (np.abs(rows) <= _MAX_ABS).all():
+            raise BadRequest(
+                f"{name} holds a number that is not finite or is beyond {_MAX_ABS:g}",
+                hint="leave such rows out",
+            )
+    return points, pixels
 
 
 def _proposed(
     propose: Engine, points_world: Array, pixels: Array, camera: Camera, options: PnpOptions
 ) -> Array | None:
-    """Return the engine's pose; one that is not finite agrees with no point, so it is found out below."""
+    """Return the engine's pose; a pose that is not finite agrees with no point and is refused later."""
     pose = propose(points_world, pixels, camera, options)
     if pose is None:
         return None
@@ -178,7 +171,7 @@ def _proposed(
 
 
 def _is_chance(n: int, count: int, largest_error2_px2: float, camera: Camera) -> bool:
-    return evidence.log10_false_alarms(n, count, largest_error2_px2, camera) > _CHANCE
+    return evidence.log10_false_alarms(n, count, largest_error2_px2, camera) > _MAX_LOG10_FALSE_ALARMS
 
 
 def _refuse_chance(
@@ -187,21 +180,21 @@ def _refuse_chance(
     camera: Camera,
     options: PnpOptions,
     count: int,
-    seen: int,
+    independent: int,
     largest_error2_px2: float,
 ) -> None:
-    """Judge once more by the largest error that there is, not by the largest that is allowed."""
+    """Repeat the test with the largest actual error instead of the largest allowed one."""
     n = len(pixels)
-    if _is_chance(n - (count - seen), seen, largest_error2_px2, camera):
+    if _is_chance(n - (count - independent), independent, largest_error2_px2, camera):
         if not _is_chance(n, count, largest_error2_px2, camera):
-            raise _in_few_places(count, seen)
+            raise _in_few_places(count, independent)
         raise _no_pose(points_world, pixels, count, options)
 
 
 def _no_pose(points_world: Array, pixels: Array, count: int, options: PnpOptions) -> PnpError:
-    """Return the best reason there is: degenerate input says more than "no consensus"."""
+    """Return the most specific error: degenerate input says more than "no consensus"."""
     for rows in (points_world, pixels):
-        thinness = evidence.slenderness(rows)
+        thinness = evidence.width_to_length(rows)
         if thinness < _COLLINEAR:
             return _collinear(thinness)
     return NoConsensus(
@@ -219,9 +212,10 @@ def _collinear(thinness: float) -> DegenerateGeometry:
     )
 
 
-def _in_few_places(count: int, seen: int) -> DegenerateGeometry:
+def _in_few_places(count: int, independent: int) -> DegenerateGeometry:
     return DegenerateGeometry(
-        f"the {count} correspondences that agree lie in {seen} places of the image; they may be copies",
+        f"the {count} correspondences that agree lie in {independent} places of the image, "
+        "and may be copies of each other",
         hint="match points all over the image, or skip this frame",
     )
 
@@ -229,30 +223,29 @@ def _in_few_places(count: int, seen: int) -> DegenerateGeometry:
 def _refuse_degenerate(shape: evidence.Shape, options: PnpOptions) -> None:
     if shape.thinness < _COLLINEAR:
         raise _collinear(shape.thinness)
-    least_px = options.inlier_px
-    if shape.radius_px < least_px:
+    if shape.radius_px < options.inlier_px:
         raise DegenerateGeometry(
             f"the pixels that agree lie {shape.radius_px:.1f} px (rms) from their centre, "
-            f"less than {least_px:g} px",
+            f"less than {options.inlier_px:g} px",
             hint="match points all over the image, or skip this frame",
         )
 
 
 def _covariance(information: Array, variance_px2: float) -> tuple[Array, list[float]]:
-    """Return the covariance and its diagonal, all of it positive."""
+    """Return the covariance and its diagonal, all of which is positive."""
     try:
         covariance, variances = evidence.inverse_of_information(information, variance_px2)
     except ZeroDivisionError:
         variances = [-1.0]
     if not all(value > 0.0 for value in variances):
         raise DegenerateGeometry(
-            "the correspondences leave a motion of the camera free", hint="match more of the scene"
+            "the correspondences do not constrain some motion of the camera", hint="match more of the scene"
         )
     return covariance, variances
 
 
 def _weakness(
-    count: int, seen: int, n: int, shape: evidence.Shape, variances: list[float], weak: WeakLimits
+    count: int, independent: int, n: int, shape: evidence.Shape, variances: list[float], weak: WeakLimits
 ) -> str:
     if count < weak.inliers:
         return "few-inliers"
@@ -260,7 +253,7 @@ def _weakness(
         return "low-inlier-ratio"
     if shape.thinness < _NEARLY_COLLINEAR:
         return "nearly-collinear"
-    if 2 * seen < weak.inliers:
+    if 2 * independent < weak.inliers:
         return "clustered"
     if sum(variances[:3]) > weak.translation_m**2 or sum(variances[3:]) > weak.rotation_rad**2:
         return "poorly-constrained"
@@ -275,13 +268,13 @@ def _ambiguity(
     squares_px2: float,
     variance_px2: float,
 ) -> str:
-    """Compare with the second pose of a plane; the difference is a likelihood ratio."""
-    twin = twin_of(T_camera_world, points, pixels, camera)
-    if twin is None:
+    """Compare with the second pose of a plane by a likelihood ratio."""
+    second = second_planar_pose(T_camera_world, points, pixels, camera)
+    if second is None:
         return ""
-    difference = (twin[1] - squares_px2) / variance_px2
+    difference = (second[1] - squares_px2) / variance_px2
     if difference < _SAME_FIT:
-        rmse, other = (math.sqrt(squares / len(pixels)) for squares in (squares_px2, twin[1]))
+        rmse, other = (math.sqrt(squares / len(pixels)) for squares in (squares_px2, second[1]))
         raise DegenerateGeometry(
             f"two poses fit alike ({rmse:.2f} and {other:.2f} px)",
             hint="match points that do not lie in one far plane",
@@ -292,10 +285,10 @@ def _ambiguity(
 def _refuse_mirrored(
     propose: Engine, points_world: Array, pixels: Array, camera: Camera, options: PnpOptions, count: int
 ) -> None:
-    """Where most rows disagree, ask whether the whole world is inside out.
+    """Where most rows disagree, test whether the world is mirrored.
 
-    The point reflection of a world projects alike, so points behind the camera and left-handed
-    worlds are told by a far better pose of the reflected points.
+    The point reflection of a world projects alike, so points behind the camera and left-handed worlds are
+    recognised by a far better pose of the reflected points.
     """
     reflected = -points_world
     few = msgspec.structs.replace(options, max_iterations=min(options.max_iterations, _MIRROR_ITERATIONS))

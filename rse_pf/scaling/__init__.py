@@ -1,1 +1,1 @@
-"""Pure rules: when servers count as busy, idle or broken, and what to do about it."""
+"""Pure rules of scaling: when servers count as busy, idle or unhealthy, and what to do then."""

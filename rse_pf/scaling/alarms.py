@@ -1,7 +1,7 @@
-"""Say the scaling policy in CloudWatch's words: metrics, alarms and step adjustments, as data.
+"""The scaling policy as CloudWatch data: metrics, alarms and step adjustments.
 
-The stacks write these alarms into the template; tests parse them back and run them beside
-`rse_pf.scaling.policy.decide`.  Promises to be the only place that translates the one into the other.
+This is the only translation of `rse_pf.scaling.policy.decide`.  The stacks write the alarms into the
+template; tests read them back from it and compare both on the same load.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ _EC2 = "AWS/EC2"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Metric:
-    """One time series; ``name`` is how an expression calls it."""
+    """One time series; ``name`` is its name in an expression."""
 
     name: str
     namespace: str
@@ -39,9 +39,9 @@ class ScalingStep:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Alarm:
-    """An alarm and the step policy it runs in every period in which it stands in ALARM.
+    """An alarm and the step policy that runs in every period in which its state is ALARM.
 
-    ``comparison`` and ``missing`` are CloudWatch's words; *periods* of *periods* must breach.
+    ``comparison`` and ``missing`` are terms of CloudWatch; *periods* of *periods* must breach.
     """
 
     name: str
@@ -63,9 +63,9 @@ _QUEUE = Metric(name="queue", namespace=NAMESPACE, metric="QueueMs", statistic="
 
 
 def alarms_of(settings: ScalingSettings) -> tuple[Alarm, ...]:
-    """Return the alarms that do what `decide` does, in the order busy, idle, then what is switched on.
+    """Return the alarms that correspond to `decide`: busy, idle, then those that are enabled.
 
-    Missing data never breaches: a fleet that nobody hears of is neither grown nor shrunk.
+    Missing data never breaches: a fleet without data neither grows nor shrinks.
     """
     further = settings.very_busy_cpu_percent - settings.busy_cpu_percent
     steps = [ScalingStep(lower=0.0, upper=further, change=settings.step)] if further else []
@@ -75,7 +75,7 @@ def alarms_of(settings: ScalingSettings) -> tuple[Alarm, ...]:
         _CPU,
         settings.busy_cpu_percent,
         (*steps, ScalingStep(lower=further, upper=None, change=settings.big_step)),
-        "the servers compute more than they should",
+        "the average CPU of the servers is too high",
     )
     idle = Alarm(
         name="idle",
@@ -87,7 +87,7 @@ def alarms_of(settings: ScalingSettings) -> tuple[Alarm, ...]:
         periods=settings.idle_s // settings.period_s,
         missing="notBreaching",
         steps=(ScalingStep(lower=0.0, upper=None, change=-1),),
-        meaning="no robot asked for anything, and the servers rest",
+        meaning="there were no requests, and the servers are idle",
     )
     alarms = [busy, idle]
     one = (ScalingStep(lower=0.0, upper=None, change=settings.step),)

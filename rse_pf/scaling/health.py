@@ -1,7 +1,6 @@
-"""Judge a server by its health checks as a target group does: counts in a row, after a grace.
+"""The health of a server by its checks, as in a target group: consecutive results, after a grace period.
 
-The same numbers go to the ALB, to Envoy and to this rule.  Promises no clock and no socket: the outcome of
-a check and the time come in, a new state comes out.
+The ALB, Envoy and this rule use the same settings.  The result of a check and the time are arguments.
 """
 
 from __future__ import annotations
@@ -32,7 +31,7 @@ CLOUD_TIMEOUT_S = 4
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Health:
-    """What is known of one server.  ``row`` counts equal outcomes; ``started_s`` begins the grace."""
+    """The health of one server.  ``row`` counts equal results; the grace period begins at ``started_s``."""
 
     started_s: float
     state: Literal["starting", "healthy", "unhealthy"] = "starting"
@@ -57,7 +56,7 @@ def observe(health: Health, ok: bool, settings: HealthSettings, *, now_s: float)
 
 
 def time_to_notice_s(settings: HealthSettings, *, local: bool) -> float:
-    """Return the longest time between a failure and its verdict, in seconds; a drain waits for it."""
+    """Return the longest time from a failure to its detection, in seconds; a drain waits for it."""
     interval_s = LOCAL_INTERVAL_S if local else settings.cloud_interval_s
     timeout_s = LOCAL_TIMEOUT_S if local else CLOUD_TIMEOUT_S
     return interval_s * settings.unhealthy_checks + timeout_s

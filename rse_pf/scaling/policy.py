@@ -1,8 +1,8 @@
 """Decide when the platform grows, shrinks or replaces a server: the paper's scale modifier as a pure rule.
 
-`decide` is told what was measured and what time it is, and says what to do; whoever calls it does it.
-`rse_pf.scaling.alarms` says the same to CloudWatch, and a law test holds both together.  Promises no clock,
-no memory between calls, and that a period without a sample is no reason to act.
+`decide` takes measurements and the time, keeps no state between calls, and returns what the caller has to do.
+A period without a sample is no reason to act.  `rse_pf.scaling.alarms` describes the same policy to
+CloudWatch; a test compares the two.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ Kind = Literal["grow", "shrink", "replace", "stay"]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Sample:
-    """What the monitor saw in one whole period, over all servers that are past their warm-up.
+    """Measurements of one whole period, over all servers that are past their warm-up.
 
-    ``start_s`` is where the period *began*, so a sample speaks for ``[start_s, start_s + period)``.
+    ``start_s`` is the begin of the period, so a sample covers ``[start_s, start_s + period)``.
     """
 
     start_s: float
@@ -35,7 +35,7 @@ class Sample:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FleetState:
-    """The servers as they stand: all of them, those still warming up, those that failed their checks."""
+    """The current servers: their number, those still warming up, and the names of the unhealthy ones."""
 
     servers: int
     warming: int = 0
@@ -44,7 +44,7 @@ class FleetState:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Action:
-    """One thing to do.  ``names`` says which servers (replace only); ``reason`` goes into the log."""
+    """One action.  ``names`` are the servers to replace; ``reason`` is for the log."""
 
     kind: Kind
     servers: int = 0
@@ -69,10 +69,10 @@ def decide(
     Args:
         samples: Whole periods, in order; later ones than *now_s* are ignored.
         fleet: The servers now.
-        settings: Thresholds and bounds.
-        now_s: Any clock, seconds; the one of the samples.
-        acted_s: When the scale was last acted on; each period is acted on once.
-        compress: Periods are shorter by this factor; for experiments.
+        settings: Thresholds and limits.
+        now_s: Seconds, on the clock of the samples.
+        acted_s: When the number of servers was last changed; each period leads to one change at most.
+        compress: Factor by which periods are shorter; for experiments.
 
     Source:
         RSE-PF paper, Sect. 6.2: busy above 70 % CPU, one server less after five idle minutes.
@@ -88,25 +88,25 @@ def decide(
             ),
         )
     period_s = settings.period_s / compress
-    # The half guards against a start that is a rounding error below its multiple.
+    # The small term guards against a start that is a rounding error below its multiple.
     ended = math.floor(now_s / period_s + 1e-6)
     if fleet.servers < settings.min_servers:
         missing = settings.min_servers - fleet.servers
         return (*replacements, Action(kind="grow", servers=missing, reason="fewer than scaling.min_servers"))
     if math.isfinite(acted_s) and ended <= math.floor(acted_s / period_s + 1e-6):
-        return (*replacements, Action(kind="stay", reason="this period was acted on"))
+        return (*replacements, Action(kind="stay", reason="this period has led to an action already"))
     by_period = {round(sample.start_s / period_s): sample for sample in samples}
     return (*replacements, _scale(by_period, ended, fleet, settings))
 
 
 def _scale(by_period: dict[int, Sample], ended: int, fleet: FleetState, settings: ScalingSettings) -> Action:
-    wish, reason = _growth(_last(by_period, ended, settings.busy_periods), settings)
-    if wish:
-        most = min(settings.max_servers, fleet.servers - fleet.warming + wish)
-        more = most - fleet.servers
+    growth, reason = _growth(_last(by_period, ended, settings.busy_periods), settings)
+    if growth:
+        target = min(settings.max_servers, fleet.servers - fleet.warming + growth)
+        more = target - fleet.servers
         if more > 0:
             return Action(kind="grow", servers=more, reason=reason)
-        bound = most == settings.max_servers
+        bound = target == settings.max_servers
         return Action(
             kind="stay", reason=f"{reason}, but {'at scaling.max_servers' if bound else 'still warming up'}"
         )
@@ -126,7 +126,7 @@ def _last(by_period: dict[int, Sample], ended: int, count: int) -> list[Sample]:
 
 
 def _growth(last: list[Sample], settings: ScalingSettings) -> tuple[int, str]:
-    """Return by how many servers the busiest reason asks to grow, and the reason."""
+    """Return by how many servers to grow, and why; 0 if the servers are not busy."""
     if not last:
         return 0, ""
     if all(sample.cpu_percent >= settings.busy_cpu_percent for sample in last):

@@ -1,8 +1,8 @@
-"""Decide how many robots a crowded server hands over, so that all servers carry about the same.
+"""Decide how many robots a crowded server moves to others, so that all servers have about the same number.
 
-`moves` knows every server, as the local control plane does; `share` is the same rule from the view of one
-server that knows only the sums, as in AWS.  Promises no clock and no randomness, that nothing moves while
-all are within the margin of even, and never more robots than that takes.
+`moves` is for a caller that knows every server, such as the local control plane; `share` is the same rule for
+one server that only knows the totals, as in AWS.  No robot moves while all servers are within the margin, and
+no more robots move than necessary.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ MARGIN = 0.2
 
 
 def moves(robots: Mapping[str, int], margin: float = MARGIN) -> dict[str, int]:
-    """Return how many robots each crowded server hands over; empty if none has to.
+    """Return how many robots each crowded server has to move; empty if none has to.
 
     Even is ``total / servers``.  When the robots that move land on the least crowded servers, all end within
     *margin* of even, or at the whole numbers around even where the margin holds none.
 
     Args:
-        robots: Robots of each server that may take and give, by name; none may be negative.
+        robots: Number of robots of each server that takes part, by name; not negative.
         margin: A share of even.
     """
     if len(robots) < 2:
@@ -43,15 +43,15 @@ def moves(robots: Mapping[str, int], margin: float = MARGIN) -> dict[str, int]:
 
 
 def share(mine: int, total: int, servers: int, margin: float = MARGIN) -> int:
-    """Return how many of its *mine* robots one server hands over, knowing only the sums.
+    """Return how many of its *mine* robots one server has to move, knowing only the totals.
 
-    It must assume that every other server but one is as crowded as itself, and that this one misses all that
-    the others have too much: so the margin is shared among them.  With two servers it is the rule of `moves`.
+    It must assume that all other servers but one are as crowded as itself, and that this one lacks what the
+    others have in excess; the margin is therefore divided among them.  For two servers this equals `moves`.
 
     Args:
         mine: Robots of this server.
         total: Robots of all servers, this one included.
-        servers: How many take and give, this one included.
+        servers: Number of servers that take part, this one included.
         margin: A share of even.
     """
     if servers < 2:

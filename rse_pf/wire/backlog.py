@@ -17,10 +17,10 @@ from dataclasses import dataclass
 
 __all__ = ["Backlog", "is_long_outage", "send_order"]
 
+# A server is loaded if a command queued for longer; equals its ``QUEUE_TARGET_S``.
 _SHORT_QUEUE_MS = 50.0
-"""A server is loaded if a command queued for longer; equals its ``QUEUE_TARGET_S``."""
+# An outage is long if it took more than this share of a frame's time.
 _LONG_OUTAGE_SHARE = 0.5
-"""An outage is long if it took more than this share of a frame's time."""
 
 
 @dataclass(slots=True, kw_only=True)

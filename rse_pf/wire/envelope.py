@@ -18,8 +18,8 @@ from rse_pf.wire.messages import Failure
 __all__ = ["Envelope", "encode_refusal", "peek"]
 
 _MAX_PEEKED_BYTES = 512
+# The start of a command as the SDK writes it: type, id, and a service of at most 64 characters.
 _INFLATED_BYTES = 160
-"""The start of a command as the SDK writes it: type, id, and a service of at most 64 characters."""
 
 _HEAD = re.compile(
     rb'\{"type":"command","id":(0|[1-9][0-9]{0,15}),"service":"([\x20-\x21\x23-\x5b\x5d-\x7e]{1,64})"[,}]'

@@ -33,11 +33,11 @@ def _steps() -> tuple[int, ...]:
     return tuple(steps)
 
 
+# By first byte of bin, ext and str: bytes of the length field, and bytes before the content.
 _LENGTHS = {
     0xC4: (1, 2), 0xC5: (2, 3), 0xC6: (4, 5), 0xC7: (1, 3), 0xC8: (2, 4), 0xC9: (4, 6), 0xD9: (1, 2),
     0xDA: (2, 3), 0xDB: (4, 5),
 }  # fmt: skip
-"""By first byte of bin, ext and str: bytes of the length field, and bytes before the content."""
 
 _STEPS = _steps()
 _MORE = tuple((MAP_VALUES if k < 0x90 or k >= 0xDE else LIST_VALUES) - 1 for k in range(256))

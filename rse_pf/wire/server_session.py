@@ -73,8 +73,8 @@ CLOSE_REVOKED = 4403
 CLOSE_UNSUPPORTED = 4406
 CLOSE_REPLACED = 4409
 CLOSE_RATE = 4429
+# An undecodable message counts once more for so many bytes.
 _BAD_MESSAGE_BYTES = 65_536
-"""An undecodable message counts once more for so many bytes."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,10 +9,10 @@ from dataclasses import dataclass
 
 __all__ = ["RenewalTimer"]
 
+# Share of a token's remaining time; the rest is for a second and a third attempt.
 _RENEW_AFTER = 0.8
-"""Share of a token's remaining time; the rest is for a second and a third attempt."""
+# Above the server's minimum pause between two renewals.
 _MIN_RETRY_S = 1.5
-"""Above the server's minimum pause between two renewals."""
 _MAX_TTL_S = 3600.0
 
 

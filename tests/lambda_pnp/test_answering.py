@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import itertools
 import json
+import math
 import zlib
 from collections.abc import Callable
 from pathlib import Path
@@ -136,7 +137,8 @@ def test_a_late_answer_is_expired_before_and_after_the_work() -> None:
 
 def over_the_websocket(body: bytes) -> Failure:
     """Return what a backend's session, scheduler and dispatch say to the same bytes."""
-    from rse_pf.backend.scheduling.scheduler import QueuedCommand, Scheduler
+    from rse_pf.backend.gateway.admission import Admission
+    from rse_pf.backend.scheduling.scheduler import QueuedCommand
     from rse_pf.service import dispatch, failure_of
     from rse_pf.services.builtin import builtin_services
     from rse_pf.wire.server_session import Send, ServerSession, Submit
@@ -155,10 +157,11 @@ def over_the_websocket(body: bytes) -> Failure:
         allowed_s = SETTINGS.session.answer_timeout_s
         if command.deadline_ms is not None:
             allowed_s = command.deadline_ms / 1e3
-        job = QueuedCommand(None, "robot-1", command, len(body), 0.0, allowed_s)
-        refusals = Scheduler(SETTINGS.serving).submit(job, 0.0)
-        if refusals:
-            told = failure_of(refusals[0].error, command, server="lambda")
+        queued = QueuedCommand(None, "robot-1", command, len(body), 0.0, allowed_s)
+        admission = Admission(SETTINGS.session, SETTINGS.serving)
+        refused = admission.judge(queued, None, (0, 0.0, 0.0), math.inf)
+        if refused is not None:
+            told = failure_of(refused.error, command, server="lambda")
         else:
             told = dispatch(builtin_services(SETTINGS), command, lambda: 0.0, server="lambda")
     assert isinstance(told, Failure)

@@ -130,13 +130,13 @@ def test_without_the_rank_check_a_line_comes_back(monkeypatch):
 
 
 def test_without_the_chance_test_noise_comes_back(monkeypatch):
-    monkeypatch.setattr(solver, "_CHANCE", np.inf)
+    monkeypatch.setattr(solver, "_MAX_LOG10_FALSE_ALARMS", np.inf)
 
     assert {"ok", "weak"} & outcomes("noise")
 
 
 def test_without_counting_places_copies_of_four_wrong_matches_are_ok(monkeypatch):
-    monkeypatch.setattr(evidence, "places", lambda view, camera: view.shape[1])
+    monkeypatch.setattr(evidence, "independent_inliers", lambda view, camera: view.shape[1])
 
     assert "ok" in outcomes("duplicated")
 

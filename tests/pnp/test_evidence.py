@@ -96,19 +96,19 @@ def test_copies_of_one_correspondence_count_once():
 
     copies = four[rng.integers(0, 4, 200)] + rng.normal(size=(200, 2))
 
-    assert evidence.places(at(copies), KINECT) == 4
+    assert evidence.independent_inliers(at(copies), KINECT) == 4
 
 
 def test_scattered_correspondences_all_count():
     pixels = np.random.default_rng(0).uniform(0, [640, 480], (200, 2))
 
-    assert evidence.places(at(pixels), KINECT) == 200
+    assert evidence.independent_inliers(at(pixels), KINECT) == 200
 
 
 def test_cells_on_a_corner_are_one_place():
     corner = [[15.9, 15.9], [16.1, 15.9], [15.9, 16.1], [16.1, 16.1]]
 
-    assert evidence.places(at(corner), KINECT) == 1
+    assert evidence.independent_inliers(at(corner), KINECT) == 1
 
 
 @pytest.mark.parametrize("strays", [0, 2, 4])
@@ -124,7 +124,7 @@ def test_a_filled_image_is_wide_and_one_place_has_no_width():
     pixels = np.random.default_rng(0).uniform(0, [640, 480], (200, 2))
 
     assert shape(at(pixels)).thinness > 0.15
-    assert evidence.slenderness(np.ones((20, 2))) == 0.0
+    assert evidence.width_to_length(np.ones((20, 2))) == 0.0
 
 
 def test_depth_variation_is_that_of_the_inverse_depth():

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from rse_pf.geometry import exp_se3, pose_difference
-from rse_pf.pnp.planar_ambiguity import twin_of
+from rse_pf.pnp.planar_ambiguity import second_planar_pose
 from rse_pf.pnp.problems import KINECT
 
 
@@ -19,7 +19,7 @@ def tilted_plane(size_m, tilt_rad, depth_m, seed=0, n=60):
 def test_a_far_tilted_plane_has_a_twin_that_fits_almost_alike():
     points, pixels = tilted_plane(size_m=0.4, tilt_rad=0.6, depth_m=4.0)
 
-    twin = twin_of(np.eye(4), points, pixels, KINECT)
+    twin = second_planar_pose(np.eye(4), points, pixels, KINECT)
 
     assert twin is not None
     _, degrees = pose_difference(twin[0], np.eye(4))
@@ -30,7 +30,7 @@ def test_a_far_tilted_plane_has_a_twin_that_fits_almost_alike():
 def test_a_near_tilted_plane_has_a_twin_that_fits_badly():
     points, pixels = tilted_plane(size_m=1.5, tilt_rad=0.6, depth_m=2.0)
 
-    twin = twin_of(np.eye(4), points, pixels, KINECT)
+    twin = second_planar_pose(np.eye(4), points, pixels, KINECT)
 
     assert twin is None or twin[1] / len(points) > 25.0
 
@@ -38,13 +38,13 @@ def test_a_near_tilted_plane_has_a_twin_that_fits_badly():
 def test_a_plane_seen_head_on_has_no_twin():
     points, pixels = tilted_plane(size_m=1.0, tilt_rad=0.0, depth_m=3.0)
 
-    assert twin_of(np.eye(4), points, pixels, KINECT) is None
+    assert second_planar_pose(np.eye(4), points, pixels, KINECT) is None
 
 
 def test_points_that_fill_space_have_no_twin_that_fits():
     rng = np.random.default_rng(2)
     points = rng.uniform([-1, -1, 5], [1, 1, 7], (60, 3))
 
-    twin = twin_of(np.eye(4), points, KINECT.project(points), KINECT)
+    twin = second_planar_pose(np.eye(4), points, KINECT.project(points), KINECT)
 
     assert twin is None or twin[1] / len(points) > 25.0
