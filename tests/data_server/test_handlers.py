@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from concurrent.futures import ThreadPoolExecutor
 
 from fake_data_service import Answer, Service, small_settings
 
@@ -71,27 +72,26 @@ def test_an_invalid_map_or_an_object_of_another_robot_is_refused(service: Servic
     assert service.ask("GET", "/data/v1/maps/none/versions").status == 404
 
 
+class AsksWhileItWrites(MemoryStore):
+    """A store that sends another request while it writes the first object."""
+
+    service: Service
+    inner: Answer | None = None
+
+    def put(self, name: str, data: bytes) -> None:
+        if self.inner is None:
+            with ThreadPoolExecutor(1) as pool:
+                path = f"/data/v1/objects/{'0' * 64}"
+                self.inner = pool.submit(self.service.ask, "PUT", path, b"y").result(30)
+        super().put(name, data)
+
+
 def test_more_uploads_at_once_than_allowed_are_busy() -> None:
-    service = Service(small_settings(max_uploads=1), MemoryStore())
-    inner: list[Answer] = []
-    body = iter([{"type": "http.request", "body": b"x", "more_body": False}])
+    store = AsksWhileItWrites()
+    service = store.service = Service(small_settings(max_uploads=1), store)
 
-    original = service.app.handlers.objects.name
+    outer = service.ask("PUT", f"/data/v1/objects/{digest_of(b'x')}", b"x")
 
-    def name_and_ask(who: object, digest: str) -> str:
-        service.app.handlers.objects.name = original  # type: ignore[method-assign]
-        inner.append(_in_thread(lambda: service.ask("PUT", f"/data/v1/objects/{'0' * 64}", b"y")))
-        return original(who, digest)  # type: ignore[arg-type]
-
-    service.app.handlers.objects.name = name_and_ask  # type: ignore[method-assign]
-    outer = service.ask("PUT", f"/data/v1/objects/{digest_of(b'x')}", body)
-
-    assert (inner[0].status, inner[0].json["code"], outer.status) == (503, "busy", 201)
-    assert inner[0].headers["retry-after"] == "1"
-
-
-def _in_thread(work: object) -> Answer:
-    from concurrent.futures import ThreadPoolExecutor
-
-    with ThreadPoolExecutor(1) as pool:
-        return pool.submit(work).result()  # type: ignore[arg-type]
+    assert store.inner is not None
+    assert (store.inner.status, store.inner.json["code"], outer.status) == (503, "busy", 201)
+    assert store.inner.headers["retry-after"] == "1"

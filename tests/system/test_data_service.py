@@ -1,4 +1,4 @@
-"""The data service as a process: killed in the middle of uploads, on a full disk, replaced when it dies."""
+"""The data service as a process: killed during uploads, on a full disk, replaced when it ends."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ MIB = 1 << 20
 
 
 class Platform:
-    """One data server and its successors, run by an event loop of their own."""
+    """One data server and its successors, run by an event loop in a thread."""
 
     def __init__(self, folder: Path, store: Path) -> None:
         (folder / "keys.json").write_text(KEY.key_set().to_json(), encoding="utf-8")
@@ -44,11 +44,11 @@ class Platform:
         self.thread.start()
         self.servers = LocalDataServers(
             SETTINGS, folder=folder, settings_file=folder / "cdk.json", keys_file=folder / "keys.json",
-            store=f"dir:{store}", tell=self._tell,
+            store=f"dir:{store}", emit=self._emit,
         )  # fmt: skip
         self._call(self.servers.start())
 
-    def _tell(self, event: str, **details: object) -> None:
+    def _emit(self, event: str, **details: object) -> None:
         self.events.append((time.monotonic(), event))
         if event == "data-server-up":
             self.up.release()
@@ -78,7 +78,7 @@ def platform(tmp_path: Path) -> Iterator[Platform]:
 
 
 @pytest.mark.slow
-def test_uploads_survive_kills_in_their_middle_and_what_was_acknowledged_is_there(
+def test_uploads_survive_kills_and_acknowledged_objects_are_stored(
     platform: Platform, tmp_path: Path
 ) -> None:
     contents = [random.Random(n).randbytes(MIB) for n in range(UPLOADS)]
@@ -109,13 +109,11 @@ def test_uploads_survive_kills_in_their_middle_and_what_was_acknowledged_is_ther
             assert platform.up.acquire(timeout=20)
         digests = [each.result() for each in running]
 
-    back_s = [
-        up - down
-        for (down, what), (up, then) in zip(platform.events, platform.events[1:], strict=False)
-        if (what, then) == ("data-server-down", "data-server-up")
-    ]
+    ended = [at for at, event in platform.events if event == "data-server-down"]
+    started = [at for at, event in platform.events if event == "data-server-up"]
+    back_s = [up - down for down, up in zip(ended, started[1:], strict=True)]
     store = DirectoryStore(tmp_path / "store")
-    print(f"{len(digests)} uploads, 3 kills, back after {', '.join(f'{s:.2f}' for s in back_s)} s")
+    print(f"{len(digests)} uploads, 3 kills, ready again after {', '.join(f'{s:.2f}' for s in back_s)} s")
     assert digests == [digest_of(content) for content in contents]
     assert len(back_s) == 3
     assert max(back_s) <= 5.0
@@ -129,7 +127,7 @@ def test_uploads_survive_kills_in_their_middle_and_what_was_acknowledged_is_ther
     client.close()
 
 
-def test_an_upload_goes_on_from_the_part_that_was_stored(platform: Platform) -> None:
+def test_an_upload_resumes_after_the_last_stored_part(platform: Platform) -> None:
     content = random.Random(7).randbytes(2 * MIB)
     seen: list[int] = []
     assert platform.up.acquire(timeout=20)
@@ -143,13 +141,13 @@ def test_an_upload_goes_on_from_the_part_that_was_stored(platform: Platform) -> 
     client = platform.client()
     digest = client.upload(content, kill_at_half)
 
-    assert seen == list(range(0, 2 * MIB + 1, MIB // 4))  # no part went twice, none was lost
+    assert seen == list(range(0, 2 * MIB + 1, MIB // 4))  # no part was sent twice, none was lost
     assert client.download(digest) == content
     client.close()
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="mounting a small disk needs root")
-def test_a_full_disk_is_told_leaves_no_piece_and_is_over_when_there_is_room(tmp_path: Path) -> None:
+def test_a_full_disk_is_reported_and_leaves_no_partial_object(tmp_path: Path) -> None:
     disk = tmp_path / "disk"
     disk.mkdir()
     mounted = subprocess.run(
@@ -159,7 +157,11 @@ def test_a_full_disk_is_told_leaves_no_piece_and_is_over_when_there_is_room(tmp_
         pytest.skip("this machine does not let us mount a tmpfs")
     try:
         platform = Platform(tmp_path, disk / "store")
-        client = platform.client()
+    except BaseException:
+        subprocess.run(["umount", str(disk)], check=True)
+        raise
+    client = platform.client()
+    try:
         kept: list[str] = []
 
         def fill() -> None:
@@ -175,13 +177,13 @@ def test_a_full_disk_is_told_leaves_no_piece_and_is_over_when_there_is_room(tmp_
         assert client.download(kept[0]) == random.Random(0).randbytes(MIB // 4)
         client.delete(kept[0])
         assert client.upload(random.Random(99).randbytes(MIB // 4))
+    finally:
         client.close()
         platform.close()
-    finally:
         subprocess.run(["umount", str(disk)], check=True)
 
 
-def test_the_service_leaves_on_sigterm_with_exit_code_0_and_comes_again(platform: Platform) -> None:
+def test_the_service_ends_on_sigterm_and_is_replaced_on_the_same_port(platform: Platform) -> None:
     assert platform.up.acquire(timeout=20)
     port = platform.servers.port
 

@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 from aws.fleet.fake_machine import FakeMachine, FakeScaling
+from botocore.exceptions import ClientError
 
 from rse_pf.audit.log import record_once
 from rse_pf.audit.verify import check_folder
@@ -169,22 +170,19 @@ def test_a_terminating_instance_drains_once_and_publishes_nothing_more(tmp_path:
     assert counting.published == []
 
 
-def test_a_refused_hook_is_retried(setup: AgentSetup) -> None:
-    class Refusing:
-        def complete_lifecycle_action(self, **arguments: Any) -> None:
-            from botocore.exceptions import ClientError
-
-            raise ClientError({"Error": {"Code": "ValidationError"}}, "CompleteLifecycleAction")
+def test_a_refused_hook_is_retried(setup: AgentSetup, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(**arguments: Any) -> None:
+        raise ClientError({"Error": {"Code": "ValidationError"}}, "CompleteLifecycleAction")
 
     setup.machine.leaving = True
-    setup.agent._autoscaling, working = Refusing(), setup.scaling
-    setup.agent.step()
+    with monkeypatch.context() as patch:
+        patch.setattr(setup.scaling, "complete_lifecycle_action", refuse)
+        setup.agent.step()
     assert not setup.agent.has_left
-    setup.agent._autoscaling = working
     setup.agent.step()
 
     assert setup.agent.has_left
-    assert len(working.completed) == 1
+    assert len(setup.scaling.completed) == 1
 
 
 def test_a_server_that_is_down_fails_one_task_only(setup: AgentSetup) -> None:
