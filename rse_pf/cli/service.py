@@ -1,8 +1,8 @@
 """Write a service of your own, try it, and run it: in Python, C/C++ or Lua.
 
-new makes a folder with a working service; test replays its recorded requests inside the walls of a server;
-run serves it from a local platform until Ctrl-C and loads every saved change; install pins it for
-rse-pf local --services; call asks a running local platform.
+new creates a folder with a working service; test replays its recorded requests in a sandbox like those of a
+server; run serves it from a local platform until Ctrl-C and loads every saved change; install copies it for
+rse-pf local --services; call sends a request to a running local platform.
 
 examples:
   rse-pf service new centroid --lang lua
@@ -30,16 +30,19 @@ from typing import Any
 
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import CommandFailed, RsePfError, UsageError
+from rse_pf.local.state import read_state, state_folder
+from rse_pf.services.custom.installed import install, installed_services, read_service
+from rse_pf.services.custom.native import INCLUDE_FOLDER
 
 __all__ = ["add_arguments", "run"]
 
 Recorded = list[tuple[str, dict[str, Any]]]
-"""Names of files, and what they hold."""
+"""File name and content of each recorded request."""
 
 _ACTIONS = ("new", "test", "run", "install", "list", "call")
 _LANGUAGES = ("python", "cpp", "lua")
 _NAME = re.compile(r"[a-z][a-z0-9_-]{0,39}")
-_LOOK_AGAIN_S = 0.3
+_POLL_S = 0.3
 _DEFAULT_TOLERANCE = 1e-9
 _RECORDED_FIELDS = {"request", "reply", "tolerance", "failure"}
 
@@ -68,7 +71,8 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
         return _list(folder)
     if args.what is None:
         raise UsageError(
-            f"rse-pf service {args.action}: say which", hint=f"write rse-pf service {args.action} NAME"
+            f"rse-pf service {args.action} needs a name or folder",
+            hint=f"write rse-pf service {args.action} NAME",
         )
     if args.action == "new":
         return _new(args.what, args.lang, Path.cwd())
@@ -86,11 +90,10 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
 
 
 def _new(name: str, language: str, where: Path) -> int:
-    from rse_pf.services.custom.native import INCLUDE_FOLDER
-
     if not _NAME.fullmatch(name):
         raise UsageError(
-            f"{name[:60]!r} is no name for a service", hint="use 1 to 40 small letters, digits, - and _"
+            f"{name[:60]!r} is not a valid service name",
+            hint="use 1 to 40 lower-case letters, digits, - and _",
         )
     folder = where / name
     if folder.exists():
@@ -112,8 +115,6 @@ def _new(name: str, language: str, where: Path) -> int:
 
 
 def _install(source: Path, folder: Path) -> int:
-    from rse_pf.services.custom.installed import install, read_service
-
     _build(source)
     service = install(read_service(source).folder, folder)
     print(
@@ -124,8 +125,6 @@ def _install(source: Path, folder: Path) -> int:
 
 
 def _list(folder: Path) -> int:
-    from rse_pf.services.custom.installed import installed_services
-
     for service in installed_services(folder):
         print(f"{service.name:<24} {service.language:<8} {service.kind:<18} {service.folder}")
     return 0
@@ -134,15 +133,11 @@ def _list(folder: Path) -> int:
 def _services_folder(settings: PlatformSettings) -> Path:
     if settings.services.folder:
         return Path(settings.services.folder)
-    from rse_pf.local.state import state_folder
-
     return state_folder("default", os.environ).parent / "services"
 
 
 def _build(source: Path) -> None:
     """Build a service that has a CMakeLists.txt and sources newer than its libraries."""
-    from rse_pf.services.custom.installed import read_service
-
     folder = read_service(source).folder
     if not (folder / "CMakeLists.txt").exists():
         return
@@ -156,8 +151,8 @@ def _build(source: Path) -> None:
     for command in (["cmake", "-S", ".", "-B", "build"], ["cmake", "--build", "build"]):
         done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
         if done.returncode != 0:
-            told = (done.stderr or done.stdout).strip()[-1500:]
-            raise CommandFailed(f"{' '.join(command)} failed:\n{told}", hint=f"mend it in {folder}")
+            output = (done.stderr or done.stdout).strip()[-1500:]
+            raise CommandFailed(f"{' '.join(command)} failed:\n{output}", hint=f"fix the sources in {folder}")
     print(f"built {folder / 'build'}")
 
 
@@ -172,28 +167,27 @@ def _mtimes(folder: Path, *, without: str) -> Iterable[float]:
 
 
 def _test(source: Path, settings: PlatformSettings) -> int:
-    from rse_pf.backend.sandbox.dry_run import try_service
-    from rse_pf.services.custom.installed import read_service
+    from rse_pf.backend.sandbox.dry_run import dry_run
     from rse_pf.wire import Failure
 
     _build(source)
     service, recorded = read_service(source), _recorded(source)
-    missing, trials = try_service(service, [each["request"] for _, each in recorded], settings, print)
+    missing, runs = dry_run(service, [each["request"] for _, each in recorded], settings, print)
     if missing:
-        print(f"note: this machine lacks walls that a server has: {', '.join(missing)}")
+        print(f"note: this machine lacks isolation that a server has: {', '.join(missing)}")
     wrong = 0
-    for (name, each), trial in zip(recorded, trials, strict=True):
-        answer, expected = trial.answer, each.get("reply")
+    for (name, each), each_run in zip(recorded, runs, strict=True):
+        answer, expected = each_run.answer, each.get("reply")
         if isinstance(answer, Failure):
-            told = f"{answer.code}: {answer.message}"
+            detail = f"{answer.code}: {answer.message}"
             good = each.get("failure") == answer.code
         else:
             tolerance = each.get("tolerance", _DEFAULT_TOLERANCE)
-            told = _difference(_plain(answer.reply), expected, tolerance) if "reply" in each else ""
-            good = "failure" not in each and not told
+            detail = _difference(_plain(answer.reply), expected, tolerance) if "reply" in each else ""
+            good = "failure" not in each and not detail
         wrong += not good
-        print(f"{name:<28} {'ok' if good else 'WRONG':<6} {trial.took_ms:8.1f} ms  {told}")
-    print(f"{len(trials) - wrong} of {len(trials)} recorded requests as expected")
+        print(f"{name:<28} {'ok' if good else 'WRONG':<6} {each_run.took_ms:8.1f} ms  {detail}")
+    print(f"{len(runs) - wrong} of {len(runs)} recorded requests as expected")
     return 1 if wrong else 0
 
 
@@ -203,7 +197,7 @@ def _recorded(source: Path) -> Recorded:
         try:
             each = json.loads(path.read_text(encoding="utf-8"))
         except ValueError as error:
-            raise UsageError(f"{path} is not JSON: {error}", hint="mend it") from error
+            raise UsageError(f"{path} is not JSON: {error}", hint="correct the file") from error
         if not isinstance(each, dict) or "request" not in each:
             raise UsageError(f"{path} holds no request", hint='write {"request": {...}, "reply": {...}}')
         found.append((path.name, each))
@@ -225,7 +219,7 @@ def _plain(value: Any) -> Any:
 
 
 def _difference(got: Any, expected: Any, tolerance: float, path: str = "reply") -> str:
-    """Return where *got* is not *expected*, or nothing."""
+    """Return the first difference of *got* from *expected*, "" if there is none."""
     if isinstance(expected, dict) and isinstance(got, dict):
         if set(got) != set(expected):
             return f"{path} has {', '.join(sorted(got))}, expected {', '.join(sorted(expected))}"
@@ -246,7 +240,6 @@ def _difference(got: Any, expected: Any, tolerance: float, path: str = "reply") 
 
 async def _run(source: Path, settings: PlatformSettings, *, once: bool) -> int:
     from rse_pf.local.control.platform import LocalPlatform
-    from rse_pf.services.custom.installed import install, read_service
 
     _build(source)
     service, recorded = read_service(source), _recorded(source)
@@ -259,48 +252,47 @@ async def _run(source: Path, settings: PlatformSettings, *, once: bool) -> int:
             asyncio.get_running_loop().add_signal_handler(number, stopped.set)
         async with LocalPlatform(
             chosen, state=place / "platform", servers=1, port=0, name="service"
-        ) as cloud:
-            print(f"{service.name} is served at {cloud.url}", flush=True)
-            good = await _ask_recorded(cloud, service, recorded, settings)
+        ) as platform:
+            print(f"{service.name} is served at {platform.url}", flush=True)
+            good = await _ask_recorded(platform, service, recorded, settings)
             if once:
                 return 0 if good else 1
             print(f"save a file in {source} to load it anew; Ctrl-C ends", flush=True)
             seen = max(_mtimes(service.folder, without="build"))
             while not stopped.is_set():
                 try:
-                    await asyncio.wait_for(stopped.wait(), _LOOK_AGAIN_S)
+                    await asyncio.wait_for(stopped.wait(), _POLL_S)
                 except asyncio.TimeoutError:
                     newest = max(_mtimes(service.folder, without="build"))
                     if newest > seen:
                         seen = newest
-                        await _reload(cloud, source, place / "services", recorded, settings)
+                        await _reload(platform, source, place / "services", recorded, settings)
     return 0
 
 
 async def _reload(
-    cloud: Any, source: Path, services: Path, recorded: Recorded, settings: PlatformSettings
+    platform: Any, source: Path, services: Path, recorded: Recorded, settings: PlatformSettings
 ) -> None:
-    from rse_pf.services.custom.installed import install, read_service
-
     try:
         _build(source)
         service = install(read_service(source).folder, services)
-        await cloud.roll()
-        await _ask_recorded(cloud, service, recorded, settings)
-    except RsePfError as error:  # the author mends it and saves again
+        await platform.roll()
+        await _ask_recorded(platform, service, recorded, settings)
+    except RsePfError as error:  # the author corrects it and saves again
         print(error.report(), flush=True)
 
 
-async def _ask_recorded(cloud: Any, service: Any, recorded: Recorded, settings: PlatformSettings) -> bool:
-    """Let a robot send every recorded request; return whether all were answered.
+async def _ask_recorded(platform: Any, service: Any, recorded: Recorded, settings: PlatformSettings) -> bool:
+    """Send every recorded request as a robot; return whether all were answered as expected.
 
-    A robot is not told why a service failed; its author is: the first such request is tried once more here.
+    Robots do not get the reason of a failure.  To show it to the author, the first failed request is repeated
+    in a dry run.
     """
     from client_sdk import connect
-    from rse_pf.backend.sandbox.dry_run import try_service
+    from rse_pf.backend.sandbox.dry_run import dry_run
 
     failed = []
-    async with connect(cloud.url, token=cloud.issue_token("robot-1")) as robot:
+    async with connect(platform.url, token=platform.issue_token("robot-1")) as robot:
         for path, each in recorded:
             try:
                 answer = await robot.call(service.name, each["request"])
@@ -312,14 +304,13 @@ async def _ask_recorded(cloud: Any, service: Any, recorded: Recorded, settings: 
             shown = json.dumps(_plain(answer.reply))
             print(f"{path}: {shown[:500]}  ({answer.round_trip_ms:.1f} ms)", flush=True)
     if failed:
-        await asyncio.to_thread(try_service, service, failed[:1], settings, lambda line: print(f"  {line}"))
+        await asyncio.to_thread(dry_run, service, failed[:1], settings, lambda line: print(f"  {line}"))
     return not failed
 
 
 async def _call(name: str, request: str | None, platform: str, settings: PlatformSettings) -> int:
     from client_sdk import connect
     from rse_pf.local.firewall import key_file, read_key
-    from rse_pf.local.state import read_state, state_folder
 
     payload, folder = _payload(request), state_folder(platform, os.environ)
     state = read_state(folder)
@@ -339,16 +330,13 @@ def _payload(request: str | None) -> Any:
     try:
         if text.startswith("@"):
             text = Path(text[1:]).read_text(encoding="utf-8")
-        told = json.loads(text)
+        payload = json.loads(text)
     except OSError as error:
         raise UsageError(f"cannot read {request}: {error.strerror}", hint="name a file after @") from error
     except ValueError as error:
         raise UsageError(
             f"--request is not JSON: {error}", hint="write --request '{\"points\": [0, 0, 1]}'"
         ) from error
-    recorded = (
-        isinstance(told, dict)
-        and "request" in told
-        and set(told) <= {"request", "reply", "tolerance", "failure"}
-    )
-    return told["request"] if recorded else told
+    if isinstance(payload, dict) and "request" in payload and set(payload) <= _RECORDED_FIELDS:
+        return payload["request"]
+    return payload

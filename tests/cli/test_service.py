@@ -46,7 +46,7 @@ def test_new_never_writes_over_a_folder(capsys: pytest.CaptureFixture[str]) -> N
 
 @pytest.mark.parametrize("name", ["../up", "Mine", "", "a b", "x" * 41])
 def test_a_name_that_could_be_a_path_is_refused(capsys: pytest.CaptureFixture[str], name: str) -> None:
-    assert "no name for a service" in complaint(capsys, "new", name)
+    assert "not a valid service name" in complaint(capsys, "new", name)
 
 
 def test_an_installed_service_is_listed_and_serves_no_more_once_changed(

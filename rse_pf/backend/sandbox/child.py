@@ -6,6 +6,7 @@ complete, and whatever a service raises becomes a typed failure.
 
 from __future__ import annotations
 
+import io
 import os
 import signal
 import socket
@@ -85,6 +86,8 @@ def _reset_process(output: int) -> None:
     null = os.open("/dev/null", os.O_RDWR)
     for fd, source in ((0, null), (1, output), (2, output)):
         os.dup2(source, fd)
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(line_buffering=True)  # a process that is killed flushes nothing
     os.environ.clear()
     os.environ.update(HOME="/scratch", TMPDIR="/scratch", PATH="/usr/bin", LANG="C.UTF-8")
 
