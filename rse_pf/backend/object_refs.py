@@ -1,9 +1,8 @@
-"""Put objects in the place of their names before a service is called, so that services stay pure.
+"""Replace references to stored objects in a payload by their bytes before a service is called.
 
-Where a request type declares ``bytes``, a robot may send ``{"object": DIGEST}`` instead: an object that it
-stored with the data service.  Promises that a robot reaches its own objects only (what is missing and what
-belongs to others look the same), that no more is read than the limits allow, and that a service sees only
-bytes whose digest is right.
+Where a request type declares ``bytes``, a robot may send ``{"object": DIGEST}`` instead, for an object that
+it stored with the data service.  A robot reaches only its own objects: a missing object and one of another
+robot give the same error.  A service gets only bytes whose digest is right.
 """
 
 from __future__ import annotations
@@ -18,7 +17,7 @@ from typing import Any, Protocol
 import msgspec
 
 from rse_pf.auth.tokens import Claims
-from rse_pf.backend.quota import quota_bytes, store_within
+from rse_pf.backend.robot_store import quota_bytes, store_within_quota
 from rse_pf.config import ServingSettings
 from rse_pf.errors import BadRequest, LimitExceeded, NotFound, QuotaExceeded, StoreError
 from rse_pf.object_store import ObjectStore, digest_of, object_name
@@ -30,31 +29,22 @@ __all__ = ["ObjectRefs", "named_in", "resolve", "takes_objects"]
 
 _KEY = "object"
 _DIGEST = re.compile(r"[0-9a-f]{64}")
-_DEEPEST = 8
-"""Request types that nest deeper (or in themselves) hold no objects below."""
-
-_Put = Callable[[Any], Any]
+_MAX_DEPTH = 8
+"""Below this depth, and in recursive types, references are not looked for."""
 
 
 def takes_objects(request_type: type[Any]) -> bool:
-    """Return whether *request_type* declares ``bytes`` anywhere, so that a name may stand there."""
+    """Return whether *request_type* declares ``bytes`` anywhere, so that a reference may stand there."""
     return _shape(request_type) is not None
 
 
 def named_in(request_type: type[Any], payload: Any) -> list[str]:
-    """Return the digests that *payload* names where *request_type* declares ``bytes``, in order.
+    """Return the digests that *payload* refers to where *request_type* declares ``bytes``, in order.
 
     Raises:
-        BadRequest: A name there is no sha256 in hex.
+        BadRequest: A reference there is no sha256 in hex.
     """
-    found: list[str] = []
-
-    def note(digest: str) -> str:
-        found.append(digest)
-        return digest
-
-    _walk(_shape(request_type), payload, note)
-    return found
+    return [_digest(reference) for reference in _references(_shape(request_type), payload)]
 
 
 def resolve(
@@ -66,9 +56,9 @@ def resolve(
     *,
     settings: ServingSettings,
 ) -> Any:
-    """Return *payload* with the robot's own objects in the place of their names; blocks for the store.
+    """Return *payload* with the robot's own objects in the place of the references; blocks for the store.
 
-    A payload that names nothing is returned as it is, and the store is not asked.
+    A payload without references is returned as it is, and the store is not asked.
 
     Args:
         request_type: What the service takes, a msgspec Struct.
@@ -79,9 +69,9 @@ def resolve(
         settings: ``max_objects_per_command`` and ``max_object_bytes_per_command``.
 
     Raises:
-        BadRequest: A name is no sha256 in hex.
+        BadRequest: A reference is no sha256 in hex.
         NotFound: The robot has no such object; another one may have.
-        LimitExceeded: More objects, or bytes in them, than one command may name.
+        LimitExceeded: More objects, or bytes in them, than one command may refer to.
         StoreError: The store fails, or holds other bytes than the digest says.
     """
     digests = list(dict.fromkeys(named_in(request_type, payload)))
@@ -89,14 +79,13 @@ def resolve(
         return payload
     if len(digests) > settings.max_objects_per_command:
         raise LimitExceeded(
-            f"{len(digests)} objects are named, at most {settings.max_objects_per_command} may be",
+            f"the command refers to {len(digests)} objects, above {settings.max_objects_per_command}",
             hint="put them into fewer commands",
         )
-    sizes = {digest: _size(store, object_name(tenant, robot, digest), digest) for digest in digests}
-    most = settings.max_object_bytes_per_command
-    if sum(sizes.values()) > most:
+    size = sum(_size(store, object_name(tenant, robot, digest), digest) for digest in digests)
+    if size > settings.max_object_bytes_per_command:
         raise LimitExceeded(
-            f"the named objects have {sum(sizes.values())} bytes, a command may name {most}",
+            f"the objects have {size} bytes, above {settings.max_object_bytes_per_command}",
             hint="put them into fewer commands",
         )
     held = {digest: _read(store, object_name(tenant, robot, digest), digest) for digest in digests}
@@ -104,7 +93,7 @@ def resolve(
 
 
 class Owner(Protocol):
-    """Whose objects."""
+    """The robot whose objects may be used."""
 
     robot: str
     tenant: str
@@ -113,20 +102,20 @@ class Owner(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class ObjectRefs:
-    """One worker's store and limits, as the command path uses them; without a store nothing is a name."""
+    """The store and limits of one worker; without a store, references are not resolved."""
 
     store: ObjectStore | None
     settings: ServingSettings
     quota_bytes: float = math.inf
-    """Of a robot whose token says nothing of it."""
+    """Quota of a robot whose token names none."""
 
     def named_by(self, command: Command, service: Service) -> bool:
         """Return whether the store would have to be asked; cheap for services that take no ``bytes``."""
         shape = None if self.store is None else _shape(service.request_type)
-        return shape is not None and any(True for _ in _names(shape, command.payload))
+        return shape is not None and any(True for _ in _references(shape, command.payload))
 
     def put_in(self, command: Command, registry: Registry, who: Owner) -> Command:
-        """Return *command* with what it names in its payload; blocks for the store.
+        """Return *command* with the bytes that its payload refers to; blocks for the store.
 
         Raises:
             UnknownService: The registry does not know the service.
@@ -141,9 +130,10 @@ class ObjectRefs:
         return msgspec.structs.replace(command, payload=payload)
 
     def kept(self, answer: Result | Failure, sent: Result | Failure, who: Owner) -> Result | Failure:
-        """Return *answer* with its reply named where it was too large and *sent* says so; blocks.
+        """Return *answer* with its reply stored, if *sent* says that the reply is too large; blocks for the
+        store.
 
-        Of a robot that has no room left, the failure that says so.
+        If the reply is beyond the robot's quota, return the failure that says so.
         """
         if self.store is None or not isinstance(answer, Result) or not isinstance(sent, Failure):
             return sent
@@ -154,47 +144,43 @@ class ObjectRefs:
             return sent
         max_bytes = quota_bytes(who.claims, self.quota_bytes)
         try:
-            digest = store_within(self.store, who.tenant, who.robot, reply, max_bytes)
+            digest = store_within_quota(self.store, who.tenant, who.robot, reply, max_bytes)
         except QuotaExceeded as error:
             return msgspec.structs.replace(sent, code=error.code, message=error.message, hint=error.hint)
         except StoreError:
-            return sent  # true, too, and says what to do
+            return sent  # the reply is too large in any case
         return msgspec.structs.replace(answer, reply=None, object=digest)
 
 
-# --- where names may stand -----------------------------------------------------------------------
+# --- where references may stand -----------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True)
 class _Bytes:
-    """Here."""
+    """A reference may stand here."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Each:
-    """In each item of a list, or in each value of a dict."""
+    """References may stand in each item of a list, or in each value of a dict."""
 
     below: Any
 
 
 @dataclass(frozen=True, slots=True)
 class _Fields:
-    """In these fields of a struct."""
+    """References may stand in these fields of a struct."""
 
     below: dict[str, Any]
 
 
-def _shape(request_type: Any) -> Any:
-    return _remembered_shape(request_type)
-
-
 @functools.lru_cache(maxsize=1024)
-def _remembered_shape(request_type: type[Any]) -> Any:
-    return _shape_of(msgspec.inspect.type_info(request_type), _DEEPEST)
+def _shape(request_type: Any) -> Any:
+    return _shape_of(msgspec.inspect.type_info(request_type), _MAX_DEPTH)
 
 
 def _shape_of(kind: Any, depth: int) -> Any:
-    """Return where below *kind* bytes are declared; None for nowhere."""
+    """Return where below *kind* bytes are declared; None if they are not."""
     known = msgspec.inspect
     if depth == 0:
         return None
@@ -218,21 +204,21 @@ def _shape_of(kind: Any, depth: int) -> Any:
     return None
 
 
-def _names(shape: Any, value: Any) -> Iterator[dict[str, Any]]:
-    """Yield what stands in the place of bytes and looks like a name."""
+def _references(shape: Any, value: Any) -> Iterator[dict[str, Any]]:
+    """Yield what stands in the place of bytes and looks like a reference."""
     if isinstance(shape, _Bytes):
         if isinstance(value, dict) and _KEY in value:
             yield value
     elif isinstance(shape, _Each) and isinstance(value, (list, tuple, dict)):
         for item in value.values() if isinstance(value, dict) else value:
-            yield from _names(shape.below, item)
+            yield from _references(shape.below, item)
     elif isinstance(shape, _Fields) and isinstance(value, dict):
         for name, below in shape.below.items():
             if name in value:
-                yield from _names(below, value[name])
+                yield from _references(below, value[name])
 
 
-def _walk(shape: Any, value: Any, put: _Put) -> Any:
+def _walk(shape: Any, value: Any, put: Callable[[Any], Any]) -> Any:
     """Return *value* with what *put* returns for each named digest; shares what it does not change."""
     if isinstance(shape, _Bytes):
         return put(_digest(value)) if isinstance(value, dict) and _KEY in value else value
@@ -250,7 +236,8 @@ def _digest(value: dict[str, Any]) -> str:
     digest = value[_KEY]
     if len(value) != 1 or not isinstance(digest, str) or not _DIGEST.fullmatch(digest):
         raise BadRequest(
-            "this names no object", hint='write {"object": "..."} with the sha256, 64 small hex digits'
+            "this is no reference to an object",
+            hint='write {"object": "..."} with the sha256, 64 small hex digits',
         )
     return digest
 

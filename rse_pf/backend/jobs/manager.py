@@ -23,7 +23,7 @@ from rse_pf.backend.jobs.lease import job_key
 from rse_pf.backend.jobs.record_gc import RecordCollector
 from rse_pf.backend.jobs.runner import WAITING, JobContext, JobOutcome, JobRequest, JobSignals, run_job
 from rse_pf.backend.ports import Log, Loop
-from rse_pf.backend.quota import quota_bytes
+from rse_pf.backend.robot_store import quota_bytes
 from rse_pf.backend.scheduling.scheduler import QueuedCommand
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import BadRequest, Busy, Cancelled, RsePfError

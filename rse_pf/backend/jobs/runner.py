@@ -17,7 +17,7 @@ from typing import Any, Literal, Protocol
 
 from rse_pf.backend.jobs.lease import MAX_TRIES, JobLease, JobRecord, record_name, verdict_on
 from rse_pf.backend.jobs.slots import JobSlots
-from rse_pf.backend.quota import store_within
+from rse_pf.backend.robot_store import store_within_quota
 from rse_pf.backend.sandbox.ipc import FrameReader, encode_message
 from rse_pf.config import ServingSettings
 from rse_pf.errors import (
@@ -322,7 +322,9 @@ class _JobRun:
         context, request, digest = self._context, self._request, digest_of(reply)
         try:
             self._retrying(
-                lambda: store_within(context.store, request.tenant, request.robot, reply, request.quota_bytes)
+                lambda: store_within_quota(
+                    context.store, request.tenant, request.robot, reply, request.quota_bytes
+                )
             )
         except QuotaExceeded as error:
             return self._failed(error)

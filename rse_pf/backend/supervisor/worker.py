@@ -33,7 +33,6 @@ from rse_pf.backend.gateway.migration import Migration
 from rse_pf.backend.gateway.queues import NoJobs, NoSandboxes
 from rse_pf.backend.gateway.token_watch import TokenWatch
 from rse_pf.backend.gateway.websocket import RobotSockets
-from rse_pf.backend.job_store import open_job_store
 from rse_pf.backend.jobs.manager import JobManager
 from rse_pf.backend.jobs.process import spawner
 from rse_pf.backend.jobs.runner import JobContext
@@ -42,6 +41,7 @@ from rse_pf.backend.log import JsonLog
 from rse_pf.backend.metrics import Metrics
 from rse_pf.backend.object_refs import ObjectRefs
 from rse_pf.backend.ports import Clocks
+from rse_pf.backend.robot_store import is_shared, open_server_store
 from rse_pf.backend.sandbox.manager import SandboxManager
 from rse_pf.backend.scheduling.cpu_throttle import CpuThrottle, NoThrottle
 from rse_pf.backend.scheduling.scheduler import Scheduler
@@ -66,8 +66,6 @@ __all__ = ["NUMBER_BYTES", "WorkerPlan", "event_loop_maker", "run_worker"]
 NUMBER_BYTES = 8
 """Length of a socket's number, which travels with its descriptor."""
 _POLL_S = 0.01
-_PRIVATE_STORE = "memory:"
-"""A store that no robot and no data server can reach, so that no command can refer to objects in it."""
 _MAX_LINE_BYTES = 1 << 26
 """A `TrustOrder` names every robot that is enrolled."""
 _CLOSE_TIMEOUT_S = 1.0
@@ -133,7 +131,7 @@ class _Worker:
         installed += published_services() if chosen.published else []
         clocks = Clocks(monotonic=time.monotonic, wall=time.time, cpu=time.process_time)
         metrics, connections = Metrics(), set[RobotConnection]()
-        store = None if settings.data.store == _PRIVATE_STORE else open_job_store(settings)
+        store = open_server_store(settings) if is_shared(settings) else None
         answers = Answers(
             registry=registry,
             services=frozenset(service.name for service in (*registry, *installed)),
@@ -206,7 +204,7 @@ class _Worker:
             settings=settings,
             max_sandboxes=-(-settings.services.max_sandboxes // plan.workers),
             server_id=plan.server_id,
-            store=open_job_store(settings),
+            store=open_server_store(settings),
             monotonic=time.monotonic,
             loop=self._loop,
             log=self._log,
@@ -217,7 +215,7 @@ class _Worker:
         settings = plan.settings
         read, write = plan.job_slots
         context = JobContext(
-            store=open_job_store(settings),
+            store=open_server_store(settings),
             slots=JobSlots((read, write)),
             settings=settings.serving,
             quota_bytes=settings.data.quota_bytes,

@@ -11,7 +11,7 @@ import pytest
 from rse_pf.auth.tokens import Claims
 from rse_pf.backend.jobs.process import store_reply
 from rse_pf.backend.object_refs import ObjectRefs
-from rse_pf.backend.quota import check_room, quota_bytes, store_within
+from rse_pf.backend.robot_store import check_quota, quota_bytes, store_within_quota
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import QuotaExceeded
 from rse_pf.object_store import DirectoryStore, MemoryStore, digest_of, object_name
@@ -47,13 +47,13 @@ def test_an_object_that_fits_exactly_is_stored_and_one_byte_more_is_not():
     store.put(object_name(*ROBOT, "own"), bytes(60))
 
     with pytest.raises(QuotaExceeded):
-        store_within(store, *ROBOT, bytes(41), 100)
-    digest = store_within(store, *ROBOT, bytes(40), 100)
+        store_within_quota(store, *ROBOT, bytes(41), 100)
+    digest = store_within_quota(store, *ROBOT, bytes(40), 100)
 
     assert store.get(object_name(*ROBOT, digest)) == bytes(40)
-    assert store_within(store, *ROBOT, bytes(40), 100) == digest
+    assert store_within_quota(store, *ROBOT, bytes(40), 100) == digest
     with pytest.raises(QuotaExceeded):
-        check_room(store, *ROBOT, 1, 100)
+        check_quota(store, *ROBOT, 1, 100)
 
 
 def test_a_large_reply_beyond_the_quota_is_refused_with_the_reason():

@@ -1,0 +1,69 @@
+"""The object store as a backend server uses it: opened from the settings, written within a robot's quota.
+
+The quota is that of the data service: ``data_bytes`` of the robot's token, or else ``data.quota_bytes``.
+Nothing is removed to make an object fit.
+"""
+
+from __future__ import annotations
+
+from rse_pf.auth.tokens import Claims
+from rse_pf.config import PlatformSettings
+from rse_pf.errors import NotFound, QuotaExceeded
+from rse_pf.object_store import ObjectStore, digest_of, object_name, open_store
+
+__all__ = ["check_quota", "is_shared", "open_server_store", "quota_bytes", "store_within_quota"]
+
+_PRIVATE_STORE = "memory:"
+
+
+def is_shared(settings: PlatformSettings) -> bool:
+    """Return whether other processes see what one process stores."""
+    return settings.data.store != _PRIVATE_STORE
+
+
+def open_server_store(settings: PlatformSettings) -> ObjectStore:
+    """Return the store of ``data.store``; raises UsageError for one that does not exist."""
+
+    def bucket(name: str) -> ObjectStore:
+        from rse_pf.aws.storage import open_bucket
+
+        return open_bucket(name, settings.cloud.region)
+
+    return open_store(settings.data.store, {"s3": bucket})
+
+
+def quota_bytes(claims: Claims | None, default: float) -> float:
+    """Return how much a robot may store: what its token says, or *default*."""
+    return (claims.quota("data_bytes") if claims is not None else None) or default
+
+
+def check_quota(store: ObjectStore, tenant: str, robot: str, size: int, max_bytes: float) -> None:
+    """Raise QuotaExceeded unless *size* more bytes fit; StoreError if the store fails.
+
+    Only stored objects are counted; the data service counts uploads that have begun.
+    """
+    used = sum(info.size for info in store.list(object_name(tenant, robot, "")))
+    if used + size > max_bytes:
+        raise QuotaExceeded(
+            f"{used} + {size} bytes are more than the quota of {max_bytes:.0f}",
+            hint="delete objects, or raise data.quota_bytes",
+        )
+
+
+def store_within_quota(store: ObjectStore, tenant: str, robot: str, data: bytes, max_bytes: float) -> str:
+    """Store *data* durably as an object of the robot, and return its digest.
+
+    An object that is stored already is not counted again.
+
+    Raises:
+        QuotaExceeded: It does not fit.
+        StoreError: The store fails.
+    """
+    digest = digest_of(data)
+    name = object_name(tenant, robot, digest)
+    try:
+        store.head(name)
+    except NotFound:
+        check_quota(store, tenant, robot, len(data), max_bytes)
+        store.put(name, data)
+    return digest
