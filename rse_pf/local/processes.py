@@ -7,20 +7,25 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import json
 import os
 import resource
 import select
 import signal
 import subprocess
+import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
+from rse_pf.errors import ConfigurationError
 from rse_pf.linux import die_with_parent
 
 __all__ = [
     "STOP_TIMEOUT_S",
     "ProcessMark",
+    "ServerProcess",
     "ended",
     "is_alive",
     "last_line",
@@ -31,6 +36,7 @@ __all__ = [
 ]
 
 _TAIL_BYTES = 8192
+_LOOK_AGAIN_S = 0.01
 STOP_TIMEOUT_S = 10.0
 """A process that has not ended so long after it was asked to is killed."""
 
@@ -129,6 +135,99 @@ def spawn(
     with contextlib.suppress(OSError):  # each robot needs two descriptors; the process may be gone already
         resource.prlimit(process.pid, resource.RLIMIT_NOFILE, (most, most))
     return process
+
+
+class ServerProcess:
+    """The process of one server with its log and announcement: started here, or adopted.
+
+    An adopted process was started by an earlier control plane and is no child of this one.
+    """
+
+    def __init__(self, name: str, folder: Path) -> None:
+        """Describe the process; its files in *folder* begin with *name*."""
+        self.name = name
+        self.log = folder / f"{name}.log"
+        self.announcement = folder / f"{name}.json"
+        self.mark: ProcessMark | None = None
+        self._folder = folder
+        self._child: subprocess.Popen[bytes] | None = None
+
+    def start(self, command: Sequence[str], *, dies_with_parent: bool) -> None:
+        """Start *command* as `spawn` does."""
+        self.announcement.unlink(missing_ok=True)
+        self.use(spawn(command, log=self.log, folder=self._folder, dies_with_parent=dies_with_parent))
+
+    def use(self, child: subprocess.Popen[bytes]) -> None:
+        """Take *child*, which was just started, for the process."""
+        self._child, self.mark = child, mark_of(child.pid)
+
+    @property
+    def pid(self) -> int:
+        """The id of the process, also of one that has ended; 0 if there was none."""
+        if self._child is not None:
+            return self._child.pid
+        return 0 if self.mark is None else self.mark.pid
+
+    def is_running(self) -> bool:
+        """Return whether the process is there."""
+        if self._child is not None:
+            return self._child.poll() is None
+        return self.mark is not None and is_alive(self.mark)
+
+    def send(self, number: signal.Signals) -> bool:
+        """Signal the process; return False if it is gone."""
+        return self.mark is not None and send_signal(self.mark, number)
+
+    async def wait_announced(self, timeout_s: float) -> dict[str, Any]:
+        """Return the announcement, once the process has written it.
+
+        Raises:
+            ConfigurationError: The process ended or was not ready in time, or another one announced itself.
+        """
+        end = time.monotonic() + timeout_s
+        while not self.announcement.exists():
+            if not self.is_running():
+                raise self.failed(self.ending())
+            if time.monotonic() >= end:
+                raise self.failed(f"was not ready within {timeout_s:g} s")
+            await asyncio.sleep(_LOOK_AGAIN_S)
+        document: dict[str, Any] = json.loads(self.announcement.read_text(encoding="utf-8"))
+        if self.mark is None or document["pid"] != self.mark.pid:
+            started = "nothing" if self.mark is None else self.mark.pid
+            raise self.failed(f"announced pid {document['pid']}, but was started as {started}")
+        return document
+
+    async def wait_over(self) -> int | None:
+        """Wait for the end; return the exit code (negative: the signal), None if the process was adopted."""
+        if self.mark is not None:
+            await ended(self.mark)
+        return None if self._child is None else self._child.wait()
+
+    async def stop(self, number: signal.Signals, timeout_s: float) -> None:
+        """Signal the process, and kill it if it has not ended after *timeout_s*."""
+        if self.mark is not None and self.send(number):
+            await ended(self.mark, timeout_s)
+        self.kill()
+
+    def kill(self) -> None:
+        """Kill the process, if it is there, reap it, and remove its announcement."""
+        self.send(signal.SIGKILL)
+        if self._child is not None:
+            self._child.kill()  # it may have ended before it had a mark
+            self._child.wait()
+        self.announcement.unlink(missing_ok=True)
+
+    def ending(self) -> str:
+        """Return how the process ended, as part of a sentence."""
+        code = None if self._child is None else self._child.poll()
+        return "ended" if code is None else f"ended with exit code {code}"
+
+    def failed(self, what: str) -> ConfigurationError:
+        """Return the error that says *what* happened, with the last line of the log."""
+        last = last_line(self.log)
+        return ConfigurationError(
+            f"{self.name} {what}{': ' if last else ''}{last}", hint=f"its log is {self.log}"
+        )
 
 
 def last_line(log: Path) -> str:

@@ -12,7 +12,6 @@ import json
 import os
 import signal
 import socket
-import subprocess
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -20,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from rse_pf.config import PlatformSettings
-from rse_pf.errors import ConfigurationError, MissingExtra
+from rse_pf.errors import MissingExtra
 from rse_pf.files import replace_json
 from rse_pf.local.balancer.envoy_config import (
     ADMIN_SOCKET,
@@ -30,7 +29,7 @@ from rse_pf.local.balancer.envoy_config import (
     endpoints,
     envoy_config,
 )
-from rse_pf.local.processes import ProcessMark, ended, is_alive, last_line, mark_of, send_signal, spawn
+from rse_pf.local.processes import ProcessMark, ServerProcess, last_line
 
 __all__ = ["EnvoyLoadBalancer", "TargetStats", "envoy_binary"]
 
@@ -62,16 +61,19 @@ class EnvoyLoadBalancer:
         self, settings: PlatformSettings, *, folder: Path, port: int, dies_with_parent: bool = True
     ) -> None:
         self.port = 0
-        self.mark: ProcessMark | None = None
-        self.log = folder / "load-balancer.log"
+        self.process = ServerProcess("load-balancer", folder)
         self._settings = settings
         self._folder = folder
         self._wanted_port = port
         self._dies_with_parent = dies_with_parent
         self._endpoints = folder / "endpoints.json"
         self._data_endpoints = folder / "data-endpoints.json"
-        self._process: subprocess.Popen[bytes] | None = None
         self._names: dict[int, str] = {}
+
+    @property
+    def mark(self) -> ProcessMark | None:
+        """The Envoy that runs now."""
+        return self.process.mark
 
     def launch(self) -> None:
         """Start the process without targets, and return before it listens.
@@ -93,14 +95,11 @@ class EnvoyLoadBalancer:
         config.write_text(json.dumps(made, indent=1), encoding="utf-8")
         command = [binary, "-c", str(config), "--concurrency", "1"]
         command += ["-l", "warning", "--disable-hot-restart"]
-        self._process = spawn(
-            command, log=self.log, folder=self._folder, dies_with_parent=self._dies_with_parent
-        )
-        self.mark = mark_of(self._process.pid)
+        self.process.start(command, dies_with_parent=self._dies_with_parent)
 
     def adopt(self, mark: ProcessMark | None, *, port: int) -> None:
         """Know the balancer of an earlier control plane, which may be gone; its port stays its port."""
-        self.mark, self.port = mark, port
+        self.process.mark, self.port = mark, port
 
     async def wait_live(self, timeout_s: float) -> None:
         """Wait until Envoy listens; sets ``port``.
@@ -119,11 +118,8 @@ class EnvoyLoadBalancer:
             return bool(listeners)
 
         if not await self._until(live, timeout_s):
-            code = None if self._process is None else self._process.poll()
-            what = f"did not start within {timeout_s:g} s" if code is None else f"ended with exit code {code}"
-            raise ConfigurationError(
-                f"the load balancer {what}: {last_line(self.log)}", hint=f"its log is {self.log}"
-            )
+            late = f"did not start within {timeout_s:g} s"
+            raise self.process.failed(late if self.is_running() else self.process.ending())
 
     def set_targets(self, targets: Sequence[Target]) -> None:
         """Let new sockets go to *targets* and nowhere else; open sockets stay where they are."""
@@ -158,29 +154,20 @@ class EnvoyLoadBalancer:
 
     def is_running(self) -> bool:
         """Return whether the process is there."""
-        if self._process is not None:
-            return self._process.poll() is None
-        return self.mark is not None and is_alive(self.mark)
+        return self.process.is_running()
 
     async def wait_over(self) -> str:
         """Wait until the process ends by itself; return the last line of its log."""
-        if self.mark is not None:
-            await ended(self.mark)
-        return last_line(self.log)
+        await self.process.wait_over()
+        return last_line(self.process.log)
 
     async def stop(self, timeout_s: float) -> None:
         """End the process, which cuts every socket; kill it after *timeout_s*."""
-        if self.mark is not None and send_signal(self.mark, signal.SIGTERM):
-            await ended(self.mark, timeout_s)
-        self.kill()
+        await self.process.stop(signal.SIGTERM, timeout_s)
 
     def kill(self) -> None:
         """End the process at once, if it is there, and reap it."""
-        if self.mark is not None:
-            send_signal(self.mark, signal.SIGKILL)
-        if self._process is not None:
-            self._process.kill()  # no mark: it ended before it could be identified
-            self._process.wait()
+        self.process.kill()
 
     def _targets(self, page: Mapping[str, Any]) -> dict[str, TargetStats]:
         found: dict[str, TargetStats] = {}

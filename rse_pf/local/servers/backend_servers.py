@@ -7,9 +7,7 @@ known are signalled.
 from __future__ import annotations
 
 import asyncio
-import json
 import signal
-import subprocess
 import sys
 import time
 from collections.abc import Sequence
@@ -19,9 +17,8 @@ from typing import Any
 
 from rse_pf.audit.log import audit_folder
 from rse_pf.auth.control_token import read_control_token
-from rse_pf.errors import ConfigurationError
 from rse_pf.local.balancer.envoy_config import Target
-from rse_pf.local.processes import ProcessMark, ended, is_alive, last_line, mark_of, send_signal, spawn
+from rse_pf.local.processes import ProcessMark, ServerProcess, mark_of
 from rse_pf.local.servers.control_client import ControlPort
 from rse_pf.local.servers.warm_standby import WarmStandby
 
@@ -74,8 +71,7 @@ class LocalBackendServers:
         self._control_token: str | None = None
         self._dies_with_parent = dies_with_parent
         self._program = tuple(program)
-        self._processes: dict[str, subprocess.Popen[bytes]] = {}
-        self._marks: dict[str, ProcessMark] = {}
+        self._processes: dict[str, ServerProcess] = {}
         self._standby: WarmStandby | None = None
         if warm_standby and self._program == RSE_PF:
             self._standby = WarmStandby(folder, dies_with_parent=dies_with_parent)
@@ -83,25 +79,23 @@ class LocalBackendServers:
     @property
     def marks(self) -> dict[str, ProcessMark]:
         """Every process that was launched and not yet ended by us, by server name."""
-        return dict(self._marks)
+        found = ((name, process.mark) for name, process in self._processes.items())
+        return {name: mark for name, mark in found if mark is not None}
 
     def launch(self, name: str) -> None:
         """Start the process of server *name*, and return before it listens."""
-        self._announce(name).unlink(missing_ok=True)
+        server = self._processes[name] = ServerProcess(name, self._folder)
+        server.announcement.unlink(missing_ok=True)
         command = ["serve", "--settings", str(self._settings_file), "--server-id", name]
-        command += ["--keys", str(self._keys_file), "--announce", str(self._announce(name))]
+        command += ["--keys", str(self._keys_file), "--announce", str(server.announcement)]
         command += ["--audit", str(audit_folder(self._folder))]
         if self._control_token_file is not None:
             command += ["--control-token", str(self._control_token_file)]
-        log = self._log(name)
-        process = None if self._standby is None else self._standby.take(command, log)
-        if process is None:
-            command = [*self._program, *command]
-            process = spawn(command, log=log, folder=self._folder, dies_with_parent=self._dies_with_parent)
-        self._processes[name] = process
-        mark = mark_of(process.pid)
-        if mark is not None:
-            self._marks[name] = mark
+        standby = None if self._standby is None else self._standby.take(command, server.log)
+        if standby is not None:
+            server.use(standby)
+        else:
+            server.start([*self._program, *command], dies_with_parent=self._dies_with_parent)
 
     def start_standby(self) -> bool:
         """Start one more process that becomes the next server, unless there is one; return whether it did."""
@@ -121,7 +115,8 @@ class LocalBackendServers:
 
     def adopt(self, name: str, mark: ProcessMark) -> None:
         """Know a server that an earlier control plane launched as *name*, ready or not."""
-        self._marks[name] = mark
+        self._processes[name] = ServerProcess(name, self._folder)
+        self._processes[name].mark = mark
 
     async def wait_ready(self, name: str, timeout_s: float) -> BackendServer:
         """Return server *name* once it has announced itself.
@@ -129,24 +124,14 @@ class LocalBackendServers:
         Raises:
             ConfigurationError: It ended or was not ready in time; its last log line is in the message.
         """
-        end = time.monotonic() + timeout_s
-        process, announce = self._processes.get(name), self._announce(name)
-        while not announce.exists():
-            if not self._runs(name):
-                code = None if process is None else process.poll()
-                raise self._failed(name, "ended" if code is None else f"ended with exit code {code}")
-            if time.monotonic() >= end:
-                raise self._failed(name, f"was not ready within {timeout_s:g} s")
-            await asyncio.sleep(_LOOK_AGAIN_S)
-        told = json.loads(announce.read_text(encoding="utf-8"))
-        mark = self._marks.get(name)
-        if mark is None or told["pid"] != mark.pid:
-            started = "nothing" if mark is None else mark.pid
-            raise self._failed(name, f"announced pid {told['pid']}, but was started as {started}")
+        process = self._processes[name]
+        told = await process.wait_announced(timeout_s)
+        mark = process.mark
+        assert mark is not None
         worker_marks = (mark_of(pid) for pid in told["workers"])
         return BackendServer(
             name=name, pid=mark.pid, port=told["port"], control_port=told["control_port"],
-            workers=tuple(told["workers"]), log=self._log(name), mark=mark,
+            workers=tuple(told["workers"]), log=process.log, mark=mark,
             worker_marks=tuple(worker for worker in worker_marks if worker is not None),
         )  # fmt: skip
 
@@ -168,62 +153,36 @@ class LocalBackendServers:
 
         None means that it is not known: the server was adopted, and is no child of this process.
         """
-        mark = self._marks.get(name)
-        if mark is not None:
-            await ended(mark)
         process = self._processes.get(name)
-        return None if process is None else process.wait()
+        return None if process is None else await process.wait_over()
 
     def send(self, name: str, number: signal.Signals) -> bool:
         """Signal server *name*; return False if it is gone."""
-        mark = self._marks.get(name)
-        return mark is not None and send_signal(mark, number)
+        process = self._processes.get(name)
+        return process is not None and process.send(number)
 
     def forget(self, name: str) -> None:
         """Drop a server whose process is over, and reap it; kills it first if it is not."""
-        self.send(name, signal.SIGKILL)
         process = self._processes.pop(name, None)
         if process is not None:
-            process.kill()  # a no-operation for one that was reaped
-            process.wait()
-        self._marks.pop(name, None)
-        self._announce(name).unlink(missing_ok=True)
+            process.kill()
 
     async def stop(self, timeout_s: float) -> None:
         """Let all servers leave at once, and kill what has not left after *timeout_s*."""
-        for name in self._marks:
-            self.send(name, signal.SIGINT)
-        await asyncio.gather(*(ended(mark, timeout_s) for mark in self._marks.values()))
+        stops = (process.stop(signal.SIGINT, timeout_s) for process in self._processes.values())
+        await asyncio.gather(*stops)
         self.kill_all()
 
     def kill_all(self) -> None:
         """End what is left, at once, and reap it."""
         if self._standby is not None:
             self._standby.close()
-        for name in {**self._marks, **self._processes}:
-            self.send(name, signal.SIGKILL)
-        for name in {**self._marks, **self._processes}:
+        for process in self._processes.values():
+            process.send(signal.SIGKILL)
+        for name in list(self._processes):
             self.forget(name)
 
     def _token(self) -> str | None:
         if self._control_token is None and self._control_token_file is not None:
             self._control_token = read_control_token(self._control_token_file)
         return self._control_token
-
-    def _runs(self, name: str) -> bool:
-        process, mark = self._processes.get(name), self._marks.get(name)
-        if process is not None:
-            return process.poll() is None
-        return mark is not None and is_alive(mark)
-
-    def _announce(self, name: str) -> Path:
-        return self._folder / f"{name}.json"
-
-    def _log(self, name: str) -> Path:
-        return self._folder / f"{name}.log"
-
-    def _failed(self, name: str, what: str) -> ConfigurationError:
-        last = last_line(self._log(name))
-        return ConfigurationError(
-            f"{name} {what}{': ' if last else ''}{last}", hint=f"its log is {self._log(name)}"
-        )

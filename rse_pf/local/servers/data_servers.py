@@ -7,13 +7,9 @@ A process that answers no health check any more is killed and replaced like one 
 from __future__ import annotations
 
 import asyncio
-import json
 import signal
-import subprocess
 import sys
-import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -22,11 +18,11 @@ from rse_pf.config import PlatformSettings
 from rse_pf.errors import ConfigurationError
 from rse_pf.linux import run_as_batch
 from rse_pf.local.balancer.envoy_config import Target
-from rse_pf.local.processes import ProcessMark, ended, is_alive, last_line, mark_of, send_signal, spawn
+from rse_pf.local.processes import ProcessMark, ServerProcess
 from rse_pf.local.servers.control_client import ControlPort
 from rse_pf.local.state import ServerState
 
-__all__ = ["NICENESS", "DataServerProcess", "LocalDataServers"]
+__all__ = ["NICENESS", "LocalDataServers"]
 
 _RSE_PF = (sys.executable, "-m", "rse_pf.cli.main")
 _LOOPBACK = "127.0.0.1"
@@ -36,17 +32,6 @@ _READY, _ALIVE = "/data/readyz", "/data/healthz"
 _FIRST_PAUSE_S, _MAX_PAUSE_S = 0.1, 5.0
 NICENESS = 10
 """Of the data server: on one machine poses go first."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class DataServerProcess:
-    """A data server that has announced itself."""
-
-    name: str
-    pid: int
-    port: int
-    log: Path
-    mark: ProcessMark
 
 
 class LocalDataServers:
@@ -82,30 +67,28 @@ class LocalDataServers:
                 ``data-server-down`` with name and code, ``data-server-silent`` and ``data-server-failed``.
         """
         self._settings = settings
-        self._folder = folder
-        self._name = name
         self._dies_with_parent = dies_with_parent
         self._replaces = replaces
         self._emit = emit
         self._port = 0
-        self._process: subprocess.Popen[bytes] | None = None
-        self._mark: ProcessMark | None = None
+        self._folder = folder
+        self._process = ServerProcess(name, folder)
         self._watching: asyncio.Task[None] | None = None
         self._command = [
             *program, "data", "--settings", str(settings_file), "--keys", str(keys_file),
-            "--host", _LOOPBACK, "--announce", str(self._announce), "--audit", str(audit_folder(folder)),
-            *(() if store is None else ("--store", store)),
+            "--host", _LOOPBACK, "--announce", str(self._process.announcement),
+            "--audit", str(audit_folder(folder)), *(() if store is None else ("--store", store)),
         ]  # fmt: skip
 
     @property
     def name(self) -> str:
         """Name of the process in log and events."""
-        return self._name
+        return self._process.name
 
     @property
     def mark(self) -> ProcessMark | None:
         """The process that runs now."""
-        return self._mark
+        return self._process.mark
 
     @property
     def port(self) -> int:
@@ -115,25 +98,25 @@ class LocalDataServers:
     @property
     def target(self) -> Target:
         """The service as the load balancer sees it."""
-        return Target(name=self._name, port=self._port, control_port=self._port)
+        return Target(name=self.name, port=self._port, control_port=self._port)
 
     @property
     def state(self) -> ServerState | None:
         """The entry of the state file; None if there is no process."""
-        mark = self._mark
-        return None if mark is None else ServerState(name=self._name, process=mark, port=self._port)
+        mark = self.mark
+        return None if mark is None else ServerState(name=self.name, process=mark, port=self._port)
 
     def document(self) -> list[dict[str, Any]]:
         """Return what is known of it, as plain JSON values."""
-        if self._mark is None:
+        if self.mark is None:
             return []
-        return [{"name": self._name, "pid": self._mark.pid, "port": self._port, "running": self.is_running()}]
+        return [{"name": self.name, "pid": self.mark.pid, "port": self._port, "running": self.is_running()}]
 
     def is_running(self) -> bool:
         """Return whether the process is there."""
-        return self._mark is not None and is_alive(self._mark)
+        return self._process.is_running()
 
-    async def start(self, port: int = 0) -> DataServerProcess:
+    async def start(self, port: int = 0) -> ServerState:
         """Start the process at *port* (0: a free one), wait until it answers, and watch it from then on.
 
         Raises:
@@ -152,7 +135,7 @@ class LocalDataServers:
 
     def adopt(self, mark: ProcessMark, port: int) -> None:
         """Watch the process of an earlier control plane, and replace it when it ends."""
-        self._mark, self._port = mark, port
+        self._process.mark, self._port = mark, port
         self._watching = asyncio.create_task(self._watch())
 
     async def is_ready(self) -> bool:
@@ -161,7 +144,7 @@ class LocalDataServers:
 
     def send(self, number: signal.Signals) -> bool:
         """Signal the process; return False if it is gone."""
-        return self._mark is not None and send_signal(self._mark, number)
+        return self._process.send(number)
 
     async def forget(self) -> None:
         """Stop watching, and leave the process running."""
@@ -173,49 +156,42 @@ class LocalDataServers:
     async def stop(self, timeout_s: float) -> None:
         """Let the service leave, and kill it after *timeout_s*."""
         await self.forget()
-        if self._mark is not None:
-            self.send(signal.SIGTERM)
-            await ended(self._mark, timeout_s)
+        await self._process.stop(signal.SIGTERM, timeout_s)
         self.kill_all()
 
     def kill_all(self) -> None:
         """End what is left, at once, and reap it."""
-        self.send(signal.SIGKILL)
-        if self._process is not None:
-            self._process.kill()  # a no-operation for one that was reaped
-            self._process.wait()
-        self._announce.unlink(missing_ok=True)
-        self._process = self._mark = None
+        self._process.kill()
+        self._process.mark = None
 
     async def _watch(self) -> None:
         pause_s = _FIRST_PAUSE_S
         while True:
-            if self._mark is not None:
-                await self._wait_ended(self._mark)
-            code = None if self._process is None else self._process.wait()
-            self._emit("data-server-down", name=self._name, code=code)
+            code = await self._wait_over()
+            self._emit("data-server-down", name=self.name, code=code)
             if not self._replaces:
                 return
             try:
                 await self._launch()
                 pause_s = _FIRST_PAUSE_S
             except ConfigurationError as error:
-                self._emit("data-server-failed", name=self._name, error=str(error))
+                self._emit("data-server-failed", name=self.name, error=str(error))
                 await asyncio.sleep(pause_s)
                 pause_s = min(2 * pause_s, _MAX_PAUSE_S)
                 self._port = 0  # another program may hold the old port
 
-    async def _wait_ended(self, mark: ProcessMark) -> None:
-        """Wait until the process has ended; kill it when it fails too many health checks."""
-        over = asyncio.ensure_future(ended(mark))
+    async def _wait_over(self) -> int | None:
+        """Wait for the end of the process and return its exit code; kill it when it fails too many checks."""
+        over = asyncio.ensure_future(self._process.wait_over())
         failed = 0
         try:
             while not over.done():
                 await asyncio.wait({over}, timeout=_ASK_S)
                 failed = 0 if await self._answers(_ALIVE) else failed + 1
                 if failed > self._settings.health.unhealthy_checks and self._replaces and not over.done():
-                    self._emit("data-server-silent", name=self._name, pid=mark.pid)
-                    send_signal(mark, signal.SIGKILL)
+                    self._emit("data-server-silent", name=self.name, pid=self._process.pid)
+                    self.send(signal.SIGKILL)
+            return over.result()
         finally:
             over.cancel()
 
@@ -223,52 +199,20 @@ class LocalDataServers:
         reply = await ControlPort(self._port).ask_once(path, timeout_s=_ASK_S)
         return reply is not None and reply.status == 200
 
-    async def _launch(self) -> DataServerProcess:
-        self._announce.unlink(missing_ok=True)
-        process = spawn(
-            [*self._command, "--port", str(self._port)],
-            log=self._log, folder=self._folder, dies_with_parent=self._dies_with_parent,
-        )  # fmt: skip
-        run_as_batch(process.pid, NICENESS)
-        self._process, self._mark = process, mark_of(process.pid)
-        self._emit("data-server-start", name=self._name, pid=process.pid)
+    async def _launch(self) -> ServerState:
+        command = [*self._command, "--port", str(self._port)]
+        self._process = ServerProcess(self.name, self._folder)
+        self._process.start(command, dies_with_parent=self._dies_with_parent)
+        pid = self._process.pid
+        run_as_batch(pid, NICENESS)
+        self._emit("data-server-start", name=self.name, pid=pid)
         try:
-            server = await self._announced(process)
-        except (ConfigurationError, asyncio.CancelledError):
-            process.kill()
-            process.wait()
+            told = await self._process.wait_announced(self._settings.local.start_timeout_s)
+        except BaseException:
+            self._process.kill()
             raise
-        self._port = server.port
-        self._emit("data-server-up", name=self._name, pid=server.pid, port=server.port)
-        return server
-
-    async def _announced(self, process: subprocess.Popen[bytes]) -> DataServerProcess:
-        timeout_s = self._settings.local.start_timeout_s
-        end = time.monotonic() + timeout_s
-        while not self._announce.exists():
-            code = process.poll()
-            if code is not None:
-                raise self._failed(f"ended with exit code {code}")
-            if time.monotonic() >= end:
-                raise self._failed(f"was not ready within {timeout_s:g} s")
-            await asyncio.sleep(_LOOK_AGAIN_S)
-        told: dict[str, Any] = json.loads(self._announce.read_text(encoding="utf-8"))
-        if self._mark is None or told["pid"] != self._mark.pid:
-            raise self._failed(f"announced pid {told['pid']}, but was started as {process.pid}")
-        return DataServerProcess(
-            name=self._name, pid=self._mark.pid, port=told["port"], log=self._log, mark=self._mark
-        )
-
-    @property
-    def _announce(self) -> Path:
-        return self._folder / f"{self._name}.json"
-
-    @property
-    def _log(self) -> Path:
-        return self._folder / f"{self._name}.log"
-
-    def _failed(self, what: str) -> ConfigurationError:
-        last = last_line(self._log)
-        return ConfigurationError(
-            f"{self._name} {what}{': ' if last else ''}{last}", hint=f"its log is {self._log}"
-        )
+        self._port = told["port"]
+        self._emit("data-server-up", name=self.name, pid=pid, port=self._port)
+        mark = self._process.mark
+        assert mark is not None
+        return ServerState(name=self.name, process=mark, port=self._port)

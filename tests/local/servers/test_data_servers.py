@@ -65,8 +65,8 @@ def test_a_server_that_dies_is_replaced_on_its_port(tmp_path: Path) -> None:
         await box.servers.stop(10.0)
 
         assert second is not None
-        assert second != first.mark
-        assert not is_alive(first.mark)
+        assert second != first.process
+        assert not is_alive(first.process)
         assert not is_alive(second)
         assert box.servers.mark is None
         assert (tmp_path / "starts").read_text() == "40001 dir:objects\n" * 2
@@ -79,7 +79,7 @@ def test_the_server_of_an_earlier_control_plane_is_adopted_and_replaced(tmp_path
     async def run() -> None:
         earlier, later = Box(tmp_path, _PROGRAM), Box(tmp_path, _PROGRAM)
         server = await earlier.servers.start()
-        later.servers.adopt(server.mark, server.port)
+        later.servers.adopt(server.process, server.port)
         await earlier.servers.forget()
 
         assert later.servers.send(9)  # type: ignore[arg-type]
@@ -98,8 +98,8 @@ def test_a_server_steps_back_behind_the_poses(tmp_path: Path) -> None:
         box = Box(tmp_path, _PROGRAM)
         server = await box.servers.start()
 
-        ours, its = os.getpriority(os.PRIO_PROCESS, 0), os.getpriority(os.PRIO_PROCESS, server.pid)
-        mine, policy = os.sched_getscheduler(0), os.sched_getscheduler(server.pid)
+        ours, its = os.getpriority(os.PRIO_PROCESS, 0), os.getpriority(os.PRIO_PROCESS, server.process.pid)
+        mine, policy = os.sched_getscheduler(0), os.sched_getscheduler(server.process.pid)
         await box.servers.stop(10.0)
 
         assert its == max(ours, NICENESS) > 0
@@ -116,7 +116,7 @@ def test_a_server_that_answers_nobody_is_ended_and_replaced(tmp_path: Path) -> N
 
         told = [await box.next(), await box.next(), await box.next()]
         assert told == ["data-server-silent", "data-server-down", "data-server-up"]
-        assert not is_alive(first.mark)
+        assert not is_alive(first.process)
         await box.servers.stop(10.0)
 
     asyncio.run(run())
@@ -174,7 +174,7 @@ def test_a_server_that_stays_is_killed(tmp_path: Path) -> None:
 
         await box.servers.stop(0.2)
 
-        assert not is_alive(server.mark)
+        assert not is_alive(server.process)
 
     asyncio.run(run())
 
