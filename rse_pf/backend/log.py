@@ -1,8 +1,8 @@
 """Write the server's log: one JSON object a line, off the hot path.
 
-Lines collect in memory and a thread of their own writes them, so that a slow disk or a full pipe
-never stops the event loop; what does not fit is counted and dropped.  Promises never to be given a
-payload or a token, and that a hostile string cannot break a line.
+Lines are collected in memory and written by a thread, so that a slow disk or a full pipe never stops the
+event loop; lines that do not fit are counted and dropped.  Payloads and tokens are never logged, and a
+hostile string cannot break a line.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _encode = msgspec.json.Encoder().encode
 
 
 class JsonLog:
-    """The log of one process; `info` and its siblings only append to a list."""
+    """The log of one process; its methods only append to a list."""
 
     def __init__(self, *, level: str, server: str, wall_clock: Callable[[], float], fd: int = 2) -> None:
         self.dropped = 0
@@ -48,7 +48,7 @@ class JsonLog:
         return _LEVELS[level] >= self._lowest
 
     def debug(self, event: str, **fields: Any) -> None:
-        """Write what only a developer wants."""
+        """Write what only developers need."""
         self._line("debug", event, fields)
 
     def info(self, event: str, **fields: Any) -> None:
@@ -64,7 +64,7 @@ class JsonLog:
         self._line("error", event, fields)
 
     def close(self, timeout_s: float = 1.0) -> None:
-        """Write what is held, waiting at most *timeout_s*."""
+        """Write the lines that are left, for at most *timeout_s*."""
         self._over = True
         self._wake.set()
         self._writer.join(timeout_s)

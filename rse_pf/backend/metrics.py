@@ -1,7 +1,7 @@
-"""Count what a worker does, add the workers up, and say it in Prometheus' words.
+"""Count what a worker does, add the workers up, and render the sums for Prometheus.
 
-A worker only adds to plain numbers; the supervisor asks for a `snapshot`, merges, and renders.
-Promises no robot id in any label, and to read no clock.
+A worker only adds to plain numbers; the supervisor asks for a `snapshot`, merges, and renders.  No label
+contains the id of a robot.
 """
 
 from __future__ import annotations
@@ -111,7 +111,7 @@ def merge(snapshots: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
 
 
 def merge_isolation(snapshots: Iterable[Mapping[str, Any] | None]) -> dict[str, Any]:
-    """Return what the workers say of isolated environments, added up; empty without installed services."""
+    """Return the workers' reports on sandboxes, added up; zero without installed services."""
     told = [snapshot["isolation"] for snapshot in snapshots if snapshot and "isolation" in snapshot]
     counts: Counter[str] = Counter()
     for each in told:
@@ -151,7 +151,7 @@ def render(merged: Mapping[str, Any]) -> bytes:
             for service, result, n in merged["requests"]:
                 requests.add_metric([service, result], n)
             yield requests
-            yield counter("shed", "commands refused for lack of time or room", "reason", merged["shed"])
+            yield counter("shed", "commands refused for lack of time or capacity", "reason", merged["shed"])
             yield counter("handshakes", "handshakes by result", "result", merged["handshakes"])
             yield counter("closed", "sockets closed by the server", "reason", merged["closed"])
             yield counter("bytes", "bytes of messages", "direction", merged["bytes"])

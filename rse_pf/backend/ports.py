@@ -1,6 +1,6 @@
-"""What a worker's core needs of the world: a socket, an event loop, clocks; tests bring their own.
+"""What the parts of a worker need of the outside: a socket, an event loop, a log and clocks.
 
-Promises to hold no code.
+Only protocols stand here; tests bring their own implementations.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ __all__ = ["Clocks", "Handle", "Log", "Loop", "Wire"]
 
 
 class Wire(Protocol):
-    """The socket of one robot, as the core sees it."""
+    """The socket of one robot."""
 
     def send(self, data: bytes, is_text: bool) -> None:
         """Write one message; does nothing on a socket that ended."""
@@ -22,27 +22,27 @@ class Wire(Protocol):
         """Write one pong frame."""
 
     def pause(self, seconds: float) -> None:
-        """Read nothing more for so long."""
+        """Read nothing more for *seconds*."""
 
     def hold(self) -> None:
-        """Read nothing more until as many `read_on` have come."""
+        """Read nothing more until `read_on` was called as often as this."""
 
     def read_on(self) -> None:
-        """Take one `hold` back."""
+        """End one `hold`."""
 
     def close(self, code: int, reason: str) -> None:
         """Write a close frame and end the connection."""
 
 
 class Handle(Protocol):
-    """A timer that can be taken back."""
+    """A timer that can be cancelled."""
 
     def cancel(self) -> None:
-        """Do not call."""
+        """Prevent the call."""
 
 
 class Loop(Protocol):
-    """What the core needs of an event loop."""
+    """What a worker needs of an event loop."""
 
     def call_later(self, delay: float, callback: Callable[[], object]) -> Handle:
         """Call *callback* in *delay* seconds."""
@@ -81,7 +81,7 @@ class Log(Protocol):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Clocks:
-    """The readings of time a worker takes: monotonic s, Unix s, CPU s of the process."""
+    """The clocks of a worker: monotonic s, Unix s, and CPU s of the process."""
 
     monotonic: Callable[[], float]
     wall: Callable[[], float]

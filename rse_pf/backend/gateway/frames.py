@@ -1,7 +1,7 @@
-"""Assemble WebSocket frames into messages, and say when a robot broke RFC 6455 or a limit.
+"""Assemble WebSocket frames into messages, and decide when a robot broke RFC 6455 or a limit.
 
-Frames and readings of the clock go in, decisions come out (`Received`, `SendPong`, `CloseSocket`).
-Promises no input or output, no clock, and never to hold more than one message of allowed size.
+Frames and times go in, decisions come out (`Received`, `SendPong`, `CloseSocket`).  At most one message of
+allowed size is held.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ FrameDecision = Received | SendPong | CloseSocket
 
 
 class FrameAssembler:
-    """What one socket has sent so far, between its messages and inside of one."""
+    """The frames of one socket, and the message that they are part of."""
 
     __slots__ = (
         "_control_at",
@@ -175,8 +175,8 @@ class FrameAssembler:
 class CloseBorder:
     """Find where the first CLOSE frame of a byte stream ends.
 
-    A parser that looks one frame ahead would answer garbage behind a CLOSE before the CLOSE itself
-    (RFC 6455, 5.5.1: nothing behind it counts).  This walks frame borders only; it judges nothing.
+    A parser that looks one frame ahead would answer invalid bytes behind a CLOSE before the CLOSE itself,
+    although nothing behind it counts (RFC 6455, 5.5.1).  Only the borders of frames are looked at here.
     """
 
     __slots__ = ("_head", "_is_close", "_left", "_upgraded", "shut")
@@ -194,7 +194,7 @@ class CloseBorder:
         return self._upgraded
 
     def wanted(self, data: memoryview) -> int:
-        """Return how many of the next bytes of the stream belong to the conversation."""
+        """Return how many of the next bytes of the stream stand before the end of the CLOSE frame."""
         if self.shut:
             return 0
         start = 0

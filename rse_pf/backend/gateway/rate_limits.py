@@ -15,7 +15,7 @@ from typing import Generic, TypeVar
 from rse_pf.config import ServingSettings, SessionSettings
 from rse_pf.token_bucket import TokenBucket
 
-__all__ = ["CutOff", "PendingHandshakes", "RobotRates", "SourceRates", "TokenBucket", "TooFast"]
+__all__ = ["CutOff", "PendingHandshakes", "RobotRates", "SourceRates", "TooFast"]
 
 _MAX_NAMES = 20000
 """Robots or addresses remembered at a time; those that did nothing wrong are forgotten first."""

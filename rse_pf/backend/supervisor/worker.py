@@ -30,7 +30,7 @@ from rse_pf.backend.gateway.decoder_thread import DecoderThread
 from rse_pf.backend.gateway.dispatcher import Dispatcher
 from rse_pf.backend.gateway.handshake import HandshakePolicy
 from rse_pf.backend.gateway.migration import Migration
-from rse_pf.backend.gateway.queues import NoJobs, NoSandboxes
+from rse_pf.backend.gateway.queues import NoQueue
 from rse_pf.backend.gateway.token_watch import TokenWatch
 from rse_pf.backend.gateway.websocket import RobotSockets
 from rse_pf.backend.jobs.manager import JobManager
@@ -173,8 +173,8 @@ class _Worker:
             answers=answers,
             sandboxes=self._sandboxes(plan, installed, answers)
             if chosen.folder or chosen.published
-            else NoSandboxes(),
-            jobs=self._jobs(plan, answers) if settings.serving.max_running_jobs else NoJobs(),
+            else NoQueue(),
+            jobs=self._jobs(plan, answers) if settings.serving.max_running_jobs else NoQueue(),
             token_watch=self._token_watch,
         )
         self._migration = Migration(connections, loop=loop, now=time.monotonic, choose=secrets.choice)

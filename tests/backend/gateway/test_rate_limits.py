@@ -12,10 +12,10 @@ from rse_pf.backend.gateway.rate_limits import (
     PendingHandshakes,
     RobotRates,
     SourceRates,
-    TokenBucket,
     TooFast,
 )
 from rse_pf.config import ServingSettings, SessionSettings
+from rse_pf.token_bucket import TokenBucket
 
 ROBOT = ("default", "r")
 LIMITS = SessionSettings(max_commands_per_s=20.0, command_burst=40, rate_ban_s=5.0)

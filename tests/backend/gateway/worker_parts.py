@@ -17,7 +17,7 @@ from rse_pf.backend.gateway.connection import RobotConnection
 from rse_pf.backend.gateway.decoder_thread import DecoderThread
 from rse_pf.backend.gateway.dispatcher import Dispatcher
 from rse_pf.backend.gateway.handshake import Accepted, HandshakePolicy
-from rse_pf.backend.gateway.queues import JobQueue, NoJobs, NoSandboxes, SandboxQueue
+from rse_pf.backend.gateway.queues import JobQueue, NoQueue, SandboxQueue
 from rse_pf.backend.gateway.token_watch import TokenWatch
 from rse_pf.backend.log import JsonLog
 from rse_pf.backend.metrics import Metrics
@@ -108,8 +108,8 @@ class WorkerParts:
             throttle=throttle if emulated_cores else NoThrottle(),
             decoder=self.decoder,
             answers=self.answers,
-            sandboxes=sandboxes or NoSandboxes(),
-            jobs=jobs or NoJobs(),
+            sandboxes=sandboxes or NoQueue(),
+            jobs=jobs or NoQueue(),
             token_watch=self.token_watch,
         )
 
