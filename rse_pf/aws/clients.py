@@ -29,6 +29,7 @@ MAX_S = 10.0
 _CONNECT_S, _READ_S = 1.0, 3.5
 FIRST_PAUSE_S = 0.1
 _THROTTLED = 429
+# Error codes of AWS that ask for a retry; most of them come with status 400.
 _TEMPORARY = frozenset(
     {
         "Throttling", "ThrottlingException", "ThrottledException", "RequestThrottled",
@@ -38,7 +39,6 @@ _TEMPORARY = frozenset(
         "TransactionInProgressException", "RequestTimeout", "RequestTimeoutException",
     }
 )  # fmt: skip
-"""Error codes of AWS that ask for a retry; most of them come with status 400."""
 
 T = TypeVar("T")
 

@@ -20,8 +20,8 @@ from rse_pf.object_store import ObjectStore, open_store
 
 __all__ = ["add_arguments", "open_any_store", "run"]
 
+# Options that are settings of the same name.
 _OPTIONS: dict[str, type] = {"host": str, "port": int, "store": str}
-"""Options that are settings of the same name."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

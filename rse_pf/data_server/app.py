@@ -111,18 +111,12 @@ class DataServer:
             trace = uuid.uuid4().hex
             line |= {"code": InternalError.code, "trace": trace, "error": repr(error)[:500]}
             reply = failure_reply(InternalError("the data server failed", hint=f"search its log for {trace}"))
-        if not request.is_complete and (reply.status == _REQUEST_TIMEOUT or not await self._drain(request)):
+        max_bytes = self._settings.data.part_bytes  # what is drained, so that the robot gets the reply
+        if not request.is_complete and (
+            reply.status == _REQUEST_TIMEOUT or not await request.drain(max_bytes)
+        ):
             reply = dataclasses.replace(reply, headers={**reply.headers, "Connection": "close"})
         return reply
-
-    async def _drain(self, request: HttpRequest) -> bool:
-        """Read the rest of a small body, so that the robot gets the reply before the connection closes."""
-        try:
-            return await request.drain(self._settings.data.part_bytes)
-        except Disconnected:
-            raise
-        except RsePfError:
-            return False
 
     async def _handle(self, request: HttpRequest, line: dict[str, Any]) -> HttpReply:
         route, handler, path = self._find(request)

@@ -132,12 +132,14 @@ class HttpRequest:
 
     async def drain(self, max_bytes: int) -> bool:
         """Read and discard the rest, so that the robot reads the reply; return whether all was read."""
-        announced = self.header_number("content-length") or 0
-        if announced > max_bytes:
-            return False
-        async for _ in self._pieces():
-            if self.received_bytes > max_bytes:
+        try:
+            if (self.header_number("content-length") or 0) > max_bytes:
                 return False
+            async for _ in self._pieces():
+                if self.received_bytes > max_bytes:
+                    return False
+        except (BadRequest, Expired):
+            return False
         return True
 
     async def _pieces(self) -> AsyncIterator[bytes]:

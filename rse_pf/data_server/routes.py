@@ -9,7 +9,8 @@ from __future__ import annotations
 import functools
 import json
 import re
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Any
 
 import msgspec
@@ -128,9 +129,8 @@ class Field:
     name: str
     place: str
     doc: str
-    whole_number: bool = False
     required: bool = False
-    maximum: int | None = None
+    schema: Mapping[str, Any] = field(default_factory=lambda: {"type": "string"})
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -156,16 +156,22 @@ class Route:
         return re.compile(re.sub(r"\\{(\w+)\\}", r"(?P<\1>[^/]*)", re.escape(self.path)))
 
 
+_WHOLE_NUMBER = {"type": "integer", "minimum": 0}
 _RANGE = Field(name="Range", place="header", doc="one range of bytes, as bytes=START-END")
 _OFFSET = Field(
-    name="Upload-Offset", place="header", doc="where this part begins", whole_number=True, required=True
+    name="Upload-Offset", place="header", doc="where this part begins", schema=_WHOLE_NUMBER, required=True
 )
 _DIRECT = Field(
     name="X-Accept-Direct", place="header",
-    doc="1: the answer may be 307 with a presigned URL in Location", whole_number=True,
+    doc="1: the answer may be 307 with a presigned URL in Location", schema=_WHOLE_NUMBER,
 )  # fmt: skip
 _AFTER = Field(name="after", place="query", doc="only objects with a greater digest")
-_LIMIT = Field(name="limit", place="query", doc="maximum number of objects", whole_number=True, maximum=1000)
+_LIMIT = Field(
+    name="limit",
+    place="query",
+    doc="maximum number of objects",
+    schema={"type": "integer", "minimum": 1, "maximum": 1000},
+)
 
 _BAD, _NOT_FOUND, _CONFLICT = {400: HttpFailure}, {404: HttpFailure}, {409: HttpFailure}
 _STORING = {408: HttpFailure, 413: HttpFailure, 503: HttpFailure, 507: HttpFailure}
@@ -263,9 +269,8 @@ ROUTES: tuple[Route, ...] = (
 )  # fmt: skip
 """All routes; the handler of each is the method named *operation*."""
 
-_DIGEST = {"type": "string", "pattern": "^[0-9a-f]{64}$"}
 _PATH_SCHEMAS: dict[str, dict[str, Any]] = {
-    "digest": _DIGEST,
+    "digest": {"type": "string", "pattern": "^[0-9a-f]{64}$"},
     "name": {"type": "string", "pattern": "^[a-z0-9][a-z0-9-]{0,63}$"},
     "version": {"type": "string", "pattern": "^(head|[0-9a-f]{6,64})$"},
 }
@@ -325,8 +330,17 @@ def _operation(route: Route) -> dict[str, Any]:
             str(status): _response(status, kind, route) for status, kind in sorted(replies.items())
         },
     }
-    parameters = [_path_parameter(name) for name in re.findall(r"{(\w+)}", route.path)]
-    parameters += [_parameter(field) for field in route.fields]
+    parameters = [
+        {"name": name, "in": "path", "required": True, "schema": _PATH_SCHEMAS[name]}
+        for name in re.findall(r"{(\w+)}", route.path)
+    ]
+    parameters += [
+        {
+            "name": each.name, "in": each.place, "required": each.required, "description": each.doc,
+            "schema": each.schema,
+        }
+        for each in route.fields
+    ]  # fmt: skip
     if parameters:
         made["parameters"] = parameters
     if route.body is not None:
@@ -353,20 +367,6 @@ def _content(kind: Any) -> dict[str, Any]:
         return {_JSON: {"schema": {"type": "object"}}}
     (schema,), _ = msgspec.json.schema_components([kind], ref_template="#/components/schemas/{name}")
     return {_JSON: {"schema": schema}}
-
-
-def _path_parameter(name: str) -> dict[str, Any]:
-    return {"name": name, "in": "path", "required": True, "schema": _PATH_SCHEMAS[name]}
-
-
-def _parameter(field: Field) -> dict[str, Any]:
-    schema: dict[str, Any] = {"type": "integer", "minimum": 0} if field.whole_number else {"type": "string"}
-    if field.maximum is not None:
-        schema |= {"minimum": 1, "maximum": field.maximum}
-    return {
-        "name": field.name, "in": field.place, "required": field.required, "description": field.doc,
-        "schema": schema,
-    }  # fmt: skip
 
 
 def _is_struct(kind: Any) -> bool:

@@ -85,7 +85,8 @@ def serve_data(
         timeout_keep_alive=30, timeout_graceful_shutdown=_STOP_TIMEOUT_S,
     )  # fmt: skip
     for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, _ignore)  # uvicorn repeats the signal to itself when it has ended
+        # uvicorn repeats the signal to itself when it has ended; the exit code is 0 all the same
+        signal.signal(number, lambda number, frame: None)
     try:
         asyncio.run(_run(uvicorn.Server(config), app, store, listening, settings, announce))
     finally:
@@ -121,10 +122,6 @@ def _audit_log(folder: Path, settings: PlatformSettings) -> AuditLog:
     ).open()  # fmt: skip
     log.start()
     return log
-
-
-def _ignore(number: int, frame: object) -> None:
-    """Let the process end by itself, with exit code 0."""
 
 
 async def _run(

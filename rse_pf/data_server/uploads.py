@@ -26,19 +26,12 @@ from rse_pf.object_store import (
     put_scratch,
 )
 
-__all__ = ["Objects", "check_digest"]
+__all__ = ["Objects"]
 
 _DIGEST = re.compile(r"[0-9a-f]{64}")
+# Other data servers write, too; their objects are counted after this.
 _RECOUNT_S = 60.0
-"""Other data servers write, too; their objects are counted after this."""
 _MAX_LOCKS = 4096
-
-
-def check_digest(text: str) -> str:
-    """Return *text* if it is a sha256 in hex; raises NotFound otherwise, because it names no object."""
-    if not _DIGEST.fullmatch(text):
-        raise NotFound("no such object", hint="objects are named by sha256, 64 hex digits")
-    return text
 
 
 class Objects:
@@ -68,8 +61,10 @@ class Objects:
         return info
 
     def name(self, claims: Claims, digest: str) -> str:
-        """Return the name of a robot's object in the store."""
-        return object_name(claims.tenant, claims.robot, check_digest(digest))
+        """Return the name of a robot's object in the store; raises NotFound if *digest* is no sha256."""
+        if not _DIGEST.fullmatch(digest):
+            raise NotFound("no such object", hint="objects are named by sha256, 64 hex digits")
+        return object_name(claims.tenant, claims.robot, digest)
 
     def list(self, claims: Claims, after: str, limit: int) -> tuple[list[ObjectInfo], bool]:
         """Return up to *limit* objects behind digest *after*, and whether there are more."""
@@ -114,8 +109,7 @@ class Objects:
         if self._find(name) is not None:
             with self._lock_of(name):
                 if self._opened(claims, digest) is not None:  # the robot uploaded it directly to the bucket
-                    self._drop_parts(claims, digest)
-                    self._forget_usage(claims)
+                    self._close(claims, digest)
             return self._state(digest, size, size)
         with self._lock_of(name):
             opened = self._opened(claims, digest)
@@ -179,8 +173,7 @@ class Objects:
     def abandon(self, claims: Claims, digest: str) -> None:
         """Remove an upload and its parts; a missing one is no error."""
         with self._lock_of(self.name(claims, digest)):
-            self._drop_parts(claims, digest)
-        self._forget_usage(claims)
+            self._close(claims, digest)
 
     def sweep(self) -> int:
         """Remove uploads of crashes and those older than ``data.upload_ttl_s``; return their number."""
@@ -209,15 +202,15 @@ class Objects:
                 buffer.write(self._store.get(part.name))
             whole = buffer.getvalue()
             if len(whole) != size or digest_of(whole) != digest:
-                self._drop_parts(claims, digest)
-                self._forget_usage(claims)
+                self._close(claims, digest)
                 raise BadRequest("the parts do not have the digest of the upload", hint="upload it again")
             self._store.put(name, whole)
-        self._drop_parts(claims, digest)
-        self._forget_usage(claims)
+        self._close(claims, digest)
 
-    def _drop_parts(self, claims: Claims, digest: str) -> None:
+    def _close(self, claims: Claims, digest: str) -> None:
+        """Remove an upload and its parts, and count the robot's usage anew."""
         self._drop(self._parts(claims, digest))
+        self._forget_usage(claims)
 
     def _drop(self, prefix: str) -> None:
         """Remove an upload; ``size`` first, because without it no upload is open, whatever a crash leaves."""

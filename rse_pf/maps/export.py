@@ -17,8 +17,8 @@ from rse_pf.maps.format import MapVersion
 
 __all__ = ["FORMATS", "export_map"]
 
+# g2o's rotation error is the vector part of a quaternion, half of our phi.
 _TO_G2O = np.diag([1.0, 1.0, 1.0, 2.0, 2.0, 2.0])
-"""g2o's rotation error is the vector part of a quaternion, half of our phi."""
 
 
 def export_map(version: MapVersion, kind: str, robot: str | None = None) -> bytes:

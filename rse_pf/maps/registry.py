@@ -20,7 +20,6 @@ from rse_pf.errors import BadRequest, Conflict, NotFound, StoreError
 from rse_pf.object_store import ObjectStore, digest_of, name_segment
 
 if TYPE_CHECKING:  # importing numpy takes a third of a data server's start, and only maps need it
-    from rse_pf.geometry import Array
     from rse_pf.maps.format import MapVersion
 
 __all__ = ["MapDiff", "MapRecord", "MapRegistry", "difference"]
@@ -28,8 +27,8 @@ __all__ = ["MapDiff", "MapRecord", "MapRegistry", "difference"]
 _NAME = re.compile(r"[a-z0-9][a-z0-9-]{0,63}")
 _ID = re.compile(r"[0-9a-f]{64}")
 _MIN_ID = 6
+# A keyframe that moved less has not moved: messages are rounded to more than this.
 _MOVED_M, _MOVED_DEG = 1e-3, 0.05
-"""A keyframe that moved less has not moved: messages are rounded to more than this."""
 
 
 class MapRecord(msgspec.Struct, frozen=True, kw_only=True):
@@ -226,9 +225,11 @@ class MapRegistry:
 
 def difference(before: MapVersion, after: MapVersion) -> MapDiff:
     """Return what *after* changed; a keyframe has moved if by more than 1 mm or 0.05 degrees."""
+    from rse_pf.geometry import pose_difference
+
     old = {keyframe.id: keyframe.T_world_camera for keyframe in before.keyframes}
     new = {keyframe.id: keyframe.T_world_camera for keyframe in after.keyframes}
-    moves = {each: _move(old[each], new[each]) for each in sorted(old.keys() & new.keys())}
+    moves = {each: pose_difference(old[each], new[each]) for each in sorted(old.keys() & new.keys())}
     old_edges = {(edge.a, edge.b, str(edge.kind)) for edge in before.edges}
     new_edges = {(edge.a, edge.b, str(edge.kind)) for edge in after.edges}
     return MapDiff(
@@ -242,15 +243,6 @@ def difference(before: MapVersion, after: MapVersion) -> MapDiff:
         points_before=len(before.points),
         points_after=len(after.points),
     )
-
-
-def _move(before: Array, after: Array) -> tuple[float, float]:
-    import numpy as np
-
-    from rse_pf.geometry import pose_difference
-
-    metres, degrees = pose_difference(before, after)
-    return float(np.asarray(metres)), float(np.asarray(degrees))
 
 
 def _moved(name: str) -> Conflict:

@@ -27,7 +27,7 @@ from rse_pf.auth.tokens import KeySet
 from rse_pf.auth.trust_store import DENY_NAME, REFRESH_S, ROBOTS_NAME
 from rse_pf.aws.clients import call_api, make_client
 from rse_pf.aws.fleet.drain_hook import leave_group
-from rse_pf.aws.fleet.instance import Instance, Machine
+from rse_pf.aws.fleet.instance import Instance
 from rse_pf.aws.fleet.metrics import ServerMetrics, datums, read_page
 from rse_pf.aws.storage.audit_ship import Shipper
 from rse_pf.aws.storage.s3_store import open_bucket
@@ -57,7 +57,7 @@ class Agent:
 
     def __init__(
         self,
-        machine: Machine,
+        machine: Instance,
         *,
         cloudwatch: Any,
         autoscaling: Any,
@@ -99,33 +99,31 @@ class Agent:
     def fetch_keys(self) -> None:
         """Write the public keys if they changed; an invalid key set is refused and the old one stays."""
         file = self._config.keys_file
-        try:
-            fresh = self._artifacts.get(self._config.keys_name)
-        except NotFound:
-            if not file.exists():
-                replace_file(file, b'{"keys":[]}\n')
-                self._log("no-keys", hint=_NO_KEYS)
-            return
-        if file.exists() and file.read_bytes() == fresh:
-            return
-        KeySet.from_json(fresh.decode("utf-8", "replace"))
-        replace_file(file, fresh)
-        self._log("keys", bytes=len(fresh))
+        exists = self._fetch(
+            self._config.keys_name, file, lambda data: KeySet.from_json(data.decode("utf-8", "replace"))
+        )
+        if not exists and not file.exists():
+            replace_file(file, b'{"keys":[]}\n')
+            self._log("no-keys", hint=_NO_KEYS)
 
     def fetch_access_control(self) -> None:
         """Write roster and deny list if they changed; a missing or invalid one changes nothing."""
-        for name, kind in ((ROBOTS_NAME, Roster), (DENY_NAME, DenyList)):
-            file = self._config.keys_file.parent / name
-            try:
-                fresh = self._artifacts.get(name)
-            except NotFound:
-                continue  # it was never written, or it was deleted and the servers keep what they know
-            if file.exists() and file.read_bytes() == fresh:
-                continue
-            from_json(fresh, kind)
+        folder = self._config.keys_file.parent
+        self._fetch(ROBOTS_NAME, folder / ROBOTS_NAME, lambda data: from_json(data, Roster))
+        self._fetch(DENY_NAME, folder / DENY_NAME, lambda data: from_json(data, DenyList))
+
+    def _fetch(self, name: str, file: Path, check: Callable[[bytes], object]) -> bool:
+        """Write the object *name* to *file* if it changed and passes *check*; return whether it exists."""
+        try:
+            fresh = self._artifacts.get(name)
+        except NotFound:
+            return False
+        if not file.exists() or file.read_bytes() != fresh:
+            check(fresh)
             file.parent.mkdir(exist_ok=True)
             replace_file(file, fresh)
-            self._log("access-control", name=name, bytes=len(fresh))
+            self._log("fetched", name=name, bytes=len(fresh))
+        return True
 
     def watch_access_control(self, sleep: Callable[[float], None] = time.sleep) -> None:
         """Fetch roster and deny list for ever; in a thread, because a drain blocks `step`."""
@@ -210,7 +208,7 @@ def main(arguments: list[str] | None = None) -> int:
         time.sleep(settings.cloud.poll_s)  # AWS does not notify an instance, so the agent polls
 
 
-def _shipper(args: argparse.Namespace, region: str, machine: Machine) -> Shipper | None:
+def _shipper(args: argparse.Namespace, region: str, machine: Instance) -> Shipper | None:
     if args.audit is None or args.audit_bucket is None:
         return None
     return Shipper(

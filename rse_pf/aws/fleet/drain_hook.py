@@ -9,7 +9,7 @@ from collections.abc import Callable
 from typing import Any
 
 from rse_pf.aws.clients import call_api
-from rse_pf.aws.fleet.instance import Machine
+from rse_pf.aws.fleet.instance import Instance
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import Disconnected
 from rse_pf.scaling.health import time_to_notice_s
@@ -17,8 +17,8 @@ from rse_pf.scaling.health import time_to_notice_s
 __all__ = ["leave_group", "wait_before_move_s"]
 
 _POLL_S = 0.5
+# Kept of the hook's time for the call that completes it, with its retries.
 _RESERVE_S = 15.0
-"""Kept of the hook's time for the call that completes it, with its retries."""
 
 
 def wait_before_move_s(settings: PlatformSettings) -> float:
@@ -27,7 +27,7 @@ def wait_before_move_s(settings: PlatformSettings) -> float:
 
 
 def leave_group(
-    machine: Machine,
+    machine: Instance,
     autoscaling: Any,
     *,
     group: str,

@@ -9,12 +9,11 @@ import http.client
 import urllib.error
 import urllib.request
 from pathlib import Path
-from typing import Protocol
 
 from rse_pf.auth.control_token import bearer, read_control_token
 from rse_pf.errors import Disconnected, UsageError
 
-__all__ = ["Instance", "Machine", "ServerControl"]
+__all__ = ["Instance"]
 
 _IMDS = "http://169.254.169.254/latest/"
 _TOKEN_TTL_S = "60"
@@ -22,35 +21,20 @@ _TIMEOUT_S = 2.0
 _NOT_FOUND = 404
 
 
-class Machine(Protocol):
-    """What the agent needs of an instance and its backend server."""
-
-    def instance_id(self) -> str:
-        """Return the instance's id; raises Disconnected."""
-
-    def is_leaving(self) -> bool:
-        """Return whether the group is ending this instance; raises Disconnected."""
-
-    def page(self) -> str:
-        """Return the server's /metrics; raises Disconnected when no server runs."""
-
-    def drain(self, wait_s: float) -> None:
-        """Tell the server to drain after *wait_s*; raises Disconnected when no server runs."""
-
-
-class ServerControl:
-    """The control port of the backend server on this machine; requests carry the token in *token_file*."""
+class Instance:
+    """This EC2 instance, with the control port of its backend server."""
 
     def __init__(self, port: int, token_file: Path | None = None) -> None:
+        """Make an instance whose server listens on *port* and expects the token in *token_file*, if any."""
         self._base = f"http://127.0.0.1:{port}"
         self._token_file = token_file
 
     def page(self) -> str:
-        """Return /metrics; raises Disconnected."""
+        """Return the server's /metrics; raises Disconnected when no server runs."""
         return self._ask("/metrics", "GET")
 
     def drain(self, wait_s: float) -> None:
-        """Tell the server to drain after *wait_s*; raises Disconnected."""
+        """Tell the server to drain after *wait_s*; raises Disconnected when no server runs."""
         self._ask(f"/drain?wait={wait_s:g}", "POST")
 
     def _ask(self, target: str, method: str) -> str:
@@ -61,10 +45,6 @@ class ServerControl:
             except UsageError as error:  # the token is made before the server starts, so no server runs
                 raise Disconnected(str(error)) from error
         return _ask(f"{self._base}{target}", method, headers)
-
-
-class Instance(ServerControl):
-    """This EC2 instance, with its server."""
 
     def instance_id(self) -> str:
         """Return the instance's id; raises Disconnected."""

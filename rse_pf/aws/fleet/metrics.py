@@ -20,8 +20,8 @@ ROBOTS = "Robots"
 _LINE = re.compile(r"^rse_pf_(\w+?)(?:\{(.*)\})? (\S+)$", flags=re.M)
 _LABEL = re.compile(r'(\w+)="([^"]*)"')
 _INF = "+Inf"
+# An answer slower than the last bound counts as twice that bound.
 _BEYOND = 2.0
-"""An answer slower than the last bound counts as twice that bound."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

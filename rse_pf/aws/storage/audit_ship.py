@@ -27,8 +27,8 @@ from rse_pf.object_store import ObjectStore
 __all__ = ["DIGEST_LETTERS", "Shipper", "piece_name"]
 
 DIGEST_LETTERS = 32
+# Of one piece: it uploads in about a second, and the agent holds at most two of them in memory.
 _MAX_BYTES = 1 << 23
-"""Of one piece: it uploads in about a second, and the agent holds at most two of them in memory."""
 _MAX_ATTEMPTS = 3
 
 

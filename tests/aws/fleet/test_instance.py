@@ -12,7 +12,7 @@ import pytest
 
 from rse_pf.auth.control_token import bearer, ensure_control_token, read_control_token
 from rse_pf.aws.fleet.agent import main
-from rse_pf.aws.fleet.instance import ServerControl
+from rse_pf.aws.fleet.instance import Instance
 from rse_pf.errors import Disconnected
 
 
@@ -46,7 +46,7 @@ def port() -> Iterator[int]:
 @pytest.mark.system
 def test_metrics_and_drain_are_requested_with_the_current_token(port: int, tmp_path: Path) -> None:
     file = tmp_path / "control.token"
-    control = ServerControl(port, file)
+    control = Instance(port, file)
     first = ensure_control_token(file, seed=b"a" * 32)
 
     assert control.page() == "numbers"
@@ -59,7 +59,7 @@ def test_metrics_and_drain_are_requested_with_the_current_token(port: int, tmp_p
 
 @pytest.mark.system
 def test_without_a_token_file_no_token_is_sent(port: int) -> None:
-    ServerControl(port).page()
+    Instance(port).page()
 
     assert _Port.heard == [("GET", "/metrics", None)]
 
@@ -67,7 +67,7 @@ def test_without_a_token_file_no_token_is_sent(port: int) -> None:
 @pytest.mark.system
 def test_a_missing_token_means_that_no_server_runs(port: int, tmp_path: Path) -> None:
     with pytest.raises(Disconnected, match="cannot read the control token"):
-        ServerControl(port, tmp_path / "none").page()
+        Instance(port, tmp_path / "none").page()
 
     assert _Port.heard == []
 
