@@ -49,7 +49,7 @@ def test_a_name_that_could_be_a_path_is_refused(capsys: pytest.CaptureFixture[st
     assert "not a valid service name" in complaint(capsys, "new", name)
 
 
-def test_an_installed_service_is_listed_and_serves_no_more_once_changed(
+def test_an_installed_service_is_listed_and_refused_after_a_change(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     main(["service", "new", "mine"])
@@ -77,7 +77,9 @@ def test_a_recorded_request_that_is_not_json_names_its_file(capsys: pytest.Captu
     assert "bad.json is not JSON" in complaint(capsys, "test", "mine")
 
 
-def test_a_folder_that_is_no_service_says_how_to_make_one(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_folder_that_is_not_a_service_is_refused_with_how_to_make_one(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     told = complaint(capsys, "test", "nothing-here")
     assert "rse-pf service new NAME" in told
 
@@ -105,7 +107,7 @@ def test_a_wrong_reply_fails_the_test_and_says_where(capsys: pytest.CaptureFixtu
 
 
 @pytest.mark.system
-def test_a_service_that_crashes_at_load_is_told_so(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_crash_of_a_service_while_loading_is_reported(capsys: pytest.CaptureFixture[str]) -> None:
     main(["service", "new", "mine"])
     Path("mine/service.py").write_text("raise ValueError('no table')\n")
     capsys.readouterr()
@@ -117,7 +119,9 @@ def test_a_service_that_crashes_at_load_is_told_so(capsys: pytest.CaptureFixture
 
 
 @pytest.mark.system
-def test_run_tells_the_author_why_and_the_robot_only_that(capsys: pytest.CaptureFixture[str]) -> None:
+def test_run_shows_the_reason_of_a_failure_to_the_author_and_not_to_the_robot(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     main(["service", "new", "mine"])
     Path("mine/service.py").write_text("def serve(:\n")
     capsys.readouterr()

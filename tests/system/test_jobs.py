@@ -1,4 +1,4 @@
-"""Long services as jobs, in real servers and processes: they outlive their server; nobody waits in vain."""
+"""Long services as jobs, in real servers and processes: they outlive their server, and every robot gets an answer."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def make(settings):
 
 
 class HandshakePolicy:
-    """A front door that leads to one server at a time."""
+    """A load balancer that forwards to one server at a time."""
 
     def __init__(self) -> None:
         self.target = 0
@@ -102,7 +102,7 @@ class HandshakePolicy:
 
 
 class Heard:
-    """What a robot was told, and a way to wait for it."""
+    """Progress that a robot was sent, and a way to wait for it."""
 
     def __init__(self) -> None:
         self.told: list[tuple[float, str]] = []
@@ -115,7 +115,7 @@ class Heard:
         self._more.set()
 
     async def until(self, what: str, within_s: float = 20.0) -> None:
-        """Return when *what* is said from now on."""
+        """Return when *what* is sent from now on."""
         self._more.clear()
         seen = len(self.told)
         until = time.monotonic() + within_s
@@ -162,7 +162,7 @@ def asked(robot: client_sdk.Robot, heard: Heard | None = None, **request: Any) -
 
 
 @in_a_loop
-async def test_a_job_runs_behind_everything_else_and_its_result_is_kept(platform, runs, tmp_path):
+async def test_a_job_runs_at_the_lowest_priority_and_its_result_is_stored(platform, runs, tmp_path):
     server, heard = platform(), Heard()
     async with client_sdk.connect(server.url, token=server.token()) as robot:
         task = asked(robot, heard, fill=3)
@@ -185,7 +185,7 @@ async def test_a_job_runs_behind_everything_else_and_its_result_is_kept(platform
 
 @pytest.mark.slow
 @in_a_loop
-async def test_a_reply_that_is_too_large_for_a_message_is_named(platform, tmp_path):
+async def test_a_reply_too_large_for_a_message_is_answered_with_its_object_name(platform, tmp_path):
     server = platform()
     (tmp_path / "job").touch()
     async with client_sdk.connect(server.url, token=server.token()) as robot:
@@ -218,7 +218,7 @@ async def test_a_job_ends_on_the_other_server_when_its_own_is_killed(platform, r
 
 @pytest.mark.slow
 @in_a_loop
-async def test_after_a_cut_the_robot_waits_for_the_same_run(platform, runs, tmp_path):
+async def test_after_a_reconnect_the_robot_waits_for_the_same_run(platform, runs, tmp_path):
     server, heard = platform(), Heard()
     async with HandshakePolicy() as door:
         door.target = server.port
@@ -236,7 +236,7 @@ async def test_after_a_cut_the_robot_waits_for_the_same_run(platform, runs, tmp_
 
 @pytest.mark.slow
 @in_a_loop
-async def test_a_drained_server_gives_its_jobs_up_at_once(platform, runs, tmp_path):
+async def test_a_draining_server_gives_up_its_jobs_at_once(platform, runs, tmp_path):
     first, second, heard = platform(job_lease_s=600.0), platform(job_lease_s=600.0), Heard()
     async with HandshakePolicy() as door:
         door.target = first.port
@@ -258,7 +258,7 @@ async def test_a_drained_server_gives_its_jobs_up_at_once(platform, runs, tmp_pa
     "deaf", [False, pytest.param(True, marks=pytest.mark.slow)], ids=["listens", "is deaf"]
 )
 @in_a_loop
-async def test_a_robot_that_takes_its_job_back_ends_it_within_a_second(platform, runs, gone, deaf):
+async def test_a_cancelled_job_ends_within_a_second(platform, runs, gone, deaf):
     server, heard = platform(), Heard()
     async with client_sdk.connect(server.url, token=server.token()) as robot:
         task = asked(robot, heard, deaf=deaf)
@@ -274,7 +274,7 @@ async def test_a_robot_that_takes_its_job_back_ends_it_within_a_second(platform,
 
 @pytest.mark.slow
 @in_a_loop
-async def test_taking_back_on_another_server_ends_the_job_where_it_runs(platform, runs, gone):
+async def test_a_cancel_on_another_server_ends_the_job_where_it_runs(platform, runs, gone):
     first, second, heard = platform(), platform(), Heard()
     async with (
         client_sdk.connect(first.url, token=first.token()) as one,
@@ -295,7 +295,7 @@ async def test_taking_back_on_another_server_ends_the_job_where_it_runs(platform
 
 @pytest.mark.parametrize("fate", ["crash", pytest.param("memory", marks=pytest.mark.slow)])
 @in_a_loop
-async def test_a_job_that_crashes_is_a_typed_failure_and_the_server_lives(platform, fate):
+async def test_a_job_that_crashes_is_a_typed_failure_and_the_server_keeps_running(platform, fate):
     server = platform()
     async with client_sdk.connect(server.url, token=server.token()) as robot:
         with pytest.raises(Crashed, match="SIGSEGV" if fate == "crash" else "memory"):
@@ -305,7 +305,7 @@ async def test_a_job_that_crashes_is_a_typed_failure_and_the_server_lives(platfo
 
 @pytest.mark.slow
 @in_a_loop
-async def test_one_job_runs_at_a_time_some_wait_and_more_are_refused(platform, runs, tmp_path):
+async def test_one_job_runs_at_a_time_a_limited_number_waits_and_more_are_refused(platform, runs, tmp_path):
     server, heard = platform(max_waiting_jobs=1), Heard()
     async with client_sdk.connect(server.url, token=server.token()) as robot:
         first = asked(robot, heard, name="a")
@@ -325,7 +325,7 @@ async def test_one_job_runs_at_a_time_some_wait_and_more_are_refused(platform, r
 
 @pytest.mark.slow
 @in_a_loop
-async def test_progress_comes_at_most_twice_a_second(platform, tmp_path):
+async def test_progress_is_sent_at_most_twice_a_second(platform, tmp_path):
     server, heard = platform(), Heard()
     async with client_sdk.connect(server.url, token=server.token()) as robot:
         task = asked(robot, heard)

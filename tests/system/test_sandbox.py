@@ -1,4 +1,4 @@
-"""Isolated environments on a real server: what a service may do to others, which is nothing."""
+"""Sandboxes of a real server: what a service cannot do to the server and to other robots."""
 
 from __future__ import annotations
 
@@ -109,7 +109,7 @@ HOSTILE_LUA = {
     "bytecode": "return load(string.dump(function() return 7 end))()",
 }
 HARMLESS = {"debug", "bytecode", "loadlib"}
-"""They may run: what they reach is the robot's own process, and system() cannot start a program there."""
+"""These may succeed: they reach the robot's own process only, where system() cannot start a program."""
 
 HOSTILE_CPP = """
 #include <fcntl.h>
@@ -167,7 +167,7 @@ def serve_isolated(start_server, services, tmp_path):
 
 
 def ask_all(server, robot_name, asks, deadline_ms=3000.0):
-    """Return what one robot is told, ask after ask."""
+    """Return the answers to one robot's requests, sent one after the other."""
 
     async def run():
         async with server.robot(token=server.token(robot_name)) as robot:
@@ -193,11 +193,11 @@ def children(pid):
 
 
 def until(condition, within_s=10.0):
-    """Wait until *condition* holds; return what it last said."""
+    """Wait until *condition* is true, with a deadline; return its last value."""
     end = time.monotonic() + within_s
-    while not (said := condition()) and time.monotonic() < end:
+    while not (value := condition()) and time.monotonic() < end:
         time.sleep(0.02)
-    return said
+    return value
 
 
 def test_each_robot_has_a_process_and_a_count_of_its_own(serve_isolated):
@@ -215,7 +215,7 @@ def test_each_robot_has_a_process_and_a_count_of_its_own(serve_isolated):
     assert asyncio.run(run()) == [1, 2, 1]
 
 
-def test_a_crash_is_one_typed_failure_and_nobody_else_notices(serve_isolated):
+def test_a_crash_is_one_typed_failure_and_does_not_affect_other_robots(serve_isolated):
     server = serve_isolated()
 
     async def run(crash):
@@ -230,14 +230,14 @@ def test_a_crash_is_one_typed_failure_and_nobody_else_notices(serve_isolated):
     for number, crash in enumerate(("segv", "abort", "leave"), 1):
         failure, after, other = asyncio.run(run(crash))
         assert isinstance(failure, Failure)
-        assert failure.code == "poison", "it was tried twice, and killed two environments"
+        assert failure.code == "poison", "it was tried twice, and crashed two sandboxes"
         assert isinstance(after, Result)
         assert other.reply["count"] == 2
         assert until(lambda: server.status()["isolation"]["counts"].get("crashed", 0) >= 2 * number)  # noqa: B023
         assert server.status()["isolation"]["counts"]["crashed"] == 2 * number
 
 
-def test_what_is_forbidden_is_a_typed_failure_and_the_server_lives(serve_isolated):
+def test_what_is_forbidden_is_a_typed_failure_and_the_server_keeps_running(serve_isolated):
     server = serve_isolated()
     before = server.status()["resident_bytes"]
     harms = ["exit", "leak", "big", "fork", "threads", "socket", "program", "write_code", "fill_disk"]
@@ -250,7 +250,7 @@ def test_what_is_forbidden_is_a_typed_failure_and_the_server_lives(serve_isolate
     assert server.status()["resident_bytes"] - before < 32 << 20
 
 
-def test_an_environment_sees_neither_keys_nor_others_nor_open_files(serve_isolated):
+def test_a_sandbox_sees_neither_keys_nor_other_processes_nor_open_files(serve_isolated):
     server = serve_isolated()
     asks = [("worker", {"do": what}) for what in ("read_keys", "others", "environment", "descriptors")]
     keys, others, environment, descriptors = (answer.reply["seen"] for answer in ask_all(server, "a", asks))
@@ -258,10 +258,10 @@ def test_an_environment_sees_neither_keys_nor_others_nor_open_files(serve_isolat
     assert keys == ""
     assert others in ("", "['1']")
     assert environment == "['HOME', 'LANG', 'PATH', 'TMPDIR']"
-    assert int(descriptors) <= 1, "the conversation, and nothing inherited"
+    assert int(descriptors) <= 1, "the IPC socket, and nothing inherited"
 
 
-def test_nobody_finds_what_another_robot_left_in_its_scratch_folder(serve_isolated):
+def test_a_robot_cannot_read_the_scratch_folder_of_another(serve_isolated):
     server = serve_isolated()
 
     async def run():
@@ -296,7 +296,7 @@ def test_an_endless_loop_is_expired_at_its_deadline_and_killed_at_twice_that(ser
     assert "too long" in died["reason"]
 
 
-def test_what_a_service_prints_is_in_the_log_in_bounds(serve_isolated):
+def test_what_a_service_prints_is_logged_up_to_a_limit(serve_isolated):
     server = serve_isolated()
     (answer,) = ask_all(server, "robot-1", [("worker", {"do": "shout"})], deadline_ms=5000.0)
 
@@ -305,7 +305,7 @@ def test_what_a_service_prints_is_in_the_log_in_bounds(serve_isolated):
     assert len(server.text) < 200 * 600
 
 
-def test_one_poison_request_costs_two_environments_however_often_it_comes(serve_isolated):
+def test_a_poison_request_crashes_two_sandboxes_however_often_it_is_sent(serve_isolated):
     server = serve_isolated()
     asks = [("worker", {"do": "segv"})] * 5 + [("worker", {"do": "look"})] * 20
     answers = ask_all(server, "robot-1", asks)
@@ -316,7 +316,7 @@ def test_one_poison_request_costs_two_environments_however_often_it_comes(serve_
     assert server.status()["isolation"]["counts"]["crashed"] == 2
 
 
-def test_a_service_that_crashes_again_and_again_rests_and_readyz_says_so(serve_isolated):
+def test_a_service_that_crashes_repeatedly_opens_its_circuit_breaker_and_readyz_reports_it(serve_isolated):
     server = serve_isolated(breaker_crashes=3, poison_crashes=1)
     asks = [("worker", {"do": what}) for what in ("segv", "abort", "leave", "look")]
     answers = ask_all(server, "robot-1", asks)
@@ -324,22 +324,22 @@ def test_a_service_that_crashes_again_and_again_rests_and_readyz_says_so(serve_i
     assert answers[3].code == "worker-lost"
     assert answers[3].retry_after_ms > 1000
     status, _, body = server.http("/readyz")
-    assert status == 200, "the server itself is well"
+    assert status == 200, "the server itself is healthy"
     assert json.loads(body)["open_breakers"] == ["worker"]
 
 
-def test_an_environment_goes_with_its_robot_and_leaves_nothing(serve_isolated):
+def test_a_sandbox_ends_with_its_robot_and_leaves_no_process_or_descriptor(serve_isolated):
     server = serve_isolated()
     (worker,) = server.workers
-    template = children(worker)
+    zygote = children(worker)
     descriptors = len(os.listdir(f"/proc/{worker}/fd"))
     ask_all(server, "robot-1", [("worker", {"do": "leave_note"}), ("counter", {})])
 
-    assert until(lambda: children(worker) == template)
+    assert until(lambda: children(worker) == zygote)
     assert until(lambda: len(os.listdir(f"/proc/{worker}/fd")) <= descriptors)
 
 
-def test_a_reconnect_within_the_grace_keeps_the_state_without_any_store(serve_isolated):
+def test_a_reconnect_within_the_grace_period_keeps_the_state_without_a_store(serve_isolated):
     server = serve_isolated(grace_s=5.0)
 
     first = ask_all(server, "robot-1", [("worker", {}), ("worker", {})])
@@ -349,7 +349,7 @@ def test_a_reconnect_within_the_grace_keeps_the_state_without_any_store(serve_is
     assert second[0].reply["count"] == 3
 
 
-def test_state_survives_the_death_of_its_server(serve_isolated, gone):
+def test_state_survives_the_crash_of_its_server(serve_isolated, gone):
     first = serve_isolated()
     assert ask_all(first, "robot-1", [("counter", {}), ("counter", {})])[-1].reply["count"] == 2
     pids = [first.process.pid, *children(first.process.pid)]
@@ -360,7 +360,7 @@ def test_state_survives_the_death_of_its_server(serve_isolated, gone):
     assert ask_all(second, "robot-1", [("counter", {})])[0].reply["count"] == 3
 
 
-def test_an_environment_whose_state_went_on_elsewhere_answers_with_no_older_count(serve_isolated):
+def test_a_sandbox_whose_state_was_changed_on_another_server_does_not_answer_with_older_state(serve_isolated):
     first, second = serve_isolated(), serve_isolated()
 
     async def run():
@@ -374,7 +374,7 @@ def test_an_environment_whose_state_went_on_elsewhere_answers_with_no_older_coun
     assert (getattr(stale, "code", stale), after.reply["count"]) == ("worker-lost", 3)
 
 
-def test_more_robots_than_environments_are_busy_and_come_in_when_one_leaves(serve_isolated):
+def test_robots_beyond_the_capacity_are_busy_until_another_robot_leaves(serve_isolated):
     server = serve_isolated(max_sandboxes=2)
 
     async def run():
@@ -396,7 +396,7 @@ def test_more_robots_than_environments_are_busy_and_come_in_when_one_leaves(serv
     assert busy.retry_after_ms > 0
 
 
-def test_the_template_may_die_and_robots_go_on(serve_isolated):
+def test_robots_are_served_again_after_the_zygote_was_killed(serve_isolated):
     server = serve_isolated()
     (worker,) = server.workers
 
@@ -411,7 +411,7 @@ def test_the_template_may_die_and_robots_go_on(serve_isolated):
     assert asyncio.run(asyncio.wait_for(run(), 10)) >= 2
 
 
-def test_hostile_lua_is_held(start_server, tmp_path):
+def test_hostile_lua_stays_in_its_sandbox(start_server, tmp_path):
     for name, script in HOSTILE_LUA.items():
         source = f"return function(request) return {{got = (function() {script} end)()}} end"
         install(written(tmp_path, name, "lua", "service.lua", source), tmp_path / "s")
@@ -429,7 +429,7 @@ def test_hostile_lua_is_held(start_server, tmp_path):
         assert ask_all(server, "bystander", [("echo", {"value": 1})])[0].reply == {"value": 1}
 
 
-def test_a_hostile_library_is_held(start_server, tmp_path):
+def test_a_hostile_library_stays_in_its_sandbox(start_server, tmp_path):
     compiler = shutil.which("c++")
     if compiler is None:
         pytest.skip("no compiler for C++ is installed")
@@ -454,7 +454,7 @@ def test_a_hostile_library_is_held(start_server, tmp_path):
 
 
 @pytest.mark.skipif(os.getuid() != 0, reason="needs root, to become a plain user")
-def test_the_same_walls_stand_for_a_plain_user(tmp_path):
+def test_a_plain_user_has_the_same_isolation(tmp_path):
     python = shutil.which("python3", path="/usr/bin")
     if python is None or shutil.which("setpriv") is None:
         pytest.skip("no python3 outside of this user's home, or no setpriv")
@@ -496,7 +496,7 @@ print(os.getuid(), isolation.missing_isolation(tries))
     assert done.stdout.strip() == "12345 []", done.stderr
 
 
-def test_without_a_services_folder_there_is_no_template(start_server):
+def test_without_a_services_folder_there_is_no_zygote(start_server):
     server = start_server()
 
     assert children(server.workers[0]) == []

@@ -1,4 +1,4 @@
-"""Turns: robots share them, whoever asks for most, and nobody waits for ever."""
+"""Robots take turns, however many jobs one of them asks for, and each is served in the end."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def test_a_robot_with_twenty_jobs_gets_every_other_turn_while_another_waits():
     assert line.first() is None
 
 
-def test_one_robots_jobs_run_in_the_order_of_asking():
+def test_the_jobs_of_one_robot_run_in_the_order_of_arrival():
     line = FairQueue()
     for number in range(3):
         line.add(number, A)
@@ -45,7 +45,7 @@ def test_one_robots_jobs_run_in_the_order_of_asking():
     assert seen == [0, 1, 2]
 
 
-def test_who_comes_late_waits_for_one_turn_of_each_other_and_makes_up_for_nothing():
+def test_a_new_robot_waits_for_one_turn_of_each_other_and_gets_no_extra_turns():
     line = FairQueue()
     for number in range(9):
         line.add(f"a{number}", A)
@@ -58,7 +58,7 @@ def test_who_comes_late_waits_for_one_turn_of_each_other_and_makes_up_for_nothin
     assert order(line, 6) == "bacbac"
 
 
-def test_tickets_that_leave_cost_their_robot_no_turn():
+def test_removed_tickets_cost_their_robot_no_turn():
     line = FairQueue()
     for number in range(9):
         line.add(f"a{number}", A)
@@ -100,14 +100,14 @@ def test_while_two_robots_wait_neither_gets_two_turns_more(comers: list[RobotId]
         assert not waiting or max(waiting) - min(waiting) <= 1
 
 
-def test_the_newest_waiting_job_of_who_has_most_makes_room():
+def test_the_newest_waiting_job_of_the_robot_with_most_jobs_is_displaced():
     jobs = [(A, False), (A, True), (B, True), (A, True), (B, True), (B, False)]
 
     assert job_to_displace(jobs, C) == 4
     assert job_to_displace([*jobs, (A, True)], C) == 6
 
 
-def test_nobody_makes_room_for_who_has_as_many_or_one_less():
+def test_no_job_is_displaced_for_a_robot_with_as_many_or_one_less():
     assert job_to_displace([(A, True), (A, True)], A) is None
     assert job_to_displace([(A, True), (A, True), (B, True)], B) is None
     assert job_to_displace([(A, True)], B) is None

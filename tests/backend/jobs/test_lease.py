@@ -1,4 +1,4 @@
-"""Who works on a job: one of all who want it, and another one when that one is gone."""
+"""The lease of a job: one owner at a time, and another one when it stops renewing."""
 
 from __future__ import annotations
 
@@ -56,13 +56,13 @@ def verdict(lease: JobLease) -> str:
         (JobRecord(state="failed", owner="a", code="crashed"), 0.0, False, "take"),
     ],
 )
-def test_the_record_says_what_to_do(record, unchanged_s, is_watched, expected):
+def test_the_verdict_follows_from_the_record(record, unchanged_s, is_watched, expected):
     found = verdict_on(record, unchanged_s=unchanged_s, lease_s=LEASE_S, is_watched=is_watched)
 
     assert found == expected
 
 
-def test_of_two_who_want_a_job_one_gets_it(store, clock):
+def test_of_two_processes_that_take_a_job_one_succeeds(store, clock):
     one, other = looked(store, "one", clock), looked(store, "other", clock)
 
     assert [one.take(), other.take()] == [True, False]
@@ -90,7 +90,7 @@ def test_an_owner_that_renews_keeps_the_job_and_one_that_does_not_loses_it(store
     assert verdict(other) == "follow"
 
 
-def test_who_looks_for_the_first_time_waits_a_whole_lease(store, clock):
+def test_a_process_that_reads_a_record_for_the_first_time_waits_a_whole_lease(store, clock):
     looked(store, "one", clock).take()
     clock.now += 1000.0
 
@@ -99,7 +99,7 @@ def test_who_looks_for_the_first_time_waits_a_whole_lease(store, clock):
     assert verdict(late) == "follow"
 
 
-def test_deaths_are_counted_but_not_what_ended_in_an_orderly_way(store, clock):
+def test_crashes_of_owners_are_counted_but_not_orderly_ends(store, clock):
     for number in range(MAX_TRIES):
         lease = looked(store, f"owner-{number}", clock)
         clock.now += LEASE_S
@@ -119,7 +119,7 @@ def test_deaths_are_counted_but_not_what_ended_in_an_orderly_way(store, clock):
     assert last.record.tries == 1
 
 
-def test_the_owner_hears_that_a_follower_takes_the_job_back(store, clock):
+def test_the_owner_learns_that_a_follower_cancels_the_job(store, clock):
     owner, follower = looked(store, "owner", clock), looked(store, "follower", clock)
     owner.take()
     follower.look()
@@ -132,7 +132,7 @@ def test_the_owner_hears_that_a_follower_takes_the_job_back(store, clock):
     assert owner.record.cancel
 
 
-def test_a_job_is_named_by_what_is_asked(store):
+def test_the_key_of_a_job_is_the_digest_of_its_request(store):
     asked = {"a": 1, "b": [1.5]}
     key = job_key("merge", asked, "s")
 
@@ -145,7 +145,7 @@ def test_a_job_is_named_by_what_is_asked(store):
         job_key("merge", {"a": object()}, "s")
 
 
-def test_a_record_that_is_none_is_a_failure_of_the_store(store, clock):
+def test_an_invalid_record_is_a_failure_of_the_store(store, clock):
     store.put(NAME, b"not a record")
 
     with pytest.raises(StoreError, match="no record"):

@@ -30,10 +30,10 @@ WAIT_S = 20.0
 
 
 class FakeProcess:
-    """A job that ends when the test says so."""
+    """The process of a job, which does what the test says."""
 
-    def __init__(self, wanted: JobRequest) -> None:
-        self.wanted = wanted
+    def __init__(self, request: JobRequest) -> None:
+        self.request = request
         self.connection, self._theirs = socket.socketpair()
 
     def say(self, *message: Any) -> None:
@@ -75,8 +75,8 @@ class Bench:
             progress=lambda _, told: self.progress.append((told.id, told.done, told.what)),
         )  # fmt: skip
 
-    def start(self, wanted: JobRequest) -> FakeProcess:
-        process = FakeProcess(wanted)
+    def start(self, request: JobRequest) -> FakeProcess:
+        process = FakeProcess(request)
         self.started.put(process)
         return process
 
@@ -120,7 +120,7 @@ def code(answer: Result | Failure) -> str:
     return "ok" if isinstance(answer, Result) else answer.code
 
 
-def test_who_asks_for_the_same_job_waits_for_the_same_run(make):
+def test_two_commands_with_the_same_request_wait_for_the_same_run(make):
     bench, owner = make(), robot()
     ask(bench, owner, 1)
     process = bench.process()
@@ -142,10 +142,10 @@ def test_the_same_request_of_another_robot_or_tenant_is_another_job(make):
 
     asked = [bench.process() for _ in range(3)]
 
-    assert len({(each.wanted.tenant, each.wanted.robot) for each in asked}) == 3
+    assert len({(each.request.tenant, each.request.robot) for each in asked}) == 3
 
 
-def test_more_jobs_than_may_wait_are_refused_with_when_to_come_again(make):
+def test_more_jobs_than_may_wait_are_refused_with_a_retry_time(make):
     bench, owner = make(max_waiting_jobs=1), robot()
     for identity in range(3):
         ask(bench, owner, identity, value=identity)
@@ -155,29 +155,29 @@ def test_more_jobs_than_may_wait_are_refused_with_when_to_come_again(make):
     assert bench.jobs.known == 2
 
 
-def test_a_robot_that_fills_the_line_makes_room_for_another_and_asks_again(make):
-    bench, greedy, modest = make(max_waiting_jobs=3), robot("greedy"), robot("modest")
-    ask(bench, greedy, 0, value=0)
+def test_the_newest_job_of_a_robot_with_many_is_displaced_by_another_robot(make):
+    bench, busy_robot, other_robot = make(max_waiting_jobs=3), robot("greedy"), robot("modest")
+    ask(bench, busy_robot, 0, value=0)
     bench.process()
     bench.run_until(lambda: bench.loop.advance(0.5) or any(what == "starts" for _, _, what in bench.progress))
     for identity in range(1, 4):
-        ask(bench, greedy, identity, value=identity)
+        ask(bench, busy_robot, identity, value=identity)
 
-    ask(bench, modest, 10, value=10)
+    ask(bench, other_robot, 10, value=10)
 
     assert code(bench.answers[3]) == "busy"
     assert bench.answers[3].retry_after_ms == 5000.0
-    ask(bench, modest, 11, value=11)
+    ask(bench, other_robot, 11, value=11)
     assert code(bench.answers[2]) == "busy"
-    ask(bench, modest, 12, value=12)
+    ask(bench, other_robot, 12, value=12)
     assert code(bench.answers[12]) == "busy"
-    ask(bench, greedy, 4, value=3)
+    ask(bench, busy_robot, 4, value=3)
     bench.run_until(lambda: 4 in bench.answers)
     assert code(bench.answers[4]) == "busy"
     assert set(bench.answers) == {2, 3, 4, 12}
 
 
-def test_the_robot_is_told_at_once_then_at_most_twice_a_second_and_never_something_old(make):
+def test_progress_is_sent_at_once_then_at_most_twice_a_second_and_never_repeated(make):
     bench, owner = make(), robot()
     ask(bench, owner, 1)
     assert bench.progress == [(1, 0.0, "waits for its turn")]
@@ -203,7 +203,7 @@ def test_the_robot_is_told_at_once_then_at_most_twice_a_second_and_never_somethi
     assert len(progress_of_1()) == 2
 
 
-def test_a_command_taken_back_leaves_the_job_to_those_who_still_wait(make):
+def test_a_cancelled_command_leaves_the_job_to_the_others_that_wait(make):
     bench, owner = make(), robot()
     ask(bench, owner, 1)
     ask(bench, owner, 2)
@@ -217,7 +217,7 @@ def test_a_command_taken_back_leaves_the_job_to_those_who_still_wait(make):
     assert code(bench.answers[2]) == "ok"
 
 
-def test_the_last_command_taken_back_ends_the_job_and_who_asks_meanwhile_gets_a_new_run(make):
+def test_cancelling_the_last_command_ends_the_job_and_a_request_meanwhile_gets_a_new_run(make):
     bench, owner = make(), robot()
     ask(bench, owner, 1)
     process = bench.process()
@@ -232,7 +232,7 @@ def test_the_last_command_taken_back_ends_the_job_and_who_asks_meanwhile_gets_a_
     assert [code(bench.answers[identity]) for identity in (1, 2)] == ["cancelled", "ok"]
 
 
-def test_nobody_takes_back_the_commands_of_others(make):
+def test_a_robot_cannot_cancel_the_commands_of_another(make):
     bench, owner = make(), robot()
     ask(bench, owner, 1)
     ask(bench, owner, 2)
@@ -246,7 +246,7 @@ def test_nobody_takes_back_the_commands_of_others(make):
     assert {code(answer) for answer in bench.answers.values()} == {"ok"}
 
 
-def test_a_job_goes_on_without_its_robot_which_finds_it_when_it_comes_back(make):
+def test_a_job_goes_on_without_its_robot_which_finds_it_after_reconnecting(make):
     bench, owner = make(), robot()
     ask(bench, owner, 1)
     process = bench.process()
@@ -262,7 +262,7 @@ def test_a_job_goes_on_without_its_robot_which_finds_it_when_it_comes_back(make)
     assert bench.started.empty()
 
 
-def test_a_leaving_server_answers_nothing_for_the_robot_asks_elsewhere(make):
+def test_a_draining_server_answers_no_job_because_the_robot_asks_another(make):
     bench, owner = make(), robot()
     ask(bench, owner, 1)
     bench.process()
@@ -275,7 +275,7 @@ def test_a_leaving_server_answers_nothing_for_the_robot_asks_elsewhere(make):
     assert bench.jobs.known == 0
 
 
-def test_the_end_of_a_job_is_when_old_records_go(make):
+def test_old_records_are_deleted_when_a_job_ends(make):
     bench, owner = make(job_record_ttl_s=60.0), robot()
     old = "jobs/default/robot-9/" + "0" * 64
     bench.store.put(old, encode_record(JobRecord(state="done", owner="", marked_s=1.0)))

@@ -12,7 +12,7 @@ from rse_pf.backend.jobs.process import JobProcess
 pytestmark = pytest.mark.system
 
 
-def test_a_job_is_behind_everything_else_before_it_runs_a_line_of_its_own() -> None:
+def test_a_job_process_has_the_lowest_priority_before_it_runs_any_code() -> None:
     began = time.monotonic()
     job = JobProcess({"worker": 0})  # it is not this process's child of 0, so it does nothing and ends
     policy, took_s = os.sched_getscheduler(job.pid), time.monotonic() - began

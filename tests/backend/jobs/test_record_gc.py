@@ -1,4 +1,4 @@
-"""Records of jobs go when they are old, and nobody who works on a job or asks for it notices."""
+"""Old records of jobs are deleted without an effect on running jobs and new requests."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def put(store: MemoryStore, record: JobRecord, name: str = NAME) -> None:
 
 
 @pytest.mark.parametrize("state", ["done", "failed", "given-up", "running"])
-def test_a_record_that_nobody_touched_goes_after_its_life_and_not_before(state):
+def test_an_unchanged_record_is_deleted_after_its_ttl_and_not_before(state):
     bench = Bench()
     put(bench.store, JobRecord(state=state, owner="gone"))
 
@@ -57,7 +57,7 @@ def test_a_record_that_nobody_touched_goes_after_its_life_and_not_before(state):
     assert bench.names == []
 
 
-def test_a_job_that_somebody_works_on_keeps_its_record_however_long_it_takes():
+def test_a_running_job_keeps_its_record_however_long_it_takes():
     bench = Bench()
     lease = bench.lease()
     assert lease.take()
@@ -71,7 +71,7 @@ def test_a_job_that_somebody_works_on_keeps_its_record_however_long_it_takes():
     assert lease.end(JobRecord(state="done", owner="", reply="r"))
 
 
-def test_who_asks_between_the_tombstone_and_the_end_waits_and_then_does_the_job_anew():
+def test_a_request_between_tombstone_and_deletion_waits_and_then_gets_a_new_run():
     asked: list[str] = []
 
     class Watched(MemoryStore):
@@ -91,7 +91,7 @@ def test_who_asks_between_the_tombstone_and_the_end_waits_and_then_does_the_job_
     assert lease.take()
 
 
-def test_who_takes_a_job_while_it_is_swept_keeps_it():
+def test_a_job_taken_during_a_garbage_collection_keeps_its_record():
     class Quick(MemoryStore):
         races = 1
 
@@ -111,14 +111,14 @@ def test_who_takes_a_job_while_it_is_swept_keeps_it():
     assert taker.renew(0.1, "goes on")
 
 
-def test_a_tombstone_of_a_sweep_that_died_holds_nobody_up_for_longer_than_a_lease():
+def test_the_tombstone_of_an_interrupted_collection_delays_a_job_by_at_most_a_lease():
     record = JobRecord(state="swept", owner="")
 
     assert verdict_on(record, unchanged_s=LEASE_S - 0.1, lease_s=LEASE_S, is_watched=False) == "follow"
     assert verdict_on(record, unchanged_s=LEASE_S, lease_s=LEASE_S, is_watched=False) == "take"
 
 
-def test_a_few_at_a_time_and_listed_once_an_hour():
+def test_records_are_read_a_few_at_a_time_and_listed_once_an_hour():
     bench = Bench()
     names = [f"jobs/default/robot-1/{number:064x}" for number in range(100)]
     for name in names:
@@ -132,7 +132,7 @@ def test_a_few_at_a_time_and_listed_once_an_hour():
     assert bench.sweep.collect() == 1
 
 
-def test_a_store_that_fails_and_a_record_of_nonsense_are_left_for_later():
+def test_after_a_failure_of_the_store_or_an_invalid_record_it_goes_on_later():
     class Gone(MemoryStore):
         def list(self, prefix: str = ""):
             raise StoreError("gone")

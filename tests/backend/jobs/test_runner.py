@@ -1,4 +1,4 @@
-"""One job from the first look to its outcome, with a process that says what the test wants."""
+"""One job from the first read of its record to its outcome, with a process that follows a script."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ DONE = ["done", 12.5, REPLY]
 
 
 class FakeProcess:
-    """Says *script* at once; ends then if it *ends*, with *code*."""
+    """Sends *script* at once; then ends with *code* if *ends*."""
 
     def __init__(self, script: list[Any], *, ends: bool = True, code: int = 0) -> None:
         self.connection, self.theirs = socket.socketpair()
@@ -51,7 +51,7 @@ class FakeProcess:
 
 
 class Clock:
-    """Goes on by a hundredth whenever it is read, so that nothing waits for long."""
+    """Advances by a hundredth of a second with each reading, so that nothing waits for long."""
 
     def __init__(self) -> None:
         self._ticks = itertools.count()
@@ -115,7 +115,7 @@ def another(bench: Bench) -> JobLease:
 
 
 class Ordered(MemoryStore):
-    """Lets nobody call a job done whose reply is not there."""
+    """Fails if a job is done before its reply is stored."""
 
     def compare_and_swap(self, name: str, expected: bytes | None, data: bytes) -> None:
         record = msgspec.json.decode(data, type=JobRecord)
@@ -124,7 +124,7 @@ class Ordered(MemoryStore):
         super().compare_and_swap(name, expected, data)
 
 
-def test_a_result_is_durable_before_anybody_hears_of_it(bench):
+def test_a_result_is_stored_before_it_is_reported(bench):
     bench.store = Ordered()
 
     outcome = bench.run(lambda: FakeProcess([["progress", 0.5, "half"], DONE]))
@@ -135,21 +135,21 @@ def test_a_result_is_durable_before_anybody_hears_of_it(bench):
     assert [what for _, what in bench.told] == ["waits for its turn", "starts", "half"]
 
 
-def test_a_job_that_was_done_is_not_done_again(bench):
+def test_a_job_with_a_stored_result_is_not_run_again(bench):
     first = bench.run(lambda: FakeProcess([DONE]))
 
     assert bench.run() == first
     assert len(bench.processes) == 1
 
 
-def test_a_large_reply_is_named_only(bench):
+def test_a_large_reply_is_reported_by_name_only(bench):
     first = bench.run(lambda: FakeProcess([DONE]), inline=3)
 
     assert (first.reply, first.object) == (None, digest_of(REPLY))
     assert bench.run(inline=3) == first
 
 
-def test_a_result_whose_object_is_gone_is_made_again(bench):
+def test_a_result_whose_object_was_deleted_is_computed_again(bench):
     outcome = bench.run(lambda: FakeProcess([DONE]))
     bench.store.delete(object_name("default", "robot-1", outcome.object))
 
@@ -157,7 +157,7 @@ def test_a_result_whose_object_is_gone_is_made_again(bench):
     assert len(bench.processes) == 2
 
 
-def test_a_failure_is_told_as_it_is_and_tried_again_when_asked_again(bench):
+def test_a_failure_is_reported_unchanged_and_the_next_request_runs_again(bench):
     outcome = bench.run(lambda: FakeProcess([["failed", "bad-request", "no maps", "send some"]]))
 
     assert code(outcome) == "bad-request"
@@ -166,7 +166,7 @@ def test_a_failure_is_told_as_it_is_and_tried_again_when_asked_again(bench):
     assert code(bench.run(lambda: FakeProcess([DONE]))) == "ok"
 
 
-def test_a_process_that_ends_without_a_word_has_crashed(bench):
+def test_a_process_that_ends_without_an_answer_has_crashed(bench):
     outcome = bench.run(lambda: FakeProcess([], code=-11))
 
     assert code(outcome) == "crashed"
@@ -180,7 +180,7 @@ def test_a_reply_that_is_too_large_ends_the_job(bench):
     assert code(outcome) == "too-large"
 
 
-def test_a_deaf_process_is_killed_soon_after_the_robot_took_the_job_back(bench):
+def test_a_process_that_ignores_the_cancel_is_killed(bench):
     bench.on_tell = lambda share, what: bench.signals.cancel() if what == "half" else None
 
     outcome = bench.run(lambda: FakeProcess([["progress", 0.5, "half"]], ends=False))
@@ -189,13 +189,13 @@ def test_a_deaf_process_is_killed_soon_after_the_robot_took_the_job_back(bench):
     assert (bench.record.state, bench.record.code) == ("failed", "cancelled")
 
 
-def test_a_result_that_came_before_the_cancel_was_heard_is_kept(bench):
+def test_a_result_that_arrives_before_the_cancel_is_processed_is_kept(bench):
     bench.on_tell = lambda share, what: bench.signals.cancel() if what == "half" else None
 
     assert code(bench.run(lambda: FakeProcess([["progress", 0.5, "half"], DONE]))) == "ok"
 
 
-def test_a_leaving_server_gives_its_job_up_for_others_to_take_at_once(bench):
+def test_a_draining_server_gives_up_its_job_so_that_others_take_it_at_once(bench):
     bench.on_tell = lambda share, what: bench.signals.give_up() if what == "half" else None
 
     outcome = bench.run(lambda: FakeProcess([["progress", 0.5, "half"]], ends=False))
@@ -204,7 +204,7 @@ def test_a_leaving_server_gives_its_job_up_for_others_to_take_at_once(bench):
     assert bench.record.state == "given-up"
 
 
-def test_a_job_that_runs_elsewhere_is_followed_to_its_end(bench):
+def test_a_job_that_runs_on_another_server_is_followed_to_its_end(bench):
     owner = another(bench)
     owner.take()
     owner.renew(0.25, "quarter")
@@ -221,7 +221,7 @@ def test_a_job_that_runs_elsewhere_is_followed_to_its_end(bench):
     assert bench.processes == []
 
 
-def test_the_failure_of_a_followed_job_is_told_not_tried_again(bench):
+def test_the_failure_of_a_followed_job_is_reported_and_not_retried(bench):
     owner = another(bench)
     owner.take()
     failed = JobRecord(state="failed", owner="", code="crashed", message="it ended")
@@ -231,7 +231,7 @@ def test_the_failure_of_a_followed_job_is_told_not_tried_again(bench):
     assert bench.processes == []
 
 
-def test_a_job_is_taken_over_when_its_owner_falls_silent(bench):
+def test_a_job_is_taken_over_when_its_owner_stops_renewing(bench):
     another(bench).take()
 
     assert code(bench.run(lambda: FakeProcess([DONE]))) == "ok"
@@ -239,13 +239,13 @@ def test_a_job_is_taken_over_when_its_owner_falls_silent(bench):
     assert len(bench.processes) == 1
 
 
-def test_who_lost_the_job_kills_its_process_and_follows_the_new_owner(bench):
+def test_a_server_that_lost_the_lease_kills_its_process_and_follows_the_new_owner(bench):
     def overtake(share: float, what: str) -> None:
         if what == "half" and bench.record.owner == "us":
-            thief = another(bench)
-            thief.take()
+            other = another(bench)
+            other.take()
             bench.store.put(object_name("default", "robot-1", digest_of(REPLY)), REPLY)
-            thief.end(JobRecord(state="done", owner="", reply=digest_of(REPLY), reply_bytes=len(REPLY)))
+            other.end(JobRecord(state="done", owner="", reply=digest_of(REPLY), reply_bytes=len(REPLY)))
 
     bench.on_tell = overtake
 
@@ -256,23 +256,23 @@ def test_who_lost_the_job_kills_its_process_and_follows_the_new_owner(bench):
 
 
 class Faulty(MemoryStore):
-    """Fails for the first renewals of a running job; *well* is called when they are over."""
+    """Fails for the first renewals of a running job, then calls *recovered*."""
 
-    def __init__(self, failures: int, well: Callable[[], None]) -> None:
+    def __init__(self, failures: int, recovered: Callable[[], None]) -> None:
         super().__init__()
         self.failures = failures
-        self._well = well
+        self._recovered = recovered
 
     def compare_and_swap(self, name: str, expected: bytes | None, data: bytes) -> None:
         if expected is not None and self.failures > 0:
             self.failures -= 1
             if self.failures == 0:
-                self._well()
+                self._recovered()
             raise StoreError("503")
         super().compare_and_swap(name, expected, data)
 
 
-def test_a_store_that_fails_for_a_moment_costs_no_job(bench):
+def test_a_short_failure_of_the_store_does_not_end_a_job(bench):
     bench.store = Faulty(2, lambda: bench.processes[0].theirs.sendall(encode_message(DONE)))
 
     assert code(bench.run(lambda: FakeProcess([], ends=False))) == "ok"
@@ -289,17 +289,17 @@ def test_a_store_that_fails_is_a_typed_failure(bench):
     assert code(bench.run()) == "store"
 
 
-def test_turns_are_given_in_order_and_come_back(bench):
+def test_a_slot_is_taken_once_and_again_after_its_release(bench):
     slots = JobSlots(bench.pipe)
     assert slots.acquire(WHO, lambda seconds: pytest.fail("there is a turn"))
-    rests: list[float] = []
-    assert not slots.acquire(WHO, lambda seconds: bool(rests.append(seconds)))
+    waits: list[float] = []
+    assert not slots.acquire(WHO, lambda seconds: bool(waits.append(seconds)))
     slots.release()
     assert slots.acquire(WHO, lambda seconds: pytest.fail("there is a turn"))
-    assert len(rests) == 1
+    assert len(waits) == 1
 
 
-def test_a_conflict_is_no_reason_to_forget_the_end(bench):
+def test_the_outcome_is_written_again_after_a_conflict(bench):
     class Racing(MemoryStore):
         races = 1
 
@@ -315,7 +315,7 @@ def test_a_conflict_is_no_reason_to_forget_the_end(bench):
     assert bench.record.state == "done"
 
 
-def test_a_reply_that_the_process_stored_is_passed_on_under_its_name(bench):
+def test_a_reply_that_the_process_stored_is_reported_by_its_name(bench):
     outcome = bench.run(lambda: FakeProcess([["stored", 12.5, "ab" * 32, 10**6, None]]))
 
     assert outcome == JobOutcome(object="ab" * 32, reply=None, compute_ms=12.5)
@@ -323,7 +323,7 @@ def test_a_reply_that_the_process_stored_is_passed_on_under_its_name(bench):
     assert [info.name for info in bench.store.list("objects/")] == []
 
 
-def test_a_reply_that_does_not_fit_the_robots_quota_is_a_typed_failure_and_not_stored(bench):
+def test_a_reply_above_the_robots_quota_is_a_typed_failure_and_not_stored(bench):
     bench.store.put(object_name("default", "robot-1", "full"), bytes(10**6 - 1))
 
     assert code(bench.run(lambda: FakeProcess([DONE]))) == "quota"

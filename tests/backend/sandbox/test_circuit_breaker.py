@@ -1,4 +1,4 @@
-"""What is not tried again: deadly requests, and services that crash again and again."""
+"""Requests that crash sandboxes and services that crash repeatedly are not run again."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ SETTINGS = PlatformSettings.from_dict(
 ).services
 
 
-def test_a_request_that_killed_twice_is_poison_whenever_it_comes_back():
+def test_a_request_that_crashed_twice_is_poison_however_late_it_returns():
     breaker = CircuitBreaker(SETTINGS)
     breaker.crashed("icp", "a", 0.0)
     assert breaker.verdict("icp", "a", 0.0) == "run"
@@ -20,7 +20,7 @@ def test_a_request_that_killed_twice_is_poison_whenever_it_comes_back():
     assert breaker.verdict("icp", "b", 5000.0) == "run"
 
 
-def test_three_deaths_in_half_a_minute_let_a_service_rest_for_a_minute():
+def test_three_crashes_in_half_a_minute_open_the_breaker_of_a_service_for_a_minute():
     breaker = CircuitBreaker(SETTINGS)
     for now, digest in ((0.0, "a"), (20.0, "b"), (30.0, "c")):
         assert breaker.verdict("icp", digest, now) == "run"
@@ -34,7 +34,7 @@ def test_three_deaths_in_half_a_minute_let_a_service_rest_for_a_minute():
     assert breaker.open_services(90.0) == []
 
 
-def test_deaths_further_apart_are_no_crash_loop():
+def test_crashes_further_apart_do_not_open_the_breaker():
     breaker = CircuitBreaker(SETTINGS)
     for i in range(20):
         breaker.crashed("icp", str(i), i * 15.1)
@@ -42,7 +42,7 @@ def test_deaths_further_apart_are_no_crash_loop():
     assert breaker.verdict("icp", "x", 20 * 15.1) == "run"
 
 
-def test_after_its_rest_a_service_must_crash_as_often_again():
+def test_after_it_closed_the_breaker_needs_as_many_crashes_again():
     breaker = CircuitBreaker(SETTINGS)
     for i in range(3):
         breaker.crashed("icp", str(i), float(i))
@@ -51,7 +51,7 @@ def test_after_its_rest_a_service_must_crash_as_often_again():
     assert breaker.verdict("icp", "x", 71.0) == "run"
 
 
-def test_memory_is_bounded_whatever_dies():
+def test_memory_is_bounded_however_many_requests_crash():
     breaker = CircuitBreaker(SETTINGS)
     for i in range(12_000):
         breaker.crashed("icp", str(i), i * 100.0)
@@ -60,4 +60,4 @@ def test_memory_is_bounded_whatever_dies():
 
     assert breaker.verdict("icp", "new", 2e7) == "poison"
     breaker.crashed("icp", "0", 1e7)
-    assert breaker.verdict("icp", "0", 2e7) == "run", "its first death is forgotten by now"
+    assert breaker.verdict("icp", "0", 2e7) == "run", "its first crash is forgotten by now"

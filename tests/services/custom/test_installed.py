@@ -1,4 +1,4 @@
-"""Service folders: what may be installed, and that nothing of it changes afterwards."""
+"""Service folders: what can be installed, and that a change afterwards is refused."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def folder(tmp_path):
     return made
 
 
-def test_a_service_is_what_its_manifest_says(folder):
+def test_a_service_is_read_from_its_manifest(folder):
     service = read_service(folder)
 
     assert (service.name, service.language, service.kind) == ("adder", "python", "stateless")
@@ -46,7 +46,7 @@ def test_a_service_is_what_its_manifest_says(folder):
         {"entry": "../service.py"}, {"entry": ""}, {"entry": 1}, {"unknown": 1},
     ],
 )  # fmt: skip
-def test_a_manifest_that_cannot_be_is_one_line(folder, change):
+def test_an_invalid_manifest_is_one_line(folder, change):
     (folder / "service.json").write_text(json.dumps({**GOOD, **change}))
 
     with pytest.raises(UsageError) as caught:
@@ -56,7 +56,7 @@ def test_a_manifest_that_cannot_be_is_one_line(folder, change):
 
 
 @pytest.mark.parametrize("text", ["", "[]", "{", '{"name": "adder"}', "\x00"])
-def test_a_manifest_that_is_none_is_one_line(folder, text):
+def test_a_manifest_that_is_not_json_is_one_line(folder, text):
     (folder / "service.json").write_text(text)
 
     with pytest.raises(UsageError, match=r"service\.json"):
@@ -85,7 +85,7 @@ def test_installing_again_replaces_every_file(folder, tmp_path):
 
 
 @pytest.mark.parametrize("harm", ["change", "add", "remove", "pins", "manifest"])
-def test_a_service_that_was_changed_since_is_refused(folder, tmp_path, harm):
+def test_a_service_that_was_changed_after_its_installation_is_refused(folder, tmp_path, harm):
     place = install(folder, tmp_path / "services").folder
     if harm == "change":
         (place / "helper" / "more.py").write_text("y = 3\n")
@@ -110,7 +110,7 @@ def test_a_library_that_was_not_built_is_one_line(folder, tmp_path):
     assert "cmake" in caught.value.hint
 
 
-def test_a_services_folder_that_is_not_there_is_one_line(tmp_path):
+def test_a_missing_services_folder_is_one_line(tmp_path):
     with pytest.raises(ConfigurationError, match="no services folder"):
         installed_services(tmp_path / "none")
 

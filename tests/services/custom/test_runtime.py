@@ -143,13 +143,13 @@ def adder(request, tmp_path):
 
 
 @pytest.mark.parametrize("values", [[1.5, 2.0], np.array([1.5, 2.0]), np.array([1.5, 2.0], np.float32)])
-def test_every_language_gets_what_was_sent(adder, values):
+def test_every_language_receives_the_payload_as_it_was_sent(adder, values):
     reply = plain(adder().call({"values": values, "label": "é"}))
 
     assert reply == {"total": 3.5, "count": 1, "label": "é"}
 
 
-def test_every_language_keeps_state_and_goes_on_from_a_snapshot(adder):
+def test_every_language_keeps_state_and_restores_a_snapshot(adder):
     first = adder()
     for _ in range(3):
         first.call({"values": [1.0]})
@@ -171,7 +171,7 @@ def test_every_language_has_typed_failures(adder):
     assert plain(service.call({"values": [1.0]}))["count"] == 1, "a failure changes nothing"
 
 
-def test_a_defect_of_a_script_is_internal_with_its_line(tmp_path):
+def test_a_defect_of_a_script_is_an_internal_error_with_its_line(tmp_path):
     service = opened(tmp_path, "lua", "service.lua", LUA)
 
     with pytest.raises(InternalError, match=r"service\.lua:10: .*nil value"):
@@ -191,12 +191,12 @@ def test_a_defect_of_a_script_is_internal_with_its_line(tmp_path):
         ("cpp", "lib.so", "no library", "cannot be loaded"),
     ],
 )
-def test_what_cannot_be_loaded_is_one_line(tmp_path, language, entry, source, says):
+def test_a_service_that_cannot_be_loaded_is_one_line(tmp_path, language, entry, source, says):
     with pytest.raises(ConfigurationError, match=says):
         opened(tmp_path, language, entry, source)
 
 
-def test_a_script_sees_nothing_of_python(tmp_path):
+def test_a_script_has_no_access_to_python(tmp_path):
     service = opened(
         tmp_path, "lua", "service.lua",
         "local json = require 'json'\nreturn function(r) return {p = tostring(python), ok = pcall(function() "

@@ -1,4 +1,4 @@
-"""icp recovers small offsets, and returns its start, with a reason, where it cannot do better."""
+"""icp recovers small offsets, and otherwise returns the initial guess with a reason."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def test_recovers_five_centimetres_and_three_degrees_between_overlapping_clouds(
 
 
 @pytest.mark.parametrize("walls", [1, 2])
-def test_surfaces_that_let_a_cloud_slide_are_refused(walls: int) -> None:
+def test_clouds_that_may_slide_on_their_surfaces_are_refused(walls: int) -> None:
     start = offset(1, 0.03, 1.0)
 
     found = align(make_room(1, walls=walls), make_room(2, walls=walls), start)

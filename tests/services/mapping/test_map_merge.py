@@ -1,4 +1,4 @@
-"""Maps are joined by loops that agree; what does not agree, or is not seen, is refused and named."""
+"""Maps are joined by consistent links; others are refused with a reason."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def test_the_same_maps_give_the_same_map() -> None:
     assert encode_map(merge_versions(maps).version) == encode_map(merge_versions(maps).version)
 
 
-def test_maps_that_share_no_view_are_not_joined_and_the_reason_is_told() -> None:
+def test_maps_that_share_no_view_are_not_joined_and_the_reason_is_reported() -> None:
     here, _ = WORLD.walk("a", np.linspace(0.0, 0.3, 8), seed=1)
     elsewhere, _ = make_world(2).walk("b", np.linspace(0.0, 0.3, 8), seed=2)
 
@@ -94,7 +94,7 @@ def planted(share: float, seed: int):  # type: ignore[no-untyped-def]
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_planted_wrong_loops_are_refused_and_do_not_bend_the_map(seed: int) -> None:
+def test_wrong_loops_are_refused_and_do_not_deform_the_map(seed: int) -> None:
     maps, truths = two_robots()
     truth = np.concatenate(truths)
 
@@ -141,7 +141,7 @@ def test_closing_the_loop_of_one_robot_brings_its_ends_together() -> None:
     assert rmse_m(merged, truth) < 0.7 * rmse_m(without, truth)
 
 
-def test_points_follow_the_keyframes_that_saw_them() -> None:
+def test_points_move_with_the_keyframes_that_observed_them() -> None:
     version, truth = WORLD.walk("a", np.linspace(0.0, 1.1, 30), seed=4, drift_m=0.02, drift_deg=0.7)
     seen = [
         k.points_camera[:40] @ k.T_world_camera[:3, :3].T + k.T_world_camera[:3, 3] for k in version.keyframes
@@ -164,7 +164,7 @@ def median_distance(points: Array, others: Array) -> float:
     return float(np.sqrt(np.median(squared)))
 
 
-def test_the_service_takes_bytes_and_accounts_for_every_map() -> None:
+def test_the_service_takes_encoded_maps_and_reports_on_every_map() -> None:
     maps, _ = two_robots()
 
     reply = merge_maps(MergeRequest(maps=[encode_map(each) for each in maps]))
@@ -201,7 +201,7 @@ def test_the_largest_set_that_agrees_is_found() -> None:
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_the_clique_is_as_large_as_brute_force_says(seed: int) -> None:
+def test_the_clique_is_as_large_as_the_one_of_brute_force(seed: int) -> None:
     rng = np.random.default_rng(seed)
     agree = rng.random((11, 11)) < 0.5
     agree = np.triu(agree, 1) | np.triu(agree, 1).T
@@ -217,7 +217,7 @@ def test_the_clique_is_as_large_as_brute_force_says(seed: int) -> None:
     assert all(agree[a, b] for a in found for b in found if a != b)
 
 
-def test_consistency_does_not_ask_where_the_origins_are() -> None:
+def test_consistency_does_not_depend_on_the_world_frames() -> None:
     maps, _ = two_robots()
     atlas = Atlas.of(maps)
     links = propose_links(atlas, MergeOptions(close_loops=False)).links

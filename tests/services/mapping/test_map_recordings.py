@@ -50,7 +50,7 @@ def test_wrong_loops_change_the_error_by_less_than_a_tenth(recordings: Path, see
     assert robots.ate_m(joined_poses(robots.runs, merged)) <= 1.1 * clean
 
 
-def test_closing_loops_makes_one_robot_better(recordings: Path) -> None:
+def test_closing_loops_reduces_the_error_of_one_robot(recordings: Path) -> None:
     robots = robots_of(recordings, cuts=((0, 250),))
     versions = [robot.version for robot in robots.runs]
 
@@ -63,7 +63,7 @@ def test_closing_loops_makes_one_robot_better(recordings: Path) -> None:
     assert ate_m <= robots.ate_m(joined_poses(robots.runs, without))
 
 
-def test_two_recordings_that_share_no_view_stay_apart(recordings: Path) -> None:
+def test_two_recordings_that_share_no_view_are_not_joined(recordings: Path) -> None:
     kitchen = robots_of(recordings, cuts=((0, 84),)).runs[0]
     desk = robots_of(recordings, cuts=((0, 10),), name="tum_fr1_xyz_start").runs[0]
 

@@ -1,4 +1,4 @@
-"""Pose graphs: fitted as well as the truth fits, never worse than before, the same for g2o."""
+"""Pose graphs: they fit as well as the truth, never worse than before, and agree with g2o."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def test_the_answer_never_costs_more_than_the_start() -> None:
     assert again.cost_after <= again.cost_before
 
 
-def test_each_connected_part_keeps_its_first_pose() -> None:
+def test_each_connected_component_keeps_its_first_pose() -> None:
     poses = np.tile(np.eye(4), (5, 1, 1))
     poses[:, 0, 3] = [0.0, 1.1, 9.0, 10.2, 11.0]
     step = exp_se3([1.0, 0, 0, 0, 0, 0])
@@ -85,7 +85,7 @@ def test_a_report_that_raises_ends_the_work() -> None:
         optimise_graph(small_sphere()[0], report=stop)
 
 
-def test_g2o_text_brings_back_the_graph() -> None:
+def test_reading_written_g2o_text_gives_the_same_graph() -> None:
     graph, _ = small_sphere()
 
     again = read_g2o(write_g2o(graph))
@@ -135,7 +135,7 @@ def numbers(words: list[str]) -> Array:
     return np.array([float(word) for word in words])
 
 
-def test_g2o_itself_reads_our_text_and_agrees_on_the_minimum() -> None:
+def test_the_g2o_library_reads_the_text_and_agrees_on_the_minimum() -> None:
     g2o = pytest.importorskip("g2o", reason="g2o-python is not installed")
     graph, _ = small_sphere()
     unity = np.diag([1.0, 1.0, 1.0, 0.25, 0.25, 0.25])  # g2o counts half angles
@@ -153,7 +153,7 @@ def test_g2o_itself_reads_our_text_and_agrees_on_the_minimum() -> None:
     assert from_the_start == pytest.approx(ours.chi2(), rel=1e-3)
 
 
-def test_the_logarithm_undoes_the_exponential() -> None:
+def test_the_logarithm_is_the_inverse_of_the_exponential() -> None:
     rng = np.random.default_rng(0)
     twists = rng.uniform(-1.7, 1.7, (200, 6))
     twists[:20] *= 1e-7
@@ -181,12 +181,12 @@ def test_the_residual_of_a_true_edge_is_zero() -> None:
         ("", "do not agree"),
     ],
 )
-def test_bad_g2o_text_is_refused_and_the_place_is_named(text: str, complaint: str) -> None:
+def test_invalid_g2o_text_is_refused_with_its_line(text: str, complaint: str) -> None:
     with pytest.raises(BadRequest, match=complaint):
         read_g2o(text)
 
 
-def test_an_information_matrix_that_is_not_positive_is_refused() -> None:
+def test_an_information_matrix_that_is_not_positive_definite_is_refused() -> None:
     graph, _ = small_sphere()
 
     with pytest.raises(BadRequest, match="positive definite"):

@@ -1,4 +1,4 @@
-"""A view is recognised and placed in a map, or said to be lost; a prior only narrows the search."""
+"""A view is recognised and located in a map, or lost; a prior only narrows the search."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def view(keyframe: Keyframe) -> View:
 
 
 @pytest.mark.parametrize("turn", [0.02, 0.31, 0.55, 0.98])
-def test_a_view_of_the_hall_is_placed_where_it_was_taken(turn: float) -> None:
+def test_a_view_of_the_hall_is_located_where_it_was_taken(turn: float) -> None:
     keyframe, truth = seen(turn)
 
     found = locate(INDEX, view(keyframe))
@@ -83,7 +83,7 @@ def test_a_view_of_another_hall_is_lost_and_not_guessed() -> None:
     assert found.T_map_camera is None
 
 
-def test_two_halls_that_look_alike_are_doubted() -> None:
+def test_a_view_of_two_halls_that_look_alike_is_weak() -> None:
     far = np.eye(4)
     far[0, 3] = 50.0
     rng = np.random.default_rng(6)
@@ -139,7 +139,7 @@ def ask(service: str, request: object) -> Result | Failure:
     return dispatch(registry, Command(id=1, service=service, payload=request), lambda: 0.0)
 
 
-def test_the_services_answer_what_travelled() -> None:
+def test_the_services_answer_encoded_requests() -> None:
     keyframe, truth = seen(0.31)
 
     place = ask("place", request_of(keyframe, PlaceRequest))

@@ -1,4 +1,4 @@
-"""wifi names a place and a radius that means what it says, and is told no address."""
+"""wifi answers with a position and a calibrated radius, and receives no hardware address."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def test_sixty_eight_in_a_hundred_lie_inside_the_stated_radius() -> None:
     assert 0.63 <= np.mean(inside) <= 0.73
 
 
-def test_louder_noise_gives_a_larger_radius() -> None:
+def test_more_noise_gives_a_larger_radius() -> None:
     radii = []
     for noise_db in (1.0, 8.0):
         building = make_building(1, noise_db=noise_db)
@@ -66,7 +66,7 @@ def test_louder_noise_gives_a_larger_radius() -> None:
     assert radii[1] > 1.5 * radii[0]
 
 
-def test_the_service_answers_with_a_place_and_a_radius() -> None:
+def test_the_service_answers_with_a_position_and_a_radius() -> None:
     building = make_building(2)
     scan = fingerprint_of(building.scan(np.array([10.0, 10.0, 0.3]), np.random.default_rng(1)), KEY)
     request = WifiRequest(scan=scan, survey=surveyed(building, 3, pitch_m=4.0))
@@ -81,7 +81,7 @@ def test_the_service_answers_with_a_place_and_a_radius() -> None:
     assert np.hypot(answer.reply.x - 10.0, answer.reply.y - 10.0) <= 4 * answer.reply.sigma_m
 
 
-def test_an_unknown_radio_world_is_not_guessed() -> None:
+def test_a_scan_of_unknown_access_points_has_no_position() -> None:
     survey = surveyed(make_building(2), 3, pitch_m=4.0)
     request = WifiRequest(scan=Fingerprint(rssi_dbm={"nobody": -50.0}), survey=survey)
 
