@@ -1,7 +1,7 @@
-"""The data servers' ground: buckets and the signing key; kept when the stack goes, and hard to delete.
+"""Buckets and the signing key: they stay when the stack is deleted, and are hard to delete.
 
-Whoever wants the data gone turns two keys: termination protection off, then the buckets emptied by hand.
-Audit logs take a third: a role that may bypass their retention.
+To delete the data, an operator turns termination protection off and then empties the buckets by hand.
+Audit logs also need a role that may bypass their retention.
 """
 
 from __future__ import annotations

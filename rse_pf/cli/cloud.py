@@ -1,4 +1,4 @@
-"""Look after the platform on AWS: what a deployment lacks, what it costs, how it is, what is left of it.
+"""Check the platform on AWS: what a deployment lacks, what it costs, its health, and what was left behind.
 
 It reads only; npx cdk deploy and npx cdk destroy do the rest, see docs/operations.md.
 
@@ -64,7 +64,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
-    """Do one action and return the exit code; 1 says that somebody has to act."""
+    """Run one action and return the exit code; 1 means that the operator has to act."""
     actions = {"doctor": _doctor, "cost": _cost, "status": _status, "leftovers": _leftovers}
     return actions[args.action](args, settings)
 
@@ -74,7 +74,7 @@ def _doctor(args: argparse.Namespace, settings: PlatformSettings) -> int:
     for finding in (*check_tools(Path.cwd()), *_account_findings(settings)):
         print(finding, flush=True)
         failed += finding.grade == "fail"
-    print(f"\n{failed} to mend first" if failed else "\nready: npx cdk deploy --all")
+    print(f"\n{failed} to fix first" if failed else "\nready: npx cdk deploy --all")
     return 1 if failed else 0
 
 

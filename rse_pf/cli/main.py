@@ -1,8 +1,8 @@
-"""The front of the command line: find the verb, read the settings, turn errors into two lines.
+"""Run one verb of the command line: find it, read the settings, print an error as two lines.
 
 A verb is the module ``rse_pf.cli.VERB``: its docstring is its help page, ``add_arguments(parser)`` declares
-options, ``run(args, settings)`` returns the exit code; it is imported only when it is called for.  Promises
-exit codes (0 done, 1 failed, 2 called or set up wrongly, 130 interrupted), no traceback for what has a name.
+its options and ``run(args, settings)`` returns the exit code.  Only the module of the verb is imported.
+Exit codes: 0 done, 1 failed, 2 wrong call or settings, 130 interrupted.  Named errors print no traceback.
 """
 
 from __future__ import annotations
@@ -25,19 +25,19 @@ __all__ = ["VERBS", "Parser", "main"]
 
 VERBS = {
     "demo": "let robots build point-cloud maps through the platform, on this machine",
-    "experiment": "run Section 6 of the paper again, or verify a run by its records",
+    "experiment": "repeat the experiments of Section 6 of the paper, or verify a run from its records",
     "local": "run the platform on this machine: load balancer and backend servers",
     "swarm": "load a platform with many robots, and measure what they see",
-    "token": "issue a robot's token, or look into one",
-    "robot": "enrol robots with keys of their own, and shut them out",
+    "token": "issue a robot's token, or show what one contains",
+    "robot": "enrol robots with keys of their own, disable them, revoke tokens",
     "service": "write, test, run and install a service of your own: Python, C/C++ or Lua",
     "serve": "run one backend server, as EC2 runs it",
     "data": "run the data service: images, keyframes, clouds and maps by HTTP",
-    "map": "look at, merge, localise in, roll back and export the maps that robots share",
-    "audit": "show who came in, what was changed, and check that nobody changed that log",
-    "cloud": "look after the platform on AWS: doctor, cost, status, leftovers",
+    "map": "show, merge, localise in, roll back and export the maps that robots share",
+    "audit": "show the audit log of robots and changes, and check that it is unchanged",
+    "cloud": "check the platform on AWS: doctor, cost, status, leftovers",
     "settings": "show every setting: value, default, unit, source",
-    "doctor": "check what this machine needs, and say how to mend it",
+    "doctor": "check what this machine needs, and say how to fix it",
 }
 """Verb and one line of help."""
 
@@ -150,7 +150,7 @@ def _first_option(message: str) -> str:
 
 
 def _discard_output() -> None:
-    """Whoever read our output has left: let nothing complain at exit."""
+    """Send the rest to /dev/null: the reader of our output is gone, and exit must not fail."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 

@@ -46,31 +46,31 @@ class ServingSettings:
     workers: int = setting(0, doc="worker processes; 0 means one per core", low=0, high=256)
     solver_threads: int = setting(1, doc="solver threads of each worker", low=1, high=64)
     max_robots: int = setting(10000, unit="robots", doc="connections of one server; more are refused with 503", low=1)
-    handshake_timeout_s: float = setting(5.0, unit="s", doc="a handshake that takes longer is cut", source="slowloris, OWASP", low=0.1)
-    max_handshake_bytes: int = setting(8192, unit="bytes", doc="head of a handshake; a longer one is cut", source="slowloris, OWASP", low=1024, high=16384)
-    max_unauthenticated: int = setting(200, unit="sockets", doc="sockets that have shown no token yet; the one that waited longest leaves", low=1)
-    max_unauthenticated_per_source: int = setting(50, unit="sockets", doc="the same, of one address; not counted behind trusted proxies; 0 is off", low=0)
-    max_accepts_per_s: float = setting(500.0, unit="sockets/s", doc="sockets accepted in a second; more wait in the backlog; 0 is off", low=0)
-    max_handshakes_per_source_per_s: float = setting(200.0, unit="handshakes/s", doc="handshakes of one address; more are refused with 429; 0 is off", low=0)
-    handshake_burst: int = setting(1000, unit="handshakes", doc="handshakes of one address at once, and sockets accepted at once", low=1)
-    trusted_proxies: int = setting(1, unit="proxies", doc="load balancers that append to x-forwarded-for; 0: robots come directly", low=0, high=8)
-    write_buffer_bytes: int = setting(262144, unit="bytes", doc="unsent bytes at which a reader counts as slow", low=4096)
-    slow_reader_timeout_s: float = setting(1.0, unit="s", doc="a reader that stays slow this long is cut off", low=0.05)
-    max_unread_bytes: int = setting(16777216, unit="bytes", doc="messages of more than inline_bytes that wait to be read in one worker; more are refused", low=262144)
-    max_queue_per_robot: int = setting(8, unit="commands", doc="commands of one robot that wait; more are refused", low=1)
-    max_objects_per_command: int = setting(64, doc="stored objects that one command may name in the place of bytes", low=0)
-    max_object_bytes_per_command: int = setting(134217728, unit="bytes", doc="of all objects that one command names", low=1024)
-    emulated_cores: float = setting(0.0, unit="cores", doc="emulated size of each worker in CPU seconds per second; 0 is off", low=0, high=64)
-    max_running_jobs: int = setting(1, doc="long services that run at a time on one server; 0 offers none", low=0, high=64)
-    max_waiting_jobs: int = setting(8, doc="jobs of one worker beside those, that wait or run on another server; more are refused", low=0, high=1000)
-    max_job_memory_bytes: int = setting(2147483648, unit="bytes", doc="memory of one job; one that needs more is ended", low=134217728)
+    handshake_timeout_s: float = setting(5.0, unit="s", doc="a handshake that takes longer is closed", source="slowloris, OWASP", low=0.1)
+    max_handshake_bytes: int = setting(8192, unit="bytes", doc="request head of a handshake; a longer one is refused with 431", source="slowloris, OWASP", low=1024, high=16384)
+    max_unauthenticated: int = setting(200, unit="sockets", doc="sockets without a verified token; the oldest one is closed when a new one exceeds the limit", low=1)
+    max_unauthenticated_per_source: int = setting(50, unit="sockets", doc="the same for each source address; not counted behind trusted proxies; 0 is off", low=0)
+    max_accepts_per_s: float = setting(500.0, unit="sockets/s", doc="sockets accepted each second; more wait in the listen backlog; 0 is off", low=0)
+    max_handshakes_per_source_per_s: float = setting(200.0, unit="handshakes/s", doc="handshakes of one source address; more are refused with 429; 0 is off", low=0)
+    handshake_burst: int = setting(1000, unit="handshakes", doc="burst of max_handshakes_per_source_per_s and of max_accepts_per_s", low=1)
+    trusted_proxies: int = setting(1, unit="proxies", doc="load balancers that append to x-forwarded-for; 0: robots connect directly", low=0, high=8)
+    write_buffer_bytes: int = setting(262144, unit="bytes", doc="unsent bytes above which a client counts as a slow reader", low=4096)
+    slow_reader_timeout_s: float = setting(1.0, unit="s", doc="a slow reader is disconnected after this", low=0.05)
+    max_unread_bytes: int = setting(16777216, unit="bytes", doc="long messages that wait for the decoder thread of a worker; more are refused", low=262144)
+    max_queue_per_robot: int = setting(8, unit="commands", doc="queued commands of one robot; more are refused", low=1)
+    max_objects_per_command: int = setting(64, doc="stored objects that one command may refer to", low=0)
+    max_object_bytes_per_command: int = setting(134217728, unit="bytes", doc="total size of the objects that one command refers to", low=1024)
+    emulated_cores: float = setting(0.0, unit="cores", doc="CPU seconds per second that each worker may use, to emulate a smaller server; 0 is off", low=0, high=64)
+    max_running_jobs: int = setting(1, doc="long jobs that run at the same time on one server; 0 turns long services off", low=0, high=64)
+    max_waiting_jobs: int = setting(8, doc="further jobs of one worker that wait, or that it follows on another server; more are refused", low=0, high=1000)
+    max_job_memory_bytes: int = setting(2147483648, unit="bytes", doc="memory of one job; a job that needs more is ended", low=134217728)
     job_heartbeat_s: float = setting(1.0, unit="s", doc="time between two renewals of a job's lease", low=0.05)
-    job_lease_s: float = setting(5.0, unit="s", doc="a job whose lease is not renewed for so long is taken over by another server", low=0.1)
+    job_lease_s: float = setting(5.0, unit="s", doc="another server takes a job over when its lease was not renewed for this long", low=0.1)
     max_job_s: float = setting(3600.0, unit="s", doc="a job that takes longer is ended", low=1)
-    job_record_ttl_s: float = setting(604800.0, unit="s", doc="the record of a job that nobody touched for so long is forgotten; asked again, the job is done again", low=60)
-    drain_wait_s: float = setting(1.0, unit="s", doc="not ready, but still accepting, before robots are moved", low=0)
-    drain_within_ms: float = setting(5000.0, unit="ms", doc="time robots get to move to another server", low=100)
-    log_level: str = setting("info", doc="lines below this level are not written", choices=("debug", "info", "warning", "error"))
+    job_record_ttl_s: float = setting(604800.0, unit="s", doc="the record of a job is deleted when it was not used for this long; the same request then runs again", low=60)
+    drain_wait_s: float = setting(1.0, unit="s", doc="a draining server reports not ready for this long before it moves its robots", low=0)
+    drain_within_ms: float = setting(5000.0, unit="ms", doc="time that robots get to move to another server", low=100)
+    log_level: str = setting("info", doc="least level of the lines that are logged", choices=("debug", "info", "warning", "error"))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -84,28 +84,28 @@ class SessionSettings:
     max_json_depth: int = setting(16, unit="levels", doc="nesting of a JSON message", low=4, high=200)
     max_json_lists: int = setting(7000, doc="lists and objects of a message, at any depth", low=16)
     max_json_values: int = setting(30000, doc="values of a robot's message outside of raw arrays; a list counts as three, an object as six", low=64)
-    max_json_memory_bytes: int = setting(2000000, unit="bytes", doc="what a JSON message of a robot may take in memory, as estimated before it is read", low=65536)
-    max_bad_messages: int = setting(10, unit="messages", doc="undecodable messages of one socket before it is closed, and its robot rests for rate_ban_s", low=0)
+    max_json_memory_bytes: int = setting(2000000, unit="bytes", doc="estimated memory of a decoded JSON message", low=65536)
+    max_bad_messages: int = setting(10, unit="messages", doc="undecodable messages of one socket before it is closed and its robot is refused for rate_ban_s", low=0)
     max_control_per_s: float = setting(10.0, unit="frames/s", doc="control frames of one socket", low=1)
     max_in_flight: int = setting(8, unit="commands", doc="unanswered commands of one robot", low=1)
     max_commands_per_s: float = setting(20.0, unit="commands/s", doc="messages of one robot; more are refused; 0 is off", source="AWS IoT and Discord limit so", low=0)
-    command_burst: int = setting(40, unit="commands", doc="messages of one robot at once", low=1)
-    rate_ban_s: float = setting(5.0, unit="s", doc="a robot that was cut off for its rate is refused this long", low=0)
+    command_burst: int = setting(40, unit="commands", doc="burst of max_commands_per_s", low=1)
+    rate_ban_s: float = setting(5.0, unit="s", doc="a robot that was disconnected for its rate is refused for this long", low=0)
     ping_interval_s: float = setting(2.0, unit="s", doc="time between application pings", source="paper, Sect. 3.3 (delays); ours in value", low=0.05)
-    ping_timeout_s: float = setting(3.0, unit="s", doc="silence after a ping that counts as a lost link", low=0.1)
-    hello_timeout_s: float = setting(5.0, unit="s", doc="a socket without a Hello is closed", low=0.1)
-    connect_timeout_s: float = setting(2.0, unit="s", doc="one try to connect", low=0.1)
-    reconnect_base_s: float = setting(0.1, unit="s", doc="first back-off; full jitter", source="AWS Architecture Blog, 2015", low=0.001)
-    reconnect_max_s: float = setting(1.0, unit="s", doc="longest back-off", low=0.01)
-    answer_timeout_s: float = setting(5.0, unit="s", doc="deadline of a command that names none", low=0.05)
-    stall_timeout_s: float = setting(1.0, unit="s", doc="an unanswered command and this much silence end the socket", low=0.05)
+    ping_timeout_s: float = setting(3.0, unit="s", doc="a connection without an answer to a ping for this long counts as lost", low=0.1)
+    hello_timeout_s: float = setting(5.0, unit="s", doc="a socket without a Hello message is closed after this", low=0.1)
+    connect_timeout_s: float = setting(2.0, unit="s", doc="time limit of one attempt to connect", low=0.1)
+    reconnect_base_s: float = setting(0.1, unit="s", doc="first reconnect back-off; full jitter", source="AWS Architecture Blog, 2015", low=0.001)
+    reconnect_max_s: float = setting(1.0, unit="s", doc="longest reconnect back-off", low=0.01)
+    answer_timeout_s: float = setting(5.0, unit="s", doc="deadline of a command that sets none", low=0.05)
+    stall_timeout_s: float = setting(1.0, unit="s", doc="the client reconnects when a command is unanswered and nothing arrived for this long", low=0.05)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PnpSettings:
     """The perspective-n-point service."""
 
-    engine: str = setting("poselib", doc="solver when a command names none", choices=("poselib", "opencv"))
+    engine: str = setting("poselib", doc="solver of a command that chooses none", choices=("poselib", "opencv"))
     max_correspondences: int = setting(5000, doc="correspondences of one command", low=4)
     max_iterations: int = setting(1000, doc="RANSAC iterations a command may ask for", low=1, high=100000)
 
@@ -115,8 +115,8 @@ class HealthSettings:
     """When a server counts as healthy."""
 
     cloud_interval_s: int = setting(5, unit="s", doc="time between checks of the ALB", low=5, high=300)
-    unhealthy_checks: int = setting(2, unit="checks", doc="failed checks in a row that take a server out", low=2, high=10)
-    grace_s: int = setting(90, unit="s", doc="a new server is not judged before", low=0)
+    unhealthy_checks: int = setting(2, unit="checks", doc="failed checks in a row after which a server is unhealthy", low=2, high=10)
+    grace_s: int = setting(90, unit="s", doc="failed checks of a new server do not count for this long", low=0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -133,10 +133,10 @@ class ScalingSettings:
     big_step: int = setting(2, unit="servers", doc="servers added when very busy", low=1)
     min_servers: int = setting(2, unit="servers", doc="never fewer", low=1)
     max_servers: int = setting(10, unit="servers", doc="never more", low=1)
-    warm_up_s: int = setting(60, unit="s", doc="a new server's CPU does not count for this long", low=0)
+    warm_up_s: int = setting(60, unit="s", doc="the CPU of a new server does not count for this long", low=0)
     max_robots_per_server: int = setting(0, unit="robots", source="paper, Sect. 3.1", doc="add a server above this many robots each; 0 is off", low=0)
     max_queue_ms: float = setting(0.0, unit="ms", doc="add a server above this queue delay; 0 is off", low=0)
-    moves_per_s: float = setting(20.0, unit="robots/s", doc="robots that one server asks to move each second when it is crowded", low=0.1)
+    moves_per_s: float = setting(20.0, unit="robots/s", doc="robots that a crowded server asks to move each second", low=0.1)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -144,18 +144,18 @@ class DataSettings:
     """Data servers: images, keyframes, clouds and maps."""
 
     enabled: bool = setting(False, doc="run the data service beside each backend server")
-    store: str = setting("memory:", doc="where objects live: dir:PATH, s3:BUCKET or memory:")
+    store: str = setting("memory:", doc="object store: dir:PATH, s3:BUCKET or memory:")
     port: int = setting(8767, doc="port of the data service; 0 takes a free one", low=0, high=65535)
     host: str = setting("127.0.0.1", doc="address the data service listens on")
-    max_object_bytes: int = setting(268435456, unit="bytes", doc="one object", low=1024)
-    quota_bytes: int = setting(10737418240, unit="bytes", doc="all objects of one robot", low=1024)
+    max_object_bytes: int = setting(268435456, unit="bytes", doc="size of one object", low=1024)
+    quota_bytes: int = setting(10737418240, unit="bytes", doc="total size of the objects of one robot", low=1024)
     part_bytes: int = setting(4194304, unit="bytes", doc="body of one request; larger objects are sent in parts", low=1024)
-    max_uploads: int = setting(32, doc="bodies received at once; more are told to come again", low=1)
-    upload_ttl_s: int = setting(86400, unit="s", doc="an unfinished upload is forgotten after this", low=60)
-    body_timeout_s: float = setting(10.0, unit="s", doc="longest silence within a body", low=0.1)
-    presigned_url_ttl_s: int = setting(300, unit="s", doc="a signed address of the bucket is good for so long", low=10, high=300)
-    background_bytes_per_s: int = setting(262144, unit="bytes/s", doc="keyframes a robot sends beside its live poses", low=1024)
-    max_spool_bytes: int = setting(1073741824, unit="bytes", doc="keyframes a robot keeps on its disk while offline", low=1024)
+    max_uploads: int = setting(32, doc="request bodies received at the same time; more are refused with 503 and Retry-After", low=1)
+    upload_ttl_s: int = setting(86400, unit="s", doc="an unfinished upload is deleted after this", low=60)
+    body_timeout_s: float = setting(10.0, unit="s", doc="a request body that pauses for longer is refused", low=0.1)
+    presigned_url_ttl_s: int = setting(300, unit="s", doc="validity of a presigned URL of the bucket", low=10, high=300)
+    background_bytes_per_s: int = setting(262144, unit="bytes/s", doc="rate at which a robot uploads keyframes in the background", low=1024)
+    max_spool_bytes: int = setting(1073741824, unit="bytes", doc="keyframes that a robot keeps on its disk while it is offline", low=1024)
     glacier_after_days: int = setting(90, unit="days", source="paper, Sect. 5.1", doc="maps move to Glacier", low=30)
 
 
@@ -163,41 +163,41 @@ class DataSettings:
 class AuthSettings:
     """Robot tokens."""
 
-    issuer: str = setting("rse-pf", doc="who signs the tokens")
-    audience: str = setting("rse-pf", doc="whom the tokens are for")
-    token_ttl_s: int = setting(900, unit="s", doc="life of a robot token", source="RFC 8725; short-lived", low=10, high=900)
-    leeway_s: int = setting(30, unit="s", doc="clock difference that is forgiven", low=0, high=300)
+    issuer: str = setting("rse-pf", doc="issuer (iss) of the tokens")
+    audience: str = setting("rse-pf", doc="audience (aud) of the tokens")
+    token_ttl_s: int = setting(900, unit="s", doc="longest validity of a robot token", source="RFC 8725; short-lived", low=10, high=900)
+    leeway_s: int = setting(30, unit="s", doc="clock difference that is tolerated", low=0, high=300)
     required: bool = setting(True, doc="robots without a token are refused")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ServiceSettings:
-    """Services that the operator installs, each robot in its own environment."""
+    """Services that the operator installs; each robot has a sandbox of its own."""
 
     folder: str = setting("", doc="folder of installed services; empty means none")
     published: bool = setting(False, doc="also run the services that installed Python packages publish (entry points rse_pf.services)")
-    max_sandboxes: int = setting(64, doc="isolated environments of one server", low=1)
-    memory_bytes: int = setting(536870912, unit="bytes", doc="address space of one environment", low=16777216)
-    scratch_bytes: int = setting(16777216, unit="bytes", doc="private folder of one environment, in memory", low=65536)
-    grace_s: float = setting(5.0, unit="s", doc="an environment outlives its connection by this", low=0)
-    start_timeout_s: float = setting(5.0, unit="s", doc="an environment that is not ready by then is killed", low=0.1)
-    poison_crashes: int = setting(2, unit="deaths", doc="a request that killed so many environments is not tried again", source="dead-letter queues; OWASP", low=1)
-    breaker_crashes: int = setting(5, unit="deaths", doc="a service that killed so many environments within breaker_window_s rests", low=2)
-    breaker_open_s: float = setting(60.0, unit="s", doc="so long a service rests after a crash loop", low=1)
-    accept_weak_isolation: bool = setting(False, doc="run installed services even where the kernel lacks a wall")
+    max_sandboxes: int = setting(64, doc="sandboxes of one server", low=1)
+    memory_bytes: int = setting(536870912, unit="bytes", doc="address space of one sandbox", low=16777216)
+    scratch_bytes: int = setting(16777216, unit="bytes", doc="private folder of one sandbox, in memory", low=65536)
+    grace_s: float = setting(5.0, unit="s", doc="a sandbox outlives the connection of its robot by this", low=0)
+    start_timeout_s: float = setting(5.0, unit="s", doc="a sandbox that is not ready by then is killed", low=0.1)
+    poison_crashes: int = setting(2, unit="crashes", doc="a request that crashed this many sandboxes is refused as poison", source="dead-letter queues; OWASP", low=1)
+    breaker_crashes: int = setting(5, unit="crashes", doc="this many crashes of a service within 30 s open its circuit breaker", low=2)
+    breaker_open_s: float = setting(60.0, unit="s", doc="time that the circuit breaker of a service stays open", low=1)
+    accept_weak_isolation: bool = setting(False, doc="run installed services even if the kernel lacks a means of isolation")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LocalSettings:
     """The platform on one machine."""
 
-    port: int = setting(8700, doc="front door of the local platform; 0 takes a free one", low=0, high=65535)
+    port: int = setting(8700, doc="port of the local load balancer; 0 takes a free one", low=0, high=65535)
     servers: int = setting(2, unit="servers", doc="backend servers at the start", low=1, high=64)
     workers: int = setting(1, doc="worker processes of each local server", low=1, high=64)
-    start_timeout_s: float = setting(20.0, unit="s", doc="a server that is not ready by then failed", low=1)
-    warm_standby: bool = setting(True, doc="keep one more process warm, about 60 MB, that becomes the next server at once", source="warm pools of AWS Auto Scaling")
-    max_restarts_per_minute: int = setting(5, unit="servers", doc="replacements of servers that died young, in any minute", low=1)
-    certificate: str = setting("", doc="file of the front door's certificate chain (PEM); with it robots dial wss://")
+    start_timeout_s: float = setting(20.0, unit="s", doc="a server that is not ready by then has failed", low=1)
+    warm_standby: bool = setting(True, doc="keep one started process, about 60 MB, that becomes the next server at once", source="warm pools of AWS Auto Scaling")
+    max_restarts_per_minute: int = setting(5, unit="servers", doc="servers that failed soon after their start and are replaced within a minute", low=1)
+    certificate: str = setting("", doc="file of the load balancer's certificate chain (PEM); robots then connect by wss://")
     private_key: str = setting("", doc="file of the private key of local.certificate (PEM)")
 
 
@@ -206,22 +206,22 @@ class CloudSettings:
     """The platform on AWS."""
 
     region: str = setting("ap-northeast-2", doc="AWS region", source="paper, Sect. 6.1 (Seoul)")
-    allow_insecure: bool = setting(True, doc="true: ws:// without a certificate, for trials; false: wss://")
-    certificate_arn: str = setting("", doc="certificate of the front door; needed when allow_insecure is false")
-    domain_name: str = setting("", doc="name of the front door; needed when allow_insecure is false")
+    allow_insecure: bool = setting(True, doc="true: ws:// without a certificate, for trials only; false: wss://")
+    certificate_arn: str = setting("", doc="ACM certificate of the load balancer; required if allow_insecure is false")
+    domain_name: str = setting("", doc="DNS name of the load balancer; required if allow_insecure is false")
     instance_type: str = setting("c7i.large", doc="EC2 type of a backend server (x86-64)")
     image_parameter: str = setting("/aws/service/debian/release/12/latest/amd64", doc="SSM parameter that names the machine image", source="Debian's public parameter")
     endpoints: str = setting("minimal", doc="interface endpoints: minimal (monitoring, autoscaling, logs) or full (also ssm, secretsmanager)", choices=("minimal", "full"))
-    s3_prefix_list: str = setting("", doc="prefix list of S3 in the region; empty takes it from the table in stacks/firewall.py")
-    robot_cidr: str = setting("0.0.0.0/0", doc="addresses that robots may come from")
+    s3_prefix_list: str = setting("", doc="prefix list of S3 in the region; empty: from the table in stacks/firewall.py")
+    robot_cidr: str = setting("0.0.0.0/0", doc="addresses that robots may connect from")
     requests_per_5_minutes: int = setting(2000, unit="requests", doc="WAF: handshakes of one address in five minutes", low=100)
-    drain_s: int = setting(60, unit="s", doc="time the termination hook gives a leaving server", low=30, high=7200)
-    poll_s: int = setting(5, unit="s", doc="time between an instance's looks at its lifecycle state", low=1, high=60)
+    drain_s: int = setting(60, unit="s", doc="time that the termination hook gives a server to drain", low=30, high=7200)
+    poll_s: int = setting(5, unit="s", doc="time between two reads of an instance's lifecycle state", low=1, high=60)
     lambda_memory_mb: int = setting(1769, unit="MB", doc="memory of the serverless PnP; 1769 is one vCPU", low=128, high=10240)
-    lambda_concurrency: int = setting(20, doc="executions of the serverless PnP at a time", low=1)
-    log_days: int = setting(30, unit="days", doc="logs are kept this long", low=1)
-    audit_ship_s: int = setting(60, unit="s", doc="time between two pieces of a server's audit log on their way to the bucket; a machine that dies at once loses so much", low=5, high=3600)
-    audit_days: int = setting(365, unit="days", doc="nobody can change or delete an audit log in the bucket for so long; then it goes by itself", low=1)
+    lambda_concurrency: int = setting(20, doc="concurrent executions of the serverless PnP", low=1)
+    log_days: int = setting(30, unit="days", doc="retention of logs", low=1)
+    audit_ship_s: int = setting(60, unit="s", doc="time between two uploads of a server's audit log; a machine that fails loses at most this much", low=5, high=3600)
+    audit_days: int = setting(365, unit="days", doc="an audit log in the bucket cannot be changed or deleted for this long, and is then deleted", low=1)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -246,7 +246,7 @@ class PlatformSettings:
 
     @classmethod
     def from_dict(cls, overrides: Mapping[str, Any]) -> PlatformSettings:
-        """Return the defaults with ``{group: {name: value}}`` laid over them."""
+        """Return the defaults with the overrides ``{group: {name: value}}``."""
         groups = {f.name: typing.get_type_hints(cls)[f.name] for f in dataclasses.fields(cls)}
         made: dict[str, Any] = {}
         for name, values in overrides.items():
@@ -297,9 +297,9 @@ def _check_contradictions(s: PlatformSettings) -> None:
             )
     if bool(s.local.certificate) != bool(s.local.private_key):
         raise SettingsError(
-            f"local.certificate = {s.local.certificate!r} without its fellow, local.private_key = "
+            f"local.certificate = {s.local.certificate!r} without local.private_key = "
             f"{s.local.private_key!r}",
-            hint=f"name both files, or none of them {WHERE}",
+            hint=f"set both files or neither {WHERE}",
         )
     if s.scaling.idle_s % s.scaling.period_s:
         raise SettingsError(

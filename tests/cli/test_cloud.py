@@ -139,7 +139,7 @@ def test_the_doctor_says_all_it_can_without_an_account(
     assert "fail  no packages in build" in lines
     assert "      fix: make assets" in lines
     assert "fail  no AWS credentials" in lines
-    assert lines[-1].endswith("to mend first")
+    assert lines[-1].endswith("to fix first")
 
 
 class NoRoom:

@@ -53,7 +53,7 @@ def _alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         ("serve --log-level inf", "'inf' is not one of debug, info", "did you mean info?"),
         ("serve --keys none.json", "cannot read the keys none.json: No such file", "JWKS"),
         ("serve --keys .", "cannot read the keys .: Is a directory", "JWKS"),
-        ("serve --keys empty", "this is not a key set", "JWKS"),
+        ("serve --keys empty", "this is not a key set", "check empty"),
         ("serve --announce none/a.json", "there is no folder", "--announce"),
         ("serve --server-id ", "'' is no name for a server", "1 to 64"),
         ("serve", "there are no keys", "key set file"),

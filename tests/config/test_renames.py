@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import importlib.util
 import json
+from pathlib import Path
+from typing import Any
 
 import pytest
 
-from rse_pf.config import setting_rows
+from rse_pf.config import load_settings, setting_rows
 from rse_pf.config.renames import RENAMED_FILE, hint_for_old_option, hint_for_old_setting
+from rse_pf.errors import SettingsError
 
 TABLE = json.loads(RENAMED_FILE.read_text(encoding="utf-8"))
 SETTINGS = {f"{row.group}.{row.name}" for row in setting_rows()}
@@ -39,3 +42,24 @@ def test_a_hint_says_what_to_write(hint: str, words: str) -> None:
 
 def test_a_name_that_never_was_one_has_no_hint() -> None:
     assert hint_for_old_setting("serving.sise") == hint_for_old_option("--sise") == ""
+
+
+@pytest.mark.parametrize(
+    ("overrides", "hint"),
+    [
+        ({"session": {"silence_s": 1.0}}, "session.silence_s was renamed: write session.stall_timeout_s"),
+        ({"cloud": {"lab": False}}, "cloud.lab was renamed: write cloud.allow_insecure"),
+        ({"local": {"young_s": 1.0}}, "local.young_s is a constant now: remove the line"),
+        ({"prices": {"command_cpu_ms": 2.0}}, "rse-pf cloud cost --prices FILE"),
+    ],
+)
+def test_a_setting_of_an_older_version_is_refused_with_its_new_name(
+    tmp_path: Path, overrides: dict[str, Any], hint: str
+) -> None:
+    file = tmp_path / "cdk.json"
+    file.write_text(json.dumps({"context": {"rse-pf": overrides}}), encoding="utf-8")
+
+    with pytest.raises(SettingsError, match="unknown") as caught:
+        load_settings(file)
+
+    assert hint in caught.value.hint

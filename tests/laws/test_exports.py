@@ -1,8 +1,9 @@
-"""What is public is listed, exists, is documented, and nobody reaches for what is not."""
+"""What is public is listed, exists and is documented; private names are not imported."""
 
 from __future__ import annotations
 
 import ast
+import re
 from collections.abc import Iterator, Mapping
 
 import pytest
@@ -37,6 +38,7 @@ def broken_export_laws(tree: Mapping[str, str]) -> list[str]:
     for path, text in tree.items():
         module = ast.parse(text)
         if path.endswith("__init__.py"):
+            broken += [f"{path}: {what}" for what in _undescribed(module)]
             broken += [f"{path}: line {node.lineno} does more than re-export" for node in _work(module)]
         broken += [f"{path}: {what}" for what in _exports(path, module)]
         broken += [f"{path}: {what}" for what in _reaches(module)]
@@ -75,6 +77,13 @@ def _reaches(module: ast.Module) -> Iterator[str]:
             for alias in node.names:
                 if alias.name.startswith("_"):
                     yield f"imports {alias.name}, which is not public"
+
+
+def _undescribed(module: ast.Module) -> Iterator[str]:
+    """Say what the docstring of a package lacks: what belongs there, and what does not."""
+    sentences = re.findall(r"[^.]*[.](?=\s|$)", ast.get_docstring(module) or "")
+    if len(sentences) < 2:
+        yield "the docstring does not say in two sentences what belongs there and what does not"
 
 
 def _undocumented(path: str, module: ast.Module) -> Iterator[str]:
@@ -121,8 +130,13 @@ def test_the_law_of_exports_catches(text: str, complaint: str) -> None:
 
 
 def test_the_law_of_exports_catches_work_in_an_init_file() -> None:
-    text = '"""D."""\n__all__ = []\nprint("hello")'
+    text = '"""D. No E."""\n__all__ = []\nprint("hello")'
 
     assert broken_export_laws({"rse_pf/local/__init__.py": text}) == [
         "rse_pf/local/__init__.py: line 3 does more than re-export"
     ]
+
+
+@pytest.mark.parametrize("text", ["", '"""Boxes."""', '"""Boxes of Fig. 2"""'])
+def test_a_package_that_does_not_say_what_belongs_there_is_caught(text: str) -> None:
+    assert any("in two sentences" in line for line in broken_export_laws({"rse_pf/local/__init__.py": text}))

@@ -74,7 +74,7 @@ def _certificate(account: Account, settings: PlatformSettings) -> Check:
         )  # fmt: skip
     found = account.find("acm", "describe_certificate", CertificateArn=cloud.certificate_arn)
     if found is None:
-        return Check("fail", "there is no such certificate", "mend cloud.certificate_arn")
+        return Check("fail", "there is no such certificate", "fix cloud.certificate_arn")
     told = found["Certificate"]
     names = {told["DomainName"], *told.get("SubjectAlternativeNames", ())}
     if not any(_covers(name, cloud.domain_name) for name in names):
