@@ -130,9 +130,10 @@ def _robustness(args: argparse.Namespace, settings: PlatformSettings) -> int:
 
 
 def _map(args: argparse.Namespace, settings: PlatformSettings) -> int:
-    from rse_pf.experiments.paper.mapping import MapRunOptions, run_map
+    from rse_pf.experiments.demo.run import DemoOptions
+    from rse_pf.experiments.paper.mapping import run_map
 
-    return run_map(_options(MapRunOptions, args), settings)
+    return run_map(_options(DemoOptions, args, rate_hz=args.fps, quiet=True), settings)
 
 
 def _options(kind: type[T], args: argparse.Namespace, **changed: Any) -> T:

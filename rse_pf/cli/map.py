@@ -189,15 +189,19 @@ def _show(args: argparse.Namespace, maps: MapRegistry) -> None:
              "provenance": version.provenance}
         )  # fmt: skip
     else:
-        print(f"version     {record.number}  {record.id}")
-        print(f"parent      {record.parent or '-'}")
-        print(f"made by     {record.author}, {_when(record.created_s)}" + f"  {record.note}".rstrip())
-        print(f"keyframes   {record.keyframes}  ({_counts(robots)})")
-        print(f"edges       {record.edges}  ({_counts(kinds)})")
-        print(f"points      {record.points}")
-        print(f"size        {record.size} bytes, sha256 {record.digest}")
-        for key in sorted(version.provenance):
-            print(f"provenance  {key} = {_shortened(str(version.provenance[key]))}")
+        _print_rows(
+            ("version", f"{record.number}  {record.id}"),
+            ("parent", record.parent or "-"),
+            ("made by", f"{record.author}, {_when(record.created_s)}  {record.note}".rstrip()),
+            ("keyframes", f"{record.keyframes}  ({_counts(robots)})"),
+            ("edges", f"{record.edges}  ({_counts(kinds)})"),
+            ("points", record.points),
+            ("size", f"{record.size} bytes, sha256 {record.digest}"),
+            *(
+                ("provenance", f"{key} = {_shortened(str(version.provenance[key]))}")
+                for key in sorted(version.provenance)
+            ),
+        )
     if args.png is not None:
         _draw(args, maps, record)
 
@@ -258,12 +262,17 @@ def _merge(args: argparse.Namespace, maps: MapRegistry) -> int:
         return 1 if not_joined else 0
     print(f"{args.into} is now version {made.number}, {made.id[:12]}: {made.keyframes} keyframes, "
           f"{made.points} points, {reply.merges} links between maps, {reply.loops} loops")  # fmt: skip
-    print(f"joined      {', '.join(joined)}")
-    for name, reason in not_joined:
-        print(f"not joined  {name}: {reason}")
-    for each in refused:
-        reasons = ", ".join(f"{count} {reason}" for reason, count in each["reasons"].items())
-        print(f"refused     {each['between']}: {reasons}")
+    _print_rows(
+        ("joined", ", ".join(joined)),
+        *(("not joined", f"{name}: {reason}") for name, reason in not_joined),
+        *(
+            (
+                "not linked",
+                f"{each['between']}: " + ", ".join(f"{n} {why}" for why, n in each["reasons"].items()),
+            )
+            for each in refused
+        ),
+    )
     return 1 if not_joined else 0
 
 
@@ -297,10 +306,12 @@ def _diff(args: argparse.Namespace, maps: MapRegistry) -> None:
     if args.json:
         _print_json(msgspec.to_builtins(found))
         return
-    print(f"keyframes   +{len(found.added)} -{len(found.removed)}, {len(found.moved)} moved")
-    print(f"largest     {found.largest_move_m:.4f} m, {found.largest_turn_deg:.3f} deg")
-    print(f"edges       +{len(found.edges_added)} -{len(found.edges_removed)}")
-    print(f"points      {found.points_before} -> {found.points_after}")
+    _print_rows(
+        ("keyframes", f"+{len(found.added)} -{len(found.removed)}, {len(found.moved)} moved"),
+        ("largest", f"{found.largest_move_m:.4f} m, {found.largest_turn_deg:.3f} deg"),
+        ("edges", f"+{len(found.edges_added)} -{len(found.edges_removed)}"),
+        ("points", f"{found.points_before} -> {found.points_after}"),
+    )
 
 
 def _rollback(args: argparse.Namespace, maps: MapRegistry) -> None:
@@ -494,6 +505,11 @@ def _shortened(text: str) -> str:
 
 def _when(created_s: float) -> str:
     return time.strftime("%Y-%m-%d %H:%M:%SZ", time.gmtime(created_s))
+
+
+def _print_rows(*rows: tuple[str, object]) -> None:
+    for name, value in rows:
+        print(f"{name:<11} {value}")
 
 
 def _print_json(value: Any) -> None:

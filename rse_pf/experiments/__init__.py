@@ -1,1 +1,4 @@
-"""Experiments: the demo, and the paper's Section 6 again; they may use every room but the stacks."""
+"""Experiments: the demo, the load generator, and the experiments of the paper's Section 6.
+
+They may use every package but `stacks`; what robots or servers need at run time belongs elsewhere.
+"""

@@ -115,7 +115,7 @@ def test_each_action_has_an_example(capsys: pytest.CaptureFixture[str], action: 
     ("words", "code", "told"),
     [
         (["merge", "a", "nowhere", "--into", "hall"], 1, "no map 'nowhere'"),
-        (["merge", "a", "b", "--into", "No Name"], 1, "no name of a map"),
+        (["merge", "a", "b", "--into", "No Name"], 1, "is not a valid name of a map"),
         (["localise", "a", "nowhere.png"], 2, "no image or recording nowhere.png"),
         (["localise", "a", "x.png", "--every", "0"], 2, "--every 0"),
         (["view", "a", "--out", "/nowhere/x.png"], 2, "no folder /nowhere"),

@@ -76,7 +76,7 @@ def demo_page(report: Mapping[str, Any]) -> str:
         *([merged_table(report["merged"])] if "merged" in report else []),
         f"Commands: {commands['sent']} sent, {commands['answered']} answered, {failures(report)} failed, "
         f"{commands['lost']} lost, {commands['twice']} answered twice.",
-        f"Reference trajectories: {report['truth']}. Load average before the run {about['load_average']}, after "
+        f"Truth: {report['truth']}. Load average before the run {about['load_average']}, after "
         f"{about['load_average_after']}; settings digest {about['settings_digest']}.",
         "Robots and servers share one machine, so the round trip has no network delay. The raw records: "
         "commands.csv, events.jsonl and samples.csv.",

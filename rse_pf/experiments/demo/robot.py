@@ -28,31 +28,53 @@ from rse_pf.experiments.results.records import CommandRecord
 from rse_pf.geometry import Array
 from rse_pf.pnp import PnpOptions
 
-__all__ = ["FrameDone", "RobotFinished", "RobotSpec", "run_robot"]
+__all__ = ["DemoOptions", "FrameDone", "RobotFinished", "RobotSpec", "run_robot"]
 
 _MIN_READINGS = 2
+_DEFAULT_FRAMES = 80
+_MERGE_FRAMES = 150
+"""Enough for each of three robots to see what the next one saw at its start."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DemoOptions:
+    """Options of the command line; ``data`` None means the rendered world."""
+
+    data: Path | None = None
+    robots: int = 3
+    rate_hz: float = 5.0
+    engine: str = "poselib"
+    codec: str = "zlib"
+    out: Path = Path("out")
+    frames: int | None = None
+    seed: int = 0
+    frontend: str = "standard"
+    merge: bool = False
+    quiet: bool = False
+
+    @property
+    def frame_count(self) -> int:
+        """The frames of each robot in the rendered world."""
+        return self.frames or (_MERGE_FRAMES if self.merge else _DEFAULT_FRAMES)
+
+    @property
+    def frontend_options(self) -> FrontEndOptions:
+        """The options of the trackers."""
+        wide = self.frontend == "wide-baseline"
+        return FrontEndOptions.wide_baseline() if wide else FrontEndOptions()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RobotSpec:
-    """What a robot does; the parent gives it at the start."""
+    """What one robot needs besides the options of the demo."""
 
     name: str
     number: int
-    robots: int
     url: str
-    codec: str
-    rate_hz: float
     folder: Path
-    data: Path | None
-    frames: int
-    seed: int
-    frontend: FrontEndOptions
+    options: DemoOptions
     session: SessionSettings
-    merge: bool = False
-    """Whether it keeps its keyframes and starts in a world frame of its own, not at its true pose."""
-    data_settings: DataSettings | None = None
-    """Settings of uploads to the data service; None if the platform has none."""
+    data_settings: DataSettings
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,22 +130,23 @@ def run_robot(spec: RobotSpec, pipe: Connection) -> None:
 async def _run(spec: RobotSpec, pipe: ParentPipe) -> None:
     from client_sdk import connect
 
+    options = spec.options
     frames, truth, truth_kind = await asyncio.to_thread(_load, spec, pipe)
 
     async def token() -> str:
         return await asyncio.to_thread(pipe.fresh_token)
 
-    async with connect(spec.url, token=token, codec=spec.codec, settings=spec.session) as robot:
+    async with connect(spec.url, token=token, codec=options.codec, settings=spec.session) as robot:
         pipe.send(ChildReady(len(frames)))
         began = await asyncio.to_thread(pipe.wait_start)
-        start = np.eye(4) if truth is None or spec.merge else truth.T_world_camera[0]
-        tracker = Tracker(spec.frontend, T_world_start=start)
+        start = np.eye(4) if truth is None or options.merge else truth.T_world_camera[0]
+        tracker = Tracker(options.frontend_options, T_world_start=start)
         point_map = PointMap(MapOptions())
         drive = _Drive()
         collector = _collector(spec, pipe.token, lambda: drive.asking)
         first_s = time.monotonic()
         for row, frame in enumerate(frames):
-            planned = began + (row + spec.number / spec.robots) / spec.rate_hz
+            planned = began + (row + spec.number / options.robots) / options.rate_hz
             await asyncio.sleep(max(0.0, planned - time.monotonic()))
             done = await _track(robot, tracker, frame, planned, began, spec, drive)
             if done.T_world_camera is not None:
@@ -229,16 +252,17 @@ def _since(began: float) -> float:
 
 def _load(spec: RobotSpec, pipe: ParentPipe) -> tuple[Any, Trajectory | None, str]:
     """Return the frames, the true trajectory and its kind; the world is rendered before the start."""
-    if spec.data is not None:
+    options, number = spec.options, spec.number
+    if options.data is not None:
         from client_sdk.datasets import open_dataset
 
-        recording = open_dataset(spec.data).thinned(spec.rate_hz).share(spec.number, spec.robots)
+        recording = open_dataset(options.data).thinned(options.rate_hz).share(number, options.robots)
         return recording, recording.truth, recording.truth_kind
     from client_sdk.simulator import render_frames, true_trajectory
 
-    truth = true_trajectory(spec.number, spec.robots, spec.frames, spec.seed)
+    truth = true_trajectory(number, options.robots, options.frame_count, options.seed)
     frames: list[Frame] = []
-    for frame in render_frames(spec.number, spec.robots, spec.frames, spec.seed):
+    for frame in render_frames(number, options.robots, options.frame_count, options.seed):
         frames.append(frame)
         pipe.send(FrameDone(len(frames)))
     return frames, truth, "ground truth"
@@ -256,12 +280,10 @@ def _trajectory(tracked: Iterable[TrackedFrame]) -> Trajectory:
 def _collector(
     spec: RobotSpec, token: Callable[[], str], is_busy: Callable[[], bool]
 ) -> KeyframeCollector | None:
-    if not spec.merge:
+    if not spec.options.merge:
         return None
-    if spec.data_settings is None:
-        return KeyframeCollector(spec.name, spec.frontend)
     uploads = KeyframeUploads(spec.url, token, spec.folder / "spool", spec.data_settings, is_busy)
-    return KeyframeCollector(spec.name, spec.frontend, uploads)
+    return KeyframeCollector(spec.name, spec.options.frontend_options, uploads)
 
 
 def _write(

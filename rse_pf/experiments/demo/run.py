@@ -17,7 +17,6 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from client_sdk.frontend import FrontEndOptions
 from client_sdk.mapping import read_ply
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import CommandFailed
@@ -31,7 +30,7 @@ from rse_pf.experiments.child_process import (
 )
 from rse_pf.experiments.demo.merge import MERGED_MAP, merge_on_platform, print_tenths, write_merged
 from rse_pf.experiments.demo.report import closing_lines, demo_page, make_report
-from rse_pf.experiments.demo.robot import FrameDone, RobotFinished, RobotSpec, run_robot
+from rse_pf.experiments.demo.robot import DemoOptions, FrameDone, RobotFinished, RobotSpec, run_robot
 from rse_pf.experiments.plots.map_image import RobotPath, draw_map
 from rse_pf.experiments.results.records import COMMANDS, EVENTS, SAMPLES, EventLog, write_commands
 from rse_pf.experiments.results.result_folder import (
@@ -47,27 +46,7 @@ __all__ = ["DemoOptions", "run_demo"]
 
 T = TypeVar("T")
 
-_DEFAULT_FRAMES = 80
-_MERGE_FRAMES = 150
-"""Enough for each of three robots to see what the next one saw at its start."""
 _EXIT_TIMEOUT_S = 5.0
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class DemoOptions:
-    """Options of the command line; ``data`` None means the rendered world."""
-
-    data: Path | None = None
-    robots: int = 3
-    rate_hz: float = 5.0
-    engine: str = "poselib"
-    codec: str = "zlib"
-    out: Path = Path("out")
-    frames: int | None = None
-    seed: int = 0
-    frontend: str = "standard"
-    merge: bool = False
-    quiet: bool = False
 
 
 @dataclass(slots=True, kw_only=True)
@@ -136,22 +115,14 @@ async def _run(
 def _start(options: DemoOptions, settings: PlatformSettings, folder: Path, url: str, number: int) -> _Robot:
     name = _name(number)
     (folder / name).mkdir()
-    frontend = FrontEndOptions.wide_baseline() if options.frontend == "wide-baseline" else FrontEndOptions()
     spec = RobotSpec(
         name=name,
         number=number,
-        robots=options.robots,
         url=url,
-        codec=options.codec,
-        rate_hz=options.rate_hz,
         folder=folder / name,
-        data=options.data,
-        frames=options.frames or (_MERGE_FRAMES if options.merge else _DEFAULT_FRAMES),
-        seed=options.seed,
-        frontend=frontend,
+        options=options,
         session=settings.session,
-        merge=options.merge,
-        data_settings=settings.data if options.merge else None,
+        data_settings=settings.data,
     )
     process, pipe = start_process(run_robot, spec, name)
     return _Robot(spec=spec, process=process, pipe=pipe)
@@ -162,7 +133,9 @@ async def _follow(
 ) -> None:
     """Wait until all robots are ready, start them together, and follow them to their end."""
     inboxes = [_messages(robot.pipe) for robot in robots]
-    screen.phase("rendering the world" if robots[0].spec.data is None else "reading the recording", robots)
+    screen.phase(
+        "rendering the world" if robots[0].spec.options.data is None else "reading the recording", robots
+    )
     ready = await asyncio.gather(
         *(_wait_for(ChildReady, *pair, platform, screen) for pair in zip(robots, inboxes, strict=True))
     )
@@ -324,7 +297,9 @@ class _Screen:
         for robot in robots:
             key = robot.spec.name
             if key not in self._tasks:
-                self._tasks[key] = self.progress.add_task(f"{key}  {name}", total=robot.spec.frames)
+                self._tasks[key] = self.progress.add_task(
+                    f"{key}  {name}", total=robot.spec.options.frame_count
+                )
             else:
                 self.progress.reset(self._tasks[key], description=f"{key}  {name}")
 

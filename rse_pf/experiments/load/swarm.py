@@ -21,7 +21,7 @@ from urllib.parse import urlsplit
 import numpy as np
 
 from rse_pf.config import SessionSettings
-from rse_pf.errors import CommandFailed, UsageError
+from rse_pf.errors import CommandFailed
 from rse_pf.experiments.child_process import (
     ChildFailed,
     ChildReady,
@@ -38,63 +38,20 @@ from rse_pf.experiments.load.swarm_process import (
     StartOrder,
     SwarmEnded,
     SwarmEvent,
+    SwarmOptions,
     SwarmSpec,
     run_swarm_process,
 )
 from rse_pf.experiments.results.records import CommandRecord
 from rse_pf.local.faults.network_emulator import LinkProcess, profile_named
-from rse_pf.wire import CODECS
 
-__all__ = ["SERVICES", "Swarm", "SwarmOptions", "SwarmResult", "records_of"]
-
-SERVICES = ("pnp", "echo")
-"""Services that the robots can call, because their true answers are known."""
+__all__ = ["Swarm", "SwarmOptions", "SwarmResult", "records_of"]
 
 _READY_TIMEOUT_S = 60.0
 _END_TIMEOUT_S = 30.0
 _HEAD_START_S = 0.2
-_MAX_ROBOTS, _MAX_PROCESSES, _MAX_FPS, _MAX_MATCHES = 5000, 16, 200.0, 5000
 
 Event = Mapping[str, Any]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SwarmOptions:
-    """Number of robots and what they do; raises UsageError for a value out of range.
-
-    Robot k connects ``k * join_every_s`` after the start.  ``keep`` asks the platform to answer every
-    frame, not only the newest.  ``link`` is the name of a profile of `rse_pf.local.faults.network_emulator`.
-    """
-
-    robots: int
-    fps: float = 5.0
-    codec: str = "zlib"
-    matches: int = 200
-    outliers: float = 0.3
-    seed: int = 0
-    join_every_s: float = 0.0
-    deadline_s: float = 5.0
-    keep: bool = True
-    service: str = "pnp"
-    processes: int = 1
-    link: str | None = None
-    robot_prefix: str = "robot"
-
-    def __post_init__(self) -> None:
-        """Check every field."""
-        _within("robots", self.robots, 1, _MAX_ROBOTS)
-        _within("fps", self.fps, 0.01, _MAX_FPS)
-        _within("matches", self.matches, 4, _MAX_MATCHES)
-        _within("outliers", self.outliers, 0.0, 0.9)
-        _within("seed", self.seed, 0, 2**31)
-        _within("join_every_s", self.join_every_s, 0.0, 3600.0)
-        _within("deadline_s", self.deadline_s, 0.01, 3600.0)
-        _within("processes", self.processes, 1, _MAX_PROCESSES)
-        for name, value, known in (("codec", self.codec, CODECS), ("service", self.service, SERVICES)):
-            if value not in known:
-                raise UsageError(f"no {name} named {value!r}", hint=f"choose one of {', '.join(known)}")
-        if self.link is not None:
-            profile_named(self.link)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -258,19 +215,11 @@ class Swarm:
         loop = asyncio.get_running_loop()
         for share in range(count):
             numbers = tuple(range(share, self.options.robots, count))
-            spec = self._spec(numbers, url)
+            spec = SwarmSpec(numbers=numbers, url=url, session=self._session, options=self.options)
             process, pipe = await asyncio.to_thread(start_process, run_swarm_process, spec, "swarm")
             child = _Child(process, pipe, numbers)
             self._children.append(child)
             loop.add_reader(pipe.fileno(), self._receive, child)
-
-    def _spec(self, numbers: tuple[int, ...], url: str) -> SwarmSpec:
-        o = self.options
-        return SwarmSpec(
-            numbers=numbers, robots=o.robots, prefix=o.robot_prefix, url=url, service=o.service,
-            codec=o.codec, fps=o.fps, matches=o.matches, outliers=o.outliers, seed=o.seed,
-            join_every_s=o.join_every_s, deadline_s=o.deadline_s, keep=o.keep, session=self._session,
-        )  # fmt: skip
 
     def _name(self, number: int) -> str:
         return f"{self.options.robot_prefix}-{number + 1}"
@@ -361,10 +310,3 @@ def records_of(rows: ResultRows, prefix: str) -> Iterator[CommandRecord]:
 
 def _known(value: float, digits: int) -> float | None:
     return None if math.isnan(value) else round(value, digits)
-
-
-def _within(name: str, value: float, low: float, high: float) -> None:
-    if not low <= value <= high:
-        raise UsageError(
-            f"{name} = {value:g} is not within {low:g}..{high:g}", hint=f"choose {name} within that range"
-        )

@@ -21,18 +21,24 @@ from typing import Any
 import numpy as np
 
 from rse_pf.config import SessionSettings
-from rse_pf.errors import RsePfError
+from rse_pf.errors import RsePfError, UsageError
 from rse_pf.experiments.child_process import ChildFailed, ChildReady, IssuedToken, TokenRequest
 from rse_pf.geometry import Array
-from rse_pf.wire import Result, make_codec
+from rse_pf.local.faults.network_emulator import profile_named
+from rse_pf.wire import CODECS, Result, make_codec
 from rse_pf.wire.client_session import Answered
 from rse_pf.wire.preencoded import PreencodedCommand, preencode
 
 __all__ = [
     "FinishOrder", "LeaveOrder", "ResultRows", "RobotJoined", "SolvedPayload", "StartOrder", "SwarmEnded",
-    "SwarmEvent", "SwarmSpec", "is_right", "make_payloads", "planned_s", "run_swarm_process",
+    "SwarmEvent", "SwarmOptions", "SwarmSpec", "is_right", "make_payloads", "planned_s", "run_swarm_process",
 ]  # fmt: skip
 
+SERVICES = ("pnp", "echo")
+"""Services that the robots can call, because their true answers are known."""
+
+_MAX_ROBOTS, _MAX_PROCESSES, _MAX_FPS, _MAX_MATCHES = 5000, 16, 200.0, 5000
+_NO_PARTS = (math.nan,) * 4
 _POOL = 64
 _ROWS = 256
 _FLUSH_EVERY_S = 0.5
@@ -42,23 +48,52 @@ _POSE_M, _POSE_RAD = 0.05, math.radians(1.0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class SwarmOptions:
+    """Number of robots and what they do; raises UsageError for a value out of range.
+
+    Robot k connects ``k * join_every_s`` after the start.  ``keep`` asks the platform to answer every
+    frame, not only the newest.  ``link`` is the name of a profile of `rse_pf.local.faults.network_emulator`.
+    """
+
+    robots: int
+    fps: float = 5.0
+    codec: str = "zlib"
+    matches: int = 200
+    outliers: float = 0.3
+    seed: int = 0
+    join_every_s: float = 0.0
+    deadline_s: float = 5.0
+    keep: bool = True
+    service: str = "pnp"
+    processes: int = 1
+    link: str | None = None
+    robot_prefix: str = "robot"
+
+    def __post_init__(self) -> None:
+        """Check every field."""
+        _within("robots", self.robots, 1, _MAX_ROBOTS)
+        _within("fps", self.fps, 0.01, _MAX_FPS)
+        _within("matches", self.matches, 4, _MAX_MATCHES)
+        _within("outliers", self.outliers, 0.0, 0.9)
+        _within("seed", self.seed, 0, 2**31)
+        _within("join_every_s", self.join_every_s, 0.0, 3600.0)
+        _within("deadline_s", self.deadline_s, 0.01, 3600.0)
+        _within("processes", self.processes, 1, _MAX_PROCESSES)
+        for name, value, known in (("codec", self.codec, CODECS), ("service", self.service, SERVICES)):
+            if value not in known:
+                raise UsageError(f"no {name} named {value!r}", hint=f"choose one of {', '.join(known)}")
+        if self.link is not None:
+            profile_named(self.link)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class SwarmSpec:
-    """The robots of a process and what they do; ``numbers`` are its robots among all ``robots``."""
+    """What one process does: the robots *numbers* of all robots of *options*."""
 
     numbers: tuple[int, ...]
-    robots: int
-    prefix: str
     url: str
-    service: str
-    codec: str
-    fps: float
-    matches: int
-    outliers: float
-    seed: int
-    join_every_s: float
-    deadline_s: float
-    keep: bool
     session: SessionSettings
+    options: SwarmOptions
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,20 +171,20 @@ class SolvedPayload:
     echo: list[float] | None = None
 
 
-def make_payloads(spec: SwarmSpec) -> list[SolvedPayload]:
-    """Return a pool of seeded problems with known answers, encoded for the codec of *spec*."""
+def make_payloads(options: SwarmOptions, session: SessionSettings) -> list[SolvedPayload]:
+    """Return a pool of seeded problems with known answers, encoded for the codec of *options*."""
     from rse_pf.pnp.problems import make_problem
     from rse_pf.services.pnp import make_request
 
-    codec = make_codec(spec.codec, spec.session)
-    if spec.service == "echo":
-        numbers = np.random.default_rng(spec.seed).integers(0, 1000, (_POOL, max(1, spec.matches)))
+    codec = make_codec(options.codec, session)
+    if options.service == "echo":
+        numbers = np.random.default_rng(options.seed).integers(0, 1000, (_POOL, max(1, options.matches)))
         return [SolvedPayload(payload=preencode(codec, {"value": row}), echo=row) for row in numbers.tolist()]
     pool = []
     for number in range(_POOL):
-        problem = make_problem(seed=spec.seed + number, n=spec.matches, outlier_ratio=spec.outliers)
+        problem = make_problem(seed=options.seed + number, n=options.matches, outlier_ratio=options.outliers)
         request = make_request(
-            problem.points_world, problem.pixels, problem.camera, binary=spec.codec == "bin"
+            problem.points_world, problem.pixels, problem.camera, binary=options.codec == "bin"
         )
         pool.append(SolvedPayload(payload=preencode(codec, request), T_camera_world=problem.T_camera_world))
     return pool
@@ -169,10 +204,10 @@ def is_right(problem: SolvedPayload, reply: Any) -> bool:
     return float(centres @ centres) <= _POSE_M**2 and cosine >= math.cos(_POSE_RAD)
 
 
-def planned_s(spec: SwarmSpec, number: int, start_s: float, frame: int) -> float:
+def planned_s(options: SwarmOptions, number: int, start_s: float, frame: int) -> float:
     """Return when robot *number* sends *frame*: fixed before the run, spread evenly over the robots."""
     phase = (number * _PHASE) % 1.0
-    return start_s + number * spec.join_every_s + (frame + phase) / spec.fps
+    return start_s + number * options.join_every_s + (frame + phase) / options.fps
 
 
 def run_swarm_process(spec: SwarmSpec, pipe: Connection) -> None:
@@ -213,7 +248,7 @@ class _Process:
 
     async def run(self) -> None:
         """Encode the payloads, follow the orders of the parent, and report the end."""
-        self.pool = await asyncio.to_thread(make_payloads, self.spec)
+        self.pool = await asyncio.to_thread(make_payloads, self.spec.options, self.spec.session)
         gc.collect()
         gc.freeze()
         loop = asyncio.get_running_loop()
@@ -316,7 +351,7 @@ class _Robot:
 
     def __init__(self, process: _Process, number: int) -> None:
         self.client: Any = None
-        self.name = f"{process.spec.prefix}-{number + 1}"
+        self.name = f"{process.spec.options.robot_prefix}-{number + 1}"
         self._process = process
         self._number = number
         self._waiting: dict[int, tuple[float, float]] = {}
@@ -330,12 +365,12 @@ class _Robot:
         """Connect at the time of this robot, retry until that works, and begin to send."""
         from client_sdk import connect
 
-        process, spec = self._process, self._process.spec
-        await asyncio.sleep(max(0.0, start_s + self._number * spec.join_every_s - time.monotonic()))
-        jitter = random.Random(f"{spec.seed}/{self.name}")
+        process, spec, options = self._process, self._process.spec, self._process.spec.options
+        await asyncio.sleep(max(0.0, start_s + self._number * options.join_every_s - time.monotonic()))
+        jitter = random.Random(f"{options.seed}/{self.name}")
         while not self._stopping:
             self.client = connect(
-                spec.url, token=self._token, codec=spec.codec, settings=spec.session,
+                spec.url, token=self._token, codec=options.codec, settings=spec.session,
                 on_change=self._changed, random=jitter,
             )  # fmt: skip
             try:
@@ -344,8 +379,8 @@ class _Robot:
             except RsePfError as error:
                 process.report("join-failed", robot=self.name, code=error.code, why=error.message)
                 await asyncio.sleep(spec.session.reconnect_max_s)
-        first = planned_s(spec, self._number, start_s, 0)
-        missed = max(0, math.ceil((time.monotonic() - first) * spec.fps))
+        first = planned_s(options, self._number, start_s, 0)
+        missed = max(0, math.ceil((time.monotonic() - first) * options.fps))
         if self._stopping:
             await self.close()
         else:
@@ -361,13 +396,13 @@ class _Robot:
             waiting = asyncio.ensure_future(self._idle.wait())
             await asyncio.wait({waiting}, timeout=grace_s)
             waiting.cancel()
-        for identity, (planned, sent) in self._waiting.items():
-            self._write(identity, planned, sent, None, math.nan)
+        for identity, times in self._waiting.items():
+            self._write(identity, times, math.nan, "", "")
         self._waiting.clear()
 
     async def leave(self) -> None:
         """Stop, then disconnect."""
-        await self.stop(self._process.spec.deadline_s)
+        await self.stop(self._process.spec.options.deadline_s)
         await self.close()
         self._process.report("robot-left", robot=self.name)
 
@@ -377,24 +412,23 @@ class _Robot:
             await self.client.close()
 
     def _plan(self, start_s: float, frame: int) -> None:
-        planned = planned_s(self._process.spec, self._number, start_s, frame)
+        planned = planned_s(self._process.spec.options, self._number, start_s, frame)
         loop = asyncio.get_running_loop()
         self._next = loop.call_at(planned, self._send, start_s, frame, planned)
 
     def _send(self, start_s: float, frame: int, planned: float) -> None:
         self._plan(start_s, frame + 1)
-        process, spec = self._process, self._process.spec
+        process, options = self._process, self._process.spec.options
         problem = process.pool[(frame + 7 * self._number) % len(process.pool)]
         identity = next(self._ids)
         sent = time.monotonic()
         try:
             self.client.post(
-                spec.service, problem.payload, functools.partial(self._answered, identity, problem),
-                deadline_s=max(0.0, spec.deadline_s - (sent - planned)), stream="pose", keep=spec.keep,
+                options.service, problem.payload, functools.partial(self._answered, identity, problem),
+                deadline_s=max(0.0, options.deadline_s - (sent - planned)), stream="pose", keep=options.keep,
             )  # fmt: skip
         except RsePfError as error:
-            row = (identity, planned, sent, sent)
-            process.write(self._row(*row), "", error.code)
+            self._write(identity, (planned, sent), sent, "", error.code)
             return
         self._waiting[identity] = (planned, sent)
         if not self._has_joined:
@@ -406,47 +440,29 @@ class _Robot:
         times = self._waiting.pop(identity, None)
         if times is None:
             return  # the robot has left, and the command counts as lost
-        self._write(identity, *times, event, time.monotonic())
-        if isinstance(event.answer, Result) and not is_right(problem, event.answer.reply):
-            self._process.wrong_poses += 1
+        answer, parts_ms, code = event.answer, _NO_PARTS, "ok"
+        if isinstance(answer, Result):
+            up_ms, down_ms = (math.nan if s is None else s * 1e3 for s in (event.up_s, event.down_s))
+            parts_ms = (up_ms, answer.queue_ms, answer.compute_ms, down_ms)
+            self._process.wrong_poses += not is_right(problem, answer.reply)
+        else:
+            code = answer.code
+        self._write(identity, times, time.monotonic(), answer.server, code, event.wire_bytes, parts_ms)
         if not self._waiting:
             self._idle.set()
 
     def _write(
-        self, identity: int, planned: float, sent: float, event: Answered | None, now_s: float
-    ) -> None:
-        if event is None:
-            self._process.write(self._row(identity, planned, sent, now_s), "", "")
-            return
-        answer = event.answer
-        if not isinstance(answer, Result):
-            row = self._row(identity, planned, sent, now_s, event.wire_bytes)
-            self._process.write(row, answer.server, answer.code)
-            return
-        up_ms, down_ms = (math.nan if s is None else s * 1e3 for s in (event.up_s, event.down_s))
-        row = self._row(
-            identity, planned, sent, now_s, event.wire_bytes, up_ms, answer.queue_ms, answer.compute_ms,
-            down_ms,
-        )  # fmt: skip
-        self._process.write(row, answer.server, "ok")
-
-    def _row(
         self,
         identity: int,
-        planned: float,
-        sent: float,
-        answered: float,
+        times: tuple[float, float],
+        ended: float,
+        server: str,
+        code: str,
         wire_bytes: int = 0,
-        up_ms: float = math.nan,
-        queue_ms: float = math.nan,
-        compute_ms: float = math.nan,
-        down_ms: float = math.nan,
-    ) -> tuple[float, ...]:
-        zero = self._process.origin_s
-        return (
-            self._number, identity, planned - zero, sent - zero, answered - zero, wire_bytes, up_ms, queue_ms,
-            compute_ms, down_ms,
-        )  # fmt: skip
+        parts_ms: tuple[float, ...] = _NO_PARTS,
+    ) -> None:
+        seconds = (each - self._process.origin_s for each in (*times, ended))
+        self._process.write((self._number, identity, *seconds, wire_bytes, *parts_ms), server, code)
 
     async def _token(self) -> str:
         return await self._process.token(self.name)
@@ -454,3 +470,10 @@ class _Robot:
     def _changed(self, what: str, why: str) -> None:
         details = {"reason": why} if what == "link-lost" else {"server": why}
         self._process.report(what, robot=self.name, **details)
+
+
+def _within(name: str, value: float, low: float, high: float) -> None:
+    if not low <= value <= high:
+        raise UsageError(
+            f"{name} = {value:g} is not within {low:g}..{high:g}", hint=f"choose {name} within that range"
+        )

@@ -42,31 +42,24 @@ class Scenario:
 async def _kill(harness: Harness, seconds: float, seed: int) -> None:
     began = harness.now()
     harness.kill(_AFTER_S)
-    await _replaced(harness, began)
+    await _wait_replaced(harness, began)
     await harness.run_for(_AFTER_S)
 
 
 async def _stop(harness: Harness, seconds: float, seed: int) -> None:
-    victim, began = harness.busiest(), harness.now()
-    harness.log("fault", fault="SIGSTOP", server=victim.name, pid=victim.pid, watch_s=10.0)
-    harness.platform.pause(victim.name)
-    await _replaced(harness, began)
+    began = harness.now()
+    _pause_busiest(harness, 10.0)
+    await _wait_replaced(harness, began)
     await harness.run_for(_AFTER_S)
 
 
 async def _balancer(harness: Harness, seconds: float, seed: int) -> None:
-    began = harness.now()
-    mark = harness.platform.load_balancer.mark
-    harness.log("fault", fault="kill -9 of the balancer", pid=None if mark is None else mark.pid, watch_s=8.0)
-    harness.platform.kill_balancer()
-    await harness.wait_for(lambda: bool(harness.events_since("balancer-back", began)), _TIMEOUT_S)
+    await _kill_balancer(harness, 8.0)
     await harness.run_for(_AFTER_S)
 
 
 async def _scale_in(harness: Harness, seconds: float, seed: int) -> None:
-    victim = harness.busiest()
-    harness.log("fault", fault="scale-in", server=victim.name, pid=victim.pid, watch_s=10.0)
-    await harness.platform.drain(victim.name, reason="experiment: scale-in under load")
+    await _drain_busiest(harness, 10.0)
     await harness.run_for(_AFTER_S)
 
 
@@ -128,23 +121,40 @@ async def _random_fault(harness: Harness, kind: str) -> None:
     if kind == "kill":
         harness.kill(_AFTER_S)
     elif kind == "stop":
-        victim = harness.busiest()
-        harness.log("fault", fault="SIGSTOP", server=victim.name, pid=victim.pid, watch_s=_AFTER_S)
-        harness.platform.pause(victim.name)
+        _pause_busiest(harness, _AFTER_S)
     elif kind == "balancer":
-        began = harness.now()
-        harness.log("fault", fault="kill -9 of the balancer", watch_s=_AFTER_S)
-        harness.platform.kill_balancer()
-        await harness.wait_for(lambda: bool(harness.events_since("balancer-back", began)), _TIMEOUT_S)
+        await _kill_balancer(harness, _AFTER_S)
     else:
-        began, victim = harness.now(), harness.busiest()
-        harness.log("fault", fault="scale-in", server=victim.name, pid=victim.pid, watch_s=_AFTER_S)
+        await _drain_busiest(harness, _AFTER_S, grow_first=True)
+
+
+def _pause_busiest(harness: Harness, watch_s: float) -> None:
+    victim = harness.busiest()
+    harness.log("fault", fault="SIGSTOP", server=victim.name, pid=victim.pid, watch_s=watch_s)
+    harness.platform.pause(victim.name)
+
+
+async def _kill_balancer(harness: Harness, watch_s: float) -> None:
+    began, mark = harness.now(), harness.platform.load_balancer.mark
+    pid = None if mark is None else mark.pid
+    harness.log("fault", fault="kill -9 of the balancer", pid=pid, watch_s=watch_s)
+    harness.platform.kill_balancer()
+    await harness.wait_for(lambda: bool(harness.events_since("balancer-back", began)), _TIMEOUT_S)
+
+
+async def _drain_busiest(harness: Harness, watch_s: float, *, grow_first: bool = False) -> None:
+    began, victim = harness.now(), harness.busiest()
+    harness.log("fault", fault="scale-in", server=victim.name, pid=victim.pid, watch_s=watch_s)
+    if grow_first:
         await harness.platform.grow(1, "experiment: before a scale-in")
-        if await harness.wait_for(lambda: bool(harness.events_since("server-healthy", began)), _TIMEOUT_S):
-            await harness.platform.drain(victim.name, reason="experiment: scale-in under load")
+        if not await harness.wait_for(
+            lambda: bool(harness.events_since("server-healthy", began)), _TIMEOUT_S
+        ):
+            return
+    await harness.platform.drain(victim.name, reason="experiment: scale-in under load")
 
 
-async def _replaced(harness: Harness, began: float) -> None:
+async def _wait_replaced(harness: Harness, began: float) -> None:
     """Wait until a server that was launched after *began* is healthy."""
 
     def replaced() -> bool:

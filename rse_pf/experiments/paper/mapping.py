@@ -9,7 +9,6 @@ from __future__ import annotations
 import csv
 import json
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -24,46 +23,30 @@ from rse_pf.experiments.results.result_folder import finish_report, load_average
 from rse_pf.experiments.results.summary import PAPER
 from rse_pf.local.control.monitor import MonitorSample, ServerSample
 
-__all__ = ["MapRunOptions", "run_map"]
+__all__ = ["run_map"]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class MapRunOptions:
-    """Options of the command line; *data* None means the rendered world."""
-
-    out: Path
-    robots: int = 3
-    fps: float = 5.0
-    data: Path | None = None
-    frames: int = 80
-    codec: str = "zlib"
-    seed: int = 0
-
-
-def run_map(options: MapRunOptions, settings: PlatformSettings) -> int:
+def run_map(options: DemoOptions, settings: PlatformSettings) -> int:
     """Run the demo, compute the figures from its files, write the report; return the exit code."""
     load_before = load_average()
-    demo = DemoOptions(
-        data=options.data,
-        robots=options.robots,
-        rate_hz=options.fps,
-        codec=options.codec,
-        out=options.out,
-        frames=options.frames,
-        seed=options.seed,
-        quiet=True,
-    )
-    code = run_demo(demo, settings)
+    code = run_demo(options, settings)
     folder = options.out.resolve()
-    frames = _write_truth(options, folder)
-    _complete_records(options, settings, folder, frames)
-    asked = {**asdict(options), "out": options.out.name, "data": options.data and options.data.name}
+    _complete_records(options, settings, folder, _write_truth(options, folder))
+    asked = {
+        "out": options.out.name,
+        "robots": options.robots,
+        "fps": options.rate_hz,
+        "data": options.data and options.data.name,
+        "frames": options.frame_count,
+        "codec": options.codec,
+        "seed": options.seed,
+    }
     report = {"experiment": "map", "asked": asked, **map_figures(read_records(folder)), "paper": PAPER}
     print(finish_report(folder, report, map_page, settings, load_before))
     return code
 
 
-def _write_truth(options: MapRunOptions, folder: Path) -> dict[str, int]:
+def _write_truth(options: DemoOptions, folder: Path) -> dict[str, int]:
     """Write the true trajectory of each robot, if it is known; return the number of frames of each."""
     frames = {}
     for number in range(options.robots):
@@ -74,20 +57,20 @@ def _write_truth(options: MapRunOptions, folder: Path) -> dict[str, int]:
     return frames
 
 
-def _truth(options: MapRunOptions, number: int) -> tuple[Trajectory | None, int]:
+def _truth(options: DemoOptions, number: int) -> tuple[Trajectory | None, int]:
     if options.data is None:
         from client_sdk.simulator import true_trajectory
 
-        truth = true_trajectory(number, options.robots, options.frames, options.seed)
-        return truth, options.frames
+        truth = true_trajectory(number, options.robots, options.frame_count, options.seed)
+        return truth, options.frame_count
     from client_sdk.datasets import open_dataset
 
-    share = open_dataset(options.data).thinned(options.fps).share(number, options.robots)
+    share = open_dataset(options.data).thinned(options.rate_hz).share(number, options.robots)
     return share.truth, len(share)
 
 
 def _complete_records(
-    options: MapRunOptions, settings: PlatformSettings, folder: Path, frames: dict[str, int]
+    options: DemoOptions, settings: PlatformSettings, folder: Path, frames: dict[str, int]
 ) -> None:
     """Write the parameters before the events of the demo, and its samples in the format of the monitor."""
     first = {
@@ -95,7 +78,7 @@ def _complete_records(
         "action": "experiment",
         "kind": "map",
         "robots": options.robots,
-        "fps": options.fps,
+        "fps": options.rate_hz,
         "frames": frames,
         **policy_parameters(settings, 1.0),
     }

@@ -20,7 +20,7 @@ __all__ = ["draw_elasticity", "draw_latency", "draw_robustness", "require_matplo
 _BLUE, _ORANGE, _GREEN, _RED, _GREY = "#1f5fa8", "#d9822b", "#3a8f4d", "#c0392b", "#8a8f98"
 _PARTS_COLOURS = {"up_ms": "#7aa6d6", "queue_ms": _ORANGE, "compute_ms": _GREEN, "down_ms": _BLUE}
 _PARTS_NAMES = {"up_ms": "up", "queue_ms": "queue", "compute_ms": "compute", "down_ms": "down"}
-_TRANSMISSION = "transmission (the paper does not split it)"
+_TRANSMISSION = "transmission, not split"
 _BINS = 80
 _MAX_PERCENT = 170.0  # emulated cores limit what is started, not what is used: peaks exceed 100 %
 _DPI = 130
@@ -252,7 +252,7 @@ def _stacked_bars(axis: Any, figures: Mapping[str, Any]) -> None:
     for place, total in enumerate(totals):
         axis.text(place, total + 2, f"{total:.1f} ms", ha="center", fontweight="bold", fontsize=10)
     axis.set_xticks([0, 1], ["the paper\nShenzhen to Seoul", "here\nemulated link"])
-    axis.set(xlim=(-0.5, 2.4), ylim=(0, 1.15 * max(totals)), ylabel="mean round trip, ms")
+    axis.set(xlim=(-0.5, 2.7), ylim=(0, 1.15 * max(totals)), ylabel="mean round trip, ms")
     axis.legend(fontsize=8, loc="center right", frameon=False)
 
 

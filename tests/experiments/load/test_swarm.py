@@ -12,7 +12,13 @@ from rse_pf.config import SessionSettings
 from rse_pf.errors import UsageError
 from rse_pf.experiments.load.run import SwarmRun, report_of
 from rse_pf.experiments.load.swarm import SwarmOptions, SwarmResult, records_of
-from rse_pf.experiments.load.swarm_process import ResultRows, SwarmSpec, is_right, make_payloads, planned_s
+from rse_pf.experiments.load.swarm_process import (
+    ResultRows,
+    SolvedPayload,
+    is_right,
+    make_payloads,
+    planned_s,
+)
 from rse_pf.experiments.results.records import CommandRecord
 from rse_pf.geometry import exp_se3
 from rse_pf.pnp import solve_pnp
@@ -21,13 +27,12 @@ from rse_pf.wire import Command, as_type, make_codec
 from rse_pf.wire.preencoded import encode_command
 
 
-def spec(**changes: Any) -> SwarmSpec:
-    given: dict[str, Any] = {
-        "numbers": (0, 1), "robots": 2, "prefix": "robot", "url": "ws://h/ws", "service": "pnp",
-        "codec": "zlib", "fps": 5.0, "matches": 200, "outliers": 0.3, "seed": 0, "join_every_s": 0.0,
-        "deadline_s": 5.0, "keep": True, "session": SessionSettings(), **changes,
-    }  # fmt: skip
-    return SwarmSpec(**given)
+def options(**changes: Any) -> SwarmOptions:
+    return SwarmOptions(**{"robots": 2, **changes})
+
+
+def payloads(**changes: Any) -> list[SolvedPayload]:
+    return make_payloads(options(**changes), SessionSettings())
 
 
 @pytest.mark.parametrize(
@@ -46,18 +51,18 @@ def test_options_that_are_none_are_refused_with_a_hint(name: str, value: Any) ->
 
 def test_send_times_are_fixed_beforehand_and_evenly_spread_over_the_robots() -> None:
     robots = 100
-    phases = sorted(planned_s(spec(), number, 0.0, 0) for number in range(robots))
+    phases = sorted(planned_s(options(), number, 0.0, 0) for number in range(robots))
     assert phases[0] >= 0.0
     assert phases[-1] < 0.2
     assert max(np.diff(phases)) < 3 * 0.2 / robots
-    assert planned_s(spec(), 7, 100.0, 10) - planned_s(spec(), 7, 100.0, 9) == pytest.approx(0.2)
-    assert planned_s(spec(join_every_s=20.0), 3, 0.0, 0) >= 60.0
+    assert planned_s(options(), 7, 100.0, 10) - planned_s(options(), 7, 100.0, 9) == pytest.approx(0.2)
+    assert planned_s(options(join_every_s=20.0), 3, 0.0, 0) >= 60.0
 
 
 @pytest.mark.parametrize("codec_name", ["zlib", "json", "bin"])
 def test_a_right_solution_of_every_payload_is_called_right_and_a_wrong_one_wrong(codec_name: str) -> None:
     codec = make_codec(codec_name)
-    for problem in make_payloads(spec(codec=codec_name))[:8]:
+    for problem in payloads(codec=codec_name)[:8]:
         data = encode_command(codec, Command(id=1, service="pnp", payload=problem.payload))
         message = codec.decode_from_robot(data)
         assert isinstance(message, Command)
@@ -74,21 +79,21 @@ def test_a_right_solution_of_every_payload_is_called_right_and_a_wrong_one_wrong
 
 @pytest.mark.parametrize("reply", [None, {}, {"T_camera_world": [1.0]}, {"T_camera_world": "x"}, 7])
 def test_a_reply_that_is_no_pose_is_wrong(reply: Any) -> None:
-    assert not is_right(make_payloads(spec())[0], reply)
+    assert not is_right(payloads()[0], reply)
 
 
 def test_an_echo_is_right_only_if_it_is_the_same() -> None:
-    problem = make_payloads(spec(service="echo", matches=5))[0]
+    problem = payloads(service="echo", matches=5)[0]
     assert is_right(problem, {"value": list(problem.echo or [])})
     assert not is_right(problem, {"value": [0.5]})
 
 
 def test_equal_seeds_make_equal_payloads() -> None:
-    def payloads(seed: int) -> list[bytes]:
-        return [problem.payload.encoded for problem in make_payloads(spec(seed=seed))[:3]]
+    def encoded(seed: int) -> list[bytes]:
+        return [problem.payload.encoded for problem in payloads(seed=seed)[:3]]
 
-    assert payloads(1) == payloads(1)
-    assert payloads(1) != payloads(100)
+    assert encoded(1) == encoded(1)
+    assert encoded(1) != encoded(100)
 
 
 def rows() -> ResultRows:
