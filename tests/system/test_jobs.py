@@ -1,4 +1,4 @@
-"""Long services as jobs, in real servers and processes: they outlive their server, and every robot gets an answer."""
+"""Long services as jobs, in real servers and processes: they outlive their server, and each is answered."""
 
 from __future__ import annotations
 
