@@ -3,7 +3,7 @@
 Defends: three robots, merged ATE at most 4.5 cm, origins 7 cm / 2.5 deg, cloud 15 mm median and 85 % under
 5 cm of the one built with true poses; one robot, loops closed, ATE at most 4.5 cm and never worse than
 without.  Runs ``rse-pf demo --merge`` twice (balancer, two servers, data service, robots, the merge as a
-job), unless --folders names what earlier runs left.  Promises to judge by the files alone.
+job), unless --folders names the folders of earlier runs.  The maps are judged by their files alone.
 
     python benchmarks/map_platform.py --recordings ../shared/data --out map_platform.json
 """

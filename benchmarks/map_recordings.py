@@ -1,6 +1,6 @@
-"""Maps and scores from a recording: what robots would upload, and how far a merged map is from truth.
+"""Maps from a recording, as robots would upload them, and the error of a merged map.
 
-Promises to solve poses in this process, without a platform, and to use truth for scores alone.
+Poses are solved in this process, without a platform; ground truth is used for errors only.
 """
 
 from __future__ import annotations

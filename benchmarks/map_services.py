@@ -3,7 +3,7 @@
 Defends: merged ATE at most 4.5 cm, origins 7 cm / 2.5 deg, cloud 15 mm median and 85 % under 5 cm;
 wrong loops (10 %) move the ATE by less than a tenth; a 2,500-pose sphere in 5 s; localise 60 % found,
 median 3 cm / 2 deg, none wrong; icp to 1 cm / 0.5 deg; 68 +- 5 % inside the wifi radius.
-Promises to write nothing but ``--out``; times from a busy machine are the reader's to discard.
+Times are meaningful on an idle machine only.
 
     python benchmarks/map_services.py --recordings ../shared/data --out map_services.json
 """

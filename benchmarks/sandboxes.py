@@ -1,9 +1,8 @@
-"""What isolated environments cost, and what one robot's crashes cost the others: the table of issue 5.
+"""Measure what sandboxes cost, and what the crashes of one robot cost the others: the table of issue 5.
 
-    python benchmarks/environments.py [--only cost,gone,...] [--crash-seconds 60] [--out FILE]
+    python benchmarks/sandboxes.py [--only cost,released,...] [--crash-seconds 60] [--out FILE]
 
-Real servers, real robots on this machine; every figure is measured here and now, on shared cores.  Promises
-no judgement beyond its bars, and to leave no process behind.
+Real servers and robots on this machine, on shared cores.
 """
 
 from __future__ import annotations
@@ -110,7 +109,7 @@ class Server:
         return connect(self.url, token=token, codec="bin")
 
     def ready(self) -> Row:
-        """Return what /readyz says."""
+        """Return the answer of /readyz."""
         url = f"http://127.0.0.1:{self._identity['control_port']}/readyz"
         try:
             with urllib.request.urlopen(url, timeout=5) as answer:
@@ -205,8 +204,8 @@ async def cost(folder: Path, robots: int = 8, calls: int = 200) -> list[Row]:
                 "following_median_ms": following, "echo_median_ms": echo,
                 "overhead_over_echo_and_direct_ms": following - echo - direct,
                 "overhead_with_network_ms": following - direct,
-                "processes_per_environment": len(memory) / robots,
-                "unique_mib_per_environment": sum(memory) / robots,
+                "processes_per_sandbox": len(memory) / robots,
+                "unique_mib_per_sandbox": sum(memory) / robots,
             })  # fmt: skip
     return rows
 
@@ -222,15 +221,15 @@ async def _median_ms(server: Server, name: str, payload: Any, calls: int) -> flo
 
 
 async def crashes(folder: Path, seconds: float, others: int = 20, count: int = 50) -> list[Row]:
-    """Let a robot crash its environment while others do PnP, in turns with quiet stretches."""
+    """Let one robot crash its sandbox while others do PnP, alternating with times without crashes."""
     rows, turns = [], 4
-    for deaths in (100_000, None):
-        limits = {} if deaths is None else {"breaker_crashes": deaths}
+    for crash_limit in (100_000, None):
+        limits = {} if crash_limit is None else {"breaker_crashes": crash_limit}
         async with serving(folder, **limits) as server:
             times: dict[bool, list[float]] = {False: [], True: []}
             failed: list[str] = []
             victims: list[tuple[str, float]] = []
-            for _ in range(turns if deaths else 1):
+            for _ in range(turns if crash_limit else 1):
                 for crashing in (False, True):
                     part_s = seconds / turns
                     end = time.perf_counter() + part_s
@@ -244,12 +243,12 @@ async def crashes(folder: Path, seconds: float, others: int = 20, count: int = 5
             quiet, busy = percentile(times[False], 99), percentile(times[True], 99)
             codes = [code for code, _ in victims]
             rows.append({
-                "row": f"{len(victims)} crashes, quarantine {'off' if deaths else 'as by default'}",
+                "row": f"{len(victims)} crashes, circuit breaker {'off' if crash_limit else 'as by default'}",
                 "others_commands": len(times[False]) + len(times[True]), "others_failed": len(failed),
                 "others_p99_quiet_ms": quiet, "others_p99_crashing_ms": busy, "ratio": busy / quiet,
                 "victims": {code: codes.count(code) for code in sorted(set(codes))},
                 "victim_worst_ms": 1e3 * max(took for _, took in victims),
-                "readyz": server.ready().get("environments", server.ready()),
+                "readyz": server.ready(),
             })  # fmt: skip
     return rows
 
@@ -286,7 +285,7 @@ async def _crash_robot(
 
 
 async def poison(folder: Path, requests: int = 5000) -> list[Row]:
-    """Hide one deadly request among many good ones, and send it again and again."""
+    """Send one request that crashes its sandbox among many good ones."""
     told: list[str] = []
     async with serving(folder) as server, server.robot("poisoner") as robot:
         for i in range(requests):
@@ -300,11 +299,11 @@ async def poison(folder: Path, requests: int = 5000) -> list[Row]:
     return [{
         "row": f"one poison among {requests}",
         "answers": {code: told.count(code) for code in sorted(set(told))},
-        "readyz": ready.get("environments", ready),
+        "readyz": ready,
     }]  # fmt: skip
 
 
-async def gone(folder: Path, robots: int = 10) -> list[Row]:
+async def released(folder: Path, robots: int = 10) -> list[Row]:
     """Count processes and descriptors before robots come and after they left."""
     async with serving(folder) as server:
         async with server.robot("first") as robot:
@@ -323,17 +322,17 @@ async def gone(folder: Path, robots: int = 10) -> list[Row]:
             await asyncio.sleep(0.1)  # looks again, with a deadline
     return [{
         "row": f"{robots} robots leave", "processes_and_descriptors_before": before, "during": during,
-        "after": after, "gone_after_s": time.monotonic() - began,
+        "after": after, "released_after_s": time.monotonic() - began,
     }]  # fmt: skip
 
 
-async def _settled(server: Server, most: int) -> None:
-    """Wait until no environment is left (its grace is 5 s)."""
+async def _settled(server: Server, sandboxes: int) -> None:
+    """Wait until only *sandboxes* are left (the grace period is 5 s)."""
     seen, end = -1, time.monotonic() + 12
     while time.monotonic() < end:
         await asyncio.sleep(1.0)
         seen = len(server.processes())
-        if seen <= 2 + most:
+        if seen <= 2 + sandboxes:
             return
 
 
@@ -351,7 +350,9 @@ async def state(folder: Path, kills: int = 5) -> list[Row]:
     failures: list[str] = []
     place = folder / "platform"
     async with (
-        LocalPlatform(chosen, state=place, servers=2, port=0, name="bench", control=ControlOptions(elastic=True)) as cloud,
+        LocalPlatform(
+            chosen, state=place, servers=2, port=0, name="bench", control=ControlOptions(elastic=True)
+        ) as cloud,
         connect(cloud.url, token=cloud.issue_token("counter")) as robot,
     ):
         for _ in range(kills):
@@ -387,7 +388,7 @@ async def _count(robot: Any, times: int, counts: list[int], failures: list[str])
 
 
 def prepare(folder: Path) -> None:
-    """Write and install what is measured, as an author would."""
+    """Write and install the measured services, like an author."""
     here = Path.cwd()
     os.chdir(folder)
     try:
@@ -413,14 +414,15 @@ def prepare(folder: Path) -> None:
 
 
 async def measure(only: list[str], crash_s: float) -> list[Row]:
-    """Return the rows, printing each as soon as it is there."""
+    """Return the rows and print each as soon as it is measured."""
     rows: list[Row] = []
-    with tempfile.TemporaryDirectory(prefix="rse-pf-environments-") as temporary:
+    with tempfile.TemporaryDirectory(prefix="rse-pf-sandboxes-") as temporary:
         folder = Path(temporary)
         prepare(folder)
         works = {
-            "cost": lambda: cost(folder), "gone": lambda: gone(folder), "poison": lambda: poison(folder),
-            "state": lambda: state(folder), "crashes": lambda: crashes(folder, crash_s),
+            "cost": lambda: cost(folder), "released": lambda: released(folder),
+            "poison": lambda: poison(folder), "state": lambda: state(folder),
+            "crashes": lambda: crashes(folder, crash_s),
         }  # fmt: skip
         for name in only:
             for row in await works[name]():
@@ -430,11 +432,11 @@ async def measure(only: list[str], crash_s: float) -> list[Row]:
 
 
 def main() -> None:
-    """Measure, and write what was measured."""
+    """Measure, and write the rows."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--only", default="cost,gone,poison,state,crashes")
+    parser.add_argument("--only", default="cost,released,poison,state,crashes")
     parser.add_argument("--crash-seconds", type=float, default=60.0)
     parser.add_argument("--out", type=Path)
     args = parser.parse_args()
