@@ -11,7 +11,7 @@ PYTEST := $(BIN)/python -m pytest
 .DEFAULT_GOAL := help
 .PHONY: help setup assets synth demo test quick slow lint types bench docs lock fuzz sbom audit-deps clean
 
-help: ## show these verbs
+help: ## show these targets
 	@awk -F':.*## ' '/^[a-z-]+:.*## /{printf "  make %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
 
 setup: ## install everything a developer needs: Node, the CDK, the cloud's packages
@@ -19,49 +19,49 @@ setup: ## install everything a developer needs: Node, the CDK, the cloud's packa
 	@$(BIN)/python scripts/assets.py
 	@sh scripts/cdk.sh
 
-assets: ## the packages that the cloud boots from, into build/
+assets: ## build the packages for AWS into build/
 	@$(SETUP) dev infra
 	@$(BIN)/python scripts/assets.py
 
-synth: ## the cloud's templates, into cdk.out; no account, no network once set up
+synth: ## write the CloudFormation templates into cdk.out; needs no account, and no network after setup
 	@$(SETUP) dev infra
 	@$(BIN)/python scripts/assets.py
 	@sh scripts/cdk.sh synth --quiet
 
-demo: ## robots build point-cloud maps through the PnP service; writes ./out
+demo: ## run robots that build point-cloud maps with the PnP service; writes ./out
 	@$(SETUP) demo
 	@$(BIN)/rse-pf demo --out out $(ARGS)
 
-test: ## the tests that CI runs, under ten minutes on two cores
+test: ## run what CI runs: lint, types, all tests but the slow ones
 	@$(SETUP) dev infra
 	@$(BIN)/ruff check . && $(BIN)/ruff format --check .
 	@$(BIN)/mypy
 	@$(PYTEST) -m "not slow" -n 2 --dist loadfile $(ARGS)
 
-quick: ## pure tests only, in seconds
+quick: ## run the pure tests only, in seconds
 	@$(SETUP) dev
 	@$(PYTEST) -q -m "not slow and not system" -n 2 --dist loadfile $(ARGS)
 
-slow: ## conformance suites, recordings, a bare Debian: what make test leaves out
+slow: ## run what make test leaves out: conformance suites, recordings, a bare Debian
 	@$(SETUP) dev infra
 	@$(BIN)/python scripts/assets.py
 	@$(PYTEST) -m slow $(ARGS)
 
-lint: ## ruff, check only
+lint: ## run ruff, check only
 	@$(SETUP) dev
 	@$(BIN)/ruff check . && $(BIN)/ruff format --check .
 
-types: ## mypy --strict
+types: ## run mypy --strict
 	@$(SETUP) dev
 	@$(BIN)/mypy
 
-bench: ## every benchmark, short; tables on the screen, JSON in out/bench
+bench: ## run every benchmark briefly; prints tables, writes JSON to out/bench
 	@$(SETUP) dev
 	@mkdir -p out/bench
 	@for each in $$(grep -l -- '"--out"' benchmarks/*.py); do \
 	  echo "== $$each"; $(BIN)/python $$each --out out/bench/$$(basename $$each .py).json || exit 1; done
 
-docs: ## write the generated pages anew
+docs: ## write the generated pages and the picture of the packages
 	@$(SETUP) dev
 	@$(BIN)/rse-pf settings --markdown > docs/settings.md
 	@$(BIN)/rse-pf data --openapi > docs/openapi.json
@@ -74,7 +74,7 @@ fuzz: ## fuzz each target for FUZZ_S seconds (600), with atheris where it is ins
 	for each in codec frames stream geometry; do echo "== $$each ($$engine)"; \
 	  $(BIN)/python -m fuzz $$each --engine $$engine --seconds $${FUZZ_S:-600} || exit 1; done
 
-sbom: ## what is installed with the product, as CycloneDX, from the locks: build/sbom.json
+sbom: ## write the bill of materials of the locks, as CycloneDX, to build/sbom.json
 	@$(SETUP) dev
 	@mkdir -p build
 	@$(BIN)/python -m cyclonedx_py requirements locks/demo.txt --pyproject pyproject.toml --mc-type application \
@@ -83,11 +83,11 @@ sbom: ## what is installed with the product, as CycloneDX, from the locks: build
 	  --output-reproducible --of JSON -o build/sbom-boot.json
 	@echo "build/sbom.json: a robot and the local platform; build/sbom-boot.json: a cloud server"
 
-audit-deps: ## look the locked versions up among known weaknesses; needs the network
+audit-deps: ## check the locked versions for known weaknesses; needs the network
 	@$(SETUP) dev
 	@$(BIN)/pip-audit --disable-pip --require-hashes -r locks/demo.txt -r locks/boot.txt -r locks/lambda.txt
 
-lock: ## choose the newest versions and write the hashes into locks/
+lock: ## resolve the newest versions and write them with hashes into locks/
 	@$(SETUP) dev
 	@sh scripts/lock.sh
 
