@@ -1,4 +1,4 @@
-"""The object store as a backend server uses it: opened from the settings, written within a robot's quota.
+"""The object store as a backend server uses it: written within a robot's quota.
 
 The quota is that of the data service: ``data_bytes`` of the robot's token, or else ``data.quota_bytes``.
 Nothing is removed to make an object fit.
@@ -9,9 +9,9 @@ from __future__ import annotations
 from rse_pf.auth.tokens import Claims
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import NotFound, QuotaExceeded
-from rse_pf.object_store import ObjectStore, digest_of, object_name, open_store
+from rse_pf.object_store import ObjectStore, digest_of, object_name
 
-__all__ = ["check_quota", "is_shared", "open_server_store", "quota_bytes", "store_within_quota"]
+__all__ = ["check_quota", "is_shared", "quota_bytes", "store_within_quota"]
 
 _PRIVATE_STORE = "memory:"
 
@@ -19,17 +19,6 @@ _PRIVATE_STORE = "memory:"
 def is_shared(settings: PlatformSettings) -> bool:
     """Return whether other processes see what one process stores."""
     return settings.data.store != _PRIVATE_STORE
-
-
-def open_server_store(settings: PlatformSettings) -> ObjectStore:
-    """Return the store of ``data.store``; raises UsageError for one that does not exist."""
-
-    def bucket(name: str) -> ObjectStore:
-        from rse_pf.aws.storage import open_bucket
-
-        return open_bucket(name, settings.cloud.region)
-
-    return open_store(settings.data.store, {"s3": bucket})
 
 
 def quota_bytes(claims: Claims | None, default: float) -> float:

@@ -1,7 +1,7 @@
 """Run the data service: images, keyframes, clouds and maps by HTTP, under /data/.
 
-It answers /data/healthz, /data/readyz and /data/openapi.json without a token.  Ctrl-C or SIGTERM ends it
-when its requests are answered.  Keys that come later than the service are picked up.
+/data/healthz, /data/readyz and /data/openapi.json need no token.  Ctrl-C or SIGTERM ends the service after
+the requests that it has.  Keys that are written after its start are found.
 
 example:
   rse-pf data --keys keys.json --store dir:objects --port 0 --announce data.json
@@ -13,12 +13,11 @@ import argparse
 import sys
 from pathlib import Path
 
-from rse_pf.auth.trust_store import REFRESH_S
+from rse_pf.aws.storage import open_data_store
 from rse_pf.config import PlatformSettings, setting_rows
 from rse_pf.errors import UsageError
-from rse_pf.object_store import ObjectStore, open_store
 
-__all__ = ["add_arguments", "open_any_store", "run"]
+__all__ = ["add_arguments", "run"]
 
 # Options that are settings of the same name.
 _OPTIONS: dict[str, type] = {"host": str, "port": int, "store": str}
@@ -33,47 +32,36 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         )
     parser.add_argument(
         "--keys", type=Path, metavar="FILE",
-        help="public keys of the tokens, a JWKS; roster and deny-list lie beside it in control/",
+        help="public keys of the tokens, a JWKS; roster and deny list are in control/ beside it",
     )  # fmt: skip
     parser.add_argument(
-        "--audit", type=Path, metavar="DIR", help="record there how maps change, and who was refused"
+        "--audit",
+        type=Path,
+        metavar="DIR",
+        help="folder of the audit log of map changes and refused tokens",
     )
+    parser.add_argument("--openapi", action="store_true", help="print the OpenAPI document and exit")
     parser.add_argument(
-        "--openapi", action="store_true", help="print the OpenAPI document and do nothing else"
-    )
-    parser.add_argument(
-        "--announce", type=Path, metavar="FILE", help="write pid and port there when all is ready"
+        "--announce", type=Path, metavar="FILE", help="file that gets pid and port when the service is ready"
     )
 
 
 def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
-    """Serve until a signal ends it."""
+    """Serve until a signal ends the process."""
     if args.openapi:
         from rse_pf.data_server.routes import openapi_page
 
         sys.stdout.write(openapi_page())
         return 0
     if args.keys is None:
-        raise UsageError("--keys is missing", hint="name a JWKS; rse-pf local writes one as keys.json")
+        raise UsageError("--keys is missing", hint="give a JWKS; rse-pf local writes one as keys.json")
     chosen = settings.replace(
         data={name: getattr(args, name) for name in _OPTIONS if getattr(args, name) is not None}
     )
     for file in (args.keys, args.announce):
         if file is not None and not file.absolute().parent.is_dir():
-            raise UsageError(f"there is no folder {file.absolute().parent}", hint="make it, or name another")
-    store = open_any_store(chosen)
+            raise UsageError(f"there is no folder {file.absolute().parent}", hint="create the folder")
     from rse_pf.data_server.server import KeysFile, serve_data
 
-    keys = KeysFile(args.keys, REFRESH_S)
+    store, keys = open_data_store(chosen), KeysFile(args.keys)
     return serve_data(chosen, store, keys=keys, announce=args.announce, audit=args.audit)
-
-
-def open_any_store(settings: PlatformSettings) -> ObjectStore:
-    """Return the store of ``data.store``, also if it is a bucket; raises UsageError."""
-
-    def bucket(name: str) -> ObjectStore:
-        from rse_pf.aws.storage import open_bucket
-
-        return open_bucket(name, settings.cloud.region)
-
-    return open_store(settings.data.store, {"s3": bucket})

@@ -32,7 +32,7 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 import numpy as np
 
-from rse_pf.cli.data import open_any_store
+from rse_pf.aws.storage import open_data_store
 from rse_pf.cli.operator import record_map_change
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import CommandFailed, NotFound, UsageError
@@ -144,7 +144,7 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
         record_map_change(chosen, action, name, version=made.id, number=made.number)
 
     max_bytes = 4 * chosen.data.max_object_bytes
-    maps = MapRegistry(open_any_store(chosen), args.tenant, max_bytes=max_bytes, on_change=record)
+    maps = MapRegistry(open_data_store(chosen), args.tenant, max_bytes=max_bytes, on_change=record)
     actions = {
         "list": _list,
         "show": _show,

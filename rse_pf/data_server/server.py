@@ -20,7 +20,7 @@ import msgspec
 
 from rse_pf.audit.log import AuditLog
 from rse_pf.auth.tokens import KeySet
-from rse_pf.auth.trust_store import TrustStore
+from rse_pf.auth.trust_store import REFRESH_S, TrustStore
 from rse_pf.config import PlatformSettings
 from rse_pf.data_server.app import DataServer
 from rse_pf.errors import ConfigurationError, MissingExtra, StoreError
@@ -37,15 +37,14 @@ _STOP_TIMEOUT_S = 10
 class KeysFile:
     """The public keys in a file, with roster and deny list beside it, reread periodically by `TrustStore`."""
 
-    def __init__(self, path: Path, refresh_s: float, clock: Callable[[], float] = time.monotonic) -> None:
+    def __init__(self, path: Path, clock: Callable[[], float] = time.monotonic) -> None:
         self._trust = TrustStore(path)
-        self._refresh_s = refresh_s
         self._clock = clock
         self._refreshed_s = float("-inf")
 
     def __call__(self) -> KeySet | None:
         """Return the keys; None while there are none."""
-        if self._clock() - self._refreshed_s >= self._refresh_s:
+        if self._clock() - self._refreshed_s >= REFRESH_S:
             self._refreshed_s = self._clock()
             self._trust.refresh()
         return self._trust.keys

@@ -11,13 +11,12 @@ from fake_data_service import KEY, Service, small_settings
 
 from rse_pf.auth.roster import EnrolledRobot, public_key_of
 from rse_pf.auth.tokens import SigningKey
-from rse_pf.auth.trust_store import AccessControlStore
+from rse_pf.auth.trust_store import REFRESH_S, AccessControlStore
 from rse_pf.data_server import DataServer
 from rse_pf.data_server.server import KeysFile
 from rse_pf.object_store import DirectoryStore, MemoryStore, digest_of
 
 ROBOT = SigningKey.of_robot(b"r" * 32)
-PAUSE_S = 0.5
 
 
 class RosterService(Service):
@@ -30,7 +29,7 @@ class RosterService(Service):
         super().__init__(small_settings(), MemoryStore())
 
     def restart(self) -> None:
-        keys = KeysFile(self.folder / "keys.json", PAUSE_S, lambda: self.now)
+        keys = KeysFile(self.folder / "keys.json", lambda: self.now)
         self.app = DataServer(
             self.settings, self.store, keys=keys, log=self.lines.append, clock=lambda: self.now,
             wall_clock=lambda: self.wall,
@@ -53,7 +52,7 @@ def test_a_disabled_robot_is_refused_after_the_next_refresh_and_after_a_restart(
     assert put(service, b"a", token) == 201
 
     service.room.change_deny_list(lambda denied: denied.with_robot("default", "robot-1", 0.0))
-    service.now += PAUSE_S
+    service.now += REFRESH_S
 
     assert put(service, b"b", token) == 401
     assert service.lines[-1]["reason"] == "disabled"

@@ -3,6 +3,6 @@
 Everything that must survive a server belongs here; instances belong to `fleet`.
 """
 
-from rse_pf.aws.storage.s3_store import S3Store, open_bucket
+from rse_pf.aws.storage.s3_store import S3Store, open_bucket, open_data_store
 
-__all__ = ["S3Store", "open_bucket"]
+__all__ = ["S3Store", "open_bucket", "open_data_store"]

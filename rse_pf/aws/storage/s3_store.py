@@ -13,10 +13,11 @@ from collections.abc import Iterator
 from typing import Any
 
 from rse_pf.aws.clients import error_code, make_client, status_of, with_retries
+from rse_pf.config import PlatformSettings
 from rse_pf.errors import Conflict, NotFound, StoreError, StoreFull
-from rse_pf.object_store import ObjectInfo, check_name
+from rse_pf.object_store import ObjectInfo, ObjectStore, check_name, open_store
 
-__all__ = ["S3Store", "open_bucket"]
+__all__ = ["S3Store", "open_bucket", "open_data_store"]
 
 _NOT_FOUND, _PRECONDITION_FAILED, _CONFLICT, _RANGE_OUTSIDE = 404, 412, 409, 416
 _FULL = {"QuotaExceeded", "EntityTooLarge", "InsufficientStorage"}
@@ -25,6 +26,11 @@ _FULL = {"QuotaExceeded", "EntityTooLarge", "InsufficientStorage"}
 def open_bucket(bucket: str, region: str) -> S3Store:
     """Return the store in *bucket* without a call to AWS; raises MissingExtra."""
     return S3Store(make_client("s3", region), bucket)
+
+
+def open_data_store(settings: PlatformSettings) -> ObjectStore:
+    """Return the store of ``data.store``, which may be a bucket; raises UsageError or MissingExtra."""
+    return open_store(settings.data.store, {"s3": lambda bucket: open_bucket(bucket, settings.cloud.region)})
 
 
 class S3Store:

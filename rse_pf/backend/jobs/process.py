@@ -21,9 +21,10 @@ from typing import Any
 
 import msgspec
 
+from rse_pf.aws.storage import open_data_store
 from rse_pf.backend.jobs.runner import JobRequest
 from rse_pf.backend.object_refs import named_in, resolve
-from rse_pf.backend.robot_store import check_quota, is_shared, open_server_store, store_within_quota
+from rse_pf.backend.robot_store import check_quota, is_shared, store_within_quota
 from rse_pf.backend.sandbox.ipc import encode_message, receive
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import BadMessage, Cancelled, Crashed, LimitExceeded, RsePfError, StoreError
@@ -159,14 +160,14 @@ def _resolved(
     """Return the payload with the robot's objects in place of their names."""
     if not named_in(request_type, payload):
         return payload
-    store = open_server_store(settings)
+    store = open_data_store(settings)
     return resolve(request_type, payload, order["tenant"], order["robot"], store, settings=settings.serving)
 
 
 def _check_quota(order: dict[str, Any], settings: PlatformSettings) -> None:
     """Raise QuotaExceeded before the work if its result cannot be stored."""
     if is_shared(settings):
-        store = open_server_store(settings)
+        store = open_data_store(settings)
         with contextlib.suppress(StoreError):  # the store is tried again when there is a result
             check_quota(store, order["tenant"], order["robot"], 1, order["quota_bytes"])
 
@@ -180,7 +181,7 @@ def store_reply(answer: list[Any], order: dict[str, Any]) -> list[Any]:
     try:
         if len(reply) > settings.data.max_object_bytes:
             raise LimitExceeded(f"a reply of {len(reply)} bytes is too large", hint="ask for less")
-        digest = _stored(reply, order, open_server_store(settings))
+        digest = _stored(reply, order, open_data_store(settings))
     except RsePfError as error:
         return _encode_answer(failure_of(error))
     return ["stored", compute_ms, digest, len(reply), reply if len(reply) <= order["inline_bytes"] else None]

@@ -22,6 +22,7 @@ from typing import Any
 
 from rse_pf.auth.tokens import KeySet
 from rse_pf.auth.trust_store import key_set_from_snapshot
+from rse_pf.aws.storage import open_data_store
 from rse_pf.backend.gateway.admission import Admission
 from rse_pf.backend.gateway.answers import Answers
 from rse_pf.backend.gateway.audit_recorder import AuditRecorder
@@ -41,7 +42,7 @@ from rse_pf.backend.log import JsonLog
 from rse_pf.backend.metrics import Metrics
 from rse_pf.backend.object_refs import ObjectRefs
 from rse_pf.backend.ports import Clocks
-from rse_pf.backend.robot_store import is_shared, open_server_store
+from rse_pf.backend.robot_store import is_shared
 from rse_pf.backend.sandbox.manager import SandboxManager
 from rse_pf.backend.scheduling.cpu_throttle import CpuThrottle, NoThrottle
 from rse_pf.backend.scheduling.scheduler import Scheduler
@@ -131,7 +132,7 @@ class _Worker:
         installed += published_services() if chosen.published else []
         clocks = Clocks(monotonic=time.monotonic, wall=time.time, cpu=time.process_time)
         metrics, connections = Metrics(), set[RobotConnection]()
-        store = open_server_store(settings) if is_shared(settings) else None
+        store = open_data_store(settings) if is_shared(settings) else None
         answers = Answers(
             registry=registry,
             services=frozenset(service.name for service in (*registry, *installed)),
@@ -204,7 +205,7 @@ class _Worker:
             settings=settings,
             max_sandboxes=-(-settings.services.max_sandboxes // plan.workers),
             server_id=plan.server_id,
-            store=open_server_store(settings),
+            store=open_data_store(settings),
             monotonic=time.monotonic,
             loop=self._loop,
             log=self._log,
@@ -215,7 +216,7 @@ class _Worker:
         settings = plan.settings
         read, write = plan.job_slots
         context = JobContext(
-            store=open_server_store(settings),
+            store=open_data_store(settings),
             slots=JobSlots((read, write)),
             settings=settings.serving,
             quota_bytes=settings.data.quota_bytes,
