@@ -79,7 +79,7 @@ class FrontEndOptions:
     keyframe_inliers: int = 120
     """A frame with fewer inliers becomes a keyframe even if the robot hardly moved."""
     chain: Literal["frame", "keyframe"] = "frame"
-    """Match against the last good frame, or against the last keyframe; the other one is used for the retry."""
+    """Match against the last good frame, or against the last keyframe; the other one is the retry."""
 
     def __post_init__(self) -> None:
         if self.min_inliers < 4 or self.max_matches < self.min_inliers or self.features < self.min_inliers:
@@ -258,8 +258,8 @@ class Tracker:
         self._last: _View | None = None
         self._keyframe: _View | None = None
         self._lost_in_a_row = 0
-        self._frame: Frame | None = None
-        self._features: Features | None = None
+        self._frame: Frame  # set by `prepare`
+        self._features: Features
         self._query: PoseQuery | None = None
         self._to_try: list[Literal["frame", "keyframe"]] = []
 
@@ -315,8 +315,6 @@ class Tracker:
         return self._next_query(matches)
 
     def _next_query(self, matches: int) -> PoseQuery | TrackedFrame:
-        assert self._frame is not None
-        assert self._features is not None
         while self._to_try:
             against = self._to_try.pop(0)
             found = match(self._view(against).features, self._features, self.options)
@@ -345,8 +343,6 @@ class Tracker:
         return is_far or inliers < options.keyframe_inliers
 
     def _keep(self, T_world_camera: Array, *, inliers: int, matches: int, keyframe: bool) -> TrackedFrame:
-        assert self._frame is not None
-        assert self._features is not None
         self._last = _View(features=self._features, T_world_camera=T_world_camera)
         self._lost_in_a_row = 0
         if keyframe:
@@ -361,7 +357,6 @@ class Tracker:
         )
 
     def _lose(self, matches: int) -> TrackedFrame:
-        assert self._frame is not None
         self.lost_frames += 1
         self._lost_in_a_row += 1
         return TrackedFrame(

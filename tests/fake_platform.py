@@ -1,6 +1,6 @@
 """A fake load balancer with any number of servers behind it, in the event loop of the test.
 
-Real sockets, the real `ServerSession`, the real `dispatch`.  Promises nothing about speed.
+Real sockets, the real `ServerSession`, the real `dispatch`.
 """
 
 from __future__ import annotations
@@ -98,9 +98,9 @@ class FakeSocket:
 
 
 class FakePlatform:
-    """A front door on 127.0.0.1; ``landing`` names the server that the next robot meets.
+    """A load balancer on 127.0.0.1; ``landing`` names the server that the next robot meets.
 
-    ``token`` is the only one let in (None lets in everybody); ``refusals`` are HTTP statuses (with a
+    ``token`` is the only one accepted (None accepts any); ``refusals`` are HTTP statuses (with a
     Retry-After in seconds or None) for the next handshakes; ``hold`` keeps commands unanswered.
     """
 
@@ -125,11 +125,11 @@ class FakePlatform:
         self.handshakes: list[float] = []
         self._listener: Server | None = None
         self._tasks: set[asyncio.Task[None]] = set()
-        self._news = asyncio.Condition()
+        self._changed = asyncio.Condition()
 
     @property
     def port(self) -> int:
-        """Where the front door listens."""
+        """Where the listener listens."""
         assert self._listener is not None
         port: int = next(iter(self._listener.sockets)).getsockname()[1]
         return port
@@ -149,14 +149,14 @@ class FakePlatform:
         await self.stop()
 
     async def listen(self, port: int = 0) -> None:
-        """Open the front door, at *port* if it matters."""
+        """Open the listener, at *port* if it matters."""
         self._listener = await serve(
             self._serve, "127.0.0.1", port, compression=None, ping_interval=None, close_timeout=1,
-            process_request=self._door, subprotocols=list(SUBPROTOCOLS.values()),  # type: ignore[arg-type]
+            process_request=self._check_handshake, subprotocols=list(SUBPROTOCOLS.values()),  # type: ignore[arg-type]
         )  # fmt: skip
 
     async def stop(self) -> None:
-        """Shut the front door and cut every socket: the load balancer dies."""
+        """Close the listener and cut every socket: the load balancer dies."""
         assert self._listener is not None
         for socket in self.sockets:
             socket.cut()
@@ -179,8 +179,8 @@ class FakePlatform:
         """Wait until *true*, looking whenever something happened at a server."""
 
         async def wait() -> None:
-            async with self._news:
-                await self._news.wait_for(true)
+            async with self._changed:
+                await self._changed.wait_for(true)
 
         await asyncio.wait_for(wait(), within_s)
 
@@ -189,7 +189,7 @@ class FakePlatform:
         self._spawn(self._answer(socket, command))
 
     async def _answer(self, socket: FakeSocket, command: Command) -> None:
-        await self._tell()
+        await self._notify()
         if self.on_command is not None:
             answer = await self.on_command(socket, command)
             if answer is not None:
@@ -208,9 +208,9 @@ class FakePlatform:
             received_s=received_s, sent_s=self.clock(),
         )  # fmt: skip
 
-    def _door(self, connection: ServerConnection, request: Request) -> Response | None:
+    def _check_handshake(self, connection: ServerConnection, request: Request) -> Response | None:
         self.handshakes.append(self.clock())
-        self._spawn(self._tell())
+        self._spawn(self._notify())
         given = request.headers.get("Authorization", "").removeprefix("Bearer ")
         self.tokens_seen.append(given)
         if self.refusals:
@@ -226,13 +226,13 @@ class FakePlatform:
         socket = FakeSocket(self, self.landing, websocket)
         socket.muted = not self.welcomes
         self.sockets.append(socket)
-        await self._tell()
+        await self._notify()
         await socket.serve()
-        await self._tell()
+        await self._notify()
 
     async def _tell(self) -> None:
-        async with self._news:
-            self._news.notify_all()
+        async with self._changed:
+            self._changed.notify_all()
 
     def _spawn(self, work: Any) -> None:
         task = asyncio.get_running_loop().create_task(work)

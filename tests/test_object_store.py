@@ -35,7 +35,7 @@ STORES: dict[str, Callable[[Path], ObjectStore]] = {
     "directory": lambda folder: DirectoryStore(folder / "objects"),
     "memory": lambda folder: MemoryStore(),
 }
-"""Whoever writes another store adds it here; S3 comes with its emulator, in the fixture."""
+"""Every other store is added here; S3 comes with its emulator, in the fixture."""
 REGION = "ap-northeast-2"
 
 
@@ -62,7 +62,7 @@ def names(store: ObjectStore, prefix: str = "") -> list[str]:
     return [info.name for info in store.list(prefix)]
 
 
-def test_what_was_put_is_there_whole(store: ObjectStore) -> None:
+def test_a_stored_object_is_complete(store: ObjectStore) -> None:
     data = bytes(range(256)) * 1000
 
     store.put("maps/lab/cloud.bin", data)
@@ -129,7 +129,7 @@ def test_names_are_listed_in_order_and_by_prefix(store: ObjectStore) -> None:
     assert [info.size for info in store.list("a/")] == [4, 3]
 
 
-def test_a_swap_happens_only_if_nobody_else_was_there(store: ObjectStore) -> None:
+def test_a_swap_requires_the_expected_content(store: ObjectStore) -> None:
     store.compare_and_swap("head", None, b"1")
     store.compare_and_swap("head", b"1", b"2")
 
@@ -198,7 +198,7 @@ def test_an_object_cannot_be_a_folder_too(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("code", [errno.ENOSPC, errno.EDQUOT])
-def test_a_full_disk_is_said_so_and_leaves_the_old_version(
+def test_a_full_disk_is_reported_and_leaves_the_old_version(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: int
 ) -> None:
     store = DirectoryStore(tmp_path)

@@ -152,7 +152,7 @@ class LabelledFile:
     """The labelled ``.mat`` file (HDF5), one image at a time.
 
     MATLAB stores columns first, so HDF5 shows ``images`` as ``(n, 3, w, h)`` and depths as
-    ``(n, w, h)``.  ``rawDepths`` (0 = no reading) are preferred, because ``depths`` have their holes filled in.
+    ``(n, w, h)``.  ``rawDepths`` (0 = no reading) are preferred, as ``depths`` have their holes filled.
     """
 
     def __init__(self, path: Path) -> None:

@@ -153,7 +153,7 @@ class AuditLog:
         """Buffer an entry for the next flush; entries beyond the buffer's limit are dropped and counted.
 
         Args:
-            action: What was done, as ``room.verb``.
+            action: What was done, such as ``robot.enrolled``.
             subject: The object of the action.
             actor: Who did it; empty for this writer.
             at_s: Unix seconds; now, if None.
@@ -311,12 +311,18 @@ class AuditLog:
 
 
 def record_once(
-    folder: Path, who: str, action: str, subject: str = "", *, wall_clock: Callable[[], float],
-    max_bytes: int = MAX_FILE_BYTES, **detail: Value,
-) -> None:  # fmt: skip
+    folder: Path,
+    who: str,
+    action: str,
+    subject: str = "",
+    *,
+    wall_clock: Callable[[], float],
+    **detail: Value,
+) -> None:
     """Open the log, write one entry and close it; raises ConfigurationError."""
-    log = AuditLog(folder, who, wall_clock=wall_clock, max_bytes=max_bytes, sync_s=0.0).open(_LOCK_TIMEOUT_S)
-    log.add([Note(time=wall_clock(), actor=who, action=action, subject=subject, detail=detail)])
+    log = AuditLog(folder, who, wall_clock=wall_clock, max_bytes=MAX_FILE_BYTES, sync_s=0.0)
+    log.open(_LOCK_TIMEOUT_S)
+    log.record(action, subject, **detail)
     log.close()
 
 

@@ -34,7 +34,7 @@ from rse_pf.auth.roster import check_robot, check_tenant
 from rse_pf.auth.tokens import KeySet, SigningKey, unverified_parts
 from rse_pf.auth.trust_store import AccessControlStore
 from rse_pf.cli.robot import add_place, max_token_s, open_access_control, record_action
-from rse_pf.config import PlatformSettings, load_settings
+from rse_pf.config import PlatformSettings
 from rse_pf.errors import ConfigurationError, Unauthorized, UsageError
 from rse_pf.files import OWNER_ONLY, replace_file
 
@@ -288,10 +288,9 @@ def _governed(keys: KeySet, access: AccessControlStore) -> KeySet:
 
 
 def _of_platform(name: str) -> PlatformSettings | None:
-    from rse_pf.local.state import settings_file
+    from rse_pf.local.state import platform_settings
 
-    path = settings_file(_folder(name))
-    return load_settings(path) if path.exists() else None
+    return platform_settings(_folder(name))
 
 
 def _folder(name: str) -> Path:

@@ -51,7 +51,7 @@ def first_wrong(lines: list[bytes]) -> tuple[int, str] | None:
     return None
 
 
-def test_a_log_that_nobody_touched_is_good():
+def test_an_unchanged_log_is_intact():
     assert first_wrong(log_of(20)) is None
 
 
@@ -66,7 +66,7 @@ def test_any_flipped_bit_is_found_in_its_own_line():
             assert found[0] == 1, (at, bit, found)
 
 
-def test_a_dropped_entry_is_found_where_it_stood():
+def test_a_removed_entry_is_found_at_its_place():
     lines = log_of(6)
 
     row, why = first_wrong(lines[:2] + lines[3:]) or (-1, "")
@@ -142,7 +142,7 @@ def test_a_token_never_reaches_the_log():
     assert line.count("(a token)") == 5
 
 
-def test_a_head_is_a_word_that_can_be_kept_elsewhere():
+def test_a_head_has_a_string_form_that_can_be_stored_elsewhere():
     head = next_entry(GENESIS, Note(time=1.0, actor="s", action="x")).head
 
     assert parse_head(str(head)) == head

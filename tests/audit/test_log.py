@@ -76,7 +76,7 @@ def test_a_missing_file_in_the_middle_or_at_the_beginning_is_found(tmp_path: Pat
     assert problem_of(tmp_path) == ""
 
 
-def test_a_torn_last_line_is_told_with_what_is_good(tmp_path: Path):
+def test_a_torn_last_line_is_reported_with_the_number_of_good_entries(tmp_path: Path):
     write(tmp_path, 4)
     path = tmp_path / "server-1.jsonl"
     path.write_bytes(path.read_bytes()[:-20])
@@ -156,7 +156,7 @@ def test_names_of_servers_cannot_leave_the_folder(tmp_path: Path):
     assert {path.name for path in tmp_path.iterdir()} == {"audit"}
 
 
-def test_entries_reach_the_disk_without_anybody_waiting(tmp_path: Path):
+def test_entries_reach_the_disk_in_the_background(tmp_path: Path):
     synced = threading.Event()
     log = AuditLog(tmp_path, "s", wall_clock=lambda: 1e9, max_bytes=1 << 20, sync_s=0.001).open()
     real = log.flush
@@ -213,7 +213,7 @@ def test_entries_dropped_for_lack_of_memory_are_recorded_as_a_gap(tmp_path: Path
     assert (last.action, last.detail) == ("log.gap", {"entries": 50})
 
 
-def test_a_cut_end_is_found_by_the_head_that_another_chain_holds(tmp_path: Path):
+def test_a_truncated_end_is_found_by_the_head_in_another_chain(tmp_path: Path):
     write(tmp_path, 5)
     control = log_in(tmp_path, "control-plane").open()
     control.record(HEADS, **{"server-1": str(newest_head(tmp_path, "server-1"))})
@@ -228,7 +228,7 @@ def test_a_cut_end_is_found_by_the_head_that_another_chain_holds(tmp_path: Path)
     assert problem_of(tmp_path) == "entry 5 is missing: entry 1 of control-plane has seen it"
 
 
-def test_a_chain_that_was_written_anew_is_found_by_a_head_kept_elsewhere(tmp_path: Path):
+def test_a_rewritten_chain_is_found_by_a_head_stored_elsewhere(tmp_path: Path):
     write(tmp_path, 5)
     head = newest_head(tmp_path, "server-1")
     assert head is not None
@@ -252,9 +252,9 @@ def test_some_files_of_a_chain_can_be_checked_alone(tmp_path: Path):
     assert verdict.notes[0].startswith("begins with entry ")
 
 
-def test_a_command_writes_one_entry_and_lets_go(tmp_path: Path):
+def test_record_once_writes_one_entry_and_releases_the_log(tmp_path: Path):
     for robot in ("robot-1", "robot-2"):
-        record_once(tmp_path, "operator", "robot.disabled", robot, wall_clock=lambda: 1e9, max_bytes=1 << 20)
+        record_once(tmp_path, "operator", "robot.disabled", robot, wall_clock=lambda: 1e9)
 
     subjects = [entry.subject for entry in entries_of(files_of(tmp_path, "operator"))]
     assert subjects == ["robot-1", "robot-2"]

@@ -21,7 +21,7 @@ def written(folder: Path, text: bytes, mode: int = 0o600) -> Path:
 
 
 @pytest.mark.parametrize("header", [bearer(TOKEN), f"bearer {TOKEN}"])
-def test_who_carries_the_token_is_admitted(header: str) -> None:
+def test_a_header_with_the_token_is_accepted(header: str) -> None:
     assert carries_token(header, TOKEN)
 
 
@@ -32,7 +32,7 @@ def test_who_carries_the_token_is_admitted(header: str) -> None:
         f"Bearer {TOKEN.upper()}", f"Bearer  {TOKEN}", f"Bearer {TOKEN} {TOKEN}", f"Bearer {TOKEN[:-1]}\xe9",
     ],
 )  # fmt: skip
-def test_everybody_else_is_not(header: str) -> None:
+def test_any_other_header_is_rejected(header: str) -> None:
     assert not carries_token(header, TOKEN)
 
 
@@ -60,7 +60,7 @@ def test_a_token_is_made_once_and_is_its_owners_alone(tmp_path: Path) -> None:
         (b"a" * 4096, 0o600, "holds no control token"),
     ],
 )
-def test_a_file_that_is_no_secret_is_refused_in_one_line(
+def test_a_file_without_a_valid_secret_is_refused_in_one_line(
     tmp_path: Path, text: bytes, mode: int, word: str
 ) -> None:
     path = written(tmp_path, text, mode)
@@ -84,7 +84,7 @@ def test_a_file_that_is_not_there_is_refused_with_a_hint(tmp_path: Path) -> None
     assert "rand" in caught.value.hint
 
 
-def test_a_pipe_does_not_hold_the_reader_up(tmp_path: Path) -> None:
+def test_a_pipe_does_not_block_the_reader(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe", 0o600)
 
     with pytest.raises(UsageError, match="holds no control token"):

@@ -97,7 +97,7 @@ def test_the_key_id_is_the_thumbprint_of_rfc_7638():
         (DenyList().with_tokens_before("lab", "robot-1", NOW_S + 1), "issued-too-early"),
     ],
 )
-def test_what_is_denied_is_refused_and_ends_what_lives_on_it(denied: DenyList, reason: str):
+def test_denied_tokens_are_refused_and_end_their_connections(denied: DenyList, reason: str):
     claims = verified(token(), trusted())
 
     assert problem(token(), trusted(denied)) == reason
@@ -116,11 +116,11 @@ def test_what_is_denied_is_refused_and_ends_what_lives_on_it(denied: DenyList, r
         DenyList().with_robot("lab", "robot-1", 0.0).without_robot("lab", "robot-1"),
     ],
 )
-def test_a_denial_of_another_is_none_of_ours(denied: DenyList):
+def test_a_denial_applies_to_its_own_robot_and_tenant_only(denied: DenyList):
     assert verified(token(), trusted(denied)).robot == "robot-1"
 
 
-def test_a_robot_that_is_no_longer_enrolled_or_has_a_new_key_loses_its_sockets():
+def test_a_robot_that_is_removed_or_has_a_new_key_loses_its_connections():
     claims = verified(token(), trusted())
     other = EnrolledRobot(robot="robot-2", tenant="lab", x=ENROLLED.x)
 
@@ -129,7 +129,7 @@ def test_a_robot_that_is_no_longer_enrolled_or_has_a_new_key_loses_its_sockets()
     assert claims_problem(replace(claims, key_id="p1"), KeySet({})) == "unknown-key"
 
 
-def test_time_takes_out_of_the_list_only_what_no_server_would_take_anyway():
+def test_pruning_removes_only_entries_about_expired_tokens():
     denied = DenyList().with_token("d", "r", "t", 1000.0).with_tokens_before("d", "r", 500.0)
     denied = denied.with_robot("d", "s", 1.0)
 
@@ -138,13 +138,13 @@ def test_time_takes_out_of_the_list_only_what_no_server_would_take_anyway():
     assert (later.tokens, later.not_before, later.disabled) == ((), (), denied.disabled)
 
 
-def test_a_later_revocation_never_forgives_an_earlier_one():
+def test_a_later_revocation_keeps_an_earlier_one():
     denied = DenyList().with_tokens_before("d", "r", 500.0).with_tokens_before("d", "r", 400.0)
 
     assert [each.at_s for each in denied.not_before] == [500.0]
 
 
-def test_saying_it_twice_changes_nothing():
+def test_denying_twice_changes_nothing():
     once = DenyList().with_robot("d", "r", 1.0).with_token("d", "r", "t", 9.0)
 
     assert once.with_robot("d", "r", 2.0).with_token("d", "r", "t", 9.0) == once
@@ -166,7 +166,7 @@ def test_both_survive_their_json():
 
 
 @given(st.binary(max_size=60) | st.text(max_size=60).map(str.encode))
-def test_nonsense_is_our_error_and_no_other(data: bytes):
+def test_invalid_json_is_a_configuration_error(data: bytes):
     with contextlib.suppress(ConfigurationError):
         assert isinstance(from_json(data, DenyList), DenyList)
 

@@ -139,7 +139,7 @@ def test_every_refusal_is_in_the_same_words() -> None:
     assert len(reports) == 1
 
 
-def test_the_log_gets_one_of_a_closed_list_of_reasons() -> None:
+def test_the_log_gets_one_of_a_fixed_set_of_reasons() -> None:
     assert {refused(forge()) for forge in FORGED.values()} == {
         "missing-or-too-long", "malformed", "wrong-algorithm-or-type", "unknown-key",
         "bad-signature-or-claims", "bad-time", "ttl-too-long", "expired", "not-yet-valid", "bad-subject",
@@ -208,7 +208,7 @@ def test_not_before_has_the_same_leeway() -> None:
 
 
 @pytest.mark.parametrize("ttl_s", [0.0, -1.0, SETTINGS.token_ttl_s + 1.0, float("nan"), float("inf")])
-def test_a_life_outside_the_settings_is_not_issued(ttl_s: float) -> None:
+def test_a_ttl_outside_the_settings_is_not_issued(ttl_s: float) -> None:
     with pytest.raises(UsageError, match="a time to live of"):
         issue(ttl_s=ttl_s)
 
@@ -225,7 +225,7 @@ def test_a_token_id_that_no_server_would_accept_is_not_issued(token_id: str) -> 
         KEY.issue("robot-7", now=NOW, token_id=token_id, settings=SETTINGS)
 
 
-def test_keys_survive_a_round_trip_and_two_can_be_good_at_once() -> None:
+def test_keys_survive_encoding_and_two_can_be_valid_at_once() -> None:
     copy = SigningKey.from_json(KEY.to_json())
     second = SigningKey.from_seed(bytes(32), "key-2")
     both = KeySet.from_json(

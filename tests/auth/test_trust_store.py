@@ -1,4 +1,4 @@
-"""The control room: changed by compare-and-swap, read without ever forgetting."""
+"""The access control store: changed by compare-and-swap, read without ever forgetting."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def test_endless_races_end_with_an_error():
         AccessControlStore(Racing(races=1000)).change_deny_list(with_robot)
 
 
-def test_an_empty_room_is_furnished_once_and_not_emptied():
+def test_missing_objects_are_created_once_and_existing_ones_are_kept():
     store = MemoryStore()
     room = AccessControlStore(store)
     room.create_missing()
@@ -91,7 +91,7 @@ def test_an_empty_room_is_furnished_once_and_not_emptied():
     assert room.roster().robots == ()
 
 
-def test_a_platform_without_a_room_trusts_its_keys(keys_file: Path):
+def test_a_platform_without_roster_and_deny_list_trusts_its_keys(keys_file: Path):
     trust = TrustStore(keys_file)
     trust.load()
 
@@ -101,7 +101,7 @@ def test_a_platform_without_a_room_trusts_its_keys(keys_file: Path):
     assert trust.problem == ""
 
 
-def test_what_is_new_is_seen_and_travels_as_text(keys_file: Path, room: AccessControlStore):
+def test_a_refresh_finds_changes_and_the_snapshot_holds_them(keys_file: Path, room: AccessControlStore):
     trust = TrustStore(keys_file)
     trust.load()
     room.change_deny_list(with_robot)
@@ -115,7 +115,7 @@ def test_what_is_new_is_seen_and_travels_as_text(keys_file: Path, room: AccessCo
 
 
 @pytest.mark.parametrize("harm", ["nonsense", "empty", "gone", "folder"])
-def test_a_list_that_cannot_be_read_any_more_stays_as_it_was_known(
+def test_a_list_that_becomes_unreadable_stays_as_it_was_known(
     keys_file: Path, room: AccessControlStore, harm: str
 ):
     room.change_deny_list(with_robot)
@@ -150,7 +150,7 @@ def test_keys_that_vanish_stay_known_and_new_denials_are_still_seen(
 
 
 @pytest.mark.parametrize("name", ["keys.json", "control/deny.json", "control/robots.json"])
-def test_a_server_that_never_knew_a_list_refuses_to_begin_without(keys_file: Path, name: str):
+def test_a_first_load_with_an_unreadable_part_is_an_error(keys_file: Path, name: str):
     (keys_file.parent / "control").mkdir()
     (keys_file.parent / name).write_text("nonsense")
 
@@ -162,7 +162,7 @@ def test_a_server_that_never_knew_a_list_refuses_to_begin_without(keys_file: Pat
     assert str(keys_file) in caught.value.hint
 
 
-def test_the_text_holds_no_private_half(keys_file: Path):
+def test_the_snapshot_holds_no_private_key(keys_file: Path):
     trust = TrustStore(keys_file)
     trust.load()
 

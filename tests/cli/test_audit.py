@@ -22,12 +22,12 @@ def folder(tmp_path: Path) -> Path:
     ):
         record_once(
             tmp_path / "audit", who, action, subject, wall_clock=lambda at=row: 1e9 + at,
-            max_bytes=1 << 20, reason="a reason\n\x1b[2J",
+            reason="a reason\n\x1b[2J",
         )  # fmt: skip
     return tmp_path / "audit"
 
 
-def test_verify_tells_a_line_for_each_chain(folder: Path, capsys: pytest.CaptureFixture[str]):
+def test_verify_prints_a_line_for_each_chain(folder: Path, capsys: pytest.CaptureFixture[str]):
     assert main(["audit", "verify", str(folder)]) == 0
 
     lines = capsys.readouterr().out.splitlines()
@@ -56,7 +56,7 @@ def test_verify_of_a_torn_file_says_how_much_is_good(folder: Path, capsys: pytes
     assert "ended in the middle of a line, 1 whole entries good" in capsys.readouterr().out
 
 
-def test_a_head_that_was_kept_elsewhere_betrays_a_cut_end(folder: Path, capsys: pytest.CaptureFixture[str]):
+def test_a_head_stored_elsewhere_detects_truncation(folder: Path, capsys: pytest.CaptureFixture[str]):
     main(["audit", "verify", str(folder)])
     head = capsys.readouterr().out.splitlines()[1].rpartition(" ")[2]
     assert main(["audit", "verify", str(folder), "--head", f"server-1={head}"]) == 0

@@ -25,7 +25,6 @@ def sent(s3: Any, folder: Path, instance: str, *actions: str) -> None:
     for row, action in enumerate(actions):
         record_once(
             folder / instance, instance, action, "robot-1", wall_clock=lambda at=row: 1e9 + at,
-            max_bytes=1 << 20,
         )  # fmt: skip
         shipper.ship()
 
@@ -44,7 +43,7 @@ def test_verify_judges_each_servers_chain(two_servers: Any, capsys: Capture) -> 
     assert [line.partition(",")[0] for line in lines] == ["i-1: 3 entries good", "i-2: 1 entries good"]
 
 
-def test_a_piece_that_somebody_deleted_is_noticed(two_servers: Any, capsys: Capture) -> None:
+def test_a_deleted_part_is_detected(two_servers: Any, capsys: Capture) -> None:
     names = [each["Key"] for each in two_servers.list_objects_v2(Bucket="audit-logs")["Contents"]]
     two_servers.delete_object(Bucket="audit-logs", Key=names[1])
 
@@ -55,7 +54,7 @@ def test_a_piece_that_somebody_deleted_is_noticed(two_servers: Any, capsys: Capt
     assert "entry 2 is missing" in out
 
 
-def test_a_cut_end_is_noticed_with_a_head_that_was_kept(two_servers: Any, capsys: Capture) -> None:
+def test_truncation_is_detected_with_a_stored_head(two_servers: Any, capsys: Capture) -> None:
     main(["audit", "verify", "--cloud"])
     head = capsys.readouterr().out.splitlines()[0].rpartition(" ")[2]
     names = [each["Key"] for each in two_servers.list_objects_v2(Bucket="audit-logs")["Contents"]]
@@ -65,7 +64,7 @@ def test_a_cut_end_is_noticed_with_a_head_that_was_kept(two_servers: Any, capsys
     assert main(["audit", "verify", "--cloud", "--head", f"i-1={head}"]) == 1
 
 
-def test_a_piece_with_other_bytes_is_noticed(two_servers: Any, capsys: Capture) -> None:
+def test_a_part_with_other_bytes_is_detected(two_servers: Any, capsys: Capture) -> None:
     name = two_servers.list_objects_v2(Bucket="audit-logs")["Contents"][0]["Key"]
     two_servers.put_object(Bucket="audit-logs", Key=name, Body=b"")
 

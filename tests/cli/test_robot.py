@@ -1,4 +1,4 @@
-"""Robots on the command line: keys that stay on the robot, a roster, and doors that close and open again."""
+"""Robots on the command line: keys that stay on the robot, the roster, and disabling a robot."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def test_a_key_is_its_owners_alone_and_only_its_public_half_is_printed(
     assert "already" in refused(capsys, "robot", "keygen", "--out", "robot.key")[0]
 
 
-def test_an_enrolled_robot_comes_in_with_tokens_that_it_made_itself(capsys: Capture, platform: Path) -> None:
+def test_an_enrolled_robot_is_accepted_with_tokens_that_it_signed(capsys: Capture, platform: Path) -> None:
     key = enrolled(capsys, "robot-1", "--scope", "services:pnp", "--scope", "maps:read", "--tenant", "lab")
     token = asyncio.run(key.token())
 

@@ -62,7 +62,7 @@ def test_a_token_is_shown_even_when_nobody_knows_its_key(
     assert told["header"]["kid"] == "k"
 
 
-def test_a_token_of_a_stranger_fails_the_check(
+def test_a_token_of_another_signer_fails_the_check(
     capsys: pytest.CaptureFixture[str], platform: Path, tmp_path: Path
 ) -> None:
     token = issued(capsys)
@@ -95,7 +95,7 @@ def test_a_token_follows_the_settings_that_its_platform_was_started_with(
     assert told["claims"]["exp"] - told["claims"]["iat"] == 30
 
 
-def test_a_longer_life_than_the_settings_allow_is_refused(
+def test_a_longer_ttl_than_the_settings_allow_is_refused(
     capsys: pytest.CaptureFixture[str], platform: Path
 ) -> None:
     assert main(["token", "issue", "robot-1", "--ttl", "901"]) == 2
@@ -153,7 +153,7 @@ def test_a_rotation_publishes_both_keys_and_signs_with_the_old_one_until_servers
     assert main(["token", "rotate", "--cloud"]) == 2, "the rotation before is not over"
 
 
-def test_a_retired_key_vouches_for_nothing(capsys: pytest.CaptureFixture[str], cloud: Any) -> None:
+def test_tokens_of_a_retired_key_are_refused(capsys: pytest.CaptureFixture[str], cloud: Any) -> None:
     main(["token", "init", "--cloud"])
     capsys.readouterr()
     stolen = issued(capsys, "--cloud")
@@ -176,7 +176,7 @@ def test_a_retired_key_vouches_for_nothing(capsys: pytest.CaptureFixture[str], c
         ["issue", "robot-1", "--cloud", "--key", "k.json"], ["issue", "robot-1", "--cloud", "--keys", "k"],
     ],
 )  # fmt: skip
-def test_words_that_contradict_are_refused(
+def test_contradicting_arguments_are_refused(
     capsys: pytest.CaptureFixture[str], cloud: Any, words: list[str]
 ) -> None:
     assert main(["token", *words]) == 2

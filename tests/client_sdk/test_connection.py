@@ -102,7 +102,7 @@ def test_a_load_balancer_that_comes_back_finds_the_robot_waiting():
     run(test())
 
 
-def test_a_silent_server_is_left_in_time_although_its_socket_stays_open():
+def test_a_stalled_server_is_left_in_time_although_its_socket_stays_open():
     async def test():
         async with FakePlatform() as platform, robot(platform.url) as a_robot:
             platform.sockets[0].muted = True
@@ -157,7 +157,7 @@ def test_a_move_opens_the_new_socket_first_and_finishes_what_the_old_one_holds()
     run(test())
 
 
-def test_a_robot_that_lands_where_it_came_from_keeps_its_socket_and_tries_again():
+def test_a_move_that_reaches_the_same_server_keeps_its_socket_and_is_retried():
     async def test():
         async with FakePlatform() as platform, robot(platform.url) as a_robot:
             await platform.sockets[0].move()
@@ -176,7 +176,7 @@ def test_a_robot_that_lands_where_it_came_from_keeps_its_socket_and_tries_again(
     run(test())
 
 
-def test_a_robot_that_cannot_move_stays_until_it_is_sent_away():
+def test_a_robot_that_cannot_move_stays_until_the_move_ends():
     async def test():
         async with FakePlatform() as platform, robot(platform.url) as a_robot:
             await platform.sockets[0].move(within_ms=50)
@@ -207,7 +207,7 @@ def test_a_server_that_dies_during_a_move_loses_nothing():
     run(test())
 
 
-def test_a_wrong_token_is_told_at_once():
+def test_a_wrong_token_is_reported_at_once():
     async def test():
         async with FakePlatform() as platform:
             platform.token = "right"
@@ -221,7 +221,7 @@ def test_a_wrong_token_is_told_at_once():
     run(test())
 
 
-def test_a_token_callable_is_asked_once_more_when_its_token_is_over():
+def test_a_token_callable_is_called_once_more_when_its_token_has_expired():
     async def test():
         tokens = iter(["over", "fresh", "second"])
 
@@ -259,7 +259,7 @@ def test_a_token_that_is_refused_later_ends_the_robot_with_a_typed_error():
     run(test())
 
 
-def test_a_token_callable_that_fails_is_a_passing_trouble():
+def test_a_token_callable_that_fails_is_called_again():
     async def test():
         told = iter([OSError("issuer is away"), OSError("still"), "fresh"])
 
@@ -275,7 +275,7 @@ def test_a_token_callable_that_fails_is_a_passing_trouble():
     run(test())
 
 
-def test_a_full_server_is_asked_again_no_sooner_than_it_said():
+def test_a_full_server_is_not_retried_before_its_retry_after():
     async def test():
         async with FakePlatform() as platform:
             platform.refusals = [(503, 1)]
@@ -289,7 +289,7 @@ def test_a_full_server_is_asked_again_no_sooner_than_it_said():
 
 
 @pytest.mark.parametrize(("status", "error"), [(403, Forbidden), (404, ConnectError), (400, ConnectError)])
-def test_a_refusal_for_good_is_not_tried_again(status, error):
+def test_a_final_refusal_is_not_retried(status, error):
     async def test():
         async with FakePlatform() as platform:
             platform.refusals = [(status, None)]
@@ -300,7 +300,7 @@ def test_a_refusal_for_good_is_not_tried_again(status, error):
     run(test())
 
 
-def test_a_missing_route_is_waited_out_once_the_robot_was_in():
+def test_a_missing_route_is_retried_once_the_robot_was_connected():
     async def test():
         async with FakePlatform() as platform, robot(platform.url) as a_robot:
             platform.refusals = [(404, None), (503, None), (400, None)]
@@ -311,7 +311,7 @@ def test_a_missing_route_is_waited_out_once_the_robot_was_in():
     run(test())
 
 
-def test_a_door_that_never_says_welcome_is_a_connect_error():
+def test_a_server_that_never_sends_welcome_is_a_connect_error():
     async def test():
         async with FakePlatform() as platform:
             platform.welcomes = False
@@ -323,7 +323,7 @@ def test_a_door_that_never_says_welcome_is_a_connect_error():
     run(test())
 
 
-def test_nobody_at_the_address_is_one_line_with_a_hint():
+def test_an_address_without_a_server_is_one_line_with_a_hint():
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         url = f"ws://127.0.0.1:{free.getsockname()[1]}/ws"
@@ -339,7 +339,7 @@ def test_nobody_at_the_address_is_one_line_with_a_hint():
 
 
 @pytest.mark.parametrize("url", ["http://localhost/ws", "localhost:8700", "ws://", "ws://h:99999/ws", ""])
-def test_what_is_no_websocket_address_is_refused_before_anything_is_opened(url):
+def test_an_invalid_address_is_refused_before_anything_is_opened(url):
     with pytest.raises(UsageError, match="not a WebSocket address"):
         robot(url)
 
@@ -351,7 +351,7 @@ def test_an_unknown_codec_is_refused_with_the_choices():
     assert "zlib, json, bin" in told.value.hint
 
 
-def test_garbage_from_a_server_harms_no_command_until_it_is_too_much():
+def test_invalid_messages_of_a_server_affect_no_command_up_to_a_limit():
     async def test():
         async with FakePlatform() as platform, robot(platform.url) as a_robot:
             first = platform.sockets[0]
@@ -377,7 +377,7 @@ def test_a_message_above_the_limit_costs_a_reconnect_and_no_command():
     run(test())
 
 
-def test_another_robot_with_the_same_token_is_told_and_not_fought():
+def test_another_robot_with_the_same_token_ends_this_one_with_a_conflict():
     async def test():
         async with FakePlatform() as platform, robot(platform.url) as a_robot:
             platform.hold = True
@@ -392,7 +392,7 @@ def test_another_robot_with_the_same_token_is_told_and_not_fought():
     run(test())
 
 
-def test_a_robot_whose_own_given_up_dial_took_its_place_comes_back():
+def test_a_robot_replaced_by_its_own_abandoned_attempt_reconnects():
     """A server that was stopped for a moment welcomes the dial late, and closes the robot's older socket."""
 
     async def test():
@@ -408,7 +408,7 @@ def test_a_robot_whose_own_given_up_dial_took_its_place_comes_back():
     run(test())
 
 
-def test_an_old_server_says_which_protocol_it_wants(monkeypatch):
+def test_an_old_server_names_the_protocol_that_it_needs(monkeypatch):
     async def test():
         async with FakePlatform() as platform:
             with pytest.raises(UnsupportedProtocol, match="protocol 1 is not 99"):

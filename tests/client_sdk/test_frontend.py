@@ -114,7 +114,7 @@ def test_points_are_where_the_depth_says():
         ([[0.2, 0.2, 0.2], [0.2, 0.2, 0.2], [0.2, 0.2, 0.2]], np.nan),  # nearer than 0.3 m
     ],
 )
-def test_a_depth_is_believed_only_on_a_surface(patch: list[list[float]], expected: float):
+def test_a_depth_is_used_only_on_a_surface(patch: list[list[float]], expected: float):
     frame = wall_frame(0)
     frame.depth_m[:] = np.tile(np.array(patch, np.float32), (80, 107))[:, :320]
 

@@ -100,7 +100,7 @@ def test_a_lost_socket_loses_no_command() -> None:
     run(work())
 
 
-def test_a_silent_server_is_left_although_its_socket_stays_open() -> None:
+def test_a_stalled_server_is_left_although_its_socket_stays_open() -> None:
     async def work() -> None:
         async with FakeServer().running() as server, connect(server) as robot:
             await robot.call("echo", {})
@@ -214,7 +214,7 @@ def test_a_token_callable_is_asked_again_once() -> None:
     run(work())
 
 
-def test_nobody_at_the_address_is_one_line_with_a_hint() -> None:
+def test_an_address_without_a_server_is_one_line_with_a_hint() -> None:
     async def work() -> None:
         with socket.socket() as free:
             free.bind(("127.0.0.1", 0))
@@ -228,7 +228,7 @@ def test_nobody_at_the_address_is_one_line_with_a_hint() -> None:
 
 
 @pytest.mark.parametrize("url", ["http://127.0.0.1/ws", "127.0.0.1:8700", "ws://", ""])
-def test_an_address_that_is_none_is_refused_at_once(url: str) -> None:
+def test_an_invalid_address_is_refused_at_once(url: str) -> None:
     with pytest.raises(UsageError):
         client_sdk.connect(url)
 
@@ -264,7 +264,7 @@ def test_closing_ends_what_still_waits() -> None:
     run(work())
 
 
-def test_busy_is_tried_again_within_the_deadline() -> None:
+def test_busy_is_retried_within_the_deadline() -> None:
     async def work() -> None:
         def busy_once(server: FakeServer, robot: FakeRobot, command: Command) -> Result | Failure | None:
             if len(server.all_commands) == 1:
@@ -277,7 +277,7 @@ def test_busy_is_tried_again_within_the_deadline() -> None:
     run(work())
 
 
-def test_busy_for_longer_than_the_deadline_is_told() -> None:
+def test_busy_beyond_the_deadline_is_raised() -> None:
     async def work() -> None:
         def busy(server: FakeServer, robot: FakeRobot, command: Command) -> Result | Failure | None:
             return Failure(id=command.id, code="busy", message="full", retry_after_ms=9000)
@@ -324,7 +324,7 @@ def test_the_robot_and_the_cloud_solve_the_same_numbers() -> None:
     run(work())
 
 
-def test_stats_tell_where_the_time_went() -> None:
+def test_stats_report_where_the_time_went() -> None:
     async def work() -> None:
         async with FakeServer().running() as server, connect(server) as robot:
             for i in range(5):

@@ -100,7 +100,7 @@ def test_a_command_that_is_too_large_is_told_with_both_numbers_and_never_sent():
 
 
 @pytest.mark.parametrize("deadline_s", [0, -1, float("nan"), float("inf"), 1e9])
-def test_an_absurd_deadline_is_refused(deadline_s):
+def test_a_deadline_out_of_range_is_refused(deadline_s):
     async def test():
         async with FakePlatform() as platform, connect(platform) as robot:
             with pytest.raises(UsageError, match="deadline_s"):
@@ -119,7 +119,7 @@ def test_the_cloud_answers_when_it_can_although_the_robot_could_too():
     run(test())
 
 
-def test_the_robot_mends_a_busy_cloud_and_says_why():
+def test_the_robot_answers_for_a_busy_cloud_and_says_why():
     async def busy(_, command):
         return Failure(id=command.id, code="busy", message="full", retry_after_ms=9e4)
 

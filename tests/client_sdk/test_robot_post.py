@@ -76,7 +76,7 @@ def test_a_posted_command_is_sent_again_on_the_next_socket_and_ends_once() -> No
     run(work())
 
 
-def test_a_posted_command_that_nobody_answers_expires() -> None:
+def test_an_unanswered_posted_command_expires() -> None:
     async def work() -> None:
         async with FakeServer(answer=answer_nothing).running() as server, connect(server) as robot:
             ends = Ends()
@@ -88,7 +88,7 @@ def test_a_posted_command_that_nobody_answers_expires() -> None:
     run(work())
 
 
-def test_a_server_that_answers_twice_is_heard_once() -> None:
+def test_a_second_answer_to_one_command_is_dropped() -> None:
     async def twice(server: FakeServer, robot: FakeRobot, command: Command) -> None:
         answer = answer_at_once(server, robot, command)
         await robot.websocket.send(robot.session.codec.encode(answer))
@@ -118,7 +118,7 @@ def test_nothing_is_posted_by_a_robot_that_is_closed() -> None:
     run(work())
 
 
-def test_a_lost_link_and_its_return_are_told_once_each() -> None:
+def test_a_lost_connection_and_its_return_are_reported_once_each() -> None:
     async def work() -> None:
         told: list[tuple[str, str]] = []
         back = asyncio.Event()
@@ -136,7 +136,7 @@ def test_a_lost_link_and_its_return_are_told_once_each() -> None:
     run(work())
 
 
-def test_a_silent_link_is_told_with_its_reason() -> None:
+def test_a_stalled_connection_is_reported_with_its_reason() -> None:
     async def work() -> None:
         told: list[tuple[str, str]] = []
         lost = asyncio.Event()

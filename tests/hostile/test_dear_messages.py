@@ -18,7 +18,7 @@ _SLOW_MACHINE = 6.0
 
 
 @pytest.mark.parametrize("name", EXPENSIVE)
-def test_the_dearest_message_that_we_can_think_of_is_cheap(name: str) -> None:
+def test_the_most_expensive_known_messages_are_cheap(name: str) -> None:
     speaks, data = EXPENSIVE[name]
     assert len(data) <= MAX_INPUT_BYTES
     meter = Meter()
@@ -33,7 +33,7 @@ def test_the_dearest_message_that_we_can_think_of_is_cheap(name: str) -> None:
 
 @pytest.mark.parametrize("name", CODECS)
 @pytest.mark.parametrize(("matches", "spare"), [(341, 2.0), (2000, 2.0), (5000, 1.0)])
-def test_what_our_robots_send_passes_with_room_to_spare(name: str, matches: int, spare: float) -> None:
+def test_messages_of_the_sdk_are_far_below_the_limits(name: str, matches: int, spare: float) -> None:
     session = SessionSettings()
     tight = replace(
         session,

@@ -160,7 +160,7 @@ def searched(count: int, seed: int) -> dict[str, Any]:
     ("count", "seed"),
     [(200, 1), pytest.param(50_000, 2, marks=[pytest.mark.slow, pytest.mark.timeout(3000)])],
 )
-def test_examples_find_no_crash_no_hang_and_no_pose_that_is_a_guess(count: int, seed: int) -> None:
+def test_examples_find_no_crash_no_hang_and_no_unfounded_pose(count: int, seed: int) -> None:
     found = searched(count, seed)
 
     assert found["examples"] >= count * 0.9

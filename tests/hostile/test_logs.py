@@ -75,7 +75,7 @@ def test_any_text_is_one_short_line(word: str) -> None:
 
 
 async def refused(url: str, headers: dict[str, str]) -> None:
-    """Knock with *headers*; whatever the door says is written somewhere."""
+    """Knock with *headers*; whatever the listener says is written somewhere."""
     with contextlib.suppress(websockets.exceptions.WebSocketException, OSError, ValueError):
         async with websockets.connect(
             url, subprotocols=[SUBPROTOCOLS["json"]], additional_headers=headers, compression=None,

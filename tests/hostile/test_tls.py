@@ -1,4 +1,4 @@
-"""TLS at the local platform's front door: old versions, weak ciphers and plain text have no answer (T19)."""
+"""TLS at the local platform's listener: old versions, weak ciphers and plain text have no answer (T19)."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ class HandshakePolicy:
         return self._cloud.issue_token("robot-1")
 
     def shake_hands(self, context: ssl.SSLContext) -> tuple[str, str] | None:
-        """Return version and cipher that the door agrees to, None if it agrees to nothing."""
+        """Return version and cipher that the listener agrees to, None if it agrees to nothing."""
         with socket.create_connection(("127.0.0.1", self.port), timeout=SOON_S) as plain:
             try:
                 with context.wrap_socket(plain, server_hostname="127.0.0.1") as secured:
@@ -89,7 +89,7 @@ class HandshakePolicy:
 
 
 @pytest.fixture(scope="module")
-def door(tmp_path_factory: pytest.TempPathFactory) -> Iterator[HandshakePolicy]:
+def listener(tmp_path_factory: pytest.TempPathFactory) -> Iterator[HandshakePolicy]:
     opened = HandshakePolicy(tmp_path_factory.mktemp("tls"))
     yield opened
     opened.close()
@@ -109,10 +109,10 @@ def speaking(version: ssl.TLSVersion, ciphers: str = "ALL:@SECLEVEL=0") -> ssl.S
 
 @pytest.mark.system
 @pytest.mark.parametrize("version", ["TLSv1_2", "TLSv1_3"])
-def test_today_s_versions_are_spoken_with_ciphers_that_authenticate(
-    door: HandshakePolicy, version: str
+def test_current_tls_versions_are_accepted_with_authenticated_ciphers(
+    listener: HandshakePolicy, version: str
 ) -> None:
-    agreed = door.shake_hands(speaking(ssl.TLSVersion[version]))
+    agreed = listener.shake_hands(speaking(ssl.TLSVersion[version]))
 
     assert agreed is not None
     assert agreed[0] == version.replace("_", ".")
@@ -121,13 +121,13 @@ def test_today_s_versions_are_spoken_with_ciphers_that_authenticate(
 
 @pytest.mark.system
 @pytest.mark.parametrize("version", ["TLSv1", "TLSv1_1"])
-def test_old_versions_get_no_handshake(door: HandshakePolicy, version: str) -> None:
-    assert door.shake_hands(speaking(ssl.TLSVersion[version])) is None
+def test_old_versions_get_no_handshake(listener: HandshakePolicy, version: str) -> None:
+    assert listener.shake_hands(speaking(ssl.TLSVersion[version])) is None
 
 
 @pytest.mark.system
 def test_of_all_ciphers_that_this_machine_can_offer_only_those_with_authentication_pass(
-    door: HandshakePolicy,
+    listener: HandshakePolicy,
 ) -> None:
     offered = [
         each["name"]
@@ -136,7 +136,7 @@ def test_of_all_ciphers_that_this_machine_can_offer_only_those_with_authenticati
     ]
     passed = []
     for name in offered:
-        agreed = door.shake_hands(speaking(ssl.TLSVersion.TLSv1_2, f"{name}:@SECLEVEL=0"))
+        agreed = listener.shake_hands(speaking(ssl.TLSVersion.TLSv1_2, f"{name}:@SECLEVEL=0"))
         if agreed is not None:
             passed.append(agreed[1])
 
@@ -146,8 +146,8 @@ def test_of_all_ciphers_that_this_machine_can_offer_only_those_with_authenticati
 
 
 @pytest.mark.system
-def test_plain_text_gets_no_answer(door: HandshakePolicy) -> None:
-    with socket.create_connection(("127.0.0.1", door.port), timeout=SOON_S) as plain:
+def test_plain_text_gets_no_answer(listener: HandshakePolicy) -> None:
+    with socket.create_connection(("127.0.0.1", listener.port), timeout=SOON_S) as plain:
         plain.sendall(b"GET /ws HTTP/1.1\r\nHost: a\r\n\r\n")
         answer = b""
         with contextlib.suppress(ConnectionError):
@@ -157,25 +157,28 @@ def test_plain_text_gets_no_answer(door: HandshakePolicy) -> None:
 
 
 @pytest.mark.system
-def test_a_robot_dials_wss_and_refuses_a_certificate_that_nobody_signed(
-    door: HandshakePolicy, monkeypatch: pytest.MonkeyPatch
+def test_a_robot_connects_by_wss_and_refuses_an_untrusted_certificate(
+    listener: HandshakePolicy, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     async def echoed() -> object:
-        async with connect(url=door.url, token=door.token()) as robot:
+        async with connect(url=listener.url, token=listener.token()) as robot:
             return await robot.call("echo", {"value": 5})
 
-    assert door.url.startswith("wss://")
+    assert listener.url.startswith("wss://")
     with pytest.raises(RsePfError):
         asyncio.run(asyncio.wait_for(echoed(), SOON_S))
-    monkeypatch.setenv("SSL_CERT_FILE", str(door.certificate))
+    monkeypatch.setenv("SSL_CERT_FILE", str(listener.certificate))
     assert asyncio.run(asyncio.wait_for(echoed(), SOON_S))
 
 
 @pytest.mark.system
-def test_sslscan_sees_neither_old_versions_nor_weak_ciphers(door: HandshakePolicy) -> None:
+def test_sslscan_sees_neither_old_versions_nor_weak_ciphers(listener: HandshakePolicy) -> None:
     try:
         done = subprocess.run(
-            ["sslscan", "--no-colour", f"127.0.0.1:{door.port}"], capture_output=True, text=True, check=False
+            ["sslscan", "--no-colour", f"127.0.0.1:{listener.port}"],
+            capture_output=True,
+            text=True,
+            check=False,
         )
     except FileNotFoundError:
         pytest.skip("sslscan is not installed: apt install sslscan")
@@ -189,4 +192,4 @@ def test_sslscan_sees_neither_old_versions_nor_weak_ciphers(door: HandshakePolic
 
 def test_a_certificate_without_its_key_is_refused_at_once() -> None:
     with pytest.raises(SettingsError, match="private_key"):
-        PlatformSettings().replace(local={"certificate": "door.pem"})
+        PlatformSettings().replace(local={"certificate": "listener.pem"})

@@ -83,7 +83,7 @@ def test_every_golden_command_gets_the_backends_answer(name: str, codec: str) ->
 
 
 @pytest.mark.parametrize("token", ["", "a.b.c", TOKEN[:-4] + "AAAA"])
-def test_a_bad_token_is_turned_away_before_anything_is_decoded(token: str) -> None:
+def test_a_bad_token_is_rejected_before_anything_is_decoded(token: str) -> None:
     answered = Answering(SETTINGS, KEYS).answer(
         event(b"not even a message", token=token), now_s=NOW_S, left_ms=9e3, clock=lambda: 0.0
     )
@@ -92,14 +92,14 @@ def test_a_bad_token_is_turned_away_before_anything_is_decoded(token: str) -> No
     assert json.loads(answered.body)["code"] == "unauthorized"
 
 
-def test_an_expired_token_is_turned_away() -> None:
+def test_an_expired_token_is_rejected() -> None:
     late = NOW_S + SETTINGS.auth.token_ttl_s + SETTINGS.auth.leeway_s + 1
     answered = Answering(SETTINGS, KEYS).answer(event(b""), now_s=late, left_ms=9e3, clock=lambda: 0.0)
 
     assert answered.status == 401
 
 
-def test_an_unknown_sub_protocol_is_turned_away() -> None:
+def test_an_unknown_sub_protocol_is_rejected() -> None:
     what = event(b"")
     what["headers"]["content-type"] = "text/html"
     answered = Answering(SETTINGS, KEYS).answer(what, now_s=NOW_S, left_ms=9e3, clock=lambda: 0.0)

@@ -61,7 +61,7 @@ class Bucket:
         return self.text
 
 
-def test_a_function_that_lives_on_learns_new_keys_and_forgets_retired_ones() -> None:
+def test_a_running_function_learns_new_keys_and_forgets_retired_ones() -> None:
     bucket = Bucket("a")
     keys = KeyCache(bucket.read, 60.0)
 
@@ -74,7 +74,7 @@ def test_a_function_that_lives_on_learns_new_keys_and_forgets_retired_ones() -> 
     assert keys.at(60.0).get("a") is None
 
 
-def test_a_bucket_that_is_away_leaves_the_keys_and_is_asked_again_soon(
+def test_an_unreachable_bucket_keeps_the_keys_and_is_retried_soon(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     bucket = Bucket("a")
@@ -90,7 +90,7 @@ def test_a_bucket_that_is_away_leaves_the_keys_and_is_asked_again_soon(
     assert bucket.reads == 3
 
 
-def test_before_the_first_key_nobody_is_trusted_and_nothing_falls_over(
+def test_before_the_first_key_every_token_is_refused(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     assert KeyCache(Bucket().read, 60.0).at(0.0).get("a") is None
@@ -98,7 +98,7 @@ def test_before_the_first_key_nobody_is_trusted_and_nothing_falls_over(
 
 
 class Room:
-    """A control room whose objects may be there, missing, or out of reach."""
+    """A access control store whose objects may be there, missing, or out of reach."""
 
     def __init__(self) -> None:
         self.objects: dict[str, str] = {}
@@ -140,7 +140,7 @@ def test_a_deny_list_out_of_reach_stays_as_it_was_known(harm: Exception | None) 
     assert cache.at(31.0).get("a") is not None
 
 
-def test_nobody_is_let_in_while_the_deny_list_was_never_read() -> None:
+def test_every_token_is_refused_while_the_deny_list_was_never_read() -> None:
     room = Room()
     room.error = OSError("HTTP Error 403: Forbidden")
 
@@ -156,7 +156,7 @@ def test_an_enrolled_robots_key_is_known() -> None:
     assert KeyCache(Bucket("a").read, 30.0, read_control=room.read).at(0.0).robot_of(key.key_id) == robot
 
 
-def test_the_control_room_lies_beside_the_keys() -> None:
+def test_roster_and_deny_list_lie_beside_the_keys() -> None:
     request = signed_request(ENVIRONMENT, NOW, "deny.json")
 
     assert request.full_url == "https://artifacts.s3.ap-northeast-2.amazonaws.com/control/deny.json"

@@ -112,7 +112,7 @@ def test_cells_on_a_corner_are_one_place():
 
 
 @pytest.mark.parametrize("strays", [0, 2, 4])
-def test_a_few_strays_do_not_make_a_line_wide(strays):
+def test_a_few_outliers_do_not_make_a_line_wide(strays):
     rng = np.random.default_rng(1)
     pixels = np.column_stack([np.linspace(50, 600, 60), np.linspace(100, 400, 60)]) + rng.normal(size=(60, 2))
     pixels[:strays] = rng.uniform(0, [640, 480], (strays, 2))

@@ -16,7 +16,7 @@ def tilted_plane(size_m, tilt_rad, depth_m, seed=0, n=60):
     return turned, KINECT.project(turned)
 
 
-def test_a_far_tilted_plane_has_a_twin_that_fits_almost_alike():
+def test_a_far_tilted_plane_has_a_second_pose_that_fits_almost_alike():
     points, pixels = tilted_plane(size_m=0.4, tilt_rad=0.6, depth_m=4.0)
 
     twin = second_planar_pose(np.eye(4), points, pixels, KINECT)
@@ -27,7 +27,7 @@ def test_a_far_tilted_plane_has_a_twin_that_fits_almost_alike():
     assert twin[1] / len(points) < 1.0
 
 
-def test_a_near_tilted_plane_has_a_twin_that_fits_badly():
+def test_a_near_tilted_plane_has_a_second_pose_that_fits_badly():
     points, pixels = tilted_plane(size_m=1.5, tilt_rad=0.6, depth_m=2.0)
 
     twin = second_planar_pose(np.eye(4), points, pixels, KINECT)
@@ -35,13 +35,13 @@ def test_a_near_tilted_plane_has_a_twin_that_fits_badly():
     assert twin is None or twin[1] / len(points) > 25.0
 
 
-def test_a_plane_seen_head_on_has_no_twin():
+def test_a_plane_seen_head_on_has_no_second_pose():
     points, pixels = tilted_plane(size_m=1.0, tilt_rad=0.0, depth_m=3.0)
 
     assert second_planar_pose(np.eye(4), points, pixels, KINECT) is None
 
 
-def test_points_that_fill_space_have_no_twin_that_fits():
+def test_points_that_fill_space_have_no_second_pose_that_fits():
     rng = np.random.default_rng(2)
     points = rng.uniform([-1, -1, 5], [1, 1, 7], (60, 3))
 

@@ -51,7 +51,7 @@ def test_the_order_of_the_rows_changes_the_inliers_numbers_only():
     np.testing.assert_allclose(one.T_camera_world, other.T_camera_world, atol=1e-3)
 
 
-def test_kinect_depth_noise_is_borne():
+def test_kinect_depth_noise_is_tolerated():
     good = 0
     for seed in range(40):
         problem = make_problem(seed=seed, depth_noise=True, outlier_ratio=0.4)
@@ -193,7 +193,7 @@ def test_shapes_that_do_not_fit_are_refused(points, pixels):
         solve_pnp(np.ones(points), np.ones(pixels), KINECT)
 
 
-def test_what_is_no_number_is_refused():
+def test_input_that_is_not_numeric_is_refused():
     with pytest.raises(BadRequest, match="must be numbers"):
         solve_pnp([["a", "b", "c"]] * 5, np.ones((5, 2)), KINECT)
 

@@ -17,11 +17,11 @@ def states(checks: str, *, step_s: float = 5.0) -> list[str]:
     return seen
 
 
-def test_two_good_checks_bring_a_server_in() -> None:
+def test_two_good_checks_make_a_server_healthy() -> None:
     assert states("++") == ["starting", "healthy"]
 
 
-def test_two_failed_checks_in_a_row_take_a_healthy_server_out() -> None:
+def test_two_failed_checks_in_a_row_make_a_healthy_server_unhealthy() -> None:
     assert states("++-+--") == ["starting", *["healthy"] * 4, "unhealthy"]
 
 
@@ -30,7 +30,7 @@ def test_a_new_server_is_not_judged_before_the_grace_is_over() -> None:
     assert states("-" * 18)[-1] == "unhealthy"
 
 
-def test_an_unhealthy_server_may_come_back() -> None:
+def test_an_unhealthy_server_can_become_healthy_again() -> None:
     assert states("++--++")[-1] == "healthy"
 
 

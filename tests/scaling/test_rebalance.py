@@ -1,4 +1,4 @@
-"""Crowded servers hand over just enough robots, and then stop."""
+"""Crowded servers move just enough robots, and then stop."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def test_nothing_moves_within_a_fifth_of_even() -> None:
 
 
 @pytest.mark.parametrize("robots", [{}, {"server-1": 100}, {"server-1": 0, "server-2": 0}])
-def test_nobody_to_move_or_nowhere_to_go_means_no_moves(robots: dict[str, int]) -> None:
+def test_without_robots_or_other_servers_nothing_moves(robots: dict[str, int]) -> None:
     assert moves(robots) == {}
 
 
@@ -120,12 +120,14 @@ def test_servers_that_know_only_the_sums_fill_up_an_empty_one_and_then_stop(robo
     assert min(after.values()) >= math.floor(even - 0.2 * even - (servers - 1) - 1e-9)
 
 
-def test_one_server_alone_hands_nothing_over() -> None:
+def test_a_single_server_moves_no_robots() -> None:
     assert share(100, 100, 1) == 0
 
 
 @pytest.mark.parametrize("servers", [2, 3, 5, 8])
-def test_an_empty_server_beside_full_ones_gets_four_fifths_of_even_whoever_decides(servers: int) -> None:
+def test_an_empty_server_beside_full_ones_gets_four_fifths_of_the_average_under_both_rules(
+    servers: int,
+) -> None:
     robots = {"new": 0} | {f"server-{i}": 100 * servers for i in range(servers - 1)}
     total = sum(robots.values())
 

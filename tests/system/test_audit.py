@@ -49,7 +49,7 @@ async def until(found: Callable[[], bool], what: Callable[[], object]) -> None:
 
 
 @awaited
-async def test_a_server_records_who_came_in_and_who_was_refused_and_no_token(tmp_path: Path):
+async def test_a_server_records_accepted_and_refused_robots_and_no_token(tmp_path: Path):
     with GuardedServer(tmp_path) as server:
         audit, good = tmp_path / "audit", server.token("robot-1")
         assert (await server.handshake(b"Bearer " + good.encode()))[0] == 101
@@ -96,7 +96,7 @@ async def test_the_chain_of_a_server_goes_on_over_kills(tmp_path: Path):
 
 
 @awaited
-async def test_a_platform_records_its_deeds_its_robots_its_operator_and_the_heads_of_all(
+async def test_a_platform_records_its_actions_its_robots_its_operator_and_all_heads(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))

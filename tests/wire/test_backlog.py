@@ -66,13 +66,13 @@ def back_with(count: int) -> tuple[ClientSession, ConnectionState, list[int]]:
     return session, welcomed(session, 1.0), waited
 
 
-def test_after_an_outage_only_the_newest_frame_goes_at_first():
+def test_after_an_outage_only_the_newest_frame_is_sent_first():
     _, connection, waited = back_with(20)
 
     assert commands(connection) == [waited[-1]]
 
 
-def test_every_answer_lets_one_more_go_and_the_newest_come_first():
+def test_every_answer_allows_one_more_frame_and_the_newest_is_sent_first():
     session, connection, waited = back_with(20)
     (first,) = commands(connection)
 
@@ -84,7 +84,7 @@ def test_every_answer_lets_one_more_go_and_the_newest_come_first():
     assert commands(connection) == [waited[16], waited[15]]
 
 
-def test_a_frame_of_the_moment_passes_those_that_waited():
+def test_a_fresh_frame_is_sent_before_waiting_ones():
     session, connection, waited = back_with(20)
     (first,) = commands(connection)
     (fresh,) = frames(session, 1, now=1.05)
@@ -96,7 +96,7 @@ def test_a_frame_of_the_moment_passes_those_that_waited():
 
 
 @pytest.mark.parametrize("told", [{"code": "busy"}, {"code": "expired"}, {"queue_ms": 400.0}])
-def test_a_server_that_is_behind_is_sent_one_at_a_time_again(told):
+def test_a_loaded_server_receives_one_frame_at_a_time_again(told):
     session, connection, _ = back_with(20)
     answer(session, connection, *commands(connection), 1.1)
     under_way = commands(connection)
@@ -109,7 +109,7 @@ def test_a_server_that_is_behind_is_sent_one_at_a_time_again(told):
     assert len(commands(connection)) == 1
 
 
-def test_the_comeback_is_over_when_none_of_those_that_waited_is_left():
+def test_the_backlog_ends_when_no_waiting_frame_is_left():
     session, connection, waited = back_with(3)
     assert commands(connection) == [waited[2]]
     fresh = frames(session, ROOM, now=4.5)
@@ -121,7 +121,7 @@ def test_the_comeback_is_over_when_none_of_those_that_waited_is_left():
     assert commands(connection) == fresh
 
 
-def test_all_that_waited_is_sent_in_the_end_and_then_frames_go_as_they_come():
+def test_all_waiting_frames_are_sent_and_then_frames_go_as_they_come():
     session, connection, waited = back_with(20)
     seen, now = [], 1.0
     while under_way := commands(connection):
@@ -145,7 +145,7 @@ def test_commands_without_a_stream_keep_their_order_and_wait_for_no_frame():
     assert commands(welcomed(session, 1.0)) == [*calls, old[-1]]
 
 
-def test_a_command_without_an_end_is_no_reason_to_hold_frames_back():
+def test_a_command_without_a_deadline_does_not_hold_frames_back():
     session = make_session()
     session.close_connection(welcomed(session))
     old = old_frames(session, 3)
@@ -154,7 +154,7 @@ def test_a_command_without_an_end_is_no_reason_to_hold_frames_back():
     assert commands(welcomed(session, 1.0)) == [endless, old[-1]]
 
 
-def test_a_frame_whose_time_ends_on_its_way_makes_room_for_the_next():
+def test_a_frame_that_expires_in_flight_allows_the_next_one():
     session, connection, waited = back_with(4)
     assert commands(connection) == [waited[3]]
     (fresh,) = frames(session, 1, now=4.0)
@@ -179,7 +179,7 @@ def commands_of(session: ClientSession, connection: ConnectionState, count: int)
 
 
 @pytest.mark.parametrize(("outage_s", "at_once"), [(2.4, 6), (2.6, 1)])
-def test_after_a_short_outage_all_can_be_in_time_and_go_as_they_came(outage_s, at_once):
+def test_after_a_short_outage_frames_are_sent_in_their_order(outage_s, at_once):
     """A server that died is replaced by its neighbour within a second or two: the frames are still young."""
     session = make_session()
     session.close_connection(welcomed(session))
@@ -198,7 +198,7 @@ def test_a_move_to_another_server_is_no_outage():
     assert len(commands(welcomed(session, 0.1))) == 4
 
 
-def test_the_turns_are_those_of_the_rule():
+def test_frames_are_ordered_newest_first_behind_commands_without_a_stream():
     waiting = [(1, "pose"), (2, ""), (3, "map"), (4, ""), (5, "pose")]
 
     assert sorted(waiting, key=lambda each: send_order(*each)) == [

@@ -83,13 +83,13 @@ def tend_until_lost(session: ClientSession, connection: ConnectionState) -> tupl
     return now, events
 
 
-def test_a_link_begins_with_hello():
+def test_a_connection_begins_with_hello():
     (hello,) = sent(make_session().open_connection(0.0))
 
     assert hello == Hello(sdk="test", capabilities=("move", "progress"))
 
 
-def test_a_command_waits_for_a_link_and_then_tells_the_time_it_has_left():
+def test_a_command_waits_for_a_connection_and_is_sent_with_its_remaining_time():
     session = make_session()
     session.submit("pnp", {"x": 1}, now=0.0, deadline_s=1.0)
 
@@ -100,7 +100,7 @@ def test_a_command_waits_for_a_link_and_then_tells_the_time_it_has_left():
     assert session.resent == 0
 
 
-def test_an_answer_ends_its_command_once_and_its_twin_is_dropped():
+def test_an_answer_ends_its_command_once_and_a_duplicate_is_dropped():
     session = make_session()
     connection = open_connection(session)
     identity = session.submit("pnp", None, now=0.0)
@@ -114,7 +114,7 @@ def test_an_answer_ends_its_command_once_and_its_twin_is_dropped():
     assert (session.dropped_answers, session.unanswered) == (1, 0)
 
 
-def test_a_lost_link_hands_its_commands_to_the_next_by_the_same_id():
+def test_commands_of_a_lost_connection_are_sent_on_the_next_under_the_same_id():
     session = make_session()
     first = open_connection(session)
     ids = [session.submit("pnp", None, now=0.0) for _ in range(3)]
@@ -140,7 +140,7 @@ def test_of_a_latest_wins_stream_only_the_newest_frame_is_sent_again():
     assert [command.id for command in commands(fresh)] == [new]
 
 
-def test_after_a_long_cut_there_is_no_catch_up_burst():
+def test_after_a_long_outage_there_is_no_catch_up_burst():
     session = make_session()
     connection = open_connection(session)
     session.close_connection(connection)
@@ -183,7 +183,7 @@ def test_an_unanswered_command_expires_at_its_deadline_and_not_before():
     assert session.next_due(0.0) <= 0.5
 
 
-def test_a_robot_keeps_back_what_the_server_has_no_room_for():
+def test_a_robot_sends_no_more_commands_than_the_server_accepts():
     session = make_session()
     connection = open_connection(session, room=2)
     for _ in range(5):
@@ -196,7 +196,7 @@ def test_a_robot_keeps_back_what_the_server_has_no_room_for():
     assert session.unanswered == 4
 
 
-def test_busy_is_tried_again_after_the_servers_pause():
+def test_busy_is_retried_after_the_servers_pause():
     session = make_session()
     connection = open_connection(session)
     session.submit("pnp", None, now=0.0, deadline_s=1.0)
@@ -211,7 +211,7 @@ def test_busy_is_tried_again_after_the_servers_pause():
     assert [again.id for again in commands(connection)] == [command.id]
 
 
-def test_a_new_link_respects_the_pause_that_busy_asked_for():
+def test_a_new_connection_respects_the_pause_of_a_busy_answer():
     session = make_session()
     connection = open_connection(session)
     session.submit("pnp", None, now=0.0)
@@ -249,7 +249,7 @@ def test_retries_after_busy_stay_within_their_budget():
     assert retries >= 400 * RETRY_SHARE
 
 
-def test_a_lost_worker_is_tried_twice_more_and_then_believed():
+def test_a_command_of_a_lost_worker_is_retried_twice():
     session = make_session()
     connection = open_connection(session)
     session.submit("pnp", None, now=0.0)
@@ -264,7 +264,7 @@ def test_a_lost_worker_is_tried_twice_more_and_then_believed():
     }
 
 
-def test_a_failure_from_a_link_the_command_has_left_is_dropped_but_its_result_is_taken():
+def test_a_failure_on_a_former_connection_is_dropped_but_a_result_is_accepted():
     session = make_session()
     old = open_connection(session)
     session.submit("pnp", None, now=0.0)
@@ -276,7 +276,7 @@ def test_a_failure_from_a_link_the_command_has_left_is_dropped_but_its_result_is
     assert codes(tell(session, old, result(command), 0.3)) == {command.id: "ok"}
 
 
-def test_a_move_leaves_what_is_unanswered_on_the_old_link():
+def test_a_move_leaves_unanswered_commands_on_the_old_connection():
     session = make_session()
     old = open_connection(session)
     session.submit("pnp", None, now=0.0)
@@ -307,7 +307,7 @@ def test_a_cancelled_command_is_forgotten_and_never_resent():
     assert commands(open_connection(session, now=1.0)) == []
 
 
-def test_a_command_cancelled_on_its_way_is_not_sent_again_when_its_link_dies():
+def test_a_command_cancelled_in_flight_is_not_sent_again_when_its_connection_is_lost():
     session = make_session()
     connection = open_connection(session)
     session.cancel(session.submit("pnp", None, now=0.0))
@@ -318,7 +318,7 @@ def test_a_command_cancelled_on_its_way_is_not_sent_again_when_its_link_dies():
     assert commands(open_connection(session, now=1.0)) == []
 
 
-def test_a_cancelled_command_still_takes_its_room_until_the_server_answered():
+def test_a_cancelled_command_counts_as_in_flight_until_the_server_answered():
     session = make_session()
     connection = open_connection(session, room=1)
     session.cancel(session.submit("pnp", None, now=0.0))
@@ -331,7 +331,7 @@ def test_a_cancelled_command_still_takes_its_room_until_the_server_answered():
     assert len(commands(connection)) == 1
 
 
-def test_silence_ends_a_link_with_an_unanswered_command_in_time():
+def test_a_stalled_connection_with_an_unanswered_command_is_lost_in_time():
     session = make_session()
     connection = open_connection(session)
     session.submit("pnp", None, now=0.0, deadline_s=60.0)
@@ -342,7 +342,7 @@ def test_silence_ends_a_link_with_an_unanswered_command_in_time():
     assert session.current is None
 
 
-def test_a_slow_command_is_no_silence_while_the_server_answers_pings():
+def test_a_slow_command_is_no_stall_while_the_server_answers_pings():
     session = make_session()
     connection = open_connection(session)
     session.submit("merge", None, now=0.0, deadline_s=60.0)
@@ -356,7 +356,7 @@ def test_a_slow_command_is_no_silence_while_the_server_answers_pings():
                 tell(session, connection, Pong(sent_s=message.sent_s, received_s=now, answered_s=now), now)
 
 
-def test_a_command_on_a_long_idle_link_is_no_reason_to_doubt_it():
+def test_a_command_after_a_long_idle_time_does_not_end_its_connection():
     session = make_session()
     connection = open_connection(session)
     session.check(connection, 0.0)
@@ -371,7 +371,7 @@ def test_a_command_on_a_long_idle_link_is_no_reason_to_doubt_it():
     assert any(isinstance(message, Ping) for message in sent(connection))
 
 
-def test_an_idle_link_is_lost_when_its_ping_stays_unanswered():
+def test_an_idle_connection_is_lost_when_its_ping_stays_unanswered():
     session = make_session()
     connection = open_connection(session)
 
@@ -380,7 +380,7 @@ def test_an_idle_link_is_lost_when_its_ping_stays_unanswered():
     assert now <= SETTINGS.ping_interval_s + SETTINGS.ping_timeout_s
 
 
-def test_a_robot_that_slept_does_not_blame_the_server():
+def test_time_in_which_the_robot_did_not_run_is_no_stall_of_the_server():
     session = make_session()
     connection = open_connection(session)
     session.submit("pnp", None, now=0.0, deadline_s=60.0)
@@ -389,7 +389,7 @@ def test_a_robot_that_slept_does_not_blame_the_server():
     assert session.check(connection, 5.0) == []
 
 
-def test_a_socket_without_a_welcome_is_given_up():
+def test_a_connection_without_a_welcome_is_lost():
     session = make_session()
     connection = session.open_connection(0.0)
 
@@ -424,7 +424,7 @@ def test_delays_add_up_to_the_time_on_the_network_and_are_never_negative():
 
 
 @pytest.mark.parametrize("sent_s", [-5.0, 1e9])
-def test_a_pong_to_no_ping_of_ours_does_not_move_the_clock(sent_s):
+def test_a_pong_without_a_ping_does_not_change_the_clock_offset(sent_s):
     session = make_session()
     connection = open_connection(session)
 
@@ -433,7 +433,7 @@ def test_a_pong_to_no_ping_of_ours_does_not_move_the_clock(sent_s):
     assert connection.clock_offset.offset_s is None
 
 
-def test_a_server_without_stamps_gives_no_delays():
+def test_results_without_timestamps_give_no_delays():
     session = make_session()
     connection = open_connection(session)
     tell(session, connection, Pong(sent_s=0.0, received_s=5.0, answered_s=5.0), 0.02)
@@ -445,7 +445,7 @@ def test_a_server_without_stamps_gives_no_delays():
     assert (event.up_s, event.down_s) == (None, None)
 
 
-def test_garbage_is_a_protocol_error_and_harms_no_command():
+def test_an_invalid_message_is_a_protocol_error_and_affects_no_command():
     session = make_session()
     connection = open_connection(session)
     identity = session.submit("pnp", None, now=0.0)
@@ -458,7 +458,7 @@ def test_garbage_is_a_protocol_error_and_harms_no_command():
     assert codes(tell(session, connection, result(command), 0.2)) == {identity: "ok"}
 
 
-def test_an_absurd_move_or_pause_cannot_stop_the_clockwork():
+def test_numbers_that_are_not_finite_in_a_move_or_pause_are_harmless():
     session = ClientSession(codec=make_codec("bin"), settings=SETTINGS, sdk="test")
     connection = session.open_connection(0.0)
     session.adopt(connection, 0.0)
@@ -475,7 +475,7 @@ def test_an_absurd_move_or_pause_cannot_stop_the_clockwork():
     assert session.unanswered == 0
 
 
-def test_what_does_not_travel_is_refused_before_it_becomes_a_command():
+def test_a_payload_that_cannot_be_encoded_is_refused_before_it_becomes_a_command():
     session = make_session()
     open_connection(session)
 

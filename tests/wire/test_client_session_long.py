@@ -69,7 +69,7 @@ def test_a_command_that_reports_progress_has_no_deadline_but_its_callers():
     assert codes(tell(session, connection, result(command), 5000.0)) == {command.id: "ok"}
 
 
-def test_a_long_command_ends_at_the_deadline_of_its_caller_and_is_taken_back():
+def test_a_long_command_ends_at_the_deadline_of_its_caller_and_is_cancelled():
     session = make_session()
     connection = open_connection(session)
     identity = session.submit("merge", None, now=0.0, deadline_s=10.0)
@@ -95,7 +95,7 @@ def test_a_long_command_is_sent_again_after_a_cut_and_on_a_move_without_waiting_
     assert [command.id for command in commands(third)] == [identity]
 
 
-def test_a_cancelled_command_is_taken_back_even_if_the_caller_left_before_it_was_known_to_be_long():
+def test_a_cancelled_command_is_cancelled_on_the_server_when_it_turns_out_to_be_long():
     session = make_session()
     connection = open_connection(session)
     identity = session.submit("merge", None, now=0.0)
@@ -108,7 +108,7 @@ def test_a_cancelled_command_is_taken_back_even_if_the_caller_left_before_it_was
     assert sent(connection).count(Cancel(id=identity)) == 1
 
 
-def test_waiting_for_a_long_command_is_no_silence():
+def test_waiting_for_a_long_command_is_no_stall():
     session = make_session()
     connection = open_connection(session)
     identity = session.submit("merge", None, now=0.0)
@@ -120,7 +120,7 @@ def test_waiting_for_a_long_command_is_no_silence():
     assert sent(connection) == []
 
 
-def test_a_long_command_whose_caller_leaves_is_taken_back_once():
+def test_a_long_command_is_cancelled_once_when_its_caller_gives_up():
     session = make_session()
     connection = open_connection(session)
     identity = session.submit("merge", None, now=0.0)
@@ -136,7 +136,7 @@ def test_a_long_command_whose_caller_leaves_is_taken_back_once():
     assert session.unanswered == 0
 
 
-def test_a_command_that_is_taken_back_while_there_is_no_link_is_taken_back_on_the_next():
+def test_a_long_command_cancelled_without_a_connection_is_cancelled_on_the_next():
     session = make_session()
     first = open_connection(session)
     identity = session.submit("merge", None, now=0.0, is_open_ended=True)
@@ -156,7 +156,7 @@ def test_a_command_that_is_taken_back_while_there_is_no_link_is_taken_back_on_th
     assert commands(open_connection(session, now=1e6 + 9, server="c")) == []
 
 
-def test_a_cancel_that_was_lost_with_its_link_is_sent_again():
+def test_a_cancel_that_was_lost_with_its_connection_is_sent_again():
     session = make_session()
     first = open_connection(session)
     identity = session.submit("merge", None, now=0.0, deadline_s=10.0)
@@ -171,7 +171,7 @@ def test_a_cancel_that_was_lost_with_its_link_is_sent_again():
     assert session.due(3600.0) == []
 
 
-def test_a_short_command_whose_caller_left_is_not_asked_again():
+def test_a_short_command_whose_caller_gave_up_is_not_sent_again():
     session = make_session()
     first = open_connection(session)
     identity = session.submit("pnp", None, now=0.0)

@@ -82,7 +82,7 @@ def test_the_two_delays_tell_a_slow_uplink_from_a_slow_downlink():
     "stamps",
     [(1.0, math.nan, 2.0, 3.0), (1.0, 2.0, math.inf, 3.0), (3.0, 1.0, 1.0, 2.0), (1.0, 5.0, 4.0, 2.0)],
 )
-def test_absurd_stamps_are_not_plausible(stamps):
+def test_invalid_timestamps_are_not_plausible(stamps):
     assert not Exchange(*stamps).is_plausible
 
 

@@ -76,7 +76,7 @@ FROM_SERVER: dict[type[Any], st.SearchStrategy[Any]] = {
 @pytest.mark.parametrize("kind", FROM_ROBOT)
 @given(data=st.data())
 @settings(max_examples=50)
-def test_what_a_robot_says_survives_the_wire(name: str, kind: type[Any], data: st.DataObject) -> None:
+def test_robot_messages_survive_encoding(name: str, kind: type[Any], data: st.DataObject) -> None:
     message = data.draw(FROM_ROBOT[kind])
     codec = make_codec(name)
 
@@ -87,7 +87,7 @@ def test_what_a_robot_says_survives_the_wire(name: str, kind: type[Any], data: s
 @pytest.mark.parametrize("kind", FROM_SERVER)
 @given(data=st.data())
 @settings(max_examples=50)
-def test_what_a_server_says_survives_the_wire(name: str, kind: type[Any], data: st.DataObject) -> None:
+def test_server_messages_survive_encoding(name: str, kind: type[Any], data: st.DataObject) -> None:
     message = data.draw(FROM_SERVER[kind])
     codec = make_codec(name)
 
@@ -170,7 +170,7 @@ def test_of_duplicate_keys_the_last_one_counts() -> None:
     assert payload_of("json", command('{"a":1,"a":2}')) == {"a": 2}
 
 
-def test_unknown_fields_are_ignored_so_that_a_newer_side_may_say_more() -> None:
+def test_unknown_fields_are_ignored_for_compatibility() -> None:
     assert payload_of("json", command('5,"colour":{"deep":[1]}')) == 5
 
 
@@ -191,7 +191,7 @@ def test_a_command_whose_fields_do_not_fit_is_a_bad_message(fields: str) -> None
 
 
 @pytest.mark.parametrize("data", [b"[]", b"1", b"{}", b'{"type":"welcome"}', b'{"type":7}', b'{"type":"x"}'])
-def test_what_no_robot_may_say_is_a_bad_message(data: bytes) -> None:
+def test_server_messages_from_a_robot_are_bad_messages(data: bytes) -> None:
     assert isinstance(refused("json", data), BadMessage)
 
 
@@ -327,7 +327,7 @@ def test_deep_messagepack_is_refused_or_skipped_and_never_a_crash(depth: int, op
 
 @pytest.mark.parametrize("value", [object(), {1, object()}, nested(3000)], ids=["object", "set", "deep"])
 @pytest.mark.parametrize("name", CODECS)
-def test_what_cannot_be_said_is_a_bad_message_of_the_speaker(name: str, value: Any) -> None:
+def test_a_message_that_cannot_be_encoded_is_a_bad_message_of_its_sender(name: str, value: Any) -> None:
     with pytest.raises(BadMessage):
         make_codec(name).encode(Result(id=1, reply=value))
 

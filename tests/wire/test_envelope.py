@@ -17,7 +17,7 @@ FAILURE = Failure(id=7, code="busy", message="behind", hint="later", retry_after
 
 @pytest.mark.parametrize("name", CODECS)
 @given(identity=st.integers(0, 2**53 - 1), size=st.integers(0, 3000))
-def test_id_and_service_are_seen_whatever_the_payload(name: str, identity: int, size: int) -> None:
+def test_id_and_service_are_read_whatever_the_payload(name: str, identity: int, size: int) -> None:
     codec = make_codec(name)
     command = Command(id=identity, service="pnp", payload={"x": list(range(size))}, trace="t", keep=True)
 
@@ -25,7 +25,7 @@ def test_id_and_service_are_seen_whatever_the_payload(name: str, identity: int, 
 
 
 @pytest.mark.parametrize("name", CODECS)
-def test_prepared_messages_are_seen_too(name: str) -> None:
+def test_preencoded_messages_are_recognised_too(name: str) -> None:
     codec = make_codec(name)
     prepared = preencode(codec, {"x": [1.5] * 500})
 
@@ -36,7 +36,7 @@ def test_prepared_messages_are_seen_too(name: str) -> None:
 
 @pytest.mark.parametrize("name", CODECS)
 @pytest.mark.parametrize("message", [Hello(), Ping(sent_s=1.0)])
-def test_what_is_no_command_is_left_to_the_codec(name: str, message: object) -> None:
+def test_other_messages_are_left_to_the_codec(name: str, message: object) -> None:
     codec = make_codec(name)
 
     assert peek(codec, codec.encode(message)) is None
@@ -44,7 +44,7 @@ def test_what_is_no_command_is_left_to_the_codec(name: str, message: object) -> 
 
 @pytest.mark.parametrize("name", CODECS)
 @given(data=st.binary(max_size=300))
-def test_rubbish_is_left_to_the_codec(name: str, data: bytes) -> None:
+def test_invalid_bytes_are_left_to_the_codec(name: str, data: bytes) -> None:
     assert peek(make_codec(name), data) is None
 
 
@@ -72,7 +72,7 @@ def test_a_refusal_reads_like_any_other_failure(name: str) -> None:
     assert codec.decode_from_server(encode_refusal(codec, FAILURE)) == FAILURE
 
 
-def test_a_bomb_is_not_inflated_for_a_glance() -> None:
+def test_a_decompression_bomb_is_not_inflated_for_its_envelope() -> None:
     bomb = zlib.compress(b'{"type":"command","id":1,"service":"pnp","payload":"' + b"x" * 10**7)
 
     assert peek(make_codec("zlib"), bomb) == Envelope(1, "pnp")

@@ -60,7 +60,7 @@ def test_a_message_is_refused_exactly_when_what_it_holds_weighs_too_much(value):
 
 
 @given(data=st.binary(max_size=500))
-def test_what_is_no_message_pack_ends_too(data):
+def test_counting_ends_for_bytes_that_are_not_messagepack(data):
     try:
         check_msgpack(data, SMALL)
     except LimitExceeded:

@@ -40,7 +40,7 @@ def test_the_server_decodes_the_same_command_as_if_it_had_been_encoded_whole(nam
 
 
 @pytest.mark.parametrize("name", CODECS)
-def test_it_weighs_at_most_two_percent_more(name: str) -> None:
+def test_a_preencoded_message_is_at_most_two_percent_longer(name: str) -> None:
     codec, payload = make_codec(name), request(name)
     prepared = encode_command(codec, command(preencode(codec, payload)))
     assert len(prepared) <= 1.02 * len(codec.encode(command(payload)))
@@ -52,7 +52,7 @@ def test_a_payload_of_another_codec_is_refused() -> None:
         encode_command(zlib, command(preencode(make_codec("bin"), {"value": 1})))
 
 
-def test_what_does_not_travel_is_refused() -> None:
+def test_a_payload_that_cannot_be_encoded_is_refused() -> None:
     with pytest.raises(BadMessage):
         preencode(make_codec("zlib"), {"value": object()})
 

@@ -41,7 +41,7 @@ def answer_all(session: ClientSession, connection: ConnectionState, now: float) 
     gap_s=st.floats(0.05, 3.0),
     delays_s=st.lists(st.floats(0.0, 0.1), min_size=1, max_size=10),
 )
-def test_whatever_a_robot_wants_its_server_sees_no_more_than_the_rate(bursts, gap_s, delays_s):
+def test_a_server_never_receives_more_than_its_rate_limit(bursts, gap_s, delays_s):
     session = ClientSession(codec=CODEC, settings=SessionSettings(answer_timeout_s=1e4), sdk="t")
     connection, server, now, sent = welcomed(session), TokenBucket(20.0, 40.0), 0.0, 0
     for number, burst in enumerate(bursts):
@@ -59,7 +59,7 @@ def test_whatever_a_robot_wants_its_server_sees_no_more_than_the_rate(bursts, ga
             now = min(until, max(now + 0.001, session.next_due(now)))
 
 
-def test_what_has_to_wait_goes_as_soon_as_the_rate_allows():
+def test_waiting_commands_are_sent_as_soon_as_the_rate_allows():
     session = ClientSession(codec=CODEC, settings=SessionSettings(answer_timeout_s=100.0), sdk="t")
     connection, now, ended = welcomed(session), 0.0, 0
     for _ in range(90):
@@ -85,7 +85,7 @@ def test_without_a_rate_nothing_waits():
     assert RateLimiter().next_s(5.0) == 5.0
 
 
-def test_pings_count_too():
+def test_pings_count_towards_the_rate():
     limiter = RateLimiter(LIMITS)
     before = limiter.available(0.0)
     session = ClientSession(codec=CODEC, settings=SessionSettings(), sdk="t")

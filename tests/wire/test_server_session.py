@@ -82,7 +82,7 @@ def test_another_protocol_version_is_told_so_and_closed() -> None:
 
 
 @pytest.mark.parametrize("message", [COMMAND, Ping(sent_s=1.0)])
-def test_whoever_speaks_before_hello_is_closed(message: Message) -> None:
+def test_a_message_before_hello_closes_the_connection(message: Message) -> None:
     assert say(session(), message) == [Close(CLOSE_PROTOCOL, "say hello first")]
 
 
@@ -116,7 +116,7 @@ def test_more_unanswered_commands_than_agreed_are_busy_with_a_time() -> None:
     assert isinstance(say(server, Command(id=3, service="echo"))[0], Submit)
 
 
-def test_bad_messages_are_forgiven_up_to_a_number() -> None:
+def test_bad_messages_are_tolerated_up_to_a_limit() -> None:
     server = opened()
 
     for _ in range(LIMITS.max_bad_messages):
@@ -128,7 +128,7 @@ def test_bad_messages_are_forgiven_up_to_a_number() -> None:
     assert close == Close(CLOSE_PROTOCOL, "too many bad messages")
 
 
-def test_a_closed_session_hears_nothing() -> None:
+def test_a_closed_session_ignores_messages() -> None:
     server = session()
     say(server, COMMAND)
 

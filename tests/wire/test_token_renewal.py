@@ -1,4 +1,4 @@
-"""A fresh token on a live socket: asked for in time, judged by whoever knows, never a reason to end."""
+"""A fresh token on a live socket: asked for in time, verified by the server, never a reason to end."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def test_the_welcome_says_how_long_the_token_is_good():
     assert server_session(None)[1].token_s is None
 
 
-def test_a_fresh_token_is_handed_out_to_be_judged_and_the_answer_is_sent():
+def test_a_fresh_token_is_returned_for_verification_and_the_result_is_sent():
     session, _ = server_session()
 
     assert session.receive(CODEC.encode(Renew(token="t")), 5.0) == [Renewal("t")]
@@ -68,7 +68,7 @@ def test_a_fresh_token_is_handed_out_to_be_judged_and_the_answer_is_sent():
     assert (failure.id, failure.code) == (None, "unauthorized")
 
 
-def test_renewals_that_come_too_fast_are_not_judged():
+def test_renewals_in_quick_succession_are_not_verified():
     session, _ = server_session()
     renew = CODEC.encode(Renew(token="t"))
     session.receive(renew, 5.0)
@@ -82,7 +82,7 @@ def test_renewals_that_come_too_fast_are_not_judged():
     assert session.receive(renew, 5.0 + RENEWAL_PAUSE_S) == [Renewal("t")]
 
 
-def test_a_robot_asks_for_a_fresh_token_at_four_fifths_of_its_life_and_then_more_often():
+def test_a_renewal_is_due_after_four_fifths_of_the_ttl_and_then_more_often():
     asked = asked_at(*linked(100.0), 100)
 
     assert asked[:3] == [80, 90, 95]
@@ -90,18 +90,18 @@ def test_a_robot_asks_for_a_fresh_token_at_four_fifths_of_its_life_and_then_more
     assert min(b - a for a, b in itertools.pairwise(asked)) >= RENEWAL_PAUSE_S
 
 
-def test_after_renewed_the_next_fresh_token_is_due_in_the_new_life():
+def test_after_a_renewal_the_next_one_is_due_in_the_new_ttl():
     session, connection = linked(100.0)
     session.receive(connection, CODEC.encode(Renewed(token_s=1000.0)), 80.0)
 
     assert asked_at(session, connection, 1080)[:2] == [880, 980]
 
 
-def test_a_server_that_does_not_speak_of_tokens_is_never_asked():
+def test_without_an_expiry_no_renewal_is_ever_due():
     assert asked_at(*linked(None), 2000) == []
 
 
-def test_a_link_that_is_left_is_not_renewed():
+def test_a_connection_that_is_being_left_is_not_renewed():
     session, connection = linked(100.0)
     connection.leaving = True
 
@@ -118,7 +118,7 @@ def test_renew_writes_one_message():
 
 
 @pytest.mark.parametrize("absurd", [-1.0, 1e12])
-def test_what_a_server_says_of_time_is_believed_within_an_hour(absurd: float):
+def test_an_implausible_expiry_counts_as_one_hour(absurd: float):
     timer = RenewalTimer()
     timer.expires_in(absurd, 0.0)
 

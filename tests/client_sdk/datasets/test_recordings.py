@@ -63,7 +63,7 @@ def test_each_image_is_used_once_by_its_nearest_partner():
     assert associate_stamps([0.0], [], 0.02) == []
 
 
-def test_truth_and_reference_poses_are_told_apart(tmp_path: Path):
+def test_ground_truth_and_reference_poses_are_distinguished(tmp_path: Path):
     folder = write_tum(tmp_path / "x", [0.0])
     (folder / "reference_poses.txt").write_text("0 1 2 3 0 0 0 1\n")
     assert open_dataset(folder).truth_kind == "reference"
@@ -85,7 +85,7 @@ def test_a_plain_tum_folder_takes_the_benchmarks_intrinsics(tmp_path: Path, name
     assert next(iter(dataset)).depth_m[240, 320] == np.float32(1000 / 5000)
 
 
-def test_a_distorted_lens_is_undone_for_colour_and_depth(tmp_path: Path):
+def test_lens_distortion_is_removed_from_colour_and_depth(tmp_path: Path):
     folder = write_tum(tmp_path / "x", [0.0], distortion=(0.2, 0, 0, 0, 0))
     depth = np.tile(np.arange(1000, 1064, dtype=np.uint16), (48, 1))
     cv2.imwrite(str(folder / "depth/0.png"), depth)
@@ -136,7 +136,7 @@ def test_robots_take_contiguous_shares_that_cover_everything_once(tmp_path: Path
         (lambda folder: cv2.imwrite(str(folder / "rgb/0.png"), np.ones((9, 9, 3), np.uint8)), "do not fit"),
     ],
 )
-def test_what_is_wrong_is_told_in_one_line_with_a_hint(tmp_path: Path, harm, told: str):
+def test_problems_are_reported_in_one_line_with_a_hint(tmp_path: Path, harm, told: str):
     folder = write_tum(tmp_path / "x", [0.0])
     harm(folder)
     with pytest.raises(UsageError, match=told) as caught:
@@ -150,7 +150,7 @@ def test_depth_in_the_wrong_unit_is_noticed(tmp_path: Path):
         list(open_dataset(write_tum(tmp_path / "x", [0.0], scale=1)))
 
 
-def test_paths_that_are_no_recording_are_refused(tmp_path: Path):
+def test_paths_without_a_recording_are_refused(tmp_path: Path):
     (tmp_path / "a.txt").write_text("")
     (tmp_path / "old.mat").write_bytes(b"MATLAB 5.0 MAT-file")
     for path in (tmp_path / "none", tmp_path / "a.txt", tmp_path / "old.mat", tmp_path):

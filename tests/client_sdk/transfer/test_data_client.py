@@ -138,12 +138,12 @@ def once(answer: Answer, method: str = "PATCH", after: int = 0) -> Script:
     return script
 
 
-def test_a_small_object_goes_at_once(service: FakeService, robot: Robot) -> None:
+def test_a_small_object_is_sent_in_one_request(service: FakeService, robot: Robot) -> None:
     assert robot.client.upload(b"small") == hashlib.sha256(b"small").hexdigest()
     assert [method for method, _ in service.asked] == ["PUT"]
 
 
-def test_a_large_one_goes_in_the_parts_that_the_server_names(service: FakeService, robot: Robot) -> None:
+def test_a_large_object_is_sent_in_parts_of_the_servers_size(service: FakeService, robot: Robot) -> None:
     told: list[tuple[int, int]] = []
 
     assert robot.client.upload(DATA, lambda done, size: told.append((done, size))) == DIGEST
@@ -156,7 +156,9 @@ def test_a_large_one_goes_in_the_parts_that_the_server_names(service: FakeServic
 @pytest.mark.parametrize(
     "cut", [(0, {}, b""), failure(503, "busy"), failure(500, "internal"), failure(408, "expired")]
 )
-def test_a_cut_is_tried_again_after_a_growing_pause(service: FakeService, robot: Robot, cut: Answer) -> None:
+def test_a_broken_request_is_retried_after_a_growing_pause(
+    service: FakeService, robot: Robot, cut: Answer
+) -> None:
     service.script = once(cut, after=1)
 
     assert robot.client.upload(DATA) == DIGEST
@@ -182,9 +184,7 @@ def test_a_part_whose_answer_was_lost_is_not_sent_twice(service: FakeService, ro
     assert service.objects[DIGEST] == DATA
 
 
-def test_an_upload_of_another_process_is_gone_on_with(
-    service: FakeService, robot: Robot, tmp_path: Path
-) -> None:
+def test_an_upload_of_another_process_is_resumed(service: FakeService, robot: Robot, tmp_path: Path) -> None:
     service.parts[DIGEST] = DATA[:400_000]
     (tmp_path / "cloud").write_bytes(DATA)
 
@@ -194,7 +194,7 @@ def test_an_upload_of_another_process_is_gone_on_with(
     assert [method for method, _ in service.asked].count("PATCH") == 2
 
 
-def test_a_refusal_is_final_and_has_its_name(service: FakeService, robot: Robot) -> None:
+def test_a_refusal_is_final_and_typed(service: FakeService, robot: Robot) -> None:
     service.script = once(failure(413, "quota"), "PUT")
 
     with pytest.raises(QuotaExceeded, match="so it is"):
@@ -202,7 +202,7 @@ def test_a_refusal_is_final_and_has_its_name(service: FakeService, robot: Robot)
     assert robot.pauses == []
 
 
-def test_patience_ends(service: FakeService, robot: Robot) -> None:
+def test_retries_end_at_the_deadline(service: FakeService, robot: Robot) -> None:
     service.script = lambda *_: (0, {}, b"")
 
     with pytest.raises(ConnectError):
@@ -212,7 +212,7 @@ def test_patience_ends(service: FakeService, robot: Robot) -> None:
     assert max(robot.pauses) <= 5.0
 
 
-def test_the_server_says_how_long_to_wait(service: FakeService, robot: Robot) -> None:
+def test_a_retry_waits_as_long_as_the_server_asks(service: FakeService, robot: Robot) -> None:
     service.script = once(failure(503, "busy", **{"Retry-After": "7"}), "PUT")
 
     robot.client.upload(b"small")
@@ -220,9 +220,7 @@ def test_the_server_says_how_long_to_wait(service: FakeService, robot: Robot) ->
     assert robot.pauses == [7.0]
 
 
-def test_a_download_is_checked_and_goes_on_after_a_cut(
-    service: FakeService, robot: Robot, tmp_path: Path
-) -> None:
+def test_a_download_is_verified_and_resumed(service: FakeService, robot: Robot, tmp_path: Path) -> None:
     large = random.Random(2).randbytes(2_500_000)
     digest = hashlib.sha256(large).hexdigest()
     service.objects[digest] = large
@@ -238,7 +236,9 @@ def test_a_download_is_checked_and_goes_on_after_a_cut(
     assert [path.name for path in tmp_path.iterdir()] == ["map"]
 
 
-def test_other_bytes_than_asked_for_are_refused(service: FakeService, robot: Robot, tmp_path: Path) -> None:
+def test_bytes_that_do_not_match_the_digest_are_refused(
+    service: FakeService, robot: Robot, tmp_path: Path
+) -> None:
     service.objects[DIGEST] = DATA[:-1] + b"?"
 
     with pytest.raises(StoreError, match="digest"):

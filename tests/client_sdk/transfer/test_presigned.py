@@ -20,7 +20,7 @@ DIGEST = digest_of(DATA)
 
 
 class Bucket(MemoryStore):
-    """A store in memory with a door of its own, which robots reach by signed addresses while it is *open*."""
+    """A store in memory with an HTTP server, which robots reach by presigned addresses while it is *open*."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -119,7 +119,7 @@ def carried(service: Service) -> int:
     return sum(line["received_bytes"] + line["sent_bytes"] for line in lines)
 
 
-def test_large_data_goes_straight_both_ways_and_the_token_stays_at_home(
+def test_large_data_uses_presigned_addresses_without_the_token(
     service: Service, bucket: Bucket, robot: DataClient
 ) -> None:
     assert robot.upload(DATA) == DIGEST
@@ -130,7 +130,7 @@ def test_large_data_goes_straight_both_ways_and_the_token_stays_at_home(
     assert bucket.tokens == 0
 
 
-def test_a_closed_bucket_is_asked_three_times_and_then_the_service_carries_the_bytes(
+def test_after_three_failures_of_the_bucket_the_service_transfers_the_bytes(
     service: Service, bucket: Bucket, robot: DataClient
 ) -> None:
     bucket.is_open = False
@@ -167,5 +167,5 @@ def test_a_presigned_address_that_expired_is_requested_again(service: Service, b
         ("", False, False),
     ],
 )
-def test_tls_is_never_left(url: str, secure: bool, allowed: bool) -> None:
+def test_tls_is_never_given_up(url: str, secure: bool, allowed: bool) -> None:
     assert is_allowed(url, secure=secure) is allowed
