@@ -243,7 +243,8 @@ def test_what_is_forbidden_is_a_typed_failure_and_the_server_keeps_running(serve
     harms = ["exit", "leak", "big", "fork", "threads", "socket", "program", "write_code", "fill_disk"]
 
     for harm in harms:
-        failure, after = ask_all(server, harm, [("worker", {"do": harm}), ("worker", {"do": "look"})])
+        asks = [("worker", {"do": harm}), ("worker", {"do": "look"})]
+        failure, after = ask_all(server, harm, asks, deadline_ms=10_000.0)
         assert isinstance(failure, Failure), harm
         assert failure.code in ("internal", "poison", "too-large", "worker-lost"), harm
         assert isinstance(after, Result), harm
