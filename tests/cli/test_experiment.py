@@ -24,7 +24,7 @@ from rse_pf.cli.main import main
         (["elasticty"], "'elasticty' is not one of"),
     ],
 )
-def test_what_is_wrong_is_said_with_a_hint_and_nothing_starts(words, told, capsys, tmp_path, monkeypatch):
+def test_a_wrong_option_is_refused_with_a_hint_and_nothing_starts(words, told, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
 
     code = main(["experiment", *words])
@@ -34,7 +34,7 @@ def test_what_is_wrong_is_said_with_a_hint_and_nothing_starts(words, told, capsy
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_folder_that_holds_something_else_is_not_touched(tmp_path, capsys):
+def test_a_folder_with_other_files_is_not_touched(tmp_path, capsys):
     (tmp_path / "thesis.tex").write_text("all of it")
 
     code = main(["experiment", "latency", "--robots", "1", "--out", str(tmp_path)])

@@ -61,7 +61,7 @@ def test_list_names_each_map_with_its_head(store: Path, capsys: pytest.CaptureFi
     assert (only["name"], only["number"], only["note"]) == ("hall", 2, "second")
 
 
-def test_show_tells_a_version_and_draws_it(store: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_show_describes_a_version_and_draws_it(store: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run(store, "show", "hall", "--png", str(store.parent / "hall.png")) == 0
 
     assert "keyframes   3  (robot-1 3)" in capsys.readouterr().out
@@ -100,7 +100,7 @@ def test_export_writes_the_file(store: Path, kind: str, begins: bytes) -> None:
         (["export", "hall", "--format", "ply", "--out", "/nowhere/x"], 2),
     ],
 )
-def test_what_cannot_be_done_is_one_sentence_and_a_hint(
+def test_an_action_that_fails_is_one_sentence_and_a_hint(
     store: Path, capsys: pytest.CaptureFixture[str], words: list[str], code: int
 ) -> None:
     assert run(store, *words) == code
@@ -110,6 +110,6 @@ def test_what_cannot_be_done_is_one_sentence_and_a_hint(
     assert "Traceback" not in said
 
 
-def test_maps_in_memory_are_nobody_elses(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_store_in_memory_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["map", "list", "--store", "memory:"]) == 2
     assert "dir:PATH" in capsys.readouterr().err

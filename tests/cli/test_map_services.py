@@ -40,7 +40,7 @@ def run(store: Path, *words: str) -> int:
     return main(["map", *words, "--store", f"dir:{store}"])
 
 
-def test_merge_makes_one_map_and_says_what_was_joined(
+def test_merge_makes_one_map_and_names_what_was_joined(
     store: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert run(store, "merge", "a", "b", "--into", "hall") == 0
@@ -53,7 +53,7 @@ def test_merge_makes_one_map_and_says_what_was_joined(
     assert any(edge.kind == "merge" for edge in version.edges)
 
 
-def test_merging_into_a_map_that_exists_follows_its_head(
+def test_merging_into_an_existing_map_adds_a_version_after_its_head(
     store: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert run(store, "merge", "a", "b", "--into", "a") == 0
@@ -64,7 +64,7 @@ def test_merging_into_a_map_that_exists_follows_its_head(
     assert records[1].note == "merged a, b"
 
 
-def test_what_was_not_joined_is_named_and_ends_in_one(
+def test_maps_that_were_not_joined_are_named_and_the_exit_code_is_1(
     store: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert run(store, "merge", "a", "b", "c", "--into", "hall", "--json") == 1
@@ -93,7 +93,7 @@ def test_an_older_version_can_be_merged(store: Path, capsys: pytest.CaptureFixtu
     assert run(store, "merge", f"a@{first.id[:8]}", "b", "--into", "hall") == 0
 
 
-def test_view_draws_the_map_there(store: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_view_draws_the_map_into_the_named_file(store: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = store.parent / "a.png"
 
     assert run(store, "view", "a", "--out", str(out)) == 0
@@ -167,7 +167,7 @@ def rendered(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, np.ndarray
     return folder / "store", truth, folder / "frame.png"
 
 
-def test_localise_finds_an_image_by_the_maps_own_camera(
+def test_localise_uses_the_camera_of_the_map_for_an_image(
     rendered: tuple[Path, np.ndarray, Path], capsys: pytest.CaptureFixture[str]
 ) -> None:
     store, truth, image = rendered
@@ -183,7 +183,7 @@ def test_localise_finds_an_image_by_the_maps_own_camera(
     assert pose_difference(estimate, truth)[0] <= 0.01
 
 
-def test_localise_prints_a_line_for_each_frame_and_ends_in_one_if_none_was_found(
+def test_localise_prints_a_line_for_each_frame_and_exits_with_1_if_none_has_a_pose(
     rendered: tuple[Path, np.ndarray, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     from PIL import Image

@@ -28,10 +28,10 @@ def demo(out: Path, *options: str, within_s: float) -> tuple[dict[str, Any], str
 
 
 @pytest.mark.timeout(110)
-def test_robots_that_share_no_view_are_not_joined_and_the_reason_is_told(tmp_path: Path) -> None:
+def test_robots_without_a_shared_view_are_not_joined_and_the_reason_is_printed(tmp_path: Path) -> None:
     out = tmp_path / "out"
 
-    merged, said = demo(out, "--robots", "2", "--frames", "8", "--rate", "10", within_s=100)
+    merged, said = demo(out, "--robots", "2", "--frames", "5", "--rate", "20", within_s=100)
 
     assert merged["joined"] == ["robot-1"]
     (left_out,) = merged["not_joined"]
@@ -51,7 +51,7 @@ def test_robots_that_share_no_view_are_not_joined_and_the_reason_is_told(tmp_pat
 @pytest.mark.slow
 @pytest.mark.data
 @pytest.mark.timeout(400)
-def test_three_robots_in_the_red_kitchen_end_in_one_map_within_the_bars(tmp_path: Path) -> None:
+def test_three_robots_in_the_red_kitchen_end_in_one_map_within_the_limits(tmp_path: Path) -> None:
     recording = Path(__file__).parents[2].parent / "shared" / "data" / "7scenes_redkitchen"
     if not recording.is_dir():
         pytest.skip(f"there is no recording {recording}")

@@ -18,7 +18,7 @@ def run(folder, *words):
     return code, json.loads((folder / "report.json").read_text()), [str(f) for f in findings if not f.agrees]
 
 
-def test_elasticity_grows_heals_shrinks_and_loses_nothing(tmp_path):
+def test_elasticity_scales_out_replaces_scales_in_and_loses_nothing(tmp_path):
     code, report, differing = run(
         tmp_path / "out", "elasticity", "--speed", "60", "--robots", "16", "--fps", "5"
     )

@@ -102,7 +102,7 @@ def test_robots_whose_tokens_are_refused_are_reported_and_no_process_is_left(tmp
     run(work())
 
 
-def test_through_the_papers_link_the_median_is_the_link_and_a_little(tmp_path: Path) -> None:
+def test_the_median_through_the_papers_link_is_little_more_than_its_delay(tmp_path: Path) -> None:
     async def work() -> None:
         async with (
             LocalPlatform(SETTINGS, servers=1, port=0, state=tmp_path / "a") as cloud,
@@ -120,7 +120,7 @@ def test_through_the_papers_link_the_median_is_the_link_and_a_little(tmp_path: P
 
 
 @pytest.mark.slow
-def test_a_herd_is_back_soon_after_the_balancer_was_killed_and_came_back(tmp_path: Path) -> None:
+def test_all_robots_reconnect_soon_after_the_load_balancer_was_killed_and_restarted(tmp_path: Path) -> None:
     async def work() -> None:
         robots, heard = 40, []
         all_back = asyncio.Event()
@@ -153,7 +153,7 @@ def test_a_herd_is_back_soon_after_the_balancer_was_killed_and_came_back(tmp_pat
 
 
 @pytest.mark.slow
-def test_the_verb_leaves_records_from_which_its_report_follows(tmp_path: Path) -> None:
+def test_the_report_of_the_verb_follows_from_its_records(tmp_path: Path) -> None:
     out = tmp_path / "out"
     words = ["swarm", "--robots", "3", "--seconds", "1", "--fps", "10", "--servers", "1", "--out", str(out)]
     done = subprocess.run(

@@ -38,7 +38,7 @@ class RecordingSink:
         return len(self.keyframes)
 
 
-def test_a_robot_keeps_its_keyframes_and_hands_each_over_once() -> None:
+def test_keyframes_are_kept_for_the_map_and_sent_once() -> None:
     sink = RecordingSink()
     collector = KeyframeCollector("robot-1", FrontEndOptions(), sink)
 

@@ -53,7 +53,7 @@ def merge(folder: Path, paths: list[Trajectory], truths: list[Trajectory | None]
     return write_merged(folder, names, paths, truths, merge_here)
 
 
-def test_robots_that_share_views_end_in_one_map_and_strangers_stay_out(tmp_path: Path) -> None:
+def test_robots_that_share_views_end_in_one_map_and_others_are_left_out(tmp_path: Path) -> None:
     a, truth_a = WORLD.walk("robot-1", np.linspace(0.0, 0.5, 13), seed=1)
     b, truth_b = WORLD.walk("robot-2", np.linspace(0.3, 0.8, 13), seed=2)
     stranger, truth_s = make_world(2).walk("robot-3", np.linspace(0.0, 0.3, 8), seed=3)
@@ -86,7 +86,7 @@ def test_a_robot_without_keyframes_is_named(tmp_path: Path) -> None:
         merge(tmp_path, paths, [None, None])
 
 
-def test_progress_is_a_line_for_each_tenth_and_never_goes_back():
+def test_progress_is_a_line_for_each_tenth_and_never_decreases():
     printed: list[str] = []
     report = print_tenths(printed.append)
 

@@ -40,7 +40,7 @@ def answer(parent: Connection, count: int) -> None:
         parent.send(IssuedToken("robot-1", f"token-{number}"))
 
 
-def test_a_token_that_comes_before_the_start_is_not_taken_for_it() -> None:
+def test_a_token_before_the_start_is_not_taken_for_the_start() -> None:
     robot, parent = pair([0.0])
     with workers(parent) as pool:
         start = pool.submit(robot.wait_start)
@@ -72,7 +72,7 @@ def test_uploads_get_a_new_token_only_when_theirs_has_aged() -> None:
     assert (first, again, robot.token()) == ("token-1", "token-1", "token-2")
 
 
-def test_a_parent_that_is_gone_is_said_to_everyone_who_waits() -> None:
+def test_the_end_of_the_parent_ends_every_wait() -> None:
     robot, parent = pair([0.0])
     with workers(parent) as pool:
         waiting = [pool.submit(robot.wait_start) for _ in range(2)]

@@ -38,7 +38,7 @@ def report(truth: Trajectory | None):
     )
 
 
-def test_judges_the_trajectory_against_the_truth():
+def test_the_errors_are_computed_against_the_truth():
     made = report(walk())
     assert made["ate_cm"][0] == pytest.approx(1.0, abs=0.15)
     assert made["rpe_cm"][0] == pytest.approx(2.0, abs=0.01)
@@ -46,13 +46,13 @@ def test_judges_the_trajectory_against_the_truth():
     assert made["paper"]["round_trip_ms"] == 156.36
 
 
-def test_says_nothing_about_accuracy_without_a_truth():
+def test_without_a_truth_no_errors_are_reported():
     made = report(None)
     assert made["ate_cm"] == [None]
     assert "ATE" not in closing_lines(made, Path("out"))
 
 
-def test_has_the_fields_that_others_read():
+def test_the_report_has_the_documented_fields():
     made = report(walk())
     for name in ("robots", "frames", "lost_frames", "ate_cm", "rpe_cm", "fps_per_robot", "failures_by_code"):
         assert name in made
@@ -61,7 +61,7 @@ def test_has_the_fields_that_others_read():
     assert {"sent", "answered", "failed", "lost", "twice"} <= set(made["commands"])
 
 
-def test_the_markdown_puts_our_figures_beside_the_papers():
+def test_the_page_shows_measured_figures_beside_those_of_the_paper():
     text = demo_page(report(walk()))
     assert "| round trip, mean ms | 9.0 | 156.36 |" in text
     assert "29.82" in text

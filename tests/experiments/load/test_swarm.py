@@ -43,13 +43,13 @@ def payloads(**changes: Any) -> list[SolvedPayload]:
         ("join_every_s", -1.0), ("seed", -1),
     ],
 )  # fmt: skip
-def test_options_that_are_none_are_refused_with_a_hint(name: str, value: Any) -> None:
+def test_options_out_of_range_are_refused_with_a_hint(name: str, value: Any) -> None:
     with pytest.raises(UsageError) as told:
         SwarmOptions(**{"robots": 2, name: value})
     assert told.value.hint
 
 
-def test_send_times_are_fixed_beforehand_and_evenly_spread_over_the_robots() -> None:
+def test_send_times_are_fixed_before_the_run_and_evenly_spread_over_the_robots() -> None:
     robots = 100
     phases = sorted(planned_s(options(), number, 0.0, 0) for number in range(robots))
     assert phases[0] >= 0.0
@@ -60,7 +60,7 @@ def test_send_times_are_fixed_beforehand_and_evenly_spread_over_the_robots() -> 
 
 
 @pytest.mark.parametrize("codec_name", ["zlib", "json", "bin"])
-def test_a_right_solution_of_every_payload_is_called_right_and_a_wrong_one_wrong(codec_name: str) -> None:
+def test_right_and_wrong_solutions_of_every_payload_are_recognised(codec_name: str) -> None:
     codec = make_codec(codec_name)
     for problem in payloads(codec=codec_name)[:8]:
         data = encode_command(codec, Command(id=1, service="pnp", payload=problem.payload))
@@ -78,11 +78,11 @@ def test_a_right_solution_of_every_payload_is_called_right_and_a_wrong_one_wrong
 
 
 @pytest.mark.parametrize("reply", [None, {}, {"T_camera_world": [1.0]}, {"T_camera_world": "x"}, 7])
-def test_a_reply_that_is_no_pose_is_wrong(reply: Any) -> None:
+def test_a_reply_without_a_pose_is_wrong(reply: Any) -> None:
     assert not is_right(payloads()[0], reply)
 
 
-def test_an_echo_is_right_only_if_it_is_the_same() -> None:
+def test_an_echo_is_right_only_if_it_equals_the_payload() -> None:
     problem = payloads(service="echo", matches=5)[0]
     assert is_right(problem, {"value": list(problem.echo or [])})
     assert not is_right(problem, {"value": [0.5]})

@@ -54,7 +54,7 @@ BUSY = [reading(t / 2, 80.0, 80.0) for t in range(1, 20)]
 """80 % throughout, twice a second, from 0 to 9.5 s."""
 
 
-def test_counts_scale_events_but_not_the_filling_of_a_gap():
+def test_counts_scale_outs_for_load_but_not_replacements():
     judged = elasticity_figures(
         run(
             events=[
@@ -71,7 +71,7 @@ def test_counts_scale_events_but_not_the_filling_of_a_gap():
     assert judged["cpu_percent_series"] == [[1.0, 10.0], [5.0, 10.0], [9.9, 1.0]]
 
 
-def test_the_mean_leaves_out_servers_that_warm_up_or_did_not_answer():
+def test_the_mean_cpu_excludes_servers_that_warm_up_or_did_not_answer():
     assert reading(1.0, 80.0, 10.0, None, warming=(1,)).cpu_percent == 80.0
     assert reading(1.0, None).cpu_percent is None
 
@@ -109,7 +109,7 @@ def test_a_drained_server_did_not_crash():
     assert elasticity_figures(run(events=events))["crashes"] == 0
 
 
-def test_periods_are_those_of_the_monitors_clock():
+def test_periods_follow_the_clock_of_the_monitor():
     readings = [reading(t / 2, 100.0 if t <= 8 else 0.0) for t in range(20)]
 
     seen = busy_periods_before(readings, 6.1, origin_s=1000.0, period_s=2.0, periods=3)
@@ -119,11 +119,11 @@ def test_periods_are_those_of_the_monitors_clock():
     assert shifted == [pytest.approx(100.0), pytest.approx(50.0)]
 
 
-def test_a_scale_out_after_busy_periods_is_lawful():
+def test_a_scale_out_after_busy_periods_is_justified():
     assert unjustified_scale_outs(run(events=[grow(4.05)], samples=BUSY)) == []
 
 
-def test_a_scale_out_without_enough_busy_periods_is_told():
+def test_a_scale_out_without_enough_busy_periods_is_reported():
     calm = [reading(t / 2, 80.0 if t > 4 else 40.0) for t in range(1, 20)]
 
     wrong = unjustified_scale_outs(run(events=[grow(4.05)], samples=calm))
@@ -131,11 +131,11 @@ def test_a_scale_out_without_enough_busy_periods_is_told():
     assert wrong == ["at 4.05 s: 40.0 %, 80.0 % before it, 70 % is required"]
 
 
-def test_a_scale_out_without_readings_is_told():
+def test_a_scale_out_without_samples_is_reported():
     assert "none" in unjustified_scale_outs(run(events=[grow(30.0)], samples=BUSY))[0]
 
 
-def test_phases_split_the_commands_by_plan():
+def test_phases_split_the_commands_by_planned_time():
     def command(number, planned):
         return CommandRecord(
             id=number, robot="r", planned=planned, sent=planned, answered=planned + 0.01, server="a",
@@ -153,12 +153,12 @@ def test_phases_split_the_commands_by_plan():
     assert judged["phases"]["full"]["commands"]["answered"] == 1
 
 
-def test_a_run_that_does_not_say_what_was_asked_is_no_run():
+def test_a_run_without_parameters_is_refused():
     with pytest.raises(UsageError, match="which experiment"):
         elasticity_figures(Records(commands=[], events=[], samples=[]))
 
 
-def test_the_size_is_such_that_the_fleet_needs_five_servers_at_the_limit():
+def test_the_emulated_cores_make_all_robots_need_five_servers_at_the_limit():
     cost = CpuCost(command_s=0.002, idle_s_per_s=0.01, commands=400)
 
     size = cost.emulated_cores(commands_per_s=500.0, busy_percent=70.0)

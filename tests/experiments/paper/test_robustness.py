@@ -56,7 +56,7 @@ def unanswered(answered, code):
     return CommandRecord(id=999, robot="hit", planned=5, sent=5, answered=answered, server="", code=code)
 
 
-def test_a_kill_that_was_survived_holds_every_bar():
+def test_a_kill_without_losses_meets_every_target():
     judged = robustness_figures(run("kill", KILL, [*HIT, *OTHER]))
 
     assert judged["gap_s"]["robots"] == 1
@@ -78,20 +78,20 @@ def test_a_kill_that_was_survived_holds_every_bar():
         (KILL, [*HIT, *OTHER, unanswered(10.0, "expired")], "commands/failed"),
     ],
 )
-def test_each_bar_of_a_kill_is_missed_by_what_breaks_it(events, commands, missed):
+def test_each_target_of_a_kill_can_be_missed(events, commands, missed):
     bars = robustness_figures(run("kill", events, commands))["bars"]
 
     assert [name for name, bar in bars.items() if not bar["held"]] == [missed]
 
 
-def test_a_figure_that_was_not_measured_misses_its_bar():
+def test_a_figure_that_was_not_measured_misses_its_target():
     bars = robustness_figures(run("kill", [], OTHER))["bars"]
 
     assert not bars["replaced_in_s"]["held"]
     assert not bars["gap_s/p99"]["held"]
 
 
-def test_a_fault_of_the_balancer_hits_every_robot():
+def test_a_fault_of_the_load_balancer_affects_every_robot():
     fault = event(4.0, "fault", fault="kill -9", watch_s=5.0)
     commands = [*steady("a", "server-1", 0, 9, silent=(4, 5)), *steady("b", "server-2", 0, 9, silent=(4, 6))]
     events = [fault, event(4.1, "balancer-gone"), event(4.6, "balancer-back")]
@@ -120,7 +120,7 @@ def test_adoption_compares_the_processes_before_and_after(after, not_adopted):
     assert judged["bars"]["not_adopted"]["held"] is (not_adopted == 0)
 
 
-def test_a_cut_is_judged_on_both_sides_and_by_the_first_answers_after_it():
+def test_the_figures_of_a_cut_link_cover_both_sides_and_the_first_answers_after_it():
     events = [
         event(4.0, "fault", fault="link cut", watch_s=10.0),
         event(8.5, "link-lost", robot="robot-1"),
@@ -153,14 +153,14 @@ def robots(time_s, *counts):
     return run_sample(time_s=time_s, healthy_servers=len(servers), servers=servers)
 
 
-def test_even_means_within_a_fifth_of_the_mean_and_staying_so():
+def test_evened_out_means_within_20_percent_of_the_mean_until_the_end():
     readings = [robots(1, 50, 50, 0), robots(2, 34, 33, 33), robots(3, 50, 30, 20), robots(4, 36, 36, 28)]
 
     assert evened_out_s(readings, 0.5) == pytest.approx(3.5)
     assert evened_out_s(readings[:3], 0.5) is None
 
 
-def test_growth_of_memory_is_that_of_one_process():
+def test_growth_of_memory_is_per_process():
     events = [
         event(1.0, "resources", when="before", memory_bytes=200, descriptors=20, processes=2),
         event(9.0, "resources", when="after", memory_bytes=330, descriptors=30, processes=3),
@@ -173,11 +173,11 @@ def test_growth_of_memory_is_that_of_one_process():
     assert judged["bars"]["descriptors_percent"]["held"]
 
 
-def test_every_scenario_asks_that_nothing_is_lost_or_answered_twice():
+def test_every_scenario_has_targets_for_lost_and_duplicate_answers():
     assert all({"commands/lost", "commands/twice"} <= set(bars) for bars in BARS.values())
 
 
-def test_a_missed_bar_reads_as_missed():
+def test_a_missed_target_is_reported_as_missed():
     counts = {"sent": 10, "answered": 9, "failed": 1, "lost": 0, "twice": 0}
     bars = {
         "gap_s/p99": {"value": 1.5, "bar": "<= 1", "held": False},

@@ -84,7 +84,7 @@ def test_draws_elasticity_of_one_run_two_runs_and_an_empty_one(tmp_path, runs):
 
 
 @pytest.mark.parametrize("records", [fleet(), EMPTY])
-def test_draws_latency_beside_the_papers_even_if_nothing_was_answered(tmp_path, records):
+def test_draws_latency_beside_the_paper_also_without_answers(tmp_path, records):
     draw_latency(tmp_path / "latency.png", latency_figures(records), "a caption")
 
     assert is_drawn(tmp_path / "latency.png")

@@ -36,7 +36,7 @@ def test_draws_the_points_in_their_colours(tmp_path):
     assert count(picture, (10, 200, 30)) > 10_000
 
 
-def test_leaves_the_ceiling_out_because_it_hides_the_room(tmp_path):
+def test_points_of_a_ceiling_are_not_drawn(tmp_path):
     floor, ceiling = plane(y=1.0), plane(y=-1.5)
     colours = np.array([[10, 200, 30]] * len(floor) + [[200, 10, 30]] * len(ceiling), dtype=np.uint8)
     picture = draw(tmp_path, np.vstack([floor, ceiling]), colours)
@@ -50,6 +50,6 @@ def test_draws_the_path_of_the_robot(tmp_path):
     assert count(picture[64:836], COLOURS[0]) > 300
 
 
-def test_an_empty_map_is_an_empty_picture(tmp_path):
+def test_an_empty_map_is_an_empty_image(tmp_path):
     picture = draw(tmp_path, np.empty((0, 3), dtype=np.float32), np.empty((0, 3), dtype=np.uint8))
     assert count(picture[64:836], _BACKGROUND) > 0.9 * 1600 * 772

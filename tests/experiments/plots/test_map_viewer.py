@@ -71,6 +71,6 @@ def test_without_viser_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> No
     assert "rse-pf[view]" in (raised.value.hint or "")
 
 
-def test_a_port_that_is_none_is_refused() -> None:
+def test_a_number_that_is_no_port_is_refused() -> None:
     with pytest.raises(UsageError, match="port 70000"):
         browse_map(MapVersion(keyframes=()), 70000, print, threading.Event())

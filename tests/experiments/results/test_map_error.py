@@ -51,7 +51,7 @@ def section(robots: list[JoinedRobot], reply: MergeReply = REPLY) -> dict[str, o
     return merge_section(names, robots, reply, MapVersion(keyframes=()), {"merged_by": "a test"})
 
 
-def test_frames_move_as_stiffly_as_their_keyframes() -> None:
+def test_frames_move_rigidly_with_their_keyframes() -> None:
     path = circle(np.linspace(0, 0.5, 21))
     T = exp_se3(np.array([1.0, -2.0, 0.5, 0.4, 0.2, -0.9]))
     rows = [0, 8, 20]
@@ -63,7 +63,7 @@ def test_frames_move_as_stiffly_as_their_keyframes() -> None:
     np.testing.assert_allclose(moved.T_world_camera, T @ path.T_world_camera, atol=1e-9)
 
 
-def test_a_frame_between_two_keyframes_takes_its_share_of_each_correction() -> None:
+def test_a_frame_between_two_keyframes_gets_an_interpolated_correction() -> None:
     path = circle(np.zeros(5))
     corrected = path.T_world_camera[[0, 4]].copy()
     corrected[1, 0, 3] += 0.08
@@ -122,7 +122,7 @@ def test_a_right_merge_of_perfect_paths_has_no_error() -> None:
     assert made["origins"] == [{"robot": "c", "cm": 0.0, "deg": 0.0}]
 
 
-def test_a_robot_laid_in_the_wrong_place_shows_in_the_merged_error_and_in_its_origin_only() -> None:
+def test_a_robot_at_the_wrong_place_changes_the_merged_error_and_its_origin_only() -> None:
     one, other = circle(np.linspace(0, 0.4, 20)), circle(np.linspace(0.5, 0.9, 20))
     off = elsewhere(other, 3)
     off.T_world_camera[:, 0, 3] += 0.10
@@ -137,7 +137,7 @@ def test_a_robot_laid_in_the_wrong_place_shows_in_the_merged_error_and_in_its_or
     assert origin["deg"] == pytest.approx(0.0, abs=0.01)
 
 
-def test_drift_that_the_merge_took_away_is_in_before_and_not_in_after() -> None:
+def test_drift_that_the_merge_removed_is_in_the_error_before_it_only() -> None:
     true = circle(np.linspace(0, 0.9, 60))
     drifted = circle(np.linspace(0, 0.9, 60), noise_m=0.02)
 
@@ -147,7 +147,7 @@ def test_drift_that_the_merge_took_away_is_in_before_and_not_in_after() -> None:
     assert made["ate_before_cm"] == pytest.approx(2.0 * 3**0.5, rel=0.2)
 
 
-def test_without_a_truth_nothing_is_said_about_errors() -> None:
+def test_without_a_truth_no_errors_are_reported() -> None:
     path = circle(np.linspace(0, 0.4, 20))
 
     made = section([robot("robot-1", path, path, None)])
@@ -156,7 +156,7 @@ def test_without_a_truth_nothing_is_said_about_errors() -> None:
     assert "ATE" not in merged_lines(made)
 
 
-def test_a_person_is_told_who_was_left_out_and_why() -> None:
+def test_the_report_names_robots_that_were_not_joined_and_why() -> None:
     path = circle(np.linspace(0, 0.4, 20))
     made = section([robot("robot-1", path, path, path), robot("robot-3", path, path, path)])
 
@@ -170,7 +170,7 @@ def test_a_person_is_told_who_was_left_out_and_why() -> None:
     assert "| not linked within robot-1 | 2 inconsistent |" in table
 
 
-def test_the_origins_are_seen_from_the_first_robot() -> None:
+def test_the_origins_are_relative_to_the_first_robot() -> None:
     one, other = circle(np.linspace(0, 0.4, 20)), circle(np.linspace(0.5, 0.9, 20))
     T = inverse(one.T_world_camera[0])
     moved = [Trajectory(each.timestamps_s, T @ each.T_world_camera) for each in (one, other)]

@@ -27,13 +27,13 @@ GOOD = CommandRecord(
 )  # fmt: skip
 
 
-def test_records_survive_the_file(tmp_path):
+def test_commands_are_read_back_as_they_were_written(tmp_path):
     commands = [GOOD, replace(GOOD, id=2, code="", answered=None, round_trip_ms=None)]
     write_commands(tmp_path / "commands.csv", commands)
     assert read_commands(tmp_path / "commands.csv") == commands
 
 
-def test_a_broken_file_is_one_line_with_a_hint(tmp_path):
+def test_a_malformed_file_is_one_line_with_a_hint(tmp_path):
     (tmp_path / "commands.csv").write_text("id,robot\nx,y\n")
     with pytest.raises(UsageError, match="cannot read"):
         read_commands(tmp_path / "commands.csv")
@@ -47,7 +47,7 @@ def test_events_are_lines_of_json_written_at_once():
     assert json.loads(file.getvalue()) == {"time": 1.5, "action": "server-killed", "server": "a", "pid": 7}
 
 
-def test_what_the_monitor_says_comes_back_from_the_file_unchanged(tmp_path):
+def test_samples_of_the_monitor_are_read_back_as_they_were_written(tmp_path):
     full = {
         "name": "server-1", "pid": 7, "state": "healthy", "robots": 2, "cpu_percent": 71.25, "requests": 5,
         "queue": 1, "queue_ms": 0.5, "in_flight": 1, "bytes_in": 10, "bytes_out": 20, "warming": True,

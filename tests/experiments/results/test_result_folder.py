@@ -11,7 +11,7 @@ from rse_pf.errors import UsageError
 from rse_pf.experiments.results.result_folder import finish_report, fresh_folder
 
 
-def test_an_earlier_run_is_replaced_whole(tmp_path):
+def test_all_results_of_an_earlier_run_are_removed(tmp_path):
     out = tmp_path / "out"
     for part in ("kill", "stop"):
         (out / part).mkdir(parents=True)
@@ -24,7 +24,7 @@ def test_an_earlier_run_is_replaced_whole(tmp_path):
     assert list(out.iterdir()) == []
 
 
-def test_what_no_experiment_wrote_is_not_touched(tmp_path):
+def test_files_of_others_are_not_touched(tmp_path):
     (tmp_path / "thesis.tex").write_text("all of it")
     with pytest.raises(UsageError, match="holds other files"):
         fresh_folder(tmp_path)
@@ -42,7 +42,7 @@ def test_only_named_files_and_folders_of_an_earlier_run_are_removed(tmp_path):
     assert sorted(each.name for each in tmp_path.iterdir()) == ["mine", "notes.txt"]
 
 
-def test_a_file_is_no_folder(tmp_path):
+def test_a_file_in_place_of_the_folder_is_refused(tmp_path):
     (tmp_path / "out").write_text("")
     with pytest.raises(UsageError, match="is a file"):
         fresh_folder(tmp_path / "out")

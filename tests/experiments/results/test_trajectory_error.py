@@ -89,7 +89,7 @@ def test_the_alignment_is_a_rotation_even_for_mirrored_points():
     np.testing.assert_allclose(pose @ inverse(pose), np.eye(4), atol=1e-12)
 
 
-def test_poses_meet_by_time_and_not_by_row():
+def test_poses_are_matched_by_time_and_not_by_row():
     truth = wander(4, 40)
     estimate = Trajectory(truth.timestamps_s[5:35:3] + 0.015, truth.T_world_camera[5:35:3])
 
@@ -100,7 +100,7 @@ def test_poses_meet_by_time_and_not_by_row():
     assert absolute_error(estimate, truth).rmse_m == pytest.approx(0.0, abs=1e-9)
 
 
-def test_clocks_that_do_not_meet_are_told():
+def test_clocks_that_do_not_overlap_are_an_error():
     truth = wander(5)
     estimate = Trajectory(truth.timestamps_s + 0.05, truth.T_world_camera)
     with pytest.raises(UsageError, match="0 poses match"):
