@@ -2,12 +2,12 @@
 
     python benchmarks/data_faults.py [--uploads 200] [--kills 3] [--robots 20] [--seconds 15] [--out FILE]
 
-One local platform (two servers, one data server) behind the balancer; robots ask for a pose 5 times a
+One local platform (two servers, one data server) behind the load balancer; robots ask for a pose 5 times a
 second (200 matches, 30 % wrong, every frame kept).  First nothing else happens; then a process of four robots
-uploads objects of 1 MiB as fast as it can, and the data server is killed with -9 at each quarter; then the
-same robots upload at the pace of keyframes (`data.background_bytes_per_s` each).
+uploads objects of 1 MiB as fast as possible, and the data server is killed with SIGKILL at each quarter; then
+the same robots upload at the rate of keyframes (`data.background_bytes_per_s` each).
 
-The uploading robots step back: what they hash and send would cost a server nothing in the field.
+The uploading robots run at the lowest priority: in the field their work costs a server nothing.
 
 Defends: service back <= 5 s after each kill; every upload that was acknowledged is readable with the right
 digest; no partial object; p99 of poses unchanged while robots upload.
@@ -42,15 +42,15 @@ from rse_pf.experiments.load.swarm import Swarm, SwarmOptions
 from rse_pf.local.control.control_plane import ControlOptions
 from rse_pf.local.control.platform import LocalPlatform
 from rse_pf.object_store import DirectoryStore, digest_of
-from rse_pf.wire.rate_limit import TokenBucket
+from rse_pf.token_bucket import TokenBucket
 
 MIB = 1 << 20
 UPLOADERS = 4
-_BACK = 19
-"""Niceness of the uploading robots, which in the field have computers of their own."""
+_LOWEST_PRIORITY = 19
+"""Niceness of the uploading robots, which in the field have their own computers."""
 BACK_S, RATIO = 5.0, 1.1
 SETTLE_S = 2.0
-PATIENCE_S = 120.0
+TIMEOUT_S = 120.0
 
 
 def content(number: int, size: int) -> bytes:
@@ -61,11 +61,11 @@ def content(number: int, size: int) -> bytes:
 def upload_all(
     pipe: Connection, url: str, tokens: list[str], numbers: list[int], size: int, bytes_per_s: float
 ) -> None:
-    """Upload from robots in a process of their own, when told; tell each acknowledged digest.
+    """Upload from robots in this process after a message on *pipe*; send each acknowledged digest.
 
-    *bytes_per_s* is the pace of each robot; 0: as fast as it can.
+    *bytes_per_s* is the rate of each robot; 0 means as fast as possible.
     """
-    os.nice(_BACK)
+    os.nice(_LOWEST_PRIORITY)
     pipe.recv()
     lock = threading.Lock()
 
@@ -73,10 +73,10 @@ def upload_all(
         part_bytes = size // 4 if not bytes_per_s else 64 * 1024
         options = DataOptions(part_bytes=part_bytes, first_pause_s=0.05, random=random.Random(row))
         client = DataClient(url, tokens[row], options)
-        pace = TokenBucket(bytes_per_s, burst=0.0) if bytes_per_s else None
+        rate = TokenBucket(bytes_per_s, burst=0.0) if bytes_per_s else None
         for number in numbers[row::UPLOADERS]:
-            if pace is not None:
-                time.sleep(pace.spend(size, time.monotonic()))  # the pace is what is measured
+            if rate is not None:
+                time.sleep(rate.spend(size, time.monotonic()))  # the rate is a parameter of the measurement
             began = time.monotonic()
             digest = client.upload(content(number, size))
             with lock:
@@ -94,8 +94,8 @@ class Uploads:
 
     def __init__(self, cloud: LocalPlatform, numbers: list[int], size: int, bytes_per_s: float = 0.0) -> None:
         self.acknowledged: list[tuple[str, float]] = []
-        self.is_over = False
-        self._heard = asyncio.Event()
+        self.is_complete = False
+        self._received = asyncio.Event()
         self._pipe, theirs = multiprocessing.get_context("spawn").Pipe()
         tokens = [cloud.issue_token(f"uploader-{row}") for row in range(UPLOADERS)]
         self._process = multiprocessing.get_context("spawn").Process(
@@ -103,30 +103,30 @@ class Uploads:
         )
         self._process.start()
         theirs.close()
-        asyncio.get_running_loop().add_reader(self._pipe.fileno(), self._hear)
+        asyncio.get_running_loop().add_reader(self._pipe.fileno(), self._receive)
 
     def begin(self) -> None:
         """Let the robots upload."""
         self._pipe.send("begin")
 
-    def _hear(self) -> None:
+    def _receive(self) -> None:
         try:
             while self._pipe.poll():
-                told = self._pipe.recv()
-                self.is_over = self.is_over or told is None
-                if told is not None:
-                    self.acknowledged.append(told)
+                message = self._pipe.recv()
+                self.is_complete = self.is_complete or message is None
+                if message is not None:
+                    self.acknowledged.append(message)
         except EOFError:
-            self.is_over = True
-        if self.is_over:
+            self.is_complete = True
+        if self.is_complete:
             asyncio.get_running_loop().remove_reader(self._pipe.fileno())
-        self._heard.set()
+        self._received.set()
 
     async def until(self, condition: Callable[[], bool]) -> None:
-        """Wait until *condition* holds or the uploads are over; raises TimeoutError."""
-        while not condition() and not self.is_over:
-            self._heard.clear()
-            await asyncio.wait_for(self._heard.wait(), PATIENCE_S)
+        """Wait until *condition* holds or the uploads have ended; raises TimeoutError."""
+        while not condition() and not self.is_complete:
+            self._received.clear()
+            await asyncio.wait_for(self._received.wait(), TIMEOUT_S)
 
     def close(self) -> None:
         """End the process."""
@@ -135,7 +135,9 @@ class Uploads:
         self._pipe.close()
 
 
-async def kill_on_the_way(cloud: LocalPlatform, uploads: Uploads, args: argparse.Namespace) -> list[float]:
+async def kill_during_uploads(
+    cloud: LocalPlatform, uploads: Uploads, args: argparse.Namespace
+) -> list[float]:
     """Kill the data server at equal shares of the uploads; return when it was ready again (s)."""
     back: list[float] = []
     for kill in range(args.kills):
@@ -145,9 +147,9 @@ async def kill_on_the_way(cloud: LocalPlatform, uploads: Uploads, args: argparse
         began = time.monotonic()
         cloud.data_servers.send(signal.SIGKILL)
         while cloud.data_servers.mark == before or not await cloud.data_servers.is_ready():
-            if time.monotonic() - began > PATIENCE_S:
-                raise TimeoutError("the data server does not come back")
-            await asyncio.sleep(0.01)  # looks again, with a deadline
+            if time.monotonic() - began > TIMEOUT_S:
+                raise TimeoutError("the data server was not replaced")
+            await asyncio.sleep(0.01)  # polls, with a deadline
         back.append(time.monotonic() - began)
     return back
 
@@ -176,7 +178,9 @@ async def run(args: argparse.Namespace) -> dict[str, Any]:
     """Return every figure of the table."""
     size, settings = args.size_kib * 1024, PlatformSettings()
     with tempfile.TemporaryDirectory() as folder:
-        cloud = LocalPlatform(settings, state=Path(folder), port=0, servers=2, data=True, control=ControlOptions(elastic=True))
+        cloud = LocalPlatform(
+            settings, state=Path(folder), port=0, servers=2, data=True, control=ControlOptions(elastic=True)
+        )
         async with cloud:
             began = time.monotonic()
             options = SwarmOptions(robots=args.robots, fps=args.fps, join_every_s=0.02)
@@ -187,15 +191,15 @@ async def run(args: argparse.Namespace) -> dict[str, Any]:
                 await swarm.start()
                 await swarm.wait_joined(60.0)
                 uploads = Uploads(cloud, list(range(args.uploads)), size)
-                pace = settings.data.background_bytes_per_s
-                count = UPLOADERS * int(args.seconds * pace / size)
-                slow = Uploads(cloud, list(range(args.uploads, args.uploads + count)), size, pace)
+                rate = settings.data.background_bytes_per_s
+                count = UPLOADERS * int(args.seconds * rate / size)
+                slow = Uploads(cloud, list(range(args.uploads, args.uploads + count)), size, rate)
                 await asyncio.sleep(SETTLE_S)
                 times = [time.monotonic() - began]
                 await asyncio.sleep(args.seconds)
                 times.append(time.monotonic() - began)
                 uploads.begin()
-                back_s = await kill_on_the_way(cloud, uploads, args)
+                back_s = await kill_during_uploads(cloud, uploads, args)
                 await uploads.until(lambda: False)
                 uploads.close()
                 times.append(time.monotonic() - began)
@@ -212,7 +216,8 @@ async def run(args: argparse.Namespace) -> dict[str, Any]:
     return {
         "poses": dict(zip(names, rows, strict=True)), "back_s": back_s, "objects": found,
         "upload_s": times[2] - times[1], "longest_upload_s": max(s for _, s in uploads.acknowledged),
-        "mib_per_s": args.uploads * size / MIB / (times[2] - times[1]), "late_sends_ms": result.late_sends,
+        "mib_per_s": args.uploads * size / MIB / (times[2] - times[1]),
+        "late_sends_ms": result.late_sends_ms_p99,
     }  # fmt: skip
 
 
@@ -244,7 +249,9 @@ def main() -> None:
             f"p99={row['p99_ms']:.1f} ms, {row['p99_ms'] / first:.2f} x before (bar {RATIO})"
         )
     back = ", ".join(f"{s:.2f}" for s in found["back_s"])
-    print(f"service back after {back} s (bar {BACK_S:g} s); longest upload {found['longest_upload_s']:.1f} s")
+    print(
+        f"service ready again after {back} s (bar {BACK_S:g} s); longest upload {found['longest_upload_s']:.1f} s"
+    )
     print(f"{found['mib_per_s']:.1f} MiB/s with the kills; {found['objects']} (bar: 0 missing, 0 partial)")
     if args.out is not None:
         args.out.write_text(json.dumps(found, indent=1))

@@ -1,9 +1,9 @@
 #!/usr/bin/python3
-"""Make a backend server of a bare Debian 12 machine; first_boot.py runs this as root, out of the package.
+"""Install a backend server on a plain Debian 12 machine; first_boot.py runs this file of the package as root.
 
-Standard library alone.  Installs the wheels that lie beside this file, by hash and without any index, into an
-environment of their own, and starts the units.  Promises to run the same a second time, and that the server,
-its agent and the data service run as a user who may write one folder.
+Uses the standard library only.  Installs the wheels beside this file, by hash and without any index, into a
+virtual environment, and starts the units.  A second run has the same result.  The server, its agent and the
+data service run as a user who may write one folder.
 """
 
 import json
@@ -29,7 +29,7 @@ def units_of(settings):
 
 
 def environment_file(facts):
-    """Return what the units read: where this server stands.
+    """Return the environment file of the units: names of this server, its group and its buckets.
 
     *facts* holds ``server``, ``bucket``, ``keys``, ``group``, ``hook``, ``store`` and ``audit``.
     """
@@ -39,12 +39,12 @@ def environment_file(facts):
     }  # fmt: skip
     for name in names.values():
         if not facts[name] or any(sign in facts[name] for sign in "\n\r\"'\\ $"):
-            raise SystemExit(f"install: {name} = {facts[name]!r} is no plain word")
+            raise SystemExit(f"install: {name} = {facts[name]!r} is not a plain word")
     return "".join(f"{variable}={facts[name]}\n" for variable, name in names.items())
 
 
 def main(facts):
-    """Do it all; any failure ends the boot, and the group replaces the machine."""
+    """Install everything; any failure ends the boot, and the group replaces the machine."""
     settings = json.loads((PACKAGE / "settings.json").read_text(encoding="utf-8"))["context"]["rse-pf"]
     if subprocess.run(["/usr/bin/id", USER], capture_output=True, check=False).returncode:
         run("/usr/sbin/useradd", "--system", "--no-create-home", "--shell", "/usr/sbin/nologin", USER)
@@ -67,7 +67,7 @@ def main(facts):
 
 
 def run(*command):
-    """Run *command*; what it writes is on the machine's console."""
+    """Run *command*; its output goes to the machine's console."""
     subprocess.run(command, check=True)
 
 

@@ -34,7 +34,7 @@ CLOSED_WITHIN_S = 2.0
 
 
 class Done(Exception):
-    """Ends an agent's thread, which goes on for ever by itself."""
+    """Ends an agent's thread, which would run for ever."""
 
 
 def agent_of(s3: Any, folder: Path) -> Agent:
@@ -49,16 +49,16 @@ def agent_of(s3: Any, folder: Path) -> Agent:
 
 @contextlib.contextmanager
 def watching(agent: Agent) -> Iterator[None]:
-    """Let the agent look into the control room at its own pace, as `main` does."""
+    """Let the agent fetch roster and deny list periodically, as `main` does."""
     stop = threading.Event()
 
-    def rest(seconds: float) -> None:
+    def sleep(seconds: float) -> None:
         if stop.wait(seconds):
             raise Done
 
     def watch() -> None:
         with contextlib.suppress(Done):
-            agent.watch_access_control(rest)
+            agent.watch_access_control(sleep)
 
     thread = threading.Thread(target=watch, daemon=True)
     thread.start()
@@ -70,35 +70,35 @@ def watching(agent: Agent) -> Iterator[None]:
         assert not thread.is_alive()
 
 
-def said(capsys: Capture, *words: str) -> str:
+def output_of(capsys: Capture, *words: str) -> str:
     assert main(list(words)) == 0, capsys.readouterr().err
     return capsys.readouterr().out
 
 
-def enrolled(capsys: Capture, name: str) -> RobotKey:
+def enrol(capsys: Capture, name: str) -> RobotKey:
     """Make a robot's key, enrol it in the cloud, and return the robot's side."""
-    Path(f"{name}.json").write_text(said(capsys, "robot", "keygen", "--out", f"{name}.key"))
-    said(capsys, "robot", "enrol", name, "--public-key", f"{name}.json", "--cloud")
+    Path(f"{name}.json").write_text(output_of(capsys, "robot", "keygen", "--out", f"{name}.key"))
+    output_of(capsys, "robot", "enrol", name, "--public-key", f"{name}.json", "--cloud")
     return RobotKey(f"{name}.key", name)
 
 
 def listed(capsys: Capture) -> dict[str, str]:
-    rows = json.loads(said(capsys, "robot", "list", "--json", "--cloud"))
+    rows = json.loads(output_of(capsys, "robot", "list", "--json", "--cloud"))
     return {row["robot"]: row["state"] for row in rows}
 
 
 def test_robots_of_a_cloud_are_enrolled_listed_disabled_enabled_and_removed(
     capsys: Capture, cloud: Any
 ) -> None:
-    said(capsys, "token", "init", "--cloud")
+    output_of(capsys, "token", "init", "--cloud")
     for name in ("robot-1", "robot-2"):
-        enrolled(capsys, name)
+        enrol(capsys, name)
     assert listed(capsys) == {"robot-1": "enrolled", "robot-2": "enrolled"}
 
-    said(capsys, "robot", "disable", "robot-1", "--cloud")
+    output_of(capsys, "robot", "disable", "robot-1", "--cloud")
     assert listed(capsys) == {"robot-1": "disabled", "robot-2": "enrolled"}
-    said(capsys, "robot", "enable", "robot-1", "--cloud")
-    said(capsys, "robot", "remove", "robot-2", "--cloud")
+    output_of(capsys, "robot", "enable", "robot-1", "--cloud")
+    output_of(capsys, "robot", "remove", "robot-2", "--cloud")
 
     assert listed(capsys) == {"robot-1": "enrolled"}
     room = AccessControlStore(S3Store(cloud, "artifacts"))
@@ -108,8 +108,8 @@ def test_robots_of_a_cloud_are_enrolled_listed_disabled_enabled_and_removed(
 
 
 def test_nothing_private_reaches_the_bucket(capsys: Capture, cloud: Any) -> None:
-    said(capsys, "token", "init", "--cloud")
-    enrolled(capsys, "robot-1")
+    output_of(capsys, "token", "init", "--cloud")
+    enrol(capsys, "robot-1")
     secret = json.loads(Path("robot-1.key").read_text())["d"]
 
     for name in ("keys.json", ROBOTS_NAME, DENY_NAME):
@@ -118,11 +118,11 @@ def test_nothing_private_reaches_the_bucket(capsys: Capture, cloud: Any) -> None
         assert '"d"' not in text
 
 
-def test_two_operators_at_once_lose_nobody(
+def test_concurrent_changes_of_two_operators_are_both_kept(
     capsys: Capture, cloud: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The other one disables a robot between this command's read and its write."""
-    said(capsys, "token", "init", "--cloud")
+    output_of(capsys, "token", "init", "--cloud")
     other, swap = AccessControlStore(S3Store(cloud, "artifacts")), S3Store.compare_and_swap
     waiting = [lambda: other.change_deny_list(lambda d: d.with_robot("default", "robot-2", 1.0))]
 
@@ -132,13 +132,13 @@ def test_two_operators_at_once_lose_nobody(
         swap(self, name, expected, data)
 
     monkeypatch.setattr(S3Store, "compare_and_swap", late)
-    said(capsys, "robot", "disable", "robot-1", "--cloud")
+    output_of(capsys, "robot", "disable", "robot-1", "--cloud")
 
     assert {each.robot for each in other.deny_list().disabled} == {"robot-1", "robot-2"}
 
 
 def problem_of(trust: TrustStore, token: str) -> str:
-    """Return why a server that trusts so refuses *token*; empty if it does not."""
+    """Return why a server with *trust* refuses *token*; empty if it accepts it."""
     from rse_pf.auth.tokens import token_problem, verify_token
 
     assert trust.keys is not None
@@ -149,15 +149,15 @@ def problem_of(trust: TrustStore, token: str) -> str:
     return ""
 
 
-def test_one_look_of_the_agent_and_one_of_the_server_are_enough(
+def test_one_fetch_of_the_agent_and_one_refresh_of_the_server_apply_a_change(
     capsys: Capture, cloud: Any, tmp_path: Path
 ) -> None:
-    said(capsys, "token", "init", "--cloud")
-    key = enrolled(capsys, "robot-1")
+    output_of(capsys, "token", "init", "--cloud")
+    key = enrol(capsys, "robot-1")
     (tmp_path / "machine").mkdir()
     agent, trust = agent_of(cloud, tmp_path / "machine"), TrustStore(tmp_path / "machine" / "keys.json")
-    tokens = [asyncio.run(key.token()), said(capsys, "token", "issue", "robot-3", "--cloud").strip()]
-    tokens.append(said(capsys, "token", "issue", "robot-2", "--cloud").strip())
+    tokens = [asyncio.run(key.token()), output_of(capsys, "token", "issue", "robot-3", "--cloud").strip()]
+    tokens.append(output_of(capsys, "token", "issue", "robot-2", "--cloud").strip())
 
     def known() -> list[str]:
         agent.fetch_keys()
@@ -167,14 +167,14 @@ def test_one_look_of_the_agent_and_one_of_the_server_are_enough(
         return [problem_of(trust, token) for token in tokens]
 
     assert known() == ["", "", ""]
-    said(capsys, "token", "revoke", tokens[1], "--cloud")
+    output_of(capsys, "token", "revoke", tokens[1], "--cloud")
     assert known() == ["", "revoked", ""]
-    said(capsys, "token", "revoke", "--all-of", "robot-2", "--cloud")
+    output_of(capsys, "token", "revoke", "--all-of", "robot-2", "--cloud")
     assert known() == ["", "revoked", "issued-too-early"]
-    said(capsys, "robot", "disable", "robot-1", "--cloud")
+    output_of(capsys, "robot", "disable", "robot-1", "--cloud")
     assert known() == ["disabled", "revoked", "issued-too-early"]
-    said(capsys, "robot", "enable", "robot-1", "--cloud")
-    said(capsys, "robot", "remove", "robot-1", "--cloud")
+    output_of(capsys, "robot", "enable", "robot-1", "--cloud")
+    output_of(capsys, "robot", "remove", "robot-1", "--cloud")
     assert known() == ["unknown-key", "revoked", "issued-too-early"]
 
 
@@ -189,16 +189,16 @@ def test_one_look_of_the_agent_and_one_of_the_server_are_enough(
 def test_a_live_socket_ends_within_two_seconds_of_the_command(
     how: str, capsys: Capture, cloud: Any, tmp_path: Path
 ) -> None:
-    said(capsys, "token", "init", "--cloud")
-    key = enrolled(capsys, "robot-1")
+    output_of(capsys, "token", "init", "--cloud")
+    key = enrol(capsys, "robot-1")
     (tmp_path / "machine").mkdir()
     server, agent = GuardedServer(tmp_path / "machine", workers=1), agent_of(cloud, tmp_path / "machine")
     agent.fetch_keys()
     agent.fetch_access_control()
     token = asyncio.run(key.token())
-    if how == "all-of":  # by the whole second: only a token of an earlier one is meant
-        token = said(capsys, "token", "issue", "robot-1", "--cloud").strip()
-    other = said(capsys, "token", "issue", "robot-2", "--cloud").strip()
+    if how == "all-of":  # in whole seconds: only tokens of an earlier second are revoked
+        token = output_of(capsys, "token", "issue", "robot-1", "--cloud").strip()
+    other = output_of(capsys, "token", "issue", "robot-2", "--cloud").strip()
     words: dict[str, list[str]] = {
         "token-revoke": ["token", "revoke", token], "all-of": ["token", "revoke", "--all-of", "robot-1"],
         "disable": ["robot", "disable", "robot-1"], "remove": ["robot", "remove", "robot-1"],
@@ -206,7 +206,7 @@ def test_a_live_socket_ends_within_two_seconds_of_the_command(
 
     with server, watching(agent):
         closed_s = asyncio.run(
-            _closed_after(server, token, other, lambda: said(capsys, *words[how], "--cloud"))
+            _closed_after(server, token, other, lambda: output_of(capsys, *words[how], "--cloud"))
         )
 
     print(f"{how}: closed {closed_s:.2f} s after the command; load {os.getloadavg()[0]:.1f}")
@@ -214,7 +214,7 @@ def test_a_live_socket_ends_within_two_seconds_of_the_command(
 
 
 async def _closed_after(server: GuardedServer, token: str, other: str, act: Callable[[], str]) -> float:
-    """Return how long after *act* the socket of *token* ended; that of *other* has to live."""
+    """Return how long after *act* the socket of *token* ended; that of *other* must stay open."""
     sockets = [
         await websockets.connect(
             server.url, subprotocols=[SUBPROTOCOLS["bin"]], compression=None, ping_interval=None,  # type: ignore[list-item]

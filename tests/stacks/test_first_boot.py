@@ -164,7 +164,7 @@ def test_the_environment_file_holds_plain_words_only() -> None:
         "STORE=s3:maps", "AUDIT_BUCKET=audit-logs",
     ]  # fmt: skip
     for bad in ("", "a\nUser=root", "a b", '"', "$HOME"):
-        with pytest.raises(SystemExit, match="no plain word"):
+        with pytest.raises(SystemExit, match="not a plain word"):
             environment_file({**FACTS, "server": bad})
 
 
