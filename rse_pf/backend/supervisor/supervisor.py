@@ -20,7 +20,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from rse_pf.auth.control_token import is_carried
+from rse_pf.auth.control_token import carries_token
 from rse_pf.auth.tokens import KeySet
 from rse_pf.auth.trust_store import REFRESH_S, TrustStore
 from rse_pf.backend.gateway.audit_recorder import ServerAudit, open_records
@@ -40,7 +40,7 @@ from rse_pf.config.placement import ServerPlacement
 from rse_pf.errors import ConfigurationError
 from rse_pf.files import replace_json
 from rse_pf.linux import cpu_seconds, raise_descriptor_limit, resident_bytes
-from rse_pf.wire.rate_limit import TokenBucket
+from rse_pf.token_bucket import TokenBucket
 
 __all__ = ["serve"]
 
@@ -55,6 +55,8 @@ _MAX_SPREAD_S = _MAX_DRAIN_WAIT_S = 3600.0
 _EXIT_OK, _EXIT_LOST = 0, 1
 _PUBLIC_PAGES = ("/healthz", "/readyz")
 """A load balancer asks for them, without a token."""
+_LISTEN_BACKLOG = 4096
+"""Connections that wait for accept; the kernel cuts it to net.core.somaxconn."""
 
 
 def serve(
@@ -153,7 +155,9 @@ class _Supervisor:
         self._signals = 0
         self._accepted = self._refused_full = 0
         self._trust = trust if settings.auth.required else None
-        self._accepts = TokenBucket(settings.serving.max_accepts_per_s, float(settings.serving.handshake_burst))
+        self._accepts = TokenBucket(
+            settings.serving.max_accepts_per_s, float(settings.serving.handshake_burst)
+        )
         self._accept_pauses = self._control_refused = 0
         self._control_token = control_token
         self._log = JsonLog(level=settings.serving.log_level, server=server_id, wall_clock=time.time)
@@ -212,7 +216,7 @@ class _Supervisor:
                 await everything
             self._finish(_EXIT_LOST)
             return
-        self._listener.listen(self._settings.serving.listen_backlog)
+        self._listener.listen(_LISTEN_BACKLOG)
         loop.add_reader(self._listener.fileno(), self._accept_some)
         self._state = "ready"
         if self._announce is not None:
@@ -336,7 +340,11 @@ class _Supervisor:
             ("POST", "/move"): self._post_move,
         }
         token = self._control_token
-        if token is not None and ask.path not in _PUBLIC_PAGES and not is_carried(ask.authorization, token):
+        if (
+            token is not None
+            and ask.path not in _PUBLIC_PAGES
+            and not carries_token(ask.authorization, token)
+        ):
             self._control_refused += 1
             return _json({"code": "unauthorized"}, status=401, headers={"WWW-Authenticate": "Bearer"})
         page = pages.get((ask.method, ask.path))

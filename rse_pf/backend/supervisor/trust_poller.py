@@ -47,5 +47,5 @@ class TrustPoller:
                 self._log.warning("access-control-unread", reason=self._problem)
         if is_new:
             for worker in self._workers():
-                worker.order(TrustOrder(self._trust.text))
-            self._log.info("trust", bytes=len(self._trust.text))
+                worker.order(TrustOrder(self._trust.snapshot))
+            self._log.info("trust", bytes=len(self._trust.snapshot))

@@ -58,7 +58,9 @@ def fork_workers(plans: Sequence[WorkerPlan], *, listener: socket.socket) -> lis
     try:
         for plan in plans:
             workers.append(
-                WorkerProcess(plan, unshared=[listener, *(end for each in workers for end in each.channels())])
+                WorkerProcess(
+                    plan, unshared=[listener, *(end for each in workers for end in each.channels())]
+                )
             )
     except OSError:
         for worker in workers:
