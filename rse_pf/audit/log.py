@@ -322,7 +322,7 @@ def record_once(
     """Open the log, write one entry and close it; raises ConfigurationError."""
     log = AuditLog(folder, who, wall_clock=wall_clock, max_bytes=MAX_FILE_BYTES, sync_s=0.0)
     log.open(_LOCK_TIMEOUT_S)
-    log.record(action, subject, **detail)
+    log.add([Note(time=wall_clock(), actor=who, action=action, subject=subject, detail=detail)])
     log.close()
 
 

@@ -1,4 +1,7 @@
-"""Perspective-n-point: problems, engines and the solver with its evidence."""
+"""Perspective-n-point: problems, engines, and the solver with its evidence.
+
+Estimating one camera pose belongs here; the messages of the service ``pnp`` belong to `rse_pf.services`.
+"""
 
 from rse_pf.pnp.engines import available_engines
 from rse_pf.pnp.options import PnpOptions, WeakLimits

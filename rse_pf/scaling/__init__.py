@@ -1,1 +1,4 @@
-"""Pure rules of scaling: when servers count as busy, idle or unhealthy, and what to do then."""
+"""Pure rules of scaling: when servers count as busy, idle or unhealthy, and what to do then.
+
+Decisions on values belong here; measuring, starting and stopping servers do not.
+"""

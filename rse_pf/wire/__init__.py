@@ -1,4 +1,7 @@
-"""The wire between robots and servers: messages, codecs and the session rules."""
+"""The protocol between robots and servers: messages, codecs, and the rules of both sides of a session.
+
+Everything here works on values and bytes; sockets, clocks and services do not belong here.
+"""
 
 from rse_pf.wire.codec import CODECS, SUBPROTOCOLS, Codec, as_type, codec_for, make_codec
 from rse_pf.wire.messages import (
