@@ -250,7 +250,7 @@ def main() -> None:
         )
     back = ", ".join(f"{s:.2f}" for s in found["back_s"])
     print(
-        f"service ready again after {back} s (bar {BACK_S:g} s); longest upload {found['longest_upload_s']:.1f} s"
+        f"service ready after {back} s (bar {BACK_S:g} s); longest upload {found['longest_upload_s']:.1f} s"
     )
     print(f"{found['mib_per_s']:.1f} MiB/s with the kills; {found['objects']} (bar: 0 missing, 0 partial)")
     if args.out is not None:

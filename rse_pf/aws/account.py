@@ -60,7 +60,7 @@ class Account:
                 return None
             raise ConfigurationError(
                 f"AWS refuses {service} {method}: {code}",
-                hint="look at your account's permissions, or sign in again",
+                hint="check your account's permissions, or sign in again",
             ) from None
         return found
 

@@ -97,7 +97,7 @@ def with_retries(
         sleep(pause_s)
         pause_s *= 2
     raise StoreError(
-        f"AWS does not answer: {last}", hint="look at the endpoints of the VPC and at status.aws.amazon.com"
+        f"AWS does not answer: {last}", hint="check the endpoints of the VPC and status.aws.amazon.com"
     ) from last
 
 
@@ -109,7 +109,7 @@ def call_api(client: Any, method: str, **arguments: Any) -> dict[str, Any]:
         found: dict[str, Any] = with_retries(lambda: getattr(client, method)(**arguments))
     except ClientError as error:
         raise ConfigurationError(
-            f"AWS refuses {method}: {error_code(error)}", hint="look at the role's policy in the template"
+            f"AWS refuses {method}: {error_code(error)}", hint="check the role's policy in the template"
         ) from error
     return found
 

@@ -185,7 +185,7 @@ def _as_store_errors(name: str) -> Iterator[None]:
         if code in _FULL:
             raise StoreFull(f"no space for {name!r}", hint="free some space") from error
         raise StoreError(
-            f"S3 refuses {name!r}: {code}", hint="look at the role's policy and the bucket's"
+            f"S3 refuses {name!r}: {code}", hint="check the role's policy and the bucket's"
         ) from error
 
 

@@ -187,7 +187,7 @@ def test_an_entry_changed_before_its_upload_is_reported_and_uploaded(
 
     setup.shipper.ship()
 
-    assert setup.problems == [(INSTANCE, "entry 2 was changed: its hash is not that of what it says")]
+    assert setup.problems == [(INSTANCE, "entry 2 was changed: its hash does not match its content")]
     (verdict,) = setup.verdicts(tmp_path / "fetched").values()
     assert verdict.problem.startswith("entry 2 was changed")
 
