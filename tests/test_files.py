@@ -84,7 +84,7 @@ def test_a_secret_that_others_may_read_or_write_is_refused(tmp_path: Path, mode:
 
 
 def test_a_missing_secret_is_refused_with_the_callers_hint(tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match="cannot read the key .*: No such file") as told:
+    with pytest.raises(UsageError, match=r"cannot read the key .*: No such file") as told:
         read_private_file(tmp_path / "key", "the key", hint="make one")
 
     assert told.value.hint == "make one"

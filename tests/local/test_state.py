@@ -82,7 +82,7 @@ def test_settings_of_0_1_0_are_refused_with_what_to_do(tmp_path: Path) -> None:
     old = {"context": {"rse-pf": {"serving": {"health_path": "/healthz", "backlog": 4096}}}}
     settings_file(tmp_path).write_text(json.dumps(old))
 
-    with pytest.raises(ConfigurationError, match="is not of this version: .*serving") as told:
+    with pytest.raises(ConfigurationError, match=r"is not of this version: .*serving") as told:
         platform_settings(tmp_path)
 
     assert told.value.hint == f"start the platform once with: rse-pf local --name {tmp_path.name}"
