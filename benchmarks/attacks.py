@@ -1,4 +1,4 @@
-"""What a hostile robot or stranger does to a front door, each attack bounded in number and time.
+"""What a hostile robot or stranger does to a front target, each attack bounded in number and time.
 
     python benchmarks/attacks.py NAME URL     one attack, its outcome as JSON; see hostile.py
 
@@ -27,7 +27,7 @@ from urllib.parse import urlsplit
 
 from rse_pf.wire import SUBPROTOCOLS, Command, Failure, Hello, make_codec
 
-__all__ = ["ATTACKS", "HandshakePolicy", "Outcome", "Socket", "frame"]
+__all__ = ["ATTACKS", "AttackTarget", "Outcome", "Socket", "frame"]
 
 CONTINUATION, BINARY, CLOSE, PING, PONG = 0, 2, 8, 9, 10
 FIN, MASKED = 0x80, 0x80
@@ -47,7 +47,7 @@ def frame(payload: bytes, opcode: int = BINARY, *, fin: bool = True) -> bytes:
 
 
 @dataclass(frozen=True, slots=True)
-class HandshakePolicy:
+class AttackTarget:
     """Where to knock, and with which tokens."""
 
     url: str
@@ -150,10 +150,10 @@ def bomb() -> bytes:
     return made[:262144]
 
 
-async def zip_bombs(door: HandshakePolicy, count: int = 1000, pause_s: float = 1.0) -> Outcome:
+async def zip_bombs(target: AttackTarget, count: int = 1000, pause_s: float = 1.0) -> Outcome:
     """Send *count* messages of 255 KB that would inflate to 256 MiB, ten a robot, all robots at once.
 
-    Who is thrown out comes back at once, and after *pause_s* if the door stays shut; each try counts.
+    Who is thrown out comes back at once, and after *pause_s* if the target stays shut; each try counts.
     """
     message, each = frame(bomb()), 10
     outcome = Outcome()
@@ -165,7 +165,7 @@ async def zip_bombs(door: HandshakePolicy, count: int = 1000, pause_s: float = 1
             outcome.tried += 1
             if socket is None:
                 try:
-                    socket = await door.enter(token)
+                    socket = await target.enter(token)
                 except ConnectionError as error:
                     outcome.refused += 1
                     outcome.ends[str(error)[9:12]] += 1
@@ -184,29 +184,29 @@ async def zip_bombs(door: HandshakePolicy, count: int = 1000, pause_s: float = 1
             outcome.ends[str(socket.closed)] += 1
             socket.end()
 
-    await _all([robot(token) for token in door.tokens[: count // each]])
+    await _all([robot(token) for token in target.tokens[: count // each]])
     return outcome
 
 
-async def empty_fragments(door: HandshakePolicy, count: int = 200_000) -> Outcome:
+async def empty_fragments(target: AttackTarget, count: int = 200_000) -> Outcome:
     """Begin one message and never end it: *count* empty fragments."""
-    socket = await door.enter(door.tokens[0])
+    socket = await target.enter(target.tokens[0])
     began = frame(b"", fin=False)
     return await _flood(socket, began, frame(b"", CONTINUATION, fin=False), count)
 
 
-async def ping_flood(door: HandshakePolicy, count: int = 200_000) -> Outcome:
+async def ping_flood(target: AttackTarget, count: int = 200_000) -> Outcome:
     """Send *count* ping frames as fast as the connection takes them."""
-    socket = await door.enter(door.tokens[0])
+    socket = await target.enter(target.tokens[0])
     return await _flood(socket, b"", frame(b"x", PING), count)
 
 
-async def slow_headers(door: HandshakePolicy, count: int = 400, pause_s: float = 0.5) -> Outcome:
+async def slow_headers(target: AttackTarget, count: int = 400, pause_s: float = 0.5) -> Outcome:
     """Send the head of *count* handshakes one header at a time."""
     outcome = Outcome(tried=count)
 
     async def one() -> None:
-        reader, writer = await door.knock()
+        reader, writer = await target.knock()
         began = time.monotonic()
         ending = asyncio.create_task(reader.read(4096))
         writer.write(b"GET / HTTP/1.1\r\nHost: a\r\n")
@@ -220,12 +220,12 @@ async def slow_headers(door: HandshakePolicy, count: int = 400, pause_s: float =
     return outcome
 
 
-async def silent_connects(door: HandshakePolicy, count: int = 2000) -> Outcome:
+async def silent_connects(target: AttackTarget, count: int = 2000) -> Outcome:
     """Open *count* connections and say nothing."""
     outcome = Outcome(tried=count)
 
     async def one() -> None:
-        reader, writer = await door.knock()
+        reader, writer = await target.knock()
         began = time.monotonic()
         ending = asyncio.create_task(reader.read(4096))
         await asyncio.wait({ending}, timeout=LONG_S)
@@ -235,14 +235,14 @@ async def silent_connects(door: HandshakePolicy, count: int = 2000) -> Outcome:
     return outcome
 
 
-async def slow_reader(door: HandshakePolicy, count: int = 20) -> Outcome:
+async def slow_reader(target: AttackTarget, count: int = 20) -> Outcome:
     """Ask on *count* sockets for large replies, and read none of them."""
     outcome = Outcome(tried=count)
     filling = {"value": "x" * 200_000}
 
     async def one(token: str) -> None:
-        reader, writer = await door.knock()
-        writer.write(door.head(token, "json"))
+        reader, writer = await target.knock()
+        writer.write(target.head(token, "json"))
         await asyncio.wait_for(reader.readuntil(b"\r\n\r\n"), LONG_S)
         codec, began = make_codec("json"), time.monotonic()
         writer.write(frame(codec.encode(Hello()), 1))
@@ -265,16 +265,16 @@ async def slow_reader(door: HandshakePolicy, count: int = 20) -> Outcome:
         outcome.slowest_s = max(outcome.slowest_s, time.monotonic() - began)
         writer.transport.abort()
 
-    await _all([one(token) for token in door.tokens[:count]])
+    await _all([one(token) for token in target.tokens[:count]])
     return outcome
 
 
-async def rate_flood(door: HandshakePolicy, per_s: float = 500.0, seconds: float = 10.0) -> Outcome:
+async def rate_flood(target: AttackTarget, per_s: float = 500.0, seconds: float = 10.0) -> Outcome:
     """Be one robot that sends *per_s* commands a second, and comes back whenever it is cut off."""
     outcome, until = Outcome(), time.monotonic() + seconds
     while time.monotonic() < until:
         try:
-            socket = await door.enter(door.tokens[0], "bin")
+            socket = await target.enter(target.tokens[0], "bin")
         except ConnectionError as error:
             outcome.ends[str(error)[9:12]] += 1
             await asyncio.sleep(0.1)  # thrown out, it comes back at this pace
@@ -339,7 +339,7 @@ async def _all(works: list[Awaitable[None]]) -> None:
             raise result
 
 
-ATTACKS: dict[str, Callable[[HandshakePolicy], Awaitable[Outcome]]] = {
+ATTACKS: dict[str, Callable[[AttackTarget], Awaitable[Outcome]]] = {
     "zip-bombs": zip_bombs,
     "empty-fragments": empty_fragments,
     "ping-flood": ping_flood,
@@ -350,9 +350,9 @@ ATTACKS: dict[str, Callable[[HandshakePolicy], Awaitable[Outcome]]] = {
 }
 
 
-async def _attack(name: str, door: HandshakePolicy) -> Outcome:
+async def _attack(name: str, target: AttackTarget) -> Outcome:
     began = time.monotonic()
-    outcome = await ATTACKS[name](door)
+    outcome = await ATTACKS[name](target)
     outcome.took_s = time.monotonic() - began
     return outcome
 
@@ -360,12 +360,12 @@ async def _attack(name: str, door: HandshakePolicy) -> Outcome:
 def main() -> None:
     """Get ready, wait, attack, tell."""
     name, url = sys.argv[1:]
-    door = HandshakePolicy(url, tuple(json.loads(sys.stdin.readline())))
+    target = AttackTarget(url, tuple(json.loads(sys.stdin.readline())))
     if name == "zip-bombs":
         bomb()
     print("ready", flush=True)
     sys.stdin.readline()
-    made = asyncio.run(_attack(name, door))
+    made = asyncio.run(_attack(name, target))
     print(json.dumps({name: getattr(made, name) for name in made.__slots__}))
 
 

@@ -1,7 +1,7 @@
-"""A real backend server behind its door, as an operator has it: keys, roster and deny-list in one folder.
+"""A real backend server with access control, as an operator runs it: keys, roster and deny-list in a folder.
 
-Handshakes are made by hand, so that a test sees each byte of the answer.  Promises loopback only, and that
-every process it started is gone when it is left.
+Handshakes are written by hand, so that a test sees each byte of the answer.  The server listens on loopback
+only, and every process of it has ended when the ``with`` block ends.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class GuardedServer:
     def __init__(self, folder: Path, *, workers: int = 2, **groups: dict[str, Any]) -> None:
         self.folder = folder
         self.settings = PlatformSettings.from_dict({**_UNLIMITED, **groups})
-        self.room = AccessControlStore(DirectoryStore(folder))
+        self.access = AccessControlStore(DirectoryStore(folder))
         self.port = 0
         self._workers = workers
         self._process: subprocess.Popen[bytes] | None = None

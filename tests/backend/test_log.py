@@ -1,4 +1,4 @@
-"""The log: one JSON object a line, whatever strangers put into it."""
+"""The log has one JSON object in each line, whatever a robot sends."""
 
 from __future__ import annotations
 

@@ -24,7 +24,7 @@ class RosterService(Service):
 
     def __init__(self, folder: Path) -> None:
         (folder / "keys.json").write_text(KEY.key_set().to_json())
-        self.room = AccessControlStore(DirectoryStore(folder))
+        self.access = AccessControlStore(DirectoryStore(folder))
         self.folder = folder
         super().__init__(small_settings(), MemoryStore())
 
@@ -51,7 +51,7 @@ def test_a_disabled_robot_is_refused_after_the_next_refresh_and_after_a_restart(
     token = service.token()
     assert put(service, b"a", token) == 201
 
-    service.room.change_deny_list(lambda denied: denied.with_robot("default", "robot-1", 0.0))
+    service.access.change_deny_list(lambda denied: denied.with_robot("default", "robot-1", 0.0))
     service.now += REFRESH_S
 
     assert put(service, b"b", token) == 401
@@ -67,7 +67,7 @@ def test_an_enrolled_robot_has_the_tenant_and_the_quota_of_the_roster(
     robot = EnrolledRobot(
         robot="own", tenant="lab", x=public_key_of(ROBOT.public_json()), quotas={"data_bytes": 100.0}
     )
-    service.room.change_roster(lambda roster: roster.enrolled(robot))
+    service.access.change_roster(lambda roster: roster.enrolled(robot))
     token = ROBOT.issue(
         "own",
         now=service.wall,

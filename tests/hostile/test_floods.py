@@ -17,7 +17,7 @@ import pytest
 from guarded_server import GuardedServer
 
 from benchmarks import attacks
-from benchmarks.attacks import HandshakePolicy, Outcome
+from benchmarks.attacks import AttackTarget, Outcome
 from client_sdk import connect
 from rse_pf.wire import Command, Result
 
@@ -69,15 +69,15 @@ def counted(server: GuardedServer, name: str, label: str, at_least: float) -> bo
 
 
 def attacked(
-    server: GuardedServer, attack: Callable[[HandshakePolicy], Awaitable[Outcome]], *, robots: int = 1
+    server: GuardedServer, attack: Callable[[AttackTarget], Awaitable[Outcome]], *, robots: int = 1
 ) -> tuple[Outcome, int]:
     """Return what came of *attack*, and how many calls of a robot beside it were answered, of 5."""
     tokens = tuple(server.token(f"hostile-{next(_NUMBERS)}") for _ in range(robots))
 
     async def run() -> tuple[Outcome, int]:
-        door, answered = HandshakePolicy(server.url, tokens), 0
+        target, answered = AttackTarget(server.url, tokens), 0
         async with connect(server.url, token=server.token("calm")) as calm:
-            attacking = asyncio.ensure_future(attack(door))
+            attacking = asyncio.ensure_future(attack(target))
             for _ in range(5):
                 answer = await calm.call("echo", {"value": 1}, deadline_s=20.0)
                 answered += answer.reply["value"] == 1
@@ -99,8 +99,8 @@ def test_endless_frames_are_cut_off_at_the_limit(server, attack, code):
 
 
 def test_a_robot_at_a_hundred_times_its_rate_is_refused_cut_off_and_banned(server):
-    async def attack(door: HandshakePolicy) -> Outcome:
-        return await attacks.rate_flood(door, 2000.0, 1.5)
+    async def attack(target: AttackTarget) -> Outcome:
+        return await attacks.rate_flood(target, 2000.0, 1.5)
 
     outcome, answered = attacked(server, attack)
 
@@ -113,8 +113,8 @@ def test_a_robot_at_a_hundred_times_its_rate_is_refused_cut_off_and_banned(serve
 
 
 def test_every_bomb_is_refused_and_memory_stays(server):
-    async def attack(door: HandshakePolicy) -> Outcome:
-        return await attacks.zip_bombs(door, 100)
+    async def attack(target: AttackTarget) -> Outcome:
+        return await attacks.zip_bombs(target, 100)
 
     attacks.bomb()  # takes a second, in which the robot beside it could not say a word
     before = resident_mib(server)
@@ -126,8 +126,8 @@ def test_every_bomb_is_refused_and_memory_stays(server):
 
 
 def test_silent_connections_are_cut_for_newer_ones_and_after_their_time(server):
-    async def attack(door: HandshakePolicy) -> Outcome:
-        return await attacks.silent_connects(door, 100)
+    async def attack(target: AttackTarget) -> Outcome:
+        return await attacks.silent_connects(target, 100)
 
     outcome, answered = attacked(server, attack)
 
@@ -137,8 +137,8 @@ def test_silent_connections_are_cut_for_newer_ones_and_after_their_time(server):
 
 
 def test_slow_request_heads_are_cut_after_the_handshake_timeout(server):
-    async def attack(door: HandshakePolicy) -> Outcome:
-        return await attacks.slow_headers(door, 20, pause_s=0.2)
+    async def attack(target: AttackTarget) -> Outcome:
+        return await attacks.slow_headers(target, 20, pause_s=0.2)
 
     outcome, answered = attacked(server, attack)
 
@@ -149,7 +149,7 @@ def test_slow_request_heads_are_cut_after_the_handshake_timeout(server):
 
 def test_a_long_request_head_is_answered_with_431(server):
     async def knock() -> bytes:
-        reader, writer = await HandshakePolicy(server.url).knock()
+        reader, writer = await AttackTarget(server.url).knock()
         writer.write(b"GET /ws HTTP/1.1\r\nHost: a\r\nX-Long: " + b"x" * 9000)
         answer = await asyncio.wait_for(reader.read(), 10)
         writer.close()
@@ -160,8 +160,8 @@ def test_a_long_request_head_is_answered_with_431(server):
 
 def test_equal_ids_and_streams_of_several_robots_are_kept_apart(server):
     async def run() -> list[tuple[int, object]]:
-        door = HandshakePolicy(server.url)
-        robots = [await door.enter(server.token(f"twin-{n}"), "bin") for n in range(20)]
+        target = AttackTarget(server.url)
+        robots = [await target.enter(server.token(f"twin-{n}"), "bin") for n in range(20)]
         heard: list[tuple[int, object]] = []
         for number, robot in enumerate(robots):
             for identity in (1, 2):

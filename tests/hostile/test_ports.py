@@ -47,7 +47,7 @@ def asked(port: int, path: str, method: str = "GET", authorization: str = "") ->
 
 
 def health_of(port: int) -> tuple[int, bytes, set[str], list[str]]:
-    """Return what the door says of its health, and what its other answers call their server."""
+    """Return the answer of the health page, and the Server header of the other answers."""
     with urllib.request.urlopen(f"http://127.0.0.1:{port}/healthz", timeout=10) as answer:
         found = answer.status, answer.read(), {name.lower() for name in answer.headers}
     named = []
@@ -86,17 +86,17 @@ def listening(pids: list[int]) -> list[str]:
 def test_the_public_port_has_three_paths_and_nothing_else_listens_publicly(tmp_path: Path) -> None:
     async def scan() -> tuple[dict[str, int], int, list[str], int, Any]:
         async with LocalPlatform(PlatformSettings(), state=tmp_path / "p", port=0, servers=1) as cloud:
-            door = cloud.load_balancer.port
+            port = cloud.load_balancer.port
             statuses = {
-                f"{method} {path}": await asyncio.to_thread(status_of, door, path, method)
+                f"{method} {path}": await asyncio.to_thread(status_of, port, path, method)
                 for path in OURS_AND_NOT_PUBLIC
                 for method in ("GET", "POST")
             }
-            robots = await asyncio.to_thread(status_of, door, "/ws")
+            robots = await asyncio.to_thread(status_of, port, "/ws")
             marks = [*cloud.backend_servers.marks.values(), cloud.load_balancer.mark]
             addresses = listening([mark.pid for mark in marks if mark is not None])
             mode = stat.S_IMODE(next((tmp_path / "p").rglob(ADMIN_SOCKET)).stat().st_mode)
-            health = await asyncio.to_thread(health_of, door)
+            health = await asyncio.to_thread(health_of, port)
             return statuses, robots, addresses, mode, health
 
     statuses, robots, addresses, mode, health = asyncio.run(scan())

@@ -112,10 +112,12 @@ async def revoke_some(server: GuardedServer, robot_count: int, revoked_count: in
         for number in gone:
             name, token_id = names[number], f"t-{server._issued - robot_count + number + 1}"
             if number % 2:
-                server.room.change_deny_list(lambda d, name=name: d.with_robot("default", name, time.time()))
+                server.access.change_deny_list(
+                    lambda d, name=name: d.with_robot("default", name, time.time())
+                )
             else:
                 until_s = time.time() + 900
-                server.room.change_deny_list(
+                server.access.change_deny_list(
                     lambda d, n=name, t=token_id, u=until_s: d.with_token("default", n, t, u)
                 )
         told = time.monotonic()
@@ -190,7 +192,9 @@ def test_revoking_the_fresh_token_ends_the_socket_that_was_renewed_with_it(serve
         async with robots(server, [server.token("twice")]) as (socket,):
             assert isinstance(await socket.ask(Renew(token=server.token("twice"))), Renewed)
             fresh = f"t-{server._issued}"
-            server.room.change_deny_list(lambda d: d.with_token("default", "twice", fresh, time.time() + 900))
+            server.access.change_deny_list(
+                lambda d: d.with_token("default", "twice", fresh, time.time() + 900)
+            )
             assert await socket.end(30.0) == CLOSE_REVOKED
 
     asyncio.run(run())
@@ -202,7 +206,7 @@ def test_a_session_outlives_its_tokens_without_a_gap_and_ends_when_its_robot_is_
 ) -> None:
     public = make_robot_key(tmp_path / "robot.key")
     enrolled = EnrolledRobot(robot="own-key", x=public_key_of(public), scopes=("services:echo",))
-    server.room.change_roster(lambda roster: roster.enrolled(enrolled))
+    server.access.change_roster(lambda roster: roster.enrolled(enrolled))
     short = server.settings.replace(auth={"token_ttl_s": 10}).auth
     key = RobotKey(tmp_path / "robot.key", "own-key", settings=short)
     tokens = 0
@@ -221,7 +225,7 @@ def test_a_session_outlives_its_tokens_without_a_gap_and_ends_when_its_robot_is_
             assert tokens >= 3
             with pytest.raises(Forbidden):
                 await robot.call("pnp", {})
-            server.room.change_deny_list(lambda d: d.with_robot("default", "own-key", time.time()))
+            server.access.change_deny_list(lambda d: d.with_robot("default", "own-key", time.time()))
             with pytest.raises(Unauthorized):
                 await echo_on(robot, until_s=began + 60.0)
 

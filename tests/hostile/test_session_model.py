@@ -1,4 +1,4 @@
-"""Both sides of the protocol together: sockets break, robots are disabled, strangers' bytes come between.
+"""Both sides of the protocol together: sockets break, robots are disabled, foreign bytes are inserted.
 
 A robot's session, real server sessions and real tokens; nothing is faked but the network.  The model only
 counts: each command ends once, one session of a robot lives, and none of a robot that is disabled.
@@ -133,7 +133,7 @@ class Platform(RuleBasedStateMachine):
 
     @rule(data=st.sampled_from([b"", b"[]", b"\xff", b'{"type":"welcome"}', b"[" * 99]))
     @precondition(lambda self: self._open())
-    def strangers_bytes(self, data: bytes) -> None:
+    def foreign_bytes(self, data: bytes) -> None:
         socket = self._open()[0]
         self._obey(socket, socket.server.receive(data, self.now))
 

@@ -225,7 +225,7 @@ class Told:
     own: bool
 
 
-async def through_the_door(folder: Path, *, opens: bool) -> tuple[dict[str, Told], list[bytes]]:
+async def through_the_load_balancer(folder: Path, *, opens: bool) -> tuple[dict[str, Told], list[bytes]]:
     """Send every sample through a real Envoy; after each one, others ask for what is theirs."""
     recorder = Recorder(opens)
     upstream = await asyncio.start_server(recorder.serve, "127.0.0.1", 0)
@@ -264,7 +264,7 @@ async def through_the_door(folder: Path, *, opens: bool) -> tuple[dict[str, Told
 def test_a_request_that_passes_the_load_balancer_is_read_alike_by_all_servers(
     tmp_path: Path, opens: bool
 ) -> None:
-    told, _ = asyncio.run(through_the_door(tmp_path, opens=opens))
+    told, _ = asyncio.run(through_the_load_balancer(tmp_path, opens=opens))
 
     unclear = {
         name: found
@@ -281,6 +281,6 @@ def test_a_request_that_passes_the_load_balancer_is_read_alike_by_all_servers(
         for name, each in told.items()
         if len(each.requests) > 1 and len(each.codes) != len(each.requests)
     }
-    assert unseen == set(), "a server answered a request that the door has not seen as one"
+    assert unseen == set(), "a server answered a request that the load balancer has not seen as one"
     after_upgrade = {name for name in SAMPLES if "websocket" in SAMPLES[name].decode("latin-1")}
     assert {name for name in after_upgrade if len(told[name].requests) > 1} == set()

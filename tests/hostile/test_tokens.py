@@ -159,14 +159,14 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[GuardedServer]:
         EnrolledRobot(robot="robot-1", x=public_key_of(ROBOT.public_json())),
         EnrolledRobot(robot="lost", x=public_key_of(STRANGER.public_json())),
     )
-    server.room.change_roster(lambda _: Roster(robots=robots))
+    server.access.change_roster(lambda _: Roster(robots=robots))
 
     def denied(_: DenyList) -> DenyList:
         fresh = DenyList().with_robot("default", "disabled", 0.0).with_robot("default", "lost", 0.0)
         fresh = fresh.with_tokens_before("default", "renewed", time.time() + 600)
         return fresh.with_token("default", "robot-1", "revoked", time.time() + 900)
 
-    server.room.change_deny_list(denied)
+    server.access.change_deny_list(denied)
     with server:
         yield server
 

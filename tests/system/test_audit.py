@@ -54,7 +54,7 @@ async def test_a_server_records_accepted_and_refused_robots_and_no_token(tmp_pat
         audit, good = tmp_path / "audit", server.token("robot-1")
         assert (await server.handshake(b"Bearer " + good.encode()))[0] == 101
         assert (await server.handshake(b"Bearer " + good[:-4].encode() + b"AAAA"))[0] == 401
-        server.room.change_deny_list(lambda denied: denied.with_robot("default", "robot-1", time.time()))
+        server.access.change_deny_list(lambda denied: denied.with_robot("default", "robot-1", time.time()))
 
         def tokens() -> list[str]:
             return [entry.action for entry in entries(audit, "guarded") if entry.action.startswith("auth")]

@@ -1,4 +1,4 @@
-"""A real backend server: door, messages, limits and numbers."""
+"""A real backend server: handshakes, messages, limits and metrics."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The door: who may upgrade, and the fixed answers for all others."""
+"""Which handshakes are accepted, and the fixed answers for all others."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ def token(ttl_s: float = 100.0, now: float = NOW_S) -> str:
     return KEY.issue("robot-1", now=now, token_id="t", settings=SETTINGS.auth, ttl_s=ttl_s)
 
 
-def judge(door: HandshakePolicy | None = None, **changed: object) -> Accepted | Rejected:
+def judge(policy: HandshakePolicy | None = None, **changed: object) -> Accepted | Rejected:
     asked: dict = {
         "path": b"/ws", "authorization": f"Bearer {token()}", "offered": [SUBPROTOCOLS["bin"]],
         "is_full": False, "anonymous": "anonymous-1", "now_s": NOW_S, **changed,
     }  # fmt: skip
-    return (door or HandshakePolicy(SETTINGS, KEY.key_set())).judge(**asked)
+    return (policy or HandshakePolicy(SETTINGS, KEY.key_set())).judge(**asked)
 
 
 def test_a_valid_token_gives_the_robot_and_the_end_of_its_connection():
@@ -94,9 +94,9 @@ def test_without_keys_robots_are_anonymous_and_never_expire():
 
 
 def test_the_conformance_echo_accepts_every_handshake():
-    door = HandshakePolicy(SETTINGS, None, conformance_echo=True)
+    policy = HandshakePolicy(SETTINGS, None, conformance_echo=True)
 
-    assert judge(door, path=b"/", offered=[], authorization="") == Accepted(
+    assert judge(policy, path=b"/", offered=[], authorization="") == Accepted(
         robot="anonymous-1", codec="", subprotocol=""
     )
 

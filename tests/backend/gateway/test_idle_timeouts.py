@@ -12,7 +12,7 @@ from rse_pf.config import SessionSettings
 SETTINGS = SessionSettings()
 LIMIT_S = max_silence_s(SETTINGS)
 BAR_S = 5.8
-"""Issue 4: a silent link is noticed within 6 s; the rest is for whoever looks at the server."""
+"""A silent link must be noticed within 6 s; the difference is for the observer of the server."""
 
 
 class Connection:
