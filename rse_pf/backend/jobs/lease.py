@@ -24,11 +24,8 @@ __all__ = [
     "Verdict",
     "decode_record",
     "encode_record",
-    "is_expired",
     "job_key",
-    "marked",
     "record_name",
-    "tombstone",
     "verdict_on",
 ]  # fmt: skip
 
@@ -71,21 +68,6 @@ def decode_record(name: str, data: bytes) -> JobRecord:
         return _decode(data)
     except msgspec.DecodeError as error:
         raise StoreError(f"{name!r} is no record of a job", hint="delete it") from error
-
-
-def marked(record: JobRecord, now: float) -> JobRecord:
-    """Return *record* with the time when a garbage collection first saw it; *now* is Unix time."""
-    return msgspec.structs.replace(record, marked_s=now)
-
-
-def is_expired(record: JobRecord, now: float, ttl_s: float) -> bool:
-    """Return whether *record* is unchanged for *ttl_s* since it was marked."""
-    return record.marked_s > 0 and now - record.marked_s >= ttl_s
-
-
-def tombstone(now: float) -> JobRecord:
-    """Return the record that replaces one which is about to be deleted."""
-    return JobRecord(state="swept", owner="", marked_s=now)
 
 
 def job_key(service: str, payload: Any, settings: str) -> str:

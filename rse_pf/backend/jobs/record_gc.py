@@ -11,7 +11,9 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable
 
-from rse_pf.backend.jobs.lease import decode_record, encode_record, is_expired, marked, tombstone
+import msgspec
+
+from rse_pf.backend.jobs.lease import JobRecord, decode_record, encode_record
 from rse_pf.errors import StoreError
 from rse_pf.object_store import ObjectStore
 
@@ -73,11 +75,13 @@ class RecordCollector:
             data = self._store.get(name)
             record, now = decode_record(name, data), self._wall_clock()
             if not record.marked_s:
-                self._store.compare_and_swap(name, data, encode_record(marked(record, now)))
+                marked = msgspec.structs.replace(record, marked_s=now)
+                self._store.compare_and_swap(name, data, encode_record(marked))
                 return False
-            if not is_expired(record, now, self._ttl_s):
+            if now - record.marked_s < self._ttl_s:
                 return False
-            self._store.compare_and_swap(name, data, encode_record(tombstone(now)))
+            tombstone = JobRecord(state="swept", owner="", marked_s=now)
+            self._store.compare_and_swap(name, data, encode_record(tombstone))
             self._store.delete(name)
         except StoreError:
             return False  # changed meanwhile, or the store failed: the next round reads it again

@@ -58,7 +58,7 @@ class _PythonRuntime:
     """A function ``serve(request: Request) -> Reply``, or a class ``Service`` with such a method."""
 
     def __init__(self, service: InstalledService) -> None:
-        module = _load_package(service) if service.language == "package" else _load(service)
+        module = _load(service)
         maker = getattr(module, "Service", None)
         self._object = maker() if callable(maker) else None
         function: Callable[[Any], Any] | None = getattr(self._object or module, "serve", None)
@@ -86,17 +86,21 @@ class _PythonRuntime:
         self._object.restore(data)
 
 
-def _load_package(service: InstalledService) -> Any:
+def _load(service: InstalledService) -> Any:
     try:
-        return importlib.import_module(service.entry)
+        if service.language == "package":
+            return importlib.import_module(service.entry)
+        return _load_file(service)
+    except RsePfError:
+        raise
     except Exception as error:
         where = f"{type(error).__name__}: {error}"
         raise ConfigurationError(
-            f"{service.name} cannot be loaded: {where}", hint="fix the package"
+            f"{service.name} cannot be loaded: {where}", hint="fix the service"
         ) from error
 
 
-def _load(service: InstalledService) -> Any:
+def _load_file(service: InstalledService) -> Any:
     name = f"rse_pf_service_{service.name.replace('-', '_')}"
     spec = importlib.util.spec_from_file_location(name, service.entry_path)
     if spec is None or spec.loader is None:
@@ -107,13 +111,5 @@ def _load(service: InstalledService) -> Any:
     sys.modules[name] = module
     if str(service.folder) not in sys.path:
         sys.path.insert(0, str(service.folder))
-    try:
-        spec.loader.exec_module(module)
-    except RsePfError:
-        raise
-    except Exception as error:
-        where = f"{type(error).__name__}: {error}"
-        raise ConfigurationError(
-            f"{service.name} cannot be loaded: {where}", hint="fix the service"
-        ) from error
+    spec.loader.exec_module(module)
     return module
