@@ -1,12 +1,11 @@
-"""What a hostile robot or stranger does to a front target, each attack bounded in number and time.
+"""Attacks of a hostile robot or client on a platform, each bounded in number and time.
 
     python benchmarks/attacks.py NAME URL     one attack, its outcome as JSON; see hostile.py
 
-Reads the tokens (one line of JSON), says ``ready`` when all that costs an attacker time beforehand is
-done, and begins at the next line.
+Reads the tokens (one line of JSON), prints ``ready`` when its messages are prepared, and begins at the next
+line of input.
 
-`ATTACKS` names them.  Promises to speak raw frames (no library of ours stands between), and to end every
-socket that it opened.
+`ATTACKS` names them.  The attacks send raw frames without any library of ours, and close every socket.
 """
 
 from __future__ import annotations
@@ -48,12 +47,12 @@ def frame(payload: bytes, opcode: int = BINARY, *, fin: bool = True) -> bytes:
 
 @dataclass(frozen=True, slots=True)
 class AttackTarget:
-    """Where to knock, and with which tokens."""
+    """The address and the tokens of an attack."""
 
     url: str
     tokens: tuple[str, ...] = ()
 
-    async def knock(self) -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
+    async def open_tcp(self) -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
         """Open a TCP connection."""
         parts = urlsplit(self.url)
         return await asyncio.open_connection(parts.hostname, parts.port)
@@ -69,7 +68,7 @@ class AttackTarget:
 
     async def enter(self, token: str, codec: str = "zlib") -> Socket:
         """Shake hands and say hello; raises ConnectionError with the status line where refused."""
-        reader, writer = await self.knock()
+        reader, writer = await self.open_tcp()
         writer.write(self.head(token, codec))
         head = await asyncio.wait_for(reader.readuntil(b"\r\n\r\n"), LONG_S)
         if not head.startswith(b"HTTP/1.1 101"):
@@ -206,7 +205,7 @@ async def slow_headers(target: AttackTarget, count: int = 400, pause_s: float = 
     outcome = Outcome(tried=count)
 
     async def one() -> None:
-        reader, writer = await target.knock()
+        reader, writer = await target.open_tcp()
         began = time.monotonic()
         ending = asyncio.create_task(reader.read(4096))
         writer.write(b"GET / HTTP/1.1\r\nHost: a\r\n")
@@ -225,7 +224,7 @@ async def silent_connects(target: AttackTarget, count: int = 2000) -> Outcome:
     outcome = Outcome(tried=count)
 
     async def one() -> None:
-        reader, writer = await target.knock()
+        reader, writer = await target.open_tcp()
         began = time.monotonic()
         ending = asyncio.create_task(reader.read(4096))
         await asyncio.wait({ending}, timeout=LONG_S)
@@ -241,7 +240,7 @@ async def slow_reader(target: AttackTarget, count: int = 20) -> Outcome:
     filling = {"value": "x" * 200_000}
 
     async def one(token: str) -> None:
-        reader, writer = await target.knock()
+        reader, writer = await target.open_tcp()
         writer.write(target.head(token, "json"))
         await asyncio.wait_for(reader.readuntil(b"\r\n\r\n"), LONG_S)
         codec, began = make_codec("json"), time.monotonic()

@@ -1,9 +1,9 @@
-"""What the audit log costs a handshake: servers with and without it, asked in turns.
+"""Cost of the audit log for a handshake: servers with and without it, in turns.
 
     python benchmarks/audit.py [--n 1500] [--only accepted|refused] [--out FILE]
 
-Three servers of one worker each: without a log, without a log again, with one.  In every round each is asked
-once, in an order drawn anew; the second server without a log shows how far equal servers differ.  From
+Three servers of one worker each: without a log, without a log again, with one.  In every round each gets
+one handshake, in random order; the second server without a log shows how far equal servers differ.  From
 connect to the end of the answer's head, milliseconds.  The bar, for tail and median: the log's difference is
 within what two equal servers differ by, or its 95 % interval (bootstrap over rounds) holds zero.
 """

@@ -1,9 +1,9 @@
-"""Uploads through the balancer while robots stream poses and the data server is killed again and again.
+"""Uploads through the load balancer while robots request poses and the data server is killed repeatedly.
 
     python benchmarks/data_faults.py [--uploads 200] [--kills 3] [--robots 20] [--seconds 15] [--out FILE]
 
-One local platform (two servers, one data server) behind the load balancer; robots ask for a pose 5 times a
-second (200 matches, 30 % wrong, every frame kept).  First nothing else happens; then a process of four robots
+One local platform (two servers, one data server) behind the load balancer; robots request 5 poses per
+second (200 matches, 30 % wrong, every frame kept).  First without uploads; then a process of four robots
 uploads objects of 1 MiB as fast as possible, and the data server is killed with SIGKILL at each quarter; then
 the same robots upload at the rate of keyframes (`data.background_bytes_per_s` each).
 

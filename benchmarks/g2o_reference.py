@@ -1,7 +1,6 @@
-"""Fit one pose graph with g2o's own optimiser, for `pose_graphs.py` to compare with.
+"""Optimise one pose graph with g2o, for the comparison in `pose_graphs.py`.
 
-Run by an interpreter of its own, which has g2o-python and numpy below 2 (with numpy 2 the wheel's fixed-size
-matrices end the process) and needs nothing else of ours:
+Needs a separate interpreter with g2o-python and numpy below 2 (with numpy 2 the wheel crashes):
 
     python benchmarks/g2o_reference.py < ORDER.json > ANSWER.json
 

@@ -1,4 +1,4 @@
-"""Where the time of one PnP command goes on a server, stage by stage.
+"""CPU time of one PnP command on a server, stage by stage.
 
     python benchmarks/handler.py [--n 500] [--out FILE]
 

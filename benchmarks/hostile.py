@@ -1,12 +1,12 @@
-"""What robots that do real PnP through the balancer notice while somebody attacks the front door.
+"""Round trips of robots that send real PnP problems through the load balancer while it is attacked.
 
     python benchmarks/hostile.py [--robots 20] [--seconds 8] [--only NAME] [--out FILE]
 
-For each attack of benchmarks/attacks.py: a quiet window, the attack for as long as it takes (at least as
-long), a rest.  "Others" send 5 commands a second each, kept; latency counts from the planned time; goodput is
-the share of commands planned in the window that came back as a pose.  The quiet window before each attack is
-its own yardstick, so that a slower machine slows both.  Attackers have their own machines: this one starts,
-and makes its messages, before the quiet window.
+For each attack of benchmarks/attacks.py: a quiet window, the attack (at least as long), a pause.  "Others" send
+5 commands per second each, kept; latency counts from the planned time; goodput is the share of commands planned
+in the window that returned a pose.  Each attack is compared with the quiet window before it, so that a slower
+machine slows both.  The attacker starts and prepares its messages before the quiet window, because real
+attackers have machines of their own.
 
 Defends (issue 7): memory of the servers < +64 MiB, every attacker refused or cut off, others' p99 < 2x
 of quiet (1.5x beside one robot at 100 times its rate, goodput >= 99 %), 0 robots dropped.
@@ -31,7 +31,7 @@ from attacks import ATTACKS
 
 from rse_pf.config import PlatformSettings
 from rse_pf.experiments.load.swarm import Swarm, SwarmOptions
-from rse_pf.experiments.results.report import CommandRecord
+from rse_pf.experiments.results.records import CommandRecord
 from rse_pf.local.control.platform import LocalPlatform
 
 REST_S = 3.0
@@ -132,7 +132,7 @@ async def run(names: Sequence[str], robots: int, seconds: float, folder: Path) -
         row["quiet"] = seen(result.commands, row["quiet_s"], row["began_s"])
         row["others"] = seen(result.commands, row["began_s"], row["ended_s"])
         row["dropped"] = sum(row["began_s"] <= at < row["ended_s"] for at in dropped)
-        row["twice"] = result.twice
+        row["twice"] = result.duplicates
     return rows
 
 

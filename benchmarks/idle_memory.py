@@ -1,9 +1,9 @@
-"""Measure what an idle robot costs a server: resident memory of all its processes, and idle CPU.
+"""Measure the cost of an idle robot on a server: resident memory of all processes, and idle CPU.
 
     python benchmarks/idle_memory.py [--robots 2000] [--workers 2] [--out FILE]
 
-Prints machine, n, KiB a robot, and CPU ms a second with all of them connected and silent.
-Defends: <= 64 KiB a robot in all our processes.
+Prints machine, n, KiB per robot, and CPU ms per second while all robots are connected and idle.
+Defends: <= 64 KiB per robot in all processes of the server.
 """
 
 from __future__ import annotations

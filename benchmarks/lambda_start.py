@@ -1,6 +1,6 @@
-"""What a cold start of the serverless PnP costs in processor time: import, set up, first solve.
+"""CPU time of a cold start of the serverless PnP: import, set-up, first solve.
 
-Each run is a fresh process; fetching the keys from S3 is left out, it costs time but no processor.
+Each run is a fresh process; fetching the keys from S3 is left out, because it takes time but no CPU.
 ``python benchmarks/lambda_start.py --out FILE``; run it in build/lambda's own Python for its own figures.
 """
 

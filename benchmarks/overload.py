@@ -1,12 +1,12 @@
-"""What one small server still delivers when it is offered 0.9, 2 and 5 times what it can do.
+"""Goodput of one small server at 0.9, 2 and 5 times its capacity.
 
     python benchmarks/overload.py [--seconds 20] [--emulated-cores 0.25] [--threads 1]
         [--codec zlib] [--out FILE]
 
-Real PnP (200 matches, 30 % wrong), open loop: Poisson send times fixed beforehand, latency from the planned
-time, a deadline of 250 ms, every frame kept.  Phases 0.9, 2, 0.9, 5, 0.9 in one run, so that a slower machine
-slows all alike.  Capacity is measured first, in a closed loop.  Messages are encoded beforehand and travel
-over plain sockets with a zero mask, so that the generator stays below half a core; its CPU is printed.
+Real PnP (200 matches, 30 % wrong), open loop: Poisson send times fixed before the run, latency from the
+planned time, a deadline of 250 ms, every frame kept.  Phases 0.9, 2, 0.9, 5, 0.9 in one run, so that a slower
+machine slows all of them.  Capacity is measured first, in a closed loop.  Messages are encoded before the run
+and sent over plain sockets with a zero mask, so that the generator stays below half a core; its CPU is printed.
 
 Defends: goodput at 2x >= 95 % and at 5x >= 90 % of that at 0.9x; wasted work <= 5 %; refusals p99 <= 50 ms,
 all busy or expired, with retry_after_ms; back to normal <= 2 s after the load; /readyz and /status < 250 ms.

@@ -1,10 +1,10 @@
-"""Round trip and CPU a command through a real server: 1 robot, and 100 robots at 5 frames a second.
+"""Round trip and CPU per command through a real server: 1 robot, and 100 robots at 5 frames per second.
 
     python benchmarks/round_trip.py [--seconds 4] [--workers 2] [--out FILE]
 
 Echo and real PnP (200 matches, 30 % wrong), JSON+zlib and binary.  One robot asks as fast as it is
-answered; a hundred send at times that were fixed beforehand, and their round trip counts from those.
-CPU is that of the server's whole process tree.  Prints the robots' own CPU too: they share the cores.
+answered; a hundred send at times that were fixed before the run, and their round trip counts from those.
+CPU is that of all processes of the server.  The CPU of the robots, which share the cores, is printed too.
 """
 
 from __future__ import annotations

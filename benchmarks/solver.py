@@ -1,9 +1,8 @@
-"""Measure the PnP engines, and what the evidence of `solve_pnp` costs on top of the bare solver.
+"""Measure the PnP engines, and the cost of the evidence of `solve_pnp` above the bare solver.
 
 Defends: at least 99.5 % right poses at 10-50 % wrong matches with both engines, and with PoseLib at
 70 %; thread CPU of `solve_pnp` at most 1.35 times the bare PoseLib call (200 matches, 30 %).
-Promises to write nothing but ``--out``, and to judge nothing: figures from a busy machine are the
-reader's to discard, which is why the load average stands beside them.
+The load average stands beside the figures: discard those of a busy machine.
 
     python benchmarks/solver.py --out solver.json
 """

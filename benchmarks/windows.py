@@ -1,4 +1,4 @@
-"""What robots noticed in a window of time: shared by the benchmarks that load a platform and disturb it."""
+"""Figures of a time window: shared by the benchmarks that load a platform and inject faults."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ from typing import Any
 
 import numpy as np
 
-from rse_pf.experiments.results.report import CommandRecord
+from rse_pf.experiments.results.records import CommandRecord
 
 
 def poses(commands: list[CommandRecord], begin_s: float, end_s: float) -> dict[str, Any]:
-    """Return how long poses took whose frame was planned from *begin_s* to *end_s*, and what got none."""
+    """Return latencies and unanswered frames of poses planned from *begin_s* to *end_s*."""
     chosen = [each for each in commands if begin_s <= each.planned < end_s]
     took = [
         (each.answered - each.planned) * 1e3

@@ -1,11 +1,10 @@
-"""Build what the cloud boots from: a folder of wheels for the servers, an unpacked folder for the function.
+"""Build the packages of the cloud: a folder of wheels for the servers, an unpacked folder for the function.
 
     python scripts/assets.py [--into build]
 
-Reads the hashed locks alone, takes finished wheels only, and gives the same bytes again: the clock of every
-entry is SOURCE_DATE_EPOCH (default: the first second that a zip can hold).  Does nothing when neither a lock
-nor a source changed since, and needs the network only for a changed lock.  Promises to run nothing that it
-downloads.
+Installs wheels only, by the hashes of the locks, and runs nothing that it downloads.  The build is
+reproducible: the time of every entry is SOURCE_DATE_EPOCH (default: the earliest of a zip file).  Nothing is
+built when neither a lock nor a source has changed; the network is needed only for a changed lock.
 """
 
 from __future__ import annotations
@@ -21,18 +20,18 @@ import zipfile
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
-ROOMS = ("rse_pf", "client_sdk", "lambda_pnp")
+PACKAGES = ("rse_pf", "client_sdk", "lambda_pnp")
 EPOCH = "315532800"
 LAMBDA_PACKAGES = ("rse_pf", "lambda_pnp")
-NEEDLESS = ("tests", "__pycache__", "f2py", "_pyinstaller", "include", "testing")
-"""Folders of wheels that no command ever reads."""
-NEEDLESS_ENDINGS = (".pyi", ".pxd", ".c", ".h", ".a")
+UNUSED = ("tests", "__pycache__", "f2py", "_pyinstaller", "include", "testing")
+"""Folders of wheels that are never used at run time."""
+UNUSED_ENDINGS = (".pyi", ".pxd", ".c", ".h", ".a")
 DEBIAN_12 = ("3.11", 36)
 AMAZON_2023 = ("3.13", 34)
 
 
 def main() -> int:
-    """Build both folders, or say in two lines why not."""
+    """Build both folders, or print in two lines why that failed."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--into", type=Path, default=ROOT / "build", metavar="DIR")
     into = parser.parse_args().into
@@ -48,7 +47,9 @@ def main() -> int:
             _wheelhouse(into / "wheelhouse", ours, into / "downloads" / "boot")
             _function(into / "lambda", ours, into / "downloads" / "lambda")
     except subprocess.CalledProcessError as error:
-        sys.stderr.write(f"assets: pip {error.cmd[3]} failed\n  hint: look above; is the network there?\n")
+        sys.stderr.write(
+            f"assets: pip {error.cmd[3]} failed\n  hint: read the output above, and check the network\n"
+        )
         return 2
     stamp.write_text(wanted, encoding="utf-8")
     for name in ("wheelhouse", "lambda"):
@@ -58,7 +59,12 @@ def main() -> int:
 
 
 def _sources() -> list[Path]:
-    files = [file for room in ROOMS for file in (ROOT / room).rglob("*") if file.suffix in (".py", ".typed")]
+    files = [
+        file
+        for package in PACKAGES
+        for file in (ROOT / package).rglob("*")
+        if file.suffix in (".py", ".typed")
+    ]
     files += [ROOT / name for name in ("pyproject.toml", "README.md", "LICENSE")]
     return sorted(file for file in files if "__pycache__" not in file.parts)
 
@@ -71,7 +77,7 @@ def _state_of_the_sources() -> str:
 
 
 def _our_wheel(work: Path) -> Path:
-    """Build our own wheel from a copy, so that nothing of an older build gets in."""
+    """Build our own wheel from a copy, without files of an earlier build."""
     copy = work / "source"
     for file in _sources():
         target = copy / file.relative_to(ROOT)
@@ -86,7 +92,7 @@ def _our_wheel(work: Path) -> Path:
 
 
 def _wheelhouse(folder: Path, ours: Path, wheels: Path) -> None:
-    """Put all wheels of a server into *folder*, with a list that pip checks by hash."""
+    """Put all wheels of a server into *folder*, with a list of their hashes for pip."""
     _empty(folder)
     _download(ROOT / "locks/boot.txt", wheels, *DEBIAN_12)
     for wheel in (*wheels.glob("*.whl"), ours):
@@ -99,7 +105,7 @@ def _wheelhouse(folder: Path, ours: Path, wheels: Path) -> None:
 
 
 def _function(folder: Path, ours: Path, wheels: Path) -> None:
-    """Unpack the function's wheels into *folder*, without what never runs."""
+    """Unpack the function's wheels into *folder*, without files that are never used."""
     _empty(folder)
     _download(ROOT / "locks/lambda.txt", wheels, *AMAZON_2023)
     for wheel in sorted(wheels.glob("*.whl")):
@@ -111,8 +117,8 @@ def _unpack(wheel: Path, folder: Path, only: tuple[str, ...] | None) -> None:
     with zipfile.ZipFile(wheel) as archive:
         for name in sorted(archive.namelist()):
             parts = Path(name).parts
-            needless = set(parts[:-1]) & set(NEEDLESS) or name.endswith((*NEEDLESS_ENDINGS, "/"))
-            if needless or (only and parts[0] not in only and not parts[0].endswith(".dist-info")):
+            unused = set(parts[:-1]) & set(UNUSED) or name.endswith((*UNUSED_ENDINGS, "/"))
+            if unused or (only and parts[0] not in only and not parts[0].endswith(".dist-info")):
                 continue
             target = folder / name
             target.parent.mkdir(parents=True, exist_ok=True)
