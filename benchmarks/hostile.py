@@ -2,11 +2,11 @@
 
     python benchmarks/hostile.py [--robots 20] [--seconds 8] [--only NAME] [--out FILE]
 
-For each attack of benchmarks/attacks.py: a quiet window, the attack (at least as long), a pause.  "Others" send
-5 commands per second each, kept; latency counts from the planned time; goodput is the share of commands planned
-in the window that returned a pose.  Each attack is compared with the quiet window before it, so that a slower
-machine slows both.  The attacker starts and prepares its messages before the quiet window, because real
-attackers have machines of their own.
+For each attack of benchmarks/attacks.py: a quiet window, the attack (at least as long), a pause.  "Others"
+send 5 commands per second each, kept; latency counts from the planned time; goodput is the share of commands
+planned in the window that returned a pose.  Each attack is compared with the quiet window before it, so that
+a slower machine slows both.  The attacker starts and prepares its messages before the quiet window, because
+real attackers have machines of their own.
 
 Defends (issue 7): memory of the servers < +64 MiB, every attacker refused or cut off, others' p99 < 2x
 of quiet (1.5x beside one robot at 100 times its rate, goodput >= 99 %), 0 robots dropped.

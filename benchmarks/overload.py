@@ -5,8 +5,9 @@
 
 Real PnP (200 matches, 30 % wrong), open loop: Poisson send times fixed before the run, latency from the
 planned time, a deadline of 250 ms, every frame kept.  Phases 0.9, 2, 0.9, 5, 0.9 in one run, so that a slower
-machine slows all of them.  Capacity is measured first, in a closed loop.  Messages are encoded before the run
-and sent over plain sockets with a zero mask, so that the generator stays below half a core; its CPU is printed.
+machine slows all of them.  Capacity is measured first, in a closed loop.  Messages are encoded before the
+run and sent over plain sockets with a zero mask, so that the generator stays below half a core; its CPU is
+printed.
 
 Defends: goodput at 2x >= 95 % and at 5x >= 90 % of that at 0.9x; wasted work <= 5 %; refusals p99 <= 50 ms,
 all busy or expired, with retry_after_ms; back to normal <= 2 s after the load; /readyz and /status < 250 ms.
