@@ -35,6 +35,7 @@ from benchmarks.map_recordings import (
 )
 from client_sdk.datasets import Dataset, open_dataset
 from rse_pf.geometry import Array, exp_se3, inverse, pose_difference
+from rse_pf.service import Report
 from rse_pf.services.mapping.icp import align
 from rse_pf.services.mapping.localise import locate
 from rse_pf.services.mapping.loop_consistency import LoopClosure
@@ -46,7 +47,7 @@ from rse_pf.services.mapping.map_merge import (
     merge_versions,
     propose_links,
 )
-from rse_pf.services.mapping.optimise import Report, optimise_graph
+from rse_pf.services.mapping.optimise import optimise_graph
 from rse_pf.services.mapping.place import PlaceIndex
 from rse_pf.services.mapping.relative_pose import View
 from rse_pf.services.mapping.wifi import Locator, fingerprint_of

@@ -17,9 +17,10 @@ import numpy.typing as npt
 from rse_pf.errors import BadRequest
 from rse_pf.geometry import Array, inverse
 from rse_pf.maps.format import Edge, Keyframe, MapVersion
+from rse_pf.service import Report
 from rse_pf.services.mapping.cloud_deform import deform_clouds
 from rse_pf.services.mapping.loop_consistency import LoopClosure, OdometryNoise, consistent
-from rse_pf.services.mapping.optimise import OptimiseOptions, Report, ignore_progress, optimise_graph
+from rse_pf.services.mapping.optimise import OptimiseOptions, ignore_progress, optimise_graph
 from rse_pf.services.mapping.place import PlaceIndex
 from rse_pf.services.mapping.pose_graph import PoseGraph
 from rse_pf.services.mapping.relative_pose import RelativePoseOptions, measure_relative_pose

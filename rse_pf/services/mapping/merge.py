@@ -9,9 +9,9 @@ import msgspec
 
 from rse_pf.errors import BadRequest, LimitExceeded
 from rse_pf.maps.format import MapVersion, decode_map, encode_map
-from rse_pf.service import Registry
+from rse_pf.service import Registry, Report
 from rse_pf.services.mapping.map_merge import MergedMap, MergeOptions, merge_versions
-from rse_pf.services.mapping.optimise import Report, ignore_progress
+from rse_pf.services.mapping.optimise import ignore_progress
 from rse_pf.services.mapping.place import MAX_KEYFRAMES
 
 __all__ = ["MergeReply", "MergeRequest", "NotJoined", "Refusal", "merge_maps", "register"]

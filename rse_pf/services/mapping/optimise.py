@@ -5,7 +5,6 @@ The same request has the same answer, which never fits worse than the given pose
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,7 +14,7 @@ import numpy.typing as npt
 
 from rse_pf.errors import BadRequest, LimitExceeded, MissingExtra
 from rse_pf.geometry import Array
-from rse_pf.service import Registry
+from rse_pf.service import Registry, Report
 from rse_pf.services.mapping.pose_graph import PoseGraph, components, read_g2o, write_g2o
 
 __all__ = [
@@ -23,7 +22,6 @@ __all__ = [
     "OptimiseReply",
     "OptimiseRequest",
     "OptimisedGraph",
-    "Report",
     "ignore_progress",
     "optimise_graph",
     "register",
@@ -31,9 +29,6 @@ __all__ = [
 ]  # fmt: skip
 
 Rows = npt.NDArray[np.int64]
-
-Report = Callable[[float, str], None]
-"""Called with the share that is done (0..1) and what is being done; raises Cancelled to end the work."""
 
 _ANCHOR_SIGMA = 1e-6
 _RELATIVE_CHANGE = 1e-7

@@ -8,6 +8,7 @@ import pytest
 from rse_pf.errors import Cancelled, MissingExtra
 from rse_pf.geometry import Array, exp_se3, inverse, pose_difference
 from rse_pf.maps.format import MapVersion, decode_map, encode_map
+from rse_pf.service import Report
 from rse_pf.services.mapping.loop_consistency import LoopClosure, OdometryNoise, consistent, largest_clique
 from rse_pf.services.mapping.map_merge import (
     Atlas,
@@ -18,7 +19,7 @@ from rse_pf.services.mapping.map_merge import (
     propose_links,
 )
 from rse_pf.services.mapping.merge import MergeRequest, merge_maps
-from rse_pf.services.mapping.optimise import Report, ignore_progress
+from rse_pf.services.mapping.optimise import ignore_progress
 from rse_pf.services.synthetic_maps import make_world
 
 for package in ("faiss", "gtsam"):
