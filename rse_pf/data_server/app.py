@@ -111,9 +111,9 @@ class DataServer:
             trace = uuid.uuid4().hex
             line |= {"code": InternalError.code, "trace": trace, "error": repr(error)[:500]}
             reply = failure_reply(InternalError("the data server failed", hint=f"search its log for {trace}"))
-        max_bytes = self._settings.data.part_bytes  # what is drained, so that the robot gets the reply
+        # A small body is drained, so that the robot reads the reply before the connection is closed.
         if not request.is_complete and (
-            reply.status == _REQUEST_TIMEOUT or not await request.drain(max_bytes)
+            reply.status == _REQUEST_TIMEOUT or not await request.drain(self._settings.data.part_bytes)
         ):
             reply = dataclasses.replace(reply, headers={**reply.headers, "Connection": "close"})
         return reply
@@ -158,7 +158,9 @@ class DataServer:
             )  # fmt: skip
         except Unauthorized as error:
             line["reason"] = token_problem(error)
-            self._record_refusal(line["reason"])
+            if self._audit is not None and self._refusals.take(line["reason"], self._clock()):
+                self.record_counted()
+                self._audit.record("auth.refused", reason=line["reason"])
             raise
         line["robot"] = claims.robot
         if not scopes_allow(claims.scopes, scope, name):
@@ -171,11 +173,6 @@ class DataServer:
         if self._audit is not None and counted:
             now, who = self._wall_clock(), self._audit.who
             self._audit.add([Note(time=now, actor=who, action="auth.refused-many", detail=counted)])
-
-    def _record_refusal(self, reason: str) -> None:
-        if self._audit is not None and self._refusals.take(reason, self._clock()):
-            self.record_counted()
-            self._audit.record("auth.refused", reason=reason)
 
 
 async def _send(reply: HttpReply, request: HttpRequest, send: Send) -> int:

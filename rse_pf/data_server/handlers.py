@@ -40,8 +40,8 @@ from rse_pf.object_store import ObjectStore, PresigningStore, read_range
 __all__ = ["Handler", "Handlers"]
 
 _T = TypeVar("_T")
+# Gets a request, the claims of its token, and the parameters of its path.
 Handler = Callable[[HttpRequest, Claims, dict[str, str]], Awaitable[HttpReply]]
-"""Gets a request, the claims of its token, and the parameters of its path."""
 
 _PIECE_BYTES = 1 << 20
 _MAX_JSON_BYTES = 16384
@@ -103,8 +103,10 @@ class Handlers:
     async def head_object(self, request: HttpRequest, claims: Claims, path: dict[str, str]) -> HttpReply:
         """Return the size."""
         info = await asyncio.to_thread(self.objects.head, claims, path["digest"])
-        headers = {**_content_headers(path["digest"]), "Content-Length": str(info.size)}
-        return HttpReply(status=200, headers=headers, media_type=BYTES)
+        return HttpReply(
+            status=200, headers={**_content_headers(path["digest"]), "Content-Length": str(info.size)},
+            media_type=BYTES,
+        )  # fmt: skip
 
     async def put_object(self, request: HttpRequest, claims: Claims, path: dict[str, str]) -> HttpReply:
         """Store a small object."""
@@ -161,10 +163,8 @@ class Handlers:
         """List maps with their heads."""
         maps = self._maps(claims)
 
-        def named() -> MapPage:
-            return MapPage(maps=[MapName(name=name, head=maps.head(name).id) for name in maps.names()])
-
-        return json_reply(200, await asyncio.to_thread(named))
+        found = await asyncio.to_thread(lambda: {name: maps.head(name).id for name in maps.names()})
+        return json_reply(200, MapPage(maps=[MapName(name=name, head=head) for name, head in found.items()]))
 
     async def list_versions(self, request: HttpRequest, claims: Claims, path: dict[str, str]) -> HttpReply:
         """List versions."""
@@ -204,10 +204,9 @@ class Handlers:
         """Move a head."""
         move = await _json_body(request, MoveHead)
 
-        def work() -> MapRecord:
-            return self._maps(claims).move_head(path["name"], move.version, expected=move.expected)
-
-        return _version(200, await asyncio.to_thread(work))
+        maps = self._maps(claims)
+        record = await asyncio.to_thread(maps.move_head, path["name"], move.version, expected=move.expected)
+        return _version(200, record)
 
     def _maps(self, claims: Claims) -> MapRegistry:
         def record_change(action: str, name: str, record: MapRecord) -> None:

@@ -63,7 +63,6 @@ _STATUS: dict[type[RsePfError], int] = {
     Unauthorized: 401, Forbidden: 403, NotFound: 404, Expired: 408, Conflict: 409, LimitExceeded: 413,
     QuotaExceeded: 413, BadRequest: 400, Busy: 503, StoreFull: 507, StoreError: 503,
 }  # fmt: skip
-_INTERNAL = 500
 _RANGE = re.compile(r"bytes=(\d{0,18})-(\d{0,18})")
 
 
@@ -156,10 +155,11 @@ class HttpRequest:
             self.received_bytes += len(piece)
             self.is_complete = not message.get("more_body", False)
             yield piece
-            lasted = self._clock() - began
-            lowest = _MIN_BODY_BYTES_PER_S
-            if not self.is_complete and lasted > _BODY_GRACE_S and self.received_bytes < lowest * lasted:
-                raise _too_slow(f"{self.received_bytes} bytes in {lasted:.1f} s; at least {lowest} a second")
+            took_s, min_rate = self._clock() - began, _MIN_BODY_BYTES_PER_S
+            if not self.is_complete and took_s > _BODY_GRACE_S and self.received_bytes < min_rate * took_s:
+                raise _too_slow(
+                    f"{self.received_bytes} bytes in {took_s:.1f} s; at least {min_rate} a second"
+                )
 
 
 def json_reply(status: int, value: Any, headers: Mapping[str, str] | None = None) -> HttpReply:
@@ -169,7 +169,7 @@ def json_reply(status: int, value: Any, headers: Mapping[str, str] | None = None
 
 def failure_reply(error: RsePfError) -> HttpReply:
     """Return the reply that reports *error*."""
-    status = next((_STATUS[kind] for kind in type(error).__mro__ if kind in _STATUS), _INTERNAL)
+    status = next((_STATUS[kind] for kind in type(error).__mro__ if kind in _STATUS), 500)
     headers: dict[str, str] = {}
     if isinstance(error, MethodNotAllowed):
         headers["Allow"] = error.allowed

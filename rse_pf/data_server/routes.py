@@ -288,11 +288,9 @@ _DESCRIPTIONS = {
 
 def openapi() -> dict[str, Any]:
     """Return the document as JSON values, OpenAPI 3.1."""
-    types = {kind for route in ROUTES for kind in (route.body, *route.replies.values())} | {HttpFailure}
-    structs = sorted((kind for kind in types if _is_struct(kind)), key=lambda kind: kind.__name__)
-    listed = [kind for kind in types if kind not in (None, bytes, dict) and not _is_struct(kind)]
+    types = {kind for route in ROUTES for kind in (route.body, *route.replies.values())} - {None, bytes, dict}
     _, components = msgspec.json.schema_components(
-        [*structs, *listed], ref_template="#/components/schemas/{name}"
+        [HttpFailure, *sorted(types, key=str)], ref_template="#/components/schemas/{name}"
     )
     paths: dict[str, dict[str, Any]] = {}
     for route in ROUTES:
@@ -367,7 +365,3 @@ def _content(kind: Any) -> dict[str, Any]:
         return {_JSON: {"schema": {"type": "object"}}}
     (schema,), _ = msgspec.json.schema_components([kind], ref_template="#/components/schemas/{name}")
     return {_JSON: {"schema": schema}}
-
-
-def _is_struct(kind: Any) -> bool:
-    return isinstance(kind, type) and issubclass(kind, msgspec.Struct)

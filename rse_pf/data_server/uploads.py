@@ -155,7 +155,7 @@ class Objects:
                 if info is None:
                     raise NotFound("no such upload", hint="begin it with PUT")
                 return self._state(digest, info.size, info.size)
-            received = self._offset(claims, digest)
+            received = sum(part.size for part in self._stored_parts(claims, digest))
             if offset != received:
                 raise Conflict(
                     f"the upload is at offset {received}, not {offset}", hint=f"continue at offset {received}"
@@ -190,7 +190,7 @@ class Objects:
 
     def _resumed(self, claims: Claims, digest: str, name: str, size: int) -> Upload:
         """Return the state of an upload; complete one whose server ended after the last part was stored."""
-        offset = self._offset(claims, digest)
+        offset = sum(part.size for part in self._stored_parts(claims, digest))
         if offset == size:
             self._assemble(claims, digest, name, size)
         return self._state(digest, size, offset)
@@ -237,9 +237,6 @@ class Objects:
             if begins == at:
                 at += part.size
                 yield part
-
-    def _offset(self, claims: Claims, digest: str) -> int:
-        return sum(part.size for part in self._stored_parts(claims, digest))
 
     def _state(self, digest: str, size: int, offset: int) -> Upload:
         return Upload(digest=digest, size=size, offset=offset, part_bytes=self._settings.part_bytes)

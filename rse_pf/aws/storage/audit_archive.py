@@ -60,16 +60,11 @@ def fetch_audit(store: ObjectStore, folder: Path) -> list[str]:
 
 def _unseen(data: bytes, seen: set[bytes]) -> Iterator[bytes]:
     """Yield the lines that no earlier piece had: an agent that lost its marks uploads some lines twice."""
-    for line in _lines(data):
+    for line in re.findall(rb"[^\n]*\n|[^\n]+", data):
         digest = hashlib.sha256(line).digest()
         if digest not in seen:
             seen.add(digest)
             yield line
-
-
-def _lines(data: bytes) -> list[bytes]:
-    *lines, rest = data.split(b"\n")
-    return [line + b"\n" for line in lines] + ([rest] if rest else [])
 
 
 def _write(folder: Path, chain: str, first: int, lines: list[bytes]) -> None:

@@ -92,7 +92,7 @@ class Shipper:
                 with contextlib.suppress(Conflict):  # the same bytes arrived before, and their mark was lost
                     self._store.compare_and_swap(name, None, piece.data)
                 marks[who] = piece.after
-                self._remember(marks)
+                replace_json(self._marks_file, {each: asdict(mark) for each, mark in marks.items()})
                 count += 1
         return count
 
@@ -103,9 +103,6 @@ class Shipper:
             return {str(who): _Mark(**row) for who, row in rows.items()}
         except (FileNotFoundError, ValueError, TypeError, AttributeError):
             return {}
-
-    def _remember(self, marks: dict[str, _Mark]) -> None:
-        replace_json(self._marks_file, {who: asdict(mark) for who, mark in marks.items()})
 
 
 def piece_name(instance: str, who: str, first: int, data: bytes) -> str:

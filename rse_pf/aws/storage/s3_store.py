@@ -51,15 +51,9 @@ class S3Store:
         if length <= 0:
             return b""
 
-        def piece() -> bytes:
-            wanted = f"bytes={start}-{start + length - 1}"
-            found = self._client.get_object(Bucket=self._bucket, Key=check_name(name), Range=wanted)
-            data: bytes = found["Body"].read()
-            return data
-
         with _as_store_errors(name):
             try:
-                return with_retries(piece)
+                return self._get(check_name(name), Range=f"bytes={start}-{start + length - 1}")[0]
             except ClientError as error:
                 if status_of(error) == _RANGE_OUTSIDE:
                     return b""
@@ -134,13 +128,16 @@ class S3Store:
         return str(self._client.generate_presigned_url("get_object", Params=place, ExpiresIn=ttl_s))
 
     def _read(self, name: str) -> tuple[bytes, str]:
-        def whole() -> tuple[bytes, str]:
-            found = self._client.get_object(Bucket=self._bucket, Key=name)
-            return found["Body"].read(), found["ETag"]
-
         check_name(name)
         with _as_store_errors(name):
-            return with_retries(whole)
+            return self._get(name)
+
+    def _get(self, name: str, **more: str) -> tuple[bytes, str]:
+        def get() -> tuple[bytes, str]:
+            found = self._client.get_object(Bucket=self._bucket, Key=name, **more)
+            return found["Body"].read(), found["ETag"]
+
+        return with_retries(get)
 
     def _write(self, name: str, data: bytes, **condition: str) -> None:
         tries = 0
