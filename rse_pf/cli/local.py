@@ -229,7 +229,10 @@ def _welcome(platform: Any, name: str) -> None:
 def _show(event: Any) -> None:
     text = _TEXTS.get(event["event"])
     if text is not None:
-        values = {key: ", ".join(map(str, value)) if isinstance(value, list) else value for key, value in event.items()}
+        values = {
+            key: ", ".join(map(str, value)) if isinstance(value, list) else value
+            for key, value in event.items()
+        }
         print(text.format_map(collections.defaultdict(lambda: "-", values)), flush=True)
 
 

@@ -43,7 +43,7 @@ class ServerPlacement:
 
     @classmethod
     def read(cls, file: Path | None, settings: PlatformSettings, **changes: Any) -> ServerPlacement:
-        """Return the placement in a settings file with *changes*; *settings* say what both leave out.
+        """Return the placement in a settings file with *changes*; *settings* say the rest.
 
         Raises:
             SettingsError: The file cannot be read, or holds a value that no such setting may have.
@@ -53,7 +53,7 @@ class ServerPlacement:
         try:
             document = json.loads(file.read_text(encoding="utf-8"))
         except (OSError, ValueError) as error:
-            raise SettingsError(f"cannot read {file}: {error}", hint="name another with --settings") from error
+            raise SettingsError(f"cannot read {file}: {error}", hint="name another file") from error
         placed = document.get(_FILE_KEY, {})
         unknown = set(placed) - set(cls.__slots__) if isinstance(placed, dict) else {_FILE_KEY}
         if unknown:

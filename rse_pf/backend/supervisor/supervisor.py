@@ -455,7 +455,7 @@ class _Supervisor:
         return _json({"robots": asked, "spread_s": last_s, "under_way": False}, status=202)
 
     def _migrate(self, robots: int, spread_s: float) -> tuple[int, float]:
-        """Order the workers to ask *robots* to move; return how many are asked, and when the last one is, s."""
+        """Order the workers to ask *robots* to move; return how many are asked, and the time that takes."""
         delays = plan(
             [worker.load for worker in self._workers], robots, spread_s=spread_s,
             moves_per_s=self._settings.scaling.moves_per_s, random=random.random,

@@ -21,7 +21,7 @@ def test_a_server_on_loopback_needs_no_authentication(host: str) -> None:
 def test_a_server_that_other_machines_reach_needs_authentication() -> None:
     settings = PlatformSettings.from_dict({**OPEN, "serving": {"host": "0.0.0.0"}})
 
-    with pytest.raises(ConfigurationError, match="auth.required") as told:
+    with pytest.raises(ConfigurationError, match=r"auth\.required") as told:
         check_authentication(settings, None, False)
 
     assert "127.0.0.1" in told.value.hint
