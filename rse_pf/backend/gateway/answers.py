@@ -150,10 +150,11 @@ class Answers:
         connection.write(data)
         if envelope is None:
             return
-        self._metrics.answered(self.label(envelope.service), Busy.code, 0.0)
+        service = self.label(envelope.service)
+        self._metrics.answered(service, Busy.code, 0.0)
         if self._log.writes("debug"):
             self._log.debug(
-                "command", robot=connection.robot, service=self.label(envelope.service), id=envelope.id,
+                "command", robot=connection.robot, service=service, id=envelope.id,
                 trace="", code=Busy.code, queue_ms=0.0, compute_ms=0.0, bytes_in=size_bytes,
                 bytes_out=len(data),
             )  # fmt: skip

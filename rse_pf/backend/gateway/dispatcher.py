@@ -22,7 +22,7 @@ from rse_pf.backend.gateway.token_watch import TokenWatch
 from rse_pf.backend.log import JsonLog
 from rse_pf.backend.metrics import LongestRecently, Metrics
 from rse_pf.backend.ports import Clocks, Handle, Loop, Wire
-from rse_pf.backend.scheduling.cpu_throttle import CpuThrottle, NoThrottle
+from rse_pf.backend.scheduling.cpu_throttle import BATCH_S, CpuThrottle, NoThrottle
 from rse_pf.backend.scheduling.scheduler import (
     QUEUE_TARGET_S,
     QueuedCommand,
@@ -219,11 +219,10 @@ class Dispatcher:
         if refusal is None or envelope is None or self._queue_of(envelope.service) != "scheduler":
             return False
         scheduler.note_refused(now)
-        send = partial(self._answers.send_unread_refusal, connection, envelope, refusal, len(data))
-        if self._throttle_timer is not None and self._throttle.batch_s:
-            self._batch(send)
+        if self._throttle_timer is None:
+            self._answers.send_unread_refusal(connection, envelope, refusal, len(data))
         else:
-            send()
+            self._batch(partial(self._answers.send_unread_refusal, connection, envelope, refusal, len(data)))
         return True
 
     def refuses_long(self, connection: RobotConnection, data: bytes) -> bool:
@@ -371,7 +370,7 @@ class Dispatcher:
     def _batch(self, send: Callable[[], None]) -> None:
         """Call *send* together with the others of its batch."""
         if not self._batched:
-            self._loop.call_later(self._throttle.batch_s, self._send_batch)
+            self._loop.call_later(BATCH_S, self._send_batch)
         self._batched.append(send)
 
     def _send_batch(self) -> None:

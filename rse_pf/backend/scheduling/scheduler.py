@@ -120,7 +120,7 @@ class Scheduler:
 
         Half of the target is kept in reserve, so that a command that is queued is served.
         """
-        return self._wanted_s / 2 if self.is_behind else math.inf
+        return max(QUEUE_TARGET_S / 2, self._service_s) if self.is_behind else math.inf
 
     def backlog(self, queued: QueuedCommand) -> tuple[int, float, float]:
         """Return how many commands of the robot wait, and how long *queued* and each turn would take, in
