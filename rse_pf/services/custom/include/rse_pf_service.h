@@ -1,7 +1,7 @@
 /* The C interface of an RSE-PF service, version 1.
  *
  * A service is a shared library that exports the functions below.  It runs in the robot's own isolated
- * environment: one process per robot, one thread, no network, its current folder is a private scratch folder.
+ * sandbox: one process per robot, one thread, no network, its current folder is a private scratch folder.
  *
  * Required:  rse_pf_service_abi, rse_pf_service_open, rse_pf_service_close, rse_pf_service_free, and at least
  *            one of rse_pf_service_call (JSON bytes) and rse_pf_service_call_arrays (typed arrays; preferred).
