@@ -107,7 +107,8 @@ def _with_atheris(options: argparse.Namespace) -> None:
             print(meter.line(), file=sys.stderr)
 
     command = [
-        sys.argv[0], f"-max_total_time={options.seconds:.0f}", f"-seed={options.seed}", f"-max_len={MAX_INPUT_BYTES}",
+        sys.argv[0], f"-max_total_time={options.seconds:.0f}", f"-seed={options.seed}",
+        f"-max_len={MAX_INPUT_BYTES}",
         f"-artifact_prefix={options.found}/", "-timeout=10", "-rss_limit_mb=1024", "-print_final_stats=1",
         str(folder), str(CORPUS / options.target),
     ]  # fmt: skip

@@ -28,7 +28,7 @@ from rse_pf.services.builtin import builtin_services
 from rse_pf.wire import Command, Failure, Result, make_codec
 from rse_pf.wire.envelope import peek
 
-__all__ = ["TARGETS", "TargetFailure", "Target", "codec", "framed", "frames", "geometry", "stream"]
+__all__ = ["TARGETS", "Target", "TargetFailure", "codec", "framed", "frames", "geometry", "stream"]
 
 Target = Callable[[bytes, Meter], None]
 
@@ -49,7 +49,7 @@ class TargetFailure(AssertionError):
 
 
 def codec(data: bytes, meter: Meter) -> None:
-    """Check the codec that the first byte selects with the rest as message; the fourth choice deflates it first.
+    """Check the codec that the first byte selects; the rest is the message, which the fourth choice deflates.
 
     Only protocol errors are raised; a decoded message survives encoding and decoding; a payload gives a
     request of a service or one of our errors.
@@ -189,7 +189,7 @@ def geometry(data: bytes, meter: Meter) -> None:
 
 
 def check_pose(answer: Result, points: np.ndarray) -> None:
-    """Raise `TargetFailure` unless the pose is a motion, and unless no line and no single point is called ok."""
+    """Raise `TargetFailure` unless the pose is rigid, and not ok for a line or a single point."""
     reply = answer.reply
     T = np.asarray(reply.T_camera_world).reshape(4, 4)
     _expect(bool(np.isfinite(T).all() and np.isfinite(reply.covariance).all()), "a pose that is not finite")
