@@ -23,7 +23,7 @@ from rse_pf.service import Registry, Service, dispatch, failure_of
 from rse_pf.wire import Command, Failure, Progress, Result
 from rse_pf.wire.envelope import Envelope, encode_refusal
 
-__all__ = ["Answer", "Answers"]
+__all__ = ["Answers", "EncodedAnswer"]
 
 _UNKNOWN = "unknown"
 _FREQUENT = ("ok", Busy.code, "stale")
@@ -31,7 +31,7 @@ _FREQUENT = ("ok", Busy.code, "stale")
 
 
 @dataclass(frozen=True, slots=True)
-class Answer:
+class EncodedAnswer:
     """The final answer to a command, and its bytes."""
 
     queued: QueuedCommand
@@ -79,7 +79,7 @@ class Answers:
         """Return whether `compute` would have to wait for the store."""
         return self._objects.named_by(command, service)
 
-    def compute(self, queued: QueuedCommand) -> Answer:
+    def compute(self, queued: QueuedCommand) -> EncodedAnswer:
         """Call the service and encode its answer; runs in the loop or in a thread, and touches nothing
         shared."""
         monotonic, command = self._clocks.monotonic, queued.command
@@ -102,7 +102,7 @@ class Answers:
         kept = self._objects.kept(message, answer.message, queued.owner)
         return answer if kept is answer.message else self._encoded(queued, kept)
 
-    def send(self, answer: Answer, now: float) -> None:
+    def send(self, answer: EncodedAnswer, now: float) -> None:
         """Write *answer*, unless its robot is gone; count and log it in any case."""
         queued, message = answer.queued, answer.message
         code = "ok" if isinstance(message, Result) else message.code
@@ -135,12 +135,12 @@ class Answers:
         self._metrics.shed[refusal.reason] += 1
         queued = refusal.queued
         failure = failure_of(refusal.error, queued.command, server=self._server_id)
-        self.send(Answer(queued, failure, queued.owner.session.codec.encode(failure)), now)
+        self.send(EncodedAnswer(queued, failure, queued.owner.session.codec.encode(failure)), now)
 
     def send_unread_refusal(
         self, connection: RobotConnection, envelope: Envelope | None, refusal: UnreadRefusal, size_bytes: int
     ) -> None:
-        """Answer a message that is not decoded; without *envelope* nobody knows which command it was."""
+        """Answer a message that is not decoded; *envelope* tells which command it is, if that is known."""
         self._metrics.shed[refusal.reason] += 1
         failure = Failure(
             id=None if envelope is None else envelope.id, code=Busy.code, message=refusal.message,
@@ -169,7 +169,7 @@ class Answers:
         offer."""
         return service if service in self._services else _UNKNOWN
 
-    def _encoded(self, queued: QueuedCommand, message: Result | Failure) -> Answer:
+    def _encoded(self, queued: QueuedCommand, message: Result | Failure) -> EncodedAnswer:
         codec, command = queued.owner.session.codec, queued.command
         try:
             data = codec.encode(message)
@@ -177,16 +177,16 @@ class Answers:
             self._log_defect(command, error)
             defect = InternalError(f"the reply of {command.service!r} cannot be encoded")
             message = failure_of(defect, command, server=self._server_id)
-            return Answer(queued, message, codec.encode(message))
+            return EncodedAnswer(queued, message, codec.encode(message))
         if len(data) <= self._max_message_bytes:
-            return Answer(queued, message, data)
+            return EncodedAnswer(queued, message, data)
         if isinstance(message, Result) and message.object and message.reply is not None:
             return self._encoded(queued, msgspec.structs.replace(message, reply=None))
         too_large = LimitExceeded(
             f"the reply has {len(data)} bytes, above {self._max_message_bytes}", hint="ask for less"
         )
         message = failure_of(too_large, command, server=self._server_id)
-        return Answer(queued, message, codec.encode(message))
+        return EncodedAnswer(queued, message, codec.encode(message))
 
     def _log_defect(self, command: Command, error: BaseException) -> None:
         text = "".join(traceback.format_exception(type(error), error, error.__traceback__))

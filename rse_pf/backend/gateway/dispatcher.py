@@ -11,7 +11,7 @@ from functools import partial
 from typing import Any
 
 from rse_pf.backend.gateway.admission import Admission
-from rse_pf.backend.gateway.answers import Answer, Answers
+from rse_pf.backend.gateway.answers import Answers, EncodedAnswer
 from rse_pf.backend.gateway.connection import ConnectionContext, RobotConnection
 from rse_pf.backend.gateway.decoder_thread import DecoderThread
 from rse_pf.backend.gateway.handshake import Accepted
@@ -318,7 +318,7 @@ class Dispatcher:
     def _run(self, queued: QueuedCommand) -> None:
         """Compute the answer to *queued*; in the event loop only one in each of its rounds.
 
-        Otherwise a slow round would hide the queue in the kernel, where nobody sees how long it is.
+        Otherwise a slow round would hide the queue in the kernel, where its length cannot be seen.
         """
         service = self._registry.get(queued.command.service)
         if not self._answers.blocks(queued.command, service) and self._scheduler.runs_inline(
@@ -331,11 +331,11 @@ class Dispatcher:
         else:
             self._threads.run(queued)
 
-    def _computed(self, answer: Answer) -> None:
+    def _computed(self, answer: EncodedAnswer) -> None:
         self._finish(answer)
         self._start()
 
-    def _finish(self, answer: Answer) -> None:
+    def _finish(self, answer: EncodedAnswer) -> None:
         now = self._clocks.monotonic()
         self._scheduler.done(answer.queued, now)
         self._answers.send(answer, now)

@@ -67,9 +67,7 @@ class RobotRates:
         """Return what to do with one more message of *robot* (tenant, name) at *now* (s); None: take it."""
         if not self.is_on:
             return None
-        known = self._robots.get(robot)
-        if known is None:
-            known = self._robots[robot] = self._new(now)
+        known = self._robots.get(robot) or self._added(robot, now)
         wait_s = known.bucket.take(now)
         if wait_s == 0.0:
             return None
@@ -81,9 +79,7 @@ class RobotRates:
 
     def ban(self, robot: tuple[str, str], now: float) -> None:
         """Refuse the handshakes of *robot*, cut off at *now* (s), for ``session.rate_ban_s``."""
-        known = self._robots.get(robot)
-        if known is None:
-            known = self._robots[robot] = self._new(now)
+        known = self._robots.get(robot) or self._added(robot, now)
         known.banned_until = now + self._limits.rate_ban_s
 
     def banned_s(self, robot: tuple[str, str], now: float) -> float:
@@ -100,7 +96,7 @@ class RobotRates:
             known.violations.popleft()
         return len(known.violations)
 
-    def _new(self, now: float) -> _Robot:
+    def _added(self, robot: tuple[str, str], now: float) -> _Robot:
         if len(self._robots) >= _MAX_NAMES:
             self._robots = _half(
                 {
@@ -109,7 +105,9 @@ class RobotRates:
                     if each.violations or each.banned_until > now or not each.bucket.is_full(now)
                 }
             )
-        return _Robot(TokenBucket(self._limits.max_commands_per_s, float(self._limits.command_burst)))
+        bucket = TokenBucket(self._limits.max_commands_per_s, float(self._limits.command_burst))
+        known = self._robots[robot] = _Robot(bucket)
+        return known
 
 
 class SourceRates:

@@ -134,7 +134,7 @@ class RobotSockets:
         """Serve the accepted socket *fd*, the server's *number*-th; *ended* is called once, at its end."""
         accepted = socket.socket(fileno=fd)
         accepted.setblocking(False)
-        # The kernel would keep megabytes for a reader who is slow, and tell nobody.
+        # Otherwise the kernel buffers megabytes for a slow reader, unnoticed.
         accepted.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, self._serving.write_buffer_bytes)
         pending = PendingSocket(_peer(accepted), self._serving.max_handshake_bytes, number)
         surplus = self._pending.enter(pending, pending.peer)
