@@ -1,1 +1,4 @@
-"""Services: typed requests to typed replies."""
+"""Services: functions from one typed request to one typed reply.
+
+Algorithms that robots call belong here; transport, scheduling and isolation do not.
+"""

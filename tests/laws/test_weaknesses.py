@@ -90,21 +90,22 @@ def text_files(repository: Path) -> list[str]:
     ]
 
 
-def test_bandit_finds_nothing_that_nobody_has_judged(repository: Path) -> None:
-    assert weaknesses(repository, SOURCES) <= HARMLESS.keys()
-
-
-def test_bandit_sees_a_shell_and_an_eval(repository: Path, tmp_path: Path) -> None:
+def test_bandit_finds_only_what_was_judged_and_sees_a_shell_and_an_eval(
+    repository: Path, tmp_path: Path
+) -> None:
     file = tmp_path / "bad.py"
     file.write_text("import subprocess\nsubprocess.run(input(), shell=True)\neval(input())\n")
 
-    assert {rule for _, rule in weaknesses(repository, [str(file)])} == {"B602", "B307"}
+    found = weaknesses(repository, [*SOURCES, str(file)])
+
+    assert {rule for name, rule in found if name == str(file)} == {"B602", "B307"}
+    assert {each for each in found if each[0] != str(file)} <= HARMLESS.keys()
 
 
 def test_no_key_lies_in_the_product_or_its_pages(repository: Path) -> None:
     files = [file for file in text_files(repository) if not file.startswith(("tests/", "benchmarks/"))]
     if not files:
-        pytest.skip("not a git checkout, so nobody knows which files belong to it")
+        pytest.skip("not a git checkout, so the files that belong to it are unknown")
 
     assert secrets(repository, files, *_QUICK) <= NO_SECRETS.keys()
 
@@ -114,7 +115,7 @@ def test_no_key_lies_in_the_product_or_its_pages(repository: Path) -> None:
 def test_no_secret_lies_anywhere_in_the_checkout(repository: Path) -> None:
     files = text_files(repository)
     if not files:
-        pytest.skip("not a git checkout, so nobody knows which files belong to it")
+        pytest.skip("not a git checkout, so the files that belong to it are unknown")
 
     assert secrets(repository, files) <= NO_SECRETS.keys()
 

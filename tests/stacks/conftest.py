@@ -1,7 +1,8 @@
-"""One synthesis for all tests of the stacks: both front doors, checked by cdk-nag on the way."""
+"""One synthesis for all tests of the stacks: with and without TLS, checked by cdk-nag."""
 
 from __future__ import annotations
 
+import fcntl
 import json
 import os
 import shutil
@@ -65,17 +66,37 @@ def stub_assets(folder: Path) -> Path:
 def assembly(
     request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory, repository: Path
 ) -> Assembly:
-    """The platform as it would be deployed, behind either front door."""
+    """The platform as it would be deployed, with and without TLS."""
     if shutil.which("node") is None:
         pytest.skip("the CDK needs Node.js")
     pytest.importorskip("aws_cdk", reason="the infra extra is not installed")
-    cdk_nag = pytest.importorskip("cdk_nag", reason="the infra extra is not installed")
+    pytest.importorskip("cdk_nag", reason="the infra extra is not installed")
+    settings = LAB if request.param == "lab" else PUBLIC
+    base = tmp_path_factory.getbasetemp()
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        base = base.parent  # of all workers: the first one synthesises, the others read
+    folder = base / f"synthesis-{request.param}"
+    folder.mkdir(exist_ok=True)
+    with (folder / "lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not (folder / "done").exists():
+            _synthesise(settings, folder, repository)
+            (folder / "done").touch()
+    report = json.loads((folder / "out" / "validation-report.json").read_text(encoding="utf-8"))
+    templates = {
+        path.name.removesuffix(".template.json"): json.loads(path.read_text(encoding="utf-8"))
+        for path in sorted((folder / "out").glob("RsePf-*.template.json"))
+    }
+    findings = [each for plugin in report["pluginReports"] for each in plugin["violations"]]
+    return Assembly(settings, folder / "out", templates, findings)
+
+
+def _synthesise(settings: PlatformSettings, folder: Path, repository: Path) -> None:
     import aws_cdk as cdk
+    import cdk_nag
 
     from app import build
 
-    settings = LAB if request.param == "lab" else PUBLIC
-    folder = tmp_path_factory.mktemp(request.param)
     context = json.loads((repository / "cdk.json").read_text(encoding="utf-8"))["context"]
     app = cdk.App(outdir=str(folder / "out"), context={k: v for k, v in context.items() if k != "rse-pf"})
     cdk.Validations.of(app).add_plugins(cdk_nag.AwsSolutionsChecks(app))
@@ -85,13 +106,6 @@ def assembly(
     except RuntimeError as error:
         if "Validation failed" not in str(error):
             raise
-    report = json.loads((folder / "out" / "validation-report.json").read_text(encoding="utf-8"))
-    templates = {
-        path.name.removesuffix(".template.json"): json.loads(path.read_text(encoding="utf-8"))
-        for path in sorted((folder / "out").glob("RsePf-*.template.json"))
-    }
-    findings = [each for plugin in report["pluginReports"] for each in plugin["violations"]]
-    return Assembly(settings, folder / "out", templates, findings)
 
 
 def _find_node() -> None:

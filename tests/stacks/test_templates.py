@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from rse_pf.config import PlatformSettings
 from rse_pf.config.resource_names import READY_PATH
 from rse_pf.errors import ConfigurationError
 from rse_pf.scaling.alarms import Alarm, Metric, ScalingStep, alarms_of
@@ -305,17 +307,38 @@ def test_nag_finds_nothing_that_is_not_acknowledged(assembly: Assembly) -> None:
     assert found == (["Annotation::rse-pf:lab"] if assembly.settings.cloud.allow_insecure else [])
 
 
-def test_cfn_lint_finds_nothing(assembly: Assembly) -> None:
-    api = pytest.importorskip("cfnlint.api", reason="cfn-lint is not installed")
-    region = [assembly.settings.cloud.region]
+Lint = Callable[[Any], list[str]]
 
+
+@pytest.fixture(scope="session")
+def lint() -> Lint:
+    """Return what cfn-lint finds in a template; its rules are loaded once, which takes most of the time."""
+    api = pytest.importorskip("cfnlint.api", reason="cfn-lint is not installed")
+    from cfnlint.config import ConfigMixIn
+    from cfnlint.core import get_rules
+
+    config = ConfigMixIn()
+    rules = get_rules([], config.ignore_checks, config.include_checks)
+    regions = [PlatformSettings().cloud.region]
+    return lambda template: [
+        str(each)
+        for each in api.lint(json.dumps(template), rules=rules, regions=regions)
+        if each.rule.id not in NEEDLESS
+    ]
+
+
+def test_cfn_lint_finds_nothing(assembly: Assembly, lint: Lint) -> None:
     for template in assembly.templates.values():
-        found = api.lint(json.dumps(template), regions=region)
-        assert [str(each) for each in found if each.rule.id not in NEEDLESS] == []
+        assert lint(template) == []
+
+
+def test_cfn_lint_sees_a_wrong_property(lint: Lint) -> None:
+    bucket = {"Type": "AWS::S3::Bucket", "Properties": {"BucketNam": "maps"}}
+
+    assert "BucketNam" in str(lint({"Resources": {"Maps": bucket}}))
 
 
 def test_missing_packages_are_one_line_and_a_hint(tmp_path: Path) -> None:
-    from rse_pf.config import PlatformSettings
     from stacks.assets import staged
 
     with pytest.raises(ConfigurationError) as told:
