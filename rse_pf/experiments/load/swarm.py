@@ -31,11 +31,11 @@ from rse_pf.experiments.child_process import (
     start_process,
 )
 from rse_pf.experiments.load.swarm_process import (
-    FinishOrder,
-    LeaveOrder,
+    FinishSwarm,
     ResultRows,
     RobotJoined,
-    StartOrder,
+    RobotsLeave,
+    StartSwarm,
     SwarmEnded,
     SwarmEvent,
     SwarmOptions,
@@ -153,7 +153,7 @@ class Swarm:
         if self._origin_s is None:
             self._origin_s = self._start_s
         for child in self._children:
-            child.pipe.send(StartOrder(self._start_s, self._origin_s))
+            child.pipe.send(StartSwarm(self._start_s, self._origin_s))
 
     async def wait_joined(self, timeout_s: float) -> None:
         """Wait until every robot is connected and sends; raises CommandFailed after *timeout_s*."""
@@ -171,14 +171,14 @@ class Swarm:
         leaving = set(self._staying[len(self._staying) - count :])
         self._staying = [number for number in self._staying if number not in leaving]
         for child in self._children:
-            child.pipe.send(LeaveOrder(tuple(sorted(leaving & set(child.numbers)))))
+            child.pipe.send(RobotsLeave(tuple(sorted(leaving & set(child.numbers)))))
         names = {self._name(number) for number in leaving}
         await self._until(lambda: names <= self.left, self.options.deadline_s + _END_TIMEOUT_S, "leave")
 
     async def finish(self, grace_s: float = 5.0) -> SwarmResult:
         """Stop sending, wait up to *grace_s* for answers, end the processes; open commands count as lost."""
         for child in self._children:
-            child.pipe.send(FinishOrder(grace_s))
+            child.pipe.send(FinishSwarm(grace_s))
         await self._until(
             lambda: all(child.ended is not None for child in self._children), grace_s + _END_TIMEOUT_S, "end"
         )

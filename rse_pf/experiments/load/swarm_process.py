@@ -30,8 +30,20 @@ from rse_pf.wire.client_session import Answered
 from rse_pf.wire.preencoded import PreencodedCommand, preencode
 
 __all__ = [
-    "FinishOrder", "LeaveOrder", "ResultRows", "RobotJoined", "SolvedPayload", "StartOrder", "SwarmEnded",
-    "SwarmEvent", "SwarmOptions", "SwarmSpec", "is_right", "make_payloads", "planned_s", "run_swarm_process",
+    "FinishSwarm",
+    "ResultRows",
+    "RobotJoined",
+    "RobotsLeave",
+    "SolvedPayload",
+    "StartSwarm",
+    "SwarmEnded",
+    "SwarmEvent",
+    "SwarmOptions",
+    "SwarmSpec",
+    "is_right",
+    "make_payloads",
+    "planned_s",
+    "run_swarm_process",
 ]  # fmt: skip
 
 SERVICES = ("pnp", "echo")
@@ -97,7 +109,7 @@ class SwarmSpec:
 
 
 @dataclass(frozen=True, slots=True)
-class StartOrder:
+class StartSwarm:
     """From the parent: robot k connects at ``start_s + k * join_every_s``; ``origin_s`` is 0 in records."""
 
     start_s: float
@@ -105,14 +117,14 @@ class StartOrder:
 
 
 @dataclass(frozen=True, slots=True)
-class LeaveOrder:
+class RobotsLeave:
     """From the parent: these robots stop sending, wait for their answers and disconnect."""
 
     numbers: tuple[int, ...]
 
 
 @dataclass(frozen=True, slots=True)
-class FinishOrder:
+class FinishSwarm:
     """From the parent: all robots stop sending, wait up to ``grace_s`` for answers, and the process ends."""
 
     grace_s: float
@@ -308,19 +320,19 @@ class _Process:
             self._over.set()
 
     def _follow(self, order: Any) -> None:
-        if isinstance(order, StartOrder):
+        if isinstance(order, StartSwarm):
             self.origin_s = order.origin_s
             self._cpu_s = time.process_time()
             for robot in self._robots.values():
                 self.spawn(robot.join(order.start_s))
-        elif isinstance(order, LeaveOrder):
+        elif isinstance(order, RobotsLeave):
             for number in order.numbers:
                 self.spawn(self._robots[number].leave())
         elif isinstance(order, IssuedToken):
             future = self._tokens.pop(order.robot, None)
             if future is not None and not future.done():
                 future.set_result(order.token)
-        elif isinstance(order, FinishOrder):
+        elif isinstance(order, FinishSwarm):
             self._grace_s = order.grace_s
             self._over.set()
 
