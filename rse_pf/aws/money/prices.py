@@ -1,6 +1,6 @@
 """The prices that an estimate is made from: a dated file for one region, without taxes.
 
-`rse_pf/aws/money/prices.json` is ours; ``rse-pf cloud cost --prices FILE`` replaces some or all of its values.
+`rse_pf/aws/money/prices.json` is ours; ``rse-pf cloud cost --prices FILE`` replaces its values.
 """
 
 from __future__ import annotations
