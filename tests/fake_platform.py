@@ -230,7 +230,7 @@ class FakePlatform:
         await socket.serve()
         await self._notify()
 
-    async def _tell(self) -> None:
+    async def _notify(self) -> None:
         async with self._changed:
             self._changed.notify_all()
 
