@@ -108,7 +108,7 @@ def measure_overhead(pairs: int) -> dict[str, Any]:
         def call_ours(p: PnpProblem = mine) -> Any:
             return solve_pnp(p.points_world, p.pixels, p.camera, options)
 
-        # Whoever goes first pays for cold caches, so they take turns.
+        # The first one pays for cold caches, so they take turns.
         for name in ("bare", "ours") if i % 2 else ("ours", "bare"):
             spent, _ = cpu_us(call_bare if name == "bare" else call_ours)
             if i >= len(problems):

@@ -100,7 +100,7 @@ class FakeLoop:
         def work() -> None:
             try:
                 result = function(*args)
-            except Exception as error:  # noqa: BLE001  it belongs to whoever waits for the future
+            except Exception as error:  # noqa: BLE001  it belongs to the code that waits for the future
                 self.call_soon(future.set_exception, error)
             else:
                 self.call_soon(future.set_result, result)

@@ -31,7 +31,7 @@ _NUMBERS = itertools.count()
 
 @pytest.fixture(scope="module")
 def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[GuardedServer]:
-    """One worker with short patience, where sockets come directly and from one address."""
+    """One worker with short timeouts, where sockets come directly and from one address."""
     groups: dict[str, dict[str, Any]] = {
         "serving": {
             "handshake_timeout_s": ONE_S, "slow_reader_timeout_s": 0.3, "write_buffer_bytes": 65536,

@@ -1,4 +1,4 @@
-"""The door is on loopback; the key is its owner's alone."""
+"""The listener is on loopback; only the owner can read the key."""
 
 from __future__ import annotations
 

@@ -62,14 +62,14 @@ def make(settings):
 '''
 
 
-class HandshakePolicy:
+class Relay:
     """A load balancer that forwards to one server at a time."""
 
     def __init__(self) -> None:
         self.target = 0
         self._cutters: set[asyncio.StreamWriter] = set()
 
-    async def __aenter__(self) -> HandshakePolicy:
+    async def __aenter__(self) -> Relay:
         self._server = await asyncio.start_server(self._serve, "127.0.0.1", 0)
         self.url = f"ws://127.0.0.1:{self._server.sockets[0].getsockname()[1]}/ws"
         return self
@@ -199,12 +199,12 @@ async def test_a_reply_too_large_for_a_message_is_answered_with_its_object_name(
 @in_a_loop
 async def test_a_job_ends_on_the_other_server_when_its_own_is_killed(platform, runs, gone, tmp_path):
     first, second, heard = platform(), platform(), Heard()
-    async with HandshakePolicy() as door:
-        door.target = first.port
-        async with client_sdk.connect(door.url, token=first.token()) as robot:
+    async with Relay() as relay:
+        relay.target = first.port
+        async with client_sdk.connect(relay.url, token=first.token()) as robot:
             task = asked(robot, heard)
             await heard.until("half")
-            door.target = second.port
+            relay.target = second.port
             first.process.send_signal(signal.SIGKILL)
             await asyncio.to_thread(gone, runs()[0])
             while len(runs()) < 2:
@@ -220,12 +220,12 @@ async def test_a_job_ends_on_the_other_server_when_its_own_is_killed(platform, r
 @in_a_loop
 async def test_after_a_reconnect_the_robot_waits_for_the_same_run(platform, runs, tmp_path):
     server, heard = platform(), Heard()
-    async with HandshakePolicy() as door:
-        door.target = server.port
-        async with client_sdk.connect(door.url, token=server.token()) as robot:
+    async with Relay() as relay:
+        relay.target = server.port
+        async with client_sdk.connect(relay.url, token=server.token()) as robot:
             task = asked(robot, heard)
             await heard.until("half")
-            door.cut()
+            relay.cut()
             await heard.until("half")
             (tmp_path / "job").touch()
             answer = await task
@@ -238,12 +238,12 @@ async def test_after_a_reconnect_the_robot_waits_for_the_same_run(platform, runs
 @in_a_loop
 async def test_a_draining_server_gives_up_its_jobs_at_once(platform, runs, tmp_path):
     first, second, heard = platform(job_lease_s=600.0), platform(job_lease_s=600.0), Heard()
-    async with HandshakePolicy() as door:
-        door.target = first.port
-        async with client_sdk.connect(door.url, token=first.token()) as robot:
+    async with Relay() as relay:
+        relay.target = first.port
+        async with client_sdk.connect(relay.url, token=first.token()) as robot:
             task = asked(robot, heard)
             await heard.until("half")
-            door.target = second.port
+            relay.target = second.port
             first.http("/drain", "POST")
             while len(runs()) < 2:
                 await heard.until("half")

@@ -70,7 +70,7 @@ async def robots(cloud: LocalPlatform, count: int, first: int = 0) -> AsyncItera
 
 
 async def refusal(url: str, token: str = "") -> int:
-    """Return the status with which the door refuses."""
+    """Return the status with which the server refuses."""
     with pytest.raises(websockets.exceptions.InvalidStatus) as told:
         async with dial(url, token):
             pass

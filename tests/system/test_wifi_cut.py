@@ -20,7 +20,7 @@ pytestmark = [pytest.mark.system, pytest.mark.slow]
 SETTINGS = PlatformSettings()
 ROBOTS = 8
 NOTICED_S = 6.0
-SERVER_NOTICED_S = 7.5  # its patience (5 s), its margin and its tick
+SERVER_NOTICED_S = 7.5  # its timeout (5 s), its margin and its tick
 BACK_S = 4.0  # 2.0 on a machine that does nothing else
 DEADLINE_S = 5.0
 

@@ -47,7 +47,7 @@ def test_a_known_error_is_measured():
     truth = Trajectory(np.arange(4.0), np.tile(np.eye(4), (4, 1, 1)))
     truth.T_world_camera[:, :2, 3] = [[1, 1], [1, -1], [-1, -1], [-1, 1]]
     estimate = Trajectory(np.arange(4.0), truth.T_world_camera.copy())
-    estimate.T_world_camera[:, 2, 3] = [0.1, -0.1, 0.1, -0.1]  # a saddle: no alignment mends it
+    estimate.T_world_camera[:, 2, 3] = [0.1, -0.1, 0.1, -0.1]  # a saddle: no alignment removes it
 
     figures = trajectory_figures(estimate, truth)
     assert figures == {

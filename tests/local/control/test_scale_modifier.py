@@ -1,4 +1,4 @@
-"""The policy is carried out: deaths are made good at once, crash loops slowly, never all at once."""
+"""The policy is carried out: crashed servers are replaced at once, crash loops slowly, never all at once."""
 
 from __future__ import annotations
 
@@ -104,7 +104,7 @@ def test_a_dead_server_is_replaced_at_once_also_between_periods_and_on_hold() ->
     assert (told[0]["event"], told[0]["server"], told[0]["by"]) == ("replace", "server-1", "server-11")
 
 
-def deaths(young: bool, seconds: int) -> tuple[list[float], list[Mapping[str, Any]]]:
+def crashes(young: bool, seconds: int) -> tuple[list[float], list[Mapping[str, Any]]]:
     """Let each replacement die at once, look once a second, and return when one was started."""
     modifier, servers, told = made(ServerHealth(servers=2, healthy=1, dead={"server-1": young}))
     starts = []
@@ -116,7 +116,7 @@ def deaths(young: bool, seconds: int) -> tuple[list[float], list[Mapping[str, An
 
 
 def test_a_crash_loop_gets_five_starts_a_minute_and_is_told_once() -> None:
-    starts, told = deaths(young=True, seconds=180)
+    starts, told = crashes(young=True, seconds=180)
 
     assert max(sum(0 <= later - start < 60.0 for later in starts) for start in starts) == 5
     assert len(starts) == 15
@@ -124,7 +124,7 @@ def test_a_crash_loop_gets_five_starts_a_minute_and_is_told_once() -> None:
 
 
 def test_servers_that_lived_long_are_replaced_however_many_they_are() -> None:
-    starts, told = deaths(young=False, seconds=20)
+    starts, told = crashes(young=False, seconds=20)
 
     assert len(starts) == 20
     assert "crash-loop" not in {event["event"] for event in told}

@@ -1,7 +1,7 @@
 """A bare Debian machine in a network of its own, with IMDS and S3 in reach and nothing else.
 
 Needs root, `ip`, `openssl` and `debootstrap` (once: the root is kept in build/).  The default route leads to
-a device that counts and drops, so whoever tries to leave is seen.
+a device that counts and drops, so an attempt to reach the internet is seen.
 """
 
 from __future__ import annotations
