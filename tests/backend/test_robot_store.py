@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from types import SimpleNamespace
-from typing import Any
 
 import msgspec
 import pytest
 
 from rse_pf.auth.tokens import Claims
-from rse_pf.backend.jobs.process import store_reply
+from rse_pf.backend.jobs.process import JobRequest, store_reply
 from rse_pf.backend.object_refs import ObjectRefs
 from rse_pf.backend.robot_store import check_quota, quota_bytes, store_within_quota
 from rse_pf.config import PlatformSettings
@@ -18,7 +17,7 @@ from rse_pf.object_store import DirectoryStore, MemoryStore, digest_of, object_n
 from rse_pf.wire import Failure, Result
 
 ROBOT = ("default", "robot-1")
-REPLY = msgspec.msgpack.encode({"value": bytes(500)})
+REPLY = msgspec.msgpack.encode({"value": bytes(600)})
 
 
 def claims(**quotas: float) -> Claims:
@@ -27,12 +26,18 @@ def claims(**quotas: float) -> Claims:
     )
 
 
-def order(store: str, **others: Any) -> dict[str, Any]:
-    settings = PlatformSettings.from_dict({"data": {"store": store, "max_object_bytes": 4096}})
-    return {
-        "settings": settings.to_dict(), "tenant": "default", "robot": "robot-1", "quota_bytes": 1000.0,
-        "inline_bytes": 1000, **others,
-    }  # fmt: skip
+REQUEST = JobRequest(
+    service="long", payload={}, tenant="default", robot="robot-1", key="k", quota_bytes=1000.0
+)
+
+
+def of(store: str, max_message_bytes: int = 2000) -> PlatformSettings:
+    return PlatformSettings.from_dict(
+        {
+            "data": {"store": store, "max_object_bytes": 4096},
+            "session": {"max_message_bytes": max_message_bytes},
+        }
+    )
 
 
 def test_the_quota_is_that_of_the_token_or_else_of_the_settings():
@@ -73,8 +78,8 @@ def test_a_large_reply_beyond_the_quota_is_refused_with_the_reason():
 
 
 def test_a_jobs_process_stores_its_reply_and_sends_only_small_ones_along(tmp_path):
-    small = store_reply(["done", 5.0, REPLY], order(f"dir:{tmp_path}"))
-    large = store_reply(["done", 5.0, REPLY], order(f"dir:{tmp_path}", inline_bytes=100))
+    small = store_reply(["done", 5.0, REPLY], REQUEST, of(f"dir:{tmp_path}"))
+    large = store_reply(["done", 5.0, REPLY], REQUEST, of(f"dir:{tmp_path}", max_message_bytes=1024))
 
     assert small == ["stored", 5.0, digest_of(REPLY), len(REPLY), REPLY]
     assert large == ["stored", 5.0, digest_of(REPLY), len(REPLY), None]
@@ -82,11 +87,15 @@ def test_a_jobs_process_stores_its_reply_and_sends_only_small_ones_along(tmp_pat
 
 
 def test_a_jobs_process_refuses_what_is_too_large_or_beyond_the_quota(tmp_path):
-    assert store_reply(["done", 5.0, bytes(5000)], order(f"dir:{tmp_path}"))[:2] == ["failed", "too-large"]
-    assert store_reply(["done", 5.0, bytes(1001)], order(f"dir:{tmp_path}"))[:2] == ["failed", "quota"]
+    settings = of(f"dir:{tmp_path}")
+
+    assert store_reply(["done", 5.0, bytes(5000)], REQUEST, settings)[:2] == ["failed", "too-large"]
+    assert store_reply(["done", 5.0, bytes(1001)], REQUEST, settings)[:2] == ["failed", "quota"]
     assert list(DirectoryStore(tmp_path).list()) == []
 
 
 def test_a_store_of_the_worker_alone_and_a_failure_are_left_to_the_worker():
-    assert store_reply(["done", 5.0, REPLY], order("memory:")) == ["done", 5.0, REPLY]
-    assert store_reply(["failed", "c", "m", "h"], order("memory:")) == ["failed", "c", "m", "h"]
+    failed = ["failed", "c", "m", "h"]
+
+    assert store_reply(["done", 5.0, REPLY], REQUEST, of("memory:")) == ["done", 5.0, REPLY]
+    assert store_reply(failed, REQUEST, of("memory:")) == failed

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any, Literal
 
 import msgspec
@@ -113,12 +112,6 @@ def verdict_on(record: JobRecord | None, *, unchanged_s: float, lease_s: float, 
     return "take" if record.tries < MAX_TRIES else "poison"
 
 
-@dataclass(slots=True)
-class _Seen:
-    data: bytes | None = None
-    since: float = 0.0
-
-
 class JobLease:
     """One process's view of the record of one job, and its lease on it."""
 
@@ -137,12 +130,13 @@ class JobLease:
         self._name = name
         self._owner = owner
         self._clock = clock
-        self._seen = _Seen(since=clock())
+        self._data: bytes | None = None
+        self._changed_s = clock()
 
     @property
     def unchanged_s(self) -> float:
         """For how long the record is unchanged, in seconds."""
-        return self._clock() - self._seen.since
+        return self._clock() - self._changed_s
 
     @property
     def is_ours(self) -> bool:
@@ -193,7 +187,7 @@ class JobLease:
     def _swap(self, record: JobRecord) -> bool:
         data = encode_record(record)
         try:
-            self._store.compare_and_swap(self._name, self._seen.data, data)
+            self._store.compare_and_swap(self._name, self._data, data)
         except Conflict:
             self.look()
             return False
@@ -201,6 +195,7 @@ class JobLease:
         return True
 
     def _note(self, data: bytes | None) -> None:
-        if data != self._seen.data:
-            self._seen = _Seen(data, self._clock())
+        if data != self._data:
+            self._data = data
+            self._changed_s = self._clock()
         self.record = None if data is None else decode_record(self._name, data)

@@ -20,12 +20,12 @@ import msgspec
 
 from rse_pf.backend.jobs.fair_queue import job_to_displace
 from rse_pf.backend.jobs.lease import job_key
+from rse_pf.backend.jobs.process import JobRequest
 from rse_pf.backend.jobs.record_gc import RecordCollector
-from rse_pf.backend.jobs.runner import WAITING, JobContext, JobOutcome, JobRequest, JobSignals, run_job
+from rse_pf.backend.jobs.runner import WAITING, JobContext, JobOutcome, JobSignals, run_job
 from rse_pf.backend.ports import Log, Loop
 from rse_pf.backend.robot_store import quota_bytes
 from rse_pf.backend.scheduling.scheduler import QueuedCommand
-from rse_pf.config import PlatformSettings
 from rse_pf.errors import BadRequest, Busy, Cancelled, RsePfError
 from rse_pf.service import failure_of
 from rse_pf.wire import Failure, Progress, Result
@@ -64,7 +64,6 @@ class JobManager:
         self,
         context: JobContext,
         *,
-        settings: PlatformSettings,
         loop: Loop,
         log: Log,
         answer: Callable[[QueuedCommand, Result | Failure], None],
@@ -75,8 +74,8 @@ class JobManager:
         """Start nothing yet.
 
         Args:
-            context: Store, slots and processes.
-            settings: Of the platform; those that a result depends on are part of a job's name.
+            context: Store, slots, processes and settings; those that a result depends on are part of a
+                job's name.
             loop: Event loop of the worker.
             log: Log of the worker.
             answer: Called exactly once for each submitted command whose robot stays connected, unless the
@@ -86,7 +85,7 @@ class JobManager:
             wall_clock: Unix seconds.
         """
         self._context = context
-        self._serving = settings.serving
+        self._serving = context.settings.serving
         self._loop = loop
         self._log = log
         self._answer = answer
@@ -96,11 +95,11 @@ class JobManager:
         self._leaving = False
         self._collector = RecordCollector(
             context.store,
-            ttl_s=settings.serving.job_record_ttl_s,
+            ttl_s=self._serving.job_record_ttl_s,
             clock=context.clock,
             wall_clock=wall_clock,
         )
-        plain = settings.to_dict()
+        plain = context.settings.to_dict()
         chosen = json.dumps([plain["services"], plain["pnp"]], sort_keys=True)
         self._settings_digest = hashlib.sha256(chosen.encode()).hexdigest()
 
@@ -197,7 +196,7 @@ class JobManager:
             tenant=queued.owner.tenant,
             robot=queued.robot,
             key=key,
-            quota_bytes=quota_bytes(queued.owner.claims, self._context.quota_bytes),
+            quota_bytes=quota_bytes(queued.owner.claims, self._context.settings.data.quota_bytes),
         )
 
     def _begin(self, entry: _Entry) -> None:

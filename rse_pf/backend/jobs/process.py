@@ -17,29 +17,41 @@ import sys
 import time
 import traceback
 from collections.abc import Callable
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, TypeVar
 
 import msgspec
 
 from rse_pf.aws.storage import open_data_store
-from rse_pf.backend.jobs.runner import JobRequest
 from rse_pf.backend.object_refs import named_in, resolve
 from rse_pf.backend.robot_store import check_quota, is_shared, store_within_quota
 from rse_pf.backend.sandbox.ipc import encode_message, receive
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import BadMessage, Cancelled, Crashed, LimitExceeded, RsePfError, StoreError
 from rse_pf.linux import die_with_parent, run_when_idle
-from rse_pf.object_store import ObjectStore
 from rse_pf.service import dispatch, failure_of
 from rse_pf.services.loading import load_services
 from rse_pf.wire import Command, Failure, Result
 from rse_pf.wire.arrays import binary_encode_hook
 
-__all__ = ["JobProcess", "main", "spawner", "store_reply"]
+__all__ = ["JobProcess", "JobRequest", "inline_bytes", "main", "retry_store", "spawner", "store_reply"]
 
 _REPORT_INTERVAL_S = 0.5
 _STORE_TRIES = 3
 _ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
+T = TypeVar("T")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class JobRequest:
+    """A job that a robot asked for; ``quota_bytes`` limits all that the robot stores, results included."""
+
+    service: str
+    payload: Any
+    tenant: str
+    robot: str
+    key: str
+    quota_bytes: float
 
 
 class JobProcess:
@@ -55,43 +67,35 @@ class JobProcess:
                 [sys.executable, "-m", "rse_pf.backend.jobs.process", str(theirs.fileno())],
                 pass_fds=(theirs.fileno(),), stdin=subprocess.DEVNULL, env={**os.environ, **_ONE_THREAD},
             )  # fmt: skip
-        run_when_idle(self._process.pid)
-        try:
+        self.pid = self._process.pid
+        run_when_idle(self.pid)
+        with contextlib.suppress(OSError):  # it has ended, which the next read shows
             self.connection.sendall(encode_message(order))
-        except OSError:
-            return  # it has ended, which the next read shows
 
-    @property
-    def pid(self) -> int:
-        """Process id."""
-        return self._process.pid
-
-    def kill(self) -> None:
-        """Kill and reap it."""
+    def kill(self) -> int:
+        """Kill it unless it has ended, reap it and return the exit code; negative for a signal."""
         self._process.kill()
-        self._process.wait()
         self.connection.close()
-
-    def wait(self) -> int:
-        """Wait for its end and return the exit code; negative for a signal."""
         return self._process.wait()
 
 
 def spawner(services: str, settings: PlatformSettings) -> Callable[[JobRequest], JobProcess]:
     """Return a function that starts the process of a job; *services* is ``module:function``."""
-    plain = settings.to_dict()
+    order = {"worker": os.getpid(), "services": services, "settings": settings.to_dict()}
+    return lambda request: JobProcess({**order, "request": request})
 
-    def start(request: JobRequest) -> JobProcess:
-        return JobProcess(
-            {
-                "worker": os.getpid(), "services": services, "settings": plain,
-                "memory_bytes": settings.serving.max_job_memory_bytes, "service": request.service,
-                "payload": request.payload, "tenant": request.tenant, "robot": request.robot,
-                "quota_bytes": request.quota_bytes, "inline_bytes": settings.session.max_message_bytes // 2,
-            }
-        )  # fmt: skip
 
-    return start
+def inline_bytes(settings: PlatformSettings) -> int:
+    """Return the size above which a reply is answered with the name of its object."""
+    return settings.session.max_message_bytes // 2
+
+
+def retry_store(act: Callable[[], T]) -> T:
+    """Return what *act* returns; it is repeated twice if the store fails."""
+    for _ in range(_STORE_TRIES - 1):
+        with contextlib.suppress(StoreError):
+            return act()
+    return act()
 
 
 def main(arguments: list[str]) -> None:
@@ -101,12 +105,12 @@ def main(arguments: list[str]) -> None:
         if order is None or not die_with_parent(order["worker"]):
             return
         _lower_priority()
-        resource.setrlimit(resource.RLIMIT_DATA, (order["memory_bytes"],) * 2)
+        settings, request = PlatformSettings.from_dict(order["settings"]), JobRequest(**order["request"])
+        resource.setrlimit(resource.RLIMIT_DATA, (settings.serving.max_job_memory_bytes,) * 2)
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+        answer = _work(request, settings, order["services"], _Reporter(worker, time.monotonic))
         with contextlib.suppress(OSError):  # the worker may have gone
-            worker.sendall(
-                encode_message(store_reply(_work(order, _Reporter(worker, time.monotonic)), order))
-            )
+            worker.sendall(encode_message(store_reply(answer, request, settings)))
 
 
 class _Reporter:
@@ -126,8 +130,9 @@ class _Reporter:
             self._worker.sendall(encode_message(["progress", float(done), str(what)[:200]]))
 
 
-def _work(order: dict[str, Any], report: Callable[[float, str], None]) -> list[Any]:
-    command = Command(id=0, service=order["service"], payload=order["payload"])
+def _work(
+    request: JobRequest, settings: PlatformSettings, services: str, report: Callable[[float, str], None]
+) -> list[Any]:
     out_of_memory = False
 
     def on_defect(_: Command, error: Exception) -> None:
@@ -136,62 +141,55 @@ def _work(order: dict[str, Any], report: Callable[[float, str], None]) -> list[A
         traceback.print_exception(error)
 
     try:
-        settings = PlatformSettings.from_dict(order["settings"])
-        registry = load_services(order["services"], settings)
-        _check_quota(order, settings)
-        payload = _resolved(command.payload, registry.get(command.service).request_type, order, settings)
-        command = msgspec.structs.replace(command, payload=payload)
+        registry = load_services(services, settings)
+        _check_quota(request, settings)
+        payload = _resolved(request, registry.get(request.service).request_type, settings)
+        command = Command(id=0, service=request.service, payload=payload)
         answer = dispatch(registry, command, time.monotonic, on_defect=on_defect, report=report)
     except RsePfError as error:
         answer = failure_of(error)
     except MemoryError:
         out_of_memory = True
     if out_of_memory:
-        megabytes = order["memory_bytes"] / 1e6
+        megabytes = settings.serving.max_job_memory_bytes / 1e6
         answer = failure_of(
             Crashed(f"the job needs more than {megabytes:.0f} MB of memory", hint="send less at once")
         )
     return _encode_answer(answer)
 
 
-def _resolved(
-    payload: Any, request_type: type[Any], order: dict[str, Any], settings: PlatformSettings
-) -> Any:
+def _resolved(request: JobRequest, kind: type[Any], settings: PlatformSettings) -> Any:
     """Return the payload with the robot's objects in place of their names."""
-    if not named_in(request_type, payload):
-        return payload
+    if not named_in(kind, request.payload):
+        return request.payload
     store = open_data_store(settings)
-    return resolve(request_type, payload, order["tenant"], order["robot"], store, settings=settings.serving)
+    return resolve(kind, request.payload, request.tenant, request.robot, store, settings=settings.serving)
 
 
-def _check_quota(order: dict[str, Any], settings: PlatformSettings) -> None:
+def _check_quota(request: JobRequest, settings: PlatformSettings) -> None:
     """Raise QuotaExceeded before the work if its result cannot be stored."""
     if is_shared(settings):
         store = open_data_store(settings)
         with contextlib.suppress(StoreError):  # the store is tried again when there is a result
-            check_quota(store, order["tenant"], order["robot"], 1, order["quota_bytes"])
+            check_quota(store, request.tenant, request.robot, 1, request.quota_bytes)
 
 
-def store_reply(answer: list[Any], order: dict[str, Any]) -> list[Any]:
+def store_reply(answer: list[Any], request: JobRequest, settings: PlatformSettings) -> list[Any]:
     """Store the reply from this process and answer with its name, and with the reply if it is small."""
-    settings = PlatformSettings.from_dict(order["settings"])
     if answer[0] != "done" or not is_shared(settings):
         return answer
     _, compute_ms, reply = answer
     try:
         if len(reply) > settings.data.max_object_bytes:
             raise LimitExceeded(f"a reply of {len(reply)} bytes is too large", hint="ask for less")
-        digest = _stored(reply, order, open_data_store(settings))
+        store = open_data_store(settings)
+        digest = retry_store(
+            lambda: store_within_quota(store, request.tenant, request.robot, reply, request.quota_bytes)
+        )
     except RsePfError as error:
         return _encode_answer(failure_of(error))
-    return ["stored", compute_ms, digest, len(reply), reply if len(reply) <= order["inline_bytes"] else None]
-
-
-def _stored(reply: bytes, order: dict[str, Any], store: ObjectStore) -> str:
-    for _ in range(_STORE_TRIES - 1):
-        with contextlib.suppress(StoreError):
-            return store_within_quota(store, order["tenant"], order["robot"], reply, order["quota_bytes"])
-    return store_within_quota(store, order["tenant"], order["robot"], reply, order["quota_bytes"])
+    inline = reply if len(reply) <= inline_bytes(settings) else None
+    return ["stored", compute_ms, digest, len(reply), inline]
 
 
 def _encode_answer(answer: Result | Failure) -> list[Any]:

@@ -6,6 +6,7 @@ process that it started has ended when it returns.
 
 from __future__ import annotations
 
+import contextlib
 import os
 import select
 import signal
@@ -13,13 +14,14 @@ import socket
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Literal, Protocol
+from typing import Any, Literal
 
 from rse_pf.backend.jobs.lease import MAX_TRIES, JobLease, JobRecord, record_name, verdict_on
+from rse_pf.backend.jobs.process import JobProcess, JobRequest, inline_bytes, retry_store
 from rse_pf.backend.jobs.slots import JobSlots
 from rse_pf.backend.robot_store import store_within_quota
 from rse_pf.backend.sandbox.ipc import FrameReader, encode_message
-from rse_pf.config import ServingSettings
+from rse_pf.config import PlatformSettings
 from rse_pf.errors import (
     Cancelled,
     Crashed,
@@ -34,40 +36,14 @@ from rse_pf.errors import (
 )
 from rse_pf.object_store import ObjectStore, digest_of, object_name
 
-__all__ = ["JobContext", "JobOutcome", "JobRequest", "JobSignals", "Process", "run_job"]
+__all__ = ["JobContext", "JobOutcome", "JobSignals", "run_job"]
 
 _POLL_SHARE = 0.5
 """Share of the time between two renewals after which a follower reads the record again."""
 _KILL_AFTER_S = 0.6
 """A cancelled job that does not end is killed after this."""
 _READ_BYTES = 1 << 18
-_STORE_TRIES = 3
 WAITING, STARTING = "waits for its turn", "starts"
-
-
-class Process(Protocol):
-    """A started job process."""
-
-    connection: socket.socket
-
-    def kill(self) -> None:
-        """Kill and reap it."""
-
-    def wait(self) -> int:
-        """Wait for its end and return the exit code; negative for a signal."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class JobRequest:
-    """A job that a robot asked for."""
-
-    service: str
-    payload: Any
-    tenant: str
-    robot: str
-    key: str
-    quota_bytes: float
-    """Limit of all that the robot stores, its results included."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -76,15 +52,9 @@ class JobContext:
 
     store: ObjectStore
     slots: JobSlots
-    settings: ServingSettings
-    quota_bytes: float
-    """Quota of a robot whose token has none."""
-    max_bytes: int
-    """Limit of a reply."""
-    inline_bytes: int
-    """Larger replies are answered with the name of their object."""
+    settings: PlatformSettings
     server_id: str
-    start: Callable[[JobRequest], Process]
+    start: Callable[[JobRequest], JobProcess]
     clock: Callable[[], float]
 
 
@@ -94,7 +64,7 @@ class JobOutcome:
 
     object: str = ""
     reply: bytes | None = None
-    """MessagePack; None if it is larger than ``inline_bytes``."""
+    """MessagePack; None if it is too large to be sent along."""
     compute_ms: float = 0.0
     error: RsePfError | None = None
 
@@ -169,7 +139,7 @@ def run_job(
 def _follow_or_run(
     request: JobRequest, context: JobContext, signals: JobSignals, tell: Tell, lease: JobLease
 ) -> JobOutcome:
-    serving = context.settings
+    serving = context.settings.serving
     while True:
         if signals.giving_up:
             return JobOutcome()
@@ -187,7 +157,8 @@ def _follow_or_run(
         if verdict == "failed" and record is not None:
             return JobOutcome(error=error_from_code(record.code, record.message, hint=record.hint))
         if verdict == "poison":
-            return JobOutcome(error=_poison())
+            reason = f"{MAX_TRIES} servers crashed while they ran this job"
+            return JobOutcome(error=Poison(reason, hint="send less at once; tell the operator"))
         if verdict == "done" and record is not None:
             stored = _stored_outcome(request, context, record)
             if stored is not None:
@@ -208,9 +179,9 @@ def _stored_outcome(request: JobRequest, context: JobContext, record: JobRecord)
     """Return the result that *record* names; None if it was deleted and must be computed again."""
     name = object_name(request.tenant, request.robot, record.reply)
     try:
-        if record.reply_bytes > context.inline_bytes:
+        reply = None
+        if record.reply_bytes > inline_bytes(context.settings):
             context.store.head(name)
-            reply = None
         else:
             reply = context.store.get(name)
     except NotFound:
@@ -230,7 +201,7 @@ class _JobRun:
         self._tell = tell
         self._lease = lease
         self._done, self._what = 0.0, STARTING
-        self._frames = FrameReader(context.max_bytes)
+        self._frames = FrameReader(context.settings.data.max_object_bytes)
         self._end: list[Any] | None = None
         self._is_over = False
 
@@ -241,7 +212,7 @@ class _JobRun:
         try:
             why = self._supervise(process)
         finally:
-            process.kill()  # all its messages have been read
+            exit_code = process.kill()  # all its messages have been read
         if why == "lost":
             return None
         if why == "given-up":
@@ -250,20 +221,19 @@ class _JobRun:
         if why == "cancelled":
             return self._failed(_cancelled())
         if why == "late":
-            max_s = self._context.settings.max_job_s
+            max_s = self._context.settings.serving.max_job_s
             return self._failed(Expired(f"the job took longer than {max_s:g} s", hint="send less at once"))
-        code = process.wait()
         if self._end is None:
-            return self._failed(_crashed(code))
+            return self._failed(_crashed(exit_code))
         if self._end[0] == "stored":
             return self._report_stored(*self._end[1:])
         if self._end[0] == "done":
             return self._store_reply(*self._end[1:])
         return self._failed(error_from_code(str(self._end[1]), str(self._end[2]), hint=str(self._end[3])))
 
-    def _supervise(self, process: Process) -> Literal["over", "lost", "given-up", "cancelled", "late"]:
+    def _supervise(self, process: JobProcess) -> Literal["over", "lost", "given-up", "cancelled", "late"]:
         """Read from the process and renew the lease until the run ends."""
-        serving, clock, signals = self._context.settings, self._context.clock, self._signals
+        serving, clock, signals = self._context.settings.serving, self._context.clock, self._signals
         began = renewed = clock()
         next_heartbeat, killed_s = began + serving.job_heartbeat_s, float("inf")
         while not self._is_over:
@@ -271,7 +241,8 @@ class _JobRun:
             if signals.giving_up:
                 return "given-up"
             if self._is_cancelled and killed_s == float("inf"):
-                _send_cancel(process)
+                with contextlib.suppress(OSError):  # it has ended, which the next read shows
+                    process.connection.sendall(encode_message(["cancel"]))
                 killed_s = now + _KILL_AFTER_S
             if now >= killed_s:
                 return "cancelled"
@@ -299,7 +270,7 @@ class _JobRun:
         except StoreError:
             return False
 
-    def _read(self, process: Process) -> None:
+    def _read(self, process: JobProcess) -> None:
         try:
             data = process.connection.recv(_READ_BYTES, socket.MSG_DONTWAIT)
         except BlockingIOError:
@@ -321,14 +292,14 @@ class _JobRun:
         """Store the reply before it is reported; used where the process has no access to the store."""
         context, request, digest = self._context, self._request, digest_of(reply)
         try:
-            self._retrying(
+            retry_store(
                 lambda: store_within_quota(
                     context.store, request.tenant, request.robot, reply, request.quota_bytes
                 )
             )
         except QuotaExceeded as error:
             return self._failed(error)
-        inline = reply if len(reply) <= context.inline_bytes else None
+        inline = reply if len(reply) <= inline_bytes(context.settings) else None
         return self._report_stored(compute_ms, digest, len(reply), inline)
 
     def _report_stored(self, compute_ms: float, digest: str, size: int, reply: bytes | None) -> JobOutcome:
@@ -348,24 +319,7 @@ class _JobRun:
         return JobOutcome(error=error)
 
     def _end_lease(self, record: JobRecord) -> None:
-        self._retrying(lambda: self._lease.end(record))
-
-    @staticmethod
-    def _retrying(act: Callable[[], object]) -> None:
-        for _ in range(_STORE_TRIES - 1):
-            try:
-                act()
-                return
-            except StoreError:
-                continue
-        act()
-
-
-def _send_cancel(process: Process) -> None:
-    try:
-        process.connection.sendall(encode_message(["cancel"]))
-    except OSError:
-        return  # it has ended, which the next read shows
+        retry_store(lambda: self._lease.end(record))
 
 
 def _cancelled() -> RsePfError:
@@ -377,10 +331,3 @@ def _crashed(code: int) -> RsePfError:
     if code < 0:
         how = signal.Signals(-code).name if -code in set(signal.Signals) else f"signal {-code}"
     return Crashed(f"the job's process ended: {how}", hint="the server's log has what it printed last")
-
-
-def _poison() -> RsePfError:
-    return Poison(
-        f"{MAX_TRIES} servers crashed while they ran this job",
-        hint="send less at once; tell the operator",
-    )

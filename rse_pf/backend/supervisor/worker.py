@@ -214,20 +214,16 @@ class _Worker:
 
     def _jobs(self, plan: WorkerPlan, answers: Answers) -> JobManager:
         settings = plan.settings
-        read, write = plan.job_slots
         context = JobContext(
             store=open_data_store(settings),
-            slots=JobSlots((read, write)),
-            settings=settings.serving,
-            quota_bytes=settings.data.quota_bytes,
-            max_bytes=settings.data.max_object_bytes,
-            inline_bytes=settings.session.max_message_bytes // 2,
+            slots=JobSlots(plan.job_slots),
+            settings=settings,
             server_id=plan.server_id,
             start=spawner(plan.services, settings),
             clock=time.monotonic,
         )
         return JobManager(
-            context, settings=settings, loop=self._loop, log=self._log, answer=answers.send_message,
+            context, loop=self._loop, log=self._log, answer=answers.send_message,
             progress=answers.send_progress, new_owner=lambda: f"{plan.server_id}-{secrets.token_hex(8)}",
         )  # fmt: skip
 

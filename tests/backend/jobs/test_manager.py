@@ -16,7 +16,8 @@ import pytest
 
 from rse_pf.backend.jobs.lease import JobRecord, encode_record
 from rse_pf.backend.jobs.manager import JobManager
-from rse_pf.backend.jobs.runner import JobContext, JobRequest
+from rse_pf.backend.jobs.process import JobRequest
+from rse_pf.backend.jobs.runner import JobContext
 from rse_pf.backend.jobs.slots import JobSlots, make_pipe
 from rse_pf.backend.log import JsonLog
 from rse_pf.backend.sandbox.ipc import encode_message
@@ -42,11 +43,9 @@ class FakeProcess:
     def done(self, value: int = 1) -> None:
         self.say("done", 5.0, msgspec.msgpack.encode({"value": value}))
 
-    def kill(self) -> None:
+    def kill(self) -> int:
         self._theirs.close()
         self.connection.close()
-
-    def wait(self) -> int:
         return 0
 
 
@@ -65,11 +64,10 @@ class Bench:
         context = JobContext(
             store=self.store, server_id="s",
             slots=JobSlots(make_pipe(self.settings.serving.max_running_jobs)),
-            settings=self.settings.serving, quota_bytes=1e6, max_bytes=1000, inline_bytes=100,
-            start=self.start, clock=lambda: self.loop.now,
+            settings=self.settings, start=self.start, clock=lambda: self.loop.now,
         )  # fmt: skip
         self.jobs = JobManager(
-            context, settings=self.settings, loop=self.loop, log=self.log,
+            context, loop=self.loop, log=self.log,
             new_owner=lambda: os.urandom(4).hex(),
             answer=lambda job, answer: self.answers.__setitem__(job.command.id, answer),
             progress=lambda _, told: self.progress.append((told.id, told.done, told.what)),

@@ -12,14 +12,21 @@ import msgspec
 import pytest
 
 from rse_pf.backend.jobs.lease import JobLease, JobRecord, record_name
-from rse_pf.backend.jobs.runner import JobContext, JobOutcome, JobRequest, JobSignals, run_job
+from rse_pf.backend.jobs.process import JobRequest
+from rse_pf.backend.jobs.runner import JobContext, JobOutcome, JobSignals, run_job
 from rse_pf.backend.jobs.slots import JobSlots, make_pipe
 from rse_pf.backend.sandbox.ipc import encode_message
-from rse_pf.config import ServingSettings
+from rse_pf.config import PlatformSettings
 from rse_pf.errors import Conflict, StoreError
 from rse_pf.object_store import MemoryStore, digest_of, object_name
 
-SETTINGS = ServingSettings(job_heartbeat_s=0.05, job_lease_s=0.2)
+SETTINGS = PlatformSettings.from_dict(
+    {
+        "serving": {"job_heartbeat_s": 0.05, "job_lease_s": 0.2},
+        "session": {"max_message_bytes": 1024},
+        "data": {"max_object_bytes": 4096},
+    }
+)
 WANTED = JobRequest(
     service="long", payload={}, tenant="default", robot="robot-1", key="ab" * 32, quota_bytes=1e6
 )
@@ -41,12 +48,10 @@ class FakeProcess:
         if ends:
             self.theirs.close()
 
-    def kill(self) -> None:
+    def kill(self) -> int:
         self.killed.set()
         self.theirs.close()
         self.connection.close()
-
-    def wait(self) -> int:
         return self._code
 
 
@@ -73,13 +78,11 @@ class Bench:
         self.processes.append(self.scripts.pop(0)())
         return self.processes[-1]
 
-    def run(
-        self, *scripts: Callable[[], FakeProcess], max_bytes: int = 1000, inline: int = 100
-    ) -> JobOutcome:
+    def run(self, *scripts: Callable[[], FakeProcess]) -> JobOutcome:
         self.scripts += scripts
         context = JobContext(
-            store=self.store, slots=JobSlots(self.pipe), settings=SETTINGS, quota_bytes=1e6,
-            max_bytes=max_bytes, inline_bytes=inline, server_id="s", start=self.start, clock=Clock(),
+            store=self.store, slots=JobSlots(self.pipe), settings=SETTINGS, server_id="s",
+            start=self.start, clock=Clock(),
         )  # fmt: skip
 
         def tell(share: float, what: str) -> None:
@@ -143,10 +146,12 @@ def test_a_job_with_a_stored_result_is_not_run_again(bench):
 
 
 def test_a_large_reply_is_reported_by_name_only(bench):
-    first = bench.run(lambda: FakeProcess([DONE]), inline=3)
+    reply = msgspec.msgpack.encode({"value": "x" * 600})
 
-    assert (first.reply, first.object) == (None, digest_of(REPLY))
-    assert bench.run(inline=3) == first
+    first = bench.run(lambda: FakeProcess([["done", 12.5, reply]]))
+
+    assert (first.reply, first.object) == (None, digest_of(reply))
+    assert bench.run() == first
 
 
 def test_a_result_whose_object_was_deleted_is_computed_again(bench):
@@ -175,7 +180,7 @@ def test_a_process_that_ends_without_an_answer_has_crashed(bench):
 
 
 def test_a_reply_that_is_too_large_ends_the_job(bench):
-    outcome = bench.run(lambda: FakeProcess([["done", 1.0, b"x" * 2000]], ends=False), max_bytes=1000)
+    outcome = bench.run(lambda: FakeProcess([["done", 1.0, b"x" * 5000]], ends=False))
 
     assert code(outcome) == "too-large"
 
