@@ -36,16 +36,13 @@ class Platform:
 
     def __init__(self, folder: Path, store: Path) -> None:
         (folder / "keys.json").write_text(KEY.key_set().to_json(), encoding="utf-8")
-        (folder / "cdk.json").write_text(json.dumps({"context": {"rse-pf": {}}}), encoding="utf-8")
+        (folder / "settings.json").write_text(json.dumps({"context": {"rse-pf": {}}}), encoding="utf-8")
         self.events: list[tuple[float, str]] = []
         self.up = threading.Semaphore(0)
         self.loop = asyncio.new_event_loop()
         self.thread = threading.Thread(target=self.loop.run_forever, daemon=True)
         self.thread.start()
-        self.servers = LocalDataServers(
-            SETTINGS, folder=folder, settings_file=folder / "cdk.json", keys_file=folder / "keys.json",
-            store=f"dir:{store}", emit=self._emit,
-        )  # fmt: skip
+        self.servers = LocalDataServers(SETTINGS, folder=folder, store=f"dir:{store}", emit=self._emit)
         self._call(self.servers.start())
 
     def _emit(self, event: str, **details: object) -> None:

@@ -12,7 +12,7 @@ import dataclasses
 import math
 import signal
 import time
-from collections.abc import Callable, Coroutine, Iterable, Sequence
+from collections.abc import Callable, Coroutine, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -20,13 +20,12 @@ from rse_pf.config import PlatformSettings
 from rse_pf.errors import ConfigurationError, UsageError
 from rse_pf.local.balancer.load_balancer import EnvoyLoadBalancer
 from rse_pf.local.control.monitor import ServerPhase
-from rse_pf.local.control.scale_modifier import ServerHealth
 from rse_pf.local.processes import STOP_TIMEOUT_S
 from rse_pf.local.servers.backend_servers import BackendServer, LocalBackendServers
 from rse_pf.local.servers.control_client import ControlPort
 from rse_pf.scaling.health import Health, time_to_notice_s
 
-__all__ = ["Fleet", "Member"]
+__all__ = ["Fleet", "Member", "ServerHealth"]
 
 _ASK_S = 2.0
 _LOOK_UP_S = 0.5
@@ -68,8 +67,26 @@ class Member:
         return "healthy" if self.healthy_s is not None and self.health.state == "healthy" else "starting"
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ServerHealth:
+    """The servers as they stand.
+
+    ``servers`` counts all that are or should be there: those that start, serve, failed or died, but not
+    those that drain.  ``broken`` run but failed their checks; ``dead`` ended unasked, each with whether that
+    was soon after its start.
+    ``replacing`` are replacements of broken ones that do not serve yet.
+    """
+
+    servers: int
+    warming: int = 0
+    healthy: int = 0
+    replacing: int = 0
+    broken: tuple[str, ...] = ()
+    dead: Mapping[str, bool] = field(default_factory=dict)
+
+
 class Fleet:
-    """The members, by name; implements `rse_pf.local.control.scale_modifier.Servers`."""
+    """The members, by name."""
 
     def __init__(
         self,
@@ -193,11 +210,9 @@ class Fleet:
         """Start a standby for the next launch, unless a server started less than 3 s ago."""
         calm_since_s = time.monotonic() - self._calm_s
         ready = (member.healthy_s for member in self.members.values())
-        if (
-            all(at is not None and at <= calm_since_s for at in ready)
-            and self._backend_servers.start_standby()
-        ):
-            self._emit("standby-started", pid=self._backend_servers.standby_pid)
+        standby = self._backend_servers.standby
+        if all(at is not None and at <= calm_since_s for at in ready) and standby.warm():
+            self._emit("standby-started", pid=standby.pid)
 
     def start(self, member: Member) -> None:
         """Bring *member* up in the background; its failure is an event and a loss."""
@@ -217,7 +232,7 @@ class Fleet:
                     f"{member.name} did not become healthy", hint=f"look at the log {member.name}.log"
                 )
 
-    # --- the protocol rse_pf.local.control.scale_modifier.Servers ----------------------------------------
+    # --- what the scale modifier does ------------------------------------------------------------
 
     def standing(self, now_s: float) -> ServerHealth:
         """Return the servers as the policy counts them."""

@@ -162,12 +162,12 @@ def monitor_sample(
 
 
 class Periods:
-    """Readings, added up to samples of whole periods of the samples' clock; the newest are kept."""
+    """Samples of the monitor, added up to samples of whole periods; the newest are kept."""
 
     def __init__(self, period_s: float, keep: int) -> None:
         self._period_s = period_s
         self._keep = keep
-        self._sums: dict[int, _Sums] = {}
+        self._taken: dict[int, list[tuple[float, MonitorSample]]] = {}
         self._before_s: float | None = None
 
     def add(self, sample: MonitorSample) -> bool:
@@ -177,44 +177,35 @@ class Periods:
             return False
         since_s = sample.time - before_s
         period = math.floor((sample.time - since_s / 2) / self._period_s)
-        self._sums.setdefault(period, _Sums()).add(sample, since_s)
-        for old in sorted(self._sums)[: -self._keep]:
-            del self._sums[old]
+        self._taken.setdefault(period, []).append((since_s, sample))
+        for old in sorted(self._taken)[: -self._keep]:
+            del self._taken[old]
         return math.floor(sample.time / self._period_s) > math.floor(before_s / self._period_s)
 
     def samples(self, now_s: float) -> tuple[Sample, ...]:
         """Return the samples of the periods that have ended by *now_s*, oldest first."""
         ended = math.floor(now_s / self._period_s + 1e-6)
         return tuple(
-            sums.sample(period * self._period_s)
-            for period, sums in sorted(self._sums.items())
-            if period < ended and sums.known_s >= _WHOLE * self._period_s
+            _period_sample(period * self._period_s, taken)
+            for period, taken in sorted(self._taken.items())
+            if period < ended and _known_s(taken) >= _WHOLE * self._period_s
         )
 
 
-class _Sums:
-    """One period.  CPU and robots are means over time, queue the worst, requests the sum."""
+def _period_sample(start_s: float, taken: Sequence[tuple[float, MonitorSample]]) -> Sample:
+    """Return the sample of one period: means over time, the longest queue, and the sum of the requests."""
+    loads = [(since_s, each) for since_s, each in taken if each.cpu_percent is not None]
+    known_s = _known_s(taken)
+    return Sample(
+        start_s=start_s,
+        cpu_percent=sum(since_s * (each.cpu_percent or 0.0) for since_s, each in loads) / known_s,
+        requests=sum(each.requests for _, each in taken),
+        robots_per_server=sum(since_s * each.robots / each.servers_count for since_s, each in loads)
+        / known_s,
+        queue_ms=max(each.queue_ms for _, each in taken),
+    )
 
-    def __init__(self) -> None:
-        self.known_s = 0.0
-        self._cpu = 0.0
-        self._robots = 0.0
-        self._requests = 0
-        self._queue_ms = 0.0
 
-    def add(self, sample: MonitorSample, since_s: float) -> None:
-        self._requests += sample.requests
-        self._queue_ms = max(self._queue_ms, sample.queue_ms)
-        if sample.cpu_percent is not None:
-            self.known_s += since_s
-            self._cpu += since_s * sample.cpu_percent
-            self._robots += since_s * sample.robots / sample.servers_count
-
-    def sample(self, start_s: float) -> Sample:
-        return Sample(
-            start_s=start_s,
-            cpu_percent=self._cpu / self.known_s,
-            requests=self._requests,
-            robots_per_server=self._robots / self.known_s,
-            queue_ms=self._queue_ms,
-        )
+def _known_s(taken: Sequence[tuple[float, MonitorSample]]) -> float:
+    """Return how long the CPU was watched."""
+    return sum(since_s for since_s, each in taken if each.cpu_percent is not None)

@@ -31,7 +31,7 @@ from rse_pf.local.control.audit_recorder import PlatformAudit
 from rse_pf.local.control.control_plane import ControlOptions, ControlPlane
 from rse_pf.local.control.fleet import Fleet
 from rse_pf.local.control.status_api import serve_status
-from rse_pf.local.firewall import check_listener, ensure_key, key_file, key_set_file, robots_url
+from rse_pf.local.firewall import check_listener, ensure_key, key_file, robots_url
 from rse_pf.local.processes import STOP_TIMEOUT_S, ProcessMark, is_alive, mark_of, send_signal
 from rse_pf.local.servers.backend_servers import RSE_PF, BackendServer, LocalBackendServers
 from rse_pf.local.servers.data_servers import LocalDataServers
@@ -107,9 +107,6 @@ class LocalPlatform:
         self._status: asyncio.Server | None = None
         self.backend_servers = LocalBackendServers(
             folder=self.state,
-            settings_file=settings_file(self.state),
-            keys_file=key_set_file(self.state),
-            control_token_file=control_token_file(self.state),
             dies_with_parent=not adoptable,
             warm_standby=settings.local.warm_standby,
             program=program,
@@ -120,8 +117,6 @@ class LocalPlatform:
         self.data_servers = LocalDataServers(
             settings,
             folder=self.state,
-            settings_file=settings_file(self.state),
-            keys_file=key_set_file(self.state),
             store=self._placement.store,
             dies_with_parent=not adoptable,
             replaces=control.elastic,
@@ -286,7 +281,7 @@ class LocalPlatform:
         self._control.hold = True
         try:
             for old in [server.name for server in self.servers]:
-                await self.backend_servers.wait_warm(self.settings.local.start_timeout_s)
+                await self.backend_servers.standby.wait_warm(self.settings.local.start_timeout_s)
                 names = list(self._fleet.grow(1, "rolling replacement"))
                 await self._until_healthy(names)
                 if old in self._fleet.members:

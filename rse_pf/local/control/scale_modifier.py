@@ -3,56 +3,22 @@
 The policy names the servers to replace; three rules here say when.  A server that died is replaced at once.
 Replacements of servers that died soon after their start are limited in number per minute (a crash loop).
 Servers that run but fail their checks are never replaced all at once: then the fault is more likely in the
-monitor or the machine.  Time is an argument, and the effects are those of `Servers`.
+monitor or the machine.  Time is an argument, and the effects are those of the `Fleet`.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Any, Protocol
+from collections.abc import Callable, Sequence
+from typing import Any
 
 from rse_pf.config import ScalingSettings
+from rse_pf.local.control.fleet import Fleet, ServerHealth
 from rse_pf.scaling.policy import Action, FleetState, Sample, decide
 
-__all__ = ["LocalScaleModifier", "ServerHealth", "Servers", "may_start_s", "replace_now"]
+__all__ = ["LocalScaleModifier", "may_start_s", "replace_now"]
 
 _MINUTE_S = 60.0
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ServerHealth:
-    """The servers as they stand.
-
-    ``servers`` counts all that are or should be there: those that start, serve, failed or died, but not
-    those that drain.  ``broken`` run but failed their checks; ``dead`` ended unasked, each with whether that
-    was soon after its start.
-    ``replacing`` are replacements of broken ones that do not serve yet.
-    """
-
-    servers: int
-    warming: int = 0
-    healthy: int = 0
-    replacing: int = 0
-    broken: tuple[str, ...] = ()
-    dead: Mapping[str, bool] = field(default_factory=dict)
-
-
-class Servers(Protocol):
-    """What is done to servers; each call returns at once."""
-
-    def standing(self, now_s: float) -> ServerHealth:
-        """Return the servers as they stand."""
-
-    def grow(self, count: int, reason: str) -> Sequence[str]:
-        """Launch *count* servers; return their names."""
-
-    def shrink(self, reason: str) -> str | None:
-        """Drain the server with the fewest robots; return its name, None if none can be spared."""
-
-    def put_in_place_of(self, name: str, reason: str) -> str:
-        """Launch a server in place of *name*, which is killed if it lives; return the new name."""
 
 
 def may_start_s(starts: Sequence[float], *, now_s: float, per_minute: int) -> float:
@@ -76,11 +42,11 @@ def replace_now(broken: Sequence[str], *, healthy: int, replacing: int) -> tuple
 
 
 class LocalScaleModifier:
-    """Applies the policy to `Servers`; remembers only when it acted and what it started."""
+    """Applies the policy to the servers of a `Fleet`; remembers only when it acted and what it started."""
 
     def __init__(
         self,
-        servers: Servers,
+        servers: Fleet,
         settings: ScalingSettings,
         *,
         max_restarts_per_minute: int,

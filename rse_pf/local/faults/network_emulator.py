@@ -8,12 +8,11 @@ sockets stay open, and what was sent meanwhile arrives after it heals, when TCP 
 from __future__ import annotations
 
 import asyncio
-import functools
-import heapq
 import math
 import multiprocessing
 import random
 import socket
+import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -132,24 +131,21 @@ class EmulatedLink:
         self.port = 0
         self.is_cut = False
         self.cuts = 0
-        self.healed_s = 0.0
         self.ways: set[_Way] = set()
         self._target = (target_host, target_port)
         self._seed = seed
         self._accepted = 0
         self._cutting: set[str] = set()
-        self._dials: set[asyncio.Task[None]] = set()
+        self._tasks: set[asyncio.Task[None]] = set()
         self._server: asyncio.Server | None = None
-        self._own_cuts: asyncio.Task[None] | None = None
 
     async def __aenter__(self) -> EmulatedLink:
         """Listen on a free port of loopback."""
-        loop = asyncio.get_running_loop()
-        self.timers = _Timers(loop)
-        self._server = await loop.create_server(lambda: _RobotEnd(self), _LOOPBACK, 0, backlog=1024)
+        self.loop = asyncio.get_running_loop()
+        self._server = await self.loop.create_server(lambda: _RobotEnd(self), _LOOPBACK, 0, backlog=1024)
         self.port = self._server.sockets[0].getsockname()[1]
         if self.profile.cut_every_s is not None:
-            self._own_cuts = asyncio.create_task(self._cut_now_and_then(self.profile.cut_every_s))
+            self._tasks.add(self.loop.create_task(self._cut_now_and_then(self.profile.cut_every_s)))
         return self
 
     async def __aexit__(
@@ -158,13 +154,11 @@ class EmulatedLink:
         """Stop listening and close every connection."""
         assert self._server is not None
         self._server.close()
-        tasks = [*self._dials, *([self._own_cuts] if self._own_cuts else [])]
-        for task in tasks:
+        for task in self._tasks:
             task.cancel()
-        await asyncio.gather(*tasks, return_exceptions=True)
+        await asyncio.gather(*self._tasks, return_exceptions=True)
         for way in list(self.ways):
             way.end()
-        self.timers.close()
         await asyncio.sleep(0)
 
     def cut(self, cause: str = "asked") -> None:
@@ -179,9 +173,8 @@ class EmulatedLink:
         if self._cutting or not self.is_cut:
             return
         self.is_cut = False
-        self.healed_s = asyncio.get_running_loop().time()
         for way in list(self.ways):
-            way.retry(self.healed_s)
+            way.retry(self.loop.time())
 
     def lanes(self) -> tuple[Lane, Lane]:
         """Return the two directions of a new connection, up first."""
@@ -196,13 +189,17 @@ class EmulatedLink:
 
         async def work() -> None:
             try:
-                await asyncio.get_running_loop().create_connection(make, *self._target)
+                await self.loop.create_connection(make, *self._target)
             except OSError:
                 failed()
 
-        task = asyncio.get_running_loop().create_task(work())
-        self._dials.add(task)
-        task.add_done_callback(self._dials.discard)
+        task = self.loop.create_task(work())
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
+
+    def at(self, when_s: float, act: Callable[..., None], *arguments: Any) -> None:
+        """Call *act* with *arguments* at *when_s*, a time of the loop."""
+        self.loop.call_at(when_s - _TIMER_GRAIN_S, act, *arguments)
 
     async def _cut_now_and_then(self, every_s: float) -> None:
         source = random.Random(f"{self._seed}/cuts")
@@ -211,40 +208,6 @@ class EmulatedLink:
             self.cut("profile")
             await asyncio.sleep(source.expovariate(1.0 / self.profile.cut_for_s))
             self.heal("profile")
-
-
-class _Timers:
-    """All deliveries of a link behind one timer of the loop."""
-
-    def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
-        self.now = loop.time
-        self._loop = loop
-        self._heap: list[tuple[float, int, Callable[[], None]]] = []
-        self._count = 0
-        self._handle: asyncio.TimerHandle | None = None
-
-    def at(self, when_s: float, act: Callable[[], None]) -> None:
-        self._count += 1
-        heapq.heappush(self._heap, (when_s, self._count, act))
-        if self._heap[0][0] == when_s:
-            self._arm()
-
-    def close(self) -> None:
-        self._heap.clear()
-        self._arm()
-
-    def _arm(self) -> None:
-        if self._handle is not None:
-            self._handle.cancel()
-        self._handle = None
-        if self._heap:
-            self._handle = self._loop.call_at(self._heap[0][0] - _TIMER_GRAIN_S, self._ring)
-
-    def _ring(self) -> None:
-        until = self.now() + _TIMER_GRAIN_S
-        while self._heap and self._heap[0][0] <= until:
-            heapq.heappop(self._heap)[2]()
-        self._arm()
 
 
 class _Way:
@@ -259,18 +222,16 @@ class _Way:
         self._queue: deque[tuple[float, float, bytes | None]] = deque()
         self._held = 0
         self._armed_s: float | None = None
-        self._is_paused = False
         link.ways.add(self)
 
     def send(self, data: bytes | None) -> None:
         """Take bytes from the source; hold it back when too many are on their way."""
-        now = self._link.timers.now()
+        now = self._link.loop.time()
         size = len(data) if data is not None else 0
         due = math.inf if self._opens_s is None else self._lane.arrival_s(max(now, self._opens_s), size)
         self._queue.append((due, now, data))
         self._held += size
-        if self._held > _HELD_BYTES and self.source is not None and not self._is_paused:
-            self._is_paused = True
+        if self._held > _HELD_BYTES and self.source is not None and self.source.is_reading():
             self.source.pause_reading()
         self._arm()
 
@@ -309,7 +270,7 @@ class _Way:
         is_ready = self.sink is not None and self._opens_s is not None and not self._link.is_cut
         if self._queue and is_ready and self._armed_s is None:
             self._armed_s = self._queue[0][0]
-            self._link.timers.at(self._armed_s, functools.partial(self._deliver, self._armed_s))
+            self._link.at(self._armed_s, self._deliver, self._armed_s)
 
     def _deliver(self, armed_s: float) -> None:
         if armed_s != self._armed_s:
@@ -317,7 +278,7 @@ class _Way:
         self._armed_s = None
         if self._link.is_cut or self.sink is None:
             return
-        until = self._link.timers.now() + _TIMER_GRAIN_S
+        until = self._link.loop.time() + _TIMER_GRAIN_S
         while self._queue and self._queue[0][0] <= until:
             data = self._queue.popleft()[2]
             if data is None:
@@ -327,10 +288,8 @@ class _Way:
             self._held -= len(data)
             if not self.sink.is_closing():
                 self.sink.write(data)
-        if self._is_paused and self._held <= _HELD_BYTES // 2 and self.source is not None:
-            self._is_paused = False
-            if not self.source.is_closing():
-                self.source.resume_reading()
+        if self._held <= _HELD_BYTES // 2 and self.source is not None and not self.source.is_closing():
+            self.source.resume_reading()  # does nothing unless it was paused
         self._arm()
 
 
@@ -365,24 +324,24 @@ class _RobotEnd(_End):
         self._link = link
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        up, down = self._link.lanes()
-        now, link = self._link.timers.now(), self._link
+        link = self._link
+        up, down = link.lanes()
+        now = link.loop.time()
         self.out, self.back = _Way(link, up), _Way(link, down)
         self.back.open(now)
         super().connection_made(transport)
-        self._dial_when_open(now, now + link.profile.up_s)
-
-    def _dial_when_open(self, accepted_s: float, when_s: float) -> None:
-        """A SYN that falls into a cut is sent again too."""
-        self._link.timers.at(when_s, functools.partial(self._dial, accepted_s))
+        link.at(now + link.profile.up_s, self._dial, now)
 
     def _dial(self, accepted_s: float) -> None:
+        """Connect to the server; a SYN that falls into a cut is sent again, too."""
         link = self._link
+        if self.out not in link.ways:  # the link is closed
+            return
         if link.is_cut:
-            again = retransmitted_s(accepted_s, link.timers.now() + _MIN_S, _FIRST_DIAL_RETRY_S)
-            self._dial_when_open(accepted_s, again)
+            again = retransmitted_s(accepted_s, link.loop.time() + _MIN_S, _FIRST_DIAL_RETRY_S)
+            link.at(again, self._dial, accepted_s)
         elif self.out.source is not None and not self.out.source.is_closing():
-            self.out.open(link.timers.now() + link.profile.down_s)
+            self.out.open(link.loop.time() + link.profile.down_s)
             link.dial(lambda: _ServerEnd(self.out, self.back), self._refused)
         else:
             self._refused()
@@ -396,9 +355,7 @@ class LinkProcess:
     """A `EmulatedLink` in a process of its own; use it with ``async with``."""
 
     def __init__(self, profile: LinkProfile, target_host: str, target_port: int, *, seed: int = 0) -> None:
-        self.profile = profile
         self.port = 0
-        self.cpu_s = 0.0
         self._arguments = (profile, target_host, target_port, seed)
         self._process: Any = None
         self._pipe: Connection | None = None
@@ -468,17 +425,15 @@ def _run(arguments: tuple[LinkProfile, str, int, int], pipe: Connection) -> None
 
 
 async def _serve(arguments: tuple[LinkProfile, str, int, int], pipe: Connection) -> None:
-    import time
-
     profile, host, port, seed = arguments
-    loop, over = asyncio.get_running_loop(), asyncio.Event()
+    over = asyncio.Event()
     async with EmulatedLink(profile, host, port, seed=seed) as link:
 
         def hear() -> None:
             try:
                 word = pipe.recv()
             except (EOFError, OSError):
-                loop.remove_reader(pipe.fileno())
+                link.loop.remove_reader(pipe.fileno())
                 over.set()
                 return
             if word in ("cut", "heal"):
@@ -486,5 +441,5 @@ async def _serve(arguments: tuple[LinkProfile, str, int, int], pipe: Connection)
             pipe.send(time.process_time())
 
         pipe.send(link.port)
-        loop.add_reader(pipe.fileno(), hear)
+        link.loop.add_reader(pipe.fileno(), hear)
         await over.wait()

@@ -9,7 +9,6 @@ from __future__ import annotations
 import asyncio
 import signal
 import sys
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,16 +17,17 @@ from typing import Any
 from rse_pf.audit.log import audit_folder
 from rse_pf.auth.control_token import read_control_token
 from rse_pf.local.balancer.envoy_config import Target
+from rse_pf.local.firewall import key_set_file
 from rse_pf.local.processes import ProcessMark, ServerProcess, mark_of
 from rse_pf.local.servers.control_client import ControlPort
-from rse_pf.local.servers.warm_standby import WarmStandby
+from rse_pf.local.servers.warm_standby import STANDBY, WarmStandby
+from rse_pf.local.state import control_token_file, settings_file
 
 __all__ = ["RSE_PF", "BackendServer", "LocalBackendServers"]
 
 RSE_PF = (sys.executable, "-m", "rse_pf.cli.main")
 """The program; ``serve`` and its options follow."""
 
-_LOOK_AGAIN_S = 0.01
 _ASK_S = 1.0
 
 
@@ -57,24 +57,19 @@ class LocalBackendServers:
         self,
         *,
         folder: Path,
-        settings_file: Path,
-        keys_file: Path,
-        control_token_file: Path | None = None,
         dies_with_parent: bool = True,
         warm_standby: bool = False,
         program: Sequence[str] = RSE_PF,
     ) -> None:
         self._folder = folder
-        self._settings_file = settings_file
-        self._keys_file = keys_file
-        self._control_token_file = control_token_file
-        self._control_token: str | None = None
         self._dies_with_parent = dies_with_parent
         self._program = tuple(program)
         self._processes: dict[str, ServerProcess] = {}
-        self._standby: WarmStandby | None = None
-        if warm_standby and self._program == RSE_PF:
-            self._standby = WarmStandby(folder, dies_with_parent=dies_with_parent)
+        self.standby = WarmStandby(
+            folder,
+            dies_with_parent=dies_with_parent,
+            program=STANDBY if warm_standby and self._program == RSE_PF else (),
+        )
 
     @property
     def marks(self) -> dict[str, ProcessMark]:
@@ -86,32 +81,15 @@ class LocalBackendServers:
         """Start the process of server *name*, and return before it listens."""
         server = self._processes[name] = ServerProcess(name, self._folder)
         server.announcement.unlink(missing_ok=True)
-        command = ["serve", "--settings", str(self._settings_file), "--server-id", name]
-        command += ["--keys", str(self._keys_file), "--announce", str(server.announcement)]
+        command = ["serve", "--settings", str(settings_file(self._folder)), "--server-id", name]
+        command += ["--keys", str(key_set_file(self._folder)), "--announce", str(server.announcement)]
         command += ["--audit", str(audit_folder(self._folder))]
-        if self._control_token_file is not None:
-            command += ["--control-token", str(self._control_token_file)]
-        standby = None if self._standby is None else self._standby.take(command, server.log)
+        command += ["--control-token", str(control_token_file(self._folder))]
+        standby = self.standby.take(command, server.log)
         if standby is not None:
             server.use(standby)
         else:
             server.start([*self._program, *command], dies_with_parent=self._dies_with_parent)
-
-    def start_standby(self) -> bool:
-        """Start one more process that becomes the next server, unless there is one; return whether it did."""
-        return self._standby is not None and self._standby.warm()
-
-    @property
-    def standby_pid(self) -> int | None:
-        """The id of the standby process; None if there is none."""
-        return None if self._standby is None else self._standby.pid
-
-    async def wait_warm(self, timeout_s: float) -> None:
-        """Wait until the standby is warm, at most *timeout_s*; return at once if this platform has none."""
-        end = time.monotonic() + timeout_s
-        self.start_standby()
-        while self._standby is not None and not self._standby.is_warm and time.monotonic() < end:
-            await asyncio.sleep(_LOOK_AGAIN_S)
 
     def adopt(self, name: str, mark: ProcessMark) -> None:
         """Know a server that an earlier control plane launched as *name*, ready or not."""
@@ -141,7 +119,7 @@ class LocalBackendServers:
         Raises:
             UsageError: The file of the token is missing, or holds none.
         """
-        return ControlPort(port, self._token())
+        return ControlPort(port, read_control_token(control_token_file(self._folder)))
 
     async def status(self, server: BackendServer) -> dict[str, Any] | None:
         """Return what the server says of itself on its control port; None when it does not answer."""
@@ -175,14 +153,8 @@ class LocalBackendServers:
 
     def kill_all(self) -> None:
         """End what is left, at once, and reap it."""
-        if self._standby is not None:
-            self._standby.close()
+        self.standby.close()
         for process in self._processes.values():
             process.send(signal.SIGKILL)
         for name in list(self._processes):
             self.forget(name)
-
-    def _token(self) -> str | None:
-        if self._control_token is None and self._control_token_file is not None:
-            self._control_token = read_control_token(self._control_token_file)
-        return self._control_token

@@ -18,9 +18,10 @@ from rse_pf.config import PlatformSettings
 from rse_pf.errors import ConfigurationError
 from rse_pf.linux import run_as_batch
 from rse_pf.local.balancer.envoy_config import Target
+from rse_pf.local.firewall import key_set_file
 from rse_pf.local.processes import ProcessMark, ServerProcess
 from rse_pf.local.servers.control_client import ControlPort
-from rse_pf.local.state import ServerState
+from rse_pf.local.state import ServerState, settings_file
 
 __all__ = ["NICENESS", "LocalDataServers"]
 
@@ -42,8 +43,6 @@ class LocalDataServers:
         settings: PlatformSettings,
         *,
         folder: Path,
-        settings_file: Path,
-        keys_file: Path,
         store: str | None = None,
         name: str = "data-1",
         dies_with_parent: bool = True,
@@ -55,9 +54,7 @@ class LocalDataServers:
 
         Args:
             settings: Groups data and local.
-            folder: For the log and the announcement.
-            settings_file: Given to the process.
-            keys_file: Public keys of the tokens.
+            folder: Holds settings and public keys, gets the log and the announcement.
             store: Overrides ``data.store``; a platform whose store is ``memory:`` names a folder here.
             name: Of the process, in log and events.
             dies_with_parent: Whether the process ends when this one does.
@@ -75,7 +72,7 @@ class LocalDataServers:
         self._process = ServerProcess(name, folder)
         self._watching: asyncio.Task[None] | None = None
         self._command = [
-            *program, "data", "--settings", str(settings_file), "--keys", str(keys_file),
+            *program, "data", "--settings", str(settings_file(folder)), "--keys", str(key_set_file(folder)),
             "--host", _LOOPBACK, "--announce", str(self._process.announcement),
             "--audit", str(audit_folder(folder)), *(() if store is None else ("--store", store)),
         ]  # fmt: skip

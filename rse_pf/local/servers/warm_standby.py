@@ -9,10 +9,12 @@ Source:
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import json
 import subprocess
 import sys
+import time
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -20,12 +22,13 @@ from rse_pf.local.processes import spawn
 
 __all__ = ["STANDBY", "WarmStandby"]
 
+_LOOK_AGAIN_S = 0.01
 STANDBY = (sys.executable, "-m", "rse_pf.cli.standby")
 """The program; it reads its arguments from standard input."""
 
 
 class WarmStandby:
-    """At most one process that has imported what a server needs."""
+    """At most one process that has imported what a server needs; none if *program* is empty."""
 
     def __init__(self, folder: Path, *, dies_with_parent: bool, program: Sequence[str] = STANDBY) -> None:
         self._folder = folder
@@ -51,7 +54,7 @@ class WarmStandby:
 
     def warm(self) -> bool:
         """Start a standby unless there is one; return whether one was started."""
-        if self.pid is not None:
+        if self.pid is not None or not self._program:
             return False
         self.close()
         self._process = spawn(
@@ -59,6 +62,13 @@ class WarmStandby:
             dies_with_parent=self._dies_with_parent, stdin=subprocess.PIPE,
         )  # fmt: skip
         return True
+
+    async def wait_warm(self, timeout_s: float) -> None:
+        """Start a standby unless there is one, and wait until it is warm, at most *timeout_s*."""
+        end = time.monotonic() + timeout_s
+        self.warm()
+        while self._program and not self.is_warm and time.monotonic() < end:
+            await asyncio.sleep(_LOOK_AGAIN_S)
 
     def take(self, arguments: Sequence[str], log: Path) -> subprocess.Popen[bytes] | None:
         """Turn the standby into the program of *arguments*, which writes to *log*; None if there is none."""

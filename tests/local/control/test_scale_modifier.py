@@ -10,7 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rse_pf.config import ScalingSettings
-from rse_pf.local.control.scale_modifier import LocalScaleModifier, ServerHealth, may_start_s, replace_now
+from rse_pf.local.control.fleet import ServerHealth
+from rse_pf.local.control.scale_modifier import LocalScaleModifier, may_start_s, replace_now
 from rse_pf.scaling.policy import Sample
 
 SCALING = ScalingSettings()
@@ -51,7 +52,13 @@ def made(standing: ServerHealth) -> tuple[LocalScaleModifier, FakeServers, list[
     def emit(event: str, **details: Any) -> None:
         told.append({"event": event, **details})
 
-    return LocalScaleModifier(servers, SCALING, max_restarts_per_minute=5, emit=emit), servers, told
+    modifier = LocalScaleModifier(
+        servers,  # type: ignore[arg-type]
+        SCALING,
+        max_restarts_per_minute=5,
+        emit=emit,
+    )
+    return modifier, servers, told
 
 
 def samples(count: int, cpu_percent: float, requests: int = 1) -> list[Sample]:

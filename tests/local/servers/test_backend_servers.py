@@ -10,9 +10,11 @@ from typing import Any
 
 import pytest
 
+from rse_pf.auth.control_token import ensure_control_token
 from rse_pf.errors import ConfigurationError
 from rse_pf.local.processes import is_alive
 from rse_pf.local.servers.backend_servers import LocalBackendServers
+from rse_pf.local.state import control_token_file
 
 pytestmark = pytest.mark.system
 
@@ -36,12 +38,8 @@ signal.pause()
 
 
 def servers(folder: Path, script: str) -> LocalBackendServers:
-    return LocalBackendServers(
-        folder=folder,
-        settings_file=folder / "settings.json",
-        keys_file=folder / "keys.json",
-        program=(sys.executable, "-c", script),
-    )
+    ensure_control_token(control_token_file(folder), seed=bytes(32))
+    return LocalBackendServers(folder=folder, program=(sys.executable, "-c", script))
 
 
 def with_server(

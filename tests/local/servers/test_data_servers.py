@@ -42,7 +42,7 @@ class Box:
         self.told: asyncio.Queue[str] = asyncio.Queue()
         self.servers = LocalDataServers(
             PlatformSettings().replace(local={"start_timeout_s": 15.0}, health=health),
-            folder=folder, settings_file=folder / "s", keys_file=folder / "k", store="dir:objects",
+            folder=folder, store="dir:objects",
             replaces=replaces, program=(sys.executable, "-W", "ignore", "-c", program),
             emit=lambda event, **_: self.told.put_nowait(event),
         )  # fmt: skip
