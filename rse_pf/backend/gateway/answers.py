@@ -20,7 +20,7 @@ from rse_pf.backend.ports import Clocks
 from rse_pf.backend.scheduling.scheduler import QueuedCommand, RefusedCommand
 from rse_pf.errors import Busy, InternalError, LimitExceeded, RsePfError
 from rse_pf.service import Registry, Service, dispatch, failure_of
-from rse_pf.wire import Command, Failure, Progress, Result
+from rse_pf.wire import Codec, Command, Failure, Result
 from rse_pf.wire.envelope import Envelope, encode_refusal
 
 __all__ = ["Answers", "EncodedAnswer"]
@@ -138,15 +138,21 @@ class Answers:
         self.send(EncodedAnswer(queued, failure, queued.owner.session.codec.encode(failure)), now)
 
     def send_unread_refusal(
-        self, connection: RobotConnection, envelope: Envelope | None, refusal: UnreadRefusal, size_bytes: int
+        self,
+        connection: RobotConnection,
+        codec: Codec,
+        envelope: Envelope | None,
+        refusal: UnreadRefusal,
+        retry_after_ms: float,
+        size_bytes: int,
     ) -> None:
         """Answer a message that is not decoded; *envelope* tells which command it is, if that is known."""
         self._metrics.shed[refusal.reason] += 1
         failure = Failure(
             id=None if envelope is None else envelope.id, code=Busy.code, message=refusal.message,
-            hint=refusal.hint, retry_after_ms=refusal.retry_after_ms, server=self._server_id,
+            hint=refusal.hint, retry_after_ms=retry_after_ms, server=self._server_id,
         )  # fmt: skip
-        data = encode_refusal(connection.codec, failure)
+        data = encode_refusal(codec, failure)
         connection.write(data)
         if envelope is None:
             return
@@ -158,11 +164,6 @@ class Answers:
                 trace="", code=Busy.code, queue_ms=0.0, compute_ms=0.0, bytes_in=size_bytes,
                 bytes_out=len(data),
             )  # fmt: skip
-
-    def send_progress(self, connection: RobotConnection, progress: Progress) -> None:
-        """Tell a robot that understands it how far its long command is."""
-        if connection.hears_progress:
-            connection.write(connection.codec.encode(progress))
 
     def label(self, service: str) -> str:
         """Return the name of *service* for metrics and log, the same for all that this server does not

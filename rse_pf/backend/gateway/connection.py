@@ -20,7 +20,7 @@ from rse_pf.backend.metrics import Metrics
 from rse_pf.backend.ports import Wire
 from rse_pf.config import SessionSettings
 from rse_pf.errors import ProtocolError
-from rse_pf.wire import Codec, Command
+from rse_pf.wire import Command, Progress
 from rse_pf.wire.messages import FromRobot
 from rse_pf.wire.server_session import Decision, Renewal, Send, ServerSession, Submit, Withdraw
 
@@ -33,10 +33,12 @@ _BAD_MESSAGE_PAUSE_S = 0.1
 class CommandHandler(Protocol):
     """What a connection needs of the dispatcher."""
 
-    def refuses_unread(self, connection: RobotConnection, data: bytes, now: float) -> bool:
+    def refuses_unread(
+        self, connection: RobotConnection, session: ServerSession, data: bytes, now: float
+    ) -> bool:
         """Refuse the message *data* before it is decoded; False if it must be decoded."""
 
-    def refuses_long(self, connection: RobotConnection, data: bytes) -> bool:
+    def refuses_long(self, connection: RobotConnection, session: ServerSession, data: bytes) -> bool:
         """Refuse a message that is too long for the event loop; False if the decoder thread may take it."""
 
     def submit(self, connection: RobotConnection, command: Command, size_bytes: int, now: float) -> None:
@@ -71,7 +73,7 @@ class RobotConnection:
     """One robot's connection between its handshake and its end."""
 
     __slots__ = (
-        "_assembler", "_context", "_deferred", "_wire", "allowed_s", "claims", "expires_s", "is_connected",
+        "_assembler", "_context", "_deferred", "_wire", "allowed_s", "claims", "is_connected",
         "last_heard_s", "moving_until_s", "number", "opened_s", "robot", "session", "tenant",
     )  # fmt: skip
 
@@ -83,7 +85,6 @@ class RobotConnection:
         accepted: Accepted,
         *,
         now: float,
-        expires_s: float | None,
         number: int = 0,
     ) -> None:
         """Know the robot; its session waits for a Hello.
@@ -94,7 +95,6 @@ class RobotConnection:
             session: The rules of the protocol; None echoes messages, for the conformance test of WebSocket.
             accepted: What the handshake says of the robot.
             now: Seconds, monotonic, as all times here.
-            expires_s: When the robot's token ends; None never.
             number: Which socket of the server this is, in the order of acceptance.
         """
         self.robot, self.tenant = accepted.robot, accepted.tenant
@@ -103,7 +103,6 @@ class RobotConnection:
         self.session = session
         self.number = number
         self.opened_s = self.last_heard_s = now
-        self.expires_s = expires_s
         self.allowed_s: float | None = None
         """Time that the last command had, from its arrival to its deadline."""
         self.moving_until_s = float("-inf")
@@ -130,17 +129,6 @@ class RobotConnection:
         """Whether the robot said Hello and can be asked to leave for another server."""
         return self.session is not None and self.session.state == "open" and not self._assembler.closed
 
-    @property
-    def hears_progress(self) -> bool:
-        """Whether the robot is still connected and understands progress messages."""
-        return self.is_connected and self.session is not None and self.session.hears_progress
-
-    @property
-    def codec(self) -> Codec:
-        """The codec of the session; a connection that only echoes has none."""
-        assert self.session is not None
-        return self.session.codec
-
     def frame(self, opcode: int, fin: bool, rsv: bool, payload: bytes) -> None:
         """Take one unmasked frame."""
         now = self._context.monotonic()
@@ -164,6 +152,11 @@ class RobotConnection:
         if not self._assembler.closed:
             self._context.metrics.bytes_out += len(data)
             self._wire.send(data, self.session is not None and self.session.codec.is_text)
+
+    def write_progress(self, progress: Progress) -> None:
+        """Write how far a long command is, if the robot is still connected and understands it."""
+        if self.is_connected and self.session is not None and self.session.hears_progress:
+            self.write(self.session.codec.encode(progress))
 
     def move(self, reason: str, within_ms: float, now: float) -> None:
         """Ask the robot to leave for another server."""
@@ -199,7 +192,7 @@ class RobotConnection:
             context.metrics.bytes_out += len(data)
             self._wire.send(data, received.is_text)
             return
-        if session.state == "open" and context.handler.refuses_unread(self, data, now):
+        if session.state == "open" and context.handler.refuses_unread(self, session, data, now):
             return
         state, bad_messages = session.state, session.bad_messages
         decoder, decisions = context.decoder, None
@@ -207,7 +200,7 @@ class RobotConnection:
             decisions = session.receive_short(data, now, decoder.short_inflated_bytes)
         if decisions is not None:
             self._follow(decisions, len(data), now, state, bad_messages)
-        elif not context.handler.refuses_long(self, data):
+        elif not context.handler.refuses_long(self, session, data):
             self._decode_in_thread(session, data, now)
 
     def _decode_in_thread(self, session: ServerSession, data: bytes, now: float) -> None:

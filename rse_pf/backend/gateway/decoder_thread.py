@@ -47,7 +47,7 @@ class DecoderThread:
 
         Args:
             codec: Of the robot.
-            data: One whole message, which `Admission.judge_size` let pass.
+            data: One whole message, which `Admission.may_wait` let pass.
             suspicion: How many messages of the robot could not be decoded; robots with fewer come first.
             done: Takes the message, or why it is none.
         """

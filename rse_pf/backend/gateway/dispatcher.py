@@ -10,19 +10,19 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
-from rse_pf.backend.gateway.admission import Admission
+from rse_pf.backend.gateway.admission import DECODER_FULL, TOO_FAST, TOO_LATE, Admission
 from rse_pf.backend.gateway.answers import Answers, EncodedAnswer
 from rse_pf.backend.gateway.connection import ConnectionContext, RobotConnection
 from rse_pf.backend.gateway.decoder_thread import DecoderThread
 from rse_pf.backend.gateway.handshake import Accepted
 from rse_pf.backend.gateway.idle_timeouts import IdleTimeouts
 from rse_pf.backend.gateway.queues import JobQueue, SandboxQueue
-from rse_pf.backend.gateway.rate_limits import CutOff
+from rse_pf.backend.gateway.rate_limits import CUT_OFF
 from rse_pf.backend.gateway.token_watch import TokenWatch
 from rse_pf.backend.log import JsonLog
 from rse_pf.backend.metrics import LongestRecently, Metrics
 from rse_pf.backend.ports import Clocks, Handle, Loop, Wire
-from rse_pf.backend.scheduling.cpu_throttle import BATCH_S, CpuThrottle, NoThrottle
+from rse_pf.backend.scheduling.cpu_throttle import BATCH_S, CpuThrottle
 from rse_pf.backend.scheduling.scheduler import (
     QUEUE_TARGET_S,
     QueuedCommand,
@@ -39,6 +39,7 @@ from rse_pf.wire.server_session import CLOSE_GOING_AWAY, CLOSE_RATE, ServerSessi
 
 __all__ = ["Dispatcher"]
 
+_DECODER_RETRY_MS = 500.0
 _UNMEASURED_TURN_S = 0.125
 """Sandboxes and jobs do not measure their turns: a robot whose queue is full waits this long for each of
 them."""
@@ -61,7 +62,7 @@ class Dispatcher:
         new_session_id: Callable[[], str],
         admission: Admission,
         scheduler: Scheduler,
-        throttle: CpuThrottle | NoThrottle,
+        throttle: CpuThrottle,
         decoder: DecoderThread,
         answers: Answers,
         sandboxes: SandboxQueue,
@@ -129,7 +130,7 @@ class Dispatcher:
         self._ran_inline = False
         self._throttle_timer: Handle | None = None
         self._sweep_timer: Handle | None = None
-        self._batched: list[Callable[[], None]] = []
+        self._batched: list[tuple[Any, ...]] = []
         self._move: tuple[str, float] | None = None
         self._idle_timeouts = IdleTimeouts(settings.session, clocks.monotonic())
         self._lag_s = 0.0
@@ -154,11 +155,9 @@ class Dispatcher:
                 limits=self._settings.session,
             )
             session.ends_s = expires_s
-        connection = RobotConnection(
-            self._context, wire, session, accepted, now=now, expires_s=expires_s, number=number
-        )
+        connection = RobotConnection(self._context, wire, session, accepted, now=now, number=number)
         self.connections.add(connection)
-        self._token_watch.connected(connection)
+        self._token_watch.connected(connection, expires_s)
         self._sandboxes.connected(connection.robot)
         return connection
 
@@ -197,42 +196,42 @@ class Dispatcher:
         self._jobs.close()
         self._sandboxes.close()
 
-    def refuses_unread(self, connection: RobotConnection, data: bytes, now: float) -> bool:
+    def refuses_unread(
+        self, connection: RobotConnection, session: ServerSession, data: bytes, now: float
+    ) -> bool:
         """Refuse the message *data* for a fraction of what decoding it costs; False if it must be decoded."""
-        refusal = self._admission.judge_rate((connection.tenant, connection.robot), now)
-        if refusal is not None:
-            if isinstance(refusal, CutOff):
-                self._metrics.shed["rate"] += 1
-                self._log.warning("cut-off", robot=connection.robot, reason="rate")
-                connection.close(CLOSE_RATE, "rate")
-            else:
-                self._answers.send_unread_refusal(
-                    connection, peek(connection.codec, data), refusal, len(data)
-                )
+        answers, codec = self._answers, session.codec
+        retry_ms = self._admission.rates.retry_after_ms((connection.tenant, connection.robot), now)
+        if retry_ms == CUT_OFF:
+            self._metrics.shed["rate"] += 1
+            self._log.warning("cut-off", robot=connection.robot, reason="rate")
+            connection.close(CLOSE_RATE, "rate")
             return True
-        scheduler, allowed_s = self._scheduler, connection.allowed_s
-        if not scheduler.is_behind or allowed_s is None:
+        if retry_ms:
+            answers.send_unread_refusal(connection, codec, peek(codec, data), TOO_FAST, retry_ms, len(data))
+            return True
+        if connection.allowed_s is None:
             return False
-        delay_s = scheduler.delay_unread_s(connection.robot)
-        refusal = self._admission.judge_delay(allowed_s, delay_s, scheduler.max_delay_s)
-        envelope = None if refusal is None else peek(connection.codec, data)
-        if refusal is None or envelope is None or self._queue_of(envelope.service) != "scheduler":
+        retry_ms = self._scheduler.retry_unread_ms(connection.robot, connection.allowed_s)
+        envelope = peek(codec, data) if retry_ms else None
+        if envelope is None or self._queue_of(envelope.service) != "scheduler":
             return False
-        scheduler.note_refused(now)
+        self._scheduler.note_refused(now)
         if self._throttle_timer is None:
-            self._answers.send_unread_refusal(connection, envelope, refusal, len(data))
+            answers.send_unread_refusal(connection, codec, envelope, TOO_LATE, retry_ms, len(data))
         else:
-            self._batch(partial(self._answers.send_unread_refusal, connection, envelope, refusal, len(data)))
+            self._batch((connection, codec, envelope, TOO_LATE, retry_ms, len(data)))
         return True
 
-    def refuses_long(self, connection: RobotConnection, data: bytes) -> bool:
+    def refuses_long(self, connection: RobotConnection, session: ServerSession, data: bytes) -> bool:
         """Refuse a message that is too long for the event loop; False if the decoder thread may take it."""
-        session = connection.session
-        bad_messages = 0 if session is None else session.bad_messages
-        refusal = self._admission.judge_size(len(data), self._decoder.unread_bytes, bad_messages)
-        if refusal is not None:
-            self._answers.send_unread_refusal(connection, peek(connection.codec, data), refusal, len(data))
-        return refusal is not None
+        may_wait = self._admission.may_wait(len(data), self._decoder.unread_bytes, session.bad_messages)
+        if not may_wait:
+            envelope = peek(session.codec, data)
+            self._answers.send_unread_refusal(
+                connection, session.codec, envelope, DECODER_FULL, _DECODER_RETRY_MS, len(data)
+            )
+        return not may_wait
 
     def submit(self, connection: RobotConnection, command: Command, size_bytes: int, now: float) -> None:
         """Admit one command to the queue of its service, or refuse it."""
@@ -367,16 +366,16 @@ class Dispatcher:
         self._throttle_timer = None
         self._start()
 
-    def _batch(self, send: Callable[[], None]) -> None:
-        """Call *send* together with the others of its batch."""
+    def _batch(self, refusal: tuple[Any, ...]) -> None:
+        """Send *refusal*, arguments of `Answers.send_unread_refusal`, together with others."""
         if not self._batched:
             self._loop.call_later(BATCH_S, self._send_batch)
-        self._batched.append(send)
+        self._batched.append(refusal)
 
     def _send_batch(self) -> None:
         batched, self._batched = self._batched, []
-        for send in batched:
-            send()
+        for refusal in batched:
+            self._answers.send_unread_refusal(*refusal)
 
     def _sweep(self) -> None:
         self._sweep_timer = None

@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from rse_pf.config import SessionSettings
+from rse_pf.token_bucket import TokenBucket
 
 __all__ = [
     "CLOSE_INVALID_TEXT",
@@ -67,8 +68,7 @@ class FrameAssembler:
     """The frames of one socket, and the message that they are part of."""
 
     __slots__ = (
-        "_control_at",
-        "_control_left",
+        "_control_frames",
         "_count",
         "_limits",
         "_message",
@@ -84,8 +84,7 @@ class FrameAssembler:
         self._opcode = 0
         self._count = 0
         self._size = 0
-        self._control_left = self._burst
-        self._control_at = 0.0
+        self._control_frames = TokenBucket(limits.max_control_per_s, limits.max_control_per_s)
 
     def receive(self, opcode: int, fin: bool, rsv: bool, payload: bytes, now: float) -> FrameDecision | None:
         """Return what one frame, unmasked, that arrived at *now* (s) means; None: wait for more."""
@@ -101,7 +100,7 @@ class FrameAssembler:
             return self._close(CLOSE_PROTOCOL_ERROR, "bad frame")
         if opcode == CLOSE:
             return self._answer_close(payload)
-        if not self._may_control(now):
+        if self._control_frames.take(now) > 0:
             return self._close(CLOSE_POLICY, "too many control frames")
         return SendPong(payload) if opcode == PING else None
 
@@ -158,19 +157,6 @@ class FrameAssembler:
         self._message = None
         return CloseSocket(code, reason)
 
-    @property
-    def _burst(self) -> float:
-        return max(1.0, self._limits.max_control_per_s)
-
-    def _may_control(self, now: float) -> bool:
-        earned = (now - self._control_at) * self._limits.max_control_per_s
-        self._control_left = min(self._burst, self._control_left + earned)
-        self._control_at = now
-        if self._control_left < 1.0:
-            return False
-        self._control_left -= 1.0
-        return True
-
 
 class CloseBorder:
     """Find where the first CLOSE frame of a byte stream ends.
@@ -179,26 +165,22 @@ class CloseBorder:
     although nothing behind it counts (RFC 6455, 5.5.1).  Only the borders of frames are looked at here.
     """
 
-    __slots__ = ("_head", "_is_close", "_left", "_upgraded", "shut")
+    __slots__ = ("_head", "_is_close", "_left", "is_upgraded", "shut")
 
     def __init__(self, *, upgraded: bool = False) -> None:
+        """Begin with the head of the handshake, or behind it if *upgraded*."""
         self.shut = False
-        self._upgraded = upgraded
+        self.is_upgraded = upgraded
         self._head = b""
         self._left = 0
         self._is_close = False
-
-    @property
-    def is_upgraded(self) -> bool:
-        """Whether the handshake's head is over."""
-        return self._upgraded
 
     def wanted(self, data: memoryview) -> int:
         """Return how many of the next bytes of the stream stand before the end of the CLOSE frame."""
         if self.shut:
             return 0
         start = 0
-        if not self._upgraded:
+        if not self.is_upgraded:
             start = self._end_of_request(data)
             if start < 0:
                 return len(data)
@@ -213,7 +195,7 @@ class CloseBorder:
             self._head = seen[-3:]
             return -1
         start = blank + 4 - len(self._head)
-        self._head, self._upgraded = b"", True
+        self._head, self.is_upgraded = b"", True
         return start
 
     def _walk(self, data: memoryview, i: int) -> int:

@@ -23,6 +23,7 @@ HEALTH = "health"
 """Result of a request for the health page."""
 
 _RETRY_AFTER_S = 2
+_JSON = {"Content-Type": "application/json"}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -50,14 +51,8 @@ class Rejected:
 
 def _rejection(status: int, code: str, message: str, hint: str, **headers: str) -> Rejected:
     body = json.dumps({"code": code, "message": message, "hint": hint}, separators=(",", ":")).encode()
-    return _answer(status, body, code, **headers)
-
-
-def _answer(status: int, body: bytes, result: str, **headers: str) -> Rejected:
     named = {name.replace("_", "-"): value for name, value in headers.items()}
-    return Rejected(
-        status=status, body=body, result=result, headers={"Content-Type": "application/json", **named}
-    )
+    return Rejected(status=status, body=body, result=code, headers={**_JSON, **named})
 
 
 class HandshakePolicy:
@@ -71,18 +66,16 @@ class HandshakePolicy:
         self._conformance_echo = conformance_echo
         path = settings.serving.path
         self._path = path.encode()
-        self._health_path = HEALTH_PATH.encode()
-        self._healthy = _answer(200, b'{"status":"ok"}', HEALTH)
+        self._healthy = Rejected(status=200, body=b'{"status":"ok"}', result=HEALTH, headers=_JSON)
         self.defect = _rejection(500, "internal", "the handshake failed", "try again")
         self._not_found = _rejection(404, "not-found", "nothing is served here", f"connect to {path}")
         self._full = _rejection(
             503, "full", "this server serves as many robots as it may", "try again later",
             Retry_After=str(_RETRY_AFTER_S),
         )  # fmt: skip
-        ban_s = settings.session.rate_ban_s
         self.too_fast = _rejection(
             429, "quota", "too many messages, or handshakes of this address", "wait, and slow down",
-            Retry_After=str(max(1, math.ceil(ban_s))),
+            Retry_After=str(max(1, math.ceil(settings.session.rate_ban_s))),
         )  # fmt: skip
         self._no_token = _rejection(
             401, "unauthorized", "the token is missing or not valid",
@@ -115,38 +108,35 @@ class HandshakePolicy:
         """
         if self._conformance_echo:
             return Accepted(robot=anonymous, codec="", subprotocol="")
-        if path == self._health_path:
+        if path == HEALTH_PATH.encode():
             return self._healthy
         if path.split(b"?")[0] != self._path:
             return self._not_found
         if is_full:
             return self._full
-        robot, tenant, expires_s, claims = anonymous, "default", None, None
+        claims = None
         if self.keys is not None:
             scheme, _, token = authorization.partition(" ")
-            try:
-                if scheme.lower() != "bearer":
-                    raise Unauthorized("no bearer token")
-                claims = verify_token(token.strip(), keys=self.keys, now=now_s, settings=self._settings.auth)
-            except Unauthorized as error:
-                return replace(self._no_token, reason=token_problem(error))
-            robot, tenant = claims.robot, claims.tenant
-            expires_s = self.ends_s(claims, now_s)
+            verified = self.verified(token.strip(), now_s) if scheme.lower() == "bearer" else "unknown"
+            if isinstance(verified, str):
+                return replace(self._no_token, reason=verified)
+            claims = verified
         codec = codec_for(offered)
         if codec is None:
             return self._no_subprotocol
-        return Accepted(
-            robot=robot, codec=codec, subprotocol=SUBPROTOCOLS[codec], expires_s=expires_s, tenant=tenant,
-            claims=claims,
-        )  # fmt: skip
+        accepted = Accepted(robot=anonymous, codec=codec, subprotocol=SUBPROTOCOLS[codec])
+        if claims is None:
+            return accepted
+        expires_s = self.ends_s(claims, now_s)
+        return replace(accepted, robot=claims.robot, tenant=claims.tenant, expires_s=expires_s, claims=claims)
 
     def ends_s(self, claims: Claims, now_s: float) -> float:
         """Return when a connection with *claims* ends, in Unix seconds; an expired token has its leeway."""
         leeway_s = self._settings.auth.leeway_s
         return claims.expires_s if now_s < claims.expires_s else claims.expires_s + leeway_s
 
-    def renewed(self, token: str, now_s: float) -> Claims | str:
-        """Return the claims of a fresh token, or why it is refused, which goes to the log only."""
+    def verified(self, token: str, now_s: float) -> Claims | str:
+        """Return the claims of *token*, or why it is refused, which goes to the log only."""
         if self.keys is None:
             return "no-keys"
         try:

@@ -15,7 +15,10 @@ from typing import Generic, TypeVar
 from rse_pf.config import ServingSettings, SessionSettings
 from rse_pf.token_bucket import TokenBucket
 
-__all__ = ["CutOff", "PendingHandshakes", "RobotRates", "SourceRates", "TooFast"]
+__all__ = ["CUT_OFF", "PendingHandshakes", "RobotRates", "SourceRates"]
+
+CUT_OFF = math.inf
+"""The robot ignores refusals, so that its connection ends: it may not try again at all."""
 
 _MAX_NAMES = 20000
 """Robots or addresses remembered at a time; those that did nothing wrong are forgotten first."""
@@ -25,18 +28,6 @@ Key = TypeVar("Key", bound=Hashable)
 Value = TypeVar("Value")
 _MAX_VIOLATIONS, _VIOLATIONS_WINDOW_S = 3, 10.0
 """A violation is ``session.command_burst`` refusals; so many within the window close the socket with 4429."""
-
-
-@dataclass(frozen=True, slots=True)
-class TooFast:
-    """Refuse this message; after *retry_after_ms* another one is allowed."""
-
-    retry_after_ms: float
-
-
-@dataclass(frozen=True, slots=True)
-class CutOff:
-    """End the connection: this robot ignores refusals."""
 
 
 @dataclass(slots=True)
@@ -54,28 +45,32 @@ class RobotRates:
     far above it is cut off within a second and banned for ``session.rate_ban_s``.
     """
 
-    def __init__(self, limits: SessionSettings) -> None:
+    def __init__(self, limits: SessionSettings, *, max_names: int = _MAX_NAMES) -> None:
+        """Remember no robot yet, and never more than *max_names*."""
         self._limits = limits
+        self._max_names = max_names
         self._robots: dict[tuple[str, str], _Robot] = {}
 
-    @property
-    def is_on(self) -> bool:
-        """Whether there is a limit at all."""
-        return self._limits.max_commands_per_s > 0
+    def __len__(self) -> int:
+        """Return how many robots are remembered."""
+        return len(self._robots)
 
-    def judge(self, robot: tuple[str, str], now: float) -> TooFast | CutOff | None:
-        """Return what to do with one more message of *robot* (tenant, name) at *now* (s); None: take it."""
-        if not self.is_on:
-            return None
+    def retry_after_ms(self, robot: tuple[str, str], now: float) -> float:
+        """Take one more message of *robot* (tenant, name) and return 0, or return when it may try again.
+
+        `CUT_OFF` ends the connection.  *now* is in seconds.
+        """
+        if self._limits.max_commands_per_s <= 0:
+            return 0.0
         known = self._robots.get(robot) or self._added(robot, now)
         wait_s = known.bucket.take(now)
         if wait_s == 0.0:
-            return None
+            return 0.0
         if self._violations(known, now) >= _MAX_VIOLATIONS:
             known.violations.clear()
             known.banned_until = now + self._limits.rate_ban_s
-            return CutOff()
-        return TooFast(max(_MIN_RETRY_MS, wait_s * 1e3))
+            return CUT_OFF
+        return max(_MIN_RETRY_MS, wait_s * 1e3)
 
     def ban(self, robot: tuple[str, str], now: float) -> None:
         """Refuse the handshakes of *robot*, cut off at *now* (s), for ``session.rate_ban_s``."""
@@ -97,14 +92,13 @@ class RobotRates:
         return len(known.violations)
 
     def _added(self, robot: tuple[str, str], now: float) -> _Robot:
-        if len(self._robots) >= _MAX_NAMES:
-            self._robots = _half(
-                {
-                    name: each
-                    for name, each in self._robots.items()
-                    if each.violations or each.banned_until > now or not each.bucket.is_full(now)
-                }
-            )
+        if len(self._robots) >= self._max_names:
+            kept = {
+                name: each
+                for name, each in self._robots.items()
+                if each.violations or each.banned_until > now or not each.bucket.is_full(now)
+            }
+            self._robots = _half(kept, self._max_names)
         bucket = TokenBucket(self._limits.max_commands_per_s, float(self._limits.command_burst))
         known = self._robots[robot] = _Robot(bucket)
         return known
@@ -113,9 +107,15 @@ class RobotRates:
 class SourceRates:
     """The rate of handshakes of each address; judged before any token is read."""
 
-    def __init__(self, serving: ServingSettings) -> None:
+    def __init__(self, serving: ServingSettings, *, max_names: int = _MAX_NAMES) -> None:
+        """Remember no address yet, and never more than *max_names*."""
         self._serving = serving
+        self._max_names = max_names
         self._sources: dict[str, TokenBucket] = {}
+
+    def __len__(self) -> int:
+        """Return how many addresses are remembered."""
+        return len(self._sources)
 
     def wait_s(self, source: str, now: float) -> float:
         """Return 0 if *source* may shake hands at *now* (s), else the seconds until it may."""
@@ -124,8 +124,9 @@ class SourceRates:
             return 0.0
         bucket = self._sources.get(source)
         if bucket is None:
-            if len(self._sources) >= _MAX_NAMES:
-                self._sources = _half({name: b for name, b in self._sources.items() if not b.is_full(now)})
+            if len(self._sources) >= self._max_names:
+                kept = {name: each for name, each in self._sources.items() if not each.is_full(now)}
+                self._sources = _half(kept, self._max_names)
             bucket = self._sources[source] = TokenBucket(rate, float(self._serving.handshake_burst))
         return bucket.take(now)
 
@@ -184,6 +185,6 @@ class PendingHandshakes(Generic[Key]):
             del self._of_source[source]
 
 
-def _half(names: dict[Key, Value]) -> dict[Key, Value]:
-    """Return the newer names, at most half of `_MAX_NAMES`, so that forgetting stays rare."""
-    return dict(list(names.items())[-_MAX_NAMES // 2 :])
+def _half(names: dict[Key, Value], max_names: int) -> dict[Key, Value]:
+    """Return the newer names, at most half of *max_names*, so that forgetting stays rare."""
+    return dict(list(names.items())[-max_names // 2 :])

@@ -69,11 +69,11 @@ class TokenWatch:
                 self._recorder.cut_off(claims, problem)
                 connection.close(CLOSE_REVOKED, "revoked")
 
-    def connected(self, connection: RobotConnection) -> None:
-        """Know a connection whose handshake is done."""
+    def connected(self, connection: RobotConnection, expires_s: float | None) -> None:
+        """Know a connection whose handshake is done; its token ends at *expires_s*, s, monotonic."""
         if connection.claims is not None:
             self._by_number[connection.number] = connection
-        self._end_in_time(connection)
+        self._end_at(connection, expires_s)
 
     def arrived(self, connection: RobotConnection) -> None:
         """Tell the supervisor that a robot said Hello; its older connections end."""
@@ -81,9 +81,7 @@ class TokenWatch:
 
     def left(self, connection: RobotConnection) -> None:
         """Forget a connection."""
-        timer = self._timers.pop(connection, None)
-        if timer is not None:
-            timer.cancel()
+        self._end_at(connection, None)
         if self._by_number.pop(connection.number, None) is not None:
             self._report("left", connection)
 
@@ -102,14 +100,13 @@ class TokenWatch:
     def renew(self, connection: RobotConnection, token: str) -> None:
         """Judge a fresh token of a live connection, and move the connection's end or leave it."""
         before, now, wall_s = connection.claims, self._clocks.monotonic(), self._clocks.wall()
-        claims = self._handshake.renewed(token, wall_s)
+        claims = self._handshake.verified(token, wall_s)
         token_s = None
         if isinstance(claims, Claims) and before is not None and _is_same_robot(before, claims):
             connection.claims = claims
             self._recorder.renewed(before, claims)
             token_s = self._handshake.ends_s(claims, wall_s) - wall_s
-            connection.expires_s = now + token_s
-            self._end_in_time(connection)
+            self._end_at(connection, now + token_s)
             self._metrics.handshakes["renewed"] += 1
         else:
             self._metrics.handshakes["renewal-refused"] += 1
@@ -118,12 +115,12 @@ class TokenWatch:
             self._recorder.renewal_refused(before, reason)
         connection.renewed(token_s, now)
 
-    def _end_in_time(self, connection: RobotConnection) -> None:
+    def _end_at(self, connection: RobotConnection, expires_s: float | None) -> None:
         timer = self._timers.pop(connection, None)
         if timer is not None:
             timer.cancel()
-        if connection.expires_s is not None:
-            left_s = max(0.0, connection.expires_s - self._clocks.monotonic())
+        if expires_s is not None:
+            left_s = max(0.0, expires_s - self._clocks.monotonic())
             self._timers[connection] = self._loop.call_later(left_s, partial(self._end, connection))
 
     def _end(self, connection: RobotConnection) -> None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-__all__ = ["BATCH_S", "MIN_WAIT_S", "CpuThrottle", "NoThrottle"]
+__all__ = ["BATCH_S", "MIN_WAIT_S", "CpuThrottle"]
 
 MIN_WAIT_S = 0.002
 """Measured: with shorter waits, the waiting itself used up the budget of a small server."""
@@ -30,7 +30,7 @@ class CpuThrottle:
         """Begin with a full bucket.
 
         Args:
-            cores: CPU seconds per second, above 0.
+            cores: CPU seconds per second; 0 uses the cores that there are.
             now: Seconds, monotonic.
             cpu: Returns the CPU seconds that the process has used.
             burst_s: Size of the bucket, CPU seconds.
@@ -44,16 +44,10 @@ class CpuThrottle:
     def wait_s(self, now: float) -> float:
         """Return 0 if a command may start at *now* (s, monotonic), else how long to wait before asking
         again."""
+        if not self._cores:
+            return 0.0
         cpu_s = self._cpu()
         earned_s = (now - self._at) * self._cores
         self._level_s = min(self._burst_s, self._level_s + earned_s - (cpu_s - self._cpu_s))
         self._at, self._cpu_s = now, cpu_s
         return 0.0 if self._level_s >= 0 else max(MIN_WAIT_S, -self._level_s / self._cores)
-
-
-class NoThrottle:
-    """A server that uses the cores it has."""
-
-    def wait_s(self, now: float) -> float:
-        """Return 0: every command may start at once."""
-        return 0.0

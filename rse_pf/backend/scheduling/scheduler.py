@@ -135,15 +135,25 @@ class Scheduler:
             return 0, 0.0, 0.0
         return len(robot.waiting), self._delay_s(robot), self.turn_s
 
-    def delay_unread_s(self, robot_name: str) -> float:
-        """Return how long the next command of a robot, not decoded yet, would wait for its turn, in seconds.
+    def retry_unread_ms(self, robot_name: str, allowed_s: float) -> float:
+        """Return when a robot may try again whose next command, not decoded yet, would wait too long.
 
-        0 where it might replace a frame that waits.
+        0 takes the command: the server is not behind, its turn comes in time, or it might replace a frame
+        that waits.
+
+        Args:
+            robot_name: Of the robot that sent it.
+            allowed_s: Time that the robot's last command had until its deadline; the next is taken for alike.
         """
+        if not self.is_behind:
+            return 0.0
         robot = self._robots.get(robot_name)
+        delay_s = self._delay_s(robot)
+        if delay_s <= max_wait_s(allowed_s, self.max_delay_s):
+            return 0.0
         if robot is not None and any(map(_is_replaceable, robot.waiting)):
             return 0.0
-        return self._delay_s(robot)
+        return retry_after_ms(delay_s)
 
     def submit(self, queued: QueuedCommand) -> list[RefusedCommand]:
         """Let *queued*, which was admitted, wait for its turn; return the frame of its stream that ends

@@ -44,7 +44,7 @@ from rse_pf.backend.object_refs import ObjectRefs
 from rse_pf.backend.ports import Clocks
 from rse_pf.backend.robot_store import is_shared
 from rse_pf.backend.sandbox.manager import SandboxManager
-from rse_pf.backend.scheduling.cpu_throttle import CpuThrottle, NoThrottle
+from rse_pf.backend.scheduling.cpu_throttle import CpuThrottle
 from rse_pf.backend.scheduling.scheduler import Scheduler
 from rse_pf.backend.supervisor.orders import (
     DrainOrder,
@@ -156,7 +156,6 @@ class _Worker:
             recorder=self._recorder,
         )
         admission = Admission(settings.session, settings.serving)
-        cores = settings.serving.emulated_cores
         self._dispatcher = Dispatcher(
             settings=settings,
             registry=registry,
@@ -169,7 +168,9 @@ class _Worker:
             new_session_id=lambda: secrets.token_hex(8),
             admission=admission,
             scheduler=Scheduler(settings.serving),
-            throttle=CpuThrottle(cores, now=time.monotonic(), cpu=clocks.cpu) if cores else NoThrottle(),
+            throttle=CpuThrottle(
+                settings.serving.emulated_cores, now=time.monotonic(), cpu=time.process_time
+            ),
             decoder=DecoderThread(loop.call_soon_threadsafe),
             answers=answers,
             sandboxes=self._sandboxes(plan, installed, answers)
@@ -224,7 +225,8 @@ class _Worker:
         )
         return JobManager(
             context, loop=self._loop, log=self._log, answer=answers.send_message,
-            progress=answers.send_progress, new_owner=lambda: f"{plan.server_id}-{secrets.token_hex(8)}",
+            progress=RobotConnection.write_progress,
+            new_owner=lambda: f"{plan.server_id}-{secrets.token_hex(8)}",
         )  # fmt: skip
 
     async def run(self) -> None:

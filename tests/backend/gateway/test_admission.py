@@ -9,8 +9,8 @@ import pytest
 from backend.scheduling.admitted import queued
 
 from rse_pf.auth.tokens import Claims
-from rse_pf.backend.gateway.admission import Admission, UnreadRefusal
-from rse_pf.backend.gateway.rate_limits import CutOff
+from rse_pf.backend.gateway.admission import Admission
+from rse_pf.backend.gateway.rate_limits import CUT_OFF
 from rse_pf.config import ServingSettings, SessionSettings
 
 SERVING = ServingSettings(max_queue_per_robot=4, max_unread_bytes=1_000_000)
@@ -72,28 +72,17 @@ def test_of_several_reasons_the_first_in_order_is_told(admission: Admission):
 
 
 def test_a_robot_above_its_rate_is_refused_and_then_cut_off(admission: Admission):
-    decisions = [admission.judge_rate(("default", "r"), 5.0) for _ in range(200)]
+    retries_ms = [admission.rates.retry_after_ms(("default", "r"), 5.0) for _ in range(200)]
 
-    assert decisions[:40] == [None] * 40
-    assert isinstance(decisions[40], UnreadRefusal)
-    assert decisions[40].reason == "rate"
-    assert decisions[40].retry_after_ms == pytest.approx(50.0)
-    assert CutOff() in decisions
-    assert admission.judge_rate(("default", "another"), 5.0) is None
-
-
-def test_a_command_is_refused_before_decoding_if_its_turn_would_come_too_late(admission: Admission):
-    assert admission.judge_delay(0.25, 0.1, math.inf) is None
-    refusal = admission.judge_delay(0.25, 0.2, 0.025)
-
-    assert refusal is not None
-    assert (refusal.reason, refusal.retry_after_ms) == ("unread", pytest.approx(200.0))
-    assert admission.judge_delay(5.0, 0.2, 0.025) is None, "it has more time than compute and network need"
+    assert retries_ms[:40] == [0] * 40
+    assert retries_ms[40] == pytest.approx(50.0)
+    assert CUT_OFF in retries_ms
+    assert admission.rates.retry_after_ms(("default", "another"), 5.0) == 0
 
 
 def test_the_bytes_that_wait_for_the_decoder_are_bounded_and_suspects_get_a_quarter(admission: Admission):
-    assert admission.judge_size(200_000, 0, 1) is None
-    assert admission.judge_size(100_000, 200_000, 1) is not None
-    assert admission.judge_size(700_000, 200_000, 0) is None
-    assert admission.judge_size(200_000, 900_000, 0) is not None
-    assert admission.judge_size(2_000_000, 0, 0) is None, "one alone is always taken"
+    assert admission.may_wait(200_000, 0, 1)
+    assert not admission.may_wait(100_000, 200_000, 1)
+    assert admission.may_wait(700_000, 200_000, 0)
+    assert not admission.may_wait(200_000, 900_000, 0)
+    assert admission.may_wait(2_000_000, 0, 0), "one alone is always taken"

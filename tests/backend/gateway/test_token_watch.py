@@ -111,7 +111,7 @@ def test_a_revocation_ends_the_connections_of_its_robot_and_no_other(worker: Wor
     worker.deny(DenyList().with_robot("default", "r", 0.0))
 
     assert (mine.closed, other.closed) == ((4403, "revoked"), None)
-    assert worker.handshake.renewed(worker.token("r"), worker.clocks.wall()) == "disabled"
+    assert worker.handshake.verified(worker.token("r"), worker.clocks.wall()) == "disabled"
 
 
 def test_a_replaced_connection_ends_and_one_that_is_moving_may_finish_first(worker: Worker):

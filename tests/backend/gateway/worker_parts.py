@@ -23,7 +23,7 @@ from rse_pf.backend.log import JsonLog
 from rse_pf.backend.metrics import Metrics
 from rse_pf.backend.object_refs import ObjectRefs
 from rse_pf.backend.ports import Clocks
-from rse_pf.backend.scheduling.cpu_throttle import CpuThrottle, NoThrottle
+from rse_pf.backend.scheduling.cpu_throttle import CpuThrottle
 from rse_pf.backend.scheduling.scheduler import Scheduler
 from rse_pf.config import PlatformSettings
 from rse_pf.object_store import MemoryStore
@@ -92,7 +92,6 @@ class WorkerParts:
             tell=lambda **message: self.told.append(message),
             recorder=AuditRecorder(self.clocks, loop=self.loop, tell=None),
         )
-        throttle = CpuThrottle(emulated_cores, now=self.loop.now, cpu=self.clocks.cpu)
         self.dispatcher = Dispatcher(
             settings=self.settings,
             registry=self.registry,
@@ -105,7 +104,7 @@ class WorkerParts:
             new_session_id=lambda: "session-1",
             admission=self.admission,
             scheduler=self.scheduler,
-            throttle=throttle if emulated_cores else NoThrottle(),
+            throttle=CpuThrottle(emulated_cores, now=self.loop.now, cpu=self.clocks.cpu),
             decoder=self.decoder,
             answers=self.answers,
             sandboxes=sandboxes or NoQueue(),

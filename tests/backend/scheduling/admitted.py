@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from rse_pf.backend.gateway.admission import Admission, UnreadRefusal
+from rse_pf.backend.gateway.admission import Admission
 from rse_pf.backend.scheduling.scheduler import QueuedCommand, RefusedCommand, Scheduler
 from rse_pf.config import ServingSettings, SessionSettings
 from rse_pf.wire import Command
@@ -30,13 +30,11 @@ class AdmittedScheduler(Scheduler):
             self.note_refused(now)
         return [refusal]
 
-    def refuse_unread(self, robot: str, allowed_s: float, now: float) -> UnreadRefusal | None:
-        if not self.is_behind:
-            return None
-        refusal = self._admission.judge_delay(allowed_s, self.delay_unread_s(robot), self.max_delay_s)
-        if refusal is not None:
+    def refuse_unread(self, robot: str, allowed_s: float, now: float) -> float:
+        retry_ms = self.retry_unread_ms(robot, allowed_s)
+        if retry_ms:
             self.note_refused(now)
-        return refusal
+        return retry_ms
 
 
 def measure_turns(scheduler: Scheduler, turn_s: float, until_s: float) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from rse_pf.backend.scheduling.cpu_throttle import MIN_WAIT_S, CpuThrottle, NoThrottle
+from rse_pf.backend.scheduling.cpu_throttle import MIN_WAIT_S, CpuThrottle
 
 
 class Process:
@@ -20,7 +20,7 @@ class Process:
 
 
 def test_a_server_that_emulates_nothing_never_waits():
-    assert NoThrottle().wait_s(1.0) == 0.0
+    assert CpuThrottle(0.0, now=0.0, cpu=lambda: 1e9).wait_s(1.0) == 0.0
 
 
 def test_a_burst_passes_and_a_debt_waits():

@@ -349,7 +349,7 @@ def test_nothing_is_refused_unread_before_the_server_is_behind():
     for i in range(50):
         scheduler.submit(queued(f"r{i}"), 0.0)
 
-    assert scheduler.refuse_unread("new", 0.05, 0.0) is None
+    assert scheduler.refuse_unread("new", 0.05, 0.0) == 0
 
 
 def test_a_command_that_can_wait_is_admitted_where_a_hurried_one_is_refused():
@@ -359,12 +359,12 @@ def test_a_command_that_can_wait_is_admitted_where_a_hurried_one_is_refused():
         scheduler.submit(queued(f"r{i}", within=5.0), 0.0)
     assert scheduler.waiting == 50
 
-    assert scheduler.refuse_unread("new", 0.25, 0.01) is not None
+    assert scheduler.refuse_unread("new", 0.25, 0.01) > 0
     assert scheduler.submit(queued("hurried", within=0.25), 0.01)[0].error.code == "busy"
-    assert scheduler.refuse_unread("new", 5.0, 0.01) is None
+    assert scheduler.refuse_unread("new", 5.0, 0.01) == 0
     assert scheduler.submit(queued("unhurried", within=5.0), 0.01) == []
     assert scheduler.sweep(3.4) == [], "five seconds without the reserve"
-    assert scheduler.refuse_unread("new", 0.25, 3.45) is not None, "so it is still behind"
+    assert scheduler.refuse_unread("new", 0.25, 3.45) > 0, "so it is still behind"
     assert len(scheduler.sweep(3.52)) == 50, "all but the one whose turn it is"
 
 
@@ -387,9 +387,20 @@ def behind_with_one_waiting(turn_s: float) -> AdmittedScheduler:
 
 
 def test_a_server_that_is_behind_admits_another_robot_only_to_a_short_queue():
-    assert behind_with_one_waiting(0.024).refuse_unread("new", 0.05, 0.01) is None
-    assert behind_with_one_waiting(0.024).refuse_unread("a", 0.05, 0.01) is not None
-    assert behind_with_one_waiting(0.026).refuse_unread("new", 0.05, 0.01) is not None
+    assert behind_with_one_waiting(0.024).refuse_unread("new", 0.05, 0.01) == 0
+    assert behind_with_one_waiting(0.024).refuse_unread("a", 0.05, 0.01) > 0
+    assert behind_with_one_waiting(0.026).refuse_unread("new", 0.05, 0.01) > 0
+
+
+def test_a_command_is_refused_before_decoding_if_its_turn_would_come_too_late():
+    scheduler = Scheduler(SETTINGS)
+    measure_turns(scheduler, 0.2, 0.0)
+    scheduler.submit(queued("a", within=60.0))
+    assert scheduler.retry_unread_ms("b", 0.25) == 0, "the server is not behind"
+    fall_behind(scheduler, now=0.5)
+
+    assert scheduler.retry_unread_ms("b", 0.25) == pytest.approx(200.0)
+    assert scheduler.retry_unread_ms("b", 5.0) == 0, "it has more time than compute and network need"
 
 
 def test_a_frame_that_may_replace_a_waiting_one_is_always_decoded():
@@ -400,8 +411,8 @@ def test_a_frame_that_may_replace_a_waiting_one_is_always_decoded():
     assert scheduler.sweep(0.06) == scheduler.sweep(0.2) == []
     assert scheduler.is_behind
 
-    assert scheduler.refuse_unread("a", 0.05, 0.21) is None
-    assert scheduler.refuse_unread("b", 0.05, 0.21) is not None
+    assert scheduler.refuse_unread("a", 0.05, 0.21) == 0
+    assert scheduler.refuse_unread("b", 0.05, 0.21) > 0
 
 
 def test_a_command_whose_turn_would_come_after_half_of_its_time_is_refused_at_once():
@@ -423,7 +434,7 @@ def test_a_server_that_refuses_half_of_its_commands_stays_behind_however_short_t
     for step in range(20):
         now = step * 0.05
         scheduler.submit(queued(f"in-{step}", at=now), now)
-        assert scheduler.refuse_unread("out", 0.05, now) is not None
+        assert scheduler.refuse_unread("out", 0.05, now) > 0
         started, _ = scheduler.start(now)
         assert started is not None
         scheduler.done(started, now)
@@ -438,7 +449,7 @@ def test_one_long_pause_does_not_make_the_server_refuse_for_ever():
     for step in range(400):
         now = step * 0.02
         for robot in ("a", "b"):
-            if scheduler.refuse_unread(robot, 0.05, now) is None:
+            if scheduler.refuse_unread(robot, 0.05, now) == 0:
                 refused += bool(scheduler.submit(queued(f"{robot}{step}", at=now), now)) and step > 300
             else:
                 refused += step > 300

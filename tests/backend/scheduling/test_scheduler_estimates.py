@@ -59,6 +59,6 @@ def test_a_robot_with_many_waiting_is_told_the_whole_queue_at_most():
             assert scheduler.submit(queued(f"r{robot}", number, within=60.0), 0.0) == []
 
     assert scheduler.waiting == 175
-    assert scheduler.delay_unread_s("r0") == pytest.approx(1.76)
-    assert scheduler.delay_unread_s("r30") == pytest.approx(1.0)
-    assert scheduler.delay_unread_s("new") == pytest.approx(0.5)
+    assert scheduler.backlog(queued("r0"))[1] == pytest.approx(1.76)
+    assert scheduler.backlog(queued("r30"))[1] == pytest.approx(1.0)
+    assert scheduler.backlog(queued("new"))[1] == pytest.approx(0.5)
