@@ -37,18 +37,13 @@ class SessionRegistry:
         """Handle what a worker reports of one socket: ``arrived``, ``stays`` or ``left``."""
         robot = (str(message["tenant"]), str(message["robot"]))
         number = int(str(message["number"]))
-        if message["event"] == "left":
-            self._forget(robot, number)
-            return
+        sockets = self._sockets.setdefault(robot, {})
         if message["event"] == "arrived":
-            self._sockets.setdefault(robot, {})[number] = worker
-        sockets = self._sockets.get(robot, {})
+            sockets[number] = worker
+        elif message["event"] == "left":
+            sockets.pop(number, None)
         for older in sorted(sockets)[:-1]:
             if message["event"] == "arrived" or older == number:
                 sockets[older].order(ReplaceOrder(older))
-
-    def _forget(self, robot: Robot, number: int) -> None:
-        sockets = self._sockets.get(robot, {})
-        sockets.pop(number, None)
         if not sockets:
-            self._sockets.pop(robot, None)
+            del self._sockets[robot]

@@ -22,7 +22,7 @@ from typing import Any
 
 from rse_pf.auth.control_token import carries_token
 from rse_pf.auth.tokens import KeySet
-from rse_pf.auth.trust_store import REFRESH_S, TrustStore
+from rse_pf.auth.trust_store import TrustStore
 from rse_pf.backend.gateway.audit_recorder import ServerAudit, open_records
 from rse_pf.backend.gateway.migration import plan
 from rse_pf.backend.jobs.slots import make_pipe
@@ -32,7 +32,7 @@ from rse_pf.backend.supervisor.control_http import ControlReply, ControlRequest,
 from rse_pf.backend.supervisor.listener import bound_socket, check_authentication
 from rse_pf.backend.supervisor.orders import DrainOrder, LeaveOrder, MigrateOrder
 from rse_pf.backend.supervisor.session_registry import SessionRegistry
-from rse_pf.backend.supervisor.trust_poller import TrustPoller
+from rse_pf.backend.supervisor.trust_poller import poll_trust
 from rse_pf.backend.supervisor.worker import WorkerPlan
 from rse_pf.backend.supervisor.worker_handle import BUILTIN, WorkerProcess, fork_workers
 from rse_pf.config import PlatformSettings
@@ -222,9 +222,7 @@ class _Supervisor:
         if self._announce is not None:
             replace_json(self._announce, self._identity())
         if self._trust is not None:
-            pause_s = REFRESH_S
-            watch = TrustPoller(self._trust, workers=lambda: self._workers, log=self._log, pause_s=pause_s)
-            self._keep(watch.run())
+            self._keep(poll_trust(self._trust, self._workers, self._log))
         self._log.info("server-ready", **self._identity(), settings=self._digest)
         self._records.note("server.ready", settings=self._digest)
 
@@ -295,10 +293,9 @@ class _Supervisor:
         within_ms = self._settings.serving.drain_within_ms
         for worker in self._workers:
             worker.order(DrainOrder(within_ms))
-        empty = [asyncio.ensure_future(worker.empty.wait()) for worker in self._workers]
-        await asyncio.wait(empty, timeout=within_ms / 1e3)
-        for waiting in empty:
-            waiting.cancel()
+        empty = asyncio.gather(*(worker.empty.wait() for worker in self._workers))
+        with suppress(asyncio.TimeoutError):
+            await asyncio.wait_for(empty, within_ms / 1e3)
         await self._leave(self._settings.session.answer_timeout_s)
 
     async def _leave(self, held_s: float) -> None:
@@ -308,9 +305,9 @@ class _Supervisor:
         self._stop_accepting()
         for worker in self._workers:
             worker.order(LeaveOrder(held_s))
-        gone = [asyncio.ensure_future(worker.gone.wait()) for worker in self._workers]
-        if gone:
-            await asyncio.wait(gone, timeout=held_s + _LEAVE_S)
+        gone = asyncio.gather(*(worker.gone.wait() for worker in self._workers))
+        with suppress(asyncio.TimeoutError):
+            await asyncio.wait_for(gone, held_s + _LEAVE_S)
         self._finish(_EXIT_OK)
 
     def _stop_accepting(self) -> None:

@@ -6,46 +6,30 @@ What cannot be read stays as it was last known, and is logged once.
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Iterable
+from collections.abc import Sequence
 
-from rse_pf.auth.trust_store import TrustStore
-from rse_pf.backend.log import JsonLog
+from rse_pf.auth.trust_store import REFRESH_S, TrustStore
+from rse_pf.backend.ports import Log
 from rse_pf.backend.supervisor.orders import TrustOrder
 from rse_pf.backend.supervisor.session_registry import WorkerHandle
 
-__all__ = ["TrustPoller"]
+__all__ = ["poll_trust", "update_workers"]
 
 
-class TrustPoller:
-    """Reads the access control store periodically; what is new goes to every worker."""
+async def poll_trust(trust: TrustStore, workers: Sequence[WorkerHandle], log: Log) -> None:
+    """Call `update_workers` periodically until cancelled."""
+    while True:
+        await asyncio.sleep(REFRESH_S)
+        await update_workers(trust, workers, log)
 
-    def __init__(
-        self,
-        trust: TrustStore,
-        *,
-        workers: Callable[[], Iterable[WorkerHandle]],
-        log: JsonLog,
-        pause_s: float,
-    ) -> None:
-        self._trust = trust
-        self._workers = workers
-        self._log = log
-        self._pause_s = pause_s
-        self._problem = ""
 
-    async def run(self) -> None:
-        """Read until cancelled."""
-        while True:
-            await asyncio.sleep(self._pause_s)
-            self.tell(await asyncio.to_thread(self._trust.refresh))
-
-    def tell(self, is_new: bool) -> None:
-        """Log a problem once, and send the workers what *is_new*."""
-        if self._trust.problem != self._problem:
-            self._problem = self._trust.problem
-            if self._problem:
-                self._log.warning("access-control-unread", reason=self._problem)
-        if is_new:
-            for worker in self._workers():
-                worker.order(TrustOrder(self._trust.snapshot))
-            self._log.info("trust", bytes=len(self._trust.snapshot))
+async def update_workers(trust: TrustStore, workers: Sequence[WorkerHandle], log: Log) -> None:
+    """Read the store in a thread, log a problem that is new, and send the workers what is new."""
+    known = trust.problem
+    is_new = await asyncio.to_thread(trust.refresh)
+    if trust.problem not in ("", known):
+        log.warning("access-control-unread", reason=trust.problem)
+    if is_new:
+        for worker in workers:
+            worker.order(TrustOrder(trust.snapshot))
+        log.info("trust", bytes=len(trust.snapshot))

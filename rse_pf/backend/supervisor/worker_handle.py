@@ -16,7 +16,6 @@ import socket
 import sys
 import traceback
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from typing import Any, NoReturn
 
 from rse_pf.backend.supervisor.orders import ReportOrder, WorkerOrder, encode_order
@@ -50,18 +49,14 @@ def fork_workers(plans: Sequence[WorkerPlan], *, listener: socket.socket) -> lis
         ConfigurationError: There are no such services.
         MissingExtra: The extra ``backend`` is not installed.
     """
-    for plan in plans[:1]:
-        warm_up(plan.services, plan.settings)
+    warm_up(plans[0].services, plans[0].settings)
     gc.collect()
     gc.freeze()  # or the first collection of a worker would copy every page that it shares
     workers: list[WorkerProcess] = []
     try:
         for plan in plans:
-            workers.append(
-                WorkerProcess(
-                    plan, unshared=[listener, *(end for each in workers for end in each.channels())]
-                )
-            )
+            channels = [end for each in workers for end in each.channels]
+            workers.append(WorkerProcess(plan, unshared=[listener, *channels]))
     except OSError:
         for worker in workers:
             worker.kill()
@@ -70,7 +65,10 @@ def fork_workers(plans: Sequence[WorkerPlan], *, listener: socket.socket) -> lis
 
 
 class WorkerProcess:
-    """One worker process, forked at once; `connect` waits until it is ready."""
+    """One worker process, forked at once; `connect` waits until it is ready.
+
+    ``channels`` are the supervisor's ends of both channels, ``pid`` is the process id.
+    """
 
     def __init__(self, plan: WorkerPlan, *, unshared: Sequence[socket.socket]) -> None:
         """Fork.  The child closes *unshared*: the sockets of its parent that it must not hold."""
@@ -80,29 +78,29 @@ class WorkerProcess:
         self.gone = asyncio.Event()
         self._data, data = socket.socketpair()
         self._control, control = socket.socketpair()
+        self.channels = (self._data, self._control)
         self._exit_code: int | None = None
         with data, control:
-            self._pid = os.fork()
-            if self._pid == 0:
-                _be_worker(plan, data, control, [*unshared, *self.channels()])
+            self.pid = os.fork()
+            if self.pid == 0:
+                _be_worker(plan, data, control, [*unshared, *self.channels])
         self._data.setblocking(False)
-        self._loop: asyncio.AbstractEventLoop | None = None
         self._writer: asyncio.StreamWriter | None = None
         self._reading: asyncio.Task[None] | None = None
         self._reported: asyncio.Future[None] | None = None
 
-    def channels(self) -> tuple[socket.socket, socket.socket]:
-        """Return the supervisor's ends of both channels."""
-        return self._data, self._control
+    def exit_code(self, how: int = os.WNOHANG) -> int | None:
+        """Return how the process ended (negative: by which signal), None while it runs.
 
-    @property
-    def pid(self) -> int:
-        """Process id."""
-        return self._pid
-
-    def exit_code(self) -> int | None:
-        """Return how the process ended (negative: by which signal), None while it runs."""
-        self._reap(os.WNOHANG)
+        With 0 for *how* it waits for the end.
+        """
+        if self._exit_code is None:
+            try:
+                pid, status = os.waitpid(self.pid, how)
+            except ChildProcessError:
+                pid, status = self.pid, 0  # somebody else reaped it
+            if pid:
+                self._exit_code = os.waitstatus_to_exitcode(status)
         return self._exit_code
 
     async def connect(
@@ -114,7 +112,7 @@ class WorkerProcess:
         """Wait until the worker takes sockets; *on_lost* is called if it ends, before that or later."""
         self._on_lost, self._on_robot = on_lost, on_robot
         reader, self._writer = await asyncio.open_unix_connection(sock=self._control, limit=_MAX_LINE_BYTES)
-        self._loop = loop = asyncio.get_running_loop()
+        loop = asyncio.get_running_loop()
         ready = asyncio.Event()
         self._reading = loop.create_task(self._listen(reader, ready))
         await ready.wait()
@@ -144,27 +142,17 @@ class WorkerProcess:
         """Kill the process and close the channels; a second call does nothing."""
         if self._data.fileno() < 0:
             return
-        if self._loop is not None and self._reading is not None:
+        if self._reading is not None:
             self._reading.cancel()
-            self._loop.remove_reader(self._data.fileno())
+            self._reading.get_loop().remove_reader(self._data.fileno())
         if self.exit_code() is None:
-            with suppress(ProcessLookupError):
-                os.kill(self._pid, signal.SIGKILL)
-            self._reap(0)
+            os.kill(self.pid, signal.SIGKILL)
+            self.exit_code(0)
         self._data.close()
         if self._writer is not None:
             self._writer.close()
         else:
             self._control.close()
-
-    def _reap(self, how: int) -> None:
-        if self._exit_code is None:
-            try:
-                pid, status = os.waitpid(self._pid, how)
-            except ChildProcessError:
-                pid, status = self._pid, 0  # somebody else reaped it
-            if pid:
-                self._exit_code = os.waitstatus_to_exitcode(status)
 
     async def _listen(self, reader: asyncio.StreamReader, ready: asyncio.Event) -> None:
         try:

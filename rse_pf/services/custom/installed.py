@@ -15,7 +15,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Literal
+
+import msgspec
 
 from rse_pf.errors import ConfigurationError, UsageError
 from rse_pf.service import Kind
@@ -38,13 +40,18 @@ ENTRY_POINTS = "rse_pf.services"
 _PACKAGE = "package"
 _MANIFEST, _PINS = "service.json", "pins.json"
 _NAME = re.compile(r"[a-z][a-z0-9_-]{0,39}")
-_KINDS = ("stateless", "per_robot_state")
-_FIELDS = {"name", "language", "entry", "kind"}
 _IGNORED = {
     "__pycache__", ".git", ".pytest_cache", "requests", "tests", _PINS,
     "CMakeFiles", "CMakeCache.txt", "cmake_install.cmake", "Makefile",
 }  # fmt: skip
 """Not installed: recorded requests, tests and temporary files of a build."""
+
+
+class _Manifest(msgspec.Struct, forbid_unknown_fields=True):
+    name: Annotated[str, msgspec.Meta(pattern=rf"^{_NAME.pattern}\Z")]
+    language: Literal["python", "cpp", "lua"]
+    entry: Annotated[str, msgspec.Meta(min_length=1)]
+    kind: Literal["stateless", "per_robot_state"] = "stateless"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -77,19 +84,21 @@ def read_service(folder: Path) -> InstalledService:
     """
     path = folder / _MANIFEST
     try:
-        manifest = json.loads(path.read_text(encoding="utf-8"))
+        manifest = msgspec.json.decode(path.read_bytes(), type=_Manifest)
     except OSError as error:
         raise UsageError(
             f"cannot read {path}: {error.strerror}", hint="make a service with: rse-pf service new NAME"
         ) from error
-    except ValueError as error:
-        raise UsageError(f"{path} is not JSON: {error}", hint="correct the file") from error
-    if not isinstance(manifest, dict) or not {"name", "language", "entry"} <= set(manifest) <= _FIELDS:
+    except msgspec.DecodeError as error:
         raise UsageError(
-            f"{path} must have name, language and entry, and may have kind",
+            f"{path} is not the description of a service: {error}",
             hint='write {"name": "icp", "language": "python", "entry": "service.py"}',
+        ) from error
+    if Path(manifest.entry).is_absolute() or ".." in Path(manifest.entry).parts:
+        raise UsageError(
+            f"{path}: entry {manifest.entry!r} is not a file inside the folder", hint="correct the file"
         )
-    return _validate(folder, path, manifest)
+    return InstalledService(**msgspec.structs.asdict(manifest), folder=folder.absolute())
 
 
 def install(folder: Path, into: Path) -> InstalledService:
@@ -158,23 +167,6 @@ def published_services() -> list[InstalledService]:
             name=point.name, language=_PACKAGE, entry=point.value, kind="per_robot_state", folder=folder
         )
     return sorted(found.values(), key=lambda service: service.name)
-
-
-def _validate(folder: Path, path: Path, manifest: dict[str, Any]) -> InstalledService:
-    name, language, entry = manifest["name"], manifest["language"], manifest["entry"]
-    kind = manifest.get("kind", "stateless")
-    problem = None
-    if not isinstance(name, str) or not _NAME.fullmatch(name):
-        problem = f"name {name!r} is not made of 1 to 40 lower-case letters, digits, - and _"
-    elif language not in LANGUAGES:
-        problem = f"language {language!r} is not one of {', '.join(LANGUAGES)}"
-    elif kind not in _KINDS:
-        problem = f"kind {kind!r} is not one of {', '.join(_KINDS)}"
-    elif not isinstance(entry, str) or not entry or Path(entry).is_absolute() or ".." in Path(entry).parts:
-        problem = f"entry {entry!r} is not a file inside the folder"
-    if problem:
-        raise UsageError(f"{path}: {problem}", hint="correct the file")
-    return InstalledService(name=name, language=language, entry=entry, kind=kind, folder=folder.absolute())
 
 
 def _check_pins(target: Path) -> None:

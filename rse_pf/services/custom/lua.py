@@ -24,6 +24,7 @@ from rse_pf.errors import (
     error_from_code,
 )
 from rse_pf.services.custom.installed import InstalledService
+from rse_pf.wire.arrays import json_encode_hook
 
 __all__ = ["LuaRuntime", "warm_up"]
 
@@ -85,7 +86,7 @@ class LuaRuntime:
     def call(self, payload: Any) -> Any:
         """Return the reply to *payload*; a script with ``takes_text`` gets and returns JSON text."""
         if self._takes_text:
-            return self._parse(self._run("serve", msgspec.json.encode(_plain(payload))))
+            return self._parse(self._run("serve", msgspec.json.encode(payload, enc_hook=json_encode_hook)))
         return self._from_lua(self._run("serve", self._to_lua(payload)))
 
     def snapshot(self) -> bytes:
@@ -148,16 +149,6 @@ class LuaRuntime:
 
     def _encode(self, value: Any) -> bytes:
         return msgspec.json.encode(self._from_lua(value))
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, np.ndarray):
-        return value.tolist()
-    if isinstance(value, Mapping):
-        return {str(key): _plain(each) for key, each in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(each) for each in value]
-    return value
 
 
 def _encode_text(value: Any) -> Any:

@@ -79,16 +79,13 @@ class NativeRuntime:
 
     def snapshot(self) -> bytes:
         """Return the library's state."""
-        assert self._snapshot is not None
         return self._bytes_of(self._snapshot, self._state)
 
     def restore(self, data: bytes) -> None:
         """Restore the library's state from *data*."""
-        assert self._restore is not None
         self._check(self._restore(self._state, data, ctypes.c_uint64(len(data))))
 
     def _call_with_bytes(self, payload: Any) -> Any:
-        assert self._call_bytes is not None
         request = msgspec.json.encode(payload, enc_hook=json_encode_hook)
         reply = self._bytes_of(self._call_bytes, self._state, request, ctypes.c_uint64(len(request)))
         try:
@@ -97,7 +94,6 @@ class NativeRuntime:
             raise CommandFailed(f"{self._name} replied with text that is not JSON: {error}") from error
 
     def _call_with_arrays(self, payload: Any) -> Any:
-        assert self._call_arrays is not None
         request, buffers = _encode_fields(payload)
         reply, count = ctypes.POINTER(_Field)(), ctypes.c_uint32()
         code = self._call_arrays(

@@ -60,7 +60,7 @@ class _PythonRuntime:
     def __init__(self, service: InstalledService) -> None:
         module = _load(service)
         maker = getattr(module, "Service", None)
-        self._object = maker() if callable(maker) else None
+        self._object: Any = maker() if callable(maker) else None
         function: Callable[[Any], Any] | None = getattr(self._object or module, "serve", None)
         if function is None:
             raise ConfigurationError(
@@ -78,11 +78,9 @@ class _PythonRuntime:
         return self._service.function(request_of(payload, self._service))
 
     def snapshot(self) -> bytes:
-        assert self._object is not None
         return bytes(self._object.snapshot())
 
     def restore(self, data: bytes) -> None:
-        assert self._object is not None
         self._object.restore(data)
 
 

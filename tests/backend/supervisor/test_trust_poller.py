@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 from pathlib import Path
 from typing import Any
@@ -9,9 +10,10 @@ from typing import Any
 from rse_pf.auth.tokens import SigningKey
 from rse_pf.auth.trust_store import TrustStore
 from rse_pf.backend.supervisor.orders import TrustOrder, WorkerOrder
-from rse_pf.backend.supervisor.trust_poller import TrustPoller
+from rse_pf.backend.supervisor.trust_poller import update_workers
 
 KEYS = SigningKey.from_seed(b"t" * 32, "k1").key_set()
+OTHER_KEYS = SigningKey.from_seed(b"o" * 32, "k2").key_set()
 
 
 class Worker:
@@ -29,34 +31,34 @@ class Log:
     def info(self, event: str, **details: Any) -> None:
         self.events.append(event)
 
-    warning = info
+    warning = error = info
 
 
-def poller(folder: Path) -> tuple[TrustPoller, TrustStore, list[Worker], Log]:
+def loaded(folder: Path) -> tuple[TrustStore, list[Worker], Log]:
     (folder / "keys.json").write_text(KEYS.to_json())
     trust, workers, log = TrustStore(folder / "keys.json"), [Worker(), Worker()], Log()
     trust.load()
-    made = TrustPoller(trust, workers=lambda: workers, log=log, pause_s=1.0)  # type: ignore[arg-type]
-    return made, trust, workers, log
+    return trust, workers, log
 
 
 def test_what_is_new_goes_to_every_worker(tmp_path: Path) -> None:
-    made, trust, workers, _ = poller(tmp_path)
-    made.tell(False)
+    trust, workers, log = loaded(tmp_path)
+    asyncio.run(update_workers(trust, workers, log))
     assert [worker.orders for worker in workers] == [[], []]
 
-    made.tell(True)
+    (tmp_path / "keys.json").write_text(OTHER_KEYS.to_json())
+    asyncio.run(update_workers(trust, workers, log))
 
     assert [worker.orders for worker in workers] == 2 * [[TrustOrder(trust.snapshot)]]
     assert json.loads(trust.snapshot)["keys"]
 
 
 def test_a_problem_is_logged_once_and_changes_nothing(tmp_path: Path) -> None:
-    made, trust, workers, log = poller(tmp_path)
+    trust, workers, log = loaded(tmp_path)
     (tmp_path / "keys.json").unlink()
 
     for _ in range(2):
-        made.tell(trust.refresh())
+        asyncio.run(update_workers(trust, workers, log))
 
     assert log.events.count("access-control-unread") == 1
     assert [worker.orders for worker in workers] == [[], []]
