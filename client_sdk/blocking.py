@@ -6,60 +6,32 @@ Every method calls its namesake of `client_sdk.robot.Robot`; any number of threa
 from __future__ import annotations
 
 import asyncio
-import random as random_module
+import functools
 import threading
-import time
 from collections.abc import Callable, Coroutine
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, Concatenate, ParamSpec, TypeVar
 
-from client_sdk.answers import Answer, PoseAnswer
-from client_sdk.connection import OnChange, Token
-from client_sdk.offload import CloudFirst
-from client_sdk.robot import OnProgress, Robot, connect
+from client_sdk.robot import Robot, connect
 from client_sdk.stats import Stats
-from rse_pf.config import SessionSettings
 from rse_pf.errors import Disconnected
-
-if TYPE_CHECKING:
-    import numpy as np
-    import numpy.typing as npt
-
-    from rse_pf.geometry import Camera
-    from rse_pf.pnp import PnpOptions
 
 __all__ = ["BlockingRobot", "connect_blocking"]
 
+P = ParamSpec("P")
 T = TypeVar("T")
 
 
-def connect_blocking(
-    url: str,
-    *,
-    token: Token = None,
-    codec: str = "zlib",
-    settings: SessionSettings | None = None,
-    offload: CloudFirst | None = None,
-    clock: Callable[[], float] = time.monotonic,
-    random: random_module.Random | None = None,
-    on_change: OnChange = None,
-) -> BlockingRobot:
-    """Return a robot for ``with connect_blocking(url, token=...) as robot``; see `connect`.
+def _blocking(
+    method: Callable[Concatenate[Robot, P], Coroutine[Any, Any, T]],
+) -> Callable[Concatenate[BlockingRobot, P], T]:
+    """Return *method* for a `BlockingRobot`, with the same arguments and documentation."""
 
-    *on_change* is called in the thread of the event loop.
-    """
-    return BlockingRobot(
-        connect(
-            url,
-            token=token,
-            codec=codec,
-            settings=settings,
-            offload=offload,
-            clock=clock,
-            random=random,
-            on_change=on_change,
-        )
-    )
+    @functools.wraps(method)
+    def call(self: BlockingRobot, /, *args: P.args, **kwargs: P.kwargs) -> T:
+        return self._wait(method(self._robot, *args, **kwargs))
+
+    return call
 
 
 class BlockingRobot:
@@ -99,47 +71,8 @@ class BlockingRobot:
             finally:
                 self._end()
 
-    def solve_pnp(
-        self,
-        points_world: npt.NDArray[np.float64],
-        pixels: npt.NDArray[np.float64],
-        camera: Camera,
-        options: PnpOptions | None = None,
-        *,
-        deadline_s: float | None = None,
-        stream: str = "pose",
-        keep: bool = False,
-    ) -> PoseAnswer:
-        """Estimate the camera pose of one frame in the cloud; see `Robot.solve_pnp`."""
-        return self._wait(
-            self._robot.solve_pnp(
-                points_world, pixels, camera, options, deadline_s=deadline_s, stream=stream, keep=keep
-            )
-        )
-
-    def call(
-        self,
-        service: str,
-        request: Any,
-        reply_type: type[Any] | None = None,
-        *,
-        deadline_s: float | None = None,
-        stream: str = "",
-        keep: bool = False,
-        on_progress: OnProgress | None = None,
-    ) -> Answer:
-        """Call a service; see `Robot.call`.  *on_progress* is called in the thread of the event loop."""
-        return self._wait(
-            self._robot.call(
-                service,
-                request,
-                reply_type,
-                deadline_s=deadline_s,
-                stream=stream,
-                keep=keep,
-                on_progress=on_progress,
-            )
-        )
+    solve_pnp = _blocking(Robot.solve_pnp)
+    call = _blocking(Robot.call)
 
     @property
     def stats(self) -> Stats:
@@ -172,3 +105,16 @@ class BlockingRobot:
             loop.call_soon_threadsafe(loop.stop)
             thread.join()
             loop.close()
+
+
+def _blocking_connect(make: Callable[P, Robot]) -> Callable[P, BlockingRobot]:
+    @functools.wraps(make, assigned=(), updated=())
+    def connect_blocking(*args: P.args, **kwargs: P.kwargs) -> BlockingRobot:
+        """Return a robot for ``with connect_blocking(url, token=...) as robot``; see `connect`."""
+        return BlockingRobot(make(*args, **kwargs))
+
+    return connect_blocking
+
+
+connect_blocking = _blocking_connect(connect)
+"""Takes the arguments of `connect`; *on_change* is called in the thread of the event loop."""

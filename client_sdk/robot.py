@@ -54,44 +54,6 @@ class _Call:
     on_progress: OnProgress | None = None
 
 
-def connect(
-    url: str,
-    *,
-    token: Token = None,
-    codec: str = "zlib",
-    settings: SessionSettings | None = None,
-    offload: CloudFirst | None = None,
-    clock: Callable[[], float] = time.monotonic,
-    random: random_module.Random | None = None,
-    on_change: OnChange = None,
-) -> Robot:
-    """Return a robot to be used as ``async with connect(...) as robot``, or awaited.
-
-    Args:
-        url: ``ws://HOST:PORT/ws`` or ``wss://HOST/ws``.
-        token: The robot's token, or an async callable that gives one (a run outlives a token).
-        codec: ``zlib`` (the paper's), ``json`` or ``bin``.
-        settings: Limits and timeouts; None means the defaults.
-        offload: `CloudFirst` lets the robot answer itself when the cloud cannot.
-        clock: Seconds, monotonic.
-        random: Source of the jitter of reconnects.
-        on_change: Called with ``link-lost``, ``link-back`` or ``moved``, and the reason or the server.
-
-    Raises:
-        UsageError: The address or the codec cannot be used.
-    """
-    return Robot(
-        url,
-        token=token,
-        codec=codec,
-        settings=settings or SessionSettings(),
-        offload=offload,
-        clock=clock,
-        random=random or random_module.Random(),
-        on_change=on_change,
-    )
-
-
 class Robot:
     """A connected robot; make one with `connect`."""
 
@@ -99,16 +61,32 @@ class Robot:
         self,
         url: str,
         *,
-        token: Token,
-        codec: str,
-        settings: SessionSettings,
-        offload: CloudFirst | None,
-        clock: Callable[[], float],
-        random: random_module.Random,
+        token: Token = None,
+        codec: str = "zlib",
+        settings: SessionSettings | None = None,
+        offload: CloudFirst | None = None,
+        clock: Callable[[], float] = time.monotonic,
+        random: random_module.Random | None = None,
         on_change: OnChange = None,
     ) -> None:
+        """Describe a robot to be used as ``async with connect(...) as robot``, or awaited.
+
+        Args:
+            url: ``ws://HOST:PORT/ws`` or ``wss://HOST/ws``.
+            token: The robot's token, or an async callable that gives one (a run outlives a token).
+            codec: ``zlib`` (the paper's), ``json`` or ``bin``.
+            settings: Limits and timeouts; None means the defaults.
+            offload: `CloudFirst` lets the robot answer itself when the cloud cannot.
+            clock: Seconds, monotonic.
+            random: Source of the jitter of reconnects.
+            on_change: Called with ``link-lost``, ``link-back`` or ``moved``, and the reason or the server.
+
+        Raises:
+            UsageError: The address or the codec cannot be used.
+        """
         if codec not in CODECS:
             raise UsageError(f"no codec named {codec!r}", hint=f"choose one of {', '.join(CODECS)}")
+        settings, random = settings or SessionSettings(), random or random_module.Random()
         self._session = ClientSession(
             codec=make_codec(codec, settings), settings=settings, sdk=f"rse-pf-python/{_version()}"
         )
@@ -121,7 +99,6 @@ class Robot:
             random=random,
             on_change=on_change,
         )
-        self._settings = settings
         self._offload = offload
         self._clock = clock
         self._local = None if offload is None else LocalServices(offload.registry, clock)
@@ -231,7 +208,7 @@ class Robot:
         """
         if not self._open:
             raise Disconnected("the robot is not connected", hint="use async with client_sdk.connect(...)")
-        wait_s = self._settings.answer_timeout_s if deadline_s is None else deadline_s
+        wait_s = self._session.settings.answer_timeout_s if deadline_s is None else deadline_s
         if not 0 < wait_s <= _MAX_DEADLINE_S:
             raise UsageError(
                 f"deadline_s = {wait_s} is not within 0..{_MAX_DEADLINE_S:g}",
@@ -484,6 +461,10 @@ class Robot:
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
         return task
+
+
+connect = Robot
+"""Return a robot for ``async with connect(url, token=...) as robot``; its arguments are those of `Robot`."""
 
 
 async def _first(task: asyncio.Task[T], timeout_s: float) -> T | None:

@@ -50,10 +50,17 @@ __all__ = [
 class RsePfError(Exception):
     """Base of every error that leaves this package.
 
-    ``code`` is stable and travels on the wire; ``hint`` says what to do next.
+    ``code`` is stable and travels on the wire; ``hint`` says what to do next.  A subclass without a code of
+    its own has that of its base.
     """
 
     code: ClassVar[str] = "error"
+
+    def __init_subclass__(cls, *, code: str = "") -> None:
+        super().__init_subclass__()
+        if code:
+            cls.code = code
+        _KIND_OF_CODE.setdefault(cls.code, cls)
 
     def __init__(self, message: str, *, hint: str = "", retry_after_ms: float | None = None) -> None:
         super().__init__(message)
@@ -73,31 +80,26 @@ class RsePfError(Exception):
         return f"{first}\n  hint: {self.hint}" if self.hint else first
 
 
+_KIND_OF_CODE = {RsePfError.code: RsePfError}
+
+
 # --- mistakes of the operator or the developer -------------------------------------------
 
 
-class ConfigurationError(RsePfError):
+class ConfigurationError(RsePfError, code="configuration"):
     """The configuration or the call is invalid; nothing was started."""
 
-    code = "configuration"
 
-
-class SettingsError(ConfigurationError):
+class SettingsError(ConfigurationError, code="settings"):
     """A setting is unknown, out of range or contradicts another one."""
 
-    code = "settings"
 
-
-class UsageError(ConfigurationError):
+class UsageError(ConfigurationError, code="usage"):
     """A command line, path or argument cannot be used."""
 
-    code = "usage"
 
-
-class MissingExtra(ConfigurationError):
+class MissingExtra(ConfigurationError, code="missing-extra"):
     """An optional dependency is not installed."""
-
-    code = "missing-extra"
 
     def __init__(self, package: str, extra: str) -> None:
         super().__init__(f"{package} is not installed", hint=f"pip install 'rse-pf[{extra}]'")
@@ -106,211 +108,143 @@ class MissingExtra(ConfigurationError):
 # --- authentication --------------------------------------------------------------------------------
 
 
-class AuthError(RsePfError):
+class AuthError(RsePfError, code="auth"):
     """A robot cannot be authenticated or is not authorized."""
 
-    code = "auth"
 
-
-class Unauthorized(AuthError):
+class Unauthorized(AuthError, code="unauthorized"):
     """The token is missing, wrong or expired; the cause is only in the server's log."""
 
-    code = "unauthorized"
 
-
-class Forbidden(AuthError):
+class Forbidden(AuthError, code="forbidden"):
     """The robot is known, but its token does not allow this."""
-
-    code = "forbidden"
 
 
 # --- the wire --------------------------------------------------------------------------------
 
 
-class ProtocolError(RsePfError):
+class ProtocolError(RsePfError, code="protocol"):
     """Bytes or messages break the protocol of ``docs/protocol.md``."""
 
-    code = "protocol"
 
-
-class BadMessage(ProtocolError):
+class BadMessage(ProtocolError, code="bad-message"):
     """A message cannot be decoded."""
 
-    code = "bad-message"
 
-
-class LimitExceeded(ProtocolError):
+class LimitExceeded(ProtocolError, code="too-large"):
     """A message is larger, deeper or longer than a limit allows."""
 
-    code = "too-large"
 
-
-class UnsupportedProtocol(ProtocolError):
+class UnsupportedProtocol(ProtocolError, code="unsupported"):
     """The two sides share no sub-protocol or version."""
 
-    code = "unsupported"
 
-
-class ConnectError(ProtocolError):
+class ConnectError(ProtocolError, code="connect"):
     """The robot could not open or keep a connection."""
 
-    code = "connect"
 
-
-class Disconnected(ProtocolError):
+class Disconnected(ProtocolError, code="disconnected"):
     """The connection ended before the answer came."""
-
-    code = "disconnected"
 
 
 # --- a command that was not answered with a result ---------------------------------------------
 
 
-class CommandFailed(RsePfError):
+class CommandFailed(RsePfError, code="failed"):
     """A command ended without a result."""
 
-    code = "failed"
 
-
-class BadRequest(CommandFailed):
+class BadRequest(CommandFailed, code="bad-request"):
     """The payload does not fit the service's request type."""
 
-    code = "bad-request"
 
-
-class UnknownService(CommandFailed):
+class UnknownService(CommandFailed, code="unknown-service"):
     """The server offers no service of that name."""
 
-    code = "unknown-service"
 
-
-class Busy(CommandFailed):
+class Busy(CommandFailed, code="busy"):
     """The server sheds load; retry after ``retry_after_ms``."""
 
-    code = "busy"
 
-
-class QuotaExceeded(CommandFailed):
+class QuotaExceeded(CommandFailed, code="quota"):
     """This robot or tenant exceeds its quota."""
 
-    code = "quota"
 
-
-class Stale(CommandFailed):
+class Stale(CommandFailed, code="stale"):
     """A newer frame of the same stream replaced this one."""
 
-    code = "stale"
 
-
-class Expired(CommandFailed):
+class Expired(CommandFailed, code="expired"):
     """The deadline passed before the work began or the answer came."""
 
-    code = "expired"
 
-
-class Cancelled(CommandFailed):
+class Cancelled(CommandFailed, code="cancelled"):
     """The robot or the operator cancelled the command."""
 
-    code = "cancelled"
 
-
-class WorkerLost(CommandFailed):
+class WorkerLost(CommandFailed, code="worker-lost"):
     """The process that worked on the command died."""
 
-    code = "worker-lost"
 
-
-class Crashed(CommandFailed):
+class Crashed(CommandFailed, code="crashed"):
     """The process of a long command crashed, or exceeded its memory limit."""
 
-    code = "crashed"
 
-
-class Poison(CommandFailed):
+class Poison(CommandFailed, code="poison"):
     """This request crashed two sandboxes and is not tried again."""
 
-    code = "poison"
 
-
-class InternalError(CommandFailed):
+class InternalError(CommandFailed, code="internal"):
     """A defect of the service or the server; the log has the details under the trace id."""
-
-    code = "internal"
 
 
 # --- perspective-n-point -----------------------------------------------------------------------
 
 
-class PnpError(RsePfError):
+class PnpError(RsePfError, code="pnp"):
     """The correspondences give no reliable pose."""
 
-    code = "pnp"
 
-
-class TooFewCorrespondences(PnpError):
+class TooFewCorrespondences(PnpError, code="too-few"):
     """Fewer correspondences than a pose needs."""
 
-    code = "too-few"
 
-
-class DegenerateGeometry(PnpError):
+class DegenerateGeometry(PnpError, code="degenerate"):
     """The points do not fix a pose: collinear, coincident or ambiguous."""
 
-    code = "degenerate"
 
-
-class NoConsensus(PnpError):
+class NoConsensus(PnpError, code="no-consensus"):
     """No pose agrees with more correspondences than chance would give."""
 
-    code = "no-consensus"
 
-
-class InvalidCamera(PnpError):
+class InvalidCamera(PnpError, code="invalid-camera"):
     """The camera's intrinsics describe no camera."""
-
-    code = "invalid-camera"
 
 
 # --- objects -----------------------------------------------------------------------------------
 
 
-class StoreError(RsePfError):
+class StoreError(RsePfError, code="store"):
     """An object cannot be read or written."""
 
-    code = "store"
 
-
-class NotFound(StoreError):
+class NotFound(StoreError, code="not-found"):
     """No object of that name is visible to this robot."""
 
-    code = "not-found"
 
-
-class Conflict(StoreError):
+class Conflict(StoreError, code="conflict"):
     """A compare-and-swap found a version other than the expected one."""
 
-    code = "conflict"
 
-
-class StoreFull(StoreError):
+class StoreFull(StoreError, code="store-full"):
     """The disk or the quota is full; nothing was stored."""
-
-    code = "store-full"
-
-
-def _leaves(of: type[RsePfError]) -> dict[str, type[RsePfError]]:
-    found = {of.code: of}
-    for child in of.__subclasses__():
-        for code, kind in _leaves(child).items():
-            found.setdefault(code, kind)  # a package's own subclass has no code of its own
-    return found
 
 
 def error_from_code(
     code: str, message: str, *, hint: str = "", retry_after_ms: float | None = None
 ) -> RsePfError:
     """Return the error that *code* stands for; an unknown code gives ``CommandFailed``."""
-    error = _bare(_leaves(RsePfError).get(code, CommandFailed), message)
+    error = _bare(_KIND_OF_CODE.get(code, CommandFailed), message)
     error.hint, error.retry_after_ms = hint, retry_after_ms
     return error
 

@@ -40,7 +40,6 @@ __all__ = [
 ]
 
 _PLAIN_SEGMENT = re.compile(r"[a-z0-9][a-z0-9-]{0,63}")
-_LEFT_BEHIND = f"{TEMPORARY_PREFIX}*"
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._=-]{0,127}(/[A-Za-z0-9][A-Za-z0-9._=-]{0,127}){0,9}")
 
 
@@ -297,10 +296,6 @@ class DirectoryStore:
 
     def _path(self, name: str) -> Path:
         return self._folder / check_name(name)
-
-    @staticmethod
-    def _write(path: Path, data: bytes, *, is_durable: bool = True) -> None:
-        replace_file(path, data, mode=OWNER_ONLY, is_durable=is_durable)
 
 
 def _read(path: Path) -> bytes:

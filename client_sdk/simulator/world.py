@@ -6,6 +6,8 @@ The same seed gives the same world; `client_sdk.simulator.camera` draws it.
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -39,6 +41,14 @@ _FABRICS: tuple[tuple[_Colour, _Colour], ...] = (
     ((84, 120, 140), (36, 56, 74)),
     ((188, 96, 74), (112, 44, 36)),
     ((214, 176, 96), (134, 96, 40)),
+)
+
+
+# Size of a point in the motif of each wallpaper; the motif ends at 1.
+_MOTIFS: tuple[Callable[[_Image, _Image], _Image], ...] = (
+    lambda a, b: np.hypot(a, 1.8 * b),
+    lambda a, b: np.abs(a) + np.abs(b),
+    lambda a, b: np.maximum(np.abs(a), 2.2 * np.abs(b)),
 )
 
 
@@ -216,11 +226,16 @@ def _hang_pictures(build: _Builder, room: int) -> None:
 
 def _noise(rng: np.random.Generator, n: int, low: float, high: float, power: float) -> _Image:
     """Return ``(n, n)`` tiling noise, about -1..1, with *low* to *high* waves a side."""
-    waves = np.hypot(np.fft.fftfreq(n, 1 / n)[:, None], np.fft.rfftfreq(n, 1 / n))
-    weight = np.where((waves >= low) & (waves <= high), np.maximum(waves, 1) ** -(1.0 + power), 0.0)
+    weight = _noise_weights(n, low, high, power)
     image = np.fft.irfft2(np.fft.rfft2(rng.standard_normal((n, n))) * weight, s=(n, n))
     scaled: _Image = (image / (2.5 * image.std())).astype(np.float32)
     return scaled
+
+
+@functools.cache
+def _noise_weights(n: int, low: float, high: float, power: float) -> npt.NDArray[np.float64]:
+    waves = np.hypot(np.fft.fftfreq(n, 1 / n)[:, None], np.fft.rfftfreq(n, 1 / n))
+    return np.where((waves >= low) & (waves <= high), np.maximum(waves, 1) ** -(1.0 + power), 0.0)
 
 
 def _wallpaper(rng: np.random.Generator, room: int) -> _Image:
@@ -233,13 +248,12 @@ def _wallpaper(rng: np.random.Generator, room: int) -> _Image:
             angle, size = rng.uniform(0, np.pi), rng.uniform(12, 26)
             cosine, sine = float(np.cos(angle) / size), float(np.sin(angle) / size)
             a, b = cosine * columns + sine * rows, cosine * rows - sine * columns
-            shape = (np.hypot(a, 1.8 * b), np.abs(a) + np.abs(b), np.maximum(np.abs(a), 2.2 * np.abs(b)))[
-                room
-            ]
+            shape = _MOTIFS[room](a, b)
             ink = np.clip((1.0 - shape) * size / 1.5, 0, 1) * rng.uniform(0.25, 0.75)
             at_y = (y + int(rng.integers(64)) + np.arange(-40, 41)) % n
             at_x = (x + int(rng.integers(64)) + np.arange(-40, 41)) % n
-            paper[np.ix_(at_y, at_x)] += ink * (0.9 - paper[np.ix_(at_y, at_x)])
+            cells = np.ix_(at_y, at_x)
+            paper[cells] += ink * (0.9 - paper[cells])
     return paper
 
 
@@ -279,10 +293,18 @@ def _poster(rng: np.random.Generator, n: int) -> _Image:
         y, x, size = rng.uniform(0.1, 0.9), rng.uniform(0.1, 0.9), rng.uniform(0.03, 0.2)
         angle, is_disc = rng.uniform(0, np.pi), rng.random() < 0.5
         cosine, sine = float(np.cos(angle)), float(np.sin(angle))
-        a, b = cosine * (columns - x) + sine * (rows - y), cosine * (rows - y) - sine * (columns - x)
+        # Nothing is drawn beyond 1.06 sizes from the centre.
+        low_y, high_y, low_x, high_x = (
+            max(0, int(n * (centre + reach)))
+            for centre in (y, x)
+            for reach in (-1.06 * size, 1.06 * size + 2 / n)
+        )
+        part = (slice(low_y, high_y), slice(low_x, high_x))
+        dx, dy = columns[part] - x, rows[part] - y
+        a, b = cosine * dx + sine * dy, cosine * dy - sine * dx
         inside = size - (np.sqrt(a * a + b * b) if is_disc else np.maximum(np.abs(a), 3 * np.abs(b)))
         cover = np.clip(inside * n / 1.5, 0, 1)
-        image += cover * (rng.uniform(0.0, 1.0) - image)
+        image[part] += cover * (rng.uniform(0.0, 1.0) - image[part])
     edge = np.minimum(np.minimum(rows, 1 - rows), np.minimum(columns, 1 - columns))
     image += np.clip((0.07 - edge) * n / 1.5, 0, 1) * (0.02 - image)
     image += np.clip((0.035 - edge) * n / 1.5, 0, 1) * (1.0 - image)

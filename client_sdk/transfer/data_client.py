@@ -2,7 +2,8 @@
 
 `DataClient` is blocking; run it in a thread.  Objects are named by their sha256, so a repeated or resumed
 transfer can neither store an object twice nor mix two versions.  An upload returns when the data server has
-reported the object durable.
+reported the object durable.  Objects may take a presigned address of the service's bucket; when that fails,
+the service carries the bytes itself.
 """
 
 from __future__ import annotations
@@ -14,13 +15,12 @@ import os
 import random
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, BinaryIO
 from urllib.parse import urlsplit
 
-from client_sdk.transfer.presigned import get_presigned, http_connection, is_allowed, put_presigned
 from rse_pf.errors import (
     BadRequest,
     CommandFailed,
@@ -33,7 +33,7 @@ from rse_pf.errors import (
     error_from_code,
 )
 
-__all__ = ["DataClient", "DataOptions", "OnBytes"]
+__all__ = ["DataClient", "DataOptions", "OnBytes", "is_allowed"]
 
 OnBytes = Callable[[int, int], None]
 """Called after each part with the bytes transferred and the bytes in total."""
@@ -43,6 +43,9 @@ _PIECE_BYTES = 1 << 20
 _PRESIGNED_TRIES = 3
 _REDIRECTED = 307
 _RETRIED = {408, 429, 500, 502, 503, 504}
+_CONNECTIONS = {True: http.client.HTTPSConnection, False: http.client.HTTPConnection}
+
+Response = tuple[int, http.client.HTTPMessage, bytes]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -194,13 +197,11 @@ class DataClient:
                 return state
             tries -= 1
             body = opened.pieces(progress)
-            if not put_presigned(direct["url"], direct["headers"], body, timeout_s=self._options.timeout_s):
+            if not _ask_bucket("PUT", direct["url"], direct["headers"], body, self._options.timeout_s):
                 self._options.sleep(pause)
                 pause *= 2
 
-    def _piece(
-        self, path: str, headers: dict[str, str], route: _Route
-    ) -> tuple[int, http.client.HTTPMessage, bytes]:
+    def _piece(self, path: str, headers: dict[str, str], route: _Route) -> Response:
         """Fetch a range from a presigned address if the service offers one, else from the service."""
         options = self._options
         while route.tries:
@@ -211,7 +212,7 @@ class DataClient:
                 if status != _REDIRECTED:
                     return status, answer, piece
             if is_allowed(route.url, secure=self._secure):
-                found = get_presigned(route.url, headers, timeout_s=options.timeout_s)
+                found = _ask_bucket("GET", route.url, headers, None, options.timeout_s)
                 if found is not None:
                     return found
             route.url, route.tries = "", route.tries - 1  # expired, or the bucket cannot be reached
@@ -254,7 +255,7 @@ class DataClient:
     def _request(
         self, method: str, path: str, body: bytes | None = None, headers: dict[str, str] | None = None,
         also: tuple[int, ...] = (),
-    ) -> tuple[int, http.client.HTTPMessage, bytes]:  # fmt: skip
+    ) -> Response:  # fmt: skip
         """Repeat a request until it succeeds or is refused; all requests of this class are idempotent."""
         options = self._options
         end, pause = options.clock() + options.deadline_s, options.first_pause_s
@@ -283,13 +284,10 @@ class DataClient:
             options.sleep(wait_s)
             pause = min(2 * pause, options.max_pause_s)
 
-    def _request_once(
-        self, method: str, path: str, body: bytes | None, headers: dict[str, str]
-    ) -> tuple[int, http.client.HTTPMessage, bytes]:
+    def _request_once(self, method: str, path: str, body: bytes | None, headers: dict[str, str]) -> Response:
         if self._connection is None:
-            self._connection = http_connection(
-                self._host, self._port, secure=self._secure, timeout_s=self._options.timeout_s
-            )
+            kind = _CONNECTIONS[self._secure]
+            self._connection = kind(self._host, self._port, timeout=self._options.timeout_s)
         token = self._token if isinstance(self._token, str) else self._token()
         self._connection.request(method, path, body, {"Authorization": f"Bearer {token}", **headers})
         answer = self._connection.getresponse()
@@ -343,6 +341,29 @@ class _Source:
     def __exit__(self, *_: object) -> None:
         if self._file is not None:
             self._file.close()
+
+
+def is_allowed(url: str, *, secure: bool) -> bool:
+    """Return whether a presigned *url* may be used with a data service that is reached by TLS or without."""
+    parts = urlsplit(url)
+    return bool(parts.hostname) and parts.scheme in (("https",) if secure else ("http", "https"))
+
+
+def _ask_bucket(
+    method: str, url: str, headers: Mapping[str, str], body: Iterable[bytes] | None, timeout_s: float
+) -> Response | None:
+    """Send exactly *headers*, never the token, to a presigned address; None unless the request succeeded."""
+    parts = urlsplit(url)
+    connection = _CONNECTIONS[parts.scheme == "https"](parts.hostname or "", parts.port, timeout=timeout_s)
+    try:
+        connection.request(method, f"{parts.path}?{parts.query}", body, dict(headers))
+        answer = connection.getresponse()
+        response = answer.status, answer.headers, answer.read()
+    except (OSError, http.client.HTTPException):
+        return None
+    finally:
+        connection.close()
+    return response if answer.status in ((200, 206, 416) if method == "GET" else (200, 201)) else None
 
 
 def _error_of(status: int, content: bytes) -> RsePfError:

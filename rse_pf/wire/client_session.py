@@ -17,16 +17,6 @@ import msgspec
 from rse_pf.config import SessionSettings
 from rse_pf.errors import LimitExceeded
 from rse_pf.wire.backlog import Backlog, is_long_outage, send_order
-from rse_pf.wire.client_events import (
-    Answered,
-    ConnectionLost,
-    Event,
-    MoveRequested,
-    Notice,
-    Progressed,
-    RenewalDue,
-    Welcomed,
-)
 from rse_pf.wire.clock_offset import ClockOffset, Exchange
 from rse_pf.wire.codec import Codec
 from rse_pf.wire.messages import (
@@ -67,6 +57,68 @@ _PINGS_PER_STALL_TIMEOUT = 3.0
 _MAX_DEADLINE_MS = 3.6e6
 RETRY_SHARE = 0.1
 """Retries after busy, as a share of the commands.  Source: Google SRE book, ch. 21."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Answered:
+    """A command ended.
+
+    ``sent_s`` is when the robot accepted it (its clock); ``up_s`` and ``down_s`` are the paper's two
+    one-way delays, None where no clock offset is known; ``wire_bytes`` is the size of its message.
+    """
+
+    id: int
+    answer: Result | Failure
+    sent_s: float
+    wire_bytes: int = 0
+    up_s: float | None = None
+    down_s: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Welcomed:
+    """The server accepted the connection; the session sends on it from now on."""
+
+    welcome: Welcome
+
+
+@dataclass(frozen=True, slots=True)
+class MoveRequested:
+    """The server asks the robot to connect to another server."""
+
+    reason: str
+    within_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class ConnectionLost:
+    """The connection is lost, although its socket may still be open."""
+
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class Notice:
+    """The server reports a failure of a message or of the session, not of one command."""
+
+    failure: Failure
+
+
+@dataclass(frozen=True, slots=True)
+class Progressed:
+    """Progress of a long command: the share *done* (0..1), and *what* was done last."""
+
+    id: int
+    done: float
+    what: str
+
+
+@dataclass(frozen=True, slots=True)
+class RenewalDue:
+    """The connection expires soon unless a fresh token is sent: see `ClientSession.renew`."""
+
+
+Event = RenewalDue | Answered | Welcomed | MoveRequested | ConnectionLost | Notice | Progressed
 
 
 @dataclass(slots=True, kw_only=True)

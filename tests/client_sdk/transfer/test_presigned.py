@@ -11,8 +11,7 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 import pytest
 from fake_data_service import HttpServer, Service, small_settings
 
-from client_sdk.transfer.data_client import DataClient, DataOptions
-from client_sdk.transfer.presigned import is_allowed
+from client_sdk.transfer.data_client import DataClient, DataOptions, is_allowed
 from rse_pf.object_store import MemoryStore, digest_of
 
 DATA = random.Random(1).randbytes(700_000)
