@@ -284,8 +284,8 @@ def wifi_row(buildings: int = 8, scans: int = 250) -> dict[str, float]:
         for _ in range(scans):
             place = np.array([rng.uniform(1, 39), rng.uniform(1, 19), 0.3])
             found = locator.position_of(fingerprint_of(building.scan(place, rng), key).rssi_dbm)
-            if not isinstance(found, str):
-                errors.append(math.hypot(found.mean[0] - place[0], found.mean[1] - place[1]))
+            if found.found:
+                errors.append(math.hypot(found.x - place[0], found.y - place[1]))
                 radii.append(found.sigma_m)
     return {
         "scans": len(errors),

@@ -33,7 +33,7 @@ import msgspec
 import numpy as np
 
 from rse_pf.aws.storage import open_data_store
-from rse_pf.cli.operator import record_map_change
+from rse_pf.audit.operator import record_map_change
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import CommandFailed, NotFound, UsageError
 from rse_pf.files import replace_file
@@ -43,7 +43,7 @@ from rse_pf.maps.format import MapVersion
 from rse_pf.maps.registry import MapRecord, MapRegistry, difference
 
 if TYPE_CHECKING:
-    from rse_pf.services.mapping.localise import Location
+    from rse_pf.services.mapping.localise import LocaliseReply
     from rse_pf.services.mapping.merge import MergeReply
     from rse_pf.services.mapping.relative_pose import View
 
@@ -439,11 +439,11 @@ def _lens_of_map(version: MapVersion, width: int, height: int, label: str) -> Ca
     )
 
 
-def _found(label: str, location: Location) -> dict[str, Any]:
+def _found(label: str, location: LocaliseReply) -> dict[str, Any]:
     T = location.T_map_camera
     return {
         "frame": label, "verdict": location.verdict, "reason": location.reason, "inliers": location.inliers,
-        "rmse_px": round(location.rmse_px, 3), "keyframes": list(location.keyframes),
+        "rmse_px": round(location.rmse_px, 3), "keyframes": location.keyframes,
         "position_m": None if T is None else [round(float(x), 4) + 0.0 for x in T[:3, 3]],
         "quaternion_xyzw": None if T is None else [round(float(x), 6) for x in to_quaternion(T[:3, :3])],
         "turned_deg": None if T is None else round(rotation_angle_deg(T[:3, :3]), 2),

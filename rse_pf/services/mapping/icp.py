@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -20,7 +20,7 @@ from rse_pf.geometry import pose_difference, transform
 from rse_pf.service import Registry
 from rse_pf.wire.arrays import Array, reshaped
 
-__all__ = ["Alignment", "IcpOptions", "IcpReply", "IcpRequest", "align", "register"]
+__all__ = ["IcpOptions", "IcpReply", "IcpRequest", "align", "register"]
 
 _MIN_POINTS = 100
 _NEIGHBOURS = 20
@@ -88,22 +88,9 @@ class IcpReply(msgspec.Struct, frozen=True, kw_only=True):
     iterations: int
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Alignment:
-    """What `align` found; the fields are those of `IcpReply`."""
-
-    T_target_source: Matrix
-    verdict: Literal["ok", "refused"]
-    reason: str
-    overlap: float
-    misfit_before_m: float
-    misfit_after_m: float
-    iterations: int
-
-
 def align(
     target: Matrix, source: Matrix, T_target_source: Matrix, options: IcpOptions | None = None
-) -> Alignment:
+) -> IcpReply:
     """Refine the pose of *source* in the frame of *target*; deterministic, one thread.
 
     Generalised ICP with a decreasing reach.  The fit is not measured by the solver but by the mean
@@ -115,6 +102,9 @@ def align(
         source: ``(m, 3)`` metres.
         T_target_source: ``(4, 4)``, the initial guess.
         options: ``None`` means the defaults.
+
+    Returns:
+        The reply of the service, with ``T_target_source`` as ``(4, 4)``.
 
     Raises:
         BadRequest: Too few points are left after thinning.
@@ -151,7 +141,7 @@ def align(
     after = fit(pose) if np.isfinite(pose).all() else _Fit(0.0, math.inf)
     reason = "" if converged else "not-converged"
     reason = reason or _refusal(T_target_source, pose, before, after, fit.constraint(pose), options)
-    return Alignment(
+    return IcpReply(
         T_target_source=T_target_source if reason else pose,
         verdict="refused" if reason else "ok",
         reason=reason,
@@ -176,15 +166,7 @@ def register(registry: Registry) -> None:
         if guess.size != 16 or not _is_rigid(guess.reshape(4, 4)):
             raise BadRequest("T_target_source is not a rigid motion", hint="send 16 numbers, row-major")
         found = align(target, source, guess.reshape(4, 4), request.options)
-        return IcpReply(
-            T_target_source=found.T_target_source.ravel(),
-            verdict=found.verdict,
-            reason=found.reason,
-            overlap=found.overlap,
-            misfit_before_m=found.misfit_before_m,
-            misfit_after_m=found.misfit_after_m,
-            iterations=found.iterations,
-        )
+        return msgspec.structs.replace(found, T_target_source=found.T_target_source.ravel())
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,7 +6,6 @@ A pose with few inliers, or on which two keyframes disagree, is not ok.  Earlier
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
 
 import msgspec
 import numpy as np
@@ -20,7 +19,7 @@ from rse_pf.services.mapping.place import PlaceIndex, Within, open_map, view_of
 from rse_pf.services.mapping.relative_pose import RelativePoseOptions, View, matched_points
 from rse_pf.wire.arrays import Array
 
-__all__ = ["LocaliseOptions", "LocaliseReply", "LocaliseRequest", "Location", "locate", "register"]
+__all__ = ["LocaliseOptions", "LocaliseReply", "LocaliseRequest", "locate", "register"]
 
 
 class LocaliseOptions(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
@@ -77,18 +76,6 @@ class LocaliseReply(msgspec.Struct, frozen=True, kw_only=True):
     """Ids of the keyframes that support the pose, best first."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Location:
-    """The result of `locate`; the fields are those of `LocaliseReply`."""
-
-    verdict: Literal["ok", "weak", "lost"]
-    reason: str
-    T_map_camera: Matrix | None = None
-    inliers: int = 0
-    rmse_px: float = 0.0
-    keyframes: tuple[int, ...] = ()
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class _CandidatePose:
     row: int
@@ -99,11 +86,14 @@ class _CandidatePose:
 
 def locate(
     index: PlaceIndex, view: View, options: LocaliseOptions | None = None, *, within: Within | None = None
-) -> Location:
+) -> LocaliseReply:
     """Find the pose of *view* among the keyframes of *index*.
 
     Place recognition gives candidates, PnP a pose from each; the best one is solved again with the points
     of all candidates that agree with it.
+
+    Returns:
+        The reply of the service, with ``T_map_camera`` as ``(4, 4)``.
 
     Raises:
         MissingExtra: faiss or the solver is not installed.
@@ -111,27 +101,27 @@ def locate(
     options = options or LocaliseOptions()
     rows = index.nearest(view.descriptors, options.candidates, index.rows_within(within))
     if not rows:
-        return Location(verdict="lost", reason="no-candidates")
+        return LocaliseReply(verdict="lost", reason="no-candidates")
     candidates = [
         candidate for row, _ in rows if (candidate := _candidate_pose(index, row, view, options)) is not None
     ]
     if not candidates:
-        return Location(verdict="lost", reason="no-pose")
+        return LocaliseReply(verdict="lost", reason="no-pose")
     candidates.sort(key=lambda candidate: -len(candidate.solution.inliers))
     best = candidates[0]
     agreeing = [candidate for candidate in candidates if _agrees(candidate, best, options)]
     solution = _solve_jointly(agreeing, view, options) or best.solution
     count = len(best.solution.inliers)
     if count < options.min_inliers // 2:
-        return Location(verdict="lost", reason="few-inliers", inliers=count)
+        return LocaliseReply(verdict="lost", reason="few-inliers", inliers=count)
     reason = _weakness(candidates, agreeing, solution, options)
-    return Location(
+    return LocaliseReply(
         verdict="weak" if reason else "ok",
         reason=reason,
         T_map_camera=inverse(solution.T_camera_world),
         inliers=count,
         rmse_px=solution.rmse_px,
-        keyframes=tuple(index.keyframes[candidate.row].id for candidate in agreeing),
+        keyframes=[index.keyframes[candidate.row].id for candidate in agreeing],
     )
 
 
@@ -144,14 +134,8 @@ def register(registry: Registry) -> None:
         view = view_of(request.camera, request.pixels, request.descriptors)
         _, index = open_map(request.map)
         found = locate(index, view, request.options, within=request.within)
-        return LocaliseReply(
-            verdict=found.verdict,
-            reason=found.reason,
-            T_map_camera=None if found.T_map_camera is None else found.T_map_camera.ravel(),
-            inliers=found.inliers,
-            rmse_px=found.rmse_px,
-            keyframes=list(found.keyframes),
-        )
+        pose = None if found.T_map_camera is None else found.T_map_camera.ravel()
+        return msgspec.structs.replace(found, T_map_camera=pose)
 
 
 def _candidate_pose(

@@ -176,7 +176,7 @@ def propose_links(atlas: Atlas, options: MergeOptions, report: Report = ignore_p
             report(0.1 + 0.7 * done / len(pairs), f"{done} of {len(pairs)} keyframe pairs")
         measured = measure_relative_pose(atlas.keyframes[a], atlas.keyframes[b], pose_options)
         if isinstance(measured, str):
-            failed[_failure_key(_pair(atlas, a, b), measured)] += 1
+            failed[(*_pair(atlas, a, b), measured)] += 1
         else:
             links.append(
                 LoopClosure(
@@ -217,13 +217,13 @@ def _select_consistent(
         if pair[0] == pair[1]:
             # Within one map a loop must also agree with the odometry.
             links = [link for link in links if _fits_odometry(atlas, link, noise)]
-            refused[_failure_key(pair, "against-odometry")] += len(groups[pair]) - len(links)
+            refused[(*pair, "against-odometry")] += len(groups[pair]) - len(links)
         rows = consistent(links, atlas.T_world_camera, atlas.order, noise)
         if pair[0] != pair[1] and len(rows) < options.min_links:
-            refused[_failure_key(pair, "too-few-agree")] += len(links)
+            refused[(*pair, "too-few-agree")] += len(links)
             continue
         accepted += [links[row] for row in rows]
-        refused[_failure_key(pair, "inconsistent")] += len(links) - len(rows)
+        refused[(*pair, "inconsistent")] += len(links) - len(rows)
     return accepted, Counter({key: count for key, count in refused.items() if count})
 
 
@@ -386,7 +386,3 @@ def _reason_not_joined(
 def _pair(atlas: Atlas, a: int, b: int) -> tuple[int, int]:
     one, other = int(atlas.of_map[a]), int(atlas.of_map[b])
     return min(one, other), max(one, other)
-
-
-def _failure_key(pair: tuple[int, int], reason: str) -> tuple[int, int, str]:
-    return pair[0], pair[1], reason

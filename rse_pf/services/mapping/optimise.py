@@ -5,7 +5,7 @@ The same request has the same answer, which never fits worse than the given pose
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import msgspec
@@ -160,7 +160,7 @@ def register(registry: Registry) -> None:
         squares = graph.squared_residuals(found.T_world_pose)
         wrong = np.flatnonzero(graph.robust & (squares > 9.0 * max(options.cauchy, 3.0) ** 2))
         return OptimiseReply(
-            g2o=write_g2o(graph.with_poses(found.T_world_pose)),
+            g2o=write_g2o(replace(graph, T_world_pose=found.T_world_pose)),
             chi2_before=graph.chi2(),
             chi2_after=float(squares.sum()),
             cost_before=found.cost_before,

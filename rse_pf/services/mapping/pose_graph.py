@@ -72,13 +72,6 @@ class PoseGraph:
                 "an information matrix is not symmetric and positive definite", hint="invert a covariance"
             )
 
-    def with_poses(self, T_world_pose: Array) -> PoseGraph:
-        """Return the graph with its poses replaced."""
-        return PoseGraph(
-            T_world_pose=T_world_pose, a=self.a, b=self.b, T_a_b=self.T_a_b,
-            information=self.information, robust=self.robust, ids=self.ids,
-        )  # fmt: skip
-
     def chi2(self, T_world_pose: Array | None = None) -> float:
         """Return the sum of squared residuals, each weighted with its information."""
         poses = self.T_world_pose if T_world_pose is None else T_world_pose

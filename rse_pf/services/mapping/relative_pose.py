@@ -20,7 +20,6 @@ __all__ = [
     "RelativePose",
     "RelativePoseOptions",
     "View",
-    "adjoint",
     "matched_points",
     "measure_relative_pose",
     "pose_of_view",
@@ -79,7 +78,8 @@ def measure_relative_pose(a: Keyframe, b: Keyframe, options: RelativePoseOptions
         return "low-inlier-ratio"
     T_b_a = solution.T_camera_world
     # T_b_a true = exp(xi) T_b_a, so inverse(T_a_b) T_a_b true = exp(-xi): the same covariance.
-    covariance = solution.covariance + _min_covariance(options)
+    floor = np.diag([options.floor_m**2] * 3 + [math.radians(options.floor_deg) ** 2] * 3)
+    covariance = solution.covariance + floor
     information = np.linalg.inv(covariance).astype(np.float64)
     return RelativePose(T_a_b=inverse(T_b_a), information=information, inliers=count, matches=matches)
 
@@ -106,16 +106,3 @@ def matched_points(reference: Keyframe, view: View, options: RelativePoseOptions
     rows, columns = hamming_matches(reference.descriptors[known], view.descriptors, options.ratio)
     rows, columns = known[rows[: options.max_matches]], columns[: options.max_matches]
     return np.asarray(reference.points_camera[rows], dtype=np.float64), rows, columns
-
-
-def adjoint(T: Array) -> Array:
-    """Return the ``(6, 6)`` matrix that moves twists ``(rho, phi)`` from the right of *T* to its left."""
-    rotation, t = T[:3, :3], T[:3, 3]
-    result = np.zeros((6, 6))
-    result[:3, :3] = result[3:, 3:] = rotation
-    result[:3, 3:] = np.cross(t[None, :], rotation.T).T
-    return result
-
-
-def _min_covariance(options: RelativePoseOptions) -> Array:
-    return np.diag([options.floor_m**2] * 3 + [math.radians(options.floor_deg) ** 2] * 3)

@@ -10,7 +10,6 @@ import hashlib
 import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
 
 import msgspec
 import numpy as np
@@ -24,7 +23,6 @@ __all__ = [
     "AccessPointReading",
     "Fingerprint",
     "Locator",
-    "Position",
     "WifiOptions",
     "WifiReply",
     "WifiRequest",
@@ -99,15 +97,6 @@ class WifiReply(msgspec.Struct, frozen=True, kw_only=True):
     common: int = 0
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Position:
-    """``(x, y, z)`` metres with the radius, in the floor's plane, of 68 % probability."""
-
-    mean: tuple[float, float, float]
-    sigma_m: float
-    common: int
-
-
 def fingerprint_of(
     readings: Iterable[AccessPointReading], key: bytes, position: tuple[float, float, float] | None = None
 ) -> Fingerprint:
@@ -155,14 +144,20 @@ class Locator:
         self._fields = {name: field.predict(self._grid) for name, field in model.fields.items()}
         self.temper = _calibrate_temper(survey, model, self._options)
 
-    def position_of(self, scan: Mapping[str, float]) -> Position | str:
-        """Return the position of *scan* (dBm by access point), or the reason why there is none."""
+    def position_of(self, scan: Mapping[str, float]) -> WifiReply:
+        """Return the position of *scan* (dBm by access point) as the reply of the service."""
         known = sorted(name for name in scan if name in self._fields)
         if len(known) < self._options.min_common:
-            return f"{len(known)} known access points are fewer than {self._options.min_common}"
+            return WifiReply(
+                found=False,
+                reason=f"{len(known)} known access points are fewer than {self._options.min_common}",
+            )
         mean, sigma_m = _posterior(self._grid, _log_likelihood(scan, self._fields), self.temper)
-        return Position(
-            mean=(float(mean[0]), float(mean[1]), float(mean[2])),
+        return WifiReply(
+            found=True,
+            x=float(mean[0]),
+            y=float(mean[1]),
+            z=float(mean[2]),
             sigma_m=max(sigma_m, 0.3 * self._options.grid_m),
             common=len(known),
         )
@@ -182,11 +177,7 @@ def register(registry: Registry) -> None:
         for each in (request.scan, *request.survey):
             _check_fingerprint(each)
         survey = [(_position_of(each), each.rssi_dbm) for each in request.survey]
-        found = Locator(survey, request.options).position_of(request.scan.rssi_dbm)
-        if isinstance(found, str):
-            return WifiReply(found=False, reason=found)
-        x, y, z = found.mean
-        return WifiReply(found=True, x=x, y=y, z=z, sigma_m=found.sigma_m, common=found.common)
+        return Locator(survey, request.options).position_of(request.scan.rssi_dbm)
 
 
 def _log_likelihood(scan: Mapping[str, float], fields: Mapping[str, tuple[Array, Array]]) -> Array:

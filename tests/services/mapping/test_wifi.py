@@ -37,8 +37,8 @@ def located(building: Building, locator: Locator, scans: int, seed: int) -> tupl
     for _ in range(scans):
         place = np.array([rng.uniform(1, 39), rng.uniform(1, 19), 0.3])
         found = locator.position_of(fingerprint_of(building.scan(place, rng), KEY).rssi_dbm)
-        assert not isinstance(found, str)
-        errors.append(float(np.hypot(found.mean[0] - place[0], found.mean[1] - place[1])))
+        assert found.found, found.reason
+        errors.append(float(np.hypot(found.x - place[0], found.y - place[1])))
         radii.append(found.sigma_m)
     return errors, radii
 
