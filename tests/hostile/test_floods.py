@@ -148,14 +148,14 @@ def test_slow_request_heads_are_cut_after_the_handshake_timeout(server):
 
 
 def test_a_long_request_head_is_answered_with_431(server):
-    async def knock() -> bytes:
-        reader, writer = await AttackTarget(server.url).knock()
+    async def send_long_head() -> bytes:
+        reader, writer = await AttackTarget(server.url).open_tcp()
         writer.write(b"GET /ws HTTP/1.1\r\nHost: a\r\nX-Long: " + b"x" * 9000)
         answer = await asyncio.wait_for(reader.read(), 10)
         writer.close()
         return answer
 
-    assert asyncio.run(knock()).startswith(b"HTTP/1.1 431 ")
+    assert asyncio.run(send_long_head()).startswith(b"HTTP/1.1 431 ")
 
 
 def test_equal_ids_and_streams_of_several_robots_are_kept_apart(server):

@@ -115,7 +115,7 @@ def test_the_public_port_has_three_paths_and_nothing_else_listens_publicly(tmp_p
 def test_a_control_port_answers_health_to_all_and_the_rest_only_with_its_token(tmp_path: Path) -> None:
     folder = tmp_path / "p"
 
-    def knock(port: int) -> tuple[list[int], list[int], set[bytes], list[int], bytes]:
+    def probe(port: int) -> tuple[list[int], list[int], set[bytes], list[int], bytes]:
         token = read_control_token(folder / "control.token")
         wrong = ("", "Bearer", token, f"Basic {token}", bearer(token[:-1]), bearer("0" * 64))
         told = [asked(port, path, method, each) for method, path in PAGES_WITH_TOKEN for each in wrong]
@@ -133,7 +133,7 @@ def test_a_control_port_answers_health_to_all_and_the_rest_only_with_its_token(t
             status_port = getattr(read_state(folder), "status_port", 0)
             unasked = await asyncio.to_thread(status_of, status_port, "/status")
             mode = stat.S_IMODE((folder / "control.token").stat().st_mode)
-            return await asyncio.to_thread(knock, server.control_port), unasked, mode
+            return await asyncio.to_thread(probe, server.control_port), unasked, mode
 
     (refused, health, bodies, carried, page), unasked, mode = asyncio.run(scan())
 
