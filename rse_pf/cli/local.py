@@ -84,7 +84,7 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
     _check(args)
     folder = state_folder(args.name, os.environ)
     if args.action == "stop":
-        from rse_pf.local.shutdown import stop_platform
+        from rse_pf.local.state import stop_platform
 
         stopped = stop_platform(folder)
         print(f"platform {args.name!r} {'is stopped' if stopped else 'was not running'}")

@@ -11,6 +11,7 @@ import json
 import os
 import resource
 import select
+import shutil
 import signal
 import subprocess
 import time
@@ -30,6 +31,8 @@ __all__ = [
     "is_alive",
     "last_line",
     "mark_of",
+    "rotate_logs",
+    "rotate_long_logs",
     "send_signal",
     "spawn",
     "wait_ended",
@@ -37,6 +40,7 @@ __all__ = [
 
 _TAIL_BYTES = 8192
 _LOOK_AGAIN_S = 0.01
+_ROTATE_EVERY_S = 5.0
 STOP_TIMEOUT_S = 10.0
 """A process that has not ended so long after it was asked to is killed."""
 
@@ -241,6 +245,32 @@ def last_line(log: Path) -> str:
     lines = [line.strip() for line in text.splitlines() if line.strip()]
     told = [line for line in lines if not line.startswith("hint:")]
     return (told or lines or [""])[-1][:300]
+
+
+async def rotate_logs(folder: Path, max_bytes: int) -> None:
+    """Rotate the logs of *folder* periodically, until cancelled."""
+    while True:
+        await asyncio.to_thread(rotate_long_logs, folder, max_bytes)
+        await asyncio.sleep(_ROTATE_EVERY_S)
+
+
+def rotate_long_logs(folder: Path, max_bytes: int) -> list[Path]:
+    """Rotate every ``*.log`` of *folder* that is longer than *max_bytes*; return those logs.
+
+    Copies and truncates as copytruncate of logrotate(8): the process that writes keeps its descriptor, and
+    the newest lines stay, in the log or in its one predecessor ``NAME.log.1``.  A line that is written
+    between the copy and the cut is lost.
+    """
+    longer: list[Path] = []
+    for log in sorted(folder.glob("*.log")):
+        with contextlib.suppress(OSError):  # it is gone, or the disk is full: try again next time
+            if log.stat().st_size > max_bytes:
+                copy = log.with_name(f"{log.name}.1")
+                shutil.copyfile(log, copy)
+                copy.chmod(log.stat().st_mode)
+                os.truncate(log, 0)
+                longer.append(log)
+    return longer
 
 
 def _apart(parent: int | None) -> Callable[[], None]:

@@ -10,6 +10,7 @@ import fcntl
 import json
 import os
 import re
+import signal
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -18,7 +19,7 @@ from typing import Any
 from rse_pf.config import PlatformSettings, load_settings
 from rse_pf.errors import ConfigurationError, SettingsError, UsageError
 from rse_pf.files import replace_file
-from rse_pf.local.processes import ProcessMark
+from rse_pf.local.processes import STOP_TIMEOUT_S, ProcessMark, is_alive, send_signal, wait_ended
 
 __all__ = [
     "PlatformLock",
@@ -30,6 +31,7 @@ __all__ = [
     "remove_state",
     "settings_file",
     "state_folder",
+    "stop_platform",
 ]
 
 _FILE = "platform.json"
@@ -169,6 +171,34 @@ def read_state(folder: Path) -> PlatformState | None:
 def remove_state(folder: Path) -> None:
     """Remove the state file, but neither key nor logs."""
     (folder / _FILE).unlink(missing_ok=True)
+
+
+def stop_platform(folder: Path, timeout_s: float = STOP_TIMEOUT_S) -> bool:
+    """End the platform in *folder*, waiting *timeout_s* for each step; return whether anything ran.
+
+    The control plane is asked first and ends its servers itself; then whatever is left is ended here, also
+    if the control plane was killed.  Only processes whose id and start time are in the file are signalled.
+
+    Raises:
+        ConfigurationError: The state file is there, but is not readable.
+    """
+    state = read_state(folder)
+    if state is None:
+        return False
+    ran = send_signal(state.control_plane, signal.SIGTERM)
+    # It gives servers and balancer their time, one after the other.
+    if ran and not wait_ended(state.control_plane, 3 * timeout_s):
+        send_signal(state.control_plane, signal.SIGKILL)
+        wait_ended(state.control_plane, timeout_s)
+    left = [mark for mark in (read_state(folder) or state).processes() if is_alive(mark)]
+    for mark in left:
+        send_signal(mark, signal.SIGINT)
+    for mark in left:
+        if not wait_ended(mark, timeout_s):
+            send_signal(mark, signal.SIGKILL)
+            wait_ended(mark, timeout_s)
+    remove_state(folder)
+    return ran or bool(left)
 
 
 def _state(document: Any) -> PlatformState:

@@ -33,8 +33,7 @@ from rse_pf.experiments.results.result_folder import remove_keys
 from rse_pf.local.firewall import key_file, read_key
 from rse_pf.local.processes import STOP_TIMEOUT_S, is_alive
 from rse_pf.local.servers.backend_servers import RSE_PF
-from rse_pf.local.shutdown import stop_platform
-from rse_pf.local.state import PlatformState, read_state, state_folder
+from rse_pf.local.state import PlatformState, read_state, state_folder, stop_platform
 
 __all__ = ["run_control_plane_fault"]
 

@@ -26,16 +26,14 @@ from rse_pf.config.placement import ServerPlacement
 from rse_pf.errors import ConfigurationError, UsageError
 from rse_pf.files import replace_json
 from rse_pf.local.balancer.load_balancer import EnvoyLoadBalancer
-from rse_pf.local.control.adoption import adopt, adopt_data
 from rse_pf.local.control.audit_recorder import PlatformAudit
 from rse_pf.local.control.control_plane import ControlOptions, ControlPlane
 from rse_pf.local.control.fleet import Fleet
-from rse_pf.local.control.status_api import serve_status
+from rse_pf.local.control.status import serve_status
 from rse_pf.local.firewall import check_listener, ensure_key, key_file, robots_url
-from rse_pf.local.processes import STOP_TIMEOUT_S, ProcessMark, is_alive, mark_of, send_signal
+from rse_pf.local.processes import STOP_TIMEOUT_S, ProcessMark, is_alive, mark_of, rotate_logs, send_signal
 from rse_pf.local.servers.backend_servers import RSE_PF, BackendServer, LocalBackendServers
 from rse_pf.local.servers.data_servers import LocalDataServers
-from rse_pf.local.servers.log_rotation import rotate_logs
 from rse_pf.local.state import (
     PlatformLock,
     PlatformState,
@@ -51,6 +49,7 @@ __all__ = ["LocalPlatform"]
 Event = Mapping[str, Any]
 
 _LOOPBACK = "127.0.0.1"
+_ASK_S = 1.0
 _LAST_EVENTS = 50
 _LOG_FILE_BYTES = 64 << 20
 """A log that has grown longer is set aside, in place of the one set aside before."""
@@ -357,10 +356,7 @@ class LocalPlatform:
         if left is None:
             await self._begin(end)
         else:
-            await _all(
-                adopt(left, self._fleet, self.backend_servers, self.load_balancer, self._emit, end),
-                adopt_data(left, self.data_servers, self.load_balancer, wanted=self._has_data),
-            )
+            await _all(self._adopt(left, end), self._adopt_data(left.data_server))
         self.url = robots_url(self.settings, self.port)
         self._status = await serve_status(self.status_document, token)
         self._fleet.keep(self._audit.watch())
@@ -376,6 +372,70 @@ class LocalPlatform:
             *(self._fleet.bring_up(member, end - time.monotonic()) for member in members),
             *((self.data_servers.start(),) if self._has_data else ()),
         )
+
+    async def _adopt(self, left: PlatformState, end: float) -> None:
+        """Adopt the balancer and the servers of *left* that still run, and launch what is missing.
+
+        Nothing that runs is killed or restarted, a server keeps its name, and the balancer keeps its port.
+        Returns once one server gets robots.
+        """
+        kept = left.load_balancer is not None and is_alive(left.load_balancer)
+        self.load_balancer.adopt(left.load_balancer if kept else None, port=left.port)
+        self._fleet.launched = left.launched
+        alive = [server for server in left.servers if is_alive(server.process)]
+        members = []
+        for server in alive:
+            self.backend_servers.adopt(server.name, server.process)
+            members.append(
+                self._fleet.adopt(server.name, now_s=time.monotonic(), is_target=bool(server.port))
+            )
+        digests = {server.name: await self._settings_digest(server) for server in alive}
+        self._emit(
+            "adopted",
+            servers=list(digests),
+            balancer=kept,
+            settings_digest=left.settings_digest,
+            digests=digests,
+        )
+        if not kept:
+            self.load_balancer.launch()
+        await self.load_balancer.wait_live(end - time.monotonic())
+        if not members:
+            members = [self._fleet.launch() for _ in left.servers] or [self._fleet.launch()]
+        for member in members:
+            self._fleet.start(member)
+        waiting = [asyncio.ensure_future(member.healthy.wait()) for member in members]
+        try:
+            left_s = max(end - time.monotonic(), 0.0)
+            done, _ = await asyncio.wait(waiting, timeout=left_s, return_when=asyncio.FIRST_COMPLETED)
+        finally:
+            for each in waiting:
+                each.cancel()
+        if not done:
+            names = ", ".join(member.name for member in members)
+            raise ConfigurationError(
+                f"none of the adopted servers became healthy: {names}",
+                hint="look at their logs, or end them with: rse-pf local stop",
+            )
+
+    async def _settings_digest(self, server: ServerState) -> str | None:
+        """Return the digest of the settings that *server* runs with; None if it does not answer."""
+        if not server.port:
+            return None
+        port = self.backend_servers.control(server.control_port)
+        reply = await port.ask_once("/status", timeout_s=_ASK_S)
+        return None if reply is None else str(reply.document().get("settings", "")) or None
+
+    async def _adopt_data(self, left: ServerState | None) -> None:
+        """Adopt the data server *left* if it runs; start a missing one, on its old port if that is free."""
+        if left is not None and left.port and is_alive(left.process):
+            self.data_servers.adopt(left.process, left.port)
+            self.load_balancer.set_data_targets([self.data_servers.target])
+            return
+        if left is not None:
+            send_signal(left.process, signal.SIGKILL)  # it had not announced itself: its port is unknown
+        if self._has_data:
+            await self.data_servers.start(0 if left is None else left.port)
 
     def _write_state(self) -> None:
         control_plane = mark_of(os.getpid())

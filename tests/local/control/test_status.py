@@ -7,7 +7,7 @@ import json
 
 import pytest
 
-from rse_pf.local.control.status_api import serve_status
+from rse_pf.local.control.status import serve_status
 
 SOON_S = 10.0
 TOKEN = "0123456789abcdef" * 4
