@@ -57,14 +57,13 @@ class Parser(argparse.ArgumentParser):
                 f"{self.prog}: {choice['word']!r} is not one of {', '.join(known)}",
                 hint=did_you_mean(choice["word"], known, f"see {self.prog} --help"),
             )
-        option, page = _first_option(message), f"see {self.prog} --help"
+        unknown = re.search(r"unrecognized arguments: ([^\s=]*)", message)
+        option = unknown[1] if unknown else ""
+        known = [word for action in self._actions for word in action.option_strings]
         raise UsageError(
             f"{self.prog}: {message}",
-            hint=hint_for_old_option(option) or did_you_mean(option, self._options(), page),
+            hint=hint_for_old_option(option) or did_you_mean(option, known, f"see {self.prog} --help"),
         )
-
-    def _options(self) -> list[str]:
-        return [word for action in self._actions for word in action.option_strings]
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -78,7 +77,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         return _EXIT_INTERRUPTED
     except BrokenPipeError:
-        _discard_output()
+        # The reader of our output is gone: the rest goes to /dev/null, so that the exit does not fail.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return _EXIT_PIPE
     except OSError as error:
         return _report(RsePfError(str(error), hint="see what the system says about this file or address"))
@@ -142,16 +142,6 @@ def _version() -> str:
 def _report(error: RsePfError) -> int:
     print(error.report(), file=sys.stderr)
     return _EXIT_USAGE if isinstance(error, ConfigurationError) else _EXIT_FAILED
-
-
-def _first_option(message: str) -> str:
-    found = re.search(r"unrecognized arguments: (\S+)", message)
-    return found[1].partition("=")[0] if found else ""
-
-
-def _discard_output() -> None:
-    """Send the rest to /dev/null: the reader of our output is gone, and exit must not fail."""
-    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 if __name__ == "__main__":

@@ -26,7 +26,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
     """Print the table."""
-    rows = list(setting_rows(settings))
+    values = settings.to_dict()
     if args.group == "digest":
         print(settings.digest())
         return 0
@@ -34,17 +34,15 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
         print(settings_page(), end="")
         return 0
     if args.group is not None:
-        groups = list(dict.fromkeys(row.group for row in rows))
-        if args.group not in groups:
-            raise UsageError(f"no group named {args.group!r}", hint=f"groups are {', '.join(groups)}")
-        rows = [row for row in rows if row.group == args.group]
+        if args.group not in values:
+            raise UsageError(f"no group named {args.group!r}", hint=f"groups are {', '.join(values)}")
+        values = {args.group: values[args.group]}
     if args.json:
-        values: dict[str, dict[str, object]] = {}
-        for row in rows:
-            values.setdefault(row.group, {})[row.name] = row.value
         print(json.dumps(values, indent=2))
         return 0
-    for row in rows:
+    for row in setting_rows(settings):
+        if row.group not in values:
+            continue
         changed = "" if row.value == row.default else f"  (default {row.default})"
         unit = f" {row.unit}" if row.unit else ""
         print(f"{row.group}.{row.name} = {row.value}{unit}{changed}\n    {row.doc} [{row.source}]")

@@ -5,7 +5,6 @@ Numbers that an operator may change belong here; what uses them, and what opens 
 
 from rse_pf.config.loading import load_settings
 from rse_pf.config.reference_page import settings_page
-from rse_pf.config.schema import SettingRow
 from rse_pf.config.settings import (
     AuthSettings,
     CloudSettings,
@@ -20,6 +19,7 @@ from rse_pf.config.settings import (
     SessionSettings,
     setting_rows,
 )
+from rse_pf.config.validation import SettingRow
 
 __all__ = [
     "AuthSettings",

@@ -39,7 +39,9 @@ class ServerPlacement:
     @classmethod
     def of(cls, settings: PlatformSettings, **changes: Any) -> ServerPlacement:
         """Return the placement that *settings* describe, with *changes*; raises SettingsError."""
-        return cls(**_values(_placed(settings, changes)))
+        placed = _placed(settings, changes)
+        serving = {name: getattr(placed.serving, name) for name in cls.__slots__ if name != _STORE}
+        return cls(**serving, store=placed.data.store)
 
     @classmethod
     def read(cls, file: Path | None, settings: PlatformSettings, **changes: Any) -> ServerPlacement:
@@ -87,8 +89,3 @@ def _placed(settings: PlatformSettings, changes: dict[str, Any]) -> PlatformSett
     serving = {name: value for name, value in changes.items() if name != _STORE}
     data = {_STORE: changes[_STORE]} if _STORE in changes else {}
     return settings.replace(serving=serving, data=data)
-
-
-def _values(settings: PlatformSettings) -> dict[str, Any]:
-    serving = {name: getattr(settings.serving, name) for name in ServerPlacement.__slots__ if name != _STORE}
-    return {**serving, _STORE: settings.data.store}

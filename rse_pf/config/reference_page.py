@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import json
 
-from rse_pf.config.schema import SettingRow
 from rse_pf.config.settings import PlatformSettings, setting_rows
+from rse_pf.config.validation import SettingRow
 
 __all__ = ["settings_page"]
 

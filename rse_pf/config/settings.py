@@ -14,8 +14,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from rse_pf.config.schema import SettingRow, setting
-from rse_pf.config.validation import WHERE, check_range, hint_for_unknown, typed
+from rse_pf.config.validation import WHERE, SettingRow, check_range, hint_for_unknown, setting, typed
 from rse_pf.errors import SettingsError
 
 __all__ = [
@@ -247,7 +246,7 @@ class PlatformSettings:
     @classmethod
     def from_dict(cls, overrides: Mapping[str, Any]) -> PlatformSettings:
         """Return the defaults with the overrides ``{group: {name: value}}``."""
-        groups = {f.name: typing.get_type_hints(cls)[f.name] for f in dataclasses.fields(cls)}
+        groups = typing.get_type_hints(cls)
         made: dict[str, Any] = {}
         for name, values in overrides.items():
             if name not in groups:

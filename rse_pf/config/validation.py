@@ -1,4 +1,4 @@
-"""Refuse a setting that is unknown, of the wrong type or out of its range.
+"""What a setting consists of, and why its value may be refused: unknown, of the wrong type, out of range.
 
 Every error names the setting, the value and its limit, and says what to do.
 """
@@ -7,16 +7,49 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Iterable
+from dataclasses import dataclass, field
 from typing import Any
 
 from rse_pf.config.renames import hint_for_old_setting
-from rse_pf.config.schema import SettingRow
 from rse_pf.errors import SettingsError
 
-__all__ = ["WHERE", "check_range", "did_you_mean", "hint_for_unknown", "typed"]
+__all__ = ["WHERE", "SettingRow", "check_range", "did_you_mean", "hint_for_unknown", "setting", "typed"]
 
 _LARGEST = 1e15
 WHERE = 'in cdk.json, context."rse-pf"'
+
+
+def setting(
+    default: Any,
+    *,
+    doc: str,
+    unit: str = "",
+    source: str = "ours",
+    low: float | None = None,
+    high: float | None = None,
+    choices: tuple[str, ...] = (),
+) -> Any:
+    """Declare one setting; the docs table, the CLI and the checks all come from here."""
+    metadata = {
+        "doc": doc, "unit": unit, "source": source, "low": low, "high": high, "choices": choices,
+    }  # fmt: skip
+    return field(default=default, metadata=metadata)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SettingRow:
+    """One setting as a row of the documentation."""
+
+    group: str
+    name: str
+    value: Any
+    default: Any
+    unit: str
+    source: str
+    doc: str
+    low: float | None
+    high: float | None
+    choices: tuple[str, ...]
 
 
 def typed(name: str, value: Any, kind: Any) -> Any:
