@@ -34,6 +34,7 @@ from rse_pf.experiments.demo.robot import DemoOptions, FrameDone, RobotFinished,
 from rse_pf.experiments.plots.map_image import RobotPath, draw_map
 from rse_pf.experiments.results.records import COMMANDS, EVENTS, SAMPLES, EventLog, write_commands
 from rse_pf.experiments.results.result_folder import (
+    RUN_FILES,
     environment,
     fresh_folder,
     load_average,
@@ -61,7 +62,18 @@ class _Robot:
 
 def run_demo(options: DemoOptions, settings: PlatformSettings) -> int:
     """Run the demo; return 0 if every command was answered or failed."""
-    folder = fresh_folder(options.out, ["map.png", "map_merged.png", "merged.ply", MERGED_MAP], ["robot-*"])
+    folder = fresh_folder(
+        options.out,
+        [
+            *RUN_FILES,
+            "map.png",
+            "map_merged.png",
+            "merged.ply",
+            MERGED_MAP,
+            "robot-[1-9]",
+            "robot-[1-9][0-9]",
+        ],
+    )
     chosen = settings.replace(pnp={"engine": options.engine})
     with (folder / EVENTS).open("w", encoding="utf-8") as file:
         report = asyncio.run(_run(options, chosen, folder, EventLog(file)))

@@ -62,7 +62,7 @@ class SwarmRun:
 
 def run_swarm(run: SwarmRun, settings: PlatformSettings) -> int:
     """Run the swarm; return 0 if every command was answered or failed, once, and all poses were right."""
-    folder = fresh_folder(run.out)
+    folder = fresh_folder(run.out, ["report.json", COMMANDS, EVENTS])
     before = environment(settings)
     with (folder / EVENTS).open("w", encoding="utf-8") as file:
         result = asyncio.run(_run(run, settings, EventLog(file)))

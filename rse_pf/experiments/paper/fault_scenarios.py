@@ -1,7 +1,7 @@
 """The faults that `rse-pf experiment robustness` injects while robots send commands.
 
 A scenario injects its fault, records it with the pid or name of the target, and waits until its consequences
-are over or a timeout has passed.  The figures are computed in `rse_pf.experiments.paper.robustness_report`.
+are over or a timeout has passed.  The figures are computed in `rse_pf.experiments.paper.robustness`.
 """
 
 from __future__ import annotations
@@ -135,7 +135,7 @@ def _pause_busiest(harness: Harness, watch_s: float) -> None:
 
 
 async def _kill_balancer(harness: Harness, watch_s: float) -> None:
-    began, mark = harness.now(), harness.platform.load_balancer.mark
+    began, mark = harness.now(), harness.platform.load_balancer.process.mark
     pid = None if mark is None else mark.pid
     harness.log("fault", fault="kill -9 of the balancer", pid=pid, watch_s=watch_s)
     harness.platform.kill_balancer()

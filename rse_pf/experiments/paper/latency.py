@@ -7,20 +7,25 @@ the lateness of the load generator itself.
 from __future__ import annotations
 
 import asyncio
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from rse_pf.config import PlatformSettings
 from rse_pf.experiments.load.swarm import SwarmOptions
 from rse_pf.experiments.paper.harness import Harness, generator_of
-from rse_pf.experiments.paper.latency_report import latency_figures, latency_page
 from rse_pf.experiments.plots.figures import draw_latency, require_matplotlib
-from rse_pf.experiments.results.records import read_records
-from rse_pf.experiments.results.result_folder import finish_report, fresh_folder, load_average
-from rse_pf.experiments.results.summary import PAPER
+from rse_pf.experiments.results.markdown import about_run, number, page, slashed, table, three
+from rse_pf.experiments.results.records import CommandRecord, Records, parameters_of, read_records
+from rse_pf.experiments.results.result_folder import RUN_FILES, finish_report, fresh_folder, load_average
+from rse_pf.experiments.results.summary import PAPER, ROUND_TRIP_PARTS, answered_percent, summary_of
 from rse_pf.local.faults.network_emulator import profile_named
 
-__all__ = ["LatencyOptions", "run_latency"]
+__all__ = ["LatencyOptions", "latency_figures", "latency_page", "run_latency"]
 
 FIGURE = "latency.png"
 _JOIN_TIMEOUT_S = 60.0
@@ -42,7 +47,7 @@ class LatencyOptions:
 def run_latency(options: LatencyOptions, settings: PlatformSettings) -> int:
     """Run the experiment, write records, report and figure; return 1 if a command was lost or duplicated."""
     require_matplotlib()
-    folder = fresh_folder(options.out, [FIGURE])
+    folder = fresh_folder(options.out, [*RUN_FILES, FIGURE])
     load_before = load_average()
     asyncio.run(_run(options, settings, folder))
     records = read_records(folder)
@@ -84,3 +89,82 @@ async def _run(options: LatencyOptions, settings: PlatformSettings, folder: Path
         await swarm.wait_joined(_JOIN_TIMEOUT_S)
         await harness.run_for(options.seconds)
         await harness.save_result(await swarm.finish())
+
+
+def latency_figures(records: Records) -> dict[str, Any]:
+    """Return round trip, its parts and the frame rate.
+
+    Raises:
+        UsageError: The events do not hold the parameters of the run.
+    """
+    link_ms = float(parameters_of(records).get("link_round_trip_ms") or 0.0)
+    summary = summary_of(records)
+    trip = summary["round_trip_ms"]
+    parts = [summary[name]["mean"] for name in ROUND_TRIP_PARTS]
+    return {
+        "commands": summary["commands"],
+        "failures_by_code": summary["failures_by_code"],
+        "wrong_poses": summary["wrong_poses"],
+        "payload_bytes": summary["payload_bytes"],
+        "round_trip_ms": trip,
+        **{name: summary[name] for name in ROUND_TRIP_PARTS},
+        "rest_ms_mean": _difference(trip["mean"], None if None in parts else sum(parts)),
+        "over_the_link_ms_p50": _difference(trip["p50"], link_ms),
+        "answered_within_150_ms_percent": answered_percent(records.commands, 150.0),
+        "fps_per_robot": _frame_rates(records.commands),
+        "against_paper": {
+            name: _difference(summary[name]["mean"], PAPER[name]) for name in ("round_trip_ms", "compute_ms")
+        },
+    }
+
+
+def latency_page(report: Mapping[str, Any]) -> str:
+    """Return ``report.md``."""
+    paper, trip, link = report["paper"], report["round_trip_ms"], report["asked"]["link"]
+    transmission = paper["round_trip_ms"] - paper["compute_ms"]
+    rows = [
+        ["round trip, mean ms", number(trip["mean"]), f"{paper['round_trip_ms']} (abstract: 153)"],
+        ["round trip p50 / p95 / p99 ms", three(trip), "not given"],
+        ["up, mean ms", number(report["up_ms"]["mean"]), f"up and down: {transmission:.2f} (near 130)"],
+        ["queue, mean ms", number(report["queue_ms"]["mean"]), "not given"],
+        ["compute, mean ms", number(report["compute_ms"]["mean"]), paper["compute_ms"]],
+        ["down, mean ms", number(report["down_ms"]["mean"]), ""],
+        ["in the robot, mean ms", number(report["rest_ms_mean"]), ""],
+        ["round trip p50 minus the delay of the link, ms", number(report["over_the_link_ms_p50"]), ""],
+        ["answered within 150 ms, %", number(report["answered_within_150_ms_percent"]), ""],
+        [
+            "frames per second, mean / slowest robot",
+            slashed(report["fps_per_robot"], "mean", "least"),
+            "near 5",
+        ],
+        ["lost / failed", slashed(report["commands"], "lost", "failed"), "not given"],
+    ]
+    return page(
+        "# RSE-PF experiment: latency (the paper's Sect. 6.2)",
+        f"{report['asked']['robots']} robots x {report['asked']['fps']:g} fps, "
+        + (f"link profile `{link}`." if link else "no emulated link between robots and platform."),
+        table(["figure", "here", "the paper"], rows),
+        "The paper gives two means: 153 ms in the abstract and the conclusion, 156.36 ms in Sect. 6.2.",
+        about_run(report),
+    )
+
+
+def _difference(value: float | None, other: float | None) -> float | None:
+    return None if value is None or other is None else round(value - other, 3)
+
+
+def _frame_rates(commands: Sequence[CommandRecord]) -> dict[str, float | None]:
+    """Return mean and minimum over the robots of answers per second, while they sent."""
+    by_robot: dict[str, list[CommandRecord]] = defaultdict(list)
+    for command in commands:
+        by_robot[command.robot].append(command)
+    rates = []
+    for own in by_robot.values():
+        planned = [each.planned for each in own]
+        sending_s = max(planned) - min(planned)
+        if sending_s > 0:  # n frames span n - 1 intervals
+            answered = sum(each.code == "ok" for each in own)
+            rates.append(answered * (len(own) - 1) / len(own) / sending_s)
+    if not rates:
+        return {"mean": None, "least": None}
+    return {"mean": round(float(np.mean(rates)), 3), "least": round(min(rates), 3)}

@@ -8,22 +8,31 @@ from __future__ import annotations
 
 import csv
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-from client_sdk.mapping import Trajectory, write_trajectory
+from client_sdk.mapping import Trajectory, read_ply, read_trajectory, write_trajectory
 from rse_pf.config import PlatformSettings
 from rse_pf.experiments.demo.run import DemoOptions, run_demo
 from rse_pf.experiments.paper.harness import policy_parameters
-from rse_pf.experiments.paper.mapping_report import map_figures, map_page
-from rse_pf.experiments.results.records import EVENTS, SAMPLES, SampleLog, read_records, run_sample
+from rse_pf.experiments.results.markdown import about_run, number, page, table, three
+from rse_pf.experiments.results.records import (
+    EVENTS,
+    SAMPLES,
+    Records,
+    SampleLog,
+    parameters_of,
+    read_records,
+    run_sample,
+)
 from rse_pf.experiments.results.result_folder import finish_report, load_average
-from rse_pf.experiments.results.summary import PAPER
+from rse_pf.experiments.results.summary import PAPER, summarise
+from rse_pf.experiments.results.trajectory_error import trajectory_figures
 from rse_pf.local.control.monitor import MonitorSample, ServerSample
 
-__all__ = ["run_map"]
+__all__ = ["map_figures", "map_page", "run_map"]
 
 
 def run_map(options: DemoOptions, settings: PlatformSettings) -> int:
@@ -49,23 +58,23 @@ def run_map(options: DemoOptions, settings: PlatformSettings) -> int:
 def _write_truth(options: DemoOptions, folder: Path) -> dict[str, int]:
     """Write the true trajectory of each robot, if it is known; return the number of frames of each."""
     frames = {}
-    for number in range(options.robots):
-        name = f"robot-{number + 1}"
-        truth, frames[name] = _truth(options, number)
+    for row in range(options.robots):
+        name = f"robot-{row + 1}"
+        truth, frames[name] = _truth(options, row)
         if truth is not None:
             write_trajectory(folder / name / "truth.txt", truth)
     return frames
 
 
-def _truth(options: DemoOptions, number: int) -> tuple[Trajectory | None, int]:
+def _truth(options: DemoOptions, row: int) -> tuple[Trajectory | None, int]:
     if options.data is None:
         from client_sdk.simulator import true_trajectory
 
-        truth = true_trajectory(number, options.robots, options.frame_count, options.seed)
+        truth = true_trajectory(row, options.robots, options.frame_count, options.seed)
         return truth, options.frame_count
     from client_sdk.datasets import open_dataset
 
-    share = open_dataset(options.data).thinned(options.rate_hz).share(number, options.robots)
+    share = open_dataset(options.data).thinned(options.rate_hz).share(row, options.robots)
     return share.truth, len(share)
 
 
@@ -115,3 +124,52 @@ def _server(row: dict[str, Any], before: dict[str, Any], took_s: float) -> Serve
         queue=int(row["queue"]),
         in_flight=int(row["in_flight"]),
     )
+
+
+def map_figures(records: Records) -> dict[str, Any]:
+    """Return figures of the commands, and for each robot frames, path, errors and points of its cloud.
+
+    Raises:
+        UsageError: The events do not hold the parameters of the run, or a trajectory cannot be read.
+    """
+    parameters = parameters_of(records)
+    summary = summarise(records.commands)
+    robots = [_robot(records, f"robot-{row + 1}", parameters) for row in range(int(parameters["robots"]))]
+    names = ("commands", "failures_by_code", "payload_bytes", "round_trip_ms", "compute_ms")
+    return {
+        **{name: summary[name] for name in names},
+        **{name: [robot[name] for robot in robots] for name in robots[0]},
+    }
+
+
+def map_page(report: Mapping[str, Any]) -> str:
+    """Return ``report.md``."""
+    names = ("frames", "lost_frames", "fps_per_robot", "path_m", "ate_cm", "rpe_cm", "rpe_deg", "map_points")
+    rows = [
+        [f"robot-{row + 1}", *(number(report[name][row]) for name in names)]
+        for row in range(len(report["frames"]))
+    ]
+    return page(
+        "# RSE-PF experiment: map (the paper's Fig. 7)",
+        table(["robot", *names], rows),
+        f"Round trip p50 / p95 / p99: {three(report['round_trip_ms'])} ms; {report['commands']['sent']} "
+        f"commands, {report['commands']['lost']} lost. The paper shows the cloud of one robot, near 5 fps, "
+        "and measures no error.",
+        about_run(report),
+    )
+
+
+def _robot(records: Records, name: str, parameters: Mapping[str, Any]) -> dict[str, Any]:
+    folder = records.folder / name
+    frames = int(parameters["frames"][name])
+    trajectory = read_trajectory(folder / "trajectory.txt")
+    planned = sorted({each.planned for each in records.commands if each.robot == name})
+    sending_s = planned[-1] - planned[0] if planned else 0.0
+    truth = read_trajectory(folder / "truth.txt") if (folder / "truth.txt").exists() else None
+    return {
+        "frames": frames,
+        "lost_frames": frames - len(trajectory),
+        "fps_per_robot": round((len(planned) - 1) / sending_s, 3) if sending_s > 0 else None,
+        **trajectory_figures(trajectory, truth),
+        "map_points": len(read_ply(folder / "map.ply")[0]),
+    }

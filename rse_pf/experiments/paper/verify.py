@@ -13,10 +13,10 @@ from pathlib import Path
 from typing import Any
 
 from rse_pf.errors import UsageError
-from rse_pf.experiments.paper.elasticity_report import elasticity_figures, unjustified_scale_outs
-from rse_pf.experiments.paper.latency_report import latency_figures
-from rse_pf.experiments.paper.mapping_report import map_figures
-from rse_pf.experiments.paper.robustness_report import robustness_figures
+from rse_pf.experiments.paper.elasticity import elasticity_figures, unjustified_scale_outs
+from rse_pf.experiments.paper.latency import latency_figures
+from rse_pf.experiments.paper.mapping import map_figures
+from rse_pf.experiments.paper.robustness import robustness_figures
 from rse_pf.experiments.results.records import (
     COMMANDS,
     EVENTS,

@@ -1,6 +1,6 @@
 """The folder that a run writes its results to, and the description of machine, versions and settings in it.
 
-Only what an earlier run left is removed from a folder; other files are never touched.
+A folder that holds other files than those of an earlier run is refused, and nothing is removed from it.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ import os
 import platform
 import shutil
 from collections.abc import Callable, Mapping, Sequence
+from fnmatch import fnmatchcase
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,7 @@ from rse_pf.errors import UsageError
 from rse_pf.experiments.results.records import COMMANDS, EVENTS, SAMPLES
 
 __all__ = [
+    "RUN_FILES",
     "environment",
     "finish_report",
     "fresh_folder",
@@ -27,7 +29,8 @@ __all__ = [
     "write_json",
 ]
 
-_WRITTEN = ("report.json", "report.md", COMMANDS, EVENTS, SAMPLES)
+RUN_FILES = ("report.json", "report.md", COMMANDS, EVENTS, SAMPLES, "platform")
+"""What every experiment and the demo write."""
 _PACKAGES = (
     "rse-pf",
     "numpy",
@@ -40,30 +43,31 @@ _PACKAGES = (
 )
 
 
-def fresh_folder(folder: Path, files: Sequence[str] = (), folders: Sequence[str] = ()) -> Path:
+def fresh_folder(folder: Path, written: Sequence[str]) -> Path:
     """Create *folder*, or remove the results of an earlier run from it; return its absolute path.
 
     Args:
-        folder: Any folder that is empty or holds the events of a run, itself or in its subfolders.
-        files: Names of files that this kind of run writes besides its records and reports.
-        folders: Patterns of folders that it writes; runs in subfolders are always removed.
+        folder: Any folder that is empty or holds the results of an earlier run of the same kind.
+        written: Names of all files and folders that this kind of run writes; they may be patterns.
 
     Raises:
-        UsageError: It is a file, holds only other files, or cannot be written.
+        UsageError: It is a file, holds other files, holds no events of a run, or cannot be written; nothing
+            was removed.
     """
     if folder.exists() and not folder.is_dir():
         raise UsageError(f"{folder} is a file", hint="name a folder with --out")
     try:
-        if folder.is_dir() and any(folder.iterdir()):
-            runs = [part.parent for part in folder.glob(f"*/{EVENTS}")]
-            if not runs and not (folder / EVENTS).exists():
-                raise UsageError(f"{folder} holds other files", hint="name an empty folder with --out")
-            parts = [part for pattern in folders for part in folder.glob(pattern)]
-            for old in [folder / "platform", *runs, *parts]:
-                shutil.rmtree(old, ignore_errors=True)
-            for name in (*_WRITTEN, *files):
-                (folder / name).unlink(missing_ok=True)
         folder.mkdir(parents=True, exist_ok=True)
+        old = list(folder.iterdir())
+        own = [each for each in old if any(fnmatchcase(each.name, name) for name in written)]
+        is_run = (folder / EVENTS).exists() or any(folder.glob(f"*/{EVENTS}"))
+        if own != old or (old and not is_run):
+            raise UsageError(f"{folder} holds other files", hint="name an empty folder with --out")
+        for each in old:
+            if each.is_dir() and not each.is_symlink():
+                shutil.rmtree(each)
+            else:
+                each.unlink()
     except OSError as error:
         raise UsageError(f"cannot write {folder}: {error.strerror}", hint="name another --out") from error
     return folder.resolve()

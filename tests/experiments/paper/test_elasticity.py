@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 
 from rse_pf.errors import UsageError
-from rse_pf.experiments.paper.elasticity import CpuCost
-from rse_pf.experiments.paper.elasticity_report import (
+from rse_pf.experiments.paper.elasticity import (
+    CpuCost,
     busy_periods_before,
     crashes,
     elasticity_figures,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from rse_pf.experiments.paper.latency_report import latency_figures
+from rse_pf.experiments.paper.latency import latency_figures
 from rse_pf.experiments.results.records import CommandRecord, Records
 
 ASKED = {"time": 0.0, "action": "experiment", "kind": "latency", "link_round_trip_ms": 130.0}

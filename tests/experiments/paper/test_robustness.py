@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from rse_pf.experiments.paper.robustness_report import BARS, evened_out_s, robustness_figures, robustness_page
+from rse_pf.experiments.paper.robustness import BARS, evened_out_s, robustness_figures, robustness_page
 from rse_pf.experiments.results.records import CommandRecord, Records, run_sample
 from rse_pf.local.control.monitor import ServerSample
 

@@ -8,8 +8,8 @@ import sys
 import pytest
 
 from rse_pf.errors import MissingExtra
-from rse_pf.experiments.paper.latency_report import latency_figures
-from rse_pf.experiments.paper.robustness_report import robustness_figures
+from rse_pf.experiments.paper.latency import latency_figures
+from rse_pf.experiments.paper.robustness import robustness_figures
 from rse_pf.experiments.plots.figures import (
     draw_elasticity,
     draw_latency,
