@@ -8,9 +8,9 @@ argument, and memory is bounded whatever robots send.
 from __future__ import annotations
 
 from collections import OrderedDict, deque
-from typing import Literal
 
 from rse_pf.config import ServiceSettings
+from rse_pf.errors import Poison, WorkerLost
 
 __all__ = ["CircuitBreaker"]
 
@@ -28,11 +28,21 @@ class CircuitBreaker:
         self._crashes_of_service: dict[str, deque[float]] = {}
         self._open_until: dict[str, float] = {}
 
-    def verdict(self, service: str, digest: str, now: float) -> Literal["run", "poison", "open"]:
-        """Return whether a request with this digest may run now, and if not, why."""
+    def refusal(self, service: str, digest: str, now: float) -> Poison | WorkerLost | None:
+        """Return why a request with this digest may not run now, None if it may."""
         if self._crashes_of_request.get(digest, 0) >= self._settings.poison_crashes:
-            return "poison"
-        return "open" if self.open_for_s(service, now) > 0 else "run"
+            return Poison(
+                "this request crashed every sandbox that ran it and is not tried again",
+                hint="send another one; the server's log has the crash",
+            )
+        open_s = self._open_until.get(service, now) - now
+        if open_s <= 0:
+            return None
+        return WorkerLost(
+            f"service {service!r} crashed repeatedly and is refused for another {open_s:.0f} s",
+            hint="tell the operator; the server's log has the crashes",
+            retry_after_ms=open_s * 1e3,
+        )
 
     def crashed(self, service: str, digest: str, now: float) -> None:
         """Note that a sandbox crashed while it worked on this request."""
@@ -41,15 +51,10 @@ class CircuitBreaker:
             self._crashes_of_request.popitem(last=False)
         crashes = self._crashes_of_service.setdefault(service, deque(maxlen=self._settings.breaker_crashes))
         crashes.append(now)
-        full = len(crashes) == self._settings.breaker_crashes
-        if full and now - crashes[0] <= WINDOW_S:
+        if len(crashes) == self._settings.breaker_crashes and now - crashes[0] <= WINDOW_S:
             self._open_until[service] = now + self._settings.breaker_open_s
             crashes.clear()
 
-    def open_for_s(self, service: str, now: float) -> float:
-        """Return for how many more seconds *service* is refused; 0 if it may run."""
-        return max(0.0, self._open_until.get(service, now) - now)
-
     def open_services(self, now: float) -> list[str]:
         """Return the services that are refused now, sorted."""
-        return sorted(service for service in self._open_until if self.open_for_s(service, now) > 0)
+        return sorted(service for service, until_s in self._open_until.items() if until_s > now)

@@ -42,7 +42,7 @@ __all__ = ["SandboxManager"]
 
 
 class SandboxManager:
-    """The sandboxes of one worker."""
+    """The sandboxes of one worker; ``missing`` names the means of isolation that this machine lacks."""
 
     def __init__(
         self,
@@ -95,15 +95,11 @@ class SandboxManager:
         self._zygote = ZygoteClient(
             services, settings, loop=loop, log=log, on_gone=self._on_gone, on_lost=self._on_lost
         )
+        self.missing = self._zygote.missing
 
     def offers(self, service: str) -> bool:
         """Return whether *service* is an installed one."""
         return service in self._names
-
-    @property
-    def missing(self) -> tuple[str, ...]:
-        """Names of the means of isolation that this machine lacks."""
-        return self._zygote.missing
 
     @property
     def held(self) -> int:

@@ -280,21 +280,25 @@ class SandboxPolicy:
         sandbox = self._sandboxes.get(number)
         if sandbox is None:
             return []
-        call, failed = sandbox.running, isinstance(outcome, RsePfError)
+        call = sandbox.running
         if call is None or sandbox.state not in ("restoring", "running"):
             return self.broken(number, "it replied without a request")
-        if sandbox.state == "restoring" and not failed:
+        if sandbox.state == "restoring" and isinstance(outcome, SandboxReply):
             self._send(sandbox, call)
         elif sandbox.state == "restoring":
             del sandbox.snapshots[call.service]  # its state is unknown: the next command restores again
             self._finish(sandbox, call, outcome, now)
-        elif isinstance(outcome, SandboxReply) and self._is_changed(sandbox, call, outcome):
+        elif (
+            isinstance(outcome, RsePfError)
+            or outcome.snapshot is None
+            or not self._keeps_state(call)
+            or outcome.snapshot == sandbox.snapshots[call.service]
+        ):
+            self._finish(sandbox, call, outcome, now)
+        else:
             sandbox.state, sandbox.unsaved = "saving", outcome
-            assert outcome.snapshot is not None
             expected = sandbox.snapshots[call.service]
             self._actions.append(SaveSnapshot(number, call, expected, outcome.snapshot))
-        else:
-            self._finish(sandbox, call, outcome, now)
         return self._take_actions()
 
     def store_replied(
@@ -335,9 +339,8 @@ class SandboxPolicy:
 
     def gone(self, number: int, how: str, now: float) -> list[Action]:
         """The process of a sandbox ended."""
-        sandbox = self._sandboxes.get(number)
-        if sandbox is not None:
-            self._crashed(sandbox, how, now)
+        if number in self._sandboxes:
+            self._crashed(self._sandboxes[number], how, now)
         return self._take_actions()
 
     def all_gone(self, how: str, now: float) -> list[Action]:
@@ -370,31 +373,19 @@ class SandboxPolicy:
     # --- rules -------------------------------------------------------------------------------------
 
     def _refusal(self, call: SandboxCall, now: float) -> RsePfError | None:
-        verdict = self._breaker.verdict(call.service, call.digest, now)
-        if verdict == "poison":
+        refusal = self._breaker.refusal(call.service, call.digest, now)
+        if isinstance(refusal, Poison):
             self.counts["poison"] += 1
-            return Poison(
-                "this request crashed every sandbox that ran it and is not tried again",
-                hint="send another one; the server's log has the crash",
-            )
-        if verdict == "open":
-            open_s = self._breaker.open_for_s(call.service, now)
-            return WorkerLost(
-                f"service {call.service!r} crashed repeatedly and is refused for another {open_s:.0f} s",
-                hint="tell the operator; the server's log has the crashes",
-                retry_after_ms=open_s * 1e3,
-            )
-        return None
+        return refusal
 
     def _has_capacity(self) -> bool:
         """Return whether one more sandbox fits; an idle one in its grace period is released for it."""
-        if len(self._sandboxes) < self._max_sandboxes:
-            return True
-        for sandbox in self._sandboxes.values():
-            if sandbox.release_s < math.inf and sandbox.running is None:
-                self._release(sandbox)
-                return True
-        return False
+        if len(self._sandboxes) >= self._max_sandboxes:
+            for sandbox in self._sandboxes.values():
+                if sandbox.release_s < math.inf and sandbox.running is None:
+                    self._release(sandbox)
+                    break
+        return len(self._sandboxes) < self._max_sandboxes
 
     def _may_retry(self, call: SandboxCall, sandbox: _Sandbox, now: float) -> bool:
         is_stateless = self._kinds[call.service] == "stateless"
@@ -403,7 +394,7 @@ class SandboxPolicy:
             and call.tries < _MAX_TRIES
             and call.queued.deadline_s > now
             and (is_stateless or sandbox.snapshots.get(call.service) is not None)
-            and self._breaker.verdict(call.service, call.digest, now) == "run"
+            and self._breaker.refusal(call.service, call.digest, now) is None
         )
 
     def _crashed(self, sandbox: _Sandbox, how: str, now: float) -> None:
@@ -490,11 +481,6 @@ class SandboxPolicy:
 
     def _keeps_state(self, call: SandboxCall) -> bool:
         return self._keeps_snapshots and self._kinds[call.service] == "per_robot_state"
-
-    def _is_changed(self, sandbox: _Sandbox, call: SandboxCall, reply: SandboxReply) -> bool:
-        if reply.snapshot is None or not self._keeps_state(call):
-            return False
-        return reply.snapshot != sandbox.snapshots[call.service]
 
     def _take_actions(self) -> list[Action]:
         actions, self._actions = self._actions, []

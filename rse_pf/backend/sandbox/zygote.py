@@ -58,8 +58,8 @@ class _Zygote:
             max_bytes=config["max_bytes"],
             missing=self._missing_isolation(list(services.values()), config["scratch_bytes"]),
         )
-        self._children: dict[int, int] = {}
-        self._slots: dict[int, int] = {}
+        self._children: dict[int, tuple[int, int]] = {}
+        """Number of the sandbox and slot of its user id, by pid."""
 
     def run(self) -> None:
         prctl(PR_SET_CHILD_SUBREAPER, 1)
@@ -98,7 +98,7 @@ class _Zygote:
         if order["do"] == "create":
             self._create(order["id"], *fds)
         else:
-            for pid, number in self._children.items():
+            for pid, (number, _) in self._children.items():
                 if number == order["id"]:
                     os.kill(pid, signal.SIGKILL)
         for fd in fds:
@@ -107,7 +107,8 @@ class _Zygote:
 
     def _create(self, number: int, channel: int, output: int) -> None:
         """Fork twice: the first child enters the namespaces, the second is the first process inside them."""
-        slot = next(n for n in range(_SLOTS) if n not in self._slots.values())
+        used = {slot for _, slot in self._children.values()}
+        slot = next(n for n in range(_SLOTS) if n not in used)
         uid = None if self._first_uid is None else self._first_uid + slot
         pid_read, pid_write = os.pipe()
         go_read, go_write = os.pipe()
@@ -121,8 +122,7 @@ class _Zygote:
         pid = int(os.read(pid_read, 32) or b"0")
         os.close(pid_read)
         if pid:
-            self._children[pid] = number
-            self._slots[pid] = slot
+            self._children[pid] = number, slot
             os.write(go_write, _GO)
         else:
             self._report(event="gone", id=number, how="it could not enter its namespaces")
@@ -149,9 +149,8 @@ class _Zygote:
                 return
             if pid == 0:
                 return
-            number = self._children.pop(pid, None)
-            self._slots.pop(pid, None)
-            if number is not None:
+            if pid in self._children:
+                number, _ = self._children.pop(pid)
                 code = os.waitstatus_to_exitcode(status)
                 how = f"exit code {code}" if code >= 0 else f"signal {signal.Signals(-code).name}"
                 self._report(event="gone", id=number, how=how)
@@ -163,11 +162,13 @@ class _Zygote:
             isolation.enter_namespaces()
             isolation.make_root(readable_paths(services), scratch_bytes, os.getuid() if uid is None else uid)
 
-        def give_up_privileges() -> None:
-            isolation.give_up_privileges(uid)
-
         return isolation.missing_isolation(
-            [isolation.enter_namespaces, make_root, give_up_privileges, isolation.forbid_system_calls]
+            [
+                isolation.enter_namespaces,
+                make_root,
+                lambda: isolation.give_up_privileges(uid),
+                isolation.forbid_system_calls,
+            ]
         )
 
     def _report(self, **message: Any) -> None:

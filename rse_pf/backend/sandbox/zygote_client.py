@@ -57,7 +57,7 @@ class ZygoteClient:
         self._on_gone = on_gone
         self._on_lost = on_lost
         self._launch()
-        self.missing: tuple[str, ...] = self._wait_until_ready()
+        self.missing = self._wait_until_ready()
         self._listen()
 
     def create(self, number: int, channel: socket.socket, output: int) -> bool:

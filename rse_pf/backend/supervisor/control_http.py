@@ -55,10 +55,11 @@ async def serve_control(
             asyncio.IncompleteReadError,
             asyncio.LimitOverrunError,
             asyncio.TimeoutError,
+            asyncio.CancelledError,
         ):
-            pass  # a malformed request ends its own connection only
-        except asyncio.CancelledError:
-            pass  # the loop ends: asyncio would log an error for each connection that was kept alive
+            # A malformed request ends its own connection only; at the end of the loop asyncio would log an
+            # error for each connection that was kept alive.
+            pass
         finally:
             writer.close()
 

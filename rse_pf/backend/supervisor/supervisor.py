@@ -145,6 +145,7 @@ class _Supervisor:
         self._records = records
         self._announce = announce
         self._listener = listener
+        self._port = listener.getsockname()[1]
         self._state = "starting"
         self._began = time.monotonic()
         self._reported = float("-inf")
@@ -230,7 +231,7 @@ class _Supervisor:
         return {
             "server": self._server_id,
             "pid": os.getpid(),
-            "port": self._listener.getsockname()[1],
+            "port": self._port,
             "control_port": self._control_port,
             "workers": [worker.pid for worker in self._workers],
         }
@@ -393,7 +394,7 @@ class _Supervisor:
             results[result] = results.get(result, 0) + n
         return _json(
             {
-                **self._identity_while_open(),
+                **self._identity(),
                 "version": _version(),
                 "state": self._state,
                 "uptime_s": round(time.monotonic() - self._began, 3),
@@ -465,10 +466,6 @@ class _Supervisor:
         self._log.info("migration", robots=asked, spread_s=round(last_s, 3))
         self._records.note("server.move", robots=asked, spread_s=round(last_s, 3))
         return asked, round(last_s, 3)
-
-    def _identity_while_open(self) -> dict[str, Any]:
-        identity = {"server": self._server_id, "pid": os.getpid(), "workers": [w.pid for w in self._workers]}
-        return identity if self._listener.fileno() < 0 else self._identity()
 
     async def _merged(self) -> dict[str, Any]:
         """Return the numbers of all workers, at most a quarter second old; a silent worker's are older."""

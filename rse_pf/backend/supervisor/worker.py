@@ -39,9 +39,8 @@ from rse_pf.backend.jobs.process import spawner
 from rse_pf.backend.jobs.runner import JobContext
 from rse_pf.backend.jobs.slots import JobSlots
 from rse_pf.backend.log import JsonLog
-from rse_pf.backend.metrics import Metrics
 from rse_pf.backend.object_refs import ObjectRefs
-from rse_pf.backend.ports import Clocks
+from rse_pf.backend.ports import Clocks, WorkerContext
 from rse_pf.backend.robot_store import is_shared
 from rse_pf.backend.sandbox.manager import SandboxManager
 from rse_pf.backend.scheduling.cpu_throttle import CpuThrottle
@@ -130,43 +129,38 @@ class _Worker:
         chosen = settings.services
         installed = installed_services(Path(chosen.folder)) if chosen.folder else []
         installed += published_services() if chosen.published else []
-        clocks = Clocks(monotonic=time.monotonic, wall=time.time, cpu=time.process_time)
-        metrics, connections = Metrics(), set[RobotConnection]()
+        self._context = WorkerContext(
+            settings=settings,
+            server_id=plan.server_id,
+            clocks=Clocks(monotonic=time.monotonic, wall=time.time, cpu=time.process_time),
+            loop=loop,
+            log=self._log,
+        )
+        connections = set[RobotConnection]()
         store = open_data_store(settings) if is_shared(settings) else None
         answers = Answers(
+            self._context,
             registry=registry,
             services=frozenset(service.name for service in (*registry, *installed)),
             objects=ObjectRefs(store, settings.serving, settings.data.quota_bytes),
-            server_id=plan.server_id,
-            max_message_bytes=settings.session.max_message_bytes,
-            clocks=clocks,
-            metrics=metrics,
-            log=self._log,
         )
         handshake = HandshakePolicy(settings, plan.keys, conformance_echo=plan.conformance_echo)
-        self._recorder = AuditRecorder(clocks, loop=loop, tell=self._say if plan.audit else None)
+        self._recorder = AuditRecorder(
+            self._context.clocks, loop=loop, tell=self._say if plan.audit else None
+        )
         self._token_watch = TokenWatch(
+            self._context,
             connections,
             handshake,
-            clocks=clocks,
-            loop=loop,
-            log=self._log,
-            metrics=metrics,
             tell=self._say,
             recorder=self._recorder,
         )
-        admission = Admission(settings.session, settings.serving)
         self._dispatcher = Dispatcher(
-            settings=settings,
+            self._context,
             registry=registry,
-            server_id=plan.server_id,
-            clocks=clocks,
-            loop=loop,
-            log=self._log,
-            metrics=metrics,
             connections=connections,
             new_session_id=lambda: secrets.token_hex(8),
-            admission=admission,
+            admission=Admission(settings.session, settings.serving),
             scheduler=Scheduler(settings.serving),
             throttle=CpuThrottle(
                 settings.serving.emulated_cores, now=time.monotonic(), cpu=time.process_time
@@ -182,18 +176,12 @@ class _Worker:
         self._migration = Migration(connections, loop=loop, now=time.monotonic, choose=secrets.choice)
         self._index, self._workers, self._named = plan.index, plan.workers, 0
         self._sockets = RobotSockets(
-            dispatcher=self._dispatcher,
-            handshake=handshake,
-            rates=admission.rates,
-            metrics=metrics,
-            clocks=clocks,
-            serving=settings.serving,
-            session=settings.session,
+            self._dispatcher,
+            handshake,
             max_robots=-(-settings.serving.max_robots // self._workers),
             workers=self._workers,
             new_name=self._new_name,
             recorder=self._recorder,
-            log=self._log,
             loop=loop,
         )
 

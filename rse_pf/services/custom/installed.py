@@ -15,7 +15,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, get_args
 
 import msgspec
 
@@ -32,7 +32,8 @@ __all__ = [
     "read_service",
 ]
 
-LANGUAGES = ("python", "cpp", "lua")
+_Language = Literal["python", "cpp", "lua"]
+LANGUAGES: tuple[str, ...] = get_args(_Language)
 
 ENTRY_POINTS = "rse_pf.services"
 """Entry-point group by which Python packages publish services: ``name = "package.module"``."""
@@ -49,7 +50,7 @@ _IGNORED = {
 
 class _Manifest(msgspec.Struct, forbid_unknown_fields=True):
     name: Annotated[str, msgspec.Meta(pattern=rf"^{_NAME.pattern}\Z")]
-    language: Literal["python", "cpp", "lua"]
+    language: _Language
     entry: Annotated[str, msgspec.Meta(min_length=1)]
     kind: Literal["stateless", "per_robot_state"] = "stateless"
 
