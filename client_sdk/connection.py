@@ -10,21 +10,23 @@ import asyncio
 import random as random_module
 from collections.abc import Awaitable, Callable, Coroutine, Iterable
 from typing import Any
+from urllib.parse import urlsplit
 
 from websockets.asyncio.client import ClientConnection
 from websockets.asyncio.client import connect as websocket_connect
 from websockets.exceptions import ConnectionClosed, InvalidStatus, WebSocketException
 from websockets.typing import Subprotocol
 
-from client_sdk.dial_errors import DialError, dial_error_of, shown_address
 from rse_pf.config import SessionSettings
 from rse_pf.errors import (
     Conflict,
     ConnectError,
+    Forbidden,
     ProtocolError,
     RsePfError,
     Unauthorized,
     UnsupportedProtocol,
+    UsageError,
 )
 from rse_pf.wire import SUBPROTOCOLS
 from rse_pf.wire.client_session import (
@@ -41,7 +43,16 @@ from rse_pf.wire.client_session import (
 )
 from rse_pf.wire.server_session import CLOSE_RATE, CLOSE_REPLACED
 
-__all__ = ["Connection", "OnChange", "Token", "cancel_all", "websocket_options"]
+__all__ = [
+    "Connection",
+    "DialError",
+    "OnChange",
+    "Token",
+    "cancel_all",
+    "dial_error_of",
+    "shown_address",
+    "websocket_options",
+]
 
 Token = str | Callable[[], Awaitable[str]] | None
 """A robot's token, or an async callable that returns a fresh one for each connect and each renewal."""
@@ -50,6 +61,7 @@ OnChange = Callable[[str, str], None] | None
 """Called with ``link-lost`` and a reason, or with ``link-back`` or ``moved`` and the server's name."""
 
 _FIRST_TRIES = 4
+_MAX_RETRY_AFTER_S = 30.0
 _MIN_TICK_S = 0.001
 # How long a server that was stopped may take to accept a connection attempt that was given up.
 _LATE_WELCOME_S = 60.0
@@ -109,7 +121,7 @@ class Connection:
         self._session = session
         self._settings = session.settings
         self._on_answer = on_answer
-        self._on_change = on_change
+        self._on_change = on_change or (lambda what, why: None)
         self._clock = clock
         self._random = random
         self._sockets: list[_Socket] = []
@@ -212,7 +224,7 @@ class Connection:
     def _reconnected(self, socket: _Socket) -> None:
         self.reconnects += 1
         self._adopt(socket)
-        self._changed_to("link-back", socket.state.server)
+        self._on_change("link-back", socket.state.server)
 
     async def _move(self, old: _Socket, until: float) -> None:
         """Make before break: leave *old* once another server has sent Welcome."""
@@ -230,7 +242,7 @@ class Connection:
                 if fresh.state.server != old.state.server:
                     self.moves += 1
                     self._adopt(fresh)
-                    self._changed_to("moved", fresh.state.server)
+                    self._on_change("moved", fresh.state.server)
                     return
                 self._spawn(self._close_socket(fresh))
             pause_s = min(self._pause_s(after_s), max(0.0, until - self._clock()))
@@ -371,7 +383,7 @@ class Connection:
             case ConnectionLost():
                 self.last_error = f"connection lost: {event.reason}"
                 if not socket.state.leaving and self._session.current is None:
-                    self._changed_to("link-lost", event.reason)
+                    self._on_change("link-lost", event.reason)
                 self._abort(socket)
             case RenewalDue() if callable(self._token):
                 self._spawn(self._renew(socket))
@@ -384,10 +396,6 @@ class Connection:
             case MoveRequested() if socket.state is self._session.current and not self._move_request:
                 self._move_request = (socket, self._clock() + event.within_s)
                 self._changed.set()
-
-    def _changed_to(self, what: str, why: str) -> None:
-        if self._on_change is not None:
-            self._on_change(what, why)
 
     def _adopt(self, socket: _Socket) -> None:
         self._adopted = self._clock()
@@ -413,7 +421,7 @@ class Connection:
         socket.ended.set()
         self._sockets.remove(socket)
         if self._session.current is socket.state and not self._closed:
-            self._changed_to("link-lost", "closed")
+            self._on_change("link-lost", "closed")
         self._session.close_connection(socket.state)
         for task in socket.tasks:
             if task is not asyncio.current_task():
@@ -461,3 +469,61 @@ async def _either(event: asyncio.Event, timeout_s: float) -> None:
         await asyncio.wait({waiting}, timeout=timeout_s)
     finally:
         waiting.cancel()
+
+
+class DialError(Exception):
+    """A failed connection attempt: its error, how long to wait, and whether a further attempt is of use.
+
+    ``is_final`` means that no later attempt can succeed, ``is_wrong_address`` that the URL is probably wrong.
+    """
+
+    def __init__(
+        self,
+        error: RsePfError,
+        *,
+        after_s: float = 0.0,
+        is_wrong_address: bool = False,
+        is_final: bool = False,
+    ) -> None:
+        super().__init__(error.message)
+        self.error = error
+        self.after_s = after_s
+        self.is_wrong_address = is_wrong_address
+        self.is_final = is_final
+
+
+def dial_error_of(address: str, status: int, retry_after: str) -> DialError:
+    """Return the error of an HTTP *status* that came instead of a WebSocket.
+
+    Args:
+        address: The URL as shown to users.
+        status: HTTP status of the handshake.
+        retry_after: The header ``Retry-After``, empty if there was none.
+    """
+    if status == 401:
+        message = "the token is missing, wrong or expired"
+        return DialError(Unauthorized(message, hint="issue one: rse-pf token issue ROBOT"), is_final=True)
+    if status == 403:
+        message = f"{address} forbids this robot to connect"
+        return DialError(Forbidden(message, hint="ask the operator"), is_final=True)
+    is_client_error = 400 <= status < 500 and status != 429
+    hint = "check the URL: it ends with the path of the servers, /ws"
+    error = ConnectError(
+        f"{address} answers {status}", hint=hint if is_client_error else "it is full or not ready; try later"
+    )
+    after_s = float(retry_after) if retry_after.isdecimal() else 0.0
+    return DialError(error, after_s=min(after_s, _MAX_RETRY_AFTER_S), is_wrong_address=status in (400, 404))
+
+
+def shown_address(url: str) -> str:
+    """Return *url* without user name and password; raises UsageError if it is no WebSocket address."""
+    parts = urlsplit(url)
+    try:
+        port = parts.port
+    except ValueError:
+        port = -1
+    if parts.scheme not in ("ws", "wss") or not parts.hostname or port == -1:
+        raise UsageError(
+            f"{url!r} is not a WebSocket address", hint="write ws://HOST:PORT/ws or wss://HOST/ws"
+        )
+    return f"{parts.scheme}://{parts.netloc.rpartition('@')[2]}{parts.path}"

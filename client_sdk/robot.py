@@ -350,8 +350,9 @@ class Robot:
             if plan.where == "both":
                 cloud = self._spawn(self._ask_cloud(call))
                 racing.append(cloud)
-                done = await _first(cloud, plan.robot_after_s)
-                if done is not None:
+                await asyncio.wait({cloud}, timeout=plan.robot_after_s)
+                if cloud.done():
+                    done = cloud.result()
                     if not (isinstance(done, Failure) and offload.can_recover(done.code)):
                         return done
                     why, cloud = f"the cloud answered {done.code}", None
@@ -465,12 +466,6 @@ class Robot:
 
 connect = Robot
 """Return a robot for ``async with connect(url, token=...) as robot``; its arguments are those of `Robot`."""
-
-
-async def _first(task: asyncio.Task[T], timeout_s: float) -> T | None:
-    """Return the result of *task* within *timeout_s*, else None; the task continues."""
-    done, _ = await asyncio.wait({task}, timeout=timeout_s)
-    return task.result() if done else None
 
 
 def _version() -> str:

@@ -14,8 +14,8 @@ import re
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
-from enum import Enum, auto
 from pathlib import Path
+from typing import Literal
 
 from rse_pf.audit.chain import (
     CONTINUED,
@@ -57,26 +57,10 @@ SYNC_S = 0.1
 """An entry is on the disk after this."""
 
 
-class _Ending(Enum):
-    """How the current file of a chain ends."""
-
-    EMPTY = auto()
-    """It is missing or empty: the writer stopped between two files."""
-    COMPLETE = auto()
-    TORN = auto()
-    """The last line is incomplete."""
-    TORN_FIRST_LINE = auto()
-    """The only line is incomplete."""
-    UNREADABLE = auto()
-    """The last complete line is not an entry."""
-
-
-_REASONS = {
-    _Ending.EMPTY: "interrupted",
-    _Ending.TORN: "torn",
-    _Ending.TORN_FIRST_LINE: "torn",
-    _Ending.UNREADABLE: "unreadable",
-}
+# How the current file of a chain ends.  Empty: it is missing or empty, because the writer stopped between
+# two files.  Torn: the last line, or the only one, is incomplete.  Unreadable: the last complete line is no entry.
+_Ending = Literal["empty", "complete", "torn", "torn-first-line", "unreadable"]
+_REASONS = {"empty": "interrupted", "torn-first-line": "torn"}
 
 
 class AuditLog:
@@ -230,19 +214,16 @@ class AuditLog:
             self.head = last.head
         self._first = self.head.seq + 1
         ending = _ending_of(current)
-        newest = _last_entry(current) if ending in (_Ending.COMPLETE, _Ending.TORN) else None
+        newest = _last_entry(current) if ending in ("complete", "torn") else None
         if newest is not None:
             self.head, self._first = newest.head, _first_seq(current, newest)
-        if ending in (
-            _Ending.TORN,
-            _Ending.UNREADABLE,
-        ):  # an unreadable file stays in the chain, to be noticed
+        if ending in ("torn", "unreadable"):  # an unreadable file stays in the chain, to be noticed
             self._set_aside(self._first)
-        elif ending is _Ending.TORN_FIRST_LINE:
+        elif ending == "torn-first-line":
             current.replace(_free(self._folder / f"{self.who}.{self._first:012d}.torn"))
         self._open_file()
-        if ending is not _Ending.COMPLETE and (older or ending is not _Ending.EMPTY):
-            self._record_continued(_REASONS[ending])
+        if ending != "complete" and (older or ending != "empty"):
+            self._record_continued(_REASONS.get(ending, ending))
 
     def _write(self, notes: list[Note]) -> None:
         head, lines = self.head, []
@@ -381,13 +362,13 @@ def _first_seq(path: Path, last: Entry) -> int:
 
 def _ending_of(path: Path) -> _Ending:
     if not path.exists() or not path.stat().st_size:
-        return _Ending.EMPTY
+        return "empty"
     if _last_entry(path) is None:
         has_line = any(line.endswith(b"\n") for line in lines_of(path))
-        return _Ending.UNREADABLE if has_line else _Ending.TORN_FIRST_LINE
+        return "unreadable" if has_line else "torn-first-line"
     with path.open("rb") as file:
         file.seek(-1, os.SEEK_END)
-        return _Ending.COMPLETE if file.read() == b"\n" else _Ending.TORN
+        return "complete" if file.read() == b"\n" else "torn"
 
 
 def _free(path: Path) -> Path:

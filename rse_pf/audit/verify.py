@@ -45,14 +45,16 @@ def check_chain(who: str, files: Sequence[Path], *, from_genesis: bool = True) -
         verdict.file = path.name
         for line in lines_of(path):
             if not line.endswith(b"\n"):
-                verdict.notes.append(_torn(path, verdict.entries))
+                verdict.notes.append(
+                    f"{path.name} ended in the middle of a line, {verdict.entries} whole entries good"
+                )
                 is_torn = True
                 break
             found = chain.add(line)
             if isinstance(found, str):
                 verdict.problem = found
                 return verdict
-            if is_torn and not _names_a_torn_file(found):
+            if is_torn and (found.action, found.detail.get("reason")) != (CONTINUED, "torn"):
                 verdict.problem = f"entry {found.seq} does not say that the file before it was torn"
                 return verdict
             is_torn = False
@@ -109,11 +111,3 @@ def _count(verdict: Verdict, entry: Entry) -> None:
             head = parse_head(word) if isinstance(word, str) else None
             if head is not None:
                 verdict.claims.append((name, head, entry.seq))
-
-
-def _names_a_torn_file(entry: Entry) -> bool:
-    return entry.action == CONTINUED and entry.detail.get("reason") == "torn"
-
-
-def _torn(path: Path, good: int) -> str:
-    return f"{path.name} ended in the middle of a line, {good} whole entries good"

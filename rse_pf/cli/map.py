@@ -32,8 +32,8 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 import numpy as np
 
-from rse_pf.aws.storage import open_data_store
 from rse_pf.audit.operator import record_map_change
+from rse_pf.aws.storage import open_data_store
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import CommandFailed, NotFound, UsageError
 from rse_pf.files import replace_file

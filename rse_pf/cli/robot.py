@@ -25,6 +25,7 @@ from pathlib import Path
 from typing import Any
 
 from rse_pf.audit.chain import Value
+from rse_pf.audit.operator import record
 from rse_pf.auth.roster import (
     DenyList,
     EnrolledRobot,
@@ -36,7 +37,6 @@ from rse_pf.auth.roster import (
     public_key_of,
 )
 from rse_pf.auth.trust_store import AccessControlStore
-from rse_pf.cli.operator import record
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import UsageError
 

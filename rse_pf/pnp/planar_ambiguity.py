@@ -54,14 +54,12 @@ def second_planar_pose(
     turn = exp_se3(np.concatenate([np.zeros(3), axis / sine * math.atan2(sine, cosine)]))
     turn[:3, 3] = centre - turn[:3, :3] @ centre
     other = _refined(turn @ T_camera_world, points_world, pixels, camera)
-    if other is None or _is_same(T_camera_world, other):
+    if other is None:
+        return None
+    metres, degrees = pose_difference(T_camera_world, other)
+    if metres < _DISTINCT_M and degrees < _DISTINCT_DEG:
         return None
     return other, float(view_of(other, points_world, pixels, camera)[ERROR2].sum())
-
-
-def _is_same(T_camera_world: Array, other: Array) -> bool:
-    metres, degrees = pose_difference(T_camera_world, other)
-    return metres < _DISTINCT_M and degrees < _DISTINCT_DEG
 
 
 def _refined(pose: Array, points_world: Array, pixels: Array, camera: Camera) -> Array | None:

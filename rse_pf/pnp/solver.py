@@ -187,7 +187,11 @@ def _refuse_chance(
     n = len(pixels)
     if _is_chance(n - (count - independent), independent, largest_error2_px2, camera):
         if not _is_chance(n, count, largest_error2_px2, camera):
-            raise _in_few_places(count, independent)
+            raise DegenerateGeometry(
+                f"the {count} correspondences that agree lie in {independent} places of the image, "
+                "and may be copies of each other",
+                hint="match points all over the image, or skip this frame",
+            )
         raise _no_pose(points_world, pixels, count, options)
 
 
@@ -208,14 +212,6 @@ def _collinear(thinness: float) -> DegenerateGeometry:
     return DegenerateGeometry(
         f"the points that agree lie on one line or coincide (width/length {thinness:.3f} is below "
         f"{_COLLINEAR})",
-        hint="match points all over the image, or skip this frame",
-    )
-
-
-def _in_few_places(count: int, independent: int) -> DegenerateGeometry:
-    return DegenerateGeometry(
-        f"the {count} correspondences that agree lie in {independent} places of the image, "
-        "and may be copies of each other",
         hint="match points all over the image, or skip this frame",
     )
 

@@ -16,7 +16,6 @@ import msgspec
 
 from rse_pf.config import SessionSettings
 from rse_pf.errors import LimitExceeded
-from rse_pf.wire.backlog import Backlog, is_long_outage, send_order
 from rse_pf.wire.clock_offset import ClockOffset, Exchange
 from rse_pf.wire.codec import Codec
 from rse_pf.wire.messages import (
@@ -34,9 +33,8 @@ from rse_pf.wire.messages import (
     Welcome,
 )
 from rse_pf.wire.preencoded import encode_command
-from rse_pf.wire.rate_limit import RateLimiter
+from rse_pf.wire.rate_limit import Backlog, RateLimiter, is_long_outage, send_order
 from rse_pf.wire.server_session import PROGRESS
-from rse_pf.wire.token_renewal import RenewalTimer
 
 __all__ = [
     "Answered",
@@ -48,6 +46,7 @@ __all__ = [
     "Notice",
     "Progressed",
     "RenewalDue",
+    "RenewalTimer",
     "Welcomed",
 ]
 
@@ -55,6 +54,11 @@ _MAX_TRIES_AFTER_LOSS = 2
 _RETRY_BURST = 5.0
 _PINGS_PER_STALL_TIMEOUT = 3.0
 _MAX_DEADLINE_MS = 3.6e6
+# Share of a token's remaining time; the rest is for a second and a third attempt.
+_RENEW_AFTER = 0.8
+# Above the server's minimum pause between two renewals.
+_MIN_RENEWAL_PAUSE_S = 1.5
+_MAX_TTL_S = 3600.0
 RETRY_SHARE = 0.1
 """Retries after busy, as a share of the commands.  Source: Google SRE book, ch. 21."""
 
@@ -119,6 +123,29 @@ class RenewalDue:
 
 
 Event = RenewalDue | Answered | Welcomed | MoveRequested | ConnectionLost | Notice | Progressed
+
+
+@dataclass(slots=True)
+class RenewalTimer:
+    """When a connection expires and when to renew its token; seconds of the robot's clock.
+
+    A renewal without a reply is repeated, but never faster than the server accepts renewals.
+    """
+
+    ends_s: float | None = None
+    _due_s: float = 0.0
+
+    def expires_in(self, token_s: float, now: float) -> None:
+        """Record that the connection expires in *token_s*; a value outside 0..3600 counts as 3600."""
+        left_s = token_s if 0.0 <= token_s <= _MAX_TTL_S else _MAX_TTL_S
+        self.ends_s, self._due_s = now + left_s, now + _RENEW_AFTER * left_s
+
+    def is_due(self, now: float) -> bool:
+        """Return whether to renew now; the next attempt is due after half of the remaining time."""
+        if self.ends_s is None or now < self._due_s:
+            return False
+        self._due_s = now + max(_MIN_RENEWAL_PAUSE_S, (self.ends_s - now) / 2)
+        return True
 
 
 @dataclass(slots=True, kw_only=True)
@@ -275,7 +302,7 @@ class ClientSession:
         """Make a welcomed *connection* the current one and send the waiting commands on it.
 
         Of a latest-wins stream only the newest frame is sent again.  After a long outage frames are sent in
-        the order and at the rate that `rse_pf.wire.backlog` describes.
+        the order and at the rate that `rse_pf.wire.rate_limit` describes.
         """
         before, self.current = self.current, connection
         if before is not None and before is not connection:

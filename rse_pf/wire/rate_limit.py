@@ -1,18 +1,35 @@
-"""The rate limiter of a robot: a token bucket a little smaller than the one that the server applies.
+"""How fast a robot sends: by the server's rate limit, and in which order and at which rate after an outage.
 
-A robot that keeps to its own rate limiter is not refused by the server for its rate.
+A robot that keeps to its own rate limiter, a token bucket a little smaller than the one that the server
+applies, is not refused for its rate.
+
+When a network recovers, every robot has seconds of frames to send, and the server receives all of them at
+once.  Sent oldest first, each frame would reach the front of the queue only when its deadline has passed, and
+fresh frames would queue behind it.  After a long outage (`is_long_outage`) frames are therefore sent newest
+first and one at a time; each answer from a server whose queue is short allows one more frame in flight.
+After a short outage, such as the death of a server, every frame can still meet its deadline and the original
+order is kept.  Commands without a stream are no frames: they are sent in their original order.
+
+Source:
+    Maurer 2015, "Fail at Scale", ACM Queue 13(8): adaptive LIFO; Jacobson 1988: slow start.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 from rse_pf.token_bucket import TokenBucket
 from rse_pf.wire.messages import Limits
 
-__all__ = ["RateLimiter"]
+__all__ = ["Backlog", "RateLimiter", "is_long_outage", "send_order"]
 
 # Share of the server's limit that a robot uses: a network may deliver messages closer together than sent.
 _OWN_SHARE = 0.9
 _UNLIMITED = 1 << 30
+# A server is loaded if a command queued for longer; equals its ``QUEUE_TARGET_S``.
+_SHORT_QUEUE_MS = 50.0
+# An outage is long if it took more than this share of a frame's time.
+_LONG_OUTAGE_SHARE = 0.5
 
 
 class RateLimiter:
@@ -41,3 +58,26 @@ class RateLimiter:
     def next_s(self, now: float) -> float:
         """Return the time at which the next message may be sent, *now* if at once."""
         return now if self._bucket is None else now + self._bucket.wait_s(now)
+
+
+@dataclass(slots=True, kw_only=True)
+class Backlog:
+    """How many frames may be in flight on a connection that was opened after a long outage."""
+
+    newest: int
+    """Id of the last frame that waited for the connection."""
+    max_in_flight: int = 1
+
+    def answered(self, queue_ms: float) -> None:
+        """Allow one more frame in flight if the server's queue is short; otherwise restart with one."""
+        self.max_in_flight = self.max_in_flight + 1 if queue_ms <= _SHORT_QUEUE_MS else 1
+
+
+def is_long_outage(submitted_s: float, deadline_s: float, now_s: float) -> bool:
+    """Return whether an outage that ends now took most of the time that a frame had."""
+    return now_s - submitted_s > _LONG_OUTAGE_SHARE * (deadline_s - submitted_s)
+
+
+def send_order(identity: int, stream: str) -> tuple[bool, int]:
+    """Return the sort key of a waiting command: without a stream oldest first, then frames newest first."""
+    return (True, -identity) if stream else (False, identity)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from client_sdk.dial_errors import dial_error_of, shown_address
+from client_sdk.connection import dial_error_of, shown_address
 from rse_pf.errors import ConnectError, Forbidden, Unauthorized, UsageError
 
 

@@ -6,8 +6,8 @@ import pytest
 
 from rse_pf.config import SessionSettings
 from rse_pf.wire import Command, Failure, Limits, Result, Welcome, make_codec
-from rse_pf.wire.backlog import Backlog, is_long_outage, send_order
 from rse_pf.wire.client_session import ClientSession, ConnectionState
+from rse_pf.wire.rate_limit import Backlog, is_long_outage, send_order
 
 CODEC = make_codec("json")
 ROOM = 8

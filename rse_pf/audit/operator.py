@@ -34,7 +34,7 @@ def record(state: Path, action: str, subject: str, **detail: Value) -> None:
             **detail,
         )
     except ConfigurationError as error:
-        print(f"the command succeeded, but is missing in the audit log: {error}", file=sys.stderr)
+        sys.stderr.write(f"the command succeeded, but is missing in the audit log: {error}\n")
 
 
 def record_map_change(
