@@ -174,8 +174,12 @@ class _Fields:
     below: dict[str, Any]
 
 
+def _shape(request_type: Any) -> Any:
+    return _cached_shape(request_type)
+
+
 @functools.lru_cache(maxsize=1024)
-def _shape(request_type: type[Any]) -> Any:
+def _cached_shape(request_type: type[Any]) -> Any:
     return _shape_of(msgspec.inspect.type_info(request_type), _MAX_DEPTH)
 
 

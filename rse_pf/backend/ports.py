@@ -1,15 +1,16 @@
-"""What the parts of a worker need of the outside: a socket, an event loop, a log and clocks.
-
-Only protocols stand here; tests bring their own implementations.
-"""
+"""What the parts of a worker need of the outside: a socket, an event loop, a log, clocks and settings."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Protocol
 
-__all__ = ["Clocks", "Handle", "Log", "Loop", "Wire"]
+from rse_pf.backend.log import JsonLog
+from rse_pf.backend.metrics import Metrics
+from rse_pf.config import PlatformSettings
+
+__all__ = ["Clocks", "Handle", "Log", "Loop", "Wire", "WorkerContext"]
 
 
 class Wire(Protocol):
@@ -86,3 +87,15 @@ class Clocks:
     monotonic: Callable[[], float]
     wall: Callable[[], float]
     cpu: Callable[[], float]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class WorkerContext:
+    """What all parts of one worker share; ``server_id`` goes into welcomes and answers."""
+
+    settings: PlatformSettings
+    server_id: str
+    clocks: Clocks
+    loop: Loop
+    log: JsonLog
+    metrics: Metrics = field(default_factory=Metrics)

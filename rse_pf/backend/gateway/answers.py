@@ -13,13 +13,11 @@ import msgspec
 
 from rse_pf.backend.gateway.admission import UnreadRefusal
 from rse_pf.backend.gateway.connection import RobotConnection
-from rse_pf.backend.log import JsonLog
-from rse_pf.backend.metrics import Metrics
 from rse_pf.backend.object_refs import ObjectRefs
-from rse_pf.backend.ports import Clocks
+from rse_pf.backend.ports import WorkerContext
 from rse_pf.backend.scheduling.scheduler import QueuedCommand, RefusedCommand
 from rse_pf.errors import Busy, InternalError, LimitExceeded, RsePfError
-from rse_pf.service import Registry, Service, dispatch, failure_of
+from rse_pf.service import Registry, dispatch, failure_of
 from rse_pf.wire import Codec, Command, Failure, Result
 from rse_pf.wire.envelope import Envelope, encode_refusal
 
@@ -43,53 +41,32 @@ class Answers:
     """Makes and sends the answers of one worker."""
 
     def __init__(
-        self,
-        *,
-        registry: Registry,
-        services: frozenset[str],
-        objects: ObjectRefs,
-        server_id: str,
-        max_message_bytes: int,
-        clocks: Clocks,
-        metrics: Metrics,
-        log: JsonLog,
+        self, context: WorkerContext, *, registry: Registry, services: frozenset[str], objects: ObjectRefs
     ) -> None:
         """Keep what answers are made of.
 
         Args:
+            context: Of the worker.
             registry: The services that `compute` calls.
             services: Names of all services of this server, installed ones included; others share one label.
             objects: Puts stored objects into payloads, and large replies into the store.
-            server_id: Goes into answers.
-            max_message_bytes: Longest answer on the wire.
-            clocks: Of the worker.
-            metrics: Of the worker.
-            log: Of the worker.
         """
+        self.objects = objects
+        self._context = context
         self._registry = registry
         self._services = services
-        self._objects = objects
-        self._server_id = server_id
-        self._max_message_bytes = max_message_bytes
-        self._clocks = clocks
-        self._metrics = metrics
-        self._log = log
-
-    def blocks(self, command: Command, service: Service) -> bool:
-        """Return whether `compute` would have to wait for the store."""
-        return self._objects.named_by(command, service)
 
     def compute(self, queued: QueuedCommand) -> EncodedAnswer:
         """Call the service and encode its answer; runs in the loop or in a thread, and touches nothing
         shared."""
-        monotonic, command = self._clocks.monotonic, queued.command
+        monotonic, command = self._context.clocks.monotonic, queued.command
         started = monotonic()
         try:
-            command = self._objects.put_in(command, self._registry, queued.owner)
+            command = self.objects.put_in(command, self._registry, queued.owner)
         except RsePfError as error:
-            return self._encoded(queued, failure_of(error, command, server=self._server_id))
+            return self._encoded(queued, failure_of(error, command, server=self._context.server_id))
         message = dispatch(
-            self._registry, command, monotonic, server=self._server_id, on_defect=self._log_defect
+            self._registry, command, monotonic, server=self._context.server_id, on_defect=self._log_defect
         )
         if isinstance(message, Result):
             message = msgspec.structs.replace(
@@ -99,7 +76,7 @@ class Answers:
                 sent_s=monotonic(),
             )
         answer = self._encoded(queued, message)
-        kept = self._objects.kept(message, answer.message, queued.owner)
+        kept = self.objects.kept(message, answer.message, queued.owner)
         return answer if kept is answer.message else self._encoded(queued, kept)
 
     def send(self, answer: EncodedAnswer, now: float) -> None:
@@ -107,11 +84,12 @@ class Answers:
         queued, message = answer.queued, answer.message
         code = "ok" if isinstance(message, Result) else message.code
         service = self.label(queued.command.service)
-        self._metrics.answered(service, code, now - queued.received_s)
+        self._context.metrics.answered(service, code, now - queued.received_s)
         connection: RobotConnection = queued.owner
         connection.answer(answer.data)
-        level, write = ("debug", self._log.debug) if code in _FREQUENT else ("info", self._log.info)
-        if self._log.writes(level):
+        log = self._context.log
+        level, write = ("debug", log.debug) if code in _FREQUENT else ("info", log.info)
+        if log.writes(level):
             write(
                 "command", robot=queued.robot, service=service, id=queued.command.id,
                 trace=queued.command.trace, code=code,
@@ -122,7 +100,7 @@ class Answers:
 
     def send_message(self, queued: QueuedCommand, message: Result | Failure) -> None:
         """Send what a sandbox or a job answered."""
-        now = self._clocks.monotonic()
+        now = self._context.clocks.monotonic()
         if isinstance(message, Result):
             queue_ms = (queued.started_s - queued.received_s) * 1e3
             message = msgspec.structs.replace(
@@ -132,9 +110,9 @@ class Answers:
 
     def send_refusal(self, refusal: RefusedCommand, now: float) -> None:
         """Answer a command that ends without compute."""
-        self._metrics.shed[refusal.reason] += 1
+        self._context.metrics.shed[refusal.reason] += 1
         queued = refusal.queued
-        failure = failure_of(refusal.error, queued.command, server=self._server_id)
+        failure = failure_of(refusal.error, queued.command, server=self._context.server_id)
         self.send(EncodedAnswer(queued, failure, queued.owner.session.codec.encode(failure)), now)
 
     def send_unread_refusal(
@@ -147,19 +125,20 @@ class Answers:
         size_bytes: int,
     ) -> None:
         """Answer a message that is not decoded; *envelope* tells which command it is, if that is known."""
-        self._metrics.shed[refusal.reason] += 1
+        context = self._context
+        context.metrics.shed[refusal.reason] += 1
         failure = Failure(
             id=None if envelope is None else envelope.id, code=Busy.code, message=refusal.message,
-            hint=refusal.hint, retry_after_ms=retry_after_ms, server=self._server_id,
+            hint=refusal.hint, retry_after_ms=retry_after_ms, server=context.server_id,
         )  # fmt: skip
         data = encode_refusal(codec, failure)
         connection.write(data)
         if envelope is None:
             return
         service = self.label(envelope.service)
-        self._metrics.answered(service, Busy.code, 0.0)
-        if self._log.writes("debug"):
-            self._log.debug(
+        context.metrics.answered(service, Busy.code, 0.0)
+        if context.log.writes("debug"):
+            context.log.debug(
                 "command", robot=connection.robot, service=service, id=envelope.id,
                 trace="", code=Busy.code, queue_ms=0.0, compute_ms=0.0, bytes_in=size_bytes,
                 bytes_out=len(data),
@@ -177,18 +156,19 @@ class Answers:
         except Exception as error:  # noqa: BLE001  the reply of a service may hold anything
             self._log_defect(command, error)
             defect = InternalError(f"the reply of {command.service!r} cannot be encoded")
-            message = failure_of(defect, command, server=self._server_id)
+            message = failure_of(defect, command, server=self._context.server_id)
             return EncodedAnswer(queued, message, codec.encode(message))
-        if len(data) <= self._max_message_bytes:
+        max_bytes = self._context.settings.session.max_message_bytes
+        if len(data) <= max_bytes:
             return EncodedAnswer(queued, message, data)
         if isinstance(message, Result) and message.object and message.reply is not None:
             return self._encoded(queued, msgspec.structs.replace(message, reply=None))
-        too_large = LimitExceeded(
-            f"the reply has {len(data)} bytes, above {self._max_message_bytes}", hint="ask for less"
-        )
-        message = failure_of(too_large, command, server=self._server_id)
+        too_large = LimitExceeded(f"the reply has {len(data)} bytes, above {max_bytes}", hint="ask for less")
+        message = failure_of(too_large, command, server=self._context.server_id)
         return EncodedAnswer(queued, message, codec.encode(message))
 
     def _log_defect(self, command: Command, error: BaseException) -> None:
         text = "".join(traceback.format_exception(type(error), error, error.__traceback__))
-        self._log.error("defect", service=command.service, id=command.id, trace=command.trace, traceback=text)
+        self._context.log.error(
+            "defect", service=command.service, id=command.id, trace=command.trace, traceback=text
+        )

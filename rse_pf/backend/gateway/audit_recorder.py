@@ -11,7 +11,6 @@ import base64
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from types import TracebackType
 from typing import Any, TypeVar
 
 import msgspec
@@ -22,7 +21,7 @@ from rse_pf.auth.tokens import Claims
 from rse_pf.backend.gateway.handshake import Accepted, Rejected
 from rse_pf.backend.ports import Clocks, Handle, Loop
 
-__all__ = ["AuditRecorder", "ServerAudit", "open_records"]
+__all__ = ["AuditRecorder", "ServerAudit"]
 
 _MAX_NOTES = 500
 """Notes in one message; a line of the channel may have 1 MiB."""
@@ -41,7 +40,8 @@ class AuditRecorder:
         clocks: Clocks,
         *,
         loop: Loop,
-        tell: Callable[..., None] | None,
+        tell: Callable[..., None],
+        is_on: bool = True,
         refusals: RefusalLimiter | None = None,
     ) -> None:
         """Hold nothing yet.
@@ -49,12 +49,14 @@ class AuditRecorder:
         Args:
             clocks: Monotonic for the rate, wall for the entries.
             loop: For the time of the next batch.
-            tell: Sends a message to the supervisor; None: nothing is recorded.
+            tell: Sends a message to the supervisor.
+            is_on: Whether anything is recorded.
             refusals: How many refusals are recorded one by one; None means the default.
         """
         self._clocks = clocks
         self._loop = loop
         self._tell = tell
+        self._is_on = is_on
         self._refusals = refusals or RefusalLimiter()
         self._held: list[dict[str, Any]] = []
         self._next: Handle | None = None
@@ -88,7 +90,7 @@ class AuditRecorder:
         self._send()
 
     def _may_record(self, reason: str) -> bool:
-        if self._tell is None:
+        if not self._is_on:
             return False
         may = self._refusals.take(reason, self._clocks.monotonic())
         if not may and self._sum is None:
@@ -102,7 +104,7 @@ class AuditRecorder:
             self._note("auth.refused-many", "", **counted)
 
     def _note(self, action: str, subject: str, /, **detail: Value) -> None:
-        if self._tell is None:
+        if not self._is_on:
             return
         note = {"time": self._clocks.wall(), "action": action, "subject": subject, "detail": detail}
         self._held.append(note)
@@ -112,21 +114,16 @@ class AuditRecorder:
     def _send(self) -> None:
         self._next = None
         held, self._held = self._held, []
-        if self._tell is not None:
-            for first in range(0, len(held), _MAX_NOTES):
-                self._tell(event="audit", notes=held[first : first + _MAX_NOTES])
+        for first in range(0, len(held), _MAX_NOTES):
+            self._tell(event="audit", notes=held[first : first + _MAX_NOTES])
 
 
 class ServerAudit:
-    """The audit log of one server; without one, nothing is recorded."""
+    """The audit log of one server; without a folder for it, nothing is recorded."""
 
-    def __init__(self, log: AuditLog | None) -> None:
-        self._log = log
-
-    @property
-    def is_on(self) -> bool:
-        """Whether anything is recorded."""
-        return self._log is not None
+    def __init__(self, folder: Path | None, server_id: str) -> None:
+        """Open nothing yet; entering raises ConfigurationError if the log cannot be kept."""
+        self._log = None if folder is None else AuditLog(folder, server_id, wall_clock=time.time)
 
     def complain_to(self, say: Callable[[str], None]) -> None:
         """Call *say*, from any thread, when the log cannot be written."""
@@ -154,22 +151,9 @@ class ServerAudit:
             self._log.open().start()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         if self._log is not None:
             self._log.close()
-
-
-def open_records(folder: Path | None, server_id: str) -> ServerAudit:
-    """Return the records of a server; entering them raises ConfigurationError if they cannot be kept."""
-    if folder is None:
-        return ServerAudit(None)
-    return ServerAudit(
-        AuditLog(
-            folder, server_id, wall_clock=time.time,
-        )
-    )  # fmt: skip
 
 
 class _Claimed(msgspec.Struct):
@@ -180,11 +164,9 @@ class _Claimed(msgspec.Struct):
 
 
 def _claimed(authorization: str) -> Mapping[str, str]:
-    parts = authorization.split(".")
-    if len(parts) != 3:
-        return {}
     try:
-        claimed = msgspec.json.decode(base64.urlsafe_b64decode(parts[1] + "=="), type=_Claimed)
+        _, payload, _ = authorization.split(".")
+        claimed = msgspec.json.decode(base64.urlsafe_b64decode(payload + "=="), type=_Claimed)
     except (ValueError, msgspec.MsgspecError, RecursionError):
         return {}
     return {"claimed_robot": claimed.sub[:_MAX_CLAIM], "claimed_token": claimed.jti[:_MAX_CLAIM]}

@@ -7,24 +7,20 @@ The connection knows no socket library, and takes nothing more once it is closin
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Protocol
 
 from rse_pf.auth.tokens import Claims
-from rse_pf.backend.gateway.admission import Admission
 from rse_pf.backend.gateway.decoder_thread import DecoderThread
 from rse_pf.backend.gateway.frames import CloseSocket, FrameAssembler, Received, SendPong
 from rse_pf.backend.gateway.handshake import Accepted
-from rse_pf.backend.metrics import Metrics
-from rse_pf.backend.ports import Wire
-from rse_pf.config import SessionSettings
+from rse_pf.backend.gateway.rate_limits import RobotRates
+from rse_pf.backend.ports import Wire, WorkerContext
 from rse_pf.errors import ProtocolError
 from rse_pf.wire import Command, Progress
 from rse_pf.wire.messages import FromRobot
 from rse_pf.wire.server_session import Decision, Renewal, Send, ServerSession, Submit, Withdraw
 
-__all__ = ["CommandHandler", "ConnectionContext", "RobotConnection"]
+__all__ = ["CommandHandler", "RobotConnection"]
 
 _BAD_MESSAGE_PAUSE_S = 0.1
 """After an undecodable message its socket is not read for this, times their number."""
@@ -32,6 +28,10 @@ _BAD_MESSAGE_PAUSE_S = 0.1
 
 class CommandHandler(Protocol):
     """What a connection needs of the dispatcher."""
+
+    context: WorkerContext
+    decoder: DecoderThread
+    rates: RobotRates
 
     def refuses_unread(
         self, connection: RobotConnection, session: ServerSession, data: bytes, now: float
@@ -57,29 +57,17 @@ class CommandHandler(Protocol):
         """Take that the socket ended."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ConnectionContext:
-    """What all connections of a worker share."""
-
-    settings: SessionSettings
-    handler: CommandHandler
-    monotonic: Callable[[], float]
-    metrics: Metrics
-    decoder: DecoderThread
-    admission: Admission
-
-
 class RobotConnection:
     """One robot's connection between its handshake and its end."""
 
     __slots__ = (
-        "_assembler", "_context", "_deferred", "_wire", "allowed_s", "claims", "is_connected",
+        "_assembler", "_context", "_deferred", "_handler", "_wire", "allowed_s", "claims", "is_connected",
         "last_heard_s", "moving_until_s", "number", "opened_s", "robot", "session", "tenant",
     )  # fmt: skip
 
     def __init__(
         self,
-        context: ConnectionContext,
+        handler: CommandHandler,
         wire: Wire,
         session: ServerSession | None,
         accepted: Accepted,
@@ -90,7 +78,7 @@ class RobotConnection:
         """Know the robot; its session waits for a Hello.
 
         Args:
-            context: What all connections share.
+            handler: Takes the commands.
             wire: The socket.
             session: The rules of the protocol; None echoes messages, for the conformance test of WebSocket.
             accepted: What the handshake says of the robot.
@@ -108,9 +96,10 @@ class RobotConnection:
         self.moving_until_s = float("-inf")
         self.is_connected = True
         """Whether the socket still exists."""
-        self._context = context
+        self._handler = handler
+        self._context = handler.context
         self._wire = wire
-        self._assembler = FrameAssembler(context.settings)
+        self._assembler = FrameAssembler(handler.context.settings.session)
         self._deferred: deque[tuple[Received, float]] | None = None
         """Messages that arrived while the decoder thread has one of this robot; None if it has none."""
 
@@ -131,7 +120,7 @@ class RobotConnection:
 
     def frame(self, opcode: int, fin: bool, rsv: bool, payload: bytes) -> None:
         """Take one unmasked frame."""
-        now = self._context.monotonic()
+        now = self._context.clocks.monotonic()
         decision = self._assembler.receive(opcode, fin, rsv, payload, now)
         if isinstance(decision, Received):
             self._take(decision, now)
@@ -178,29 +167,30 @@ class RobotConnection:
     def ended(self) -> None:
         """Note that the socket is gone."""
         self.is_connected = False
-        self._context.handler.disconnect(self)
+        self._handler.disconnect(self)
 
     def _take(self, received: Received, now: float) -> None:
         """Take one whole message: defer, echo, refuse, decode at once, or pass to the decoder thread."""
         self.last_heard_s = now
-        context, session, data = self._context, self.session, received.data
+        handler, session, data = self._handler, self.session, received.data
         if self._deferred is not None:
             self._deferred.append((received, now))
             return
-        context.metrics.bytes_in += len(data)
+        metrics = self._context.metrics
+        metrics.bytes_in += len(data)
         if session is None:
-            context.metrics.bytes_out += len(data)
+            metrics.bytes_out += len(data)
             self._wire.send(data, received.is_text)
             return
-        if session.state == "open" and context.handler.refuses_unread(self, session, data, now):
+        if session.state == "open" and handler.refuses_unread(self, session, data, now):
             return
         state, bad_messages = session.state, session.bad_messages
-        decoder, decisions = context.decoder, None
+        decoder, decisions = handler.decoder, None
         if len(data) <= decoder.short_bytes:
             decisions = session.receive_short(data, now, decoder.short_inflated_bytes)
         if decisions is not None:
-            self._follow(decisions, len(data), now, state, bad_messages)
-        elif not context.handler.refuses_long(self, session, data):
+            self._follow(session, decisions, len(data), now, state, bad_messages)
+        elif not handler.refuses_long(self, session, data):
             self._decode_in_thread(session, data, now)
 
     def _decode_in_thread(self, session: ServerSession, data: bytes, now: float) -> None:
@@ -209,7 +199,8 @@ class RobotConnection:
         def decoded(message: FromRobot | ProtocolError) -> None:
             deferred, self._deferred = self._deferred, None
             if self.is_connected and not self._assembler.closed:
-                self._follow(session.take(message, now, len(data)), len(data), now, state, bad_messages)
+                decisions = session.take(message, now, len(data))
+                self._follow(session, decisions, len(data), now, state, bad_messages)
             for received, arrived in deferred or ():
                 if not self._assembler.closed:
                     self._take(received, arrived)
@@ -217,32 +208,32 @@ class RobotConnection:
 
         self._deferred = deque()
         self._wire.hold()
-        self._context.decoder.begin(session.codec, data, suspicion=bad_messages, done=decoded)
+        self._handler.decoder.begin(session.codec, data, suspicion=bad_messages, done=decoded)
 
     def _follow(
-        self, decisions: list[Decision], size_bytes: int, now: float, state: str, bad_messages: int
+        self,
+        session: ServerSession,
+        decisions: list[Decision],
+        size_bytes: int,
+        now: float,
+        state: str,
+        bad_messages: int,
     ) -> None:
         """Execute what the session decided about one message; it was in *state* before."""
         self._execute(decisions, now, size_bytes)
-        session, context = self.session, self._context
-        if session is None:
+        if session.bad_messages > self._context.settings.session.max_bad_messages:
+            self._handler.rates.ban((self.tenant, self.robot), now)
+        if self._assembler.closed:
             return
         if session.bad_messages > bad_messages:
-            self._limit_bad_messages(session, now)
-        elif state == "opening" and session.state == "open" and not self._assembler.closed:
-            context.handler.opened(self, now)
-
-    def _limit_bad_messages(self, session: ServerSession, now: float) -> None:
-        """Read the connection more and more rarely: refusing a bad message costs as much as reading it."""
-        context = self._context
-        if session.bad_messages > context.settings.max_bad_messages:
-            context.admission.rates.ban((self.tenant, self.robot), now)
-        if not self._assembler.closed:
-            context.metrics.shed["bad-message"] += 1
+            # Refusing a bad message costs as much as reading it, so the socket is read more and more rarely.
+            self._context.metrics.shed["bad-message"] += 1
             self._wire.pause(session.bad_messages * _BAD_MESSAGE_PAUSE_S)
+        elif state == "opening" and session.state == "open":
+            self._handler.opened(self, now)
 
     def _execute(self, decisions: list[Decision], now: float, size_bytes: int = 0) -> None:
-        handler = self._context.handler
+        handler = self._handler
         for decision in decisions:
             if isinstance(decision, Submit):
                 handler.submit(self, decision.command, size_bytes, now)

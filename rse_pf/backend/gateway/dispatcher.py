@@ -12,16 +12,15 @@ from typing import Any
 
 from rse_pf.backend.gateway.admission import DECODER_FULL, TOO_FAST, TOO_LATE, Admission
 from rse_pf.backend.gateway.answers import Answers, EncodedAnswer
-from rse_pf.backend.gateway.connection import ConnectionContext, RobotConnection
+from rse_pf.backend.gateway.connection import RobotConnection
 from rse_pf.backend.gateway.decoder_thread import DecoderThread
 from rse_pf.backend.gateway.handshake import Accepted
 from rse_pf.backend.gateway.idle_timeouts import IdleTimeouts
 from rse_pf.backend.gateway.queues import JobQueue, SandboxQueue
 from rse_pf.backend.gateway.rate_limits import CUT_OFF
 from rse_pf.backend.gateway.token_watch import TokenWatch
-from rse_pf.backend.log import JsonLog
-from rse_pf.backend.metrics import LongestRecently, Metrics
-from rse_pf.backend.ports import Clocks, Handle, Loop, Wire
+from rse_pf.backend.metrics import LongestRecently
+from rse_pf.backend.ports import Handle, Wire, WorkerContext
 from rse_pf.backend.scheduling.cpu_throttle import BATCH_S, CpuThrottle
 from rse_pf.backend.scheduling.scheduler import (
     QUEUE_TARGET_S,
@@ -30,7 +29,6 @@ from rse_pf.backend.scheduling.scheduler import (
     Scheduler,
 )
 from rse_pf.backend.scheduling.thread_pool import SolverThreads
-from rse_pf.config import PlatformSettings
 from rse_pf.errors import UnknownService
 from rse_pf.service import Registry
 from rse_pf.wire import CODECS, Codec, Command, make_codec
@@ -50,14 +48,9 @@ class Dispatcher:
 
     def __init__(
         self,
+        context: WorkerContext,
         *,
-        settings: PlatformSettings,
         registry: Registry,
-        server_id: str,
-        clocks: Clocks,
-        loop: Loop,
-        log: JsonLog,
-        metrics: Metrics,
         connections: set[RobotConnection],
         new_session_id: Callable[[], str],
         admission: Admission,
@@ -72,13 +65,8 @@ class Dispatcher:
         """Take no connection yet; start the solver threads and the timer of idle connections.
 
         Args:
-            settings: Of the platform.
+            context: Of the worker.
             registry: The stateless and long services.
-            server_id: Goes into welcomes.
-            clocks: Of the worker.
-            loop: Event loop of the worker.
-            log: Of the worker.
-            metrics: Of the worker.
             connections: The live ones; shared with *token_watch*.
             new_session_id: Makes the id of a session.
             admission: Decides which commands are taken.
@@ -90,36 +78,25 @@ class Dispatcher:
             jobs: Runs long services.
             token_watch: Ends connections whose token is no longer valid.
         """
+        settings, monotonic = context.settings, context.clocks.monotonic
+        self.context = context
         self.connections = connections
-        self._settings = settings
+        self.rates = admission.rates
+        self.decoder = decoder
         self._registry = registry
-        self._server_id = server_id
-        self._clocks = clocks
-        self._loop = loop
-        self._log = log
-        self._metrics = metrics
         self._new_session_id = new_session_id
         self._admission = admission
         self._scheduler = scheduler
         self._throttle = throttle
-        self._decoder = decoder
         self._answers = answers
         self._sandboxes = sandboxes
         self._jobs = jobs
         self._token_watch = token_watch
         self._codecs: dict[str, Codec] = {name: make_codec(name, settings.session) for name in CODECS}
-        self._context = ConnectionContext(
-            settings=settings.session,
-            handler=self,
-            monotonic=clocks.monotonic,
-            metrics=metrics,
-            decoder=decoder,
-            admission=admission,
-        )
         self._threads = SolverThreads(
             settings.serving.solver_threads,
             answers.compute,
-            partial(loop.call_soon_threadsafe, self._computed),
+            partial(context.loop.call_soon_threadsafe, self._computed),
         )
         of_kind = {
             "stateless": "scheduler",
@@ -132,9 +109,9 @@ class Dispatcher:
         self._sweep_timer: Handle | None = None
         self._batched: list[tuple[Any, ...]] = []
         self._move: tuple[str, float] | None = None
-        self._idle_timeouts = IdleTimeouts(settings.session, clocks.monotonic())
+        self._idle_timeouts = IdleTimeouts(settings.session, monotonic())
         self._lag_s = 0.0
-        loop.call_later(self._idle_timeouts.left_s(clocks.monotonic()), self._tick)
+        context.loop.call_later(self._idle_timeouts.left_s(monotonic()), self._tick)
 
     @property
     def held(self) -> int:
@@ -143,19 +120,21 @@ class Dispatcher:
 
     def connect(self, wire: Wire, accepted: Accepted, number: int = 0) -> RobotConnection:
         """Return the connection of a robot whose handshake is done; *number* says which socket it is."""
-        now = self._clocks.monotonic()
-        expires_s = None if accepted.expires_s is None else now + accepted.expires_s - self._clocks.wall()
+        now = self.context.clocks.monotonic()
+        expires_s = (
+            None if accepted.expires_s is None else now + accepted.expires_s - self.context.clocks.wall()
+        )
         session = None
         if accepted.codec:
             session = ServerSession(
                 codec=self._codecs[accepted.codec],
                 robot=accepted.robot,
-                server=self._server_id,
+                server=self.context.server_id,
                 session=self._new_session_id(),
-                limits=self._settings.session,
+                limits=self.context.settings.session,
             )
             session.ends_s = expires_s
-        connection = RobotConnection(self._context, wire, session, accepted, now=now, number=number)
+        connection = RobotConnection(self, wire, session, accepted, now=now, number=number)
         self.connections.add(connection)
         self._token_watch.connected(connection, expires_s)
         self._sandboxes.connected(connection.robot)
@@ -169,12 +148,12 @@ class Dispatcher:
         self._token_watch.left(connection)
         self._jobs.left(connection)
         for queued in self._scheduler.leave(connection):
-            self._metrics.requests[self._answers.label(queued.command.service), "disconnected"] += 1
-        self._log.debug("disconnected", robot=connection.robot)
+            self.context.metrics.requests[self._answers.label(queued.command.service), "disconnected"] += 1
+        self.context.log.debug("disconnected", robot=connection.robot)
 
     def opened(self, connection: RobotConnection, now: float) -> None:
         """Take that a robot said Hello; while the server leaves, ask the robot to move at once."""
-        self._log.debug("connected", robot=connection.robot)
+        self.context.log.debug("connected", robot=connection.robot)
         self._token_watch.arrived(connection)
         if self._move is not None:
             connection.move(*self._move, now)
@@ -183,7 +162,7 @@ class Dispatcher:
         """Ask every robot, now and from now on, to leave for another server."""
         self._move = (reason, within_ms)
         self._jobs.give_up()
-        now = self._clocks.monotonic()
+        now = self.context.clocks.monotonic()
         for connection in list(self.connections):
             connection.move(reason, within_ms, now)
 
@@ -192,7 +171,7 @@ class Dispatcher:
         for connection in list(self.connections):
             connection.close(CLOSE_GOING_AWAY, "leaving")
         self._threads.close()
-        self._decoder.close()
+        self.decoder.close()
         self._jobs.close()
         self._sandboxes.close()
 
@@ -201,10 +180,10 @@ class Dispatcher:
     ) -> bool:
         """Refuse the message *data* for a fraction of what decoding it costs; False if it must be decoded."""
         answers, codec = self._answers, session.codec
-        retry_ms = self._admission.rates.retry_after_ms((connection.tenant, connection.robot), now)
+        retry_ms = self.rates.retry_after_ms((connection.tenant, connection.robot), now)
         if retry_ms == CUT_OFF:
-            self._metrics.shed["rate"] += 1
-            self._log.warning("cut-off", robot=connection.robot, reason="rate")
+            self.context.metrics.shed["rate"] += 1
+            self.context.log.warning("cut-off", robot=connection.robot, reason="rate")
             connection.close(CLOSE_RATE, "rate")
             return True
         if retry_ms:
@@ -225,7 +204,7 @@ class Dispatcher:
 
     def refuses_long(self, connection: RobotConnection, session: ServerSession, data: bytes) -> bool:
         """Refuse a message that is too long for the event loop; False if the decoder thread may take it."""
-        may_wait = self._admission.may_wait(len(data), self._decoder.unread_bytes, session.bad_messages)
+        may_wait = self._admission.may_wait(len(data), self.decoder.unread_bytes, session.bad_messages)
         if not may_wait:
             envelope = peek(session.codec, data)
             self._answers.send_unread_refusal(
@@ -236,7 +215,9 @@ class Dispatcher:
     def submit(self, connection: RobotConnection, command: Command, size_bytes: int, now: float) -> None:
         """Admit one command to the queue of its service, or refuse it."""
         deadline_ms = command.deadline_ms
-        allowed_s = self._settings.session.answer_timeout_s if deadline_ms is None else deadline_ms / 1e3
+        allowed_s = (
+            self.context.settings.session.answer_timeout_s if deadline_ms is None else deadline_ms / 1e3
+        )
         connection.allowed_s = allowed_s
         queued = QueuedCommand(connection, connection.robot, command, size_bytes, now, now + allowed_s)
         queue = self._queue_of(command.service)
@@ -272,22 +253,22 @@ class Dispatcher:
 
     def snapshot(self) -> dict[str, Any]:
         """Return the numbers of this worker for /metrics and /status."""
-        now = self._clocks.monotonic()
+        now = self.context.clocks.monotonic()
         oldest_wait_s = self._scheduler.oldest_wait_s(now)
         isolation = self._sandboxes.report()
-        self._metrics.gauges = {
+        self.context.metrics.gauges = {
             "robots": float(len(self.connections)),
             "queue": float(self._scheduler.waiting),
             "queue_oldest_s": oldest_wait_s,
             "queue_ms": max(self._waits.longest_s(now), oldest_wait_s) * 1e3,
             "in_flight": float(self._scheduler.running),
             "loop_lag_s": self._lag_s,
-            "cpu_s": self._clocks.cpu(),
-            "log_lines_dropped": float(self._log.dropped),
+            "cpu_s": self.context.clocks.cpu(),
+            "log_lines_dropped": float(self.context.log.dropped),
             **({"sandboxes": float(isolation["sandboxes"])} if isolation else {}),
         }
         self._lag_s = 0.0
-        return {**self._metrics.snapshot(), **({"isolation": isolation} if isolation else {})}
+        return {**self.context.metrics.snapshot(), **({"isolation": isolation} if isolation else {})}
 
     # --- from the queue to an answer -----------------------------------------------------------
 
@@ -297,13 +278,13 @@ class Dispatcher:
         while (
             not self._ran_inline
             and scheduler.waiting
-            and scheduler.running < self._settings.serving.solver_threads
+            and scheduler.running < self.context.settings.serving.solver_threads
         ):
-            now = self._clocks.monotonic()
+            now = self.context.clocks.monotonic()
             wait_s = self._throttle.wait_s(now)
             if wait_s > 0:
                 if self._throttle_timer is None:
-                    self._throttle_timer = self._loop.call_later(wait_s, self._go_on)
+                    self._throttle_timer = self.context.loop.call_later(wait_s, self._go_on)
                 break
             queued, refusals = scheduler.start(now)
             self._refuse(refusals, now)
@@ -312,7 +293,7 @@ class Dispatcher:
                 self._run(queued)
         if scheduler.waiting and self._sweep_timer is None:
             pause_s = QUEUE_TARGET_S / 2
-            self._sweep_timer = self._loop.call_later(pause_s, self._sweep)
+            self._sweep_timer = self.context.loop.call_later(pause_s, self._sweep)
 
     def _run(self, queued: QueuedCommand) -> None:
         """Compute the answer to *queued*; in the event loop only one in each of its rounds.
@@ -320,12 +301,12 @@ class Dispatcher:
         Otherwise a slow round would hide the queue in the kernel, where its length cannot be seen.
         """
         service = self._registry.get(queued.command.service)
-        if not self._answers.blocks(queued.command, service) and self._scheduler.runs_inline(
+        if not self._answers.objects.named_by(queued.command, service) and self._scheduler.runs_inline(
             cheap=service.cheap,
             size_bytes=queued.size_bytes,
         ):
             self._ran_inline = True
-            self._loop.call_later(0.0, self._next_round)
+            self.context.loop.call_later(0.0, self._next_round)
             self._finish(self._answers.compute(queued))
         else:
             self._threads.run(queued)
@@ -335,7 +316,7 @@ class Dispatcher:
         self._start()
 
     def _finish(self, answer: EncodedAnswer) -> None:
-        now = self._clocks.monotonic()
+        now = self.context.clocks.monotonic()
         self._scheduler.done(answer.queued, now)
         self._answers.send(answer, now)
 
@@ -369,7 +350,7 @@ class Dispatcher:
     def _batch(self, refusal: tuple[Any, ...]) -> None:
         """Send *refusal*, arguments of `Answers.send_unread_refusal`, together with others."""
         if not self._batched:
-            self._loop.call_later(BATCH_S, self._send_batch)
+            self.context.loop.call_later(BATCH_S, self._send_batch)
         self._batched.append(refusal)
 
     def _send_batch(self) -> None:
@@ -379,12 +360,12 @@ class Dispatcher:
 
     def _sweep(self) -> None:
         self._sweep_timer = None
-        now = self._clocks.monotonic()
+        now = self.context.clocks.monotonic()
         self._refuse(self._scheduler.sweep(now), now)
         self._start()
 
     def _tick(self) -> None:
-        now = self._clocks.monotonic()
+        now = self.context.clocks.monotonic()
         self._lag_s = max(self._lag_s, -self._idle_timeouts.left_s(now))
         self._idle_timeouts.look(self.connections, now)
-        self._loop.call_later(self._idle_timeouts.left_s(now), self._tick)
+        self.context.loop.call_later(self._idle_timeouts.left_s(now), self._tick)

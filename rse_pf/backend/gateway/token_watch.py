@@ -12,9 +12,7 @@ from rse_pf.auth.tokens import Claims, KeySet, claims_problem
 from rse_pf.backend.gateway.audit_recorder import AuditRecorder
 from rse_pf.backend.gateway.connection import RobotConnection
 from rse_pf.backend.gateway.handshake import HandshakePolicy
-from rse_pf.backend.log import JsonLog
-from rse_pf.backend.metrics import Metrics
-from rse_pf.backend.ports import Clocks, Handle, Loop
+from rse_pf.backend.ports import Handle, WorkerContext
 from rse_pf.wire.server_session import CLOSE_REPLACED, CLOSE_REVOKED, CLOSE_TOKEN_OVER
 
 __all__ = ["TokenWatch"]
@@ -25,34 +23,25 @@ class TokenWatch:
 
     def __init__(
         self,
+        context: WorkerContext,
         connections: Set[RobotConnection],
         handshake: HandshakePolicy,
         *,
-        clocks: Clocks,
-        loop: Loop,
-        log: JsonLog,
-        metrics: Metrics,
         tell: Callable[..., None],
         recorder: AuditRecorder,
     ) -> None:
         """Watch *connections*.
 
         Args:
+            context: Of the worker.
             connections: The live ones of this worker, now and later.
             handshake: Judges fresh tokens, and gets new keys.
-            clocks: Of the worker.
-            loop: For the ends of tokens.
-            log: One line for each connection that is ended.
-            metrics: Counts renewals.
             tell: Sends a message to the supervisor.
             recorder: Records fresh tokens, and connections that are ended.
         """
         self._connections = connections
         self._handshake = handshake
-        self._clocks = clocks
-        self._loop = loop
-        self._log = log
-        self._metrics = metrics
+        self._context = context
         self._tell = tell
         self._recorder = recorder
         self._by_number: dict[int, RobotConnection] = {}
@@ -65,7 +54,7 @@ class TokenWatch:
             claims = connection.claims
             problem = "" if claims is None else claims_problem(claims, keys)
             if claims is not None and problem and not connection.is_closing:
-                self._log.info("revoked", robot=connection.robot, reason=problem)
+                self._context.log.info("revoked", robot=connection.robot, reason=problem)
                 self._recorder.cut_off(claims, problem)
                 connection.close(CLOSE_REVOKED, "revoked")
 
@@ -90,28 +79,33 @@ class TokenWatch:
         connection = self._by_number.get(number)
         if connection is None or connection.is_closing:
             return
-        left_s = connection.moving_until_s - self._clocks.monotonic()
+        left_s = connection.moving_until_s - self._context.clocks.monotonic()
         if left_s > 0:
-            self._loop.call_later(left_s, partial(self._report, "stays", connection))
+            self._context.loop.call_later(left_s, partial(self._report, "stays", connection))
             return
-        self._log.info("replaced", robot=connection.robot)
+        self._context.log.info("replaced", robot=connection.robot)
         connection.close(CLOSE_REPLACED, "replaced")
 
     def renew(self, connection: RobotConnection, token: str) -> None:
         """Judge a fresh token of a live connection, and move the connection's end or leave it."""
-        before, now, wall_s = connection.claims, self._clocks.monotonic(), self._clocks.wall()
+        before, clocks = connection.claims, self._context.clocks
+        now, wall_s = clocks.monotonic(), clocks.wall()
         claims = self._handshake.verified(token, wall_s)
         token_s = None
-        if isinstance(claims, Claims) and before is not None and _is_same_robot(before, claims):
+        if (
+            isinstance(claims, Claims)
+            and before is not None
+            and (before.tenant, before.robot) == (claims.tenant, claims.robot)
+        ):
             connection.claims = claims
             self._recorder.renewed(before, claims)
             token_s = self._handshake.ends_s(claims, wall_s) - wall_s
             self._end_at(connection, now + token_s)
-            self._metrics.handshakes["renewed"] += 1
+            self._context.metrics.handshakes["renewed"] += 1
         else:
-            self._metrics.handshakes["renewal-refused"] += 1
+            self._context.metrics.handshakes["renewal-refused"] += 1
             reason = claims if isinstance(claims, str) else "wrong-robot"
-            self._log.info("renewal-refused", robot=connection.robot, reason=reason)
+            self._context.log.info("renewal-refused", robot=connection.robot, reason=reason)
             self._recorder.renewal_refused(before, reason)
         connection.renewed(token_s, now)
 
@@ -120,8 +114,8 @@ class TokenWatch:
         if timer is not None:
             timer.cancel()
         if expires_s is not None:
-            left_s = max(0.0, expires_s - self._clocks.monotonic())
-            self._timers[connection] = self._loop.call_later(left_s, partial(self._end, connection))
+            left_s = max(0.0, expires_s - self._context.clocks.monotonic())
+            self._timers[connection] = self._context.loop.call_later(left_s, partial(self._end, connection))
 
     def _end(self, connection: RobotConnection) -> None:
         if not connection.is_closing:
@@ -131,7 +125,3 @@ class TokenWatch:
         claims = connection.claims
         if claims is not None and (event == "left" or connection in self._connections):
             self._tell(event=event, tenant=claims.tenant, robot=claims.robot, number=connection.number)
-
-
-def _is_same_robot(before: Claims, after: Claims) -> bool:
-    return (before.tenant, before.robot) == (after.tenant, after.robot)

@@ -18,11 +18,9 @@ from rse_pf.backend.gateway.connection import RobotConnection
 from rse_pf.backend.gateway.dispatcher import Dispatcher
 from rse_pf.backend.gateway.frames import CloseBorder
 from rse_pf.backend.gateway.handshake import HEALTH, Accepted, HandshakePolicy, Rejected
-from rse_pf.backend.gateway.rate_limits import PendingHandshakes, RobotRates, SourceRates
-from rse_pf.backend.log import JsonLog
-from rse_pf.backend.metrics import Metrics
-from rse_pf.backend.ports import Clocks, Handle
-from rse_pf.config import ServingSettings, SessionSettings
+from rse_pf.backend.gateway.rate_limits import PendingHandshakes, SourceRates
+from rse_pf.backend.ports import Handle
+from rse_pf.config import ServingSettings
 from rse_pf.errors import MissingExtra
 
 __all__ = ["PendingSocket", "RobotSockets", "protocol_type"]
@@ -88,26 +86,19 @@ class RobotSockets:
 
     def __init__(
         self,
-        *,
         dispatcher: Dispatcher,
         handshake: HandshakePolicy,
-        rates: RobotRates,
-        metrics: Metrics,
-        clocks: Clocks,
-        serving: ServingSettings,
-        session: SessionSettings,
+        *,
         max_robots: int,
         workers: int,
         new_name: Callable[[], str],
         recorder: AuditRecorder,
-        log: JsonLog,
         loop: asyncio.AbstractEventLoop,
     ) -> None:
         self._dispatcher = dispatcher
+        self._context = dispatcher.context
         self._handshake = handshake
-        self._rates = rates
-        self._metrics = metrics
-        self._clocks = clocks
+        serving = self._context.settings.serving
         self._max_robots = max_robots
         self._sources = SourceRates(serving)
         per_source = 0 if serving.trusted_proxies else serving.max_unauthenticated_per_source
@@ -116,9 +107,7 @@ class RobotSockets:
         )
         self._new_name = new_name
         self._recorder = recorder
-        self._log = log
         self._loop = loop
-        self._serving = serving
         self._tasks: set[asyncio.Task[None]] = set()
         picows, self._connect_accepted_socket = _libraries()
         self._picows = picows
@@ -127,7 +116,7 @@ class RobotSockets:
         self._arguments = (
             _NoLogger(), True, serving.handshake_timeout_s,
             False, 20.0, 20.0, picows.WSAutoPingStrategy.PING_WHEN_IDLE, False,
-            session.max_message_bytes, None, _READ_BUFFER_BYTES,
+            self._context.settings.session.max_message_bytes, None, _READ_BUFFER_BYTES,
         )  # fmt: skip
 
     def take(self, fd: int, ended: Callable[[], None], number: int) -> None:
@@ -135,11 +124,12 @@ class RobotSockets:
         accepted = socket.socket(fileno=fd)
         accepted.setblocking(False)
         # Otherwise the kernel buffers megabytes for a slow reader, unnoticed.
-        accepted.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, self._serving.write_buffer_bytes)
-        pending = PendingSocket(_peer(accepted), self._serving.max_handshake_bytes, number)
+        serving = self._context.settings.serving
+        accepted.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, serving.write_buffer_bytes)
+        pending = PendingSocket(_peer(accepted), serving.max_handshake_bytes, number)
         surplus = self._pending.enter(pending, pending.peer)
         if surplus is not None:
-            self._metrics.closed["unauthenticated"] += 1
+            self._context.metrics.closed["unauthenticated"] += 1
             surplus.cut()
 
         def gone() -> None:
@@ -171,26 +161,26 @@ class RobotSockets:
             verdict = self._verdict(pending, request)
             self._recorder.judged(verdict, pending.source, request.headers.get("Authorization", ""))
         except Exception as error:  # noqa: BLE001  see above
-            self._log.error("defect", at="handshake", traceback=repr(error))
+            self._context.log.error("defect", at="handshake", traceback=repr(error))
             verdict = self._handshake.defect
         if isinstance(verdict, Rejected):
-            self._metrics.handshakes[verdict.result] += 1
+            self._context.metrics.handshakes[verdict.result] += 1
             kinds = self._picows.WSUpgradeResponse
             if verdict.result == HEALTH:
                 response = kinds.create_ok_response(verdict.body, dict(verdict.headers))
             else:
-                self._log.info("refused", result=verdict.result, reason=verdict.reason)
+                self._context.log.info("refused", result=verdict.result, reason=verdict.reason)
                 response = kinds.create_error_response(verdict.status, verdict.body, dict(verdict.headers))
             return self._picows.WSUpgradeResponseWithListener(response, None)
-        self._metrics.handshakes["ok"] += 1
+        self._context.metrics.handshakes["ok"] += 1
         chosen = {"Sec-WebSocket-Protocol": verdict.subprotocol} if verdict.subprotocol else None
         response = self._picows.WSUpgradeResponse.create_101_response(chosen)
         return self._picows.WSUpgradeResponseWithListener(
-            response, self._listener(self._dispatcher, self._metrics, verdict, pending.number)
+            response, self._listener(self._dispatcher, verdict, pending.number)
         )
 
     def _verdict(self, pending: PendingSocket, request: Any) -> Accepted | Rejected:
-        headers, now = request.headers, self._clocks.monotonic()
+        headers, now = request.headers, self._context.clocks.monotonic()
         source = pending.source = self._sources.source(
             pending.peer, ",".join(headers.getall("X-Forwarded-For", []))
         )
@@ -206,11 +196,11 @@ class RobotSockets:
             offered=[word.strip() for word in offered],
             is_full=len(self._dispatcher.connections) >= self._max_robots,
             anonymous=self._new_name(),
-            now_s=self._clocks.wall(),
+            now_s=self._context.clocks.wall(),
         )
         if not isinstance(verdict, Accepted):
             return verdict
-        banned_s = self._rates.banned_s((verdict.tenant, verdict.robot), now)
+        banned_s = self._dispatcher.rates.banned_s((verdict.tenant, verdict.robot), now)
         return self._handshake.too_fast if banned_s > 0 else verdict
 
 
@@ -278,9 +268,8 @@ def _listener_type(picows: Any, loop: asyncio.AbstractEventLoop, serving: Servin
     class Listener(picows.WSListener):  # type: ignore[misc]
         """One robot's socket: passes frames to its connection, and is the connection's `Wire`."""
 
-        def __init__(self, dispatcher: Dispatcher, metrics: Metrics, accepted: Accepted, number: int) -> None:
+        def __init__(self, dispatcher: Dispatcher, accepted: Accepted, number: int) -> None:
             self._dispatcher = dispatcher
-            self._metrics = metrics
             self._accepted = accepted
             self._number = number
             self._transport: Any = None
@@ -346,7 +335,7 @@ def _listener_type(picows: Any, loop: asyncio.AbstractEventLoop, serving: Servin
             loop.call_later(_LINGER_S, self._transport.disconnect, False)
 
         def _cut_off(self) -> None:
-            self._metrics.closed["slow-reader"] += 1
+            self._dispatcher.context.metrics.closed["slow-reader"] += 1
             self._transport.disconnect(False)
 
     return Listener

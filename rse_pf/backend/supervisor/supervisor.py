@@ -23,7 +23,7 @@ from typing import Any
 from rse_pf.auth.control_token import carries_token
 from rse_pf.auth.tokens import KeySet
 from rse_pf.auth.trust_store import TrustStore
-from rse_pf.backend.gateway.audit_recorder import ServerAudit, open_records
+from rse_pf.backend.gateway.audit_recorder import ServerAudit
 from rse_pf.backend.gateway.migration import plan
 from rse_pf.backend.jobs.slots import make_pipe
 from rse_pf.backend.log import JsonLog
@@ -113,7 +113,7 @@ def serve(
     with bound_socket(settings.serving.host, settings.serving.port) as listener:
         workers = fork_workers(plans, listener=listener)
         try:
-            with open_records(audit, server_id) as records:
+            with ServerAudit(audit, server_id) as records:
                 supervisor = _Supervisor(
                     settings, workers=workers, trust=trust, server_id=server_id, announce=announce,
                     listener=listener, digest=digest, records=records,

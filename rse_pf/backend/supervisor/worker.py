@@ -129,7 +129,7 @@ class _Worker:
         chosen = settings.services
         installed = installed_services(Path(chosen.folder)) if chosen.folder else []
         installed += published_services() if chosen.published else []
-        self._context = WorkerContext(
+        context = WorkerContext(
             settings=settings,
             server_id=plan.server_id,
             clocks=Clocks(monotonic=time.monotonic, wall=time.time, cpu=time.process_time),
@@ -139,24 +139,22 @@ class _Worker:
         connections = set[RobotConnection]()
         store = open_data_store(settings) if is_shared(settings) else None
         answers = Answers(
-            self._context,
+            context,
             registry=registry,
             services=frozenset(service.name for service in (*registry, *installed)),
             objects=ObjectRefs(store, settings.serving, settings.data.quota_bytes),
         )
         handshake = HandshakePolicy(settings, plan.keys, conformance_echo=plan.conformance_echo)
-        self._recorder = AuditRecorder(
-            self._context.clocks, loop=loop, tell=self._say if plan.audit else None
-        )
+        self._recorder = AuditRecorder(context.clocks, loop=loop, tell=self._say, is_on=plan.audit)
         self._token_watch = TokenWatch(
-            self._context,
+            context,
             connections,
             handshake,
             tell=self._say,
             recorder=self._recorder,
         )
         self._dispatcher = Dispatcher(
-            self._context,
+            context,
             registry=registry,
             connections=connections,
             new_session_id=lambda: secrets.token_hex(8),

@@ -14,7 +14,7 @@ from rse_pf.audit.chain import RefusalLimiter
 from rse_pf.audit.log import files_of
 from rse_pf.audit.verify import check_folder, entries_of
 from rse_pf.auth.tokens import Claims
-from rse_pf.backend.gateway.audit_recorder import AuditRecorder, open_records
+from rse_pf.backend.gateway.audit_recorder import AuditRecorder, ServerAudit
 from rse_pf.backend.gateway.handshake import Accepted, Rejected
 from rse_pf.backend.ports import Clocks
 
@@ -32,9 +32,7 @@ class Recording:
         self.told: list[dict[str, Any]] = []
         self.loop = FakeLoop(0.0)
         clocks = Clocks(monotonic=self.loop.time, wall=lambda: 1e9 + self.loop.now, cpu=lambda: 0.0)
-        self.recorder = AuditRecorder(
-            clocks, refusals=refusals, loop=self.loop, tell=self._tell if is_on else None
-        )
+        self.recorder = AuditRecorder(clocks, refusals=refusals, loop=self.loop, tell=self._tell, is_on=is_on)
 
     @property
     def notes(self) -> list[dict[str, Any]]:
@@ -154,7 +152,7 @@ def test_the_supervisor_writes_the_notes_of_workers_and_passes_other_messages_on
     recording.recorder.judged(ACCEPTED, "10.0.0.7", "")
     recording.recorder.flush()
 
-    with open_records(tmp_path, "server-1") as records:
+    with ServerAudit(tmp_path, "server-1") as records:
         hear = records.heard(lambda worker, message: others.append(message))
         hear("worker", recording.told[0])
         hear("worker", {"event": "left", "robot": "robot-1"})
@@ -169,8 +167,11 @@ def test_the_supervisor_writes_the_notes_of_workers_and_passes_other_messages_on
 
 
 @pytest.mark.parametrize("message", [{"event": "audit", "notes": []}])
-def test_without_a_folder_notes_are_dropped(message: dict[str, Any]):
-    with open_records(None, "server-1") as records:
-        assert not records.is_on
+def test_without_a_folder_notes_are_dropped(
+    message: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.chdir(tmp_path)
+    with ServerAudit(None, "server-1") as records:
         records.heard(lambda worker, other: None)("worker", message)
         records.note("server.over")
+    assert list(tmp_path.iterdir()) == []

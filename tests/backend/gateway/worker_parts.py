@@ -20,9 +20,8 @@ from rse_pf.backend.gateway.handshake import Accepted, HandshakePolicy
 from rse_pf.backend.gateway.queues import JobQueue, NoQueue, SandboxQueue
 from rse_pf.backend.gateway.token_watch import TokenWatch
 from rse_pf.backend.log import JsonLog
-from rse_pf.backend.metrics import Metrics
 from rse_pf.backend.object_refs import ObjectRefs
-from rse_pf.backend.ports import Clocks
+from rse_pf.backend.ports import Clocks, WorkerContext
 from rse_pf.backend.scheduling.cpu_throttle import CpuThrottle
 from rse_pf.backend.scheduling.scheduler import Scheduler
 from rse_pf.config import PlatformSettings
@@ -53,7 +52,6 @@ class WorkerParts:
     ) -> None:
         self.settings = settings or PlatformSettings()
         self.loop = FakeLoop()
-        self.metrics = Metrics()
         self.codec: Codec = make_codec(codec)
         self.told: list[dict[str, Any]] = []
         self.cpu_s = 0.0
@@ -71,35 +69,27 @@ class WorkerParts:
         self.admission = Admission(self.settings.session, self.settings.serving)
         self.handshake = HandshakePolicy(self.settings, keys)
         self.decoder = DecoderThread(self.loop.call_soon_threadsafe)
+        self.context = WorkerContext(
+            settings=self.settings, server_id="s-1", clocks=self.clocks, loop=self.loop, log=log
+        )
+        self.metrics = self.context.metrics
         self.answers = Answers(
+            self.context,
             registry=self.registry,
             services=frozenset(service.name for service in self.registry),
             objects=ObjectRefs(store, self.settings.serving, self.settings.data.quota_bytes),
-            server_id="s-1",
-            max_message_bytes=self.settings.session.max_message_bytes,
-            clocks=self.clocks,
-            metrics=self.metrics,
-            log=log,
         )
         connections: set[RobotConnection] = set()
         self.token_watch = TokenWatch(
+            self.context,
             connections,
             self.handshake,
-            clocks=self.clocks,
-            loop=self.loop,
-            log=log,
-            metrics=self.metrics,
             tell=lambda **message: self.told.append(message),
-            recorder=AuditRecorder(self.clocks, loop=self.loop, tell=None),
+            recorder=AuditRecorder(self.clocks, loop=self.loop, tell=self.told.append, is_on=False),
         )
         self.dispatcher = Dispatcher(
-            settings=self.settings,
+            self.context,
             registry=self.registry,
-            server_id="s-1",
-            clocks=self.clocks,
-            loop=self.loop,
-            log=log,
-            metrics=self.metrics,
             connections=connections,
             new_session_id=lambda: "session-1",
             admission=self.admission,
