@@ -115,17 +115,26 @@ class JobManager:
         """
         if self._leaving:
             return
+        command = queued.command
         try:
-            request = self._request_of(queued)
+            key = job_key(command.service, command.payload, self._settings_digest)
         except BadRequest as error:
             self._fail(queued, error)
             return
-        name = (request.tenant, request.robot, request.key)
+        name = (queued.owner.tenant, queued.robot, key)
         entry = self._entries.get(name)
         if entry is not None and (entry.signals.cancelled or entry.signals.giving_up):
             entry.resubmitted.append(queued)
             return
         if entry is None:
+            request = JobRequest(
+                service=command.service,
+                payload=command.payload,
+                tenant=queued.owner.tenant,
+                robot=queued.robot,
+                key=key,
+                quota_bytes=quota_bytes(queued.owner.claims, self._context.settings.data.quota_bytes),
+            )
             if not self._has_capacity(request):
                 self._fail(queued, _too_many())
                 return
@@ -186,18 +195,6 @@ class JobManager:
         for waiter in waiters:
             self._fail(waiter.queued, _too_many())
         return True
-
-    def _request_of(self, queued: QueuedCommand) -> JobRequest:
-        command = queued.command
-        key = job_key(command.service, command.payload, self._settings_digest)
-        return JobRequest(
-            service=command.service,
-            payload=command.payload,
-            tenant=queued.owner.tenant,
-            robot=queued.robot,
-            key=key,
-            quota_bytes=quota_bytes(queued.owner.claims, self._context.settings.data.quota_bytes),
-        )
 
     def _begin(self, entry: _Entry) -> None:
         owner = self._new_owner()

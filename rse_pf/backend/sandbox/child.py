@@ -34,15 +34,16 @@ _SYSTEM_PATHS = ("/usr", "/lib", "/lib64", "/bin", "/etc/ld.so.cache", "/etc/loc
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SandboxPlan:
-    """What every sandbox of a server has in common."""
+    """What every sandbox of a server has in common.
+
+    ``max_bytes`` limits a reply, and ``missing`` names the means of isolation that this kernel lacks.
+    """
 
     services: Mapping[str, InstalledService]
     memory_bytes: int
     scratch_bytes: int
     max_bytes: int
-    """Of a reply, and of a snapshot."""
     missing: Sequence[str]
-    """Means of isolation that this kernel lacks; the operator accepted that."""
 
 
 def readable_paths(services: Sequence[InstalledService]) -> list[Path]:

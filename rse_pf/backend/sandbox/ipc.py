@@ -101,7 +101,6 @@ class IpcChannel:
         self._output, self.their_output = os.pipe()
         self._unsent = bytearray()
         self._lines = 0
-        self._closed = False
         self._socket.setblocking(False)
         os.set_blocking(self._output, False)
 
@@ -119,10 +118,9 @@ class IpcChannel:
 
     def close(self) -> None:
         """Read what was printed last, and close both."""
-        if self._closed:
+        if self._socket.fileno() < 0:
             return
         self._read_output()
-        self._closed = True
         self._loop.remove_reader(self._output)
         self._loop.remove_reader(self._socket.fileno())
         self._loop.remove_writer(self._socket.fileno())
@@ -130,7 +128,7 @@ class IpcChannel:
         os.close(self._output)
 
     def _flush(self) -> None:
-        if self._closed:
+        if self._socket.fileno() < 0:
             return
         try:
             del self._unsent[: self._socket.send(self._unsent)]
@@ -165,7 +163,7 @@ class IpcChannel:
         self._on_fault(why)
 
     def _read_output(self) -> None:
-        if self._closed:
+        if self._socket.fileno() < 0:
             return
         try:
             text = os.read(self._output, _READ_BYTES)

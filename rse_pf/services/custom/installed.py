@@ -38,7 +38,6 @@ LANGUAGES: tuple[str, ...] = get_args(_Language)
 ENTRY_POINTS = "rse_pf.services"
 """Entry-point group by which Python packages publish services: ``name = "package.module"``."""
 
-_PACKAGE = "package"
 _MANIFEST, _PINS = "service.json", "pins.json"
 _NAME = re.compile(r"[a-z][a-z0-9_-]{0,39}")
 _IGNORED = {
@@ -165,7 +164,7 @@ def published_services() -> list[InstalledService]:
         spec = importlib.util.find_spec(top)
         folder = Path(spec.origin).parent if spec is not None and spec.origin else Path()
         found[point.name] = InstalledService(
-            name=point.name, language=_PACKAGE, entry=point.value, kind="per_robot_state", folder=folder
+            name=point.name, language="package", entry=point.value, kind="per_robot_state", folder=folder
         )
     return sorted(found.values(), key=lambda service: service.name)
 

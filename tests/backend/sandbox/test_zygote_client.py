@@ -1,0 +1,102 @@
+"""A worker's zygote: how it starts, what it is ordered, and what it reports."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import socket
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+
+from rse_pf.backend.sandbox.ipc import receive
+from rse_pf.backend.sandbox.zygote_client import ZygoteClient
+from rse_pf.config import PlatformSettings
+from rse_pf.errors import ConfigurationError
+
+pytestmark = pytest.mark.system
+SETTINGS = PlatformSettings.from_dict({"services": {"accept_weak_isolation": True}})
+WAIT_S = 20.0
+
+
+class Log:
+    """Events by name."""
+
+    def __init__(self) -> None:
+        self.events: list[str] = []
+
+    def info(self, event: str, **_: Any) -> None:
+        self.events.append(event)
+
+    warning = error = info
+
+
+class Reports:
+    """What a zygote reported: the number of each sandbox that ended, and its own end as -1."""
+
+    def __init__(self) -> None:
+        self.ends: asyncio.Queue[tuple[int, str]] = asyncio.Queue()
+
+    def gone(self, number: int, how: str) -> None:
+        self.ends.put_nowait((number, how))
+
+    def lost(self) -> None:
+        self.ends.put_nowait((-1, "lost"))
+
+
+def run(test: Callable[[ZygoteClient, Reports, Log], Any]) -> None:
+    """Run *test* with a zygote that has no services, and end the zygote."""
+
+    async def with_zygote() -> None:
+        reports, log = Reports(), Log()
+        zygote = ZygoteClient(
+            [], SETTINGS, loop=asyncio.get_running_loop(), log=log, on_gone=reports.gone, on_lost=reports.lost
+        )
+        try:
+            await asyncio.wait_for(test(zygote, reports, log), WAIT_S)
+        finally:
+            zygote.close()
+
+    asyncio.run(with_zygote())
+
+
+async def create(zygote: ZygoteClient, number: int) -> socket.socket:
+    """Create sandbox *number*, wait until it is ready, and return the worker's end of its channel."""
+    ours, theirs = socket.socketpair()
+    output = os.open(os.devnull, os.O_WRONLY)
+    try:
+        assert zygote.create(number, theirs, output)
+    finally:
+        theirs.close()
+        os.close(output)
+    ours.settimeout(WAIT_S)
+    assert await asyncio.to_thread(receive, ours) == ["ready"]
+    return ours
+
+
+def test_a_sandbox_that_is_ended_is_reported_with_its_number_and_signal() -> None:
+    async def test(zygote: ZygoteClient, reports: Reports, log: Log) -> None:
+        with await create(zygote, 7), await create(zygote, 8):
+            zygote.end(7)
+            zygote.end(7)
+
+            assert await reports.ends.get() == (7, "signal SIGKILL")
+
+    run(test)
+
+
+def test_a_sandbox_whose_channel_is_closed_ends_by_itself() -> None:
+    async def test(zygote: ZygoteClient, reports: Reports, log: Log) -> None:
+        (await create(zygote, 3)).close()
+
+        assert await reports.ends.get() == (3, "exit code 0")
+
+    run(test)
+
+
+def test_a_zygote_that_does_not_start_is_a_typed_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sys.executable", "/bin/false")
+
+    with pytest.raises(ConfigurationError, match="did not start"):
+        run(lambda *_: asyncio.sleep(0))
