@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from rse_pf.audit.log import record_once
-from rse_pf.aws.storage.audit_ship import Shipper
+from rse_pf.aws.storage.audit_archive import Shipper
 from rse_pf.aws.storage.s3_store import S3Store
 from rse_pf.cli.main import main
 

@@ -29,7 +29,7 @@ from rse_pf.aws.clients import call_api, make_client
 from rse_pf.aws.fleet.drain_hook import leave_group
 from rse_pf.aws.fleet.instance import Instance
 from rse_pf.aws.fleet.metrics import ServerMetrics, datums, read_page
-from rse_pf.aws.storage.audit_ship import Shipper
+from rse_pf.aws.storage.audit_archive import Shipper
 from rse_pf.aws.storage.s3_store import open_bucket
 from rse_pf.config import PlatformSettings, load_settings
 from rse_pf.errors import NotFound, RsePfError

@@ -14,16 +14,11 @@ from rse_pf.config import PlatformSettings
 from rse_pf.errors import Disconnected
 from rse_pf.scaling.health import time_to_notice_s
 
-__all__ = ["leave_group", "wait_before_move_s"]
+__all__ = ["leave_group"]
 
 _POLL_S = 0.5
 # Kept of the hook's time for the call that completes it, with its retries.
 _RESERVE_S = 15.0
-
-
-def wait_before_move_s(settings: PlatformSettings) -> float:
-    """Return how long a load balancer may go on sending robots after the server says not ready."""
-    return time_to_notice_s(settings.health, local=False)
 
 
 def leave_group(
@@ -44,7 +39,8 @@ def leave_group(
     until = clock() + settings.cloud.drain_s - _RESERVE_S
     has_ended = False
     try:
-        machine.drain(min(wait_before_move_s(settings), settings.cloud.drain_s / 3))
+        # The load balancer sends robots until it has noticed that the server is not ready.
+        machine.drain(min(time_to_notice_s(settings.health, local=False), settings.cloud.drain_s / 3))
         while clock() < until:
             machine.page()
             sleep(_POLL_S)

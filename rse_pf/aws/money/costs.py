@@ -1,6 +1,6 @@
 """Estimate what a load costs a month on the EC2 fleet and on the Lambda.
 
-A server takes commands up to ``scaling.busy_cpu_percent``; the fleet has as many servers as that needs, but
+A server accepts commands up to ``scaling.busy_cpu_percent``; the fleet has as many servers as that needs, but
 never fewer than ``scaling.min_servers``.  What the estimate leaves out is in `NOT_INCLUDED`.
 """
 
@@ -23,7 +23,7 @@ __all__ = [
 ]
 
 HOURS = 730.0
-"""Hours of a month, as AWS counts."""
+"""Hours of a month, as in the calculator of AWS."""
 NOT_INCLUDED = (
     "taxes, data out to the robots (the same for both), stored maps and logs, WAF by the handshake, "
     "savings plans, the free tier"
@@ -37,7 +37,7 @@ _MB_OF_A_VCPU = 1769
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Load:
-    """What robots ask while they are at work."""
+    """How many robots send how many commands, and for how long each day."""
 
     robots: int
     fps: float
@@ -45,22 +45,22 @@ class Load:
 
     @property
     def commands_per_s(self) -> float:
-        """Of all robots together, in their hours."""
+        """Return the commands per second of all robots together, in their hours."""
         return self.robots * self.fps
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Costs:
-    """What a load costs a month, in the currency of the prices, and what that buys."""
+    """What a load costs a month, in the currency of the prices, and the capacity that it needs."""
 
     floor: float
-    """The fleet when nobody asks."""
+    """Cost of the fleet without any command."""
     fleet: float
     serverless: float
     servers: int
-    """Servers that the fleet needs in its busy hours."""
+    """Servers that the fleet needs in the busy hours."""
     executions: float
-    """Executions that the Lambda needs at once."""
+    """Concurrent executions that the Lambda needs."""
     crossing_commands_per_s: float | None
 
 
@@ -110,13 +110,13 @@ def crossing_commands_per_s(
 
 
 class _Tariff:
-    """What one unit of everything costs under *settings*, for robots of *fps*."""
+    """The cost of a server, a command and an execution under *settings*, for robots of *fps*."""
 
     def __init__(self, settings: PlatformSettings, prices: Prices, fps: float) -> None:
         busy = settings.scaling.busy_cpu_percent / 100
         memory_mb = settings.cloud.lambda_memory_mb
         self.capacity_per_s = prices.server_vcpus * busy / (prices.command_cpu_ms / 1e3)
-        # The balancer counts connections or bytes, whichever is more.
+        # AWS counts connections or bytes of the load balancer, whichever costs more.
         units = max(1 / fps / _CONNECTIONS_OF_A_UNIT, 3600 * prices.command_bytes / _BYTES_OF_A_UNIT)
         self.units_per_command = prices.balancer_unit_per_hour * units
         # A warm execution; less memory is less of a vCPU.

@@ -1,7 +1,7 @@
 """Find what is still in an account after `cdk destroy`: what was kept on purpose, and what was forgotten.
 
-Everything of ours carries the tag ``rse-pf`` or a name that begins with ours; what a living stack owns is no
-leftover.  Promises to delete nothing, and to say for each how a person would.
+Resources of the platform have the tag ``rse-pf`` or a name with one of our prefixes; what an existing stack
+owns is not left over.  Nothing is deleted; each leftover names the command that deletes it.
 """
 
 from __future__ import annotations
@@ -27,7 +27,10 @@ _KEPT = {
 
 @dataclass(frozen=True, slots=True, kw_only=True, order=True)
 class Leftover:
-    """One thing that is still there; ``remove`` is a command.  ``unread``: perhaps it is not ours."""
+    """A resource that is left over; ``remove`` is the command that deletes it.
+
+    ``unread`` means that it could not be inspected, so that it may belong to somebody else.
+    """
 
     kind: str
     name: str
@@ -37,14 +40,14 @@ class Leftover:
 
 
 def living_stacks(account: Account) -> list[str]:
-    """Return the names of our stacks that stand."""
+    """Return the names of our stacks that exist."""
     found = account.pages("cloudformation", "describe_stacks", "Stacks")
     names = [row["StackName"] for row in found if row["StackStatus"] not in _GONE]
     return sorted(name for name in names if name.startswith(_STACKS))
 
 
 def find_leftovers(account: Account) -> list[Leftover]:
-    """Return what no living stack owns, sorted by kind and name; raises as `Account.find`."""
+    """Return what no existing stack owns, sorted by kind and name; raises as `Account.find`."""
     owned = {
         str(row.get("PhysicalResourceId", ""))
         for stack in living_stacks(account)

@@ -1,6 +1,6 @@
 """The prices that an estimate is made from: a dated file for one region, without taxes.
 
-`rse_pf/aws/money/prices.json` is ours; ``rse-pf cloud cost --prices FILE`` replaces its values.
+`rse_pf/aws/money/prices.json` holds the defaults; ``rse-pf cloud cost --prices FILE`` replaces them.
 """
 
 from __future__ import annotations
@@ -29,14 +29,14 @@ class Prices(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     region: str
     currency: str
     source: str
-    """Who read them, and where."""
+    """Where the prices were read, and by whom."""
     instance_type: str
     """The type of server that the prices of a server are for."""
     server_vcpus: _Count
     server_per_hour: _Price
     """One server, on demand."""
     server_per_month: _Price
-    """What comes to the hours of a server: 8 GB of gp3, seven detailed metrics and one of ours."""
+    """Cost of a server beside its hours: 8 GB of gp3, seven detailed metrics and one of ours."""
     balancer_per_hour: _Price
     """The load balancer with two public addresses."""
     balancer_unit_per_hour: _Price

@@ -1,6 +1,7 @@
-"""Check that an account can take the platform before anything is created: room, certificate, bootstrap.
+"""Check before a deployment that the account allows it: quotas, certificate, bootstrap.
 
-Each check stands alone: one that may not be made warns, and the next follows.  Promises to change nothing.
+The checks are independent: one that AWS does not permit gives a warning, and the next one follows.  Nothing
+is changed.
 """
 
 from __future__ import annotations
@@ -19,13 +20,13 @@ __all__ = ["Check", "check_account"]
 _BOOTSTRAP = "/cdk-bootstrap/hnb659fds/version"
 _VCPUS, _EXECUTIONS, _VPCS = ("ec2", "L-1216C47A"), ("lambda", "L-B99A9384"), ("vpc", "L-F678F1CE")
 _ALWAYS_UNRESERVED = 100
-"""Executions of an account that no function may reserve."""
+"""AWS keeps this many executions of an account for functions without a reservation."""
 _NETWORK_STACK = "RsePf-Network"
 _ASK_FOR_MORE = "ask for more in the Service Quotas console"
 
 
 class Check(NamedTuple):
-    """One line: ``grade`` is ok, warn or fail; ``fix`` says what to do unless it is ok."""
+    """The result of one check: ``grade`` is ok, warn or fail; ``fix`` says what to do unless it is ok."""
 
     grade: str
     what: str
@@ -33,10 +34,10 @@ class Check(NamedTuple):
 
 
 def check_account(account: Account, settings: PlatformSettings) -> Iterator[Check]:
-    """Yield what is found.
+    """Yield the result of each check.
 
     Raises:
-        ConfigurationError: AWS does not know who asks.
+        ConfigurationError: AWS does not accept the credentials.
         StoreError: AWS does not answer.
     """
     who = account.find("sts", "get_caller_identity") or {}
@@ -105,7 +106,7 @@ def _instance_type(account: Account, settings: PlatformSettings) -> Check:
 
 
 def _vcpus(account: Account, settings: PlatformSettings) -> Check:
-    # An instance that drains stands beside the one that follows it.
+    # An instance that drains still runs when its replacement starts.
     needed = (settings.scaling.max_servers + 1) * load_prices().server_vcpus
     return _enough(
         account, _VCPUS, needed, "vCPUs of on-demand instances for scaling.max_servers and one more"
@@ -128,7 +129,7 @@ def _enough(account: Account, quota: tuple[str, str], needed: int, what: str) ->
     service, code = quota
     asked = {"ServiceCode": service, "QuotaCode": code}
     found = account.find("service-quotas", "get_service_quota", **asked)
-    if found is None:  # nobody ever asked for another than AWS's own
+    if found is None:  # the account has the default of AWS
         found = account.find("service-quotas", "get_aws_default_service_quota", **asked)
     if found is None:
         return Check("warn", f"quota {service} {code} is not told; needed are {needed} {what}", _ASK_FOR_MORE)

@@ -16,8 +16,7 @@ from rse_pf.auth.tokens import SigningKey
 from rse_pf.auth.trust_store import DENY_NAME, AccessControlStore
 from rse_pf.aws.clients import make_client
 from rse_pf.aws.fleet.agent import Agent, AgentConfig, main
-from rse_pf.aws.storage.audit_archive import fetch_audit
-from rse_pf.aws.storage.audit_ship import Shipper
+from rse_pf.aws.storage.audit_archive import Shipper, fetch_audit
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import StoreError
 from rse_pf.object_store import MemoryStore

@@ -6,9 +6,9 @@ import boto3
 from aws.fleet.fake_machine import FakeMachine, FakeScaling
 from botocore.stub import Stubber
 
-from rse_pf.aws.fleet.drain_hook import leave_group, wait_before_move_s
+from rse_pf.aws.fleet.drain_hook import leave_group
 from rse_pf.config import PlatformSettings
-from rse_pf.scaling.health import CLOUD_TIMEOUT_S
+from rse_pf.scaling.health import CLOUD_TIMEOUT_S, time_to_notice_s
 
 SETTINGS = PlatformSettings()
 
@@ -59,12 +59,11 @@ def test_robots_move_only_after_the_load_balancer_has_noticed() -> None:
 
     health = SETTINGS.health
     assert machine.waits == [health.cloud_interval_s * health.unhealthy_checks + CLOUD_TIMEOUT_S]
-    assert wait_before_move_s(SETTINGS) == machine.waits[0]
 
 
 def test_the_whole_drain_fits_into_the_hook_by_default() -> None:
     longest_s = (
-        wait_before_move_s(SETTINGS)
+        time_to_notice_s(SETTINGS.health, local=False)
         + SETTINGS.serving.drain_within_ms / 1e3
         + SETTINGS.session.answer_timeout_s
     )

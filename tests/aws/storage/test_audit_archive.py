@@ -11,8 +11,7 @@ from rse_pf.audit.log import AuditLog, files_of
 from rse_pf.audit.verify import Verdict, check_folder
 from rse_pf.aws.account import Account
 from rse_pf.aws.clients import make_client
-from rse_pf.aws.storage.audit_archive import fetch_audit, open_audit_archive
-from rse_pf.aws.storage.audit_ship import Shipper, piece_name
+from rse_pf.aws.storage.audit_archive import Shipper, fetch_audit, open_audit_archive, piece_name
 from rse_pf.aws.storage.s3_store import S3Store
 from rse_pf.errors import ConfigurationError, StoreError
 from rse_pf.object_store import MemoryStore
