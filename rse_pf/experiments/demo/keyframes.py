@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -20,19 +19,9 @@ from rse_pf.config import DataSettings
 from rse_pf.experiments.demo.merge import commit
 from rse_pf.maps.format import Keyframe, MapVersion, encode_map
 
-__all__ = ["KeyframeCollector", "KeyframeSink", "KeyframeUploads"]
+__all__ = ["KeyframeCollector", "KeyframeUploads"]
 
 _UPLOAD_TIMEOUT_S = 30.0
-
-
-class KeyframeSink(Protocol):
-    """Receives the keyframes and the map of a robot."""
-
-    def keyframe(self, data: bytes) -> None:
-        """Take an encoded map of one keyframe; must not block."""
-
-    def finish(self, robot: str, data: bytes) -> int:
-        """Take the whole map of the robot; return how many keyframes have arrived."""
 
 
 class KeyframeUploads:
@@ -56,7 +45,10 @@ class KeyframeUploads:
         self._background.add(data)
 
     def finish(self, robot: str, data: bytes) -> int:
-        """Wait for the keyframes, commit the map under the name of the robot, and close the connections."""
+        """Wait for the keyframes, commit the map under the name of the robot, and close the connections.
+
+        Returns how many keyframes have arrived.
+        """
         try:
             self._background.wait_sent(_UPLOAD_TIMEOUT_S)
             commit(self._client, robot, data, "a drive of the demo")
@@ -69,19 +61,17 @@ class KeyframeUploads:
 class KeyframeCollector:
     """Collects the keyframes of one robot."""
 
-    def __init__(self, robot: str, options: FrontEndOptions, sink: KeyframeSink | None = None) -> None:
+    def __init__(self, robot: str, options: FrontEndOptions, uploads: KeyframeUploads) -> None:
         """Start without keyframes.
 
         Args:
             robot: Name of the robot, which its keyframes carry.
             options: Options of its tracker: features are extracted again with the same ones.
-            sink: Receives each keyframe, encoded as a map of one, and the map.
+            uploads: Takes each keyframe, encoded as a map of one, and the map.
         """
-        self.uploaded = 0
-        """Keyframes that have arrived, once the map was shared."""
         self._robot = robot
         self._options = options
-        self._sink = sink
+        self._uploads = uploads
         self._keyframes: list[Keyframe] = []
 
     def __len__(self) -> int:
@@ -103,8 +93,7 @@ class KeyframeCollector:
             points_camera=found.points_camera.astype(np.float32),
         )
         self._keyframes.append(keyframe)
-        if self._sink is not None:
-            self._sink.keyframe(encode_map(MapVersion(keyframes=(keyframe,))))
+        self._uploads.keyframe(encode_map(MapVersion(keyframes=(keyframe,))))
 
     def encoded_map(self, points: npt.NDArray[np.float32], colours: npt.NDArray[np.uint8]) -> bytes:
         """Return the robot's map with its cloud, ``(n, 3)`` metres and ``(n, 3)`` uint8."""
@@ -116,11 +105,6 @@ class KeyframeCollector:
         )
         return encode_map(version)
 
-    def share(self, data: bytes) -> None:
-        """Send the whole map to the sink, and wait until it has arrived.
-
-        Raises:
-            RsePfError: The sink refused it.
-        """
-        if self._sink is not None:
-            self.uploaded = self._sink.finish(self._robot, data)
+    def share(self, data: bytes) -> int:
+        """Upload the whole map, and return how many keyframes have arrived; raises RsePfError."""
+        return self._uploads.finish(self._robot, data)

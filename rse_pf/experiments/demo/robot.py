@@ -20,10 +20,9 @@ from client_sdk.frontend import Frame, FrontEndOptions, PoseQuery, TrackedFrame,
 from client_sdk.mapping import MapOptions, PointMap, Trajectory, write_ply, write_trajectory
 from rse_pf.config import DataSettings, SessionSettings
 from rse_pf.errors import RsePfError
-from rse_pf.experiments.child_process import ChildFailed, ChildReady
+from rse_pf.experiments.child_process import ChildFailed, ChildReady, ParentPipe
 from rse_pf.experiments.demo.keyframes import KeyframeCollector, KeyframeUploads
 from rse_pf.experiments.demo.merge import MAP_FILE
-from rse_pf.experiments.demo.parent_pipe import ParentPipe
 from rse_pf.experiments.results.records import CommandRecord
 from rse_pf.geometry import Array
 from rse_pf.pnp import PnpOptions
@@ -82,7 +81,6 @@ class FrameDone:
     """From the robot: a frame was loaded or, after the start, tracked."""
 
     frames: int
-    lost: bool = False
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -154,10 +152,10 @@ async def _run(spec: RobotSpec, pipe: ParentPipe) -> None:
                 if collector is not None:
                     await asyncio.to_thread(collector.add, done)
             drive.tracked.append(done)
-            pipe.send(FrameDone(row + 1, done.lost))
+            pipe.send(FrameDone(row + 1))
         took_s = time.monotonic() - first_s
         trajectory = _trajectory(drive.tracked)
-        await asyncio.to_thread(_write, spec.folder, point_map, trajectory, collector)
+        uploaded = await asyncio.to_thread(_write, spec.folder, point_map, trajectory, collector)
         pipe.send(
             RobotFinished(
                 frames=tracker.frames,
@@ -175,7 +173,7 @@ async def _run(spec: RobotSpec, pipe: ParentPipe) -> None:
                 stats={
                     "reconnects": robot.stats.reconnects,
                     "resent": robot.stats.resent,
-                    "keyframes_uploaded": 0 if collector is None else collector.uploaded,
+                    "keyframes_uploaded": uploaded,
                 },
             )
         )
@@ -288,11 +286,13 @@ def _collector(
 
 def _write(
     folder: Path, point_map: PointMap, trajectory: Trajectory, collector: KeyframeCollector | None
-) -> None:
+) -> int:
+    """Write the files of the robot, upload its map, and return how many keyframes were uploaded."""
     points, colours = point_map.points(min_readings=_MIN_READINGS)
     write_ply(folder / "map.ply", points, colours)
     write_trajectory(folder / "trajectory.txt", trajectory)
-    if collector is not None:
-        data = collector.encoded_map(points, colours)
-        (folder / MAP_FILE).write_bytes(data)
-        collector.share(data)
+    if collector is None:
+        return 0
+    data = collector.encoded_map(points, colours)
+    (folder / MAP_FILE).write_bytes(data)
+    return collector.share(data)

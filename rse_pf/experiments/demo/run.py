@@ -9,11 +9,11 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import time
-from collections.abc import AsyncIterator, Callable, Mapping
+from collections.abc import AsyncIterator, Callable
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
@@ -43,6 +43,9 @@ from rse_pf.experiments.results.result_folder import (
 )
 from rse_pf.local.control.platform import LocalPlatform
 
+if TYPE_CHECKING:
+    from rich.progress import Progress, TaskID
+
 __all__ = ["DemoOptions", "run_demo"]
 
 T = TypeVar("T")
@@ -57,6 +60,7 @@ class _Robot:
     spec: RobotSpec
     process: Any
     pipe: Connection
+    bar: TaskID
     finished: RobotFinished | None = None
 
 
@@ -90,21 +94,23 @@ async def _run(
     def now() -> float:
         return time.monotonic() - origin
 
-    def record(event: Mapping[str, Any]) -> None:
-        events.write(now(), str(event["event"]), **{k: v for k, v in event.items() if k != "event"})
-
-    screen = _Screen(options.quiet)
-    with screen.progress:
+    with _progress_bars(options.quiet) as screen:
         screen.print("starting the platform: Envoy and two backend servers")
         async with LocalPlatform(
-            settings, port=0, state=folder / "platform", name="demo", on_event=record, data=options.merge
+            settings,
+            port=0,
+            state=folder / "platform",
+            name="demo",
+            on_event=lambda event: events.copy(event, now()),
+            data=options.merge,
         ) as platform:
             pids = ", ".join(f"{server.name} {server.pid}" for server in platform.servers)
             screen.print(f"running at {platform.url}: {pids}")
             screen.print("kill -9 one of these processes: the robots continue on the other server")
             samples = asyncio.create_task(_sample(platform, folder / SAMPLES, now))
             robots = [
-                _start(options, settings, folder, platform.url, number) for number in range(options.robots)
+                _start(options, settings, folder, platform.url, number, screen)
+                for number in range(options.robots)
             ]
             try:
                 await _follow(robots, platform, screen, events, now)
@@ -124,7 +130,9 @@ async def _run(
     return _write_results(options, folder, finished, before, merged)
 
 
-def _start(options: DemoOptions, settings: PlatformSettings, folder: Path, url: str, number: int) -> _Robot:
+def _start(
+    options: DemoOptions, settings: PlatformSettings, folder: Path, url: str, number: int, screen: Progress
+) -> _Robot:
     name = _name(number)
     (folder / name).mkdir()
     spec = RobotSpec(
@@ -137,27 +145,28 @@ def _start(options: DemoOptions, settings: PlatformSettings, folder: Path, url: 
         data_settings=settings.data,
     )
     process, pipe = start_process(run_robot, spec, name)
-    return _Robot(spec=spec, process=process, pipe=pipe)
+    phase = "rendering the world" if options.data is None else "reading the recording"
+    bar = screen.add_task(f"{name}  {phase}", total=options.frame_count)
+    return _Robot(spec=spec, process=process, pipe=pipe, bar=bar)
 
 
 async def _follow(
-    robots: list[_Robot], platform: LocalPlatform, screen: _Screen, events: EventLog, now: Callable[[], float]
+    robots: list[_Robot],
+    platform: LocalPlatform,
+    screen: Progress,
+    events: EventLog,
+    now: Callable[[], float],
 ) -> None:
     """Wait until all robots are ready, start them together, and follow them to their end."""
     inboxes = [_messages(robot.pipe) for robot in robots]
-    screen.phase(
-        "rendering the world" if robots[0].spec.options.data is None else "reading the recording", robots
-    )
     ready = await asyncio.gather(
         *(_wait_for(ChildReady, *pair, platform, screen) for pair in zip(robots, inboxes, strict=True))
     )
-    for robot, message in zip(robots, ready, strict=True):
-        screen.total(robot.spec.name, message.frames)
     began = time.monotonic() + 0.2
     events.write(now(), "robots-start", robots=len(robots))
     screen.print("the robots start")
-    screen.phase("mapping", robots)
-    for robot in robots:
+    for robot, message in zip(robots, ready, strict=True):
+        screen.reset(robot.bar, description=f"{robot.spec.name}  mapping", total=message.frames)
         robot.pipe.send(began)
     finished = await asyncio.gather(
         *(_wait_for(RobotFinished, *pair, platform, screen) for pair in zip(robots, inboxes, strict=True))
@@ -168,7 +177,7 @@ async def _follow(
 
 
 async def _wait_for(
-    kind: type[T], robot: _Robot, inbox: AsyncIterator[Any], platform: LocalPlatform, screen: _Screen
+    kind: type[T], robot: _Robot, inbox: AsyncIterator[Any], platform: LocalPlatform, screen: Progress
 ) -> T:
     """Handle the messages of *robot* until one of *kind* comes, and return that."""
     async for message in inbox:
@@ -180,9 +189,9 @@ async def _wait_for(
     )
 
 
-def _handle(robot: _Robot, message: Any, platform: LocalPlatform, screen: _Screen) -> None:
+def _handle(robot: _Robot, message: Any, platform: LocalPlatform, screen: Progress) -> None:
     if isinstance(message, FrameDone):
-        screen.advance(robot.spec.name, message)
+        screen.update(robot.bar, completed=message.frames)
     elif isinstance(message, TokenRequest):
         robot.pipe.send(IssuedToken(message.robot, platform.issue_token(message.robot)))
     elif isinstance(message, ChildFailed):
@@ -235,7 +244,7 @@ def _merge(
     folder: Path,
     finished: list[RobotFinished],
     platform: LocalPlatform,
-    screen: _Screen,
+    screen: Progress,
 ) -> dict[str, Any]:
     """Merge the maps that the robots have committed, on the platform."""
     names = [_name(number) for number in range(len(finished))]
@@ -288,37 +297,11 @@ def _write_results(
     return report
 
 
-class _Screen:
-    """Lines of text and a progress bar per robot on the terminal, or nothing if *quiet*."""
+def _progress_bars(quiet: bool) -> Progress:
+    """Return a progress bar per robot below the lines of text, or nothing if *quiet*."""
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-    def __init__(self, quiet: bool) -> None:
-        from rich.console import Console
-        from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
-
-        text = TextColumn("{task.description:<34}")
-        columns = (text, BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-        self.progress = Progress(*columns, console=Console(quiet=quiet))
-        self._tasks: dict[str, Any] = {}
-
-    def print(self, text: str) -> None:
-        """Print one line."""
-        self.progress.console.print(text, highlight=False)
-
-    def phase(self, name: str, robots: list[_Robot]) -> None:
-        """Restart the bars of *robots* for a phase."""
-        for robot in robots:
-            key = robot.spec.name
-            if key not in self._tasks:
-                self._tasks[key] = self.progress.add_task(
-                    f"{key}  {name}", total=robot.spec.options.frame_count
-                )
-            else:
-                self.progress.reset(self._tasks[key], description=f"{key}  {name}")
-
-    def total(self, name: str, frames: int) -> None:
-        """Set the number of frames of a robot."""
-        self.progress.update(self._tasks[name], total=frames)
-
-    def advance(self, name: str, done: FrameDone) -> None:
-        """Advance the bar of a robot."""
-        self.progress.update(self._tasks[name], completed=done.frames)
+    text = TextColumn("{task.description:<34}")
+    columns = (text, BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    return Progress(*columns, console=Console(quiet=quiet, highlight=False))

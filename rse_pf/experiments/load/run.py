@@ -106,14 +106,6 @@ def report_of(run: SwarmRun, result: SwarmResult, before: Mapping[str, Any]) -> 
 
 async def _run(run: SwarmRun, settings: PlatformSettings, events: EventLog) -> SwarmResult:
     origin = time.monotonic()
-
-    def record(event: Mapping[str, Any]) -> None:
-        details = {key: value for key, value in event.items() if key not in ("event", "time")}
-        events.write(float(event.get("time", time.monotonic() - origin)), str(event["event"]), **details)
-
-    def record_platform(event: Mapping[str, Any]) -> None:
-        record({key: value for key, value in event.items() if key != "time"})
-
     options = run.options
     async with AsyncExitStack() as stack:
         platform = run.platform
@@ -122,7 +114,13 @@ async def _run(run: SwarmRun, settings: PlatformSettings, events: EventLog) -> S
             state = Path(tempfile.mkdtemp(prefix="rse-pf-swarm-"))
             stack.callback(shutil.rmtree, state, ignore_errors=True)
             local = await stack.enter_async_context(
-                LocalPlatform(settings, state=state, port=0, name="swarm", on_event=record_platform)
+                LocalPlatform(
+                    settings,
+                    state=state,
+                    port=0,
+                    name="swarm",
+                    on_event=lambda event: events.copy(event, time.monotonic() - origin),
+                )
             )
             platform = TargetPlatform(local.url, local.issue_token)
         _say(run, f"{options.robots} robots send {options.fps:g} commands per second each to {platform.url}")
@@ -132,7 +130,7 @@ async def _run(run: SwarmRun, settings: PlatformSettings, events: EventLog) -> S
                 url=platform.url,
                 token_of=platform.token_of,
                 session=settings.session,
-                on_event=record,
+                on_event=lambda event: events.copy(event, float(event["time"])),
                 origin=origin,
             )
         )

@@ -11,7 +11,7 @@ import math
 import time
 from array import array
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from types import TracebackType
@@ -33,7 +33,6 @@ from rse_pf.experiments.child_process import (
 from rse_pf.experiments.load.swarm_process import (
     FinishSwarm,
     ResultRows,
-    RobotJoined,
     RobotsLeave,
     StartSwarm,
     SwarmEnded,
@@ -172,7 +171,7 @@ class Swarm:
         self._staying = [number for number in self._staying if number not in leaving]
         for child in self._children:
             child.pipe.send(RobotsLeave(tuple(sorted(leaving & set(child.numbers)))))
-        names = {self._name(number) for number in leaving}
+        names = {f"{self.options.robot_prefix}-{number + 1}" for number in leaving}
         await self._until(lambda: names <= self.left, self.options.deadline_s + _END_TIMEOUT_S, "leave")
 
     async def finish(self, grace_s: float = 5.0) -> SwarmResult:
@@ -183,22 +182,21 @@ class Swarm:
             lambda: all(child.ended is not None for child in self._children), grace_s + _END_TIMEOUT_S, "end"
         )
         wall_s = time.monotonic() - self._start_s
-        return self._result(wall_s, [child.ended for child in self._children if child.ended is not None])
-
-    def _result(self, wall_s: float, ended: Iterable[SwarmEnded]) -> SwarmResult:
-        last = list(ended)
+        ended = [child.ended for child in self._children if child.ended is not None]
+        totals = sum((each.counts for each in ended), Counter[str]())
         commands = [command for rows in self.rows for command in records_of(rows, self.options.robot_prefix)]
         late_ms = [1e3 * (command.sent - command.planned) for command in commands]
-        counts = Counter((command.robot, command.id) for command in commands)
         return SwarmResult(
             commands=commands,
-            cpu_s=round(sum(each.cpu_s for each in last), 3),
+            cpu_s=round(sum(each.cpu_s for each in ended), 3),
             wall_s=round(wall_s, 3),
-            wrong_poses=sum(each.wrong_poses for each in last),
-            reconnects=sum(each.reconnects for each in last),
-            resent=sum(each.resent for each in last),
-            moves=sum(each.moves for each in last),
-            duplicates=sum(each.duplicates for each in last) + sum(count - 1 for count in counts.values()),
+            wrong_poses=totals["wrong_poses"],
+            reconnects=totals["reconnects"],
+            resent=totals["resent"],
+            moves=totals["moves"],
+            duplicates=totals["duplicates"]
+            + len(commands)
+            - len({(each.robot, each.id) for each in commands}),
             link=self.options.link,
             late_sends_ms_p99=round(float(np.percentile(late_ms, 99)), 3) if late_ms else 0.0,
         )
@@ -221,9 +219,6 @@ class Swarm:
             self._children.append(child)
             loop.add_reader(pipe.fileno(), self._receive, child)
 
-    def _name(self, number: int) -> str:
-        return f"{self.options.robot_prefix}-{number + 1}"
-
     def _receive(self, child: _Child) -> None:
         try:
             while child.pipe.poll():
@@ -242,12 +237,11 @@ class Swarm:
         elif isinstance(message, TokenRequest):
             child.pipe.send(IssuedToken(message.robot, self._token_of(message.robot)))
         elif isinstance(message, SwarmEvent):
-            if message.event["event"] == "robot-left":
-                self.left.add(message.event["robot"])
+            members = {"robot-joined": self.joined, "robot-left": self.left}.get(message.event["event"])
+            if members is not None:
+                members.add(message.event["robot"])
             if self._on_event is not None:
                 self._on_event(message.event)
-        elif isinstance(message, RobotJoined):
-            self.joined.add(message.robot)
         elif isinstance(message, ChildReady):
             child.ready = True
         elif isinstance(message, ChildFailed):

@@ -14,6 +14,7 @@ import math
 import random
 import time
 from array import array
+from collections import Counter
 from dataclasses import dataclass, field
 from multiprocessing.connection import Connection
 from typing import Any
@@ -32,7 +33,6 @@ from rse_pf.wire.preencoded import PreencodedCommand, preencode
 __all__ = [
     "FinishSwarm",
     "ResultRows",
-    "RobotJoined",
     "RobotsLeave",
     "SolvedPayload",
     "StartSwarm",
@@ -131,13 +131,6 @@ class FinishSwarm:
 
 
 @dataclass(frozen=True, slots=True)
-class RobotJoined:
-    """From the process: a robot is connected and has sent its first command."""
-
-    robot: str
-
-
-@dataclass(frozen=True, slots=True)
 class SwarmEvent:
     """From the process: an event of the run; ``time`` as in the records."""
 
@@ -146,14 +139,10 @@ class SwarmEvent:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SwarmEnded:
-    """From the process: its robots have ended; ``duplicates`` counts answers that were delivered twice."""
+    """From the process: its robots have ended; ``counts`` has the counts of `SwarmResult` by their names."""
 
     cpu_s: float
-    wrong_poses: int
-    reconnects: int
-    resent: int
-    moves: int
-    duplicates: int
+    counts: Counter[str]
 
 
 @dataclass(slots=True)
@@ -347,15 +336,12 @@ class _Process:
             self.rows = ResultRows()
 
     def _ended(self, cpu_s: float) -> SwarmEnded:
-        stats = [robot.client.stats for robot in self._robots.values() if robot.client is not None]
-        return SwarmEnded(
-            cpu_s=cpu_s,
-            wrong_poses=self.wrong_poses,
-            reconnects=sum(each.reconnects for each in stats),
-            resent=sum(each.resent for each in stats),
-            moves=sum(each.moves for each in stats),
-            duplicates=sum(each.duplicates for each in stats),
-        )
+        counts = Counter(wrong_poses=self.wrong_poses)
+        for robot in self._robots.values():
+            if robot.client is not None:
+                names = ("reconnects", "resent", "moves", "duplicates")
+                counts.update({name: getattr(robot.client.stats, name) for name in names})
+        return SwarmEnded(cpu_s=cpu_s, counts=counts)
 
 
 class _Robot:
@@ -445,7 +431,6 @@ class _Robot:
         self._waiting[identity] = (planned, sent)
         if not self._has_joined:
             self._has_joined = True
-            process.send(RobotJoined(self.name))
             process.report("robot-joined", robot=self.name, server=self.client.stats.server)
 
     def _answered(self, identity: int, problem: SolvedPayload, event: Answered) -> None:

@@ -20,7 +20,7 @@ from typing import Any
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import CommandFailed
 from rse_pf.experiments.load.swarm import Swarm, SwarmOptions
-from rse_pf.experiments.paper.harness import event_details, generator_event, policy_parameters
+from rse_pf.experiments.paper.harness import generator_event, policy_parameters
 from rse_pf.experiments.results.records import (
     COMMANDS,
     EVENTS,
@@ -78,9 +78,7 @@ async def run_control_plane_fault(
                 url=before.url,
                 token_of=_token_maker(state_at, settings),
                 session=settings.session,
-                on_event=lambda event: log.write(
-                    float(event["time"]), str(event["event"]), **event_details(event)
-                ),
+                on_event=lambda event: log.copy(event, float(event["time"])),
                 origin=origin_s,
             )
             async with swarm:

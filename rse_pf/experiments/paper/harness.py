@@ -26,6 +26,7 @@ from rse_pf.experiments.results.records import (
     EventLog,
     Records,
     SampleLog,
+    event_details,
     sample_from_document,
     write_commands,
 )
@@ -34,7 +35,7 @@ from rse_pf.local.control.control_plane import ControlOptions
 from rse_pf.local.control.monitor import MonitorSample
 from rse_pf.local.control.platform import LocalPlatform
 
-__all__ = ["Harness", "event_details", "generator_event", "generator_of", "policy_parameters"]
+__all__ = ["Harness", "generator_event", "generator_of", "policy_parameters"]
 
 _SERVER_CHANGES = {
     "grow", "shrink", "replace", "server-launched", "server-healthy", "server-gone", "phase",
@@ -197,11 +198,6 @@ class Harness:
         self.samples.append(sample)
         self._sample_log.write(sample)
         self._changed.set()
-
-
-def event_details(event: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the fields of an event of platform or swarm but for its name and time."""
-    return {name: value for name, value in event.items() if name not in ("event", "time", "action")}
 
 
 def generator_event(result: SwarmResult) -> dict[str, Any]:

@@ -30,6 +30,7 @@ __all__ = [
     "EventLog",
     "Records",
     "SampleLog",
+    "event_details",
     "parameters_of",
     "read_commands",
     "read_records",
@@ -96,6 +97,15 @@ class EventLog:
         self._file.write(json.dumps({"time": round(time_s, 4), "action": action, **details}) + "\n")
         self._file.flush()
 
+    def copy(self, event: Event, time_s: float) -> None:
+        """Append an event of a platform or swarm, which has its name in the field ``event``."""
+        self.write(time_s, str(event["event"]), **event_details(event))
+
+
+def event_details(event: Event) -> dict[str, Any]:
+    """Return the fields of an event but for its name and time."""
+    return {name: value for name, value in event.items() if name not in ("event", "time", "action")}
+
 
 class SampleLog:
     """Samples of the monitor as CSV lines, each flushed at once."""
@@ -157,7 +167,7 @@ def parameters_of(records: Records) -> dict[str, Any]:
     """Return the parameters of the run, which its first event holds; raises UsageError without one."""
     for event in records.events:
         if event["action"] == "experiment":
-            return {name: value for name, value in event.items() if name not in ("time", "action")}
+            return event_details(event)
     raise UsageError(
         "the events do not say which experiment this was", hint=f"check the first line of {EVENTS}"
     )

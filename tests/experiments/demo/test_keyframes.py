@@ -55,6 +55,7 @@ def test_keyframes_are_kept_for_the_map_and_sent_once() -> None:
     np.testing.assert_allclose(sent.points_camera[:, 2], 2.0, atol=1e-4)
 
     whole = encode_map(version)
-    collector.share(whole)
+    uploaded = collector.share(whole)
+
     assert sink.maps == {"robot-1": whole}
-    assert collector.uploaded == 2
+    assert uploaded == 2

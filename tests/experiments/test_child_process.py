@@ -12,8 +12,7 @@ from multiprocessing.connection import Connection
 import pytest
 
 from rse_pf.errors import Disconnected
-from rse_pf.experiments.child_process import IssuedToken, TokenRequest
-from rse_pf.experiments.demo.parent_pipe import ParentPipe
+from rse_pf.experiments.child_process import IssuedToken, ParentPipe, TokenRequest
 
 
 def pair(clock: list[float]) -> tuple[ParentPipe, Connection]:
