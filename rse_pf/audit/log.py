@@ -58,7 +58,8 @@ SYNC_S = 0.1
 
 
 # How the current file of a chain ends.  Empty: it is missing or empty, because the writer stopped between
-# two files.  Torn: the last line, or the only one, is incomplete.  Unreadable: the last complete line is no entry.
+# two files.  Torn: the last line, or the only one, is incomplete.  Unreadable: the last complete line is no
+# entry.
 _Ending = Literal["empty", "complete", "torn", "torn-first-line", "unreadable"]
 _REASONS = {"empty": "interrupted", "torn-first-line": "torn"}
 

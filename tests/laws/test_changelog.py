@@ -7,7 +7,7 @@ import re
 from collections.abc import Mapping
 from pathlib import Path
 
-KINDS = ("settings", "options", "metrics", "classes", "imports")
+KINDS = ("settings", "options", "metrics", "classes", "members", "imports")
 """Of ``renamed.json``; its words are vocabulary, not names."""
 
 
