@@ -135,9 +135,8 @@ class ObjectRefs:
 
         If the reply is beyond the robot's quota, return the failure that says so.
         """
-        if self.store is None or not isinstance(answer, Result) or not isinstance(sent, Failure):
-            return sent
-        if sent.code != LimitExceeded.code:
+        is_too_large = isinstance(sent, Failure) and sent.code == LimitExceeded.code
+        if self.store is None or not isinstance(answer, Result) or not is_too_large:
             return sent
         reply = msgspec.msgpack.encode(answer.reply, enc_hook=binary_encode_hook)
         if len(reply) > self.settings.max_object_bytes_per_command:
@@ -195,11 +194,9 @@ def _shape_of(kind: Any, depth: int) -> Any:
     if isinstance(kind, known.UnionType):
         shapes = [shape for each in kind.types if (shape := _shape_of(each, depth)) is not None]
         return shapes[0] if len(shapes) == 1 else None
-    if isinstance(kind, (known.ListType, known.VarTupleType)):
-        below = _shape_of(kind.item_type, depth - 1)
-        return None if below is None else _Each(below)
-    if isinstance(kind, known.DictType):
-        below = _shape_of(kind.value_type, depth - 1)
+    if isinstance(kind, (known.ListType, known.VarTupleType, known.DictType)):
+        item = kind.value_type if isinstance(kind, known.DictType) else kind.item_type
+        below = _shape_of(item, depth - 1)
         return None if below is None else _Each(below)
     if isinstance(kind, (known.StructType, known.DataclassType)):
         fields = {field.encode_name: _shape_of(field.type, depth - 1) for field in kind.fields}

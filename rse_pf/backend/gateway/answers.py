@@ -64,7 +64,7 @@ class Answers:
         try:
             command = self.objects.put_in(command, self._registry, queued.owner)
         except RsePfError as error:
-            return self._encoded(queued, failure_of(error, command, server=self._context.server_id))
+            return self._failed(queued, error)
         message = dispatch(
             self._registry, command, monotonic, server=self._context.server_id, on_defect=self._log_defect
         )
@@ -111,9 +111,7 @@ class Answers:
     def send_refusal(self, refusal: RefusedCommand, now: float) -> None:
         """Answer a command that ends without compute."""
         self._context.metrics.shed[refusal.reason] += 1
-        queued = refusal.queued
-        failure = failure_of(refusal.error, queued.command, server=self._context.server_id)
-        self.send(EncodedAnswer(queued, failure, queued.owner.session.codec.encode(failure)), now)
+        self.send(self._failed(refusal.queued, refusal.error), now)
 
     def send_unread_refusal(
         self,
@@ -156,16 +154,18 @@ class Answers:
         except Exception as error:  # noqa: BLE001  the reply of a service may hold anything
             self._log_defect(command, error)
             defect = InternalError(f"the reply of {command.service!r} cannot be encoded")
-            message = failure_of(defect, command, server=self._context.server_id)
-            return EncodedAnswer(queued, message, codec.encode(message))
+            return self._failed(queued, defect)
         max_bytes = self._context.settings.session.max_message_bytes
         if len(data) <= max_bytes:
             return EncodedAnswer(queued, message, data)
         if isinstance(message, Result) and message.object and message.reply is not None:
             return self._encoded(queued, msgspec.structs.replace(message, reply=None))
         too_large = LimitExceeded(f"the reply has {len(data)} bytes, above {max_bytes}", hint="ask for less")
-        message = failure_of(too_large, command, server=self._context.server_id)
-        return EncodedAnswer(queued, message, codec.encode(message))
+        return self._failed(queued, too_large)
+
+    def _failed(self, queued: QueuedCommand, error: RsePfError) -> EncodedAnswer:
+        failure = failure_of(error, queued.command, server=self._context.server_id)
+        return EncodedAnswer(queued, failure, queued.owner.session.codec.encode(failure))
 
     def _log_defect(self, command: Command, error: BaseException) -> None:
         text = "".join(traceback.format_exception(type(error), error, error.__traceback__))

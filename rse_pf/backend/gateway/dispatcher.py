@@ -10,17 +10,18 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
-from rse_pf.backend.gateway.admission import DECODER_FULL, TOO_FAST, TOO_LATE, Admission
+from rse_pf.backend.gateway.admission import DECODER_FULL, TOO_FAST, TOO_LATE, Admission, UnreadRefusal
 from rse_pf.backend.gateway.answers import Answers, EncodedAnswer
 from rse_pf.backend.gateway.connection import RobotConnection
 from rse_pf.backend.gateway.decoder_thread import DecoderThread
 from rse_pf.backend.gateway.handshake import Accepted
 from rse_pf.backend.gateway.idle_timeouts import IdleTimeouts
-from rse_pf.backend.gateway.queues import JobQueue, SandboxQueue
 from rse_pf.backend.gateway.rate_limits import CUT_OFF
 from rse_pf.backend.gateway.token_watch import TokenWatch
+from rse_pf.backend.jobs.manager import JobManager
 from rse_pf.backend.metrics import LongestRecently
 from rse_pf.backend.ports import Handle, Wire, WorkerContext
+from rse_pf.backend.sandbox.manager import SandboxManager
 from rse_pf.backend.scheduling.cpu_throttle import BATCH_S, CpuThrottle
 from rse_pf.backend.scheduling.scheduler import (
     QUEUE_TARGET_S,
@@ -32,15 +33,42 @@ from rse_pf.backend.scheduling.thread_pool import SolverThreads
 from rse_pf.errors import UnknownService
 from rse_pf.service import Registry
 from rse_pf.wire import CODECS, Codec, Command, make_codec
-from rse_pf.wire.envelope import peek
+from rse_pf.wire.envelope import Envelope, peek
 from rse_pf.wire.server_session import CLOSE_GOING_AWAY, CLOSE_RATE, ServerSession
 
-__all__ = ["Dispatcher"]
+__all__ = ["Dispatcher", "JobQueue", "NoQueue", "SandboxQueue"]
 
 _DECODER_RETRY_MS = 500.0
 _UNMEASURED_TURN_S = 0.125
 """Sandboxes and jobs do not measure their turns: a robot whose queue is full waits this long for each of
 them."""
+
+
+class NoQueue:
+    """Stands for the sandboxes of a server without installed services, and for jobs that are switched off."""
+
+    held = 0
+
+    def offers(self, service: str) -> bool:
+        """Return False: no service is offered, so that nothing is ever submitted."""
+        return False
+
+    def waiting_of(self, robot: str) -> int:
+        """Return 0."""
+        return 0
+
+    def report(self) -> dict[str, Any]:
+        """Return nothing."""
+        return {}
+
+    def ignore(self, *_: Any) -> None:
+        """Do nothing."""
+
+    submit = connected = disconnected = left = withdraw = give_up = close = ignore
+
+
+SandboxQueue = SandboxManager | NoQueue
+JobQueue = JobManager | NoQueue
 
 
 class Dispatcher:
@@ -107,7 +135,7 @@ class Dispatcher:
         self._ran_inline = False
         self._throttle_timer: Handle | None = None
         self._sweep_timer: Handle | None = None
-        self._batched: list[tuple[Any, ...]] = []
+        self._batched: list[tuple[RobotConnection, Codec, Envelope, UnreadRefusal, float, int]] = []
         self._move: tuple[str, float] | None = None
         self._idle_timeouts = IdleTimeouts(settings.session, monotonic())
         self._lag_s = 0.0
@@ -199,7 +227,9 @@ class Dispatcher:
         if self._throttle_timer is None:
             answers.send_unread_refusal(connection, codec, envelope, TOO_LATE, retry_ms, len(data))
         else:
-            self._batch((connection, codec, envelope, TOO_LATE, retry_ms, len(data)))
+            if not self._batched:
+                self.context.loop.call_later(BATCH_S, self._send_batch)
+            self._batched.append((connection, codec, envelope, TOO_LATE, retry_ms, len(data)))
         return True
 
     def refuses_long(self, connection: RobotConnection, session: ServerSession, data: bytes) -> bool:
@@ -346,12 +376,6 @@ class Dispatcher:
     def _go_on(self) -> None:
         self._throttle_timer = None
         self._start()
-
-    def _batch(self, refusal: tuple[Any, ...]) -> None:
-        """Send *refusal*, arguments of `Answers.send_unread_refusal`, together with others."""
-        if not self._batched:
-            self.context.loop.call_later(BATCH_S, self._send_batch)
-        self._batched.append(refusal)
 
     def _send_batch(self) -> None:
         batched, self._batched = self._batched, []

@@ -65,7 +65,6 @@ class Migration:
         self._loop = loop
         self._now = now
         self._choose = choose
-        self._asked_until: dict[RobotConnection, float] = {}
 
     def begin(self, delays_s: Iterable[float], within_ms: float) -> None:
         """Ask one robot after each of *delays_s*; each gets *within_ms* to leave."""
@@ -74,12 +73,7 @@ class Migration:
 
     def _ask_one(self, within_ms: float) -> None:
         now = self._now()
-        present = list(self._connections)
-        self._asked_until = {each: self._asked_until.get(each, 0.0) for each in present}
-        candidates = [each for each in present if each.may_move and self._asked_until[each] <= now]
-        if not candidates:
-            return
-        chosen = self._choose(candidates)
-        self._asked_until[chosen] = now + within_ms / 1e3
-        self.asked += 1
-        chosen.move("rebalance", within_ms, now)
+        candidates = [each for each in self._connections if each.may_move and each.moving_until_s <= now]
+        if candidates:
+            self.asked += 1
+            self._choose(candidates).move("rebalance", within_ms, now)

@@ -163,7 +163,10 @@ class Scheduler:
             robot = self._robots[queued.robot] = _Robot()
         older = _replaceable(robot.waiting, queued)
         if older is not None:
-            return [self._replace(robot, older, queued)]
+            if queued.command.seq < older.command.seq:
+                return [_stale(queued)]
+            robot.waiting[robot.waiting.index(older)] = queued
+            return [_stale(older)]
         robot.waiting.append(queued)
         self.waiting += 1
         if robot.running is None and len(robot.waiting) == 1:
@@ -184,18 +187,19 @@ class Scheduler:
             robot = self._robots[name]
             queued = robot.waiting.popleft()
             self.waiting -= 1
-            refusal = self._give_up(robot, queued, now)
-            if refusal is None:
+            turn_wait_s = _turn_wait(robot, queued, now)
+            self._note_turn_wait(turn_wait_s, now)
+            if queued.deadline_s > now and not self._is_hopeless(robot, queued, now, len(self._turns)):
                 robot.running, queued.started_s = queued, now
                 self.running += 1
                 self._started += 1
-                self._measure_turn(_turn_wait(robot, queued, now), now)
+                self._measure_turn(turn_wait_s, now)
                 return queued, refusals
-            refusals.append(refusal)
+            refusals.append(self._refused_late(robot, queued, now))
             if robot.waiting:
                 self._turns.append(name)
             else:
-                self._forget_if_idle(name)
+                del self._robots[name]
         self._note_turn_wait(0.0, now)
         return None, refusals
 
@@ -209,7 +213,7 @@ class Scheduler:
         if robot.waiting:
             self._turns.append(queued.robot)
         else:
-            self._forget_if_idle(queued.robot)
+            del self._robots[queued.robot]
 
     def sweep(self, now: float) -> list[RefusedCommand]:
         """Give up what expired or waited too long, without starting anything."""
@@ -234,12 +238,9 @@ class Scheduler:
         """Drop the waiting commands of a connection that ended, and return them."""
         dropped: list[QueuedCommand] = []
         for name, robot in list(self._robots.items()):
-            gone = [queued for queued in robot.waiting if queued.owner is owner]
-            if gone:
-                dropped += gone
-                self._rewait(
-                    name, robot, deque(queued for queued in robot.waiting if queued.owner is not owner)
-                )
+            dropped += [queued for queued in robot.waiting if queued.owner is owner]
+            kept = deque(queued for queued in robot.waiting if queued.owner is not owner)
+            self._rewait(name, robot, kept)
         return dropped
 
     def oldest_wait_s(self, now: float) -> float:
@@ -256,18 +257,6 @@ class Scheduler:
         """
         saves_time = self.waiting == 0 or (self.is_behind and self._is_serial)
         return cheap and size_bytes <= INLINE_BYTES and saves_time and self.running <= 1
-
-    def _replace(self, robot: _Robot, older: QueuedCommand, newer: QueuedCommand) -> RefusedCommand:
-        if newer.command.seq < older.command.seq:
-            return _stale(newer)
-        robot.waiting[robot.waiting.index(older)] = newer
-        return _stale(older)
-
-    def _give_up(self, robot: _Robot, queued: QueuedCommand, now: float) -> RefusedCommand | None:
-        self._note_turn_wait(_turn_wait(robot, queued, now), now)
-        if queued.deadline_s <= now or self._is_hopeless(robot, queued, now, len(self._turns)):
-            return self._refused_late(robot, queued, now)
-        return None
 
     def _delay_s(self, robot: _Robot | None) -> float:
         """How long the next command of *robot* will wait: a round for each of its own, at most for all."""
@@ -329,14 +318,8 @@ class Scheduler:
             return
         self.waiting -= len(robot.waiting) - len(kept)
         robot.waiting = kept
-        if not kept:
-            if robot.running is None:
-                self._turns.remove(name)
-            self._forget_if_idle(name)
-
-    def _forget_if_idle(self, name: str) -> None:
-        robot = self._robots.get(name)
-        if robot is not None and robot.running is None and not robot.waiting:
+        if not kept and robot.running is None:
+            self._turns.remove(name)
             del self._robots[name]
 
 

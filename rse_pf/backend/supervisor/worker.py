@@ -28,10 +28,9 @@ from rse_pf.backend.gateway.answers import Answers
 from rse_pf.backend.gateway.audit_recorder import AuditRecorder
 from rse_pf.backend.gateway.connection import RobotConnection
 from rse_pf.backend.gateway.decoder_thread import DecoderThread
-from rse_pf.backend.gateway.dispatcher import Dispatcher
+from rse_pf.backend.gateway.dispatcher import Dispatcher, NoQueue
 from rse_pf.backend.gateway.handshake import HandshakePolicy
 from rse_pf.backend.gateway.migration import Migration
-from rse_pf.backend.gateway.queues import NoQueue
 from rse_pf.backend.gateway.token_watch import TokenWatch
 from rse_pf.backend.gateway.websocket import RobotSockets
 from rse_pf.backend.jobs.manager import JobManager

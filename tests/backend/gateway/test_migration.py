@@ -15,10 +15,12 @@ from rse_pf.backend.gateway.migration import Migration, plan
 class Connection:
     def __init__(self, *, may_move: bool = True) -> None:
         self.may_move = may_move
+        self.moving_until_s = float("-inf")
         self.asks: list[tuple[str, float, float]] = []
 
     def move(self, reason: str, within_ms: float, now: float) -> None:
         self.asks.append((reason, within_ms, now))
+        self.moving_until_s = now + within_ms / 1e3
 
 
 def migration(connections: list[Connection], loop: FakeLoop) -> Migration:

@@ -15,9 +15,8 @@ from rse_pf.backend.gateway.answers import Answers
 from rse_pf.backend.gateway.audit_recorder import AuditRecorder
 from rse_pf.backend.gateway.connection import RobotConnection
 from rse_pf.backend.gateway.decoder_thread import DecoderThread
-from rse_pf.backend.gateway.dispatcher import Dispatcher
+from rse_pf.backend.gateway.dispatcher import Dispatcher, JobQueue, NoQueue, SandboxQueue
 from rse_pf.backend.gateway.handshake import Accepted, HandshakePolicy
-from rse_pf.backend.gateway.queues import JobQueue, NoQueue, SandboxQueue
 from rse_pf.backend.gateway.token_watch import TokenWatch
 from rse_pf.backend.log import JsonLog
 from rse_pf.backend.object_refs import ObjectRefs
