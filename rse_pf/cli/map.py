@@ -160,36 +160,36 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
 
 def _list(args: argparse.Namespace, maps: MapRegistry) -> None:
     heads = {name: maps.head(name) for name in maps.names()}
-    if args.json:
-        _print_json([{"name": name, **_fields(head)} for name, head in heads.items()])
-        return
-    if not heads:
-        print("no maps")
-    for name, head in heads.items():
-        print(f"{name:<24} {_record_line(head)}")
+    _print(
+        args,
+        [{"name": name, **_fields(head)} for name, head in heads.items()],
+        *([f"{name:<24} {_record_line(head)}" for name, head in heads.items()] or ["no maps"]),
+    )
 
 
 def _show(args: argparse.Namespace, maps: MapRegistry) -> None:
     if args.all:
         head = _id_of_head(args.name, maps)
         records = maps.versions(args.name)
-        if args.json:
-            _print_json([{**_fields(record), "head": record.id == head} for record in records])
-            return
-        for record in records:
-            print(f"{'*' if record.id == head else ' '} {_record_line(record)}")
+        _print(
+            args,
+            [{**_fields(record), "head": record.id == head} for record in records],
+            *(f"{'*' if record.id == head else ' '} {_record_line(record)}" for record in records),
+        )
         return
     record = maps.record(args.name, args.version)
     version = maps.load(args.name, record.id)
     kinds = Counter(str(edge.kind) for edge in version.edges)
     robots = Counter(keyframe.robot for keyframe in version.keyframes)
-    if args.json:
-        _print_json(
-            {**_fields(record), "edges_by_kind": kinds, "keyframes_by_robot": robots,
-             "provenance": version.provenance}
-        )  # fmt: skip
-    else:
-        _print_rows(
+    _print(
+        args,
+        {
+            **_fields(record),
+            "edges_by_kind": kinds,
+            "keyframes_by_robot": robots,
+            "provenance": version.provenance,
+        },
+        *_rows(
             ("version", f"{record.number}  {record.id}"),
             ("parent", record.parent or "-"),
             ("made by", f"{record.author}, {_when(record.created_s)}  {record.note}".rstrip()),
@@ -201,7 +201,8 @@ def _show(args: argparse.Namespace, maps: MapRegistry) -> None:
                 ("provenance", f"{key} = {_shortened(str(version.provenance[key]))}")
                 for key in sorted(version.provenance)
             ),
-        )
+        ),
+    )
     if args.png is not None:
         _draw(args, maps, record)
 
@@ -213,18 +214,20 @@ def _view(args: argparse.Namespace, maps: MapRegistry) -> None:
 
         version = maps.load(args.name, record.id)
         with contextlib.suppress(KeyboardInterrupt):
-            browse_map(version, args.port, _print_address, threading.Event())
+            browse_map(
+                version,
+                args.port,
+                lambda url: print(f"{url}  (Ctrl-C ends it)", flush=True),
+                threading.Event(),
+            )
         return
     args.png = args.out or Path(f"{args.name}.png")
     _draw(args, maps, record)
-    if args.json:
-        _print_json({"file": str(args.png), "id": record.id})
-    else:
-        print(f"{args.png}: {args.name}, version {record.number}")
-
-
-def _print_address(url: str) -> None:
-    print(f"{url}  (Ctrl-C ends it)", flush=True)
+    _print(
+        args,
+        {"file": str(args.png), "id": record.id},
+        f"{args.png}: {args.name}, version {record.number}",
+    )
 
 
 def _merge(args: argparse.Namespace, maps: MapRegistry) -> int:
@@ -253,24 +256,31 @@ def _merge(args: argparse.Namespace, maps: MapRegistry) -> int:
         note=args.note or f"merged {', '.join(joined)}",
     )  # fmt: skip
     refused = _refused(args.names, reply)
-    if args.json:
-        _print_json(
-            {"name": args.into, "id": made.id, "number": made.number, "joined": joined,
-             "not_joined": [{"map": name, "reason": reason} for name, reason in not_joined],
-             "refused": refused, "links": reply.merges, "loops": reply.loops, "seconds": seconds}
-        )  # fmt: skip
-        return 1 if not_joined else 0
-    print(f"{args.into} is now version {made.number}, {made.id[:12]}: {made.keyframes} keyframes, "
-          f"{made.points} points, {reply.merges} links between maps, {reply.loops} loops")  # fmt: skip
-    _print_rows(
-        ("joined", ", ".join(joined)),
-        *(("not joined", f"{name}: {reason}") for name, reason in not_joined),
-        *(
-            (
-                "not linked",
-                f"{each['between']}: " + ", ".join(f"{n} {why}" for why, n in each["reasons"].items()),
-            )
-            for each in refused
+    _print(
+        args,
+        {
+            "name": args.into,
+            "id": made.id,
+            "number": made.number,
+            "joined": joined,
+            "not_joined": [{"map": name, "reason": reason} for name, reason in not_joined],
+            "refused": refused,
+            "links": reply.merges,
+            "loops": reply.loops,
+            "seconds": seconds,
+        },
+        f"{args.into} is now version {made.number}, {made.id[:12]}: {made.keyframes} keyframes, "
+        f"{made.points} points, {reply.merges} links between maps, {reply.loops} loops",
+        *_rows(
+            ("joined", ", ".join(joined)),
+            *(("not joined", f"{name}: {reason}") for name, reason in not_joined),
+            *(
+                (
+                    "not linked",
+                    f"{each['between']}: " + ", ".join(f"{n} {why}" for why, n in each["reasons"].items()),
+                )
+                for each in refused
+            ),
         ),
     )
     return 1 if not_joined else 0
@@ -294,33 +304,32 @@ def _localise(args: argparse.Namespace, maps: MapRegistry) -> int:
         if not args.json:
             print(_location_line(found[-1]), flush=True)
     good = sum(each["verdict"] == "ok" for each in found)
-    if args.json:
-        _print_json(found)
-    else:
-        print(f"{good} of {len(found)} found")
+    _print(args, found, f"{good} of {len(found)} found")
     return 0 if good else 1
 
 
 def _diff(args: argparse.Namespace, maps: MapRegistry) -> None:
     found = difference(maps.load(args.name, args.before), maps.load(args.name, args.after))
-    if args.json:
-        _print_json(msgspec.to_builtins(found))
-        return
-    _print_rows(
-        ("keyframes", f"+{len(found.added)} -{len(found.removed)}, {len(found.moved)} moved"),
-        ("largest", f"{found.largest_move_m:.4f} m, {found.largest_turn_deg:.3f} deg"),
-        ("edges", f"+{len(found.edges_added)} -{len(found.edges_removed)}"),
-        ("points", f"{found.points_before} -> {found.points_after}"),
+    _print(
+        args,
+        msgspec.to_builtins(found),
+        *_rows(
+            ("keyframes", f"+{len(found.added)} -{len(found.removed)}, {len(found.moved)} moved"),
+            ("largest", f"{found.largest_move_m:.4f} m, {found.largest_turn_deg:.3f} deg"),
+            ("edges", f"+{len(found.edges_added)} -{len(found.edges_removed)}"),
+            ("points", f"{found.points_before} -> {found.points_after}"),
+        ),
     )
 
 
 def _rollback(args: argparse.Namespace, maps: MapRegistry) -> None:
     head = maps.head(args.name)
     record = maps.move_head(args.name, args.version, expected=head.id)
-    if args.json:
-        _print_json({"was": head.id, "head": record.id})
-    else:
-        print(f"the head of {args.name} was {head.id[:_SHORT]} and is {record.id[:_SHORT]}")
+    _print(
+        args,
+        {"was": head.id, "head": record.id},
+        f"the head of {args.name} was {head.id[:_SHORT]} and is {record.id[:_SHORT]}",
+    )
 
 
 def _export(args: argparse.Namespace, maps: MapRegistry) -> None:
@@ -328,10 +337,7 @@ def _export(args: argparse.Namespace, maps: MapRegistry) -> None:
         raise UsageError(f"there is no folder {args.out.absolute().parent}", hint="create it")
     data = export_map(maps.load(args.name, args.version), args.format, args.robot)
     replace_file(args.out, data)
-    if args.json:
-        _print_json({"file": str(args.out), "bytes": len(data)})
-    else:
-        print(f"{args.out}: {len(data)} bytes")
+    _print(args, {"file": str(args.out), "bytes": len(data)}, f"{args.out}: {len(data)} bytes")
 
 
 def _draw(args: argparse.Namespace, maps: MapRegistry, record: MapRecord) -> None:
@@ -507,10 +513,10 @@ def _when(created_s: float) -> str:
     return time.strftime("%Y-%m-%d %H:%M:%SZ", time.gmtime(created_s))
 
 
-def _print_rows(*rows: tuple[str, object]) -> None:
-    for name, value in rows:
-        print(f"{name:<11} {value}")
+def _rows(*rows: tuple[str, object]) -> list[str]:
+    return [f"{name:<11} {value}" for name, value in rows]
 
 
-def _print_json(value: Any) -> None:
-    print(json.dumps(value, indent=2, sort_keys=True, default=str))
+def _print(args: argparse.Namespace, value: Any, *lines: str) -> None:
+    """Print *value* with ``--json``, else *lines*."""
+    print(json.dumps(value, indent=2, sort_keys=True, default=str) if args.json else "\n".join(lines))

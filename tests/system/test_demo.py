@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import csv
 import json
 import os
 import re
@@ -79,6 +80,14 @@ def wait_for_robot_on_server(samples: Path, process: subprocess.Popen[str]) -> i
     raise AssertionError(f"no server with a robot in:\n{samples.read_text()}")
 
 
+def commands_after_the_longest(records: Path) -> int:
+    """Return how many commands were sent after the answer to the one with the longest round trip."""
+    with records.open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    longest = max(rows, key=lambda row: float(row["round_trip_ms"]))
+    return sum(float(row["sent"]) > float(longest["answered"]) for row in rows)
+
+
 def test_writes_a_map_for_each_robot_and_ends_every_process(tmp_path, gone):
     out = tmp_path / "out"
     with demo(out, "--robots", "2", "--frames", "6", "--rate", "10") as process:
@@ -107,6 +116,9 @@ def test_a_killed_server_costs_no_command(tmp_path, gone):
         victim = wait_for_robot_on_server(out / "samples.csv", process)
         handle = os.pidfd_open(victim)
         workers = [int(pid) for pid in Path(f"/proc/{victim}/task/{victim}/children").read_text().split()]
+        for pid in workers:  # the next commands, at most a period of 0.2 s later, stay unanswered
+            os.kill(pid, signal.SIGSTOP)
+        threading.Event().wait(0.3)
         signal.pidfd_send_signal(handle, signal.SIGKILL)
         os.close(handle)
         report = finish(process, out)
@@ -115,6 +127,8 @@ def test_a_killed_server_costs_no_command(tmp_path, gone):
     assert report["commands"]["answered"] == report["commands"]["sent"] >= 22
     assert report["lost_frames"] == 0
     assert report["reconnects"] >= 1
+    assert report["resent"] >= 1, "no command was in flight when the server was killed"
+    assert commands_after_the_longest(out / "commands.csv") >= 5
     assert workers
     for pid in workers:
         gone(pid)
