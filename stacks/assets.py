@@ -1,6 +1,6 @@
 """Find the packages that `make assets` built, and lay settings and boot files beside them.
 
-Promises to build nothing itself: synthesis only copies and hashes what it finds.
+Nothing is built here: synthesis only copies and hashes what it finds.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ def staged(assets: Path, name: str, settings: PlatformSettings, into: Path) -> P
 
 
 def sums_digest(package: Path) -> str:
-    """Return the sha256 of a staged package's list of sums: it vouches for every byte of the package."""
+    """Return the sha256 of a staged package's list of sums, which covers every byte of the package."""
     return hashlib.sha256((package / SUMS_FILE).read_bytes()).hexdigest()
 
 
@@ -78,13 +78,10 @@ def _inside(wheel: Path) -> dict[str, bytes]:
     """Return our sources in *wheel*."""
     try:
         with zipfile.ZipFile(wheel) as archive:
-            return {each: archive.read(each) for each in archive.namelist() if _is_ours(each)}
+            names = [each for each in archive.namelist() if each.startswith(f"{_OURS}/")]
+            return {each: archive.read(each) for each in names if each.endswith(".py")}
     except (OSError, EOFError, NotImplementedError, zipfile.BadZipFile, zlib.error) as error:
         raise ConfigurationError(f"{wheel} cannot be read: {error}", hint="run make assets") from error
-
-
-def _is_ours(name: str) -> bool:
-    return name.startswith(f"{_OURS}/") and name.endswith(".py")
 
 
 def _sums(folder: Path) -> str:

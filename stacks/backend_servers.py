@@ -1,7 +1,7 @@
-"""The backend servers of Fig. 2: an Auto Scaling group of Debian machines without a way to the internet.
+"""The backend servers of Fig. 2: an Auto Scaling group of Debian machines without a route to the internet.
 
-They boot from one package in S3; the template carries the digest that vouches for it.  Promises no SSH, no
-public address, IMDSv2 with one hop, and that an instance is replaced when the load balancer finds it ill.
+They boot from one package in S3, whose digest is in the template.  There is no SSH and no public address;
+IMDSv2 is limited to one hop.  An instance that the load balancer finds unhealthy is replaced.
 """
 
 from __future__ import annotations
@@ -60,8 +60,8 @@ class BackendServers(Construct):
         scaling = settings.scaling
         self.role = self._role(package, artifacts)
         if settings.data.enabled:
-            self._let_in(maps)
-        self._let_write(audit_logs)
+            self._allow_objects(maps)
+        self._allow_audit(audit_logs)
         self.group = autoscaling.AutoScalingGroup(
             self, "Group", auto_scaling_group_name=GROUP, vpc=vpc,
             min_capacity=scaling.min_servers, max_capacity=scaling.max_servers,
@@ -117,16 +117,16 @@ class BackendServers(Construct):
         )
         return role
 
-    def _let_in(self, maps: s3.IBucket) -> None:
-        """Robots' objects and maps, read and written by the servers and by the data service beside them."""
+    def _allow_objects(self, maps: s3.IBucket) -> None:
+        """Allow the servers and the data service beside them to read and write robots' objects and maps."""
         objects = maps.arn_for_objects("*")
         actions = ["s3:GetObject", "s3:PutObject", "s3:DeleteObject"]
         self.role.add_to_policy(iam.PolicyStatement(actions=actions, resources=[objects]))
         self.role.add_to_policy(iam.PolicyStatement(actions=["s3:ListBucket"], resources=[maps.bucket_arn]))
         acknowledge(self.role, "names of objects are digests, which nobody knows beforehand", _MAPS_FINDING)
 
-    def _let_write(self, audit_logs: s3.IBucket) -> None:
-        """Pieces of the audit log under names that are not there yet; no reading, listing or deleting."""
+    def _allow_audit(self, audit_logs: s3.IBucket) -> None:
+        """Allow the servers to write pieces of the audit log under new names; not to read, list or delete."""
         self.role.add_to_policy(
             iam.PolicyStatement(
                 actions=["s3:PutObject"], resources=[audit_logs.arn_for_objects(f"{AUDIT_PREFIX}/*")],

@@ -1,4 +1,4 @@
-"""The platform itself: load balancer, backend servers, monitor, scale modifier, and who is told."""
+"""The platform itself: load balancer, backend servers, monitor, scale modifier and the topic of alarms."""
 
 from __future__ import annotations
 
@@ -21,11 +21,10 @@ from stacks.load_balancer import LoadBalancer
 from stacks.network_stack import NetworkStack
 from stacks.scale_modifier import ScaleModifier
 
-__all__ = ["KEY_SET", "TRUSTED", "BackendStack"]
+__all__ = ["TRUSTED", "BackendStack"]
 
-KEY_SET = KEYS_NAME
 TRUSTED = (KEYS_NAME, ROBOTS_NAME, DENY_NAME)
-"""What says who may come in: keys, enrolled robots, revoked tokens."""
+"""Objects that decide which robots are admitted: public keys, enrolled robots, revoked tokens."""
 
 
 class BackendStack(cdk.Stack):
@@ -63,7 +62,7 @@ class BackendStack(cdk.Stack):
             self, "Servers", vpc=network.vpc, firewall_group=network.firewall.servers, package=package,
             package_sums=sums, topic=self.topic, targets=list(self.balancer.targets.values()),
             settings=settings, artifacts=data.artifacts, maps=data.maps,
-            audit_logs=data.audit_logs, key_set=KEY_SET,
+            audit_logs=data.audit_logs, key_set=KEYS_NAME,
         )  # fmt: skip
         self.servers.role.add_to_policy(
             iam.PolicyStatement(
@@ -94,15 +93,15 @@ class BackendStack(cdk.Stack):
             self, "ScaleModifier", group_name=group.auto_scaling_group_name, topic_arn=self.topic.topic_arn,
             settings=settings,
         )  # fmt: skip
-        self._say_where(settings)
+        self._outputs(settings)
 
-    def _say_where(self, settings: PlatformSettings) -> None:
+    def _outputs(self, settings: PlatformSettings) -> None:
         cdk.CfnOutput(self, "Topic", value=self.topic.topic_arn, description="subscribe to be told of alarms")
         name = self.balancer.alb.load_balancer_dns_name
         path = settings.serving.path
         if settings.cloud.allow_insecure:
             cdk.Annotations.of(self).add_warning_v2(
-                "rse-pf:lab",
+                "rse-pf:allow-insecure",
                 "cloud.allow_insecure is true: robots and tokens travel without TLS; for trials only",
             )
             cdk.CfnOutput(self, "Url", value=f"ws://{name}{path}")

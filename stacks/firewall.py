@@ -1,7 +1,7 @@
 """The firewall of Fig. 2: world -> load balancer -> backend servers, and nothing else in any direction.
 
-Servers reach S3's addresses and the interface endpoints alone.  Promises one open range of addresses only,
-``cloud.robot_cidr`` at the listener.
+Servers reach only S3 and the interface endpoints.  Only the listener is open to a range of addresses,
+``cloud.robot_cidr``.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ def s3_prefix_list(settings: PlatformSettings) -> str:
 
 
 def front_port(settings: PlatformSettings) -> int:
-    """Return the port of the listener: plain in the lab, TLS otherwise."""
+    """Return the port of the listener: 80 with ``cloud.allow_insecure``, else 443 for TLS."""
     return _HTTP if settings.cloud.allow_insecure else _HTTPS
 
 

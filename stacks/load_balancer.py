@@ -1,4 +1,4 @@
-"""The load balancer of Fig. 2: an ALB that takes WebSockets and asks servers if they are ready."""
+"""The load balancer of Fig. 2: an ALB that accepts WebSockets and checks whether servers are ready."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ __all__ = ["LoadBalancer"]
 
 _FIVE_MINUTES_S = 300
 _IDLE_TIMEOUT_S = 120
-"""The ALB ends a connection that has been silent for so long; robots ping far more often."""
+"""The ALB closes a connection without traffic after this; robots send pings far more often."""
 _DEREGISTRATION_S = 30
-"""Time a server that leaves gets to end its connections."""
+"""Time that a server gets to end its connections before it is removed."""
 
 
 class LoadBalancer(Construct):
@@ -44,12 +44,12 @@ class LoadBalancer(Construct):
         )  # fmt: skip
         self.alb.log_access_logs(logs, "alb")
         self.targets = {"robots": self._targets("Robots", vpc, settings.serving.port, settings)}
-        lab = settings.cloud.allow_insecure
+        insecure = settings.cloud.allow_insecure
         listener = self.alb.add_listener(
             "Front", port=front_port(settings), open=False,
-            protocol=elbv2.ApplicationProtocol.HTTP if lab else elbv2.ApplicationProtocol.HTTPS,
-            ssl_policy=None if lab else elbv2.SslPolicy.TLS13_RES,
-            certificates=[] if lab else [elbv2.ListenerCertificate(settings.cloud.certificate_arn)],
+            protocol=elbv2.ApplicationProtocol.HTTP if insecure else elbv2.ApplicationProtocol.HTTPS,
+            ssl_policy=None if insecure else elbv2.SslPolicy.TLS13_RES,
+            certificates=[] if insecure else [elbv2.ListenerCertificate(settings.cloud.certificate_arn)],
             default_target_groups=[self.targets["robots"]],
         )  # fmt: skip
         if settings.data.enabled:
@@ -58,7 +58,7 @@ class LoadBalancer(Construct):
                 "DataRule", priority=10, conditions=[elbv2.ListenerCondition.path_patterns(["/data/*"])],
                 target_groups=[self.targets["data"]],
             )  # fmt: skip
-            # Each would ask the bucket; the balancer's own checks do not come through the listener.
+            # Each request would cost a request to the bucket; health checks do not pass through the listener.
             listener.add_action(
                 "NotReady", priority=5,
                 conditions=[elbv2.ListenerCondition.path_patterns([f"/data{READY_PATH}"])],
@@ -70,7 +70,7 @@ class LoadBalancer(Construct):
         self, name: str, vpc: ec2.IVpc, port: int, settings: PlatformSettings
     ) -> elbv2.ApplicationTargetGroup:
         health = settings.health
-        # The data service answers for itself, below /data; a backend server at its control port.
+        # The data service is checked at its own port, below /data; a backend server at its control port.
         robots = name == "Robots"
         asked, path = (settings.serving.control_port, READY_PATH) if robots else (port, f"/data{READY_PATH}")
         return elbv2.ApplicationTargetGroup(

@@ -1,4 +1,4 @@
-"""The ground: a VPC in two zones without a way to the internet but the load balancer's, and its firewall."""
+"""The network: a VPC in two zones, routed to the internet only for the load balancer, and the firewall."""
 
 from __future__ import annotations
 
@@ -17,13 +17,15 @@ from stacks.firewall import Firewall, front_port, inner_ports
 
 __all__ = ["NetworkStack"]
 
+_MINIMAL = {
+    "Monitoring": ec2.InterfaceVpcEndpointAwsService.CLOUDWATCH_MONITORING,
+    "AutoScaling": ec2.InterfaceVpcEndpointAwsService.AUTOSCALING,
+    "Logs": ec2.InterfaceVpcEndpointAwsService.CLOUDWATCH_LOGS,
+}
 _ENDPOINTS = {
-    "minimal": {
-        "Monitoring": ec2.InterfaceVpcEndpointAwsService.CLOUDWATCH_MONITORING,
-        "AutoScaling": ec2.InterfaceVpcEndpointAwsService.AUTOSCALING,
-        "Logs": ec2.InterfaceVpcEndpointAwsService.CLOUDWATCH_LOGS,
-    },
+    "minimal": _MINIMAL,
     "full": {
+        **_MINIMAL,
         "Ssm": ec2.InterfaceVpcEndpointAwsService.SSM,
         "Secrets": ec2.InterfaceVpcEndpointAwsService.SECRETS_MANAGER,
     },
@@ -60,10 +62,7 @@ class NetworkStack(cdk.Stack):
                 resources=["*"], conditions={"StringEquals": {"aws:ResourceAccount": self.account}},
             )
         )  # fmt: skip
-        chosen = dict(_ENDPOINTS["minimal"])
-        if settings.cloud.endpoints == "full":
-            chosen.update(_ENDPOINTS["full"])
-        for name, service in chosen.items():
+        for name, service in _ENDPOINTS[settings.cloud.endpoints].items():
             self.vpc.add_interface_endpoint(
                 name, service=service, open=False, security_groups=[self.firewall.endpoints]
             )
@@ -73,11 +72,11 @@ class NetworkStack(cdk.Stack):
     @property
     @jsii.member(jsii_name="availabilityZones")
     def availability_zones(self) -> list[str]:
-        """The two zones, so that synthesis asks nobody."""
+        """The two zones, so that synthesis makes no request to AWS."""
         return [cdk.Fn.select(at, cdk.Fn.get_azs()) for at in range(2)]
 
     def _control_lists(self, settings: PlatformSettings) -> None:
-        """Second fence, without memory: what the security groups allow, and the answers to it."""
+        """Repeat what the security groups allow, with the responses: access control lists are stateless."""
         answers = ec2.AclTraffic.tcp_port_range(_FIRST_ANSWER_PORT, _LAST_PORT)
         anywhere, inside = ec2.AclCidr.any_ipv4(), ec2.AclCidr.ipv4(self.vpc.vpc_cidr_block)
         front = self._control_list("FrontList", ec2.SubnetType.PUBLIC)

@@ -1,6 +1,6 @@
-"""What an operator looks at: one dashboard (the paper's Fig. 8 among it) and alarms with a runbook each.
+"""Monitoring for the operator: one dashboard, with the paper's Fig. 8, and alarms with a runbook each.
 
-Promises no scaling: the alarms here only tell people.
+The alarms here notify people; they do not scale the group.
 """
 
 from __future__ import annotations
@@ -57,7 +57,6 @@ class ObservabilityStack(cdk.Stack):
                 for title, series in rows.items()
             )
         )
-        tell = actions.SnsAction(backend.topic)
         for name, metric, threshold in (("unhealthy", unhealthy, 1), ("errors", errors, 1)):
             alarm = cloudwatch.Alarm(
                 self, name.capitalize(), alarm_name=f"rse-pf-{name}", metric=metric, threshold=threshold,
@@ -65,7 +64,7 @@ class ObservabilityStack(cdk.Stack):
                 alarm_description=f"runbook: docs/operations.md#{name}",
                 treat_missing_data=cloudwatch.TreatMissingData.NOT_BREACHING,
             )  # fmt: skip
-            alarm.add_alarm_action(tell)
+            alarm.add_alarm_action(actions.SnsAction(backend.topic))
 
     def _metric(
         self, namespace: str, name: str, statistic: str, dimensions: dict[str, str]

@@ -1,4 +1,4 @@
-"""Pose estimation without a server: `lambda_pnp` behind a Function URL, for robots that ask now and then."""
+"""Pose estimation without a server: `lambda_pnp` behind a Function URL, for robots with rare requests."""
 
 from __future__ import annotations
 
@@ -13,8 +13,9 @@ from aws_cdk import aws_logs as logs
 from constructs import Construct
 
 from rse_pf.config import PlatformSettings
+from rse_pf.config.resource_names import KEYS_NAME
 from stacks.assets import staged
-from stacks.backend_stack import KEY_SET, TRUSTED
+from stacks.backend_stack import TRUSTED
 from stacks.data_stack import DataStack
 from stacks.findings import acknowledge
 
@@ -55,7 +56,7 @@ class ServerlessStack(cdk.Stack):
                 memory_size=settings.cloud.lambda_memory_mb,
                 timeout=cdk.Duration.seconds(_TIMEOUT_S),
                 reserved_concurrent_executions=settings.cloud.lambda_concurrency,
-                environment={"RSE_PF_KEYS": f"{data.artifacts.bucket_name}/{KEY_SET}"},
+                environment={"RSE_PF_KEYS": f"{data.artifacts.bucket_name}/{KEYS_NAME}"},
             )  # fmt: skip
         acknowledge(function, "the newest runtime with wheels of every package in the lock", "L1")
         # Robots carry our own tokens, which the handler checks; AWS's signatures are not for robots.

@@ -14,7 +14,7 @@ import pytest
 
 from rse_pf.config import PlatformSettings
 
-LAB = PlatformSettings()
+INSECURE = PlatformSettings()
 PUBLIC = PlatformSettings.from_dict(
     {
         "cloud": {
@@ -62,7 +62,7 @@ def stub_assets(folder: Path) -> Path:
     return folder
 
 
-@pytest.fixture(scope="session", params=["lab", "public"])
+@pytest.fixture(scope="session", params=["insecure", "public"])
 def assembly(
     request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory, repository: Path
 ) -> Assembly:
@@ -71,7 +71,7 @@ def assembly(
         pytest.skip("the CDK needs Node.js")
     pytest.importorskip("aws_cdk", reason="the infra extra is not installed")
     pytest.importorskip("cdk_nag", reason="the infra extra is not installed")
-    settings = LAB if request.param == "lab" else PUBLIC
+    settings = INSECURE if request.param == "insecure" else PUBLIC
     base = tmp_path_factory.getbasetemp()
     if "PYTEST_XDIST_WORKER" in os.environ:
         base = base.parent  # of all workers: the first one synthesises, the others read

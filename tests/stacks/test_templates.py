@@ -304,7 +304,7 @@ def test_synthesis_asks_nobody(assembly: Assembly) -> None:
 def test_nag_finds_nothing_that_is_not_acknowledged(assembly: Assembly) -> None:
     found = [each["ruleName"] for each in assembly.findings]
 
-    assert found == (["Annotation::rse-pf:lab"] if assembly.settings.cloud.allow_insecure else [])
+    assert found == (["Annotation::rse-pf:allow-insecure"] if assembly.settings.cloud.allow_insecure else [])
 
 
 Lint = Callable[[Any], list[str]]
