@@ -58,28 +58,39 @@ class FrontEndOptions:
     """How a robot finds and matches features, and which poses it accepts.
 
     Defaults: measured on the red-kitchen recording at 5 and 10 Hz (ATE 4 to 5 cm).
+
+    Attributes:
+        features: How many ORB features are sought in a frame.
+        ratio: Lowe's ratio test: the best match must be this much closer than the second best.
+        max_matches: The best by descriptor distance are sent, so that a command stays under 10 kB.
+        min_depth_m: Nearer depth readings are not used.
+        max_depth_m: Farther depth readings are not used.
+        depth_spread_percent: A 3x3 patch whose depths differ by more of their median lies on an edge and is
+            not used.
+        inlier_px: Largest reprojection error of an inlier.
+        max_iterations: Of RANSAC.
+        min_inliers: A pose with fewer is not accepted.
+        max_jump_m: The largest plausible motion from one frame to the next.
+        keyframe_m: A frame farther from the last keyframe becomes one.
+        keyframe_deg: A frame turned further from the last keyframe becomes one.
+        keyframe_inliers: A frame with fewer inliers becomes a keyframe even if the robot hardly moved.
+        chain: Match against the last good frame, or against the last keyframe; the other one is the retry.
     """
 
     features: int = 1000
     ratio: float = 0.75
-    """Lowe's ratio test: the best match must be this much closer than the second best."""
     max_matches: int = 700
-    """The best by descriptor distance are sent, so that a command stays under 10 kB."""
     min_depth_m: float = 0.3
     max_depth_m: float = 6.0
     depth_spread_percent: float = 5.0
-    """A 3x3 patch whose depths differ by more of their median lies on an edge and is not used."""
     inlier_px: float = 3.0
     max_iterations: int = 1000
     min_inliers: int = 12
     max_jump_m: float = 0.5
-    """The largest plausible motion from one frame to the next."""
     keyframe_m: float = 0.2
     keyframe_deg: float = 12.0
     keyframe_inliers: int = 120
-    """A frame with fewer inliers becomes a keyframe even if the robot hardly moved."""
     chain: Literal["frame", "keyframe"] = "frame"
-    """Match against the last good frame, or against the last keyframe; the other one is the retry."""
 
     def __post_init__(self) -> None:
         if self.min_inliers < 4 or self.max_matches < self.min_inliers or self.features < self.min_inliers:
@@ -245,14 +256,14 @@ class Tracker:
     A frame is matched against the last good frame.  If the pose has too few inliers or jumps, it is
     queried once more against the last keyframe.  If that fails, too, the frame is lost: it is
     counted, and later frames are not matched against it.
+
+    ``frames`` counts the frames prepared so far, ``lost_frames`` those of them without an accepted pose.
     """
 
     def __init__(self, options: FrontEndOptions | None = None, T_world_start: Array | None = None) -> None:
         self.options = options or FrontEndOptions()
         self.frames = 0
-        """Frames prepared so far."""
         self.lost_frames = 0
-        """Frames without an accepted pose, for any reason."""
         self.keyframes = 0
         self._T_world_start = np.eye(4) if T_world_start is None else T_world_start
         self._last: _View | None = None

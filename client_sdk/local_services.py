@@ -10,7 +10,7 @@ from collections import deque
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 
-from rse_pf.errors import InternalError, MissingExtra, RsePfError
+from rse_pf.errors import MissingExtra, RsePfError
 from rse_pf.service import Registry, dispatch, failure_of
 from rse_pf.wire import Command, Failure, Result, make_codec
 
@@ -73,9 +73,8 @@ class LocalServices:
             sent = self._codec.decode_from_server(self._codec.encode(answer))
         except RsePfError as error:
             return failure_of(error, command, server="robot")
-        if isinstance(sent, Result | Failure):
-            return sent
-        return failure_of(InternalError("the local service gave no answer"), command)
+        assert isinstance(sent, Result | Failure)
+        return sent
 
     def _prepare(self) -> None:
         from rse_pf.pnp import available_engines

@@ -37,17 +37,24 @@ _VERTEX = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("red", "u1"), ("g
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MapOptions:
-    """The density of a map, and which depth readings are used."""
+    """The density of a map, and which depth readings are used.
+
+    Attributes:
+        voxel_m: Length of a voxel's edge; each voxel holds one point.
+        min_depth_m: Nearer readings are not used.
+        max_depth_m: Farther readings are not used.
+        every_px: Take every n-th row and column of a frame.
+        edge_percent: Skip a reading whose neighbours differ by more of its depth: it lies between two
+            surfaces.
+        max_points: No voxels are added beyond this; a point takes about 60 to 120 bytes.
+    """
 
     voxel_m: float = 0.015
     min_depth_m: float = 0.3
     max_depth_m: float = 3.5
     every_px: int = 2
-    """Take every n-th row and column of a frame."""
     edge_percent: float = 5.0
-    """Skip a reading whose neighbours differ by more of its depth: it lies between two surfaces."""
     max_points: int = 4_000_000
-    """No voxels are added beyond this; a point takes about 60 to 120 bytes."""
 
     def __post_init__(self) -> None:
         if not 0.001 <= self.voxel_m <= 1.0:
@@ -63,7 +70,8 @@ class PointMap:
     """A voxel grid that holds the mean position and colour of what was seen in each voxel.
 
     Voxels live in an open-addressing hash table over flat arrays, both of which grow by
-    doubling: a frame costs time in its own points alone, amortised.
+    doubling: a frame costs time in its own points alone, amortised.  ``refused_points`` counts the
+    voxels that were not added because the map was full, ``probes`` the slots read so far.
 
     Source:
         RSE-PF paper, Sect. 6.1: "it will join current frame into the point cloud".
@@ -72,9 +80,7 @@ class PointMap:
     def __init__(self, options: MapOptions | None = None) -> None:
         self.options = options or MapOptions()
         self.refused_points = 0
-        """Voxels that were not added because the map was full."""
         self.probes = 0
-        """Hash-table slots read so far, including growth; a measure of the work for tests."""
         self._size = 0
         self._slot_keys: npt.NDArray[np.int64] = np.full(4096, _EMPTY, dtype=np.int64)
         self._slot_rows: npt.NDArray[np.int32] = np.zeros(4096, dtype=np.int32)

@@ -141,11 +141,8 @@ def load_answering() -> Answering:
     """Load what a cold start needs: the settings of the package, the keys of the artifact bucket."""
     settings = load_settings(_ROOT / "settings.json")
 
-    def read() -> str:
-        return read_object(os.environ, datetime.now(timezone.utc))
-
-    def read_control(name: str) -> str:
-        return read_object(os.environ, datetime.now(timezone.utc), name)
+    def read(control: str = "") -> str:
+        return read_object(os.environ, datetime.now(timezone.utc), control)
 
     period_s = min(_MAX_STALE_S, settings.scaling.period_s)
-    return Answering(settings, KeyCache(read, period_s, read_control=read_control))
+    return Answering(settings, KeyCache(read, period_s, read_control=read))

@@ -39,7 +39,11 @@ _REPORT = "report"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Service:
-    """A registered function, and what a server needs to know about it."""
+    """A registered function, and what a server needs to know about it.
+
+    A ``cheap`` service may run in the event loop when no command waits.  One that ``reports`` takes the
+    keyword ``report``: a long service that reports progress and can be cancelled then.
+    """
 
     name: str
     function: Callable[..., Any]
@@ -47,9 +51,7 @@ class Service:
     reply_type: type[Any]
     kind: Kind = "stateless"
     cheap: bool = False
-    """Whether the service may run in the event loop when no command waits."""
     reports: bool = False
-    """Whether it takes ``report``: a long service that reports progress and can be cancelled then."""
 
     @property
     def summary(self) -> str:

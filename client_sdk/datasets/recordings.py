@@ -42,17 +42,19 @@ _FREIBURG_DEPTH_SCALE = 5000.0
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Dataset:
-    """A recording: iterate over it to get its frames in order of time."""
+    """A recording: iterate over it to get its frames in order of time.
+
+    ``truth_kind`` is ``reference`` if the poses came with the source as an estimate.  ``read`` reads one of
+    ``rows``; row *i* has the time stamp ``timestamps_s[i]`` of this dataset.
+    """
 
     name: str
     camera: Camera
     timestamps_s: tuple[float, ...]
     truth: Trajectory | None
     truth_kind: Literal["ground truth", "reference", "none"]
-    """"reference": poses that came with the source, an estimate."""
     rows: tuple[int, ...]
     read: Callable[[int], Frame]
-    """Read one of *rows*; row *i* has the time stamp ``timestamps_s[i]`` of this dataset."""
 
     def __len__(self) -> int:
         return len(self.rows)

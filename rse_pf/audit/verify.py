@@ -17,7 +17,10 @@ __all__ = ["Verdict", "check_chain", "check_folder", "entries_of"]
 
 @dataclass(slots=True, kw_only=True)
 class Verdict:
-    """The result for one chain; ``problem`` is empty if it is intact."""
+    """The result for one chain; ``problem`` is empty if it is intact.
+
+    ``claims`` are the heads of other chains that this one recorded, with the number of the entry.
+    """
 
     who: str
     entries: int = 0
@@ -27,7 +30,6 @@ class Verdict:
     notes: list[str] = field(default_factory=list)
     hashes: dict[int, str] = field(default_factory=dict)
     claims: list[tuple[str, Head, int]] = field(default_factory=list)
-    """Heads of other chains that this one recorded, with the number of the entry."""
 
 
 def check_chain(who: str, files: Sequence[Path], *, from_genesis: bool = True) -> Verdict:

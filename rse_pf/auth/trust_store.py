@@ -85,6 +85,7 @@ class TrustStore:
     """The keys, robots and denials that one server knows; `refresh` loads what changed.  Blocking.
 
     ``snapshot`` is all of it as JSON, for a server's other processes; see `key_set_from_snapshot`.
+    ``problem`` is what the last `refresh` could not read, empty if it could read everything.
     """
 
     def __init__(self, keys_file: Path) -> None:
@@ -96,7 +97,6 @@ class TrustStore:
         self.keys: KeySet | None = None
         self.snapshot = ""
         self.problem = ""
-        """What the last `refresh` could not read; empty if it could read everything."""
         self._keys_file = keys_file
         self._store = DirectoryStore(keys_file.parent)
         self._parts: dict[str, str] = {}

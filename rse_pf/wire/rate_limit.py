@@ -62,10 +62,12 @@ class RateLimiter:
 
 @dataclass(slots=True, kw_only=True)
 class Backlog:
-    """How many frames may be in flight on a connection that was opened after a long outage."""
+    """How many frames may be in flight on a connection that was opened after a long outage.
+
+    ``newest`` is the id of the last frame that waited for the connection.
+    """
 
     newest: int
-    """Id of the last frame that waited for the connection."""
     max_in_flight: int = 1
 
     def answered(self, queue_ms: float) -> None:

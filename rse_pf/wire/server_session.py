@@ -117,7 +117,13 @@ Decision = Send | Submit | Withdraw | Renewal | Close
 
 
 class ServerSession:
-    """One robot's connection, as its server sees it."""
+    """One robot's connection, as its server sees it.
+
+    Attributes:
+        ends_s: When the robot's token expires, on the server's clock; set after authentication.
+        hears_progress: Whether the robot announced the capability `PROGRESS`.
+        bad_messages: How many invalid messages arrived; a long one counts several times.
+    """
 
     def __init__(
         self, *, codec: Codec, robot: str, server: str, session: str, limits: SessionSettings
@@ -126,15 +132,12 @@ class ServerSession:
         self.state: Literal["opening", "open", "closed"] = "opening"
         self.in_flight = 0
         self.ends_s: float | None = None
-        """When the robot's token expires, on the server's clock; set after authentication."""
         self.hears_progress = False
-        """Whether the robot announced the capability `PROGRESS`."""
         self.codec = codec
         self._server = server
         self._session = session
         self._limits = limits
         self.bad_messages = 0
-        """How many invalid messages arrived; a long one counts several times."""
         self._next_renewal_s = float("-inf")
 
     def receive(self, data: bytes, now: float) -> list[Decision]:
