@@ -82,21 +82,20 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
 
 
 def _check(args: argparse.Namespace) -> None:
-    _within("--robots", args.robots, 1, _MAX_ROBOTS[args.kind], "the paper uses 100")
-    _within("--fps", args.fps, 0.1, 60, "the paper uses 5")
-    _within("--speed", args.speed, 1, 100, "1 takes as long as the paper; 30 suits CI")
-    _within("--seconds", args.seconds, 1, 3600, "30 is enough for percentiles")
-    if args.emulated_cores is not None:
-        _within("--emulated-cores", args.emulated_cores, 0.001, 64, "leave it out to measure it")
-    _within("--repeat", args.repeat, 1, 20, "3 shows the spread")
-    _within("--frames", args.frames, 2, 2000, "80 is a path of 5.5 m")
+    limits = (
+        ("--robots", args.robots, 1, _MAX_ROBOTS[args.kind], "the paper uses 100"),
+        ("--fps", args.fps, 0.1, 60, "the paper uses 5"),
+        ("--speed", args.speed, 1, 100, "1 takes as long as the paper; 30 suits CI"),
+        ("--seconds", args.seconds, 1, 3600, "30 is enough for percentiles"),
+        ("--emulated-cores", args.emulated_cores, 0.001, 64, "leave it out to measure it"),
+        ("--repeat", args.repeat, 1, 20, "3 shows the spread"),
+        ("--frames", args.frames, 2, 2000, "80 is a path of 5.5 m"),
+    )
+    for name, value, low, high, hint in limits:
+        if value is not None and not (math.isfinite(value) and low <= value <= high):
+            raise UsageError(f"{name} {value:g} is not within {low:g}..{high:g}", hint=hint)
     if args.seed < 0:
         raise UsageError(f"--seed {args.seed} is below 0", hint="choose 0 or more")
-
-
-def _within(name: str, value: float, low: float, high: float, hint: str) -> None:
-    if not (math.isfinite(value) and low <= value <= high):
-        raise UsageError(f"{name} {value:g} is not within {low:g}..{high:g}", hint=hint)
 
 
 def _elasticity(args: argparse.Namespace, settings: PlatformSettings) -> int:

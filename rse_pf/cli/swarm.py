@@ -74,7 +74,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
     """Check the options and run the swarm."""
-    from rse_pf.experiments.load.run import SwarmRun, run_swarm
+    from rse_pf.experiments.load.run import run_swarm
     from rse_pf.experiments.load.swarm import SwarmOptions
 
     if not (math.isfinite(args.seconds) and 0 < args.seconds <= _MAX_S):
@@ -102,8 +102,12 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
             )
         settings = settings.replace(local={"servers": args.servers})
     return run_swarm(
-        SwarmRun(options=options, seconds=args.seconds, out=args.out, platform=platform, quiet=args.quiet),
+        options,
         settings,
+        seconds=args.seconds,
+        out=args.out,
+        platform=platform,
+        quiet=args.quiet,
     )
 
 

@@ -183,19 +183,15 @@ async def _wait_for(
     async for message in inbox:
         if isinstance(message, kind):
             return message
-        _handle(robot, message, platform, screen)
+        if isinstance(message, FrameDone):
+            screen.update(robot.bar, completed=message.frames)
+        elif isinstance(message, TokenRequest):
+            robot.pipe.send(IssuedToken(message.robot, platform.issue_token(message.robot)))
+        elif isinstance(message, ChildFailed):
+            raise message.error(robot.spec.name)
     raise CommandFailed(
         f"the process of {robot.spec.name} ended early", hint="check the memory of this machine"
     )
-
-
-def _handle(robot: _Robot, message: Any, platform: LocalPlatform, screen: Progress) -> None:
-    if isinstance(message, FrameDone):
-        screen.update(robot.bar, completed=message.frames)
-    elif isinstance(message, TokenRequest):
-        robot.pipe.send(IssuedToken(message.robot, platform.issue_token(message.robot)))
-    elif isinstance(message, ChildFailed):
-        raise message.error(robot.spec.name)
 
 
 async def _messages(pipe: Connection) -> AsyncIterator[Any]:

@@ -32,7 +32,7 @@ from rse_pf.experiments.results.result_folder import (
 from rse_pf.experiments.results.summary import answered_percent, percentiles, summarise
 from rse_pf.local.control.platform import LocalPlatform
 
-__all__ = ["FAST_MS", "SwarmRun", "TargetPlatform", "report_of", "run_swarm"]
+__all__ = ["FAST_MS", "TargetPlatform", "report_of", "run_swarm"]
 
 FAST_MS = 150.0
 """Limit for "answered in time": below the paper's mean round trip of 156.36 ms."""
@@ -49,32 +49,34 @@ class TargetPlatform:
     token_of: Callable[[str], str]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SwarmRun:
-    """Options of the command line; ``platform`` None starts one for the run."""
+def run_swarm(
+    options: SwarmOptions,
+    settings: PlatformSettings,
+    *,
+    seconds: float,
+    out: Path,
+    platform: TargetPlatform | None = None,
+    quiet: bool = False,
+) -> int:
+    """Run the swarm for *seconds* on *platform*; None starts one for the run.
 
-    options: SwarmOptions
-    seconds: float
-    out: Path
-    platform: TargetPlatform | None = None
-    quiet: bool = False
-
-
-def run_swarm(run: SwarmRun, settings: PlatformSettings) -> int:
-    """Run the swarm; return 0 if every command was answered or failed, once, and all poses were right."""
-    folder = fresh_folder(run.out, ["report.json", COMMANDS, EVENTS])
+    Returns 0 if every command was answered or failed, once, and all poses were right.
+    """
+    folder = fresh_folder(out, ["report.json", COMMANDS, EVENTS])
     before = environment(settings)
     with (folder / EVENTS).open("w", encoding="utf-8") as file:
-        result = asyncio.run(_run(run, settings, EventLog(file)))
+        result = asyncio.run(_run(options, settings, seconds, platform, EventLog(file), quiet))
     write_commands(folder / COMMANDS, result.commands)
-    report = report_of(run, result, before)
+    report = report_of(options, seconds, result, before)
     write_json(folder / "report.json", report)
     print(_table(report, folder))
     commands = report["commands"]
     return 1 if commands["lost"] or result.duplicates or result.wrong_poses or not commands["answered"] else 0
 
 
-def report_of(run: SwarmRun, result: SwarmResult, before: Mapping[str, Any]) -> dict[str, Any]:
+def report_of(
+    options: SwarmOptions, seconds: float, result: SwarmResult, before: Mapping[str, Any]
+) -> dict[str, Any]:
     """Return the report of a run.
 
     The frame rate of a robot is its answers over the time between its first and last planned command.
@@ -85,7 +87,7 @@ def report_of(run: SwarmRun, result: SwarmResult, before: Mapping[str, Any]) -> 
         "answered_percent": answered_percent(result.commands) or 0.0,
         "answered_in_time_percent": answered_percent(result.commands, FAST_MS) or 0.0,
         "in_time_ms": FAST_MS,
-        "fps_per_robot": percentiles(_frame_rates(result.commands, run.options.fps)),
+        "fps_per_robot": percentiles(_frame_rates(result.commands, options.fps)),
         "wrong_poses": result.wrong_poses,
         "twice": result.duplicates,
         "reconnects": result.reconnects,
@@ -99,18 +101,23 @@ def report_of(run: SwarmRun, result: SwarmResult, before: Mapping[str, Any]) -> 
             "late_sends_ms_p99": result.late_sends_ms_p99,
             "load_average_after": load_average(),
         },
-        "asked": {**asdict(run.options), "seconds": run.seconds},
+        "asked": {**asdict(options), "seconds": seconds},
         "environment": dict(before),
     }
 
 
-async def _run(run: SwarmRun, settings: PlatformSettings, events: EventLog) -> SwarmResult:
+async def _run(
+    options: SwarmOptions,
+    settings: PlatformSettings,
+    seconds: float,
+    platform: TargetPlatform | None,
+    events: EventLog,
+    quiet: bool,
+) -> SwarmResult:
     origin = time.monotonic()
-    options = run.options
     async with AsyncExitStack() as stack:
-        platform = run.platform
         if platform is None:
-            _say(run, "starting the platform")
+            _say(quiet, "starting the platform")
             state = Path(tempfile.mkdtemp(prefix="rse-pf-swarm-"))
             stack.callback(shutil.rmtree, state, ignore_errors=True)
             local = await stack.enter_async_context(
@@ -123,7 +130,9 @@ async def _run(run: SwarmRun, settings: PlatformSettings, events: EventLog) -> S
                 )
             )
             platform = TargetPlatform(local.url, local.issue_token)
-        _say(run, f"{options.robots} robots send {options.fps:g} commands per second each to {platform.url}")
+        _say(
+            quiet, f"{options.robots} robots send {options.fps:g} commands per second each to {platform.url}"
+        )
         swarm = await stack.enter_async_context(
             Swarm(
                 options,
@@ -134,18 +143,18 @@ async def _run(run: SwarmRun, settings: PlatformSettings, events: EventLog) -> S
                 origin=origin,
             )
         )
-        screen = asyncio.create_task(_show(run, swarm))
+        screen = asyncio.create_task(_show(swarm, quiet))
         stack.callback(screen.cancel)
         await swarm.start()
         await swarm.wait_joined(options.robots * options.join_every_s + _JOIN_S)
-        await asyncio.sleep(run.seconds)
+        await asyncio.sleep(seconds)
         return await swarm.finish(options.deadline_s)
 
 
-async def _show(run: SwarmRun, swarm: Swarm) -> None:
+async def _show(swarm: Swarm, quiet: bool) -> None:
     """Print one line per second: what was answered since the last line."""
     seen, last_s = 0, time.monotonic()
-    while not run.quiet:
+    while not quiet:
         await asyncio.sleep(_SHOW_EVERY_S)
         fresh, seen = swarm.rows[seen:], len(swarm.rows)
         elapsed_s, last_s = time.monotonic() - last_s, time.monotonic()
@@ -154,7 +163,7 @@ async def _show(run: SwarmRun, swarm: Swarm) -> None:
         if len(trips):
             p50, p99 = np.percentile(trips, [50, 99])
             line += f"   p50 {p50:7.1f} ms   p99 {p99:7.1f} ms"
-        _say(run, line)
+        _say(quiet, line)
 
 
 def _round_trips_ms(rows: ResultRows) -> np.ndarray[Any, np.dtype[np.float64]]:
@@ -194,6 +203,6 @@ def _ms(value: float | None) -> str:
     return "-" if value is None else f"{value:.1f} ms"
 
 
-def _say(run: SwarmRun, text: str) -> None:
-    if not run.quiet:
+def _say(quiet: bool, text: str) -> None:
+    if not quiet:
         print(text, file=sys.stderr, flush=True)

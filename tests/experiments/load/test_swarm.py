@@ -10,7 +10,7 @@ import pytest
 
 from rse_pf.config import SessionSettings
 from rse_pf.errors import UsageError
-from rse_pf.experiments.load.run import SwarmRun, report_of
+from rse_pf.experiments.load.run import report_of
 from rse_pf.experiments.load.swarm import SwarmOptions, SwarmResult, records_of
 from rse_pf.experiments.load.swarm_process import (
     ResultRows,
@@ -127,8 +127,7 @@ def result(commands: list[CommandRecord]) -> SwarmResult:
 
 
 def test_the_report_counts_what_was_answered_in_time(tmp_path: Any) -> None:
-    run = SwarmRun(options=SwarmOptions(robots=1), seconds=1.0, out=tmp_path)
-    report = report_of(run, result(list(records_of(rows(), "robot"))), {})
+    report = report_of(SwarmOptions(robots=1), 1.0, result(list(records_of(rows(), "robot"))), {})
     assert report["commands"]["sent"] == 3
     assert report["commands"]["lost"] == 1
     assert report["failures_by_code"] == {"expired": 1}
