@@ -9,6 +9,7 @@ from __future__ import annotations
 from bisect import bisect_left
 from collections import Counter
 from collections.abc import Iterable, Mapping
+from itertools import accumulate
 from typing import Any
 
 from rse_pf.errors import MissingExtra
@@ -170,8 +171,5 @@ def render(merged: Mapping[str, Any]) -> bytes:
 
 
 def _cumulated(buckets: list[int]) -> list[tuple[str, float]]:
-    total, found = 0, []
-    for bound, n in zip([*map(str, BUCKETS_S), "+Inf"], buckets, strict=True):
-        total += n
-        found.append((bound, float(total)))
-    return found
+    bounds = [*map(str, BUCKETS_S), "+Inf"]
+    return list(zip(bounds, map(float, accumulate(buckets)), strict=True))

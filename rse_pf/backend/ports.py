@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from asyncio import AbstractEventLoop
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, Protocol
@@ -10,7 +11,7 @@ from rse_pf.backend.log import JsonLog
 from rse_pf.backend.metrics import Metrics
 from rse_pf.config import PlatformSettings
 
-__all__ = ["Clocks", "Handle", "Log", "Loop", "Wire", "WorkerContext"]
+__all__ = ["Clocks", "Log", "Wire", "WorkerContext"]
 
 
 class Wire(Protocol):
@@ -33,38 +34,6 @@ class Wire(Protocol):
 
     def close(self, code: int, reason: str) -> None:
         """Write a close frame and end the connection."""
-
-
-class Handle(Protocol):
-    """A timer that can be cancelled."""
-
-    def cancel(self) -> None:
-        """Prevent the call."""
-
-
-class Loop(Protocol):
-    """What a worker needs of an event loop."""
-
-    def call_later(self, delay: float, callback: Callable[[], object]) -> Handle:
-        """Call *callback* in *delay* seconds."""
-
-    def call_soon_threadsafe(self, callback: Callable[..., object], *args: Any) -> object:
-        """Call *callback* in the loop's thread."""
-
-    def run_in_executor(self, executor: None, function: Callable[..., Any], *args: Any) -> Any:
-        """Run *function* in a thread and return its future."""
-
-    def add_reader(self, fd: int, callback: Callable[..., object], *args: Any) -> None:
-        """Call *callback* whenever *fd* can be read."""
-
-    def remove_reader(self, fd: int) -> bool:
-        """Stop watching *fd* for reading."""
-
-    def add_writer(self, fd: int, callback: Callable[..., object], *args: Any) -> None:
-        """Call *callback* whenever *fd* can be written."""
-
-    def remove_writer(self, fd: int) -> bool:
-        """Stop watching *fd* for writing."""
 
 
 class Log(Protocol):
@@ -96,6 +65,6 @@ class WorkerContext:
     settings: PlatformSettings
     server_id: str
     clocks: Clocks
-    loop: Loop
+    loop: AbstractEventLoop
     log: JsonLog
     metrics: Metrics = field(default_factory=Metrics)

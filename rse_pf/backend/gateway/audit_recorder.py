@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import base64
 import time
+from asyncio import AbstractEventLoop, TimerHandle
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
@@ -19,7 +20,7 @@ from rse_pf.audit.chain import Note, RefusalLimiter, Value
 from rse_pf.audit.log import SYNC_S, AuditLog
 from rse_pf.auth.tokens import Claims
 from rse_pf.backend.gateway.handshake import Accepted, Rejected
-from rse_pf.backend.ports import Clocks, Handle, Loop
+from rse_pf.backend.ports import Clocks
 
 __all__ = ["AuditRecorder", "ServerAudit"]
 
@@ -39,7 +40,7 @@ class AuditRecorder:
         self,
         clocks: Clocks,
         *,
-        loop: Loop,
+        loop: AbstractEventLoop,
         tell: Callable[..., None],
         is_on: bool = True,
         refusals: RefusalLimiter | None = None,
@@ -59,8 +60,8 @@ class AuditRecorder:
         self._is_on = is_on
         self._refusals = refusals or RefusalLimiter()
         self._held: list[dict[str, Any]] = []
-        self._next: Handle | None = None
-        self._sum: Handle | None = None
+        self._next: TimerHandle | None = None
+        self._sum: TimerHandle | None = None
 
     def judged(self, verdict: Accepted | Rejected, source: str, authorization: str) -> None:
         """Record the verdict on a handshake from the address *source*."""

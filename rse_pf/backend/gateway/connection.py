@@ -95,7 +95,6 @@ class RobotConnection:
         """Time that the last command had, from its arrival to its deadline."""
         self.moving_until_s = float("-inf")
         self.is_connected = True
-        """Whether the socket still exists."""
         self._handler = handler
         self._context = handler.context
         self._wire = wire

@@ -6,8 +6,8 @@ Nothing but the computation of an answer (`Answers.compute`) runs outside of the
 
 from __future__ import annotations
 
+from asyncio import TimerHandle
 from collections.abc import Callable
-from functools import partial
 from typing import Any
 
 from rse_pf.backend.gateway.admission import DECODER_FULL, TOO_FAST, TOO_LATE, Admission, UnreadRefusal
@@ -20,7 +20,7 @@ from rse_pf.backend.gateway.rate_limits import CUT_OFF
 from rse_pf.backend.gateway.token_watch import TokenWatch
 from rse_pf.backend.jobs.manager import JobManager
 from rse_pf.backend.metrics import LongestRecently
-from rse_pf.backend.ports import Handle, Wire, WorkerContext
+from rse_pf.backend.ports import Wire, WorkerContext
 from rse_pf.backend.sandbox.manager import SandboxManager
 from rse_pf.backend.scheduling.cpu_throttle import BATCH_S, CpuThrottle
 from rse_pf.backend.scheduling.scheduler import (
@@ -124,7 +124,7 @@ class Dispatcher:
         self._threads = SolverThreads(
             settings.serving.solver_threads,
             answers.compute,
-            partial(context.loop.call_soon_threadsafe, self._computed),
+            lambda answer: context.loop.call_soon_threadsafe(self._computed, answer),
         )
         of_kind = {
             "stateless": "scheduler",
@@ -133,8 +133,8 @@ class Dispatcher:
         self._queues = {service.name: of_kind.get(service.kind, "refused") for service in registry}
         self._waits = LongestRecently()
         self._ran_inline = False
-        self._throttle_timer: Handle | None = None
-        self._sweep_timer: Handle | None = None
+        self._throttle_timer: TimerHandle | None = None
+        self._sweep_timer: TimerHandle | None = None
         self._batched: list[tuple[RobotConnection, Codec, Envelope, UnreadRefusal, float, int]] = []
         self._move: tuple[str, float] | None = None
         self._idle_timeouts = IdleTimeouts(settings.session, monotonic())
@@ -322,8 +322,7 @@ class Dispatcher:
                 self._waits.note(now - queued.received_s, now)
                 self._run(queued)
         if scheduler.waiting and self._sweep_timer is None:
-            pause_s = QUEUE_TARGET_S / 2
-            self._sweep_timer = self.context.loop.call_later(pause_s, self._sweep)
+            self._sweep_timer = self.context.loop.call_later(QUEUE_TARGET_S / 2, self._sweep)
 
     def _run(self, queued: QueuedCommand) -> None:
         """Compute the answer to *queued*; in the event loop only one in each of its rounds.

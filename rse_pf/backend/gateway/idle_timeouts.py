@@ -53,9 +53,8 @@ class IdleTimeouts:
                 connection.last_heard_s = min(now, connection.last_heard_s + late_s)
                 connection.opened_s = min(now, connection.opened_s + late_s)
             is_opening = connection.is_opening
-            if is_opening and now - connection.opened_s < self._hello_s:
-                continue
-            if not is_opening and now - connection.last_heard_s < self._max_silence_s:
+            idle_s = now - (connection.opened_s if is_opening else connection.last_heard_s)
+            if idle_s < (self._hello_s if is_opening else self._max_silence_s):
                 continue
             if connection not in self._suspects:
                 suspects.add(connection)

@@ -6,11 +6,11 @@ in a second than the settings allow, and no robot is asked again while it still 
 
 from __future__ import annotations
 
+from asyncio import AbstractEventLoop
 from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 
 from rse_pf.backend.gateway.connection import RobotConnection
-from rse_pf.backend.ports import Loop
 
 __all__ = ["Migration", "plan"]
 
@@ -48,7 +48,7 @@ class Migration:
         self,
         connections: Iterable[RobotConnection],
         *,
-        loop: Loop,
+        loop: AbstractEventLoop,
         now: Callable[[], float],
         choose: Callable[[Sequence[RobotConnection]], RobotConnection],
     ) -> None:

@@ -5,6 +5,7 @@ A robot learns no reason beyond the close code.  Keys that cannot be read leave 
 
 from __future__ import annotations
 
+from asyncio import TimerHandle
 from collections.abc import Callable, Set
 from functools import partial
 
@@ -12,7 +13,7 @@ from rse_pf.auth.tokens import Claims, KeySet, claims_problem
 from rse_pf.backend.gateway.audit_recorder import AuditRecorder
 from rse_pf.backend.gateway.connection import RobotConnection
 from rse_pf.backend.gateway.handshake import HandshakePolicy
-from rse_pf.backend.ports import Handle, WorkerContext
+from rse_pf.backend.ports import WorkerContext
 from rse_pf.wire.server_session import CLOSE_REPLACED, CLOSE_REVOKED, CLOSE_TOKEN_OVER
 
 __all__ = ["TokenWatch"]
@@ -45,7 +46,7 @@ class TokenWatch:
         self._tell = tell
         self._recorder = recorder
         self._by_number: dict[int, RobotConnection] = {}
-        self._timers: dict[RobotConnection, Handle] = {}
+        self._timers: dict[RobotConnection, TimerHandle] = {}
 
     def trust(self, keys: KeySet) -> None:
         """Verify tokens with *keys* from now on, and end every connection whose token they do not allow."""

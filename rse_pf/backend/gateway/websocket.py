@@ -19,7 +19,6 @@ from rse_pf.backend.gateway.dispatcher import Dispatcher
 from rse_pf.backend.gateway.frames import CloseBorder
 from rse_pf.backend.gateway.handshake import HEALTH, Accepted, HandshakePolicy, Rejected
 from rse_pf.backend.gateway.rate_limits import PendingHandshakes, SourceRates
-from rse_pf.backend.ports import Handle
 from rse_pf.config import ServingSettings
 from rse_pf.errors import MissingExtra
 
@@ -93,7 +92,6 @@ class RobotSockets:
         workers: int,
         new_name: Callable[[], str],
         recorder: AuditRecorder,
-        loop: asyncio.AbstractEventLoop,
     ) -> None:
         self._dispatcher = dispatcher
         self._context = dispatcher.context
@@ -107,12 +105,11 @@ class RobotSockets:
         )
         self._new_name = new_name
         self._recorder = recorder
-        self._loop = loop
         self._tasks: set[asyncio.Task[None]] = set()
         picows, self._connect_accepted_socket = _libraries()
         self._picows = picows
         self._protocol = protocol_type(picows)
-        self._listener = _listener_type(picows, loop, serving)
+        self._listener = _listener_type(picows, self._context.loop, serving)
         self._arguments = (
             _NoLogger(), True, serving.handshake_timeout_s,
             False, 20.0, 20.0, picows.WSAutoPingStrategy.PING_WHEN_IDLE, False,
@@ -136,7 +133,7 @@ class RobotSockets:
             self._pending.leave(pending)
             ended()
 
-        task = self._loop.create_task(self._serve(accepted, pending, gone))
+        task = self._context.loop.create_task(self._serve(accepted, pending, gone))
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
 
@@ -146,7 +143,7 @@ class RobotSockets:
         judge = partial(self._judge, pending)
         try:
             await self._connect_accepted_socket(
-                self._loop,
+                self._context.loop,
                 lambda: self._protocol(pending, ended, None, None, False, judge, *self._arguments),
                 accepted,
             )
@@ -274,7 +271,7 @@ def _listener_type(picows: Any, loop: asyncio.AbstractEventLoop, serving: Servin
             self._number = number
             self._transport: Any = None
             self._connection: RobotConnection | None = None
-            self._cut: Handle | None = None
+            self._cut: asyncio.TimerHandle | None = None
             self._holds = 0
 
         def on_ws_connected(self, transport: Any) -> None:

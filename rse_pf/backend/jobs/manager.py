@@ -12,6 +12,7 @@ import hashlib
 import json
 import threading
 import time
+from asyncio import AbstractEventLoop
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
@@ -23,7 +24,7 @@ from rse_pf.backend.jobs.lease import job_key
 from rse_pf.backend.jobs.process import JobRequest
 from rse_pf.backend.jobs.record_gc import RecordCollector
 from rse_pf.backend.jobs.runner import WAITING, JobContext, JobOutcome, JobSignals, run_job
-from rse_pf.backend.ports import Log, Loop
+from rse_pf.backend.ports import Log
 from rse_pf.backend.robot_store import quota_bytes
 from rse_pf.backend.scheduling.scheduler import QueuedCommand
 from rse_pf.errors import BadRequest, Busy, Cancelled, RsePfError
@@ -64,7 +65,7 @@ class JobManager:
         self,
         context: JobContext,
         *,
-        loop: Loop,
+        loop: AbstractEventLoop,
         log: Log,
         answer: Callable[[QueuedCommand, Result | Failure], None],
         progress: Callable[[Any, Progress], None],

@@ -10,12 +10,12 @@ from __future__ import annotations
 import os
 import socket
 import struct
+from asyncio import AbstractEventLoop
 from collections.abc import Callable, Iterator
 from typing import Any
 
 import msgspec
 
-from rse_pf.backend.ports import Loop
 from rse_pf.errors import BadMessage, LimitExceeded, RsePfError
 from rse_pf.wire.arrays import binary_encode_hook, extension_hook
 
@@ -75,7 +75,7 @@ class IpcChannel:
 
     def __init__(
         self,
-        loop: Loop,
+        loop: AbstractEventLoop,
         *,
         max_bytes: int,
         on_message: Callable[[Any], None],

@@ -9,11 +9,12 @@ from __future__ import annotations
 import functools
 import hashlib
 import math
+from asyncio import AbstractEventLoop, TimerHandle
 from collections import deque
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from rse_pf.backend.ports import Handle, Log, Loop
+from rse_pf.backend.ports import Log
 from rse_pf.backend.sandbox.ipc import IpcChannel, encode_message
 from rse_pf.backend.sandbox.policy import (
     Action,
@@ -53,7 +54,7 @@ class SandboxManager:
         server_id: str,
         store: ObjectStore | None,
         monotonic: Callable[[], float],
-        loop: Loop,
+        loop: AbstractEventLoop,
         log: Log,
         answer: Callable[[QueuedCommand, Result | Failure], None],
     ) -> None:
@@ -90,7 +91,7 @@ class SandboxManager:
         self._channels: dict[int, IpcChannel] = {}
         self._actions: deque[Action] = deque()
         self._is_executing = False
-        self._timer: Handle | None = None
+        self._timer: TimerHandle | None = None
         self._timer_s = math.inf
         self._zygote = ZygoteClient(
             services, settings, loop=loop, log=log, on_gone=self._on_gone, on_lost=self._on_lost

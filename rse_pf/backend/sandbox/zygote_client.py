@@ -11,9 +11,10 @@ import os
 import socket
 import subprocess
 import sys
+from asyncio import AbstractEventLoop
 from collections.abc import Callable, Sequence
 
-from rse_pf.backend.ports import Log, Loop
+from rse_pf.backend.ports import Log
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import ConfigurationError
 from rse_pf.services.custom.installed import InstalledService
@@ -31,7 +32,7 @@ class ZygoteClient:
         services: Sequence[InstalledService],
         settings: PlatformSettings,
         *,
-        loop: Loop,
+        loop: AbstractEventLoop,
         log: Log,
         on_gone: Callable[[int, str], None],
         on_lost: Callable[[], None],

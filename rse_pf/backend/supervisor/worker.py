@@ -179,7 +179,6 @@ class _Worker:
             workers=self._workers,
             new_name=self._new_name,
             recorder=self._recorder,
-            loop=loop,
         )
 
     def _sandboxes(
