@@ -143,10 +143,10 @@ async def kill_during_uploads(
     for kill in range(args.kills):
         share = (kill + 1) * args.uploads // (args.kills + 1)
         await uploads.until(lambda share=share: len(uploads.acknowledged) >= share)  # type: ignore[misc]
-        before = cloud.data_servers.mark
+        before = cloud.data_servers.process.mark
         began = time.monotonic()
-        cloud.data_servers.send(signal.SIGKILL)
-        while cloud.data_servers.mark == before or not await cloud.data_servers.is_ready():
+        cloud.data_servers.process.send(signal.SIGKILL)
+        while cloud.data_servers.process.mark == before or not await cloud.data_servers.is_ready():
             if time.monotonic() - began > TIMEOUT_S:
                 raise TimeoutError("the data server was not replaced")
             await asyncio.sleep(0.01)  # polls, with a deadline

@@ -12,6 +12,7 @@ examples:
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import math
 import os
@@ -24,7 +25,7 @@ from datetime import datetime, timezone
 from importlib import metadata
 from pathlib import Path
 
-from rse_pf.cli.doctor import Finding
+from rse_pf.cli.doctor import Finding, report
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import RsePfError, UsageError
 
@@ -48,7 +49,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
             "doctor": "check tools, packages, account, certificate and quotas before a deployment",
             "cost": "what a load costs a month, on the fleet and on the Lambda",
             "status": "servers, their health, alarms, robots",
-            "leftovers": "what is still in the account and belongs to no stack",
+            "leftovers": "resources in the account that belong to no stack",
         }.items()
     }
     made["cost"].add_argument("--robots", type=int, default=10, metavar="N", help="default: %(default)s")
@@ -70,12 +71,8 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
 
 
 def _doctor(args: argparse.Namespace, settings: PlatformSettings) -> int:
-    failed = 0
-    for finding in (*check_tools(Path.cwd()), *_account_findings(settings)):
-        print(finding, flush=True)
-        failed += finding.grade == "fail"
-    print(f"\n{failed} to fix first" if failed else "\nready: npx cdk deploy --all")
-    return 1 if failed else 0
+    findings = itertools.chain(check_tools(Path.cwd()), _account_findings(settings))
+    return report(findings, "ready: npx cdk deploy --all")
 
 
 def _account_findings(settings: PlatformSettings) -> Iterator[Finding]:
@@ -93,10 +90,9 @@ def check_tools(checkout: Path) -> Iterator[Finding]:
     """Yield what a deployment from *checkout* needs on this machine; no account is asked."""
     yield _node()
     yield _cli(checkout)
-    built = [name for name in ("wheelhouse", "lambda") if _has_files(checkout / _PACKAGES / name)]
     yield (
         Finding(grade="ok", what="packages are built")
-        if len(built) == 2
+        if all(any((checkout / _PACKAGES / name).glob("*")) for name in ("wheelhouse", "lambda"))
         else Finding(grade="fail", what=f"no packages in {_PACKAGES}", fix="make assets")
     )
 
@@ -139,10 +135,6 @@ def _cli(checkout: Path) -> Finding:
     if version != pinned:
         return Finding(grade="warn", what=f"{line}; package.json pins {pinned}", fix=fix)
     return Finding(grade="ok", what=line)
-
-
-def _has_files(folder: Path) -> bool:
-    return folder.is_dir() and any(folder.iterdir())
 
 
 def _cost(args: argparse.Namespace, settings: PlatformSettings) -> int:

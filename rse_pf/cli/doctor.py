@@ -1,6 +1,6 @@
 """Check what this machine needs to run the platform, and say how to fix what it lacks.
 
-Each line is ok, warn or fail; a failure is something that rse-pf local or rse-pf demo cannot do without.
+Each line is ok, warn or fail; a failure is something that rse-pf local or rse-pf demo requires.
 
 example:
   rse-pf doctor
@@ -9,13 +9,15 @@ example:
 from __future__ import annotations
 
 import argparse
+import contextlib
 import importlib
 import importlib.util
 import os
 import platform
+import re
 import resource
 import subprocess
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
@@ -23,7 +25,7 @@ from pathlib import Path
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import ConfigurationError, MissingExtra
 
-__all__ = ["Finding", "add_arguments", "check_machine", "run"]
+__all__ = ["Finding", "add_arguments", "check_machine", "report", "run"]
 
 _EXTRAS: dict[str, tuple[tuple[str, ...], bool]] = {
     "base": (("numpy", "websockets", "msgspec"), True),
@@ -65,11 +67,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
     """Print every finding; 1 if something required failed."""
+    return report(check_machine(settings), "ready: rse-pf local, or rse-pf demo")
+
+
+def report(findings: Iterable[Finding], ready: str) -> int:
+    """Print *findings* as they come, then how many failed, or *ready*; return the exit code."""
     failed = 0
-    for finding in check_machine(settings):
+    for finding in findings:
         print(finding, flush=True)
         failed += finding.grade == "fail"
-    print(f"\n{failed} to fix first" if failed else "\nready: rse-pf local, or rse-pf demo")
+    print(f"\n{failed} to fix first" if failed else f"\n{ready}")
     return 1 if failed else 0
 
 
@@ -86,19 +93,15 @@ def _system(settings: PlatformSettings) -> Iterator[Finding]:
     yield Finding(grade="ok", what=f"Python {platform.python_version()}")
     system, machine = platform.system(), platform.machine()
     fix = "run the platform on Linux, x86-64" if (system, machine) != ("Linux", "x86_64") else ""
-    grade = "ok" if not fix else ("warn" if system == "Linux" else "fail")
-    yield Finding(grade=grade, what=f"{system} on {machine}", fix=fix)
+    yield _finding(f"{system} on {machine}", fix, is_required=system != "Linux")
 
 
 def _extras(settings: PlatformSettings) -> Iterator[Finding]:
     for extra, (modules, required) in _EXTRAS.items():
-        missing = [module for module in modules if not _has(module)]
-        if not missing:
-            yield Finding(grade="ok", what=f"extra {extra}")
-            continue
+        missing = ", ".join(module for module in modules if not _has(module))
         fix = "pip install rse-pf" if extra == "base" else f"pip install 'rse-pf[{extra}]'"
-        what = f"extra {extra}: {', '.join(missing)} cannot be imported"
-        yield Finding(grade="fail" if required else "warn", what=what, fix=fix)
+        what = f"extra {extra}: {missing} cannot be imported" if missing else f"extra {extra}"
+        yield _finding(what, fix if missing else "", is_required=required)
 
 
 def _engines(settings: PlatformSettings) -> Iterator[Finding]:
@@ -107,11 +110,8 @@ def _engines(settings: PlatformSettings) -> Iterator[Finding]:
             yield Finding(grade="ok", what=f"engine {engine} {_version_of(module)}")
         else:
             chosen = settings.pnp.engine == engine
-            yield Finding(
-                grade="fail" if chosen else "warn",
-                what=f"engine {engine} is not installed" + (" but chosen by pnp.engine" if chosen else ""),
-                fix=f"pip install 'rse-pf[{extra}]'",
-            )
+            what = f"engine {engine} is not installed" + (" but chosen by pnp.engine" if chosen else "")
+            yield _finding(what, f"pip install 'rse-pf[{extra}]'", is_required=chosen)
 
 
 def _balancer(settings: PlatformSettings) -> Iterator[Finding]:
@@ -157,36 +157,33 @@ def _open_files(settings: PlatformSettings) -> Iterator[Finding]:
     needed = settings.serving.max_robots * _DESCRIPTORS_PER_ROBOT + _OTHER_DESCRIPTORS
     robots = max(0, (most - _OTHER_DESCRIPTORS) // _DESCRIPTORS_PER_ROBOT)
     what = f"open files: {most}, enough for {robots} robots through one load balancer"
-    if most >= needed:
-        yield Finding(grade="ok", what=what)
-    else:
-        yield Finding(
-            grade="warn", what=f"{what}; serving.max_robots is {settings.serving.max_robots}",
-            fix=f"raise the hard limit (ulimit -Hn) to {needed}, or lower serving.max_robots",
-        )  # fmt: skip
+    fix = ""
+    if most < needed:
+        what += f"; serving.max_robots is {settings.serving.max_robots}"
+        fix = f"raise the hard limit (ulimit -Hn) to {needed}, or lower serving.max_robots"
+    yield _finding(what, fix)
 
 
 def _size(settings: PlatformSettings) -> Iterator[Finding]:
     cores = len(os.sched_getaffinity(0))
     wanted = settings.local.servers * settings.local.workers
     fix = f"expect shared cores: local.servers x local.workers = {wanted}" if cores < wanted else ""
-    yield Finding(grade="warn" if fix else "ok", what=f"{cores} cores", fix=fix)
-    mebibytes = _available_mebibytes()
-    little = mebibytes is not None and mebibytes < _LITTLE_MEMORY_MIB
-    yield Finding(
-        grade="warn" if little else "ok",
-        what="memory unknown" if mebibytes is None else f"{mebibytes} MiB of memory available",
-        fix=f"free some: the demo needs about {_LITTLE_MEMORY_MIB} MiB" if little else "",
-    )
+    yield _finding(f"{cores} cores", fix)
+    found = None
+    with contextlib.suppress(OSError):
+        found = re.search(r"MemAvailable: *(\d+) kB", Path("/proc/meminfo").read_text(encoding="ascii"))
+    if found is None:
+        yield _finding("memory unknown")
+        return
+    what = f"{int(found[1]) // 1024} MiB of memory available"
+    fix = f"free some: the demo needs about {_LITTLE_MEMORY_MIB} MiB"
+    yield _finding(what, fix if int(found[1]) // 1024 < _LITTLE_MEMORY_MIB else "")
 
 
-def _available_mebibytes() -> int | None:
-    try:
-        lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
-    except OSError:
-        return None
-    found = [int(line.split()[1]) // 1024 for line in lines if line.startswith("MemAvailable:")]
-    return found[0] if found else None
+def _finding(what: str, fix: str = "", *, is_required: bool = False) -> Finding:
+    """Return what is ok if it needs no *fix*; else it warns, or fails if it *is_required*."""
+    grade = "fail" if is_required else "warn"
+    return Finding(grade=grade if fix else "ok", what=what, fix=fix)
 
 
 def _has(module: str) -> bool:

@@ -1,6 +1,6 @@
 """Run the platform on this machine until Ctrl-C: a load balancer, and backend servers behind it.
 
-Each is a process of its own; Ctrl-C, a closed terminal and rse-pf local stop leave nothing running.  The
+Each box is a separate process; Ctrl-C, closing the terminal and rse-pf local stop end all of them.  The
 platform grows, shrinks and replaces what breaks.  The other actions show its state, or inject a fault.
 
 examples:
@@ -52,9 +52,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--for", dest="for_s", type=float, metavar="S",
         help="pause, slow, partition: end after S seconds (without: pause stays, the others end with Ctrl-C)",
     )  # fmt: skip
-    parser.add_argument("--percent", type=float, metavar="P", help="slow: leave the server P %% of its time")
     parser.add_argument(
-        "--name", default=DEFAULT_NAME, help=f"which platform, if there are several (default: {DEFAULT_NAME})"
+        "--percent", type=float, metavar="P", help="slow: leave the server P %% of its CPU time"
+    )
+    parser.add_argument(
+        "--name", default=DEFAULT_NAME, help=f"name of the platform, if several run (default: {DEFAULT_NAME})"
     )
     parser.add_argument(
         "--servers", type=int, metavar="N",
@@ -216,7 +218,9 @@ def _welcome(platform: Any, name: str) -> None:
     from rse_pf.local.control.status import data_url
 
     which = "" if name == DEFAULT_NAME else f" --name {name}"
-    large = f"large data goes to {data_url(platform.url)}\n" if platform.data_servers.is_running() else ""
+    large = (
+        f"large data goes to {data_url(platform.url)}\n" if platform.data_servers.process.is_running() else ""
+    )
     print(
         f"\nrobots connect to  {platform.url}\n{large}"
         f"a robot's token    rse-pf token issue robot-1{which}\n"

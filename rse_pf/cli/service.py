@@ -58,9 +58,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--services", type=Path, metavar="DIR", help="install, list: the services folder")
     parser.add_argument(
-        "--request", metavar="JSON", help="call: the request; @FILE reads it, also a recorded one"
+        "--request",
+        metavar="JSON",
+        help="call: the request as JSON; @FILE reads it from a file, which may be a recorded request",
     )
-    parser.add_argument("--name", default="default", help="call: which local platform (default: default)")
+    parser.add_argument(
+        "--name", default="default", help="call: name of the local platform (default: default)"
+    )
     parser.add_argument("--once", action="store_true", help="run: answer the recorded requests, then end")
 
 
@@ -209,13 +213,8 @@ def _recorded(source: Path) -> Recorded:
 
 
 def _plain(value: Any) -> Any:
-    import numpy as np
-
-    if isinstance(value, np.ndarray):
-        return value.tolist()
-    if isinstance(value, dict):
-        return {key: _plain(each) for key, each in value.items()}
-    return [_plain(each) for each in value] if isinstance(value, list) else value
+    """Return *value* as JSON gives it back: arrays are lists, and what JSON cannot hold is text."""
+    return json.loads(json.dumps(value, default=lambda each: getattr(each, "tolist", each.__repr__)()))
 
 
 def _difference(got: Any, expected: Any, tolerance: float, path: str = "reply") -> str:

@@ -93,7 +93,7 @@ def test_the_public_port_has_three_paths_and_nothing_else_listens_publicly(tmp_p
                 for method in ("GET", "POST")
             }
             robots = await asyncio.to_thread(status_of, port, "/ws")
-            marks = [*cloud.backend_servers.marks.values(), cloud.load_balancer.mark]
+            marks = [*cloud.backend_servers.marks.values(), cloud.load_balancer.process.mark]
             addresses = listening([mark.pid for mark in marks if mark is not None])
             mode = stat.S_IMODE(next((tmp_path / "p").rglob(ADMIN_SOCKET)).stat().st_mode)
             health = await asyncio.to_thread(health_of, port)

@@ -88,9 +88,9 @@ async def event(cloud: LocalPlatform, name: str, heard: asyncio.Queue[Any]) -> A
 
 def processes(cloud: LocalPlatform) -> list[int]:
     """Return every process of a running platform."""
-    assert cloud.load_balancer.mark is not None
+    assert cloud.load_balancer.process.mark is not None
     workers = [pid for server in cloud.servers for pid in server.workers]
-    return [cloud.load_balancer.mark.pid, *(server.pid for server in cloud.servers), *workers]
+    return [cloud.load_balancer.process.mark.pid, *(server.pid for server in cloud.servers), *workers]
 
 
 def test_robots_with_a_token_are_welcomed_by_both_servers_and_nothing_is_left(
@@ -222,8 +222,8 @@ def test_a_server_that_does_not_start_ends_the_start_and_leaves_nothing(
     with pytest.raises(ConfigurationError, match=complaint):
         asyncio.run(cloud.__aenter__())
 
-    assert cloud.load_balancer.mark is not None
-    gone(cloud.load_balancer.mark.pid)
+    assert cloud.load_balancer.process.mark is not None
+    gone(cloud.load_balancer.process.mark.pid)
     assert cloud.backend_servers.marks == {}
     assert read_state(tmp_path / "a") is None
     assert cloud.events[-1] == {"event": "platform-gone"}
@@ -238,7 +238,7 @@ from rse_pf.config import PlatformSettings
 async def run():
     async with LocalPlatform(PlatformSettings(), servers=1, port=0, state=Path("a")) as cloud:
         workers = [pid for server in cloud.servers for pid in server.workers]
-        print(cloud.load_balancer.mark.pid, cloud.servers[0].pid, *workers, flush=True)
+        print(cloud.load_balancer.process.mark.pid, cloud.servers[0].pid, *workers, flush=True)
         await asyncio.Event().wait()
 asyncio.run(run())
 """

@@ -48,7 +48,7 @@ async def start_again(cloud: LocalPlatform, before: Any) -> None:
     """Start a balancer that was killed, at the same port, unless the platform has done so itself."""
     balancer = cloud.load_balancer
     await asyncio.to_thread(wait_ended, before, 5.0)
-    if balancer.mark == before:
+    if balancer.process.mark == before:
         balancer.launch()
         await balancer.wait_live(10.0)
         balancer.set_targets([server.target for server in cloud.servers])
@@ -135,7 +135,7 @@ def test_all_robots_reconnect_soon_after_the_load_balancer_was_killed_and_restar
             async with swarm_of(cloud, SwarmOptions(robots=robots), on_event=listen, origin=origin) as swarm:
                 await swarm.start()
                 await swarm.wait_joined(30)
-                before = cloud.load_balancer.mark
+                before = cloud.load_balancer.process.mark
                 assert before is not None
                 os.kill(before.pid, signal.SIGKILL)
                 killed_s = time.monotonic() - origin

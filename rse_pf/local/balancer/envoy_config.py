@@ -6,6 +6,7 @@ robots notice when servers start, drain, stall and crash.
 
 from __future__ import annotations
 
+import socket
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,8 +29,6 @@ _LOOPBACK = "127.0.0.1"
 _NO_LIMIT = 1_000_000
 """A server counts its robots itself (``serving.max_robots``); Envoy's breakers must not act before."""
 _MAX_HEADERS = 64
-_SOL_SOCKET, _SO_SNDBUF, _SO_RCVBUF, _IPPROTO_TCP, _TCP_USER_TIMEOUT = 1, 7, 8, 6, 18
-"""Of Linux."""
 _CIPHERS = (
     "ECDHE-ECDSA-AES128-GCM-SHA256", "ECDHE-RSA-AES128-GCM-SHA256", "ECDHE-ECDSA-AES256-GCM-SHA384",
     "ECDHE-RSA-AES256-GCM-SHA384", "ECDHE-ECDSA-CHACHA20-POLY1305", "ECDHE-RSA-CHACHA20-POLY1305",
@@ -80,7 +79,7 @@ def endpoints(targets: Sequence[Target], cluster: str = CLUSTER) -> dict[str, An
         {
             "endpoint": {
                 "hostname": target.name,
-                **_endpoint_address(target.port),
+                "address": _address(_LOOPBACK, target.port),
                 "health_check_config": {"port_value": target.control_port},
             }
         }
@@ -142,7 +141,7 @@ def _listener(settings: PlatformSettings, port: int) -> dict[str, Any]:
         "enable_reuse_port": False,
         # Behind a slow reader no more is kept, here and in the kernel, than a server would keep itself.
         "per_connection_buffer_limit_bytes": settings.serving.write_buffer_bytes,
-        "socket_options": [_kernel_buffer(_SO_SNDBUF, settings), _unread_timeout(settings)],
+        "socket_options": [_kernel_buffer(socket.SO_SNDBUF, settings), _unread_timeout(settings)],
         "filter_chains": [{"filters": [{"name": "http", "typed_config": manager}], **_tls(settings)}],
     }
 
@@ -174,14 +173,19 @@ def _tls(settings: PlatformSettings) -> dict[str, Any]:
 
 def _kernel_buffer(name: int, settings: PlatformSettings) -> dict[str, Any]:
     value = settings.serving.write_buffer_bytes
-    return {"level": _SOL_SOCKET, "name": name, "int_value": value, "state": "STATE_PREBIND"}
+    return {"level": socket.SOL_SOCKET, "name": name, "int_value": value, "state": "STATE_PREBIND"}
 
 
 def _unread_timeout(settings: PlatformSettings) -> dict[str, Any]:
     """End a connection whose robot reads nothing: Envoy would keep it, with all that is unread, for ever."""
     session = settings.session
     max_ms = int(2e3 * (session.ping_interval_s + session.ping_timeout_s))
-    return {"level": _IPPROTO_TCP, "name": _TCP_USER_TIMEOUT, "int_value": max_ms, "state": "STATE_PREBIND"}
+    return {
+        "level": socket.IPPROTO_TCP,
+        "name": socket.TCP_USER_TIMEOUT,
+        "int_value": max_ms,
+        "state": "STATE_PREBIND",
+    }
 
 
 def _max_connections(most: int) -> dict[str, Any]:
@@ -256,7 +260,7 @@ def _cluster(
         # A server that leaves the file gets nothing new, and keeps its open sockets.
         "ignore_health_on_host_removal": True,
         "connect_timeout": "0.5s",
-        "upstream_bind_config": {"socket_options": [_kernel_buffer(_SO_RCVBUF, settings)]},
+        "upstream_bind_config": {"socket_options": [_kernel_buffer(socket.SO_RCVBUF, settings)]},
         "per_connection_buffer_limit_bytes": settings.serving.write_buffer_bytes,
         "circuit_breakers": {"thresholds": [dict.fromkeys(limits, _NO_LIMIT)]},
         "health_checks": [
@@ -276,10 +280,6 @@ def _cluster(
 def _address(host: str, port: int) -> dict[str, Any]:
     address = _LOOPBACK if host == "localhost" else host  # Envoy resolves no names here
     return {"socket_address": {"address": address, "port_value": port}}
-
-
-def _endpoint_address(port: int) -> dict[str, Any]:
-    return {"address": _address(_LOOPBACK, port)}
 
 
 def _seconds(value: float) -> str:

@@ -68,12 +68,6 @@ class EnvoyLoadBalancer:
         self._dies_with_parent = dies_with_parent
         self._endpoints = folder / "endpoints.json"
         self._data_endpoints = folder / "data-endpoints.json"
-        self._names: dict[int, str] = {}
-
-    @property
-    def mark(self) -> ProcessMark | None:
-        """The Envoy that runs now."""
-        return self.process.mark
 
     def launch(self) -> None:
         """Start the process without targets, and return before it listens.
@@ -81,7 +75,7 @@ class EnvoyLoadBalancer:
         After an earlier one, it takes the same port and the same targets.
         """
         binary = envoy_binary()
-        if self.mark is None:
+        if self.process.mark is None:
             self.set_targets(())
             self.set_data_targets(())
         self.kill()  # reaps one that ended by itself
@@ -119,11 +113,10 @@ class EnvoyLoadBalancer:
 
         if not await self._until(live, timeout_s):
             late = f"did not start within {timeout_s:g} s"
-            raise self.process.failed(late if self.is_running() else self.process.ending())
+            raise self.process.failed(late if self.process.is_running() else self.process.ending())
 
     def set_targets(self, targets: Sequence[Target]) -> None:
         """Let new sockets go to *targets* and nowhere else; open sockets stay where they are."""
-        self._names.update({target.port: target.name for target in targets})
         replace_json(self._endpoints, endpoints(targets))
 
     def set_data_targets(self, targets: Sequence[Target]) -> None:
@@ -132,7 +125,7 @@ class EnvoyLoadBalancer:
 
     async def stats(self) -> Mapping[str, TargetStats]:
         """Return the targets that Envoy has now, by server name; empty when it does not answer."""
-        return self._targets(json.loads(await self._get("/clusters?format=json") or b"{}"))
+        return _targets(json.loads(await self._get("/clusters?format=json") or b"{}"))
 
     async def wait_healthy(self, names: Iterable[str], timeout_s: float) -> bool:
         """Wait until Envoy gives robots to every one of *names*; return whether it does."""
@@ -148,13 +141,9 @@ class EnvoyLoadBalancer:
 
         async def gone() -> bool:
             page = await self._get("/clusters?format=json")
-            return bool(page) and name not in self._targets(json.loads(page))
+            return bool(page) and name not in _targets(json.loads(page))
 
         return await self._until(gone, timeout_s)
-
-    def is_running(self) -> bool:
-        """Return whether the process is there."""
-        return self.process.is_running()
 
     async def wait_over(self) -> str:
         """Wait until the process ends by itself; return the last line of its log."""
@@ -169,27 +158,10 @@ class EnvoyLoadBalancer:
         """End the process at once, if it is there, and reap it."""
         self.process.kill()
 
-    def _targets(self, page: Mapping[str, Any]) -> dict[str, TargetStats]:
-        found: dict[str, TargetStats] = {}
-        for cluster in page.get("cluster_statuses", []):
-            if cluster.get("name") == CLUSTER:
-                found.update(self._target(host) for host in cluster.get("host_statuses", []))
-        return found
-
-    def _target(self, host: Mapping[str, Any]) -> tuple[str, TargetStats]:
-        port = host["address"]["socket_address"]["port_value"]
-        robots = [int(s.get("value", 0)) for s in host.get("stats", []) if s.get("name") == "rq_active"]
-        health = host.get("health_status", {})
-        failed = {
-            name for name, value in health.items() if name.startswith(("failed_", "pending_")) and value
-        }
-        healthy = not failed and health.get("eds_health_status", "HEALTHY") in ("HEALTHY", "UNKNOWN")
-        return self._names.get(port, str(port)), TargetStats(healthy=healthy, robots=sum(robots))
-
     async def _until(self, condition: Callable[[], Any], timeout_s: float) -> bool:
         """Ask *condition* until it holds, the time is over, or Envoy has ended."""
         end = time.monotonic() + timeout_s
-        while self.is_running():
+        while self.process.is_running():
             if await condition():
                 return True
             if time.monotonic() >= end:
@@ -199,6 +171,22 @@ class EnvoyLoadBalancer:
 
     async def _get(self, path: str) -> bytes:
         return await asyncio.to_thread(_ask, self._folder, path)
+
+
+def _targets(page: Mapping[str, Any]) -> dict[str, TargetStats]:
+    found: dict[str, TargetStats] = {}
+    for cluster in page.get("cluster_statuses", []):
+        if cluster.get("name") == CLUSTER:
+            found.update(_target(host) for host in cluster.get("host_statuses", []))
+    return found
+
+
+def _target(host: Mapping[str, Any]) -> tuple[str, TargetStats]:
+    robots = [int(s.get("value", 0)) for s in host.get("stats", []) if s.get("name") == "rq_active"]
+    health = host.get("health_status", {})
+    failed = {name for name, value in health.items() if name.startswith(("failed_", "pending_")) and value}
+    healthy = not failed and health.get("eds_health_status", "HEALTHY") in ("HEALTHY", "UNKNOWN")
+    return host["hostname"], TargetStats(healthy=healthy, robots=sum(robots))
 
 
 class _Admin(http.client.HTTPConnection):

@@ -8,6 +8,7 @@ plane itself delayed does not count against a server.
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import math
 import os
 import time
@@ -32,7 +33,7 @@ from rse_pf.local.control.monitor import (
 )
 from rse_pf.local.control.rebalancer import MoveRequest, Rebalancer
 from rse_pf.local.control.scale_modifier import LocalScaleModifier
-from rse_pf.local.servers.control_client import ControlPort, ControlPortReply
+from rse_pf.local.servers.control_client import ControlPort
 from rse_pf.scaling.health import LOCAL_INTERVAL_S, LOCAL_TIMEOUT_S, observe
 
 __all__ = ["ControlOptions", "ControlPlane"]
@@ -98,7 +99,6 @@ class ControlPlane:
         self._every_s = sample_interval_s(period_s)
         self._periods = Periods(period_s, keep=scaling.idle_s // scaling.period_s + scaling.busy_periods + 1)
         self._rebalancer = Rebalancer(scaling) if options.elastic and options.rebalance else None
-        self._before: dict[str, Observed] = {}
         self._ports: dict[str, ControlPort] = {}
         self._cores = len(os.sched_getaffinity(0))
 
@@ -137,10 +137,9 @@ class ControlPlane:
 
     def document(self) -> dict[str, Any]:
         """Return the state of the policy as plain JSON values."""
-        samples = self._periods.samples(time.monotonic())
         told = [
             {"start_s": sample.start_s, "cpu_percent": sample.cpu_percent, "requests": sample.requests}
-            for sample in samples
+            for sample in self._periods.samples(time.monotonic())
         ]
         return {**self.modifier.document(), "elastic": self._elastic, "samples": told}
 
@@ -163,12 +162,11 @@ class ControlPlane:
 
     async def _check(self, member: Member, port: ControlPort, began_s: float) -> bool | None:
         """Return the outcome of one check; None if it tells nothing about the server."""
-        timeout_s = LOCAL_TIMEOUT_S
         try:
-            reply: ControlPortReply = await port.ask(READY_PATH, timeout_s=timeout_s)
+            reply = await port.ask(READY_PATH, timeout_s=LOCAL_TIMEOUT_S)
         except ConnectionError:
-            late_s = time.monotonic() - began_s - timeout_s
-            return None if late_s > _LATE_SHARE * timeout_s else False
+            late_s = time.monotonic() - began_s - LOCAL_TIMEOUT_S
+            return None if late_s > _LATE_SHARE * LOCAL_TIMEOUT_S else False
         if reply.status != 200 and reply.document().get("state") in _LEAVING:
             self._fleet.leaves_by_itself(member)
             return None
@@ -206,32 +204,29 @@ class ControlPlane:
     async def _sample_all(self) -> MonitorSample:
         members = list(self._fleet.members.values())
         stats, servers = await asyncio.gather(
-            self._load_balancer.stats(), asyncio.gather(*(self._monitore(member) for member in members))
+            self._load_balancer.stats(), asyncio.gather(*(self._sample(member) for member in members))
         )
         there = set(self._fleet.members)
         for gone in set(self._ports) - there:
             self._ports.pop(gone).close()
-            self._before.pop(gone, None)
         in_balancer = frozenset(name for name, target in stats.items() if target.healthy)
         return monitor_sample(time.monotonic(), [each for each in servers if each.name in there], in_balancer)
 
-    async def _monitore(self, member: Member) -> ServerSample:
+    async def _sample(self, member: Member) -> ServerSample:
         server = member.server
         observed = None
         if server is not None:
             if member.name not in self._ports:
                 self._ports[member.name] = self._fleet.control(server)
-            port = self._ports[member.name]
-            try:
-                reply = await port.ask("/status", timeout_s=_STATUS_SHARE * self._every_s)
-                told = reply.document()
-                if reply.status == 200 and "cpu_s" in told:
-                    observed = Observed(at_s=time.monotonic(), status=told)
-            except ConnectionError:
-                pass  # a server that does not answer has no numbers; `_check_on` judges its health
+            # A server that does not answer has no numbers; `_check_on` judges its health.
+            with contextlib.suppress(ConnectionError):
+                timeout_s = _STATUS_SHARE * self._every_s
+                reply = await self._ports[member.name].ask("/status", timeout_s=timeout_s)
+                if reply.status == 200 and "cpu_s" in reply.document():
+                    observed = Observed(at_s=time.monotonic(), status=reply.document())
         workers = 1 if server is None else len(server.workers)
         sample = server_sample(
-            self._before.get(member.name),
+            member.observed,
             observed,
             name=member.name,
             pid=0 if server is None else server.pid,
@@ -240,7 +235,7 @@ class ControlPlane:
             capacity=capacity_cores(self._settings.serving, workers, self._cores),
         )
         if observed is not None:
-            self._before[member.name] = observed
+            member.observed = observed
             member.robots = sample.robots
         return sample
 
@@ -282,12 +277,12 @@ class ControlPlane:
         while True:
             why = await self._load_balancer.wait_over()
             began_s = time.monotonic()
-            mark = self._load_balancer.mark
+            mark = self._load_balancer.process.mark
             self._emit("balancer-gone", pid=None if mark is None else mark.pid, reason=why)
             await self._restart_balancer()
             seconds = round(time.monotonic() - began_s, 3)
             self._changed()
-            mark = self._load_balancer.mark
+            mark = self._load_balancer.process.mark
             self._emit("balancer-back", seconds=seconds, pid=None if mark is None else mark.pid)
             self.watch_spread()
 

@@ -19,7 +19,7 @@ from typing import Any
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import ConfigurationError, UsageError
 from rse_pf.local.balancer.load_balancer import EnvoyLoadBalancer
-from rse_pf.local.control.monitor import ServerPhase
+from rse_pf.local.control.monitor import Observed, ServerPhase
 from rse_pf.local.processes import STOP_TIMEOUT_S
 from rse_pf.local.servers.backend_servers import BackendServer, LocalBackendServers
 from rse_pf.local.servers.control_client import ControlPort
@@ -56,6 +56,7 @@ class Member:
     replaces_living: bool = False
     adopted: bool = False
     robots: int = 0
+    observed: Observed | None = None
 
     @property
     def phase(self) -> ServerPhase:
@@ -186,7 +187,9 @@ class Fleet:
         try:
             server = await self._backend_servers.wait_ready(member.name, timeout_s)
         except ConfigurationError:
-            code = await self._give_up(member)
+            self._backend_servers.send(member.name, signal.SIGKILL)
+            code = await self._backend_servers.wait_over(member.name)
+            self._forget(member)
             self._emit("server-gone", server=member.name, pid=None, exit_code=code)
             raise
         member.server = server
@@ -270,13 +273,12 @@ class Fleet:
         """
         self.dead.pop(name, None)
         member = self.members.get(name)
-        if member is not None and member.leaving:
-            member = None
-        if member is not None:
+        cut_off = member is not None and not member.leaving
+        if member is not None and cut_off:
             member.out = True
             self._set_targets()
-        new = self.launch(replaces_living=member is not None)
-        if member is not None:
+        new = self.launch(replaces_living=cut_off)
+        if cut_off:
             self._backend_servers.send(name, signal.SIGKILL)
         self.start(new)
         return new.name
@@ -354,12 +356,6 @@ class Fleet:
             elif not member.out and not member.leaving:
                 self._lost(member)
 
-    async def _give_up(self, member: Member) -> int | None:
-        self._backend_servers.send(member.name, signal.SIGKILL)
-        code = await self._backend_servers.wait_over(member.name)
-        self._forget(member)
-        return code
-
     def _now_healthy(self, member: Member, server: BackendServer) -> None:
         """Note that the balancer found *member* healthy, by the same rule as `observe`."""
         member.healthy_s = time.monotonic()
@@ -379,8 +375,7 @@ class Fleet:
         self._emit("server-gone", server=server.name, pid=server.pid, exit_code=code)
         if unasked:
             self._lost(member)
-        timeout_s = STOP_TIMEOUT_S
-        if not member.leaving and await self._load_balancer.wait_gone(server.name, timeout_s):
+        if not member.leaving and await self._load_balancer.wait_gone(server.name, STOP_TIMEOUT_S):
             self._emit("server-out", server=server.name)
 
     def _forget(self, member: Member) -> None:
@@ -391,8 +386,8 @@ class Fleet:
         self._changed()
 
     def _lost(self, member: Member) -> None:
-        lived_s = math.inf if member.healthy_s is None else time.monotonic() - member.healthy_s
-        self.dead[member.name] = member.healthy_s is None or lived_s < _MIN_UPTIME_S
+        young_since_s = time.monotonic() - _MIN_UPTIME_S
+        self.dead[member.name] = member.healthy_s is None or member.healthy_s > young_since_s
         self.on_lost()
 
     def _set_targets(self) -> None:

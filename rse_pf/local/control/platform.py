@@ -31,7 +31,7 @@ from rse_pf.local.control.control_plane import ControlOptions, ControlPlane
 from rse_pf.local.control.fleet import Fleet
 from rse_pf.local.control.status import serve_status
 from rse_pf.local.firewall import check_listener, ensure_key, key_file, robots_url
-from rse_pf.local.processes import STOP_TIMEOUT_S, ProcessMark, is_alive, mark_of, rotate_logs, send_signal
+from rse_pf.local.processes import STOP_TIMEOUT_S, is_alive, mark_of, rotate_logs, send_signal
 from rse_pf.local.servers.backend_servers import RSE_PF, BackendServer, LocalBackendServers
 from rse_pf.local.servers.data_servers import LocalDataServers
 from rse_pf.local.state import (
@@ -200,7 +200,7 @@ class LocalPlatform:
 
     def status_document(self) -> dict[str, Any]:
         """Return everything the control plane knows, as plain JSON values."""
-        mark, sample = self.load_balancer.mark, self.sample
+        mark, sample = self.load_balancer.process.mark, self.sample
         servers = [
             {
                 "name": member.name,
@@ -219,7 +219,7 @@ class LocalPlatform:
             "balancer": {
                 "pid": None if mark is None else mark.pid,
                 "port": self.load_balancer.port,
-                "running": self.load_balancer.is_running(),
+                "running": self.load_balancer.process.is_running(),
             },
             "servers": [{**read.get(str(each["name"]), {}), **each} for each in servers],
             "data_servers": self.data_servers.document(),
@@ -248,8 +248,7 @@ class LocalPlatform:
             UsageError: There is no such server, or it is the last one.
         """
         member = self._fleet.member(name)
-        others = [server for server in self.servers if server.name != name]
-        if not others:
+        if all(server.name == name for server in self.servers):
             raise UsageError(f"{name} is the last server", hint="grow or roll the platform instead")
         began = time.monotonic()
         if member.leaving:
@@ -309,7 +308,7 @@ class LocalPlatform:
 
     def kill_balancer(self) -> None:
         """End the balancer with SIGKILL, which cuts every socket; an elastic platform brings it back."""
-        mark = self.load_balancer.mark
+        mark = self.load_balancer.process.mark
         self._emit("balancer-killed", pid=None if mark is None else mark.pid)
         if mark is not None:
             send_signal(mark, signal.SIGKILL)
@@ -440,6 +439,11 @@ class LocalPlatform:
     def _write_state(self) -> None:
         control_plane = mark_of(os.getpid())
         assert control_plane is not None
+        ports = {
+            member.name: {"port": member.server.port, "control_port": member.server.control_port}
+            for member in self._fleet.members.values()
+            if member.server is not None
+        }
         PlatformState(
             name=self.name,
             control_plane=control_plane,
@@ -449,10 +453,11 @@ class LocalPlatform:
             key_file=str(key_file(self.state)),
             control_token_file=str(control_token_file(self.state)),
             servers=tuple(
-                self._server_state(name, mark) for name, mark in self.backend_servers.marks.items()
+                ServerState(name=name, process=mark, **ports.get(name, {}))
+                for name, mark in self.backend_servers.marks.items()
             ),
             data_server=self.data_servers.state,
-            load_balancer=self.load_balancer.mark,
+            load_balancer=self.load_balancer.process.mark,
             port=self.load_balancer.port,
             status_port=0 if self._status is None else self._status.sockets[0].getsockname()[1],
             launched=self._fleet.launched,
@@ -464,25 +469,19 @@ class LocalPlatform:
             self.load_balancer.set_data_targets([self.data_servers.target])
         self._write_state()
 
-    def _server_state(self, name: str, mark: ProcessMark) -> ServerState:
-        member = self._fleet.members.get(name)
-        server = None if member is None else member.server
-        if server is None:
-            return ServerState(name=name, process=mark)
-        return ServerState(name=name, process=mark, port=server.port, control_port=server.control_port)
-
     # --- stop ------------------------------------------------------------------------------------
 
     async def _end(self) -> None:
         """Let the servers close their robots' connections first; kill what is left, whatever fails."""
-        timeout_s = STOP_TIMEOUT_S
         try:
             self._control.stop()
             await self._fleet.close()
             if self._status is not None:
                 self._status.close()
-            await asyncio.gather(self.backend_servers.stop(timeout_s), self.data_servers.stop(timeout_s))
-            await self.load_balancer.stop(timeout_s)
+            await asyncio.gather(
+                self.backend_servers.stop(STOP_TIMEOUT_S), self.data_servers.stop(STOP_TIMEOUT_S)
+            )
+            await self.load_balancer.stop(STOP_TIMEOUT_S)
         finally:
             self.backend_servers.kill_all()
             self.data_servers.kill_all()

@@ -105,10 +105,9 @@ class LocalScaleModifier:
         last = None
         if self._last is not None:
             last = {"kind": self._last.kind, "servers": self._last.servers, "reason": self._last.reason}
-        scaling = self._settings
         return {
-            "min_servers": scaling.min_servers,
-            "max_servers": scaling.max_servers,
+            "min_servers": self._settings.min_servers,
+            "max_servers": self._settings.max_servers,
             "compress": self._compress,
             "crash_loop": self._in_crash_loop,
             "last_action": last,

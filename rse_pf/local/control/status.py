@@ -16,7 +16,7 @@ from typing import Any
 from urllib.parse import urlsplit
 
 from rse_pf.auth.control_token import carries_token, read_control_token
-from rse_pf.local.processes import is_alive
+from rse_pf.local.processes import ProcessMark, is_alive
 from rse_pf.local.servers.control_client import ControlPort
 from rse_pf.local.state import PlatformState, ServerState
 
@@ -106,12 +106,9 @@ async def serve_status(document: Callable[[], Mapping[str, Any]], token: str) ->
 
 async def _data_server(server: ServerState) -> dict[str, Any]:
     known: dict[str, Any] = {"name": server.name, "pid": server.process.pid, "port": server.port}
-    if not is_alive(server.process):
-        return {**known, "state": "gone"}
-    if _is_stopped(server.process.pid):
-        return {**known, "state": "stopped"}
-    if not server.port:
-        return {**known, "state": "starting"}
+    silent = _state_without_answer(server.process, server.port)
+    if silent is not None:
+        return {**known, "state": silent}
     reply = await ControlPort(server.port).ask_once("/data/readyz", timeout_s=_TIMEOUT_S)
     if reply is None:
         return {**known, "state": "silent"}
@@ -120,12 +117,9 @@ async def _data_server(server: ServerState) -> dict[str, Any]:
 
 async def _server(server: ServerState, token: str | None, sample_s: float) -> dict[str, Any]:
     known: dict[str, Any] = {"name": server.name, "pid": server.process.pid}
-    if not is_alive(server.process):
-        return {**known, "state": "gone"}
-    if _is_stopped(server.process.pid):
-        return {**known, "state": "stopped"}
-    if not server.control_port:
-        return {**known, "state": "starting"}
+    silent = _state_without_answer(server.process, server.control_port)
+    if silent is not None:
+        return {**known, "state": silent}
     port = ControlPort(server.control_port, token)
     try:
         first, began = await _ask(port), time.monotonic()
@@ -155,6 +149,15 @@ async def _ask(port: ControlPort) -> dict[str, Any]:
     if reply.status != 200 or "workers" not in told:
         raise ConnectionError(f"the control port answers {reply.status}")
     return told
+
+
+def _state_without_answer(process: ProcessMark, port: int) -> str | None:
+    """Return the state of a process that cannot answer; None if it can."""
+    if not is_alive(process):
+        return "gone"
+    if _is_stopped(process.pid):
+        return "stopped"
+    return None if port else "starting"
 
 
 def _row(server: Mapping[str, Any]) -> tuple[str, ...]:

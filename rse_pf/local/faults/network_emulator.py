@@ -76,7 +76,6 @@ PROFILES = {
         name="lte", up_s=0.035, down_s=0.035, jitter_s=0.015, up_mbit_per_s=10.0, down_mbit_per_s=30.0
     ),
 }  # fmt: skip
-"""The links that have a name."""
 
 
 def profile_named(name: str) -> LinkProfile:

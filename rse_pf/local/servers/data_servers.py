@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import asyncio
 import signal
-import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -20,12 +19,12 @@ from rse_pf.linux import run_as_batch
 from rse_pf.local.balancer.envoy_config import Target
 from rse_pf.local.firewall import key_set_file
 from rse_pf.local.processes import ProcessMark, ServerProcess
+from rse_pf.local.servers.backend_servers import RSE_PF
 from rse_pf.local.servers.control_client import ControlPort
 from rse_pf.local.state import ServerState, settings_file
 
 __all__ = ["NICENESS", "LocalDataServers"]
 
-_RSE_PF = (sys.executable, "-m", "rse_pf.cli.main")
 _LOOPBACK = "127.0.0.1"
 _LOOK_AGAIN_S = 0.01
 _ASK_S = 1.0
@@ -36,7 +35,10 @@ NICENESS = 10
 
 
 class LocalDataServers:
-    """The data service of one platform: one process with a name, and its replacements."""
+    """The data service of one platform: one process with a name, and its replacements.
+
+    ``port`` is that of the process and of its replacements, 0 before the first start.
+    """
 
     def __init__(
         self,
@@ -47,7 +49,7 @@ class LocalDataServers:
         name: str = "data-1",
         dies_with_parent: bool = True,
         replaces: bool = True,
-        program: Sequence[str] = _RSE_PF,
+        program: Sequence[str] = RSE_PF,
         emit: Callable[..., None] = lambda event, **details: None,
     ) -> None:
         """Remember what to start.
@@ -67,81 +69,58 @@ class LocalDataServers:
         self._dies_with_parent = dies_with_parent
         self._replaces = replaces
         self._emit = emit
-        self._port = 0
-        self._folder = folder
-        self._process = ServerProcess(name, folder)
+        self.port = 0
+        self.process = ServerProcess(name, folder)
         self._watching: asyncio.Task[None] | None = None
         self._command = [
             *program, "data", "--settings", str(settings_file(folder)), "--keys", str(key_set_file(folder)),
-            "--host", _LOOPBACK, "--announce", str(self._process.announcement),
+            "--host", _LOOPBACK, "--announce", str(self.process.announcement),
             "--audit", str(audit_folder(folder)), *(() if store is None else ("--store", store)),
         ]  # fmt: skip
 
     @property
-    def name(self) -> str:
-        """Name of the process in log and events."""
-        return self._process.name
-
-    @property
-    def mark(self) -> ProcessMark | None:
-        """The process that runs now."""
-        return self._process.mark
-
-    @property
-    def port(self) -> int:
-        """The port of the process and of its replacements; 0 before the first start."""
-        return self._port
-
-    @property
     def target(self) -> Target:
         """The service as the load balancer sees it."""
-        return Target(name=self.name, port=self._port, control_port=self._port)
+        return Target(name=self.process.name, port=self.port, control_port=self.port)
 
     @property
     def state(self) -> ServerState | None:
         """The entry of the state file; None if there is no process."""
-        mark = self.mark
-        return None if mark is None else ServerState(name=self.name, process=mark, port=self._port)
+        name, mark = self.process.name, self.process.mark
+        return None if mark is None else ServerState(name=name, process=mark, port=self.port)
 
     def document(self) -> list[dict[str, Any]]:
         """Return what is known of it, as plain JSON values."""
-        if self.mark is None:
-            return []
-        return [{"name": self.name, "pid": self.mark.pid, "port": self._port, "running": self.is_running()}]
+        name, mark = self.process.name, self.process.mark
+        running = self.process.is_running()
+        return (
+            [] if mark is None else [{"name": name, "pid": mark.pid, "port": self.port, "running": running}]
+        )
 
-    def is_running(self) -> bool:
-        """Return whether the process is there."""
-        return self._process.is_running()
-
-    async def start(self, port: int = 0) -> ServerState:
+    async def start(self, port: int = 0) -> None:
         """Start the process at *port* (0: a free one), wait until it answers, and watch it from then on.
 
         Raises:
             ConfigurationError: It ended or was not ready within ``local.start_timeout_s``.
         """
-        self._port = port
+        self.port = port
         try:
-            server = await self._launch()
+            await self._launch()
         except ConfigurationError:
             if not port:
                 raise
-            self._port = 0  # another program has it now
-            server = await self._launch()
+            self.port = 0  # another program has it now
+            await self._launch()
         self._watching = asyncio.create_task(self._watch())
-        return server
 
     def adopt(self, mark: ProcessMark, port: int) -> None:
         """Watch the process of an earlier control plane, and replace it when it ends."""
-        self._process.mark, self._port = mark, port
+        self.process.mark, self.port = mark, port
         self._watching = asyncio.create_task(self._watch())
 
     async def is_ready(self) -> bool:
         """Return whether the service answers and its store does."""
-        return self._port > 0 and await self._answers(_READY)
-
-    def send(self, number: signal.Signals) -> bool:
-        """Signal the process; return False if it is gone."""
-        return self._process.send(number)
+        return self.port > 0 and await self._answers(_READY)
 
     async def forget(self) -> None:
         """Stop watching, and leave the process running."""
@@ -153,63 +132,59 @@ class LocalDataServers:
     async def stop(self, timeout_s: float) -> None:
         """Let the service leave, and kill it after *timeout_s*."""
         await self.forget()
-        await self._process.stop(signal.SIGTERM, timeout_s)
+        await self.process.stop(signal.SIGTERM, timeout_s)
         self.kill_all()
 
     def kill_all(self) -> None:
         """End what is left, at once, and reap it."""
-        self._process.kill()
-        self._process.mark = None
+        self.process.kill()
+        self.process.mark = None
 
     async def _watch(self) -> None:
         pause_s = _FIRST_PAUSE_S
         while True:
             code = await self._wait_over()
-            self._emit("data-server-down", name=self.name, code=code)
+            self._emit("data-server-down", name=self.process.name, code=code)
             if not self._replaces:
                 return
             try:
                 await self._launch()
                 pause_s = _FIRST_PAUSE_S
             except ConfigurationError as error:
-                self._emit("data-server-failed", name=self.name, error=str(error))
+                self._emit("data-server-failed", name=self.process.name, error=str(error))
                 await asyncio.sleep(pause_s)
                 pause_s = min(2 * pause_s, _MAX_PAUSE_S)
-                self._port = 0  # another program may hold the old port
+                self.port = 0  # another program may hold the old port
 
     async def _wait_over(self) -> int | None:
         """Wait for the end of the process and return its exit code; kill it when it fails too many checks."""
-        over = asyncio.ensure_future(self._process.wait_over())
+        over = asyncio.ensure_future(self.process.wait_over())
         failed = 0
         try:
             while not over.done():
                 await asyncio.wait({over}, timeout=_ASK_S)
                 failed = 0 if await self._answers(_ALIVE) else failed + 1
                 if failed > self._settings.health.unhealthy_checks and self._replaces and not over.done():
-                    self._emit("data-server-silent", name=self.name, pid=self._process.pid)
-                    self.send(signal.SIGKILL)
+                    self._emit("data-server-silent", name=self.process.name, pid=self.process.pid)
+                    self.process.send(signal.SIGKILL)
             return over.result()
         finally:
             over.cancel()
 
     async def _answers(self, path: str) -> bool:
-        reply = await ControlPort(self._port).ask_once(path, timeout_s=_ASK_S)
+        reply = await ControlPort(self.port).ask_once(path, timeout_s=_ASK_S)
         return reply is not None and reply.status == 200
 
-    async def _launch(self) -> ServerState:
-        command = [*self._command, "--port", str(self._port)]
-        self._process = ServerProcess(self.name, self._folder)
-        self._process.start(command, dies_with_parent=self._dies_with_parent)
-        pid = self._process.pid
+    async def _launch(self) -> None:
+        command = [*self._command, "--port", str(self.port)]
+        self.process.start(command, dies_with_parent=self._dies_with_parent)
+        pid = self.process.pid
         run_as_batch(pid, NICENESS)
-        self._emit("data-server-start", name=self.name, pid=pid)
+        self._emit("data-server-start", name=self.process.name, pid=pid)
         try:
-            told = await self._process.wait_announced(self._settings.local.start_timeout_s)
+            told = await self.process.wait_announced(self._settings.local.start_timeout_s)
         except BaseException:
-            self._process.kill()
+            self.process.kill()
             raise
-        self._port = told["port"]
-        self._emit("data-server-up", name=self.name, pid=pid, port=self._port)
-        mark = self._process.mark
-        assert mark is not None
-        return ServerState(name=self.name, process=mark, port=self._port)
+        self.port = told["port"]
+        self._emit("data-server-up", name=self.process.name, pid=pid, port=self.port)

@@ -56,19 +56,21 @@ class Box:
 def test_a_server_that_dies_is_replaced_on_its_port(tmp_path: Path) -> None:
     async def run() -> None:
         box = Box(tmp_path, _PROGRAM)
-        first = await box.servers.start()
+        await box.servers.start()
+        first = box.servers.state
+        assert first is not None
         assert await box.next() == "data-server-up"
 
-        assert box.servers.send(9)  # type: ignore[arg-type]
+        assert box.servers.process.send(9)  # type: ignore[arg-type]
         assert [await box.next(), await box.next()] == ["data-server-down", "data-server-up"]
-        second = box.servers.mark
+        second = box.servers.process.mark
         await box.servers.stop(10.0)
 
         assert second is not None
         assert second != first.process
         assert not is_alive(first.process)
         assert not is_alive(second)
-        assert box.servers.mark is None
+        assert box.servers.process.mark is None
         assert (tmp_path / "starts").read_text() == "40001 dir:objects\n" * 2
         assert not (tmp_path / "data-1.json").exists()
 
@@ -78,11 +80,13 @@ def test_a_server_that_dies_is_replaced_on_its_port(tmp_path: Path) -> None:
 def test_the_server_of_an_earlier_control_plane_is_adopted_and_replaced(tmp_path: Path) -> None:
     async def run() -> None:
         earlier, later = Box(tmp_path, _PROGRAM), Box(tmp_path, _PROGRAM)
-        server = await earlier.servers.start()
+        await earlier.servers.start()
+        server = earlier.servers.state
+        assert server is not None
         later.servers.adopt(server.process, server.port)
         await earlier.servers.forget()
 
-        assert later.servers.send(9)  # type: ignore[arg-type]
+        assert later.servers.process.send(9)  # type: ignore[arg-type]
         assert [await later.next(), await later.next()] == ["data-server-down", "data-server-up"]
         await later.servers.stop(10.0)
         earlier.servers.kill_all()  # reaps its child
@@ -96,7 +100,9 @@ def test_the_server_of_an_earlier_control_plane_is_adopted_and_replaced(tmp_path
 def test_a_server_steps_back_behind_the_poses(tmp_path: Path) -> None:
     async def run() -> None:
         box = Box(tmp_path, _PROGRAM)
-        server = await box.servers.start()
+        await box.servers.start()
+        server = box.servers.state
+        assert server is not None
 
         ours, its = os.getpriority(os.PRIO_PROCESS, 0), os.getpriority(os.PRIO_PROCESS, server.process.pid)
         mine, policy = os.sched_getscheduler(0), os.sched_getscheduler(server.process.pid)
@@ -111,7 +117,9 @@ def test_a_server_steps_back_behind_the_poses(tmp_path: Path) -> None:
 def test_a_server_that_answers_nobody_is_ended_and_replaced(tmp_path: Path) -> None:
     async def run() -> None:
         box = Box(tmp_path, _PROGRAM, health={"unhealthy_checks": 2})
-        first = await box.servers.start()
+        await box.servers.start()
+        first = box.servers.state
+        assert first is not None
         assert await box.next() == "data-server-up"
 
         told = [await box.next(), await box.next(), await box.next()]
@@ -128,9 +136,9 @@ def test_a_platform_that_heals_nothing_only_tells_of_the_end(tmp_path: Path) -> 
         await box.servers.start()
         assert await box.next() == "data-server-up"
 
-        assert box.servers.send(9)  # type: ignore[arg-type]
+        assert box.servers.process.send(9)  # type: ignore[arg-type]
         assert await box.next() == "data-server-down"
-        assert not box.servers.is_running()
+        assert not box.servers.process.is_running()
         await box.servers.stop(10.0)
         assert (tmp_path / "starts").read_text().count("\n") == 1
 
@@ -143,11 +151,11 @@ def test_a_port_that_somebody_took_meanwhile_is_given_up(tmp_path: Path) -> None
             tmp_path, _PROGRAM.replace("port = ", "args['--port'] == '0' or sys.exit('taken')\nport = ")
         )
 
-        server = await box.servers.start(port=40002)
+        await box.servers.start(port=40002)
+        server = box.servers.state
+        assert server is not None
 
         assert server.port == box.servers.port == 40001
-        assert box.servers.state is not None
-        assert box.servers.state.port == 40001
         await box.servers.stop(10.0)
 
     asyncio.run(run())
@@ -170,7 +178,9 @@ def test_a_server_that_stays_is_killed(tmp_path: Path) -> None:
         stays = "signal.signal(signal.SIGTERM, signal.SIG_IGN)\ntemporary = "
         stubborn = _PROGRAM.replace("temporary = ", stays).replace("lambda *_: sys.exit(0)", "signal.SIG_IGN")
         box = Box(tmp_path, stubborn)
-        server = await box.servers.start()
+        await box.servers.start()
+        server = box.servers.state
+        assert server is not None
 
         await box.servers.stop(0.2)
 
@@ -183,4 +193,4 @@ def test_nobody_is_ready_before_the_first_start(tmp_path: Path) -> None:
     box = Box(tmp_path, _PROGRAM)
 
     assert asyncio.run(box.servers.is_ready()) is False
-    assert box.servers.send(15) is False  # type: ignore[arg-type]
+    assert box.servers.process.send(15) is False  # type: ignore[arg-type]
