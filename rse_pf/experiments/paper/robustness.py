@@ -21,10 +21,16 @@ from rse_pf.experiments.paper.fault_scenarios import SCENARIOS
 from rse_pf.experiments.paper.harness import Harness, generator_of
 from rse_pf.experiments.plots.figures import draw_robustness, require_matplotlib
 from rse_pf.experiments.results.markdown import about_run, failures, number, page, slashed, table
-from rse_pf.experiments.results.outages import outage_figures, robots_on
 from rse_pf.experiments.results.records import CommandRecord, Event, Records, parameters_of, read_records
 from rse_pf.experiments.results.result_folder import RUN_FILES, finish_report, fresh_folder, load_average
-from rse_pf.experiments.results.summary import PAPER, answered_percent, percentiles, summary_of
+from rse_pf.experiments.results.summary import (
+    PAPER,
+    answered_percent,
+    outage_figures,
+    percentiles,
+    robots_on,
+    summary_of,
+)
 from rse_pf.local.control.monitor import MonitorSample
 
 __all__ = [

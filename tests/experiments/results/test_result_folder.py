@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
 
 import pytest
 
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import UsageError
+from rse_pf.experiments.demo.run import DemoOptions, run_demo
+from rse_pf.experiments.load.run import run_swarm
+from rse_pf.experiments.load.swarm import SwarmOptions
 from rse_pf.experiments.results.result_folder import RUN_FILES, finish_report, fresh_folder
 
 
@@ -75,3 +79,30 @@ def test_a_report_names_machine_load_and_settings(tmp_path):
     assert len(around["load_average_after"]) == 3
     assert around["settings_digest"] == settings.digest()
     assert "numpy" in around["versions"]
+
+
+def start_demo(out: Path) -> None:
+    run_demo(DemoOptions(out=out), PlatformSettings())
+
+
+def start_swarm(out: Path) -> None:
+    run_swarm(SwarmOptions(robots=1), PlatformSettings(), seconds=1.0, out=out)
+
+
+@pytest.mark.parametrize(
+    ("start", "other"),
+    [
+        (start_demo, "notes.txt"),
+        (start_demo, "robot-photos"),
+        (start_swarm, "map.png"),
+        (start_swarm, "platform"),
+    ],
+)
+def test_demo_and_swarm_refuse_a_folder_with_files_that_they_did_not_write(tmp_path, start, other):
+    for name in ("events.jsonl", "report.json", other):
+        (tmp_path / name).write_text("")
+
+    with pytest.raises(UsageError, match="holds other files"):
+        start(tmp_path)
+
+    assert sorted(each.name for each in tmp_path.iterdir()) == sorted(["events.jsonl", "report.json", other])
