@@ -10,7 +10,7 @@ Layout: ``maps/TENANT/NAME/blobs/DIGEST``, ``.../versions/ID`` (ID is the sha256
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -149,14 +149,6 @@ class MapRegistry:
         if not ids:
             raise NotFound(f"there is no map {name!r}", hint="see rse-pf map list")
         return sorted((self.record(name, each) for each in ids), key=lambda r: (r.number, r.created_s, r.id))
-
-    def lineage(self, name: str, version: str = "head") -> Iterator[MapRecord]:
-        """Yield a version and its ancestors, newest first."""
-        record = self.record(name, version)
-        yield record
-        while record.parent is not None:
-            record = self.record(name, record.parent)
-            yield record
 
     def data(self, name: str, version: str = "head") -> bytes:
         """Return the bytes of a version, checked by their digest."""

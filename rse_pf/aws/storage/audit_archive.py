@@ -14,13 +14,14 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-import json
 import os
 import re
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import BinaryIO
+
+import msgspec
 
 from rse_pf.audit.chain import GENESIS, Chain, Entry, Head, parse_head
 from rse_pf.audit.log import chain_names, files_of
@@ -110,9 +111,8 @@ class Shipper:
     def _marks(self) -> dict[str, _Mark]:
         """Return the marks; when they cannot be read, everything is uploaded again."""
         try:
-            rows = json.loads(self._marks_file.read_text(encoding="utf-8"))
-            return {str(who): _Mark(**row) for who, row in rows.items()}
-        except (FileNotFoundError, ValueError, TypeError, AttributeError):
+            return msgspec.json.decode(self._marks_file.read_bytes(), type=dict[str, _Mark])
+        except (FileNotFoundError, msgspec.DecodeError, UnicodeDecodeError, RecursionError):
             return {}
 
 

@@ -15,7 +15,7 @@ import numpy.typing as npt
 from rse_pf.geometry import Array
 from rse_pf.services.mapping.pose_graph import inverses, log_se3
 
-__all__ = ["LoopClosure", "OdometryNoise", "consistent", "largest_clique", "pairwise_consistency"]
+__all__ = ["LoopClosure", "OdometryNoise", "consistent", "largest_clique"]
 
 _CHI2_3_99 = 11.345
 """99 % of the squared Mahalanobis norms of a 3-vector lie below."""
@@ -51,6 +51,10 @@ def consistent(
 ) -> npt.NDArray[np.int64]:
     """Return the rows of the largest set of *links* that agree pairwise; deterministic.
 
+    Two links agree if the round trip a1 -> b1 -> b2 -> a2 -> a1 is the identity; translation and rotation are
+    tested separately, at 99 %, against the noise of both links and of the odometry between them; rotation
+    noise acts on translation with the length of the path as its lever.
+
     Args:
         links: All between the same two trajectories (or within one).
         T_world_camera: ``(n, 4, 4)``, odometry of each trajectory in its own frame.
@@ -60,25 +64,9 @@ def consistent(
     Source:
         Mangelson et al., Pairwise consistent measurement set maximization, ICRA 2018.
     """
-    agree = pairwise_consistency(links, T_world_camera, order, noise)
-    return largest_clique(agree)
-
-
-def pairwise_consistency(
-    links: Sequence[LoopClosure],
-    T_world_camera: Array,
-    order: npt.NDArray[np.int64],
-    noise: OdometryNoise,
-) -> npt.NDArray[np.bool_]:
-    """Return the ``(m, m)`` matrix of pairs of links that agree; the diagonal is False.
-
-    The round trip a1 -> b1 -> b2 -> a2 -> a1 should be the identity; translation and rotation are
-    tested separately, at 99 %, against the noise of both links and of the odometry between them;
-    rotation noise acts on translation with the length of the path as its lever.
-    """
     m = len(links)
     if m == 0:
-        return np.zeros((0, 0), dtype=np.bool_)
+        return np.empty(0, dtype=np.int64)
     a = np.array([link.a for link in links])
     b = np.array([link.b for link in links])
     steps = np.array([link.T_a_b for link in links])
@@ -99,11 +87,13 @@ def pairwise_consistency(
         )
     agree &= agree.T
     np.fill_diagonal(agree, False)
-    return agree
+    return largest_clique(agree)
 
 
 def largest_clique(agree: npt.NDArray[np.bool_]) -> npt.NDArray[np.int64]:
     """Return the sorted rows of a largest set that agree pairwise; exact unless it is very large.
+
+    *agree* is ``(m, m)``, symmetric, with a diagonal of False.
 
     Branch and bound with a greedy colouring as the bound; among equals the first found wins.
 

@@ -176,7 +176,8 @@ def propose_links(atlas: Atlas, options: MergeOptions, report: Report = ignore_p
             report(0.1 + 0.7 * done / len(pairs), f"{done} of {len(pairs)} keyframe pairs")
         measured = measure_relative_pose(atlas.keyframes[a], atlas.keyframes[b], pose_options)
         if isinstance(measured, str):
-            failed[(*_pair(atlas, a, b), measured)] += 1
+            one, other = _pair(atlas, a, b)
+            failed[one, other, measured] += 1
         else:
             links.append(
                 LoopClosure(
@@ -213,17 +214,17 @@ def _select_consistent(
         groups.setdefault(_pair(atlas, link.a, link.b), []).append(link)
     accepted: list[LoopClosure] = []
     noise = OdometryNoise()
-    for pair, links in sorted(groups.items()):
-        if pair[0] == pair[1]:
+    for (one, other), links in sorted(groups.items()):
+        if one == other:
             # Within one map a loop must also agree with the odometry.
             links = [link for link in links if _fits_odometry(atlas, link, noise)]
-            refused[(*pair, "against-odometry")] += len(groups[pair]) - len(links)
+            refused[one, other, "against-odometry"] += len(groups[one, other]) - len(links)
         rows = consistent(links, atlas.T_world_camera, atlas.order, noise)
-        if pair[0] != pair[1] and len(rows) < options.min_links:
-            refused[(*pair, "too-few-agree")] += len(links)
+        if one != other and len(rows) < options.min_links:
+            refused[one, other, "too-few-agree"] += len(links)
             continue
         accepted += [links[row] for row in rows]
-        refused[(*pair, "inconsistent")] += len(links) - len(rows)
+        refused[one, other, "inconsistent"] += len(links) - len(rows)
     return accepted, Counter({key: count for key, count in refused.items() if count})
 
 

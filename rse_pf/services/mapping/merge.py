@@ -53,7 +53,10 @@ class MergeReply(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def merge_maps(request: MergeRequest, *, report: Report = ignore_progress) -> MergeReply:
-    """Answer *request*; *report* is told the progress and may raise Cancelled to end the work."""
+    """Make one map of several robots' maps, or close the loops of one.
+
+    *report* gets the progress, and may raise Cancelled to end the work.
+    """
     if not request.maps:
         raise BadRequest("no map was sent", hint="send one or more")
     versions: list[MapVersion] = []
@@ -71,11 +74,7 @@ def merge_maps(request: MergeRequest, *, report: Report = ignore_progress) -> Me
 
 def register(registry: Registry) -> None:
     """Add ``merge`` to *registry*."""
-
-    @registry.service("merge", kind="long")
-    def merge(request: MergeRequest, *, report: Report = ignore_progress) -> MergeReply:
-        """Make one map of several robots' maps, or close the loops of one."""
-        return merge_maps(request, report=report)
+    registry.service("merge", kind="long")(merge_maps)
 
 
 def _reply(merged: MergedMap) -> MergeReply:
