@@ -102,7 +102,8 @@ class ZygoteClient:
                 [sys.executable, "-m", "rse_pf.backend.sandbox.zygote", str(theirs.fileno())],
                 pass_fds=(theirs.fileno(),), stdin=subprocess.DEVNULL, env=variables,
             )  # fmt: skip
-        self._channel.send(json.dumps(config).encode())
+        with contextlib.suppress(OSError):  # it has ended, which the next read shows
+            self._channel.send(json.dumps(config).encode())
 
     def _wait_until_ready(self) -> tuple[str, ...]:
         self._channel.settimeout(self._settings.local.start_timeout_s)
