@@ -14,6 +14,7 @@ from fuzz.meter import Meter
 from fuzz.targets import TARGETS, TargetFailure
 from rse_pf.backend.gateway import frames as frame_layer
 from rse_pf.backend.gateway.frames import CloseBorder, FrameAssembler
+from rse_pf.token_bucket import TokenBucket
 
 
 def fuzzed(target: str, *, seed: int, inputs: int) -> Meter:
@@ -54,7 +55,7 @@ def _forgetful(self: CloseBorder, data: memoryview, i: int) -> int:
 
 WRONG: dict[str, tuple[str, type[Any], str, Callable[..., Any]]] = {
     "fragments are not counted": ("frames", FrameAssembler, "_continue", _endless),
-    "control frames have no rate": ("frames", FrameAssembler, "_may_control", lambda self, now: True),
+    "control frames have no rate": ("frames", TokenBucket, "take", lambda self, now: 0.0),
     "a close is forgotten": (
         "frames", FrameAssembler, "_close",
         lambda self, code, reason: frame_layer.CloseSocket(code, reason),
