@@ -148,13 +148,14 @@ def _checked(points_world: Array, pixels: Array) -> tuple[Array, Array]:
             f"got {len(points)} correspondences, a pose needs at least 4",
             hint="loosen the matcher, or skip this frame",
         )
-    for name, rows in (("points_world", points), ("pixels", pixels)):
-        # vdot of a row of numbers with itself is their sum of squares; it overflows without a warning.
-        if not np.vdot(rows, rows) < _MAX_ABS**2 and not (np.abs(rows) <= _MAX_ABS).all():
-            raise BadRequest(
-                f"{name} holds a number that is not finite or is beyond {_MAX_ABS:g}",
-                hint="leave such rows out",
-            )
+    # vdot of a row of numbers with itself is their sum of squares; it overflows without a warning.
+    if not (np.vdot(points, points) < _MAX_ABS**2 and np.vdot(pixels, pixels) < _MAX_ABS**2):
+        for name, rows in (("points_world", points), ("pixels", pixels)):
+            if not (np.abs(rows) <= _MAX_ABS).all():
+                raise BadRequest(
+                    f"{name} holds a number that is not finite or is beyond {_MAX_ABS:g}",
+                    hint="leave such rows out",
+                )
     return points, pixels
 
 

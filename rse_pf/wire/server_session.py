@@ -171,14 +171,14 @@ class ServerSession:
                 return self._hello(message, now)
             case _ if self.state == "opening":
                 return self._close(CLOSE_PROTOCOL, "say hello first")
+            case Command():
+                return self._command(message)
             case Ping():
                 return [self._send(Pong(sent_s=message.sent_s, received_s=now, answered_s=now))]
             case Cancel():
                 return [Withdraw(message.id)]
-            case Renew():
-                return self._renew(message, now)
             case _:
-                return self._command(message)
+                return self._renew(message, now)
 
     def answer(self, message: Result | Failure) -> Send:
         """Return the message with the final answer to a command that was submitted.
