@@ -158,7 +158,7 @@ def test_the_axes_of_a_camera_are_right_down_and_forward() -> None:
         ({"cy": -700.0}, "principal point"),
     ],
 )
-def test_absurd_intrinsics_are_no_camera(change: dict[str, Any], words: str) -> None:
+def test_implausible_intrinsics_are_an_invalid_camera(change: dict[str, Any], words: str) -> None:
     with pytest.raises(InvalidCamera, match=words) as caught:
         Camera(**{**KINECT, **change})
 

@@ -46,5 +46,5 @@ def test_a_page_that_lies_is_seen(repository: Path) -> None:
     assert broken(lies, repository) == [
         "T24 has no row",
         "there is no rse_pf/author.py",
-        "tests/system/test_sandbox.py has no test_gone",
+        "tests/system/server/test_sandbox.py has no test_gone",
     ]

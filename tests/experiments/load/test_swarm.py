@@ -1,4 +1,4 @@
-"""Send times, payloads and records of the load generator; `tests/system/test_swarm.py` runs it."""
+"""Send times, payloads and records of the load generator; `tests/system/demo/test_swarm.py` runs it."""
 
 from __future__ import annotations
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-DOCS = Path(__file__).parents[2] / "docs" / "services.md"
+DOCS = Path(__file__).parents[3] / "docs" / "services.md"
 pytestmark = [pytest.mark.system, pytest.mark.slow]
 
 

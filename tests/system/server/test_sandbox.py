@@ -459,7 +459,7 @@ def test_a_plain_user_has_the_same_isolation(tmp_path):
     python = shutil.which("python3", path="/usr/bin")
     if python is None or shutil.which("setpriv") is None:
         pytest.skip("no python3 outside of this user's home, or no setpriv")
-    package = Path(__file__).resolve().parents[2] / "rse_pf"
+    package = Path(__file__).resolve().parents[3] / "rse_pf"
     (tmp_path / "rse_pf").mkdir()
     for source, target in (("backend/sandbox/isolation.py", "isolation.py"), ("linux.py", "rse_pf/linux.py")):
         (tmp_path / target).write_text((package / source).read_text())

@@ -52,7 +52,7 @@ def test_robots_without_a_shared_view_are_not_joined_and_the_reason_is_printed(t
 @pytest.mark.data
 @pytest.mark.timeout(400)
 def test_three_robots_in_the_red_kitchen_end_in_one_map_within_the_limits(tmp_path: Path) -> None:
-    recording = Path(__file__).parents[2].parent / "shared" / "data" / "7scenes_redkitchen"
+    recording = Path(__file__).parents[3].parent / "shared" / "data" / "7scenes_redkitchen"
     if not recording.is_dir():
         pytest.skip(f"there is no recording {recording}")
     out = tmp_path / "out"
