@@ -38,10 +38,12 @@ def s3_server(monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
 
 
 def bucket_in(region: str) -> S3Store:
-    make_client("s3", region).create_bucket(
-        Bucket=BUCKET, CreateBucketConfiguration={"LocationConstraint": region}
-    )
+    create_bucket(make_client("s3", region), region)
     return open_bucket(BUCKET, region)
+
+
+def create_bucket(client: Any, region: str) -> None:
+    client.create_bucket(Bucket=BUCKET, CreateBucketConfiguration={"LocationConstraint": region})
 
 
 def client_of(server: HttpServer, service: Service, **options: Any) -> DataClient:
@@ -50,17 +52,21 @@ def client_of(server: HttpServer, service: Service, **options: Any) -> DataClien
 
 
 def test_large_objects_travel_directly_between_robot_and_bucket(s3_server: str) -> None:
-    store = bucket_in("ap-northeast-2")
-    service = Service(small_settings(max_object_bytes=1_000_000, quota_bytes=2_000_000), store)
     told: list[int] = []
 
-    with HttpServer(service) as server, contextlib.closing(client_of(server, service)) as robot:
+    with contextlib.ExitStack() as stack:
+        client = stack.enter_context(contextlib.closing(make_client("s3", "ap-northeast-2")))
+        create_bucket(client, "ap-northeast-2")
+        store = S3Store(client, BUCKET)
+        service = Service(small_settings(max_object_bytes=1_000_000, quota_bytes=2_000_000), store)
+        server = stack.enter_context(HttpServer(service))
+        robot = stack.enter_context(contextlib.closing(client_of(server, service)))
         digest = robot.upload(LARGE, lambda done, size: told.append(done))
 
         assert store.get(object_name("default", "robot-1", digest)) == LARGE
         assert robot.download(digest) == LARGE
+        assert list(store.list("uploads/")) == []
     assert told[-1] == len(LARGE)
-    assert list(store.list("uploads/")) == []
     assert sum(line["received_bytes"] for line in service.lines) < 1000, "the service received the object"
     assert max(line["sent_bytes"] for line in service.lines) < 2000
 

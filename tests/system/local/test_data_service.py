@@ -102,7 +102,7 @@ def test_uploads_survive_kills_and_acknowledged_objects_are_stored(
         running = [pool.submit(upload, content) for content in contents]
         for event in reached.values():
             assert event.wait(100)
-            platform.servers.send(signal.SIGKILL)
+            platform.servers.process.send(signal.SIGKILL)
             assert platform.up.acquire(timeout=20)
         digests = [each.result() for each in running]
 
@@ -132,7 +132,7 @@ def test_an_upload_resumes_after_the_last_stored_part(platform: Platform) -> Non
     def kill_at_half(done: int, size: int) -> None:
         seen.append(done)
         if done == size // 2:
-            platform.servers.send(signal.SIGKILL)
+            platform.servers.process.send(signal.SIGKILL)
             assert platform.up.acquire(timeout=20)
 
     client = platform.client()
@@ -184,7 +184,7 @@ def test_the_service_ends_on_sigterm_and_is_replaced_on_the_same_port(platform: 
     assert platform.up.acquire(timeout=20)
     port = platform.servers.port
 
-    platform.servers.send(signal.SIGTERM)
+    platform.servers.process.send(signal.SIGTERM)
 
     assert platform.up.acquire(timeout=20)
     assert platform.servers.port == port
