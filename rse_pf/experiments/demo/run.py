@@ -1,4 +1,4 @@
-"""The demo: robots build point-platform maps through the PnP service, on one machine.
+"""The demo: robots build point-cloud maps through the PnP service, on one machine.
 
 Starts the local platform (real servers behind a real load balancer), runs every robot as a process, and
 writes maps, trajectories, figures and a report.  Everything that it started has ended when it returns.
