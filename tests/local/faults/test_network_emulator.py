@@ -244,7 +244,8 @@ def test_a_robot_is_dropped_when_nobody_listens_behind_the_link() -> None:
 
 def test_a_profile_cuts_by_itself_now_and_then() -> None:
     async def work() -> None:
-        profile = LinkProfile(name="t", up_s=0.0, down_s=0.0, cut_every_s=0.02, cut_for_s=0.02)
+        # Short cuts: were half of the time cut, every 64th message would need six tries, which are 12.6 s.
+        profile = LinkProfile(name="t", up_s=0.0, down_s=0.0, cut_every_s=0.05, cut_for_s=0.005)
         async with echo() as server, EmulatedLink(profile, "127.0.0.1", server.port, seed=2) as link:
             reader, writer = await asyncio.open_connection("127.0.0.1", link.port)
             while link.cuts < 5:
