@@ -14,7 +14,7 @@ import pytest
 
 ORDER = (
     "rse_pf", "errors", "linux", "files", "geometry", "token_bucket", "config",
-    "wire", "scaling", "object_store", "maps", "auth", "audit", "service",
+    "wire", "scaling", "object_store", "identity", "maps", "auth", "audit", "service",
     "pnp", "services.mapping", "services.custom", "services",
     "aws", "aws.storage", "aws.fleet", "aws.money",
     "backend", "backend.scheduling", "backend.sandbox", "backend.jobs", "backend.gateway",

@@ -1,0 +1,41 @@
+"""Who a robot is: tenant, name and enrolment, the only key under which anything of a robot is kept.
+
+Two tenants may have robots of one name, and a name that was removed and enrolled again belongs to another
+robot.  A dictionary, a lock, a path or a lease that knows a robot by its name alone mixes them up;
+`tests/laws/test_identity.py` forbids it.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from rse_pf.object_store import name_segment
+
+__all__ = ["DEFAULT_TENANT", "RobotId"]
+
+DEFAULT_TENANT = "default"
+
+
+class RobotId(NamedTuple):
+    """One robot; a hashable value that two processes may exchange as a list of three texts.
+
+    Attributes:
+        tenant: Of the token or the roster.
+        name: Unique in the tenant at any time.
+        enrolment: RFC 7638 thumbprint of the key that was enrolled; "" for a robot whose tokens the platform
+            signs, and where no token is required.
+    """
+
+    tenant: str
+    name: str
+    enrolment: str = ""
+
+    def __str__(self) -> str:
+        """Return the name as an operator writes it: with the tenant, unless that is the default one."""
+        return self.name if self.tenant == DEFAULT_TENANT else f"{self.tenant}/{self.name}"
+
+    @property
+    def folder(self) -> str:
+        """``TENANT/ROBOT`` or ``TENANT/ROBOT=THUMBPRINT``, for names of objects; no two robots share one."""
+        name = name_segment(self.name)
+        return f"{name_segment(self.tenant)}/{name}{'=' if self.enrolment else ''}{self.enrolment}"
