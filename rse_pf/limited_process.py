@@ -1,0 +1,445 @@
+"""Run a function over a stranger's bytes in processes that have a memory limit and are killed at a timeout.
+
+    with LimitedProcesses("rse_pf.maps.describe:describer", memory_bytes=1 << 28) as processes:
+        description = processes.call(data, timeout_s=5.0)
+
+``describer`` is called once, in a template process that has one thread, with the configuration; it imports
+what the work needs and returns a function from bytes to bytes.  Each process is forked from the template and
+answers one call after the other, so what that function caches stays until its process is killed.  A process
+that was killed is replaced in some milliseconds.  `LimitedProcesses.call` blocks and may be called by several
+threads.
+
+Bytes that crash their process, exhaust its memory or never end cost that one process and nothing else.  This
+is no sandbox: code that took over the process may do what its user may do.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import gc
+import importlib
+import json
+import os
+import queue
+import resource
+import signal
+import socket
+import struct
+import subprocess
+import sys
+import threading
+import time
+import traceback
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NoReturn
+
+from rse_pf.errors import Crashed, Expired, InternalError, RsePfError, WorkerLost, error_from_code
+from rse_pf.linux import die_with_parent, set_process_name
+
+__all__ = ["DEFAULT_NICENESS", "Handler", "LimitedProcesses", "main"]
+
+Handler = Callable[[bytes], bytes]
+"""What answers a call; raises MemoryError, or an `RsePfError` that the caller is to see."""
+
+DEFAULT_NICENESS = 5
+_MAX_REPLY_BYTES = 1 << 20
+_MAX_ORDER_BYTES = 1 << 17
+_ORDER_TIMEOUT_S = 10.0
+"""A template that does not fork or kill a process within this is replaced."""
+_OUT_OF_MEMORY = 77
+"""Exit code of a process whose handler raised MemoryError."""
+_LENGTH = struct.Struct("<Q")
+_REPLY = struct.Struct("<BQ")
+_DONE, _REFUSED, _DEFECT = 0, 1, 2
+_ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
+
+
+class LimitedProcesses:
+    """Up to *count* processes that answer calls; nothing is started before the first call."""
+
+    def __init__(
+        self,
+        target: str,
+        *,
+        memory_bytes: int,
+        configuration: str = "",
+        count: int = 1,
+        niceness: int = DEFAULT_NICENESS,
+        max_reply_bytes: int = _MAX_REPLY_BYTES,
+    ) -> None:
+        """Say what is run and within which limits.
+
+        Args:
+            target: ``module:function``; the function takes *configuration* and returns a `Handler`.
+            memory_bytes: What calls may allocate in one process, beside what the template has allocated.
+            configuration: Text for *target*, such as settings in JSON; at most 100 kB.
+            count: Processes that work at the same time; further calls wait for one of them.
+            niceness: Of the processes, above that of this process.
+            max_reply_bytes: A process that replies with more has failed.
+        """
+        self._order = json.dumps(
+            {"target": target, "configuration": configuration, "memory_bytes": memory_bytes}
+        ).encode()
+        self._memory_bytes = memory_bytes
+        self._max_reply_bytes = max_reply_bytes
+        self._template = _Template(self._order, niceness)
+        self._free: queue.LifoQueue[_Slot] = queue.LifoQueue()
+        for _ in range(count):
+            self._free.put(_Slot())
+
+    def __enter__(self) -> LimitedProcesses:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def call(self, data: bytes, timeout_s: float) -> bytes:
+        """Return what the handler returns for *data*; blocks for at most *timeout_s* seconds, and some ms.
+
+        A call whose process ends, although it had answered other calls before, is repeated once in a new
+        process: what others left there may have been the cause.
+
+        Raises:
+            Crashed: *data* ended a new process: the memory limit, or a signal; the message says which.
+            Expired: *timeout_s* passed.  The process was killed, or none was free.
+            WorkerLost: The processes cannot be started, or were closed; *data* has no part in it.
+            InternalError: The handler raised an exception that is none of the platform's.
+            RsePfError: What the handler raised.
+        """
+        until = time.monotonic() + timeout_s
+        try:
+            slot = self._free.get(timeout=max(0.0, timeout_s))
+        except queue.Empty:
+            raise Expired("no process was free in time", hint="allow more time") from None
+        try:
+            while True:
+                is_new = slot.process is None or not self._template.has(slot.process)
+                if is_new:
+                    slot.process = None
+                    slot.process = self._template.fork(until)
+                process = slot.process
+                assert process is not None
+                try:
+                    return _exchange(process.connection, data, until, self._max_reply_bytes)
+                except TimeoutError:
+                    self._end(slot, process)
+                    raise Expired(
+                        f"the work took longer than {timeout_s:.3g} s and was ended", hint="allow more time"
+                    ) from None
+                except _ProcessEnded as ended:
+                    how = self._end(slot, process)
+                    if is_new:
+                        raise self._crash(ended.reason or how) from None
+        finally:
+            self._free.put(slot)
+
+    def pids(self) -> list[int]:
+        """Return the ids of the template, if it runs, and of its processes."""
+        return self._template.pids()
+
+    def close(self) -> None:
+        """End the template and all processes; a call that is under way raises WorkerLost."""
+        self._template.close()
+
+    def _end(self, slot: _Slot, process: _Process) -> str:
+        """Kill *process* unless it has ended, and return how it ended."""
+        slot.process = None
+        return self._template.end(process)
+
+    def _crash(self, how: str) -> Crashed:
+        if how == f"exit code {_OUT_OF_MEMORY}":
+            how = f"it needs more than {self._memory_bytes / 1e6:.0f} MB of memory"
+        return Crashed(f"the process that worked on this ended: {how}", hint="send less at once")
+
+
+class _Process:
+    """One forked process; *generation* numbers its template."""
+
+    def __init__(self, pid: int, connection: socket.socket, generation: int) -> None:
+        self.pid = pid
+        self.connection = connection
+        self.generation = generation
+
+
+class _Slot:
+    """The place of one process; None until the next call forks it."""
+
+    def __init__(self) -> None:
+        self.process: _Process | None = None
+
+
+class _ProcessEnded(Exception):
+    """The process closed its socket, or broke the rules for the reason that is given."""
+
+    def __init__(self, reason: str = "") -> None:
+        super().__init__(reason)
+        self.reason = reason
+
+
+class _Template:
+    """The template process as its owner sees it: started by the first fork, replaced when it ended."""
+
+    def __init__(self, order: bytes, niceness: int) -> None:
+        self._order = order
+        self._niceness = niceness
+        self._lock = threading.Lock()
+        self._process: subprocess.Popen[bytes] | None = None
+        self._channel: socket.socket | None = None
+        self._is_ready = False
+        self._is_closed = False
+        self._generation = 0
+        self._forked: set[int] = set()
+
+    def has(self, process: _Process) -> bool:
+        """Return whether *process* was forked from the template that runs now."""
+        return process.generation == self._generation and process.pid in self._forked
+
+    def pids(self) -> list[int]:
+        return ([self._process.pid] if self._process is not None else []) + sorted(self._forked)
+
+    def fork(self, until: float) -> _Process:
+        """Return a new process.
+
+        Raises:
+            Expired: The template was not ready in time; it goes on starting.
+            WorkerLost: It cannot start, or was closed.
+        """
+        with self._locked(until):
+            if self._is_closed:
+                raise WorkerLost("the processes were closed", hint="try again elsewhere")
+            if self._process is None:
+                self._start()
+            self._wait_until_ready(until)
+            ours, theirs = socket.socketpair()
+            with theirs:
+                reply = self._ask({"do": "fork"}, theirs)
+            self._forked.add(reply["pid"])
+            return _Process(reply["pid"], ours, self._generation)
+
+    def end(self, process: _Process) -> str:
+        """Kill *process* unless it has ended, reap it, and return how it ended."""
+        process.connection.close()
+        with self._lock:
+            if self._is_closed or not self.has(process):
+                raise WorkerLost("the process ended with its template", hint="try again")
+            self._forked.discard(process.pid)
+            code = int(self._ask({"do": "end", "pid": process.pid})["code"])
+        return f"exit code {code}" if code >= 0 else f"signal {signal.Signals(-code).name}"
+
+    def close(self) -> None:
+        with self._lock:
+            self._is_closed = True
+            self._stop()
+
+    @contextlib.contextmanager
+    def _locked(self, until: float) -> Any:
+        if not self._lock.acquire(timeout=max(0.0, until - time.monotonic())):
+            raise Expired("no process was free in time", hint="allow more time")
+        try:
+            yield
+        finally:
+            self._lock.release()
+
+    def _start(self) -> None:
+        self._channel, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        with theirs:
+            self._process = subprocess.Popen(
+                [sys.executable, "-m", "rse_pf.limited_process", str(theirs.fileno())],
+                pass_fds=(theirs.fileno(),), stdin=subprocess.DEVNULL, stdout=2,
+                env={**os.environ, **_ONE_THREAD},
+            )  # fmt: skip
+        self._generation += 1
+        with contextlib.suppress(OSError):
+            own = os.getpriority(os.PRIO_PROCESS, 0)
+            os.setpriority(os.PRIO_PROCESS, self._process.pid, own + self._niceness)
+        with contextlib.suppress(OSError):  # it has ended, which the next read shows
+            self._channel.send(self._order)
+
+    def _wait_until_ready(self, until: float) -> None:
+        if self._is_ready:
+            return
+        assert self._channel is not None
+        self._channel.settimeout(max(1e-3, until - time.monotonic()))
+        try:
+            message = self._channel.recv(_MAX_ORDER_BYTES)
+        except TimeoutError:
+            raise Expired("the process was not started in time", hint="try again") from None
+        except OSError:
+            message = b""
+        if not message:
+            self._stop()
+            raise WorkerLost(
+                "the process cannot be started", hint="tell the operator; the server's log has it"
+            )
+        self._is_ready = True
+
+    def _ask(self, order: dict[str, Any], passed: socket.socket | None = None) -> dict[str, Any]:
+        assert self._channel is not None
+        self._channel.settimeout(_ORDER_TIMEOUT_S)
+        fds = [] if passed is None else [passed.fileno()]
+        try:
+            socket.send_fds(self._channel, [json.dumps(order).encode()], fds)
+            reply: dict[str, Any] = json.loads(self._channel.recv(_MAX_ORDER_BYTES))
+        except (OSError, ValueError):
+            self._stop()
+            raise WorkerLost("the template of the processes ended", hint="try again") from None
+        return reply
+
+    def _stop(self) -> None:
+        """End the template, and with it every process, which dies with its parent."""
+        if self._process is not None and self._channel is not None:
+            self._channel.close()
+            self._process.kill()
+            self._process.wait()
+        self._process = self._channel = None
+        self._is_ready = False
+        self._generation += 1
+        self._forked.clear()
+
+
+def _exchange(connection: socket.socket, data: bytes, until: float, max_reply_bytes: int) -> bytes:
+    """Send *data* and return the reply; raises TimeoutError, `_ProcessEnded` or what the process refused."""
+    try:
+        connection.settimeout(_left_s(until))
+        connection.sendall(_LENGTH.pack(len(data)))
+        connection.sendall(data)
+        kind, length = _REPLY.unpack(_receive(connection, _REPLY.size, until))
+        if length > max_reply_bytes:
+            raise _ProcessEnded(f"it replied with {length} bytes, above {max_reply_bytes}")
+        reply = _receive(connection, length, until)
+    except TimeoutError:
+        raise
+    except OSError:
+        raise _ProcessEnded from None
+    if kind == _DONE:
+        return reply
+    if kind == _REFUSED:
+        code, message, hint, retry_after_ms = json.loads(reply)
+        raise error_from_code(code, message, hint=hint, retry_after_ms=retry_after_ms)
+    raise InternalError("the work failed", hint="the server's log has it")
+
+
+def _receive(connection: socket.socket, size: int, until: float) -> bytes:
+    received = bytearray()
+    while len(received) < size:
+        connection.settimeout(_left_s(until))
+        piece = connection.recv(min(size - len(received), 1 << 18))
+        if not piece:
+            raise _ProcessEnded
+        received += piece
+    return bytes(received)
+
+
+def _left_s(until: float) -> float:
+    left_s = until - time.monotonic()
+    if left_s <= 0:
+        raise TimeoutError
+    return left_s
+
+
+# --- the template process -------------------------------------------------------------------------------
+
+
+def main(arguments: list[str]) -> None:
+    """Fork and kill processes as the owner of the socket with this number orders, until it is gone."""
+    owner = socket.socket(fileno=int(arguments[0]))
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_IGN)
+    set_process_name("rse-pf limited")
+    order = json.loads(owner.recv(_MAX_ORDER_BYTES) or b"null")
+    if order is None:
+        return
+    module, _, function = order["target"].partition(":")
+    handler: Handler = getattr(importlib.import_module(module), function)(order["configuration"])
+    gc.collect()
+    gc.freeze()
+    work = functools.partial(_work, owner, handler, order["memory_bytes"])
+    owner.send(b'"ready"')
+    while _obey(owner, work):
+        pass
+
+
+def _obey(owner: socket.socket, work: Callable[[socket.socket], NoReturn]) -> bool:
+    """Follow one order; return False when the owner is gone."""
+    try:
+        message, fds, _, _ = socket.recv_fds(owner, _MAX_ORDER_BYTES, 1)
+    except OSError:
+        return False
+    if not message:
+        return False
+    order = json.loads(message)
+    if order["do"] == "fork":
+        with socket.socket(fileno=fds[0]) as connection:
+            pid = os.fork()
+            if pid == 0:
+                work(connection)
+        reply = {"pid": pid}
+    else:
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(order["pid"], signal.SIGKILL)  # not reaped yet, so nobody else has this id
+        _, status = os.waitpid(order["pid"], 0)
+        reply = {"code": os.waitstatus_to_exitcode(status)}
+    try:
+        owner.send(json.dumps(reply).encode())
+    except OSError:
+        return False
+    return True
+
+
+def _work(owner: socket.socket, handler: Handler, memory_bytes: int, connection: socket.socket) -> NoReturn:
+    """Answer calls until the connection ends; never return."""
+    try:
+        template = os.getppid()
+        owner.close()
+        if die_with_parent(template):
+            _limit(memory_bytes)
+            while _answer(connection, handler):
+                pass
+        os._exit(0)
+    except MemoryError:
+        os._exit(_OUT_OF_MEMORY)
+    finally:
+        os._exit(1)
+
+
+def _limit(memory_bytes: int) -> None:
+    """Allow this process *memory_bytes* more than it has, no core file, and let it be killed first."""
+    pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[5])
+    limit = pages * os.sysconf("SC_PAGE_SIZE") + memory_bytes
+    resource.setrlimit(resource.RLIMIT_DATA, (limit, limit))
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    with contextlib.suppress(OSError):
+        Path("/proc/self/oom_score_adj").write_text("1000", encoding="ascii")
+
+
+def _answer(connection: socket.socket, handler: Handler) -> bool:
+    """Answer one call; return False at the end of the connection."""
+    header = connection.recv(_LENGTH.size, socket.MSG_WAITALL)
+    if len(header) < _LENGTH.size:
+        return False
+    (length,) = _LENGTH.unpack(header)
+    data = connection.recv(length, socket.MSG_WAITALL)
+    if len(data) < length:
+        return False
+    try:
+        kind, reply = _DONE, handler(data)
+    except MemoryError:
+        raise
+    except RsePfError as error:
+        told = [error.code, error.message, error.hint, error.retry_after_ms]
+        kind, reply = _REFUSED, json.dumps(told).encode()
+    except BaseException:  # noqa: BLE001  the reason goes to the log, and the process answers the next call
+        traceback.print_exc()
+        kind, reply = _DEFECT, b""
+    try:
+        connection.sendall(_REPLY.pack(kind, len(reply)))
+        connection.sendall(reply)
+    except OSError:
+        return False
+    return True
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
