@@ -36,9 +36,10 @@ from rse_pf.config import PlatformSettings
 from rse_pf.errors import RsePfError
 from rse_pf.experiments.load.swarm import Swarm, SwarmOptions
 from rse_pf.geometry import Array, inverse
+from rse_pf.identity import RobotId, object_name
 from rse_pf.local.control.platform import LocalPlatform
 from rse_pf.maps.format import Keyframe, MapVersion, encode_map
-from rse_pf.object_store import digest_of, object_name, open_store
+from rse_pf.object_store import digest_of, open_store
 from rse_pf.services.mapping.merge import MergeReply
 from rse_pf.wire import as_type
 
@@ -97,7 +98,7 @@ class Bench:
         """Store the maps as objects of *robot*, and return the request that names them."""
         store = open_store(f"dir:{self.cloud.state / 'objects'}")
         for data in self.maps:
-            store.put(object_name("default", robot, digest_of(data)), data)
+            store.put(object_name(RobotId("default", robot), digest_of(data)), data)
         request: dict[str, Any] = {"maps": [{"object": digest_of(data)} for data in self.maps]}
         if options:
             request["options"] = options

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 from rse_pf.object_store import name_segment
 
-__all__ = ["DEFAULT_TENANT", "RobotId"]
+__all__ = ["DEFAULT_TENANT", "RobotId", "object_name", "state_name"]
 
 DEFAULT_TENANT = "default"
 
@@ -32,10 +32,21 @@ class RobotId(NamedTuple):
 
     def __str__(self) -> str:
         """Return the name as an operator writes it: with the tenant, unless that is the default one."""
-        return self.name if self.tenant == DEFAULT_TENANT else f"{self.tenant}/{self.name}"
+        is_plain = self.tenant == DEFAULT_TENANT and "/" not in self.name
+        return self.name if is_plain else f"{self.tenant}/{self.name}"
 
     @property
     def folder(self) -> str:
         """``TENANT/ROBOT`` or ``TENANT/ROBOT=THUMBPRINT``, for names of objects; no two robots share one."""
         name = name_segment(self.name)
         return f"{name_segment(self.tenant)}/{name}{'=' if self.enrolment else ''}{self.enrolment}"
+
+
+def object_name(robot: RobotId, digest: str) -> str:
+    """Return the name of the object *digest* of *robot*: ``objects/TENANT/ROBOT[=THUMBPRINT]/DIGEST``."""
+    return f"objects/{robot.folder}/{digest}"
+
+
+def state_name(robot: RobotId, service: str) -> str:
+    """Return the name of the state of *service* for *robot*: ``states/TENANT/ROBOT[=THUMBPRINT]/SERVICE``."""
+    return f"states/{robot.folder}/{service}"

@@ -32,8 +32,8 @@ __all__ = [
     "ScratchStore",
     "check_name",
     "digest_of",
+    "is_name",
     "name_segment",
-    "object_name",
     "open_store",
     "put_scratch",
     "read_range",
@@ -122,19 +122,19 @@ def name_segment(text: str) -> str:
     return "x=" + digest_of(text.encode("utf-8", "surrogatepass"))
 
 
-def object_name(tenant: str, robot: str, digest: str) -> str:
-    """Return where the object *digest* of a robot lives: ``objects/TENANT/ROBOT/DIGEST``."""
-    return f"objects/{name_segment(tenant)}/{name_segment(robot)}/{digest}"
-
-
 def digest_of(data: bytes) -> str:
     """Return the sha256 of *data* in hex: the name of an immutable object."""
     return hashlib.sha256(data).hexdigest()
 
 
+def is_name(name: str) -> bool:
+    """Return whether *name* consists of at most ten plain path segments."""
+    return _NAME.fullmatch(name) is not None
+
+
 def check_name(name: str) -> str:
     """Return *name*; raises StoreError unless it consists of at most ten plain path segments."""
-    if not _NAME.fullmatch(name):
+    if not is_name(name):
         raise StoreError(
             f"{name[:80]!r} is not a name of an object",
             hint="use segments of letters, digits and . _ = -, joined by /",

@@ -16,6 +16,7 @@ from typing import Annotated, TypeVar
 import msgspec
 
 from rse_pf.errors import ConfigurationError, UsageError
+from rse_pf.identity import RobotId
 
 __all__ = [
     "QUOTAS",
@@ -69,6 +70,11 @@ class EnrolledRobot(_Value, frozen=True, kw_only=True):
     def key_id(self) -> str:
         """The ``kid`` of the tokens that it signs."""
         return key_id_of(self.x)
+
+    @property
+    def id(self) -> RobotId:
+        """Its identity; another key under the same name is another robot."""
+        return RobotId(self.tenant, self.robot, self.key_id.removeprefix(ROBOT_KEY))
 
 
 class Roster(_Value, frozen=True, kw_only=True):

@@ -26,6 +26,7 @@ from rse_pf.auth.roster import (
 )
 from rse_pf.config import AuthSettings
 from rse_pf.errors import MissingExtra, Unauthorized, UsageError
+from rse_pf.identity import DEFAULT_TENANT, RobotId
 
 if TYPE_CHECKING:
     from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey, Ed25519PublicKey
@@ -35,6 +36,7 @@ __all__ = [
     "KeySet",
     "SigningKey",
     "claims_problem",
+    "renewed_claims",
     "token_problem",
     "unverified_parts",
     "verify_token",
@@ -51,12 +53,11 @@ _MAX_TOKEN_BYTES = 4096
 class Claims:
     """The claims of a verified token, the only source of a robot's identity."""
 
-    robot: str
+    robot: RobotId
     token_id: str
     issued_s: float
     expires_s: float
     key_id: str
-    tenant: str = "default"
     scopes: tuple[str, ...] = ()
     quotas: tuple[tuple[str, float], ...] = ()
 
@@ -109,7 +110,7 @@ class SigningKey:
         settings: AuthSettings,
         ttl_s: float | None = None,
         scopes: tuple[str, ...] = (),
-        tenant: str = "default",
+        tenant: str = DEFAULT_TENANT,
     ) -> str:
         """Return a token for *robot* that is valid from *now* (Unix seconds) for *ttl_s*."""
         check_robot(robot)
@@ -214,7 +215,7 @@ class KeySet:
 
     def denies(self, claims: Claims) -> str:
         """Return why *claims* are denied although their signature is valid; empty if they are not."""
-        robot = (claims.tenant, claims.robot)
+        robot = (claims.robot.tenant, claims.robot.name)  # an operator denies a name, whatever its key
         if robot in self._disabled:
             return "disabled"
         if (*robot, claims.token_id) in self._revoked:
@@ -250,9 +251,15 @@ def claims_problem(claims: Claims, keys: KeySet) -> str:
     if not keys.knows(claims.key_id):
         return "unknown-key"
     enrolled = keys.robot_of(claims.key_id)
-    if enrolled is not None and (enrolled.tenant, enrolled.robot) != (claims.tenant, claims.robot):
+    if enrolled is not None and enrolled.id != claims.robot:
         return "wrong-robot"
     return keys.denies(claims)
+
+
+def renewed_claims(claims: Claims, keys: KeySet) -> Claims:
+    """Return *claims*, which `claims_problem` allows, with the scopes and quotas of the present roster."""
+    enrolled = keys.robot_of(claims.key_id)
+    return claims if enrolled is None else _as_enrolled(claims, enrolled)
 
 
 def unverified_parts(token: str) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -310,11 +317,9 @@ def _checked(token: str, keys: KeySet, now: float, settings: AuthSettings) -> Cl
     verified = _checked_times(claims, str(header["kid"]), now, settings)
     enrolled = keys.robot_of(verified.key_id)
     if enrolled is not None:
-        if enrolled.robot != verified.robot:
+        if enrolled.robot != verified.robot.name:
             raise _TokenRefused("wrong-robot")
-        verified = replace(
-            verified, tenant=enrolled.tenant, scopes=enrolled.scopes, quotas=tuple(enrolled.quotas.items())
-        )
+        verified = _as_enrolled(verified, enrolled)
     denied = keys.denies(verified)
     if denied:
         raise _TokenRefused(denied)
@@ -338,14 +343,19 @@ def _checked_times(claims: dict[str, Any], key_id: str, now: float, settings: Au
     if not all(isinstance(word, str) and 0 < len(word) <= 64 for word in (robot, token_id)):
         raise _TokenRefused("bad-subject")
     return Claims(
-        robot=robot,
+        robot=RobotId(str(claims.get("tenant", DEFAULT_TENANT)), robot),
         token_id=token_id,
         issued_s=float(issued),
         expires_s=float(expires),
         key_id=key_id,
-        tenant=str(claims.get("tenant", "default")),
         scopes=tuple(str(claims.get("scope", "")).split()),
     )
+
+
+def _as_enrolled(claims: Claims, enrolled: EnrolledRobot) -> Claims:
+    """Return *claims* with what the roster says of the robot; a token says nothing of it."""
+    quotas = tuple(enrolled.quotas.items())
+    return replace(claims, robot=enrolled.id, scopes=enrolled.scopes, quotas=quotas)
 
 
 def _is_canonical(token: str) -> bool:

@@ -15,6 +15,8 @@ from typing import Any
 
 import msgspec
 
+from rse_pf.identity import RobotId
+
 __all__ = ["JsonLog"]
 
 _LEVELS = {"debug": 10, "info": 20, "warning": 30, "error": 40}
@@ -72,6 +74,8 @@ class JsonLog:
     def _line(self, level: str, event: str, fields: dict[str, Any]) -> None:
         if _LEVELS[level] < self._lowest:
             return
+        if isinstance(fields.get("robot"), RobotId):
+            fields["tenant"], fields["robot"], _ = fields["robot"]
         for name, value in fields.items():
             if isinstance(value, str) and len(value) > _MAX_TEXT:
                 fields[name] = value[-_MAX_TRACEBACK:] if name == "traceback" else value[:_MAX_TEXT]

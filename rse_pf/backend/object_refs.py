@@ -20,7 +20,8 @@ from rse_pf.auth.tokens import Claims
 from rse_pf.backend.robot_store import quota_bytes, store_within_quota
 from rse_pf.config import ServingSettings
 from rse_pf.errors import BadRequest, LimitExceeded, NotFound, QuotaExceeded, StoreError
-from rse_pf.object_store import ObjectStore, digest_of, object_name
+from rse_pf.identity import RobotId, object_name
+from rse_pf.object_store import ObjectStore, digest_of
 from rse_pf.service import Registry, Service
 from rse_pf.wire import Command, Failure, Result
 from rse_pf.wire.arrays import binary_encode_hook
@@ -50,8 +51,7 @@ def named_in(request_type: type[Any], payload: Any) -> list[str]:
 def resolve(
     request_type: type[Any],
     payload: Any,
-    tenant: str,
-    robot: str,
+    robot: RobotId,
     store: ObjectStore,
     *,
     settings: ServingSettings,
@@ -63,8 +63,7 @@ def resolve(
     Args:
         request_type: What the service takes, a msgspec Struct.
         payload: As decoded from the wire: plain dicts and lists; not changed.
-        tenant: Of the robot's token.
-        robot: Likewise.
+        robot: Of the token.
         store: Of the platform.
         settings: ``max_objects_per_command`` and ``max_object_bytes_per_command``.
 
@@ -82,21 +81,20 @@ def resolve(
             f"the command refers to {len(digests)} objects, above {settings.max_objects_per_command}",
             hint="put them into fewer commands",
         )
-    size = sum(_size(store, object_name(tenant, robot, digest), digest) for digest in digests)
+    size = sum(_size(store, object_name(robot, digest), digest) for digest in digests)
     if size > settings.max_object_bytes_per_command:
         raise LimitExceeded(
             f"the objects have {size} bytes, above {settings.max_object_bytes_per_command}",
             hint="put them into fewer commands",
         )
-    held = {digest: _read(store, object_name(tenant, robot, digest), digest) for digest in digests}
+    held = {digest: _read(store, object_name(robot, digest), digest) for digest in digests}
     return _walk(_shape(request_type), payload, held.__getitem__)
 
 
 class Owner(Protocol):
     """The robot whose objects may be used."""
 
-    robot: str
-    tenant: str
+    robot: RobotId
     claims: Claims | None
 
 
@@ -125,7 +123,7 @@ class ObjectRefs:
         if self.store is None or not self.named_by(command, service):
             return command
         payload = resolve(
-            service.request_type, command.payload, who.tenant, who.robot, self.store, settings=self.settings
+            service.request_type, command.payload, who.robot, self.store, settings=self.settings
         )
         return msgspec.structs.replace(command, payload=payload)
 
@@ -143,7 +141,7 @@ class ObjectRefs:
             return sent
         max_bytes = quota_bytes(who.claims, self.quota_bytes)
         try:
-            digest = store_within_quota(self.store, who.tenant, who.robot, reply, max_bytes)
+            digest = store_within_quota(self.store, who.robot, reply, max_bytes)
         except QuotaExceeded as error:
             return msgspec.structs.replace(sent, code=error.code, message=error.message, hint=error.hint)
         except StoreError:

@@ -9,7 +9,8 @@ from __future__ import annotations
 from rse_pf.auth.tokens import Claims
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import NotFound, QuotaExceeded
-from rse_pf.object_store import ObjectStore, digest_of, object_name
+from rse_pf.identity import RobotId, object_name
+from rse_pf.object_store import ObjectStore, digest_of
 
 __all__ = ["check_quota", "is_shared", "quota_bytes", "store_within_quota"]
 
@@ -26,12 +27,12 @@ def quota_bytes(claims: Claims | None, default: float) -> float:
     return (claims.quota("data_bytes") if claims is not None else None) or default
 
 
-def check_quota(store: ObjectStore, tenant: str, robot: str, size: int, max_bytes: float) -> None:
+def check_quota(store: ObjectStore, robot: RobotId, size: int, max_bytes: float) -> None:
     """Raise QuotaExceeded unless *size* more bytes fit; StoreError if the store fails.
 
     Only stored objects are counted; the data service counts uploads that have begun.
     """
-    used = sum(info.size for info in store.list(object_name(tenant, robot, "")))
+    used = sum(info.size for info in store.list(object_name(robot, "")))
     if used + size > max_bytes:
         raise QuotaExceeded(
             f"{used} + {size} bytes are more than the quota of {max_bytes:.0f}",
@@ -39,7 +40,7 @@ def check_quota(store: ObjectStore, tenant: str, robot: str, size: int, max_byte
         )
 
 
-def store_within_quota(store: ObjectStore, tenant: str, robot: str, data: bytes, max_bytes: float) -> str:
+def store_within_quota(store: ObjectStore, robot: RobotId, data: bytes, max_bytes: float) -> str:
     """Store *data* durably as an object of the robot, and return its digest.
 
     An object that is stored already is not counted again.
@@ -49,10 +50,10 @@ def store_within_quota(store: ObjectStore, tenant: str, robot: str, data: bytes,
         StoreError: The store fails.
     """
     digest = digest_of(data)
-    name = object_name(tenant, robot, digest)
+    name = object_name(robot, digest)
     try:
         store.head(name)
     except NotFound:
-        check_quota(store, tenant, robot, len(data), max_bytes)
+        check_quota(store, robot, len(data), max_bytes)
         store.put(name, data)
     return digest

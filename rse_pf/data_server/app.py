@@ -32,11 +32,12 @@ from rse_pf.errors import (
     RsePfError,
     Unauthorized,
 )
+from rse_pf.identity import RobotId
 from rse_pf.object_store import ObjectStore
 
 __all__ = ["DataServer"]
 
-_ANONYMOUS = Claims(robot="", token_id="", issued_s=0.0, expires_s=0.0, key_id="")
+_ANONYMOUS = Claims(robot=RobotId("", ""), token_id="", issued_s=0.0, expires_s=0.0, key_id="")
 _PROBES = ("/data/healthz", "/data/readyz")
 _RETRY_AFTER_MS = 1000.0
 _REQUEST_TIMEOUT = 408
@@ -162,7 +163,7 @@ class DataServer:
                 self.record_counted()
                 self._audit.record("auth.refused", reason=line["reason"])
             raise
-        line["robot"] = claims.robot
+        line["tenant"], line["robot"] = claims.robot.tenant, claims.robot.name
         if not scopes_allow(claims.scopes, scope, name):
             raise Forbidden(f"this token does not have the scope {scope}", hint="issue another token")
         return claims

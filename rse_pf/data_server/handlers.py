@@ -34,6 +34,7 @@ from rse_pf.data_server.routes import (
 )
 from rse_pf.data_server.uploads import Objects
 from rse_pf.errors import BadRequest, NotFound
+from rse_pf.identity import RobotId
 from rse_pf.maps.registry import MapRecord, MapRegistry
 from rse_pf.object_store import ObjectStore, PresigningStore, read_range
 
@@ -182,7 +183,7 @@ class Handlers:
 
         def work() -> MapRecord:
             return self._maps(claims).commit(
-                path["name"], self._store.get(name), parent=commit.parent, author=claims.robot,
+                path["name"], self._store.get(name), parent=commit.parent, author=claims.robot.name,
                 created_s=self._wall_clock(), note=commit.note,
             )  # fmt: skip
 
@@ -211,13 +212,13 @@ class Handlers:
     def _maps(self, claims: Claims) -> MapRegistry:
         def record_change(action: str, name: str, record: MapRecord) -> None:
             if self._audit is not None:
-                subject = name if claims.tenant == "default" else f"{claims.tenant}/{name}"
+                subject = str(RobotId(claims.robot.tenant, name))
                 self._audit.record(
-                    action, subject, actor=claims.robot, version=record.id, number=record.number
+                    action, subject, actor=str(claims.robot), version=record.id, number=record.number
                 )
 
         max_bytes = 4 * self._settings.max_object_bytes
-        return MapRegistry(self._store, claims.tenant, max_bytes=max_bytes, on_change=record_change)
+        return MapRegistry(self._store, claims.robot.tenant, max_bytes=max_bytes, on_change=record_change)
 
     async def _content(self, request: HttpRequest, name: str, size: int, digest: str) -> HttpReply:
         store, ttl_s = self._store, self._settings.presigned_url_ttl_s

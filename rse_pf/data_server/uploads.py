@@ -17,12 +17,11 @@ from rse_pf.auth.tokens import Claims
 from rse_pf.config import DataSettings
 from rse_pf.data_server.routes import Upload
 from rse_pf.errors import BadRequest, Conflict, LimitExceeded, NotFound, QuotaExceeded
+from rse_pf.identity import object_name
 from rse_pf.object_store import (
     ObjectInfo,
     ObjectStore,
     digest_of,
-    name_segment,
-    object_name,
     put_scratch,
 )
 
@@ -64,11 +63,11 @@ class Objects:
         """Return the name of a robot's object in the store; raises NotFound if *digest* is no sha256."""
         if not _DIGEST.fullmatch(digest):
             raise NotFound("no such object", hint="objects are named by sha256, 64 hex digits")
-        return object_name(claims.tenant, claims.robot, digest)
+        return object_name(claims.robot, digest)
 
     def list(self, claims: Claims, after: str, limit: int) -> tuple[list[ObjectInfo], bool]:
         """Return up to *limit* objects behind digest *after*, and whether there are more."""
-        prefix = object_name(claims.tenant, claims.robot, "")
+        prefix = object_name(claims.robot, "")
         found = [info for info in self._store.list(prefix) if info.name > prefix + after]
         return found[:limit], len(found) > limit
 
@@ -294,4 +293,4 @@ class Objects:
 
 
 def _folder_of(claims: Claims) -> str:
-    return f"{name_segment(claims.tenant)}/{name_segment(claims.robot)}/"
+    return f"{claims.robot.folder}/"

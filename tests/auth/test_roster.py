@@ -61,7 +61,7 @@ def problem(text: str, keys: KeySet, now: float = NOW_S) -> str:
 def test_an_enrolled_robot_signs_for_itself_and_the_roster_says_what_it_may():
     claims = verified(token(tenant="other", scopes=("services:*",)), trusted())
 
-    assert (claims.robot, claims.tenant, claims.scopes) == ("robot-1", "lab", ("services:pnp",))
+    assert (claims.robot, claims.scopes) == (ENROLLED.id, ("services:pnp",))
     assert claims.quota("data_bytes") == 10.0
     assert verified(token(PLATFORM), trusted()).quota("data_bytes") is None
 
@@ -117,7 +117,7 @@ def test_denied_tokens_are_refused_and_end_their_connections(denied: DenyList, r
     ],
 )
 def test_a_denial_applies_to_its_own_robot_and_tenant_only(denied: DenyList):
-    assert verified(token(), trusted(denied)).robot == "robot-1"
+    assert verified(token(), trusted(denied)).robot == ENROLLED.id
 
 
 def test_a_robot_that_is_removed_or_has_a_new_key_loses_its_connections():

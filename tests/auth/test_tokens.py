@@ -17,6 +17,7 @@ from hypothesis import strategies as st
 from rse_pf.auth.tokens import Claims, KeySet, SigningKey, token_problem, verify_token
 from rse_pf.config import AuthSettings
 from rse_pf.errors import Unauthorized, UsageError
+from rse_pf.identity import RobotId
 
 NOW = 1_790_000_000.0
 SETTINGS = AuthSettings()
@@ -59,13 +60,13 @@ def test_a_good_token_says_who_the_robot_is() -> None:
     token = issue(scopes=("services:pnp", "maps:*"), tenant="lab", ttl_s=60.0)
 
     assert verify_token(token, keys=KEYS, now=NOW + 1, settings=SETTINGS) == Claims(
-        robot="robot-7", token_id="t1", issued_s=NOW, expires_s=NOW + 60, key_id="key-1", tenant="lab",
+        robot=RobotId("lab", "robot-7"), token_id="t1", issued_s=NOW, expires_s=NOW + 60, key_id="key-1",
         scopes=("services:pnp", "maps:*"),
     )  # fmt: skip
 
 
 def test_the_tests_own_signer_makes_good_tokens_too() -> None:
-    assert verify_token(sign(GOOD), keys=KEYS, now=NOW, settings=SETTINGS).robot == "robot-7"
+    assert verify_token(sign(GOOD), keys=KEYS, now=NOW, settings=SETTINGS).robot.name == "robot-7"
 
 
 PUBLIC = KEY._private.public_key().public_bytes_raw()
@@ -187,7 +188,7 @@ def test_odd_claims_under_a_good_signature_are_accepted_or_refused(changes: dict
 def test_time_is_an_argument_and_the_machines_clock_never_decides(now: float) -> None:
     token = KEY.issue("robot-7", now=now, token_id="t1", settings=SETTINGS)
 
-    assert verify_token(token, keys=KEYS, now=now + 1, settings=SETTINGS).robot == "robot-7"
+    assert verify_token(token, keys=KEYS, now=now + 1, settings=SETTINGS).robot.name == "robot-7"
     assert refused(token, now=now + SETTINGS.token_ttl_s + SETTINGS.leeway_s + 2) == "expired"
 
 
@@ -203,7 +204,7 @@ def test_the_leeway_is_kept_to_the_second() -> None:
 def test_not_before_has_the_same_leeway() -> None:
     token = sign({**GOOD, "nbf": NOW + SETTINGS.leeway_s})
 
-    assert verify_token(token, keys=KEYS, now=NOW, settings=SETTINGS).robot == "robot-7"
+    assert verify_token(token, keys=KEYS, now=NOW, settings=SETTINGS).robot.name == "robot-7"
     assert refused(token, now=NOW - 1) == "not-yet-valid"
 
 

@@ -10,13 +10,15 @@ import pytest
 from rse_pf.backend.object_refs import ObjectRefs, named_in, resolve, takes_objects
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import BadRequest, LimitExceeded, NotFound, RsePfError, StoreError
-from rse_pf.object_store import MemoryStore, ObjectInfo, digest_of, object_name
+from rse_pf.identity import RobotId, object_name
+from rse_pf.object_store import MemoryStore, ObjectInfo, digest_of
 from rse_pf.service import Registry
 from rse_pf.services.mapping.localise import LocaliseRequest
 from rse_pf.services.mapping.merge import MergeRequest
 from rse_pf.services.pnp import PnpRequest
 from rse_pf.wire import Command
 
+ROBOT = RobotId("lab", "robot-1")
 SERVING = PlatformSettings().serving
 MAP, OTHER = b"a map" * 400, b"another"
 
@@ -59,7 +61,7 @@ def store() -> Counting:
     """What robot-1 of the tenant lab has stored: two objects."""
     made = Counting()
     for data in (MAP, OTHER):
-        made.put(object_name("lab", "robot-1", digest_of(data)), data)
+        made.put(object_name(ROBOT, digest_of(data)), data)
     return made
 
 
@@ -67,10 +69,8 @@ def name(data: bytes) -> dict[str, str]:
     return {"object": digest_of(data)}
 
 
-def resolved(
-    payload: Any, store: MemoryStore, kind: type[Any] = Asked, *, robot: str = "robot-1", tenant: str = "lab"
-) -> Any:
-    return resolve(kind, payload, tenant, robot, store, settings=SERVING)
+def resolved(payload: Any, store: MemoryStore, kind: type[Any] = Asked, *, robot: RobotId = ROBOT) -> Any:
+    return resolve(kind, payload, robot, store, settings=SERVING)
 
 
 def test_references_become_bytes_wherever_the_request_declares_bytes(store: Counting) -> None:
@@ -106,7 +106,7 @@ def test_each_object_is_read_once_however_often_it_is_referred_to(store: Countin
 @pytest.mark.parametrize(("tenant", "robot"), [("lab", "robot-2"), ("other", "robot-1")])
 def test_an_object_of_another_robot_is_reported_as_missing(store: Counting, tenant: str, robot: str) -> None:
     with pytest.raises(NotFound) as foreign:
-        resolved({"one": name(MAP)}, store, tenant=tenant, robot=robot)
+        resolved({"one": name(MAP)}, store, robot=RobotId(tenant, robot))
     with pytest.raises(NotFound) as missing:
         resolved({"one": name(MAP)}, MemoryStore())
 
@@ -137,13 +137,13 @@ def test_more_than_a_command_may_refer_to_is_refused_before_it_is_read(
     payload = {"many": [name(MAP), name(OTHER)]}
 
     with pytest.raises(LimitExceeded):
-        resolve(Asked, payload, "lab", "robot-1", store, settings=settings)
+        resolve(Asked, payload, ROBOT, store, settings=settings)
 
     assert (store.heads, store.gets) == (reads, 0)
 
 
 def test_an_object_that_changed_in_the_store_reaches_no_service(store: Counting) -> None:
-    store.put(object_name("lab", "robot-1", digest_of(MAP)), b"rotten")
+    store.put(object_name(ROBOT, digest_of(MAP)), b"rotten")
 
     with pytest.raises(StoreError, match="digest"):
         resolved({"one": name(MAP)}, store)

@@ -13,22 +13,21 @@ from rse_pf.backend.object_refs import ObjectRefs
 from rse_pf.backend.robot_store import check_quota, quota_bytes, store_within_quota
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import QuotaExceeded
-from rse_pf.object_store import DirectoryStore, MemoryStore, digest_of, object_name
+from rse_pf.identity import RobotId, object_name
+from rse_pf.object_store import DirectoryStore, MemoryStore, digest_of
 from rse_pf.wire import Failure, Result
 
-ROBOT = ("default", "robot-1")
+ROBOT = RobotId("default", "robot-1")
 REPLY = msgspec.msgpack.encode({"value": bytes(600)})
 
 
 def claims(**quotas: float) -> Claims:
     return Claims(
-        robot="robot-1", token_id="t", issued_s=0.0, expires_s=1.0, key_id="k", quotas=tuple(quotas.items())
+        robot=ROBOT, token_id="t", issued_s=0.0, expires_s=1.0, key_id="k", quotas=tuple(quotas.items())
     )
 
 
-REQUEST = JobRequest(
-    service="long", payload={}, tenant="default", robot="robot-1", key="k", quota_bytes=1000.0
-)
+REQUEST = JobRequest(service="long", payload={}, robot=ROBOT, key="k", quota_bytes=1000.0)
 
 
 def of(store: str, max_message_bytes: int = 2000) -> PlatformSettings:
@@ -48,24 +47,24 @@ def test_the_quota_is_that_of_the_token_or_else_of_the_settings():
 
 def test_an_object_that_fits_exactly_is_stored_and_one_byte_more_is_not():
     store = MemoryStore()
-    store.put(object_name("default", "robot-2", "other"), bytes(500))
-    store.put(object_name(*ROBOT, "own"), bytes(60))
+    store.put(object_name(RobotId("default", "robot-2"), "other"), bytes(500))
+    store.put(object_name(ROBOT, "own"), bytes(60))
 
     with pytest.raises(QuotaExceeded):
-        store_within_quota(store, *ROBOT, bytes(41), 100)
-    digest = store_within_quota(store, *ROBOT, bytes(40), 100)
+        store_within_quota(store, ROBOT, bytes(41), 100)
+    digest = store_within_quota(store, ROBOT, bytes(40), 100)
 
-    assert store.get(object_name(*ROBOT, digest)) == bytes(40)
-    assert store_within_quota(store, *ROBOT, bytes(40), 100) == digest
+    assert store.get(object_name(ROBOT, digest)) == bytes(40)
+    assert store_within_quota(store, ROBOT, bytes(40), 100) == digest
     with pytest.raises(QuotaExceeded):
-        check_quota(store, *ROBOT, 1, 100)
+        check_quota(store, ROBOT, 1, 100)
 
 
 def test_a_large_reply_beyond_the_quota_is_refused_with_the_reason():
     store, settings = MemoryStore(), PlatformSettings()
     gate = ObjectRefs(store, settings.serving, 100)
     answer, sent = Result(id=1, reply=bytes(500)), Failure(id=1, code="too-large", message="too large")
-    owner = SimpleNamespace(tenant="default", robot="robot-1", claims=None)
+    owner = SimpleNamespace(robot=ROBOT, claims=None)
 
     refused = gate.kept(answer, sent, owner)
     owner.claims = claims(data_bytes=1000.0)
@@ -74,7 +73,7 @@ def test_a_large_reply_beyond_the_quota_is_refused_with_the_reason():
     assert isinstance(refused, Failure)
     assert (refused.id, refused.code) == (1, "quota")
     assert isinstance(stored, Result)
-    assert [info.name for info in store.list()] == [object_name(*ROBOT, stored.object)]
+    assert [info.name for info in store.list()] == [object_name(ROBOT, stored.object)]
 
 
 def test_a_jobs_process_stores_its_reply_and_sends_only_small_ones_along(tmp_path):
@@ -83,7 +82,7 @@ def test_a_jobs_process_stores_its_reply_and_sends_only_small_ones_along(tmp_pat
 
     assert small == ["stored", 5.0, digest_of(REPLY), len(REPLY), REPLY]
     assert large == ["stored", 5.0, digest_of(REPLY), len(REPLY), None]
-    assert DirectoryStore(tmp_path).get(object_name(*ROBOT, digest_of(REPLY))) == REPLY
+    assert DirectoryStore(tmp_path).get(object_name(ROBOT, digest_of(REPLY))) == REPLY
 
 
 def test_a_jobs_process_refuses_what_is_too_large_or_beyond_the_quota(tmp_path):

@@ -7,11 +7,12 @@ import json
 import pytest
 from fake_data_service import Service, small_settings
 
-from rse_pf.object_store import MemoryStore, digest_of, object_name
+from rse_pf.identity import RobotId, object_name
+from rse_pf.object_store import MemoryStore, digest_of
 
 DATA = bytes(range(256)) * 40
 DIGEST = digest_of(DATA)
-NAME = object_name("default", "robot-1", DIGEST)
+NAME = object_name(RobotId("default", "robot-1"), DIGEST)
 BEGIN = json.dumps({"size": len(DATA)}).encode()
 
 

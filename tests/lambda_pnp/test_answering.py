@@ -18,6 +18,7 @@ from lambda_pnp.answering import Answering
 from lambda_pnp.keys import KeyCache
 from rse_pf.auth.tokens import SigningKey
 from rse_pf.config import PlatformSettings
+from rse_pf.identity import RobotId
 from rse_pf.wire import SUBPROTOCOLS, Command, Failure, Hello, Message, Result, make_codec
 
 SETTINGS = PlatformSettings()
@@ -157,7 +158,7 @@ def over_the_websocket(body: bytes) -> Failure:
         allowed_s = SETTINGS.session.answer_timeout_s
         if command.deadline_ms is not None:
             allowed_s = command.deadline_ms / 1e3
-        queued = QueuedCommand(None, "robot-1", command, len(body), 0.0, allowed_s)
+        queued = QueuedCommand(None, RobotId("default", "robot-1"), command, len(body), 0.0, allowed_s)
         admission = Admission(SETTINGS.session, SETTINGS.serving)
         refused = admission.judge(queued, None, (0, 0.0, 0.0), math.inf)
         if refused is not None:

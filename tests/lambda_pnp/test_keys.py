@@ -10,6 +10,7 @@ from lambda_pnp.keys import KeyCache, signed_request
 from rse_pf.auth.roster import DenyList, EnrolledRobot, Roster, public_key_of, to_json
 from rse_pf.auth.tokens import Claims, SigningKey
 from rse_pf.errors import NotFound
+from rse_pf.identity import RobotId
 
 ENVIRONMENT = {
     "RSE_PF_KEYS": "artifacts/keys.json", "AWS_REGION": "ap-northeast-2", "AWS_ACCESS_KEY_ID": "AKIDEXAMPLE",
@@ -112,7 +113,7 @@ class Room:
         return self.objects[name]
 
 
-CLAIMS = Claims(robot="r", token_id="t", issued_s=0.0, expires_s=900.0, key_id="a")
+CLAIMS = Claims(robot=RobotId("default", "r"), token_id="t", issued_s=0.0, expires_s=900.0, key_id="a")
 DISABLED = to_json(DenyList().with_robot("default", "r", 1.0)).decode()
 
 

@@ -67,23 +67,23 @@ class AuditRecorder:
         """Record the verdict on a handshake from the address *source*."""
         if isinstance(verdict, Accepted):
             if verdict.claims is not None:
-                self._note("auth.accepted", _subject(verdict.claims), **_of(verdict.claims), source=source)
+                self._note("auth.accepted", str(verdict.claims.robot), **_of(verdict.claims), source=source)
         elif verdict.status == _UNAUTHORIZED and self._may_record(verdict.reason):
             self._note("auth.refused", "", reason=verdict.reason, source=source, **_claimed(authorization))
 
     def renewed(self, before: Claims, claims: Claims) -> None:
         """Record the fresh token of a live connection; the same token again is not recorded."""
         if claims.token_id != before.token_id:
-            self._note("auth.renewed", _subject(claims), **_of(claims))
+            self._note("auth.renewed", str(claims.robot), **_of(claims))
 
     def renewal_refused(self, before: Claims | None, reason: str) -> None:
         """Record that the fresh token of a live connection was refused."""
         if self._may_record(reason):
-            self._note("auth.renewal-refused", "" if before is None else _subject(before), reason=reason)
+            self._note("auth.renewal-refused", "" if before is None else str(before.robot), reason=reason)
 
     def cut_off(self, claims: Claims, reason: str) -> None:
         """Record that a live connection was ended because its token is no longer valid."""
-        self._note("auth.cut-off", _subject(claims), **_of(claims), reason=reason)
+        self._note("auth.cut-off", str(claims.robot), **_of(claims), reason=reason)
 
     def flush(self) -> None:
         """Send what is held, now."""
@@ -171,10 +171,6 @@ def _claimed(authorization: str) -> Mapping[str, str]:
     except (ValueError, msgspec.MsgspecError, RecursionError):
         return {}
     return {"claimed_robot": claimed.sub[:_MAX_CLAIM], "claimed_token": claimed.jti[:_MAX_CLAIM]}
-
-
-def _subject(claims: Claims) -> str:
-    return claims.robot if claims.tenant == "default" else f"{claims.tenant}/{claims.robot}"
 
 
 def _of(claims: Claims) -> dict[str, str]:

@@ -62,7 +62,7 @@ class RobotConnection:
 
     __slots__ = (
         "_assembler", "_context", "_deferred", "_handler", "_wire", "allowed_s", "claims", "is_connected",
-        "last_heard_s", "moving_until_s", "number", "opened_s", "robot", "session", "tenant",
+        "last_heard_s", "moving_until_s", "number", "opened_s", "robot", "session",
     )  # fmt: skip
 
     def __init__(
@@ -85,7 +85,7 @@ class RobotConnection:
             now: Seconds, monotonic, as all times here.
             number: Which socket of the server this is, in the order of acceptance.
         """
-        self.robot, self.tenant = accepted.robot, accepted.tenant
+        self.robot = accepted.robot
         self.claims: Claims | None = accepted.claims
         """What the robot's token says; None where no token is required."""
         self.session = session
@@ -221,7 +221,7 @@ class RobotConnection:
         """Execute what the session decided about one message; it was in *state* before."""
         self._execute(decisions, now, size_bytes)
         if session.bad_messages > self._context.settings.session.max_bad_messages:
-            self._handler.rates.ban((self.tenant, self.robot), now)
+            self._handler.rates.ban(self.robot, now)
         if self._assembler.closed:
             return
         if session.bad_messages > bad_messages:

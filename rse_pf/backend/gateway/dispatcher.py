@@ -31,6 +31,7 @@ from rse_pf.backend.scheduling.scheduler import (
 )
 from rse_pf.backend.scheduling.thread_pool import SolverThreads
 from rse_pf.errors import UnknownService
+from rse_pf.identity import RobotId
 from rse_pf.service import Registry
 from rse_pf.wire import CODECS, Codec, Command, make_codec
 from rse_pf.wire.envelope import Envelope, peek
@@ -53,7 +54,7 @@ class NoQueue:
         """Return False: no service is offered, so that nothing is ever submitted."""
         return False
 
-    def waiting_of(self, robot: str) -> int:
+    def waiting_of(self, robot: RobotId) -> int:
         """Return 0."""
         return 0
 
@@ -156,7 +157,7 @@ class Dispatcher:
         if accepted.codec:
             session = ServerSession(
                 codec=self._codecs[accepted.codec],
-                robot=accepted.robot,
+                robot=accepted.robot.name,
                 server=self.context.server_id,
                 session=self._new_session_id(),
                 limits=self.context.settings.session,
@@ -208,7 +209,7 @@ class Dispatcher:
     ) -> bool:
         """Refuse the message *data* for a fraction of what decoding it costs; False if it must be decoded."""
         answers, codec = self._answers, session.codec
-        retry_ms = self.rates.retry_after_ms((connection.tenant, connection.robot), now)
+        retry_ms = self.rates.retry_after_ms(connection.robot, now)
         if retry_ms == CUT_OFF:
             self.context.metrics.shed["rate"] += 1
             self.context.log.warning("cut-off", robot=connection.robot, reason="rate")

@@ -15,6 +15,7 @@ from rse_pf.auth.tokens import Claims, KeySet, token_problem, verify_token
 from rse_pf.config import PlatformSettings
 from rse_pf.config.resource_names import HEALTH_PATH
 from rse_pf.errors import Unauthorized
+from rse_pf.identity import DEFAULT_TENANT, RobotId
 from rse_pf.wire import SUBPROTOCOLS, codec_for
 
 __all__ = ["HEALTH", "Accepted", "HandshakePolicy", "Rejected"]
@@ -30,12 +31,11 @@ _JSON = {"Content-Type": "application/json"}
 class Accepted:
     """A robot that may upgrade to WebSocket.  ``expires_s`` is Unix time; None never expires."""
 
-    robot: str
+    robot: RobotId
     codec: str
     subprotocol: str
     expires_s: float | None = None
     claims: Claims | None = field(default=None, compare=False)
-    tenant: str = "default"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -106,8 +106,9 @@ class HandshakePolicy:
             anonymous: Name of a robot where no token is required.
             now_s: Unix seconds.
         """
+        unnamed = RobotId(DEFAULT_TENANT, anonymous)
         if self._conformance_echo:
-            return Accepted(robot=anonymous, codec="", subprotocol="")
+            return Accepted(robot=unnamed, codec="", subprotocol="")
         if path == HEALTH_PATH.encode():
             return self._healthy
         if path.split(b"?")[0] != self._path:
@@ -124,11 +125,11 @@ class HandshakePolicy:
         codec = codec_for(offered)
         if codec is None:
             return self._no_subprotocol
-        accepted = Accepted(robot=anonymous, codec=codec, subprotocol=SUBPROTOCOLS[codec])
+        accepted = Accepted(robot=unnamed, codec=codec, subprotocol=SUBPROTOCOLS[codec])
         if claims is None:
             return accepted
         expires_s = self.ends_s(claims, now_s)
-        return replace(accepted, robot=claims.robot, tenant=claims.tenant, expires_s=expires_s, claims=claims)
+        return replace(accepted, robot=claims.robot, expires_s=expires_s, claims=claims)
 
     def ends_s(self, claims: Claims, now_s: float) -> float:
         """Return when a connection with *claims* ends, in Unix seconds; an expired token has its leeway."""

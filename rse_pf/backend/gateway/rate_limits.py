@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 from typing import Generic, TypeVar
 
 from rse_pf.config import ServingSettings, SessionSettings
+from rse_pf.identity import RobotId
 from rse_pf.token_bucket import TokenBucket
 
 __all__ = ["CUT_OFF", "PendingHandshakes", "RobotRates", "SourceRates"]
@@ -49,14 +50,14 @@ class RobotRates:
         """Remember no robot yet, and never more than *max_names*."""
         self._limits = limits
         self._max_names = max_names
-        self._robots: dict[tuple[str, str], _Robot] = {}
+        self._robots: dict[RobotId, _Robot] = {}
 
     def __len__(self) -> int:
         """Return how many robots are remembered."""
         return len(self._robots)
 
-    def retry_after_ms(self, robot: tuple[str, str], now: float) -> float:
-        """Take one more message of *robot* (tenant, name) and return 0, or return when it may try again.
+    def retry_after_ms(self, robot: RobotId, now: float) -> float:
+        """Take one more message of *robot* and return 0, or return when it may try again.
 
         `CUT_OFF` ends the connection.  *now* is in seconds.
         """
@@ -72,12 +73,12 @@ class RobotRates:
             return CUT_OFF
         return max(_MIN_RETRY_MS, wait_s * 1e3)
 
-    def ban(self, robot: tuple[str, str], now: float) -> None:
+    def ban(self, robot: RobotId, now: float) -> None:
         """Refuse the handshakes of *robot*, cut off at *now* (s), for ``session.rate_ban_s``."""
         known = self._robots.get(robot) or self._added(robot, now)
         known.banned_until = now + self._limits.rate_ban_s
 
-    def banned_s(self, robot: tuple[str, str], now: float) -> float:
+    def banned_s(self, robot: RobotId, now: float) -> float:
         """Return for how many seconds more *robot* is banned, 0 if it is not."""
         known = self._robots.get(robot)
         return 0.0 if known is None else max(0.0, known.banned_until - now)
@@ -91,7 +92,7 @@ class RobotRates:
             known.violations.popleft()
         return len(known.violations)
 
-    def _added(self, robot: tuple[str, str], now: float) -> _Robot:
+    def _added(self, robot: RobotId, now: float) -> _Robot:
         if len(self._robots) >= self._max_names:
             kept = {
                 name: each

@@ -9,7 +9,7 @@ from asyncio import TimerHandle
 from collections.abc import Callable, Set
 from functools import partial
 
-from rse_pf.auth.tokens import Claims, KeySet, claims_problem
+from rse_pf.auth.tokens import Claims, KeySet, claims_problem, renewed_claims
 from rse_pf.backend.gateway.audit_recorder import AuditRecorder
 from rse_pf.backend.gateway.connection import RobotConnection
 from rse_pf.backend.gateway.handshake import HandshakePolicy
@@ -49,15 +49,22 @@ class TokenWatch:
         self._timers: dict[RobotConnection, TimerHandle] = {}
 
     def trust(self, keys: KeySet) -> None:
-        """Verify tokens with *keys* from now on, and end every connection whose token they do not allow."""
+        """Verify tokens with *keys* from now on, and end every connection whose token they do not allow.
+
+        Open connections of enrolled robots take the scopes and quotas of the present roster.
+        """
         self._handshake.keys = keys
         for connection in list(self._connections):
             claims = connection.claims
-            problem = "" if claims is None else claims_problem(claims, keys)
-            if claims is not None and problem and not connection.is_closing:
+            if claims is None or connection.is_closing:
+                continue
+            problem = claims_problem(claims, keys)
+            if problem:
                 self._context.log.info("revoked", robot=connection.robot, reason=problem)
                 self._recorder.cut_off(claims, problem)
                 connection.close(CLOSE_REVOKED, "revoked")
+            else:
+                connection.claims = renewed_claims(claims, keys)
 
     def connected(self, connection: RobotConnection, expires_s: float | None) -> None:
         """Know a connection whose handshake is done; its token ends at *expires_s*, s, monotonic."""
@@ -93,11 +100,7 @@ class TokenWatch:
         now, wall_s = clocks.monotonic(), clocks.wall()
         claims = self._handshake.verified(token, wall_s)
         token_s = None
-        if (
-            isinstance(claims, Claims)
-            and before is not None
-            and (before.tenant, before.robot) == (claims.tenant, claims.robot)
-        ):
+        if isinstance(claims, Claims) and before is not None and before.robot == claims.robot:
             connection.claims = claims
             self._recorder.renewed(before, claims)
             token_s = self._handshake.ends_s(claims, wall_s) - wall_s
@@ -125,4 +128,4 @@ class TokenWatch:
     def _report(self, event: str, connection: RobotConnection) -> None:
         claims = connection.claims
         if claims is not None and (event == "left" or connection in self._connections):
-            self._tell(event=event, tenant=claims.tenant, robot=claims.robot, number=connection.number)
+            self._tell(event=event, robot=claims.robot, number=connection.number)

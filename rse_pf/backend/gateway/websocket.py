@@ -197,7 +197,7 @@ class RobotSockets:
         )
         if not isinstance(verdict, Accepted):
             return verdict
-        banned_s = self._dispatcher.rates.banned_s((verdict.tenant, verdict.robot), now)
+        banned_s = self._dispatcher.rates.banned_s(verdict.robot, now)
         return self._handshake.too_fast if banned_s > 0 else verdict
 
 

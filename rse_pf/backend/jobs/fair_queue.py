@@ -8,10 +8,9 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 
-__all__ = ["FairQueue", "RobotId", "job_to_displace"]
+from rse_pf.identity import RobotId
 
-RobotId = tuple[str, str]
-"""Tenant and robot."""
+__all__ = ["FairQueue", "job_to_displace"]
 
 
 class FairQueue:

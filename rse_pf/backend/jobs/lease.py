@@ -13,7 +13,8 @@ from typing import Any, Literal
 import msgspec
 
 from rse_pf.errors import BadMessage, BadRequest, Conflict, NotFound, StoreError
-from rse_pf.object_store import ObjectStore, name_segment
+from rse_pf.identity import RobotId
+from rse_pf.object_store import ObjectStore
 from rse_pf.wire.arrays import binary_encode_hook
 
 __all__ = [
@@ -84,9 +85,9 @@ def job_key(service: str, payload: Any, settings: str) -> str:
     return hashlib.sha256(plain).hexdigest()
 
 
-def record_name(tenant: str, robot: str, key: str) -> str:
-    """Return the object name of the record of a robot's job: ``jobs/TENANT/ROBOT/KEY``."""
-    return f"jobs/{name_segment(tenant)}/{name_segment(robot)}/{key}"
+def record_name(robot: RobotId, key: str) -> str:
+    """Return the object name of the record of a robot's job: ``jobs/TENANT/ROBOT[=THUMBPRINT]/KEY``."""
+    return f"jobs/{robot.folder}/{key}"
 
 
 def verdict_on(record: JobRecord | None, *, unchanged_s: float, lease_s: float, is_watched: bool) -> Verdict:

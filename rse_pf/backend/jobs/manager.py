@@ -28,6 +28,7 @@ from rse_pf.backend.ports import Log
 from rse_pf.backend.robot_store import quota_bytes
 from rse_pf.backend.scheduling.scheduler import QueuedCommand
 from rse_pf.errors import BadRequest, Busy, Cancelled, RsePfError
+from rse_pf.identity import RobotId
 from rse_pf.service import failure_of
 from rse_pf.wire import Failure, Progress, Result
 from rse_pf.wire.arrays import extension_hook
@@ -92,7 +93,7 @@ class JobManager:
         self._answer = answer
         self._progress = progress
         self._new_owner = new_owner
-        self._entries: dict[tuple[str, str, str], _Entry] = {}
+        self._entries: dict[tuple[RobotId, str], _Entry] = {}
         self._leaving = False
         self._collector = RecordCollector(
             context.store,
@@ -122,7 +123,7 @@ class JobManager:
         except BadRequest as error:
             self._fail(queued, error)
             return
-        name = (queued.owner.tenant, queued.robot, key)
+        name = (queued.robot, key)
         entry = self._entries.get(name)
         if entry is not None and (entry.signals.cancelled or entry.signals.giving_up):
             entry.resubmitted.append(queued)
@@ -131,7 +132,6 @@ class JobManager:
             request = JobRequest(
                 service=command.service,
                 payload=command.payload,
-                tenant=queued.owner.tenant,
                 robot=queued.robot,
                 key=key,
                 quota_bytes=quota_bytes(queued.owner.claims, self._context.settings.data.quota_bytes),
@@ -145,7 +145,7 @@ class JobManager:
         entry.waiters.append(waiter)
         self._send_progress(entry, waiter)
 
-    def waiting_of(self, robot: str) -> int:
+    def waiting_of(self, robot: RobotId) -> int:
         """Return how many commands of *robot* have no answer yet."""
         entries = [entry for entry in self._entries.values() if entry.request.robot == robot]
         return sum(len(entry.waiters) + len(entry.resubmitted) for entry in entries)
@@ -187,8 +187,8 @@ class JobManager:
         here = [entry for entry in self._entries.values() if not entry.signals.giving_up]
         if len(here) < self._serving.max_running_jobs + self._serving.max_waiting_jobs:
             return True
-        known = [((entry.request.tenant, entry.request.robot), entry.what == WAITING) for entry in here]
-        row = job_to_displace(known, (request.tenant, request.robot))
+        known = [(entry.request.robot, entry.what == WAITING) for entry in here]
+        row = job_to_displace(known, request.robot)
         if row is None:
             return False
         here[row].signals.give_up()
@@ -241,7 +241,7 @@ class JobManager:
 
     def _on_outcome(self, entry: _Entry, outcome: JobOutcome) -> None:
         request = entry.request
-        del self._entries[request.tenant, request.robot, request.key]
+        del self._entries[request.robot, request.key]
         waiters, entry.waiters = entry.waiters, []
         entry.signals.close()
         code = "given-up" if outcome.is_given_up else "ok" if outcome.error is None else outcome.error.code

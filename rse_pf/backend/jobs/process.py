@@ -28,6 +28,7 @@ from rse_pf.backend.robot_store import check_quota, is_shared, store_within_quot
 from rse_pf.backend.sandbox.ipc import encode_message, receive
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import BadMessage, Cancelled, Crashed, LimitExceeded, RsePfError, StoreError
+from rse_pf.identity import RobotId
 from rse_pf.linux import die_with_parent, run_when_idle
 from rse_pf.service import dispatch, failure_of
 from rse_pf.services.loading import load_services
@@ -48,8 +49,7 @@ class JobRequest:
 
     service: str
     payload: Any
-    tenant: str
-    robot: str
+    robot: RobotId
     key: str
     quota_bytes: float
 
@@ -105,12 +105,16 @@ def main(arguments: list[str]) -> None:
         if order is None or not die_with_parent(order["worker"]):
             return
         _lower_priority()
-        settings, request = PlatformSettings.from_dict(order["settings"]), JobRequest(**order["request"])
+        settings, request = PlatformSettings.from_dict(order["settings"]), _request(order["request"])
         resource.setrlimit(resource.RLIMIT_DATA, (settings.serving.max_job_memory_bytes,) * 2)
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
         answer = _work(request, settings, order["services"], _Reporter(worker, time.monotonic))
         with contextlib.suppress(OSError):  # the worker may have gone
             worker.sendall(encode_message(store_reply(answer, request, settings)))
+
+
+def _request(plain: dict[str, Any]) -> JobRequest:
+    return JobRequest(**{**plain, "robot": RobotId(*plain["robot"])})
 
 
 class _Reporter:
@@ -163,7 +167,7 @@ def _resolved(request: JobRequest, kind: type[Any], settings: PlatformSettings) 
     if not named_in(kind, request.payload):
         return request.payload
     store = open_data_store(settings)
-    return resolve(kind, request.payload, request.tenant, request.robot, store, settings=settings.serving)
+    return resolve(kind, request.payload, request.robot, store, settings=settings.serving)
 
 
 def _check_quota(request: JobRequest, settings: PlatformSettings) -> None:
@@ -171,7 +175,7 @@ def _check_quota(request: JobRequest, settings: PlatformSettings) -> None:
     if is_shared(settings):
         store = open_data_store(settings)
         with contextlib.suppress(StoreError):  # the store is tried again when there is a result
-            check_quota(store, request.tenant, request.robot, 1, request.quota_bytes)
+            check_quota(store, request.robot, 1, request.quota_bytes)
 
 
 def store_reply(answer: list[Any], request: JobRequest, settings: PlatformSettings) -> list[Any]:
@@ -183,9 +187,7 @@ def store_reply(answer: list[Any], request: JobRequest, settings: PlatformSettin
         if len(reply) > settings.data.max_object_bytes:
             raise LimitExceeded(f"a reply of {len(reply)} bytes is too large", hint="ask for less")
         store = open_data_store(settings)
-        digest = retry_store(
-            lambda: store_within_quota(store, request.tenant, request.robot, reply, request.quota_bytes)
-        )
+        digest = retry_store(lambda: store_within_quota(store, request.robot, reply, request.quota_bytes))
     except RsePfError as error:
         return _encode_answer(failure_of(error))
     inline = reply if len(reply) <= inline_bytes(settings) else None

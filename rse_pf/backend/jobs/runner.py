@@ -34,7 +34,8 @@ from rse_pf.errors import (
     StoreError,
     error_from_code,
 )
-from rse_pf.object_store import ObjectStore, digest_of, object_name
+from rse_pf.identity import object_name
+from rse_pf.object_store import ObjectStore, digest_of
 
 __all__ = ["JobContext", "JobOutcome", "JobSignals", "run_job"]
 
@@ -128,7 +129,7 @@ def run_job(
         tell: Called in this thread with the share that is done, and what is being done.
         owner: Name that is unique to this process and this call.
     """
-    name = record_name(request.tenant, request.robot, request.key)
+    name = record_name(request.robot, request.key)
     lease = JobLease(context.store, name, owner, context.clock)
     try:
         return _follow_or_run(request, context, signals, tell, lease)
@@ -164,7 +165,7 @@ def _follow_or_run(
             if stored is not None:
                 return stored
         tell(0.0, WAITING)
-        if not context.slots.acquire((request.tenant, request.robot), signals.wait):
+        if not context.slots.acquire(request.robot, signals.wait):
             continue
         try:
             if lease.take():
@@ -177,7 +178,7 @@ def _follow_or_run(
 
 def _stored_outcome(request: JobRequest, context: JobContext, record: JobRecord) -> JobOutcome | None:
     """Return the result that *record* names; None if it was deleted and must be computed again."""
-    name = object_name(request.tenant, request.robot, record.reply)
+    name = object_name(request.robot, record.reply)
     try:
         reply = None
         if record.reply_bytes > inline_bytes(context.settings):
@@ -292,11 +293,7 @@ class _JobRun:
         """Store the reply before it is reported; used where the process has no access to the store."""
         context, request, digest = self._context, self._request, digest_of(reply)
         try:
-            retry_store(
-                lambda: store_within_quota(
-                    context.store, request.tenant, request.robot, reply, request.quota_bytes
-                )
-            )
+            retry_store(lambda: store_within_quota(context.store, request.robot, reply, request.quota_bytes))
         except QuotaExceeded as error:
             return self._failed(error)
         inline = reply if len(reply) <= inline_bytes(context.settings) else None

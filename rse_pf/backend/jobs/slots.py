@@ -12,7 +12,8 @@ import os
 import threading
 from collections.abc import Callable
 
-from rse_pf.backend.jobs.fair_queue import FairQueue, RobotId
+from rse_pf.backend.jobs.fair_queue import FairQueue
+from rse_pf.identity import RobotId
 
 __all__ = ["JobSlots", "make_pipe"]
 

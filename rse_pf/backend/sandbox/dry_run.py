@@ -14,13 +14,15 @@ from typing import Any
 from rse_pf.backend.sandbox.manager import SandboxManager
 from rse_pf.backend.scheduling.scheduler import QueuedCommand
 from rse_pf.config import PlatformSettings
+from rse_pf.identity import DEFAULT_TENANT, RobotId
 from rse_pf.object_store import MemoryStore
 from rse_pf.services.custom.installed import InstalledService
 from rse_pf.wire import Command, Failure, Result
 
 __all__ = ["DryRun", "dry_run"]
 
-_ROBOT = "dry-run"
+_SERVER = "dry-run"
+_ROBOT = RobotId(DEFAULT_TENANT, _SERVER)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -83,7 +85,7 @@ async def _dry_run(
         [service],
         settings=settings.replace(services={"accept_weak_isolation": True}),
         max_sandboxes=1,
-        server_id=_ROBOT,
+        server_id=_SERVER,
         store=MemoryStore(),
         monotonic=time.monotonic,
         loop=loop,

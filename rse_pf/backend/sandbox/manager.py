@@ -33,8 +33,9 @@ from rse_pf.backend.sandbox.policy import (
 from rse_pf.backend.sandbox.zygote_client import ZygoteClient
 from rse_pf.backend.scheduling.scheduler import QueuedCommand
 from rse_pf.config import PlatformSettings
-from rse_pf.errors import NotFound, RsePfError, error_from_code
-from rse_pf.object_store import ObjectStore
+from rse_pf.errors import NotFound, RsePfError, StoreError, error_from_code
+from rse_pf.identity import RobotId, state_name
+from rse_pf.object_store import ObjectStore, is_name
 from rse_pf.service import failure_of
 from rse_pf.services.custom.installed import InstalledService
 from rse_pf.wire import Failure, Result
@@ -107,7 +108,7 @@ class SandboxManager:
         """Commands that wait or run."""
         return self._policy.held
 
-    def waiting_of(self, robot: str) -> int:
+    def waiting_of(self, robot: RobotId) -> int:
         """Return how many commands of *robot* wait."""
         return self._policy.waiting_of(robot)
 
@@ -120,11 +121,11 @@ class SandboxManager:
             "counts": dict(self._policy.counts),
         }
 
-    def connected(self, robot: str) -> None:
+    def connected(self, robot: RobotId) -> None:
         """Note a connection of *robot*."""
         self._policy.connected(robot)
 
-    def disconnected(self, robot: str) -> None:
+    def disconnected(self, robot: RobotId) -> None:
         """Note the end of a connection; after the last one and a grace period the sandbox is released."""
         self._policy.disconnected(robot, self._monotonic())
         self._execute([])
@@ -203,7 +204,7 @@ class SandboxManager:
             case LogCrash(robot, service, reason):
                 self._log.error("sandbox-crashed", robot=robot, service=service, reason=reason)
 
-    def _create(self, number: int, robot: str) -> None:
+    def _create(self, number: int, robot: RobotId) -> None:
         channel = self._channels[number] = IpcChannel(
             self._loop,
             max_bytes=self._max_message_bytes,
@@ -243,19 +244,38 @@ class SandboxManager:
             outcome = future.exception() or future.result()
             self._execute(self._policy.store_replied(number, call, outcome, self._monotonic()))
 
-        name = f"snapshots/{call.queued.robot}/{call.service}"
-        self._loop.run_in_executor(None, function, self._store, name, *args).add_done_callback(done)
+        work = functools.partial(function, self._store, call.queued.robot, call.service, *args)
+        self._loop.run_in_executor(None, work).add_done_callback(done)
 
 
-def _load(store: ObjectStore, name: str) -> bytes | None:
+def _load(store: ObjectStore, robot: RobotId, service: str) -> bytes | None:
+    """Return the snapshot, None if there is none; raises StoreError if only one without an owner is there."""
     try:
-        return store.get(name)
+        return store.get(state_name(robot, service))
     except NotFound:
-        return None
+        pass
+    if _has_unowned_snapshot(store, robot, service):
+        raise StoreError(
+            "the only snapshot is stored under the robot's name alone, as versions before 0.3 did, and might "
+            "belong to a robot of another tenant",
+            hint=f"let this robot have it with rse-pf robot adopt {robot.name}, or delete it",
+        )
+    return None
 
 
-def _save(store: ObjectStore, name: str, expected: bytes | None, data: bytes) -> None:
-    store.compare_and_swap(name, expected, data)
+def _has_unowned_snapshot(store: ObjectStore, robot: RobotId, service: str) -> bool:
+    name = f"snapshots/{robot.name}/{service}"
+    if not is_name(name):
+        return False
+    try:
+        store.head(name)
+    except NotFound:
+        return False
+    return True
+
+
+def _save(store: ObjectStore, robot: RobotId, service: str, expected: bytes | None, data: bytes) -> None:
+    store.compare_and_swap(state_name(robot, service), expected, data)
 
 
 def _outcome_of(message: Any) -> SandboxReply | RsePfError:

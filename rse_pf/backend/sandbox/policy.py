@@ -24,6 +24,7 @@ from rse_pf.backend.sandbox.ipc import encode_message
 from rse_pf.backend.scheduling.scheduler import QueuedCommand
 from rse_pf.config import ServiceSettings
 from rse_pf.errors import Busy, Conflict, Expired, Poison, RsePfError, StoreError, WorkerLost
+from rse_pf.identity import RobotId
 from rse_pf.service import Kind
 
 __all__ = [
@@ -77,7 +78,7 @@ class CreateSandbox:
     """Start a process for *robot* and report `ready` or `gone`."""
 
     number: int
-    robot: str
+    robot: RobotId
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,7 +133,7 @@ class AnswerCall:
 class LogCrash:
     """Log that a sandbox crashed; *service* is "" if it ran none."""
 
-    robot: str
+    robot: RobotId
     service: str
     reason: str
 
@@ -152,7 +153,7 @@ Action = (
 @dataclass(eq=False, slots=True)
 class _Sandbox:
     number: int
-    robot: str
+    robot: RobotId
     kill_s: float
     """When it is killed: it did not start, or works too long."""
     state: Literal["starting", "idle", "loading", "restoring", "running", "saving", "dying"] = "starting"
@@ -195,8 +196,8 @@ class SandboxPolicy:
         self._keeps_snapshots = keeps_snapshots
         self._breaker = CircuitBreaker(settings)
         self._sandboxes: dict[int, _Sandbox] = {}
-        self._by_robot: dict[str, _Sandbox] = {}
-        self._connections: Counter[str] = Counter()
+        self._by_robot: dict[RobotId, _Sandbox] = {}
+        self._connections: Counter[RobotId] = Counter()
         self._last_number = 0
         self._actions: list[Action] = []
 
@@ -216,7 +217,7 @@ class SandboxPolicy:
         times = (min(each.kill_s, each.late_s, each.release_s) for each in self._sandboxes.values())
         return min(times, default=math.inf)
 
-    def waiting_of(self, robot: str) -> int:
+    def waiting_of(self, robot: RobotId) -> int:
         """Return how many commands of *robot* wait."""
         sandbox = self._by_robot.get(robot)
         return 0 if sandbox is None else len(sandbox.waiting)
@@ -227,13 +228,13 @@ class SandboxPolicy:
 
     # --- events from the gateway -------------------------------------------------------------------
 
-    def connected(self, robot: str) -> None:
+    def connected(self, robot: RobotId) -> None:
         """A connection of *robot* was opened: its sandbox, if it still has one, is kept."""
         self._connections[robot] += 1
         if robot in self._by_robot:
             self._by_robot[robot].release_s = math.inf
 
-    def disconnected(self, robot: str, now: float) -> None:
+    def disconnected(self, robot: RobotId, now: float) -> None:
         """A connection of *robot* was closed; after the last one the grace period of its sandbox begins."""
         self._connections[robot] -= 1
         if self._connections[robot] > 0:
@@ -316,7 +317,9 @@ class SandboxPolicy:
             self._answer(call, _lost(call.service, "its state was changed on another server"))
             self._move_waiting(sandbox, now)
         elif isinstance(outcome, BaseException):
-            failure = StoreError(f"the state of the service cannot be kept: {outcome}", hint="send it again")
+            hint = outcome.hint if isinstance(outcome, RsePfError) else ""
+            reason = f"the state of the service cannot be kept: {outcome}"
+            failure = StoreError(reason, hint=hint or "send it again")
             self._finish(sandbox, call, failure, now)
         elif sandbox.unsaved is not None:
             sandbox.snapshots[call.service] = sandbox.unsaved.snapshot
@@ -423,7 +426,7 @@ class SandboxPolicy:
 
     # --- steps -------------------------------------------------------------------------------------
 
-    def _create(self, robot: str, now: float) -> _Sandbox:
+    def _create(self, robot: RobotId, now: float) -> _Sandbox:
         self._last_number += 1
         sandbox = _Sandbox(self._last_number, robot, kill_s=now + self._settings.start_timeout_s)
         self._sandboxes[sandbox.number] = self._by_robot[robot] = sandbox

@@ -16,6 +16,7 @@ from typing import Any
 
 from rse_pf.config import ServingSettings
 from rse_pf.errors import Busy, Expired, RsePfError, Stale
+from rse_pf.identity import RobotId
 from rse_pf.wire import Command
 
 __all__ = [
@@ -71,7 +72,7 @@ class QueuedCommand:
     """One command from its arrival to its answer; ``owner`` is the connection that waits for the answer."""
 
     owner: Any
-    robot: str
+    robot: RobotId
     command: Command
     size_bytes: int
     received_s: float
@@ -105,8 +106,8 @@ class Scheduler:
         self.turn_s = 0.0
         """Average time between two starts while robots wait: threads and CPU throttle included."""
         self._is_serial = settings.solver_threads == 1 or 0 < settings.emulated_cores <= 1
-        self._robots: dict[str, _Robot] = {}
-        self._turns: deque[str] = deque()
+        self._robots: dict[RobotId, _Robot] = {}
+        self._turns: deque[RobotId] = deque()
         self._late_since: float | None = None
         self._judged_s = 0.0
         self._started = self._refused = 0
@@ -135,19 +136,19 @@ class Scheduler:
             return 0, 0.0, 0.0
         return len(robot.waiting), self._delay_s(robot), self.turn_s
 
-    def retry_unread_ms(self, robot_name: str, allowed_s: float) -> float:
+    def retry_unread_ms(self, robot_id: RobotId, allowed_s: float) -> float:
         """Return when a robot may try again whose next command, not decoded yet, would wait too long.
 
         0 takes the command: the server is not behind, its turn comes in time, or it might replace a frame
         that waits.
 
         Args:
-            robot_name: Of the robot that sent it.
+            robot_id: The robot that sent it.
             allowed_s: Time that the robot's last command had until its deadline; the next is taken for alike.
         """
         if not self.is_behind:
             return 0.0
-        robot = self._robots.get(robot_name)
+        robot = self._robots.get(robot_id)
         delay_s = self._delay_s(robot)
         if delay_s <= max_wait_s(allowed_s, self.max_delay_s):
             return 0.0
@@ -183,8 +184,8 @@ class Scheduler:
         """Return the command whose turn it is, now running, and those that were given up on the way."""
         refusals: list[RefusedCommand] = []
         while self._turns:
-            name = self._turns.popleft()
-            robot = self._robots[name]
+            robot_id = self._turns.popleft()
+            robot = self._robots[robot_id]
             queued = robot.waiting.popleft()
             self.waiting -= 1
             turn_wait_s = _turn_wait(robot, queued, now)
@@ -197,9 +198,9 @@ class Scheduler:
                 return queued, refusals
             refusals.append(self._refused_late(robot, queued, now))
             if robot.waiting:
-                self._turns.append(name)
+                self._turns.append(robot_id)
             else:
-                del self._robots[name]
+                del self._robots[robot_id]
         self._note_turn_wait(0.0, now)
         return None, refusals
 
@@ -221,7 +222,7 @@ class Scheduler:
         if self._turns:
             first = self._robots[self._turns[0]]
             self._note_turn_wait(_turn_wait(first, first.waiting[0], now), now)
-        for name, robot in list(self._robots.items()):
+        for robot_id, robot in list(self._robots.items()):
             kept: deque[QueuedCommand] = deque()
             for queued in robot.waiting:
                 too_late = queued.deadline_s <= now or (
@@ -231,16 +232,16 @@ class Scheduler:
                     refusals.append(self._refused_late(robot, queued, now))
                 else:
                     kept.append(queued)
-            self._rewait(name, robot, kept)
+            self._rewait(robot_id, robot, kept)
         return refusals
 
     def leave(self, owner: Any) -> list[QueuedCommand]:
         """Drop the waiting commands of a connection that ended, and return them."""
         dropped: list[QueuedCommand] = []
-        for name, robot in list(self._robots.items()):
+        for robot_id, robot in list(self._robots.items()):
             dropped += [queued for queued in robot.waiting if queued.owner is owner]
             kept = deque(queued for queued in robot.waiting if queued.owner is not owner)
-            self._rewait(name, robot, kept)
+            self._rewait(robot_id, robot, kept)
         return dropped
 
     def oldest_wait_s(self, now: float) -> float:
@@ -313,14 +314,14 @@ class Scheduler:
             self.turn_s = _averaged(self.turn_s, now - self._last_start)
         self._last_start = now
 
-    def _rewait(self, name: str, robot: _Robot, kept: deque[QueuedCommand]) -> None:
+    def _rewait(self, robot_id: RobotId, robot: _Robot, kept: deque[QueuedCommand]) -> None:
         if len(kept) == len(robot.waiting):
             return
         self.waiting -= len(robot.waiting) - len(kept)
         robot.waiting = kept
         if not kept and robot.running is None:
-            self._turns.remove(name)
-            del self._robots[name]
+            self._turns.remove(robot_id)
+            del self._robots[robot_id]
 
 
 def retry_after_ms(delay_s: float) -> float:

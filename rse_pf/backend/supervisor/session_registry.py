@@ -6,14 +6,12 @@ moving keeps its old connection until the move is over; its worker reports ``sta
 
 from __future__ import annotations
 
-from typing import Protocol
+from typing import Any, Protocol
 
 from rse_pf.backend.supervisor.orders import ReplaceOrder, WorkerOrder
+from rse_pf.identity import RobotId
 
 __all__ = ["SessionRegistry", "WorkerHandle"]
-
-Robot = tuple[str, str]
-"""Tenant and name."""
 
 
 class WorkerHandle(Protocol):
@@ -27,15 +25,15 @@ class SessionRegistry:
     """The sockets of every robot that is connected to one server."""
 
     def __init__(self) -> None:
-        self._sockets: dict[Robot, dict[int, WorkerHandle]] = {}
+        self._sockets: dict[RobotId, dict[int, WorkerHandle]] = {}
 
     def __len__(self) -> int:
         """Return the number of robots that are connected."""
         return len(self._sockets)
 
-    def handle(self, worker: WorkerHandle, message: dict[str, object]) -> None:
+    def handle(self, worker: WorkerHandle, message: dict[str, Any]) -> None:
         """Handle what a worker reports of one socket: ``arrived``, ``stays`` or ``left``."""
-        robot = (str(message["tenant"]), str(message["robot"]))
+        robot = RobotId(*message["robot"])
         number = int(str(message["number"]))
         sockets = self._sockets.setdefault(robot, {})
         if message["event"] == "arrived":

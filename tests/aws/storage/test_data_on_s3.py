@@ -15,7 +15,8 @@ from client_sdk.transfer.data_client import DataClient, DataOptions
 from rse_pf.aws import clients
 from rse_pf.aws.clients import make_client
 from rse_pf.aws.storage import S3Store, open_bucket
-from rse_pf.object_store import digest_of, object_name
+from rse_pf.identity import RobotId, object_name
+from rse_pf.object_store import digest_of
 
 BUCKET = "objects"
 FAILING_SHARE = 0.3
@@ -63,7 +64,7 @@ def test_large_objects_travel_directly_between_robot_and_bucket(s3_server: str) 
         robot = stack.enter_context(contextlib.closing(client_of(server, service)))
         digest = robot.upload(LARGE, lambda done, size: told.append(done))
 
-        assert store.get(object_name("default", "robot-1", digest)) == LARGE
+        assert store.get(object_name(RobotId("default", "robot-1"), digest)) == LARGE
         assert robot.download(digest) == LARGE
         assert list(store.list("uploads/")) == []
     assert told[-1] == len(LARGE)
@@ -142,6 +143,6 @@ def test_an_s3_that_fails_three_times_in_ten_loses_nothing_acknowledged(
     refused = sum(line["status"] >= 500 for line in service.lines)
     assert refused > UPLOADS / 4 or tries > 1, "no failure reached the robot"
     for digest, content in zip(acknowledged, contents, strict=True):
-        assert plain.get(object_name("default", "robot-1", digest)) == content
-    names = {object_name("default", "robot-1", digest) for digest in acknowledged}
+        assert plain.get(object_name(RobotId("default", "robot-1"), digest)) == content
+    names = {object_name(RobotId("default", "robot-1"), digest) for digest in acknowledged}
     assert {info.name for info in plain.list("objects/")} == names, "a partial object is left"

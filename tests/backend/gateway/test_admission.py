@@ -12,6 +12,7 @@ from rse_pf.auth.tokens import Claims
 from rse_pf.backend.gateway.admission import Admission
 from rse_pf.backend.gateway.rate_limits import CUT_OFF
 from rse_pf.config import ServingSettings, SessionSettings
+from rse_pf.identity import RobotId
 
 SERVING = ServingSettings(max_queue_per_robot=4, max_unread_bytes=1_000_000)
 ADMITTED: dict[str, Any] = {
@@ -20,7 +21,9 @@ ADMITTED: dict[str, Any] = {
 
 
 def claims(*scopes: str) -> Claims:
-    return Claims(robot="r", token_id="t", issued_s=0.0, expires_s=9.0, key_id="k", scopes=scopes)
+    return Claims(
+        robot=RobotId("default", "r"), token_id="t", issued_s=0.0, expires_s=9.0, key_id="k", scopes=scopes
+    )
 
 
 @pytest.fixture
@@ -72,12 +75,12 @@ def test_of_several_reasons_the_first_in_order_is_told(admission: Admission):
 
 
 def test_a_robot_above_its_rate_is_refused_and_then_cut_off(admission: Admission):
-    retries_ms = [admission.rates.retry_after_ms(("default", "r"), 5.0) for _ in range(200)]
+    retries_ms = [admission.rates.retry_after_ms(RobotId("default", "r"), 5.0) for _ in range(200)]
 
     assert retries_ms[:40] == [0] * 40
     assert retries_ms[40] == pytest.approx(50.0)
     assert CUT_OFF in retries_ms
-    assert admission.rates.retry_after_ms(("default", "another"), 5.0) == 0
+    assert admission.rates.retry_after_ms(RobotId("default", "another"), 5.0) == 0
 
 
 def test_the_bytes_that_wait_for_the_decoder_are_bounded_and_suspects_get_a_quarter(admission: Admission):

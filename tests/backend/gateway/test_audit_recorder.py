@@ -17,9 +17,11 @@ from rse_pf.auth.tokens import Claims
 from rse_pf.backend.gateway.audit_recorder import AuditRecorder, ServerAudit
 from rse_pf.backend.gateway.handshake import Accepted, Rejected
 from rse_pf.backend.ports import Clocks
+from rse_pf.identity import RobotId
 
-CLAIMS = Claims(robot="robot-1", token_id="t-1", issued_s=1.0, expires_s=900.0, key_id="k-1")
-ACCEPTED = Accepted(robot="robot-1", codec="bin", subprotocol="x", claims=CLAIMS)
+ROBOT = RobotId("default", "robot-1")
+CLAIMS = Claims(robot=ROBOT, token_id="t-1", issued_s=1.0, expires_s=900.0, key_id="k-1")
+ACCEPTED = Accepted(robot=ROBOT, codec="bin", subprotocol="x", claims=CLAIMS)
 REJECTED = Rejected(status=401, body=b"", result="unauthorized", reason="bad-signature-or-claims")
 CLAIMED = "Bearer eyJhbGciOiJFZERTQSJ9.eyJzdWIiOiJyb2JvdC05IiwianRpIjoidC05In0.c2ln"
 """A token that says it is t-9 of robot-9."""
@@ -57,9 +59,11 @@ def test_an_accepted_handshake_is_recorded_with_robot_token_key_and_source():
 
 def test_a_robot_of_another_tenant_is_named_with_it():
     recording = Recording()
-    claims = Claims(robot="r", tenant="acme", token_id="t", issued_s=1.0, expires_s=9.0, key_id="k")
+    claims = Claims(robot=RobotId("acme", "r"), token_id="t", issued_s=1.0, expires_s=9.0, key_id="k")
 
-    recording.recorder.judged(Accepted(robot="r", codec="bin", subprotocol="x", claims=claims), "", "")
+    recording.recorder.judged(
+        Accepted(robot=claims.robot, codec="bin", subprotocol="x", claims=claims), "", ""
+    )
     recording.loop.advance(1.0)
 
     assert recording.notes[0]["subject"] == "acme/r"
@@ -123,7 +127,7 @@ def test_many_notes_travel_in_several_messages():
 
 def test_a_renewal_with_the_same_token_is_not_recorded():
     recording = Recording()
-    fresh = Claims(robot="robot-1", token_id="t-2", issued_s=1.0, expires_s=900.0, key_id="k-1")
+    fresh = Claims(robot=ROBOT, token_id="t-2", issued_s=1.0, expires_s=900.0, key_id="k-1")
 
     recording.recorder.renewed(CLAIMS, CLAIMS)
     recording.recorder.renewed(CLAIMS, fresh)

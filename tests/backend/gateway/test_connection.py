@@ -11,6 +11,7 @@ from backend.gateway.worker_parts import WorkerParts, worker_parts
 from fakes import FakeWire
 
 from rse_pf.config import PlatformSettings
+from rse_pf.identity import RobotId
 from rse_pf.wire import Command, Failure, Ping, Pong, Result, make_codec
 
 SETTINGS = PlatformSettings()
@@ -76,14 +77,14 @@ def test_three_long_bombs_close_the_connection_and_ban_the_robot(worker: WorkerP
 
     for number in range(3):
         assert wire.closed is None
-        assert rates.banned_s(("default", "r"), worker.loop.now) == 0
+        assert rates.banned_s(connection.robot, worker.loop.now) == 0
         worker.say(connection, bomb)
         worker.loop.run_until(lambda: len(answered(wire)) > number)  # noqa: B023  it is called at once
 
     assert wire.closed == (4400, "too many bad messages")
     assert wire.pauses == pytest.approx([5 * PAUSE_S, 10 * PAUSE_S])
-    assert rates.banned_s(("default", "r"), worker.loop.now) == limits.rate_ban_s
-    assert rates.banned_s(("default", "r2"), worker.loop.now) == 0
+    assert rates.banned_s(connection.robot, worker.loop.now) == limits.rate_ban_s
+    assert rates.banned_s(RobotId("default", "r2"), worker.loop.now) == 0
 
 
 def test_a_long_command_of_a_robot_that_left_meanwhile_is_dropped(worker: WorkerParts):

@@ -14,7 +14,8 @@ from fakes import FakeWire
 
 from rse_pf.backend.scheduling.scheduler import QueuedCommand
 from rse_pf.config import PlatformSettings
-from rse_pf.object_store import MemoryStore, digest_of, object_name
+from rse_pf.identity import RobotId, object_name
+from rse_pf.object_store import MemoryStore, digest_of
 from rse_pf.service import Registry
 from rse_pf.wire import Command, Failure, Move, Ping, Pong, Result, Welcome
 
@@ -87,7 +88,7 @@ def test_a_reply_that_cannot_be_encoded_is_an_internal_failure(worker: WorkerPar
 
 def test_a_named_object_is_read_by_a_thread_and_a_large_reply_is_stored_in_turn():
     store, data, threads = MemoryStore(), bytes(2 * SETTINGS.session.max_message_bytes), set()
-    store.put(object_name("default", "r", digest_of(data)), data)
+    store.put(object_name(RobotId("default", "r"), digest_of(data)), data)
     get = store.get
 
     def noted_get(name: str) -> bytes:
@@ -102,14 +103,14 @@ def test_a_named_object_is_read_by_a_thread_and_a_large_reply_is_stored_in_turn(
 
     (result,) = results(wire)
     assert (result.id, result.reply) == (3, None)
-    reply = msgspec.msgpack.decode(get(object_name("default", "r", result.object)), type=Large)
+    reply = msgspec.msgpack.decode(get(object_name(RobotId("default", "r"), result.object)), type=Large)
     assert reply.data == data
     assert threads == {"solver-0"}, "the event loop never waits for the store"
 
 
 def test_an_object_of_another_robot_is_not_found():
     store = MemoryStore()
-    store.put(object_name("default", "other", digest_of(b"x")), b"x")
+    store.put(object_name(RobotId("default", "other"), digest_of(b"x")), b"x")
     with worker_parts(register=register, store=store) as worker:
         connection, wire = worker.join()
         worker.say(connection, Command(id=4, service="large", payload={"data": {"object": digest_of(b"x")}}))
@@ -123,7 +124,7 @@ def test_a_reply_that_is_too_large_is_a_failure_without_a_store(worker: WorkerPa
     data = bytes(2 * SETTINGS.session.max_message_bytes)
     large = Command(id=5, service="large", payload={"data": data})
 
-    answer = worker.answers.compute(QueuedCommand(connection, "r", large, 9, 0.0, 1.0))
+    answer = worker.answers.compute(QueuedCommand(connection, connection.robot, large, 9, 0.0, 1.0))
 
     assert (answer.message.id, answer.message.code) == (5, "too-large")
 
@@ -311,7 +312,7 @@ def test_a_flood_is_refused_by_id_and_then_cut_off(worker: WorkerParts):
     assert [each.id for each in refused] == list(range(40, 159))
     assert all(each.code == "busy" and each.retry_after_ms > 0 for each in refused)
     assert wire.closed == (4429, "rate")
-    assert worker.admission.rates.banned_s(("default", "r"), worker.loop.now) > 0
+    assert worker.admission.rates.banned_s(connection.robot, worker.loop.now) > 0
     assert worker.metrics.shed["rate"] == 120
 
 

@@ -9,6 +9,7 @@ import pytest
 from rse_pf.auth.tokens import SigningKey
 from rse_pf.backend.gateway.handshake import HEALTH, Accepted, HandshakePolicy, Rejected
 from rse_pf.config import PlatformSettings
+from rse_pf.identity import RobotId
 from rse_pf.wire import SUBPROTOCOLS
 
 SETTINGS = PlatformSettings()
@@ -30,7 +31,10 @@ def judge(policy: HandshakePolicy | None = None, **changed: object) -> Accepted 
 
 def test_a_valid_token_gives_the_robot_and_the_end_of_its_connection():
     assert judge() == Accepted(
-        robot="robot-1", codec="bin", subprotocol=SUBPROTOCOLS["bin"], expires_s=NOW_S + 100
+        robot=RobotId("default", "robot-1"),
+        codec="bin",
+        subprotocol=SUBPROTOCOLS["bin"],
+        expires_s=NOW_S + 100,
     )
 
 
@@ -89,7 +93,7 @@ def test_all_causes_of_a_bad_token_get_the_same_bytes_but_the_log_knows():
 
 def test_without_keys_robots_are_anonymous_and_never_expire():
     assert judge(HandshakePolicy(SETTINGS, None)) == Accepted(
-        robot="anonymous-1", codec="bin", subprotocol=SUBPROTOCOLS["bin"], expires_s=None
+        robot=RobotId("default", "anonymous-1"), codec="bin", subprotocol=SUBPROTOCOLS["bin"], expires_s=None
     )
 
 
@@ -97,7 +101,7 @@ def test_the_conformance_echo_accepts_every_handshake():
     policy = HandshakePolicy(SETTINGS, None, conformance_echo=True)
 
     assert judge(policy, path=b"/", offered=[], authorization="") == Accepted(
-        robot="anonymous-1", codec="", subprotocol=""
+        robot=RobotId("default", "anonymous-1"), codec="", subprotocol=""
     )
 
 

@@ -8,9 +8,10 @@ from hypothesis import strategies as st
 
 from rse_pf.backend.gateway.rate_limits import CUT_OFF, PendingHandshakes, RobotRates, SourceRates
 from rse_pf.config import ServingSettings, SessionSettings
+from rse_pf.identity import RobotId
 from rse_pf.token_bucket import TokenBucket
 
-ROBOT = ("default", "r")
+ROBOT = RobotId("default", "r")
 LIMITS = SessionSettings(max_commands_per_s=20.0, command_burst=40, rate_ban_s=5.0)
 
 
@@ -91,15 +92,15 @@ def test_a_robot_far_above_its_rate_is_cut_off_within_half_a_second_and_banned()
     assert 40 + 3 * 40 <= cut_off <= 180
     assert rates.banned_s(ROBOT, 100.0 + cut_off / 500) == pytest.approx(5.0)
     assert rates.banned_s(ROBOT, 106.0) == 0.0
-    assert rates.banned_s(("default", "another"), 100.5) == 0.0
+    assert rates.banned_s(RobotId("default", "another"), 100.5) == 0.0
 
 
 def test_robots_have_buckets_of_their_own():
     rates = RobotRates(LIMITS)
-    judged(rates, per_s=500.0, seconds=0.5, robot=("a", "flood"))
+    judged(rates, per_s=500.0, seconds=0.5, robot=RobotId("a", "flood"))
 
-    assert rates.retry_after_ms(("a", "calm"), 100.5) == 0
-    assert rates.retry_after_ms(("b", "flood"), 100.5) == 0, "a name belongs to its tenant"
+    assert rates.retry_after_ms(RobotId("a", "calm"), 100.5) == 0
+    assert rates.retry_after_ms(RobotId("b", "flood"), 100.5) == 0, "a name belongs to its tenant"
 
 
 def test_zero_turns_the_rate_off():
@@ -112,7 +113,7 @@ def test_the_number_of_remembered_names_is_bounded():
     rates, sources = RobotRates(LIMITS, max_names=100), SourceRates(ServingSettings(), max_names=100)
 
     for k in range(1000):
-        rates.retry_after_ms(("default", f"r-{k}"), 100.0)
+        rates.retry_after_ms(RobotId("default", f"r-{k}"), 100.0)
         sources.wait_s(f"10.0.0.{k}", 100.0)
         assert len(rates) <= 100
         assert len(sources) <= 100
@@ -123,7 +124,7 @@ def test_a_banned_robot_is_not_forgotten_for_names_that_did_nothing():
     judged(rates, per_s=500.0, seconds=0.5)
 
     for k in range(400):
-        rates.retry_after_ms(("default", f"r-{k}"), 101.0 + k / 100)
+        rates.retry_after_ms(RobotId("default", f"r-{k}"), 101.0 + k / 100)
 
     assert rates.banned_s(ROBOT, 101.0) > 0
 

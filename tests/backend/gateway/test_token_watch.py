@@ -15,6 +15,7 @@ from rse_pf.backend.gateway.connection import RobotConnection
 from rse_pf.backend.gateway.handshake import Accepted
 from rse_pf.backend.log import JsonLog
 from rse_pf.config import PlatformSettings
+from rse_pf.identity import RobotId
 from rse_pf.wire import SUBPROTOCOLS, Command, Failure, Hello, Renew, Renewed, Result, Welcome
 
 SETTINGS = PlatformSettings()
@@ -125,7 +126,7 @@ def test_a_replaced_connection_ends_and_one_that_is_moving_may_finish_first(work
     worker.told.clear()
     moving.last_heard_s = worker.loop.now + 1000.0
     worker.loop.advance(3.0)
-    assert worker.told == [{"event": "stays", "tenant": "default", "robot": "s", "number": moving.number}]
+    assert worker.told == [{"event": "stays", "robot": RobotId("default", "s"), "number": moving.number}]
     worker.token_watch.replace(moving.number)
     assert other.closed == (4409, "replaced")
 
@@ -135,7 +136,7 @@ def test_the_supervisor_is_told_which_robots_arrive_and_leave(worker: Worker):
     worker.dispatcher.disconnect(connection)
     worker.token_watch.replace(connection.number)
 
-    said = {"tenant": "default", "robot": "r", "number": connection.number}
+    said = {"robot": RobotId("default", "r"), "number": connection.number}
     assert worker.told == [{"event": "arrived", **said}, {"event": "left", **said}]
 
 

@@ -24,6 +24,7 @@ from rse_pf.backend.ports import Clocks, WorkerContext
 from rse_pf.backend.scheduling.cpu_throttle import CpuThrottle
 from rse_pf.backend.scheduling.scheduler import Scheduler
 from rse_pf.config import PlatformSettings
+from rse_pf.identity import RobotId
 from rse_pf.object_store import MemoryStore
 from rse_pf.service import Registry
 from rse_pf.services import echo
@@ -106,7 +107,10 @@ class WorkerParts:
     ) -> tuple[RobotConnection, FakeWire]:
         """Connect *robot*, whose token expires at Unix time *expires_s*."""
         accepted = Accepted(
-            robot=robot, codec=self.codec.name, subprotocol=SUBPROTOCOLS[self.codec.name], expires_s=expires_s
+            robot=RobotId("default", robot),
+            codec=self.codec.name,
+            subprotocol=SUBPROTOCOLS[self.codec.name],
+            expires_s=expires_s,
         )
         wire = FakeWire(self.codec)
         connection = self.dispatcher.connect(wire, accepted)

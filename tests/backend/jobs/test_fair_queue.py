@@ -5,9 +5,10 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rse_pf.backend.jobs.fair_queue import FairQueue, RobotId, job_to_displace
+from rse_pf.backend.jobs.fair_queue import FairQueue, job_to_displace
+from rse_pf.identity import RobotId
 
-A, B, C = ("default", "a"), ("default", "b"), ("default", "c")
+A, B, C = (RobotId("default", name) for name in "abc")
 
 
 def order(line: FairQueue, count: int) -> str:

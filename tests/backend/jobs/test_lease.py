@@ -7,9 +7,10 @@ import pytest
 
 from rse_pf.backend.jobs.lease import MAX_TRIES, JobLease, JobRecord, job_key, record_name, verdict_on
 from rse_pf.errors import BadRequest, StoreError
+from rse_pf.identity import RobotId
 from rse_pf.object_store import MemoryStore
 
-NAME = record_name("default", "robot-1", "ab" * 32)
+NAME = record_name(RobotId("default", "robot-1"), "ab" * 32)
 LEASE_S = 5.0
 
 

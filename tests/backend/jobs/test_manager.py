@@ -23,6 +23,7 @@ from rse_pf.backend.log import JsonLog
 from rse_pf.backend.sandbox.ipc import encode_message
 from rse_pf.backend.scheduling.scheduler import QueuedCommand
 from rse_pf.config import PlatformSettings
+from rse_pf.identity import RobotId
 from rse_pf.object_store import MemoryStore
 from rse_pf.wire import Command, Failure, Result
 from tests.fakes import FakeLoop
@@ -106,7 +107,7 @@ def make():
 
 
 def robot(name: str = "robot-1", tenant: str = "default") -> Any:
-    return SimpleNamespace(robot=name, tenant=tenant, claims=None)
+    return SimpleNamespace(robot=RobotId(tenant, name), claims=None)
 
 
 def ask(bench: Bench, owner: Any, identity: int, value: int = 1) -> None:
@@ -140,7 +141,7 @@ def test_the_same_request_of_another_robot_or_tenant_is_another_job(make):
 
     asked = [bench.process() for _ in range(3)]
 
-    assert len({(each.request.tenant, each.request.robot) for each in asked}) == 3
+    assert len({each.request.robot for each in asked}) == 3
 
 
 def test_more_jobs_than_may_wait_are_refused_with_a_retry_time(make):

@@ -18,7 +18,8 @@ from rse_pf.backend.jobs.slots import JobSlots, make_pipe
 from rse_pf.backend.sandbox.ipc import encode_message
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import Conflict, StoreError
-from rse_pf.object_store import MemoryStore, digest_of, object_name
+from rse_pf.identity import RobotId, object_name
+from rse_pf.object_store import MemoryStore, digest_of
 
 SETTINGS = PlatformSettings.from_dict(
     {
@@ -28,10 +29,10 @@ SETTINGS = PlatformSettings.from_dict(
     }
 )
 WANTED = JobRequest(
-    service="long", payload={}, tenant="default", robot="robot-1", key="ab" * 32, quota_bytes=1e6
+    service="long", payload={}, robot=RobotId("default", "robot-1"), key="ab" * 32, quota_bytes=1e6
 )
-WHO = ("default", "robot-1")
-NAME = record_name("default", "robot-1", WANTED.key)
+WHO = RobotId("default", "robot-1")
+NAME = record_name(RobotId("default", "robot-1"), WANTED.key)
 REPLY = msgspec.msgpack.encode({"value": 1})
 DONE = ["done", 12.5, REPLY]
 
@@ -123,7 +124,7 @@ class Ordered(MemoryStore):
     def compare_and_swap(self, name: str, expected: bytes | None, data: bytes) -> None:
         record = msgspec.json.decode(data, type=JobRecord)
         if record.state == "done":
-            self.get(object_name("default", "robot-1", record.reply))
+            self.get(object_name(RobotId("default", "robot-1"), record.reply))
         super().compare_and_swap(name, expected, data)
 
 
@@ -133,7 +134,7 @@ def test_a_result_is_stored_before_it_is_reported(bench):
     outcome = bench.run(lambda: FakeProcess([["progress", 0.5, "half"], DONE]))
 
     assert outcome == JobOutcome(object=digest_of(REPLY), reply=REPLY, compute_ms=12.5)
-    assert bench.store.get(object_name("default", "robot-1", outcome.object)) == REPLY
+    assert bench.store.get(object_name(RobotId("default", "robot-1"), outcome.object)) == REPLY
     assert (bench.record.state, bench.record.reply) == ("done", outcome.object)
     assert [what for _, what in bench.told] == ["waits for its turn", "starts", "half"]
 
@@ -156,7 +157,7 @@ def test_a_large_reply_is_reported_by_name_only(bench):
 
 def test_a_result_whose_object_was_deleted_is_computed_again(bench):
     outcome = bench.run(lambda: FakeProcess([DONE]))
-    bench.store.delete(object_name("default", "robot-1", outcome.object))
+    bench.store.delete(object_name(RobotId("default", "robot-1"), outcome.object))
 
     assert bench.run(lambda: FakeProcess([DONE])) == outcome
     assert len(bench.processes) == 2
@@ -216,7 +217,7 @@ def test_a_job_that_runs_on_another_server_is_followed_to_its_end(bench):
 
     def end(share: float, what: str) -> None:
         if owner.record is not None and owner.record.state == "running":
-            bench.store.put(object_name("default", "robot-1", digest_of(REPLY)), REPLY)
+            bench.store.put(object_name(RobotId("default", "robot-1"), digest_of(REPLY)), REPLY)
             owner.end(JobRecord(state="done", owner="", reply=digest_of(REPLY), reply_bytes=len(REPLY)))
 
     bench.on_tell = end
@@ -249,7 +250,7 @@ def test_a_server_that_lost_the_lease_kills_its_process_and_follows_the_new_owne
         if what == "half" and bench.record.owner == "us":
             other = another(bench)
             other.take()
-            bench.store.put(object_name("default", "robot-1", digest_of(REPLY)), REPLY)
+            bench.store.put(object_name(RobotId("default", "robot-1"), digest_of(REPLY)), REPLY)
             other.end(JobRecord(state="done", owner="", reply=digest_of(REPLY), reply_bytes=len(REPLY)))
 
     bench.on_tell = overtake
@@ -329,7 +330,7 @@ def test_a_reply_that_the_process_stored_is_reported_by_its_name(bench):
 
 
 def test_a_reply_above_the_robots_quota_is_a_typed_failure_and_not_stored(bench):
-    bench.store.put(object_name("default", "robot-1", "full"), bytes(10**6 - 1))
+    bench.store.put(object_name(RobotId("default", "robot-1"), "full"), bytes(10**6 - 1))
 
     assert code(bench.run(lambda: FakeProcess([DONE]))) == "quota"
     assert bench.record.code == "quota"

@@ -8,8 +8,9 @@ from collections.abc import Iterator
 import pytest
 
 from rse_pf.backend.jobs.slots import JobSlots, make_pipe
+from rse_pf.identity import RobotId
 
-ONE, TWO = ("default", "robot-1"), ("default", "robot-2")
+ONE, TWO = RobotId("default", "robot-1"), RobotId("default", "robot-2")
 
 
 def stop(_: float) -> bool:

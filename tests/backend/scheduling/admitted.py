@@ -5,6 +5,7 @@ from __future__ import annotations
 from rse_pf.backend.gateway.admission import Admission
 from rse_pf.backend.scheduling.scheduler import QueuedCommand, RefusedCommand, Scheduler
 from rse_pf.config import ServingSettings, SessionSettings
+from rse_pf.identity import RobotId
 from rse_pf.wire import Command
 
 
@@ -12,7 +13,8 @@ def queued(
     robot: str, identity: int = 0, *, at: float = 0.0, within: float = 10.0, **command: object
 ) -> QueuedCommand:
     """Return a command of *robot* that arrives at *at* and has *within* seconds."""
-    return QueuedCommand(robot, robot, Command(id=identity, service="work", **command), 100, at, at + within)
+    work = Command(id=identity, service="work", **command)
+    return QueuedCommand(robot, RobotId("default", robot), work, 100, at, at + within)
 
 
 class AdmittedScheduler(Scheduler):
@@ -31,7 +33,7 @@ class AdmittedScheduler(Scheduler):
         return [refusal]
 
     def refuse_unread(self, robot: str, allowed_s: float, now: float) -> float:
-        retry_ms = self.retry_unread_ms(robot, allowed_s)
+        retry_ms = self.retry_unread_ms(RobotId("default", robot), allowed_s)
         if retry_ms:
             self.note_refused(now)
         return retry_ms

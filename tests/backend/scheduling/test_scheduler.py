@@ -19,7 +19,7 @@ def run_order(scheduler: Scheduler, count: int) -> list[tuple[str, int]]:
     for _ in range(count):
         started, _ = scheduler.start(0.0)
         assert started is not None
-        order.append((started.robot, started.command.id))
+        order.append((started.robot.name, started.command.id))
         scheduler.done(started, 0.0)
     return order
 
@@ -280,7 +280,7 @@ def test_one_robot_may_wait_for_a_slow_command_of_another():
     assert refusals == []
     started, _ = scheduler.start(0.3)
     assert started is not None
-    assert started.robot == "a"
+    assert started.robot.name == "a"
 
 
 def test_slow_services_below_capacity_are_not_shed():
@@ -309,7 +309,7 @@ def test_no_robot_starves_under_overload():
 
     good, _, _ = simulate(AdmittedScheduler(ServingSettings()), arrivals, random.Random(1))
 
-    served = Counter(each.robot for each in good)
+    served = Counter(each.robot.name for each in good)
     assert len(served) == 40
     assert min(served.values()) >= 0.75 * len(good) / 40
 
@@ -320,7 +320,7 @@ def test_a_flooding_robot_takes_nothing_from_the_others():
 
     good, _, _ = simulate(AdmittedScheduler(ServingSettings()), sorted(calm + flood), random.Random(1))
 
-    served = Counter(each.robot for each in good)
+    served = Counter(each.robot.name for each in good)
     calm_served = sum(count for robot, count in served.items() if robot != "flood")
     assert calm_served >= 0.99 * len(calm)
 

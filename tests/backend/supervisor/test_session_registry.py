@@ -15,7 +15,7 @@ class Worker:
 
 
 def say(event: str, number: int, robot: str = "r", tenant: str = "default") -> dict[str, object]:
-    return {"event": event, "tenant": tenant, "robot": robot, "number": number}
+    return {"event": event, "robot": [tenant, robot, ""], "number": number}
 
 
 def test_the_socket_that_was_accepted_earlier_ends_on_its_own_worker():

@@ -20,8 +20,9 @@ from client_sdk.transfer.data_client import DataClient, DataOptions
 from rse_pf.auth.tokens import SigningKey
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import StoreFull
+from rse_pf.identity import RobotId, object_name
 from rse_pf.local.servers.data_servers import LocalDataServers
-from rse_pf.object_store import DirectoryStore, digest_of, object_name
+from rse_pf.object_store import DirectoryStore, digest_of
 
 pytestmark = pytest.mark.system
 
@@ -114,7 +115,7 @@ def test_uploads_survive_kills_and_acknowledged_objects_are_stored(
     assert digests == [digest_of(content) for content in contents]
     assert len(back_s) == 3
     assert max(back_s) <= 5.0
-    names = {object_name("default", "robot-1", digest) for digest in digests}
+    names = {object_name(RobotId("default", "robot-1"), digest) for digest in digests}
     assert {info.name for info in store.list("objects/")} == names
     for name in names:
         assert digest_of(store.get(name)) == name.rpartition("/")[2]

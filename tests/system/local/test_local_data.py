@@ -19,12 +19,13 @@ import client_sdk
 from client_sdk.transfer.data_client import DataClient, DataOptions
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import ConnectError, RsePfError
+from rse_pf.identity import RobotId, object_name
 from rse_pf.local.control.control_plane import ControlOptions
 from rse_pf.local.control.platform import LocalPlatform
 from rse_pf.local.control.status import data_url, platform_status, status_table
 from rse_pf.local.faults import faults
 from rse_pf.local.state import read_state
-from rse_pf.object_store import DirectoryStore, object_name
+from rse_pf.object_store import DirectoryStore
 
 pytestmark = pytest.mark.system
 
@@ -96,7 +97,7 @@ def test_services_read_what_a_robot_stored_through_the_load_balancer(
             digest = await asyncio.to_thread(robot.upload, data)
             assert await asyncio.to_thread(robot.download, digest) == data
             store = DirectoryStore(tmp_path / "a" / "objects")
-            assert store.get(object_name("default", "robot-1", digest)) == data
+            assert store.get(object_name(RobotId("default", "robot-1"), digest)) == data
             assert await localise_in(platform, "robot-1", digest) == "bad-request", "the object was not read"
             assert await localise_in(platform, "robot-2", digest) == "not-found"
 
