@@ -1,6 +1,6 @@
-"""Run a function over a stranger's bytes in processes that have a memory limit and are killed at a timeout.
+"""Run a function over a stranger's bytes in processes that have limits and are killed at a timeout.
 
-    with LimitedProcesses("rse_pf.maps.describe:describer", memory_bytes=1 << 28) as processes:
+    with LimitedProcesses("rse_pf.maps.describe:describer", memory_bytes=1 << 28, cpu_s=5.0) as processes:
         description = processes.call(data, timeout_s=5.0)
 
 ``describer`` is called once, in a template process that has one thread, with the configuration; it imports
@@ -9,8 +9,9 @@ answers one call after the other, so what that function caches stays until its p
 that was killed is replaced in some milliseconds.  `LimitedProcesses.call` blocks and may be called by several
 threads.
 
-Bytes that crash their process, exhaust its memory or never end cost that one process and nothing else.  This
-is no sandbox: code that took over the process may do what its user may do.
+Bytes that crash their process, exhaust its memory or its CPU time cost that one process and nothing else, and
+only they raise Crashed: it is evidence against whoever sent the bytes, the other errors are not.  This is no
+sandbox: code that took over the process may do what its user may do.
 """
 
 from __future__ import annotations
@@ -35,7 +36,15 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NoReturn
 
-from rse_pf.errors import Crashed, Expired, InternalError, RsePfError, WorkerLost, error_from_code
+from rse_pf.errors import (
+    Busy,
+    Crashed,
+    Expired,
+    InternalError,
+    RsePfError,
+    WorkerLost,
+    error_from_code,
+)
 from rse_pf.linux import die_with_parent, set_process_name
 
 __all__ = ["DEFAULT_NICENESS", "Handler", "LimitedProcesses", "main"]
@@ -48,8 +57,11 @@ _MAX_REPLY_BYTES = 1 << 20
 _MAX_ORDER_BYTES = 1 << 17
 _ORDER_TIMEOUT_S = 10.0
 """A template that does not fork or kill a process within this is replaced."""
+_BUSY_RETRY_MS = 1000.0
 _OUT_OF_MEMORY = 77
 """Exit code of a process whose handler raised MemoryError."""
+_OUT_OF_TIME = signal.SIGPROF
+"""Ends a process that used up its CPU time, which it arms before each call."""
 _LENGTH = struct.Struct("<Q")
 _REPLY = struct.Struct("<BQ")
 _DONE, _REFUSED, _DEFECT = 0, 1, 2
@@ -64,6 +76,7 @@ class LimitedProcesses:
         target: str,
         *,
         memory_bytes: int,
+        cpu_s: float = 60.0,
         configuration: str = "",
         count: int = 1,
         niceness: int = DEFAULT_NICENESS,
@@ -74,15 +87,17 @@ class LimitedProcesses:
         Args:
             target: ``module:function``; the function takes *configuration* and returns a `Handler`.
             memory_bytes: What calls may allocate in one process, beside what the template has allocated.
+            cpu_s: CPU seconds of one call, however busy the machine is.
             configuration: Text for *target*, such as settings in JSON; at most 100 kB.
             count: Processes that work at the same time; further calls wait for one of them.
             niceness: Of the processes, above that of this process.
             max_reply_bytes: A process that replies with more has failed.
         """
         self._order = json.dumps(
-            {"target": target, "configuration": configuration, "memory_bytes": memory_bytes}
+            {"target": target, "configuration": configuration, "limits": [memory_bytes, cpu_s]}
         ).encode()
         self._memory_bytes = memory_bytes
+        self._cpu_s = cpu_s
         self._max_reply_bytes = max_reply_bytes
         self._template = _Template(self._order, niceness)
         self._free: queue.LifoQueue[_Slot] = queue.LifoQueue()
@@ -102,8 +117,9 @@ class LimitedProcesses:
         process: what others left there may have been the cause.
 
         Raises:
-            Crashed: *data* ended a new process: the memory limit, or a signal; the message says which.
-            Expired: *timeout_s* passed.  The process was killed, or none was free.
+            Crashed: *data* ended the process: a limit, or a signal; the message says which.
+            Expired: *timeout_s* passed during the work, and the process was killed.
+            Busy: *timeout_s* passed before a process was free or had been started.
             WorkerLost: The processes cannot be started, or were closed; *data* has no part in it.
             InternalError: The handler raised an exception that is none of the platform's.
             RsePfError: What the handler raised.
@@ -112,7 +128,7 @@ class LimitedProcesses:
         try:
             slot = self._free.get(timeout=max(0.0, timeout_s))
         except queue.Empty:
-            raise Expired("no process was free in time", hint="allow more time") from None
+            raise _busy("no process was free in time") from None
         try:
             while True:
                 is_new = slot.process is None or not self._template.has(slot.process)
@@ -130,7 +146,7 @@ class LimitedProcesses:
                     ) from None
                 except _ProcessEnded as ended:
                     how = self._end(slot, process)
-                    if is_new:
+                    if is_new or how == _name_of(_OUT_OF_TIME):
                         raise self._crash(ended.reason or how) from None
         finally:
             self._free.put(slot)
@@ -151,6 +167,8 @@ class LimitedProcesses:
     def _crash(self, how: str) -> Crashed:
         if how == f"exit code {_OUT_OF_MEMORY}":
             how = f"it needs more than {self._memory_bytes / 1e6:.0f} MB of memory"
+        elif how == _name_of(_OUT_OF_TIME):
+            how = f"it needs more than {self._cpu_s:g} s of CPU time"
         return Crashed(f"the process that worked on this ended: {how}", hint="send less at once")
 
 
@@ -203,7 +221,7 @@ class _Template:
         """Return a new process.
 
         Raises:
-            Expired: The template was not ready in time; it goes on starting.
+            Busy: The template was not ready in time; it goes on starting.
             WorkerLost: It cannot start, or was closed.
         """
         with self._locked(until):
@@ -226,7 +244,7 @@ class _Template:
                 raise WorkerLost("the process ended with its template", hint="try again")
             self._forked.discard(process.pid)
             code = int(self._ask({"do": "end", "pid": process.pid})["code"])
-        return f"exit code {code}" if code >= 0 else f"signal {signal.Signals(-code).name}"
+        return f"exit code {code}" if code >= 0 else _name_of(-code)
 
     def close(self) -> None:
         with self._lock:
@@ -236,7 +254,7 @@ class _Template:
     @contextlib.contextmanager
     def _locked(self, until: float) -> Any:
         if not self._lock.acquire(timeout=max(0.0, until - time.monotonic())):
-            raise Expired("no process was free in time", hint="allow more time")
+            raise _busy("no process was free in time")
         try:
             yield
         finally:
@@ -265,7 +283,7 @@ class _Template:
         try:
             message = self._channel.recv(_MAX_ORDER_BYTES)
         except TimeoutError:
-            raise Expired("the process was not started in time", hint="try again") from None
+            raise _busy("the process was not started in time") from None
         except OSError:
             message = b""
         if not message:
@@ -297,6 +315,14 @@ class _Template:
         self._is_ready = False
         self._generation += 1
         self._forked.clear()
+
+
+def _busy(why: str) -> Busy:
+    return Busy(why, hint="try again later, or allow more time", retry_after_ms=_BUSY_RETRY_MS)
+
+
+def _name_of(signal_number: int) -> str:
+    return f"signal {signal.Signals(signal_number).name}"
 
 
 def _exchange(connection: socket.socket, data: bytes, until: float, max_reply_bytes: int) -> bytes:
@@ -355,7 +381,7 @@ def main(arguments: list[str]) -> None:
     handler: Handler = getattr(importlib.import_module(module), function)(order["configuration"])
     gc.collect()
     gc.freeze()
-    work = functools.partial(_work, owner, handler, order["memory_bytes"])
+    work = functools.partial(_work, owner, handler, *order["limits"])
     owner.send(b'"ready"')
     while _obey(owner, work):
         pass
@@ -388,14 +414,16 @@ def _obey(owner: socket.socket, work: Callable[[socket.socket], NoReturn]) -> bo
     return True
 
 
-def _work(owner: socket.socket, handler: Handler, memory_bytes: int, connection: socket.socket) -> NoReturn:
+def _work(
+    owner: socket.socket, handler: Handler, memory_bytes: int, cpu_s: float, connection: socket.socket
+) -> NoReturn:
     """Answer calls until the connection ends; never return."""
     try:
         template = os.getppid()
         owner.close()
         if die_with_parent(template):
             _limit(memory_bytes)
-            while _answer(connection, handler):
+            while _answer(connection, handler, cpu_s):
                 pass
         os._exit(0)
     except MemoryError:
@@ -414,7 +442,7 @@ def _limit(memory_bytes: int) -> None:
         Path("/proc/self/oom_score_adj").write_text("1000", encoding="ascii")
 
 
-def _answer(connection: socket.socket, handler: Handler) -> bool:
+def _answer(connection: socket.socket, handler: Handler, cpu_s: float) -> bool:
     """Answer one call; return False at the end of the connection."""
     header = connection.recv(_LENGTH.size, socket.MSG_WAITALL)
     if len(header) < _LENGTH.size:
@@ -423,6 +451,7 @@ def _answer(connection: socket.socket, handler: Handler) -> bool:
     data = connection.recv(length, socket.MSG_WAITALL)
     if len(data) < length:
         return False
+    signal.setitimer(signal.ITIMER_PROF, cpu_s)
     try:
         kind, reply = _DONE, handler(data)
     except MemoryError:
@@ -433,6 +462,7 @@ def _answer(connection: socket.socket, handler: Handler) -> bool:
     except BaseException:  # noqa: BLE001  the reason goes to the log, and the process answers the next call
         traceback.print_exc()
         kind, reply = _DEFECT, b""
+    signal.setitimer(signal.ITIMER_PROF, 0.0)
     try:
         connection.sendall(_REPLY.pack(kind, len(reply)))
         connection.sendall(reply)
