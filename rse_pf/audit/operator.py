@@ -6,7 +6,6 @@ A command that cannot be recorded is not undone; one line on standard error repo
 from __future__ import annotations
 
 import getpass
-import sys
 import time
 from pathlib import Path
 
@@ -14,6 +13,7 @@ from rse_pf.audit.chain import Value
 from rse_pf.audit.log import audit_folder, record_once
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import ConfigurationError
+from rse_pf.terminal import show
 
 __all__ = ["record", "record_map_change"]
 
@@ -34,7 +34,7 @@ def record(state: Path, action: str, subject: str, **detail: Value) -> None:
             **detail,
         )
     except ConfigurationError as error:
-        sys.stderr.write(f"the command succeeded, but is missing in the audit log: {error}\n")
+        show(f"the command succeeded, but is missing in the audit log: {error}", error=True)
 
 
 def record_map_change(

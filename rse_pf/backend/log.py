@@ -16,6 +16,7 @@ from typing import Any
 import msgspec
 
 from rse_pf.identity import RobotId
+from rse_pf.terminal import json_line
 
 __all__ = ["JsonLog"]
 
@@ -79,9 +80,8 @@ class JsonLog:
         for name, value in fields.items():
             if isinstance(value, str) and len(value) > _MAX_TEXT:
                 fields[name] = value[-_MAX_TRACEBACK:] if name == "traceback" else value[:_MAX_TEXT]
-        line = _encode(
-            {"time": self._wall_clock(), "level": level, "event": event, "server": self._server, **fields}
-        )
+        about = {"time": self._wall_clock(), "level": level, "event": event, "server": self._server}
+        line = json_line({**about, **fields}, _encode)
         if len(self._lines) >= _MAX_HELD_LINES:
             self.dropped += 1
             return

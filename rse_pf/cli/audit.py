@@ -21,7 +21,6 @@ import argparse
 import json
 import os
 import re
-import sys
 import tempfile
 import time
 from collections import deque
@@ -34,6 +33,7 @@ from rse_pf.audit.log import audit_folder, chain_names, files_of
 from rse_pf.audit.verify import Verdict, check_chain, check_folder, entries_of
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import UsageError
+from rse_pf.terminal import show
 
 __all__ = ["add_arguments", "run"]
 
@@ -95,7 +95,7 @@ def _run_in_cloud(args: argparse.Namespace, settings: PlatformSettings) -> int:
 def _run_on(args: argparse.Namespace, problems: Sequence[str]) -> int:
     """Show or verify files on this machine; *problems* were found while fetching them."""
     for problem in problems:
-        print(f"BROKEN: {problem}", file=sys.stderr if args.action == "show" else None)
+        show(f"BROKEN: {problem}", error=args.action == "show")
     is_folder = not args.files or (len(args.files) == 1 and args.files[0].is_dir())
     folder = _folder(args) if is_folder else None
     for path in args.files:
@@ -118,7 +118,7 @@ def _show(args: argparse.Namespace, folder: Path | None) -> int:
     wanted = ((who, entry) for who, entry in found if args.only is None or args.only in entry.action)
     shown = sorted(wanted, key=lambda each: (each[1].time, each[0], each[1].seq))
     for who, entry in deque(shown, args.last):
-        print(_json_line(who, entry) if args.json else _line(who, entry))
+        show(_json_line(who, entry) if args.json else _line(who, entry))
     return 0
 
 
@@ -153,10 +153,10 @@ def _check_live(folder: Path, known: dict[str, Head]) -> list[Verdict]:
 
 def _print_verdict(verdict: Verdict) -> None:
     if verdict.problem:
-        print(f"{verdict.who}: BROKEN in {verdict.file}: {verdict.problem}")
+        show(f"{verdict.who}: BROKEN in {verdict.file}: {verdict.problem}")
         return
     notes = "".join(f"; {note}" for note in verdict.notes)
-    print(f"{verdict.who}: {verdict.entries} entries good, head {verdict.head}{notes}")
+    show(f"{verdict.who}: {verdict.entries} entries good, head {verdict.head}{notes}")
 
 
 def _heads(words: Sequence[str]) -> dict[str, Head]:
@@ -198,4 +198,4 @@ def _line(who: str, entry: Entry) -> str:
 
 def _word(value: object) -> str:
     text = str(value)
-    return text if _PLAIN.fullmatch(text) else json.dumps(text)
+    return text if _PLAIN.fullmatch(text) else json.dumps(text, ensure_ascii=False)

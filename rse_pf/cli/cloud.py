@@ -28,6 +28,7 @@ from pathlib import Path
 from rse_pf.cli.doctor import Finding, report
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import RsePfError, UsageError
+from rse_pf.terminal import show
 
 __all__ = ["add_arguments", "check_tools", "run"]
 
@@ -158,28 +159,30 @@ def _cost(args: argparse.Namespace, settings: PlatformSettings) -> int:
         ("needs", f"{costs.servers} servers", f"{costs.executions:.1f} executions"),
         ("may have", f"{most} servers", f"{executions} executions"),
     ]
-    print(
+    show(
         f"{load.robots} robots, {load.fps:g} commands/s each, {load.hours_per_day:g} h a day: "
-        f"{load.commands_per_s:g} commands/s of {prices.command_cpu_ms:g} ms\n"
+        f"{load.commands_per_s:g} commands/s of {prices.command_cpu_ms:g} ms",
+        "",
     )
     for name, fleet, function in rows:
-        print(f"{name:<12}{fleet:>14}{function:>16}")
+        show(f"{name:<12}{fleet:>14}{function:>16}")
     rate = costs.crossing_commands_per_s
-    print(
-        f"\nthe fleet is cheaper from {rate:.1f} commands/s, {math.ceil(rate / load.fps)} such robots"
+    show(
+        "",
+        f"the fleet is cheaper from {rate:.1f} commands/s, {math.ceil(rate / load.fps)} such robots"
         if rate is not None
-        else f"\nthe Lambda is cheaper up to {most} servers"
+        else f"the Lambda is cheaper up to {most} servers",
     )
     if costs.servers > most or costs.executions > executions:
-        print("more than scaling.max_servers or cloud.lambda_concurrency allows: robots would be refused")
-    print(f"\nprices of {prices.as_of}, {prices.region}: {prices.source}; a month has {HOURS:g} h")
+        show("more than scaling.max_servers or cloud.lambda_concurrency allows: robots would be refused")
+    show("", f"prices of {prices.as_of}, {prices.region}: {prices.source}; a month has {HOURS:g} h")
     for what, of, wanted in (
         ("cloud.region", prices.region, cloud.region),
         ("cloud.instance_type", prices.instance_type, cloud.instance_type),
     ):
         if of != wanted:
-            print(f"WRONG PRICES: they are for {of}, and {what} is {wanted}: give yours with --prices")
-    print(f"not included: {NOT_INCLUDED}")
+            show(f"WRONG PRICES: they are for {of}, and {what} is {wanted}: give yours with --prices")
+    show(f"not included: {NOT_INCLUDED}")
     return 0
 
 
@@ -189,23 +192,23 @@ def _status(args: argparse.Namespace, settings: PlatformSettings) -> int:
 
     account = open_account(settings.cloud.region)
     fleet = read_group(account, settings, now=datetime.now(timezone.utc))
-    print(
+    show(
         f"{len(fleet.servers)} servers, wanted {fleet.wanted_servers}"
         f" of {fleet.min_servers} to {fleet.max_servers}"
     )
     for each in fleet.servers:
         health = ", ".join(each.targets) or "in no target group"
         robots = "robots: not told" if each.robots is None else f"{each.robots:g} robots"
-        print(f"  {each.name}  {each.zone}  {each.state:<12}  {health:<20}  {robots}")
+        show(f"  {each.name}  {each.zone}  {each.state:<12}  {health:<20}  {robots}")
     if fleet.robots:
         told = fleet.robots
         of = f" of {len(fleet.servers)}" if len(told) < len(fleet.servers) else ""
-        print(f"{sum(told):g} robots on {len(told)}{of} servers, {min(told):g} to {max(told):g} on each")
+        show(f"{sum(told):g} robots on {len(told)}{of} servers, {min(told):g} to {max(told):g} on each")
     else:
-        print("robots: no server told how many it has")
+        show("robots: no server told how many it has")
     for name, state in sorted(fleet.alarms.items()):
         hint = f"  docs/operations.md#{name}" if state == "ALARM" else ""
-        print(f"  alarm {name:<12} {state}{hint}")
+        show(f"  alarm {name:<12} {state}{hint}")
     return 0 if fleet.is_healthy else 1
 
 
@@ -216,10 +219,10 @@ def _leftovers(args: argparse.Namespace, settings: PlatformSettings) -> int:
     account = open_account(settings.cloud.region)
     stacks = living_stacks(account)
     if stacks:
-        print(f"these stacks stand, and what they own is not listed: {', '.join(stacks)}")
+        show(f"these stacks stand, and what they own is not listed: {', '.join(stacks)}")
     found = find_leftovers(account)
     for each in found:
-        print(f"{each.kind}  {each.name}\n  {each.why}\n  remove: {each.remove}")
+        show(f"{each.kind}  {each.name}", f"  {each.why}", f"  remove: {each.remove}")
     unread = sum(each.unread for each in found)
-    print(f"{len(found) - unread} left over" + (f", {unread} could not be looked into" if unread else ""))
+    show(f"{len(found) - unread} left over" + (f", {unread} could not be looked into" if unread else ""))
     return 1 if found else 0

@@ -10,12 +10,12 @@ example:
 from __future__ import annotations
 
 import argparse
-import sys
 from pathlib import Path
 
 from rse_pf.aws.storage import open_data_store
 from rse_pf.config import PlatformSettings, setting_rows
 from rse_pf.errors import UsageError
+from rse_pf.terminal import show_page
 
 __all__ = ["add_arguments", "run"]
 
@@ -51,7 +51,7 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
     if args.openapi:
         from rse_pf.data_server.routes import openapi_page
 
-        sys.stdout.write(openapi_page())
+        show_page(openapi_page())
         return 0
     if args.keys is None:
         raise UsageError("--keys is missing", hint="give a JWKS; rse-pf local writes one as keys.json")

@@ -24,6 +24,7 @@ from pathlib import Path
 
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import ConfigurationError, MissingExtra
+from rse_pf.terminal import show
 
 __all__ = ["Finding", "add_arguments", "check_machine", "report", "run"]
 
@@ -56,9 +57,9 @@ class Finding:
     what: str
     fix: str = ""
 
-    def __str__(self) -> str:
-        line = f"{self.grade:<4}  {self.what}"
-        return f"{line}\n      fix: {self.fix}" if self.fix else line
+    def lines(self) -> list[str]:
+        """Return what is shown to a user."""
+        return [f"{self.grade:<4}  {self.what}", *([f"      fix: {self.fix}"] if self.fix else [])]
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -74,9 +75,9 @@ def report(findings: Iterable[Finding], ready: str) -> int:
     """Print *findings* as they come, then how many failed, or *ready*; return the exit code."""
     failed = 0
     for finding in findings:
-        print(finding, flush=True)
+        show(*finding.lines())
         failed += finding.grade == "fail"
-    print(f"\n{failed} to fix first" if failed else f"\n{ready}")
+    show("", f"{failed} to fix first" if failed else ready)
     return 1 if failed else 0
 
 

@@ -20,6 +20,7 @@ from typing import Any, TypeVar
 
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import UsageError
+from rse_pf.terminal import show
 
 __all__ = ["KINDS", "add_arguments", "run"]
 
@@ -149,9 +150,9 @@ def _verify(folder: Path | None) -> int:
         raise UsageError("verify needs a folder", hint="rse-pf experiment verify DIR")
     checks = verify(folder)
     for check in checks:
-        print(check)
+        show(str(check))
     checked = sum(check.agrees is not None for check in checks)
     differing = sum(check.agrees is False for check in checks)
     skipped = f", {len(checks) - checked} skipped" if checked < len(checks) else ""
-    print(f"{checked} figures and invariants checked, {differing} differ{skipped}")
+    show(f"{checked} figures and invariants checked, {differing} differ{skipped}")
     return int(differing > 0)

@@ -17,17 +17,16 @@ import argparse
 import asyncio
 import collections
 import functools
-import json
 import math
 import os
 import signal
-import sys
 import time
 from pathlib import Path
 from typing import Any
 
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import UsageError
+from rse_pf.terminal import show, show_json, show_page
 
 __all__ = ["DEFAULT_NAME", "add_arguments", "run"]
 
@@ -89,7 +88,7 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
         from rse_pf.local.state import stop_platform
 
         stopped = stop_platform(folder)
-        print(f"platform {args.name!r} {'is stopped' if stopped else 'was not running'}")
+        show(f"platform {args.name!r} {'is stopped' if stopped else 'was not running'}")
         return 0
     if args.action != "start":
         return _on_running(args, folder)
@@ -137,32 +136,35 @@ def _on_running(args: argparse.Namespace, folder: Any) -> int:
         raise UsageError(f"platform {args.name!r} is not running", hint="start it with: rse-pf local")
     if args.action == "status":
         status = asyncio.run(platform_status(state, sample_s=_SAMPLE_S))
-        print(json.dumps(status, indent=2) if args.json else status_table(status))
+        if args.json:
+            show_json(status, indent=2)
+        else:
+            show_page(status_table(status))
         return 0
     if args.action == "kill-balancer":
-        print(f"killed the load balancer (pid {faults.kill_balancer(state)})")
+        show(f"killed the load balancer (pid {faults.kill_balancer(state)})")
         return 0
     server = faults.find_server(state, args.server)
     signal.pthread_sigmask(signal.SIG_BLOCK, _STOPPERS)
     wait = functools.partial(_wait, math.inf if args.for_s is None else time.monotonic() + args.for_s)
     if args.action == "slow":
-        print(f"{server.name} has {args.percent:g} % of its time; Ctrl-C ends that", flush=True)
+        show(f"{server.name} has {args.percent:g} % of its time; Ctrl-C ends that")
         faults.slow_down(server.process, args.percent, wait)
-        print(f"{server.name} has all of its time again")
+        show(f"{server.name} has all of its time again")
     elif args.action == "partition":
         with faults.cut_off(server, args.name):
-            print(f"{server.name} is cut off; Ctrl-C ends that", flush=True)
+            show(f"{server.name} is cut off; Ctrl-C ends that")
             wait(math.inf)
-        print(f"{server.name} is reachable again")
+        show(f"{server.name} is reachable again")
     else:
         number = {"kill": signal.SIGKILL, "pause": signal.SIGSTOP, "resume": signal.SIGCONT}[args.action]
         count = faults.signal_tree(server.process, number)
         done = {"kill": "killed", "pause": "stopped", "resume": "let go on"}[args.action]
-        print(f"{done}: {server.name} (pid {server.process.pid}, {count} processes)", flush=True)
+        show(f"{done}: {server.name} (pid {server.process.pid}, {count} processes)")
         if args.action == "pause" and args.for_s is not None:
             wait(math.inf)
             left = faults.signal_tree(server.process, signal.SIGCONT)
-            print(f"{server.name} {'goes on' if left else 'is gone: it was replaced meanwhile'}")
+            show(f"{server.name} {'goes on' if left else 'is gone: it was replaced meanwhile'}")
     return 0
 
 
@@ -207,9 +209,9 @@ async def _foreground(name: str, folder: Any, settings: PlatformSettings, *, dat
             ready = True
             _welcome(platform, name)
             await stopped.wait()
-            print("\nstopping", flush=True)
+            show("", "stopping")
     except asyncio.CancelledError:
-        print("\nstopped before it was ready", file=sys.stderr)
+        show("", "stopped before it was ready", error=True)
         return 130
     return 0
 
@@ -218,15 +220,15 @@ def _welcome(platform: Any, name: str) -> None:
     from rse_pf.local.control.status import data_url
 
     which = "" if name == DEFAULT_NAME else f" --name {name}"
-    large = (
-        f"large data goes to {data_url(platform.url)}\n" if platform.data_servers.process.is_running() else ""
-    )
-    print(
-        f"\nrobots connect to  {platform.url}\n{large}"
-        f"a robot's token    rse-pf token issue robot-1{which}\n"
-        f"to stop            Ctrl-C, or rse-pf local stop{which}\n"
-        f"logs and state     {platform.state}\n",
-        flush=True,
+    has_data = platform.data_servers.process.is_running()
+    show(
+        "",
+        f"robots connect to  {platform.url}",
+        *([f"large data goes to {data_url(platform.url)}"] if has_data else []),
+        f"a robot's token    rse-pf token issue robot-1{which}",
+        f"to stop            Ctrl-C, or rse-pf local stop{which}",
+        f"logs and state     {platform.state}",
+        "",
     )
 
 
@@ -237,7 +239,7 @@ def _show(event: Any) -> None:
             key: ", ".join(map(str, value)) if isinstance(value, list) else value
             for key, value in event.items()
         }
-        print(text.format_map(collections.defaultdict(lambda: "-", values)), flush=True)
+        show(text.format_map(collections.defaultdict(lambda: "-", values)))
 
 
 _TEXTS = {

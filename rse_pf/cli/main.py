@@ -20,6 +20,7 @@ from rse_pf.config import load_settings
 from rse_pf.config.renames import hint_for_old_option
 from rse_pf.config.validation import did_you_mean
 from rse_pf.errors import ConfigurationError, RsePfError, UsageError
+from rse_pf.terminal import show, show_error, show_page
 
 __all__ = ["VERBS", "Parser", "main"]
 
@@ -87,10 +88,10 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _run(words: list[str]) -> int:
     if not words or words[0] in ("-h", "--help", "help"):
-        print(_front_page())
+        show_page(_front_page())
         return _EXIT_OK
     if words[0] == "--version":
-        print(f"rse-pf {_version()}")
+        show(f"rse-pf {_version()}")
         return _EXIT_OK
     name, *rest = words
     if name.startswith("-"):
@@ -140,7 +141,7 @@ def _version() -> str:
 
 
 def _report(error: RsePfError) -> int:
-    print(error.report(), file=sys.stderr)
+    show_error(error)
     return _EXIT_USAGE if isinstance(error, ConfigurationError) else _EXIT_FAILED
 
 

@@ -18,9 +18,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import json
 import re
-import sys
 import threading
 import time
 from collections import Counter
@@ -41,6 +39,7 @@ from rse_pf.geometry import Camera, rotation_angle_deg, to_quaternion
 from rse_pf.maps.export import FORMATS, export_map
 from rse_pf.maps.format import MapVersion
 from rse_pf.maps.registry import MapRecord, MapRegistry, difference
+from rse_pf.terminal import show, show_json, show_progress
 
 if TYPE_CHECKING:
     from rse_pf.services.mapping.localise import LocaliseReply
@@ -217,7 +216,7 @@ def _view(args: argparse.Namespace, maps: MapRegistry) -> None:
             browse_map(
                 version,
                 args.port,
-                lambda url: print(f"{url}  (Ctrl-C ends it)", flush=True),
+                lambda url: show(f"{url}  (Ctrl-C ends it)"),
                 threading.Event(),
             )
         return
@@ -241,7 +240,7 @@ def _merge(args: argparse.Namespace, maps: MapRegistry) -> int:
         maps=[maps.data(name, record.id) for (name, _), record in zip(names, records, strict=True)]
     )
     began = time.perf_counter()
-    reply = merge_maps(request, report=_progress(sys.stderr))
+    reply = merge_maps(request, report=_progress)
     seconds = round(time.perf_counter() - began, 3)
     not_joined = [(args.names[each.map], each.reason) for each in reply.not_joined]
     if len(args.names) > 1 and len(reply.joined) < 2:
@@ -302,7 +301,7 @@ def _localise(args: argparse.Namespace, maps: MapRegistry) -> int:
         location = locate(index, _view_of(each, version_map, args.camera))
         found.append(_found(each.label, location))
         if not args.json:
-            print(_location_line(found[-1]), flush=True)
+            show(_location_line(found[-1]))
     good = sum(each["verdict"] == "ok" for each in found)
     _print(args, found, f"{good} of {len(found)} found")
     return 0 if good else 1
@@ -480,15 +479,9 @@ def _refused(names: Sequence[str], reply: MergeReply) -> list[dict[str, Any]]:
     return [{"between": between, "reasons": reasons} for between, reasons in pairs.items()]
 
 
-def _progress(screen: Any) -> Any:
-    """Return a callback that rewrites one line of a terminal, and prints nothing to a file or pipe."""
-
-    def report(done: float, what: str) -> None:
-        if screen.isatty():
-            end = "\n" if done >= 1.0 else ""
-            print(f"\r\033[K{100 * done:3.0f} %  {what}", end=end, file=screen, flush=True)
-
-    return report
+def _progress(done: float, what: str) -> None:
+    """Show how much of a merge is done, between 0 and 1, and what is being done."""
+    show_progress(f"{100 * done:3.0f} %  {what}", is_over=done >= 1.0)
 
 
 def _record_line(record: MapRecord) -> str:
@@ -519,4 +512,7 @@ def _rows(*rows: tuple[str, object]) -> list[str]:
 
 def _print(args: argparse.Namespace, value: Any, *lines: str) -> None:
     """Print *value* with ``--json``, else *lines*."""
-    print(json.dumps(value, indent=2, sort_keys=True, default=str) if args.json else "\n".join(lines))
+    if args.json:
+        show_json(value, indent=2, sort_keys=True)
+    else:
+        show(*lines)

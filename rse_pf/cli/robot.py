@@ -17,7 +17,6 @@ examples:
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import sys
 import time
@@ -39,6 +38,7 @@ from rse_pf.auth.roster import (
 from rse_pf.auth.trust_store import AccessControlStore
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import UsageError
+from rse_pf.terminal import show, show_json
 
 __all__ = ["add_arguments", "add_place", "max_token_s", "open_access_control", "record_action", "run"]
 
@@ -90,7 +90,7 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
     if args.action == "keygen":
         from rse_pf.auth.robot_key import make_robot_key
 
-        print(make_robot_key(args.out))
+        show(make_robot_key(args.out))
         return 0
     access, now = open_access_control(args, settings), time.time()
     if args.action == "list":
@@ -106,7 +106,7 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
             lambda denied: denied.pruned(now=now, max_token_s=longest).with_robot(tenant, robot, now)
         )
         record_action(args, settings, "robot.disabled", robot, tenant=tenant)
-        print(f"robot {robot!r} is disabled: its connections end within 2 s, and all its tokens are refused")
+        show(f"robot {robot!r} is disabled: its connections end within 2 s, and all its tokens are refused")
         return 0
     if not access.deny_list().is_disabled(tenant, robot):
         raise UsageError(f"robot {robot!r} is not disabled", hint="rse-pf robot list shows who is")
@@ -117,7 +117,7 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
 
     access.change_deny_list(enabled)
     record_action(args, settings, "robot.enabled", robot, tenant=tenant)
-    print(f"robot {robot!r} is enabled again, for tokens issued from now on")
+    show(f"robot {robot!r} is enabled again, for tokens issued from now on")
     return 0
 
 
@@ -186,7 +186,7 @@ def _enrol(
     record_action(
         args, settings, "robot.enrolled", robot.robot, tenant=robot.tenant, key=robot.key_id, scopes=allowed
     )
-    print(f"robot {robot.robot!r} is enrolled with {robot.key_id}; it may use {allowed}")
+    show(f"robot {robot.robot!r} is enrolled with {robot.key_id}; it may use {allowed}")
     return 0
 
 
@@ -200,7 +200,7 @@ def _remove(args: argparse.Namespace, access: AccessControlStore, settings: Plat
 
     access.change_roster(without)
     record_action(args, settings, "robot.removed", args.robot, tenant=args.tenant, key=found.key_id)
-    print(f"robot {args.robot!r} is removed: tokens signed by {found.key_id} are refused within 2 s")
+    show(f"robot {args.robot!r} is removed: tokens signed by {found.key_id} are refused within 2 s")
     return 0
 
 
@@ -230,12 +230,12 @@ def _list(args: argparse.Namespace, access: AccessControlStore) -> int:
         if each.tenant == args.tenant and roster.find(each.tenant, each.robot) is None:
             rows.append({"robot": each.robot, "state": "disabled", "key": "no key of its own", "scopes": []})
     if args.json:
-        print(json.dumps(rows, indent=2))
+        show_json(rows, indent=2)
         return 0
     for row in rows:
-        print(f"{row['robot']}  {row['state']}  {row['key']}  {' '.join(row['scopes'])}".rstrip())
+        show(f"{row['robot']}  {row['state']}  {row['key']}  {' '.join(row['scopes'])}".rstrip())
     if not rows:
-        print("no robot is enrolled or disabled; other robots use tokens of rse-pf token issue")
+        show("no robot is enrolled or disabled; other robots use tokens of rse-pf token issue")
     return 0
 
 

@@ -33,6 +33,7 @@ from rse_pf.errors import CommandFailed, RsePfError, UsageError
 from rse_pf.local.state import read_state, state_folder
 from rse_pf.services.custom.installed import install, installed_services, read_service
 from rse_pf.services.custom.native import INCLUDE_FOLDER
+from rse_pf.terminal import error_lines, show, show_json
 
 __all__ = ["add_arguments", "run"]
 
@@ -110,10 +111,11 @@ def _new(name: str, language: str, where: Path) -> int:
         target.write_text(text, encoding="utf-8")
     if language == "cpp":
         shutil.copytree(INCLUDE_FOLDER, folder / "include")
-    print(
-        f"{folder} is a working service\n\n"
-        f"  rse-pf service test {name}     replay its recorded request\n"
-        f"  rse-pf service run {name}      serve it, and load every saved change"
+    show(
+        f"{folder} is a working service",
+        "",
+        f"  rse-pf service test {name}     replay its recorded request",
+        f"  rse-pf service run {name}      serve it, and load every saved change",
     )
     return 0
 
@@ -121,16 +123,16 @@ def _new(name: str, language: str, where: Path) -> int:
 def _install(source: Path, folder: Path) -> int:
     _build(source)
     service = install(read_service(source).folder, folder)
-    print(
-        f"{service.name} ({service.language}) is installed in {folder}\n"
-        f"serve it with: rse-pf local --services {folder}"
+    show(
+        f"{service.name} ({service.language}) is installed in {folder}",
+        f"serve it with: rse-pf local --services {folder}",
     )
     return 0
 
 
 def _list(folder: Path) -> int:
     for service in installed_services(folder):
-        print(f"{service.name:<24} {service.language:<8} {service.kind:<18} {service.folder}")
+        show(f"{service.name:<24} {service.language:<8} {service.kind:<18} {service.folder}")
     return 0
 
 
@@ -157,7 +159,7 @@ def _build(source: Path) -> None:
         if done.returncode != 0:
             output = (done.stderr or done.stdout).strip()[-1500:]
             raise CommandFailed(f"{' '.join(command)} failed:\n{output}", hint=f"fix the sources in {folder}")
-    print(f"built {folder / 'build'}")
+    show(f"built {folder / 'build'}")
 
 
 def _mtimes(folder: Path, *, without: str) -> Iterable[float]:
@@ -176,9 +178,9 @@ def _test(source: Path, settings: PlatformSettings) -> int:
 
     _build(source)
     service, recorded = read_service(source), _recorded(source)
-    missing, runs = dry_run(service, [each["request"] for _, each in recorded], settings, print)
+    missing, runs = dry_run(service, [each["request"] for _, each in recorded], settings, show)
     if missing:
-        print(f"note: this machine lacks isolation that a server has: {', '.join(missing)}")
+        show(f"note: this machine lacks isolation that a server has: {', '.join(missing)}")
     wrong = 0
     for (name, each), each_run in zip(recorded, runs, strict=True):
         answer, expected = each_run.answer, each.get("reply")
@@ -190,8 +192,8 @@ def _test(source: Path, settings: PlatformSettings) -> int:
             detail = _difference(_plain(answer.reply), expected, tolerance) if "reply" in each else ""
             good = "failure" not in each and not detail
         wrong += not good
-        print(f"{name:<28} {'ok' if good else 'WRONG':<6} {each_run.took_ms:8.1f} ms  {detail}")
-    print(f"{len(runs) - wrong} of {len(runs)} recorded requests as expected")
+        show(f"{name:<28} {'ok' if good else 'WRONG':<6} {each_run.took_ms:8.1f} ms  {detail}")
+    show(f"{len(runs) - wrong} of {len(runs)} recorded requests as expected")
     return 1 if wrong else 0
 
 
@@ -252,11 +254,11 @@ async def _run(source: Path, settings: PlatformSettings, *, once: bool) -> int:
         async with LocalPlatform(
             chosen, state=place / "platform", servers=1, port=0, name="service"
         ) as platform:
-            print(f"{service.name} is served at {platform.url}", flush=True)
+            show(f"{service.name} is served at {platform.url}")
             good = await _ask_recorded(platform, service, recorded, settings)
             if once:
                 return 0 if good else 1
-            print(f"save a file in {source} to load it anew; Ctrl-C ends", flush=True)
+            show(f"save a file in {source} to load it anew; Ctrl-C ends")
             seen = max(_mtimes(service.folder, without="build"))
             while not stopped.is_set():
                 try:
@@ -278,7 +280,7 @@ async def _reload(
         await platform.roll()
         await _ask_recorded(platform, service, recorded, settings)
     except RsePfError as error:  # the author corrects it and saves again
-        print(error.report(), flush=True)
+        show(*error_lines(error))
 
 
 async def _ask_recorded(platform: Any, service: Any, recorded: Recorded, settings: PlatformSettings) -> bool:
@@ -298,12 +300,12 @@ async def _ask_recorded(platform: Any, service: Any, recorded: Recorded, setting
             except RsePfError as error:
                 if each.get("failure") != error.code:
                     failed.append(each["request"])
-                print(f"{path}: {error.code}: {error.message}", flush=True)
+                show(f"{path}: {error.code}: {error.message}")
                 continue
             shown = json.dumps(_plain(answer.reply))
-            print(f"{path}: {shown[:500]}  ({answer.round_trip_ms:.1f} ms)", flush=True)
+            show(f"{path}: {shown[:500]}  ({answer.round_trip_ms:.1f} ms)")
     if failed:
-        await asyncio.to_thread(dry_run, service, failed[:1], settings, lambda line: print(f"  {line}"))
+        await asyncio.to_thread(dry_run, service, failed[:1], settings, lambda line: show(f"  {line}"))
     return not failed
 
 
@@ -320,7 +322,7 @@ async def _call(name: str, request: str | None, platform: str, settings: Platfor
     )
     async with connect(state.url, token=token) as robot:
         answer = await robot.call(name, payload)
-    print(json.dumps(_plain(answer.reply)))
+    show_json(_plain(answer.reply))
     return 0
 
 

@@ -8,10 +8,10 @@ examples:
 from __future__ import annotations
 
 import argparse
-import json
 
 from rse_pf.config import PlatformSettings, setting_rows, settings_page
 from rse_pf.errors import UsageError
+from rse_pf.terminal import show, show_json, show_page
 
 __all__ = ["add_arguments", "run"]
 
@@ -28,22 +28,22 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
     """Print the table."""
     values = settings.to_dict()
     if args.group == "digest":
-        print(settings.digest())
+        show(settings.digest())
         return 0
     if args.markdown:
-        print(settings_page(), end="")
+        show_page(settings_page())
         return 0
     if args.group is not None:
         if args.group not in values:
             raise UsageError(f"no group named {args.group!r}", hint=f"groups are {', '.join(values)}")
         values = {args.group: values[args.group]}
     if args.json:
-        print(json.dumps(values, indent=2))
+        show_json(values, indent=2)
         return 0
     for row in setting_rows(settings):
         if row.group not in values:
             continue
         changed = "" if row.value == row.default else f"  (default {row.default})"
         unit = f" {row.unit}" if row.unit else ""
-        print(f"{row.group}.{row.name} = {row.value}{unit}{changed}\n    {row.doc} [{row.source}]")
+        show(f"{row.group}.{row.name} = {row.value}{unit}{changed}", f"    {row.doc} [{row.source}]")
     return 0

@@ -14,6 +14,8 @@ import os
 import sys
 import threading
 
+from rse_pf.terminal import show
+
 __all__ = ["main"]
 
 _MODULES = (
@@ -54,7 +56,7 @@ def _import_slowly(ordered: threading.Event) -> None:
             return
         importlib.import_module(name)
     importlib.import_module("rse_pf.backend.supervisor").warm_up()
-    print("warm", flush=True)
+    show("warm")
 
 
 if __name__ == "__main__":

@@ -22,7 +22,6 @@ examples:
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import secrets
 import sys
@@ -37,6 +36,7 @@ from rse_pf.cli.robot import add_place, max_token_s, open_access_control, record
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import ConfigurationError, Unauthorized, UsageError
 from rse_pf.files import OWNER_ONLY, replace_file
+from rse_pf.terminal import show, show_json
 
 if TYPE_CHECKING:
     from rse_pf.aws.storage.key_store import KeyStore
@@ -122,7 +122,7 @@ def _issue(args: argparse.Namespace, settings: PlatformSettings) -> int:
     )
     if args.key is None:
         record_action(args, settings, "token.issued", args.subject, tenant=args.tenant, token=token_id)
-    print(token)
+    show(token)
     return 0
 
 
@@ -141,7 +141,7 @@ def _revoke(args: argparse.Namespace, settings: PlatformSettings) -> int:
             )
         )
         record_action(args, settings, "token.revoked-all", robot, tenant=tenant)
-        print(f"every token of {robot!r} until now is revoked; tokens issued after one second are valid")
+        show(f"every token of {robot!r} until now is revoked; tokens issued after one second are valid")
         return 0
     header, claims = unverified_parts(_token(args.subject))
     name, token_id, over = claims.get("sub"), claims.get("jti"), claims.get("exp")
@@ -158,7 +158,7 @@ def _revoke(args: argparse.Namespace, settings: PlatformSettings) -> int:
         lambda denied: denied.pruned(now=now, max_token_s=longest).with_token(tenant, name, token_id, until_s)
     )
     record_action(args, settings, "token.revoked", name, tenant=tenant, token=token_id)
-    print(f"token {token_id} of {name!r} is revoked: its connections end within 2 s")
+    show(f"token {token_id} of {name!r} is revoked: its connections end within 2 s")
     return 0
 
 
@@ -191,20 +191,20 @@ def _change_keys(args: argparse.Namespace, settings: PlatformSettings) -> int:
     if args.action in ("rotate", "rotate-keys"):
         ring = store.ring().rotated(new, now=now, settings=settings)
         store.write(ring)
-        print(f"key {new.key_id} is published, and signs in {spread_s(settings):g} s")
+        show(f"key {new.key_id} is published, and signs in {spread_s(settings):g} s")
         return 0
     if args.action == "retire":
         ring = store.ring().retired(now=now, force=args.force)
         store.write(ring)
-        print(f"only key {ring.keys[0][0].key_id} is trusted; servers know in {spread_s(settings):g} s")
+        show(f"only key {ring.keys[0][0].key_id} is trusted; servers know in {spread_s(settings):g} s")
         return 0
     there = store.read()
     if there is not None:  # it may never have been published
         store.publish(there)
-        print(f"key {there.signer(now).key_id} exists already; its public half is published again")
+        show(f"key {there.signer(now).key_id} exists already; its public half is published again")
         return 0
     store.write(KeyRing(keys=((new, now),)))
-    print(f"key {new.key_id} is created; servers know it in {spread_s(settings):g} s")
+    show(f"key {new.key_id} is created; servers know it in {spread_s(settings):g} s")
     return 0
 
 
@@ -220,7 +220,7 @@ def _rotate_local(args: argparse.Namespace, settings: PlatformSettings) -> int:
     replace_file(key_set_file(folder), public.to_json(), mode=0o644)
     replace_file(key_file(folder), new.to_json(), mode=OWNER_ONLY)
     record_action(args, settings, "key.rotated", new.key_id, before=old.key_id)
-    print(f"key {new.key_id} signs from now on; tokens of {old.key_id} are valid until they expire")
+    show(f"key {new.key_id} signs from now on; tokens of {old.key_id} are valid until they expire")
     return 0
 
 
@@ -237,7 +237,7 @@ def _inspect(args: argparse.Namespace, settings: PlatformSettings) -> int:
     now = time.time()
     verdict, code = _verdict(token, _keys(args, settings), now, settings)
     told = {"header": header, "claims": claims, "seconds_left": _left(claims, now), "verified": verdict}
-    print(json.dumps(told, indent=2))
+    show_json(told, indent=2)
     return code
 
 

@@ -10,7 +10,6 @@ import asyncio
 import os
 import signal
 import socket
-import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -26,6 +25,7 @@ from rse_pf.data_server.app import DataServer
 from rse_pf.errors import ConfigurationError, MissingExtra, StoreError
 from rse_pf.files import replace_json
 from rse_pf.object_store import DirectoryStore, ObjectStore
+from rse_pf.terminal import json_line, show
 
 __all__ = ["KeysFile", "serve_data"]
 
@@ -174,4 +174,4 @@ def _listen(settings: PlatformSettings) -> socket.socket:
 
 
 def _write_line(fields: dict[str, Any]) -> None:
-    sys.stderr.write(msgspec.json.encode({"t": round(time.time(), 3), **fields}).decode() + "\n")
+    show(json_line({"t": round(time.time(), 3), **fields}, msgspec.json.encode).decode(), error=True)

@@ -13,7 +13,7 @@ from collections.abc import Iterator, Mapping
 import pytest
 
 ORDER = (
-    "rse_pf", "errors", "terminal", "linux", "limited_process", "files", "geometry", "token_bucket", "config",
+    "rse_pf", "errors", "terminal", "linux", "limited_process", "files", "geometry", "token_bucket", "config", "budget",
     "wire", "scaling", "object_store", "identity", "maps", "auth", "audit", "service",
     "pnp", "services.mapping", "services.custom", "services",
     "aws", "aws.storage", "aws.fleet", "aws.money",

@@ -36,6 +36,7 @@ from rse_pf.errors import NotFound, RsePfError
 from rse_pf.files import replace_file
 from rse_pf.object_store import ObjectStore
 from rse_pf.scaling.alarms import NAMESPACE
+from rse_pf.terminal import show, show_error
 
 __all__ = ["Agent", "AgentConfig", "main"]
 
@@ -200,7 +201,7 @@ def main(arguments: list[str] | None = None) -> int:
             agent.fetch_access_control()
             return 0
     except RsePfError as error:
-        sys.stderr.write(f"{error.report()}\n")
+        show_error(error)
         return 2
     threading.Thread(target=agent.watch_access_control, daemon=True).start()
     while True:
@@ -220,8 +221,7 @@ def _shipper(args: argparse.Namespace, region: str, machine: Instance) -> Shippe
 
 def _log(event: str, **fields: Any) -> None:
     line = {"at_s": round(time.time(), 3), "event": f"agent-{event}", **fields}
-    sys.stderr.write(json.dumps(line) + "\n")
-    sys.stderr.flush()
+    show(json.dumps(line), error=True)
 
 
 if __name__ == "__main__":

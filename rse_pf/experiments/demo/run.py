@@ -42,6 +42,7 @@ from rse_pf.experiments.results.result_folder import (
     write_json,
 )
 from rse_pf.local.control.platform import LocalPlatform
+from rse_pf.terminal import show_page
 
 if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
@@ -81,7 +82,7 @@ def run_demo(options: DemoOptions, settings: PlatformSettings) -> int:
     chosen = settings.replace(pnp={"engine": options.engine})
     with (folder / EVENTS).open("w", encoding="utf-8") as file:
         report = asyncio.run(_run(options, chosen, folder, EventLog(file)))
-    print(closing_lines(report, folder))
+    show_page(closing_lines(report, folder))
     return 0 if report["commands"]["lost"] == 0 else 1
 
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import asyncio
 import shutil
-import sys
 import tempfile
 import time
 from collections.abc import Callable, Mapping
@@ -31,6 +30,7 @@ from rse_pf.experiments.results.result_folder import (
 )
 from rse_pf.experiments.results.summary import answered_percent, percentiles, summarise
 from rse_pf.local.control.platform import LocalPlatform
+from rse_pf.terminal import show, show_page
 
 __all__ = ["FAST_MS", "TargetPlatform", "report_of", "run_swarm"]
 
@@ -69,7 +69,7 @@ def run_swarm(
     write_commands(folder / COMMANDS, result.commands)
     report = report_of(options, seconds, result, before)
     write_json(folder / "report.json", report)
-    print(_table(report, folder))
+    show_page(_table(report, folder))
     commands = report["commands"]
     return 1 if commands["lost"] or result.duplicates or result.wrong_poses or not commands["answered"] else 0
 
@@ -205,4 +205,4 @@ def _ms(value: float | None) -> str:
 
 def _say(quiet: bool, text: str) -> None:
     if not quiet:
-        print(text, file=sys.stderr, flush=True)
+        show(text, error=True)

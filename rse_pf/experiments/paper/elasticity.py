@@ -26,6 +26,7 @@ from rse_pf.experiments.results.records import Event, Records, parameters_of, re
 from rse_pf.experiments.results.result_folder import RUN_FILES, finish_report, fresh_folder, load_average
 from rse_pf.experiments.results.summary import PAPER, summarise, summary_of
 from rse_pf.local.control.monitor import MonitorSample
+from rse_pf.terminal import show, show_page
 
 __all__ = [
     "ElasticityOptions",
@@ -107,10 +108,12 @@ def run_elasticity(options: ElasticityOptions, settings: PlatformSettings) -> in
         "generator": {name: generator_of(each) for name, each in records.items()},
         "paper": PAPER,
     }
-    print(finish_report(folder, report, lambda whole: elasticity_page(whole, figures), chosen, load_before))
+    show_page(
+        finish_report(folder, report, lambda whole: elasticity_page(whole, figures), chosen, load_before)
+    )
     captions = {"": "with rebalancing" if options.rebalance else "without rebalancing"}
     draw_elasticity(folder / FIGURE, {captions.get(name, name): each for name, each in records.items()})
-    print(f"wrote {FIGURE}, report.json, report.md and the raw records to {options.out}")
+    show(f"wrote {FIGURE}, report.json, report.md and the raw records to {options.out}")
     return int(any(run["commands"]["lost"] or run["commands"]["twice"] for run in figures.values()))
 
 
@@ -134,12 +137,11 @@ async def _emulated_cores(
     cost = await _measure(options, settings, scratch)
     shutil.rmtree(scratch)
     cores = cost.emulated_cores(options.robots * options.fps, settings.scaling.busy_cpu_percent)
-    print(
+    show(
         f"one command costs a server {1000 * cost.command_s:.2f} ms of CPU, an idle second "
-        f"{1000 * cost.idle_s_per_s:.1f} ms (measured over {cost.commands} commands)\n"
+        f"{1000 * cost.idle_s_per_s:.1f} ms (measured over {cost.commands} commands)",
         f"each server emulates {cores:g} cores, so that {options.robots} robots x {options.fps:g} fps need "
         f"about {_SERVERS_AT_FULL} servers at {settings.scaling.busy_cpu_percent:g} %",
-        flush=True,
     )
     return cores, cost
 
@@ -226,13 +228,13 @@ async def _crash(harness: Harness, quiet_s: float) -> None:
     await harness.wait_for(lambda: bool(harness.events_since("server-gone", began)), 10.0)
     await harness.wait_for(lambda: harness.samples[-1].healthy_servers >= healthy, 60.0)
     await harness.wait_quiet(quiet_s, timeout_s=3 * quiet_s + 20.0)
-    print(f"{victim} was killed at {began:.1f} s", flush=True)
+    show(f"{victim} was killed at {began:.1f} s")
 
 
 def _phase(harness: Harness, name: str) -> None:
     harness.log("phase", phase=name)
     healthy = harness.samples[-1].healthy_servers if harness.samples else 0
-    print(f"{harness.now():7.1f} s  {name:<8}  {healthy} healthy servers", flush=True)
+    show(f"{harness.now():7.1f} s  {name:<8}  {healthy} healthy servers")
 
 
 _FEWER = "fewer than"

@@ -24,6 +24,7 @@ from rse_pf.experiments.results.records import CommandRecord, Records, parameter
 from rse_pf.experiments.results.result_folder import RUN_FILES, finish_report, fresh_folder, load_average
 from rse_pf.experiments.results.summary import PAPER, ROUND_TRIP_PARTS, answered_percent, summary_of
 from rse_pf.local.faults.network_emulator import profile_named
+from rse_pf.terminal import show, show_page
 
 __all__ = ["LatencyOptions", "latency_figures", "latency_page", "run_latency"]
 
@@ -59,12 +60,12 @@ def run_latency(options: LatencyOptions, settings: PlatformSettings) -> int:
         "generator": {"": generator_of(records)},
         "paper": PAPER,
     }
-    print(finish_report(folder, report, latency_page, settings, load_before))
+    show_page(finish_report(folder, report, latency_page, settings, load_before))
     link = f"link profile {options.link}" if options.link else "no emulated link"
     draw_latency(
         folder / FIGURE, figures, f"RSE-PF, latency: {options.robots} robots x {options.fps:g} fps, {link}"
     )
-    print(f"wrote {FIGURE}, report.json, report.md and the raw records to {options.out}")
+    show(f"wrote {FIGURE}, report.json, report.md and the raw records to {options.out}")
     return int(figures["commands"]["lost"] > 0 or figures["commands"]["twice"] > 0)
 
 

@@ -31,6 +31,7 @@ from rse_pf.experiments.results.result_folder import finish_report, load_average
 from rse_pf.experiments.results.summary import PAPER, summarise
 from rse_pf.experiments.results.trajectory_error import trajectory_figures
 from rse_pf.local.control.monitor import MonitorSample, ServerSample
+from rse_pf.terminal import show_page
 
 __all__ = ["map_figures", "map_page", "run_map"]
 
@@ -51,7 +52,7 @@ def run_map(options: DemoOptions, settings: PlatformSettings) -> int:
         "seed": options.seed,
     }
     report = {"experiment": "map", "asked": asked, **map_figures(read_records(folder)), "paper": PAPER}
-    print(finish_report(folder, report, map_page, settings, load_before))
+    show_page(finish_report(folder, report, map_page, settings, load_before))
     return code
 
 

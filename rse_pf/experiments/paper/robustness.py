@@ -32,6 +32,7 @@ from rse_pf.experiments.results.summary import (
     summary_of,
 )
 from rse_pf.local.control.monitor import MonitorSample
+from rse_pf.terminal import show
 
 __all__ = [
     "BARS",
@@ -79,7 +80,7 @@ def run_robustness(options: RobustnessOptions, settings: PlatformSettings) -> in
             (folder / name).mkdir()
             asyncio.run(_run(options, settings, folder / name, scenario, options.seed + len(runs)))
             runs[name] = robustness_figures(read_records(folder / name))
-            print(_line(name, runs[name]), flush=True)
+            show(_line(name, runs[name]))
     records = {name: read_records(folder / name) for name in runs}
     report = {
         "experiment": "robustness",
@@ -90,7 +91,7 @@ def run_robustness(options: RobustnessOptions, settings: PlatformSettings) -> in
     }
     finish_report(folder, report, robustness_page, settings, load_before)
     draw_robustness(folder / FIGURE, records, runs)
-    print(f"wrote {FIGURE}, report.json, report.md and the raw records to {options.out}")
+    show(f"wrote {FIGURE}, report.json, report.md and the raw records to {options.out}")
     return int(any(run["commands"]["lost"] or run["commands"]["twice"] for run in runs.values()))
 
 

@@ -6,7 +6,7 @@ Drawn with Pillow alone, because matplotlib and its fonts would be a fifth of wh
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +15,7 @@ import numpy.typing as npt
 
 from rse_pf.errors import MissingExtra
 from rse_pf.geometry import Array
+from rse_pf.terminal import printable
 
 __all__ = ["COLOURS", "RobotPath", "draw_map"]
 
@@ -56,6 +57,7 @@ def draw_map(
         MissingExtra: Pillow is not installed.
     """
     image_module, draw_module, font_module = _pillow()
+    robots = [replace(robot, name=printable(robot.name)) for robot in robots]
     up = _up(robots)
     shown = _below_ceiling(points_world, robots, up)
     points, tints = points_world[shown].astype(np.float64), colours[shown]
@@ -73,7 +75,8 @@ def draw_map(
                 place, robot.name, fill=_INK, font=small, anchor="mm", stroke_width=4, stroke_fill=_WHITE
             )
     scale_left = _draw_scale(draw, view, small)
-    draw.text((_MARGIN, 18), _fitting(draw, caption, big, _WIDTH - 2 * _MARGIN), fill=_INK, font=big)
+    text = _fitting(draw, printable(caption), big, _WIDTH - 2 * _MARGIN)
+    draw.text((_MARGIN, 18), text, fill=_INK, font=big)
     _draw_legend(draw, robots, small, scale_left - _MARGIN)
     image.save(path, format="PNG")
 

@@ -15,6 +15,7 @@ from rse_pf.errors import MissingExtra, UsageError
 from rse_pf.experiments.plots.map_image import COLOURS
 from rse_pf.geometry import to_quaternion
 from rse_pf.maps.format import MapVersion
+from rse_pf.terminal import printable
 
 __all__ = ["browse_map"]
 
@@ -68,7 +69,7 @@ def _draw(server: Any, version: MapVersion) -> None:
         T, camera = keyframe.T_world_camera, keyframe.camera
         x, y, z, w = to_quaternion(T[:3, :3])
         server.scene.add_camera_frustum(
-            f"/{keyframe.robot}/{keyframe.id}",
+            f"/{printable(keyframe.robot)}/{keyframe.id}",
             fov=float(2 * np.arctan2(camera.height / 2, camera.fy)),
             aspect=camera.width / camera.height,
             scale=_CAMERA_M,

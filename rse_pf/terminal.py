@@ -1,0 +1,134 @@
+"""Write text to a terminal, a page or a log, and escape what a robot may have hidden in it.
+
+Names, notes, provenance, answers of services and messages of errors may come from a robot.  A control
+character in them would move the cursor, change the clipboard or forge a line; an override of the writing
+direction, or an invisible character, would make one name look like another.  Commands write only through
+`show`, and logs only through `json_line`, so that no caller has to know whose a text is.  Letters of every
+language stay as they are.
+
+Source:
+    The Unicode Standard 15, Sect. 4.5 (general categories) and 5.21 (characters that are ignored in display);
+    Boucher and Anderson, "Trojan Source", 2021.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import sys
+import unicodedata
+from collections.abc import Callable
+from typing import Any, TextIO
+
+from rse_pf.errors import RsePfError
+
+__all__ = [
+    "error_lines",
+    "json_line",
+    "printable",
+    "show",
+    "show_error",
+    "show_json",
+    "show_page",
+    "show_progress",
+]
+
+_HIDDEN_CATEGORIES = {"Cc", "Cf", "Cs", "Co", "Cn", "Zl", "Zp"}
+# Letters, marks and symbols that are drawn as nothing, although their category does not say so.
+_INVISIBLE = re.compile(
+    "[\u034f\u115f\u1160\u17b4\u17b5\u180b-\u180f\u2800\u3164\ufe00-\ufe0f\uffa0\U000e0000-\U000e0fff]"
+)
+_SHORT = {"\n": r"\n", "\r": r"\r", "\t": r"\t"}
+_NOT_ASCII = re.compile(r"[^\x20-\x7e]")
+_CONTINUED = "  | "
+_CLEAR_LINE = "\r\033[K"
+
+
+def printable(text: str) -> str:
+    r"""Return *text* with every character that is not simply drawn as its escape, such as ``\x1b``.
+
+    Escaped are control, format, private, unassigned and invisible characters, surrogates, and all separators
+    of lines.  An escaped text is returned as it is, so that escaping twice changes nothing.
+    """
+    if text.isascii() and text.isprintable():
+        return text
+    return _NOT_ASCII.sub(_escape, text)
+
+
+def show(*lines: str, error: bool = False) -> None:
+    """Write lines to standard output, each on one line whatever it holds.
+
+    Args:
+        *lines: Without the newlines that end them; a newline inside a line is escaped.
+        error: Write to standard error instead.
+    """
+    _write(sys.stderr if error else sys.stdout, "".join(f"{printable(line)}\n" for line in lines))
+
+
+def show_page(text: str) -> None:
+    """Write a text of several lines, in which nothing of a robot ends a line, to standard output."""
+    show(*text.removesuffix("\n").split("\n"))
+
+
+def show_json(value: Any, *, indent: int | None = None, sort_keys: bool = False) -> None:
+    """Write *value* to standard output as JSON in ASCII; what JSON cannot hold is written as text."""
+    _write(sys.stdout, json.dumps(value, indent=indent, sort_keys=sort_keys, default=str) + "\n")
+
+
+def show_error(error: RsePfError) -> None:
+    """Write what is wrong, and what to do, to standard error."""
+    show(*error_lines(error), error=True)
+
+
+def error_lines(error: RsePfError) -> list[str]:
+    """Return the report on *error* as lines; a message of several lines cannot pass for several reports."""
+    first = f"{type(error).__name__}: {error.message}".rstrip("\n").replace("\n", f"\n{_CONTINUED}")
+    return first.split("\n") + ([f"  hint: {error.hint}"] if error.hint else [])
+
+
+def show_progress(text: str, *, is_over: bool) -> None:
+    """Rewrite the last line of a terminal on standard error with *text*; write nothing to a file or pipe."""
+    if sys.stderr.isatty():
+        end = "\n" if is_over else ""
+        _write(sys.stderr, f"{_CLEAR_LINE}{printable(text)}{end}")
+
+
+def json_line(value: Any, encode: Callable[[Any], bytes]) -> bytes:
+    """Return *value* as JSON on one line, without a newline, in which nothing needs escaping any more.
+
+    Args:
+        value: What JSON can hold.
+        encode: Returns the JSON of a value in UTF-8; this module imports no encoder, to load at once.
+    """
+    try:
+        line = encode(value)
+    except UnicodeEncodeError:  # a lone surrogate
+        return json.dumps(value, default=str).encode()
+    if line.isascii() and b"\x7f" not in line:
+        return line
+    return _NOT_ASCII.sub(_escape_in_json, line.decode()).encode()
+
+
+def _escape(match: re.Match[str]) -> str:
+    letter, code = match[0], ord(match[0])
+    if not _is_hidden(letter):
+        return letter
+    form = "\\x{:02x}" if code < 0x100 else "\\u{:04x}" if code < 0x10000 else "\\U{:08x}"
+    return _SHORT.get(letter) or form.format(code)
+
+
+def _escape_in_json(match: re.Match[str]) -> str:
+    return json.dumps(match[0])[1:-1] if _is_hidden(match[0]) else match[0]
+
+
+def _is_hidden(letter: str) -> bool:
+    return unicodedata.category(letter) in _HIDDEN_CATEGORIES or _INVISIBLE.match(letter) is not None
+
+
+def _write(stream: TextIO, text: str) -> None:
+    try:
+        stream.write(text)
+    except UnicodeEncodeError:  # a terminal that has no such letters
+        encoding = stream.encoding or "ascii"
+        stream.write(text.encode(encoding, "backslashreplace").decode(encoding))
+    stream.flush()

@@ -1,0 +1,132 @@
+"""What reaches a terminal, a page or a log is drawn and never obeyed."""
+
+from __future__ import annotations
+
+import io
+import json
+import unicodedata
+
+import msgspec
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rse_pf.errors import CommandFailed
+from rse_pf.terminal import (
+    error_lines,
+    json_line,
+    printable,
+    show,
+    show_error,
+    show_json,
+    show_page,
+    show_progress,
+)
+
+OBEYED = {"Cc", "Cf", "Cs", "Co", "Zl", "Zp"}
+encode = msgspec.json.Encoder().encode
+
+
+def obeyed(text: str) -> list[str]:
+    """Return the characters of *text* that are not simply drawn."""
+    return [letter for letter in text if unicodedata.category(letter) in OBEYED]
+
+
+@pytest.mark.parametrize(
+    ("hostile", "escaped"),
+    [
+        ("\x1b[2J", r"\x1b[2J"),
+        ("\x1b]52;c;cm0gLXJm\x07", r"\x1b]52;c;cm0gLXJm\x07"),
+        ("ok\r\nforged", r"ok\r\nforged"),
+        ("\x9b31m\x7f\x00", r"\x9b31m\x7f\x00"),
+        ("\u202etxt.exe\u2066\u200f", r"\u202etxt.exe\u2066\u200f"),
+        ("robot\u200b-1\ufeff\u00ad\u034f\ufe0f\u3164", r"robot\u200b-1\ufeff\xad\u034f\ufe0f\u3164"),
+        ("a\u2028b\u2029c\x85d", r"a\u2028b\u2029c\x85d"),
+        ("\udc80\ud800", r"\udc80\ud800"),
+        ("\U000e0041\U000f0000", r"\U000e0041\U000f0000"),
+    ],
+)
+def test_what_a_terminal_would_obey_or_hide_is_escaped(hostile: str, escaped: str) -> None:
+    assert printable(hostile) == escaped
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "robot-1",
+        "Küche",
+        "厨房 三",
+        "кухня",
+        "مطبخ",
+        "रसोई",
+        "ครัว",
+        "부엌",
+        "e\u0301",
+        "π ≈ 3, 20 °C",
+        "\\x1b",
+    ],
+)
+def test_text_of_every_language_stays(text: str) -> None:
+    assert printable(text) == text
+
+
+@given(st.text(st.characters()))
+def test_nothing_is_left_to_obey_and_escaping_twice_changes_nothing(text: str) -> None:
+    shown = printable(text)
+
+    assert obeyed(shown) == []
+    assert printable(shown) == shown
+
+
+@given(st.dictionaries(st.text(), st.text(st.characters()), max_size=3))
+def test_a_line_of_a_log_holds_no_control_byte_and_reads_as_what_was_logged(fields: dict[str, str]) -> None:
+    line = json_line(fields, encode)
+
+    assert obeyed(line.decode()) == []
+    assert json.loads(line) == fields
+
+
+def test_a_newline_in_a_name_cannot_make_a_line_of_its_own(capsys: pytest.CaptureFixture[str]) -> None:
+    show("robot-1\nok: all logs are intact", "second")
+
+    assert capsys.readouterr().out == "robot-1\\nok: all logs are intact\nsecond\n"
+
+
+def test_a_message_of_several_lines_cannot_pass_for_two_reports(capsys: pytest.CaptureFixture[str]) -> None:
+    error = CommandFailed("cmake failed:\nUsageError: x\n\x1b[A", hint="fix\nit")
+
+    show_error(error)
+
+    lines = ["CommandFailed: cmake failed:", "  | UsageError: x", r"  | \x1b[A", r"  hint: fix\nit"]
+    assert capsys.readouterr().err.splitlines() == lines
+    assert error_lines(CommandFailed("short")) == ["CommandFailed: short"]
+
+
+def test_json_and_pages_are_written_whole(capsys: pytest.CaptureFixture[str]) -> None:
+    show_json({"name": "\x7f\x1b\u202e", "at": 1}, indent=None)
+    show_page("one\n\ntwo\x1b\n")
+
+    assert capsys.readouterr().out == '{"name": "\\u007f\\u001b\\u202e", "at": 1}\none\n\ntwo\\x1b\n'
+
+
+def test_a_terminal_without_the_letters_gets_their_escapes(monkeypatch: pytest.MonkeyPatch) -> None:
+    written = io.BytesIO()
+    monkeypatch.setattr("sys.stdout", io.TextIOWrapper(written, encoding="latin-1"))
+
+    show("Küche 厨房")
+
+    assert written.getvalue() == "Küche \\u53a8\\u623f\n".encode("latin-1")
+
+
+@pytest.mark.parametrize("is_terminal", [True, False])
+def test_progress_rewrites_a_line_of_a_terminal_only(
+    is_terminal: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    screen = io.StringIO()
+    monkeypatch.setattr(screen, "isatty", lambda: is_terminal, raising=False)
+    monkeypatch.setattr("sys.stderr", screen)
+
+    show_progress("50 %\n\x1b", is_over=False)
+    show_progress("done", is_over=True)
+
+    assert screen.getvalue() == ("\r\033[K50 %\\n\\x1b\r\033[Kdone\n" if is_terminal else "")
