@@ -187,7 +187,7 @@ class WorkerLost(CommandFailed, code="worker-lost"):
 
 
 class Crashed(CommandFailed, code="crashed"):
-    """The process of a long command crashed, or exceeded its memory limit."""
+    """The process of the command crashed, or exceeded its limit of memory or time."""
 
 
 class Poison(CommandFailed, code="poison"):

@@ -42,7 +42,9 @@ class Service:
     """A registered function, and what a server needs to know about it.
 
     A ``cheap`` service may run in the event loop when no command waits.  One that ``reports`` takes the
-    keyword ``report``: a long service that reports progress and can be cancelled then.
+    keyword ``report``: a long service that reports progress and can be cancelled then.  A ``limited`` one
+    decodes data that may expand to anything: a backend server computes it in a process that has a memory
+    limit and is killed at the deadline.  Such a process calls ``warm_up`` once, to import what is slow.
     """
 
     name: str
@@ -52,6 +54,8 @@ class Service:
     kind: Kind = "stateless"
     cheap: bool = False
     reports: bool = False
+    limited: bool = False
+    warm_up: Callable[[], object] | None = None
 
     @property
     def summary(self) -> str:
@@ -66,21 +70,31 @@ class Registry:
         self._services: dict[str, Service] = {}
 
     def service(
-        self, name: str, *, kind: Kind = "stateless", cheap: bool = False
+        self,
+        name: str,
+        *,
+        kind: Kind = "stateless",
+        cheap: bool = False,
+        limited: bool = False,
+        warm_up: Callable[[], object] | None = None,
     ) -> Callable[[Function], Function]:
         """Register the decorated function under *name*; a long one may also take a keyword ``report``.
 
         Raises:
-            ConfigurationError: The name is taken, or the function is not annotated with one
-                request and one reply type, both `msgspec.Struct`.
+            ConfigurationError: The name is taken, the function is not annotated with one request and one
+                reply type, both `msgspec.Struct`, or a limited service is not stateless or is cheap.
         """
+        if limited and (cheap or kind != "stateless"):
+            raise ConfigurationError(
+                f"service {name!r} is limited, but cheap or not stateless", hint="choose one of them"
+            )
 
         def register(function: Function) -> Function:
             request_type, reply_type = _signature(name, function, kind)
             self.add(
                 Service(
                     name=name, function=function, request_type=request_type, reply_type=reply_type,
-                    kind=kind, cheap=cheap,
+                    kind=kind, cheap=cheap, limited=limited, warm_up=warm_up,
                     reports=kind == "long" and _REPORT in inspect.signature(function).parameters,
                 )
             )  # fmt: skip

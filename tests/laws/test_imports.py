@@ -13,11 +13,12 @@ from collections.abc import Iterator, Mapping
 import pytest
 
 ORDER = (
-    "rse_pf", "errors", "terminal", "linux", "limited_process", "files", "geometry", "token_bucket", "config", "budget",
-    "wire", "scaling", "object_store", "identity", "maps", "auth", "audit", "service",
+    "rse_pf", "errors", "terminal", "linux", "limited_process", "files", "geometry", "token_bucket", "config",
+    "budget", "wire", "scaling", "object_store", "identity", "maps", "auth", "audit", "service",
     "pnp", "services.mapping", "services.custom", "services",
     "aws", "aws.storage", "aws.fleet", "aws.money",
-    "backend", "backend.scheduling", "backend.sandbox", "backend.jobs", "backend.gateway",
+    "backend", "backend.scheduling", "backend.sandbox", "backend.jobs", "backend.compute",
+    "backend.gateway",
     "backend.supervisor",
     "data_server",
     "local", "local.balancer", "local.servers", "local.control", "local.faults",

@@ -68,12 +68,19 @@ class Answers:
         message = dispatch(
             self._registry, command, monotonic, server=self._context.server_id, on_defect=self._log_defect
         )
+        return self.encode(queued, message, started)
+
+    def encode(self, queued: QueuedCommand, message: Result | Failure, started_s: float) -> EncodedAnswer:
+        """Return *message*, computed since *started_s*, as it is sent; runs where `compute` may run.
+
+        Blocks for the store if the reply is too large for a message.
+        """
         if isinstance(message, Result):
             message = msgspec.structs.replace(
                 message,
-                queue_ms=(started - queued.received_s) * 1e3,
+                queue_ms=(started_s - queued.received_s) * 1e3,
                 received_s=queued.received_s,
-                sent_s=monotonic(),
+                sent_s=self._context.clocks.monotonic(),
             )
         answer = self._encoded(queued, message)
         kept = self.objects.kept(message, answer.message, queued.owner)

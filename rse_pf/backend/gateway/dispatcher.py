@@ -6,10 +6,12 @@ Nothing but the computation of an answer (`Answers.compute`) runs outside of the
 
 from __future__ import annotations
 
+import math
 from asyncio import TimerHandle
 from collections.abc import Callable
 from typing import Any
 
+from rse_pf.backend.compute.lane import ComputeLane
 from rse_pf.backend.gateway.admission import DECODER_FULL, TOO_FAST, TOO_LATE, Admission, UnreadRefusal
 from rse_pf.backend.gateway.answers import Answers, EncodedAnswer
 from rse_pf.backend.gateway.connection import RobotConnection
@@ -37,7 +39,7 @@ from rse_pf.wire import CODECS, Codec, Command, make_codec
 from rse_pf.wire.envelope import Envelope, peek
 from rse_pf.wire.server_session import CLOSE_GOING_AWAY, CLOSE_RATE, ServerSession
 
-__all__ = ["Dispatcher", "JobQueue", "NoQueue", "SandboxQueue"]
+__all__ = ["ComputeQueue", "Dispatcher", "JobQueue", "NoQueue", "SandboxQueue"]
 
 _DECODER_RETRY_MS = 500.0
 _UNMEASURED_TURN_S = 0.125
@@ -46,9 +48,11 @@ them."""
 
 
 class NoQueue:
-    """Stands for the sandboxes of a server without installed services, and for jobs that are switched off."""
+    """Stands for the sandboxes of a server without installed services, and for queues that are switched
+    off."""
 
     held = 0
+    max_delay_s = math.inf
 
     def offers(self, service: str) -> bool:
         """Return False: no service is offered, so that nothing is ever submitted."""
@@ -58,6 +62,14 @@ class NoQueue:
         """Return 0."""
         return 0
 
+    def backlog(self, queued: QueuedCommand) -> tuple[int, float, float]:
+        """Return zeros."""
+        return 0, 0.0, 0.0
+
+    def leave(self, owner: object) -> list[QueuedCommand]:
+        """Return nothing."""
+        return []
+
     def report(self) -> dict[str, Any]:
         """Return nothing."""
         return {}
@@ -65,9 +77,10 @@ class NoQueue:
     def ignore(self, *_: Any) -> None:
         """Do nothing."""
 
-    submit = connected = disconnected = left = withdraw = give_up = close = ignore
+    submit = connected = disconnected = left = withdraw = give_up = close = note_refused = ignore
 
 
+ComputeQueue = ComputeLane[EncodedAnswer] | NoQueue
 SandboxQueue = SandboxManager | NoQueue
 JobQueue = JobManager | NoQueue
 
@@ -87,6 +100,7 @@ class Dispatcher:
         throttle: CpuThrottle,
         decoder: DecoderThread,
         answers: Answers,
+        compute: ComputeQueue,
         sandboxes: SandboxQueue,
         jobs: JobQueue,
         token_watch: TokenWatch,
@@ -103,6 +117,7 @@ class Dispatcher:
             throttle: Emulates a server with fewer cores.
             decoder: Decodes long messages.
             answers: Computes and sends answers.
+            compute: Runs limited services.
             sandboxes: Runs installed services.
             jobs: Runs long services.
             token_watch: Ends connections whose token is no longer valid.
@@ -118,6 +133,7 @@ class Dispatcher:
         self._scheduler = scheduler
         self._throttle = throttle
         self._answers = answers
+        self._compute = compute
         self._sandboxes = sandboxes
         self._jobs = jobs
         self._token_watch = token_watch
@@ -131,7 +147,10 @@ class Dispatcher:
             "stateless": "scheduler",
             "long": "jobs" if settings.serving.max_running_jobs else "refused",
         }
-        self._queues = {service.name: of_kind.get(service.kind, "refused") for service in registry}
+        self._queues = {
+            service.name: "compute" if compute.offers(service.name) else of_kind.get(service.kind, "refused")
+            for service in registry
+        }
         self._waits = LongestRecently()
         self._ran_inline = False
         self._throttle_timer: TimerHandle | None = None
@@ -145,7 +164,8 @@ class Dispatcher:
     @property
     def held(self) -> int:
         """Commands that wait or run."""
-        return self._scheduler.waiting + self._scheduler.running + self._sandboxes.held
+        held = self._scheduler.waiting + self._scheduler.running
+        return held + self._compute.held + self._sandboxes.held
 
     def connect(self, wire: Wire, accepted: Accepted, number: int = 0) -> RobotConnection:
         """Return the connection of a robot whose handshake is done; *number* says which socket it is."""
@@ -176,7 +196,7 @@ class Dispatcher:
         self.connections.discard(connection)
         self._token_watch.left(connection)
         self._jobs.left(connection)
-        for queued in self._scheduler.leave(connection):
+        for queued in self._scheduler.leave(connection) + self._compute.leave(connection):
             self.context.metrics.requests[self._answers.label(queued.command.service), "disconnected"] += 1
         self.context.log.debug("disconnected", robot=connection.robot)
 
@@ -202,6 +222,7 @@ class Dispatcher:
         self._threads.close()
         self.decoder.close()
         self._jobs.close()
+        self._compute.close()
         self._sandboxes.close()
 
     def refuses_unread(
@@ -252,16 +273,19 @@ class Dispatcher:
         connection.allowed_s = allowed_s
         queued = QueuedCommand(connection, connection.robot, command, size_bytes, now, now + allowed_s)
         queue = self._queue_of(command.service)
+        turns = self._compute if queue == "compute" else self._scheduler
         refusal = self._admission.judge(
-            queued, connection.claims, self._backlog(queued, queue), self._scheduler.max_delay_s
+            queued, connection.claims, self._backlog(queued, queue), turns.max_delay_s
         )
         if refusal is not None:
             if refusal.reason == "behind":
-                self._scheduler.note_refused(now)
+                turns.note_refused(now)
             self._answers.send_refusal(refusal, now)
         elif queue == "scheduler":
             self._refuse(self._scheduler.submit(queued), now)
             self._start()
+        elif queue == "compute":
+            self._compute.submit(queued, now)
         elif queue == "sandboxes":
             self._sandboxes.submit(queued)
         elif queue == "jobs":
@@ -296,6 +320,7 @@ class Dispatcher:
             "loop_lag_s": self._lag_s,
             "cpu_s": self.context.clocks.cpu(),
             "log_lines_dropped": float(self.context.log.dropped),
+            **self._compute.report(),
             **({"sandboxes": float(isolation["sandboxes"])} if isolation else {}),
         }
         self._lag_s = 0.0
@@ -364,6 +389,8 @@ class Dispatcher:
         """Return what `Admission.judge` has to know about the queue that *queued* would join."""
         if queue == "scheduler":
             return self._scheduler.backlog(queued)
+        if queue == "compute":
+            return self._compute.backlog(queued)
         waiting_of = {"sandboxes": self._sandboxes.waiting_of, "jobs": self._jobs.waiting_of}.get(queue)
         return (0 if waiting_of is None else waiting_of(queued.robot), 0.0, _UNMEASURED_TURN_S)
 

@@ -1,4 +1,4 @@
-"""Compute commands in threads beside the event loop; the solvers release the interpreter lock."""
+"""Compute commands in threads beside the event loop; solvers and waits release the interpreter lock."""
 
 from __future__ import annotations
 
@@ -18,14 +18,19 @@ class SolverThreads(Generic[Outcome]):
     """Threads of one worker; *compute* runs in them, *deliver* is told of each outcome there."""
 
     def __init__(
-        self, count: int, compute: Callable[[QueuedCommand], Outcome], deliver: Callable[[Outcome], object]
+        self,
+        count: int,
+        compute: Callable[[QueuedCommand], Outcome],
+        deliver: Callable[[Outcome], object],
+        *,
+        name: str = "solver",
     ) -> None:
         self._commands: SimpleQueue[QueuedCommand | None] = SimpleQueue()
         self._compute = compute
         self._deliver = deliver
         self._count = count
         for number in range(count):
-            threading.Thread(target=self._work, name=f"solver-{number}", daemon=True).start()
+            threading.Thread(target=self._work, name=f"{name}-{number}", daemon=True).start()
 
     def run(self, queued: QueuedCommand) -> None:
         """Let the next free thread compute *queued*."""

@@ -23,8 +23,10 @@ from typing import Any
 from rse_pf.auth.tokens import KeySet
 from rse_pf.auth.trust_store import key_set_from_snapshot
 from rse_pf.aws.storage import open_data_store
+from rse_pf.backend.compute.lane import ComputeLane
+from rse_pf.backend.compute.limited_services import LimitedServices, limited_processes
 from rse_pf.backend.gateway.admission import Admission
-from rse_pf.backend.gateway.answers import Answers
+from rse_pf.backend.gateway.answers import Answers, EncodedAnswer
 from rse_pf.backend.gateway.audit_recorder import AuditRecorder
 from rse_pf.backend.gateway.connection import RobotConnection
 from rse_pf.backend.gateway.decoder_thread import DecoderThread
@@ -57,6 +59,7 @@ from rse_pf.backend.supervisor.orders import (
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import MissingExtra
 from rse_pf.linux import die_with_parent, set_process_name
+from rse_pf.service import Registry
 from rse_pf.services.custom.installed import InstalledService, installed_services, published_services
 from rse_pf.services.loading import load_services
 
@@ -164,6 +167,7 @@ class _Worker:
             ),
             decoder=DecoderThread(loop.call_soon_threadsafe),
             answers=answers,
+            compute=self._compute(plan, context, registry, answers),
             sandboxes=self._sandboxes(plan, installed, answers)
             if chosen.folder or chosen.published
             else NoQueue(),
@@ -179,6 +183,22 @@ class _Worker:
             workers=self._workers,
             new_name=self._new_name,
             recorder=self._recorder,
+        )
+
+    def _compute(
+        self, plan: WorkerPlan, context: WorkerContext, registry: Registry, answers: Answers
+    ) -> ComputeLane[EncodedAnswer]:
+        serving = plan.settings.serving
+        return ComputeLane(
+            [service.name for service in registry if service.limited],
+            LimitedServices(context, limited_processes(plan.services, plan.settings)),
+            scheduler=Scheduler(serving),
+            threads=serving.compute_processes,
+            loop=self._loop,
+            monotonic=time.monotonic,
+            encode=answers.encode,
+            send=answers.send,
+            refuse=answers.send_refusal,
         )
 
     def _sandboxes(

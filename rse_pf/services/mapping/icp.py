@@ -155,7 +155,7 @@ def align(
 def register(registry: Registry) -> None:
     """Add ``icp`` to *registry*."""
 
-    @registry.service("icp")
+    @registry.service("icp", limited=True, warm_up=_small_gicp)
     def icp(request: IcpRequest) -> IcpReply:
         """Refine the pose between two overlapping point clouds."""
         target = reshaped("target", request.target, 3)

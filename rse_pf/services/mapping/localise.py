@@ -15,6 +15,7 @@ from rse_pf.geometry import Array as Matrix
 from rse_pf.geometry import Camera, inverse, pose_difference, transform
 from rse_pf.pnp import PnpOptions, PnpSolution, solve_pnp
 from rse_pf.service import Registry
+from rse_pf.services.mapping.descriptors import load_faiss
 from rse_pf.services.mapping.place import PlaceIndex, Within, open_map, view_of
 from rse_pf.services.mapping.relative_pose import RelativePoseOptions, View, matched_points
 from rse_pf.wire.arrays import Array
@@ -128,7 +129,7 @@ def locate(
 def register(registry: Registry) -> None:
     """Add ``localise`` to *registry*."""
 
-    @registry.service("localise")
+    @registry.service("localise", limited=True, warm_up=load_faiss)
     def localise(request: LocaliseRequest) -> LocaliseReply:
         """Find the camera's pose in a map."""
         view = view_of(request.camera, request.pixels, request.descriptors)

@@ -152,7 +152,7 @@ def view_of(camera: Camera, pixels: Array, descriptors: bytes) -> View:
 def register(registry: Registry) -> None:
     """Add ``place`` to *registry*."""
 
-    @registry.service("place")
+    @registry.service("place", limited=True, warm_up=load_faiss)
     def place(request: PlaceRequest) -> PlaceReply:
         """Find the keyframes of a map that show what a view shows."""
         if not 1 <= request.candidates <= 100:

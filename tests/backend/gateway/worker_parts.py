@@ -15,7 +15,7 @@ from rse_pf.backend.gateway.answers import Answers
 from rse_pf.backend.gateway.audit_recorder import AuditRecorder
 from rse_pf.backend.gateway.connection import RobotConnection
 from rse_pf.backend.gateway.decoder_thread import DecoderThread
-from rse_pf.backend.gateway.dispatcher import Dispatcher, JobQueue, NoQueue, SandboxQueue
+from rse_pf.backend.gateway.dispatcher import ComputeQueue, Dispatcher, JobQueue, NoQueue, SandboxQueue
 from rse_pf.backend.gateway.handshake import Accepted, HandshakePolicy
 from rse_pf.backend.gateway.token_watch import TokenWatch
 from rse_pf.backend.log import JsonLog
@@ -48,6 +48,7 @@ class WorkerParts:
         store: MemoryStore | None = None,
         sandboxes: SandboxQueue | None = None,
         jobs: JobQueue | None = None,
+        compute: ComputeQueue | None = None,
         emulated_cores: float = 0.0,
     ) -> None:
         self.settings = settings or PlatformSettings()
@@ -97,6 +98,7 @@ class WorkerParts:
             throttle=CpuThrottle(emulated_cores, now=self.loop.now, cpu=self.clocks.cpu),
             decoder=self.decoder,
             answers=self.answers,
+            compute=compute or NoQueue(),
             sandboxes=sandboxes or NoQueue(),
             jobs=jobs or NoQueue(),
             token_watch=self.token_watch,

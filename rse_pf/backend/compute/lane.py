@@ -1,0 +1,159 @@
+"""The queue of limited services: beside that of the solver threads, so that no pose waits for a map.
+
+It has the same rules as the other queue (`Scheduler`), and as many threads as there are processes.
+"""
+
+from __future__ import annotations
+
+from asyncio import AbstractEventLoop, TimerHandle
+from collections.abc import Callable, Iterable
+from typing import Generic, Protocol, TypeVar
+
+from rse_pf.backend.compute.limited_services import LimitedServices
+from rse_pf.backend.scheduling.scheduler import (
+    QUEUE_TARGET_S,
+    QueuedCommand,
+    RefusedCommand,
+    Scheduler,
+)
+from rse_pf.backend.scheduling.thread_pool import SolverThreads
+from rse_pf.wire import Failure, Result
+
+__all__ = ["ComputeLane"]
+
+
+class _Answered(Protocol):
+    """An answer that knows its command."""
+
+    @property
+    def queued(self) -> QueuedCommand:
+        """The command."""
+
+
+Answer = TypeVar("Answer", bound=_Answered)
+
+
+class ComputeLane(Generic[Answer]):
+    """Commands of limited services that wait or run."""
+
+    def __init__(
+        self,
+        names: Iterable[str],
+        limited: LimitedServices,
+        *,
+        scheduler: Scheduler,
+        threads: int,
+        loop: AbstractEventLoop,
+        monotonic: Callable[[], float],
+        encode: Callable[[QueuedCommand, Result | Failure, float], Answer],
+        send: Callable[[Answer, float], None],
+        refuse: Callable[[RefusedCommand, float], None],
+    ) -> None:
+        """Start the threads; they do nothing before the first command.
+
+        Args:
+            names: Names of the limited services.
+            limited: Computes their commands.
+            scheduler: A queue of its own.
+            threads: Commands that run at the same time.
+            loop: Event loop of the worker.
+            monotonic: Its clock, s.
+            encode: Makes an answer of a message and of the time when its computation began, in the threads.
+            send: Takes each answer and the time, in the loop.
+            refuse: Takes each command that is given up and the time, in the loop.
+        """
+        self._names = frozenset(names)
+        self._limited = limited
+        self._scheduler = scheduler
+        self._count = threads
+        self._loop = loop
+        self._monotonic = monotonic
+        self._encode = encode
+        self._send = send
+        self._refuse = refuse
+        self._sweep_timer: TimerHandle | None = None
+        self._threads = SolverThreads(
+            threads,
+            self._compute,
+            lambda answer: loop.call_soon_threadsafe(self._computed, answer),
+            name="compute",
+        )
+
+    @property
+    def held(self) -> int:
+        """Commands that wait or run."""
+        return self._scheduler.waiting + self._scheduler.running
+
+    @property
+    def max_delay_s(self) -> float:
+        """How long a command may wait now; see `Scheduler.max_delay_s`."""
+        return self._scheduler.max_delay_s
+
+    def offers(self, service: str) -> bool:
+        """Return whether *service* is a limited one."""
+        return service in self._names
+
+    def backlog(self, queued: QueuedCommand) -> tuple[int, float, float]:
+        """Return what `Scheduler.backlog` returns."""
+        return self._scheduler.backlog(queued)
+
+    def note_refused(self, now: float) -> None:
+        """Count a command that was not queued because it would have waited too long."""
+        self._scheduler.note_refused(now)
+
+    def submit(self, queued: QueuedCommand, now: float) -> None:
+        """Let *queued*, which was admitted, wait for its turn, unless its robot is kept out for a while."""
+        refusal = self._limited.refusal(queued, now)
+        if refusal is not None:
+            self._refuse(RefusedCommand(queued, refusal, "blocked"), now)
+            return
+        self._refuse_all(self._scheduler.submit(queued), now)
+        self._start()
+
+    def leave(self, owner: object) -> list[QueuedCommand]:
+        """Drop the waiting commands of a connection that ended, and return them; what runs goes on."""
+        return self._scheduler.leave(owner)
+
+    def report(self) -> dict[str, float]:
+        """Return gauges for /metrics."""
+        return {
+            "compute_queue": float(self._scheduler.waiting),
+            "compute_running": float(self._scheduler.running),
+            "compute_blocked_robots": float(self._limited.blocked_robots(self._monotonic())),
+        }
+
+    def close(self) -> None:
+        """End the threads when they have nothing left, and the processes at once."""
+        self._threads.close()
+        self._limited.close()
+
+    def _start(self) -> None:
+        scheduler = self._scheduler
+        while scheduler.waiting and scheduler.running < self._count:
+            now = self._monotonic()
+            queued, refusals = scheduler.start(now)
+            self._refuse_all(refusals, now)
+            if queued is not None:
+                self._threads.run(queued)
+        if scheduler.waiting and self._sweep_timer is None:
+            self._sweep_timer = self._loop.call_later(QUEUE_TARGET_S / 2, self._sweep)
+
+    def _compute(self, queued: QueuedCommand) -> Answer:
+        started = self._monotonic()
+        return self._encode(queued, self._limited.compute(queued), started)
+
+    def _computed(self, answer: Answer) -> None:
+        now = self._monotonic()
+        self._scheduler.done(answer.queued, now)
+        self._send(answer, now)
+        self._start()
+
+    def _sweep(self) -> None:
+        self._sweep_timer = None
+        now = self._monotonic()
+        self._refuse_all(self._scheduler.sweep(now), now)
+        self._start()
+
+    def _refuse_all(self, refusals: list[RefusedCommand], now: float) -> None:
+        for refusal in refusals:
+            self._refuse(refusal, now)

@@ -1,0 +1,87 @@
+"""Compute a command of a limited service in a process that is killed at the deadline of the command.
+
+What a command needs beyond its limits costs its own robot: the answer says so, and a robot whose commands
+ended two processes is kept from these services for a while.
+"""
+
+from __future__ import annotations
+
+from rse_pf.backend.compute.crash_record import CrashRecord
+from rse_pf.backend.compute.process import TARGET, configuration_of, decode_reply, encode_request
+from rse_pf.backend.ports import WorkerContext
+from rse_pf.backend.scheduling.scheduler import QueuedCommand
+from rse_pf.config import PlatformSettings
+from rse_pf.errors import Busy, Crashed, Expired, RsePfError
+from rse_pf.limited_process import LimitedProcesses
+from rse_pf.service import failure_of
+from rse_pf.wire import Failure, Result
+
+__all__ = ["LimitedServices", "limited_processes"]
+
+
+def limited_processes(services: str, settings: PlatformSettings) -> LimitedProcesses:
+    """Return the processes of one worker, none of which is started; *services* is ``module:function``."""
+    serving = settings.serving
+    return LimitedProcesses(
+        TARGET,
+        configuration=configuration_of(services, settings),
+        count=serving.compute_processes,
+        memory_bytes=serving.max_compute_memory_bytes,
+        cpu_s=serving.max_compute_s,
+        max_reply_bytes=settings.session.max_inflated_bytes,
+    )
+
+
+class LimitedServices:
+    """The limited services of one worker."""
+
+    def __init__(self, context: WorkerContext, processes: LimitedProcesses) -> None:
+        self._context = context
+        self._processes = processes
+        self._crashes = CrashRecord(context.settings.services)
+
+    def refusal(self, queued: QueuedCommand, now: float) -> Busy | None:
+        """Return why the robot of *queued* may not use these services now, None if it may."""
+        return self._crashes.refusal(queued.robot, now)
+
+    def compute(self, queued: QueuedCommand) -> Result | Failure:
+        """Answer *queued*; blocks until its deadline at most, and may run in several threads."""
+        try:
+            return self._compute(queued)
+        except RsePfError as error:
+            return failure_of(error, queued.command, server=self._context.server_id)
+
+    def blocked_robots(self, now: float) -> int:
+        """Return how many robots are refused now."""
+        return self._crashes.blocked(now)
+
+    def close(self) -> None:
+        """End all processes; commands that are under way are answered with WorkerLost."""
+        self._processes.close()
+
+    def _compute(self, queued: QueuedCommand) -> Result | Failure:
+        context, command = self._context, queued.command
+        now = context.clocks.monotonic()
+        refusal = self.refusal(queued, now)
+        if refusal is not None:
+            raise refusal
+        try:
+            reply = self._processes.call(encode_request(command, queued.robot), queued.deadline_s - now)
+        except Expired:
+            raise Expired(
+                f"its deadline passed after {(context.clocks.monotonic() - now) * 1e3:.0f} ms of work",
+                hint="allow more time, or send a smaller map",
+            ) from None
+        except Crashed as crash:
+            is_blocked = self._crashes.crashed(queued.robot, context.clocks.monotonic())
+            context.log.warning(
+                "compute-crashed", robot=queued.robot, service=command.service, id=command.id,
+                trace=command.trace, reason=crash.message, blocked=is_blocked,
+            )  # fmt: skip
+            raise
+        answer, defect = decode_reply(reply, command, server=context.server_id)
+        if defect:
+            context.log.error(
+                "defect", service=command.service, id=command.id, trace=command.trace, traceback=defect
+            )
+        return answer
