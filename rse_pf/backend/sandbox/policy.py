@@ -6,7 +6,8 @@ order.  The rules:
 - Each robot has at most one sandbox, which works on one command at a time; the others wait in order.
 - A command whose sandbox crashed is retried once in a new sandbox, unless its deadline has passed, its
   service keeps state that no snapshot holds, or `CircuitBreaker` refuses it.
-- A command is answered at its deadline; its sandbox is killed at a multiple of the deadline.
+- A command is answered at its deadline; its sandbox is killed at a multiple of the deadline, which is no
+  crash.
 - A sandbox outlives the last connection of its robot by a grace period, unless its place is needed.
 - Commands that wait for a sandbox which crashed move to the new one.
 """
@@ -34,6 +35,7 @@ __all__ = [
     "KillSandbox",
     "LoadSnapshot",
     "LogCrash",
+    "LogOverrun",
     "ReleaseSandbox",
     "SandboxCall",
     "SandboxPolicy",
@@ -138,6 +140,15 @@ class LogCrash:
     reason: str
 
 
+@dataclass(frozen=True, slots=True)
+class LogOverrun:
+    """Log that a sandbox was killed because its robot's deadline had passed."""
+
+    robot: RobotId
+    service: str
+    reason: str
+
+
 Action = (
     CreateSandbox
     | SendMessage
@@ -147,6 +158,7 @@ Action = (
     | SaveSnapshot
     | AnswerCall
     | LogCrash
+    | LogOverrun
 )
 
 
@@ -168,6 +180,8 @@ class _Sandbox:
     unsaved: SandboxReply | None = None
     """The reply whose snapshot is being saved."""
     fault: str = ""
+    is_overrun: bool = False
+    """It was killed because the deadline of the running call had passed."""
 
 
 class SandboxPolicy:
@@ -223,7 +237,7 @@ class SandboxPolicy:
         return 0 if sandbox is None else len(sandbox.waiting)
 
     def open_services(self, now: float) -> list[str]:
-        """Return the services whose circuit breaker is open, sorted."""
+        """Return the services whose circuit breaker is open for more than one robot, sorted."""
         return self._breaker.open_services(now)
 
     # --- events from the gateway -------------------------------------------------------------------
@@ -268,7 +282,7 @@ class SandboxPolicy:
     def ready(self, number: int, now: float) -> list[Action]:
         """A sandbox has started and takes requests."""
         sandbox = self._sandboxes.get(number)
-        if sandbox is None:
+        if sandbox is None or sandbox.fault:
             return []
         if sandbox.state != "starting":
             return self.broken(number, "it reported its start twice")
@@ -277,9 +291,9 @@ class SandboxPolicy:
         return self._take_actions()
 
     def replied(self, number: int, outcome: SandboxReply | RsePfError, now: float) -> list[Action]:
-        """A sandbox answered the last message."""
+        """A sandbox answered the last message; what it says while it is being killed is too late."""
         sandbox = self._sandboxes.get(number)
-        if sandbox is None:
+        if sandbox is None or sandbox.fault:
             return []
         call = sandbox.running
         if call is None or sandbox.state not in ("restoring", "running"):
@@ -336,20 +350,21 @@ class SandboxPolicy:
 
     def broken(self, number: int, why: str) -> list[Action]:
         """A sandbox violated the protocol or closed its channel ("")."""
-        if number in self._sandboxes:
-            self._kill(self._sandboxes[number], why)
+        sandbox = self._sandboxes.get(number)
+        if sandbox is not None and not sandbox.fault:
+            self._kill(sandbox, why)
         return self._take_actions()
 
     def gone(self, number: int, how: str, now: float) -> list[Action]:
         """The process of a sandbox ended."""
         if number in self._sandboxes:
-            self._crashed(self._sandboxes[number], how, now)
+            self._ended(self._sandboxes[number], how, now)
         return self._take_actions()
 
     def all_gone(self, how: str, now: float) -> list[Action]:
-        """Every sandbox ended, because the zygote did."""
+        """Every sandbox ended, because the zygote did: evidence against no service and no request."""
         for sandbox in list(self._sandboxes.values()):
-            self._crashed(sandbox, how, now)
+            self._ended(sandbox, how, now, is_evidence=False)
         return self._take_actions()
 
     def tick(self, now: float) -> list[Action]:
@@ -364,6 +379,7 @@ class SandboxPolicy:
                 sandbox.late_s = math.inf
                 self._answer(call, Expired("the service did not answer before the deadline"))
             if sandbox.kill_s <= now:
+                sandbox.is_overrun = call is not None and not sandbox.fault  # else it is being killed
                 self._kill(sandbox, "it did not start in time" if call is None else "it took too long")
         return self._take_actions()
 
@@ -376,7 +392,7 @@ class SandboxPolicy:
     # --- rules -------------------------------------------------------------------------------------
 
     def _refusal(self, call: SandboxCall, now: float) -> RsePfError | None:
-        refusal = self._breaker.refusal(call.service, call.digest, now)
+        refusal = self._breaker.refusal(call.queued.robot, call.service, call.digest, now)
         if isinstance(refusal, Poison):
             self.counts["poison"] += 1
         return refusal
@@ -397,17 +413,25 @@ class SandboxPolicy:
             and call.tries < _MAX_TRIES
             and call.queued.deadline_s > now
             and (is_stateless or sandbox.snapshots.get(call.service) is not None)
-            and self._breaker.refusal(call.service, call.digest, now) is None
+            and self._breaker.refusal(call.queued.robot, call.service, call.digest, now) is None
         )
 
-    def _crashed(self, sandbox: _Sandbox, how: str, now: float) -> None:
+    def _ended(self, sandbox: _Sandbox, how: str, now: float, *, is_evidence: bool = True) -> None:
+        """Release a sandbox whose process ended by itself or was killed; retry or answer its command."""
         call, why = sandbox.running, sandbox.fault or how
         self._release(sandbox)
-        self.counts["crashed"] += 1
-        service = "" if call is None else call.service
-        self._actions.append(LogCrash(sandbox.robot, service, f"{why} ({how})"))
+        service, reason = "" if call is None else call.service, f"{why} ({how})"
+        if sandbox.is_overrun:
+            self.counts["overran"] += 1
+            self._actions.append(LogOverrun(sandbox.robot, service, reason))
+        else:
+            self.counts["crashed"] += 1
+            self._actions.append(LogCrash(sandbox.robot, service, reason))
         if call is not None:
-            self._breaker.crashed(service, call.digest, now)
+            if sandbox.is_overrun:
+                self._breaker.overran(sandbox.robot, service, now)
+            elif is_evidence:
+                self._breaker.crashed(sandbox.robot, service, call.digest, now)
             call.tries += 1
             if self._may_retry(call, sandbox, now):
                 sandbox.waiting.appendleft(call)
@@ -447,7 +471,7 @@ class SandboxPolicy:
 
     def _start_next(self, sandbox: _Sandbox, now: float) -> None:
         """Start the next call of an idle sandbox; refuse those that are no longer worth it."""
-        while sandbox.state == "idle" and sandbox.waiting:
+        while sandbox.state == "idle" and not sandbox.fault and sandbox.waiting:
             call = sandbox.waiting.popleft()
             queued, refusal = call.queued, self._refusal(call, now)
             if refusal is None and queued.deadline_s <= now:
@@ -467,7 +491,8 @@ class SandboxPolicy:
 
     def _send(self, sandbox: _Sandbox, call: SandboxCall) -> None:
         sandbox.state = "running"
-        self._actions.append(SendMessage(sandbox.number, call.data))
+        if not sandbox.fault:
+            self._actions.append(SendMessage(sandbox.number, call.data))
 
     def _finish(
         self, sandbox: _Sandbox, call: SandboxCall, outcome: SandboxReply | RsePfError, now: float

@@ -13,6 +13,7 @@ from rse_pf.backend.sandbox.policy import (
     KillSandbox,
     LoadSnapshot,
     LogCrash,
+    LogOverrun,
     ReleaseSandbox,
     SandboxCall,
     SandboxPolicy,
@@ -23,9 +24,11 @@ from rse_pf.backend.sandbox.policy import (
 from rse_pf.backend.scheduling.scheduler import QueuedCommand
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import BadRequest, Conflict, RsePfError, StoreError
+from rse_pf.identity import RobotId
 from rse_pf.wire import Command
 
 GRACE_S, START_S, FACTOR, OPEN_S = 5.0, 2.0, 2.0, 60.0
+A, B, C = (RobotId("acme", name) for name in "abc")
 KINDS = {"icp": "stateless", "counter": "per_robot_state"}
 
 
@@ -39,13 +42,18 @@ def make_policy(*, max_sandboxes: int = 4, keeps_snapshots: bool = True, **servi
     policy = SandboxPolicy(
         KINDS, settings.services, max_sandboxes=max_sandboxes, keeps_snapshots=keeps_snapshots
     )
-    for robot in "abc":
+    for robot in (A, B, C):
         policy.connected(robot)
     return policy
 
 
 def make_call(
-    robot: str = "a", service: str = "icp", *, payload: str = "x", now: float = 0.0, deadline_s: float = 10.0
+    robot: RobotId = A,
+    service: str = "icp",
+    *,
+    payload: str = "x",
+    now: float = 0.0,
+    deadline_s: float = 10.0,
 ) -> SandboxCall:
     """Return a command that was received *now* and has *deadline_s* seconds."""
     command = Command(id=1, service=service, payload=payload)
@@ -85,7 +93,7 @@ OK = SandboxReply("done", 1.5)
 def test_the_first_command_of_a_robot_creates_its_sandbox_and_runs_once_that_is_ready():
     policy, call = make_policy(), make_call()
 
-    assert policy.submit(call, 0.0) == [CreateSandbox(1, "a")]
+    assert policy.submit(call, 0.0) == [CreateSandbox(1, A)]
     assert policy.ready(1, 0.5) == [SendMessage(1, b"x")]
     assert call.queued.started_s == 0.5
     assert policy.replied(1, OK, 1.0) == [AnswerCall(call, OK)]
@@ -104,8 +112,8 @@ def test_a_second_command_waits_for_the_first_and_uses_the_same_sandbox():
 def test_each_robot_has_a_sandbox_of_its_own():
     policy = make_policy()
 
-    assert policy.submit(make_call("a"), 0.0) == [CreateSandbox(1, "a")]
-    assert policy.submit(make_call("b"), 0.0) == [CreateSandbox(2, "b")]
+    assert policy.submit(make_call(A), 0.0) == [CreateSandbox(1, A)]
+    assert policy.submit(make_call(B), 0.0) == [CreateSandbox(2, B)]
 
 
 def test_an_error_of_the_service_is_answered_and_costs_no_sandbox():
@@ -127,7 +135,7 @@ def test_a_stateless_command_whose_sandbox_crashed_is_tried_once_more_in_a_new_o
     actions = policy.gone(1, "signal SIGSEGV", 1.0)
 
     assert actions == [
-        ReleaseSandbox(1), LogCrash("a", "icp", "signal SIGSEGV (signal SIGSEGV)"), CreateSandbox(2, "a")
+        ReleaseSandbox(1), LogCrash(A, "icp", "signal SIGSEGV (signal SIGSEGV)"), CreateSandbox(2, A)
     ]  # fmt: skip
     assert policy.ready(2, 1.5) == [SendMessage(2, b"x")]
     assert outcomes(policy.replied(2, OK, 2.0)) == [(call, "ok")]
@@ -145,18 +153,19 @@ def test_a_command_is_tried_twice_and_no_more():
     assert policy.sandboxes == 0
 
 
-def test_a_request_that_crashed_so_many_sandboxes_is_poison_for_every_robot():
-    policy, call = make_policy(poison_crashes=2), make_call("a")
+def test_a_request_that_crashed_so_many_sandboxes_of_a_robot_is_poison_for_that_robot():
+    policy, call = make_policy(poison_crashes=2), make_call(A)
     start(policy, call)
     number = created(policy.gone(1, "exit code 1", 1.0))
     policy.ready(number, 1.0)
     assert outcomes(policy.gone(number, "exit code 1", 2.0)) == [(call, "poison")]
 
-    same, other = make_call("b"), make_call("b", payload="y")
+    again, other, same_of_b = make_call(A), make_call(A, payload="y"), make_call(B)
 
-    assert outcomes(policy.submit(same, 3.0)) == [(same, "poison")]
+    assert outcomes(policy.submit(again, 3.0)) == [(again, "poison")]
     assert created(policy.submit(other, 3.0)) == 3
-    assert policy.counts == {"created": 3, "crashed": 2, "poison": 2}
+    assert created(policy.submit(same_of_b, 3.0)) == 4
+    assert policy.counts == {"created": 4, "crashed": 2, "poison": 2}
 
 
 def test_an_open_circuit_breaker_refuses_the_service_until_it_closes():
@@ -171,20 +180,29 @@ def test_an_open_circuit_breaker_refuses_the_service_until_it_closes():
     assert isinstance(answer.outcome, RsePfError)
     assert answer.outcome.code == "worker-lost"
     assert answer.outcome.retry_after_ms == (OPEN_S - 1.0) * 1e3
-    assert policy.open_services(2.0) == ["icp"]
+    assert created(policy.submit(make_call(B, payload="new"), 2.0)) == 3, "another robot"
+    assert created(policy.submit(make_call(payload="new"), OPEN_S + 1.0)) == 4
+
+
+def test_a_circuit_breaker_that_is_open_for_several_robots_is_reported():
+    policy = make_policy(breaker_crashes=2, poison_crashes=1)
+    for robot in (A, B, C):
+        number = start(policy, make_call(robot, payload=robot.name))
+        policy.gone(number, "exit code 1", 1.0)
+        assert policy.open_services(1.0) == (["icp"] if robot == C else [])
+
     assert policy.open_services(OPEN_S + 1.0) == []
-    assert created(policy.submit(make_call(payload="new"), OPEN_S + 1.0)) == 3
 
 
 def test_an_open_circuit_breaker_refuses_what_waits_as_well():
     policy = make_policy(breaker_crashes=2, poison_crashes=1)
-    first, second = make_call("a", payload="1"), make_call("b", payload="2")
+    first, second, waiting = (make_call(payload=name) for name in "123")
     start(policy, first)
-    start(policy, second)
-    waiting = make_call("b", payload="3")
+    policy.submit(second, 0.0)
     policy.submit(waiting, 0.0)
-    policy.gone(1, "exit code 1", 1.0)
-    number = created(policy.gone(2, "exit code 1", 1.0))
+    number = created(policy.gone(1, "exit code 1", 1.0))
+    policy.ready(number, 1.0)
+    number = created(policy.gone(number, "exit code 1", 1.0))
 
     assert outcomes(policy.ready(number, 1.5)) == [(waiting, "worker-lost")]
 
@@ -252,14 +270,28 @@ def test_a_sandbox_that_ends_before_it_is_ready_fails_all_that_wait_and_is_not_r
 
 
 def test_the_end_of_the_zygote_is_a_crash_of_every_sandbox():
-    policy, one, two = make_policy(), make_call("a"), make_call("b", payload="y")
+    policy, one, two = make_policy(), make_call(A), make_call(B, payload="y")
     start(policy, one)
     start(policy, two)
 
     actions = policy.all_gone("the zygote ended", 1.0)
 
-    assert [each.robot for each in actions if isinstance(each, CreateSandbox)] == ["a", "b"]
+    assert [each.robot for each in actions if isinstance(each, CreateSandbox)] == [A, B]
     assert policy.counts["crashed"] == 2
+
+
+def test_the_end_of_the_zygote_is_evidence_against_no_service_and_no_request():
+    policy = make_policy(breaker_crashes=2, poison_crashes=1)
+    for i in range(3):
+        for robot in (A, B, C):
+            start(policy, make_call(robot, now=i), now=i)
+        policy.all_gone("the zygote ended", i)
+        for number in range(6 * i + 4, 6 * i + 7):
+            policy.ready(number, i)
+            policy.replied(number, OK, i)
+        policy.all_gone("the zygote ended", i)
+
+    assert created(policy.submit(make_call(now=3.0), 3.0))
 
 
 def test_what_is_reported_of_a_sandbox_that_was_released_changes_nothing():
@@ -288,8 +320,55 @@ def test_a_command_is_answered_at_its_deadline_and_its_sandbox_killed_at_a_facto
     assert policy.tick(7.0) == [KillSandbox(1)]
     assert policy.tick(8.0) == [], "once is enough"
     assert policy.gone(1, "signal SIGKILL", 8.0) == [
-        ReleaseSandbox(1), LogCrash("a", "icp", "it took too long (signal SIGKILL)")
+        ReleaseSandbox(1), LogOverrun(A, "icp", "it took too long (signal SIGKILL)")
     ]  # fmt: skip
+
+
+def overrun(policy: SandboxPolicy, call: SandboxCall, now: float) -> None:
+    """Let *call* run to its deadline, and be killed at twice that."""
+    number = start(policy, call, now)
+    policy.tick(call.queued.deadline_s)
+    policy.tick(2 * call.queued.deadline_s - call.queued.received_s)
+    policy.gone(number, "signal SIGKILL", 2 * call.queued.deadline_s - call.queued.received_s)
+
+
+def test_the_deadline_of_a_robot_is_no_evidence_for_others_and_its_request_no_poison():
+    policy = make_policy(breaker_crashes=2, poison_crashes=1)
+    for i in range(3):
+        for robot in (A, B, C):
+            overrun(policy, make_call(robot, now=100.0 * i, deadline_s=0.06), 100.0 * i)
+    another = RobotId("acme", "d")
+    policy.connected(another)
+
+    assert policy.counts == {"created": 9, "overran": 9}
+    assert created(policy.submit(make_call(A, now=300.0), 300.0)) == 10
+    assert created(policy.submit(make_call(another, now=300.0), 300.0)) == 11
+
+
+def test_a_robot_whose_sandbox_was_killed_repeatedly_for_its_deadline_is_refused_the_service():
+    policy = make_policy(breaker_crashes=2)
+    for now in (0.0, 1.0):
+        overrun(policy, make_call(A, payload=str(now), now=now, deadline_s=0.06), now)
+    refused, other = make_call(A, payload="x", now=2.0), make_call(B, payload="x", now=2.0)
+
+    assert outcomes(policy.submit(refused, 2.0)) == [(refused, "worker-lost")]
+    assert created(policy.submit(other, 2.0)) == 3
+
+
+def test_what_a_sandbox_says_while_it_is_being_killed_is_too_late():
+    policy, call, second = make_policy(), make_call(deadline_s=1.0), make_call(payload="2")
+    start(policy, call)
+    policy.submit(second, 0.5)
+    policy.tick(1.0)
+    assert policy.tick(2.0) == [KillSandbox(1)]
+
+    assert policy.replied(1, OK, 2.0) == []
+    assert policy.ready(1, 2.0) == []
+    assert policy.broken(1, "it sent an invalid message") == []
+    actions = policy.gone(1, "signal SIGKILL", 2.1)
+
+    assert LogOverrun(A, "icp", "it took too long (signal SIGKILL)") in actions
+    assert policy.ready(created(actions), 2.2) == [SendMessage(2, b"2")]
 
 
 def test_a_late_reply_is_not_answered_again_and_lets_the_next_command_run():
@@ -322,7 +401,7 @@ def test_a_sandbox_that_does_not_start_in_time_is_killed():
     actions = policy.gone(1, "signal SIGKILL", START_S)
 
     assert outcomes(actions) == [(call, "worker-lost")]
-    assert LogCrash("a", "", "it did not start in time (signal SIGKILL)") in actions
+    assert LogCrash(A, "", "it did not start in time (signal SIGKILL)") in actions
 
 
 def test_a_sandbox_that_violates_the_protocol_is_killed():
@@ -358,12 +437,12 @@ def test_a_command_for_an_idle_sandbox_that_is_being_killed_waits_for_the_next_o
 
 def test_a_sandbox_is_released_a_grace_period_after_the_last_connection_of_its_robot():
     policy = make_policy()
-    policy.connected("a")
+    policy.connected(A)
     start(policy, make_call())
     policy.replied(1, OK, 1.0)
-    policy.disconnected("a", 2.0)
+    policy.disconnected(A, 2.0)
     assert policy.wake_s == math.inf, "one connection is left"
-    policy.disconnected("a", 3.0)
+    policy.disconnected(A, 3.0)
 
     assert policy.tick(3.0 + GRACE_S - 0.1) == []
     assert policy.tick(3.0 + GRACE_S) == [ReleaseSandbox(1)]
@@ -374,8 +453,8 @@ def test_a_robot_that_reconnects_within_the_grace_period_keeps_its_sandbox():
     policy = make_policy()
     start(policy, make_call())
     policy.replied(1, OK, 1.0)
-    policy.disconnected("a", 2.0)
-    policy.connected("a")
+    policy.disconnected(A, 2.0)
+    policy.connected(A)
 
     assert policy.tick(100.0) == []
     assert policy.submit(make_call(payload="2", now=100.0), 100.0) == [SendMessage(1, b"2")]
@@ -385,7 +464,7 @@ def test_commands_that_wait_for_a_robot_that_left_are_dropped_and_not_moved():
     policy = make_policy()
     start(policy, make_call(payload="1"))
     policy.submit(make_call(payload="2"), 0.0)
-    policy.disconnected("a", 1.0)
+    policy.disconnected(A, 1.0)
     assert policy.held == 1
 
     assert not any(isinstance(each, CreateSandbox) for each in policy.gone(1, "exit code 1", 1.5))
@@ -393,9 +472,9 @@ def test_commands_that_wait_for_a_robot_that_left_are_dropped_and_not_moved():
 
 def test_a_robot_beyond_the_capacity_is_told_when_to_try_again():
     policy = make_policy(max_sandboxes=1)
-    start(policy, make_call("a"))
+    start(policy, make_call(A))
 
-    (answer,) = policy.submit(make_call("b"), 0.0)
+    (answer,) = policy.submit(make_call(B), 0.0)
 
     assert isinstance(answer, AnswerCall)
     assert isinstance(answer.outcome, RsePfError)
@@ -404,28 +483,28 @@ def test_a_robot_beyond_the_capacity_is_told_when_to_try_again():
 
 def test_an_idle_sandbox_in_its_grace_period_gives_its_place_to_another_robot():
     policy = make_policy(max_sandboxes=1)
-    start(policy, make_call("a"))
+    start(policy, make_call(A))
     policy.replied(1, OK, 1.0)
-    policy.disconnected("a", 1.0)
+    policy.disconnected(A, 1.0)
 
-    assert policy.submit(make_call("b"), 1.5) == [ReleaseSandbox(1), CreateSandbox(2, "b")]
+    assert policy.submit(make_call(B), 1.5) == [ReleaseSandbox(1), CreateSandbox(2, B)]
 
 
 def test_a_sandbox_that_works_or_whose_robot_is_connected_keeps_its_place():
     policy = make_policy(max_sandboxes=2)
-    start(policy, make_call("a"))
-    start(policy, make_call("b", payload="y"))
+    start(policy, make_call(A))
+    start(policy, make_call(B, payload="y"))
     policy.replied(2, OK, 0.5)
-    policy.disconnected("a", 1.0)
-    call = make_call("c")
+    policy.disconnected(A, 1.0)
+    call = make_call(C)
 
     assert outcomes(policy.submit(call, 1.5)) == [(call, "busy")]
 
 
 def test_closing_releases_everything_and_answers_nothing():
     policy = make_policy()
-    start(policy, make_call("a"))
-    start(policy, make_call("b", payload="y"))
+    start(policy, make_call(A))
+    start(policy, make_call(B, payload="y"))
 
     assert policy.close() == [ReleaseSandbox(1), ReleaseSandbox(2)]
     assert policy.wake_s == math.inf
