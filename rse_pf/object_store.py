@@ -10,35 +10,53 @@ import contextlib
 import errno
 import fcntl
 import hashlib
+import io
 import os
 import re
+import secrets
 import stat
 import threading
+import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO, Protocol, runtime_checkable
+from typing import BinaryIO, Protocol, TypeVar, runtime_checkable
 
 from rse_pf.errors import Conflict, NotFound, StoreError, StoreFull, UsageError
 from rse_pf.files import OWNER_ONLY, TEMPORARY_PREFIX, replace_file, sync_folder
 
 __all__ = [
+    "MIN_CHARGE_BYTES",
     "DirectoryStore",
+    "MeasuringStore",
     "MemoryStore",
     "ObjectInfo",
     "ObjectStore",
+    "PieceStore",
     "PresigningStore",
     "RangedStore",
     "ScratchStore",
+    "Usage",
+    "charge_of",
     "check_name",
     "digest_of",
     "is_name",
     "name_segment",
     "open_store",
+    "put_pieces",
     "put_scratch",
     "read_range",
+    "usage_of",
 ]
 
+_T = TypeVar("_T")
+_Names = list[str]  # within a class that has a method "list"
+_SHARD, _LOCK = "+", ".lock-"
+_DIGEST = re.compile(r"[0-9a-f]{64}")
+_WRITE_TRIES = 8
+# A folder that changed within this time before it was read may change again at the same time of change.
+_UNSETTLED_NS = 100_000_000
+_MAX_MEASURED = 100_000
 _PLAIN_SEGMENT = re.compile(r"[a-z0-9][a-z0-9-]{0,63}")
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._=-]{0,127}(/[A-Za-z0-9][A-Za-z0-9._=-]{0,127}){0,9}")
 
@@ -49,6 +67,22 @@ class ObjectInfo:
 
     name: str
     size: int
+
+
+MIN_CHARGE_BYTES = 4096
+"""An object counts for at least this much of a quota: a file takes a block and an inode, however short."""
+
+
+@dataclass(frozen=True, slots=True)
+class Usage:
+    """What objects count for: their number, and their bytes with `MIN_CHARGE_BYTES` for each at least."""
+
+    objects: int = 0
+    charged_bytes: int = 0
+
+    def __add__(self, other: Usage) -> Usage:
+        """Return the sum."""
+        return Usage(self.objects + other.objects, self.charged_bytes + other.charged_bytes)
 
 
 class ObjectStore(Protocol):
@@ -63,8 +97,11 @@ class ObjectStore(Protocol):
     def head(self, name: str) -> ObjectInfo:
         """Return size and name; raises NotFound."""
 
-    def list(self, prefix: str = "") -> Iterator[ObjectInfo]:
-        """Yield the objects whose names begin with *prefix*, sorted by name."""
+    def list(self, prefix: str = "", after: str = "") -> Iterator[ObjectInfo]:
+        """Yield the objects whose names begin with *prefix* and are greater than *after*, sorted by name."""
+
+    def folders(self, prefix: str) -> Iterator[str]:
+        """Yield, sorted, what stands between *prefix*, which ends with /, and the next slash in names."""
 
     def delete(self, name: str) -> None:
         """Remove the object; a missing one is no error."""
@@ -87,6 +124,22 @@ class ScratchStore(Protocol):
 
     def put_scratch(self, name: str, data: bytes) -> None:
         """Store an object that survives this process, but may be lost or truncated if the machine crashes."""
+
+
+@runtime_checkable
+class MeasuringStore(Protocol):
+    """A store that knows how much it holds without listing all of it each time."""
+
+    def usage(self, prefix: str) -> Usage:
+        """Return what the objects below the folder *prefix*, which ends with a slash, count for."""
+
+
+@runtime_checkable
+class PieceStore(Protocol):
+    """A store that can write an object without holding it in memory."""
+
+    def put_pieces(self, name: str, pieces: Iterator[bytes]) -> None:
+        """Store the object durably and atomically; if *pieces* raises an error, nothing is stored."""
 
 
 @runtime_checkable
@@ -113,6 +166,32 @@ def put_scratch(store: ObjectStore, name: str, data: bytes) -> None:
         store.put_scratch(name, data)
     else:
         store.put(name, data)
+
+
+def put_pieces(store: ObjectStore, name: str, pieces: Iterator[bytes]) -> None:
+    """Store an object that comes in pieces; if *pieces* raises an error, nothing is stored."""
+    if isinstance(store, PieceStore):
+        store.put_pieces(name, pieces)
+        return
+    buffer = io.BytesIO()  # holds the object once; joining a list would hold it twice
+    for piece in pieces:
+        buffer.write(piece)
+    store.put(name, buffer.getvalue())
+
+
+def charge_of(size: int) -> int:
+    """Return for how many bytes of a quota an object of *size* bytes counts."""
+    return max(size, MIN_CHARGE_BYTES)
+
+
+def usage_of(store: ObjectStore, prefix: str) -> Usage:
+    """Return what the objects below the folder *prefix* count for, in the cheapest way."""
+    if isinstance(store, MeasuringStore):
+        return store.usage(prefix)
+    objects = charged = 0
+    for info in store.list(prefix):
+        objects, charged = objects + 1, charged + charge_of(info.size)
+    return Usage(objects, charged)
 
 
 def name_segment(text: str) -> str:
@@ -187,13 +266,21 @@ class MemoryStore:
         """Return size and name."""
         return ObjectInfo(name=name, size=len(self.get(name)))
 
-    def list(self, prefix: str = "") -> Iterator[ObjectInfo]:
-        """Yield the objects whose names begin with *prefix*."""
+    def list(self, prefix: str = "", after: str = "") -> Iterator[ObjectInfo]:
+        """Yield the objects whose names begin with *prefix* and are greater than *after*."""
         with self._lock:
-            found = sorted((name, len(data)) for name, data in self._objects.items())
+            found = sorted(
+                (name, len(data))
+                for name, data in self._objects.items()
+                if name.startswith(prefix) and name > after
+            )
         for name, size in found:
-            if name.startswith(prefix):
-                yield ObjectInfo(name=name, size=size)
+            yield ObjectInfo(name=name, size=size)
+
+    def folders(self, prefix: str) -> Iterator[str]:
+        """Yield what stands between *prefix* and the next slash in names."""
+        rests = (info.name.removeprefix(prefix).partition("/") for info in self.list(prefix))
+        yield from sorted({folder for folder, slash, _ in rests if slash})
 
     def delete(self, name: str) -> None:
         """Remove the object."""
@@ -209,99 +296,224 @@ class MemoryStore:
 
 
 class DirectoryStore:
-    """Objects as files below one folder, written by temporary file, fsync and rename."""
+    """Objects as files below one folder, written by temporary file, fsync and rename.
+
+    A robot's objects lie in up to 256 folders by the first two digits of their digests, as
+    ``objects/TENANT/ROBOT/+ab/DIGEST``, so that a page of a list reads a few small folders.  Earlier versions
+    wrote them to ``objects/TENANT/ROBOT``, where they are found, too.
+    """
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
+        self._measured: dict[str, tuple[int, Usage, _Names]] = {}
 
     def get(self, name: str) -> bytes:
         """Return the object."""
-        path = self._path(name)
-        with _as_store_errors(name):
-            return _read(path)
+        with _as_store_errors(name), self._find(name, _open) as file:
+            return file.read()
 
     def get_range(self, name: str, start: int, length: int) -> bytes:
         """Return a part of the object."""
-        path = self._path(name)
-        with _as_store_errors(name), _open(path) as file:
+        with _as_store_errors(name), self._find(name, _open) as file:
             file.seek(start)
             return file.read(length)
 
     def put(self, name: str, data: bytes) -> None:
         """Store the object durably."""
-        path = self._path(name)
-        with _as_store_errors(name):
-            _make_folder(path.parent)
-            replace_file(path, data, mode=OWNER_ONLY, is_durable=True)
+        self._write(name, lambda path: replace_file(path, data, mode=OWNER_ONLY, is_durable=True))
 
     def put_scratch(self, name: str, data: bytes) -> None:
         """Store the object atomically, without waiting for the disk."""
-        path = self._path(name)
-        with _as_store_errors(name):
-            _make_folder(path.parent)
-            replace_file(path, data, mode=OWNER_ONLY)
+        self._write(name, lambda path: replace_file(path, data, mode=OWNER_ONLY))
+
+    def put_pieces(self, name: str, pieces: Iterator[bytes]) -> None:
+        """Store the object durably; if *pieces* raises an error, nothing is stored."""
+        self._write(name, lambda path: _replace_by_pieces(path, pieces))
 
     def head(self, name: str) -> ObjectInfo:
         """Return size and name."""
         with _as_store_errors(name):
-            found = self._path(name).lstat()
+            found = self._find(name, Path.lstat)
         if not stat.S_ISREG(found.st_mode):
             raise NotFound(f"no object named {name!r}")
         return ObjectInfo(name=name, size=found.st_size)
 
-    def list(self, prefix: str = "") -> Iterator[ObjectInfo]:
-        """Yield the objects whose names begin with *prefix*."""
-        above = prefix.rpartition("/")[0]
-        start = self._folder / above if _NAME.fullmatch(above) else self._folder
-        if not start.is_dir():
-            return
-        names = (
-            path.relative_to(self._folder).as_posix()
-            for path in start.rglob("*")
-            if path.is_file() and not path.is_symlink()
-        )
-        for name in sorted(names):
-            if name.startswith(prefix) and _NAME.fullmatch(name):
-                with contextlib.suppress(NotFound):
-                    yield self.head(name)
+    def list(self, prefix: str = "", after: str = "") -> Iterator[ObjectInfo]:
+        """Yield the objects whose names begin with *prefix* and are greater than *after*.
+
+        Only the folders that the caller's iteration reaches are read.
+        """
+        above, slash, _ = prefix.rpartition("/")
+        if not slash or is_name(above):
+            yield from self._walk(above + slash, prefix, after)
+
+    def folders(self, prefix: str) -> Iterator[str]:
+        """Yield what stands between *prefix* and the next slash in names."""
+        yield from sorted(name for name in self._scan(prefix)[1] if is_name(name))
+
+    def usage(self, prefix: str) -> Usage:
+        """Return what the objects below *prefix* count for; only folders that changed are read again."""
+        place = f"{self._folder}/{prefix}"
+        with _as_store_errors(prefix):
+            try:
+                changed_ns = os.stat(place).st_mtime_ns
+            except (FileNotFoundError, NotADirectoryError):
+                return Usage()
+        known = self._measured.get(place)
+        if known is None or known[0] != changed_ns:
+            known = changed_ns, *self._measure(prefix)
+            if time.time_ns() - changed_ns > _UNSETTLED_NS:
+                if len(self._measured) >= _MAX_MEASURED:
+                    self._measured.clear()
+                self._measured[place] = known
+        total = known[1]
+        for folder in known[2]:
+            total += self.usage(f"{prefix}{folder}/")
+        return total
 
     def delete(self, name: str) -> None:
-        """Remove the object."""
-        path = self._path(name)
-        with _as_store_errors(name), contextlib.suppress(NotFound):
+        """Remove the object, and its folder if nothing else lies there; a missing one is no error."""
+        paths = self._paths(name)
+        path, lock = paths[0], paths[0].with_name(f"{_LOCK}{paths[0].name}")
+        with contextlib.suppress(NotFound), _as_store_errors(name):
             self.head(name)
-            path.unlink(missing_ok=True)
+            with _locked(lock) if lock.exists() else contextlib.nullcontext():
+                for each in paths:
+                    each.unlink(missing_ok=True)
+                lock.unlink(missing_ok=True)
+            if len(paths) == 1 and path.parent != self._folder:
+                with contextlib.suppress(OSError):  # it is not empty
+                    path.parent.rmdir()
 
     def compare_and_swap(self, name: str, expected: bytes | None, data: bytes) -> None:
         """Replace the object if it still holds *expected*; a lock file excludes other writers."""
-        path = self._path(name)
-        with _as_store_errors(name):
-            _make_folder(path.parent)
-            with (path.parent / f".lock-{path.name}").open("wb") as lock:
-                fcntl.flock(lock, fcntl.LOCK_EX)
-                current = _read(path) if os.path.lexists(path) else None
+
+        def swap(path: Path) -> None:
+            with _locked(path.with_name(f"{_LOCK}{path.name}")):
+                try:
+                    current = self.get(name)
+                except NotFound:
+                    current = None
                 if current != expected:
                     raise Conflict(f"{name!r} was changed meanwhile", hint="read it again and retry")
                 replace_file(path, data, mode=OWNER_ONLY, is_durable=True)
 
+        self._write(name, swap)
+
     def sweep(self, *, now: float, older_than_s: float) -> int:
         """Remove the temporary files of writers that crashed and return their number; *now* is Unix time."""
         removed = 0
-        for path in self._folder.rglob(f"{TEMPORARY_PREFIX}*"):
-            with contextlib.suppress(FileNotFoundError):
-                if now - path.lstat().st_mtime > older_than_s:
-                    path.unlink()
-                    removed += 1
+        for at, _, names in os.walk(self._folder):
+            for path in (Path(at, name) for name in names if name.startswith(TEMPORARY_PREFIX)):
+                with contextlib.suppress(FileNotFoundError):
+                    if now - path.lstat().st_mtime > older_than_s:
+                        path.unlink()
+                        removed += 1
         return removed
 
-    def _path(self, name: str) -> Path:
-        return self._folder / check_name(name)
+    def move_old_objects(self) -> int:
+        """Move robots' objects from where earlier versions wrote them to the folders by digest; return how
+        many.
+        """
+        moved = 0
+        for tenant in self.folders("objects/"):
+            for robot in self.folders(f"objects/{tenant}/"):
+                at = f"objects/{tenant}/{robot}/"
+                for name in filter(_DIGEST.fullmatch, self._scan(at)[0]):
+                    path, old = self._paths(at + name)
+                    with _as_store_errors(at + name):
+                        _make_folder(path.parent)
+                        with contextlib.suppress(FileNotFoundError):  # the robot removed it
+                            old.rename(path)
+                            moved += 1
+        return moved
 
+    def _paths(self, name: str) -> tuple[Path, ...]:
+        """Return where the object is written, and then where an earlier version may have written it."""
+        path = self._folder / check_name(name)
+        if not (name.startswith("objects/") and _DIGEST.fullmatch(path.name)):
+            return (path,)
+        return path.parent / f"{_SHARD}{path.name[:2]}" / path.name, path
 
-def _read(path: Path) -> bytes:
-    """Return the content of a regular file; a symbolic link is not an object."""
-    with _open(path) as file:
-        return file.read()
+    def _find(self, name: str, read: Callable[[Path], _T]) -> _T:
+        """Return what *read* returns for the file of the object; raises OSError."""
+        *first, last = self._paths(name)
+        for path in [*first, *([last] if first else [])]:
+            with contextlib.suppress(FileNotFoundError):
+                return read(path)
+        return read(first[0] if first else last)  # it may have been moved there meanwhile
+
+    def _write(self, name: str, write: Callable[[Path], None]) -> None:
+        """Call *write* for the path of the object; again if its folder was removed as empty meanwhile."""
+        path = self._paths(name)[0]
+        with _as_store_errors(name):
+            for tries_left in reversed(range(_WRITE_TRIES)):
+                try:
+                    _make_folder(path.parent)
+                    write(path)
+                except FileNotFoundError:
+                    if not tries_left:
+                        raise
+                else:
+                    break
+
+    def _measure(self, prefix: str) -> tuple[Usage, _Names]:
+        """Return what the objects in the folder *prefix* itself count for, and the folders in it."""
+        objects = charged = 0
+        files, folders = self._scan(prefix)
+        for name in files:
+            if is_name(name):
+                with contextlib.suppress(FileNotFoundError):
+                    objects += 1
+                    charged += charge_of(os.lstat(f"{self._folder}/{prefix}{name}").st_size)
+        return Usage(objects, charged), folders
+
+    def _scan(self, at: str) -> tuple[_Names, _Names]:
+        """Return the names of the files and of the folders in the folder *at*, which is "" or ends with /."""
+        files, folders = [], []
+        with (
+            _as_store_errors(at), contextlib.suppress(FileNotFoundError, NotADirectoryError),
+            os.scandir(f"{self._folder}/{at}") as entries,
+        ):  # fmt: skip
+            for entry in entries:
+                if entry.is_file(follow_symlinks=False):
+                    files.append(entry.name)
+                elif entry.is_dir(follow_symlinks=False):
+                    folders.append(entry.name)
+        return files, folders
+
+    def _walk(self, at: str, prefix: str, after: str) -> Iterator[ObjectInfo]:
+        """Yield the objects below the folder *at* in the order of their names."""
+        files, folders = self._scan(at)
+        # What lies in +ab sorts where "ab" does; files of an earlier version are merged with it.
+        shards: dict[str, _Names] = {name[1:]: [] for name in folders if name.startswith(_SHARD)}
+        below = [f"{name}/" for name in folders if not name.startswith(_SHARD)]
+        for name in files:
+            shards.get(name[:2], below).append(name)
+        for name in sorted([*below, *shards]):
+            begin = at + name
+            if not (begin.startswith(prefix) or prefix.startswith(begin)):
+                continue
+            if name not in shards and not name.endswith("/"):
+                yield from self._info(begin, begin, after)
+            elif begin < after and not after.startswith(begin):
+                continue
+            elif name in shards:
+                yield from self._walk_shard(at, name, shards[name], prefix, after)
+            else:
+                yield from self._walk(begin, prefix, after)
+
+    def _walk_shard(self, at: str, shard: str, old: _Names, prefix: str, after: str) -> Iterator[ObjectInfo]:
+        within = set(self._scan(f"{at}{_SHARD}{shard}/")[0])
+        for name in sorted(within.union(old)):
+            if (at + name).startswith(prefix):
+                place = f"{at}{_SHARD}{shard}/{name}" if name in within else at + name
+                yield from self._info(at + name, place, after)
+
+    def _info(self, name: str, place: str, after: str) -> Iterator[ObjectInfo]:
+        if name > after and is_name(name):
+            with contextlib.suppress(FileNotFoundError):
+                yield ObjectInfo(name=name, size=os.lstat(f"{self._folder}/{place}").st_size)
 
 
 def _open(path: Path) -> BinaryIO:
@@ -316,12 +528,47 @@ def _make_folder(folder: Path) -> None:
         folder = folder.parent
     for each in reversed(missing):
         try:
-            each.mkdir(exist_ok=True)
-        except (FileExistsError, NotADirectoryError) as error:
-            raise StoreError(
-                f"{each.name!r} is an object, not a folder", hint="choose another name"
-            ) from error
+            each.mkdir()
+        except FileExistsError as error:
+            if not stat.S_ISDIR(each.lstat().st_mode):
+                raise StoreError(
+                    f"{each.name!r} is an object, not a folder", hint="choose another name"
+                ) from error
         sync_folder(each.parent)
+
+
+def _replace_by_pieces(path: Path, pieces: Iterator[bytes]) -> None:
+    temporary = path.with_name(f"{TEMPORARY_PREFIX}{secrets.token_hex(8)}")
+    handle = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, OWNER_ONLY)
+    try:
+        with os.fdopen(handle, "wb") as file:
+            for piece in pieces:
+                file.write(piece)
+            file.flush()
+            os.fsync(handle)
+        os.replace(temporary, path)
+    except BaseException:
+        temporary.unlink(missing_ok=True)
+        raise
+    sync_folder(path.parent)
+
+
+@contextlib.contextmanager
+def _locked(path: Path) -> Iterator[None]:
+    """Hold the lock file *path*, which its holder may remove."""
+    while True:
+        with path.open("wb") as file:
+            fcntl.flock(file, fcntl.LOCK_EX)
+            if _is_at(path, file):  # else it was removed while this writer waited
+                yield
+                return
+
+
+def _is_at(path: Path, file: BinaryIO) -> bool:
+    try:
+        return os.path.samestat(os.fstat(file.fileno()), path.lstat())
+    except FileNotFoundError:
+        return False
 
 
 @contextlib.contextmanager

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import itertools
 import os
 import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -25,10 +27,13 @@ from rse_pf.object_store import (
     ObjectInfo,
     ObjectStore,
     RangedStore,
+    Usage,
     check_name,
     digest_of,
     open_store,
+    put_pieces,
     read_range,
+    usage_of,
 )
 
 STORES: dict[str, Callable[[Path], ObjectStore]] = {
@@ -129,6 +134,65 @@ def test_names_are_listed_in_order_and_by_prefix(store: ObjectStore) -> None:
     assert [info.size for info in store.list("a/")] == [4, 3]
 
 
+def test_a_list_continues_after_a_name(store: ObjectStore) -> None:
+    digests = [digest_of(bytes([n])) for n in range(40)]
+    stored = [*sorted(f"objects/lab/robot-1/{each}" for each in digests), "objects/lab/robot-10/x", "z/a"]
+    for name in stored:
+        store.put(name, b"x")
+
+    for row, name in enumerate(stored):
+        assert [info.name for info in store.list(after=name)] == stored[row + 1 :]
+    page = [info.name for info in store.list("objects/lab/robot-1/", after=stored[9])]
+    assert page == stored[10:40]
+    assert [info.name for info in store.list("objects/lab/robot-1/", after="z")] == []
+    assert [info.name for info in store.list("objects/lab/robot-1/", after="a")] == stored[:40]
+
+
+def test_folders_are_what_stands_before_the_next_slash(store: ObjectStore) -> None:
+    for name in ("maps/lab/b/head", "maps/lab/a/head", "maps/lab/a/versions/1", "maps/lab/file", "maps/x/y"):
+        store.put(name, b"x")
+
+    assert list(store.folders("maps/lab/")) == ["a", "b"]
+    assert list(store.folders("maps/")) == ["lab", "x"]
+    assert list(store.folders("nothing/")) == []
+
+
+def test_an_object_of_many_pieces_is_complete(store: ObjectStore) -> None:
+    pieces = [bytes([n]) * (6 << 20) for n in range(3)]
+
+    put_pieces(store, "large", iter(pieces))
+    put_pieces(store, "empty", iter(()))
+
+    assert store.get("large") == b"".join(pieces)
+    assert store.get("empty") == b""
+
+
+@pytest.mark.parametrize("count", [1, 3])
+def test_an_object_whose_pieces_fail_is_not_stored(store: ObjectStore, count: int) -> None:
+    def pieces() -> Iterator[bytes]:
+        yield from [bytes(6 << 20)] * count
+        raise StoreError("the last part is missing")
+
+    with pytest.raises(StoreError, match="last part"):
+        put_pieces(store, "large", pieces())
+
+    assert names(store) == []
+
+
+def test_an_object_counts_for_four_kib_at_least(store: ObjectStore) -> None:
+    assert usage_of(store, "objects/lab/robot-1/") == Usage()
+    for size in (0, 8, 4096, 10_000):
+        name = f"objects/lab/robot-1/{digest_of(bytes(size))}"
+        store.put(name, bytes(size))
+        store.put(name, bytes(size))
+    store.put(f"objects/lab/robot-2/{digest_of(b'x')}", b"x")
+
+    assert usage_of(store, "objects/lab/robot-1/") == Usage(4, 3 * 4096 + 10_000)
+    assert usage_of(store, "objects/lab/") == Usage(5, 4 * 4096 + 10_000)
+    store.delete(name)
+    assert usage_of(store, "objects/lab/robot-1/") == Usage(3, 3 * 4096)
+
+
 def test_a_swap_requires_the_expected_content(store: ObjectStore) -> None:
     store.compare_and_swap("head", None, b"1")
     store.compare_and_swap("head", b"1", b"2")
@@ -195,6 +259,115 @@ def test_an_object_cannot_be_a_folder_too(tmp_path: Path) -> None:
 
     assert not isinstance(caught.value, NotFound)
     assert store.get("a") == b"x"
+
+
+def old_path(folder: Path, robot: str, digest: str) -> Path:
+    """Return where versions before the folders by digest wrote a robot's object."""
+    path = folder / "objects" / "default" / robot / digest
+    path.parent.mkdir(parents=True, exist_ok=True)
+    return path
+
+
+def test_objects_of_an_earlier_version_are_read_listed_and_removed(tmp_path: Path) -> None:
+    store, digests = DirectoryStore(tmp_path), sorted(digest_of(b"%d" % n) for n in range(100))
+    for row, digest in enumerate(digests):
+        if row % 2:
+            old_path(tmp_path, "robot-1", digest).write_bytes(b"old")
+        else:
+            store.put(f"objects/default/robot-1/{digest}", b"new")
+    prefix = "objects/default/robot-1/"
+
+    assert names(store, prefix) == [prefix + digest for digest in digests]
+    assert [info.name for info in store.list(prefix, after=prefix + digests[50])] == [
+        prefix + digest for digest in digests[51:]
+    ]
+    assert store.get(prefix + digests[1]) == b"old"
+    assert store.head(prefix + digests[1]).size == 3
+    assert store.usage(prefix).objects == 100
+    store.put(prefix + digests[1], b"newer")
+    assert len(names(store, prefix)) == 100
+    store.delete(prefix + digests[1])
+    store.delete(prefix + digests[3])
+    assert names(store, prefix) == [prefix + each for row, each in enumerate(digests) if row not in (1, 3)]
+
+
+def test_objects_of_an_earlier_version_are_moved_and_keep_their_names(tmp_path: Path) -> None:
+    store, digests = DirectoryStore(tmp_path), sorted(digest_of(bytes([n])) for n in range(20))
+    for digest in digests:
+        old_path(tmp_path, "robot-1", digest).write_bytes(digest.encode())
+    before = names(store)
+
+    assert store.move_old_objects() == 20
+    assert store.move_old_objects() == 0
+
+    assert names(store) == before
+    assert [store.get(name) for name in before] == [digest.encode() for digest in digests]
+    assert not [path for path in old_path(tmp_path, "robot-1", "x").parent.iterdir() if path.is_file()]
+
+
+def test_a_page_reads_only_the_folders_that_it_needs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    store, prefix = DirectoryStore(tmp_path), "objects/default/robot-1/"
+    for number in range(1000):
+        path = tmp_path / f"{prefix}+{number % 256:02x}" / f"{number % 256:02x}{number:062x}"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.touch()
+    read: list[str] = []
+    scandir = os.scandir
+    monkeypatch.setattr(os, "scandir", lambda path: read.append(str(path)) or scandir(path))
+
+    page = list(itertools.islice(store.list(prefix, after=f"{prefix}80"), 20))
+
+    assert page[0].name == f"{prefix}80{128:062x}"
+    assert len(read) == 1 + 5  # the robot's folder, and 20 objects in folders of 4
+
+
+def test_usage_reads_only_folders_that_changed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    store, prefix = DirectoryStore(tmp_path), "objects/default/robot-1/"
+    for number in range(20):
+        store.put(prefix + digest_of(bytes([number])), b"x")
+    for folder in [tmp_path / prefix, *(tmp_path / prefix).iterdir()]:
+        os.utime(folder, (1, 1))
+    assert store.usage(prefix).objects == 20
+    read: list[str] = []
+    scandir = os.scandir
+    monkeypatch.setattr(os, "scandir", lambda path: read.append(str(path)) or scandir(path))
+    other = DirectoryStore(tmp_path)
+
+    assert store.usage(prefix).objects == 20
+    assert read == []
+    other.delete(prefix + digest_of(bytes([3])))
+    assert store.usage(prefix).objects == 19
+    assert len(read) == 1
+
+
+def test_nothing_is_left_of_what_was_deleted(tmp_path: Path) -> None:
+    store = DirectoryStore(tmp_path / "store")
+    store.put("uploads/lab/robot-1/abc/size", b"8")
+    store.put_scratch("uploads/lab/robot-1/abc/part-0", b"x")
+    store.compare_and_swap("jobs/lab/robot-1/key", None, b"1")
+
+    for name in names(store):
+        store.delete(name)
+
+    left = {path.relative_to(tmp_path / "store").as_posix() for path in tmp_path.glob("store/**/*")}
+    assert left == {"uploads", "uploads/lab", "uploads/lab/robot-1", "jobs", "jobs/lab"}
+
+
+def test_writers_and_removers_of_one_folder_never_disturb_each_other(tmp_path: Path) -> None:
+    store = DirectoryStore(tmp_path)
+
+    def work(number: int) -> None:
+        for turn in range(100):
+            store.put_scratch(f"uploads/a/{number}", b"x")
+            with contextlib.suppress(Conflict):
+                store.compare_and_swap("uploads/a/head", None, b"%d" % turn)
+            store.delete(f"uploads/a/{number}")
+            store.delete("uploads/a/head")
+
+    with ThreadPoolExecutor(4) as pool:
+        for each in [pool.submit(work, number) for number in range(4)]:
+            each.result(60)
+    assert names(store) == []
 
 
 @pytest.mark.parametrize("code", [errno.ENOSPC, errno.EDQUOT])

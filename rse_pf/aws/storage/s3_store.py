@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import base64
 import contextlib
+import itertools
 from collections.abc import Iterator
 from typing import Any
 
@@ -20,6 +21,8 @@ from rse_pf.object_store import ObjectInfo, ObjectStore, check_name, open_store
 __all__ = ["S3Store", "open_bucket", "open_data_store"]
 
 _NOT_FOUND, _PRECONDITION_FAILED, _CONFLICT, _RANGE_OUTSIDE = 404, 412, 409, 416
+_PART_BYTES = 8 << 20
+"""Of a large object; S3 takes parts of 5 MiB or more."""
 _FULL = {"QuotaExceeded", "EntityTooLarge", "InsufficientStorage"}
 
 
@@ -63,22 +66,46 @@ class S3Store:
         """Store the object durably; raises StoreFull."""
         self._write(check_name(name), data)
 
+    def put_pieces(self, name: str, pieces: Iterator[bytes]) -> None:
+        """Store the object durably, in parts of `_PART_BYTES`; if *pieces* raises an error, store nothing."""
+        parts = _joined(pieces, _PART_BYTES)
+        first, second = next(parts, b""), next(parts, None)
+        if second is None:
+            self.put(name, first)
+            return
+        upload = self._ask(name, "create_multipart_upload", Key=check_name(name))["UploadId"]
+        try:
+            sent = []
+            for number, part in enumerate(itertools.chain([first, second], parts), 1):
+                found = self._ask(
+                    name, "upload_part", Key=name, UploadId=upload, PartNumber=number, Body=part
+                )
+                sent.append({"PartNumber": number, "ETag": found["ETag"]})
+            self._ask(
+                name, "complete_multipart_upload", Key=name, UploadId=upload, MultipartUpload={"Parts": sent}
+            )
+        except BaseException:
+            with contextlib.suppress(StoreError):
+                self._ask(name, "abort_multipart_upload", Key=name, UploadId=upload)
+            raise
+
     def head(self, name: str) -> ObjectInfo:
         """Return size and name; raises NotFound."""
         found = self._ask(name, "head_object", Key=check_name(name))
         return ObjectInfo(name=name, size=int(found["ContentLength"]))
 
-    def list(self, prefix: str = "") -> Iterator[ObjectInfo]:
-        """Yield the objects whose names begin with *prefix*, sorted by name."""
-        more: dict[str, str] = {}
-        while True:
-            page = self._ask(prefix, "list_objects_v2", Prefix=prefix, **more)
+    def list(self, prefix: str = "", after: str = "") -> Iterator[ObjectInfo]:
+        """Yield the objects whose names begin with *prefix* and are greater than *after*, sorted by name."""
+        for page in self._pages(prefix, **({"StartAfter": after} if after else {})):
             for each in page.get("Contents", ()):
                 with contextlib.suppress(StoreError):  # a name that the platform did not write
                     yield ObjectInfo(name=check_name(each["Key"]), size=int(each["Size"]))
-            if not page.get("IsTruncated"):
-                return
-            more = {"ContinuationToken": page["NextContinuationToken"]}
+
+    def folders(self, prefix: str) -> Iterator[str]:
+        """Yield what stands between *prefix* and the next slash in names, sorted."""
+        for page in self._pages(prefix, Delimiter="/"):
+            for each in page.get("CommonPrefixes", ()):
+                yield str(each["Prefix"])[len(prefix) : -1]
 
     def delete(self, name: str) -> None:
         """Remove the object; a missing one is no error."""
@@ -127,6 +154,14 @@ class S3Store:
         place = {"Bucket": self._bucket, "Key": check_name(name)}
         return str(self._client.generate_presigned_url("get_object", Params=place, ExpiresIn=ttl_s))
 
+    def _pages(self, prefix: str, **arguments: str) -> Iterator[dict[str, Any]]:
+        while True:
+            page = self._ask(prefix, "list_objects_v2", Prefix=prefix, **arguments)
+            yield page
+            if not page.get("IsTruncated"):
+                return
+            arguments["ContinuationToken"] = page["NextContinuationToken"]
+
     def _read(self, name: str) -> tuple[bytes, str]:
         check_name(name)
         with _as_store_errors(name):
@@ -160,6 +195,18 @@ class S3Store:
                 lambda: getattr(self._client, method)(Bucket=self._bucket, **arguments)
             )
         return found
+
+
+def _joined(pieces: Iterator[bytes], size: int) -> Iterator[bytes]:
+    """Yield what *pieces* hold in parts of at least *size* bytes, the last one excepted."""
+    held = bytearray()
+    for piece in pieces:
+        held += piece
+        if len(held) >= size:
+            yield bytes(held)
+            held.clear()
+    if held:
+        yield bytes(held)
 
 
 @contextlib.contextmanager
