@@ -10,7 +10,7 @@ that was killed is replaced in some milliseconds.  `LimitedProcesses.call` block
 threads.
 
 Bytes that crash their process, exhaust its memory or its CPU time cost that one process and nothing else, and
-only they raise Crashed: it is evidence against whoever sent the bytes, the other errors are not.  This is no
+only they raise Crashed: it is evidence against the sender of the bytes, the other errors are not.  This is no
 sandbox: code that took over the process may do what its user may do.
 """
 
