@@ -9,6 +9,9 @@ order.  The rules:
 - A command is answered at its deadline; its sandbox is killed at a multiple of the deadline, which is no
   crash.
 - A sandbox outlives the last connection of its robot by a grace period, unless its place is needed.
+- When all places are taken, a robot gets the place of a sandbox in its grace period, or else, by
+  `FairShare`, that of the sandbox which has been idle longest of the tenant that holds most; if none of that
+  tenant is idle, the next one whose command ends is released.  State that no snapshot holds is lost.
 - Commands that wait for a sandbox which crashed move to the new one.
 """
 
@@ -22,6 +25,7 @@ from typing import Any, Literal
 
 from rse_pf.backend.sandbox.circuit_breaker import CircuitBreaker
 from rse_pf.backend.sandbox.ipc import encode_message
+from rse_pf.backend.scheduling.fair_share import FairShare
 from rse_pf.backend.scheduling.scheduler import QueuedCommand
 from rse_pf.config import ServiceSettings
 from rse_pf.errors import Busy, Conflict, Expired, Poison, RsePfError, StoreError, WorkerLost
@@ -179,6 +183,7 @@ class _Sandbox:
     """Last snapshot of each stateful service, as it stands in the store."""
     unsaved: SandboxReply | None = None
     """The reply whose snapshot is being saved."""
+    idle_since_s: float = 0.0
     fault: str = ""
     is_overrun: bool = False
     """It was killed because the deadline of the running call had passed."""
@@ -211,6 +216,8 @@ class SandboxPolicy:
         self._breaker = CircuitBreaker(settings)
         self._sandboxes: dict[int, _Sandbox] = {}
         self._by_robot: dict[RobotId, _Sandbox] = {}
+        self._shares = FairShare(max_sandboxes)
+        self._held_by_tenant: Counter[str] = Counter()
         self._connections: Counter[RobotId] = Counter()
         self._last_number = 0
         self._actions: list[Action] = []
@@ -263,12 +270,8 @@ class SandboxPolicy:
         """A robot sent a command."""
         refusal = self._refusal(call, now)
         sandbox = self._by_robot.get(call.queued.robot)
-        if refusal is None and sandbox is None and not self._has_capacity():
-            refusal = Busy(
-                f"all {self._max_sandboxes} sandboxes of this server are in use",
-                hint="try again later",
-                retry_after_ms=_BUSY_RETRY_MS,
-            )
+        if refusal is None and sandbox is None and not self._gets_place(call.queued.robot.tenant, now):
+            refusal = self._full()
         if refusal is not None:
             self._answer(call, refusal)
             return self._take_actions()
@@ -286,7 +289,7 @@ class SandboxPolicy:
             return []
         if sandbox.state != "starting":
             return self.broken(number, "it reported its start twice")
-        sandbox.state, sandbox.kill_s = "idle", math.inf
+        sandbox.state, sandbox.kill_s, sandbox.idle_since_s = "idle", math.inf, now
         self._start_next(sandbox, now)
         return self._take_actions()
 
@@ -397,14 +400,35 @@ class SandboxPolicy:
             self.counts["poison"] += 1
         return refusal
 
-    def _has_capacity(self) -> bool:
-        """Return whether one more sandbox fits; an idle one in its grace period is released for it."""
+    def _gets_place(self, tenant: str, now: float) -> bool:
+        """Return whether *tenant* gets one more sandbox; if all are in use, one may be released for it."""
         if len(self._sandboxes) >= self._max_sandboxes:
-            for sandbox in self._sandboxes.values():
-                if sandbox.release_s < math.inf and sandbox.running is None:
-                    self._release(sandbox)
-                    break
-        return len(self._sandboxes) < self._max_sandboxes
+            spare = self._spare(tenant)
+            if spare is not None:
+                self.counts["released"] += 1
+                self._release(spare)
+        takes = self._shares.takes(tenant, self._held_by_tenant, now)
+        if not takes:
+            self._shares.claim(tenant, now)
+        return takes
+
+    def _spare(self, tenant: str) -> _Sandbox | None:
+        free = [each for each in self._sandboxes.values() if each.running is None]
+        in_grace = [each for each in free if each.release_s < math.inf]
+        if in_grace:
+            return max(in_grace, key=lambda each: self._held_by_tenant[each.robot.tenant])
+        for donor in self._shares.donors(tenant, self._held_by_tenant):
+            idle = [each for each in free if each.robot.tenant == donor and each.state == "idle"]
+            if idle:
+                return min(idle, key=lambda each: each.idle_since_s)
+        return None
+
+    def _full(self) -> Busy:
+        return Busy(
+            f"all {self._max_sandboxes} sandboxes of this server are in use",
+            hint="try again later",
+            retry_after_ms=_BUSY_RETRY_MS,
+        )
 
     def _may_retry(self, call: SandboxCall, sandbox: _Sandbox, now: float) -> bool:
         is_stateless = self._kinds[call.service] == "stateless"
@@ -445,8 +469,16 @@ class SandboxPolicy:
 
     def _move_waiting(self, sandbox: _Sandbox, now: float) -> None:
         """Let the commands that waited for a released sandbox wait for a new one."""
-        if sandbox.waiting and self._connections[sandbox.robot] > 0:
+        if not sandbox.waiting or self._connections[sandbox.robot] == 0:
+            return
+        if self._shares.takes(sandbox.robot.tenant, self._held_by_tenant, now):
             self._create(sandbox.robot, now).waiting.extend(sandbox.waiting)
+        else:
+            self._refuse_waiting(sandbox)
+
+    def _refuse_waiting(self, sandbox: _Sandbox) -> None:
+        while sandbox.waiting:
+            self._answer(sandbox.waiting.popleft(), self._full())
 
     # --- steps -------------------------------------------------------------------------------------
 
@@ -454,12 +486,14 @@ class SandboxPolicy:
         self._last_number += 1
         sandbox = _Sandbox(self._last_number, robot, kill_s=now + self._settings.start_timeout_s)
         self._sandboxes[sandbox.number] = self._by_robot[robot] = sandbox
+        self._held_by_tenant[robot.tenant] += 1
         self.counts["created"] += 1
         self._actions.append(CreateSandbox(sandbox.number, robot))
         return sandbox
 
     def _release(self, sandbox: _Sandbox) -> None:
         del self._sandboxes[sandbox.number], self._by_robot[sandbox.robot]
+        self._held_by_tenant -= Counter([sandbox.robot.tenant])
         self._actions.append(ReleaseSandbox(sandbox.number))
 
     def _kill(self, sandbox: _Sandbox, why: str) -> None:
@@ -499,8 +533,14 @@ class SandboxPolicy:
     ) -> None:
         sandbox.state, sandbox.running, sandbox.unsaved = "idle", None, None
         sandbox.late_s = sandbox.kill_s = math.inf
+        sandbox.idle_since_s = now
         self._answer(call, outcome)
-        self._start_next(sandbox, now)
+        if self._shares.gives(sandbox.robot.tenant, self._held_by_tenant, now):
+            self.counts["released"] += 1
+            self._refuse_waiting(sandbox)
+            self._release(sandbox)
+        else:
+            self._start_next(sandbox, now)
 
     def _answer(self, call: SandboxCall, outcome: SandboxReply | RsePfError) -> None:
         if not call.is_answered:

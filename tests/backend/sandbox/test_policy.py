@@ -501,6 +501,66 @@ def test_a_sandbox_that_works_or_whose_robot_is_connected_keeps_its_place():
     assert outcomes(policy.submit(call, 1.5)) == [(call, "busy")]
 
 
+RIVALS = [RobotId("rival", name) for name in "abcd"]
+
+
+def taken_by_rivals(*, idle: bool) -> tuple[SandboxPolicy, list[SandboxCall]]:
+    """Return a policy whose four places one tenant holds: its sandboxes run, or became idle at 4, 3, 2, 1 s."""
+    policy, calls = make_policy(), [make_call(rival) for rival in RIVALS]
+    for i, call in enumerate(calls):
+        policy.connected(call.queued.robot)
+        number = start(policy, call)
+        if idle:
+            policy.replied(number, OK, 4.0 - i)
+    return policy, calls
+
+
+def test_a_tenant_that_holds_all_places_loses_the_one_that_was_idle_longest_to_another_tenant():
+    policy, _ = taken_by_rivals(idle=True)
+
+    assert policy.submit(make_call(A), 5.0) == [ReleaseSandbox(4), CreateSandbox(5, A)]
+    assert policy.submit(make_call(B), 5.0) == [ReleaseSandbox(3), CreateSandbox(6, B)]
+    third = make_call(C)
+    assert outcomes(policy.submit(third, 5.0)) == [(third, "busy")], "both tenants have two"
+
+
+def test_a_tenant_whose_sandboxes_all_work_gives_up_the_first_that_ends_its_command():
+    policy, calls = taken_by_rivals(idle=False)
+    call, waiting = make_call(A, now=1.0), make_call(RIVALS[0], payload="2")
+    policy.submit(waiting, 1.0)
+    assert outcomes(policy.submit(call, 1.0)) == [(call, "busy")]
+
+    actions = policy.replied(1, OK, 1.5)
+
+    assert outcomes(actions) == [(calls[0], "ok"), (waiting, "busy")]
+    assert ReleaseSandbox(1) in actions
+    more = make_call(RIVALS[0], payload="3")
+    assert outcomes(policy.submit(more, 1.6)) == [(more, "busy")], "the place is kept for who asked first"
+    assert outcomes(policy.replied(2, OK, 1.7)) == [(calls[1], "ok")]
+    assert policy.submit(make_call(A), 2.0) == [CreateSandbox(5, A)]
+
+
+def test_a_crash_does_not_help_a_tenant_to_keep_a_place_that_another_one_claims():
+    policy, _ = taken_by_rivals(idle=False)
+    policy.submit(make_call(RIVALS[0], payload="2"), 1.0)
+    policy.submit(make_call(A), 1.0)
+
+    actions = policy.gone(1, "exit code 1", 1.5)
+
+    assert not any(isinstance(each, CreateSandbox) for each in actions)
+    assert [code for _, code in outcomes(actions)] == ["busy", "busy"]
+
+
+def test_a_robot_has_one_sandbox_however_many_it_asks_for():
+    policy = make_policy()
+    start(policy, make_call(A))
+    for i in range(64):
+        policy.submit(make_call(A, payload=str(i)), 0.1)
+
+    assert policy.sandboxes == 1
+    assert created(policy.submit(make_call(B), 0.2)) == 2
+
+
 def test_closing_releases_everything_and_answers_nothing():
     policy = make_policy()
     start(policy, make_call(A))
