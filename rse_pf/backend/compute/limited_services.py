@@ -6,11 +6,11 @@ ended two processes is kept from these services for a while.
 
 from __future__ import annotations
 
-from rse_pf.backend.compute.crash_record import CrashRecord
 from rse_pf.backend.compute.process import TARGET, configuration_of, decode_reply, encode_request
 from rse_pf.backend.ports import WorkerContext
 from rse_pf.backend.scheduling.scheduler import QueuedCommand
 from rse_pf.config import PlatformSettings
+from rse_pf.crash_record import CrashRecord
 from rse_pf.errors import Busy, Crashed, Expired, RsePfError
 from rse_pf.limited_process import LimitedProcesses
 from rse_pf.service import failure_of

@@ -1,4 +1,4 @@
-"""Keep a robot whose commands ended processes from limited services for a while.
+"""Keep a robot whose bytes ended processes from what would start more of them, for a while.
 
 Only what this robot sent counts, and only against it.  Its own deadline never counts: a command that was
 given too little time says nothing about its bytes.  Time is an argument, and memory is bounded whatever
@@ -22,7 +22,7 @@ _MAX_ROBOTS = 10_000
 
 
 class CrashRecord:
-    """Which robots ended processes of one worker, and when; may be used by several threads."""
+    """Which robots ended processes of one worker or data server, and when; may be used by several threads."""
 
     def __init__(self, settings: ServiceSettings) -> None:
         self._settings = settings
