@@ -131,12 +131,11 @@ class LimitedProcesses:
             raise _busy("no process was free in time") from None
         try:
             while True:
-                is_new = slot.process is None or not self._template.has(slot.process)
-                if is_new:
-                    slot.process = None
-                    slot.process = self._template.fork(until)
                 process = slot.process
-                assert process is not None
+                is_new = process is None or not self._template.has(process)
+                if process is None or is_new:
+                    slot.forget()
+                    process = slot.process = self._template.fork(until)
                 try:
                     return _exchange(process.connection, data, until, self._max_reply_bytes)
                 except TimeoutError:
@@ -158,10 +157,13 @@ class LimitedProcesses:
     def close(self) -> None:
         """End the template and all processes; a call that is under way raises WorkerLost."""
         self._template.close()
+        with contextlib.suppress(queue.Empty):
+            while True:
+                self._free.get_nowait().forget()
 
     def _end(self, slot: _Slot, process: _Process) -> str:
         """Kill *process* unless it has ended, and return how it ended."""
-        slot.process = None
+        slot.forget()
         return self._template.end(process)
 
     def _crash(self, how: str) -> Crashed:
@@ -186,6 +188,11 @@ class _Slot:
 
     def __init__(self) -> None:
         self.process: _Process | None = None
+
+    def forget(self) -> None:
+        if self.process is not None:
+            self.process.connection.close()
+            self.process = None
 
 
 class _ProcessEnded(Exception):
@@ -231,14 +238,15 @@ class _Template:
                 self._start()
             self._wait_until_ready(until)
             ours, theirs = socket.socketpair()
-            with theirs:
-                reply = self._ask({"do": "fork"}, theirs)
-            self._forked.add(reply["pid"])
-            return _Process(reply["pid"], ours, self._generation)
+            with theirs, contextlib.ExitStack() as undo:
+                undo.enter_context(ours)
+                pid = int(self._ask({"do": "fork"}, theirs)["pid"])
+                undo.pop_all()
+            self._forked.add(pid)
+            return _Process(pid, ours, self._generation)
 
     def end(self, process: _Process) -> str:
         """Kill *process* unless it has ended, reap it, and return how it ended."""
-        process.connection.close()
         with self._lock:
             if self._is_closed or not self.has(process):
                 raise WorkerLost("the process ended with its template", hint="try again")
