@@ -213,10 +213,10 @@ def test_what_the_handler_refuses_arrives_with_its_hint(processes: LimitedProces
 
 @pytest.mark.parametrize("data", [b"defect", b"exit"])
 def test_a_defect_of_the_handler_is_internal_and_goes_to_the_log(
-    processes: LimitedProcesses, capfd: pytest.CaptureFixture[str], data: bytes
+    own: LimitedProcesses, capfd: pytest.CaptureFixture[str], data: bytes
 ):
     with pytest.raises(InternalError) as raised:
-        processes.call(data, LONG_S)
+        own.call(data, LONG_S)
 
     assert "secret" not in raised.value.message
     assert "Traceback" in capfd.readouterr().err
