@@ -14,8 +14,8 @@ from pathlib import Path
 
 __all__ = [
     "PR_CAPBSET_DROP", "PR_SET_CHILD_SUBREAPER", "PR_SET_DUMPABLE", "PR_SET_NO_NEW_PRIVS", "PR_SET_SECCOMP",
-    "cpu_seconds", "die_with_parent", "prctl", "raise_descriptor_limit", "resident_bytes",
-    "run_as_batch", "run_when_idle", "set_process_name",
+    "cpu_seconds", "die_with_parent", "prctl", "proportional_bytes", "raise_descriptor_limit",
+    "resident_bytes", "run_as_batch", "run_when_idle", "set_process_name",
 ]  # fmt: skip
 
 PR_SET_DUMPABLE, PR_SET_SECCOMP, PR_CAPBSET_DROP = 4, 22, 24
@@ -68,6 +68,20 @@ def resident_bytes(pid: int) -> int:
     return pages * os.sysconf("SC_PAGE_SIZE")
 
 
+def proportional_bytes(pid: int) -> int:
+    """Return the memory that Linux charges to *pid*: its pages, shared ones in part, swap and page tables.
+
+    Of a process that this user may not look into, shared pages count in full and files do not.  0 if it
+    is gone.
+    """
+    tables = _kilobytes(f"/proc/{pid}/status", "VmPTE")
+    try:
+        pages = _kilobytes(f"/proc/{pid}/smaps_rollup", "Pss", "SwapPss")
+    except PermissionError:
+        pages = _kilobytes(f"/proc/{pid}/status", "RssAnon", "RssShmem", "VmSwap")
+    return 1024 * (pages + tables)
+
+
 def run_when_idle(pid: int) -> None:
     """Let *pid* (0: this process) run only when nothing else wants the processor, for good.
 
@@ -89,3 +103,15 @@ def run_as_batch(pid: int, nice: int) -> None:
         os.setpriority(os.PRIO_PROCESS, pid, max(nice, os.getpriority(os.PRIO_PROCESS, 0)))
         if os.sched_getscheduler(pid) == os.SCHED_OTHER:
             os.sched_setscheduler(pid, os.SCHED_BATCH, os.sched_param(0))
+
+
+def _kilobytes(file: str, *names: str) -> int:
+    """Return the sum of the lines *names* of a file in procfs, 0 if its process is gone."""
+    try:
+        lines = Path(file).read_text().splitlines()
+    except PermissionError:
+        raise
+    except OSError:
+        return 0
+    wanted = {f"{name}:" for name in names}
+    return sum(int(words[1]) for words in map(str.split, lines) if words and words[0] in wanted)

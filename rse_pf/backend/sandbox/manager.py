@@ -90,6 +90,8 @@ class SandboxManager:
         self._log = log
         self._answer = answer
         self._channels: dict[int, IpcChannel] = {}
+        self._working: set[int] = set()
+        """Sandboxes that were sent a request and have not replied; all others are paused."""
         self._actions: deque[Action] = deque()
         self._is_executing = False
         self._timer: TimerHandle | None = None
@@ -153,7 +155,12 @@ class SandboxManager:
         self._execute(self._policy.broken(number, why))
 
     def _on_message(self, number: int, message: Any) -> None:
-        now = self._monotonic()
+        self._working.discard(number)
+        self._follow_message(number, message, self._monotonic())
+        if number in self._channels and number not in self._working:
+            self._zygote.pause(number)
+
+    def _follow_message(self, number: int, message: Any, now: float) -> None:
         if message == ["ready"]:
             self._execute(self._policy.ready(number, now))
             return
@@ -187,7 +194,9 @@ class SandboxManager:
         match action:
             case SendMessage(number, data):
                 if number in self._channels:
+                    self._working.add(number)
                     self._channels[number].send(data)
+                    self._zygote.resume(number)
             case AnswerCall(call, outcome):
                 self._answer(call.queued, self._answer_of(call, outcome))
             case CreateSandbox(number, robot):
@@ -197,6 +206,7 @@ class SandboxManager:
             case ReleaseSandbox(number):
                 self._zygote.end(number)
                 self._channels.pop(number).close()
+                self._working.discard(number)
             case LoadSnapshot(number, call):
                 self._ask_store(number, call, _load)
             case SaveSnapshot(number, call, expected, data):

@@ -15,11 +15,15 @@ import select
 import signal
 import socket
 import sys
+import time
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from rse_pf.backend.sandbox import isolation
+from rse_pf.backend.sandbox.cgroup import Cgroups, own_hierarchies
 from rse_pf.backend.sandbox.child import SandboxPlan, readable_paths, run_sandbox
+from rse_pf.backend.sandbox.watcher import MemoryWatcher
 from rse_pf.errors import MissingExtra
 from rse_pf.linux import PR_SET_CHILD_SUBREAPER, die_with_parent, prctl
 from rse_pf.services.custom.installed import InstalledService
@@ -32,6 +36,8 @@ _SLOTS = 500
 """User ids of one zygote; the next zygote's begin after them."""
 _FIRST_UID = 1_000_000
 """Sandboxes of a server that runs as root get user ids from here."""
+_MAX_THREADS = 64
+_FIRST_LOOK_S = 0.1
 
 
 def main(arguments: list[str]) -> None:
@@ -40,6 +46,15 @@ def main(arguments: list[str]) -> None:
     config = json.loads(worker.recv(_MAX_MESSAGE) or b"null")
     if config is not None and die_with_parent(config["worker"]):
         _Zygote(worker, config).run()
+
+
+@dataclass(frozen=True, slots=True)
+class _Child:
+    """A sandbox: its number, the slot of its user id, and a descriptor of its process."""
+
+    number: int
+    slot: int
+    handle: int
 
 
 class _Zygote:
@@ -58,34 +73,60 @@ class _Zygote:
             max_bytes=config["max_bytes"],
             missing=self._missing_isolation(list(services.values()), config["scratch_bytes"]),
         )
-        self._children: dict[int, tuple[int, int]] = {}
-        """Number of the sandbox and slot of its user id, by pid."""
+        self._cgroups = Cgroups(
+            own_hierarchies(),
+            owner=os.getpid(),
+            memory_bytes=config["memory_bytes"],
+            max_threads=_MAX_THREADS,
+        )
+        self._cgroups.prepare()
+        self._watcher = (
+            None if "memory" in self._cgroups.controllers else MemoryWatcher(config["memory_bytes"])
+        )
+        self._look_s = 0.0
+        """When the watcher looks next."""
+        self._children: dict[int, _Child] = {}
+        """By pid."""
+        self._reasons: dict[int, str] = {}
+        """Why sandboxes were killed that are still ending, by pid."""
+        self._poll = select.poll()
 
     def run(self) -> None:
         prctl(PR_SET_CHILD_SUBREAPER, 1)
-        child_ended, wakeup = os.pipe()
-        for fd in (child_ended, wakeup):
-            os.set_blocking(fd, False)
-        signal.set_wakeup_fd(wakeup, warn_on_full_buffer=False)
-        signal.signal(signal.SIGCHLD, lambda *_: None)
+        signal.signal(signal.SIGCHLD, signal.SIG_DFL)  # descriptors of processes report their end
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, signal.SIG_IGN)
         gc.collect()
         gc.freeze()
-        self._report(event="ready", missing=list(self._plan.missing))
-        poll = select.poll()
-        poll.register(self._worker, select.POLLIN)
-        poll.register(child_ended, select.POLLIN)
+        self._report(event="ready", missing=list(self._plan.missing), cgroup=list(self._cgroups.controllers))
+        self._poll.register(self._worker, select.POLLIN)
         while True:
-            ready = {fd for fd, _ in poll.poll()}
-            if child_ended in ready:
-                os.read(child_ended, 4096)
+            ready = {fd for fd, _ in self._poll.poll(self._wait_ms())}
             self._reap()
+            self._watch()
             if self._worker.fileno() in ready and not self._follow_order():
                 break
         for pid in self._children:
             os.kill(pid, signal.SIGKILL)
+        while self._children:
+            self._reap(wait=True)
+        self._cgroups.close()
         os._exit(0)
+
+    def _wait_ms(self) -> float | None:
+        """Return how long there is nothing to do without an event; None is forever."""
+        if self._watcher is None or not self._children:
+            return None
+        return max(0.0, self._look_s - time.monotonic()) * 1e3
+
+    def _watch(self) -> None:
+        """End the sandboxes that use too much memory in all."""
+        if self._watcher is None or not self._children or time.monotonic() < self._look_s:
+            return
+        for pid, reason in self._watcher.look(list(self._children)).items():
+            self._reasons[pid] = reason
+            os.kill(pid, signal.SIGKILL)
+        self._look_s = time.monotonic() + self._watcher.interval_s
 
     def _follow_order(self) -> bool:
         try:
@@ -98,16 +139,19 @@ class _Zygote:
         if order["do"] == "create":
             self._create(order["id"], *fds)
         else:
-            for pid, (number, _) in self._children.items():
-                if number == order["id"]:
+            for pid, child in self._children.items():
+                if child.number == order["id"]:
                     os.kill(pid, signal.SIGKILL)
         for fd in fds:
             os.close(fd)
         return True
 
     def _create(self, number: int, channel: int, output: int) -> None:
-        """Fork twice: the first child enters the namespaces, the second is the first process inside them."""
-        used = {slot for _, slot in self._children.values()}
+        """Fork twice: the first child enters the namespaces, the second is the first process inside them.
+
+        Its cgroup comes last: moving a process takes about 10 ms, in which it isolates itself.
+        """
+        used = {child.slot for child in self._children.values()}
         slot = next(n for n in range(_SLOTS) if n not in used)
         uid = None if self._first_uid is None else self._first_uid + slot
         pid_read, pid_write = os.pipe()
@@ -122,15 +166,28 @@ class _Zygote:
         pid = int(os.read(pid_read, 32) or b"0")
         os.close(pid_read)
         if pid:
-            self._children[pid] = number, slot
+            handle = os.pidfd_open(pid)
+            self._children[pid] = _Child(number, slot, handle)
+            self._poll.register(handle, select.POLLIN)
+            self._look_s = min(self._look_s, time.monotonic() + _FIRST_LOOK_S)
+            self._report(handle, event="created", id=number)
             os.write(go_write, _GO)
+            if not self._cgroups.add(number, pid):
+                self._reasons[pid] = "it could not enter its cgroup"
+                os.kill(pid, signal.SIGKILL)
         else:
             self._report(event="gone", id=number, how="it could not enter its namespaces")
         os.close(go_write)
 
     def _fork_inside(self, channel: int, output: int, uid: int | None, pid_write: int, go_read: int) -> None:
-        """Enter the namespaces, fork the sandbox, tell its pid and exit."""
+        """Enter the namespaces, fork the sandbox, tell its pid and exit.
+
+        A session of its own: Linux shares the processor between sessions (`sched_autogroup_enabled`), so that
+        the threads of a sandbox weigh no more than one.  And a stopped process in the server's process group
+        would have Linux end that group with SIGHUP when the parent of the group ends.
+        """
         try:
+            os.setsid()
             if "namespaces" not in self._plan.missing:
                 isolation.enter_namespaces()
             pid = os.fork()
@@ -141,19 +198,23 @@ class _Zygote:
         finally:
             os._exit(0)
 
-    def _reap(self) -> None:
+    def _reap(self, *, wait: bool = False) -> None:
         while self._children:
             try:
-                pid, status = os.waitpid(-1, os.WNOHANG)
+                pid, status = os.waitpid(-1, 0 if wait else os.WNOHANG)
             except ChildProcessError:
                 return
             if pid == 0:
                 return
             if pid in self._children:
-                number, _ = self._children.pop(pid)
+                child = self._children.pop(pid)
+                self._poll.unregister(child.handle)
+                os.close(child.handle)
                 code = os.waitstatus_to_exitcode(status)
                 how = f"exit code {code}" if code >= 0 else f"signal {signal.Signals(-code).name}"
-                self._report(event="gone", id=number, how=how)
+                how = self._reasons.pop(pid, how)
+                how = self._cgroups.remove(child.number) or how
+                self._report(event="gone", id=child.number, how=how)
 
     def _missing_isolation(self, services: list[InstalledService], scratch_bytes: int) -> list[str]:
         uid = self._first_uid
@@ -171,9 +232,10 @@ class _Zygote:
             ]
         )
 
-    def _report(self, **message: Any) -> None:
+    def _report(self, handle: int | None = None, **message: Any) -> None:
+        data = json.dumps(message).encode()
         with contextlib.suppress(OSError):  # the worker is gone, which the next poll shows
-            self._worker.send(json.dumps(message).encode())
+            socket.send_fds(self._worker, [data], [] if handle is None else [handle])
 
 
 def _warm_up(languages: set[str]) -> None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import signal
 import socket
 import subprocess
 import sys
@@ -22,6 +23,8 @@ from rse_pf.services.custom.installed import InstalledService
 __all__ = ["ZygoteClient"]
 
 _MAX_MESSAGE = 1 << 16
+_END_S = 0.5
+"""Time that a zygote has to end its sandboxes before it is killed."""
 
 
 class ZygoteClient:
@@ -57,6 +60,9 @@ class ZygoteClient:
         self._log = log
         self._on_gone = on_gone
         self._on_lost = on_lost
+        self._handles: dict[int, int] = {}
+        """Descriptors of the processes of sandboxes, by number."""
+        self._paused: set[int] = set()
         self._launch()
         self.missing = self._wait_until_ready()
         self._listen()
@@ -75,10 +81,27 @@ class ZygoteClient:
         with contextlib.suppress(OSError):
             self._channel.send(json.dumps({"do": "end", "id": number}).encode())
 
+    def pause(self, number: int) -> None:
+        """Stop every thread of sandbox *number* until `resume`; it may still be starting."""
+        self._paused.add(number)
+        self._signal(number, signal.SIGSTOP)
+
+    def resume(self, number: int) -> None:
+        """Let sandbox *number* run again; one that is not paused is no error."""
+        if number in self._paused:
+            self._paused.discard(number)
+            self._signal(number, signal.SIGCONT)
+
     def close(self) -> None:
         """End the zygote, and with it every sandbox."""
         self._loop.remove_reader(self._channel.fileno())
         self._stop()
+
+    def _signal(self, number: int, which: signal.Signals) -> None:
+        """Send a signal; a descriptor never means another process, as a reused process id could."""
+        if number in self._handles:
+            with contextlib.suppress(ProcessLookupError):  # it has ended, which the zygote reports
+                signal.pidfd_send_signal(self._handles[number], which)
 
     def _launch(self) -> None:
         self._channel, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
@@ -132,11 +155,11 @@ class ZygoteClient:
     def _read_reports(self) -> None:
         while True:
             try:
-                message = self._channel.recv(_MAX_MESSAGE)
+                message, handles, _, _ = socket.recv_fds(self._channel, _MAX_MESSAGE, 1)
             except BlockingIOError:
                 return
             except OSError:
-                message = b""
+                message, handles = b"", []
             if not message:
                 self._loop.remove_reader(self._channel.fileno())
                 self._stop()
@@ -146,10 +169,27 @@ class ZygoteClient:
                 self._on_lost()
                 return
             report = json.loads(message)
-            if report["event"] == "gone":
-                self._on_gone(report["id"], report["how"])
+            number = report["id"]
+            if report["event"] == "created":
+                (self._handles[number],) = handles
+                if number in self._paused:
+                    self._signal(number, signal.SIGSTOP)
+            elif report["event"] == "gone":
+                self._forget(number)
+                self._on_gone(number, report["how"])
+
+    def _forget(self, number: int) -> None:
+        self._paused.discard(number)
+        if number in self._handles:
+            os.close(self._handles.pop(number))
 
     def _stop(self) -> None:
+        """End the zygote: it ends its sandboxes and removes their cgroups when the channel is closed."""
         self._channel.close()
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            self._process.wait(_END_S)
         self._process.kill()
         self._process.wait()
+        for number in list(self._handles):
+            self._forget(number)
+        self._paused.clear()

@@ -1,0 +1,71 @@
+"""Measure the memory of sandboxes, for machines on which the platform may not make memory cgroups.
+
+The hard limits (address space, size of the scratch folder, refused system calls) hold without it.  The
+watcher adds up what they bound one by one, and names the sandbox that is above the limit in all.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from rse_pf.linux import proportional_bytes, resident_bytes
+
+__all__ = ["MemoryWatcher"]
+
+_SOONEST_S, _LATEST_S = 0.02, 0.25
+_FASTEST_GROWTH = 2 << 30
+"""Bytes per second: a core does not fill new pages faster than this."""
+
+
+class MemoryWatcher:
+    """Look at sandboxes often enough that none passes its limit by more than a tenth unseen."""
+
+    def __init__(self, memory_bytes: int, *, proc: Path = Path("/proc")) -> None:
+        """Keep the limit.
+
+        Args:
+            memory_bytes: Memory of one sandbox: its processes' pages, page tables and scratch folder.
+            proc: Where procfs is mounted.
+        """
+        self._limit = memory_bytes
+        self._proc = proc
+        self._next_s = _LATEST_S
+
+    @property
+    def interval_s(self) -> float:
+        """Time until the next look: short when a sandbox of the last look was close to its limit."""
+        return self._next_s
+
+    def look(self, pids: list[int]) -> dict[int, str]:
+        """Measure the sandboxes whose first processes are *pids*; return why some of them must be ended."""
+        reasons = {}
+        least = self._limit
+        for pid in pids:
+            used = self.used_bytes(pid)
+            if used > self._limit:
+                reasons[pid] = f"it used {used} bytes of memory, the limit is {self._limit}"
+            else:
+                least = min(least, self._limit - used)
+        self._next_s = max(_SOONEST_S, min(_LATEST_S, least / _FASTEST_GROWTH))
+        return reasons
+
+    def used_bytes(self, pid: int) -> int:
+        """Return the memory of a sandbox, 0 if it is gone.
+
+        Pages that processes share count in proportion, but only near the limit, where that matters: adding
+        them up takes milliseconds.
+        """
+        scratch = self._scratch_bytes(pid)
+        resident = resident_bytes(pid)
+        if resident + scratch <= self._limit // 2:
+            return resident + scratch
+        return proportional_bytes(pid) + scratch
+
+    def _scratch_bytes(self, pid: int) -> int:
+        """Return what the scratch folder holds; 0 where only its own limit is known, for plain users."""
+        try:
+            state = os.statvfs(self._proc / str(pid) / "root/scratch")
+        except OSError:
+            return 0
+        return (state.f_blocks - state.f_bfree) * state.f_frsize
