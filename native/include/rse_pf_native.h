@@ -1,0 +1,89 @@
+/* The C ABI of the native core: one call from matches to a pose with its evidence.
+ *
+ * Every function may be called from any thread at any time.  Equal requests give equal bytes on every
+ * processor, whatever was solved before.  A request is never written to. */
+#ifndef RSE_PF_NATIVE_H
+#define RSE_PF_NATIVE_H
+
+#include <stdint.h>
+
+#ifdef __cplusplus
+extern "C" {
+#endif
+
+#define RSE_PF_NATIVE_ABI 1
+
+/* Flags of a request. */
+#define RSE_PF_PNP_PORTABLE 1u /* Use no AVX2, for tests: the bytes of the result are the same. */
+#define RSE_PF_PNP_PROPOSE 2u  /* Return the pose only, without inliers and evidence. */
+
+/* What became of a request; all but the first leave no pose. */
+enum rse_pf_pnp_status {
+    RSE_PF_PNP_SOLVED = 0,
+    RSE_PF_PNP_BAD_REQUEST = 1,   /* A size, an option or the ABI does not fit. */
+    RSE_PF_PNP_BAD_POINTS = 2,    /* A coordinate is not finite or is beyond 1e6. */
+    RSE_PF_PNP_BAD_PIXELS = 3,
+    RSE_PF_PNP_NO_CONSENSUS = 4,  /* No more rows agree than chance would give: count. */
+    RSE_PF_PNP_COLLINEAR = 5,     /* thinness */
+    RSE_PF_PNP_COPIES = 6,        /* count, independent */
+    RSE_PF_PNP_ONE_PLACE = 7,     /* radius_px */
+    RSE_PF_PNP_UNCONSTRAINED = 8,
+    RSE_PF_PNP_TWO_POSES = 9,     /* rmse_px, other_rmse_px */
+    RSE_PF_PNP_MIRRORED = 10,     /* count, other_count */
+    RSE_PF_PNP_EXPIRED = 11,
+    RSE_PF_PNP_CANCELLED = 12,
+    RSE_PF_PNP_OUT_OF_MEMORY = 13
+};
+
+/* Why a pose is weak; 0 for a pose that is ok. */
+enum rse_pf_pnp_reason {
+    RSE_PF_PNP_OK = 0,
+    RSE_PF_PNP_FEW_INLIERS = 1,
+    RSE_PF_PNP_LOW_INLIER_RATIO = 2,
+    RSE_PF_PNP_NEARLY_COLLINEAR = 3,
+    RSE_PF_PNP_CLUSTERED = 4,
+    RSE_PF_PNP_POORLY_CONSTRAINED = 5,
+    RSE_PF_PNP_AMBIGUOUS = 6
+};
+
+typedef struct rse_pf_pnp_request {
+    uint32_t abi;   /* RSE_PF_NATIVE_ABI */
+    uint32_t flags;
+    int64_t rows;   /* 4 and more */
+    const double *points_world; /* rows x 3, metres, world frame, row-major */
+    const double *pixels;       /* rows x 2, undistorted pixels, row-major */
+    double fx, fy, cx, cy;      /* pixels */
+    int32_t width, height;      /* pixels */
+    double inlier_px;
+    double confidence;
+    int32_t max_iterations, min_iterations;
+    uint64_t seed;
+    double weak_inliers, weak_inlier_ratio, weak_translation_m, weak_rotation_rad;
+    int64_t deadline_ns;               /* CLOCK_MONOTONIC; 0 for none */
+    const volatile int32_t *cancelled; /* Not zero ends the call soon; may be null. */
+} rse_pf_pnp_request;
+
+typedef struct rse_pf_pnp_result {
+    int32_t status;
+    int32_t reason;
+    int64_t count, independent, other_count;
+    int64_t trials, refinements;
+    double rmse_px, other_rmse_px, thinness, radius_px;
+    double T_camera_world[16]; /* row-major */
+    double covariance[36];     /* of the twist (rho metres, phi radians) left of the pose */
+} rse_pf_pnp_result;
+
+/* Return RSE_PF_NATIVE_ABI of the library, to compare with the header's. */
+uint32_t rse_pf_native_abi(void);
+
+/* Return "avx2" or "portable": the instructions that this processor gets. */
+const char *rse_pf_native_lanes(void);
+
+/* Estimate the camera pose.  inliers has room for as many numbers as the request has rows (it may be null
+ * with RSE_PF_PNP_PROPOSE); the first `count` of them become the sorted row numbers that agree. */
+void rse_pf_pnp_solve(const rse_pf_pnp_request *request, int64_t *inliers, rse_pf_pnp_result *result);
+
+#ifdef __cplusplus
+}
+#endif
+#endif

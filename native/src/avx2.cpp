@@ -1,0 +1,8 @@
+// The same solver with wider vectors; the build compiles this file, and no other, for AVX2.
+#if defined(__x86_64__)
+#define RSE_PF_ISA rse_pf_avx2
+#include "solve.hpp"
+#include "clock.hpp"
+
+void rse_pf::avx2::solve(const rse_pf::Task& task) { rse_pf_avx2::solve_task(task); }
+#endif

@@ -1,0 +1,144 @@
+// Vectors of three, poses, and systems of six equations.
+#pragma once
+
+#include "elementary.hpp"
+
+namespace RSE_PF_ISA {
+
+struct Vector3 {
+    double x, y, z;
+};
+RSE_PF_INLINE Vector3 operator+(const Vector3& a, const Vector3& b) { return {a.x + b.x, a.y + b.y, a.z + b.z}; }
+RSE_PF_INLINE Vector3 operator-(const Vector3& a, const Vector3& b) { return {a.x - b.x, a.y - b.y, a.z - b.z}; }
+RSE_PF_INLINE Vector3 operator*(const Vector3& a, double s) { return {a.x * s, a.y * s, a.z * s}; }
+RSE_PF_INLINE double dot(const Vector3& a, const Vector3& b) { return a.x * b.x + a.y * b.y + a.z * b.z; }
+RSE_PF_INLINE Vector3 cross(const Vector3& a, const Vector3& b) {
+    return {a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x};
+}
+RSE_PF_INLINE Vector3 normalised(const Vector3& a) { return a * (1.0 / square_root(dot(a, a))); }
+
+// Maps a point p of the world into the camera's frame: R p + t.
+struct Pose {
+    double R[3][3];
+    Vector3 t;
+};
+
+RSE_PF_INLINE Vector3 rotated(const double (&R)[3][3], const Vector3& p) {
+    return {R[0][0] * p.x + R[0][1] * p.y + R[0][2] * p.z, R[1][0] * p.x + R[1][1] * p.y + R[1][2] * p.z,
+            R[2][0] * p.x + R[2][1] * p.y + R[2][2] * p.z};
+}
+
+RSE_PF_INLINE bool is_finite(const Pose& pose) {
+    double total = pose.t.x + pose.t.y + pose.t.z;
+    for (const auto& row : pose.R) total += row[0] + row[1] + row[2];
+    return total - total == 0.0;
+}
+
+// Return R turned by `turn` first and shifted then, both in the camera's frame.
+static inline Pose moved(const double (&turn)[3][3], const Vector3& shift, const Pose& pose) {
+    Pose out;
+    for (int i = 0; i < 3; ++i)
+        for (int j = 0; j < 3; ++j)
+            out.R[i][j] = turn[i][0] * pose.R[0][j] + turn[i][1] * pose.R[1][j] + turn[i][2] * pose.R[2][j];
+    out.t = rotated(turn, pose.t) + shift;
+    return out;
+}
+
+// Apply the twist (rho, phi) to the left of the pose.  The rotation is Cayley's, a rational function that
+// agrees with the exponential map up to second order, so steps that vanish lead to the same pose.
+static inline Pose moved(const double (&twist)[6], const Pose& pose) {
+    const double a = 0.5 * twist[3], b = 0.5 * twist[4], c = 0.5 * twist[5];
+    const double s = 2.0 / (1.0 + a * a + b * b + c * c);
+    const double turn[3][3] = {
+        {1.0 - s * (b * b + c * c), s * (a * b - c), s * (a * c + b)},
+        {s * (a * b + c), 1.0 - s * (a * a + c * c), s * (b * c - a)},
+        {s * (a * c - b), s * (b * c + a), 1.0 - s * (a * a + b * b)},
+    };
+    return moved(turn, {twist[0], twist[1], twist[2]}, pose);
+}
+
+// J^T J and J^T r of a left perturbation (rho, phi); only the upper triangle is filled.
+struct Normal {
+    double A[6][6];
+    double b[6];
+};
+
+// Solve (A + damping diag A) x = b by Cholesky's method; false where A is not positive.
+static bool solved(const Normal& normal, double damping, double (&x)[6]) {
+    double L[6][6], inverse[6];
+    for (int i = 0; i < 6; ++i) {
+        double pivot = normal.A[i][i] * (1.0 + damping);
+        for (int k = 0; k < i; ++k) pivot -= L[i][k] * L[i][k];
+        if (!(pivot > 1e-14 * normal.A[i][i])) return false;
+        inverse[i] = 1.0 / square_root(pivot);
+        for (int j = i + 1; j < 6; ++j) {
+            double value = normal.A[i][j];
+            for (int k = 0; k < i; ++k) value -= L[i][k] * L[j][k];
+            L[j][i] = value * inverse[i];
+        }
+    }
+    for (int i = 0; i < 6; ++i) {
+        double value = normal.b[i];
+        for (int k = 0; k < i; ++k) value -= L[i][k] * x[k];
+        x[i] = value * inverse[i];
+    }
+    for (int i = 5; i >= 0; --i) {
+        double value = x[i];
+        for (int k = i + 1; k < 6; ++k) value -= L[k][i] * x[k];
+        x[i] = value * inverse[i];
+    }
+    return true;
+}
+
+// Return the eigenvalues of a symmetric 3x3 matrix, smallest first, and its eigenvectors as rows of `axes`.
+// Jacobi's method; Golub and Van Loan, Matrix Computations, Sect. 8.5.
+static void eigenvectors(const double (&matrix)[3][3], double (&values)[3], double (&axes)[3][3]) {
+    double a[3][3];
+    for (int i = 0; i < 3; ++i)
+        for (int j = 0; j < 3; ++j) {
+            a[i][j] = matrix[i][j];
+            axes[i][j] = i == j ? 1.0 : 0.0;
+        }
+    for (int sweep = 0; sweep < 12; ++sweep) {
+        const double aside = absolute(a[0][1]) + absolute(a[0][2]) + absolute(a[1][2]);
+        if (!(aside > 1e-17 * (absolute(a[0][0]) + absolute(a[1][1]) + absolute(a[2][2])))) break;
+        for (int p = 0; p < 2; ++p)
+            for (int q = p + 1; q < 3; ++q) {
+                if (a[p][q] == 0.0) continue;
+                const double theta = (a[q][q] - a[p][p]) / (2.0 * a[p][q]);
+                const double sign = theta < 0.0 ? -1.0 : 1.0;
+                const double tangent = sign / (absolute(theta) + square_root(theta * theta + 1.0));
+                const double cosine = 1.0 / square_root(tangent * tangent + 1.0), sine = tangent * cosine;
+                for (int k = 0; k < 3; ++k) {
+                    const double kp = a[k][p], kq = a[k][q];
+                    a[k][p] = cosine * kp - sine * kq;
+                    a[k][q] = sine * kp + cosine * kq;
+                }
+                for (int k = 0; k < 3; ++k) {
+                    const double pk = a[p][k], qk = a[q][k];
+                    a[p][k] = cosine * pk - sine * qk;
+                    a[q][k] = sine * pk + cosine * qk;
+                }
+                for (int k = 0; k < 3; ++k) {
+                    const double pk = axes[p][k], qk = axes[q][k];
+                    axes[p][k] = cosine * pk - sine * qk;
+                    axes[q][k] = sine * pk + cosine * qk;
+                }
+            }
+    }
+    for (int i = 0; i < 3; ++i) values[i] = a[i][i];
+    for (int pass = 0; pass < 2; ++pass)
+        for (int i = 0; i < 2; ++i)
+            if (values[i + 1] < values[i]) {
+                const double value = values[i];
+                values[i] = values[i + 1];
+                values[i + 1] = value;
+                for (int k = 0; k < 3; ++k) {
+                    const double axis = axes[i][k];
+                    axes[i][k] = axes[i + 1][k];
+                    axes[i + 1][k] = axis;
+                }
+            }
+}
+
+}  // namespace RSE_PF_ISA

@@ -1,0 +1,296 @@
+"""The native core: the whole PnP solver with its evidence in one call into a shared library.
+
+The library is looked for at first use, and everything works without it.  Nothing here compiles or installs
+it: ``native/README.md`` says how.  A call holds no interpreter lock, and equal requests give equal bytes.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import struct
+import threading
+from collections.abc import Callable
+from functools import cache, lru_cache
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+
+from rse_pf.errors import (
+    BadRequest,
+    Cancelled,
+    ConfigurationError,
+    DegenerateGeometry,
+    Expired,
+    MissingExtra,
+    NoConsensus,
+    RsePfError,
+)
+from rse_pf.geometry import Array, Camera
+
+__all__ = ["Evidence", "NativeOptions", "NativeSolver", "find_library", "native_solver", "open_solver"]
+
+_ABI = 1
+_FILE = "librse_pf_native.so"
+_PORTABLE, _PROPOSE = 1, 2
+# rse_pf_pnp_request: abi, flags, rows, points, pixels | camera | options | deadline, cancelled.
+_HEAD = struct.Struct("=IIqQQ")
+_BODY = struct.Struct("=ddddiiddiiQdddd")
+_TAIL = struct.Struct("=qQ")
+# rse_pf_pnp_result: status, reason, five counts, four measures | pose | covariance.
+_RESULT = struct.Struct("=iiqqqqqdddd")
+_POSE_AT, _COVARIANCE_AT = _RESULT.size, _RESULT.size + 16 * 8
+_RESULT_BYTES = _COVARIANCE_AT + 36 * 8
+_COLLINEAR = 0.02
+
+_REASONS = (
+    "", "few-inliers", "low-inlier-ratio", "nearly-collinear", "clustered", "poorly-constrained", "ambiguous",
+)  # fmt: skip
+
+
+class NativeOptions(msgspec.Struct, frozen=True, kw_only=True):
+    """How the library solves, and where a pose stops being ok.
+
+    ``portable`` forbids AVX2, which changes no byte of the result; the other fields are those of
+    `rse_pf.pnp.PnpOptions` and, with ``weak_`` before them, of `rse_pf.pnp.WeakLimits`.
+    """
+
+    inlier_px: float
+    confidence: float
+    max_iterations: int
+    min_iterations: int
+    weak_inliers: float
+    weak_inlier_ratio: float
+    weak_translation_m: float
+    weak_rotation_rad: float
+    portable: bool = False
+
+
+class Evidence(msgspec.Struct, frozen=True, kw_only=True, eq=False):
+    """A pose and what speaks for it; the fields are those of `rse_pf.pnp.PnpSolution`.
+
+    ``trials`` is the number of samples drawn, which no reply carries.
+    """
+
+    T_camera_world: Array
+    inliers: npt.NDArray[np.intp]
+    rmse_px: float
+    covariance: Array
+    reason: str
+    trials: int
+
+
+class _Buffers(threading.local):
+    """The request and the result of one thread, with views of their parts."""
+
+    def __init__(self) -> None:
+        request = np.zeros(_HEAD.size + _BODY.size + _TAIL.size, dtype=np.uint8)
+        result = np.zeros(_RESULT_BYTES, dtype=np.uint8)
+        self.request = memoryview(request)  # type: ignore[arg-type]
+        self.result = memoryview(result)  # type: ignore[arg-type]
+        self.request_at, self.result_at = _address(request), _address(result)
+        self.pose = result[_POSE_AT:_COVARIANCE_AT].view(np.float64).reshape(4, 4)
+        self.covariance = result[_COVARIANCE_AT:].view(np.float64).reshape(6, 6)
+
+
+def _address(array: npt.NDArray[Any]) -> int:
+    address: int = array.__array_interface__["data"][0]
+    return address
+
+
+@lru_cache(maxsize=256)
+def _packed(camera: Camera, options: NativeOptions) -> bytes:
+    return _BODY.pack(
+        camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height,
+        options.inlier_px, options.confidence, options.max_iterations,
+        min(options.min_iterations, options.max_iterations), 0,
+        options.weak_inliers, options.weak_inlier_ratio, options.weak_translation_m,
+        options.weak_rotation_rad,
+    )  # fmt: skip
+
+
+class NativeSolver:
+    """The solver of one loaded library; every thread may call it."""
+
+    def __init__(self, call: Callable[[int, int, int], None], lanes: str) -> None:
+        self._call = call
+        self._buffers = _Buffers()
+        self.lanes = lanes
+        """``avx2`` or ``portable``: the instructions that this processor gets."""
+
+    def solve(
+        self,
+        points_world: Array,
+        pixels: Array,
+        camera: Camera,
+        options: NativeOptions,
+        *,
+        deadline_ns: int = 0,
+        cancelled: ctypes.c_int32 | None = None,
+    ) -> Evidence:
+        """Estimate the camera pose with its evidence.
+
+        Args:
+            points_world: ``(n, 3)`` contiguous, metres, world frame; ``n >= 4``.
+            pixels: ``(n, 2)`` contiguous, undistorted pixels.
+            camera: Intrinsics of the image the pixels come from.
+            options: How to solve.
+            deadline_ns: Of `time.monotonic_ns`, after which the search is given up; 0 for none.
+            cancelled: Another thread sets it to 1 to end the call soon.
+
+        Raises:
+            BadRequest: A number is not finite or absurd.
+            DegenerateGeometry: The points lie on one line or coincide, or two poses fit alike.
+            NoConsensus: No pose agrees with more rows than chance would give.
+            Expired: The deadline has passed.
+            Cancelled: The flag was set.
+        """
+        n = len(pixels)
+        inliers = np.empty(n, dtype=np.int64)
+        values = self._run(
+            points_world, pixels, camera, options, 0, _address(inliers), deadline_ns, cancelled
+        )
+        status, reason, count, _, _, trials = values[:6]
+        if status:
+            raise _error(values, n, options)
+        buffers = self._buffers
+        return Evidence(
+            T_camera_world=buffers.pose.copy(),
+            inliers=inliers[:count],
+            rmse_px=values[7],
+            covariance=buffers.covariance.copy(),
+            reason=_REASONS[reason],
+            trials=trials,
+        )
+
+    def propose(
+        self, points_world: Array, pixels: Array, camera: Camera, options: NativeOptions
+    ) -> Array | None:
+        """Return the ``(3, 4)`` pose [R | t] without evidence, or None where there is none."""
+        values = self._run(points_world, pixels, camera, options, _PROPOSE, 0, 0, None)
+        return None if values[0] else self._buffers.pose[:3].copy()
+
+    def _run(
+        self,
+        points_world: Array,
+        pixels: Array,
+        camera: Camera,
+        options: NativeOptions,
+        flags: int,
+        inliers_at: int,
+        deadline_ns: int,
+        cancelled: ctypes.c_int32 | None,
+    ) -> tuple[Any, ...]:
+        buffers = self._buffers
+        request = buffers.request
+        flags |= _PORTABLE if options.portable else 0
+        _HEAD.pack_into(request, 0, _ABI, flags, len(pixels), _address(points_world), _address(pixels))
+        request[_HEAD.size : _HEAD.size + _BODY.size] = _packed(camera, options)
+        flag_at = 0 if cancelled is None else ctypes.addressof(cancelled)
+        _TAIL.pack_into(request, _HEAD.size + _BODY.size, deadline_ns, flag_at)
+        self._call(buffers.request_at, inliers_at, buffers.result_at)
+        return _RESULT.unpack_from(buffers.result)
+
+
+def _error(values: tuple[Any, ...], n: int, options: NativeOptions) -> RsePfError:
+    """Return the error of a result; the sentences are those of `rse_pf.pnp.solver`."""
+    status, _, count, independent, other, _, _, rmse_px, other_rmse_px, thinness, radius_px = values
+    everywhere = "match points all over the image, or skip this frame"
+    match status:
+        case 2 | 3:
+            return BadRequest(
+                f"{'points_world' if status == 2 else 'pixels'} holds a number that is not finite or is "
+                "beyond 1e+06",
+                hint="leave such rows out",
+            )
+        case 4:
+            return NoConsensus(
+                f"the best pose agrees with {count} of {n} correspondences within "
+                f"{options.inlier_px:g} px, no more than chance would give",
+                hint="tighten the matcher, or skip this frame",
+            )
+        case 5:
+            return DegenerateGeometry(
+                f"the points that agree lie on one line or coincide (width/length {thinness:.3f} is below "
+                f"{_COLLINEAR})",
+                hint=everywhere,
+            )
+        case 6:
+            return DegenerateGeometry(
+                f"the {count} correspondences that agree lie in {independent} places of the image, "
+                "and may be copies of each other",
+                hint=everywhere,
+            )
+        case 7:
+            return DegenerateGeometry(
+                f"the pixels that agree lie {radius_px:.1f} px (rms) from their centre, "
+                f"less than {options.inlier_px:g} px",
+                hint=everywhere,
+            )
+        case 8:
+            return DegenerateGeometry(
+                "the correspondences do not constrain some motion of the camera",
+                hint="match more of the scene",
+            )
+        case 9:
+            return DegenerateGeometry(
+                f"two poses fit alike ({rmse_px:.2f} and {other_rmse_px:.2f} px)",
+                hint="match points that do not lie in one far plane",
+            )
+        case 10:
+            return DegenerateGeometry(
+                f"{other} points agree behind the camera or mirrored, and only {count} as they are",
+                hint="check the handedness of the world frame and the sign of the depth",
+            )
+        case 11:
+            return Expired("the deadline passed while the pose was sought", hint="send fewer matches")
+        case 12:
+            return Cancelled("the pose was no longer wanted", hint="ask again if it is")
+        case 13:
+            return BadRequest(f"no memory for {n} correspondences", hint="send the best matches only")
+    return BadRequest("the options or sizes of the request do not fit", hint="leave the options out")
+
+
+def find_library() -> Path | None:
+    """Return the library's file: that of the package ``rse_pf_native``, else that built in this checkout."""
+    folders = [Path(__file__).parent.parent / "native" / "build"]
+    installed = find_spec("rse_pf_native")
+    if installed is not None and installed.origin:
+        folders.insert(0, Path(installed.origin).parent)
+    return next((folder / _FILE for folder in folders if (folder / _FILE).is_file()), None)
+
+
+def open_solver(path: Path) -> NativeSolver:
+    """Load the library at *path*.
+
+    Raises:
+        ConfigurationError: It cannot be loaded, or was built for another version of this package.
+    """
+    again = "build it again: make -C native"
+    try:
+        library = ctypes.CDLL(str(path))
+        solve, abi, lanes = library.rse_pf_pnp_solve, library.rse_pf_native_abi, library.rse_pf_native_lanes
+    except (OSError, AttributeError) as error:
+        raise ConfigurationError(f"{path} cannot be loaded: {error}", hint=again) from error
+    abi.restype, lanes.restype = ctypes.c_uint32, ctypes.c_char_p
+    if abi() != _ABI:
+        raise ConfigurationError(f"{path} has ABI {abi()}, this package needs {_ABI}", hint=again)
+    solve.argtypes, solve.restype = (ctypes.c_void_p, ctypes.c_void_p, ctypes.c_void_p), None
+    return NativeSolver(solve, lanes().decode())
+
+
+@cache
+def native_solver() -> NativeSolver:
+    """Return the solver of the library that `find_library` finds; later calls return the same.
+
+    Raises:
+        MissingExtra: There is none.
+        ConfigurationError: It does not fit.
+    """
+    path = find_library()
+    if path is None:
+        raise MissingExtra("rse-pf-native", "solver")
+    return open_solver(path)
