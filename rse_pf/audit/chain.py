@@ -24,6 +24,7 @@ __all__ = [
     "GAP",
     "GENESIS",
     "HEADS",
+    "HEADS_LOST",
     "REFUSALS_PER_S",
     "REFUSAL_BURST",
     "Chain",
@@ -39,8 +40,8 @@ __all__ = [
 
 Value = str | int | float | bool | None
 
-CONTINUED, GAP, HEADS = "log.continued", "log.gap", "log.heads"
-"""Actions of the log itself: a new file of the chain, lost entries, heads of other chains."""
+CONTINUED, GAP, HEADS, HEADS_LOST = "log.continued", "log.gap", "log.heads", "log.heads-lost"
+"""Actions of the log itself: a new file of the chain, lost entries, heads of chains, a lost file of heads."""
 
 _MAX_CHARACTERS, _MAX_DETAILS, _MAX_NUMBER = 200, 64, 2**53
 _TOKEN = re.compile(r"eyJ[\w-]{5,}\.[\w.-]+")

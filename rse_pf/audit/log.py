@@ -3,6 +3,11 @@
 One chain has one writer.  It writes ``WHO.jsonl``; its older files are ``WHO.FIRST.jsonl``.  Recording never
 waits for a disk; entries are durable when `AuditLog.flush` returns.  After a crash the chain continues
 with an entry that says how its last file ended.
+
+The head of each chain is kept twice more: in the file of heads, and in the chains of other writers.  The
+control plane records the heads of all chains; each writer that runs records those of the control plane and of
+operators.  A writer whose chain lacks the head in the file of heads records that head, and so names what was
+removed.
 """
 
 from __future__ import annotations
@@ -13,7 +18,7 @@ import os
 import re
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Literal
 
@@ -21,6 +26,8 @@ from rse_pf.audit.chain import (
     CONTINUED,
     GAP,
     GENESIS,
+    HEADS,
+    HEADS_LOST,
     Chain,
     Entry,
     Head,
@@ -29,21 +36,30 @@ from rse_pf.audit.chain import (
     line_of,
     next_entry,
 )
+from rse_pf.audit.heads import HeadsFile
 from rse_pf.errors import ConfigurationError
 from rse_pf.files import sync_folder
 
 __all__ = [
+    "CONTROL_PLANE",
+    "HEADS_S",
     "MAX_FILE_BYTES",
+    "OPERATOR",
     "SYNC_S",
     "AuditLog",
     "audit_folder",
     "chain_names",
     "files_of",
+    "grown_heads",
     "lines_of",
     "newest_head",
     "record_once",
 ]
 
+CONTROL_PLANE, OPERATOR = "control-plane", "operator"
+"""The chains whose heads every writer that runs records."""
+HEADS_S = 60.0
+"""Time between two looks of a writer at the heads of other chains."""
 _FILE = re.compile(r"(?P<who>[A-Za-z0-9_-]{1,64})(\.(?P<first>\d{12}))?\.jsonl")
 _UNSAFE = re.compile(r"[^A-Za-z0-9_-]")
 _MAX_BUFFERED = 20_000
@@ -76,6 +92,7 @@ class AuditLog:
         max_bytes: int = MAX_FILE_BYTES,
         sync_s: float = SYNC_S,
         max_buffered: int = _MAX_BUFFERED,
+        heads_s: float = HEADS_S,
         on_problem: Callable[[str], None] = lambda problem: None,
     ) -> None:
         """Describe a log; nothing is opened yet.
@@ -87,6 +104,7 @@ class AuditLog:
             max_bytes: A file that has grown longer is set aside, and the chain goes on in the next.
             sync_s: How long an entry may wait for the disk.
             max_buffered: How many entries may wait for the disk; further ones are dropped and counted.
+            heads_s: How often a log that was started records the heads of the control plane and of operators.
             on_problem: Called once with a sentence when writing fails.
         """
         self.who = _UNSAFE.sub("_", who)[:64]
@@ -97,6 +115,10 @@ class AuditLog:
         self._max_bytes = max_bytes
         self._sync_s = sync_s
         self._max_buffered = max_buffered
+        self._heads_s = heads_s
+        self._others = [] if self.who == CONTROL_PLANE else sorted({CONTROL_PLANE, OPERATOR} - {self.who})
+        self._recorded: dict[str, str] = {}
+        self._heads = HeadsFile(folder, self.who, lambda: _heads_in(folder))
         self.on_problem = on_problem
         self._failed = False
         self._buffered: list[Note] = []
@@ -118,7 +140,13 @@ class AuditLog:
             self._folder.mkdir(mode=0o700, parents=True, exist_ok=True)
             self._lock = os.open(self._folder / f".{self.who}.lock", os.O_RDWR | os.O_CREAT, 0o600)
             self._take_lock(wait_s)
+            known, was_lost = self._heads.open()
             self._continue()
+            if known.seq > self.head.seq or (known.seq and not _holds(self._folder, self.who, known)):
+                self._write([self._own(HEADS, {self.who: str(known)})])
+            if was_lost:
+                self._write([self._own(HEADS_LOST)])
+            self._keep_head()
         except OSError as error:
             self._release()
             raise ConfigurationError(
@@ -164,8 +192,7 @@ class AuditLog:
                 notes, self._buffered = self._buffered, []
                 dropped, self.dropped = self.dropped, 0
             if dropped:
-                now = self._wall_clock()
-                notes.append(Note(time=now, actor=self.who, action=GAP, detail={"entries": dropped}))
+                notes.append(self._own(GAP, {"entries": dropped}))
             if not notes or self._fd < 0:
                 return
             try:
@@ -179,6 +206,11 @@ class AuditLog:
                 if not self._failed:
                     self._failed = True
                     self.on_problem(f"the audit log of {self.who} cannot be written: {error.strerror}")
+                return
+            try:
+                self._keep_head()
+            except OSError as error:
+                self.on_problem(f"the head of the audit log of {self.who} cannot be kept: {error.strerror}")
 
     def close(self) -> None:
         """Write the buffered entries, and unlock the log."""
@@ -186,6 +218,7 @@ class AuditLog:
         self._wake.set()
         if self._thread is not None:
             self._thread.join()
+            self._record_others()
         self.flush()
         self._release()
 
@@ -249,14 +282,24 @@ class AuditLog:
             self._open_file()
             self._record_continued("rotated")
 
+    def _keep_head(self) -> None:
+        """Write the head into the file of heads; one that was lost is made again, and that is recorded."""
+        if self._heads.is_lost():
+            self._heads.open()
+            self._write([self._own(HEADS_LOST)])
+        self._heads.write(self.head)
+
+    def _record_others(self) -> None:
+        grown = grown_heads(self._folder, self._others, self._recorded)
+        if grown:
+            self.add([self._own(HEADS, grown)])
+
+    def _own(self, action: str, detail: Mapping[str, Value] | None = None) -> Note:
+        return Note(time=self._wall_clock(), actor=self.who, action=action, detail=detail or {})
+
     def _record_continued(self, reason: str) -> None:
         self._first = self.head.seq + 1
-        note = Note(
-            time=self._wall_clock(),
-            actor=self.who,
-            action=CONTINUED,
-            detail={"reason": reason, "head": str(self.head)},
-        )
+        note = self._own(CONTINUED, {"reason": reason, "head": str(self.head)})
         entry = next_entry(self.head, note)
         os.write(self._fd, line_of(entry))
         os.fsync(self._fd)
@@ -277,14 +320,19 @@ class AuditLog:
             if fd >= 0:
                 os.close(fd)
         self._fd = self._lock = -1
+        self._heads.close()
 
     @property
     def _current(self) -> Path:
         return self._folder / f"{self.who}.jsonl"
 
     def _write_on(self) -> None:
+        heads_due_s = time.monotonic() + self._heads_s
         while not self._closed.is_set():
-            self._wake.wait()
+            self._wake.wait(max(0.0, heads_due_s - time.monotonic()))
+            if time.monotonic() >= heads_due_s:
+                self._record_others()
+                heads_due_s = time.monotonic() + self._heads_s
             self._closed.wait(self._sync_s)
             self._wake.clear()
             self.flush()
@@ -336,24 +384,61 @@ def lines_of(path: Path) -> Iterator[bytes]:
             yield line
 
 
-def newest_head(folder: Path, who: str) -> Head | None:
-    """Return the head of a chain that may still be written; None if it has no entry."""
+def newest_head(folder: Path, who: str, *, apart_from: str = "") -> Head | None:
+    """Return the head of a chain that may still be written; None if it has no entry.
+
+    Args:
+        folder: Of the logs.
+        who: Name of the chain.
+        apart_from: Entries of this action at the end of the chain are skipped.
+    """
     for path in reversed(files_of(folder, who)):
         with contextlib.suppress(OSError):  # the file was renamed meanwhile
-            entry = _last_entry(path)
+            entry = _last_entry(path, apart_from)
             if entry is not None:
                 return entry.head
     return None
 
 
-def _last_entry(path: Path) -> Entry | None:
+def grown_heads(folder: Path, names: Iterable[str], recorded: dict[str, str]) -> dict[str, Value]:
+    """Return the heads of those chains that have grown, and update *recorded*, their heads as text.
+
+    Entries that hold nothing but heads are not counted: two writers would answer each other forever.
+    """
+    grown: dict[str, Value] = {}
+    for who in names:
+        head = newest_head(folder, who, apart_from=HEADS)
+        if head is not None and recorded.get(who) != str(head):
+            grown[who] = recorded[who] = str(head)
+    return grown
+
+
+def _heads_in(folder: Path) -> dict[str, Head]:
+    return {who: newest_head(folder, who) or GENESIS for who in chain_names(folder)}
+
+
+def _holds(folder: Path, who: str, head: Head) -> bool:
+    """Whether the chain has the entry *head*, which is near its end unless the writer was killed."""
+    if newest_head(folder, who) == head:
+        return True
+    lines = (line for path in reversed(files_of(folder, who)) for line in lines_of(path))
+    entries = (Chain(None).add(line) for line in lines)
+    return any(isinstance(entry, Entry) and entry.head == head for entry in entries)
+
+
+def _last_entry(path: Path, apart_from: str = "") -> Entry | None:
     """Return the last complete entry of a file, None if there is none near its end."""
     with path.open("rb") as file:
         size = file.seek(0, os.SEEK_END)
         file.seek(max(0, size - _MAX_ENTRY_BYTES))
         lines = file.read().split(b"\n")[:-1]
-    entry = Chain(None).add(lines[-1] + b"\n") if lines else ""
-    return entry if isinstance(entry, Entry) else None
+    for line in reversed(lines):
+        entry = Chain(None).add(line + b"\n")
+        if isinstance(entry, str):
+            return None
+        if entry.action != apart_from:
+            return entry
+    return None
 
 
 def _first_seq(path: Path, last: Entry) -> int:

@@ -10,14 +10,13 @@ import time
 from pathlib import Path
 
 from rse_pf.audit.chain import Value
-from rse_pf.audit.log import audit_folder, record_once
+from rse_pf.audit.log import OPERATOR, audit_folder, record_once
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import ConfigurationError
 from rse_pf.terminal import show
 
 __all__ = ["record", "record_map_change"]
 
-_WHO = "operator"
 _DIRECTORY = "dir:"
 
 
@@ -26,7 +25,7 @@ def record(state: Path, action: str, subject: str, **detail: Value) -> None:
     try:
         record_once(
             audit_folder(state),
-            _WHO,
+            OPERATOR,
             action,
             subject,
             wall_clock=time.time,

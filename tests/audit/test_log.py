@@ -87,7 +87,7 @@ def test_a_torn_last_line_is_reported_with_the_number_of_good_entries(tmp_path: 
 def test_the_writer_goes_on_behind_a_torn_line_and_names_the_head_it_found(tmp_path: Path):
     write(tmp_path, 4)
     path = tmp_path / "server-1.jsonl"
-    torn = path.read_bytes()[:-20]
+    torn = path.read_bytes() + b'{"action":"auth.acc'
     path.write_bytes(torn)
 
     write(tmp_path, 1)
@@ -97,9 +97,9 @@ def test_the_writer_goes_on_behind_a_torn_line_and_names_the_head_it_found(tmp_p
     continued = next(entries_of([new]))
     assert old.read_bytes() == torn
     assert verdict.problem == ""
-    assert verdict.notes == [f"{old.name} ended in the middle of a line, 3 whole entries good"]
-    assert (continued.action, continued.detail["reason"], continued.seq) == ("log.continued", "torn", 4)
-    assert str(continued.detail["head"]).startswith("3:")
+    assert verdict.notes == [f"{old.name} ended in the middle of a line, 4 whole entries good"]
+    assert (continued.action, continued.detail["reason"], continued.seq) == ("log.continued", "torn", 5)
+    assert str(continued.detail["head"]).startswith("4:")
 
 
 def test_a_torn_end_that_the_next_file_does_not_name_is_a_problem(tmp_path: Path):
@@ -225,7 +225,7 @@ def test_a_truncated_end_is_found_by_the_head_in_another_chain(tmp_path: Path):
 
     assert problem_of(tmp_path) == "entry 5 is missing: entry 1 of control-plane has seen it"
     path.unlink()
-    assert problem_of(tmp_path) == "entry 5 is missing: entry 1 of control-plane has seen it"
+    assert problem_of(tmp_path) == "the log is missing: entry 1 of control-plane has seen entry 5"
 
 
 def test_a_rewritten_chain_is_found_by_a_head_stored_elsewhere(tmp_path: Path):
@@ -233,9 +233,10 @@ def test_a_rewritten_chain_is_found_by_a_head_stored_elsewhere(tmp_path: Path):
     head = newest_head(tmp_path, "server-1")
     assert head is not None
     assert check_folder(tmp_path, known={"server-1": head})[0].problem == ""
-    (tmp_path / "server-1.jsonl").unlink()
+    for path in (tmp_path / "server-1.jsonl", tmp_path / "heads"):
+        path.unlink()
     write(tmp_path, 7, who="server-1")
-    assert problem_of(tmp_path) == ""
+    assert problem_of(tmp_path) == "", "all that is in the folder was forged"
 
     (verdict,) = check_folder(tmp_path, known={"server-1": Head(head.seq, "f" * 64)})
 

@@ -62,7 +62,9 @@ def test_a_head_stored_elsewhere_detects_truncation(folder: Path, capsys: pytest
     assert main(["audit", "verify", str(folder), "--head", f"server-1={head}"]) == 0
     path = folder / "server-1.jsonl"
     path.write_bytes(path.read_bytes().splitlines(keepends=True)[0])
-    assert main(["audit", "verify", str(folder)]) == 0
+    (folder / "heads").unlink()
+    record_once(folder, "operator", "robot.enabled", wall_clock=lambda: 1e9 + 9)
+    assert main(["audit", "verify", str(folder)]) == 0, "what is in the folder was forged"
     capsys.readouterr()
 
     assert main(["audit", "verify", str(folder), "--head", f"server-1={head}"]) == 1

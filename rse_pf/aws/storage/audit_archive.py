@@ -24,7 +24,8 @@ from typing import BinaryIO
 import msgspec
 
 from rse_pf.audit.chain import GENESIS, Chain, Entry, Head, parse_head
-from rse_pf.audit.log import chain_names, files_of
+from rse_pf.audit.heads import write_heads
+from rse_pf.audit.log import chain_names, files_of, newest_head
 from rse_pf.aws.account import Account
 from rse_pf.aws.storage.s3_store import S3Store
 from rse_pf.config.resource_names import AUDIT_PREFIX, DATA_STACK
@@ -151,6 +152,8 @@ def fetch_audit(store: ObjectStore, folder: Path) -> list[str]:
             if hashlib.sha256(data).hexdigest()[:_DIGEST_LETTERS] != name.rsplit(".", 2)[1]:
                 problems.append(f"{name} was changed: its bytes do not have the digest in its name")
             _write(folder, chain, first, list(_unseen(data, seen)))
+    if chains:
+        write_heads(folder, {chain: newest_head(folder, chain) or GENESIS for chain in chains})
     return problems
 
 

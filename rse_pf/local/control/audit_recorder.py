@@ -1,28 +1,37 @@
 """The control plane's own audit log: what it started, stopped and moved, and the heads of the other logs.
 
 Every event of the platform becomes an entry.  The heads of the other chains become entries, too, which shows
-if the end of one of them is removed.  A log that cannot be written neither delays nor ends the platform.
+if the end of one of them is removed; the control plane's last head is recorded in the log of operators.  A
+log that cannot be written neither delays nor ends the platform.
 """
 
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import time
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from rse_pf.audit.chain import HEADS, Note, Value
-from rse_pf.audit.log import AuditLog, audit_folder, chain_names, newest_head
+from rse_pf.audit.log import (
+    CONTROL_PLANE,
+    HEADS_S,
+    OPERATOR,
+    AuditLog,
+    audit_folder,
+    chain_names,
+    grown_heads,
+    record_once,
+)
+from rse_pf.errors import ConfigurationError
 
 __all__ = ["PlatformAudit"]
 
-_WHO = "control-plane"
 _MAX_HEADS = 50
 """In one entry."""
 _WAIT_S = 2.0
-HEADS_S = 60.0
-"""Time between two looks at the heads of the other audit logs."""
 
 
 class PlatformAudit:
@@ -33,7 +42,7 @@ class PlatformAudit:
         self._heads_s = heads_s
         self._is_open = False
         self._recorded: dict[str, str] = {}
-        self._log = AuditLog(self.folder, _WHO, wall_clock=time.time)
+        self._log = AuditLog(self.folder, CONTROL_PLANE, wall_clock=time.time)
 
     def open(self) -> None:
         """Begin to record; raises ConfigurationError."""
@@ -55,11 +64,8 @@ class PlatformAudit:
 
     def record_heads(self) -> None:
         """Record the heads of the other chains that have grown."""
-        grown: dict[str, Value] = {}
-        for who in chain_names(self.folder):
-            head = None if who == _WHO else newest_head(self.folder, who)
-            if head is not None and self._recorded.get(who) != str(head):
-                grown[who] = self._recorded[who] = str(head)
+        others = [who for who in chain_names(self.folder) if who != CONTROL_PLANE]
+        grown = grown_heads(self.folder, others, self._recorded)
         names = list(grown)
         for first in range(0, len(names), _MAX_HEADS):
             some = names[first : first + _MAX_HEADS]
@@ -72,9 +78,14 @@ class PlatformAudit:
             self.record_heads()
             self._add("platform.over", "", {})
             self._log.close()
+            head = {CONTROL_PLANE: str(self._log.head)}
+            with contextlib.suppress(ConfigurationError):  # the next start records it
+                record_once(self.folder, OPERATOR, HEADS, wall_clock=time.time, **head)
 
     def _add(self, action: str, subject: str, detail: Mapping[str, Value]) -> None:
-        self._log.add([Note(time=time.time(), actor=_WHO, action=action, subject=subject, detail=detail)])
+        self._log.add(
+            [Note(time=time.time(), actor=CONTROL_PLANE, action=action, subject=subject, detail=detail)]
+        )
 
 
 def _value(value: Any) -> Value:

@@ -194,7 +194,8 @@ def test_an_entry_changed_before_its_upload_is_reported_and_uploaded(
 def test_a_log_rewritten_after_its_upload_is_detected(setup: ShipperSetup, tmp_path: Path) -> None:
     setup.write(5)
     setup.shipper.ship()
-    (setup.folder / f"{INSTANCE}.jsonl").unlink()
+    for name in (f"{INSTANCE}.jsonl", "heads"):
+        (setup.folder / name).unlink()
     log = AuditLog(setup.folder, INSTANCE, wall_clock=lambda: 2e9, max_bytes=SMALL, sync_s=0.0).open()
     log.record("nothing.happened")
     log.close()
@@ -210,6 +211,7 @@ def test_a_file_truncated_after_its_upload_is_detected(setup: ShipperSetup, tmp_
     setup.shipper.ship()
     current = setup.folder / f"{INSTANCE}.jsonl"
     current.write_bytes(b"".join(current.read_bytes().splitlines(keepends=True)[:2]))
+    (setup.folder / "heads").unlink()
     setup.write(1)
     setup.shipper.ship()
 

@@ -1,0 +1,121 @@
+"""The heads of all chains of a folder, in one file beside them: so that a cut end or a lost log is noticed.
+
+A chain alone does not show that its last entries were removed, or that it was removed as a whole.  The file
+``heads`` has a line of fixed length for each chain.  A writer finds or adds its line when it opens its log,
+and overwrites only that line, after its entries are on the disk.  So no line is ahead of its chain, writers
+do not wait for each other, and a crash leaves old heads, not wrong ones.  An attacker has to forge this
+file, and the entries in which writers record each other's heads; see `rse_pf.audit.log`.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import os
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+from rse_pf.audit.chain import GENESIS, Head, parse_head
+from rse_pf.files import replace_file
+
+__all__ = ["FILE", "HeadsFile", "read_heads", "write_heads"]
+
+FILE = "heads"
+_LINE_BYTES = 256
+"""A divisor of the size of a page, so that no line is written in two parts."""
+_MAX_BYTES = 1 << 24
+
+
+class HeadsFile:
+    """The line of one chain in the file of heads, while its log is open."""
+
+    def __init__(self, folder: Path, who: str, present: Callable[[], Mapping[str, Head]]) -> None:
+        """Describe it; nothing is opened.
+
+        Args:
+            folder: Of the logs.
+            who: Name of the chain.
+            present: Returns the heads of the chains that are there, for a file that has to be made.
+        """
+        self._path = folder / FILE
+        self._who = who
+        self._present = present
+        self._fd = -1
+        self._offset = 0
+
+    def open(self) -> tuple[Head, bool]:
+        """Find or add the line of the chain; return its head, and whether the file was lost.
+
+        A file is lost if it is missing or empty although there are entries.
+
+        Raises:
+            OSError: The file cannot be read or written.
+        """
+        self.close()
+        self._fd = os.open(self._path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+        fcntl.flock(self._fd, fcntl.LOCK_EX)  # held for some microseconds, and only while a log is opened
+        try:
+            data = os.pread(self._fd, _MAX_BYTES, 0)
+            was_lost = False
+            if not data:
+                heads = dict(self._present())
+                was_lost = any(head.seq for head in heads.values())
+                data = b"".join(_line(who, head) for who, head in heads.items())
+                os.pwrite(self._fd, data, 0)
+            for offset in range(0, len(data), _LINE_BYTES):
+                found = _parsed(data[offset : offset + _LINE_BYTES])
+                if found is not None and found[0] == self._who:
+                    self._offset = offset
+                    return found[1], was_lost
+            self._offset = -(-len(data) // _LINE_BYTES) * _LINE_BYTES
+            os.pwrite(self._fd, _line(self._who, GENESIS), self._offset)
+            return GENESIS, was_lost
+        finally:
+            fcntl.flock(self._fd, fcntl.LOCK_UN)
+
+    def is_lost(self) -> bool:
+        """Whether the file was removed or emptied while it was open."""
+        about = os.fstat(self._fd)
+        return about.st_nlink == 0 or about.st_size <= self._offset
+
+    def write(self, head: Head) -> None:
+        """Write *head*, which is that of the chain on the disk; raises OSError."""
+        os.pwrite(self._fd, _line(self._who, head), self._offset)
+
+    def close(self) -> None:
+        """Close the file."""
+        if self._fd >= 0:
+            os.close(self._fd)
+        self._fd = -1
+
+
+def read_heads(folder: Path) -> tuple[dict[str, Head], list[str]] | None:
+    """Return the heads in the file of *folder*, and what is wrong with it; None if there is no such file."""
+    try:
+        with (folder / FILE).open("rb") as file:
+            data = file.read(_MAX_BYTES)
+    except FileNotFoundError:
+        return None
+    heads: dict[str, Head] = {}
+    problems = []
+    for number in range(-(-len(data) // _LINE_BYTES)):
+        found = _parsed(data[number * _LINE_BYTES : (number + 1) * _LINE_BYTES])
+        if found is None or found[0] in heads:
+            problems.append(f"line {number + 1} was changed: it is not the head of a chain")
+        else:
+            heads[found[0]] = found[1]
+    return heads, problems
+
+
+def write_heads(folder: Path, heads: Mapping[str, Head]) -> None:
+    """Write the file of heads for chains that were copied into *folder*."""
+    replace_file(folder / FILE, b"".join(_line(who, heads[who]) for who in sorted(heads)), mode=0o600)
+
+
+def _line(who: str, head: Head) -> bytes:
+    return f"{who} {head}".ljust(_LINE_BYTES - 1).encode() + b"\n"
+
+
+def _parsed(line: bytes) -> tuple[str, Head] | None:
+    who, _, rest = line.decode("ascii", "replace").partition(" ")
+    head = parse_head(rest.rstrip(" \n"))
+    return None if head is None or line != _line(who, head) else (who, head)
