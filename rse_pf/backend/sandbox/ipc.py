@@ -25,6 +25,7 @@ _HEADER = struct.Struct("<I")
 _READ_BYTES = 1 << 18
 _MAX_LINES = 200
 _MAX_LINE = 256
+_NO_MESSAGE = object()
 
 
 def encode_message(message: Any) -> bytes:
@@ -101,6 +102,7 @@ class IpcChannel:
         self._output, self.their_output = os.pipe()
         self._unsent = bytearray()
         self._lines = 0
+        self._is_reading = True
         self._socket.setblocking(False)
         os.set_blocking(self._output, False)
 
@@ -116,13 +118,19 @@ class IpcChannel:
         self._unsent += data
         self._flush()
 
+    def stop_reading(self) -> None:
+        """Take no further message, not even one that was received: the sandbox is being killed."""
+        if self._is_reading:
+            self._is_reading = False
+            self._loop.remove_reader(self._socket.fileno())
+
     def close(self) -> None:
         """Read what was printed last, and close both."""
         if self._socket.fileno() < 0:
             return
+        self.stop_reading()
         self._read_output()
         self._loop.remove_reader(self._output)
-        self._loop.remove_reader(self._socket.fileno())
         self._loop.remove_writer(self._socket.fileno())
         self._socket.close()
         os.close(self._output)
@@ -148,18 +156,21 @@ class IpcChannel:
             return
         except OSError:
             data = b""
-        try:
-            messages = list(self._frames.feed(data))
-        except RsePfError as error:
-            self._fail(f"it sent an invalid message: {error.message}")
-            return
-        for message in messages:
+        messages = self._frames.feed(data)
+        while self._is_reading:
+            try:
+                message = next(messages, _NO_MESSAGE)
+            except RsePfError as error:
+                self._fail(f"it sent an invalid message: {error.message}")
+                return
+            if message is _NO_MESSAGE:
+                break
             self._on_message(message)
-        if not data:
+        if not data and self._is_reading:
             self._fail("")
 
     def _fail(self, why: str) -> None:
-        self._loop.remove_reader(self._socket.fileno())
+        self.stop_reading()
         self._on_fault(why)
 
     def _read_output(self) -> None:
@@ -183,5 +194,5 @@ class IpcChannel:
 def _decode(body: bytes) -> Any:
     try:
         return msgspec.msgpack.decode(body, ext_hook=extension_hook)
-    except (msgspec.DecodeError, TypeError, ValueError, LookupError) as error:
+    except (msgspec.DecodeError, TypeError, ValueError, LookupError, RecursionError) as error:
         raise BadMessage(f"not MessagePack: {error}") from error

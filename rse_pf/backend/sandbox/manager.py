@@ -23,6 +23,7 @@ from rse_pf.backend.sandbox.policy import (
     KillSandbox,
     LoadSnapshot,
     LogCrash,
+    LogOverrun,
     ReleaseSandbox,
     SandboxCall,
     SandboxPolicy,
@@ -30,10 +31,11 @@ from rse_pf.backend.sandbox.policy import (
     SaveSnapshot,
     SendMessage,
 )
+from rse_pf.backend.sandbox.replies import is_ready, outcome_of
 from rse_pf.backend.sandbox.zygote_client import ZygoteClient
 from rse_pf.backend.scheduling.scheduler import QueuedCommand
 from rse_pf.config import PlatformSettings
-from rse_pf.errors import NotFound, RsePfError, StoreError, error_from_code
+from rse_pf.errors import BadMessage, NotFound, RsePfError, StoreError
 from rse_pf.identity import RobotId, state_name
 from rse_pf.object_store import ObjectStore, is_name
 from rse_pf.service import failure_of
@@ -161,13 +163,13 @@ class SandboxManager:
             self._zygote.pause(number)
 
     def _follow_message(self, number: int, message: Any, now: float) -> None:
-        if message == ["ready"]:
+        if is_ready(message):
             self._execute(self._policy.ready(number, now))
             return
         try:
-            outcome = _outcome_of(message)
-        except (TypeError, ValueError, LookupError):
-            self._on_fault(number, "it sent a message of no known form")
+            outcome = outcome_of(message)
+        except BadMessage as error:
+            self._on_fault(number, error.message)
         else:
             self._execute(self._policy.replied(number, outcome, now))
 
@@ -203,6 +205,7 @@ class SandboxManager:
                 self._create(number, robot)
             case KillSandbox(number):
                 self._zygote.end(number)
+                self._channels[number].stop_reading()
             case ReleaseSandbox(number):
                 self._zygote.end(number)
                 self._channels.pop(number).close()
@@ -213,6 +216,8 @@ class SandboxManager:
                 self._ask_store(number, call, _save, expected, data)
             case LogCrash(robot, service, reason):
                 self._log.error("sandbox-crashed", robot=robot, service=service, reason=reason)
+            case LogOverrun(robot, service, reason):
+                self._log.warning("sandbox-overran", robot=robot, service=service, reason=reason)
 
     def _create(self, number: int, robot: RobotId) -> None:
         channel = self._channels[number] = IpcChannel(
@@ -286,12 +291,3 @@ def _has_unowned_snapshot(store: ObjectStore, robot: RobotId, service: str) -> b
 
 def _save(store: ObjectStore, robot: RobotId, service: str, expected: bytes | None, data: bytes) -> None:
     store.compare_and_swap(state_name(robot, service), expected, data)
-
-
-def _outcome_of(message: Any) -> SandboxReply | RsePfError:
-    """Return what a sandbox says became of a request; raises TypeError, ValueError or LookupError."""
-    if message[0] is True:
-        _, value, snapshot, compute_ms = message
-        return SandboxReply(value, float(compute_ms), None if snapshot is None else bytes(snapshot))
-    _, code, text, hint, _ = message
-    return error_from_code(str(code), str(text)[:500], hint=str(hint)[:500])

@@ -50,17 +50,23 @@ def test_a_blocking_receiver_gets_each_message_and_none_at_the_end():
 class Peer:
     """A channel with the sandbox's ends in the hands of the test."""
 
-    def __init__(self, max_bytes: int = 1000) -> None:
+    def __init__(self, max_bytes: int = 1000, stops_after: int = 1000) -> None:
+        self.stops_after = stops_after
         self.loop = FakeLoop()
         self.messages: list[Any] = []
         self.faults: list[str] = []
         self.lines: list[str] = []
         self.channel = IpcChannel(
-            self.loop, max_bytes=max_bytes, on_message=self.messages.append, on_fault=self.faults.append,
+            self.loop, max_bytes=max_bytes, on_message=self.take, on_fault=self.faults.append,
             on_line=self.lines.append,
         )  # fmt: skip
         self.socket, self.output = self.channel.theirs.dup(), os.dup(self.channel.their_output)
         self.channel.start()
+
+    def take(self, message: Any) -> None:
+        self.messages.append(message)
+        if len(self.messages) == self.stops_after:
+            self.channel.stop_reading()
 
     def close(self) -> None:
         self.channel.close()
@@ -109,6 +115,18 @@ def test_an_invalid_message_is_reported_once_and_nothing_is_read_after_it(peer, 
     assert len(peer.faults) == 1
     assert "invalid message" in peer.faults[0]
     assert peer.messages == []
+
+
+def test_a_flood_of_messages_ends_with_the_one_after_which_the_channel_stops_reading():
+    peer = Peer(stops_after=2)
+    peer.socket.sendall(encode_message(["ready"]) * 1000)
+    peer.loop.run_until(lambda: peer.messages)
+    peer.socket.sendall(encode_message(["more"]))
+    peer.loop.advance(1.0)
+    peer.close()
+
+    assert peer.messages == [["ready"]] * 2
+    assert peer.faults == []
 
 
 def test_the_end_of_the_sandbox_is_reported_without_a_reason(peer):
