@@ -8,7 +8,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import numpy as np
 import pytest
 
@@ -21,7 +20,6 @@ SOURCE = """
 import os
 import stat
 import time
-import msgspec
 
 class Request(msgspec.Struct):
     frames: bytes = b""
