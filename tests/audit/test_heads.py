@@ -73,6 +73,16 @@ def test_a_cut_end_stays_named_when_the_writer_goes_on(folder: Path, who: str) -
     assert problems(folder)[who].endswith(f" of {who} names another")
 
 
+def test_a_lost_last_entry_is_named_although_another_one_has_its_number(tmp_path: Path) -> None:
+    write(tmp_path, "server-1", 1)
+    path = tmp_path / "server-1.jsonl"
+    path.write_bytes(b'{"action":"auth.acc')
+
+    write(tmp_path, "server-1", 1)
+
+    assert problems(tmp_path) == {"server-1": "entry 1 was changed: entry 2 of server-1 names another"}
+
+
 @pytest.mark.parametrize("who", WRITERS)
 def test_a_removed_log_is_named_before_and_after_its_writer_begins_anew(folder: Path, who: str) -> None:
     for path in files_of(folder, who):

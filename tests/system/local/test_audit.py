@@ -123,12 +123,20 @@ async def test_a_platform_records_its_actions_its_robots_its_operator_and_all_he
     assert {"platform.platform-ready", "platform.server-ready", "platform.over"} <= deeds
     assert {verdict.problem for verdict in check_folder(audit)} == {""}
 
-    path = audit / f"{server}.jsonl"
-    path.write_bytes(b"".join(path.read_bytes().splitlines(keepends=True)[:-1]))
-    capsys.readouterr()
-    assert main(["audit", "verify", "--name", "audited"]) == 1
-    (broken,) = [line for line in capsys.readouterr().out.splitlines() if "BROKEN" in line]
-    assert broken.startswith(f"{server}: BROKEN in {server}.jsonl: entry ")
-    assert "is missing: entry " in broken
+    for who, count, teller in (
+        (server, 1, "the file of heads"),
+        (server, 2, "entry "),
+        ("control-plane", 1, "entry 2 of operator"),
+        ("operator", 1, "the file of heads"),
+    ):
+        path = audit / f"{who}.jsonl"
+        whole = path.read_bytes()
+        path.write_bytes(b"".join(whole.splitlines(keepends=True)[:-count]))
+        capsys.readouterr()
+        assert main(["audit", "verify", "--name", "audited"]) == 1
+        (broken,) = [line for line in capsys.readouterr().out.splitlines() if "BROKEN" in line]
+        assert broken.startswith(f"{who}: BROKEN in {who}.jsonl: entry ")
+        assert f"is missing: {teller}" in broken
+        path.write_bytes(whole)
     assert main(["audit", "show", "--name", "audited", "--only", "robot.disabled", "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["subject"] == "robot-7"
