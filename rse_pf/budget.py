@@ -26,6 +26,7 @@ __all__ = [
     "PROVENANCE",
     "SERVICE_REPLY",
     "Budget",
+    "announced_values",
     "check_json",
     "check_json_containers",
     "check_msgpack",
@@ -33,6 +34,7 @@ __all__ = [
     "inflate_short",
     "inflate_within",
     "measure_msgpack",
+    "small_text",
 ]
 
 Text = bytes | bytearray
@@ -265,6 +267,34 @@ def measure_msgpack(data: Text, at: int, budget: Budget) -> int:
     if at > end:
         raise _cut_off()
     return at
+
+
+def announced_values(data: Text, at: int) -> int:
+    """Return how many values the list or map at byte *at* announces, two for each key; 0 for other values.
+
+    Raises:
+        BadMessage: *data* ends before.
+    """
+    if at >= len(data):
+        raise _cut_off()
+    first = data[at]
+    step = _STEPS[first]
+    if step >= 0:
+        return 0
+    count = first & 15 if step == -1 else int.from_bytes(data[at + 1 : at - step], "big")
+    return 2 * count if first < 0x90 or first >= 0xDE else count
+
+
+def small_text(data: Text, at: int) -> tuple[str, int]:
+    """Return the text of at most 31 bytes at byte *at*, such as the name of a field, and where it ends.
+
+    Raises:
+        BadMessage: There is something else.
+    """
+    if at >= len(data) or not 0xA0 <= data[at] < 0xC0:
+        raise BadMessage("the name of a field is not a short text", hint="send whole messages")
+    end = at + 1 + (data[at] & 31)
+    return data[at + 1 : end].decode("ascii", "replace"), end
 
 
 def _check_containers(depth: int, containers: int, budget: Budget) -> None:

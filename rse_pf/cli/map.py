@@ -186,7 +186,7 @@ def _show(args: argparse.Namespace, maps: MapRegistry) -> None:
             **_fields(record),
             "edges_by_kind": kinds,
             "keyframes_by_robot": robots,
-            "provenance": version.provenance,
+            "provenance": dict(version.provenance),
         },
         *_rows(
             ("version", f"{record.number}  {record.id}"),

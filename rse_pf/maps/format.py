@@ -1,15 +1,16 @@
 """Maps as values (keyframes, edges, a point cloud) and their encoding as bytes.
 
-`decode_map` returns complete and validated maps only and executes nothing it reads.  The same map always
-gives the same bytes.
+`decode_map` returns complete and validated maps only and executes nothing it reads.  Sizes and counts are
+judged on the bytes, before any object is made.  The same map always gives the same bytes.
 
 Format: ``RSEMAP1\\n``, then one MessagePack map, zlib-compressed; arrays are raw little-endian bytes.
 """
 
 from __future__ import annotations
 
+import functools
 import zlib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -17,16 +18,45 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from rse_pf.errors import BadRequest, RsePfError
+from rse_pf.budget import (
+    LIST_VALUES,
+    MAP_VALUES,
+    PROVENANCE,
+    Budget,
+    announced_values,
+    inflate_within,
+    measure_msgpack,
+    small_text,
+)
+from rse_pf.errors import BadMessage, BadRequest, LimitExceeded, RsePfError
 from rse_pf.geometry import Array, Camera
 
-__all__ = ["Edge", "EdgeKind", "Keyframe", "MapVersion", "decode_map", "encode_map"]
+__all__ = ["Edge", "EdgeKind", "Keyframe", "MapLimits", "MapVersion", "decode_map", "encode_map"]
 
 EdgeKind = Literal["odometry", "loop", "merge"]
 
 _MAGIC = b"RSEMAP1\n"
 _MAX_BYTES = 1 << 30
+_MAX_RATIO, _FREE_BYTES = 50.0, 1 << 20
+"""Features and clouds deflate to half their size; only empty or hostile maps deflate to a fiftieth."""
 _DESCRIPTOR_BYTES = 32
+_MAX_ID = 2**63 - 1
+_MAX_NAME = 64
+_MAX_NUMBER, _MAX_TIME_S = 1e9, 1e12
+"""Metres or pixels, and seconds: larger numbers overflow in what computes with them."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MapLimits:
+    """How much a map may hold; one with more is refused before it is decoded.
+
+    ``keyframe_features`` is the limit of one keyframe, ``features`` that of all together.
+    """
+
+    keyframes: int = 20_000
+    keyframe_features: int = 20_000
+    features: int = 5_000_000
+    edges: int = 100_000
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -61,8 +91,15 @@ class Keyframe:
             and self.points_camera.shape == (n, 3)
         ):
             raise BadRequest(f"the arrays of keyframe {self.id} do not fit", hint="one row for each feature")
-        if not (np.isfinite(self.pixels).all() and np.isfinite(self.timestamp_s)):
-            raise BadRequest(f"keyframe {self.id} holds a number that is not finite", hint="leave it out")
+        if not (0 <= self.id <= _MAX_ID and len(self.robot) <= _MAX_NAME):
+            raise BadRequest(
+                f"the id {self.id} is not within 0..2**63-1, or the robot's name longer than {_MAX_NAME}",
+                hint="number keyframes from 0",
+            )
+        if not (abs(self.timestamp_s) <= _MAX_TIME_S and _is_bounded(self.pixels)):
+            raise BadRequest(
+                f"keyframe {self.id} holds a number that is not finite, or absurd", hint="leave it out"
+            )
         _check_pose(f"keyframe {self.id}", self.T_world_camera)
 
 
@@ -109,7 +146,7 @@ class MapVersion:
                 f"edge {dangling.a}-{dangling.b} names a missing keyframe", hint="add the keyframe"
             )
         m = len(self.points)
-        if self.points.shape != (m, 3) or self.colours.shape != (m, 3) or not np.isfinite(self.points).all():
+        if self.points.shape != (m, 3) or self.colours.shape != (m, 3) or not _is_bounded(self.points):
             raise BadRequest("points and colours of a map do not fit", hint="send (m, 3) of both")
 
 
@@ -119,9 +156,9 @@ class _Keyframe(msgspec.Struct, frozen=True, kw_only=True):
     timestamp_s: float
     pose: bytes
     camera: Camera
-    pixels: bytes
-    descriptors: bytes
-    points: bytes
+    pixels: memoryview
+    descriptors: memoryview
+    points: memoryview
 
 
 class _Edge(msgspec.Struct, frozen=True, kw_only=True):
@@ -135,9 +172,9 @@ class _Edge(msgspec.Struct, frozen=True, kw_only=True):
 class _Map(msgspec.Struct, frozen=True, kw_only=True):
     keyframes: list[_Keyframe]
     edges: list[_Edge]
-    points: bytes
-    colours: bytes
-    provenance: dict[str, Any]
+    points: memoryview
+    colours: memoryview
+    provenance: msgspec.Raw
 
 
 def encode_map(version: MapVersion) -> bytes:
@@ -146,8 +183,8 @@ def encode_map(version: MapVersion) -> bytes:
         keyframes=[
             _Keyframe(
                 id=k.id, robot=k.robot, timestamp_s=k.timestamp_s, pose=_raw(k.T_world_camera, "<f8"),
-                camera=k.camera, pixels=_raw(k.pixels, "<f4"), descriptors=_raw(k.descriptors, "u1"),
-                points=_raw(k.points_camera, "<f4"),
+                camera=k.camera, pixels=_view(k.pixels, "<f4"), descriptors=_view(k.descriptors, "u1"),
+                points=_view(k.points_camera, "<f4"),
             )
             for k in version.keyframes
         ],
@@ -157,30 +194,33 @@ def encode_map(version: MapVersion) -> bytes:
             )
             for e in version.edges
         ],
-        points=_raw(version.points, "<f4"),
-        colours=_raw(version.colours, "u1"),
-        provenance=dict(version.provenance),
+        points=_view(version.points, "<f4"),
+        colours=_view(version.colours, "u1"),
+        provenance=msgspec.Raw(msgspec.msgpack.encode(dict(version.provenance), order="deterministic")),
     )  # fmt: skip
     return _MAGIC + zlib.compress(msgspec.msgpack.encode(packed, order="deterministic"), 1)
 
 
-def decode_map(data: bytes, max_bytes: int = _MAX_BYTES) -> MapVersion:
-    """Return the map of *data*.
+def decode_map(data: bytes, max_bytes: int = _MAX_BYTES, limits: MapLimits | None = None) -> MapVersion:
+    """Return the map of *data*, whose arrays share the memory of the inflated bytes.
+
+    The provenance is decoded when it is first asked for, and raises BadRequest then if it is damaged.
+
+    Args:
+        data: What `encode_map` returned, or a stranger's bytes.
+        max_bytes: Size of the inflated map.
+        limits: Counts that it may hold; None means the defaults.
 
     Raises:
         BadRequest: The bytes are not a map, are damaged, or hold more than *max_bytes*.
+        LimitExceeded: The map holds more than *limits* allow.
     """
-    if data[: len(_MAGIC)] != _MAGIC:
-        raise BadRequest("these bytes are not a map", hint="send what encode_map returned")
+    limits = limits or MapLimits()
+    text = _inflated(data, max_bytes)
     try:
-        inflater = zlib.decompressobj()
-        raw = inflater.decompress(data[len(_MAGIC) :], max_bytes)
-        if not inflater.eof:
-            raise BadRequest(
-                f"the map is truncated, or holds more than {max_bytes} bytes",
-                hint="send the complete map, or fewer points",
-            )
-        packed = msgspec.msgpack.decode(raw, type=_Map)
+        _check_sections(text, limits)
+        packed = msgspec.msgpack.decode(memoryview(text).toreadonly(), type=_Map)
+        _check_features(packed.keyframes, limits)
         return MapVersion(
             keyframes=tuple(_keyframe(each) for each in packed.keyframes),
             edges=tuple(
@@ -192,12 +232,110 @@ def decode_map(data: bytes, max_bytes: int = _MAX_BYTES) -> MapVersion:
             ),
             points=_array(packed.points, "<f4", (-1, 3)),
             colours=_array(packed.colours, "u1", (-1, 3)),
-            provenance=packed.provenance,
+            provenance=_Provenance(bytes(packed.provenance)),
         )  # fmt: skip
-    except (zlib.error, msgspec.MsgspecError, ValueError) as error:
-        if isinstance(error, RsePfError):
+    except (msgspec.MsgspecError, ValueError, RecursionError, BadMessage) as error:
+        if isinstance(error, RsePfError) and not isinstance(error, BadMessage):
             raise
         raise BadRequest(f"the map is damaged: {error}", hint="fetch it again") from error
+
+
+def _inflated(data: bytes, max_bytes: int) -> bytes | bytearray:
+    if data[: len(_MAGIC)] != _MAGIC:
+        raise BadRequest("these bytes are not a map", hint="send what encode_map returned")
+    budget = Budget(
+        wire_bytes=max_bytes, inflated_bytes=max_bytes, inflate_ratio=_MAX_RATIO, free_bytes=_FREE_BYTES,
+        depth=0, containers=0, values=0, mixed_values=0, memory_bytes=max_bytes,
+    )  # fmt: skip
+    try:
+        return inflate_within(data[len(_MAGIC) :], budget)
+    except LimitExceeded as error:
+        raise BadRequest(f"the map: {error.message}", hint="send fewer points") from error
+    except BadMessage as error:
+        raise BadRequest(f"the map is truncated or damaged: {error.message}", hint="send it again") from error
+
+
+def _check_sections(text: bytes | bytearray, limits: MapLimits) -> None:
+    """Check the counts of each field of an encoded map, which is one MessagePack map."""
+    count, at, names = announced_values(text, 0), 1, set()
+    if not 0x80 <= text[0] <= 0x8F:
+        raise BadMessage("it is not a map of fields")
+    for _ in range(count // 2):
+        name, at = small_text(text, at)
+        if name in names:
+            raise BadMessage(f"the field {name!r} is there twice")
+        names.add(name)
+        items = announced_values(text, at)
+        if name in _ITEM_VALUES and items > getattr(limits, name):
+            raise LimitExceeded(
+                f"a map of {items} {name} is above {getattr(limits, name)}", hint="split the map"
+            )
+        if name == "provenance" and not (0x80 <= text[at] < 0x90 or text[at] in (0xDE, 0xDF)):
+            raise BadMessage("its provenance is not a map")
+        begin, at = at, measure_msgpack(text, at, _budget_of(name, items))
+        if name == "provenance" and at - begin > PROVENANCE.wire_bytes:
+            raise LimitExceeded(
+                f"a provenance of {at - begin} bytes is above {PROVENANCE.wire_bytes}", hint="leave it out"
+            )
+
+
+_ITEM_VALUES = {"keyframes": 100, "edges": 40}
+"""Values of one item of a list, beyond what the format has today, so that fields may be added."""
+_OTHER_FIELD = 1000
+
+
+def _budget_of(name: str, items: int) -> Budget:
+    """Return the budget of a field whose value announces *items* items."""
+    if name == "provenance":
+        return PROVENANCE
+    values = LIST_VALUES + items * _ITEM_VALUES[name] if name in _ITEM_VALUES else _OTHER_FIELD
+    containers = 1 + values // MAP_VALUES
+    return Budget(
+        wire_bytes=_MAX_BYTES, inflated_bytes=_MAX_BYTES, inflate_ratio=_MAX_RATIO, free_bytes=_FREE_BYTES,
+        depth=4, containers=containers, values=values, mixed_values=values, memory_bytes=_MAX_BYTES,
+    )  # fmt: skip
+
+
+def _check_features(keyframes: list[_Keyframe], limits: MapLimits) -> None:
+    total = 0
+    for each in keyframes:
+        count = max(len(each.pixels) // 8, len(each.descriptors) // _DESCRIPTOR_BYTES, len(each.points) // 12)
+        total += count
+        if count > limits.keyframe_features or total > limits.features:
+            raise LimitExceeded(
+                f"keyframe {each.id} has {count} features, which is above {limits.keyframe_features}, or the "
+                f"map more than {limits.features}",
+                hint="keep the strongest features of each image",
+            )
+
+
+class _Provenance(Mapping[str, Any]):
+    """What a map says about its origin, decoded when it is first asked for."""
+
+    def __init__(self, raw: bytes) -> None:
+        self._raw = raw
+
+    def __getitem__(self, name: str) -> Any:
+        return self._decoded[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._decoded)
+
+    def __len__(self) -> int:
+        return len(self._decoded)
+
+    @functools.cached_property
+    def _decoded(self) -> dict[str, Any]:
+        try:
+            return msgspec.msgpack.decode(self._raw, type=dict[str, Any], ext_hook=_no_extension)
+        except (msgspec.MsgspecError, ValueError, RecursionError) as error:
+            raise BadRequest(
+                f"the provenance of the map is damaged: {error}", hint="fetch it again"
+            ) from error
+
+
+def _no_extension(kind: int, _: memoryview) -> Any:
+    raise ValueError(f"it holds the extension {kind}")
 
 
 def _keyframe(k: _Keyframe) -> Keyframe:
@@ -213,13 +351,34 @@ def _raw(array: npt.NDArray[Any], kind: str) -> bytes:
     return np.ascontiguousarray(array, dtype=np.dtype(kind)).tobytes()
 
 
-def _array(raw: bytes, kind: str, shape: tuple[int, ...]) -> npt.NDArray[Any]:
+def _view(array: npt.NDArray[Any], kind: str) -> memoryview:
+    return memoryview(_raw(array, kind))
+
+
+def _array(raw: bytes | memoryview, kind: str, shape: tuple[int, ...]) -> npt.NDArray[Any]:
     return np.frombuffer(raw, dtype=np.dtype(kind)).reshape(shape)
 
 
+def _is_bounded(values: npt.NDArray[np.float32]) -> bool:
+    """Return whether all *values* are finite and not absurd; a NaN makes both comparisons false."""
+    if not values.size:
+        return True
+    return bool(values.min() >= -_MAX_NUMBER and values.max() <= _MAX_NUMBER)
+
+
 def _check_pose(what: str, T: Array) -> None:
-    if T.shape != (4, 4) or not np.isfinite(T).all() or not np.allclose(T[3], [0, 0, 0, 1]):
+    if T.shape != (4, 4):
         raise BadRequest(f"{what} has no rigid pose", hint="send (4, 4) matrices of finite numbers")
-    rotation = T[:3, :3]
-    if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-4) or np.linalg.det(rotation) < 0:
+    # Twenty times faster than by arrays of this size.
+    (a, b, c, x), (d, e, f, y), (g, h, i, z), last = T.tolist()
+    moved = max(abs(x), abs(y), abs(z)) if x == x and y == y and z == z else float("inf")
+    off_last = max(abs(last[0]), abs(last[1]), abs(last[2]))
+    if not (moved <= _MAX_NUMBER and off_last <= 1e-8 and abs(last[3] - 1.0) <= 1e-5):
+        raise BadRequest(f"{what} has no rigid pose", hint="send (4, 4) matrices of finite numbers")
+    off = (
+        a * a + b * b + c * c - 1.0, d * d + e * e + f * f - 1.0, g * g + h * h + i * i - 1.0,
+        a * d + b * e + c * f, a * g + b * h + c * i, d * g + e * h + f * i,
+    )  # fmt: skip
+    determinant = a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g)
+    if not (all(abs(each) <= 1e-4 for each in off) and determinant > 0):
         raise BadRequest(f"{what} holds a matrix that is not a rotation", hint="orthonormalise it")

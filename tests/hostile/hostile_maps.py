@@ -15,7 +15,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
-__all__ = ["DECODABLE", "hostile_maps"]
+__all__ = ["DAMAGED_PROVENANCE", "DECODABLE", "hostile_maps"]
 
 _MAGIC = b"RSEMAP1\n"
 _PIECE_BYTES = 1 << 20
@@ -28,9 +28,14 @@ _EMPTY = {
     "provenance": b"\x80",
 }  # fmt: skip
 
-DECODABLE = frozenset(
-    {"2000 keyframes without features", "2000 keyframes of one feature", "a name of control characters"}
+DAMAGED_PROVENANCE = frozenset(
+    {"a text that is not UTF-8", "keys that are no text", "keys that are lists", "an unknown extension"}
 )
+"""Maps whose provenance is damaged, which may show only when it is asked for."""
+
+DECODABLE = DAMAGED_PROVENANCE | {
+    "2000 keyframes without features", "2000 keyframes of one feature", "a name of control characters",
+}  # fmt: skip
 """Maps within every limit, which a decoder may accept; all others it must refuse."""
 
 
