@@ -37,7 +37,6 @@ _SLOTS = 500
 _FIRST_UID = 1_000_000
 """Sandboxes of a server that runs as root get user ids from here."""
 _MAX_THREADS = 64
-_FIRST_LOOK_S = 0.1
 
 
 def main(arguments: list[str]) -> None:
@@ -73,16 +72,13 @@ class _Zygote:
             max_bytes=config["max_bytes"],
             missing=self._missing_isolation(list(services.values()), config["scratch_bytes"]),
         )
+        total_bytes = config["total_bytes"]
         self._cgroups = Cgroups(
-            own_hierarchies(),
-            owner=os.getpid(),
-            memory_bytes=config["memory_bytes"],
-            max_threads=_MAX_THREADS,
+            own_hierarchies(), owner=os.getpid(), memory_bytes=total_bytes, max_threads=_MAX_THREADS
         )
         self._cgroups.prepare()
-        self._watcher = (
-            None if "memory" in self._cgroups.controllers else MemoryWatcher(config["memory_bytes"])
-        )
+        has_cgroup = "memory" in self._cgroups.controllers
+        self._watcher = None if has_cgroup else MemoryWatcher(total_bytes)
         self._look_s = 0.0
         """When the watcher looks next."""
         self._children: dict[int, _Child] = {}
@@ -169,7 +165,6 @@ class _Zygote:
             handle = os.pidfd_open(pid)
             self._children[pid] = _Child(number, slot, handle)
             self._poll.register(handle, select.POLLIN)
-            self._look_s = min(self._look_s, time.monotonic() + _FIRST_LOOK_S)
             self._report(handle, event="created", id=number)
             os.write(go_write, _GO)
             if not self._cgroups.add(number, pid):

@@ -116,6 +116,7 @@ class ZygoteClient:
                 for s in self._services
             ],
             "memory_bytes": limits.memory_bytes, "scratch_bytes": limits.scratch_bytes,
+            "total_bytes": limits.memory_bytes,
             "max_bytes": self._settings.session.max_inflated_bytes,
         }  # fmt: skip
         # No credentials, and no threads of the linear algebra library: it will be forked.

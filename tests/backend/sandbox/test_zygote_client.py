@@ -61,8 +61,8 @@ def run(test: Callable[[ZygoteClient, Reports, Log], Any]) -> None:
     asyncio.run(with_zygote())
 
 
-async def create(zygote: ZygoteClient, number: int) -> socket.socket:
-    """Create sandbox *number*, wait until it is ready, and return the worker's end of its channel."""
+def order(zygote: ZygoteClient, number: int) -> socket.socket:
+    """Order sandbox *number* and return the worker's end of its channel."""
     ours, theirs = socket.socketpair()
     output = os.open(os.devnull, os.O_WRONLY)
     try:
@@ -71,6 +71,12 @@ async def create(zygote: ZygoteClient, number: int) -> socket.socket:
         theirs.close()
         os.close(output)
     ours.settimeout(WAIT_S)
+    return ours
+
+
+async def create(zygote: ZygoteClient, number: int) -> socket.socket:
+    """Create sandbox *number*, wait until it is ready, and return the worker's end of its channel."""
+    ours = order(zygote, number)
     assert await asyncio.to_thread(receive, ours) == ["ready"]
     return ours
 
@@ -91,6 +97,35 @@ def test_a_sandbox_whose_channel_is_closed_ends_by_itself() -> None:
         (await create(zygote, 3)).close()
 
         assert await reports.ends.get() == (3, "exit code 0")
+
+    run(test)
+
+
+def test_a_paused_sandbox_does_nothing_until_it_is_resumed() -> None:
+    async def test(zygote: ZygoteClient, reports: Reports, log: Log) -> None:
+        channel = await create(zygote, 3)
+        zygote.pause(3)
+        channel.close()  # which would end it, see above
+        (await create(zygote, 4)).close()
+
+        assert await reports.ends.get() == (4, "exit code 0")
+        zygote.resume(3)
+        assert await reports.ends.get() == (3, "exit code 0")
+
+    run(test)
+
+
+def test_a_sandbox_that_is_paused_while_it_starts_waits_too() -> None:
+    async def test(zygote: ZygoteClient, reports: Reports, log: Log) -> None:
+        with order(zygote, 3):
+            zygote.pause(3)
+            (await create(zygote, 4)).close()
+            assert await reports.ends.get() == (4, "exit code 0")
+        (await create(zygote, 5)).close()
+
+        assert await reports.ends.get() == (5, "exit code 0")
+        zygote.end(3)
+        assert await reports.ends.get() == (3, "signal SIGKILL")
 
     run(test)
 
