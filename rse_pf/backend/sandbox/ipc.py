@@ -2,7 +2,7 @@
 
 A message on a stream socket is its length and its MessagePack body; sandboxes and job processes both use
 this format.  Neither a slow nor a hostile sandbox can block the event loop or fill the worker's memory:
-the size of a message and the number and length of printed lines have limits.
+the size of a message, its values and levels, and the number and length of printed lines have limits.
 """
 
 from __future__ import annotations
@@ -16,10 +16,11 @@ from typing import Any
 
 import msgspec
 
+from rse_pf.budget import SERVICE_REPLY, check_msgpack
 from rse_pf.errors import BadMessage, LimitExceeded, RsePfError
 from rse_pf.wire.arrays import binary_encode_hook, extension_hook
 
-__all__ = ["FrameReader", "IpcChannel", "encode_message", "receive"]
+__all__ = ["FrameReader", "IpcChannel", "encode_message", "encode_reply", "receive"]
 
 _HEADER = struct.Struct("<I")
 _READ_BYTES = 1 << 18
@@ -32,6 +33,17 @@ def encode_message(message: Any) -> bytes:
     """Return *message* with its length before it."""
     body = msgspec.msgpack.encode(message, enc_hook=binary_encode_hook)
     return _HEADER.pack(len(body)) + body
+
+
+def encode_reply(message: Any) -> bytes:
+    """Return *message* of a sandbox with its length before it.
+
+    Raises:
+        LimitExceeded: The worker would refuse it for its values or levels.
+    """
+    data = encode_message(message)
+    check_msgpack(data[_HEADER.size :], SERVICE_REPLY)
+    return data
 
 
 def receive(connection: socket.socket) -> Any:
@@ -55,7 +67,7 @@ class FrameReader:
         """Yield every message that *data* completes.
 
         Raises:
-            LimitExceeded: A message is longer than the limit.
+            LimitExceeded: A message is longer than the limit, or holds too many values or levels.
             BadMessage: A body is not MessagePack.
         """
         self._received += data
@@ -68,6 +80,7 @@ class FrameReader:
                 return
             body = bytes(self._received[_HEADER.size : end])
             del self._received[:end]
+            check_msgpack(body, SERVICE_REPLY)
             yield _decode(body)
 
 
@@ -194,5 +207,7 @@ class IpcChannel:
 def _decode(body: bytes) -> Any:
     try:
         return msgspec.msgpack.decode(body, ext_hook=extension_hook)
+    except RsePfError:
+        raise
     except (msgspec.DecodeError, TypeError, ValueError, LookupError, RecursionError) as error:
         raise BadMessage(f"not MessagePack: {error}") from error

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from rse_pf.backend.sandbox.ipc import FrameReader, IpcChannel, encode_message, receive
+from rse_pf.backend.sandbox.ipc import FrameReader, IpcChannel, encode_message, encode_reply, receive
 from rse_pf.errors import BadMessage, LimitExceeded
 from tests.fakes import FakeLoop
 
@@ -33,6 +33,40 @@ def test_a_message_above_the_limit_is_refused_by_its_header():
 def test_a_body_that_is_not_messagepack_is_a_bad_message():
     with pytest.raises(BadMessage):
         list(FrameReader(10).feed(b"\x01\x00\x00\x00\xc1"))
+
+
+def framed(body: bytes) -> bytes:
+    return len(body).to_bytes(4, "little") + body
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        b"\x91" * 1_000_000,
+        b"\x91" * 1001 + b"\x01",
+        b"\xdd\x00\x0f\x00\x00" + b"\x90" * 0xF0000,
+        b"\xdd\x00\x07\x00\x00" + b"\xa1a" * 0x70000,
+        b"\xdd\x7f\xff\xff\xff" + b"\x01" * 100_000,
+        b"\x94\xc3\xc0\xc0\xc7\x03\x01abc",
+        b"\x94\xc3\xc0\xc0\xd4\x77a",
+    ],
+)
+def test_a_body_that_is_expensive_or_damaged_is_refused_with_a_typed_error(body):
+    with pytest.raises((BadMessage, LimitExceeded)):
+        list(FrameReader(1 << 20).feed(framed(body)))
+
+
+@pytest.mark.parametrize("reply", [[1.5] * 100_000, list(range(100)) * 1000, {"a": [[1, 2]] * 3000}])
+def test_a_reply_of_flat_lists_may_be_long(reply):
+    message = [True, reply, None, 1.5]
+
+    assert list(FrameReader(1 << 20).feed(encode_reply(message))) == [message]
+
+
+@pytest.mark.parametrize("reply", [[[1]] * 8000, ["a", 1] * 20_000, [1.5] * 200_000])
+def test_a_sandbox_sees_by_itself_that_its_reply_would_be_refused(reply):
+    with pytest.raises(LimitExceeded):
+        encode_reply([True, reply, None, 1.5])
 
 
 def test_a_blocking_receiver_gets_each_message_and_none_at_the_end():
