@@ -8,9 +8,12 @@ from __future__ import annotations
 
 import io
 import os
+import re
 import signal
+import site
 import socket
 import sys
+import sysconfig
 import time
 import traceback
 from collections.abc import Mapping, Sequence
@@ -19,7 +22,7 @@ from pathlib import Path
 from typing import Any
 
 from rse_pf.backend.sandbox import isolation
-from rse_pf.backend.sandbox.ipc import encode_message, receive
+from rse_pf.backend.sandbox.ipc import encode_message, encode_reply, receive
 from rse_pf.errors import ConfigurationError, InternalError, LimitExceeded, RsePfError
 from rse_pf.linux import die_with_parent
 from rse_pf.services.custom.installed import InstalledService
@@ -29,7 +32,14 @@ __all__ = ["SandboxPlan", "readable_paths", "run_sandbox"]
 
 _FRAMES_SHOWN = -3
 """The last ones: those of the service."""
-_SYSTEM_PATHS = ("/usr", "/lib", "/lib64", "/bin", "/etc/ld.so.cache", "/etc/localtime")
+_LOADER_CACHE = Path("/etc/ld.so.cache")
+_SYSTEM_PATHS = (
+    str(_LOADER_CACHE), "/etc/localtime", "/usr/lib/locale", "/usr/share/zoneinfo",
+)  # fmt: skip
+_LINKS = (Path("/lib"), Path("/lib64"))
+"""Where /usr is merged they are links, which the loader and libraries name."""
+_SHARED_PREFIXES = ("/usr", "/usr/local")
+"""Of a Python whose ``lib`` folder is not its own."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -47,10 +57,16 @@ class SandboxPlan:
 
 
 def readable_paths(services: Sequence[InstalledService]) -> list[Path]:
-    """Return what a sandbox may read: the system's libraries, Python, this package, the services."""
+    """Return what a sandbox may read: Python's modules, this package, the system's libraries, the services.
+
+    Programs, documentation, settings and homes are not among it.
+    """
     package = Path(__file__).resolve().parents[2]
-    own = [Path(sys.prefix), Path(sys.base_prefix), package, *(service.folder for service in services)]
-    return [*(Path(path) for path in _SYSTEM_PATHS), *own]
+    modules = [sysconfig.get_path(name) for name in ("stdlib", "platstdlib", "purelib", "platlib")]
+    if sys.base_prefix not in _SHARED_PREFIXES:
+        modules.append(f"{sys.base_prefix}/lib")  # libraries that its modules link to, as in conda
+    names = [*_SYSTEM_PATHS, *_library_folders(), *modules, *site.getsitepackages()]
+    return [*map(Path, names), package, *(service.folder for service in services)]
 
 
 def run_sandbox(plan: SandboxPlan, channel: int, output: int, uid: int | None) -> None:
@@ -66,9 +82,8 @@ def run_sandbox(plan: SandboxPlan, channel: int, output: int, uid: int | None) -
     try:
         _reset_process(output)
         isolation.close_other_descriptors(channel)
-        _isolate(plan, uid)
-        die_with_parent()
         with socket.socket(fileno=channel) as connection:
+            _isolate(plan, uid)
             connection.sendall(encode_message(["ready"]))
             _serve(plan, connection)
         code = 0
@@ -78,6 +93,17 @@ def run_sandbox(plan: SandboxPlan, channel: int, output: int, uid: int | None) -
         sys.stdout.flush()
         sys.stderr.flush()
         os._exit(code)
+
+
+def _library_folders() -> list[str]:
+    """Return the folders in which the loader's cache lists libraries, without a cache all of /lib."""
+    try:
+        listed = re.findall(rb"(/[^\0]+)/[^\0/]+\0", _LOADER_CACHE.read_bytes())
+    except OSError:
+        listed = []
+    folders = {os.fsdecode(folder) for folder in listed} or {"/lib", "/usr/lib"}
+    links = [str(link) for link in _LINKS if link.is_symlink()]
+    return [*links, *sorted({os.path.realpath(folder) for folder in folders})]
 
 
 def _reset_process(output: int) -> None:
@@ -101,8 +127,10 @@ def _isolate(plan: SandboxPlan, uid: int | None) -> None:
     isolation.limit_resources(plan.memory_bytes, plan.scratch_bytes, alone=alone)
     if "privileges" not in plan.missing:
         isolation.give_up_privileges(uid)
+    die_with_parent()  # after the change of the user, which would undo it
     if "seccomp" not in plan.missing:
-        isolation.forbid_system_calls()
+        languages = {service.language for service in plan.services.values()}
+        isolation.forbid_system_calls({"python" if each == "package" else each for each in languages})
 
 
 def _serve(plan: SandboxPlan, connection: socket.socket) -> None:
@@ -143,7 +171,7 @@ def _answer(plan: SandboxPlan, runtimes: dict[str, Runtime], kind: str, name: st
 
 def _encode_within(answer: list[Any], max_bytes: int) -> bytes:
     try:
-        data = encode_message(answer)
+        data = encode_reply(answer)
         problem = f"a reply of {len(data)} bytes is above {max_bytes}" if len(data) > max_bytes else ""
     except (TypeError, ValueError, OverflowError, RsePfError) as error:
         problem = f"the reply cannot be encoded: {str(error)[:150]}"

@@ -12,9 +12,10 @@ import os
 import platform
 import resource
 import struct
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 
+from rse_pf.backend.sandbox.seccomp import LANGUAGES, MACHINES, filter_program
 from rse_pf.linux import PR_CAPBSET_DROP, PR_SET_DUMPABLE, PR_SET_NO_NEW_PRIVS, PR_SET_SECCOMP, prctl
 
 __all__ = [
@@ -47,27 +48,7 @@ _SECCOMP_MODE_FILTER = 2
 _CAP_VERSION_3 = 0x20080522
 _LAST_CAP = 63
 _MAX_THREADS = 64
-
-_AUDIT_ARCH_X86_64 = 0xC000003E
-_X32 = 0x40000000
-_ALLOW, _KILL, _ERRNO = 0x7FFF0000, 0x80000000, 0x00050000
-_EPERM, _ENOSYS = 1, 38
-_LOAD, _JUMP_EQUAL, _JUMP_AT_LEAST, _JUMP_SET, _RETURN = 0x20, 0x15, 0x35, 0x45, 0x06
-_CLONE, _CLONE3, _CLONE_THREAD = 56, 435, 0x00010000
-
-_FORBIDDEN_X86_64 = {
-    "socket": 41, "fork": 57, "vfork": 58, "execve": 59, "ptrace": 101, "syslog": 103,
-    "personality": 135, "pivot_root": 155, "adjtimex": 159, "chroot": 161, "acct": 163,
-    "settimeofday": 164, "mount": 165, "umount2": 166, "swapon": 167, "swapoff": 168, "reboot": 169,
-    "init_module": 175, "delete_module": 176, "quotactl": 179, "clock_settime": 227, "kexec_load": 246,
-    "add_key": 248, "request_key": 249, "keyctl": 250, "unshare": 272, "perf_event_open": 298,
-    "open_by_handle_at": 304, "setns": 308, "process_vm_readv": 310, "process_vm_writev": 311,
-    "kcmp": 312, "finit_module": 313, "kexec_file_load": 320, "bpf": 321, "execveat": 322,
-    "userfaultfd": 323, "io_uring_setup": 425, "io_uring_enter": 426, "io_uring_register": 427,
-    "open_tree": 428, "move_mount": 429, "fsopen": 430, "fsconfig": 431, "fsmount": 432, "fspick": 433,
-    "pidfd_getfd": 438, "mount_setattr": 442,
-}  # fmt: skip
-"""No new programs, processes, sockets or mounts, no kernel interfaces; threads stay allowed."""
+_ROOT_INODES, _BYTES_PER_INODE = 4096, 4096
 
 
 class IsolationUnavailable(Exception):
@@ -114,17 +95,19 @@ def make_root(readable: Sequence[Path], scratch_bytes: int, owner: int) -> None:
 
     Args:
         readable: Files and folders that keep their names; missing ones are left out.
-        scratch_bytes: Size of the scratch folder, in memory.
+        scratch_bytes: Size of the scratch folder, in memory; it may hold one file per 4,096 bytes of that.
         owner: User of the scratch folder.
     """
     _mount(None, "/", None, _MS_REC | _MS_PRIVATE, None)
     base = _free_mount_point(readable)
-    _mount("root", base, "tmpfs", _MS_NOSUID | _MS_NODEV, "size=1m,mode=755")
+    _mount("root", base, "tmpfs", _MS_NOSUID | _MS_NODEV, f"size=1m,nr_inodes={_ROOT_INODES},mode=755")
     for path in (*_outermost(readable), *(Path("/dev") / name for name in ("null", "zero", "urandom"))):
         _bind(path, base)
     scratch = base + "/scratch"
     os.mkdir(scratch)
-    _mount("scratch", scratch, "tmpfs", _MS_NOSUID | _MS_NODEV, f"size={scratch_bytes},mode=700")
+    inodes = max(1, scratch_bytes // _BYTES_PER_INODE)
+    options = f"size={scratch_bytes},nr_inodes={inodes},mode=700"
+    _mount("scratch", scratch, "tmpfs", _MS_NOSUID | _MS_NODEV, options)
     os.chown(scratch, owner, owner if os.getuid() == 0 else os.getgid())
     if not os.path.lexists(base + "/tmp"):
         os.symlink("scratch", base + "/tmp")
@@ -147,15 +130,15 @@ def limit_resources(memory_bytes: int, scratch_bytes: int, *, alone: bool) -> No
     Processes are bounded by seccomp, processor time by the deadline.
 
     Args:
-        memory_bytes: Address space.
-        scratch_bytes: One file.
+        memory_bytes: Address space and scratch folder together.
+        scratch_bytes: Scratch folder, and the longest file in it.
         alone: Whether the user or the user namespace belongs to this sandbox alone, so that its threads
             can be counted.
     """
     if alone:
         resource.setrlimit(resource.RLIMIT_NPROC, (_MAX_THREADS, _MAX_THREADS))
     for which, limit in (
-        (resource.RLIMIT_AS, memory_bytes),
+        (resource.RLIMIT_AS, memory_bytes - scratch_bytes),
         (resource.RLIMIT_FSIZE, scratch_bytes),
         (resource.RLIMIT_NOFILE, 64),
         (resource.RLIMIT_CORE, 0),
@@ -181,11 +164,12 @@ def give_up_privileges(uid: int | None) -> None:
     os.umask(0o077)
 
 
-def forbid_system_calls() -> None:
-    """Forbid new programs, processes, sockets and mounts from now on."""
-    if platform.machine() != "x86_64" or struct.calcsize("P") != 8:
-        raise IsolationUnavailable("seccomp", f"no filter is written for {platform.machine()}")
-    code = _filter(sorted(_FORBIDDEN_X86_64.values()))
+def forbid_system_calls(languages: Collection[str] = LANGUAGES) -> None:
+    """Refuse from now on every system call that none of *languages* needs; `seccomp` has the lists."""
+    machine = platform.machine()
+    if machine not in MACHINES or struct.calcsize("P") != 8:
+        raise IsolationUnavailable("seccomp", f"no filter is written for {machine}")
+    code = filter_program(languages, machine, os.getpid())
     buffer = ctypes.create_string_buffer(code, len(code))
     program = struct.pack("@HxxxxxxP", len(code) // 8, ctypes.addressof(buffer))
     _call("seccomp", prctl, PR_SET_NO_NEW_PRIVS, 1)
@@ -196,40 +180,6 @@ def close_other_descriptors(keep: int) -> None:
     """Close every file that a parent left open, but *keep* and the standard ones."""
     os.closerange(3, keep)
     os.closerange(max(3, keep + 1), 1 << 16)
-
-
-def _filter(forbidden: Sequence[int]) -> bytes:
-    """Return the filter as instructions of 8 bytes.
-
-    Layout: architecture, x32, the forbidden numbers, then ``clone`` (threads only) and ``clone3`` (said
-    to be unknown, so that the C library falls back to ``clone``, whose flags can be looked at).
-    """
-
-    def step(code: int, k: int, if_true: int = 0, if_false: int = 0) -> bytes:
-        return struct.pack("=HBBI", code, if_true, if_false, k)
-
-    number_at, architecture_at, first_argument_at = 0, 4, 16
-    checks = len(forbidden)
-    # What follows the forbidden numbers: clone3, clone (3 steps), allow, refuse, unknown.
-    tail = [
-        step(_JUMP_EQUAL, _CLONE3, 5, 0),
-        step(_JUMP_EQUAL, _CLONE, 0, 2),
-        step(_LOAD, first_argument_at),
-        step(_JUMP_SET, _CLONE_THREAD, 0, 1),
-        step(_RETURN, _ALLOW),
-        step(_RETURN, _ERRNO | _EPERM),
-        step(_RETURN, _ERRNO | _ENOSYS),
-    ]
-    steps = [
-        step(_LOAD, architecture_at),
-        step(_JUMP_EQUAL, _AUDIT_ARCH_X86_64, 1, 0),
-        step(_RETURN, _KILL),
-        step(_LOAD, number_at),
-        step(_JUMP_AT_LEAST, _X32, checks + 5, 0),
-        *(step(_JUMP_EQUAL, number, checks - 1 - i + 5, 0) for i, number in enumerate(forbidden)),
-        *tail,
-    ]
-    return b"".join(steps)
 
 
 def _free_mount_point(readable: Sequence[Path]) -> str:

@@ -464,11 +464,12 @@ def test_a_plain_user_has_the_same_isolation(tmp_path):
     if python is None or shutil.which("setpriv") is None:
         pytest.skip("no python3 outside of this user's home, or no setpriv")
     package = Path(__file__).resolve().parents[3] / "rse_pf"
-    (tmp_path / "rse_pf").mkdir()
-    for source, target in (("backend/sandbox/isolation.py", "isolation.py"), ("linux.py", "rse_pf/linux.py")):
-        (tmp_path / target).write_text((package / source).read_text())
-        (tmp_path / target).chmod(0o644)
-    for folder in (tmp_path / "rse_pf", tmp_path, *tmp_path.parents):
+    copied = tmp_path / "rse_pf" / "backend" / "sandbox"
+    copied.mkdir(parents=True)
+    for source in ("backend/sandbox/isolation.py", "backend/sandbox/seccomp.py", "linux.py"):
+        (tmp_path / "rse_pf" / source).write_text((package / source).read_text())
+        (tmp_path / "rse_pf" / source).chmod(0o644)
+    for folder in (copied, *copied.parents):
         if folder != Path("/tmp") and folder.is_relative_to("/tmp"):
             folder.chmod(0o755)
     script = f"""
@@ -476,7 +477,8 @@ import os, sys
 sys.dont_write_bytecode = True
 sys.path.insert(0, {str(tmp_path)!r})
 from pathlib import Path
-import isolation
+from rse_pf.backend.sandbox import isolation
+assert isolation.__file__.startswith({str(tmp_path)!r}), isolation.__file__
 def root():
     isolation.enter_namespaces()
     isolation.make_root([Path("/usr")], 1 << 20, os.getuid())
@@ -495,7 +497,7 @@ print(os.getuid(), isolation.missing_isolation(tries))
 """
     done = subprocess.run(
         ["setpriv", "--reuid", "12345", "--regid", "12345", "--clear-groups", python, "-c", script],
-        capture_output=True, text=True, check=False,
+        capture_output=True, text=True, check=False, cwd=tmp_path,
     )  # fmt: skip
 
     assert done.stdout.strip() == "12345 []", done.stderr
