@@ -42,7 +42,7 @@ ONLY: dict[str, set[str]] = {
     "backend": _BELOW - {"scaling"},
     "data_server": _BELOW - {"scaling"},
     "lambda_pnp": _BELOW - {"scaling", "aws"},
-    "local": {"config", "scaling", "errors", "auth", "object_store", "audit", "linux", "files"},
+    "local": {"config", "scaling", "errors", "auth", "object_store", "audit", "linux", "files", "terminal"},
     "client_sdk": {
         "config",
         "errors",

@@ -19,6 +19,7 @@ from rse_pf.auth.control_token import carries_token, read_control_token
 from rse_pf.local.processes import ProcessMark, is_alive
 from rse_pf.local.servers.control_client import ControlPort
 from rse_pf.local.state import PlatformState, ServerState
+from rse_pf.terminal import printable
 
 __all__ = ["data_url", "platform_status", "serve_status", "status_table"]
 
@@ -75,7 +76,7 @@ def status_table(status: Mapping[str, Any]) -> str:
     lines.append(f"robots connect to  {status['url'] or 'nothing yet'}")
     if status["data_servers"] and status["url"]:
         lines.append(f"large data goes to  {data_url(status['url'])}")
-    return "\n".join(lines)
+    return "\n".join(map(printable, lines))
 
 
 def data_url(url: str) -> str:
