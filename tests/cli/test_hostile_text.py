@@ -192,8 +192,8 @@ def test_what_a_service_prints_and_raises_in_a_dry_run_is_escaped(
 ) -> None:
     main(["service", "new", "loud"])
     source = (
-        f"text = {HOSTILE!a}\n\n"
-        "def serve(request: dict) -> dict:\n    print(text)\n    raise ValueError(text)\n"
+        f"import msgspec\n\ntext = {HOSTILE!a}\n\nclass Any(msgspec.Struct):\n    pass\n\n"
+        "def serve(request: Any) -> Any:\n    print(text)\n    raise ValueError(text)\n"
     )
     Path("loud/service.py").write_text(source)
 
