@@ -134,15 +134,15 @@ class NativeSolver:
         """Estimate the camera pose with its evidence.
 
         Args:
-            points_world: ``(n, 3)`` contiguous, metres, world frame; ``n >= 4``.
-            pixels: ``(n, 2)`` contiguous, undistorted pixels.
+            points_world: ``(n, 3)``, metres, world frame; ``n >= 4``.
+            pixels: ``(n, 2)``, undistorted pixels.
             camera: Intrinsics of the image the pixels come from.
             options: How to solve.
             deadline_ns: Of `time.monotonic_ns`, after which the search is given up; 0 for none.
             cancelled: Another thread sets it to 1 to end the call soon.
 
         Raises:
-            BadRequest: A number is not finite or absurd.
+            BadRequest: Shapes do not fit, or a number is not finite or absurd.
             DegenerateGeometry: The points lie on one line or coincide, or two poses fit alike.
             NoConsensus: No pose agrees with more rows than chance would give.
             Expired: The deadline has passed.
@@ -184,6 +184,14 @@ class NativeSolver:
         deadline_ns: int,
         cancelled: ctypes.c_int32 | None,
     ) -> tuple[Any, ...]:
+        # The library trusts these: what is not contiguous or not float64 is copied.
+        points_world = np.ascontiguousarray(points_world, dtype=np.float64)
+        pixels = np.ascontiguousarray(pixels, dtype=np.float64)
+        if points_world.shape != (len(pixels), 3) or pixels.shape != (len(pixels), 2):
+            raise BadRequest(
+                f"points {points_world.shape} and pixels {pixels.shape} are not (n, 3) and (n, 2)",
+                hint="send one pixel for each point",
+            )
         buffers = self._buffers
         request = buffers.request
         flags |= _PORTABLE if options.portable else 0
@@ -292,5 +300,7 @@ def native_solver() -> NativeSolver:
     """
     path = find_library()
     if path is None:
-        raise MissingExtra("rse-pf-native", "solver")
+        error = MissingExtra("the native solver", "solver")
+        error.hint = "build it: make -C native; or choose the engine poselib"
+        raise error
     return open_solver(path)

@@ -129,44 +129,38 @@ static double width_to_length(const double* x, const double* y, const double* z,
 
 // How the inliers lie in the image, as Shape in evidence.py has it.
 struct Shape {
-    double thinness, radius_px, depth_variation;
+    double thinness, radius_px;
 };
 
 static Shape shape_of(const rse_pf::Workspace& view, int64_t count, const rse_pf_pnp_request& request) {
     typedef Lanes<double> F;
     const double* const pixel_u = view.u;
     const double* const pixel_v = view.v;
-    F u = all(0.0), v = u, uu = u, uv = u, vv = u, w = u, ww = u;
+    F u = all(0.0), v = u, uu = u, uv = u, vv = u;
     const int64_t whole = count / kLanes * kLanes;
     for (int64_t i = 0; i < whole; i += kLanes) {
-        const F pu = load(pixel_u + i), pv = load(pixel_v + i), pw = load(view.z_inverse + i);
+        const F pu = load(pixel_u + i), pv = load(pixel_v + i);
         u = u + pu;
         v = v + pv;
         uu = uu + pu * pu;
         uv = uv + pu * pv;
         vv = vv + pv * pv;
-        w = w + pw;
-        ww = ww + pw * pw;
     }
     double su = sum<double>(u), sv = sum<double>(v), suu = sum<double>(uu), suv = sum<double>(uv),
-           svv = sum<double>(vv), sw = sum<double>(w), sww = sum<double>(ww);
+           svv = sum<double>(vv);
     for (int64_t i = whole; i < count; ++i) {
-        const double pu = pixel_u[i], pv = pixel_v[i], pw = view.z_inverse[i];
+        const double pu = pixel_u[i], pv = pixel_v[i];
         su += pu;
         sv += pv;
         suu += pu * pu;
         suv += pu * pv;
         svv += pv * pv;
-        sw += pw;
-        sww += pw * pw;
     }
     const double k = static_cast<double>(count), mean_u = su / k, mean_v = sv / k;
     const double xx = suu - su * mean_u, xy = suv - su * mean_v, yy = svv - sv * mean_v;
     const double half = 0.5 * (xx - yy), mean = 0.5 * (xx + yy), root = square_root(half * half + xy * xy);
     const double length2 = mean + root, width2 = mean - root, spread = length2 + width2;
     Shape shape;
-    const double variation2 = sww * k / (sw * sw) - 1.0;
-    shape.depth_variation = square_root(variation2 > 0.0 ? variation2 : 0.0);
     shape.radius_px = square_root((spread > 0.0 ? spread : 0.0) / k);
     // No inlier lies further out than the corner of the image (or, outside it, than three times the rms).
     const double at_u = mean_u + request.cx, at_v = mean_v + request.cy;

@@ -4,10 +4,11 @@
 // rse_pf/pnp/planar_ambiguity.py.
 #pragma once
 
-#include "robust.hpp"
+#include "kernels.hpp"
 
 namespace RSE_PF_ISA {
 
+constexpr double kWeakPerspective = 0.08;  // variation of 1/z below which a plane may have two poses
 constexpr int kMirrorSteps = 15;
 constexpr double kMaxMirrorStep = 10.0, kConverged = 1e-7;
 constexpr double kDistinctMetres = 0.05;
@@ -24,7 +25,7 @@ static bool refine_mirrored(const rse_pf::Columns<double>& rows, int64_t count, 
         if (!solved(normal, damping, twist)) return false;
         for (const double each : twist) length = absolute(each) > length ? absolute(each) : length;
         if (!(length < kMaxMirrorStep)) return false;
-        const Pose next = moved(twist, pose);
+        const Pose next = moved_along(twist, pose);
         const double next_cost =
             linearised<double, Loss::kSquared>(rows, count, optics, next, 0.0, next_normal, agree);
         if (next_cost > cost) {
@@ -41,10 +42,10 @@ static bool refine_mirrored(const rse_pf::Columns<double>& rows, int64_t count, 
     return true;
 }
 
-// Return the sum of squared errors (px^2) of the second pose over the gathered inliers; -1 where the refinement
-// fails or comes back to `pose`.
-static double second_pose_squares(const rse_pf::Workspace& data, int64_t count, const Optics& optics,
-                                  const Pose& pose) {
+// Find the second pose of the gathered inliers and its sum of squared errors (px^2), which is -1 where the
+// refinement fails or comes back to `pose`.
+static double second_pose(const rse_pf::Workspace& data, int64_t count, const Optics& optics, const Pose& pose,
+                          Pose& other) {
     const rse_pf::Columns<double>& rows = data.inliers;
     Vector3 centre = {0.0, 0.0, 0.0};
     for (int64_t i = 0; i < count; ++i)
@@ -75,7 +76,7 @@ static double second_pose_squares(const rse_pf::Workspace& data, int64_t count, 
         {c * k.x * k.y + sine * k.z, cosine + c * k.y * k.y, c * k.y * k.z - sine * k.x},
         {c * k.x * k.z - sine * k.y, c * k.y * k.z + sine * k.x, cosine + c * k.z * k.z},
     };
-    Pose other = moved(turn, centre - rotated(turn, centre), pose);
+    other = moved(turn, centre - rotated(turn, centre), pose);
     if (!refine_mirrored(rows, count, optics, other)) return -1.0;
     // The poses differ where their rotations or their camera centres in the world's frame do.
     double D[3][3];
@@ -92,6 +93,17 @@ static double second_pose_squares(const rse_pf::Workspace& data, int64_t count, 
     double squares = 0.0;
     for (int64_t i = 0; i < count; ++i) squares += data.error2[i];
     return squares;
+}
+
+// Return the standard deviation of 1/z over its mean, for the rows in the view.
+static double depth_variation(const rse_pf::Workspace& view, int64_t count) {
+    double w = 0.0, ww = 0.0;
+    for (int64_t i = 0; i < count; ++i) {
+        w += view.z_inverse[i];
+        ww += view.z_inverse[i] * view.z_inverse[i];
+    }
+    const double variation2 = ww * static_cast<double>(count) / (w * w) - 1.0;
+    return square_root(variation2 > 0.0 ? variation2 : 0.0);
 }
 
 }  // namespace RSE_PF_ISA

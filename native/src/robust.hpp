@@ -3,8 +3,8 @@
 // Source: Chum, Matas and Kittler, Locally Optimized RANSAC, DAGM 2003; Lebeda, Matas and Chum, BMVC 2012.
 #pragma once
 
-#include "kernels.hpp"
 #include "p3p.hpp"
+#include "planar.hpp"
 
 namespace RSE_PF_ISA {
 
@@ -183,17 +183,35 @@ static int64_t gather(const rse_pf::Workspace& data, int64_t n, double limit2, i
     return count;
 }
 
+// Refine the pose over the rows that agree with it; they are gathered, and the view then holds them only.
+static int64_t refine_inliers(const rse_pf::Workspace& data, int64_t n, const Optics& optics, double limit2,
+                              Pose& pose) {
+    project(data.all, n, optics, pose, data);
+    const int64_t count = gather(data, n, limit2, nullptr);
+    // Half of the inlier limit is the scale of Cauchy's loss, as in PoseLib.
+    if (count >= 4) refine<Loss::kCauchy>(data.inliers, count, optics, 0.25 * limit2, pose);
+    project(data.inliers, count, optics, pose, data);
+    return count;
+}
+
 // Return the robust pose of the rows as they stand in the workspace.
 static Search propose(const rse_pf::Task& task, const Optics& optics, const SearchOptions& options, Pose& pose) {
     Model best;
     const Search found = search(task, optics, options, best);
     if (found != Search::kFound) return found;
     const rse_pf::Workspace& data = *task.workspace;
+    const int64_t n = task.request->rows;
     pose = best.pose;
-    project(data.all, task.request->rows, optics, pose, data);
-    const int64_t count = gather(data, task.request->rows, options.limit2, nullptr);
-    // Half of the inlier limit as the scale of Cauchy's loss, as PoseLib has it.
-    if (count >= 4) refine<Loss::kCauchy>(data.inliers, count, optics, 0.25 * options.limit2, pose);
+    const int64_t count = refine_inliers(data, n, optics, options.limit2, pose);
+    if (count >= 4 && depth_variation(data, count) < kWeakPerspective) {
+        // The search may have ended in the worse one of the two poses of a plane.
+        Pose twin;
+        if (second_pose(data, count, optics, pose, twin) >= 0.0) {
+            refine_inliers(data, n, optics, options.limit2, twin);
+            const double cost = score(data.single, n, optics, pose, options.limit2, kInfinity);
+            if (score(data.single, n, optics, twin, options.limit2, cost) < cost) pose = twin;
+        }
+    }
     return is_finite(pose) ? Search::kFound : Search::kNothing;
 }
 

@@ -57,6 +57,29 @@ static inline Pose moved(const double (&twist)[6], const Pose& pose) {
     return moved(turn, {twist[0], twist[1], twist[2]}, pose);
 }
 
+// Return exp(twist) pose, for steps of any length: the series of a small part of the twist, then squared.
+// Source: Moler and Van Loan, Nineteen Dubious Ways, SIAM Review 2003, method 3.
+static inline Pose moved_along(const double (&twist)[6], const Pose& pose) {
+    Vector3 rho = {twist[0], twist[1], twist[2]}, phi = {twist[3], twist[4], twist[5]};
+    int doublings = 0;
+    for (; dot(phi, phi) > 0.0625 && doublings < 12; ++doublings) {
+        rho = rho * 0.5;
+        phi = phi * 0.5;
+    }
+    // sin(a)/a, (1 - cos a)/a^2 and (a - sin a)/a^3 by their series; Barfoot (2017), eqs. 7.16 and 7.34.
+    const double q = dot(phi, phi);
+    const double a = 1.0 - q / 6.0 * (1.0 - q / 20.0 * (1.0 - q / 42.0 * (1.0 - q / 72.0 * (1.0 - q / 110.0))));
+    const double b = 0.5 * (1.0 - q / 12.0 * (1.0 - q / 30.0 * (1.0 - q / 56.0 * (1.0 - q / 90.0))));
+    const double c = (1.0 - q / 20.0 * (1.0 - q / 42.0 * (1.0 - q / 72.0 * (1.0 - q / 110.0)))) / 6.0;
+    const double x = phi.x, y = phi.y, z = phi.z;
+    Pose step = {{{1.0 - b * (y * y + z * z), b * x * y - a * z, b * x * z + a * y},
+                  {b * x * y + a * z, 1.0 - b * (x * x + z * z), b * y * z - a * x},
+                  {b * x * z - a * y, b * y * z + a * x, 1.0 - b * (x * x + y * y)}},
+                 rho + cross(phi, rho) * b + cross(phi, cross(phi, rho)) * c};
+    for (; doublings > 0; --doublings) step = moved(step.R, step.t, Pose(step));
+    return moved(step.R, step.t, pose);
+}
+
 // J^T J and J^T r of a left perturbation (rho, phi); only the upper triangle is filled.
 struct Normal {
     double A[6][6];

@@ -4,12 +4,11 @@
 #pragma once
 
 #include "evidence.hpp"
-#include "planar.hpp"
+#include "robust.hpp"
 
 namespace RSE_PF_ISA {
 
 constexpr double kCollinear = 0.02, kNearlyCollinear = 0.1;
-constexpr double kWeakPerspective = 0.08;
 constexpr double kSameFit = 9.0, kSimilarFit = 40.0;
 constexpr double kNoiseFloor2 = 0.01;
 constexpr int64_t kMirrorIterations = 50;
@@ -116,8 +115,9 @@ static int32_t judged(const rse_pf::Task& task, const Vector3& centre) {
     linearised<double, Loss::kSquared>(data.inliers, count, optics, pose, 0.0, normal, agree);
     if (!covariance_of(normal, variance, result.covariance)) return RSE_PF_PNP_UNCONSTRAINED;
     result.reason = weakness(request, result, shape);
-    if (shape.depth_variation < kWeakPerspective) {
-        const double second = second_pose_squares(data, count, optics, pose);
+    if (depth_variation(data, count) < kWeakPerspective) {
+        Pose twin;
+        const double second = second_pose(data, count, optics, pose, twin);
         if (second >= 0.0) {
             result.other_rmse_px = square_root(second / static_cast<double>(count));
             const double difference = (second - squares) / variance;

@@ -1,7 +1,8 @@
-"""Two robust PnP engines behind one contract: PoseLib, and the paper's ``solvePnPRansac``.
+"""Three robust PnP engines behind one contract: PoseLib, the paper's ``solvePnPRansac``, and the native core.
 
 An engine proposes a pose; `rse_pf.pnp.solver` decides whether to accept it.  Engines are deterministic (fixed
-seeds, one thread) and raise no exceptions of their libraries.
+seeds, one thread) and raise no exceptions of their libraries.  The native core can also judge its pose in the
+same call: `native_evidence`.
 """
 
 from __future__ import annotations
@@ -12,11 +13,12 @@ from typing import Any
 
 import numpy as np
 
-from rse_pf.errors import BadRequest, MissingExtra
+from rse_pf import native
+from rse_pf.errors import BadRequest, ConfigurationError, MissingExtra
 from rse_pf.geometry import Array, Camera
-from rse_pf.pnp.options import PnpOptions
+from rse_pf.pnp.options import PnpOptions, WeakLimits
 
-__all__ = ["ENGINES", "Engine", "available_engines", "engine_for"]
+__all__ = ["ENGINES", "Engine", "available_engines", "engine_for", "native_evidence", "native_options"]
 
 # Refinements of the opencv engine, each on the inliers of the previous one.
 _MAX_REFINEMENTS = 4
@@ -31,6 +33,7 @@ def engine_for(name: str) -> Engine:
     Raises:
         BadRequest: There is none.
         MissingExtra: Its library is not installed.
+        ConfigurationError: Its library does not fit.
     """
     make = ENGINES.get(name)
     if make is None:
@@ -39,12 +42,12 @@ def engine_for(name: str) -> Engine:
 
 
 def available_engines() -> tuple[str, ...]:
-    """Return the names of the engines whose libraries are installed."""
+    """Return the names of the engines whose libraries are installed and fit."""
     found = []
     for name, make in ENGINES.items():
         try:
             make()
-        except MissingExtra:
+        except ConfigurationError:
             continue
         found.append(name)
     return tuple(found)
@@ -134,4 +137,57 @@ def _opencv_engine() -> Engine:
     return solve
 
 
-ENGINES: dict[str, Callable[[], Engine]] = {"poselib": _poselib_engine, "opencv": _opencv_engine}
+@lru_cache(maxsize=64)
+def native_options(options: PnpOptions, weak: WeakLimits) -> native.NativeOptions:
+    """Return *options* and *weak* as the native core takes them."""
+    return native.NativeOptions(
+        inlier_px=options.inlier_px,
+        confidence=options.confidence,
+        max_iterations=options.max_iterations,
+        min_iterations=options.min_iterations,
+        weak_inliers=weak.inliers,
+        weak_inlier_ratio=weak.inlier_ratio,
+        weak_translation_m=weak.translation_m,
+        weak_rotation_rad=weak.rotation_rad,
+    )
+
+
+@cache
+def _native_engine() -> Engine:
+    solver = native.native_solver()
+
+    def solve(points_world: Array, pixels: Array, camera: Camera, options: PnpOptions) -> Array | None:
+        """LO-RANSAC with P3P, then robust refinement (``native/src/robust.hpp``)."""
+        return solver.propose(points_world, pixels, camera, native_options(options, _NO_LIMITS))
+
+    return solve
+
+
+def native_evidence(
+    points_world: Array, pixels: Array, camera: Camera, options: PnpOptions, weak: WeakLimits
+) -> native.Evidence:
+    """Return the native core's pose with its evidence: what `solve_pnp` does, in one call.
+
+    Args:
+        points_world: ``(n, 3)``, metres, world frame; ``n >= 4``.
+        pixels: ``(n, 2)``, undistorted pixels.
+        camera: Intrinsics of the image the pixels come from.
+        options: RANSAC settings; the engine in them is not looked at.
+        weak: Where a pose stops being ``ok``.
+
+    Raises:
+        BadRequest: A number is not finite or absurd.
+        DegenerateGeometry: The points lie on one line or coincide, or two poses fit alike.
+        NoConsensus: No pose agrees with more correspondences than chance would give.
+        MissingExtra: The library is not built.
+        ConfigurationError: The library does not fit.
+    """
+    return native.native_solver().solve(points_world, pixels, camera, native_options(options, weak))
+
+
+_NO_LIMITS = WeakLimits()
+ENGINES: dict[str, Callable[[], Engine]] = {
+    "poselib": _poselib_engine,
+    "opencv": _opencv_engine,
+    "native": _native_engine,
+}

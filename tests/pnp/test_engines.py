@@ -9,6 +9,7 @@ import numpy as np
 import poselib
 import pytest
 
+from rse_pf import native
 from rse_pf.errors import BadRequest, MissingExtra
 from rse_pf.geometry import pose_difference
 from rse_pf.pnp import PnpOptions, available_engines, engines, solve_pnp
@@ -184,5 +185,7 @@ def test_a_missing_library_names_the_pip_command(monkeypatch, name, module):
         make.cache_clear()
 
 
-def test_both_engines_are_here():
-    assert available_engines() == ("poselib", "opencv")
+def test_both_engines_are_here_and_the_native_one_where_it_is_built():
+    built = () if native.find_library() is None else ("native",)
+
+    assert available_engines() == ("poselib", "opencv", *built)

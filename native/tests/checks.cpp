@@ -1,0 +1,246 @@
+// Checks of the parts that Python cannot reach, each against an independent computation.
+//
+// The solver behind the C ABI is linked in, with `aligned_alloc` counted.
+#include <algorithm>
+#include <cmath>
+#include <cstdio>
+#include <cstdlib>
+#include <random>
+#include <vector>
+
+#define RSE_PF_ISA checked
+#include "solve.hpp"
+#include "clock.hpp"
+
+static int allocations = 0;
+extern "C" void* __real_aligned_alloc(size_t alignment, size_t size);
+extern "C" void* __wrap_aligned_alloc(size_t alignment, size_t size) {
+    ++allocations;
+    return __real_aligned_alloc(alignment, size);
+}
+
+namespace {
+
+using namespace checked;
+
+int failures = 0;
+void expect(bool holds, const char* what) {
+    if (holds) return;
+    std::printf("FAILED: %s\n", what);
+    ++failures;
+}
+
+std::mt19937_64 random_bits(1);
+double uniform(double low, double high) {
+    return low + (high - low) * static_cast<double>(random_bits() >> 11) * 0x1p-53;
+}
+
+void check_elementary() {
+    double worst = 0.0, worst_factorial = 0.0;
+    for (int i = 0; i < 200000; ++i) {
+        const double x = std::exp(uniform(-700.0, 700.0)), y = 1.0 - std::exp(uniform(-36.0, -0.01));
+        worst = std::max(worst, std::fabs(natural_log(x) - std::log(x)) / std::max(1.0, std::fabs(std::log(x))));
+        worst = std::max(worst, std::fabs(natural_log(y) - std::log(y)) / std::fabs(std::log(y)));
+    }
+    for (int64_t n = 0; n < 20000; ++n) {
+        const double expected = std::lgamma(static_cast<double>(n) + 1.0);
+        worst_factorial = std::max(worst_factorial, std::fabs(log_factorial(n) - expected) / std::max(1.0, expected));
+    }
+    expect(worst < 1e-15, "the logarithm is right to the last bits");
+    expect(worst_factorial < 1e-14, "the logarithm of the factorial is that of the gamma function");
+    expect(natural_log(0.0) == -kInfinity && std::isnan(natural_log(-1.0)), "log of 0 and of what is negative");
+    expect(std::fabs(natural_log(5e-324) - std::log(5e-324)) < 1e-12, "log of the smallest number");
+}
+
+void check_lanes() {
+    alignas(64) float numbers[kLanes];
+    for (int k = 0; k < kLanes; ++k) numbers[k] = static_cast<float>(uniform(-1e6, 1e6));
+    const float pairs = ((numbers[0] + numbers[1]) + (numbers[2] + numbers[3])) +
+                        ((numbers[4] + numbers[5]) + (numbers[6] + numbers[7]));
+    expect(sum<float>(load(numbers)) == pairs, "lanes are summed in pairs");
+    const Doubles nan = all(__builtin_nan("")), one = all(1.0), two = all(2.0);
+    expect(sum<double>(where_less(nan, one, one, two)) == 16.0, "nan is not less than anything");
+    expect(sum<double>(where_less(one, two, one, two)) == 8.0, "one is less than two");
+}
+
+void check_roots() {
+    for (int i = 0; i < 20000; ++i) {
+        const double p = uniform(-3, 3), q = uniform(-3, 3), r = uniform(-3, 3);
+        const double t = real_root(-(p + q + r), p * q + q * r + r * p, -p * q * r);
+        expect(std::min({std::fabs(t - p), std::fabs(t - q), std::fabs(t - r)}) < 1e-4, "a root of a cubic");
+    }
+}
+
+void check_p3p() {
+    int found = 0, tries = 20000;
+    for (int i = 0; i < tries; ++i) {
+        double twist[6];
+        for (double& each : twist) each = uniform(-1.5, 1.5);
+        const Pose identity = {{{1, 0, 0}, {0, 1, 0}, {0, 0, 1}}, {0, 0, 0}};
+        const Pose truth = moved(twist, identity);
+        Vector3 bearings[3], points[3];
+        for (int k = 0; k < 3; ++k) {
+            const double z = uniform(0.5, 6.0);
+            const Vector3 seen = {uniform(-0.6, 0.6) * z, uniform(-0.5, 0.5) * z, z}, q = seen - truth.t;
+            bearings[k] = normalised(seen);
+            points[k] = {truth.R[0][0] * q.x + truth.R[1][0] * q.y + truth.R[2][0] * q.z,
+                         truth.R[0][1] * q.x + truth.R[1][1] * q.y + truth.R[2][1] * q.z,
+                         truth.R[0][2] * q.x + truth.R[1][2] * q.y + truth.R[2][2] * q.z};
+        }
+        Pose poses[4];
+        double nearest = kInfinity;
+        for (int k = p3p(bearings, points, poses) - 1; k >= 0; --k) {
+            double apart = std::sqrt(dot(poses[k].t - truth.t, poses[k].t - truth.t));
+            for (int a = 0; a < 3; ++a)
+                for (int b = 0; b < 3; ++b) apart = std::max(apart, std::fabs(poses[k].R[a][b] - truth.R[a][b]));
+            nearest = std::min(nearest, apart);
+        }
+        found += nearest < 1e-4 ? 1 : 0;
+    }
+    std::printf("p3p: %d of %d poses within 1e-4\n", found, tries);
+    expect(found > tries - tries / 500, "three exact points give their pose");
+    const Vector3 line[3] = {{0, 0, 1}, {0, 0, 2}, {0, 0, 3}}, same[3] = {{1, 2, 3}, {1, 2, 3}, {1, 2, 3}};
+    const Vector3 seen[3] = {normalised({0, 0, 1}), normalised({0.1, 0, 1}), normalised({0, 0.1, 1})};
+    Pose poses[4];
+    expect(p3p(seen, line, poses) == 0 && p3p(seen, same, poses) == 0, "a line and one point give no pose");
+}
+
+void check_systems() {
+    for (int i = 0; i < 2000; ++i) {
+        Normal normal = {};
+        double x[6], expected[6];
+        for (int row = 0; row < 12; ++row) {
+            double each[6];
+            for (double& value : each) value = uniform(-1, 1);
+            for (int a = 0; a < 6; ++a)
+                for (int b = 0; b < 6; ++b) normal.A[a][b] += each[a] * each[b];
+        }
+        for (double& value : expected) value = uniform(-1, 1);
+        for (int a = 0; a < 6; ++a)
+            for (int b = 0; b < 6; ++b) normal.b[a] += normal.A[a][b] * expected[b];
+        expect(solved(normal, 0.0, x), "a positive system is solved");
+        for (int a = 0; a < 6; ++a) expect(std::fabs(x[a] - expected[a]) < 1e-6, "the solution of a system");
+        double covariance[36];
+        expect(covariance_of(normal, 2.0, covariance), "a positive system has a covariance");
+        for (int a = 0; a < 6; ++a)
+            for (int b = 0; b < 6; ++b) {
+                double product = 0.0;
+                for (int k = 0; k < 6; ++k) product += covariance[6 * a + k] * normal.A[k][b];
+                expect(std::fabs(product - (a == b ? 2.0 : 0.0)) < 1e-6, "the covariance is the inverse");
+            }
+        double matrix[3][3], values[3], axes[3][3];
+        for (int a = 0; a < 3; ++a)
+            for (int b = 0; b < 3; ++b) matrix[a][b] = normal.A[a][b];
+        eigenvectors(matrix, values, axes);
+        expect(values[0] <= values[1] && values[1] <= values[2], "eigenvalues are in order");
+        for (int a = 0; a < 3; ++a)
+            for (int b = 0; b < 3; ++b) {
+                double product = 0.0;
+                for (int k = 0; k < 3; ++k) product += matrix[b][k] * axes[a][k];
+                expect(std::fabs(product - values[a] * axes[a][b]) < 1e-9, "eigenvectors keep their direction");
+            }
+    }
+    Normal singular = {};
+    double x[6];
+    expect(!solved(singular, 0.0, x), "a system of zeros is refused");
+}
+
+void check_motion() {
+    const Pose identity = {{{1, 0, 0}, {0, 1, 0}, {0, 0, 1}}, {0, 0, 0}};
+    const double quarter[6] = {0, 0, 0, 0, 0, kPi / 2};
+    const Pose turned = moved_along(quarter, identity);
+    expect(std::fabs(turned.R[0][1] + 1.0) < 1e-14 && std::fabs(turned.R[1][0] - 1.0) < 1e-14, "a quarter turn");
+    const double small[6] = {1e-4, 2e-4, -1e-4, 3e-4, -2e-4, 1e-4};
+    const Pose one = moved(small, identity), other = moved_along(small, identity);
+    double apart = 0.0;
+    for (int a = 0; a < 3; ++a)
+        for (int b = 0; b < 3; ++b) apart = std::max(apart, std::fabs(one.R[a][b] - other.R[a][b]));
+    expect(apart < 1e-10, "both kinds of step agree where they are small");
+}
+
+void check_selection() {
+    for (int i = 0; i < 300; ++i) {
+        std::vector<double> numbers(static_cast<size_t>(1 + random_bits() % 200));
+        for (double& each : numbers) each = std::floor(uniform(0, 30));
+        std::vector<double> sorted = numbers;
+        std::sort(sorted.begin(), sorted.end());
+        const auto kth = static_cast<size_t>(random_bits() % numbers.size());
+        const double found =
+            selected(numbers.data(), static_cast<int64_t>(numbers.size()), static_cast<int64_t>(kth));
+        expect(found == sorted[kth], "the kth of some numbers");
+    }
+}
+
+void check_sampler() {
+    Sampler sampler = {0};
+    std::vector<int> drawn(10);
+    for (int i = 0; i < 30000; ++i) {
+        int64_t rows[3];
+        sampler.three(10, rows);
+        expect(rows[0] != rows[1] && rows[1] != rows[2] && rows[0] != rows[2], "three different rows");
+        for (const int64_t row : rows) ++drawn.at(static_cast<size_t>(row));
+    }
+    for (const int each : drawn) expect(std::abs(each - 9000) < 500, "every row is drawn alike");
+    int64_t rows[3];
+    sampler.three(3, rows);
+    expect(rows[0] + rows[1] + rows[2] == 3, "three of three");
+}
+
+void check_allocations() {
+    const int64_t n = 300;
+    std::vector<double> points(3 * n), pixels(2 * n);
+    std::vector<int64_t> inliers(n);
+    for (int64_t i = 0; i < n; ++i) {
+        const auto p = static_cast<size_t>(3 * i), q = static_cast<size_t>(2 * i);
+        points[p + 2] = uniform(1, 5);
+        points[p] = uniform(-0.5, 0.5) * points[p + 2];
+        points[p + 1] = uniform(-0.4, 0.4) * points[p + 2];
+        pixels[q] = 500 * points[p] / points[p + 2] + 320 + (i % 3 == 0 ? uniform(-200, 200) : uniform(-1, 1));
+        pixels[q + 1] = 500 * points[p + 1] / points[p + 2] + 240 + uniform(-1, 1);
+    }
+    rse_pf_pnp_request request = {};
+    request.abi = RSE_PF_NATIVE_ABI;
+    request.rows = n;
+    request.points_world = points.data();
+    request.pixels = pixels.data();
+    request.fx = request.fy = 500;
+    request.cx = 320;
+    request.cy = 240;
+    request.width = 640;
+    request.height = 480;
+    request.inlier_px = 8;
+    request.confidence = 0.999;
+    request.max_iterations = 1000;
+    request.min_iterations = 10;
+    request.weak_inliers = 12;
+    request.weak_inlier_ratio = 0.25;
+    request.weak_translation_m = 0.03;
+    request.weak_rotation_rad = 0.01;
+    rse_pf_pnp_result result;
+    rse_pf_pnp_solve(&request, inliers.data(), &result);
+    expect(result.status == RSE_PF_PNP_SOLVED && result.count >= 190, "a request is solved");
+    const int warm = allocations;
+    expect(warm >= 1, "the workspace is allocated, and that is counted");
+    for (int i = 0; i < 100; ++i) rse_pf_pnp_solve(&request, inliers.data(), &result);
+    expect(allocations == warm, "no allocation after the first request");
+    request.abi += 1;
+    rse_pf_pnp_solve(&request, inliers.data(), &result);
+    expect(result.status == RSE_PF_PNP_BAD_REQUEST, "another ABI is refused");
+}
+
+}  // namespace
+
+int main() {
+    static_cast<void>(&solve_task);
+    check_elementary();
+    check_lanes();
+    check_roots();
+    check_p3p();
+    check_systems();
+    check_motion();
+    check_selection();
+    check_sampler();
+    check_allocations();
+    std::printf(failures == 0 ? "all checks passed (%s)\n" : "checks failed (%s)\n", rse_pf_native_lanes());
+    return failures == 0 ? 0 : 1;
+}

@@ -1,0 +1,374 @@
+"""The native solver: the verdicts of the Python evidence, the poses of PoseLib, and the same bytes anywhere.
+
+The library is compiled from the sources of this checkout; without a C++ compiler the tests are skipped.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import itertools
+import math
+import os
+import re
+import shutil
+import subprocess
+import threading
+import time
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from benchmarks.native_solver import case, compare, degenerate, normalised_errors, outcome, same_bytes
+from rse_pf import native
+from rse_pf.errors import (
+    BadRequest,
+    Cancelled,
+    ConfigurationError,
+    Expired,
+    MissingExtra,
+    NoConsensus,
+    RsePfError,
+)
+from rse_pf.geometry import exp_se3
+from rse_pf.pnp import PnpOptions, WeakLimits, available_engines, engines, solve_pnp
+from rse_pf.pnp.problems import KINECT, make_problem
+
+COMPILER = os.environ.get("CXX", "g++")
+OPTIONS = engines.native_options(PnpOptions(), WeakLimits())
+
+
+@pytest.fixture(scope="module")
+def library(tmp_path_factory: pytest.TempPathFactory, repository: Path) -> Path:
+    """The library, built from today's sources."""
+    if shutil.which(COMPILER) is None or shutil.which("make") is None:
+        pytest.skip(f"no C++ compiler ({COMPILER}) or no make")
+    out = tmp_path_factory.mktemp("native")
+    built = subprocess.run(
+        ["make", "-C", str(repository / "native"), f"OUT={out}", f"CXX={COMPILER}"],
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert built.returncode == 0, built.stderr
+    return out / "librse_pf_native.so"
+
+
+@pytest.fixture
+def solver(library: Path, monkeypatch: pytest.MonkeyPatch):
+    """The solver, which the engine ``native`` uses as well while the test runs."""
+    monkeypatch.setattr(native, "find_library", lambda: library)
+    native.native_solver.cache_clear()
+    engines.ENGINES["native"].cache_clear()
+    yield native.native_solver()
+    native.native_solver.cache_clear()
+    engines.ENGINES["native"].cache_clear()
+
+
+def solve(solver, problem, **changes):
+    options = msgspec.structs.replace(OPTIONS, **changes)
+    return solver.solve(problem.points_world, problem.pixels, problem.camera, options)
+
+
+def assert_meets_the_bars(report):
+    """At least PoseLib's success and accuracy, no wrong pose that is ok, and no bit that depends on AVX2."""
+    total = report["all"]
+    assert total["native right"] >= total["poselib right"] - 0.0005 * total["n"]
+    assert total["native right and ok"] >= total["poselib right and ok"]
+    assert total.get("native wrong and ok", 0) == 0
+    for row in report["kinds"].values():
+        assert row["native right"] >= row["poselib right"] - 0.005 * row["n"]
+    ours, theirs = report["error_mm"]["native"], report["error_mm"]["poselib"]
+    assert ours["p50"] <= 1.02 * theirs["p50"]
+    assert ours["p95"] <= 1.05 * theirs["p95"]
+    assert report["other_bytes_without_avx2"] == 0
+
+
+def test_no_less_success_and_accuracy_than_poselib_and_the_same_bytes_without_avx2(solver):
+    report = compare(map(case, range(500)))
+
+    assert_meets_the_bars(report)
+    assert report["all"]["native right"] > 400
+
+
+@pytest.mark.slow
+def test_no_less_success_and_accuracy_than_poselib_on_ten_thousand_problems(solver):
+    assert_meets_the_bars(compare(map(case, range(10_000))))
+
+
+@pytest.mark.parametrize("make", [case, degenerate])
+def test_the_evidence_says_of_its_pose_what_the_python_evidence_says(solver, make):
+    for each in map(make, range(300)):
+        python = outcome(
+            lambda each=each: solve_pnp(each.points_world, each.pixels, KINECT, default_engine="native")
+        )
+        ours = outcome(lambda each=each: solver.solve(each.points_world, each.pixels, KINECT, OPTIONS))
+
+        # Verdict or error, sentence and hint.
+        assert ours[:2] == python[:2]
+        if ours[2] is not None:
+            np.testing.assert_allclose(ours[2].T_camera_world, python[2].T_camera_world, atol=1e-9)
+            assert np.array_equal(ours[2].inliers, python[2].inliers)
+            assert ours[2].rmse_px == pytest.approx(python[2].rmse_px, rel=1e-6)
+            deviation = np.sqrt(np.diag(python[2].covariance))
+            difference = (ours[2].covariance - python[2].covariance) / np.outer(deviation, deviation)
+            assert np.abs(difference).max() < 1e-5
+
+
+@pytest.mark.parametrize(
+    ("limits", "reason"),
+    [
+        ({"weak_inliers": 190.0}, "few-inliers"),
+        ({"weak_inlier_ratio": 0.9}, "low-inlier-ratio"),
+        ({"weak_translation_m": 1e-5}, "poorly-constrained"),
+        ({"weak_rotation_rad": 1e-6}, "poorly-constrained"),
+        ({}, ""),
+    ],
+)
+def test_the_limits_of_weak_poses_are_those_of_the_caller(solver, limits, reason):
+    assert solve(solver, make_problem(seed=2), **limits).reason == reason
+
+
+def test_degenerate_input_never_gives_a_pose_that_is_ok(solver):
+    verdicts = {
+        outcome(lambda n=n, px=px: solve(solver, degenerate(n), inlier_px=px))[0]
+        for n, px in itertools.product(range(280), (3.0, 8.0))
+    }
+
+    assert "ok" not in verdicts
+    assert {"DegenerateGeometry", "NoConsensus", "BadRequest"} <= verdicts
+
+
+@pytest.mark.parametrize("n", [4, 5, 6, 8, 13, 30, 100, 1000])
+def test_pure_noise_is_never_a_pose(solver, n):
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        points, pixels = rng.uniform(-3, 3, (n, 3)), rng.uniform(0, [640, 480], (n, 2))
+        with pytest.raises((NoConsensus, native.DegenerateGeometry)):
+            solver.solve(points, pixels, KINECT, OPTIONS)
+
+
+def test_the_covariance_predicts_the_error(solver):
+    """Normalised error squared is chi-square with 6 degrees: mean 6, standard error sqrt(12 / n)."""
+    assert abs(normalised_errors(300, 0.3)["mean"] - 6.0) < 4.0 * math.sqrt(12.0 / 300)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("outlier_ratio", [0.0, 0.3])
+def test_the_mean_normalised_error_squared_is_six(solver, outlier_ratio):
+    assert abs(normalised_errors(1000, outlier_ratio)["mean"] - 6.0) <= 0.6
+
+
+def test_a_world_far_from_its_origin_has_the_same_pose(solver):
+    problem = make_problem(seed=1, outlier_ratio=0.5)
+    shift = np.array([4.0e5, -7.0e5, 9.0e4])
+
+    near = solve(solver, problem)
+    far = solver.solve(problem.points_world + shift, problem.pixels, KINECT, OPTIONS)
+
+    np.testing.assert_allclose(far.T_camera_world[:3, :3], near.T_camera_world[:3, :3], atol=1e-6)
+    moved_back = far.T_camera_world[:3, 3] + far.T_camera_world[:3, :3] @ shift
+    np.testing.assert_allclose(moved_back, near.T_camera_world[:3, 3], atol=1e-6)
+
+
+def test_wrong_points_at_the_limit_of_what_is_allowed_do_not_spoil_the_others(solver):
+    problem = make_problem(seed=4, outlier_ratio=0.4)
+    points = problem.points_world.copy()
+    points[~problem.is_inlier] *= 1e5
+
+    found = solver.solve(points, problem.pixels, KINECT, OPTIONS)
+
+    np.testing.assert_allclose(found.T_camera_world, problem.T_camera_world, atol=0.02)
+
+
+def test_the_same_request_gives_the_same_bytes_whatever_was_solved_before_and_in_any_thread(solver):
+    problem, found = make_problem(seed=11, outlier_ratio=0.6), []
+
+    def work():
+        for n in (30, 3000, 200):
+            solve(solver, make_problem(seed=n, n=n))
+            found.append(solve(solver, problem))
+
+    threads = [threading.Thread(target=work) for _ in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(timeout=60)
+
+    assert len(found) == 12
+    assert all(same_bytes(each, found[0]) for each in found)
+
+
+def test_other_array_kinds_are_taken_and_the_input_is_left_as_it_was(solver):
+    problem = make_problem(seed=3)
+    points, pixels = problem.points_world.copy(), problem.pixels.copy()
+
+    plain = solve(solver, problem)
+    columns = solver.solve(np.asfortranarray(points), pixels, KINECT, OPTIONS)
+    single = solver.solve(points.astype("f4"), pixels.astype("f4"), KINECT, OPTIONS)
+
+    assert same_bytes(plain, columns)
+    np.testing.assert_allclose(plain.T_camera_world, single.T_camera_world, atol=1e-4)
+    assert np.array_equal(points, problem.points_world)
+    assert np.array_equal(pixels, problem.pixels)
+
+
+def hard_problem():
+    """Noise without a pose: the search goes on for minutes."""
+    rng = np.random.default_rng(0)
+    return rng.uniform(-3, 3, (50_000, 3)), rng.uniform(0, [640, 480], (50_000, 2))
+
+
+def test_a_call_ends_soon_after_its_deadline(solver):
+    options = msgspec.structs.replace(OPTIONS, max_iterations=100_000)
+    begin = time.monotonic_ns()
+
+    with pytest.raises(Expired):
+        solver.solve(*hard_problem(), KINECT, options, deadline_ns=begin + 20_000_000)
+
+    assert time.monotonic_ns() - begin < 5_000_000_000
+
+
+def test_another_thread_ends_a_call_while_it_runs(solver):
+    """The flag can only be set while the call runs if the call holds no interpreter lock."""
+    options = msgspec.structs.replace(OPTIONS, max_iterations=100_000)
+    flag, begun, ended = ctypes.c_int32(0), threading.Event(), []
+    points, pixels = hard_problem()
+
+    def work():
+        begun.set()
+        try:
+            solver.solve(points, pixels, KINECT, options, cancelled=flag)
+        except Cancelled as error:
+            ended.append(error)
+
+    thread = threading.Thread(target=work)
+    thread.start()
+    begun.wait(10)
+    flag.value = 1
+    thread.join(timeout=10)
+
+    assert not thread.is_alive()
+    assert len(ended) == 1
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf, 1.1e6, -1e300])
+@pytest.mark.parametrize("which", ["points_world", "pixels"])
+def test_one_absurd_number_is_refused(solver, which, value):
+    problem = make_problem(seed=6)
+    getattr(problem, which)[17, 1] = value
+
+    with pytest.raises(BadRequest, match=which):
+        solve(solver, problem)
+
+
+@pytest.mark.parametrize(
+    ("points", "pixels"),
+    [((9, 3), (8, 2)), ((9, 2), (9, 2)), ((9, 3), (9, 3)), ((3, 3), (3, 2)), ((0, 3), (0, 2))],
+)
+def test_shapes_that_do_not_fit_are_refused(solver, points, pixels):
+    with pytest.raises(BadRequest):
+        solver.solve(np.ones(points), np.ones(pixels), KINECT, OPTIONS)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [{"inlier_px": math.nan}, {"inlier_px": 0.0}, {"confidence": 1.0}, {"max_iterations": 0}],
+)
+def test_options_that_mean_nothing_are_refused(solver, changes):
+    with pytest.raises(BadRequest, match="do not fit"):
+        solve(solver, make_problem(seed=6), **changes)
+
+
+numbers = st.floats(width=64, allow_nan=True, allow_infinity=True, allow_subnormal=True)
+mild = st.floats(-10, 700, allow_nan=False)
+
+
+@settings(max_examples=120, deadline=None)
+@given(data=st.data(), n=st.integers(4, 40))
+def test_any_numbers_give_finite_evidence_or_a_typed_error(library, data, n):
+    opened = native.open_solver(library)
+    elements = data.draw(st.sampled_from([numbers, mild, st.integers(-3, 3).map(float)]))
+    points = data.draw(hnp.arrays(np.float64, (n, 3), elements=elements))
+    pixels = data.draw(hnp.arrays(np.float64, (n, 2), elements=elements))
+
+    narrow = outcome(
+        lambda: opened.solve(points, pixels, KINECT, msgspec.structs.replace(OPTIONS, portable=True))
+    )
+    wide = outcome(lambda: opened.solve(points, pixels, KINECT, OPTIONS))
+
+    assert narrow[:2] == wide[:2]
+    assert same_bytes(narrow[2], wide[2])
+    if wide[2] is not None:
+        assert np.isfinite(wide[2].T_camera_world).all()
+        assert np.isfinite(wide[2].covariance).all()
+
+
+def test_the_rotation_is_orthonormal_to_the_last_bits(solver):
+    for seed in range(20):
+        R = solve(solver, make_problem(seed=seed, outlier_ratio=0.6)).T_camera_world[:3, :3]
+
+        np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-13)
+
+
+def test_a_plane_is_never_wrong_and_ok(solver):
+    for seed in range(60):
+        rng = np.random.default_rng(seed)
+        flat = np.column_stack([rng.uniform(-0.3, 0.3, (60, 2)), np.zeros(60)])
+        points = flat @ exp_se3([0, 0, 0, 0.5, 0.1, 0])[:3, :3].T + [0.0, 0.0, rng.uniform(1, 4)]
+        pixels = KINECT.project(points) + rng.normal(size=(60, 2))
+        try:
+            found = solver.solve(points, pixels, KINECT, OPTIONS)
+        except RsePfError:
+            continue
+        assert found.reason or np.abs(found.T_camera_world - np.eye(4)).max() < 0.1
+
+
+def test_the_file_needs_the_c_library_of_2018_and_nothing_else(library):
+    """Debian 10, Amazon Linux 2023 and every later system have it."""
+    if shutil.which("readelf") is None:
+        pytest.skip("no readelf")
+    listed = subprocess.run(
+        ["readelf", "--wide", "--dynamic", "--version-info", str(library)],
+        capture_output=True, text=True, check=True,
+    ).stdout  # fmt: skip
+    versions = [tuple(map(int, each.split("."))) for each in re.findall(r"GLIBC_(\d+\.\d+)", listed)]
+
+    assert set(re.findall(r"NEEDED.*\[(.+)\]", listed)) <= {"libc.so.6", "ld-linux-x86-64.so.2"}
+    assert "GLIBCXX" not in listed
+    assert max(versions) <= (2, 28)
+
+
+def test_the_checks_in_cpp_pass(repository, library):
+    done = subprocess.run(
+        ["make", "-C", str(repository / "native"), f"OUT={library.parent}", f"CXX={COMPILER}", "check"],
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+def test_without_the_library_the_other_engines_work_and_the_error_says_how_to_build_it(monkeypatch):
+    monkeypatch.setattr(native, "find_library", lambda: None)
+    native.native_solver.cache_clear()
+    engines.ENGINES["native"].cache_clear()
+    problem = make_problem(seed=1)
+
+    with pytest.raises(MissingExtra) as caught:
+        solve_pnp(problem.points_world, problem.pixels, KINECT, default_engine="native")
+
+    assert "make -C native" in caught.value.hint
+    assert available_engines() == ("poselib", "opencv")
+    assert solve_pnp(problem.points_world, problem.pixels, KINECT).verdict == "ok"
+
+
+def test_a_file_that_is_no_library_is_refused_with_the_command_that_builds_one(tmp_path):
+    path = tmp_path / "librse_pf_native.so"
+    path.write_bytes(b"no library")
+
+    with pytest.raises(ConfigurationError, match="cannot be loaded") as caught:
+        native.open_solver(path)
+
+    assert "make -C native" in caught.value.hint
