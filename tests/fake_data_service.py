@@ -12,6 +12,9 @@ from typing import Any
 from rse_pf.auth.tokens import SigningKey
 from rse_pf.config import PlatformSettings
 from rse_pf.data_server import DataServer
+from rse_pf.data_server.map_describer import max_map_bytes
+from rse_pf.identity import RobotId
+from rse_pf.maps.describe import MapSummary, describe_map
 from rse_pf.object_store import ObjectStore
 
 NOW = 1_700_000_000.0
@@ -42,8 +45,12 @@ class Service:
     def restart(self) -> None:
         self.app = DataServer(
             self.settings, self.store, keys=KEY.key_set, log=self.lines.append,
-            clock=lambda: self.now, wall_clock=lambda: self.wall,
+            clock=lambda: self.now, wall_clock=lambda: self.wall, describe=self.describe,
         )  # fmt: skip
+
+    def describe(self, robot: RobotId, name: str) -> MapSummary:
+        """Count what a map holds in this process; a data server has a process with limits for it."""
+        return describe_map(self.store.get(name), max_map_bytes(self.settings))
 
     def token(self, robot: str = "robot-1", tenant: str = "default", scopes: tuple[str, ...] = ()) -> str:
         return KEY.issue(

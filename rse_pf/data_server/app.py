@@ -8,6 +8,7 @@ payload is logged.
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import dataclasses
 import time
 import uuid
@@ -19,8 +20,10 @@ from rse_pf.audit.log import AuditLog
 from rse_pf.auth.roster import scopes_allow
 from rse_pf.auth.tokens import Claims, KeySet, token_problem, verify_token
 from rse_pf.config import PlatformSettings
+from rse_pf.data_server.admission import Admission
 from rse_pf.data_server.handlers import Handler, Handlers
 from rse_pf.data_server.http import HttpReply, HttpRequest, MethodNotAllowed, Receive, Send, failure_reply
+from rse_pf.data_server.map_describer import MapDescriber
 from rse_pf.data_server.routes import ROUTES, Route
 from rse_pf.errors import (
     BadRequest,
@@ -33,6 +36,7 @@ from rse_pf.errors import (
     Unauthorized,
 )
 from rse_pf.identity import RobotId
+from rse_pf.maps.describe import MapSummary
 from rse_pf.object_store import ObjectStore
 
 __all__ = ["DataServer"]
@@ -56,8 +60,9 @@ class DataServer:
         clock: Callable[[], float] = time.monotonic,
         wall_clock: Callable[[], float] = time.time,
         audit: AuditLog | None = None,
+        describe: Callable[[RobotId, str], MapSummary] | None = None,
     ) -> None:
-        """Make the application; nothing is read yet.
+        """Make the application; nothing is read or started yet.
 
         Args:
             settings: Groups data and auth.
@@ -67,6 +72,8 @@ class DataServer:
             clock: Monotonic seconds.
             wall_clock: Unix seconds.
             audit: Records refused tokens and changes of maps; None records nothing.
+            describe: Returns what the map in an object that a robot sent holds; None starts a process with
+                limits for it.
         """
         self._audit = audit
         self._refusals = RefusalLimiter()
@@ -75,8 +82,16 @@ class DataServer:
         self._log = log
         self._clock = clock
         self._wall_clock = wall_clock
-        self._open_bodies = 0
-        self.handlers = Handlers(store, settings.data, clock=clock, wall_clock=wall_clock, audit=audit)
+        self._admission = Admission(settings.data)
+        self._closing = contextlib.ExitStack()
+        if describe is None:
+            describer = MapDescriber(settings, store, clock)
+            describe = describer.describe
+            self._closing.callback(describer.close)
+        self.handlers = Handlers(
+            store, settings.data, describe=describe, clock=clock,
+            wall_clock=wall_clock, audit=audit,
+        )  # fmt: skip
         self._routes = [(route.pattern, route, getattr(self.handlers, route.operation)) for route in ROUTES]
 
     async def __call__(self, scope: Mapping[str, Any], receive: Receive, send: Send) -> None:
@@ -86,13 +101,18 @@ class DataServer:
         began = self._clock()
         request = HttpRequest(scope, receive, self._clock, self._settings.data)
         line: dict[str, Any] = {"event": "request", "method": request.method}
+        work = asyncio.ensure_future(self._serve(request, line, send))
+        gone = asyncio.ensure_future(request.wait_until_gone())
         try:
-            reply = await self._reply(request, line)
-            sent = await _send(reply, request, send)
-        except Disconnected:
-            line["status"] = "disconnected"
-        else:
-            line |= {"status": reply.status, "sent_bytes": sent}
+            await asyncio.wait((work, gone), return_when=asyncio.FIRST_COMPLETED)
+            if work.done():
+                work.result()
+            else:  # nobody waits for the reply
+                line["status"] = "disconnected"
+        finally:
+            work.cancel()
+            gone.cancel()
+            await asyncio.gather(work, gone, return_exceptions=True)
         line |= {
             "received_bytes": request.received_bytes,
             "took_ms": round(1000 * (self._clock() - began), 2),
@@ -100,9 +120,22 @@ class DataServer:
         if request.path not in _PROBES:
             self._log(line)
 
-    async def _reply(self, request: HttpRequest, line: dict[str, Any]) -> HttpReply:
+    async def _serve(self, request: HttpRequest, line: dict[str, Any], send: Send) -> None:
+        """Reply to a request, which the robot may end at any time."""
+        with contextlib.ExitStack() as admitted:
+            try:
+                reply = await self._reply(request, line, admitted)
+                sent = await _send(reply, request, send)
+            except Disconnected:
+                line["status"] = "disconnected"
+            else:
+                line |= {"status": reply.status, "sent_bytes": sent}
+
+    async def _reply(
+        self, request: HttpRequest, line: dict[str, Any], admitted: contextlib.ExitStack
+    ) -> HttpReply:
         try:
-            reply = await self._handle(request, line)
+            reply = await self._handle(request, line, admitted)
         except Disconnected:
             raise
         except RsePfError as error:
@@ -119,21 +152,21 @@ class DataServer:
             reply = dataclasses.replace(reply, headers={**reply.headers, "Connection": "close"})
         return reply
 
-    async def _handle(self, request: HttpRequest, line: dict[str, Any]) -> HttpReply:
+    async def _handle(
+        self, request: HttpRequest, line: dict[str, Any], admitted: contextlib.ExitStack
+    ) -> HttpReply:
+        """Reply to a request; what *admitted* gets is given back when the reply was sent."""
         route, handler, path = self._find(request)
         line["operation"] = route.operation
-        claims = _ANONYMOUS
-        if route.scope is not None:
-            claims = self._claims(request, route.scope, path.get("name", ""), line)
-        if route.body is None:
-            return await handler(request, claims, path)
-        if self._open_bodies >= self._settings.data.max_uploads:
-            raise Busy("too many uploads at once", hint="retry later", retry_after_ms=_RETRY_AFTER_MS)
-        self._open_bodies += 1
-        try:
-            return await handler(request, claims, path)
-        finally:
-            self._open_bodies -= 1
+        if route.scope is None:
+            return await handler(request, _ANONYMOUS, path)
+        claims = self._claims(request, route.scope, path.get("name", ""), line)
+        has_body = route.body is not None
+        self._admission.begin(claims.robot, route.cost, self._clock(), has_body=has_body)
+        admitted.callback(self._admission.end, claims.robot, has_body=has_body)
+        if not has_body and not await request.drain(self._settings.data.part_bytes):
+            raise BadRequest("this request takes no body", hint="leave it out")
+        return await handler(request, claims, path)
 
     def _find(self, request: HttpRequest) -> tuple[Route, Handler, dict[str, str]]:
         allowed = []
@@ -167,6 +200,11 @@ class DataServer:
         if not scopes_allow(claims.scopes, scope, name):
             raise Forbidden(f"this token does not have the scope {scope}", hint="issue another token")
         return claims
+
+    def close(self) -> None:
+        """End what the application started, when its work is done."""
+        self._closing.close()
+        self.handlers.close()
 
     def record_counted(self) -> None:
         """Record how many refusals were counted, but not recorded one by one, since the last call."""

@@ -7,8 +7,10 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import functools
+import re
 import time
-from collections.abc import AsyncIterator, Awaitable, Callable
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
 from typing import Any, TypeVar
 
 import msgspec
@@ -16,7 +18,9 @@ import msgspec
 from rse_pf.audit.log import AuditLog
 from rse_pf.auth.tokens import Claims
 from rse_pf.config import DataSettings
+from rse_pf.data_server.fair_threads import FairThreads, check_wanted
 from rse_pf.data_server.http import HttpReply, HttpRequest, failure_reply, json_reply, requested_range
+from rse_pf.data_server.quota import charge_name
 from rse_pf.data_server.routes import (
     BYTES,
     Commit,
@@ -33,8 +37,9 @@ from rse_pf.data_server.routes import (
     openapi_page,
 )
 from rse_pf.data_server.uploads import Objects
-from rse_pf.errors import BadRequest, NotFound
+from rse_pf.errors import BadRequest, Conflict, NotFound
 from rse_pf.identity import RobotId
+from rse_pf.maps.describe import MapSummary
 from rse_pf.maps.registry import MapRecord, MapRegistry
 from rse_pf.object_store import ObjectStore, PresigningStore, read_range
 
@@ -48,6 +53,9 @@ _PIECE_BYTES = 1 << 20
 _MAX_JSON_BYTES = 16384
 _MAX_NOTE_LETTERS = 500
 _MAX_PAGE = 1000
+_BEGINNING = re.compile(r"[0-9a-f]{0,64}")
+_MAP_THREADS = 1
+"""They wait for the process that reads maps, so that slow maps delay only other maps."""
 _PROBE = "ready/probe"
 
 
@@ -59,16 +67,26 @@ class Handlers:
         store: ObjectStore,
         settings: DataSettings,
         *,
+        describe: Callable[[RobotId, str], MapSummary],
         clock: Callable[[], float] = time.monotonic,
         wall_clock: Callable[[], float] = time.time,
         audit: AuditLog | None = None,
     ) -> None:
+        """Make the handlers; *describe* returns what the map in an object that a robot sent holds."""
         self._store = store
         self._audit = audit
         self._settings = settings
         self._wall_clock = wall_clock
+        self._describe = describe
+        self.threads = FairThreads()
+        self._map_threads = FairThreads(_MAP_THREADS)
         self.objects = Objects(store, settings, clock, wall_clock)
         self._document = openapi_page().encode()
+
+    def close(self) -> None:
+        """End the threads when their work is done."""
+        self.threads.close()
+        self._map_threads.close()
 
     async def healthz(self, request: HttpRequest, claims: Claims, path: dict[str, str]) -> HttpReply:
         """Return 200."""
@@ -90,20 +108,21 @@ class Handlers:
         limit = int(text) if text.isdecimal() and text.isascii() and len(text) < 6 else 0
         if not 1 <= limit <= _MAX_PAGE:
             raise BadRequest(f"limit {text[:40]!r} is not in 1 to {_MAX_PAGE}", hint="leave it out")
-        found, more = await asyncio.to_thread(
-            self.objects.list, claims, request.query.get("after", ""), limit
-        )
+        after = request.query.get("after", "")
+        if not _BEGINNING.fullmatch(after):
+            raise BadRequest(f"after={after[:80]!r} begins no digest", hint="use next of the page before")
+        found, more = await self.threads.run(claims.robot, self.objects.list, claims, after, limit)
         page = [StoredObject(digest=info.name.rpartition("/")[2], size=info.size) for info in found]
         return json_reply(200, ObjectPage(objects=page, next=page[-1].digest if more else None))
 
     async def get_object(self, request: HttpRequest, claims: Claims, path: dict[str, str]) -> HttpReply:
         """Return an object or a range of it."""
-        info = await asyncio.to_thread(self.objects.head, claims, path["digest"])
-        return await self._content(request, info.name, info.size, path["digest"])
+        info = await self.threads.run(claims.robot, self.objects.head, claims, path["digest"])
+        return await self._content(request, claims.robot, info.name, info.size, path["digest"])
 
     async def head_object(self, request: HttpRequest, claims: Claims, path: dict[str, str]) -> HttpReply:
         """Return the size."""
-        info = await asyncio.to_thread(self.objects.head, claims, path["digest"])
+        info = await self.threads.run(claims.robot, self.objects.head, claims, path["digest"])
         return HttpReply(
             status=200, headers={**_content_headers(path["digest"]), "Content-Length": str(info.size)},
             media_type=BYTES,
@@ -113,12 +132,12 @@ class Handlers:
         """Store a small object."""
         self.objects.name(claims, path["digest"])
         data = await request.body(self._settings.part_bytes)
-        new = await asyncio.to_thread(self.objects.put, claims, path["digest"], data)
+        new = await self.threads.run(claims.robot, self.objects.put, claims, path["digest"], data)
         return json_reply(201 if new else 200, StoredObject(digest=path["digest"], size=len(data)))
 
     async def delete_object(self, request: HttpRequest, claims: Claims, path: dict[str, str]) -> HttpReply:
         """Remove an object."""
-        await asyncio.to_thread(self.objects.delete, claims, path["digest"])
+        await self.threads.run(claims.robot, self.objects.delete, claims, path["digest"])
         return HttpReply(status=204)
 
     async def begin_upload(self, request: HttpRequest, claims: Claims, path: dict[str, str]) -> HttpReply:
@@ -126,8 +145,8 @@ class Handlers:
         begin = await _json_body(request, UploadBegin)
         if begin.size < 1:
             raise BadRequest(f"a size of {begin.size} bytes needs no upload", hint="PUT the object")
-        state = await asyncio.to_thread(self.objects.begin, claims, path["digest"], begin.size)
-        direct = await asyncio.to_thread(self._presigned_put, claims, state)
+        state = await self.threads.run(claims.robot, self.objects.begin, claims, path["digest"], begin.size)
+        direct = await self.threads.run(claims.robot, self._presigned_put, claims, state)
         return _upload(200, msgspec.structs.replace(state, direct=direct))
 
     def _presigned_put(self, claims: Claims, state: Upload) -> PresignedPut | None:
@@ -141,7 +160,9 @@ class Handlers:
 
     async def get_upload(self, request: HttpRequest, claims: Claims, path: dict[str, str]) -> HttpReply:
         """Return the state of an upload."""
-        return _upload(200, await asyncio.to_thread(self.objects.progress, claims, path["digest"]))
+        return _upload(
+            200, await self.threads.run(claims.robot, self.objects.progress, claims, path["digest"])
+        )
 
     head_upload = get_upload
 
@@ -152,24 +173,26 @@ class Handlers:
             raise BadRequest("the header Upload-Offset is missing", hint="send the offset of this part")
         self.objects.name(claims, path["digest"])
         data = await request.body(self._settings.part_bytes)
-        state = await asyncio.to_thread(self.objects.append, claims, path["digest"], offset, data)
+        state = await self.threads.run(
+            claims.robot, self.objects.append, claims, path["digest"], offset, data
+        )
         return _upload(201 if state.offset == state.size else 200, state)
 
     async def abandon_upload(self, request: HttpRequest, claims: Claims, path: dict[str, str]) -> HttpReply:
         """Remove an upload."""
-        await asyncio.to_thread(self.objects.abandon, claims, path["digest"])
+        await self.threads.run(claims.robot, self.objects.abandon, claims, path["digest"])
         return HttpReply(status=204)
 
     async def list_maps(self, request: HttpRequest, claims: Claims, path: dict[str, str]) -> HttpReply:
         """List maps with their heads."""
         maps = self._maps(claims)
 
-        found = await asyncio.to_thread(lambda: {name: maps.head(name).id for name in maps.names()})
+        found = await self.threads.run(claims.robot, maps.heads)
         return json_reply(200, MapPage(maps=[MapName(name=name, head=head) for name, head in found.items()]))
 
     async def list_versions(self, request: HttpRequest, claims: Claims, path: dict[str, str]) -> HttpReply:
         """List versions."""
-        records = await asyncio.to_thread(self._maps(claims).versions, path["name"])
+        records = await self.threads.run(claims.robot, self._maps(claims).versions, path["name"])
         return json_reply(200, [MapVersionInfo(id=record.id, record=record) for record in records])
 
     async def commit_version(self, request: HttpRequest, claims: Claims, path: dict[str, str]) -> HttpReply:
@@ -179,34 +202,57 @@ class Handlers:
             raise BadRequest(
                 f"the note has {len(commit.note)} letters, at most {_MAX_NOTE_LETTERS}", hint="shorten it"
             )
-        name = self.objects.name(claims, commit.digest)
+        robot, source = claims.robot, self.objects.name(claims, commit.digest)
+        size = (await self.threads.run(robot, self.objects.head, claims, commit.digest)).size
+        summary = await self._map_threads.run(robot, self._describe, robot, source)
 
         def work() -> MapRecord:
-            return self._maps(claims).commit(
-                path["name"], self._store.get(name), parent=commit.parent, author=claims.robot.name,
-                created_s=self._wall_clock(), note=commit.note,
+            return self._maps(claims).commit_object(
+                path["name"], source, summary, digest=commit.digest, size=size, parent=commit.parent,
+                author=robot.name, created_s=self._wall_clock(), note=commit.note,
+                charged=functools.partial(self._charged, claims, path["name"]),
             )  # fmt: skip
 
-        return _version(201, await asyncio.to_thread(work))
+        return _version(201, await self.threads.run(robot, work))
+
+    @contextlib.contextmanager
+    def _charged(self, claims: Claims, map_name: str, record: MapRecord, size: int) -> Iterator[None]:
+        """Charge a robot with a version while it is written; not if nothing of it was stored."""
+        charge = charge_name(claims.robot, map_name, record.id, size)
+        with self.objects.ledger.reserved(claims, size):
+            self._store.put(charge, b"")
+            try:
+                yield
+            except Conflict:  # the version is stored, another one is the head
+                self.objects.ledger.forget(claims.robot)
+                raise
+            except BaseException:
+                self._store.delete(charge)
+                raise
 
     async def show_version(self, request: HttpRequest, claims: Claims, path: dict[str, str]) -> HttpReply:
         """Show a version."""
-        return _version(
-            200, await asyncio.to_thread(self._maps(claims).record, path["name"], path["version"])
-        )
+        found = self._maps(claims).record
+        return _version(200, await self.threads.run(claims.robot, found, path["name"], path["version"]))
 
     async def get_version(self, request: HttpRequest, claims: Claims, path: dict[str, str]) -> HttpReply:
         """Return the bytes of a version or a range of them."""
         maps = self._maps(claims)
-        record = await asyncio.to_thread(maps.record, path["name"], path["version"])
-        return await self._content(request, maps.blob_name(path["name"], record), record.size, record.digest)
+        record = await self.threads.run(claims.robot, maps.record, path["name"], path["version"])
+        return await self._content(
+            request, claims.robot, maps.blob_name(path["name"], record), record.size, record.digest
+        )
 
     async def move_head(self, request: HttpRequest, claims: Claims, path: dict[str, str]) -> HttpReply:
         """Move a head."""
         move = await _json_body(request, MoveHead)
 
         maps = self._maps(claims)
-        record = await asyncio.to_thread(maps.move_head, path["name"], move.version, expected=move.expected)
+
+        def work() -> MapRecord:
+            return maps.move_head(path["name"], move.version, expected=move.expected)
+
+        record = await self.threads.run(claims.robot, work)
         return _version(200, record)
 
     def _maps(self, claims: Claims) -> MapRegistry:
@@ -217,13 +263,14 @@ class Handlers:
                     action, subject, actor=str(claims.robot), version=record.id, number=record.number
                 )
 
-        max_bytes = 4 * self._settings.max_object_bytes
-        return MapRegistry(self._store, claims.robot.tenant, max_bytes=max_bytes, on_change=record_change)
+        return MapRegistry(self._store, claims.robot.tenant, on_change=record_change, check=check_wanted)
 
-    async def _content(self, request: HttpRequest, name: str, size: int, digest: str) -> HttpReply:
+    async def _content(
+        self, request: HttpRequest, robot: RobotId, name: str, size: int, digest: str
+    ) -> HttpReply:
         store, ttl_s = self._store, self._settings.presigned_url_ttl_s
         if request.headers.get("x-accept-direct") == "1" and isinstance(store, PresigningStore):
-            url = await asyncio.to_thread(store.presigned_get, name, ttl_s=ttl_s)
+            url = await self.threads.run(robot, lambda: store.presigned_get(name, ttl_s=ttl_s))
             return HttpReply(status=307, headers={"Location": url, **_content_headers(digest)})
         try:
             part = requested_range(request.headers.get("range"), size)
@@ -235,15 +282,14 @@ class Handlers:
         if part:
             headers["Content-Range"] = f"bytes {start}-{end - 1}/{size}"
         return HttpReply(
-            status=206 if part else 200, body=self._pieces(name, start, end), headers=headers,
+            status=206 if part else 200, body=self._pieces(robot, name, start, end), headers=headers,
             media_type=BYTES,
         )  # fmt: skip
 
-    async def _pieces(self, name: str, start: int, end: int) -> AsyncIterator[bytes]:
+    async def _pieces(self, robot: RobotId, name: str, start: int, end: int) -> AsyncIterator[bytes]:
         while start < end:
-            piece = await asyncio.to_thread(
-                read_range, self._store, name, start, min(_PIECE_BYTES, end - start)
-            )
+            length = min(_PIECE_BYTES, end - start)
+            piece = await self.threads.run(robot, read_range, self._store, name, start, length)
             if not piece:
                 raise NotFound("the object was removed while it was read")
             start += len(piece)

@@ -20,6 +20,7 @@ from rse_pf.errors import (
     BadRequest,
     Busy,
     Conflict,
+    Crashed,
     Disconnected,
     Expired,
     Forbidden,
@@ -30,6 +31,7 @@ from rse_pf.errors import (
     StoreError,
     StoreFull,
     Unauthorized,
+    WorkerLost,
 )
 
 __all__ = [
@@ -39,6 +41,7 @@ __all__ = [
     "MethodNotAllowed",
     "Receive",
     "Send",
+    "TooManyRequests",
     "failure_reply",
     "json_reply",
     "requested_range",
@@ -58,10 +61,15 @@ class MethodNotAllowed(BadRequest):
         self.allowed = allowed
 
 
+class TooManyRequests(Busy):
+    """This robot asks more than its share; the others do not notice."""
+
+
 _STATUS: dict[type[RsePfError], int] = {
-    MethodNotAllowed: 405,
+    MethodNotAllowed: 405, TooManyRequests: 429,
     Unauthorized: 401, Forbidden: 403, NotFound: 404, Expired: 408, Conflict: 409, LimitExceeded: 413,
-    QuotaExceeded: 413, BadRequest: 400, Busy: 503, StoreFull: 507, StoreError: 503,
+    QuotaExceeded: 413, Crashed: 413, BadRequest: 400, Busy: 503, WorkerLost: 503,
+    StoreFull: 507, StoreError: 503,
 }  # fmt: skip
 _RANGE = re.compile(r"bytes=(\d{0,18})-(\d{0,18})")
 
@@ -97,10 +105,21 @@ class HttpRequest:
         }
         self.query = dict(parse_qsl(scope["query_string"].decode("latin-1"), keep_blank_values=True))
         self.received_bytes = 0
-        self.is_complete = False
+        self._complete = asyncio.Event()
         self._receive = receive
         self._clock = clock
         self._limits = limits
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether the whole request was read, or its connection was closed."""
+        return self._complete.is_set()
+
+    async def wait_until_gone(self) -> None:
+        """Return when the connection is closed after the whole request was read."""
+        await self._complete.wait()
+        while (await self._receive())["type"] != "http.disconnect":
+            pass
 
     def header_number(self, name: str) -> int | None:
         """Return a header that is a whole number; None if it is missing; raises BadRequest."""
@@ -149,11 +168,12 @@ class HttpRequest:
             except asyncio.TimeoutError:
                 raise _too_slow(f"no data for {self._limits.body_timeout_s:g} s") from None
             if message["type"] == "http.disconnect":
-                self.is_complete = True
+                self._complete.set()
                 raise Disconnected("the robot closed the connection within its request")
             piece: bytes = message.get("body", b"")
             self.received_bytes += len(piece)
-            self.is_complete = not message.get("more_body", False)
+            if not message.get("more_body", False):
+                self._complete.set()
             yield piece
             took_s, min_rate = self._clock() - began, _MIN_BODY_BYTES_PER_S
             if not self.is_complete and took_s > _BODY_GRACE_S and self.received_bytes < min_rate * took_s:

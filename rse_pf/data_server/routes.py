@@ -138,7 +138,7 @@ class Route:
     """One operation of the service.
 
     A route whose *scope* is None needs no token; *body* and *replies* hold a msgspec type, ``bytes``, or None
-    for an empty body.
+    for an empty body.  A request counts as *cost* requests against the robot's rate.
     """
 
     operation: str
@@ -149,6 +149,7 @@ class Route:
     replies: dict[int, Any]
     fields: tuple[Field, ...] = ()
     body: Any = None
+    cost: float = 1.0
 
     @property
     def pattern(self) -> re.Pattern[str]:
@@ -156,6 +157,7 @@ class Route:
         return re.compile(re.sub(r"\\{(\w+)\\}", r"(?P<\1>[^/]*)", re.escape(self.path)))
 
 
+_LIST_COST, _COMMIT_COST = 5.0, 20.0
 _WHOLE_NUMBER = {"type": "integer", "minimum": 0}
 _RANGE = Field(name="Range", place="header", doc="one range of bytes, as bytes=START-END")
 _OFFSET = Field(
@@ -193,6 +195,7 @@ ROUTES: tuple[Route, ...] = (
     ),
     Route(
         operation="list_objects", method="GET", path="/data/v1/objects", scope="data:read",
+        cost=_LIST_COST,
         doc="List this robot's objects", fields=(_AFTER, _LIMIT), replies={200: ObjectPage, **_BAD},
     ),
     Route(
@@ -238,15 +241,16 @@ ROUTES: tuple[Route, ...] = (
     ),
     Route(
         operation="list_maps", method="GET", path="/data/v1/maps", scope="maps:read",
-        doc="List the maps of this tenant", replies={200: MapPage},
+        cost=_LIST_COST, doc="List the maps of this tenant", replies={200: MapPage},
     ),
     Route(
         operation="list_versions", method="GET", path=_MAP, scope="maps:read",
-        doc="List the versions of a map, oldest first",
+        cost=_LIST_COST, doc="List the versions of a map, oldest first",
         replies={200: list[MapVersionInfo], **_BAD, **_NOT_FOUND},
     ),
     Route(
         operation="commit_version", method="POST", path=_MAP, scope="maps:write", body=Commit,
+        cost=_COMMIT_COST,
         doc="Make an uploaded object the next version and the head of a map",
         replies={201: MapVersionInfo, **_BAD, **_NOT_FOUND, **_CONFLICT, **_STORING},
     ),
@@ -281,7 +285,8 @@ _DESCRIPTIONS = {
     400: "Invalid request", 401: "No valid token", 403: "The token's scopes do not allow this",
     404: "Does not exist, or belongs to another robot", 408: "The body was too slow",
     409: "Changed by another request", 413: "Larger than a limit or the quota",
-    416: "The range is outside of the object", 503: "Unavailable; retry later",
+    416: "The range is outside of the object",
+    429: "More requests than one robot may send; see Retry-After", 503: "Unavailable; retry later",
     507: "The disk is full; nothing was stored",
 }  # fmt: skip
 
@@ -320,7 +325,7 @@ def _operation(route: Route) -> dict[str, Any]:
     replies = dict(route.replies)
     if route.scope is not None:
         failure = None if route.method == "HEAD" else HttpFailure
-        replies |= {401: failure, 403: failure, 503: failure}
+        replies |= {401: failure, 403: failure, 429: failure, 503: failure}
     made: dict[str, Any] = {
         "operationId": route.operation,
         "summary": route.doc,

@@ -89,6 +89,7 @@ def serve_data(
     try:
         asyncio.run(_run(uvicorn.Server(config), app, store, listening, settings, announce))
     finally:
+        app.close()
         app.record_counted()
         if log is not None:
             log.close()
@@ -143,6 +144,8 @@ async def _run(
 
 
 async def _sweep_periodically(app: DataServer, store: ObjectStore, upload_ttl_s: float) -> None:
+    if isinstance(store, DirectoryStore):
+        await asyncio.to_thread(_move_old_objects, store)
     while True:
         await asyncio.sleep(_SWEEP_S)
         await asyncio.to_thread(_sweep, app, store, upload_ttl_s)
@@ -159,6 +162,17 @@ def _sweep(app: DataServer, store: ObjectStore, upload_ttl_s: float) -> None:
         return
     if uploads or files:
         _write_line({"event": "swept", "uploads": uploads, "files": files})
+
+
+def _move_old_objects(store: DirectoryStore) -> None:
+    """Move objects of earlier versions to where they are listed quickly; they can be read meanwhile."""
+    try:
+        moved = store.move_old_objects()
+    except StoreError as error:
+        _write_line({"event": "sweep-failed", "error": str(error)})
+        return
+    if moved:
+        _write_line({"event": "moved", "objects": moved})
 
 
 def _listen(settings: PlatformSettings) -> socket.socket:

@@ -8,29 +8,35 @@ what it stored is durable; no name contains text that a robot chose.
 from __future__ import annotations
 
 import contextlib
-import io
+import hashlib
+import itertools
 import re
 import threading
 from collections.abc import Callable, Iterator
 
 from rse_pf.auth.tokens import Claims
 from rse_pf.config import DataSettings
+from rse_pf.data_server.fair_threads import while_wanted
+from rse_pf.data_server.quota import QuotaLedger
 from rse_pf.data_server.routes import Upload
 from rse_pf.errors import BadRequest, Conflict, LimitExceeded, NotFound, QuotaExceeded
 from rse_pf.identity import object_name
 from rse_pf.object_store import (
     ObjectInfo,
     ObjectStore,
+    PresigningStore,
     digest_of,
+    put_pieces,
     put_scratch,
 )
 
 __all__ = ["Objects"]
 
 _DIGEST = re.compile(r"[0-9a-f]{64}")
-# Other data servers write, too; their objects are counted after this.
-_RECOUNT_S = 60.0
-_MAX_LOCKS = 4096
+_MAX_OPEN_UPLOADS = 1000
+"""Of one robot."""
+_FEW_PARTS, _SHORT_PART_BYTES = 64, 65_536
+"""An upload has at most so many parts, and one more for each so many bytes of the object."""
 
 
 class Objects:
@@ -45,12 +51,10 @@ class Objects:
     ) -> None:
         self._store = store
         self._settings = settings
-        self._clock = clock
         self._wall_clock = wall_clock
-        self._lock = threading.Lock()
-        self._assembling = threading.Lock()
-        self._usage: dict[str, tuple[float, int]] = {}
-        self._writing: dict[str, threading.Lock] = {}
+        self.ledger = QuotaLedger(store, settings, clock)
+        self._lock = threading.Lock()  # of the dictionary, never held during work
+        self._writing: dict[str, tuple[threading.Lock, int]] = {}
 
     def head(self, claims: Claims, digest: str) -> ObjectInfo:
         """Return size and name; raises NotFound, also for an object of another robot."""
@@ -68,8 +72,9 @@ class Objects:
     def list(self, claims: Claims, after: str, limit: int) -> tuple[list[ObjectInfo], bool]:
         """Return up to *limit* objects behind digest *after*, and whether there are more."""
         prefix = object_name(claims.robot, "")
-        found = [info for info in self._store.list(prefix) if info.name > prefix + after]
-        return found[:limit], len(found) > limit
+        found = while_wanted(self._store.list(prefix, after=prefix + after))
+        page = list(itertools.islice(found, limit + 1))
+        return page[:limit], len(page) > limit
 
     def put(self, claims: Claims, digest: str, data: bytes) -> bool:
         """Store an object; return False if it is there already.
@@ -81,16 +86,21 @@ class Objects:
         name = self.name(claims, digest)
         if digest_of(data) != digest:
             raise BadRequest("the bytes are not those of the digest", hint="send the object again")
-        if self._find(name) is not None:
-            return False
-        with self._reserved(claims, len(data)):
-            self._store.put(name, data)
+        with self._exclusive(name):
+            if self._find(name) is not None:
+                return False
+            with self.ledger.reserved(claims, len(data)):
+                self._store.put(name, data)
         return True
 
     def delete(self, claims: Claims, digest: str) -> None:
         """Remove an object; a missing one is no error."""
-        self._store.delete(self.name(claims, digest))
-        self._forget_usage(claims)
+        name = self.name(claims, digest)
+        with self._exclusive(name):
+            found = self._find(name)
+            if found is not None:
+                self._store.delete(name)
+                self.ledger.release(claims.robot, found.size)
 
     def begin(self, claims: Claims, digest: str, size: int) -> Upload:
         """Open an upload of *size* bytes, or return the state of the open one.
@@ -106,14 +116,15 @@ class Objects:
                 hint="split it, or raise data.max_object_bytes",
             )
         if self._find(name) is not None:
-            with self._lock_of(name):
+            with self._exclusive(name):
                 if self._opened(claims, digest) is not None:  # the robot uploaded it directly to the bucket
-                    self._close(claims, digest)
+                    self._drop(self._parts(claims, digest))
             return self._state(digest, size, size)
-        with self._lock_of(name):
+        with self._exclusive(name):
             opened = self._opened(claims, digest)
             if opened is None:
-                with self._reserved(claims, size):
+                self._check_open_uploads(claims)
+                with self.ledger.reserved(claims, size):
                     self._store.put(
                         f"{self._parts(claims, digest)}size", f"{size} {self._wall_clock():.0f}".encode()
                     )
@@ -127,7 +138,7 @@ class Objects:
     def progress(self, claims: Claims, digest: str) -> Upload:
         """Return the state of an upload; raises NotFound."""
         name = self.name(claims, digest)
-        with self._lock_of(name):
+        with self._exclusive(name):
             opened = self._opened(claims, digest)
             if opened is None:
                 size = self.head(claims, digest).size
@@ -147,14 +158,15 @@ class Objects:
             StoreFull, StoreError: The part was not stored; earlier parts stay.
         """
         name = self.name(claims, digest)
-        with self._lock_of(name):
+        with self._exclusive(name):
             size = self._opened(claims, digest)
             if size is None:
                 info = self._find(name)
                 if info is None:
                     raise NotFound("no such upload", hint="begin it with PUT")
                 return self._state(digest, info.size, info.size)
-            received = sum(part.size for part in self._stored_parts(claims, digest))
+            parts = list(self._stored_parts(claims, digest))
+            received = sum(part.size for part in parts)
             if offset != received:
                 raise Conflict(
                     f"the upload is at offset {received}, not {offset}", hint=f"continue at offset {received}"
@@ -162,6 +174,11 @@ class Objects:
             if offset + len(data) > size or (not data and size > offset):
                 raise BadRequest(
                     f"{len(data)} bytes at {offset} do not fit {size}", hint="check size, offset and length"
+                )
+            if len(parts) >= _FEW_PARTS + size // _SHORT_PART_BYTES:
+                raise LimitExceeded(
+                    f"the upload has {len(parts)} parts already",
+                    hint=f"DELETE it, begin again and send parts of {self._settings.part_bytes} bytes",
                 )
             if data:
                 put_scratch(self._store, f"{self._parts(claims, digest)}part-{offset:015d}", data)
@@ -171,13 +188,13 @@ class Objects:
 
     def abandon(self, claims: Claims, digest: str) -> None:
         """Remove an upload and its parts; a missing one is no error."""
-        with self._lock_of(self.name(claims, digest)):
-            self._close(claims, digest)
+        with self._exclusive(self.name(claims, digest)):
+            self._discard(claims, digest)
 
     def sweep(self) -> int:
         """Remove uploads of crashes and those older than ``data.upload_ttl_s``; return their number."""
         folders: dict[str, float] = {}
-        for info in list(self._store.list("uploads/")):
+        for info in self._store.list("uploads/"):
             folder, _, last = info.name.rpartition("/")
             begun = float(self._store.get(info.name).split()[1]) if last == "size" else 0.0
             folders[folder] = max(begun, folders.get(folder, 0.0))
@@ -195,21 +212,30 @@ class Objects:
         return self._state(digest, size, offset)
 
     def _assemble(self, claims: Claims, digest: str, name: str, size: int) -> None:
-        with self._assembling:  # one whole object in memory at a time
-            buffer = io.BytesIO()  # holds the object once; joining a list of parts would hold it twice
+        def whole() -> Iterator[bytes]:
+            hashed, received = hashlib.sha256(), 0
             for part in self._stored_parts(claims, digest):
-                buffer.write(self._store.get(part.name))
-            whole = buffer.getvalue()
-            if len(whole) != size or digest_of(whole) != digest:
-                self._close(claims, digest)
+                data = self._store.get(part.name)
+                hashed.update(data)
+                received += len(data)
+                yield data
+            if received != size or hashed.hexdigest() != digest:
                 raise BadRequest("the parts do not have the digest of the upload", hint="upload it again")
-            self._store.put(name, whole)
-        self._close(claims, digest)
 
-    def _close(self, claims: Claims, digest: str) -> None:
-        """Remove an upload and its parts, and count the robot's usage anew."""
+        try:
+            put_pieces(self._store, name, whole())
+        except BadRequest:
+            self._discard(claims, digest)
+            raise
         self._drop(self._parts(claims, digest))
-        self._forget_usage(claims)
+
+    def _discard(self, claims: Claims, digest: str) -> None:
+        """Remove an upload that became no object."""
+        size = self._opened(claims, digest)
+        self._drop(self._parts(claims, digest))
+        if size is not None and not isinstance(self._store, PresigningStore):
+            # else the robot may have a URL with which it can still store the object
+            self.ledger.release(claims.robot, size)
 
     def _drop(self, prefix: str) -> None:
         """Remove an upload; ``size`` first, because without it no upload is open, whatever a crash leaves."""
@@ -218,7 +244,7 @@ class Objects:
             self._store.delete(part.name)
 
     def _parts(self, claims: Claims, digest: str) -> str:
-        return f"uploads/{_folder_of(claims)}{digest}/"
+        return f"uploads/{claims.robot.folder}/{digest}/"
 
     def _opened(self, claims: Claims, digest: str) -> int | None:
         try:
@@ -246,51 +272,27 @@ class Objects:
         except NotFound:
             return None
 
-    def _lock_of(self, name: str) -> threading.Lock:
-        with self._lock:
-            if len(self._writing) > _MAX_LOCKS:
-                self._writing = {key: lock for key, lock in self._writing.items() if lock.locked()}
-            return self._writing.setdefault(name, threading.Lock())
+    def _check_open_uploads(self, claims: Claims) -> None:
+        count = sum(1 for _ in self._store.folders(f"uploads/{claims.robot.folder}/"))
+        if count >= _MAX_OPEN_UPLOADS:
+            raise QuotaExceeded(
+                f"{count} uploads of this robot are not complete, the limit is {_MAX_OPEN_UPLOADS}",
+                hint="complete or DELETE them",
+            )
 
     @contextlib.contextmanager
-    def _reserved(self, claims: Claims, size: int) -> Iterator[None]:
-        """Count *size* bytes for a robot while they are written; take them back if the write fails.
-
-        Raises:
-            QuotaExceeded: The robot's objects and open uploads would hold more than its quota.
-        """
-        key = _folder_of(claims)
+    def _exclusive(self, name: str) -> Iterator[None]:
+        """Let no other request write the object *name* meanwhile."""
         with self._lock:
-            counted_at, used = self._usage.get(key, (float("-inf"), 0))
-            if self._clock() - counted_at > _RECOUNT_S:
-                counted_at, used = self._clock(), self._count(key)
-            self._usage[key] = counted_at, used
-            quota = claims.quota("data_bytes") or self._settings.quota_bytes
-            if used + size > quota:
-                raise QuotaExceeded(
-                    f"{used} + {size} bytes are more than the quota of {quota:.0f}",
-                    hint="delete objects, or raise data.quota_bytes",
-                )
-            self._usage[key] = counted_at, used + size
+            lock, users = self._writing.get(name, (threading.Lock(), 0))
+            self._writing[name] = lock, users + 1
         try:
-            yield
-        except BaseException:
+            with lock:
+                yield
+        finally:
             with self._lock:
-                if key in self._usage:
-                    counted_at, used = self._usage[key]
-                    self._usage[key] = counted_at, max(0, used - size)
-            raise
-
-    def _count(self, key: str) -> int:
-        """Return the bytes of a robot's objects and of its open uploads."""
-        stored = sum(info.size for info in self._store.list(f"objects/{key}"))
-        opened = [info.name for info in self._store.list(f"uploads/{key}") if info.name.endswith("/size")]
-        return stored + sum(int(self._store.get(name).split()[0]) for name in opened)
-
-    def _forget_usage(self, claims: Claims) -> None:
-        with self._lock:
-            self._usage.pop(_folder_of(claims), None)
-
-
-def _folder_of(claims: Claims) -> str:
-    return f"{claims.robot.folder}/"
+                users = self._writing[name][1] - 1
+                if users:
+                    self._writing[name] = lock, users
+                else:
+                    del self._writing[name]

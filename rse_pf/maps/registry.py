@@ -9,15 +9,26 @@ Layout: ``maps/TENANT/NAME/blobs/DIGEST``, ``.../versions/ID`` (ID is the sha256
 
 from __future__ import annotations
 
+import contextlib
+import hashlib
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import msgspec
 
-from rse_pf.errors import BadRequest, Conflict, NotFound, StoreError
-from rse_pf.object_store import ObjectStore, digest_of, name_segment
+from rse_pf.errors import BadRequest, Conflict, LimitExceeded, NotFound, StoreError
+from rse_pf.maps.describe import MapSummary, describe_map
+from rse_pf.object_store import (
+    ObjectStore,
+    digest_of,
+    name_segment,
+    put_pieces,
+    read_range,
+    usage_of,
+)
 
 if TYPE_CHECKING:  # importing numpy takes a third of a data server's start, and only maps need it
     from rse_pf.maps.format import MapVersion
@@ -27,6 +38,9 @@ __all__ = ["MapDiff", "MapRecord", "MapRegistry", "difference"]
 _NAME = re.compile(r"[a-z0-9][a-z0-9-]{0,63}")
 _ID = re.compile(r"[0-9a-f]{64}")
 _MIN_ID = 6
+_MAX_MAPS, _MAX_VERSIONS = 10_000, 10_000
+"""Of one tenant, and of one map: all of them are read when somebody asks for a list."""
+_PIECE_BYTES = 1 << 20
 # A keyframe that moved less has not moved: messages are rounded to more than this.
 _MOVED_M, _MOVED_DEG = 1e-3, 0.05
 
@@ -77,17 +91,36 @@ class MapRegistry:
         *,
         max_bytes: int = 1 << 30,
         on_change: Callable[[str, str, MapRecord], None] = lambda action, name, record: None,
+        check: Callable[[], None] = lambda: None,
     ) -> None:
-        """Make a registry; *on_change* gets ``map.commit`` or ``map.head``, map and version."""
+        """Make a registry.
+
+        Args:
+            store: Where the maps lie.
+            tenant: Whose maps.
+            max_bytes: Size of a map when it is decoded.
+            on_change: Gets ``map.commit`` or ``map.head``, map and version.
+            check: Called between two reads of long work; ends the work by the error that it raises.
+        """
         self._store = store
         self._on_change = on_change
         self._prefix = f"maps/{name_segment(tenant)}/"
         self._max_bytes = max_bytes
+        self._check = check
 
     def names(self) -> list[str]:
-        """Return the names of all maps that have a head."""
-        found = (info.name.removeprefix(self._prefix).split("/") for info in self._store.list(self._prefix))
-        return sorted({name for name, *rest in found if rest == ["head"]})
+        """Return the names of all maps that have a head, sorted."""
+        return list(self.heads())
+
+    def heads(self) -> dict[str, str]:
+        """Return the id of the newest version of each map, by its name, sorted."""
+        found = {}
+        for name in self._store.folders(self._prefix):
+            self._check()
+            head = self._head(name) if _NAME.fullmatch(name) else None
+            if head is not None:
+                found[name] = head
+        return found
 
     def commit(
         self, name: str, data: bytes, *, parent: str | None, author: str, created_s: float, note: str = ""
@@ -106,22 +139,104 @@ class MapRegistry:
             Conflict: The head is not *parent*: read it, merge, and commit again.
             StoreError: The head did not change.
         """
+        return self._commit(
+            name, describe_map(data, self._max_bytes), digest=digest_of(data), size=len(data), parent=parent,
+            author=author, created_s=created_s, note=note,
+            write=lambda blob: self._store.put(blob, data), charged=lambda record, size: _free(),
+        )  # fmt: skip
+
+    def commit_object(
+        self,
+        name: str,
+        source: str,
+        summary: MapSummary,
+        *,
+        digest: str,
+        size: int,
+        parent: str | None,
+        author: str,
+        created_s: float,
+        note: str,
+        charged: Callable[[MapRecord, int], AbstractContextManager[None]],
+    ) -> MapRecord:
+        """Make an object of the store the next version, as `commit` does, without holding it in memory.
+
+        Args:
+            name: Of the map.
+            source: Name of the object.
+            summary: What the map holds, from `rse_pf.maps.describe`.
+            digest: Of the object.
+            size: Likewise.
+            parent: The head that the caller last read; None for the first version.
+            author: Who made it.
+            created_s: Unix seconds.
+            note: What was done.
+            charged: Returns the context in which the version is written, for its record and the bytes that
+                it adds to the store; refuses it by an error.
+
+        Raises:
+            As `commit`, and what *charged* raises.
+        """
+
+        def pieces() -> Iterator[bytes]:
+            hashed = hashlib.sha256()
+            for start in range(0, size, _PIECE_BYTES):
+                self._check()
+                piece = read_range(self._store, source, start, _PIECE_BYTES)
+                hashed.update(piece)
+                yield piece
+            if hashed.hexdigest() != digest:
+                raise StoreError("the bytes are not those of the digest", hint="store the object again")
+
+        return self._commit(
+            name, summary, digest=digest, size=size, parent=parent, author=author, created_s=created_s,
+            note=note, write=lambda blob: put_pieces(self._store, blob, pieces()), charged=charged,
+        )  # fmt: skip
+
+    def _commit(
+        self, name: str, summary: MapSummary, *, digest: str, size: int, parent: str | None, author: str,
+        created_s: float, note: str, write: Callable[[str], None],
+        charged: Callable[[MapRecord, int], AbstractContextManager[None]],
+    ) -> MapRecord:  # fmt: skip
         base = self._base(name)
-        decoded = self._decode(data)
         before = self.record(name, parent) if parent is not None else None
         if self._head(name) != parent:
             raise _moved(name)
+        self._check_counts(base, is_new=before is None)
         record = MapRecord(
-            digest=digest_of(data), size=len(data), parent=None if before is None else before.id,
+            digest=digest, size=size, parent=None if before is None else before.id,
             number=1 if before is None else before.number + 1, author=author, created_s=created_s, note=note,
-            keyframes=len(decoded.keyframes), edges=len(decoded.edges), points=len(decoded.points),
-            robots=tuple(sorted({keyframe.robot for keyframe in decoded.keyframes})),
+            keyframes=summary.keyframes, edges=summary.edges, points=summary.points, robots=summary.robots,
         )  # fmt: skip
-        self._store.put(f"{base}blobs/{record.digest}", data)
-        self._store.put(f"{base}versions/{record.id}", msgspec.json.encode(record))
-        self._swap(name, parent, record.id)
+        blob = f"{base}blobs/{digest}"
+        is_new = not self._holds(blob)
+        with charged(record, size if is_new else 0):
+            if is_new:
+                write(blob)
+            self._store.put(f"{base}versions/{record.id}", msgspec.json.encode(record))
+            self._swap(name, parent, record.id)
         self._on_change("map.commit", name, record)
         return record
+
+    def _check_counts(self, base: str, *, is_new: bool) -> None:
+        """Raise LimitExceeded if the tenant has no place for another map, or the map for another version."""
+        versions = usage_of(self._store, f"{base}versions/").objects
+        if versions >= _MAX_VERSIONS:
+            raise LimitExceeded(
+                f"the map has {versions} versions, the limit is {_MAX_VERSIONS}", hint="begin another map"
+            )
+        maps = sum(1 for _ in self._store.folders(self._prefix)) if is_new else 0
+        if maps >= _MAX_MAPS:
+            raise LimitExceeded(
+                f"the tenant has {maps} maps, the limit is {_MAX_MAPS}", hint="commit to an existing map"
+            )
+
+    def _holds(self, name: str) -> bool:
+        try:
+            self._store.head(name)
+        except NotFound:
+            return False
+        return True
 
     def head(self, name: str) -> MapRecord:
         """Return the record of the newest version; raises NotFound."""
@@ -145,10 +260,13 @@ class MapRegistry:
     def versions(self, name: str) -> list[MapRecord]:
         """Return all versions, oldest first, including those that are not ancestors of the head."""
         prefix = f"{self._base(name)}versions/"
-        ids = [info.name.removeprefix(prefix) for info in self._store.list(prefix)]
-        if not ids:
+        found = []
+        for info in self._store.list(prefix):
+            self._check()
+            found.append(self.record(name, info.name.removeprefix(prefix)))
+        if not found:
             raise NotFound(f"there is no map {name!r}", hint="see rse-pf map list")
-        return sorted((self.record(name, each) for each in ids), key=lambda r: (r.number, r.created_s, r.id))
+        return sorted(found, key=lambda record: (record.number, record.created_s, record.id))
 
     def data(self, name: str, version: str = "head") -> bytes:
         """Return the bytes of a version, checked by their digest."""
@@ -164,7 +282,9 @@ class MapRegistry:
 
     def load(self, name: str, version: str = "head") -> MapVersion:
         """Return a version as a value."""
-        return self._decode(self.data(name, version))
+        from rse_pf.maps.format import decode_map
+
+        return decode_map(self.data(name, version), self._max_bytes)
 
     def move_head(self, name: str, version: str, *, expected: str) -> MapRecord:
         """Move the head to an existing *version*, as a rollback does.
@@ -177,11 +297,6 @@ class MapRegistry:
         self._swap(name, self.record(name, expected).id, record.id)
         self._on_change("map.head", name, record)
         return record
-
-    def _decode(self, data: bytes) -> MapVersion:
-        from rse_pf.maps.format import decode_map
-
-        return decode_map(data, self._max_bytes)
 
     def _base(self, name: str) -> str:
         if not _NAME.fullmatch(name):
@@ -235,6 +350,12 @@ def difference(before: MapVersion, after: MapVersion) -> MapDiff:
         points_before=len(before.points),
         points_after=len(after.points),
     )
+
+
+@contextlib.contextmanager
+def _free() -> Iterator[None]:
+    """Charge nobody: an operator commits."""
+    yield
 
 
 def _moved(name: str) -> Conflict:

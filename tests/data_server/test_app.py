@@ -209,7 +209,7 @@ class Failing(MemoryStore):
 
 
 def test_a_full_disk_is_507_and_uses_no_quota() -> None:
-    service = Service(small_settings(quota_bytes=1500), Failing())
+    service = Service(small_settings(quota_bytes=6000), Failing())
 
     for _ in range(3):
         answer = service.ask("PUT", OBJECT, DATA)

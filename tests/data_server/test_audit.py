@@ -30,7 +30,7 @@ class Recorded(Service):
     def restart(self) -> None:
         self.app = DataServer(
             self.settings, self.store, keys=KEY.key_set, log=self.lines.append, clock=lambda: self.now,
-            wall_clock=lambda: self.wall, audit=self.log,
+            wall_clock=lambda: self.wall, describe=self.describe, audit=self.log,
         )  # fmt: skip
 
     def entries(self) -> list[Entry]:

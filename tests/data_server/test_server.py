@@ -32,7 +32,7 @@ class RosterService(Service):
         keys = KeysFile(self.folder / "keys.json", lambda: self.now)
         self.app = DataServer(
             self.settings, self.store, keys=keys, log=self.lines.append, clock=lambda: self.now,
-            wall_clock=lambda: self.wall,
+            wall_clock=lambda: self.wall, describe=self.describe,
         )  # fmt: skip
 
 
@@ -65,7 +65,7 @@ def test_an_enrolled_robot_has_the_tenant_and_the_quota_of_the_roster(
     service: RosterService,
 ) -> None:
     robot = EnrolledRobot(
-        robot="own", tenant="lab", x=public_key_of(ROBOT.public_json()), quotas={"data_bytes": 100.0}
+        robot="own", tenant="lab", x=public_key_of(ROBOT.public_json()), quotas={"data_bytes": 8192.0}
     )
     service.access.change_roster(lambda roster: roster.enrolled(robot))
     token = ROBOT.issue(
@@ -76,9 +76,10 @@ def test_an_enrolled_robot_has_the_tenant_and_the_quota_of_the_roster(
         tenant="other",
     )
 
-    assert put(service, b"x" * 60, token) == 201
-    assert put(service, b"y" * 60, token) == 413
-    assert [info.name.split("/")[1] for info in service.store.list("objects/")] == ["lab"]
+    assert put(service, b"x" * 3000, token) == 201
+    assert put(service, b"y" * 4096, token) == 201
+    assert put(service, b"z", token) == 413
+    assert [info.name.split("/")[1] for info in service.store.list("objects/")] == ["lab", "lab"]
 
 
 def test_a_scope_for_one_map_does_not_cover_another(service: RosterService) -> None:

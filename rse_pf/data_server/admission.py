@@ -1,0 +1,123 @@
+"""Decide whether a robot's request is taken now: its rate, its requests in progress, and bodies in memory.
+
+What one robot sends never uses up what others need: every limit is kept for each robot, and the memory for
+bodies, which all share, is limited for each robot and each tenant, too.  Time is an argument.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, OrderedDict
+from dataclasses import dataclass
+
+from rse_pf.config import DataSettings
+from rse_pf.data_server.http import TooManyRequests
+from rse_pf.errors import Busy
+from rse_pf.identity import RobotId
+from rse_pf.token_bucket import TokenBucket
+
+__all__ = ["Admission"]
+
+_BURST_S = 10.0
+"""A robot may make the requests of this time at once."""
+_MAX_ROBOTS = 10_000
+_BODIES_PER_ROBOT, _BODIES_PER_TENANT = 0.25, 0.75
+"""Shares of ``data.max_uploads``."""
+_RETRY_AFTER_MS = 1000.0
+
+
+@dataclass(slots=True)
+class _Robot:
+    bucket: TokenBucket
+    requests: int = 0
+    bodies: int = 0
+
+
+class Admission:
+    """The requests of all robots that one data server works on; used by one thread."""
+
+    def __init__(self, settings: DataSettings) -> None:
+        self._settings = settings
+        self._robots: OrderedDict[RobotId, _Robot] = OrderedDict()
+        self._tenant_bodies: Counter[str] = Counter()
+
+    def begin(self, robot: RobotId, cost: float, now: float, *, has_body: bool) -> None:
+        """Take a request of *robot*, which `end` gives back.
+
+        Args:
+            robot: Who sends it.
+            cost: How many plain requests it counts for.
+            now: Monotonic seconds.
+            has_body: Whether its body will be held in memory.
+
+        Raises:
+            TooManyRequests: The robot's rate or its requests in progress are at their limit.
+            Busy: Too many bodies are being received, of this robot, its tenant or all.
+        """
+        held = self._of(robot, now)
+        if held.requests >= self._settings.max_requests_per_robot:
+            raise TooManyRequests(
+                f"{held.requests} requests of this robot are in progress, the limit is "
+                f"{self._settings.max_requests_per_robot}",
+                hint="wait for their replies",
+                retry_after_ms=_RETRY_AFTER_MS,
+            )
+        if has_body:
+            self._check_bodies(held, robot.tenant)
+        wait_s = held.bucket.wait_s(now)
+        if wait_s:
+            raise TooManyRequests(
+                f"this robot sends more than {self._settings.max_requests_per_s:g} requests a second",
+                hint="send fewer and larger ones",
+                retry_after_ms=1000 * wait_s,
+            )
+        held.bucket.spend(cost, now)
+        held.requests += 1
+        if has_body:
+            held.bodies += 1
+            self._tenant_bodies[robot.tenant] += 1
+
+    def end(self, robot: RobotId, *, has_body: bool) -> None:
+        """Give back what `begin` took, except for the rate."""
+        held = self._robots[robot]
+        held.requests -= 1
+        if has_body:
+            held.bodies -= 1
+            self._tenant_bodies[robot.tenant] -= 1
+            if not self._tenant_bodies[robot.tenant]:
+                del self._tenant_bodies[robot.tenant]
+
+    def _check_bodies(self, held: _Robot, tenant: str) -> None:
+        most = self._settings.max_uploads
+        limits = (
+            (held.bodies, _share(most, _BODIES_PER_ROBOT), "this robot"),
+            (self._tenant_bodies[tenant], _share(most, _BODIES_PER_TENANT), "this tenant"),
+            (self._tenant_bodies.total(), most, "all robots"),
+        )
+        for count, limit, whose in limits:
+            if count >= limit:
+                raise Busy(
+                    f"{count} uploads of {whose} are in progress, the limit is {limit}",
+                    hint="retry later",
+                    retry_after_ms=_RETRY_AFTER_MS,
+                )
+
+    def _of(self, robot: RobotId, now: float) -> _Robot:
+        held = self._robots.get(robot)
+        if held is None:
+            rate = self._settings.max_requests_per_s
+            held = self._robots[robot] = _Robot(TokenBucket(rate, burst=rate * _BURST_S))
+            self._forget_one(now)
+        self._robots.move_to_end(robot)
+        return held
+
+    def _forget_one(self, now: float) -> None:
+        """Forget the robot that has been quiet for longest; its bucket is full again in all likelihood."""
+        if len(self._robots) > _MAX_ROBOTS:
+            for robot, held in self._robots.items():
+                if not held.requests and held.bucket.is_full(now):
+                    del self._robots[robot]
+                    return
+
+
+def _share(most: int, share: float) -> int:
+    return max(1, int(most * share))
