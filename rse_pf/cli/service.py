@@ -4,10 +4,15 @@ new creates a folder with a working service; test replays its recorded requests 
 server; run serves it from a local platform until Ctrl-C and loads every saved change; install copies it for
 rse-pf local --services; call sends a request to a running local platform.
 
+A server refuses a service or a request after crashes: to the robot whose sandboxes crashed, and to others if
+theirs crashed as well.  status shows what is refused to whom and for how long, unblock lifts it.
+
 examples:
   rse-pf service new centroid --lang lua
   rse-pf service test centroid
   rse-pf service run centroid
+  rse-pf service status
+  rse-pf service unblock centroid --robot robot-1
 """
 
 from __future__ import annotations
@@ -28,6 +33,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+from rse_pf.cli.service_blocks import add_block_arguments, show_blocks, unblock
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import CommandFailed, RsePfError, UsageError
 from rse_pf.local.state import read_state, state_folder
@@ -40,7 +46,7 @@ __all__ = ["add_arguments", "run"]
 Recorded = list[tuple[str, dict[str, Any]]]
 """File name and content of each recorded request."""
 
-_ACTIONS = ("new", "test", "run", "install", "list", "call")
+_ACTIONS = ("new", "test", "run", "install", "list", "call", "status", "unblock")
 _LANGUAGES = ("python", "cpp", "lua")
 _NAME = re.compile(r"[a-z][a-z0-9_-]{0,39}")
 _POLL_S = 0.3
@@ -52,8 +58,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument("action", choices=_ACTIONS, help="what to do")
     parser.add_argument(
-        "what", nargs="?", metavar="NAME|FOLDER", help="new, call: a name; test, run, install: the folder"
-    )
+        "what", nargs="?", metavar="NAME|FOLDER",
+        help="new, call: a name; test, run, install: the folder; unblock: only this service",
+    )  # fmt: skip
     parser.add_argument(
         "--lang", choices=_LANGUAGES, default="python", help="new: language (default: python)"
     )
@@ -64,8 +71,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="call: the request as JSON; @FILE reads it from a file, which may be a recorded request",
     )
     parser.add_argument(
-        "--name", default="default", help="call: name of the local platform (default: default)"
-    )
+        "--name", default="default",
+        help="call, status, unblock: name of the local platform (default: default)",
+    )  # fmt: skip
+    add_block_arguments(parser)
     parser.add_argument("--once", action="store_true", help="run: answer the recorded requests, then end")
 
 
@@ -74,6 +83,10 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
     folder = args.services or _services_folder(settings)
     if args.action == "list":
         return _list(folder)
+    if args.action == "status":
+        return show_blocks(args)
+    if args.action == "unblock":
+        return unblock(args)
     if args.what is None:
         raise UsageError(
             f"rse-pf service {args.action} needs a name or folder",

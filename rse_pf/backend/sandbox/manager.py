@@ -15,6 +15,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from rse_pf.backend.ports import Log
+from rse_pf.backend.sandbox.circuit_breaker import Block
 from rse_pf.backend.sandbox.ipc import IpcChannel, encode_message
 from rse_pf.backend.sandbox.policy import (
     Action,
@@ -121,9 +122,17 @@ class SandboxManager:
         return {
             "sandboxes": self._policy.sandboxes,
             "missing_isolation": list(self.missing),
-            "open_breakers": self._policy.open_services(self._monotonic()),
+            "open_breakers": self._policy.breaker.open_services(self._monotonic()),
             "counts": dict(self._policy.counts),
         }
+
+    def blocks(self) -> list[Block]:
+        """Return what is refused now after crashes, and to whom."""
+        return self._policy.breaker.blocks(self._monotonic())
+
+    def unblock(self, service: str | None, tenant: str | None, robot: str | None) -> list[Block]:
+        """Lift what is refused (None stands for all), and return what it was."""
+        return self._policy.breaker.unblock(self._monotonic(), service=service, tenant=tenant, robot=robot)
 
     def connected(self, robot: RobotId) -> None:
         """Note a connection of *robot*."""

@@ -190,7 +190,10 @@ class _Sandbox:
 
 
 class SandboxPolicy:
-    """All sandboxes of one worker; every event returns the actions that follow from it."""
+    """All sandboxes of one worker; every event returns the actions that follow from it.
+
+    ``breaker`` knows what is refused after crashes, and ``counts`` what happened how often.
+    """
 
     def __init__(
         self,
@@ -213,7 +216,7 @@ class SandboxPolicy:
         self._settings = settings
         self._max_sandboxes = max_sandboxes
         self._keeps_snapshots = keeps_snapshots
-        self._breaker = CircuitBreaker(settings)
+        self.breaker = CircuitBreaker(settings)
         self._sandboxes: dict[int, _Sandbox] = {}
         self._by_robot: dict[RobotId, _Sandbox] = {}
         self._shares = FairShare(max_sandboxes)
@@ -242,10 +245,6 @@ class SandboxPolicy:
         """Return how many commands of *robot* wait."""
         sandbox = self._by_robot.get(robot)
         return 0 if sandbox is None else len(sandbox.waiting)
-
-    def open_services(self, now: float) -> list[str]:
-        """Return the services whose circuit breaker is open for more than one robot, sorted."""
-        return self._breaker.open_services(now)
 
     # --- events from the gateway -------------------------------------------------------------------
 
@@ -395,7 +394,7 @@ class SandboxPolicy:
     # --- rules -------------------------------------------------------------------------------------
 
     def _refusal(self, call: SandboxCall, now: float) -> RsePfError | None:
-        refusal = self._breaker.refusal(call.queued.robot, call.service, call.digest, now)
+        refusal = self.breaker.refusal(call.queued.robot, call.service, call.digest, now)
         if isinstance(refusal, Poison):
             self.counts["poison"] += 1
         return refusal
@@ -437,7 +436,7 @@ class SandboxPolicy:
             and call.tries < _MAX_TRIES
             and call.queued.deadline_s > now
             and (is_stateless or sandbox.snapshots.get(call.service) is not None)
-            and self._breaker.refusal(call.queued.robot, call.service, call.digest, now) is None
+            and self.breaker.refusal(call.queued.robot, call.service, call.digest, now) is None
         )
 
     def _ended(self, sandbox: _Sandbox, how: str, now: float, *, is_evidence: bool = True) -> None:
@@ -453,9 +452,9 @@ class SandboxPolicy:
             self._actions.append(LogCrash(sandbox.robot, service, reason))
         if call is not None:
             if sandbox.is_overrun:
-                self._breaker.overran(sandbox.robot, service, now)
+                self.breaker.overran(sandbox.robot, service, now)
             elif is_evidence:
-                self._breaker.crashed(sandbox.robot, service, call.digest, now)
+                self.breaker.crashed(sandbox.robot, service, call.digest, now)
             call.tries += 1
             if self._may_retry(call, sandbox, now):
                 sandbox.waiting.appendleft(call)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import msgspec
 
 __all__ = [
-    "DrainOrder", "LeaveOrder", "MigrateOrder", "ReplaceOrder", "ReportOrder", "TrustOrder", "WorkerOrder",
-    "decode_order", "encode_order",
+    "BlocksOrder", "DrainOrder", "LeaveOrder", "MigrateOrder", "ReplaceOrder", "ReportOrder", "TrustOrder",
+    "UnblockOrder", "WorkerOrder", "decode_order", "encode_order",
 ]  # fmt: skip
 
 
@@ -39,13 +39,40 @@ class ReplaceOrder(msgspec.Struct, tag="replace", tag_field="do", frozen=True):
     number: int
 
 
+class BlocksOrder(msgspec.Struct, tag="blocks", tag_field="do", frozen=True):
+    """Tell in an answer with this *number* what circuit breakers and poison requests are refused."""
+
+    number: int
+
+
+class UnblockOrder(msgspec.Struct, tag="unblock", tag_field="do", frozen=True):
+    """Lift what is refused, and tell in an answer with this *number* what it was.
+
+    None stands for every service, everybody, and every robot of the tenant.
+    """
+
+    number: int
+    service: str | None = None
+    tenant: str | None = None
+    robot: str | None = None
+
+
 class LeaveOrder(msgspec.Struct, tag="leave", tag_field="do", frozen=True):
     """Wait at most *held_s* for commands that are held, close every socket, and end."""
 
     held_s: float
 
 
-WorkerOrder = ReportOrder | DrainOrder | MigrateOrder | TrustOrder | ReplaceOrder | LeaveOrder
+WorkerOrder = (
+    ReportOrder
+    | DrainOrder
+    | MigrateOrder
+    | TrustOrder
+    | ReplaceOrder
+    | BlocksOrder
+    | UnblockOrder
+    | LeaveOrder
+)
 
 _DECODER: msgspec.json.Decoder[WorkerOrder] = msgspec.json.Decoder(WorkerOrder)
 

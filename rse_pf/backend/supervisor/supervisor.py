@@ -30,7 +30,7 @@ from rse_pf.backend.log import JsonLog
 from rse_pf.backend.metrics import merge, merge_isolation, render
 from rse_pf.backend.supervisor.control_http import ControlReply, ControlRequest, serve_control
 from rse_pf.backend.supervisor.listener import bound_socket, check_authentication
-from rse_pf.backend.supervisor.orders import DrainOrder, LeaveOrder, MigrateOrder
+from rse_pf.backend.supervisor.orders import BlocksOrder, DrainOrder, LeaveOrder, MigrateOrder, UnblockOrder
 from rse_pf.backend.supervisor.session_registry import SessionRegistry
 from rse_pf.backend.supervisor.trust_poller import poll_trust
 from rse_pf.backend.supervisor.worker import WorkerPlan
@@ -49,8 +49,10 @@ _ACCEPT_PAUSE_S = 0.1
 _MIN_PAUSE_S = 0.01
 _FRESH_S = 0.25
 _REPORT_S = 0.3
+_BLOCKS_S = 2.0
 _LEAVE_S = 3.0
 _MAX_MOVES = 10000
+_MAX_BLOCKS = 2000
 _MAX_SPREAD_S = _MAX_DRAIN_WAIT_S = 3600.0
 _EXIT_OK, _EXIT_LOST = 0, 1
 _PUBLIC_PAGES = ("/healthz", "/readyz")
@@ -150,6 +152,8 @@ class _Supervisor:
         self._began = time.monotonic()
         self._reported = float("-inf")
         self._reporting = asyncio.Lock()
+        self._asking_blocks = asyncio.Lock()
+        self._asked_blocks = 0
         self._tasks: set[asyncio.Task[None]] = set()
         self._control_port = 0
         self._moving_until = 0.0
@@ -334,6 +338,8 @@ class _Supervisor:
             ("GET", "/readyz"): self._readyz,
             ("GET", "/metrics"): self._metrics,
             ("GET", "/status"): self._status,
+            ("GET", "/blocks"): self._blocks,
+            ("POST", "/unblock"): self._post_unblock,
             ("POST", "/drain"): self._post_drain,
             ("POST", "/move"): self._post_move,
         }
@@ -418,6 +424,38 @@ class _Supervisor:
                 "isolation": merge_isolation(worker.report for worker in self._workers),
             }
         )
+
+    async def _blocks(self, ask: ControlRequest) -> ControlReply:
+        return _json(await self._ask_blocks(BlocksOrder))
+
+    async def _post_unblock(self, ask: ControlRequest) -> ControlReply:
+        """Lift what is refused after crashes: all, or that of a service, a tenant, or a robot of a tenant."""
+        wanted = {name: ask.query.get(name) for name in ("service", "tenant", "robot")}
+        if not ask.is_local:
+            return _refused(403, "forbidden", "unblock from the server's own machine")
+        if set(ask.query) - set(wanted) or (wanted["robot"] and not wanted["tenant"]):
+            return _refused(
+                400, "bad-request", "name a service, a tenant, a robot of that tenant, or nothing"
+            )
+        told = await self._ask_blocks(lambda number: UnblockOrder(number, **wanted))
+        self._log.info("unblock", **wanted, lifted=told["count"])
+        self._records.note("server.unblock", **wanted, lifted=told["count"])
+        return _json(told)
+
+    async def _ask_blocks(self, make_order: Callable[[int], BlocksOrder | UnblockOrder]) -> dict[str, Any]:
+        """Return what all workers tell; the same thing of several workers is listed several times."""
+        async with self._asking_blocks:
+            self._asked_blocks += 1
+            order = make_order(self._asked_blocks)
+            told = await asyncio.gather(*(worker.ask_blocks(order, _BLOCKS_S) for worker in self._workers))
+        answers = [each for each in told if each is not None]
+        blocks = [block for each in answers for block in each["blocks"]]
+        return {
+            "server": self._server_id,
+            "blocks": blocks[:_MAX_BLOCKS],
+            "count": sum(each["count"] for each in answers),
+            "silent_workers": len(told) - len(answers),
+        }
 
     async def _post_drain(self, ask: ControlRequest) -> ControlReply:
         if not ask.is_local:

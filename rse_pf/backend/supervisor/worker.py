@@ -16,7 +16,7 @@ import signal
 import socket
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -43,16 +43,19 @@ from rse_pf.backend.log import JsonLog
 from rse_pf.backend.object_refs import ObjectRefs
 from rse_pf.backend.ports import Clocks, WorkerContext
 from rse_pf.backend.robot_store import is_shared
+from rse_pf.backend.sandbox.circuit_breaker import Block
 from rse_pf.backend.sandbox.manager import SandboxManager
 from rse_pf.backend.scheduling.cpu_throttle import CpuThrottle
 from rse_pf.backend.scheduling.scheduler import Scheduler
 from rse_pf.backend.supervisor.orders import (
+    BlocksOrder,
     DrainOrder,
     LeaveOrder,
     MigrateOrder,
     ReplaceOrder,
     ReportOrder,
     TrustOrder,
+    UnblockOrder,
     WorkerOrder,
     decode_order,
 )
@@ -71,6 +74,8 @@ _POLL_S = 0.01
 _MAX_LINE_BYTES = 1 << 26
 """A `TrustOrder` names every robot that is enrolled."""
 _CLOSE_TIMEOUT_S = 1.0
+_MAX_BLOCKS = 500
+"""Told at once; an operator reads no more."""
 
 
 @dataclass(frozen=True)
@@ -155,6 +160,9 @@ class _Worker:
             tell=self._say,
             recorder=self._recorder,
         )
+        self._sandboxes = (
+            self._make_sandboxes(plan, installed, answers) if chosen.folder or chosen.published else None
+        )
         self._dispatcher = Dispatcher(
             context,
             registry=registry,
@@ -168,9 +176,7 @@ class _Worker:
             decoder=DecoderThread(loop.call_soon_threadsafe),
             answers=answers,
             compute=self._compute(plan, context, registry, answers),
-            sandboxes=self._sandboxes(plan, installed, answers)
-            if chosen.folder or chosen.published
-            else NoQueue(),
+            sandboxes=self._sandboxes or NoQueue(),
             jobs=self._jobs(plan, answers) if settings.serving.max_running_jobs else NoQueue(),
             token_watch=self._token_watch,
         )
@@ -201,7 +207,7 @@ class _Worker:
             refuse=answers.send_refusal,
         )
 
-    def _sandboxes(
+    def _make_sandboxes(
         self, plan: WorkerPlan, services: Sequence[InstalledService], answers: Answers
     ) -> SandboxManager:
         settings = plan.settings
@@ -263,11 +269,21 @@ class _Worker:
                 self._token_watch.trust(key_set_from_snapshot(order.snapshot))
             case ReplaceOrder():
                 self._token_watch.replace(order.number)
+            case BlocksOrder():
+                self._tell_blocks(order.number, [] if self._sandboxes is None else self._sandboxes.blocks())
+            case UnblockOrder(number, service, tenant, robot):
+                sandboxes = self._sandboxes
+                lifted = [] if sandboxes is None else sandboxes.unblock(service, tenant, robot)
+                self._tell_blocks(number, lifted)
 
     def _report(self) -> dict[str, Any]:
         report = self._dispatcher.snapshot()
         report["gauges"]["moved"] = float(self._migration.asked)
         return report
+
+    def _tell_blocks(self, number: int, blocks: list[Block]) -> None:
+        told = [asdict(block) for block in blocks[:_MAX_BLOCKS]]
+        self._say(event="blocks", number=number, count=len(blocks), blocks=told)
 
     async def _tell_when_empty(self) -> None:
         while self._dispatcher.connections:

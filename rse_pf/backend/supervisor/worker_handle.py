@@ -18,7 +18,13 @@ import traceback
 from collections.abc import Callable, Sequence
 from typing import Any, NoReturn
 
-from rse_pf.backend.supervisor.orders import ReportOrder, WorkerOrder, encode_order
+from rse_pf.backend.supervisor.orders import (
+    BlocksOrder,
+    ReportOrder,
+    UnblockOrder,
+    WorkerOrder,
+    encode_order,
+)
 from rse_pf.backend.supervisor.worker import NUMBER_BYTES, WorkerPlan, event_loop_maker, run_worker
 from rse_pf.config import PlatformSettings
 from rse_pf.services.loading import load_services
@@ -88,6 +94,8 @@ class WorkerProcess:
         self._writer: asyncio.StreamWriter | None = None
         self._reading: asyncio.Task[None] | None = None
         self._reported: asyncio.Future[None] | None = None
+        self._told_blocks: asyncio.Future[dict[str, Any]] | None = None
+        self._blocks_number = 0
 
     def exit_code(self, how: int = os.WNOHANG) -> int | None:
         """Return how the process ended (negative: by which signal), None while it runs.
@@ -138,6 +146,14 @@ class WorkerProcess:
         self.order(ReportOrder())
         await asyncio.wait([self._reported], timeout=timeout_s)
 
+    async def ask_blocks(self, order: BlocksOrder | UnblockOrder, timeout_s: float) -> dict[str, Any] | None:
+        """Return the worker's answer to *order*, None if there is none in time; one order at a time."""
+        self._told_blocks = asyncio.get_running_loop().create_future()
+        self._blocks_number = order.number
+        self.order(order)
+        await asyncio.wait([self._told_blocks], timeout=timeout_s)
+        return self._told_blocks.result() if self._told_blocks.done() else None
+
     def kill(self) -> None:
         """Kill the process and close the channels; a second call does nothing."""
         if self._data.fileno() < 0:
@@ -169,6 +185,10 @@ class WorkerProcess:
             ready.set()
         elif message["event"] == "empty":
             self.empty.set()
+        elif message["event"] == "blocks":
+            told = self._told_blocks
+            if told is not None and not told.done() and message["number"] == self._blocks_number:
+                told.set_result(message)
         elif message["event"] != "report":
             self._on_robot(self, message)
         else:

@@ -20,6 +20,7 @@ SOURCE = """
 import os
 import stat
 import time
+import msgspec
 
 class Request(msgspec.Struct):
     frames: bytes = b""

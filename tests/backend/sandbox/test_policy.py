@@ -189,9 +189,9 @@ def test_a_circuit_breaker_that_is_open_for_several_robots_is_reported():
     for robot in (A, B, C):
         number = start(policy, make_call(robot, payload=robot.name))
         policy.gone(number, "exit code 1", 1.0)
-        assert policy.open_services(1.0) == (["icp"] if robot == C else [])
+        assert policy.breaker.open_services(1.0) == (["icp"] if robot == C else [])
 
-    assert policy.open_services(OPEN_S + 1.0) == []
+    assert policy.breaker.open_services(OPEN_S + 1.0) == []
 
 
 def test_an_open_circuit_breaker_refuses_what_waits_as_well():
@@ -505,7 +505,7 @@ RIVALS = [RobotId("rival", name) for name in "abcd"]
 
 
 def taken_by_rivals(*, idle: bool) -> tuple[SandboxPolicy, list[SandboxCall]]:
-    """Return a policy whose four places one tenant holds: its sandboxes run, or became idle at 4, 3, 2, 1 s."""
+    """Return a policy whose four places one tenant holds: all run, or became idle at 4, 3, 2 and 1 s."""
     policy, calls = make_policy(), [make_call(rival) for rival in RIVALS]
     for i, call in enumerate(calls):
         policy.connected(call.queued.robot)

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 
+from rse_pf.cli.main import main as rse_pf
 from rse_pf.services.custom.installed import install
 from rse_pf.services.custom.native import INCLUDE_FOLDER
 from rse_pf.wire import Failure, Result
@@ -331,6 +332,27 @@ def test_a_service_that_crashes_repeatedly_opens_its_circuit_breaker_and_readyz_
     status, _, body = server.http("/readyz")
     assert status == 200, "the server itself is healthy"
     assert json.loads(body)["open_breakers"] == ["worker"]
+
+
+def test_an_operator_sees_and_lifts_what_is_refused_after_crashes(serve_isolated, capsys):
+    server = serve_isolated(breaker_crashes=2, poison_crashes=1)
+    look = [("worker", {"do": "look"})]
+    ask_all(server, "robot-1", [("worker", {"do": what}) for what in ("segv", "abort")])
+    port = ["--control-port", str(server.identity["control_port"])]
+    assert ask_all(server, "robot-1", look)[0].code == "worker-lost"
+
+    assert rse_pf(["service", "status", *port]) == 0
+    seen = capsys.readouterr().out
+    assert rse_pf(["service", "unblock", "worker", "--robot", "robot-1", *port]) == 0
+    lifted = capsys.readouterr().out
+
+    assert "robot default/robot-1  crashes" in seen
+    assert "robot default/robot-1  2 poison requests" in seen
+    assert "worker is no longer refused to robot default/robot-1 (crashes)" in lifted
+    assert isinstance(ask_all(server, "robot-1", look)[0], Result)
+    assert json.loads(server.http("/blocks")[2])["blocks"] == []
+    assert server.wait_for_log("unblock")["lifted"] == 2
+    assert server.http("/unblock?robot=robot-1", "POST")[0] == 400
 
 
 def test_a_sandbox_ends_with_its_robot_and_leaves_no_process_or_descriptor(serve_isolated):

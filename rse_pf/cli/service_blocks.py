@@ -1,0 +1,156 @@
+"""The actions status and unblock of the verb service: show and lift what servers refuse after crashes.
+
+Every server decides by itself, so that each is asked on its control port: all servers of a local platform,
+or the one whose port is named.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlencode
+
+from rse_pf.auth.control_token import read_control_token
+from rse_pf.errors import CommandFailed, UsageError
+from rse_pf.identity import DEFAULT_TENANT
+from rse_pf.local.servers.control_client import ControlPort, ControlPortReply
+from rse_pf.local.state import read_state, state_folder
+from rse_pf.terminal import show
+
+__all__ = ["add_block_arguments", "show_blocks", "unblock"]
+
+_TIMEOUT_S = 5.0
+_COLUMNS = ("server", "service", "refused to", "because of", "for another")
+Server = tuple[str, int, str | None]
+"""What it is called, its control port, and the token of that port."""
+
+
+def add_block_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options of both actions."""
+    parser.add_argument(
+        "--tenant", help=f"unblock: only for this tenant (with --robot, default: {DEFAULT_TENANT})"
+    )
+    parser.add_argument("--robot", metavar="NAME", help="unblock: only for this robot of the tenant")
+    parser.add_argument(
+        "--control-port", type=int, metavar="PORT",
+        help="status, unblock: ask the server on this machine with this control port, not a local platform",
+    )  # fmt: skip
+    parser.add_argument(
+        "--control-token", type=Path, metavar="FILE", help="status, unblock: token file of that server"
+    )
+
+
+def show_blocks(args: argparse.Namespace) -> int:
+    """Show what is refused, to whom, and for how long; return 1 if a server did not answer."""
+    told, silent = asyncio.run(_ask_all(_servers(args), "GET", "/blocks"))
+    rows = [_row(server, block) for server, each in told for block in each["blocks"]]
+    left_out = sum(each["count"] - len(each["blocks"]) for _, each in told)
+    if rows:
+        _show_table([_COLUMNS, *rows])
+    elif told:
+        show("no service and no request is refused")
+    if left_out:
+        show(f"and {left_out} more")
+    return _show_silent(silent, told)
+
+
+def unblock(args: argparse.Namespace) -> int:
+    """Lift what is refused, and show what it was; return 1 if a server did not answer."""
+    tenant = args.tenant or (DEFAULT_TENANT if args.robot else None)
+    wanted = {"service": args.what, "tenant": tenant, "robot": args.robot}
+    query = urlencode({name: value for name, value in wanted.items() if value})
+    target = f"/unblock?{query}" if query else "/unblock"
+    told, silent = asyncio.run(_ask_all(_servers(args), "POST", target))
+    for server, each in told:
+        for block in each["blocks"]:
+            _, service, whom, why, _ = _row(server, block)
+            show(f"{server}: {service} is no longer refused to {whom} ({why})")
+        left_out = each["count"] - len(each["blocks"])
+        if left_out:
+            show(f"{server}: and {left_out} more")
+    if told and not any(each["count"] for _, each in told):
+        show("nothing was refused that could be lifted")
+    return _show_silent(silent, told)
+
+
+def _servers(args: argparse.Namespace) -> list[Server]:
+    if args.control_port is not None:
+        if not 0 < args.control_port < 65536:
+            raise UsageError(f"{args.control_port} is no port", hint="name a port from 1 to 65535")
+        token = None if args.control_token is None else read_control_token(args.control_token)
+        return [(f"port {args.control_port}", args.control_port, token)]
+    state = read_state(state_folder(args.name, os.environ))
+    servers = [] if state is None else [each for each in state.servers if each.control_port]
+    if state is None or not servers:
+        raise UsageError(
+            f"no server of a platform named {args.name!r} is running",
+            hint="start one with: rse-pf local; for a server of rse-pf serve, name its --control-port",
+        )
+    token = read_control_token(Path(state.control_token_file)) if state.control_token_file else None
+    return [(server.name, server.control_port, token) for server in servers]
+
+
+async def _ask_all(
+    servers: Sequence[Server], method: str, target: str
+) -> tuple[list[tuple[str, dict[str, Any]]], list[str]]:
+    """Return the name and answer of each server that answered, and the names of those that did not."""
+    replies = await asyncio.gather(
+        *(
+            ControlPort(port, token).ask_once(target, timeout_s=_TIMEOUT_S, method=method)
+            for _, port, token in servers
+        )
+    )
+    told, silent = [], []
+    for (name, _, _), reply in zip(servers, replies, strict=True):
+        document = None if reply is None else _document(name, reply)
+        if document is None:
+            silent.append(name)
+            continue
+        told.append((str(document["server"]), document))
+        if document["silent_workers"]:
+            silent.append(f"{document['silent_workers']} workers of {name}")
+    return told, silent
+
+
+def _document(name: str, reply: ControlPortReply) -> dict[str, Any] | None:
+    document = reply.document()
+    if reply.status == 401:
+        raise UsageError(f"{name} requires a token", hint="name the file of it with --control-token")
+    if reply.status == 404:
+        raise CommandFailed(f"{name} is of an earlier version", hint="roll the servers to this version")
+    if reply.status != 200:
+        raise CommandFailed(
+            f"{name} answers {reply.status}", hint=str(document.get("hint", "see the server's log"))
+        )
+    return document if {"server", "blocks", "count", "silent_workers"} <= set(document) else None
+
+
+def _show_silent(silent: Sequence[str], told: Sequence[Any]) -> int:
+    if not told:
+        raise CommandFailed(
+            f"no answer from {', '.join(silent)}", hint="see rse-pf local status and the logs of the servers"
+        )
+    for name in silent:
+        show(f"no answer from {name}", error=True)
+    return 1 if silent else 0
+
+
+def _row(server: str, block: Mapping[str, Any]) -> tuple[str, ...]:
+    tenant, robot, requests = block["tenant"], block["robot"], block["requests"]
+    whom = f"robot {tenant}/{robot}" if robot else f"tenant {tenant}" if tenant else "all robots"
+    why = {
+        "crashes": "crashes",
+        "overruns": "overrun deadlines",
+        "poison": f"{requests} poison request{'s' if requests > 1 else ''}",
+    }[block["reason"]]
+    return server, str(block["service"]), whom, why, f"{block['left_s']:.0f} s"
+
+
+def _show_table(rows: Sequence[tuple[str, ...]]) -> None:
+    widths = [max(len(row[column]) for row in rows) for column in range(len(_COLUMNS))]
+    for row in rows:
+        show("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip())
