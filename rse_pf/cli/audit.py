@@ -2,9 +2,10 @@
 
 Servers, the control plane, the data service and operators' commands write one chain each: robots accepted,
 refused and revoked, servers started and stopped, maps changed.  verify prints a line for each chain, and
-exits with 1 if an entry was changed, moved, added or lost.  To detect truncation as well, store a chain's
-head elsewhere and pass it with --head.  --cloud reads what the servers of the deployment on AWS have sent to
-its bucket; --out keeps the files, so that they can be shown again without AWS.
+exits with 1 if an entry was changed, moved, added or lost, if the end of a chain is missing, or if a chain
+was removed or copied.  Someone who may write the whole folder can forge all of it: store a chain's head
+elsewhere, and pass it with --head.  --cloud reads what the servers of the deployment on AWS have sent to its
+bucket; --out keeps the files, so that they can be shown again without AWS.
 
 examples:
   rse-pf audit verify

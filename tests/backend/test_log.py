@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import unicodedata
 
 from hypothesis import given
 from hypothesis import strategies as st
@@ -50,3 +51,14 @@ def test_many_lines_keep_their_order():
     lines = written(*(("info", "n", {"n": n}) for n in range(200)))
 
     assert [json.loads(line)["n"] for line in lines] == list(range(200))
+
+
+def test_no_byte_of_a_name_is_obeyed_by_a_terminal_that_shows_the_log():
+    hostile = "r\x1b[2J\x7f\x9b31m\u202e\u200b\u2028é厨\ud800"
+
+    (line,) = written(("info", "join", {"robot": hostile}))
+
+    assert json.loads(line)["robot"] == hostile
+    assert [letter for letter in line if unicodedata.category(letter)[0] == "C"] == []
+    (plain,) = written(("info", "join", {"robot": "é厨"}))
+    assert "é厨" in plain
