@@ -10,7 +10,8 @@ from rse_pf.auth.tokens import Claims
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import NotFound, QuotaExceeded
 from rse_pf.identity import RobotId, object_name
-from rse_pf.object_store import ObjectStore, digest_of
+from rse_pf.maps.charges import charged_to
+from rse_pf.object_store import MIN_CHARGE_BYTES, ObjectStore, charge_of, digest_of, usage_of
 
 __all__ = ["check_quota", "is_shared", "quota_bytes", "store_within_quota"]
 
@@ -28,14 +29,16 @@ def quota_bytes(claims: Claims | None, default: float) -> float:
 
 
 def check_quota(store: ObjectStore, robot: RobotId, size: int, max_bytes: float) -> None:
-    """Raise QuotaExceeded unless *size* more bytes fit; StoreError if the store fails.
+    """Raise QuotaExceeded unless an object of *size* bytes fits; StoreError if the store fails.
 
-    Only stored objects are counted; the data service counts uploads that have begun.
+    Stored objects and committed versions of maps are counted, each with `MIN_CHARGE_BYTES` at least; the data
+    service counts uploads that have begun, too, and limits the number of objects.
     """
-    used = sum(info.size for info in store.list(object_name(robot, "")))
-    if used + size > max_bytes:
+    used = (usage_of(store, object_name(robot, "")) + charged_to(store, robot)).charged_bytes
+    if used + charge_of(size) > max_bytes:
         raise QuotaExceeded(
-            f"{used} + {size} bytes are more than the quota of {max_bytes:.0f}",
+            f"{used} + {charge_of(size)} bytes are more than the quota of {max_bytes:.0f}; a short object "
+            f"counts as {MIN_CHARGE_BYTES}",
             hint="delete objects, or raise data.quota_bytes",
         )
 

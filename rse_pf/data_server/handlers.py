@@ -20,7 +20,6 @@ from rse_pf.auth.tokens import Claims
 from rse_pf.config import DataSettings
 from rse_pf.data_server.fair_threads import FairThreads, check_wanted
 from rse_pf.data_server.http import HttpReply, HttpRequest, failure_reply, json_reply, requested_range
-from rse_pf.data_server.quota import charge_name
 from rse_pf.data_server.routes import (
     BYTES,
     Commit,
@@ -39,6 +38,7 @@ from rse_pf.data_server.routes import (
 from rse_pf.data_server.uploads import Objects
 from rse_pf.errors import BadRequest, Conflict, NotFound
 from rse_pf.identity import RobotId
+from rse_pf.maps.charges import charge_name
 from rse_pf.maps.describe import MapSummary
 from rse_pf.maps.registry import MapRecord, MapRegistry
 from rse_pf.object_store import ObjectStore, PresigningStore, read_range

@@ -4,9 +4,6 @@ What a robot has stored is counted when it first writes, and then kept by this l
 for it, too: another data server, or a worker that stores a large reply.  So the ledger counts again: in a
 folder every `_RECOUNT_S`, reading only what changed, and in other stores every `_SLOW_RECOUNT_S`.  Of n data
 servers with one store, all together can exceed a quota by at most what n - 1 of them accept in that time.
-
-A version of a map belongs to its tenant, but counts for the robot that committed it: ``charges/TENANT/ROBOT/
-MAP/VERSION.SIZE`` is an empty object that says so.
 """
 
 from __future__ import annotations
@@ -19,21 +16,17 @@ from dataclasses import dataclass, field
 
 from rse_pf.auth.tokens import Claims
 from rse_pf.config import DataSettings
-from rse_pf.data_server.fair_threads import while_wanted
+from rse_pf.data_server.fair_threads import check_wanted, while_wanted
 from rse_pf.errors import NotFound, QuotaExceeded
 from rse_pf.identity import RobotId
+from rse_pf.maps.charges import charged_to
 from rse_pf.object_store import MeasuringStore, ObjectStore, Usage, charge_of, usage_of
 
-__all__ = ["QuotaLedger", "charge_name"]
+__all__ = ["QuotaLedger"]
 
 _RECOUNT_S, _SLOW_RECOUNT_S = 10.0, 600.0
 _MAX_ACCOUNTS = 10_000
 _NEVER = float("-inf")
-
-
-def charge_name(robot: RobotId, map_name: str, version: str, size: int) -> str:
-    """Return the name of the object that charges *robot* with *size* bytes for a version of a map."""
-    return f"charges/{robot.folder}/{map_name}/{version}.{size}"
 
 
 @dataclass(slots=True)
@@ -115,9 +108,7 @@ class QuotaLedger:
             with contextlib.suppress(NotFound):  # it has just been completed
                 size = int(self._store.get(f"uploads/{folder}{upload}/size").split()[0])
                 total += Usage(1, charge_of(size))
-        for info in while_wanted(self._store.list(f"charges/{folder}")):
-            total += Usage(1, charge_of(int(info.name.rpartition(".")[2])))
-        return total
+        return total + charged_to(self._store, robot, check_wanted)
 
     def _check(self, used: Usage, charge: Usage, claims: Claims) -> None:
         max_bytes = claims.quota("data_bytes") or self._settings.quota_bytes

@@ -14,6 +14,7 @@ from rse_pf.backend.robot_store import check_quota, quota_bytes, store_within_qu
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import QuotaExceeded
 from rse_pf.identity import RobotId, object_name
+from rse_pf.maps.charges import charge_name
 from rse_pf.object_store import DirectoryStore, MemoryStore, digest_of
 from rse_pf.wire import Failure, Result
 
@@ -27,13 +28,13 @@ def claims(**quotas: float) -> Claims:
     )
 
 
-REQUEST = JobRequest(service="long", payload={}, robot=ROBOT, key="k", quota_bytes=1000.0)
+REQUEST = JobRequest(service="long", payload={}, robot=ROBOT, key="k", quota_bytes=4100.0)
 
 
 def of(store: str, max_message_bytes: int = 2000) -> PlatformSettings:
     return PlatformSettings.from_dict(
         {
-            "data": {"store": store, "max_object_bytes": 4096},
+            "data": {"store": store, "max_object_bytes": 4900},
             "session": {"max_message_bytes": max_message_bytes},
         }
     )
@@ -47,27 +48,40 @@ def test_the_quota_is_that_of_the_token_or_else_of_the_settings():
 
 def test_an_object_that_fits_exactly_is_stored_and_one_byte_more_is_not():
     store = MemoryStore()
-    store.put(object_name(RobotId("default", "robot-2"), "other"), bytes(500))
-    store.put(object_name(ROBOT, "own"), bytes(60))
+    store.put(object_name(RobotId("default", "robot-2"), "other"), bytes(50_000))
+    store.put(object_name(ROBOT, "own"), bytes(6000))
 
     with pytest.raises(QuotaExceeded):
-        store_within_quota(store, ROBOT, bytes(41), 100)
-    digest = store_within_quota(store, ROBOT, bytes(40), 100)
-
-    assert store.get(object_name(ROBOT, digest)) == bytes(40)
-    assert store_within_quota(store, ROBOT, bytes(40), 100) == digest
+        store_within_quota(store, ROBOT, bytes(4001), 10_000)
     with pytest.raises(QuotaExceeded):
-        check_quota(store, ROBOT, 1, 100)
+        store_within_quota(store, ROBOT, bytes(5001), 11_000)
+    digest = store_within_quota(store, ROBOT, bytes(5000), 11_000)
+
+    assert store.get(object_name(ROBOT, digest)) == bytes(5000)
+    assert store_within_quota(store, ROBOT, bytes(5000), 11_000) == digest
+    with pytest.raises(QuotaExceeded):
+        check_quota(store, ROBOT, 1, 11_000)
+
+
+def test_short_objects_and_committed_maps_count():
+    store = MemoryStore()
+    store.put(object_name(ROBOT, "own"), b"x")
+    store.put(charge_name(ROBOT, "kitchen", "a" * 64, 5000), b"")
+    store.put(charge_name(RobotId("default", "robot-2"), "kitchen", "b" * 64, 5000), b"")
+
+    check_quota(store, ROBOT, 1, 4096 + 5000 + 4096)
+    with pytest.raises(QuotaExceeded, match="9096"):
+        check_quota(store, ROBOT, 1, 4096 + 5000 + 4095)
 
 
 def test_a_large_reply_beyond_the_quota_is_refused_with_the_reason():
     store, settings = MemoryStore(), PlatformSettings()
-    gate = ObjectRefs(store, settings.serving, 100)
+    gate = ObjectRefs(store, settings.serving, 4000)
     answer, sent = Result(id=1, reply=bytes(500)), Failure(id=1, code="too-large", message="too large")
     owner = SimpleNamespace(robot=ROBOT, claims=None)
 
     refused = gate.kept(answer, sent, owner)
-    owner.claims = claims(data_bytes=1000.0)
+    owner.claims = claims(data_bytes=5000.0)
     stored = gate.kept(answer, sent, owner)
 
     assert isinstance(refused, Failure)
@@ -89,7 +103,7 @@ def test_a_jobs_process_refuses_what_is_too_large_or_beyond_the_quota(tmp_path):
     settings = of(f"dir:{tmp_path}")
 
     assert store_reply(["done", 5.0, bytes(5000)], REQUEST, settings)[:2] == ["failed", "too-large"]
-    assert store_reply(["done", 5.0, bytes(1001)], REQUEST, settings)[:2] == ["failed", "quota"]
+    assert store_reply(["done", 5.0, bytes(4101)], REQUEST, settings)[:2] == ["failed", "quota"]
     assert list(DirectoryStore(tmp_path).list()) == []
 
 
