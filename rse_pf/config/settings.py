@@ -154,6 +154,7 @@ class DataSettings:
     max_objects: int = setting(100000, unit="objects", doc="objects, unfinished uploads and map versions of one robot", source="file systems run out of inodes", low=1)
     max_requests_per_s: float = setting(50.0, unit="requests/s", doc="requests of one robot; a list counts as 5, a commit of a map as 20; more are refused with 429", low=0.1)
     max_requests_per_robot: int = setting(8, unit="requests", doc="requests of one robot in progress; more are refused with 429", low=1)
+    max_keyframe_features: int = setting(20000, unit="features", doc="features of one keyframe of a map that a service decodes", low=1)
     part_bytes: int = setting(4194304, unit="bytes", doc="body of one request; larger objects are sent in parts", low=1024)
     max_uploads: int = setting(32, doc="request bodies received at the same time; more are refused with 503 and Retry-After", low=1)
     upload_ttl_s: int = setting(86400, unit="s", doc="an unfinished upload is deleted after this", low=60)

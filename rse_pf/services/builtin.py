@@ -16,6 +16,9 @@ def builtin_services(settings: PlatformSettings) -> Registry:
     pnp.register(registry, settings.pnp)
     echo.register(registry)
     # Optional packages are imported by the first command: a server without them answers missing-extra.
-    for each in (icp, place, localise, merge, optimise, wifi):
-        each.register(registry)
+    icp.register(registry)
+    for each in (place, localise, merge):
+        each.register(registry, settings.data)
+    optimise.register(registry)
+    wifi.register(registry)
     return registry

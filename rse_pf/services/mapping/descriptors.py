@@ -17,6 +17,8 @@ Descriptors = npt.NDArray[np.uint8]
 BYTES = 32
 _MAX_TRAINING = 20_000
 _KMEANS_ITERATIONS = 12
+_ROWS_AT_ONCE = 4096
+"""Descriptors that are expanded to floats at once: a descriptor of 32 bytes becomes one of 1 KiB."""
 
 
 def descriptors_of(data: bytes, rows: int) -> Descriptors:
@@ -58,12 +60,9 @@ def train_words(views: Sequence[Descriptors], words: int, seed: int) -> npt.NDAr
     Trained from these views alone, so that a vocabulary belongs to one map version and holds no data of
     others.  Deterministic for a *seed*.
     """
-    stacked = np.concatenate([np.asarray(view, dtype=np.uint8) for view in views]) if views else None
-    if stacked is None or not len(stacked):
+    stacked = _sample(views, seed)
+    if not len(stacked):
         raise BadRequest("the map holds no descriptors", hint="upload keyframes with their descriptors")
-    rng = np.random.default_rng(seed)
-    if len(stacked) > _MAX_TRAINING:
-        stacked = stacked[np.sort(rng.choice(len(stacked), _MAX_TRAINING, replace=False))]
     k = int(min(words, len(stacked)))
     kmeans = load_faiss().Kmeans(
         8 * BYTES, k, niter=_KMEANS_ITERATIONS, seed=seed, verbose=False, min_points_per_centroid=1
@@ -82,10 +81,12 @@ def view_vector(view: Descriptors, words: npt.NDArray[np.float32]) -> npt.NDArra
     """
     sums = np.zeros_like(words)
     if len(view):
-        bits = _bits(view)
-        # Nearest centre: |b - c|^2 without the constant |b|^2.
-        nearest = np.argmin((words**2).sum(axis=1) - 2.0 * (bits @ words.T), axis=1)
-        np.add.at(sums, nearest, bits - words[nearest])
+        squares = (words**2).sum(axis=1)
+        for begin in range(0, len(view), _ROWS_AT_ONCE):
+            bits = _bits(view[begin : begin + _ROWS_AT_ONCE])
+            # Nearest centre: |b - c|^2 without the constant |b|^2.
+            nearest = np.argmin(squares - 2.0 * (bits @ words.T), axis=1)
+            np.add.at(sums, nearest, bits - words[nearest])
         sums = np.sign(sums) * np.sqrt(np.abs(sums))
         sums /= np.maximum(np.linalg.norm(sums, axis=1, keepdims=True), 1e-9)
     flat: npt.NDArray[np.float32] = sums.ravel()
@@ -103,6 +104,26 @@ def load_faiss() -> Any:
     return faiss
 
 
+def _sample(views: Sequence[Descriptors], seed: int) -> Descriptors:
+    """Return the descriptors of all *views*, or `_MAX_TRAINING` of them, without copying the others."""
+    ends = np.cumsum([len(view) for view in views], dtype=np.int64)
+    total = int(ends[-1]) if len(ends) else 0
+    if total == 0:
+        return np.empty((0, BYTES), dtype=np.uint8)
+    if total <= _MAX_TRAINING:
+        return np.concatenate([np.asarray(view, dtype=np.uint8) for view in views])
+    rows = np.sort(np.random.default_rng(seed).choice(total, _MAX_TRAINING, replace=False))
+    borders = np.searchsorted(rows, ends)
+    parts, begin = [], 0
+    for view, end, border in zip(views, ends.tolist(), borders.tolist(), strict=True):
+        parts.append(view[rows[begin:border] - (end - len(view))])
+        begin = border
+    return np.concatenate(parts)
+
+
 def _bits(view: Descriptors) -> npt.NDArray[np.float32]:
-    ones: npt.NDArray[np.float32] = np.unpackbits(np.ascontiguousarray(view), axis=1).astype(np.float32)
-    return 2.0 * ones - 1.0
+    """Return the bits of ``(n, 32)`` descriptors as ``(n, 256)`` numbers -1 and 1."""
+    bits: npt.NDArray[np.float32] = np.unpackbits(np.ascontiguousarray(view), axis=1).astype(np.float32)
+    bits *= 2.0
+    bits -= 1.0
+    return bits

@@ -10,13 +10,14 @@ from dataclasses import dataclass
 import msgspec
 import numpy as np
 
+from rse_pf.config import DataSettings
 from rse_pf.errors import BadRequest, PnpError
 from rse_pf.geometry import Array as Matrix
 from rse_pf.geometry import Camera, inverse, pose_difference, transform
 from rse_pf.pnp import PnpOptions, PnpSolution, solve_pnp
 from rse_pf.service import Registry
 from rse_pf.services.mapping.descriptors import load_faiss
-from rse_pf.services.mapping.place import PlaceIndex, Within, open_map, view_of
+from rse_pf.services.mapping.place import PlaceIndex, Within, check_comparisons, open_map, view_of
 from rse_pf.services.mapping.relative_pose import RelativePoseOptions, View, matched_points
 from rse_pf.wire.arrays import Array
 
@@ -45,6 +46,12 @@ class LocaliseOptions(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=T
             raise BadRequest(
                 f"candidates = {self.candidates} is not within 1..100, min_inliers = {self.min_inliers} "
                 f"below 12, or inlier_px = {self.inlier_px:g} not within 0..100",
+                hint="leave them out to get the defaults",
+            )
+        if not (0 <= self.min_inlier_ratio <= 1 and self.agree_m > 0 and self.agree_deg > 0):
+            raise BadRequest(
+                f"min_inlier_ratio = {self.min_inlier_ratio:g} is not within 0..1, or agree_m = "
+                f"{self.agree_m:g} or agree_deg = {self.agree_deg:g} not above 0",
                 hint="leave them out to get the defaults",
             )
 
@@ -126,14 +133,16 @@ def locate(
     )
 
 
-def register(registry: Registry) -> None:
-    """Add ``localise`` to *registry*."""
+def register(registry: Registry, data: DataSettings | None = None) -> None:
+    """Add ``localise`` to *registry*; *data* has the limit of a keyframe's features."""
+    keyframe_features = (data or DataSettings()).max_keyframe_features
 
     @registry.service("localise", limited=True, warm_up=load_faiss)
     def localise(request: LocaliseRequest) -> LocaliseReply:
         """Find the camera's pose in a map."""
         view = view_of(request.camera, request.pixels, request.descriptors)
-        _, index = open_map(request.map)
+        _, index = open_map(request.map, keyframe_features)
+        check_comparisons(index, view, (request.options or LocaliseOptions()).candidates)
         found = locate(index, view, request.options, within=request.within)
         pose = None if found.T_map_camera is None else found.T_map_camera.ravel()
         return msgspec.structs.replace(found, T_map_camera=pose)

@@ -199,7 +199,7 @@ def _candidate_pairs(atlas: Atlas, index: PlaceIndex, options: MergeOptions) -> 
             allowed = every[atlas.of_map == which]
             if own:
                 allowed = allowed[np.abs(atlas.order[allowed] - atlas.order[a]) >= _MIN_LOOP_LENGTH]
-            for b, _ in index.nearest_to(index.vectors[a], options.candidates, allowed):
+            for b, _ in index.nearest_to(index.vector(a), options.candidates, allowed):
                 pairs.add((min(a, b), max(a, b)))
     return sorted(pairs)
 

@@ -7,14 +7,20 @@ from __future__ import annotations
 
 import msgspec
 
+from rse_pf.config import DataSettings
 from rse_pf.errors import BadRequest, LimitExceeded
 from rse_pf.maps.format import MapVersion, decode_map, encode_map
 from rse_pf.service import Registry, Report
 from rse_pf.services.mapping.map_merge import MergedMap, MergeOptions, merge_versions
 from rse_pf.services.mapping.optimise import ignore_progress
-from rse_pf.services.mapping.place import MAX_KEYFRAMES
+from rse_pf.services.mapping.place import MAX_KEYFRAMES, map_limits
 
-__all__ = ["MergeReply", "MergeRequest", "NotJoined", "Refusal", "merge_maps", "register"]
+__all__ = ["MAX_MAPS", "MergeReply", "MergeRequest", "NotJoined", "Refusal", "merge_maps", "register"]
+
+
+MAX_MAPS = 64
+_MAX_PROJECTIONS = 20_000_000_000
+"""Of one point of a cloud into one keyframe: an hour of work, which is all that a job has."""
 
 
 class MergeRequest(msgspec.Struct, frozen=True, kw_only=True):
@@ -52,29 +58,40 @@ class MergeReply(msgspec.Struct, frozen=True, kw_only=True):
     cost_after: float
 
 
-def merge_maps(request: MergeRequest, *, report: Report = ignore_progress) -> MergeReply:
+def merge_maps(
+    request: MergeRequest, *, report: Report = ignore_progress, data: DataSettings | None = None
+) -> MergeReply:
     """Make one map of several robots' maps, or close the loops of one.
 
-    *report* gets the progress, and may raise Cancelled to end the work.
+    *report* gets the progress, and may raise Cancelled to end the work; *data* has the limit of a keyframe's
+    features.
     """
-    if not request.maps:
-        raise BadRequest("no map was sent", hint="send one or more")
+    if not 1 <= len(request.maps) <= MAX_MAPS:
+        raise BadRequest(f"{len(request.maps)} maps are not within 1..{MAX_MAPS}", hint="send one or more")
+    keyframe_features = (data or DataSettings()).max_keyframe_features
     versions: list[MapVersion] = []
-    for data in request.maps:
-        versions.append(decode_map(data))
+    for encoded in request.maps:
+        versions.append(decode_map(encoded, limits=map_limits(keyframe_features)))
         count = sum(len(version.keyframes) for version in versions)
-        if count > MAX_KEYFRAMES:
+        points = sum(len(version.points) for version in versions)
+        if count > MAX_KEYFRAMES or count * points > _MAX_PROJECTIONS:
             raise LimitExceeded(
-                f"{count} keyframes are above {MAX_KEYFRAMES}", hint="merge fewer maps at once"
+                f"{count} keyframes are above {MAX_KEYFRAMES}, or with {points} points of clouds above "
+                f"{_MAX_PROJECTIONS} projections",
+                hint="merge fewer maps at once, or thin their clouds",
             )
     if not all(version.keyframes for version in versions):
         raise BadRequest("a map has no keyframes", hint="leave it out")
     return _reply(merge_versions(versions, request.options, report=report))
 
 
-def register(registry: Registry) -> None:
-    """Add ``merge`` to *registry*."""
-    registry.service("merge", kind="long")(merge_maps)
+def register(registry: Registry, data: DataSettings | None = None) -> None:
+    """Add ``merge`` to *registry*; *data* has the limit of a keyframe's features."""
+
+    @registry.service("merge", kind="long")
+    def merge(request: MergeRequest, *, report: Report = ignore_progress) -> MergeReply:
+        """Make one map of several robots' maps, or close the loops of one."""
+        return merge_maps(request, report=report, data=data)
 
 
 def _reply(merged: MergedMap) -> MergeReply:

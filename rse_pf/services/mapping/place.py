@@ -13,9 +13,10 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
+from rse_pf.config import DataSettings
 from rse_pf.errors import BadRequest, LimitExceeded
 from rse_pf.geometry import Camera
-from rse_pf.maps.format import Keyframe, MapVersion, decode_map
+from rse_pf.maps.format import Keyframe, MapLimits, MapVersion, decode_map
 from rse_pf.service import Registry
 from rse_pf.services.mapping.descriptors import (
     Descriptors,
@@ -29,11 +30,14 @@ from rse_pf.wire.arrays import Array, reshaped
 
 __all__ = [
     "MAX_KEYFRAMES",
+    "MAX_VIEW_FEATURES",
     "Candidate",
     "PlaceIndex",
     "PlaceReply",
     "PlaceRequest",
     "Within",
+    "check_comparisons",
+    "map_limits",
     "open_map",
     "register",
     "view_of",
@@ -44,6 +48,12 @@ SEED = 20
 _CACHED_MAPS = 2
 MAX_KEYFRAMES = 2000
 """Limit of all maps of one request together."""
+MAX_FEATURES = 2_000_000
+"""Likewise."""
+MAX_VIEW_FEATURES = 20_000
+"""Of the view of a request."""
+_MAX_COMPARISONS = 2_000_000_000
+"""Of one descriptor of the view with one of a candidate; they take about five seconds."""
 
 
 class Within(msgspec.Struct, frozen=True, kw_only=True):
@@ -95,11 +105,16 @@ class PlaceIndex:
     def __init__(self, keyframes: Sequence[Keyframe], *, words: int = WORDS, seed: int = SEED) -> None:
         self.keyframes = tuple(keyframes)
         self._words = train_words([each.descriptors for each in self.keyframes], words, seed)
-        self.vectors: npt.NDArray[np.float32] = np.stack(
-            [view_vector(each.descriptors, self._words) for each in self.keyframes]
-        )
-        self._index = load_faiss().IndexFlatIP(self.vectors.shape[1])
-        self._index.add(self.vectors)
+        vectors = np.empty((len(self.keyframes), self._words.size), dtype=np.float32)
+        for row, each in enumerate(self.keyframes):
+            vectors[row] = view_vector(each.descriptors, self._words)
+        self._index = load_faiss().IndexFlatIP(vectors.shape[1])
+        self._index.add(vectors)  # a copy of them; the only one that stays
+
+    def vector(self, row: int) -> npt.NDArray[np.float32]:
+        """Return the vector of the keyframe at *row*."""
+        found: npt.NDArray[np.float32] = self._index.reconstruct(row)
+        return found
 
     def nearest(
         self, descriptors: Descriptors, count: int, allowed: npt.NDArray[np.int64] | None = None
@@ -131,26 +146,53 @@ class PlaceIndex:
         return np.flatnonzero(np.linalg.norm(places - centre, axis=1) <= within.radius_m).astype(np.int64)
 
 
+def map_limits(keyframe_features: int, keyframes: int = MAX_KEYFRAMES) -> MapLimits:
+    """Return what a map may hold that a service computes with."""
+    return MapLimits(keyframes=keyframes, keyframe_features=keyframe_features, features=MAX_FEATURES)
+
+
 @functools.lru_cache(maxsize=_CACHED_MAPS)
-def open_map(data: bytes) -> tuple[MapVersion, PlaceIndex]:
-    """Return the map of *data* and its index; the last results are cached."""
-    version = decode_map(data)
-    if not 1 <= len(version.keyframes) <= MAX_KEYFRAMES:
+def open_map(
+    data: bytes, keyframe_features: int = MapLimits().keyframe_features
+) -> tuple[MapVersion, PlaceIndex]:
+    """Return the map of *data* and its index; the last results are cached.
+
+    Raises:
+        BadRequest: The bytes are not a map.
+        LimitExceeded: It holds no keyframe, or more keyframes or features than a service computes with.
+    """
+    version = decode_map(data, limits=map_limits(keyframe_features))
+    if not version.keyframes:
         raise LimitExceeded(
-            f"a map of {len(version.keyframes)} keyframes is not within 1..{MAX_KEYFRAMES}",
-            hint="send a part of the map",
+            f"a map of 0 keyframes is not within 1..{MAX_KEYFRAMES}", hint="send a map with keyframes"
         )
     return version, PlaceIndex(version.keyframes)
 
 
 def view_of(camera: Camera, pixels: Array, descriptors: bytes) -> View:
-    """Return the view of a request; raises BadRequest."""
+    """Return the view of a request; raises BadRequest or LimitExceeded."""
     rows = reshaped("pixels", pixels, 2)
+    if len(rows) > MAX_VIEW_FEATURES:
+        raise LimitExceeded(
+            f"a view of {len(rows)} features is above {MAX_VIEW_FEATURES}", hint="send the strongest ones"
+        )
     return View(camera=camera, pixels=rows, descriptors=descriptors_of(descriptors, len(rows)))
 
 
-def register(registry: Registry) -> None:
-    """Add ``place`` to *registry*."""
+def check_comparisons(index: PlaceIndex, view: View, candidates: int) -> None:
+    """Raise LimitExceeded if matching *view* to *candidates* keyframes of *index* would take too long."""
+    largest = max(len(each.descriptors) for each in index.keyframes)
+    comparisons = min(candidates, len(index.keyframes)) * largest * len(view.pixels)
+    if comparisons > _MAX_COMPARISONS:
+        raise LimitExceeded(
+            f"{comparisons} comparisons of features are above {_MAX_COMPARISONS}",
+            hint="ask for fewer candidates, or send fewer features",
+        )
+
+
+def register(registry: Registry, data: DataSettings | None = None) -> None:
+    """Add ``place`` to *registry*; *data* has the limit of a keyframe's features."""
+    keyframe_features = (data or DataSettings()).max_keyframe_features
 
     @registry.service("place", limited=True, warm_up=load_faiss)
     def place(request: PlaceRequest) -> PlaceReply:
@@ -160,7 +202,9 @@ def register(registry: Registry) -> None:
                 f"candidates = {request.candidates} is not within 1..100", hint="5 to 10 are enough"
             )
         view = view_of(request.camera, request.pixels, request.descriptors)
-        _, index = open_map(request.map)
+        _, index = open_map(request.map, keyframe_features)
+        if request.check:
+            check_comparisons(index, view, request.candidates)
         rows = index.nearest(view.descriptors, request.candidates, index.rows_within(request.within))
         found = [_candidate(index.keyframes[row], score, view, request.check) for row, score in rows]
         if request.check:
