@@ -40,6 +40,11 @@ class Admission:
         self._robots: OrderedDict[RobotId, _Robot] = OrderedDict()
         self._tenant_bodies: Counter[str] = Counter()
 
+    @property
+    def known_robots(self) -> int:
+        """How many robots are remembered; bounded, whoever sends."""
+        return len(self._robots)
+
     def begin(self, robot: RobotId, cost: float, now: float, *, has_body: bool) -> None:
         """Take a request of *robot*, which `end` gives back.
 

@@ -1,0 +1,95 @@
+"""A robot's requests are limited by its rate, by those in progress, and by the memory for bodies."""
+
+from __future__ import annotations
+
+import pytest
+
+from rse_pf.config import DataSettings
+from rse_pf.data_server.admission import Admission
+from rse_pf.data_server.http import TooManyRequests
+from rse_pf.errors import Busy
+from rse_pf.identity import RobotId
+
+ROBOT, OTHER = RobotId("acme", "robot-1"), RobotId("rival", "robot-1")
+
+
+def admission(**settings: float) -> Admission:
+    return Admission(DataSettings(**{"max_requests_per_s": 10.0, **settings}))  # type: ignore[arg-type]
+
+
+def ask(admission: Admission, robot: RobotId, now: float, cost: float = 1.0) -> None:
+    admission.begin(robot, cost, now, has_body=False)
+    admission.end(robot, has_body=False)
+
+
+def test_a_robot_beyond_its_rate_is_told_when_to_come_back_and_others_are_served() -> None:
+    gate = admission()
+    for _ in range(100):  # ten seconds' worth may come at once
+        ask(gate, ROBOT, now=0.0)
+
+    with pytest.raises(TooManyRequests) as refused:
+        ask(gate, ROBOT, now=0.0)
+
+    assert refused.value.retry_after_ms == pytest.approx(100.0)
+    ask(gate, OTHER, now=0.0)
+    ask(gate, ROBOT, now=0.1)
+
+
+def test_a_dear_request_counts_for_several() -> None:
+    gate = admission()
+    for _ in range(5):
+        ask(gate, ROBOT, now=0.0, cost=20.0)
+
+    with pytest.raises(TooManyRequests):
+        ask(gate, ROBOT, now=0.0)
+
+
+def test_a_robot_has_a_limit_of_requests_in_progress() -> None:
+    gate = admission(max_requests_per_robot=2)
+    for _ in range(2):
+        gate.begin(ROBOT, 1.0, 0.0, has_body=False)
+
+    with pytest.raises(TooManyRequests, match="2 requests"):
+        gate.begin(ROBOT, 1.0, 0.0, has_body=False)
+
+    gate.begin(OTHER, 1.0, 0.0, has_body=False)
+    gate.end(ROBOT, has_body=False)
+    gate.begin(ROBOT, 1.0, 0.0, has_body=False)
+
+
+def test_bodies_are_limited_for_a_robot_its_tenant_and_all() -> None:
+    gate = admission(max_uploads=8)
+    robots = [RobotId("acme", f"robot-{number}") for number in range(4)]
+
+    for robot in robots[:3]:
+        for _ in range(2):
+            gate.begin(robot, 1.0, 0.0, has_body=True)
+        with pytest.raises(Busy, match="this robot"):
+            gate.begin(robot, 1.0, 0.0, has_body=True)
+    with pytest.raises(Busy, match="this tenant"):
+        gate.begin(robots[3], 1.0, 0.0, has_body=True)
+    for robot in (OTHER, OTHER._replace(tenant="third")):
+        gate.begin(robot, 1.0, 0.0, has_body=True)
+    with pytest.raises(Busy, match="all robots"):
+        gate.begin(OTHER, 1.0, 0.0, has_body=True)
+    gate.end(robots[0], has_body=True)
+    gate.begin(OTHER, 1.0, 0.0, has_body=True)
+
+
+def test_a_refused_request_takes_nothing() -> None:
+    gate = admission(max_requests_per_robot=1, max_uploads=4)
+    gate.begin(ROBOT, 1.0, 0.0, has_body=True)
+    for _ in range(1000):
+        with pytest.raises(TooManyRequests):
+            gate.begin(ROBOT, 1.0, 0.0, has_body=True)
+    gate.end(ROBOT, has_body=True)
+
+    ask(gate, ROBOT, now=0.0, cost=99.0)
+
+
+def test_the_names_of_robots_that_come_and_go_take_no_memory() -> None:
+    gate = admission()
+    for number in range(30_000):
+        ask(gate, RobotId("acme", f"robot-{number}"), now=float(number))
+
+    assert gate.known_robots <= 10_001
