@@ -17,6 +17,10 @@ SERVES = ("rse_pf/backend", "rse_pf/data_server", "lambda_pnp")
 MEANT = {
     "rse_pf/backend/gateway/handshake.py: anonymous: str",
     "rse_pf/backend/sandbox/manager.py: the name in a path",  # finds state without an owner, to refuse it
+    # An operator names a robot by tenant and name, whatever key it was enrolled with.
+    "rse_pf/backend/sandbox/circuit_breaker.py: robot: str | None",
+    "rse_pf/backend/sandbox/manager.py: robot: str | None",
+    "rse_pf/backend/supervisor/orders.py: robot: str | None",
 }
 """What is meant to know a robot as text."""
 _KEYED = {"get", "setdefault", "pop"}

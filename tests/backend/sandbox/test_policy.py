@@ -1,4 +1,7 @@
-"""Every rule about sandboxes: events and the time go in, actions come out, no process is started."""
+"""Every rule about sandboxes: events and the time go in, actions come out, no process is started.
+
+More than 600 lines because every rule has a test of its own, and all of them need the same events.
+"""
 
 from __future__ import annotations
 
