@@ -7,6 +7,7 @@ keeps to its rate is never refused.
 from __future__ import annotations
 
 import math
+import re
 from collections import deque
 from collections.abc import Hashable
 from dataclasses import dataclass, field
@@ -24,6 +25,8 @@ CUT_OFF = math.inf
 _MAX_NAMES = 20000
 """Robots or addresses remembered at a time; those that did nothing wrong are forgotten first."""
 _MIN_RETRY_MS = 1.0
+_ADDRESS = re.compile(r"[0-9a-fA-F.:]{2,45}|\[[0-9a-fA-F.:]{2,45}\]:\d{1,5}")
+"""An IPv4 or IPv6 address, perhaps with a port, as load balancers append it."""
 
 Key = TypeVar("Key", bound=Hashable)
 Value = TypeVar("Value")
@@ -137,11 +140,12 @@ class SourceRates:
         Args:
             peer: The other end of the TCP connection.
             forwarded_for: The ``x-forwarded-for`` headers, joined; each trusted proxy appended one entry, and
-                whatever stands before those may be a lie.
+                whatever stands before those may be a lie.  An entry that is no address is a lie, too.
         """
         trusted = self._serving.trusted_proxies
         entries = [entry.strip() for entry in forwarded_for.split(",") if entry.strip()]
-        return entries[-trusted] if 0 < trusted <= len(entries) else peer
+        told = entries[-trusted] if 0 < trusted <= len(entries) else peer
+        return told if _ADDRESS.fullmatch(told) else peer
 
 
 class PendingHandshakes(Generic[Key]):

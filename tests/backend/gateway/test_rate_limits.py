@@ -138,6 +138,9 @@ def test_a_banned_robot_is_not_forgotten_for_names_that_did_nothing():
         (2, "a lie, 10.0.0.9, 10.0.0.1", "10.0.0.9"),
         (1, "", "peer"),
         (2, "10.0.0.9", "peer"),
+        (1, "2001:db8::1", "2001:db8::1"),
+        (1, f"10.0.0.9, {'x' * 8000}", "peer"),
+        (1, "10.0.0.9, ok\x1b[2J", "peer"),
     ],
 )
 def test_the_source_is_the_address_that_the_first_trusted_proxy_saw(trusted, told, source):
