@@ -5,6 +5,10 @@ robot signs its own short-lived tokens.  Every change reaches all servers of the
 means the deployment on AWS.  remove deletes the public key, so tokens signed by the robot are refused;
 disable refuses all tokens of the robot, also those of rse-pf token issue.
 
+A name with another key is another robot, which sees nothing of the one before.  adopt gives the robot that
+has the name now what was stored under the name before robots' keys counted (versions before 0.3), or, with
+--from-key, under its earlier key.
+
 examples:
   rse-pf robot keygen --out robot.key > robot.json
   rse-pf robot enrol robot-1 --public-key robot.json --scope services:pnp
@@ -12,6 +16,7 @@ examples:
   rse-pf robot disable robot-1
   rse-pf robot enable robot-1
   rse-pf robot remove robot-1
+  rse-pf robot adopt robot-1
 """
 
 from __future__ import annotations
@@ -43,7 +48,7 @@ from rse_pf.terminal import show, show_json
 __all__ = ["add_arguments", "add_place", "max_token_s", "open_access_control", "record_action", "run"]
 
 _DEFAULT = "default"
-_ACTIONS = ("keygen", "enrol", "list", "disable", "enable", "remove")
+_ACTIONS = ("keygen", "enrol", "list", "disable", "enable", "remove", "adopt")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -73,6 +78,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="NAME=N",
         help="enrol: data_bytes, how much it may store (default: data.quota_bytes)",
     )
+    parser.add_argument(
+        "--from-key", default="", metavar="KEY",
+        help="adopt: the id of the robot's earlier key (default: what was stored before keys counted)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--store", help="adopt: dir:PATH or s3:BUCKET (default: data.store, or the local platform's)"
+    )
     parser.add_argument("--json", action="store_true", help="list: as JSON")
     add_place(parser)
 
@@ -99,6 +111,15 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
     longest = max_token_s(settings)
     if args.action == "enrol":
         return _enrol(args, access, now, settings)
+    if args.action == "adopt":
+        from rse_pf.cli.adopt import run_adopt
+
+        adopted = run_adopt(args, settings, access.roster())
+        record_action(
+            args, settings, "robot.adopted", robot, tenant=tenant, source=args.from_key,
+            objects=adopted.objects, snapshots=adopted.snapshots,
+        )  # fmt: skip
+        return 0
     if args.action == "remove":
         return _remove(args, access, settings)
     if args.action == "disable":
@@ -155,7 +176,7 @@ def max_token_s(settings: PlatformSettings) -> float:
 
 def _check(args: argparse.Namespace) -> None:
     """Raise UsageError for arguments that the action does not take."""
-    named = args.action in ("enrol", "disable", "enable", "remove")
+    named = args.action not in ("keygen", "list")
     if named != (args.robot is not None):
         what = "needs the name of a robot" if named else "names no robot"
         raise UsageError(f"rse-pf robot {args.action} {what}", hint="see rse-pf robot --help")
@@ -166,6 +187,8 @@ def _check(args: argparse.Namespace) -> None:
             "--public-key belongs to enrol, which needs it",
             hint="name the file with the public key that keygen printed",
         )
+    if args.action != "adopt" and (args.from_key or args.store):
+        raise UsageError("--from-key and --store are for adopt", hint="see rse-pf robot --help")
     if args.action != "enrol" and (args.scope or args.quota):
         raise UsageError("--scope and --quota are for enrol", hint="enrol the robot again to change them")
 

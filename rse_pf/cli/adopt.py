@@ -1,0 +1,145 @@
+"""Give a robot what is stored under an older identity of it, because an operator says that it is the same.
+
+Versions before 0.3 kept an enrolled robot's objects without its key, and the snapshots of services under its
+bare name; a robot that was enrolled with a new key has what it stored under the old one.  A server never
+decides by itself that two identities are one robot.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import os
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from rse_pf.auth.roster import ROBOT_KEY, Roster
+from rse_pf.aws.storage import open_data_store
+from rse_pf.config import PlatformSettings
+from rse_pf.errors import Conflict, NotFound, UsageError
+from rse_pf.identity import RobotId
+from rse_pf.local.state import state_folder
+from rse_pf.object_store import ObjectStore, is_name, put_pieces, read_range
+from rse_pf.terminal import show
+
+__all__ = ["Adopted", "adopt", "run_adopt"]
+
+_PRIVATE_STORE = "memory:"
+_THUMBPRINT = re.compile(r"[A-Za-z0-9_-]{43}")
+
+_PIECE_BYTES = 1 << 20
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Adopted:
+    """What was moved: objects, their bytes, snapshots of services, and the services that have a newer one."""
+
+    objects: int
+    object_bytes: int
+    snapshots: int
+    kept: tuple[str, ...]
+
+
+def run_adopt(args: argparse.Namespace, settings: PlatformSettings, roster: Roster) -> Adopted:
+    """Do ``rse-pf robot adopt``, print what was moved, and return it.
+
+    Args:
+        args: ``robot``, ``tenant``, ``from_key``, ``store``, ``cloud`` and ``name``.
+        settings: Group data, for the store.
+        roster: The robot is who is enrolled there under its name now, or else who has tokens of the platform.
+
+    Raises:
+        UsageError: The store belongs to another process.
+        StoreError: The store failed in between; the same command continues.
+    """
+    enrolled = roster.find(args.tenant, args.robot)
+    robot = RobotId(args.tenant, args.robot) if enrolled is None else enrolled.id
+    source = robot._replace(enrolment=_thumbprint(args.from_key))
+    adopted = adopt(_open_store(args, settings), robot, source=source)
+    show(
+        f"robot {str(robot)!r} has {adopted.objects} objects more, {adopted.object_bytes} bytes, and "
+        f"{adopted.snapshots} snapshots of services"
+    )
+    for service in adopted.kept:
+        show(f"its snapshot of service {service!r} is newer than the one that was to be moved, and stays")
+    return adopted
+
+
+def _thumbprint(key_id: str) -> str:
+    thumbprint = key_id.removeprefix(ROBOT_KEY)
+    if key_id and not _THUMBPRINT.fullmatch(thumbprint):
+        raise UsageError(
+            f"{key_id[:80]!r} is not the id of a robot's key",
+            hint="rse-pf audit show names removed ones",
+        )
+    return thumbprint
+
+
+def _open_store(args: argparse.Namespace, settings: PlatformSettings) -> ObjectStore:
+    location = args.store or settings.data.store
+    if location == _PRIVATE_STORE:
+        objects = state_folder(args.name, os.environ) / "objects"
+        if args.cloud or not objects.is_dir():
+            raise UsageError("a store in memory belongs to another process", hint="name --store dir:PATH")
+        location = f"dir:{objects}"
+    return open_data_store(settings.replace(data={"store": location}))
+
+
+def adopt(store: ObjectStore, robot: RobotId, *, source: RobotId) -> Adopted:
+    """Move what is stored for *source* to *robot*; after an interruption, the next call continues.
+
+    Snapshots that were stored under the bare name of the robot are moved, too.  A snapshot that *robot* has
+    already stays, and the older one is left where it is.
+
+    Args:
+        store: Of the platform.
+        robot: Who gets it.
+        source: Who it was stored for.
+
+    Raises:
+        StoreError: The store failed in between.
+    """
+    objects = object_bytes = snapshots = 0
+    kept = []
+    for kind in ("objects", "charges") if source != robot else ():
+        old, new = f"{kind}/{source.folder}/", f"{kind}/{robot.folder}/"
+        for info in store.list(old):
+            put_pieces(store, new + info.name.removeprefix(old), _pieces(store, info.name, info.size))
+            store.delete(info.name)
+            objects += kind == "objects"
+            object_bytes += info.size
+    new = f"states/{robot.folder}/"
+    for old in _places_of_snapshots(source, robot):
+        for info in list(store.list(old)):
+            service = info.name.removeprefix(old)
+            try:
+                store.compare_and_swap(new + service, None, store.get(info.name))
+            except Conflict:
+                if _is_equal(store, info.name, new + service):
+                    store.delete(info.name)
+                else:
+                    kept.append(service)
+                continue
+            store.delete(info.name)
+            snapshots += 1
+    return Adopted(objects=objects, object_bytes=object_bytes, snapshots=snapshots, kept=tuple(kept))
+
+
+def _places_of_snapshots(source: RobotId, robot: RobotId) -> Iterator[str]:
+    if source != robot:
+        yield f"states/{source.folder}/"
+    unowned = f"snapshots/{robot.name}"  # by the bare name: versions before 0.3
+    if is_name(unowned):
+        yield f"{unowned}/"
+
+
+def _pieces(store: ObjectStore, name: str, size: int) -> Iterator[bytes]:
+    for start in range(0, size, _PIECE_BYTES):
+        yield read_range(store, name, start, _PIECE_BYTES)
+
+
+def _is_equal(store: ObjectStore, name: str, other: str) -> bool:
+    with contextlib.suppress(NotFound):
+        return store.get(name) == store.get(other)
+    return False
