@@ -110,7 +110,11 @@ class Server:
 
     def ready(self) -> Row:
         """Return the answer of /readyz."""
-        url = f"http://127.0.0.1:{self._identity['control_port']}/readyz"
+        return self.control("/readyz")
+
+    def control(self, path: str) -> Row:
+        """Return what the control port answers."""
+        url = f"http://127.0.0.1:{self._identity['control_port']}{path}"
         try:
             with urllib.request.urlopen(url, timeout=5) as answer:
                 return dict(json.loads(answer.read()))
