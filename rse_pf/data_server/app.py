@@ -20,10 +20,10 @@ from rse_pf.audit.log import AuditLog
 from rse_pf.auth.roster import scopes_allow
 from rse_pf.auth.tokens import Claims, KeySet, token_problem, verify_token
 from rse_pf.config import PlatformSettings
-from rse_pf.data_server.admission import Admission
 from rse_pf.data_server.handlers import Handler, Handlers
 from rse_pf.data_server.http import HttpReply, HttpRequest, MethodNotAllowed, Receive, Send, failure_reply
 from rse_pf.data_server.map_describer import MapDescriber
+from rse_pf.data_server.request_limits import RequestLimits
 from rse_pf.data_server.routes import ROUTES, Route
 from rse_pf.errors import (
     BadRequest,
@@ -82,7 +82,7 @@ class DataServer:
         self._log = log
         self._clock = clock
         self._wall_clock = wall_clock
-        self._admission = Admission(settings.data)
+        self._limits = RequestLimits(settings.data)
         self._closing = contextlib.ExitStack()
         if describe is None:
             describer = MapDescriber(settings, store, clock)
@@ -162,8 +162,8 @@ class DataServer:
             return await handler(request, _ANONYMOUS, path)
         claims = self._claims(request, route.scope, path.get("name", ""), line)
         has_body = route.body is not None
-        self._admission.begin(claims.robot, route.cost, self._clock(), has_body=has_body)
-        admitted.callback(self._admission.end, claims.robot, has_body=has_body)
+        self._limits.begin(claims.robot, route.cost, self._clock(), has_body=has_body)
+        admitted.callback(self._limits.end, claims.robot, has_body=has_body)
         if not has_body and not await request.drain(self._settings.data.part_bytes):
             raise BadRequest("this request takes no body", hint="leave it out")
         return await handler(request, claims, path)

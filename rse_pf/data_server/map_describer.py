@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from typing import Protocol
 
 import msgspec
 
@@ -20,7 +21,7 @@ from rse_pf.limited_process import Handler, LimitedProcesses
 from rse_pf.maps.describe import MapSummary, describe_map
 from rse_pf.object_store import ObjectStore
 
-__all__ = ["MapDescriber", "make_handler", "max_map_bytes"]
+__all__ = ["MapDescriber", "Processes", "make_handler", "max_map_bytes"]
 
 _TARGET = f"{__name__}:make_handler"
 _PRIVATE_STORE = "memory:"
@@ -35,15 +36,39 @@ def max_map_bytes(settings: PlatformSettings) -> int:
     return _MAX_INFLATED * settings.data.max_object_bytes
 
 
+class Processes(Protocol):
+    """What `LimitedProcesses` offers."""
+
+    def call(self, data: bytes, timeout_s: float) -> bytes:
+        """Return the reply of a process to *data*; raises Crashed if the data ended it."""
+
+    def close(self) -> None:
+        """End all processes."""
+
+
 class MapDescriber:
     """The process of one data server that reads maps; the first map starts it."""
 
-    def __init__(self, settings: PlatformSettings, store: ObjectStore, clock: Callable[[], float]) -> None:
-        self._store = None if settings.data.store != _PRIVATE_STORE else store
+    def __init__(
+        self,
+        settings: PlatformSettings,
+        store: ObjectStore,
+        clock: Callable[[], float],
+        processes: Processes | None = None,
+    ) -> None:
+        """Remember what is needed; nothing is started.
+
+        Args:
+            settings: Groups data, serving and services.
+            store: Is read here only if ``data.store`` is in the memory of this process.
+            clock: Monotonic seconds.
+            processes: What reads maps; None means a process with the limits of ``serving``.
+        """
+        self._store = store if settings.data.store == _PRIVATE_STORE else None
         self._clock = clock
         self._crashes = CrashRecord(settings.services)
         self._timeout_s = _WALL_S_PER_CPU_S * settings.serving.max_compute_s
-        self._processes = LimitedProcesses(
+        self._processes = processes or LimitedProcesses(
             _TARGET,
             configuration=json.dumps(settings.to_dict()),
             memory_bytes=settings.serving.max_compute_memory_bytes,
@@ -69,10 +94,6 @@ class MapDescriber:
             self._crashes.crashed(robot, self._clock())
             raise
         return msgspec.msgpack.decode(reply, type=MapSummary)
-
-    def pids(self) -> list[int]:
-        """Return the ids of the processes that run."""
-        return self._processes.pids()
 
     def close(self) -> None:
         """End the processes; a call that is under way raises WorkerLost."""

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import asyncio
 import os
 import tempfile
+import threading
+from collections.abc import Iterator, Mapping
 from pathlib import Path
+from typing import Any
 
 import pytest
 from fake_data_service import KEY, Service, small_settings
@@ -206,6 +210,71 @@ class Failing(MemoryStore):
         if not self.reads:
             raise self.error
         return super().head(name)
+
+
+def test_a_robot_above_its_rate_gets_429_and_others_are_served() -> None:
+    service = Service(small_settings(max_requests_per_s=0.5), MemoryStore())  # five at once
+
+    statuses = [service.ask("HEAD", OBJECT).status for _ in range(6)]
+    refused = service.ask("GET", OBJECT)
+
+    assert statuses == [404] * 5 + [429]
+    assert (refused.status, refused.json["code"], refused.headers["retry-after"]) == (429, "busy", "2")
+    assert service.ask("GET", OBJECT, robot="robot-2").status == 404
+    service.now += 2.0
+    assert service.ask("GET", OBJECT).status == 404
+
+
+def test_a_list_costs_more_than_a_plain_request() -> None:
+    service = Service(small_settings(max_requests_per_s=1.0), MemoryStore())
+
+    statuses = [service.ask("GET", "/data/v1/objects").status for _ in range(3)]
+
+    assert statuses == [200, 200, 429]
+
+
+class SlowList(MemoryStore):
+    """Stops within a list until it is let go."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.listed, self.gone, self.ended = threading.Event(), threading.Event(), threading.Event()
+        self.read = 0
+
+    def list(self, prefix: str = "", after: str = "") -> Iterator[ObjectInfo]:
+        try:
+            for self.read in range(1, 2000):
+                yield ObjectInfo(name=f"{prefix}{self.read:064x}", size=1)
+                self.listed.set()
+                self.gone.wait(30)
+        finally:
+            self.ended.set()
+
+
+def test_work_ends_when_its_robot_closed_the_connection() -> None:
+    store = SlowList()
+    service = Service(small_settings(), store)
+    messages = [{"type": "http.request", "body": b"", "more_body": False}]
+
+    async def receive() -> dict[str, Any]:
+        if not messages:
+            await asyncio.to_thread(store.listed.wait, 30)
+            return {"type": "http.disconnect"}
+        return messages.pop()
+
+    async def send(message: Mapping[str, Any]) -> None:
+        raise AssertionError("nobody reads this")
+
+    scope = {
+        "type": "http", "method": "GET", "path": "/data/v1/objects", "query_string": b"",
+        "headers": [(b"authorization", f"Bearer {service.token()}".encode())],
+    }  # fmt: skip
+    asyncio.run(service.app(scope, receive, send))
+    store.gone.set()
+
+    assert store.ended.wait(30)
+    assert store.read == 2, "the work ends at the next object"
+    assert service.lines[-1]["status"] == "disconnected"
 
 
 def test_a_full_disk_is_507_and_uses_no_quota() -> None:

@@ -15,7 +15,7 @@ from rse_pf.errors import Busy
 from rse_pf.identity import RobotId
 from rse_pf.token_bucket import TokenBucket
 
-__all__ = ["Admission"]
+__all__ = ["RequestLimits"]
 
 _BURST_S = 10.0
 """A robot may make the requests of this time at once."""
@@ -32,7 +32,7 @@ class _Robot:
     bodies: int = 0
 
 
-class Admission:
+class RequestLimits:
     """The requests of all robots that one data server works on; used by one thread."""
 
     def __init__(self, settings: DataSettings) -> None:

@@ -5,19 +5,19 @@ from __future__ import annotations
 import pytest
 
 from rse_pf.config import DataSettings
-from rse_pf.data_server.admission import Admission
 from rse_pf.data_server.http import TooManyRequests
+from rse_pf.data_server.request_limits import RequestLimits
 from rse_pf.errors import Busy
 from rse_pf.identity import RobotId
 
 ROBOT, OTHER = RobotId("acme", "robot-1"), RobotId("rival", "robot-1")
 
 
-def admission(**settings: float) -> Admission:
-    return Admission(DataSettings(**{"max_requests_per_s": 10.0, **settings}))  # type: ignore[arg-type]
+def admission(**settings: float) -> RequestLimits:
+    return RequestLimits(DataSettings(**{"max_requests_per_s": 10.0, **settings}))  # type: ignore[arg-type]
 
 
-def ask(admission: Admission, robot: RobotId, now: float, cost: float = 1.0) -> None:
+def ask(admission: RequestLimits, robot: RobotId, now: float, cost: float = 1.0) -> None:
     admission.begin(robot, cost, now, has_body=False)
     admission.end(robot, has_body=False)
 
