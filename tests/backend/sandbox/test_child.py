@@ -114,6 +114,11 @@ def entries():
         below[:] = [name for name in below if os.path.join(folder, name) not in msgspec.json.decode(KNOWN)]
     return {"found": found}
 
+def writable():
+    wanted = os.ST_RDONLY | os.ST_NOSUID | os.ST_NODEV
+    mounted = [name for name in msgspec.json.decode(KNOWN) if os.path.exists(name) and not os.path.islink(name)]
+    return {"found": [name for name in mounted if os.statvfs(name).f_flag & wanted != wanted], "of": len(mounted)}
+
 def heap():
     held = []
     try:
@@ -324,6 +329,13 @@ def test_nothing_but_modules_libraries_and_the_service_can_be_read(ask, tmp_path
 
     assert found <= allowed | folders_on_the_way | own, found - allowed - folders_on_the_way - own
     assert own - {"/dev"} <= found
+
+
+def test_all_that_can_be_read_is_mounted_read_only_without_devices_and_set_user_ids(ask):
+    writable = ask("writable")
+
+    assert writable["found"] == []
+    assert writable["of"] >= 4
 
 
 def test_the_readable_paths_hold_no_program_home_setting_or_other_service(tmp_path):
