@@ -234,10 +234,13 @@ class _Template:
         with self._locked(until):
             if self._is_closed:
                 raise WorkerLost("the processes were closed", hint="try again elsewhere")
-            if self._process is None:
-                self._start()
-            self._wait_until_ready(until)
-            ours, theirs = socket.socketpair()
+            try:
+                if self._process is None:
+                    self._start()
+                self._wait_until_ready(until)
+                ours, theirs = socket.socketpair()
+            except OSError as error:
+                raise WorkerLost(f"no process can be started: {error.strerror}", hint="try again") from error
             with theirs, contextlib.ExitStack() as undo:
                 undo.enter_context(ours)
                 pid = int(self._ask({"do": "fork"}, theirs)["pid"])

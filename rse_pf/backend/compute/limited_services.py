@@ -6,15 +6,17 @@ ended two processes is kept from these services for a while.
 
 from __future__ import annotations
 
+import traceback
+
 from rse_pf.backend.compute.process import TARGET, configuration_of, decode_reply, encode_request
 from rse_pf.backend.ports import WorkerContext
 from rse_pf.backend.scheduling.scheduler import QueuedCommand
 from rse_pf.config import PlatformSettings
 from rse_pf.crash_record import CrashRecord
-from rse_pf.errors import Busy, Crashed, Expired, RsePfError
+from rse_pf.errors import Busy, Crashed, Expired, InternalError, RsePfError
 from rse_pf.limited_process import LimitedProcesses
 from rse_pf.service import failure_of
-from rse_pf.wire import Failure, Result
+from rse_pf.wire import Command, Failure, Result
 
 __all__ = ["LimitedServices", "limited_processes"]
 
@@ -49,7 +51,11 @@ class LimitedServices:
         try:
             return self._compute(queued)
         except RsePfError as error:
-            return failure_of(error, queued.command, server=self._context.server_id)
+            failure = error
+        except Exception as error:  # noqa: BLE001  a defect must not end the thread of the queue
+            self._log_defect(queued.command, "".join(traceback.format_exception(error)))
+            failure = InternalError(f"service {queued.command.service!r} failed", hint="see the server's log")
+        return failure_of(failure, queued.command, server=self._context.server_id)
 
     def blocked_robots(self, now: float) -> int:
         """Return how many robots are refused now."""
@@ -81,7 +87,10 @@ class LimitedServices:
             raise
         answer, defect = decode_reply(reply, command, server=context.server_id)
         if defect:
-            context.log.error(
-                "defect", service=command.service, id=command.id, trace=command.trace, traceback=defect
-            )
+            self._log_defect(command, defect)
         return answer
+
+    def _log_defect(self, command: Command, text: str) -> None:
+        self._context.log.error(
+            "defect", service=command.service, id=command.id, trace=command.trace, traceback=text
+        )

@@ -10,12 +10,14 @@ from typing import Any
 from fakes import FakeLoop, FakeWire
 
 from rse_pf.auth.tokens import KeySet
+from rse_pf.backend.compute.lane import ComputeLane
+from rse_pf.backend.compute.limited_services import LimitedServices
 from rse_pf.backend.gateway.admission import Admission
-from rse_pf.backend.gateway.answers import Answers
+from rse_pf.backend.gateway.answers import Answers, EncodedAnswer
 from rse_pf.backend.gateway.audit_recorder import AuditRecorder
 from rse_pf.backend.gateway.connection import RobotConnection
 from rse_pf.backend.gateway.decoder_thread import DecoderThread
-from rse_pf.backend.gateway.dispatcher import ComputeQueue, Dispatcher, JobQueue, NoQueue, SandboxQueue
+from rse_pf.backend.gateway.dispatcher import Dispatcher, JobQueue, NoQueue, SandboxQueue
 from rse_pf.backend.gateway.handshake import Accepted, HandshakePolicy
 from rse_pf.backend.gateway.token_watch import TokenWatch
 from rse_pf.backend.log import JsonLog
@@ -25,6 +27,7 @@ from rse_pf.backend.scheduling.cpu_throttle import CpuThrottle
 from rse_pf.backend.scheduling.scheduler import Scheduler
 from rse_pf.config import PlatformSettings
 from rse_pf.identity import RobotId
+from rse_pf.limited_process import LimitedProcesses
 from rse_pf.object_store import MemoryStore
 from rse_pf.service import Registry
 from rse_pf.services import echo
@@ -48,7 +51,7 @@ class WorkerParts:
         store: MemoryStore | None = None,
         sandboxes: SandboxQueue | None = None,
         jobs: JobQueue | None = None,
-        compute: ComputeQueue | None = None,
+        processes: LimitedProcesses | None = None,
         emulated_cores: float = 0.0,
     ) -> None:
         self.settings = settings or PlatformSettings()
@@ -98,10 +101,23 @@ class WorkerParts:
             throttle=CpuThrottle(emulated_cores, now=self.loop.now, cpu=self.clocks.cpu),
             decoder=self.decoder,
             answers=self.answers,
-            compute=compute or NoQueue(),
+            compute=NoQueue() if processes is None else self._lane(processes),
             sandboxes=sandboxes or NoQueue(),
             jobs=jobs or NoQueue(),
             token_watch=self.token_watch,
+        )
+
+    def _lane(self, processes: LimitedProcesses) -> ComputeLane[EncodedAnswer]:
+        return ComputeLane(
+            [service.name for service in self.registry if service.limited],
+            LimitedServices(self.context, processes),
+            scheduler=Scheduler(self.settings.serving),
+            threads=self.settings.serving.compute_processes,
+            loop=self.loop,
+            monotonic=self.clocks.monotonic,
+            encode=self.answers.encode,
+            send=self.answers.send,
+            refuse=self.answers.send_refusal,
         )
 
     def join(
