@@ -116,8 +116,9 @@ def entries():
 
 def writable():
     wanted = os.ST_RDONLY | os.ST_NOSUID | os.ST_NODEV
-    mounted = [name for name in msgspec.json.decode(KNOWN) if os.path.exists(name) and not os.path.islink(name)]
-    return {"found": [name for name in mounted if os.statvfs(name).f_flag & wanted != wanted], "of": len(mounted)}
+    known = msgspec.json.decode(KNOWN)
+    flags = {name: os.statvfs(name).f_flag for name in known if os.path.exists(name)}
+    return {"found": [name for name, flag in flags.items() if flag & wanted != wanted], "of": len(flags)}
 
 def heap():
     held = []
