@@ -4,7 +4,7 @@
 
 A service of 0.3 s is asked by six robots of three tenants, once a second each.  Beside them, after a quiet
 window of a quarter of the time, a robot of a fourth tenant asks with deadlines of 60 ms as fast as it can:
-in the row ``own`` with a payload of its own, in the row ``shared`` with the payload that all others use.
+in the row ``own`` with another payload each time, in the row ``shared`` with the payload that all others use.
 In the row ``sandboxes``, 64 robots of one tenant ask without a pause for the 16 sandboxes of a server before
 the others come.  Latency counts from the planned time.
 
@@ -102,7 +102,7 @@ async def other(
             planned += PERIOD_S
 
 
-async def deadlines(folder: Path, seconds: float, *, row: str, payload: Row) -> Row:
+async def deadlines(folder: Path, seconds: float, *, row: str, payload_of: Callable[[int], Row]) -> Row:
     """Let one robot overrun its deadlines beside the others."""
     quiet, beside, attacker = Seen(), Seen(), Seen()
     async with serving(folder) as server:
@@ -114,7 +114,10 @@ async def deadlines(folder: Path, seconds: float, *, row: str, payload: Row) -> 
         ]
         async with robot_of(server, "hostile", "robot-0") as robot:
             await asyncio.sleep(attack_s - time.perf_counter())
+            number = 1000
             while time.perf_counter() < end_s:
+                number += 1
+                payload = payload_of(number)
                 code = await ask(robot, payload, HOSTILE_DEADLINE_S, time.perf_counter(), attacker)
                 await asyncio.sleep(0.0 if code == "expired" else HOSTILE_DEADLINE_S)
         await asyncio.gather(*others)
@@ -176,9 +179,14 @@ async def measure(only: list[str], seconds: float) -> list[Row]:
         (made / "service.json").write_text(json.dumps(manifest))
         install(made, folder / "services")
         works: dict[str, Callable[[], Awaitable[Row]]] = {
-            "own": lambda: deadlines(folder, seconds, row="deadlines of 60 ms", payload={"number": 1}),
+            "own": lambda: deadlines(
+                folder, seconds, row="deadlines of 60 ms", payload_of=lambda n: {"number": n}
+            ),
             "shared": lambda: deadlines(
-                folder, seconds, row="the same with a payload that others use", payload=COMMON_PAYLOAD
+                folder,
+                seconds,
+                row="the same with a payload that others use",
+                payload_of=lambda _: COMMON_PAYLOAD,
             ),
             "sandboxes": lambda: sandboxes(folder, min(seconds, 60.0)),
         }
