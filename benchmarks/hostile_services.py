@@ -28,10 +28,11 @@ MIB = 1 << 20
 MEMORY_BYTES, SCRATCH_BYTES = 512 * MIB, 16 * MIB
 HOSTILE = """
 from __future__ import annotations
-import ctypes, mmap, os, socket, threading, time, msgspec
+import ctypes, hashlib, mmap, os, socket, threading, time, msgspec
 
 libc = ctypes.CDLL(None, use_errno=True)
 HELD = []
+BLOCK = bytes(1 << 20)
 
 class Request(msgspec.Struct):
     do: str = "look"
@@ -115,12 +116,12 @@ def sockets():
         except BlockingIOError: pass
 
 def burn(end):
-    while time.monotonic() < end: pass
+    while time.monotonic() < end: hashlib.sha256(BLOCK).digest()  # without the interpreter's lock
 
 def serve(request: Request) -> Reply:
     end = time.monotonic() + request.seconds
     if request.do in ("work_on", "work_in"):
-        for _ in range(8): threading.Thread(target=burn, args=(end,), daemon=True).start()
+        for _ in range(6): threading.Thread(target=burn, args=(end,), daemon=True).start()
         if request.do == "work_in": burn(end)
     elif request.do != "look":
         globals()[request.do]()

@@ -119,8 +119,12 @@ class ZygoteClient:
             "total_bytes": limits.memory_bytes,
             "max_bytes": self._settings.session.max_inflated_bytes,
         }  # fmt: skip
-        # No credentials, and no threads of the linear algebra library: it will be forked.
-        variables = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "PYTHONDONTWRITEBYTECODE": "1"}
+        # No credentials, and no threads of the linear algebra library: it will be forked.  Each arena of the
+        # allocator takes 64 MiB of address space, which is limited; with one for each thread, 7 threads fit.
+        variables = {
+            "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "PYTHONDONTWRITEBYTECODE": "1",
+            "MALLOC_ARENA_MAX": "2",
+        }  # fmt: skip
         with theirs:
             self._process = subprocess.Popen(
                 [sys.executable, "-m", "rse_pf.backend.sandbox.zygote", str(theirs.fileno())],
