@@ -46,10 +46,12 @@ _SHARED_PREFIXES = ("/usr", "/usr/local")
 class SandboxPlan:
     """What every sandbox of a server has in common.
 
-    ``max_bytes`` limits a reply, and ``missing`` names the means of isolation that this kernel lacks.
+    ``readable`` is what `readable_paths` returned, ``max_bytes`` limits a reply, and ``missing`` names the
+    means of isolation that this kernel lacks.
     """
 
     services: Mapping[str, InstalledService]
+    readable: Sequence[Path]
     memory_bytes: int
     scratch_bytes: int
     max_bytes: int
@@ -122,7 +124,7 @@ def _reset_process(output: int) -> None:
 def _isolate(plan: SandboxPlan, uid: int | None) -> None:
     owner = os.getuid() if uid is None else uid
     if "root" not in plan.missing:
-        isolation.make_root(readable_paths(list(plan.services.values())), plan.scratch_bytes, owner)
+        isolation.make_root(plan.readable, plan.scratch_bytes, owner)
     alone = uid is not None or "namespaces" not in plan.missing
     isolation.limit_resources(plan.memory_bytes, plan.scratch_bytes, alone=alone)
     if "privileges" not in plan.missing:

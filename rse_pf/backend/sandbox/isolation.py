@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import ctypes
 import os
-import platform
 import resource
 import struct
 from collections.abc import Callable, Collection, Sequence
@@ -113,9 +112,10 @@ def make_root(readable: Sequence[Path], scratch_bytes: int, owner: int) -> None:
         os.symlink("scratch", base + "/tmp")
     old = base + "/old"
     os.mkdir(old)
-    number = _SYS_PIVOT_ROOT.get(platform.machine())
+    machine = os.uname().machine
+    number = _SYS_PIVOT_ROOT.get(machine)
     if number is None:
-        raise IsolationUnavailable("root", f"pivot_root is unknown on {platform.machine()}")
+        raise IsolationUnavailable("root", f"pivot_root is unknown on {machine}")
     _call("root", _LIBC.syscall, number, base.encode(), old.encode())
     os.chdir("/")
     _call("root", _LIBC.umount2, b"/old", _MNT_DETACH)
@@ -166,7 +166,7 @@ def give_up_privileges(uid: int | None) -> None:
 
 def forbid_system_calls(languages: Collection[str] = LANGUAGES) -> None:
     """Refuse from now on every system call that none of *languages* needs; `seccomp` has the lists."""
-    machine = platform.machine()
+    machine = os.uname().machine
     if machine not in MACHINES or struct.calcsize("P") != 8:
         raise IsolationUnavailable("seccomp", f"no filter is written for {machine}")
     code = filter_program(languages, machine, os.getpid())
@@ -192,11 +192,14 @@ def _free_mount_point(readable: Sequence[Path]) -> str:
 
 def _outermost(paths: Sequence[Path]) -> list[Path]:
     """Return *paths* without those inside another one, in an order in which they can be mounted."""
-    chosen: list[Path] = []
-    for path in sorted({Path(os.path.normpath(path)) for path in paths}, key=lambda p: len(p.parts)):
-        if not any(path.is_relative_to(outer) and not outer.is_symlink() for outer in chosen):
+    chosen: list[str] = []
+    inside: tuple[str, ...] = ()
+    for path in sorted({os.path.normpath(path) for path in paths}, key=lambda name: name.count("/")):
+        if not path.startswith(inside):
             chosen.append(path)
-    return chosen
+            if not os.path.islink(path):
+                inside += (path + "/",)
+    return [Path(path) for path in chosen]
 
 
 def _bind(path: Path, base: str) -> None:

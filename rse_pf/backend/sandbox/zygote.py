@@ -65,12 +65,14 @@ class _Zygote:
         }
         _warm_up({service.language for service in services.values()})
         self._first_uid = _FIRST_UID + os.getpid() * _SLOTS if os.getuid() == 0 else None
+        readable = readable_paths(list(services.values()))
         self._plan = SandboxPlan(
             services=services,
+            readable=readable,
             memory_bytes=config["memory_bytes"],
             scratch_bytes=config["scratch_bytes"],
             max_bytes=config["max_bytes"],
-            missing=self._missing_isolation(list(services.values()), config["scratch_bytes"]),
+            missing=self._missing_isolation(readable, config["scratch_bytes"]),
         )
         total_bytes = config["total_bytes"]
         self._cgroups = Cgroups(
@@ -211,12 +213,12 @@ class _Zygote:
                 how = self._cgroups.remove(child.number) or how
                 self._report(event="gone", id=child.number, how=how)
 
-    def _missing_isolation(self, services: list[InstalledService], scratch_bytes: int) -> list[str]:
+    def _missing_isolation(self, readable: list[Path], scratch_bytes: int) -> list[str]:
         uid = self._first_uid
 
         def make_root() -> None:
             isolation.enter_namespaces()
-            isolation.make_root(readable_paths(services), scratch_bytes, os.getuid() if uid is None else uid)
+            isolation.make_root(readable, scratch_bytes, os.getuid() if uid is None else uid)
 
         return isolation.missing_isolation(
             [

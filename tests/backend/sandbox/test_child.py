@@ -220,6 +220,7 @@ def sandbox(tmp_path: Path) -> Iterator[Callable[[str, str, str], Ask]]:
         service = read_service(tmp_path)
         plan = SandboxPlan(
             services={"tried": service},
+            readable=readable_paths([service]),
             memory_bytes=MEMORY,
             scratch_bytes=SCRATCH,
             max_bytes=1 << 24,
