@@ -151,6 +151,7 @@ class ZygoteClient:
             )
         if missing:
             self._log.warning("weak-isolation", missing=", ".join(missing))
+        self._log.info("sandbox-limits", cgroup=", ".join(report["cgroup"]))
         return missing
 
     def _listen(self) -> None:
@@ -174,14 +175,16 @@ class ZygoteClient:
                 self._on_lost()
                 return
             report = json.loads(message)
-            number = report["id"]
             if report["event"] == "created":
-                (self._handles[number],) = handles
-                if number in self._paused:
-                    self._signal(number, signal.SIGSTOP)
+                self._created(report["id"], *handles)
             elif report["event"] == "gone":
-                self._forget(number)
-                self._on_gone(number, report["how"])
+                self._forget(report["id"])
+                self._on_gone(report["id"], report["how"])
+
+    def _created(self, number: int, handle: int) -> None:
+        self._handles[number] = handle
+        if number in self._paused:
+            self._signal(number, signal.SIGSTOP)
 
     def _forget(self, number: int) -> None:
         self._paused.discard(number)

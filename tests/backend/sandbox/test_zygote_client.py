@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import os
+import signal
 import socket
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -128,6 +131,30 @@ def test_a_sandbox_that_is_paused_while_it_starts_waits_too() -> None:
         assert await reports.ends.get() == (3, "signal SIGKILL")
 
     run(test)
+
+
+def test_a_zygote_that_is_killed_is_replaced_by_one_that_takes_orders() -> None:
+    async def test(zygote: ZygoteClient, reports: Reports, log: Log) -> None:
+        with await create(zygote, 3):
+            os.kill(zygote_of(os.getpid()), signal.SIGKILL)
+            assert await reports.ends.get() == (-1, "lost")
+        (await create(zygote, 4)).close()
+
+        assert await reports.ends.get() == (4, "exit code 0")
+        assert "zygote-lost" in log.events
+
+    run(test)
+
+
+def zygote_of(worker: int) -> int:
+    """Return the pid of the zygote that *worker* started."""
+    for folder in Path("/proc").glob("[0-9]*"):
+        with contextlib.suppress(OSError):
+            is_zygote = b"sandbox.zygote" in (folder / "cmdline").read_bytes()
+            parent = int((folder / "stat").read_text().rpartition(")")[2].split()[1])
+            if is_zygote and parent == worker:
+                return int(folder.name)
+    raise AssertionError("no zygote")
 
 
 def test_a_zygote_that_does_not_start_is_a_typed_error(monkeypatch: pytest.MonkeyPatch) -> None:
