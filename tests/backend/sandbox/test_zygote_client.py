@@ -52,14 +52,15 @@ def run(test: Callable[[ZygoteClient, Reports, Log], Any]) -> None:
     """Run *test* with a zygote that has no services, and end the zygote."""
 
     async def with_zygote() -> None:
-        reports, log = Reports(), Log()
-        zygote = ZygoteClient(
-            [], SETTINGS, loop=asyncio.get_running_loop(), log=log, on_gone=reports.gone, on_lost=reports.lost
-        )
+        reports, log, loop = Reports(), Log(), asyncio.get_running_loop()
+        failures: list[dict[str, Any]] = []
+        loop.set_exception_handler(lambda _, context: failures.append(context))
+        zygote = ZygoteClient([], SETTINGS, loop=loop, log=log, on_gone=reports.gone, on_lost=reports.lost)
         try:
             await asyncio.wait_for(test(zygote, reports, log), WAIT_S)
         finally:
             zygote.close()
+        assert failures == []
 
     asyncio.run(with_zygote())
 
