@@ -56,7 +56,8 @@ enum class Loss {
     kSquared,    // squared error; infinite cost where a point lies behind the camera
 };
 
-// Fill the normal equations at `pose` and return the cost; `agree` counts the rows with weight.
+// Fill the normal equations at `pose` and return the cost; under the truncated loss, `agree` becomes the number
+// of rows that have weight.
 template <class T, Loss loss>
 static double linearised(const rse_pf::Columns<T>& rows, int64_t count, const Optics& optics, const Pose& pose,
                          double limit2, Normal& normal, int64_t& agree) {
@@ -107,7 +108,7 @@ static double linearised(const rse_pf::Columns<T>& rows, int64_t count, const Op
             cost = cost + error2 * weight;
             behind = behind + where_less(near, depth, zero, one) * weight;
         }
-        weights = weights + weight;
+        if (loss == Loss::kTruncated) weights = weights + weight;
         const F gu = weight * fx, gv = weight * fy;
         const F wu = gu * fx, wv = gv * fy;
         const F eu = gu * ru, ev = gv * rv;
@@ -150,8 +151,10 @@ static double linearised(const rse_pf::Columns<T>& rows, int64_t count, const Op
         for (int j = i; j < 6; ++j) normal.A[i][j] = static_cast<double>(sum<T>(*upper[i][j]));
         normal.b[i] = static_cast<double>(sum<T>(*right[i]));
     }
-    agree = static_cast<int64_t>(sum<T>(weights));
-    if (loss == Loss::kTruncated) return static_cast<double>(sum<T>(cost));
+    if (loss == Loss::kTruncated) {
+        agree = static_cast<int64_t>(sum<T>(weights));
+        return static_cast<double>(sum<T>(cost));
+    }
     if (static_cast<double>(sum<T>(behind)) > 0.0) return kInfinity;
     return loss == Loss::kCauchy ? limit2 * logs : static_cast<double>(sum<T>(cost));
 }

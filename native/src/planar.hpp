@@ -43,9 +43,9 @@ static bool refine_mirrored(const rse_pf::Columns<double>& rows, int64_t count, 
 }
 
 // Find the second pose of the gathered inliers and its sum of squared errors (px^2), which is -1 where the
-// refinement fails or comes back to `pose`.
+// refinement fails or comes back to `pose`.  `origin` is the origin of the rows in the caller's world.
 static double second_pose(const rse_pf::Workspace& data, int64_t count, const Optics& optics, const Pose& pose,
-                          Pose& other) {
+                          const Vector3& origin, Pose& other) {
     const rse_pf::Columns<double>& rows = data.inliers;
     Vector3 centre = {0.0, 0.0, 0.0};
     for (int64_t i = 0; i < count; ++i)
@@ -78,12 +78,12 @@ static double second_pose(const rse_pf::Workspace& data, int64_t count, const Op
     };
     other = moved(turn, centre - rotated(turn, centre), pose);
     if (!refine_mirrored(rows, count, optics, other)) return -1.0;
-    // The poses differ where their rotations or their camera centres in the world's frame do.
+    // The poses are told apart as pose_difference in rse_pf/geometry.py does, in the caller's world.
     double D[3][3];
     for (int i = 0; i < 3; ++i)
         for (int j = 0; j < 3; ++j)
             D[i][j] = other.R[0][i] * pose.R[0][j] + other.R[1][i] * pose.R[1][j] + other.R[2][i] * pose.R[2][j];
-    const Vector3 apart = pose.t - other.t;
+    const Vector3 apart = (pose.t - rotated(pose.R, origin)) - (other.t - rotated(other.R, origin));
     const double metres = square_root(dot(apart, apart));
     const double a = D[2][1] - D[1][2], b = D[0][2] - D[2][0], d = D[1][0] - D[0][1];
     const double sine_apart = 0.5 * square_root(a * a + b * b + d * d);

@@ -9,8 +9,8 @@
 namespace RSE_PF_ISA {
 
 constexpr int kLocalSteps = 4;
-constexpr int kLastSteps = 25;
-constexpr double kDoneStep = 1e-8;
+constexpr int kLastSteps = 100;
+constexpr double kDoneStep = 1e-6;  // metres and radians: what is left then is a tenth of it
 
 // A sequence of pseudo-random numbers; Steele, Lea and Flood, OOPSLA 2014 (SplitMix64).
 struct Sampler {
@@ -195,7 +195,8 @@ static int64_t refine_inliers(const rse_pf::Workspace& data, int64_t n, const Op
 }
 
 // Return the robust pose of the rows as they stand in the workspace.
-static Search propose(const rse_pf::Task& task, const Optics& optics, const SearchOptions& options, Pose& pose) {
+static Search propose(const rse_pf::Task& task, const Optics& optics, const SearchOptions& options,
+                      const Vector3& origin, Pose& pose) {
     Model best;
     const Search found = search(task, optics, options, best);
     if (found != Search::kFound) return found;
@@ -206,7 +207,7 @@ static Search propose(const rse_pf::Task& task, const Optics& optics, const Sear
     if (count >= 4 && depth_variation(data, count) < kWeakPerspective) {
         // The search may have ended in the worse one of the two poses of a plane.
         Pose twin;
-        if (second_pose(data, count, optics, pose, twin) >= 0.0) {
+        if (second_pose(data, count, optics, pose, origin, twin) >= 0.0) {
             refine_inliers(data, n, optics, options.limit2, twin);
             const double cost = score(data.single, n, optics, pose, options.limit2, kInfinity);
             if (score(data.single, n, optics, twin, options.limit2, cost) < cost) pose = twin;

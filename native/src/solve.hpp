@@ -77,7 +77,7 @@ static int32_t judged(const rse_pf::Task& task, const Vector3& centre) {
     const SearchOptions options = {limit2, request.confidence, request.max_iterations,
                                    request.min_iterations, request.seed};
     Pose pose;
-    const Search found = propose(task, optics, options, pose);
+    const Search found = propose(task, optics, options, centre, pose);
     if (found != Search::kFound) return status_of(found, task);
     give(result.T_camera_world, pose, centre);
     if ((request.flags & RSE_PF_PNP_PROPOSE) != 0) return RSE_PF_PNP_SOLVED;
@@ -117,7 +117,7 @@ static int32_t judged(const rse_pf::Task& task, const Vector3& centre) {
     result.reason = weakness(request, result, shape);
     if (depth_variation(data, count) < kWeakPerspective) {
         Pose twin;
-        const double second = second_pose(data, count, optics, pose, twin);
+        const double second = second_pose(data, count, optics, pose, centre, twin);
         if (second >= 0.0) {
             result.other_rmse_px = square_root(second / static_cast<double>(count));
             const double difference = (second - squares) / variance;
@@ -132,7 +132,7 @@ static int32_t judged(const rse_pf::Task& task, const Vector3& centre) {
     few.max_iterations = few.max_iterations < kMirrorIterations ? few.max_iterations : kMirrorIterations;
     reflect(data, n);
     Pose reflected;
-    const Search other = propose(task, optics, few, reflected);
+    const Search other = propose(task, optics, few, centre * -1.0, reflected);
     if (other == Search::kExpired || other == Search::kCancelled) return status_of(other, task);
     if (other == Search::kFound) {
         project(data.all, n, optics, reflected, data);

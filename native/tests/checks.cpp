@@ -5,6 +5,7 @@
 #include <cmath>
 #include <cstdio>
 #include <cstdlib>
+#include <cstring>
 #include <random>
 #include <vector>
 
@@ -186,21 +187,10 @@ void check_sampler() {
     expect(rows[0] + rows[1] + rows[2] == 3, "three of three");
 }
 
-void check_allocations() {
-    const int64_t n = 300;
-    std::vector<double> points(3 * n), pixels(2 * n);
-    std::vector<int64_t> inliers(n);
-    for (int64_t i = 0; i < n; ++i) {
-        const auto p = static_cast<size_t>(3 * i), q = static_cast<size_t>(2 * i);
-        points[p + 2] = uniform(1, 5);
-        points[p] = uniform(-0.5, 0.5) * points[p + 2];
-        points[p + 1] = uniform(-0.4, 0.4) * points[p + 2];
-        pixels[q] = 500 * points[p] / points[p + 2] + 320 + (i % 3 == 0 ? uniform(-200, 200) : uniform(-1, 1));
-        pixels[q + 1] = 500 * points[p + 1] / points[p + 2] + 240 + uniform(-1, 1);
-    }
+rse_pf_pnp_request request_of(const std::vector<double>& points, const std::vector<double>& pixels) {
     rse_pf_pnp_request request = {};
     request.abi = RSE_PF_NATIVE_ABI;
-    request.rows = n;
+    request.rows = static_cast<int64_t>(pixels.size() / 2);
     request.points_world = points.data();
     request.pixels = pixels.data();
     request.fx = request.fy = 500;
@@ -216,6 +206,65 @@ void check_allocations() {
     request.weak_inlier_ratio = 0.25;
     request.weak_translation_m = 0.03;
     request.weak_rotation_rad = 0.01;
+    return request;
+}
+
+// A number of any kind: mild, repeated, tiny, huge, at a limit, or any bits.
+double hostile(int kind) {
+    const uint64_t bits = random_bits();
+    switch (kind == 0 ? static_cast<int>(bits % 7) : kind) {
+        case 1: return uniform(-10.0, 700.0);
+        case 2: return static_cast<double>(bits % 3);
+        case 3: return uniform(-1e6, 1e6);
+        case 4: return std::ldexp(uniform(-1.0, 1.0), -static_cast<int>(bits % 1070));
+        case 5: return bits % 2 == 0 ? 1e6 : -1e6;
+        default: {
+            double any;
+            std::memcpy(&any, &bits, sizeof any);
+            return bits % 20 == 0 ? any : std::fmod(std::isfinite(any) ? any : 0.0, 1e6);
+        }
+    }
+}
+
+void check_hostile() {
+    for (int i = 0; i < 5000; ++i) {
+        const auto n = static_cast<size_t>(random_bits() % 70);
+        const int kind = static_cast<int>(random_bits() % 7), other = static_cast<int>(random_bits() % 7);
+        std::vector<double> points(3 * n), pixels(2 * n);
+        for (double& each : points) each = hostile(kind);
+        for (double& each : pixels) each = hostile(other);
+        std::vector<int64_t> inliers(n);
+        rse_pf_pnp_request request = request_of(points, pixels);
+        request.flags = static_cast<uint32_t>(random_bits() % 4);
+        request.max_iterations = static_cast<int32_t>(1 + random_bits() % 50);
+        request.inlier_px = i % 2 == 0 ? 8.0 : uniform(1e-3, 100.0);
+        rse_pf_pnp_result result;
+        rse_pf_pnp_solve(&request, inliers.data(), &result);
+        expect(result.status >= 0 && result.status <= 13, "a hostile request has a status");
+        if (result.status != RSE_PF_PNP_SOLVED) continue;
+        for (const double each : result.T_camera_world) expect(std::isfinite(each), "a pose is finite");
+        for (const double each : result.covariance) expect(std::isfinite(each), "a covariance is finite");
+        expect(result.count >= 0 && result.count <= request.rows, "inliers are rows");
+        for (int64_t k = 0; k < result.count; ++k) {
+            const int64_t row = inliers[static_cast<size_t>(k)];
+            expect(row >= (k > 0 ? inliers[static_cast<size_t>(k - 1)] + 1 : 0) && row < request.rows, "in order");
+        }
+    }
+}
+
+void check_allocations() {
+    const int64_t n = 300;
+    std::vector<double> points(3 * n), pixels(2 * n);
+    std::vector<int64_t> inliers(n);
+    for (int64_t i = 0; i < n; ++i) {
+        const auto p = static_cast<size_t>(3 * i), q = static_cast<size_t>(2 * i);
+        points[p + 2] = uniform(1, 5);
+        points[p] = uniform(-0.5, 0.5) * points[p + 2];
+        points[p + 1] = uniform(-0.4, 0.4) * points[p + 2];
+        pixels[q] = 500 * points[p] / points[p + 2] + 320 + (i % 3 == 0 ? uniform(-200, 200) : uniform(-1, 1));
+        pixels[q + 1] = 500 * points[p + 1] / points[p + 2] + 240 + uniform(-1, 1);
+    }
+    rse_pf_pnp_request request = request_of(points, pixels);
     rse_pf_pnp_result result;
     rse_pf_pnp_solve(&request, inliers.data(), &result);
     expect(result.status == RSE_PF_PNP_SOLVED && result.count >= 190, "a request is solved");
@@ -241,6 +290,7 @@ int main() {
     check_selection();
     check_sampler();
     check_allocations();
+    check_hostile();
     std::printf(failures == 0 ? "all checks passed (%s)\n" : "checks failed (%s)\n", rse_pf_native_lanes());
     return failures == 0 ? 0 : 1;
 }
