@@ -33,6 +33,8 @@ _MAX_MISFIT = 0.2
 """Mean distance, as a share of the reach, above which surfaces do not fit."""
 MAX_POINTS = 1_000_000
 """Of one cloud."""
+_MAX_VOXELS = 500_000
+"""From the origin along an axis; small_gicp numbers voxels by 21 bits."""
 
 
 class IcpOptions(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
@@ -162,6 +164,7 @@ def register(registry: Registry) -> None:
         source = reshaped("source", request.source, 3)
         if max(len(target), len(source)) > MAX_POINTS:
             raise LimitExceeded(f"a cloud has more than {MAX_POINTS} points", hint="thin it to voxels first")
+        _check_extent(request)
         guess = np.asarray(request.T_target_source, dtype=np.float64)
         if guess.size != 16 or not _is_rigid(guess.reshape(4, 4)):
             raise BadRequest("T_target_source is not a rigid motion", hint="send 16 numbers, row-major")
@@ -173,6 +176,18 @@ def register(registry: Registry) -> None:
 class _Fit:
     overlap: float
     misfit_m: float
+
+
+def _check_extent(request: IcpRequest) -> None:
+    """Raise BadRequest for numbers so large that their voxels have no number."""
+    voxel_m = (request.options or IcpOptions()).voxel_m
+    numbers = (request.target, request.source, request.T_target_source)
+    extent_m = max((float(np.abs(each).max(initial=0.0)) for each in numbers), default=0.0)
+    if extent_m > _MAX_VOXELS * voxel_m:
+        raise BadRequest(
+            f"a coordinate of {extent_m:g} m is above {_MAX_VOXELS * voxel_m:g} m, {_MAX_VOXELS} voxels",
+            hint="send metres near the origin, or a larger voxel_m",
+        )
 
 
 class _FitMeasure:

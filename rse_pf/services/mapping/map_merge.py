@@ -9,12 +9,14 @@ import math
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from rse_pf.errors import BadRequest
+from rse_pf.budget import PROVENANCE, check_msgpack
+from rse_pf.errors import BadRequest, LimitExceeded
 from rse_pf.geometry import Array, inverse
 from rse_pf.maps.format import Edge, Keyframe, MapVersion
 from rse_pf.service import Report
@@ -27,6 +29,8 @@ from rse_pf.services.mapping.relative_pose import RelativePoseOptions, measure_r
 
 __all__ = ["Atlas", "LoopProposals", "MergeOptions", "MergedMap", "merge_versions", "propose_links"]
 
+_MAX_PAIRS = 500_000
+"""Keyframe pairs that may be tried; each takes some milliseconds."""
 _MIN_LOOP_LENGTH = 3
 """Keyframes of one robot that are closer than this along its trajectory are not a loop."""
 
@@ -163,7 +167,17 @@ def merge_versions(
 
 
 def propose_links(atlas: Atlas, options: MergeOptions, report: Report = ignore_progress) -> LoopProposals:
-    """Measure the relative poses of keyframes that place recognition considers the same place."""
+    """Measure the relative poses of keyframes that place recognition considers the same place.
+
+    Raises:
+        LimitExceeded: There may be more pairs than can be measured.
+    """
+    most = len(atlas.keyframes) * (int(atlas.of_map.max()) + 1) * options.candidates
+    if most > _MAX_PAIRS:
+        raise LimitExceeded(
+            f"up to {most} pairs of keyframes are above {_MAX_PAIRS}",
+            hint="merge fewer maps at once, or ask for fewer candidates",
+        )
     index = PlaceIndex(atlas.keyframes)
     pairs = _candidate_pairs(atlas, index, options)
     pose_options = RelativePoseOptions(
@@ -351,19 +365,36 @@ def _version(
         keyframes=keyframes,
         edges=tuple(
             Edge(
-                a=place[link.a], b=place[link.b], T_a_b=link.T_a_b, information=link.information,
+                a=place[link.a],
+                b=place[link.b],
+                T_a_b=link.T_a_b,
+                information=link.information,
                 kind="odometry" if kind == "odometry" else "loop" if kind == "loop" else "merge",
             )
             for link, kind in edges
         ),
         points=points,
         colours=colours,
-        provenance={
-            "made_by": "merge",
-            "from": [[int(atlas.of_map[row]), atlas.keyframes[row].id] for row in place],
-            "parents": [dict(version.provenance) for version in versions],
-        },
-    )  # fmt: skip
+        provenance=_provenance(
+            versions, [[int(atlas.of_map[row]), atlas.keyframes[row].id] for row in place]
+        ),
+    )
+
+
+def _provenance(versions: Sequence[MapVersion], origins: list[list[int]]) -> dict[str, Any]:
+    """Return the provenance with those of *versions*, whose own parents are left out where it is too long."""
+    whole: list[Mapping[str, Any]] = [dict(version.provenance) for version in versions]
+    short = [{name: each[name] for name in each if name != "parents"} for each in whole]
+    for parents in (whole, short):
+        provenance = {"made_by": "merge", "from": origins, "parents": parents}
+        encoded = msgspec.msgpack.encode(provenance)
+        try:
+            check_msgpack(encoded, PROVENANCE)
+        except LimitExceeded:
+            continue
+        if len(encoded) <= PROVENANCE.wire_bytes:
+            return provenance
+    return {"made_by": "merge", "from": origins}
 
 
 def _reason_not_joined(

@@ -124,9 +124,9 @@ def optimise_graph(
     for share, start in ((0.1, None), (0.5, "chordal")):
         report(share, "from the given poses" if start is None else "from the chordal start")
         poses = graph.T_world_pose if start is None else _chordal(gtsam, graph, anchors)
-        if poses is None:
+        found = None if poses is None else _minimise(gtsam, graph, poses, anchors, options)
+        if found is None:
             continue
-        found = _minimise(gtsam, graph, poses, anchors, options)
         cost = robust_cost(graph, found, options.cauchy)
         if np.isfinite(found).all() and cost < best_cost:
             best, best_cost = found, cost
@@ -188,15 +188,19 @@ def _factors(gtsam: Any, graph: PoseGraph, anchors: Rows, cauchy: float) -> Any:
 
 def _minimise(
     gtsam: Any, graph: PoseGraph, T_world_pose: Array, anchors: Rows, options: OptimiseOptions
-) -> Array:
+) -> Array | None:
+    """Return the best poses from *T_world_pose* on, None where the linear systems have no solution."""
     values = gtsam.Values()
     for row, T in enumerate(T_world_pose):
         values.insert(row, gtsam.Pose3(T))
     parameters = gtsam.LevenbergMarquardtParams()
     parameters.setMaxIterations(options.max_iterations)
     parameters.setRelativeErrorTol(_RELATIVE_CHANGE)
-    factors = _factors(gtsam, graph, anchors, options.cauchy)
-    found = gtsam.LevenbergMarquardtOptimizer(factors, values, parameters).optimize()
+    try:
+        factors = _factors(gtsam, graph, anchors, options.cauchy)
+        found = gtsam.LevenbergMarquardtOptimizer(factors, values, parameters).optimize()
+    except RuntimeError:  # raised for an indeterminate system
+        return None
     return np.array([found.atPose3(row).matrix() for row in range(len(T_world_pose))])
 
 

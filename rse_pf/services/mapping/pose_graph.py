@@ -21,6 +21,9 @@ from rse_pf.geometry import Array, from_quaternion, to_quaternion
 __all__ = ["PoseGraph", "components", "inverses", "log_se3", "misfit", "read_g2o", "write_g2o"]
 
 _UPPER = np.triu_indices(6)
+_MAX_ID = 2**53
+_MAX_M, _MAX_INFORMATION = 1e9, 1e18
+"""Larger numbers overflow in what optimises a graph."""
 _FROM_G2O = np.diag([1.0, 1.0, 1.0, 0.5, 0.5, 0.5])
 """g2o's rotation error is the vector part of a quaternion, half of phi."""
 
@@ -169,12 +172,12 @@ def read_g2o(text: str) -> PoseGraph:
     for number, tag, words in _lines(text):
         try:
             if tag == "VERTEX_SE3:QUAT":
-                vertices[int(words[0])] = _pose(words[1:])
+                vertices[_id(words[0])] = _pose(words[1:])
             elif tag == "EDGE_SE3:QUAT":
                 information = np.zeros((6, 6))
                 information[_UPPER] = [float(word) for word in words[9:]]
                 information = np.triu(information) + np.triu(information, 1).T
-                edges.append((int(words[0]), int(words[1]), _pose(words[2:9]), information))
+                edges.append((_id(words[0]), _id(words[1]), _pose(words[2:9]), information))
             elif tag != "FIX":
                 raise ValueError(f"{tag[:40]!r} is not a 3-D pose or edge")
         except (ValueError, IndexError) as error:
@@ -203,6 +206,13 @@ def _lines(text: str) -> Iterator[tuple[int, str, list[str]]]:
         words = line.split()
         if words and not words[0].startswith("#"):
             yield number, words[0], words[1:]
+
+
+def _id(word: str) -> int:
+    number = int(word)
+    if abs(number) > _MAX_ID:
+        raise ValueError("an id is not within 53 bits")
+    return number
 
 
 def _pose_numbers(T: Array) -> Array:
@@ -254,7 +264,7 @@ def _quaternions(rotation: Array) -> Array:
 def _check_rigid(what: str, T: Array) -> None:
     if not len(T):
         return
-    if not np.isfinite(T).all() or not np.allclose(T[:, 3], [0, 0, 0, 1]):
+    if not (np.abs(T) <= _MAX_M).all() or not np.allclose(T[:, 3], [0, 0, 0, 1]):
         raise BadRequest(f"{what} is not a rigid motion", hint="send (4, 4) matrices of finite numbers")
     rotation = T[:, :3, :3]
     off = np.abs(rotation @ np.swapaxes(rotation, 1, 2) - np.eye(3)).max()
@@ -265,7 +275,7 @@ def _check_rigid(what: str, T: Array) -> None:
 def _is_positive_definite(information: Array) -> bool:
     if not len(information):
         return True
-    if not np.isfinite(information).all():
+    if not (np.abs(information) <= _MAX_INFORMATION).all():
         return False
     scale = np.abs(information).max(axis=(1, 2))
     skewed = np.abs(information - np.swapaxes(information, 1, 2)).max(axis=(1, 2)) > 1e-6 * scale

@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import math
 import re
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 
 import msgspec
@@ -17,7 +18,7 @@ import numpy as np
 from rse_pf.errors import BadRequest, LimitExceeded
 from rse_pf.geometry import Array
 from rse_pf.service import Registry
-from rse_pf.services.mapping.wifi_signal import SignalModel, fit_signals
+from rse_pf.services.mapping.wifi_signal import MAX_READINGS, SignalModel, fit_signals
 
 __all__ = [
     "AccessPointReading",
@@ -44,6 +45,10 @@ _CALIBRATION_GRID_M = 0.5
 Survey = tuple[tuple[float, float, float], Mapping[str, float]]
 MAX_FINGERPRINTS = 5000
 """Of one request."""
+_MAX_FLOORS, _MAX_ACCESS_POINTS = 100, 300
+_MAX_POSTERIORS, _MAX_PREDICTIONS = 5_000_000, 100_000_000
+"""Grid points times positions, and times the readings of all access points: five seconds of work each."""
+_DISTANCES_AT_ONCE = 1_000_000
 
 
 class AccessPointReading(msgspec.Struct, frozen=True, kw_only=True):
@@ -139,7 +144,8 @@ class Locator:
 
     def __init__(self, survey: Sequence[Survey], options: WifiOptions | None = None) -> None:
         self._options = options or WifiOptions()
-        model = fit_signals(survey)
+        _check_work(survey, self._options)
+        model = fit_signals(survey, max_fields=_MAX_ACCESS_POINTS)
         self._grid = _grid(model.places, self._options.grid_m, self._options.reach_m)
         self._fields = {name: field.predict(self._grid) for name, field in model.fields.items()}
         self.temper = _calibrate_temper(survey, model, self._options)
@@ -166,7 +172,7 @@ class Locator:
 def register(registry: Registry) -> None:
     """Add ``wifi`` to *registry*."""
 
-    @registry.service("wifi")
+    @registry.service("wifi", limited=True)
     def wifi(request: WifiRequest) -> WifiReply:
         """Locate a robot by the access points it hears."""
         if len(request.survey) > MAX_FINGERPRINTS:
@@ -239,22 +245,59 @@ def _position_of(fingerprint: Fingerprint) -> tuple[float, float, float]:
     return position
 
 
+def _check_work(survey: Sequence[Survey], options: WifiOptions) -> None:
+    """Raise LimitExceeded if *survey* would take too long."""
+    if not survey:
+        return
+    places = np.array([place for place, _ in survey], dtype=np.float64)
+    low, high = _bounds(places, options.reach_m)
+    floors = len(np.unique(np.round(places[:, 2])))
+    cells = float(np.prod((high - low) / _pitch(low, high, options.grid_m) + 1.0)) * floors
+    heard_at = Counter(name for _, heard in survey for name in heard)
+    readings = sum(min(count, MAX_READINGS) for count in heard_at.values())
+    if (
+        floors > _MAX_FLOORS
+        or cells * len(survey) > _MAX_POSTERIORS
+        or cells * readings > _MAX_PREDICTIONS
+    ):  # fmt: skip
+        raise LimitExceeded(
+            f"{len(survey)} positions on {floors} floors with {readings} readings, on a grid of up to "
+            f"{cells:.0f} points, are too much for one request",
+            hint="send the fingerprints near the robot's last position, or a larger grid_m",
+        )
+
+
+def _bounds(places: Array, reach_m: float) -> tuple[Array, Array]:
+    return places[:, :2].min(axis=0) - reach_m, places[:, :2].max(axis=0) + reach_m
+
+
+def _pitch(low: Array, high: Array, grid_m: float) -> float:
+    """Return the distance of grid points: *grid_m*, or more so that there are about 40,000."""
+    area, longest = float(np.prod(high - low)), float((high - low).max())
+    return max(grid_m, math.sqrt(area / 40_000.0), longest / 40_000.0)
+
+
 def _grid(places: Array, grid_m: float, reach_m: float) -> Array:
     """Return ``(g, 3)`` grid points within reach of surveyed positions, at the height of the nearest one."""
-    low = places[:, :2].min(axis=0) - reach_m
-    high = places[:, :2].max(axis=0) + reach_m
-    pitch = max(grid_m, math.sqrt(float(np.prod(high - low)) / 40_000.0))
+    low, high = _bounds(places, reach_m)
+    pitch = _pitch(low, high, grid_m)
     x, y = (np.arange(low[axis], high[axis] + pitch, pitch) for axis in (0, 1))
     flat = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1).reshape(-1, 2)
     floors = np.round(places[:, 2])
     parts = []
     for floor in np.unique(floors):
         on_floor = places[floors == floor]
-        squared = ((flat[:, None, :] - on_floor[None, :, :2]) ** 2).sum(axis=2)
-        near = squared.min(axis=1) <= reach_m**2
-        height = on_floor[np.argmin(squared, axis=1), 2]
-        parts.append(np.column_stack([flat[near], height[near]]))
-    return np.concatenate(parts)
+        step = max(1, _DISTANCES_AT_ONCE // len(on_floor))
+        for begin in range(0, len(flat), step):
+            part = flat[begin : begin + step]
+            squared = ((part[:, None, :] - on_floor[None, :, :2]) ** 2).sum(axis=2)
+            near = squared.min(axis=1) <= reach_m**2
+            height = on_floor[np.argmin(squared, axis=1), 2]
+            parts.append(np.column_stack([part[near], height[near]]))
+    grid = np.concatenate(parts)
+    if not len(grid):
+        raise BadRequest(f"no point of the grid is within {reach_m:g} m of the survey", hint="raise reach_m")
+    return grid
 
 
 def _quantile(values: Array, weights: Array, share: float) -> float:

@@ -12,12 +12,12 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from rse_pf.errors import BadRequest
+from rse_pf.errors import BadRequest, LimitExceeded
 from rse_pf.geometry import Array
 
 Rows = npt.NDArray[np.int64]
 
-__all__ = ["SignalField", "SignalModel", "fit_signals"]
+__all__ = ["MAX_READINGS", "SignalField", "SignalModel", "fit_signals"]
 
 _MIN_READINGS = 5
 _LENGTHS_M = (2.0, 4.0, 8.0, 16.0)
@@ -25,7 +25,9 @@ _SHARES = (0.1, 0.3, 0.5, 0.7, 0.85)
 """Candidate shares of the residual variance that are smooth in space; the rest is noise."""
 _FLOOR_DBM2 = 1.0
 _NEAR_M = 1.0
-_MAX_READINGS = 400
+_PLACES_AT_ONCE = 8192
+"""Places whose covariances with all readings are computed at once."""
+MAX_READINGS = 400
 """Readings of one access point in the Gaussian process, evenly chosen: its cost is cubic."""
 
 
@@ -47,6 +49,13 @@ class SignalField:
 
     def predict(self, places: Array) -> tuple[Array, Array]:
         """Return mean (dBm) and variance of a new reading at ``(n, 3)`` places."""
+        parts = [
+            self._predict(places[begin : begin + _PLACES_AT_ONCE])
+            for begin in range(0, len(places), _PLACES_AT_ONCE)
+        ]
+        return np.concatenate([mean for mean, _ in parts]), np.concatenate([sigma for _, sigma in parts])
+
+    def _predict(self, places: Array) -> tuple[Array, Array]:
         k = _kernel(places, self.places, self.signal_dbm2, self.length_m)
         mean = _trend(places, self.source) @ self.trend + k @ self.weights
         variance = self.signal_dbm2 - ((k @ self.inverse) * k).sum(axis=1)
@@ -71,11 +80,14 @@ class SignalModel:
     places: Array
 
 
-def fit_signals(survey: Sequence[tuple[tuple[float, float, float], Mapping[str, float]]]) -> SignalModel:
+def fit_signals(
+    survey: Sequence[tuple[tuple[float, float, float], Mapping[str, float]]], *, max_fields: int | None = None
+) -> SignalModel:
     """Return the model of *survey*: places (metres) with strengths (dBm); deterministic.
 
     Raises:
         BadRequest: No access point was heard at five places or more.
+        LimitExceeded: More than *max_fields* were.
 
     Source:
         Path loss after Rappaport, Wireless Communications, 4.9; processes after Ferris et al. 2006,
@@ -86,6 +98,11 @@ def fit_signals(survey: Sequence[tuple[tuple[float, float, float], Mapping[str, 
     for row, (_, heard) in enumerate(survey):
         for name, dbm in heard.items():
             readings.setdefault(name, []).append((row, dbm))
+    heard_often = sum(len(heard) >= _MIN_READINGS for heard in readings.values())
+    if max_fields is not None and heard_often > max_fields:
+        raise LimitExceeded(
+            f"{heard_often} access points are above {max_fields}", hint="send those near the last position"
+        )
     fields = {
         name: _fit(places, np.array([row for row, _ in heard]), np.array([dbm for _, dbm in heard]))
         for name, heard in sorted(readings.items())
@@ -99,8 +116,8 @@ def fit_signals(survey: Sequence[tuple[tuple[float, float, float], Mapping[str, 
 
 
 def _fit(all_places: Array, rows: Rows, dbm: Array) -> SignalField:
-    if len(rows) > _MAX_READINGS:
-        chosen = np.linspace(0, len(rows) - 1, _MAX_READINGS).astype(np.int64)
+    if len(rows) > MAX_READINGS:
+        chosen = np.linspace(0, len(rows) - 1, MAX_READINGS).astype(np.int64)
         rows, dbm = rows[chosen], dbm[chosen]
     places = all_places[rows]
     source = _source(places, dbm)
