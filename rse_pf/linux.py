@@ -14,8 +14,8 @@ from pathlib import Path
 
 __all__ = [
     "PR_CAPBSET_DROP", "PR_SET_CHILD_SUBREAPER", "PR_SET_DUMPABLE", "PR_SET_NO_NEW_PRIVS", "PR_SET_SECCOMP",
-    "cpu_seconds", "die_with_parent", "prctl", "proportional_bytes", "raise_descriptor_limit",
-    "resident_bytes", "run_as_batch", "run_when_idle", "set_process_name",
+    "cpu_seconds", "die_with_parent", "page_table_bytes", "prctl", "proportional_bytes",
+    "raise_descriptor_limit", "resident_bytes", "run_as_batch", "run_when_idle", "set_process_name",
 ]  # fmt: skip
 
 PR_SET_DUMPABLE, PR_SET_SECCOMP, PR_CAPBSET_DROP = 4, 22, 24
@@ -68,18 +68,22 @@ def resident_bytes(pid: int) -> int:
     return pages * os.sysconf("SC_PAGE_SIZE")
 
 
+def page_table_bytes(pid: int) -> int:
+    """Return the memory that the kernel needs for the page tables of *pid*, 0 if it is gone."""
+    return 1024 * _kilobytes(f"/proc/{pid}/status", "VmPTE")
+
+
 def proportional_bytes(pid: int) -> int:
     """Return the memory that Linux charges to *pid*: its pages, shared ones in part, swap and page tables.
 
     Of a process that this user may not look into, shared pages count in full and files do not.  0 if it
     is gone.
     """
-    tables = _kilobytes(f"/proc/{pid}/status", "VmPTE")
     try:
         pages = _kilobytes(f"/proc/{pid}/smaps_rollup", "Pss", "SwapPss")
     except PermissionError:
         pages = _kilobytes(f"/proc/{pid}/status", "RssAnon", "RssShmem", "VmSwap")
-    return 1024 * (pages + tables)
+    return 1024 * pages + page_table_bytes(pid)
 
 
 def run_when_idle(pid: int) -> None:

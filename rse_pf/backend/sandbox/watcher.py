@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-from rse_pf.linux import proportional_bytes, resident_bytes
+from rse_pf.linux import page_table_bytes, proportional_bytes, resident_bytes
 
 __all__ = ["MemoryWatcher"]
 
@@ -57,9 +57,9 @@ class MemoryWatcher:
         them up takes milliseconds.
         """
         scratch = self._scratch_bytes(pid)
-        resident = resident_bytes(pid)
-        if resident + scratch <= self._limit // 2:
-            return resident + scratch
+        at_least = resident_bytes(pid) + page_table_bytes(pid) + scratch
+        if at_least <= self._limit // 2:
+            return at_least
         return proportional_bytes(pid) + scratch
 
     def _scratch_bytes(self, pid: int) -> int:

@@ -15,8 +15,13 @@ from rse_pf.backend.sandbox.watcher import MemoryWatcher
 pytestmark = pytest.mark.system
 MIB = 1 << 20
 HOLD = """
-import mmap, os, sys
-size, shares = map(int, sys.argv[1:])
+import ctypes, mmap, os, sys
+size, shares, pages = map(int, sys.argv[1:])
+libc = ctypes.CDLL(None)
+libc.mmap.restype = ctypes.c_void_p
+libc.mmap.argtypes = [ctypes.c_void_p, ctypes.c_size_t, *[ctypes.c_int] * 3, ctypes.c_long]
+for i in range(pages):  # each in another gigabyte, and read only, so that it is not resident
+    ctypes.string_at(libc.mmap((1 << 40) + (i << 30), 4096, mmap.PROT_READ, 0x100022, -1, 0), 1)
 block = mmap.mmap(-1, size, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
 for at in range(0, size, 4096):
     block[at] = 1
@@ -33,9 +38,9 @@ def holding() -> Iterator[Start]:
     """Yield a function that starts a process which holds that much memory, alone or with a child."""
     started: list[subprocess.Popen[str]] = []
 
-    def start(size: int, *, shares: bool = False) -> int:
+    def start(size: int, *, shares: bool = False, pages: int = 0) -> int:
         child = subprocess.Popen(
-            [sys.executable, "-c", HOLD, str(size), str(int(shares))],
+            [sys.executable, "-c", HOLD, str(size), str(int(shares)), str(pages)],
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
         )  # fmt: skip
         started.append(child)
@@ -64,6 +69,13 @@ def test_a_sandbox_above_its_limit_is_named_with_both_numbers(holding: Start) ->
 
 def test_pages_that_processes_share_count_in_proportion(holding: Start) -> None:
     assert MemoryWatcher(50 * MIB).look([holding(60 * MIB, shares=True)]) == {}
+
+
+def test_page_tables_count_even_of_pages_that_are_not_resident(holding: Start) -> None:
+    pid = holding(4096, pages=8000)
+
+    assert list(MemoryWatcher(60 * MIB).look([pid])) == [pid]
+    assert MemoryWatcher(60 * MIB).look([holding(4096)]) == {}
 
 
 def test_it_looks_more_often_when_a_sandbox_is_near_its_limit(holding: Start) -> None:
