@@ -92,11 +92,13 @@ class CircuitBreaker:
     def refusal(self, robot: RobotId, service: str, digest: str, now: float) -> Poison | WorkerLost | None:
         """Return why *robot* may not run the request with this digest now, None if it may."""
         ends = self._ends_of_request.get((service, digest), ())
-        if any(self._poison_until(scope, ends) > now for scope in _scopes_of(robot)):
+        if ends and any(self._poison_until(scope, ends) > now for scope in _scopes_of(robot)):
             return Poison(
                 "this request crashed every sandbox that ran it and is not tried again",
                 hint="send another one; the server's log has the crash",
             )
+        if not self._breakers:
+            return None
         found = [self._breakers.get((service, scope)) for scope in _scopes_of(robot)]
         breaker = max((each for each in found if each), key=lambda each: each.until_s, default=None)
         if breaker is None or breaker.until_s <= now:
@@ -196,7 +198,7 @@ class CircuitBreaker:
             del self._breakers[next(iter(self._breakers))]
 
     def _poison_until(self, scope: Scope, ends: tuple[_End, ...]) -> float:
-        return _evidence_since(scope, ends, self._settings.poison_crashes) + POISON_S if ends else -math.inf
+        return _evidence_since(scope, ends, self._settings.poison_crashes) + POISON_S
 
     def _oldest_s(self) -> float:
         return next(iter(self._ends_of_request.values()))[-1].at_s

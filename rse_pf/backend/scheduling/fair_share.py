@@ -52,6 +52,8 @@ class FairShare:
 
     def gives(self, tenant: str, held: Mapping[str, int], now: float) -> bool:
         """Return whether *tenant* gives up a place whose work has ended, because another one claims it."""
+        if not self._claims:
+            return False
         free = self._places - sum(held.values())
         claims = sum(_owes(held.get(tenant, 0), held.get(other, 0)) for other in self._claimants(now))
         return claims > free
