@@ -1,6 +1,7 @@
 """Answer one HTTP event, with keys, settings and time as arguments.
 
-Nothing is decoded before the token is verified.  Every event gets a result or a typed failure.
+Nothing is decoded before the token is verified.  Every event, whatever it holds, gets a result or a typed
+failure.
 """
 
 from __future__ import annotations
@@ -18,7 +19,15 @@ from lambda_pnp.keys import KeyCache, read_object
 from rse_pf.auth.roster import scopes_allow
 from rse_pf.auth.tokens import verify_token
 from rse_pf.config import PlatformSettings, load_settings
-from rse_pf.errors import BadMessage, Expired, Forbidden, RsePfError, Unauthorized, UnsupportedProtocol
+from rse_pf.errors import (
+    BadMessage,
+    Expired,
+    Forbidden,
+    LimitExceeded,
+    RsePfError,
+    Unauthorized,
+    UnsupportedProtocol,
+)
 from rse_pf.service import Registry, dispatch, failure_of
 from rse_pf.services import pnp
 from rse_pf.wire import SUBPROTOCOLS, Codec, Command, codec_for, make_codec
@@ -29,6 +38,7 @@ _ROOT = Path(__file__).resolve().parents[1]
 _SERVER = "lambda"
 # How long a revoked token may still be accepted; there is no connection that could be closed.
 _MAX_STALE_S = 30.0
+_MAX_HEADERS = 200
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -68,8 +78,8 @@ class Answering:
     ) -> LambdaAnswer:
         """Answer *event* at Unix time *now_s*, with *left_ms* before the time-out; *clock* is in seconds."""
         arrived = clock()
-        headers = {str(name).lower(): str(each) for name, each in (event.get("headers") or {}).items()}
         try:
+            headers, body = _read(event)
             kind, _, token = headers.get("authorization", "").partition(" ")
             who = verify_token(
                 token.strip() if kind.lower() == "bearer" else "",
@@ -79,7 +89,7 @@ class Answering:
         except RsePfError as error:
             return _rejected(error)
         try:
-            message = codec.decode_from_robot(_body(event))
+            message = codec.decode_from_robot(self._decoded(body))
             if not isinstance(message, Command):
                 raise BadMessage(
                     "this is not a command", hint="send commands only; this function has no sessions"
@@ -109,6 +119,18 @@ class Answering:
             )
         return self._codecs[name]
 
+    def _decoded(self, body: str | bytes) -> bytes:
+        """Return the message of a body; a ``str`` is base64 that is judged by its length first."""
+        if isinstance(body, bytes):
+            return body
+        max_bytes = self._settings.session.max_message_bytes
+        if len(body) > 4 * (max_bytes // 3 + 1):
+            raise LimitExceeded(f"the body is longer than {max_bytes} bytes", hint="send smaller messages")
+        try:
+            return base64.b64decode(body, validate=True)
+        except ValueError as error:
+            raise BadMessage("the body is not base64", hint="send the bytes of one message") from error
+
     @staticmethod
     def _late(command: Command) -> Any:
         error = Expired("the deadline passed before the answer was ready", hint="set a longer deadline_s")
@@ -127,14 +149,34 @@ def _rejected(error: RsePfError) -> LambdaAnswer:
     return LambdaAnswer(status=status, content_type="application/json", body=json.dumps(body).encode())
 
 
-def _body(event: Mapping[str, Any]) -> bytes:
-    body = event.get("body") or ""
-    if not event.get("isBase64Encoded"):
-        return str(body).encode()
+def _read(event: object) -> tuple[dict[str, str], str | bytes]:
+    """Return the headers, names in small letters, and the body of *event*: base64 as ``str``, else bytes.
+
+    Raises:
+        BadMessage: *event* is not one of a Function URL.
+    """
+    if not isinstance(event, Mapping):
+        raise _no_event("it is not an object")
+    headers, body = event.get("headers") or {}, event.get("body") or ""
+    if not isinstance(headers, Mapping) or len(headers) > _MAX_HEADERS:
+        raise _no_event(f"its headers are not an object of at most {_MAX_HEADERS} texts")
+    if not all(isinstance(name, str) and isinstance(value, str) for name, value in headers.items()):
+        raise _no_event("a header is not a text")
+    if not isinstance(body, str):
+        raise _no_event("its body is not a text")
+    lowered = {name.lower(): value for name, value in headers.items()}
+    if event.get("isBase64Encoded"):
+        return lowered, body
     try:
-        return base64.b64decode(body, validate=True)
-    except ValueError as error:
-        raise BadMessage("the body is not base64", hint="send the bytes of one message") from error
+        return lowered, body.encode()
+    except UnicodeEncodeError as error:
+        raise _no_event("its body is not UTF-8") from error
+
+
+def _no_event(problem: str) -> BadMessage:
+    return BadMessage(
+        f"this is not an event of a Function URL: {problem}", hint="call the function by its URL"
+    )
 
 
 def load_answering() -> Answering:

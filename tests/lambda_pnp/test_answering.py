@@ -13,6 +13,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+from hostile.hostile_maps import hostile_maps
+from hypothesis import given
+from hypothesis import settings as hypothesis_settings
+from hypothesis import strategies as st
 
 from lambda_pnp.answering import Answering
 from lambda_pnp.keys import KeyCache
@@ -212,3 +216,72 @@ def test_the_answer_says_whether_the_start_was_cold() -> None:
     assert http["headers"]["x-rse-pf-init-ms"] == "12.3"
     assert http["headers"]["x-rse-pf-cold"] == "true"
     assert base64.b64decode(http["body"]) == made.body
+
+
+def rejected(what: Any) -> tuple[int, str]:
+    answered = Answering(SETTINGS, KEYS).answer(what, now_s=NOW_S, left_ms=9e3, clock=lambda: 0.0)
+    return answered.status, json.loads(answered.body)["code"]
+
+
+@pytest.mark.parametrize(
+    "what",
+    [
+        None, 7, "text", [], b"bytes", {"headers": 7}, {"headers": "a: b"}, {"headers": [["a", "b"]]},
+        {"headers": {"authorization": None}}, {"headers": {"authorization": ["Bearer", TOKEN]}},
+        {"headers": {7: "seven"}}, {"headers": {f"h{n}": "" for n in range(300)}}, event(b"") | {"body": 7},
+        event(b"") | {"body": ["a"]}, event(b"") | {"body": b"bytes"}, event(b"") | {"body": {"a": 1}},
+        event(b"") | {"body": "\ud800", "isBase64Encoded": False},
+    ],
+)  # fmt: skip
+def test_an_event_of_another_form_is_a_typed_400(what: Any) -> None:
+    assert rejected(what) == (400, "bad-message")
+
+
+@pytest.mark.parametrize(
+    "what", [{}, {"headers": None, "body": None}, {"headers": {}}, {"isBase64Encoded": 7}]
+)
+def test_an_event_without_a_token_is_unauthorized(what: Any) -> None:
+    assert rejected(what) == (401, "unauthorized")
+
+
+@pytest.mark.parametrize("body", ["====", "a", "é" * 8, "AAAA\n", "\ud800", "AAA", "*" * 100])
+def test_a_body_that_is_not_base64_is_a_bad_message(body: str) -> None:
+    assert failure(event(b"") | {"body": body}) == "bad-message"
+
+
+def test_a_huge_body_is_refused_by_its_length_before_it_is_decoded() -> None:
+    assert failure(event(b"") | {"body": "*" * 6_000_000}) == "too-large"
+
+
+@given(
+    what=st.dictionaries(
+        st.sampled_from(["headers", "body", "isBase64Encoded", "requestContext"]),
+        st.recursive(
+            st.none() | st.booleans() | st.integers() | st.floats() | st.text() | st.binary(max_size=20),
+            lambda inner: (
+                st.lists(inner, max_size=3)
+                | st.dictionaries(
+                    st.sampled_from(["authorization", "content-type", "Content-Type", "x"]), inner
+                )
+            ),
+            max_leaves=6,
+        ),
+    )
+)
+@hypothesis_settings(max_examples=150, deadline=None)
+def test_no_event_raises(what: dict[str, Any]) -> None:
+    assert rejected(what)[0] in (400, 401)
+    signed = what | {"headers": event(b"")["headers"]}
+    answered = Answering(SETTINGS, KEYS).answer(signed, now_s=NOW_S, left_ms=9e3, clock=lambda: 0.0)
+    assert answered.status in (200, 400)
+
+
+def test_every_hostile_map_is_refused_as_a_message() -> None:
+    for codec in SUBPROTOCOLS:
+        for name, data in hostile_maps().items():
+            answered = Answering(SETTINGS, KEYS).answer(
+                event(data, codec), now_s=NOW_S, left_ms=9e3, clock=lambda: 0.0
+            )
+            message = make_codec(codec).decode_from_server(answered.body)
+            assert isinstance(message, Failure), name
+            assert message.code in ("bad-message", "too-large"), name
