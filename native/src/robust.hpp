@@ -9,6 +9,8 @@
 namespace RSE_PF_ISA {
 
 constexpr int kLocalSteps = 4;
+// With few rows a trial is cheap, and one row more or less decides about the verdict.
+constexpr int64_t kFewRows = 32, kTrialsOfFewRows = 30;
 constexpr int kLastSteps = 100;
 constexpr double kDoneStep = 1e-6;  // metres and radians: what is left then is a tenth of it
 
@@ -103,8 +105,10 @@ static Search search(const rse_pf::Task& task, const Optics& optics, const Searc
     best.cost = kInfinity;
     best.agree = 0;
     double needed = static_cast<double>(options.max_iterations);
+    int64_t least = options.min_iterations;
+    if (n <= kFewRows && least < kTrialsOfFewRows) least = kTrialsOfFewRows;
     for (int64_t trial = 0; trial < options.max_iterations; ++trial) {
-        if (trial >= options.min_iterations && static_cast<double>(trial) >= needed) break;
+        if (trial >= least && static_cast<double>(trial) >= needed) break;
         if (trial % 16 == 0 && must_stop(*task.request, why)) return why;
         ++task.result->trials;
         int64_t rows[3];
