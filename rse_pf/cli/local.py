@@ -255,6 +255,7 @@ _TEXTS = {
     "drain-over": "{server} has left after {seconds} s",
     "drain-start": "{server} drains ({reason}); its robots move",
     "grow": "{servers} more: {reason}",
+    "not-written": "{reason}",
     "platform-ready": "the platform is ready after {seconds:.1f} s",
     "rebalance": "{robots} robots of {server} are asked to move",
     "replace": "{server} is replaced by {by}: {reason}",

@@ -30,6 +30,7 @@ __all__ = [
     "read_state",
     "remove_state",
     "settings_file",
+    "state_file",
     "state_folder",
     "stop_platform",
 ]
@@ -79,7 +80,11 @@ class PlatformState:
 
     def write(self, folder: Path) -> None:
         """Replace the file in *folder* in one step."""
-        replace_file(folder / _FILE, json.dumps(asdict(self), indent=2) + "\n")
+        replace_file(state_file(folder), self.to_json())
+
+    def to_json(self) -> str:
+        """Return the content of the file."""
+        return json.dumps(asdict(self), indent=2) + "\n"
 
 
 class PlatformLock:
@@ -149,6 +154,11 @@ def platform_settings(folder: Path) -> PlatformSettings | None:
             f"{file} is not of this version: {error.message}",
             hint=f"start the platform once with: rse-pf local --name {folder.name}",
         ) from error
+
+
+def state_file(folder: Path) -> Path:
+    """Return the file that says what runs in *folder*."""
+    return folder / _FILE
 
 
 def read_state(folder: Path) -> PlatformState | None:

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from rse_pf.config import PlatformSettings
-from rse_pf.errors import MissingExtra
+from rse_pf.errors import ConfigurationError, MissingExtra
 from rse_pf.files import replace_json
 from rse_pf.local.balancer.envoy_config import (
     ADMIN_SOCKET,
@@ -29,6 +29,7 @@ from rse_pf.local.balancer.envoy_config import (
     endpoints,
     envoy_config,
 )
+from rse_pf.local.latest_file import LatestFile
 from rse_pf.local.processes import ProcessMark, ServerProcess, last_line
 
 __all__ = ["EnvoyLoadBalancer", "TargetStats", "envoy_binary"]
@@ -58,8 +59,23 @@ class EnvoyLoadBalancer:
     """One Envoy.  ``port`` is 0 before `wait_live`; its admin page is a socket file for this user only."""
 
     def __init__(
-        self, settings: PlatformSettings, *, folder: Path, port: int, dies_with_parent: bool = True
+        self,
+        settings: PlatformSettings,
+        *,
+        folder: Path,
+        port: int,
+        dies_with_parent: bool = True,
+        on_problem: Callable[[str], None] = lambda problem: None,
     ) -> None:
+        """Describe one; nothing is started.
+
+        Args:
+            settings: Limits of connections and requests.
+            folder: Of its files and its log.
+            port: Where robots connect; 0 takes a free one.
+            dies_with_parent: Whether it ends with this process.
+            on_problem: Called with a sentence when the disk refuses a list of targets, which is retried.
+        """
         self.port = 0
         self.process = ServerProcess("load-balancer", folder)
         self._settings = settings
@@ -68,17 +84,22 @@ class EnvoyLoadBalancer:
         self._dies_with_parent = dies_with_parent
         self._endpoints = folder / "endpoints.json"
         self._data_endpoints = folder / "data-endpoints.json"
+        self._targets = LatestFile(self._endpoints, on_problem=on_problem)
+        self._data_targets = LatestFile(self._data_endpoints, on_problem=on_problem)
 
     def launch(self) -> None:
         """Start the process without targets, and return before it listens.
 
         After an earlier one, it takes the same port and the same targets.
+
+        Raises:
+            ConfigurationError: Its configuration cannot be written.
         """
         binary = envoy_binary()
         if self.process.mark is None:
             self.set_targets(())
             self.set_data_targets(())
-        self.kill()  # reaps one that ended by itself
+        self.process.kill()  # reaps one that ended by itself
         self._wanted_port = self.port or self._wanted_port
         config = self._folder / "envoy.json"
         (self._folder / ADMIN_SOCKET).unlink(missing_ok=True)
@@ -86,7 +107,12 @@ class EnvoyLoadBalancer:
             self._settings, port=self._wanted_port, endpoints_file=self._endpoints,
             data_endpoints_file=self._data_endpoints,
         )  # fmt: skip
-        config.write_text(json.dumps(made, indent=1), encoding="utf-8")
+        try:
+            replace_json(config, made, indent=1)
+        except OSError as error:
+            raise ConfigurationError(
+                f"{config} cannot be written: {error.strerror}", hint="free some space"
+            ) from error
         command = [binary, "-c", str(config), "--concurrency", "1"]
         command += ["-l", "warning", "--disable-hot-restart"]
         self.process.start(command, dies_with_parent=self._dies_with_parent)
@@ -117,11 +143,11 @@ class EnvoyLoadBalancer:
 
     def set_targets(self, targets: Sequence[Target]) -> None:
         """Let new sockets go to *targets* and nowhere else; open sockets stay where they are."""
-        replace_json(self._endpoints, endpoints(targets))
+        self._targets.write(json.dumps(endpoints(targets)))
 
     def set_data_targets(self, targets: Sequence[Target]) -> None:
         """Let what is asked under ``/data/`` go to *targets*."""
-        replace_json(self._data_endpoints, endpoints(targets, DATA_CLUSTER))
+        self._data_targets.write(json.dumps(endpoints(targets, DATA_CLUSTER)))
 
     async def stats(self) -> Mapping[str, TargetStats]:
         """Return the targets that Envoy has now, by server name; empty when it does not answer."""
@@ -152,11 +178,17 @@ class EnvoyLoadBalancer:
 
     async def stop(self, timeout_s: float) -> None:
         """End the process, which cuts every socket; kill it after *timeout_s*."""
+        self._close_files()
         await self.process.stop(signal.SIGTERM, timeout_s)
 
     def kill(self) -> None:
         """End the process at once, if it is there, and reap it."""
+        self._close_files()
         self.process.kill()
+
+    def _close_files(self) -> None:
+        self._targets.close()
+        self._data_targets.close()
 
     async def _until(self, condition: Callable[[], Any], timeout_s: float) -> bool:
         """Ask *condition* until it holds, the time is over, or Envoy has ended."""

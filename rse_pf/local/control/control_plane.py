@@ -289,8 +289,8 @@ class ControlPlane:
     async def _restart_balancer(self) -> None:
         pause_s = LOCAL_INTERVAL_S
         while True:
-            self._load_balancer.launch()
             try:
+                self._load_balancer.launch()
                 await self._load_balancer.wait_live(self._settings.local.start_timeout_s)
                 return
             except ConfigurationError as error:

@@ -31,6 +31,7 @@ from rse_pf.local.control.control_plane import ControlOptions, ControlPlane
 from rse_pf.local.control.fleet import Fleet
 from rse_pf.local.control.status import serve_status
 from rse_pf.local.firewall import check_listener, ensure_key, key_file, robots_url
+from rse_pf.local.latest_file import LatestFile
 from rse_pf.local.processes import STOP_TIMEOUT_S, is_alive, mark_of, rotate_logs, send_signal
 from rse_pf.local.servers.backend_servers import RSE_PF, BackendServer, LocalBackendServers
 from rse_pf.local.servers.data_servers import LocalDataServers
@@ -42,6 +43,7 @@ from rse_pf.local.state import (
     read_state,
     remove_state,
     settings_file,
+    state_file,
 )
 
 __all__ = ["LocalPlatform"]
@@ -102,6 +104,7 @@ class LocalPlatform:
         self._on_event = on_event
         self._lock = PlatformLock(self.state)
         self._audit = PlatformAudit(self.state)
+        self._state_file = LatestFile(state_file(self.state), on_problem=self._not_written)
         self._key: SigningKey | None = None
         self._status: asyncio.Server | None = None
         self.backend_servers = LocalBackendServers(
@@ -111,8 +114,9 @@ class LocalPlatform:
             program=program,
         )
         self.load_balancer = EnvoyLoadBalancer(
-            settings, folder=self.state, port=self._wanted_port, dies_with_parent=not adoptable
-        )
+            settings, folder=self.state, port=self._wanted_port, dies_with_parent=not adoptable,
+            on_problem=self._not_written,
+        )  # fmt: skip
         self.data_servers = LocalDataServers(
             settings,
             folder=self.state,
@@ -444,7 +448,7 @@ class LocalPlatform:
             for member in self._fleet.members.values()
             if member.server is not None
         }
-        PlatformState(
+        state = PlatformState(
             name=self.name,
             control_plane=control_plane,
             url=self.url,
@@ -461,7 +465,8 @@ class LocalPlatform:
             port=self.load_balancer.port,
             status_port=0 if self._status is None else self._status.sockets[0].getsockname()[1],
             launched=self._fleet.launched,
-        ).write(self.state)
+        )
+        self._state_file.write(state.to_json())
 
     def _data_changed(self, event: str, **details: Any) -> None:
         self._emit(event, **details)
@@ -486,6 +491,7 @@ class LocalPlatform:
             self.backend_servers.kill_all()
             self.data_servers.kill_all()
             self.load_balancer.kill()
+            self._state_file.close()
             self._fleet.members.clear()
             with contextlib.suppress(OSError):  # the folder may have been removed meanwhile
                 remove_state(self.state)
@@ -495,6 +501,9 @@ class LocalPlatform:
             self._audit.close()
             self._lock.release()
         self._emit("platform-gone")
+
+    def _not_written(self, problem: str) -> None:
+        self._emit("not-written", reason=problem)
 
     def _emit(self, event: str, **details: Any) -> None:
         entry = {"event": event, **details}
