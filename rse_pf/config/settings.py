@@ -183,8 +183,8 @@ class ServiceSettings:
     folder: str = setting("", doc="folder of installed services; empty means none")
     published: bool = setting(False, doc="also run the services that installed Python packages publish (entry points rse_pf.services)")
     max_sandboxes: int = setting(64, doc="sandboxes of one server", low=1)
-    memory_bytes: int = setting(536870912, unit="bytes", doc="address space of one sandbox", low=16777216)
-    scratch_bytes: int = setting(16777216, unit="bytes", doc="private folder of one sandbox, in memory", low=65536)
+    memory_bytes: int = setting(536870912, unit="bytes", doc="memory of one sandbox: its address space and its scratch folder together", low=16777216)
+    scratch_bytes: int = setting(16777216, unit="bytes", doc="scratch folder of one sandbox; it holds at most one file per 4096 bytes of this", low=65536)
     grace_s: float = setting(5.0, unit="s", doc="a sandbox outlives the connection of its robot by this", low=0)
     start_timeout_s: float = setting(5.0, unit="s", doc="a sandbox that is not ready by then is killed", low=0.1)
     poison_crashes: int = setting(2, unit="crashes", doc="a request that crashed this many sandboxes is refused as poison", source="dead-letter queues; OWASP", low=1)
@@ -293,6 +293,7 @@ def _check_contradictions(s: PlatformSettings) -> None:
         ("scaling", "step", "big_step"),
         ("session", "max_message_bytes", "max_inflated_bytes"),
         ("session", "reconnect_base_s", "reconnect_max_s"),
+        ("services", "scratch_bytes", "memory_bytes"),
     ]
     for group, small, large in pairs:
         low, high = (getattr(getattr(s, group), name) for name in (small, large))

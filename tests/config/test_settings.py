@@ -51,6 +51,7 @@ def test_the_paper_is_the_default() -> None:
         ({"scaling": {"step": 3}}, ["scaling.big_step = 2", "scaling.step = 3"]),
         ({"scaling": {"idle_s": 90}}, ["scaling.idle_s = 90", "scaling.period_s = 60"]),
         ({"session": {"max_inflated_bytes": 2048}}, ["session.max_message_bytes"]),
+        ({"services": {"memory_bytes": 16777216, "scratch_bytes": 16777217}}, ["services.scratch_bytes"]),
         ({"session": {"reconnect_base_s": 2}}, ["session.reconnect_max_s = 1"]),
         ({"cloud": {"allow_insecure": False}}, ["cloud.certificate_arn", "cloud.domain_name"]),
     ],
