@@ -38,7 +38,7 @@ def test_the_key_is_its_owners_alone_and_the_public_half_verifies(tmp_path: Path
 
     assert key_file(tmp_path).stat().st_mode & 0o777 == 0o600
     assert '"d"' not in key_set_file(tmp_path).read_text()
-    assert verify_token(token, keys=public, now=1001.0, settings=AuthSettings()).robot == "robot-1"
+    assert verify_token(token, keys=public, now=1001.0, settings=AuthSettings()).robot.name == "robot-1"
 
 
 def test_a_platform_that_starts_again_keeps_its_key(tmp_path: Path) -> None:
