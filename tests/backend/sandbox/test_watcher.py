@@ -27,7 +27,7 @@ for at in range(0, size, 4096):
     block[at] = 1
 if shares:
     os.fork()
-print("held", flush=True)
+os.write(1, b"held\\n")
 sys.stdin.read()
 """
 Start = Callable[..., int]
