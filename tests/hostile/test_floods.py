@@ -147,6 +147,54 @@ def test_slow_request_heads_are_cut_after_the_handshake_timeout(server):
     assert answered == 5
 
 
+def _raw(first: int, *, masked: bool = True, length: bytes = b"\x00", payload: bytes = b"") -> bytes:
+    """Return a frame with any first byte and any length; the mask is zero."""
+    second = bytes([length[0] | (0x80 if masked else 0)]) + length[1:]
+    return bytes([first]) + second + (bytes(4) if masked else b"") + payload
+
+
+BROKEN_FRAMES = {
+    "unmasked text": _raw(0x81, masked=False, length=b"\x02", payload=b"{}"),
+    "unmasked ping": _raw(0x89, masked=False),
+    "unmasked close": _raw(0x88, masked=False),
+    **{f"reserved bits {bits}": _raw(0x82 | bits << 4) for bits in range(1, 8)},
+    **{f"opcode {number}": _raw(0x80 | number) for number in (3, 4, 5, 6, 7, 11, 12, 13, 14, 15)},
+    "length 2^63": _raw(0x82, length=b"\x7f" + (1 << 63).to_bytes(8, "big")),
+    "length 2^64 - 1": _raw(0x82, length=b"\x7f" + b"\xff" * 8),
+    "length 2^40": _raw(0x82, length=b"\x7f" + (1 << 40).to_bytes(8, "big")),
+    "a short length in 16 bits": _raw(0x82, length=b"\x7e\x00\x01", payload=b"x"),
+    "a short length in 64 bits": _raw(0x82, length=b"\x7f" + bytes(7) + b"\x01", payload=b"x"),
+    "fragmented ping": _raw(0x09),
+    "long ping": _raw(0x89, length=b"\x7e\x00\x7e", payload=bytes(126)),
+    "close of one byte": _raw(0x88, length=b"\x01", payload=b"\x03"),
+    "close with 1005": _raw(0x88, length=b"\x02", payload=b"\x03\xed"),
+    "nothing to continue": _raw(0x80),
+    "text in text": _raw(0x01) + _raw(0x81),
+    "text that is not UTF-8": _raw(0x81, length=b"\x01", payload=b"\xff"),
+    "another request": b"GET / HTTP/1.1\r\nHost: x\r\n\r\n",
+    "zeros": bytes(1000),
+}
+"""What RFC 6455 forbids; each ends the connection with one of the codes that it names."""
+
+
+def test_frames_that_the_protocol_forbids_end_their_own_connection_only(server):
+    async def attack(target: AttackTarget) -> Outcome:
+        outcome = Outcome()
+        for data in BROKEN_FRAMES.values():
+            robot = await target.enter(server.token(f"hostile-{next(_NUMBERS)}"), "bin")
+            robot.send(data)
+            assert await asyncio.wait_for(robot.hear(), SOON_S) is None
+            outcome.ends[str(robot.closed)] += 1
+        return outcome
+
+    outcome, answered = attacked(server, attack)
+
+    assert sum(outcome.ends.values()) == len(BROKEN_FRAMES)
+    assert set(outcome.ends) <= {"1002", "1007", "1009"}
+    assert answered == 5
+    assert "defect" not in server.log
+
+
 def test_a_long_request_head_is_answered_with_431(server):
     async def send_long_head() -> bytes:
         reader, writer = await AttackTarget(server.url).open_tcp()

@@ -22,6 +22,7 @@ import pytest
 from guarded_server import KEY, GuardedServer
 from hostile.smuggling_samples import HIDDEN, REFUSED, SAMPLES, put, upgrade
 
+from rse_pf.backend.gateway.rate_limits import SourceRates
 from rse_pf.config import PlatformSettings
 from rse_pf.local.balancer.envoy_config import Target
 from rse_pf.local.balancer.load_balancer import EnvoyLoadBalancer
@@ -284,3 +285,51 @@ def test_a_request_that_passes_the_load_balancer_is_read_alike_by_all_servers(
     assert unseen == set(), "a server answered a request that the load balancer has not seen as one"
     after_upgrade = {name for name in SAMPLES if "websocket" in SAMPLES[name].decode("latin-1")}
     assert {name for name in after_upgrade if len(told[name].requests) > 1} == set()
+
+
+FORGED = (
+    b"X-Forwarded-For: 10.9.9.9",
+    b"X-Forwarded-For: 10.9.9.9, 10.9.9.8",
+    b"X-Forwarded-For: 10.9.9.9\r\nX-Forwarded-For: 10.9.9.8",
+    b"x-forwarded-for: 10.9.9.9",
+    b"X-Forwarded-For: ,,,",
+    b"X-Forwarded-For: " + b"10.9.9.9," * 500,
+    b"X-Forwarded-For: 10.9.9.9,\t",
+    b"X-Envoy-External-Address: 10.9.9.9",
+    b"X-Real-IP: 10.9.9.9",
+    b"Forwarded: for=10.9.9.9",
+    b"X_Forwarded_For: 10.9.9.9",
+)
+"""Lines by which a robot says that it is somebody else."""
+
+
+def test_no_robot_chooses_the_address_that_its_handshakes_count_for(tmp_path: Path) -> None:
+    async def run() -> dict[bytes, str]:
+        recorder = Recorder(opens=False)
+        upstream = await asyncio.start_server(recorder.serve, "127.0.0.1", 0)
+        port = upstream.sockets[0].getsockname()[1]
+        balancer = EnvoyLoadBalancer(PlatformSettings(), folder=tmp_path, port=0)
+        balancer.launch()
+        sources = {}
+        try:
+            await balancer.wait_live(SOON_S)
+            balancer.set_targets([Target(name="robots", port=port, control_port=port)])
+            assert await balancer.wait_healthy(["robots"], SOON_S)
+            for line in FORGED:
+                recorder.requests.clear()
+                await answer_to(balancer.port, b"GET /ws HTTP/1.1\r\nHost: x\r\n" + line + b"\r\n\r\n")
+                heads = [head.decode("latin-1").lower() for head, _ in recorder.requests]
+                told = [",".join(re.findall(r"\r\nx-forwarded-for: ([^\r]*)", head)) for head in heads]
+                rates = SourceRates(PlatformSettings().serving)
+                sources[line] = ",".join(rates.source("the balancer", each) for each in told)
+        finally:
+            balancer.kill()
+            upstream.close()
+        return sources
+
+    found = asyncio.run(run())
+
+    (own,) = {source for source in found.values() if source}  # Envoy names an address of this machine
+    assert own not in ("the balancer", "")
+    assert not own.startswith("10.9.9.")
+    assert [line for line, source in found.items() if not source] == [b"X_Forwarded_For: 10.9.9.9"], "refused"
