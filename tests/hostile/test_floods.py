@@ -185,6 +185,7 @@ def test_frames_that_the_protocol_forbids_end_their_own_connection_only(server):
             robot.send(data)
             assert await asyncio.wait_for(robot.hear(), SOON_S) is None
             outcome.ends[str(robot.closed)] += 1
+            robot.writer.transport.abort()
         return outcome
 
     outcome, answered = attacked(server, attack)
