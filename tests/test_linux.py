@@ -8,7 +8,7 @@ import sys
 
 import pytest
 
-from rse_pf.linux import run_when_idle
+from rse_pf.linux import proportional_bytes, resident_bytes, run_when_idle
 
 pytestmark = pytest.mark.system
 
@@ -28,3 +28,22 @@ def test_a_process_that_is_gone_is_no_error() -> None:
     child.wait()
 
     run_when_idle(child.pid)
+
+
+@pytest.mark.skipif(os.getuid() != 0, reason="needs root, to become a plain user")
+def test_the_memory_of_a_process_that_this_user_may_not_look_into_is_still_counted() -> None:
+    read, write = os.pipe()
+    child = os.fork()
+    if child == 0:
+        try:
+            os.setgid(12345)
+            os.setuid(12345)
+            os.write(write, str(proportional_bytes(os.getppid())).encode())
+        finally:
+            os._exit(0)
+    os.close(write)
+    os.waitpid(child, 0)
+    counted = int(os.read(read, 32) or b"0")
+    os.close(read)
+
+    assert resident_bytes(os.getpid()) // 4 < counted < 2 * resident_bytes(os.getpid())
