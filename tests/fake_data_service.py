@@ -46,7 +46,12 @@ class Service:
         self.app = DataServer(
             self.settings, self.store, keys=KEY.key_set, log=self.lines.append,
             clock=lambda: self.now, wall_clock=lambda: self.wall, describe=self.describe,
+            pause=self.pause,
         )  # fmt: skip
+
+    async def pause(self, seconds: float) -> None:
+        """Let the pause before a refusal pass at once."""
+        self.now += seconds
 
     def describe(self, robot: RobotId, name: str) -> MapSummary:
         """Count what a map holds in this process; a data server has a process with limits for it."""

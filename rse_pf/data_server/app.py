@@ -12,7 +12,7 @@ import contextlib
 import dataclasses
 import time
 import uuid
-from collections.abc import Callable, Mapping
+from collections.abc import Awaitable, Callable, Mapping
 from typing import Any
 
 from rse_pf.audit.chain import Note, RefusalLimiter
@@ -21,7 +21,15 @@ from rse_pf.auth.roster import scopes_allow
 from rse_pf.auth.tokens import Claims, KeySet, token_problem, verify_token
 from rse_pf.config import PlatformSettings
 from rse_pf.data_server.handlers import Handler, Handlers
-from rse_pf.data_server.http import HttpReply, HttpRequest, MethodNotAllowed, Receive, Send, failure_reply
+from rse_pf.data_server.http import (
+    HttpReply,
+    HttpRequest,
+    MethodNotAllowed,
+    Receive,
+    Send,
+    TooManyRequests,
+    failure_reply,
+)
 from rse_pf.data_server.map_describer import MapDescriber
 from rse_pf.data_server.request_limits import RequestLimits
 from rse_pf.data_server.routes import ROUTES, Route
@@ -45,6 +53,8 @@ _ANONYMOUS = Claims(robot=RobotId("", ""), token_id="", issued_s=0.0, expires_s=
 _PROBES = ("/data/healthz", "/data/readyz")
 _RETRY_AFTER_MS = 1000.0
 _REQUEST_TIMEOUT = 408
+_REFUSAL_PAUSE_S = 0.25
+"""A refusal costs half a millisecond: a robot that ignores it would use up the server with refusals."""
 
 
 class DataServer:
@@ -61,6 +71,7 @@ class DataServer:
         wall_clock: Callable[[], float] = time.time,
         audit: AuditLog | None = None,
         describe: Callable[[RobotId, str], MapSummary] | None = None,
+        pause: Callable[[float], Awaitable[None]] = asyncio.sleep,
     ) -> None:
         """Make the application; nothing is read or started yet.
 
@@ -74,6 +85,7 @@ class DataServer:
             audit: Records refused tokens and changes of maps; None records nothing.
             describe: Returns what the map in an object that a robot sent holds; None starts a process with
                 limits for it.
+            pause: Waits for so many seconds before a robot above its rate gets its refusal.
         """
         self._audit = audit
         self._refusals = RefusalLimiter()
@@ -82,6 +94,7 @@ class DataServer:
         self._log = log
         self._clock = clock
         self._wall_clock = wall_clock
+        self._pause = pause
         self._limits = RequestLimits(settings.data)
         self._closing = contextlib.ExitStack()
         if describe is None:
@@ -162,7 +175,11 @@ class DataServer:
             return await handler(request, _ANONYMOUS, path)
         claims = self._claims(request, route.scope, path.get("name", ""), line)
         has_body = route.body is not None
-        self._limits.begin(claims.robot, route.cost, self._clock(), has_body=has_body)
+        try:
+            self._limits.begin(claims.robot, route.cost, self._clock(), has_body=has_body)
+        except TooManyRequests:
+            await self._pause(_REFUSAL_PAUSE_S)  # each of its connections asks again only after this
+            raise
         admitted.callback(self._limits.end, claims.robot, has_body=has_body)
         if not has_body and not await request.drain(self._settings.data.part_bytes):
             raise BadRequest("this request takes no body", hint="leave it out")

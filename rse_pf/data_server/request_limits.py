@@ -17,7 +17,7 @@ from rse_pf.token_bucket import TokenBucket
 
 __all__ = ["RequestLimits"]
 
-_BURST_S = 10.0
+_BURST_S = 4.0
 """A robot may make the requests of this time at once."""
 _MAX_ROBOTS = 10_000
 _BODIES_PER_ROBOT, _BODIES_PER_TENANT = 0.25, 0.75
@@ -42,7 +42,7 @@ class RequestLimits:
 
     @property
     def known_robots(self) -> int:
-        """How many robots are remembered; bounded, whoever sends."""
+        """How many robots are remembered; bounded, however many send."""
         return len(self._robots)
 
     def begin(self, robot: RobotId, cost: float, now: float, *, has_body: bool) -> None:

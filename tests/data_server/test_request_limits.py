@@ -24,7 +24,7 @@ def ask(admission: RequestLimits, robot: RobotId, now: float, cost: float = 1.0)
 
 def test_a_robot_beyond_its_rate_is_told_when_to_come_back_and_others_are_served() -> None:
     gate = admission()
-    for _ in range(100):  # ten seconds' worth may come at once
+    for _ in range(40):  # four seconds' worth may come at once
         ask(gate, ROBOT, now=0.0)
 
     with pytest.raises(TooManyRequests) as refused:
@@ -37,7 +37,7 @@ def test_a_robot_beyond_its_rate_is_told_when_to_come_back_and_others_are_served
 
 def test_a_dear_request_counts_for_several() -> None:
     gate = admission()
-    for _ in range(5):
+    for _ in range(2):
         ask(gate, ROBOT, now=0.0, cost=20.0)
 
     with pytest.raises(TooManyRequests):
@@ -84,7 +84,7 @@ def test_a_refused_request_takes_nothing() -> None:
             gate.begin(ROBOT, 1.0, 0.0, has_body=True)
     gate.end(ROBOT, has_body=True)
 
-    ask(gate, ROBOT, now=0.0, cost=99.0)
+    ask(gate, ROBOT, now=0.0, cost=39.0)
 
 
 def test_the_names_of_robots_that_come_and_go_take_no_memory() -> None:
