@@ -12,10 +12,12 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
-__all__ = ["MAX_MIB", "MAX_MS", "Meter"]
+__all__ = ["BARS", "MAX_MIB", "MAX_MS", "Meter"]
 
 MAX_MS = 10.0
 MAX_MIB = 2.0
+BARS = {"codec": (MAX_MS, MAX_MIB), "snapshots": (MAX_MS, 16.0), "maps": (100.0, 64.0)}
+"""Milliseconds and MiB of one input by target: those that a server reads for a stranger."""
 
 _TRACED_FROM_MS = 0.5
 """Nothing takes two MiB in less."""

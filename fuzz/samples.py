@@ -6,14 +6,22 @@ the same on every machine.
 
 from __future__ import annotations
 
+import math
 import zlib
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import msgspec
+import numpy as np
 
+from rse_pf.backend.sandbox.ipc import encode_message
+from rse_pf.maps.format import Edge, MapVersion, decode_map, encode_map
 from rse_pf.pnp.problems import DEGENERATE, KINECT, make_degenerate, make_problem
+from rse_pf.services.mapping.pose_graph import write_g2o
 from rse_pf.services.pnp import make_request
+from rse_pf.services.synthetic_maps import make_room, make_sphere, make_world
 from rse_pf.wire import Cancel, Command, Failure, Hello, Ping, Result, make_codec
 
 __all__ = ["CORPUS", "EXPENSIVE", "MAX_INPUT_BYTES", "samples"]
@@ -145,4 +153,59 @@ EXPENSIVE: dict[str, tuple[str, bytes]] = {
 }  # fmt: skip
 """Name to codec and message."""
 
-_MADE = {"codec": _messages, "frames": _frames, "stream": _streams, "geometry": _problems}
+
+def _maps() -> list[bytes]:
+    bare = encode_map(MapVersion(keyframes=(), provenance={"made_by": "fuzz", "list": [1, [2.5, None]]}))
+    whole = encode_map(make_world(7, points=300).walk("robot-1", np.linspace(0.0, 0.1, 3), seed=2)[0])
+    few = decode_map(whole).keyframes[:2]
+    cut = [replace(k, pixels=k.pixels[:2], descriptors=k.descriptors[:2], points_camera=k.points_camera[:2])
+           for k in few]  # fmt: skip
+    edge = Edge(a=cut[0].id, b=cut[1].id, T_a_b=np.eye(4), information=np.eye(6))
+    cloud = np.ones((2, 3), dtype=np.float32)
+    small = encode_map(
+        MapVersion(keyframes=tuple(cut), edges=(edge,), points=cloud, colours=cloud.astype(np.uint8))
+    )
+    return [
+        each
+        for data in (bare, small, whole)
+        for each in (b"\x01" + data, b"\x00" + zlib.decompress(data[8:]))
+    ]
+
+
+def _keyframes() -> list[bytes]:
+    keyframe = make_world(7, points=300).walk("robot-1", np.linspace(0.0, 0.1, 3), seed=2)[0].keyframes[0]
+    features = keyframe.pixels.tobytes() + keyframe.descriptors.tobytes() + keyframe.points_camera.tobytes()
+    heads = (b"\x28\x00\x50\x30\x00", b"\x3f\x00\xd0\x30\x01", b"\x00\x00\x00\x00\x01")
+    return [head + b"\0\0\0" + features for head in heads]
+
+
+def _sandbox_messages() -> list[bytes]:
+    answers: tuple[Any, ...] = (
+        ["ready"], [True, {"count": 1, "list": [1.5] * 40}, b"state", 1.5], [True, np.arange(8.0), None, 0.1],
+        [False, "bad-request", "a problem", "a hint", 2.0], [True, None, None, math.nan], [True, 1, 7, 1.0],
+        [True, [["a", 1]] * 30, None, 1.0],
+    )  # fmt: skip
+    frames = [encode_message(answer) for answer in answers]
+    return [b"\x01" + b"".join(frames), *(b"\x00" + frame[4:] for frame in frames)]
+
+
+def _graphs() -> list[bytes]:
+    sphere, _ = make_sphere(1, rings=4, per_ring=5)
+    text = write_g2o(sphere).encode()
+    lines = text.splitlines(keepends=True)
+    return [text, b"".join(lines[:2] + lines[20:21]), b"# nothing\n", b"FIX 0\n" + b"".join(lines[:6])]
+
+
+def _clouds() -> list[bytes]:
+    room = make_room(3, points=150)
+    head = b"\x64\x01\x00\x04\x04\x3c\x80\x08\x10\x01\x01"
+    return [
+        bytes([kind]) + head + room.astype(form).tobytes()
+        for kind, form in ((0, "<f8"), (3, "<f4"), (1, "i1"))
+    ]
+
+
+_MADE = {
+    "codec": _messages, "frames": _frames, "stream": _streams, "geometry": _problems, "maps": _maps,
+    "keyframes": _keyframes, "snapshots": _sandbox_messages, "graph": _graphs, "cloud": _clouds,
+}  # fmt: skip

@@ -7,11 +7,12 @@ is wrong.  Targets are deterministic and use no socket and no file.
 from __future__ import annotations
 
 import zlib
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
+from fuzz import map_targets
+from fuzz.checks import Target, TargetFailure, expect
 from fuzz.meter import Meter
 from rse_pf.backend.gateway.frames import (
     CloseBorder,
@@ -30,8 +31,6 @@ from rse_pf.wire.envelope import peek
 
 __all__ = ["TARGETS", "Target", "TargetFailure", "codec", "framed", "frames", "geometry", "stream"]
 
-Target = Callable[[bytes, Meter], None]
-
 PLATFORM = PlatformSettings()
 NARROW = SessionSettings(max_message_bytes=2000, max_fragments=4, max_control_per_s=3.0)
 _CONTINUATION, _TEXT, _BINARY, _CLOSE, _PING, _PONG = 0, 1, 2, 8, 9, 10
@@ -42,10 +41,6 @@ _SHORT = 8192
 """Longer payloads are not tried on every service: time is better spent on other inputs."""
 _REGISTRY = builtin_services(PLATFORM)
 _SERVICES: tuple[Service, ...] = tuple(_REGISTRY)
-
-
-class TargetFailure(AssertionError):
-    """The product violates one of its rules."""
 
 
 def codec(data: bytes, meter: Meter) -> None:
@@ -113,7 +108,7 @@ def frames(data: bytes, meter: Meter) -> None:
     parts, opened, pongs, over = list[bytes](), 0, list[float](), False
     for (opcode, fin, rsv, payload, now), decision in zip(sent, decisions, strict=True):
         if over:
-            _expect(decision is None, f"{decision!r} after the close")
+            expect(decision is None, f"{decision!r} after the close")
             continue
         if opcode in (_TEXT, _BINARY):
             parts, opened = [payload], opcode
@@ -121,31 +116,31 @@ def frames(data: bytes, meter: Meter) -> None:
             parts.append(payload)
         over = isinstance(decision, CloseSocket)
         if rsv or opcode not in (_CONTINUATION, _TEXT, _BINARY, _CLOSE, _PING, _PONG):
-            _expect(over, "a frame that RFC 6455 forbids did not end the socket")
+            expect(over, "a frame that RFC 6455 forbids did not end the socket")
         if isinstance(decision, CloseSocket):
-            _expect(1000 <= decision.code <= 4999, "a close code that nobody may send")
+            expect(1000 <= decision.code <= 4999, "a close code that nobody may send")
         elif isinstance(decision, Received):
             _check_message(decision, parts, opened, limits, fin)
             parts = []
         elif isinstance(decision, SendPong):
             pongs.append(now)
-            _expect(opcode == _PING and decision.data == payload and len(payload) <= 125, "a wrong pong")
+            expect(opcode == _PING and decision.data == payload and len(payload) <= 125, "a wrong pong")
             recent = [at for at in pongs if at > now - 1.0]
-            _expect(len(recent) <= 2 * max(1.0, limits.max_control_per_s), "pongs beyond the rate")
+            expect(len(recent) <= 2 * max(1.0, limits.max_control_per_s), "pongs beyond the rate")
         else:
-            _expect(decision is None, f"{decision!r} is no decision")
-            _expect(len(parts) <= limits.max_fragments, "more fragments than allowed are held")
-            _expect(sum(map(len, parts)) <= limits.max_message_bytes, "more bytes than allowed are held")
+            expect(decision is None, f"{decision!r} is no decision")
+            expect(len(parts) <= limits.max_fragments, "more fragments than allowed are held")
+            expect(sum(map(len, parts)) <= limits.max_message_bytes, "more bytes than allowed are held")
 
 
 def _check_message(
     message: Received, parts: list[bytes], opened: int, limits: SessionSettings, fin: bool
 ) -> None:
-    _expect(fin, "a message ended without its last frame")
-    _expect(message.data == b"".join(parts), "a message is not what its frames held")
-    _expect(message.is_text == (opened == _TEXT), "a message changed its kind")
-    _expect(len(message.data) <= limits.max_message_bytes, "a message above the limit")
-    _expect(len(parts) <= limits.max_fragments, "a message of more fragments than allowed")
+    expect(fin, "a message ended without its last frame")
+    expect(message.data == b"".join(parts), "a message is not what its frames held")
+    expect(message.is_text == (opened == _TEXT), "a message changed its kind")
+    expect(len(message.data) <= limits.max_message_bytes, "a message above the limit")
+    expect(len(parts) <= limits.max_fragments, "a message of more fragments than allowed")
     if message.is_text:
         message.data.decode()
 
@@ -162,7 +157,7 @@ def stream(data: bytes, meter: Meter) -> None:
 
     whole = meter.call(lambda sent: taken([memoryview(sent)]), body, ProtocolError)
     cut = [memoryview(body)[i : i + step] for i in range(0, len(body), step)]
-    _expect(taken(cut) == whole, f"cut each {step} bytes, the stream ends elsewhere")
+    expect(taken(cut) == whole, f"cut each {step} bytes, the stream ends elsewhere")
 
 
 def geometry(data: bytes, meter: Meter) -> None:
@@ -183,7 +178,7 @@ def geometry(data: bytes, meter: Meter) -> None:
     command = Command(id=1, service="pnp", payload=payload)
     answer = meter.call(lambda _: dispatch(_REGISTRY, command, lambda: 0.0), data, ProtocolError)
     if isinstance(answer, Failure):
-        _expect(answer.code != "internal", f"a defect: {answer.message}")
+        expect(answer.code != "internal", f"a defect: {answer.message}")
         return
     check_pose(answer, np.reshape(points, (-1, 3)))
 
@@ -192,14 +187,14 @@ def check_pose(answer: Result, points: np.ndarray) -> None:
     """Raise `TargetFailure` unless the pose is rigid, and not ok for a line or a single point."""
     reply = answer.reply
     T = np.asarray(reply.T_camera_world).reshape(4, 4)
-    _expect(bool(np.isfinite(T).all() and np.isfinite(reply.covariance).all()), "a pose that is not finite")
-    _expect(bool(np.abs(T[:3, :3] @ T[:3, :3].T - np.eye(3)).max() < 1e-6), "not a rotation")
-    _expect(bool(np.linalg.det(T[:3, :3]) > 0.0), "a reflection")
+    expect(bool(np.isfinite(T).all() and np.isfinite(reply.covariance).all()), "a pose that is not finite")
+    expect(bool(np.abs(T[:3, :3] @ T[:3, :3].T - np.eye(3)).max() < 1e-6), "not a rotation")
+    expect(bool(np.linalg.det(T[:3, :3]) > 0.0), "a reflection")
     inliers = points[np.asarray(reply.inliers, dtype=int)]
-    _expect(len(inliers) >= 4, "a pose of fewer than four matches")
+    expect(len(inliers) >= 4, "a pose of fewer than four matches")
     spread = np.linalg.svd(inliers - inliers.mean(axis=0), compute_uv=False)
     on_a_line = spread[1] <= 1e-6 * max(spread[0], 1e-300)
-    _expect(not (on_a_line and reply.verdict == "ok"), "points on one line were called ok")
+    expect(not (on_a_line and reply.verdict == "ok"), "points on one line were called ok")
 
 
 def _numbers(kind: int, data: bytes, count: int) -> list[float]:
@@ -213,9 +208,8 @@ def _numbers(kind: int, data: bytes, count: int) -> list[float]:
     return np.resize(found, count).tolist() if len(found) else [0.0] * count
 
 
-def _expect(holds: bool, otherwise: str) -> None:
-    if not holds:
-        raise TargetFailure(otherwise)
-
-
-TARGETS: dict[str, Target] = {"codec": codec, "frames": frames, "stream": stream, "geometry": geometry}
+TARGETS: dict[str, Target] = {
+    "codec": codec, "frames": frames, "stream": stream, "geometry": geometry, "maps": map_targets.maps,
+    "keyframes": map_targets.keyframes, "snapshots": map_targets.snapshots, "graph": map_targets.graph,
+    "cloud": map_targets.cloud,
+}  # fmt: skip

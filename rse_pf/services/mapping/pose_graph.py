@@ -8,7 +8,6 @@ a twist ``(rho metres, phi radians)``; ``information`` is the inverse covariance
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -225,8 +224,8 @@ def _join(values: Array) -> str:
 
 def _pose(words: list[str]) -> Array:
     numbers = [float(word) for word in words]
-    if len(numbers) != 7 or not all(math.isfinite(value) for value in numbers):
-        raise ValueError("a pose is x y z qx qy qz qw")
+    if len(numbers) != 7 or not all(abs(value) <= _MAX_M for value in numbers):
+        raise ValueError(f"a pose is x y z qx qy qz qw, each of at most {_MAX_M:g}")
     if np.linalg.norm(numbers[3:]) < 1e-6:
         raise ValueError("a quaternion is zero")
     T = np.eye(4)
