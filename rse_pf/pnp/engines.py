@@ -18,7 +18,15 @@ from rse_pf.errors import BadRequest, ConfigurationError, MissingExtra
 from rse_pf.geometry import Array, Camera
 from rse_pf.pnp.options import PnpOptions, WeakLimits
 
-__all__ = ["ENGINES", "Engine", "available_engines", "engine_for", "native_evidence", "native_options"]
+__all__ = [
+    "ENGINES",
+    "Engine",
+    "available_engines",
+    "engine_for",
+    "native_evidence",
+    "native_options",
+    "usable_engine",
+]
 
 # Refinements of the opencv engine, each on the inliers of the previous one.
 _MAX_REFINEMENTS = 4
@@ -51,6 +59,11 @@ def available_engines() -> tuple[str, ...]:
             continue
         found.append(name)
     return tuple(found)
+
+
+def usable_engine(name: str) -> str:
+    """Return *name*, or ``poselib`` where it is ``native`` and the library is missing or does not fit."""
+    return "poselib" if name == "native" and name not in available_engines() else name
 
 
 @cache

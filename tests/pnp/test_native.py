@@ -313,6 +313,11 @@ def test_the_rotation_is_orthonormal_to_the_last_bits(solver):
         np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-13)
 
 
+def test_the_native_engine_is_used_where_its_library_is(solver):
+    assert available_engines() == ("poselib", "opencv", "native")
+    assert engines.usable_engine("native") == "native"
+
+
 def test_a_plane_is_never_wrong_and_ok(solver):
     for seed in range(60):
         rng = np.random.default_rng(seed)
@@ -361,6 +366,7 @@ def test_without_the_library_the_other_engines_work_and_the_error_says_how_to_bu
 
     assert "make -C native" in caught.value.hint
     assert available_engines() == ("poselib", "opencv")
+    assert [engines.usable_engine(each) for each in ("native", "opencv")] == ["poselib", "opencv"]
     assert solve_pnp(problem.points_world, problem.pixels, KINECT).verdict == "ok"
 
 
