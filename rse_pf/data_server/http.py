@@ -24,6 +24,7 @@ from rse_pf.errors import (
     Disconnected,
     Expired,
     Forbidden,
+    InvalidCamera,
     LimitExceeded,
     NotFound,
     QuotaExceeded,
@@ -68,7 +69,7 @@ class TooManyRequests(Busy):
 _STATUS: dict[type[RsePfError], int] = {
     MethodNotAllowed: 405, TooManyRequests: 429,
     Unauthorized: 401, Forbidden: 403, NotFound: 404, Expired: 408, Conflict: 409, LimitExceeded: 413,
-    QuotaExceeded: 413, Crashed: 413, BadRequest: 400, Busy: 503, WorkerLost: 503,
+    QuotaExceeded: 413, Crashed: 413, BadRequest: 400, InvalidCamera: 400, Busy: 503, WorkerLost: 503,
     StoreFull: 507, StoreError: 503,
 }  # fmt: skip
 _RANGE = re.compile(r"bytes=(\d{0,18})-(\d{0,18})")
