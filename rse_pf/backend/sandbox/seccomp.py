@@ -1,7 +1,7 @@
 """The system calls that a sandbox may make, by language, and the seccomp filter that refuses all others.
 
-The lists hold what the examples, the templates and the tests of each language were seen to call (strace),
-and what other C libraries and kernels call in the same places.  Nothing here applies a filter.
+The lists hold what the examples, the templates and the tests of each language call, as strace showed, and
+what other C libraries and kernels call in the same places.  Nothing here applies a filter.
 
 Refused are, among others: new programs and processes, sockets, pipes and passed descriptors, mounts,
 shared memory and message queues of System V and POSIX, files in memory (memfd), file locks and leases

@@ -135,7 +135,8 @@ def locate(
 
 def register(registry: Registry, data: DataSettings | None = None) -> None:
     """Add ``localise`` to *registry*; *data* has the limit of a keyframe's features."""
-    keyframe_features = (data or DataSettings()).max_keyframe_features
+    limits = data or DataSettings()
+    keyframe_features = limits.max_keyframe_features
 
     @registry.service("localise", limited=True, warm_up=load_faiss)
     def localise(request: LocaliseRequest) -> LocaliseReply:

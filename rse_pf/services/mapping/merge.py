@@ -68,7 +68,8 @@ def merge_maps(
     """
     if not 1 <= len(request.maps) <= MAX_MAPS:
         raise BadRequest(f"{len(request.maps)} maps are not within 1..{MAX_MAPS}", hint="send one or more")
-    keyframe_features = (data or DataSettings()).max_keyframe_features
+    limits = data or DataSettings()
+    keyframe_features = limits.max_keyframe_features
     versions: list[MapVersion] = []
     for encoded in request.maps:
         versions.append(decode_map(encoded, limits=map_limits(keyframe_features)))

@@ -192,7 +192,8 @@ def check_comparisons(index: PlaceIndex, view: View, candidates: int) -> None:
 
 def register(registry: Registry, data: DataSettings | None = None) -> None:
     """Add ``place`` to *registry*; *data* has the limit of a keyframe's features."""
-    keyframe_features = (data or DataSettings()).max_keyframe_features
+    limits = data or DataSettings()
+    keyframe_features = limits.max_keyframe_features
 
     @registry.service("place", limited=True, warm_up=load_faiss)
     def place(request: PlaceRequest) -> PlaceReply:
