@@ -12,6 +12,7 @@ The load average stands beside the figures: discard CPU figures of a busy machin
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
 import os
 import platform
@@ -35,7 +36,7 @@ RIGHT_M, RIGHT_DEG = 0.1, 2.0
 KINDS = ("room", "room", "room", "room", "plane", "near-line", "few", "few")
 RECORDINGS = Path(__file__).resolve().parents[2] / "shared" / "data"
 OPTIONS, LIMITS = PnpOptions(), WeakLimits()
-OLD = "poselib of 0.1.0"
+OLD, PYTHON = "poselib of 0.1.0", "native pose, Python evidence"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -131,6 +132,17 @@ def old_engine() -> engines.Engine:
     return solve
 
 
+@contextlib.contextmanager
+def references() -> Iterator[None]:
+    """Let `solve_pnp` know PoseLib as 0.1.0 used it, and the native pose with the Python evidence."""
+    engines.ENGINES[OLD] = old_engine
+    engines.ENGINES[PYTHON] = engines.ENGINES["native"]
+    try:
+        yield
+    finally:
+        del engines.ENGINES[OLD], engines.ENGINES[PYTHON]
+
+
 def cpu_us(work: Callable[[], Any]) -> tuple[float, Any]:
     """Return the calling thread's CPU time of *work*, in microseconds, and its result."""
     begin = time.thread_time_ns()
@@ -193,16 +205,16 @@ def judgements(each: Case) -> tuple[tuple[str, str, Any], ...]:
         outcome(lambda: solve_pnp(points, pixels, camera, OPTIONS, default_engine=OLD)),
         outcome(lambda: solver.solve(points, pixels, camera, limits)),
         outcome(lambda: solver.solve(points, pixels, camera, narrow)),
-        outcome(lambda: solve_pnp(points, pixels, camera, OPTIONS, default_engine="native")),
+        outcome(lambda: solve_pnp(points, pixels, camera, OPTIONS, default_engine=PYTHON)),
     )
 
 
+@references()
 def compare(cases: Iterator[Case]) -> dict[str, Any]:
     """Return success, error and verdicts of PoseLib and the native solver on the same problems.
 
     A right pose lies within 0.1 m and 2 degrees of the truth.  Errors are compared where both are right.
     """
-    engines.ENGINES[OLD] = old_engine
     tally: dict[str, Counter[str]] = {}
     verdicts: Counter[str] = Counter()
     errors_m: dict[str, list[float]] = {"poselib": [], "native": []}
@@ -233,7 +245,6 @@ def compare(cases: Iterator[Case]) -> dict[str, Any]:
         if len(right) == 2:
             for name, metres in right.items():
                 errors_m[name].append(metres)
-    del engines.ENGINES[OLD]
     total: Counter[str] = sum(tally.values(), Counter())
     return {
         "kinds": {kind: dict(row) for kind, row in sorted(tally.items())},

@@ -23,7 +23,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from benchmarks.native_solver import case, compare, degenerate, normalised_errors, outcome, same_bytes
+from benchmarks.native_solver import (
+    case,
+    compare,
+    degenerate,
+    judgements,
+    normalised_errors,
+    outcome,
+    references,
+    same_bytes,
+)
 from rse_pf import native
 from rse_pf.errors import (
     BadRequest,
@@ -99,12 +108,12 @@ def test_no_less_success_and_accuracy_than_poselib_on_ten_thousand_problems(solv
 
 
 @pytest.mark.parametrize("make", [case, degenerate])
-def test_the_evidence_says_of_its_pose_what_the_python_evidence_says(solver, make):
-    for each in map(make, range(300)):
-        python = outcome(
-            lambda each=each: solve_pnp(each.points_world, each.pixels, KINECT, default_engine="native")
-        )
-        ours = outcome(lambda each=each: solver.solve(each.points_world, each.pixels, KINECT, OPTIONS))
+@pytest.mark.usefixtures("solver")
+def test_the_evidence_says_of_its_pose_what_the_python_evidence_says(make):
+    # The last ones have a second pose near the first, at another distance from the origin than from the points.
+    for each in map(make, [*range(300), 331, 471, 667, 681, 849]):
+        with references():
+            _, ours, _, python = judgements(each)
 
         # Verdict or error, sentence and hint.
         assert ours[:2] == python[:2]
