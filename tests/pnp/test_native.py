@@ -110,7 +110,7 @@ def test_no_less_success_and_accuracy_than_poselib_on_ten_thousand_problems(solv
 @pytest.mark.parametrize("make", [case, degenerate])
 @pytest.mark.usefixtures("solver")
 def test_the_evidence_says_of_its_pose_what_the_python_evidence_says(make):
-    # The last ones have a second pose near the first, at another distance from the origin than from the points.
+    # The last five have a second pose near the first, by the distance that pose_difference measures.
     for each in map(make, [*range(300), 331, 471, 667, 681, 849]):
         with references():
             _, ours, _, python = judgements(each)
