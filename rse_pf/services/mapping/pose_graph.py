@@ -174,7 +174,7 @@ def read_g2o(text: str) -> PoseGraph:
                 vertices[_id(words[0])] = _pose(words[1:])
             elif tag == "EDGE_SE3:QUAT":
                 information = np.zeros((6, 6))
-                information[_UPPER] = [float(word) for word in words[9:]]
+                information[_UPPER] = _information(words[9:])
                 information = np.triu(information) + np.triu(information, 1).T
                 edges.append((_id(words[0]), _id(words[1]), _pose(words[2:9]), information))
             elif tag != "FIX":
@@ -212,6 +212,13 @@ def _id(word: str) -> int:
     if abs(number) > _MAX_ID:
         raise ValueError("an id is not within 53 bits")
     return number
+
+
+def _information(words: list[str]) -> list[float]:
+    numbers = [float(word) for word in words]
+    if not all(abs(value) <= _MAX_INFORMATION for value in numbers):
+        raise ValueError(f"a number of the information is not within {_MAX_INFORMATION:g}")
+    return numbers
 
 
 def _pose_numbers(T: Array) -> Array:
