@@ -119,6 +119,7 @@ class ComputeLane(Generic[Answer]):
         return {
             "compute_queue": float(self._scheduler.waiting),
             "compute_running": float(self._scheduler.running),
+            "compute_cpu_s": self._limited.cpu_s(),
             "compute_blocked_robots": float(self._limited.blocked_robots(self._monotonic())),
         }
 

@@ -15,6 +15,7 @@ from rse_pf.config import PlatformSettings
 from rse_pf.crash_record import CrashRecord
 from rse_pf.errors import Busy, Crashed, Expired, InternalError, RsePfError
 from rse_pf.limited_process import LimitedProcesses
+from rse_pf.linux import cpu_seconds
 from rse_pf.service import failure_of
 from rse_pf.wire import Command, Failure, Result
 
@@ -60,6 +61,10 @@ class LimitedServices:
     def blocked_robots(self, now: float) -> int:
         """Return how many robots are refused now."""
         return self._crashes.blocked(now)
+
+    def cpu_s(self) -> float:
+        """Return the CPU seconds of all processes so far; less again after a template was lost."""
+        return sum(map(cpu_seconds, self._processes.pids()))
 
     def close(self) -> None:
         """End all processes; commands that are under way are answered with WorkerLost."""

@@ -14,7 +14,7 @@ import random
 import signal
 import socket
 import time
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Mapping
 from contextlib import suppress
 from importlib import metadata
 from pathlib import Path
@@ -383,7 +383,7 @@ class _Supervisor:
         merged = await self._merged()
         merged["gauges"].update(
             {
-                "cpu_s": self._cpu_s(),
+                "cpu_s": self._cpu_s(merged["gauges"]),
                 "resident_bytes": float(sum(map(resident_bytes, self._pids()))),
                 "ready": float(self._state == "ready"),
                 "accept_pauses": float(self._accept_pauses),
@@ -416,7 +416,7 @@ class _Supervisor:
                 "bytes_in": int(merged["bytes"].get("in", 0)),
                 "bytes_out": int(merged["bytes"].get("out", 0)),
                 "moved": int(gauges.get("moved", 0)),
-                "cpu_s": self._cpu_s(),
+                "cpu_s": self._cpu_s(merged["gauges"]),
                 "worker_cpu_s": [cpu_seconds(worker.pid) for worker in self._workers],
                 "resident_bytes": sum(map(resident_bytes, self._pids())),
                 "emulated_cores": self._settings.serving.emulated_cores,
@@ -518,8 +518,9 @@ class _Supervisor:
     def _pids(self) -> list[int]:
         return [os.getpid(), *(worker.pid for worker in self._workers)]
 
-    def _cpu_s(self) -> float:
-        return round(sum(map(cpu_seconds, self._pids())), 3)
+    def _cpu_s(self, gauges: Mapping[str, float]) -> float:
+        """Return the CPU seconds of the server and of its limited processes, which the workers report."""
+        return round(sum(map(cpu_seconds, self._pids())) + gauges.get("compute_cpu_s", 0.0), 3)
 
 
 def _json(value: Any, *, status: int = 200, headers: dict[str, str] | None = None) -> ControlReply:

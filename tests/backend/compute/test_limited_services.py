@@ -33,6 +33,9 @@ class ScriptedProcesses:
             raise outcome
         return outcome
 
+    def pids(self) -> list[int]:
+        return []
+
     def close(self) -> None:
         self.is_closed = True
 

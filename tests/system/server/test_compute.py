@@ -15,7 +15,7 @@ import pytest
 
 import client_sdk
 from rse_pf.errors import Busy, Crashed, Expired
-from rse_pf.linux import resident_bytes
+from rse_pf.linux import cpu_seconds, resident_bytes
 from rse_pf.pnp.problems import make_problem
 
 pytestmark = pytest.mark.system
@@ -109,6 +109,8 @@ async def test_poses_are_answered_while_hostile_commands_end_their_processes(ser
     assert kept_out.value.retry_after_ms is not None
     assert kept_out.value.retry_after_ms > 1e3
     assert server.http("/readyz")[0] == 200
+    own_s = cpu_seconds(server.process.pid) + cpu_seconds(worker)
+    assert server.status()["cpu_s"] - own_s > 0.4, "the scale modifier must see the CPU time of map services"
     line = server.wait_for_log("compute-crashed")
     assert (line["robot"], line["service"], line["blocked"]) == ("hostile", "decode", False)
 
