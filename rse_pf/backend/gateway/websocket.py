@@ -8,6 +8,7 @@ cut off, and nothing behind the first CLOSE frame is read.
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import socket
 from collections.abc import Callable
 from functools import partial
@@ -22,7 +23,7 @@ from rse_pf.backend.gateway.rate_limits import PendingHandshakes, SourceRates
 from rse_pf.config import ServingSettings
 from rse_pf.errors import MissingExtra
 
-__all__ = ["PendingSocket", "RobotSockets", "protocol_type"]
+__all__ = ["PendingSocket", "RobotSockets", "listener_type", "protocol_type"]
 
 _MAX_CLOSE_REASON_BYTES = 123
 _TOO_LONG = b"HTTP/1.1 431 Request Header Fields Too Large\r\nConnection: close\r\nContent-Length: 0\r\n\r\n"
@@ -109,7 +110,7 @@ class RobotSockets:
         picows, self._connect_accepted_socket = _libraries()
         self._picows = picows
         self._protocol = protocol_type(picows)
-        self._listener = _listener_type(picows, self._context.loop, serving)
+        self._listener = listener_type(picows, self._context.loop, serving)
         self._arguments = (
             _NoLogger(), True, serving.handshake_timeout_s,
             False, 20.0, 20.0, picows.WSAutoPingStrategy.PING_WHEN_IDLE, False,
@@ -259,7 +260,8 @@ def protocol_type(picows: Any) -> Any:
     return Protocol
 
 
-def _listener_type(picows: Any, loop: asyncio.AbstractEventLoop, serving: ServingSettings) -> Any:
+def listener_type(picows: Any, loop: asyncio.AbstractEventLoop, serving: ServingSettings) -> Any:
+    """Return the subclass of picows' listener that passes frames between a socket and the dispatcher."""
     kinds = picows.WSMsgType
 
     class Listener(picows.WSListener):  # type: ignore[misc]
@@ -328,7 +330,8 @@ def _listener_type(picows: Any, loop: asyncio.AbstractEventLoop, serving: Servin
         def close(self, code: int, reason: str) -> None:
             self._transport.send_close(code, reason.encode()[:_MAX_CLOSE_REASON_BYTES])
             # Closing with unread bytes would reset the connection, and the robot would not see the code.
-            self._transport.underlying_transport.write_eof()
+            with contextlib.suppress(OSError):  # the robot reset it, and the loop has not heard of that yet
+                self._transport.underlying_transport.write_eof()
             loop.call_later(_LINGER_S, self._transport.disconnect, False)
 
         def _cut_off(self) -> None:

@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import asyncio
+import errno
 import logging
+from types import SimpleNamespace
 
+from fakes import FakeLoop
 from picows import picows
 
-from rse_pf.backend.gateway.websocket import PendingSocket, protocol_type
+from rse_pf.backend.gateway.websocket import PendingSocket, listener_type, protocol_type
+from rse_pf.config import ServingSettings
 
 
 def test_the_protocol_takes_the_fifteen_arguments_that_we_give_it():
@@ -29,3 +33,36 @@ def test_opcodes_are_the_numbers_of_the_rfc():
     names = ("CONTINUATION", "TEXT", "BINARY", "CLOSE", "PING", "PONG")
 
     assert [int(getattr(picows.WSMsgType, name)) for name in names] == [0, 1, 2, 8, 9, 10]
+
+
+def test_a_socket_that_the_robot_has_reset_can_be_closed():
+    done: list[str] = []
+
+    class Transport:
+        """A socket whose reset the event loop has not seen yet."""
+
+        @property
+        def underlying_transport(self) -> Transport:
+            return self
+
+        def set_write_buffer_limits(self, high: int, low: int) -> None:
+            pass
+
+        def send_close(self, code: int, reason: bytes) -> None:
+            done.append(f"{code} {reason.decode()}")
+
+        def write_eof(self) -> None:
+            raise OSError(errno.ENOTCONN, "Transport endpoint is not connected")
+
+        def disconnect(self, graceful: bool) -> None:
+            done.append("disconnected")
+
+    loop = FakeLoop(0.0)
+    dispatcher = SimpleNamespace(connect=lambda *arguments: None)
+    listener = listener_type(picows, loop, ServingSettings())(dispatcher, None, 1)
+    listener.on_ws_connected(Transport())
+
+    listener.close(4403, "revoked")
+    loop.advance(60.0)
+
+    assert done == ["4403 revoked", "disconnected"], "one robot's socket must not end its worker"

@@ -282,6 +282,56 @@ def test_each_of_a_thousand_races_leaves_one_live_session(server: GuardedServer)
     asyncio.run(races(server, 1000))
 
 
+async def connect_on(server: GuardedServer, name: str, over: asyncio.Event) -> float:
+    """Connect again and again with fresh tokens; return when the last socket ended, refused after *over*."""
+    ended_s = 0.0
+    while True:
+        is_over = over.is_set()
+        try:
+            socket = Socket(await dial(server, server.token(name)))
+        except websockets.InvalidHandshake as error:  # also where a newer socket ended it before the answer
+            if is_over and isinstance(error, websockets.InvalidStatus):
+                return ended_s
+            continue
+        with contextlib.suppress(websockets.ConnectionClosed):
+            await socket.socket.send(CODEC.encode(Hello()))
+        await socket.end(30.0)
+        ended_s = socket.ended_s
+
+
+async def revoke_races(server: GuardedServer, count: int) -> float:
+    """Disable robots while each connects all the time; return the longest life after that, in seconds."""
+    longest_s = 0.0
+    for number in range(count):
+        name, over = f"storm-{number}", asyncio.Event()
+        connecting = [asyncio.create_task(connect_on(server, name, over)) for _ in range(4)]
+        await asyncio.sleep(0.01 * (number % 7))  # the moment is what is tried
+        server.access.change_deny_list(lambda d, name=name: d.with_robot("default", name, time.time()))
+        disabled_s = time.monotonic()
+        assert await until_refused(server, name) < 30.0
+        over.set()
+        longest_s = max(longest_s, max(await asyncio.gather(*connecting)) - disabled_s)
+    return longest_s
+
+
+async def until_refused(server: GuardedServer, name: str) -> float:
+    """Return how long a fresh token of *name* was accepted, in seconds."""
+    began = time.monotonic()
+    while (await server.handshake(f"Bearer {server.token(name)}".encode()))[0] == 101:
+        pass
+    return time.monotonic() - began
+
+
+def test_a_robot_that_connects_while_it_is_disabled_is_out_within_two_seconds(server: GuardedServer) -> None:
+    assert asyncio.run(revoke_races(server, 3)) < 2.0
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+def test_of_a_hundred_races_of_connecting_and_disabling_the_robot_wins_none(server: GuardedServer) -> None:
+    assert asyncio.run(revoke_races(server, 100)) < 2.0
+
+
 def test_keys_that_are_rotated_out_end_their_sockets_and_new_ones_need_no_restart(
     server: GuardedServer,
 ) -> None:
