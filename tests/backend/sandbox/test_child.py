@@ -203,6 +203,7 @@ int rse_pf_service_call(void *state, const uint8_t *request, uint64_t size, uint
   return RSE_PF_OK;
 }
 """
+EXAMPLES = Path(__file__).parents[3] / "examples" / "services"
 Ask = Callable[[Any], Any]
 
 
@@ -373,3 +374,21 @@ def test_a_full_scratch_folder_is_an_error_of_the_service(ask):
 
     assert full["why"] in ("ENOSPC", "EFBIG")
     assert full["bytes"] <= SCRATCH
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("example", ["icp-python", "icp-cpp", "icp-lua", "pnp-lua"])
+def test_every_example_answers_its_recorded_requests_in_a_sandbox(tmp_path, example):
+    if example != "icp-python" and shutil.which("cmake") is None:
+        pytest.skip("cmake is not installed")
+    folder = tmp_path / example
+    shutil.copytree(EXAMPLES / example, folder, ignore=shutil.ignore_patterns("build"))
+
+    done = subprocess.run(
+        [sys.executable, "-m", "rse_pf.cli.main", "service", "test", str(folder)],
+        capture_output=True, text=True, timeout=120, check=False,
+    )  # fmt: skip
+
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "2 of 2 recorded requests as expected" in done.stdout
+    assert "isolation" not in done.stdout + done.stderr, "a means of isolation is missing here"
