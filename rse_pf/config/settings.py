@@ -62,7 +62,7 @@ class ServingSettings:
     emulated_cores: float = setting(0.0, unit="cores", doc="CPU seconds per second that each worker may use, to emulate a smaller server; 0 is off", low=0, high=64)
     compute_processes: int = setting(1, doc="processes of each worker that compute map services; they are killed at the deadline", low=1, high=64)
     max_compute_memory_bytes: int = setting(1073741824, unit="bytes", doc="memory of one command of a map service; the process of one that needs more is ended", low=67108864)
-    max_compute_s: float = setting(10.0, unit="s", doc="CPU time of one command of a map service; the process of one that needs more is ended", low=0.1)
+    max_compute_s: float = setting(20.0, unit="s", doc="CPU time of one command of a map service; the process of one that needs more is ended", low=0.1)
     max_running_jobs: int = setting(1, doc="long jobs that run at the same time on one server; 0 turns long services off", low=0, high=64)
     max_waiting_jobs: int = setting(8, doc="further jobs of one worker that wait, or that it follows on another server; more are refused", low=0, high=1000)
     max_job_memory_bytes: int = setting(2147483648, unit="bytes", doc="memory of one job; a job that needs more is ended", low=134217728)
