@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import fcntl
 import itertools
 import os
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import BinaryIO
 
 import pytest
 from hypothesis import HealthCheck, given
@@ -351,6 +354,42 @@ def test_nothing_is_left_of_what_was_deleted(tmp_path: Path) -> None:
 
     left = {path.relative_to(tmp_path / "store").as_posix() for path in tmp_path.glob("store/**/*")}
     assert left == {"uploads", "uploads/lab", "uploads/lab/robot-1", "jobs", "jobs/lab"}
+
+
+def is_waited_for(lock: BinaryIO) -> bool:
+    """Return whether somebody waits for the lock on this file."""
+    inode = f":{os.fstat(lock.fileno()).st_ino} "
+    return any("->" in line and inode in line for line in Path("/proc/locks").read_text().splitlines())
+
+
+def locked(path: Path) -> BinaryIO:
+    lock = path.open("wb")
+    fcntl.flock(lock, fcntl.LOCK_EX)
+    return lock
+
+
+def until(condition: Callable[[], bool]) -> None:
+    deadline = time.monotonic() + 30
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.001)
+
+
+def test_a_writer_that_waited_for_a_removed_lock_waits_for_the_new_one(tmp_path: Path) -> None:
+    store, path = DirectoryStore(tmp_path), tmp_path / ".lock-head"
+    store.put("head", b"1")
+    with ThreadPoolExecutor(1) as pool, locked(path) as first:
+        writer = pool.submit(store.compare_and_swap, "head", b"1", b"2")
+        until(lambda: is_waited_for(first))
+        path.unlink()  # as one does who removes the object
+        with locked(path) as second:
+            first.close()
+            until(lambda: is_waited_for(second) or writer.done())
+            assert not writer.done(), "two writers hold the lock"
+            store.put("head", b"3")
+        with pytest.raises(Conflict):
+            writer.result(30)
+    assert store.get("head") == b"3"
 
 
 def test_writers_and_removers_of_one_folder_never_disturb_each_other(tmp_path: Path) -> None:
