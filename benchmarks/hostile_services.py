@@ -168,10 +168,11 @@ async def memory(folder: Path) -> list[Row]:
             await robot.call("hostile", {}, deadline_s=5)
             before, own = shared_and_kernel_bytes(), _own_bytes(server)
             call = asyncio.create_task(_outcome(robot, attack, 1.0))
-            peak, shared_peak = 0, 0
-            while not call.done():
-                shared_peak = max(shared_peak, shared_and_kernel_bytes() - before)
-                peak = max(peak, _own_bytes(server) - own + shared_and_kernel_bytes() - before)
+            peak, shared_peak, is_over = 0, 0, False
+            while not is_over:  # one sample comes after the answer
+                is_over = call.done()
+                shared = shared_and_kernel_bytes() - before
+                shared_peak, peak = max(shared_peak, shared), max(peak, _own_bytes(server) - own + shared)
                 await asyncio.sleep(0.02)  # samples
             rows.append({
                 "row": f"memory, {attack}", "outcome": call.result(), "peak_mib": peak / MIB,
