@@ -6,6 +6,8 @@ import asyncio
 import contextlib
 import datetime
 import ipaddress
+import random
+import shutil
 import socket
 import ssl
 import subprocess
@@ -154,6 +156,47 @@ def test_plain_text_gets_no_answer(listener: HandshakePolicy) -> None:
             answer = plain.recv(1024)
 
     assert not answer.startswith(b"HTTP")
+
+
+def client_hello(version: ssl.TLSVersion, host: str = "robots.invalid") -> bytes:
+    """Return the first flight of a client."""
+    received, sent = ssl.MemoryBIO(), ssl.MemoryBIO()
+    client = speaking(version).wrap_bio(received, sent, server_hostname=host)
+    with contextlib.suppress(ssl.SSLWantReadError):
+        client.do_handshake()
+    return sent.read()
+
+
+@pytest.mark.system
+def test_damaged_first_flights_and_any_server_name_leave_the_listener_as_it_was(
+    listener: HandshakePolicy,
+) -> None:
+    rng = random.Random(14)
+    versions = ssl.TLSVersion.TLSv1_2, ssl.TLSVersion.TLSv1_3
+    names = ("x.invalid", "a.b." * 60 + "c", "*.*", "127.0.0.1", "-")
+    flights = [client_hello(version, name) for version in versions for name in names]
+    with contextlib.ExitStack() as opened:
+        for number in range(200):
+            flight = bytearray(rng.choice(flights))
+            for _ in range(rng.randrange(1, 6)):
+                flight[rng.randrange(len(flight))] = rng.randrange(256)
+            plain = opened.enter_context(socket.create_connection(("127.0.0.1", listener.port), SOON_S))
+            plain.sendall(flight[: rng.randrange(len(flight))] if number % 5 == 0 else flight)
+
+        assert [listener.shake_hands(speaking(version)) is not None for version in versions] == [True, True]
+
+
+@pytest.mark.system
+@pytest.mark.skipif(shutil.which("openssl") is None, reason="openssl is not installed")
+def test_a_client_that_asks_to_renegotiate_is_refused(listener: HandshakePolicy) -> None:
+    told = subprocess.run(
+        ["openssl", "s_client", "-connect", f"127.0.0.1:{listener.port}", "-tls1_2", "-msg"],
+        input=b"R\n", capture_output=True, timeout=SOON_S, check=False,
+    )  # fmt: skip
+
+    _, asked, after = (told.stdout + told.stderr).partition(b"RENEGOTIATING")
+    assert asked
+    assert b"fatal no_renegotiation" in after or b"no renegotiation" in after
 
 
 @pytest.mark.system
