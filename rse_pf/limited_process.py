@@ -47,7 +47,7 @@ from rse_pf.errors import (
 )
 from rse_pf.linux import die_with_parent, set_process_name
 
-__all__ = ["DEFAULT_NICENESS", "Handler", "LimitedProcesses", "main"]
+__all__ = ["DEFAULT_NICENESS", "Handler", "LimitedProcesses", "Overran", "main"]
 
 Handler = Callable[[bytes], bytes]
 """What answers a call; raises MemoryError, or an `RsePfError` that the caller is to see."""
@@ -63,9 +63,18 @@ _OUT_OF_MEMORY = 77
 _OUT_OF_TIME = signal.SIGPROF
 """Ends a process that used up its CPU time, which it arms before each call."""
 _LENGTH = struct.Struct("<Q")
-_REPLY = struct.Struct("<BQ")
+_REPLY = struct.Struct("<BQd")
+"""Kind and length of what follows, and the CPU seconds of the process so far."""
 _DONE, _REFUSED, _DEFECT = 0, 1, 2
 _ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
+
+
+class Overran(Expired):
+    """The timeout passed during the work, which had taken ``cpu_s`` seconds of CPU time, and was killed."""
+
+    def __init__(self, timeout_s: float, cpu_s: float) -> None:
+        super().__init__(f"the work took longer than {timeout_s:.3g} s and was ended", hint="allow more time")
+        self.cpu_s = cpu_s
 
 
 class LimitedProcesses:
@@ -118,7 +127,7 @@ class LimitedProcesses:
 
         Raises:
             Crashed: *data* ended the process: a limit, or a signal; the message says which.
-            Expired: *timeout_s* passed during the work, and the process was killed.
+            Overran: *timeout_s* passed during the work, and the process was killed.
             Busy: *timeout_s* passed before a process was free or had been started.
             WorkerLost: The processes cannot be started, or were closed; *data* has no part in it.
             InternalError: The handler raised an exception that is none of the platform's.
@@ -137,14 +146,12 @@ class LimitedProcesses:
                     slot.forget()
                     process = slot.process = self._template.fork(until)
                 try:
-                    return _exchange(process.connection, data, until, self._max_reply_bytes)
+                    return _exchange(process, data, until, self._max_reply_bytes)
                 except TimeoutError:
-                    self._end(slot, process)
-                    raise Expired(
-                        f"the work took longer than {timeout_s:.3g} s and was ended", hint="allow more time"
-                    ) from None
+                    _, cpu_s = self._end(slot, process)
+                    raise Overran(timeout_s, cpu_s) from None
                 except _ProcessEnded as ended:
-                    how = self._end(slot, process)
+                    how, _ = self._end(slot, process)
                     if is_new or how == _name_of(_OUT_OF_TIME):
                         raise self._crash(ended.reason or how) from None
         finally:
@@ -161,8 +168,8 @@ class LimitedProcesses:
             while True:
                 self._free.get_nowait().forget()
 
-    def _end(self, slot: _Slot, process: _Process) -> str:
-        """Kill *process* unless it has ended, and return how it ended."""
+    def _end(self, slot: _Slot, process: _Process) -> tuple[str, float]:
+        """Kill *process* unless it has ended; return how it ended, and the CPU seconds of its last call."""
         slot.forget()
         return self._template.end(process)
 
@@ -181,6 +188,8 @@ class _Process:
         self.pid = pid
         self.connection = connection
         self.generation = generation
+        self.cpu_s = 0.0
+        """CPU seconds at the end of the last call."""
 
 
 class _Slot:
@@ -248,14 +257,16 @@ class _Template:
             self._forked.add(pid)
             return _Process(pid, ours, self._generation)
 
-    def end(self, process: _Process) -> str:
-        """Kill *process* unless it has ended, reap it, and return how it ended."""
+    def end(self, process: _Process) -> tuple[str, float]:
+        """Kill *process* unless it has ended; return how it ended, and the CPU seconds of its last call."""
         with self._lock:
             if self._is_closed or not self.has(process):
                 raise WorkerLost("the process ended with its template", hint="try again")
             self._forked.discard(process.pid)
-            code = int(self._ask({"do": "end", "pid": process.pid})["code"])
-        return f"exit code {code}" if code >= 0 else _name_of(-code)
+            reply = self._ask({"do": "end", "pid": process.pid})
+        code = int(reply["code"])
+        how = f"exit code {code}" if code >= 0 else _name_of(-code)
+        return how, max(0.0, float(reply["cpu_s"]) - process.cpu_s)
 
     def close(self) -> None:
         with self._lock:
@@ -336,13 +347,14 @@ def _name_of(signal_number: int) -> str:
     return f"signal {signal.Signals(signal_number).name}"
 
 
-def _exchange(connection: socket.socket, data: bytes, until: float, max_reply_bytes: int) -> bytes:
+def _exchange(process: _Process, data: bytes, until: float, max_reply_bytes: int) -> bytes:
     """Send *data* and return the reply; raises TimeoutError, `_ProcessEnded` or what the process refused."""
+    connection = process.connection
     try:
         connection.settimeout(_left_s(until))
         connection.sendall(_LENGTH.pack(len(data)))
         connection.sendall(data)
-        kind, length = _REPLY.unpack(_receive(connection, _REPLY.size, until))
+        kind, length, process.cpu_s = _REPLY.unpack(_receive(connection, _REPLY.size, until))
         if length > max_reply_bytes:
             raise _ProcessEnded(f"it replied with {length} bytes, above {max_reply_bytes}")
         reply = _receive(connection, length, until)
@@ -412,12 +424,12 @@ def _obey(owner: socket.socket, work: Callable[[socket.socket], NoReturn]) -> bo
             pid = os.fork()
             if pid == 0:
                 work(connection)
-        reply = {"pid": pid}
+        reply: dict[str, float] = {"pid": pid}
     else:
         with contextlib.suppress(ProcessLookupError):
             os.kill(order["pid"], signal.SIGKILL)  # not reaped yet, so nobody else has this id
-        _, status = os.waitpid(order["pid"], 0)
-        reply = {"code": os.waitstatus_to_exitcode(status)}
+        _, status, used = os.wait4(order["pid"], 0)
+        reply = {"code": os.waitstatus_to_exitcode(status), "cpu_s": used.ru_utime + used.ru_stime}
     try:
         owner.send(json.dumps(reply).encode())
     except OSError:
@@ -475,7 +487,7 @@ def _answer(connection: socket.socket, handler: Handler, cpu_s: float) -> bool:
         kind, reply = _DEFECT, b""
     signal.setitimer(signal.ITIMER_PROF, 0.0)
     try:
-        connection.sendall(_REPLY.pack(kind, len(reply)))
+        connection.sendall(_REPLY.pack(kind, len(reply), time.process_time()))
         connection.sendall(reply)
     except OSError:
         return False

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from rse_pf.errors import BadRequest, Busy, Crashed, Expired, InternalError, RsePfError, WorkerLost
-from rse_pf.limited_process import LimitedProcesses
+from rse_pf.limited_process import LimitedProcesses, Overran
 
 _HANDLER = '''
 import os, resource, signal, socket, time
@@ -38,6 +38,10 @@ def make(configuration):
             kept.append(bytearray(int(rest)))
         if word == "signal":
             os.kill(os.getpid(), int(rest))
+        if word == "burn":
+            end = time.process_time() + float(rest)
+            while time.process_time() < end:
+                pass
         if word == "loop":
             while True:
                 pass
@@ -190,11 +194,21 @@ def test_a_call_that_sleeps_is_killed_at_its_timeout(processes: LimitedProcesses
     pid = int(processes.call(b"pid", LONG_S))
     began = time.monotonic()
 
-    with pytest.raises(Expired):
+    with pytest.raises(Overran) as raised:
         processes.call(b"sleep", 0.1)
 
+    assert raised.value.cpu_s < 0.05
     assert time.monotonic() - began < 5.0
     assert state_of(pid) == ""
+
+
+def test_a_timeout_tells_the_cpu_time_of_its_own_call_alone(processes: LimitedProcesses):
+    processes.call(b"burn 0.2", LONG_S)
+
+    with pytest.raises(Overran) as raised:
+        processes.call(b"loop", 0.1)
+
+    assert 0.0 < raised.value.cpu_s < 0.15
 
 
 def test_what_the_handler_refuses_arrives_with_its_hint(processes: LimitedProcesses):

@@ -14,12 +14,16 @@ from rse_pf.backend.scheduling.scheduler import QueuedCommand
 from rse_pf.config import PlatformSettings
 from rse_pf.crash_record import CrashRecord
 from rse_pf.errors import Busy, Crashed, Expired, InternalError, RsePfError
-from rse_pf.limited_process import LimitedProcesses
+from rse_pf.limited_process import LimitedProcesses, Overran
 from rse_pf.linux import cpu_seconds
 from rse_pf.service import failure_of
 from rse_pf.wire import Command, Failure, Result
 
 __all__ = ["LimitedServices", "limited_processes"]
+
+_LONG_WORK_S = 2.0
+"""A command that used this much CPU time and did not end by its deadline counts like a crash, or its robot could
+take all the time of the processes.  One that was given less time does not."""
 
 
 def limited_processes(services: str, settings: PlatformSettings) -> LimitedProcesses:
@@ -78,22 +82,28 @@ class LimitedServices:
             raise refusal
         try:
             reply = self._processes.call(encode_request(command, queued.robot), queued.deadline_s - now)
-        except Expired:
+        except Overran as overrun:
+            if overrun.cpu_s >= _LONG_WORK_S:
+                self._note_crash(queued, overrun.message)
             raise Expired(
                 f"its deadline passed after {(context.clocks.monotonic() - now) * 1e3:.0f} ms of work",
                 hint="allow more time, or send a smaller map",
             ) from None
         except Crashed as crash:
-            is_blocked = self._crashes.crashed(queued.robot, context.clocks.monotonic())
-            context.log.warning(
-                "compute-crashed", robot=queued.robot, service=command.service, id=command.id,
-                trace=command.trace, reason=crash.message, blocked=is_blocked,
-            )  # fmt: skip
+            self._note_crash(queued, crash.message)
             raise
         answer, defect = decode_reply(reply, command, server=context.server_id)
         if defect:
             self._log_defect(command, defect)
         return answer
+
+    def _note_crash(self, queued: QueuedCommand, reason: str) -> None:
+        context, command = self._context, queued.command
+        is_blocked = self._crashes.crashed(queued.robot, context.clocks.monotonic())
+        context.log.warning(
+            "compute-crashed", robot=queued.robot, service=command.service, id=command.id,
+            trace=command.trace, reason=reason, blocked=is_blocked,
+        )  # fmt: skip
 
     def _log_defect(self, command: Command, text: str) -> None:
         self._context.log.error(

@@ -11,8 +11,9 @@ from backend.gateway.worker_parts import WorkerParts, worker_parts
 
 from rse_pf.backend.compute.limited_services import LimitedServices
 from rse_pf.backend.scheduling.scheduler import QueuedCommand
-from rse_pf.errors import Busy, Crashed, Expired, WorkerLost
+from rse_pf.errors import Busy, Crashed, WorkerLost
 from rse_pf.identity import RobotId
+from rse_pf.limited_process import Overran
 from rse_pf.wire import Command, Failure, Result
 
 ALICE, BOB = RobotId("default", "alice"), RobotId("default", "bob")
@@ -116,7 +117,8 @@ def test_two_crashes_keep_their_robot_out_and_no_other(
 @pytest.mark.parametrize(
     ("error", "code"),
     [
-        (Expired("its own deadline"), "expired"),
+        (Overran(0.06, 0.05), "expired"),
+        (Overran(60.0, 1.9), "expired"),
         (WorkerLost("no template"), "worker-lost"),
         (Busy("not started"), "busy"),
     ],
@@ -129,6 +131,16 @@ def test_only_crashes_are_evidence(
     codes = [code_of(limited.compute(place(worker))) for _ in range(6)]
 
     assert codes == [code] * 5 + ["ok"]
+
+
+def test_long_work_that_ends_at_the_deadline_is_evidence_too(
+    worker: WorkerParts, processes: ScriptedProcesses, limited: LimitedServices
+):
+    processes.script = [Overran(5.0, 4.5)] * 2
+
+    codes = [code_of(limited.compute(place(worker))) for _ in range(3)]
+
+    assert codes == ["expired", "expired", "busy"]
 
 
 @pytest.mark.parametrize("reply", [b"", b"\xc1", b"\x90", reply_of(0.0, None, ["x"]), b"\x93\x01\x02\x03"])
