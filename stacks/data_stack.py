@@ -37,7 +37,8 @@ class DataStack(cdk.Stack):
                     (s3.StorageClass.INFREQUENT_ACCESS, _INFREQUENT_AFTER_DAYS),
                     (s3.StorageClass.GLACIER, settings.data.glacier_after_days),
                 )
-            ]
+            ],
+            abort_incomplete_multipart_upload_after=cdk.Duration.days(1),
         )
         self.artifacts = self._bucket("Artifacts", self.access_logs)
         self.audit_logs = self._bucket(

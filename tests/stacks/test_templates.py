@@ -92,6 +92,20 @@ def test_alarms_of_this_account_may_publish_to_the_topic_and_nobody_without_tls(
     ]
 
 
+def test_parts_of_an_upload_that_was_not_completed_are_removed_after_a_day(assembly: Any) -> None:
+    rules = [
+        rule
+        for bucket in assembly.all("AWS::S3::Bucket")
+        for rule in bucket.get("LifecycleConfiguration", {}).get("Rules", [])
+    ]
+
+    assert [
+        rule["AbortIncompleteMultipartUpload"]["DaysAfterInitiation"]
+        for rule in rules
+        if "Transitions" in rule
+    ] == [1]
+
+
 def test_no_role_may_do_anything_to_everything_but_publish_numbers(assembly: Assembly) -> None:
     statements = [
         each
