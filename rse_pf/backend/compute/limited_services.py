@@ -22,8 +22,8 @@ from rse_pf.wire import Command, Failure, Result
 __all__ = ["LimitedServices", "limited_processes"]
 
 _LONG_WORK_S = 2.0
-"""A command that used this much CPU time and did not end by its deadline counts like a crash, or its robot could
-take all the time of the processes.  One that was given less time does not."""
+"""A command that used this much CPU time and did not end by its deadline counts like a crash: its robot could
+take all the time of the processes otherwise.  A command that was given less time does not count."""
 
 
 def limited_processes(services: str, settings: PlatformSettings) -> LimitedProcesses:
