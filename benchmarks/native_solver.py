@@ -209,6 +209,12 @@ def judgements(each: Case) -> tuple[tuple[str, str, Any], ...]:
     )
 
 
+def spread_mm(metres: list[float]) -> dict[str, float]:
+    """Return the median and the 95th percentile, in millimetres."""
+    p50, p95 = np.percentile(metres, [50, 95])
+    return {"p50": 1e3 * float(p50), "p95": 1e3 * float(p95)}
+
+
 @references()
 def compare(cases: Iterator[Case]) -> dict[str, Any]:
     """Return success, error and verdicts of PoseLib and the native solver on the same problems.
@@ -249,12 +255,8 @@ def compare(cases: Iterator[Case]) -> dict[str, Any]:
     return {
         "kinds": {kind: dict(row) for kind, row in sorted(tally.items())},
         "all": dict(total),
-        "error_mm": {
-            name: {"p50": 1e3 * float(np.median(found)), "p95": 1e3 * float(np.percentile(found, 95))}
-            for name, found in errors_m.items()
-            if found
-        },
-        "apart_mm": {"p50": 1e3 * float(np.median(apart_m)), "p95": 1e3 * float(np.percentile(apart_m, 95))},
+        "error_mm": {name: spread_mm(found) for name, found in errors_m.items() if found},
+        "apart_mm": spread_mm(apart_m) if apart_m else {},
         "other_verdict_than_0.1.0": dict(verdicts.most_common()),
         "other_bytes_without_avx2": lanes_differ,
         "other_verdict_than_python_on_the_same_pose": evidence_differs,
