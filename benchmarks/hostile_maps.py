@@ -137,7 +137,7 @@ def main() -> None:
     parser.add_argument("--n", type=int, default=300, help="commands of each kind with each server")
     parser.add_argument("--only", default="", help="regular expression of the names of hostile maps")
     parser.add_argument("--without-jobs", action="store_true")
-    parser.add_argument("--tree", type=Path, default=ROOT, help="flood a server of these sources")
+    parser.add_argument("--tree", type=Path, default=ROOT, help="sources of the server, or of the later one")
     parser.add_argument("--before", type=Path, help="sources of the other server")
     parser.add_argument("--out", type=Path, help="write the figures as JSON")
     args = parser.parse_args()
@@ -322,7 +322,7 @@ def show_flood(rows: dict[str, dict[str, Any]], others: dict[str, dict[str, Any]
 
 async def honest(args: argparse.Namespace, folder: Path) -> dict[str, Any]:
     """Ask two servers the same, in turns."""
-    trees = {"after": ROOT, "before": args.before.absolute()}
+    trees = {"after": args.tree.absolute(), "before": args.before.absolute()}
     servers = {name: Server(folder / name, workers=1, tree=tree) for name, tree in trees.items()}
     draw, report = random.Random(7), {}
     try:
