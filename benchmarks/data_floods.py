@@ -8,10 +8,14 @@ eight bytes, lists them over *listers* connections (every second one with ``limi
 over *writers* connections, all as fast as the service answers.  The two phases alternate, *rounds* times.  At
 the end, the hostile robot sends objects to a server without a limit of rates, beyond its number of objects.
 
-The hostile robot runs at the lowest priority: in the field its work costs a server nothing.
+In a third kind of phase, *committers* hostile robots upload and commit the maps of
+`tests/hostile/hostile_maps.py`, again and again, each robot all of them.
 
-Defends: the p99 of the PUT beside the flood is at most twice that of the quiet phases; the flood stores not
-one object above ``data.max_objects``; a page of 1,000 of 100,000 objects takes at most 50 ms.
+The hostile robots run at the lowest priority: in the field their work costs a server nothing.
+
+Defends: the p99 of the PUT beside the flood is at most twice that of the quiet phases, and beside hostile
+maps at most 1.5 times and 100 ms, with no 503; the flood stores not one object above ``data.max_objects``; a
+page of 1,000 of 100,000 objects takes at most 50 ms; the server grows by at most 64 MiB.
 """
 
 from __future__ import annotations
@@ -20,10 +24,12 @@ import argparse
 import contextlib
 import hashlib
 import http.client
+import itertools
 import json
 import multiprocessing
 import os
 import platform
+import runpy
 import signal
 import statistics
 import subprocess
@@ -32,7 +38,7 @@ import tempfile
 import threading
 import time
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from multiprocessing.synchronize import Event
 from pathlib import Path
 from typing import Any
@@ -42,8 +48,9 @@ from rse_pf.config import AuthSettings, PlatformSettings
 from rse_pf.identity import RobotId, object_name
 from rse_pf.object_store import DirectoryStore
 
+CORPUS = Path(__file__).resolve().parents[1] / "tests" / "hostile" / "hostile_maps.py"
 KIB = 1024
-RATIO, PAGE_MS = 2.0, 50.0
+RATIO, PAGE_MS, MAPS_RATIO, MAPS_MS, GROWTH_MIB = 2.0, 50.0, 1.5, 100.0, 64.0
 VICTIM, HOSTILE = RobotId("acme", "robot-1"), RobotId("rival", "robot-1")
 _LOWEST_PRIORITY = 19
 _TIMEOUT_S = 60.0
@@ -146,14 +153,42 @@ def flood(port: int, token: str, listers: int, writers: int, begun: Event, stop:
     results.put(dict(statuses))
 
 
+def flood_of_maps(port: int, tokens: list[str], begun: Event, stop: Event, results: Any) -> None:
+    """Upload and commit hostile maps, each robot all of them, until *stop*."""
+    os.nice(_LOWEST_PRIORITY)
+    statuses: Counter[str] = Counter()
+    maps = list(runpy.run_path(str(CORPUS))["hostile_maps"]().values())
+
+    def work(row: int) -> None:
+        client = Client(port, tokens[row])
+        for number in itertools.count(row * len(maps) // len(tokens)):
+            if stop.is_set():
+                break
+            data = maps[number % len(maps)]
+            status, _ = client.put(data)
+            statuses[f"put {status}"] += 1
+            body = json.dumps({"digest": hashlib.sha256(data).hexdigest()}).encode()
+            status, _ = client.ask("POST", f"/data/v1/maps/m-{row}-{number}/versions", body)
+            statuses[f"commit {status}"] += 1
+        client.close()
+
+    threads = [threading.Thread(target=work, args=(row,)) for row in range(len(tokens))]
+    for each in threads:
+        each.start()
+    begun.set()
+    for each in threads:
+        each.join()
+    results.put(dict(statuses))
+
+
 @contextlib.contextmanager
-def hostile_robot(port: int, token: str, args: argparse.Namespace, statuses: Counter[str]) -> Iterator[None]:
-    """Run the flood meanwhile, and add its statuses."""
+def hostile(
+    target: Callable[..., None], arguments: tuple[Any, ...], statuses: Counter[str]
+) -> Iterator[None]:
+    """Run a flood in a process meanwhile, and add its statuses."""
     context = multiprocessing.get_context("spawn")
     begun, stop, results = context.Event(), context.Event(), context.Queue()
-    process = context.Process(
-        target=flood, args=(port, token, args.listers, args.writers, begun, stop, results)
-    )
+    process = context.Process(target=target, args=(*arguments, begun, stop, results))
     process.start()
     try:
         if not begun.wait(_TIMEOUT_S):
@@ -235,8 +270,10 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
     """Return every figure."""
     key = SigningKey.from_seed(os.urandom(32), "key-1")
     statuses: Counter[str] = Counter()
+    map_statuses: Counter[str] = Counter()
     quiet: list[float] = []
     beside: list[float] = []
+    beside_maps: list[float] = []
     with tempfile.TemporaryDirectory(dir=args.folder) as made:
         folder = Path(made)
         store = DirectoryStore(folder / "objects")
@@ -244,11 +281,17 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
         with Server(folder, key, max_objects=args.objects) as server:
             victim = Client(server.port, token_of(key, VICTIM))
             store_pictures(victim, 2.0)
+            before_mib = server.memory_mib()
+            lists = server.port, token_of(key, HOSTILE), args.listers, args.writers
+            robots = [RobotId("rival", f"mapper-{row}") for row in range(args.committers)]
+            maps = server.port, [token_of(key, robot) for robot in robots]
             for _ in range(args.rounds):
                 quiet += store_pictures(victim, args.seconds)
-                with hostile_robot(server.port, token_of(key, HOSTILE), args, statuses):
+                with hostile(flood, lists, statuses):
                     beside += store_pictures(victim, args.seconds)
-            memory_mib = server.memory_mib()
+                with hostile(flood_of_maps, maps, map_statuses):
+                    beside_maps += store_pictures(victim, args.seconds)
+            grown_mib = server.memory_mib() - before_mib
             victim.close()
         with Server(folder, key) as server:
             lister = Client(server.port, token_of(key, HOSTILE))
@@ -257,8 +300,9 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
         count = reach_the_count(folder, key, args.attempts, args.objects)
         stored = store.usage(object_name(HOSTILE, "")).objects
     return {
-        "quiet": row(quiet), "beside": row(beside), "flood": dict(sorted(statuses.items())),
-        "pages": row(pages), "count": count, "stored": stored, "server_memory_mib": memory_mib,
+        "quiet": row(quiet), "lists": row(beside), "maps": row(beside_maps), "pages": row(pages),
+        "statuses": {"lists": dict(sorted(statuses.items())), "maps": dict(sorted(map_statuses.items()))},
+        "count": count, "stored": stored, "server_grown_mib": grown_mib,
     }  # fmt: skip
 
 
@@ -272,6 +316,7 @@ def main() -> None:
     parser.add_argument("--attempts", type=int, default=4000, help="new objects without a limit of rates")
     parser.add_argument("--listers", type=int, default=12)
     parser.add_argument("--writers", type=int, default=4)
+    parser.add_argument("--committers", type=int, default=4)
     parser.add_argument("--folder", type=Path, help="where the store is made (default: the system's)")
     parser.add_argument("--out", type=Path)
     args = parser.parse_args()
@@ -279,16 +324,15 @@ def main() -> None:
     found = run(args)
     found["load"] = [load, os.getloadavg()[0]]
     print(f"{platform.node()}, {os.cpu_count()} cores, load {load:.1f} -> {found['load'][1]:.1f}")
-    for name in ("quiet", "beside", "pages"):
+    for name in ("quiet", "lists", "maps", "pages"):
         figures = " ".join(f"{what}={value:.1f}" for what, value in found[name].items() if what != "n")
         print(f"{name:8} n={found[name]['n']} {figures}")
-    ratio = found["beside"]["p99_ms"] / found["quiet"]["p99_ms"]
-    print(f"PUT beside the flood: p99 {ratio:.2f} x quiet (bar {RATIO}); pages: bar {PAGE_MS:g} ms")
-    print(f"flood: {found['flood']}")
-    print(
-        f"stored {found['stored']} of at most {args.objects}; without a limit of rates: {found['count']}; "
-        f"server {found['server_memory_mib']:.0f} MiB at most"
-    )
+    lists, maps = (found[name]["p99_ms"] / found["quiet"]["p99_ms"] for name in ("lists", "maps"))
+    print(f"PUT beside lists and writes: p99 {lists:.2f} x quiet (bar {RATIO}); pages: bar {PAGE_MS:g} ms")
+    print(f"PUT beside hostile maps: p99 {maps:.2f} x quiet (bar {MAPS_RATIO}, and {MAPS_MS:g} ms)")
+    print(f"answers to the hostile robots: {found['statuses']}")
+    print(f"stored {found['stored']} of at most {args.objects}; without a limit of rates: {found['count']}")
+    print(f"the server grew by {found['server_grown_mib']:.0f} MiB (bar {GROWTH_MIB:g})")
     if args.out is not None:
         args.out.write_text(json.dumps(found, indent=1))
 
