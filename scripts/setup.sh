@@ -50,3 +50,5 @@ for lock in "$@"; do
   fi
   echo "$wanted" > "$stamp"
 done
+
+sh scripts/native.sh
