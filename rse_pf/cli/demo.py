@@ -39,7 +39,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--rate", type=float, default=5.0, metavar="HZ", help="frames per second (default: 5)"
     )
     parser.add_argument(
-        "--engine", choices=("poselib", "opencv"), default="poselib", help="PnP solver (default: poselib)"
+        "--engine",
+        choices=("native", "poselib", "opencv"),
+        default="native",
+        help="PnP solver (default: native, or poselib where the native library is missing)",
     )
     parser.add_argument(
         "--codec",
@@ -84,6 +87,7 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
             if importlib.util.find_spec(package) is None:  # before the drive, not after it
                 raise MissingExtra(package, extra)
     from rse_pf.experiments.demo.run import DemoOptions, run_demo
+    from rse_pf.pnp import usable_engine
 
     if args.data is not None:
         from client_sdk.datasets import open_dataset
@@ -95,7 +99,7 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
         data=args.data,
         robots=robots,
         rate_hz=args.rate,
-        engine=args.engine,
+        engine=usable_engine(args.engine),
         codec=args.codec,
         out=args.out,
         frames=args.frames,

@@ -107,7 +107,7 @@ class SessionSettings:
 class PnpSettings:
     """The perspective-n-point service."""
 
-    engine: str = setting("poselib", doc="solver of a command that chooses none", choices=("poselib", "opencv"))
+    engine: str = setting("native", doc="solver of a command that chooses none; poselib stands in where the native library is missing", choices=("native", "poselib", "opencv"))
     max_correspondences: int = setting(5000, doc="correspondences of one command", low=4)
     max_iterations: int = setting(1000, doc="RANSAC iterations a command may ask for", low=1, high=100000)
 

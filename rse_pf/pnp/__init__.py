@@ -3,8 +3,8 @@
 Estimating one camera pose belongs here; the messages of the service ``pnp`` belong to `rse_pf.services`.
 """
 
-from rse_pf.pnp.engines import available_engines
+from rse_pf.pnp.engines import available_engines, usable_engine
 from rse_pf.pnp.options import PnpOptions, WeakLimits
 from rse_pf.pnp.solver import PnpSolution, solve_pnp
 
-__all__ = ["PnpOptions", "PnpSolution", "WeakLimits", "available_engines", "solve_pnp"]
+__all__ = ["PnpOptions", "PnpSolution", "WeakLimits", "available_engines", "solve_pnp", "usable_engine"]

@@ -63,7 +63,12 @@ def available_engines() -> tuple[str, ...]:
 
 def usable_engine(name: str) -> str:
     """Return *name*, or ``poselib`` where it is ``native`` and the library is missing or does not fit."""
-    return "poselib" if name == "native" and name not in available_engines() else name
+    if name == "native":
+        try:
+            _native_engine()
+        except ConfigurationError:
+            return "poselib"
+    return name
 
 
 @cache

@@ -12,7 +12,7 @@ import numpy.typing as npt
 from rse_pf.errors import BadRequest, DegenerateGeometry, NoConsensus, PnpError, TooFewCorrespondences
 from rse_pf.geometry import Array, Camera
 from rse_pf.pnp import evidence
-from rse_pf.pnp.engines import Engine, engine_for
+from rse_pf.pnp.engines import Engine, engine_for, native_evidence, usable_engine
 from rse_pf.pnp.options import PnpOptions, WeakLimits
 from rse_pf.pnp.planar_ambiguity import second_planar_pose
 
@@ -65,7 +65,7 @@ def solve_pnp(
     camera: Camera,
     options: PnpOptions | None = None,
     *,
-    default_engine: str = "poselib",
+    default_engine: str | None = None,
     weak: WeakLimits = _DEFAULT_LIMITS,
 ) -> PnpSolution:
     """Estimate the camera pose from 3-D to 2-D matches, some of which are wrong.
@@ -79,7 +79,8 @@ def solve_pnp(
         pixels: ``(n, 2)``, undistorted pixels; row *i* observes row *i* of *points_world*.
         camera: Intrinsics of the image the pixels come from.
         options: RANSAC settings; ``None`` means the defaults.
-        default_engine: The engine when *options* names none.
+        default_engine: The engine when *options* names none; ``None`` means the native core, or PoseLib
+            where its library is missing.
         weak: Where a pose stops being ``ok``.
 
     Raises:
@@ -94,7 +95,9 @@ def solve_pnp(
     """
     options = options or _DEFAULT_OPTIONS
     points_world, pixels = _checked(points_world, pixels)
-    engine = options.engine or default_engine
+    engine = options.engine or default_engine or usable_engine("native")
+    if engine == "native":
+        return _solved_natively(points_world, pixels, camera, options, weak)
     propose = engine_for(engine)
     n = len(pixels)
     T_camera_world = _proposed(propose, points_world, pixels, camera, options)
@@ -129,6 +132,22 @@ def solve_pnp(
         verdict="weak" if reason else "ok",
         reason=reason,
         engine=engine,
+    )
+
+
+def _solved_natively(
+    points_world: Array, pixels: Array, camera: Camera, options: PnpOptions, weak: WeakLimits
+) -> PnpSolution:
+    """Return the pose and the evidence that the native core finds in one call."""
+    found = native_evidence(points_world, pixels, camera, options, weak)
+    return PnpSolution(
+        T_camera_world=found.T_camera_world,
+        inliers=found.inliers,
+        rmse_px=found.rmse_px,
+        covariance=found.covariance,
+        verdict="weak" if found.reason else "ok",
+        reason=found.reason,
+        engine="native",
     )
 
 

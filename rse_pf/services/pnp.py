@@ -12,11 +12,12 @@ import numpy.typing as npt
 from rse_pf.config import PnpSettings
 from rse_pf.errors import LimitExceeded, TooFewCorrespondences
 from rse_pf.geometry import Camera
-from rse_pf.pnp import PnpOptions, PnpSolution, solve_pnp
+from rse_pf.pnp import PnpOptions, PnpSolution, solve_pnp, usable_engine
 from rse_pf.service import Registry
 from rse_pf.wire.arrays import Array, reshaped
+from rse_pf.wire.native_codec import PnpTypes
 
-__all__ = ["PnpReply", "PnpRequest", "make_request", "register"]
+__all__ = ["PnpReply", "PnpRequest", "make_request", "register", "wire_types"]
 
 _UPPER = np.triu_indices(6)
 _FLAT_UPPER = 6 * _UPPER[0] + _UPPER[1]
@@ -104,9 +105,16 @@ def make_request(
     )
 
 
+def wire_types(registry: Registry) -> PnpTypes | None:
+    """Return what the codecs of a server decode a `pnp` command to, None if *registry* offers another one."""
+    own = any(each.name == "pnp" and each.request_type is PnpRequest for each in registry)
+    return PnpTypes(PnpRequest, Camera, PnpOptions, PnpReply) if own else None
+
+
 def register(registry: Registry, settings: PnpSettings) -> None:
     """Add ``pnp`` to *registry*, with the limits and the engine of *settings*."""
     defaults = PnpOptions(max_iterations=settings.max_iterations)
+    engine = usable_engine(settings.engine)
 
     @registry.service("pnp", cheap=True)
     def pnp(request: PnpRequest) -> PnpReply:
@@ -130,6 +138,4 @@ def register(registry: Registry, settings: PnpSettings) -> None:
                 f"{options.max_iterations} iterations are above {settings.max_iterations}",
                 hint="ask for fewer",
             )
-        return PnpReply.of(
-            solve_pnp(points_world, pixels, request.camera, options, default_engine=settings.engine)
-        )
+        return PnpReply.of(solve_pnp(points_world, pixels, request.camera, options, default_engine=engine))

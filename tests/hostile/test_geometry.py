@@ -14,6 +14,7 @@ import pytest
 from hostile.geometry_examples import search
 
 from fuzz.targets import check_pose
+from rse_pf import native
 from rse_pf.config import PlatformSettings
 from rse_pf.pnp import solver
 from rse_pf.service import dispatch
@@ -22,7 +23,10 @@ from rse_pf.wire import Command, Failure, make_codec
 
 SETTINGS = PlatformSettings()
 REGISTRY = builtin_services(SETTINGS)
-BOTH = pytest.mark.parametrize("engine", ["poselib", "opencv"])
+NATIVE = pytest.param(
+    "native", marks=pytest.mark.skipif(native.find_library() is None, reason="the native core is not built")
+)
+EVERY = pytest.mark.parametrize("engine", ["poselib", "opencv", NATIVE])
 
 _DEADLINE_S = SETTINGS.session.answer_timeout_s
 _ALLOWED_BEYOND_S = 0.1
@@ -128,7 +132,7 @@ def verdict(payload: dict[str, Any], engine: str) -> tuple[str, float]:
     return answer.reply.verdict, took_s
 
 
-@BOTH
+@EVERY
 @pytest.mark.parametrize("name", CASES)
 def test_each_case_has_its_answer_within_its_deadline(name: str, engine: str) -> None:
     payload, right = CASES[name]

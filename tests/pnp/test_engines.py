@@ -15,7 +15,10 @@ from rse_pf.geometry import pose_difference
 from rse_pf.pnp import PnpOptions, available_engines, engines, solve_pnp
 from rse_pf.pnp.problems import make_problem
 
-BOTH = pytest.mark.parametrize("engine", ["poselib", "opencv"])
+NATIVE = pytest.param(
+    "native", marks=pytest.mark.skipif(native.find_library() is None, reason="the native core is not built")
+)
+EVERY = pytest.mark.parametrize("engine", ["poselib", "opencv", NATIVE])
 
 
 def right(solution, problem):
@@ -32,7 +35,7 @@ def share_right(engine, *, n, outlier_ratio, problems):
     return good / problems
 
 
-@BOTH
+@EVERY
 @pytest.mark.parametrize("n", [100, 200])
 @pytest.mark.parametrize("outlier_ratio", [0.1, 0.3, 0.5])
 def test_both_engines_are_right_at_up_to_half_wrong_matches(engine, n, outlier_ratio):
@@ -115,7 +118,7 @@ def test_the_engines_agree_with_each_other():
         assert degrees < 0.2
 
 
-@BOTH
+@EVERY
 def test_the_same_request_gives_the_same_pose_whatever_was_solved_before_and_in_any_thread(engine):
     problem = make_problem(seed=11, outlier_ratio=0.6)
     options = PnpOptions(engine=engine)
@@ -139,7 +142,7 @@ def test_the_same_request_gives_the_same_pose_whatever_was_solved_before_and_in_
     assert all(np.array_equal(pose, poses[0]) for pose in poses)
 
 
-@BOTH
+@EVERY
 def test_a_plane_is_solved_right_or_not_at_all(engine):
     """Kept from a fault: EPnP fell into a plane's second minimum, and its pose was called ok."""
     rng = np.random.default_rng(3)

@@ -42,7 +42,7 @@ class DemoOptions:
     data: Path | None = None
     robots: int = 3
     rate_hz: float = 5.0
-    engine: str = "poselib"
+    engine: str = "native"
     codec: str = "zlib"
     out: Path = Path("out")
     frames: int | None = None
