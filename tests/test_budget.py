@@ -209,3 +209,29 @@ def test_inflating_refuses_what_is_not_one_stream():
             inflate_within(wrong, WIDE)
     with pytest.raises(LimitExceeded):
         inflate_within(zlib.compress(np.random.default_rng(1).bytes((1 << 20) + 1)), WIDE)
+
+
+def test_bytes_that_deflate_well_are_refused_by_their_ratio_behind_others_that_do_not():
+    noise = np.random.default_rng(3).bytes(1500)
+    for zeros, is_allowed in ((25_000, True), (40_000, False), (1 << 19, False)):
+        data = zlib.compress(noise + bytes(zeros), 9)
+        assert (len(noise) + zeros <= len(data) * WIDE.inflate_ratio) == is_allowed
+        if is_allowed:
+            assert inflate_within(data, WIDE) == noise + bytes(zeros)
+            continue
+        with pytest.raises(LimitExceeded):
+            inflate_within(data, WIDE)
+
+
+def test_bytes_after_a_stream_are_seen_wherever_it_ends():
+    noise = np.random.default_rng(4).bytes(70_000)
+    first = int(WIDE.free_bytes / WIDE.inflate_ratio)
+    ends = {first - 1, first, first + 1, first + 65_535, first + 65_536, first + 65_537}
+    streams = [zlib.compress(noise[:size], 0) for base in ends for size in range(base - 40, base)]
+    assert ends <= {len(data) for data in streams}
+
+    for data in (each for each in streams if len(each) in ends):
+        assert inflate_within(data, WIDE) == zlib.decompress(data)
+        for more in (b"x", bytes(100_000)):
+            with pytest.raises(BadMessage):
+                inflate_within(data + more, WIDE)

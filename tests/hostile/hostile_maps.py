@@ -69,7 +69,7 @@ def _damaged() -> dict[str, bytes]:
         "a provenance that is a list": _map(_top(provenance=b"\x90")),
         "a text that is not UTF-8": _map(_top(provenance=b"\x81\xa1a\xa4\xff\xfe\xc0\x80")),
         "a field twice": _map(
-            b"\x86" + _top(keyframes=_list(_keyframe()))[1:] + _packed("keyframes") + _list(b"\x01")
+            b"\x86" + _top(keyframes=_list(_keyframe()))[1:] + _packed("keyframes") + _list(_keyframe())
         ),
         "keys that are no text": _map(_top(provenance=b"\x82\x01\x02\xc0\x03")),
         "keys that are lists": _map(_top(provenance=b"\x81\x91\x01\x02")),

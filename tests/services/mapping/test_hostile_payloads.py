@@ -131,7 +131,6 @@ HOSTILE: dict[str, tuple[str, dict[str, Any]]] = {
     "localise, a tolerance that is not a number": ("localise", view(options={"agree_m": math.nan})),
     "localise, a ratio that is not a number": ("localise", view(options={"min_inlier_ratio": math.nan})),
     "merge, no maps": ("merge", {"maps": []}),
-    "merge, a thousand maps": ("merge", {"maps": [MAP] * 1000}),
     "merge, a kernel without end": ("merge", {"maps": [MAP], "options": {"cauchy": math.inf}}),
 }  # fmt: skip
 ANSWERED = {
@@ -224,6 +223,21 @@ def test_a_map_that_was_merged_often_stays_readable() -> None:
     after = decode_map(encode_map(merged)).provenance
     assert after["parents"] == [{"robot": "robot-1"}] * 2
     assert len(after["from"]) == len(merged.keyframes)
+
+
+def test_merging_refuses_more_maps_than_can_be_paired() -> None:
+    answer = asked("merge", {"maps": [MAP] * 65, "options": {"candidates": 100}})
+
+    assert isinstance(answer, Failure)
+    assert "65 maps are not within 1..64" in answer.message
+
+
+@pytest.mark.parametrize("payload", [cloud(source=[1e7 + each for each in ROOM]), cloud(target=[1e12] * 300)])
+def test_clouds_beyond_the_voxels_of_the_solver_are_refused_before_it_is_asked(payload: Any) -> None:
+    answer = asked("icp", payload)
+
+    assert isinstance(answer, Failure)
+    assert "500000 voxels" in answer.message
 
 
 def test_merging_refuses_more_pairs_than_can_be_tried() -> None:
