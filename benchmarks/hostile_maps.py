@@ -135,6 +135,7 @@ def main() -> None:
     parser.add_argument("--robots", type=int, default=10)
     parser.add_argument("--seconds", type=float, default=20.0, help="length of the quiet windows")
     parser.add_argument("--n", type=int, default=300, help="commands of each kind with each server")
+    parser.add_argument("--rate", type=float, default=10.0, help="hostile commands per second, at most")
     parser.add_argument("--only", default="", help="regular expression of the names of hostile maps")
     parser.add_argument("--without-jobs", action="store_true")
     parser.add_argument("--tree", type=Path, default=ROOT, help="sources of the server, or of the later one")
@@ -179,7 +180,7 @@ async def flood(args: argparse.Namespace, folder: Path) -> dict[str, Any]:
                 await asyncio.sleep(args.seconds)
                 windows[f"quiet before {name}"] = began, now()
                 began = now()
-                rows[name] = await attack(server, mine, args.seconds)
+                rows[name] = await attack(server, mine, seconds=args.seconds, per_s=args.rate)
                 windows[name] = began, now()
             result = await swarm.finish(GRACE_S)
     finally:
@@ -230,9 +231,9 @@ def honest_view() -> Keyframe:
 
 
 async def attack(
-    server: Server, requests: list[tuple[str, str, dict[str, Any]]], seconds: float
+    server: Server, requests: list[tuple[str, str, dict[str, Any]]], *, seconds: float, per_s: float
 ) -> dict[str, Any]:
-    """Send *requests*, several at a time, again and again for *seconds*, at least once.
+    """Send *requests*, several at a time, again and again for *seconds*, each at least once.
 
     Returns:
         How they ended, and by how much memory grew.
@@ -251,6 +252,7 @@ async def attack(
             robot_name, service, payload = waiting[0]
             waiting.rotate(-1)
             sent += 1
+            await asyncio.sleep(began + sent / per_s - time.monotonic())
             asked = time.monotonic()
             try:
                 async with server.robot(robot_name) as robot:
