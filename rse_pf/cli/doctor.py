@@ -24,6 +24,7 @@ from pathlib import Path
 
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import ConfigurationError, MissingExtra
+from rse_pf.native import find_library, open_solver
 from rse_pf.terminal import show
 
 __all__ = ["Finding", "add_arguments", "check_machine", "report", "run"]
@@ -47,6 +48,8 @@ _DESCRIPTORS_PER_ROBOT = 2
 _OTHER_DESCRIPTORS = 256
 _LITTLE_MEMORY_MIB = 1024
 _ENVOY_ANSWERS_S = 10.0
+_NATIVE_FIX = "make -C native, which needs a C++ compiler, or pip install rse-pf-native"
+_ISOLATION_FIX = "allow user namespaces: sysctl -w user.max_user_namespaces=10000"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -84,7 +87,7 @@ def report(findings: Iterable[Finding], ready: str) -> int:
 def check_machine(settings: PlatformSettings) -> Iterator[Finding]:
     """Yield what is found, in the order in which it should be fixed."""
     checks: tuple[Callable[[PlatformSettings], Iterator[Finding]], ...] = (
-        _system, _extras, _engines, _balancer, _listener, _open_files, _size,
+        _system, _extras, _native_library, _engines, _isolation, _balancer, _listener, _open_files, _size,
     )  # fmt: skip
     for check in checks:
         yield from check(settings)
@@ -105,14 +108,53 @@ def _extras(settings: PlatformSettings) -> Iterator[Finding]:
         yield _finding(what, fix if missing else "", is_required=required)
 
 
+def _native_library(settings: PlatformSettings) -> Iterator[Finding]:
+    path = find_library()
+    if path is None:
+        yield _finding("native library: not built, so poses take several times the CPU", _NATIVE_FIX)
+        return
+    try:
+        solver = open_solver(path)
+    except ConfigurationError as error:
+        yield _finding(f"native library: {error.message}", error.hint)
+        return
+    yield _finding(f"native library: {solver.lanes} instructions, {path}")
+
+
 def _engines(settings: PlatformSettings) -> Iterator[Finding]:
+    from rse_pf.pnp import usable_engine
+
+    chosen = usable_engine(settings.pnp.engine)
+    yield _finding(f"engine in use: {chosen} (pnp.engine is {settings.pnp.engine})")
     for engine, module, extra in (("poselib", "poselib", "solver"), ("opencv", "cv2", "vision")):
         if _has(module):
             yield Finding(grade="ok", what=f"engine {engine} {_version_of(module)}")
         else:
-            chosen = settings.pnp.engine == engine
-            what = f"engine {engine} is not installed" + (" but chosen by pnp.engine" if chosen else "")
-            yield _finding(what, f"pip install 'rse-pf[{extra}]'", is_required=chosen)
+            needed = chosen == engine
+            what = f"engine {engine} is not installed" + (" but needed by pnp.engine" if needed else "")
+            yield _finding(what, f"pip install 'rse-pf[{extra}]'", is_required=needed)
+
+
+def _isolation(settings: PlatformSettings) -> Iterator[Finding]:
+    from rse_pf.backend.sandbox import isolation
+    from rse_pf.backend.sandbox.child import readable_paths
+
+    def make_root() -> None:
+        isolation.enter_namespaces()
+        isolation.make_root(readable_paths([]), 1 << 20, os.getuid())
+
+    missing = isolation.missing_isolation(
+        [
+            isolation.enter_namespaces,
+            make_root,
+            lambda: isolation.give_up_privileges(None),
+            isolation.forbid_system_calls,
+        ]
+    )
+    held = ", ".join(name for name in isolation.ISOLATION if name not in missing)
+    what = f"isolation of custom services: {held or 'none'}"
+    what += f"; missing: {', '.join(missing)}" if missing else ""
+    yield _finding(what, _ISOLATION_FIX if missing else "")
 
 
 def _balancer(settings: PlatformSettings) -> Iterator[Finding]:

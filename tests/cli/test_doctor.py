@@ -6,6 +6,7 @@ import socket
 import subprocess
 import sys
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 
@@ -56,12 +57,60 @@ def test_a_missing_required_extra_fails_and_an_optional_one_warns(monkeypatch: p
         return present(name)
 
     monkeypatch.setattr(doctor.importlib, "import_module", without)
-    found = findings()
+    found = findings(SETTINGS.replace(pnp={"engine": "poselib"}))
 
     assert only("extra backend: picows", found).grade == "fail"
     assert only("extra backend: picows", found).fix == "pip install 'rse-pf[backend]'"
     assert only("extra experiments: matplotlib", found).grade == "warn"
     assert only("engine poselib", found).grade == "fail"
+
+
+def test_a_native_library_stands_in_for_a_missing_poselib(monkeypatch: pytest.MonkeyPatch) -> None:
+    present = doctor.importlib.import_module
+
+    def without(name: str) -> object:
+        if name == "poselib":
+            raise ImportError(name)
+        return present(name)
+
+    monkeypatch.setattr(doctor.importlib, "import_module", without)
+    monkeypatch.setattr("rse_pf.pnp.usable_engine", lambda name: name)
+    found = findings()
+
+    assert only("engine in use", found).what == "engine in use: native (pnp.engine is native)"
+    assert only("engine poselib", found).grade == "warn"
+
+
+def test_without_the_native_library_the_doctor_says_how_to_build_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("rse_pf.cli.doctor.find_library", lambda: None)
+    monkeypatch.setattr("rse_pf.pnp.usable_engine", lambda name: "poselib")
+    found = findings()
+
+    assert only("native library", found).grade == "warn"
+    assert "make -C native" in only("native library", found).fix
+    assert only("engine in use", found).what == "engine in use: poselib (pnp.engine is native)"
+
+
+def test_a_native_library_that_does_not_load_is_a_warning(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    broken = tmp_path / "librse_pf_native.so"
+    broken.write_bytes(b"no library")
+    monkeypatch.setattr("rse_pf.cli.doctor.find_library", lambda: broken)
+
+    assert only("native library", findings()).grade == "warn"
+
+
+@pytest.mark.parametrize(("missing", "grade"), [([], "ok"), (["namespaces"], "warn")])
+def test_the_means_of_isolation_are_listed(
+    monkeypatch: pytest.MonkeyPatch, missing: list[str], grade: str
+) -> None:
+    monkeypatch.setattr("rse_pf.backend.sandbox.isolation.missing_isolation", lambda _: missing)
+    told = only("isolation", findings())
+
+    assert told.grade == grade
+    assert "seccomp" in told.what
+    assert ("missing: namespaces" in told.what) == bool(missing)
 
 
 def test_a_missing_solver_that_nobody_chose_is_a_warning(monkeypatch: pytest.MonkeyPatch) -> None:
