@@ -71,7 +71,10 @@ class Answering:
         self._keys = keys
         self._registry = Registry()
         pnp.register(self._registry, settings.pnp)
-        self._codecs: dict[str, Codec] = {name: make_codec(name, settings.session) for name in SUBPROTOCOLS}
+        self._codecs: dict[str, Codec] = {
+            name: make_codec(name, settings.session, pnp=pnp.wire_types(self._registry))
+            for name in SUBPROTOCOLS
+        }
 
     def answer(
         self, event: Mapping[str, Any], *, now_s: float, left_ms: float, clock: Callable[[], float]

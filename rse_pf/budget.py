@@ -11,14 +11,15 @@ Source:
 from __future__ import annotations
 
 import zlib
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
 
 from rse_pf.config import SessionSettings
-from rse_pf.errors import BadMessage, LimitExceeded
+from rse_pf.errors import BadMessage, LimitExceeded, RsePfError
 
 __all__ = [
     "LIST_VALUES",
@@ -26,6 +27,7 @@ __all__ = [
     "PROVENANCE",
     "SERVICE_REPLY",
     "Budget",
+    "Refusal",
     "announced_values",
     "check_json",
     "check_json_containers",
@@ -34,6 +36,7 @@ __all__ = [
     "inflate_short",
     "inflate_within",
     "measure_msgpack",
+    "refusal",
     "small_text",
 ]
 
@@ -100,6 +103,38 @@ def _plain(*, size: int, depth: int, containers: int, values: int, mixed_values:
     )  # fmt: skip
 
 
+Refusal = Literal[
+    "json-containers", "json-depth", "containers", "depth", "values", "memory", "cut-off", "followed",
+    "not-zlib", "not-one-stream", "bomb",
+]  # fmt: skip
+"""Why bytes are refused."""
+
+
+def refusal(reason: Refusal, budget: Budget, *, size: int, max_bytes: int) -> RsePfError:
+    """Return the error of *reason*, for another implementation of these guards.
+
+    Args:
+        reason: What was found.
+        budget: The limits.
+        size: Bytes on the wire.
+        max_bytes: What a bomb inflates to more than.
+    """
+    errors: dict[Refusal, Callable[[], RsePfError]] = {
+        "json-containers": lambda: _too_many_json_containers(budget.containers),
+        "json-depth": lambda: _too_deep_json(budget.depth),
+        "containers": lambda: _too_many_containers(budget.containers),
+        "depth": lambda: _too_deep(budget.depth),
+        "values": lambda: _too_many_values(budget.values),
+        "memory": lambda: _too_much_memory(budget.memory_bytes),
+        "cut-off": _cut_off,
+        "followed": _followed,
+        "not-zlib": _not_zlib,
+        "not-one-stream": _not_one_stream,
+        "bomb": lambda: _bomb(size, max_bytes),
+    }
+    return errors[reason]()
+
+
 PROVENANCE = _plain(size=1 << 20, depth=64, containers=40_000, values=150_000, mixed_values=150_000)
 """Where a map comes from, as its author wrote it."""
 
@@ -135,14 +170,14 @@ def inflate_within(data: bytes, budget: Budget) -> Text:
         # A decompression bomb is detected here, at a quarter of the cost of inflating all that is allowed.
         head = stream.decompress(data[:first], min(plain, max_bytes) + 1)
         if len(head) > min(plain, max_bytes):
-            raise _bomb(data, min(plain, max_bytes))
+            raise _bomb(len(data), min(plain, max_bytes))
         text: Text = head
         if len(data) > first:
             text = _rest(stream, head, data, first, max_bytes)
     except zlib.error as error:
         raise _not_zlib() from error
     if len(text) > max_bytes:
-        raise _bomb(data, max_bytes)
+        raise _bomb(len(data), max_bytes)
     if not stream.eof or stream.unused_data:
         raise _not_one_stream()
     return text
@@ -190,8 +225,8 @@ def _not_one_stream() -> BadMessage:
     return BadMessage("the zlib stream does not end with the message", hint="one stream for each message")
 
 
-def _bomb(data: bytes, max_bytes: int) -> LimitExceeded:
-    return LimitExceeded(f"{len(data)} bytes inflate to more than {max_bytes}", hint="send smaller messages")
+def _bomb(size: int, max_bytes: int) -> LimitExceeded:
+    return LimitExceeded(f"{size} bytes inflate to more than {max_bytes}", hint="send smaller messages")
 
 
 # --- MessagePack ----------------------------------------------------------------------------------
@@ -212,7 +247,7 @@ def check_msgpack(data: Text, budget: Budget) -> bool:
     if end <= budget.containers and end * MAP_VALUES <= budget.mixed_values:
         return False
     if measure_msgpack(data, 0, budget) != end:
-        raise BadMessage("bytes follow the message", hint="one value for each message")
+        raise _followed()
     return True
 
 
@@ -299,9 +334,9 @@ def small_text(data: Text, at: int) -> tuple[str, int]:
 
 def _check_containers(depth: int, containers: int, budget: Budget) -> None:
     if containers > budget.containers:
-        raise LimitExceeded(f"more than {budget.containers} lists and maps", hint="send arrays, raw")
+        raise _too_many_containers(budget.containers)
     if depth > budget.depth:
-        raise LimitExceeded(f"a message is nested deeper than {budget.depth}", hint="send flat lists")
+        raise _too_deep(budget.depth)
 
 
 def _flat_bytes(data: Text, at: int, count: int) -> int:
@@ -351,6 +386,18 @@ def _too_many_values(max_values: int) -> LimitExceeded:
     )
 
 
+def _too_many_containers(most: int) -> LimitExceeded:
+    return LimitExceeded(f"more than {most} lists and maps", hint="send arrays, raw")
+
+
+def _too_deep(most: int) -> LimitExceeded:
+    return LimitExceeded(f"a message is nested deeper than {most}", hint="send flat lists")
+
+
+def _followed() -> BadMessage:
+    return BadMessage("bytes follow the message", hint="one value for each message")
+
+
 # --- JSON -----------------------------------------------------------------------------------------
 
 
@@ -374,11 +421,9 @@ def check_json_containers(text: Text, budget: Budget) -> None:
         return
     brackets = _without_strings(text, _NOT_BRACKETS_OR_QUOTES)
     if brackets.count(b"[") + brackets.count(b"{") > max_lists:
-        raise LimitExceeded(
-            f"JSON of more than {max_lists} lists and objects", hint="send flat lists of numbers"
-        )
+        raise _too_many_json_containers(max_lists)
     if _depth(brackets) > max_depth:
-        raise LimitExceeded(f"JSON is nested deeper than {max_depth}", hint="send flat lists")
+        raise _too_deep_json(max_depth)
 
 
 def _check_values(text: Text, max_values: int) -> None:
@@ -398,10 +443,7 @@ def _check_memory(text: Text, max_bytes: int) -> None:
         return
     characters = len(text) if strings > _FEW_STRINGS or b'\\"' in text else _characters(text)
     if other + width * characters > max_bytes:
-        raise LimitExceeded(
-            f"a message that would take more than {max_bytes} bytes of memory",
-            hint="send arrays of numbers, or large data to the data server",
-        )
+        raise _too_much_memory(max_bytes)
 
 
 def _characters(text: Text) -> int:
@@ -435,3 +477,18 @@ def _without_strings(text: Text, dropped: bytes) -> bytes:
         kept.append(signs[~(inside | quotes)].tobytes())
         is_inside = bool(inside[-1])
     return b"".join(kept)
+
+
+def _too_many_json_containers(most: int) -> LimitExceeded:
+    return LimitExceeded(f"JSON of more than {most} lists and objects", hint="send flat lists of numbers")
+
+
+def _too_deep_json(most: int) -> LimitExceeded:
+    return LimitExceeded(f"JSON is nested deeper than {most}", hint="send flat lists")
+
+
+def _too_much_memory(max_bytes: int) -> LimitExceeded:
+    return LimitExceeded(
+        f"a message that would take more than {max_bytes} bytes of memory",
+        hint="send arrays of numbers, or large data to the data server",
+    )

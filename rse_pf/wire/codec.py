@@ -1,7 +1,8 @@
 """Bytes to messages and back: JSON, JSON+zlib (the paper's) and MessagePack with raw arrays.
 
 Input is untrusted: limits hold *while* decoding, and only errors of `rse_pf.errors` are raised.  A codec
-keeps no state between messages.
+keeps no state between messages.  Where the native core is built, it does what takes most of the time; the
+messages, the verdicts and the bytes stay the same, but for how a `pnp` reply is deflated.
 """
 
 from __future__ import annotations
@@ -25,7 +26,8 @@ from rse_pf.budget import (
 from rse_pf.config import SessionSettings
 from rse_pf.errors import BadMessage, LimitExceeded, RsePfError, UnsupportedProtocol
 from rse_pf.wire import arrays
-from rse_pf.wire.messages import FromRobot, FromServer, Message
+from rse_pf.wire.messages import Command, FromRobot, FromServer, Message, Result
+from rse_pf.wire.native_codec import NativeCodec, PnpTypes, native_codec
 
 __all__ = ["CODECS", "SUBPROTOCOLS", "Codec", "as_type", "codec_for", "make_codec"]
 
@@ -68,13 +70,27 @@ class Codec(Protocol):
         """Return what a server sent; raises BadMessage or LimitExceeded."""
 
 
-def make_codec(name: str, limits: SessionSettings | None = None) -> Codec:
-    """Return the codec called *name*: ``zlib``, ``json`` or ``bin``."""
+def make_codec(
+    name: str, limits: SessionSettings | None = None, *, pnp: PnpTypes | None = None, use_native: bool = True
+) -> Codec:
+    """Return the codec called *name*: ``zlib``, ``json`` or ``bin``.
+
+    Args:
+        name: Which one.
+        limits: What is accepted from the other side.
+        pnp: The types of the service `pnp`, where a server offers the platform's own: the payload of a plain
+            command is decoded to its request at once.
+        use_native: Whether the native core may be used, if it is there.
+
+    Raises:
+        UnsupportedProtocol: There is no such codec.
+    """
     session = limits or SessionSettings()
+    native = native_codec() if use_native else None
     if name == "bin":
-        return _BinaryCodec(session)
+        return _BinaryCodec(session, native, pnp)
     if name in ("zlib", "json"):
-        return _JsonCodec(session, compressed=name == "zlib")
+        return _JsonCodec(session, native, pnp, compressed=name == "zlib")
     raise UnsupportedProtocol(f"no codec named {name!r}", hint=f"choose one of {', '.join(CODECS)}")
 
 
@@ -95,11 +111,19 @@ def codec_for(offered: list[str]) -> str | None:
 
 
 class _JsonCodec:
-    def __init__(self, limits: SessionSettings, *, compressed: bool) -> None:
+    def __init__(
+        self,
+        limits: SessionSettings,
+        native: NativeCodec | None,
+        pnp: PnpTypes | None,
+        *,
+        compressed: bool,
+    ) -> None:
         self.name = "zlib" if compressed else "json"
         self.is_text = not compressed
         self._budget = Budget.of_messages(limits)
         self._compressed = compressed
+        self._native, self._pnp = native, pnp
         self._encode = msgspec.json.Encoder(enc_hook=arrays.json_encode_hook).encode
         self._from_robot = msgspec.json.Decoder(FromRobot).decode
         self._from_server = msgspec.json.Decoder(FromServer).decode
@@ -110,10 +134,20 @@ class _JsonCodec:
             return data
         if isinstance(message, FromRobot):
             return zlib.compress(data, _LEVEL)
+        if self._native is not None and self._is_pose(message):
+            return self._native.deflate(data)
         stream = zlib.compressobj(_REPLY_LEVEL, zlib.DEFLATED, _REPLY_WINDOW_BITS, _REPLY_MEMORY)
         return stream.compress(data) + stream.flush()
 
     def decode_from_robot(self, data: bytes) -> FromRobot:
+        if self._native is not None:
+            check_size(data, self._budget)
+            found = self._native.read(data, self.name, self._budget, self._pnp)
+            if isinstance(found, Command):
+                return found
+            if found is not None:
+                message: FromRobot = _guarded(self._from_robot, found)
+                return message
         return self._read(self._open(data))
 
     def decode_short_from_robot(self, data: bytes, max_bytes: int) -> FromRobot | None:
@@ -126,8 +160,14 @@ class _JsonCodec:
         message: FromServer = _guarded(self._from_server, text)
         return message
 
+    def _is_pose(self, message: Message) -> bool:
+        return (
+            self._pnp is not None and isinstance(message, Result) and type(message.reply) is self._pnp.reply
+        )
+
     def _read(self, text: bytes | bytearray) -> FromRobot:
-        check_json(text, self._budget)
+        if self._native is None or not self._native.check(text, "json", self._budget):
+            check_json(text, self._budget)
         message: FromRobot = _guarded(self._from_robot, text)
         return message
 
@@ -140,7 +180,8 @@ class _BinaryCodec:
     name = "bin"
     is_text = False
 
-    def __init__(self, limits: SessionSettings) -> None:
+    def __init__(self, limits: SessionSettings, native: NativeCodec | None, pnp: PnpTypes | None) -> None:
+        self._native, self._pnp = native, pnp
         self._budget = Budget.of_messages(limits)
         self._encode = msgspec.msgpack.Encoder(enc_hook=arrays.binary_encode_hook).encode
         self._from_robot = msgspec.msgpack.Decoder(FromRobot, ext_hook=arrays.extension_hook).decode
@@ -151,7 +192,13 @@ class _BinaryCodec:
 
     def decode_from_robot(self, data: bytes) -> FromRobot:
         check_size(data, self._budget)
-        is_checked = check_msgpack(data, self._budget)
+        is_checked = False
+        if self._native is not None:
+            found = self._native.read(data, self.name, self._budget, self._pnp)
+            if isinstance(found, Command):
+                return found
+            is_checked = found is not None
+        is_checked = is_checked or check_msgpack(data, self._budget)
         message: FromRobot = _guarded(self._from_robot, data)
         if not is_checked:
             _check_nesting(getattr(message, "payload", None), self._budget.depth)

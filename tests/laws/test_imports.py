@@ -13,10 +13,10 @@ from collections.abc import Iterator, Mapping
 import pytest
 
 ORDER = (
-    "rse_pf", "errors", "terminal", "linux", "limited_process", "files", "geometry", "token_bucket", "config",
-    "budget", "wire", "scaling", "object_store", "identity", "crash_record", "maps", "auth", "audit",
-    "service",
-    "native", "pnp", "services.mapping", "services.custom", "services",
+    "rse_pf", "errors", "terminal", "linux", "limited_process", "files", "geometry", "native",
+    "native_buffers", "token_bucket", "config", "budget", "wire", "scaling", "object_store", "identity",
+    "crash_record", "maps", "auth", "audit", "service",
+    "pnp", "services.mapping", "services.custom", "services",
     "aws", "aws.storage", "aws.fleet", "aws.money",
     "backend", "backend.scheduling", "backend.sandbox", "backend.jobs", "backend.compute",
     "backend.gateway",

@@ -35,6 +35,7 @@ from rse_pf.backend.scheduling.thread_pool import SolverThreads
 from rse_pf.errors import UnknownService
 from rse_pf.identity import RobotId
 from rse_pf.service import Registry
+from rse_pf.services.pnp import wire_types
 from rse_pf.wire import CODECS, Codec, Command, make_codec
 from rse_pf.wire.envelope import Envelope, peek
 from rse_pf.wire.server_session import CLOSE_GOING_AWAY, CLOSE_RATE, ServerSession
@@ -137,7 +138,9 @@ class Dispatcher:
         self._sandboxes = sandboxes
         self._jobs = jobs
         self._token_watch = token_watch
-        self._codecs: dict[str, Codec] = {name: make_codec(name, settings.session) for name in CODECS}
+        self._codecs: dict[str, Codec] = {
+            name: make_codec(name, settings.session, pnp=wire_types(registry)) for name in CODECS
+        }
         self._threads = SolverThreads(
             settings.serving.solver_threads,
             answers.compute,

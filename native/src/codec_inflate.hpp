@@ -1,0 +1,408 @@
+// Inflate one zlib stream from a stranger, within limits that hold while it is inflated.
+//
+// Source: RFC 1950 and RFC 1951.  What is refused is what zlib refuses.
+#pragma once
+
+#include <cstdint>
+#include <cstring>
+
+#include "rse_pf_codec.h"
+
+namespace rse_pf_codec {
+
+constexpr uint32_t kAdlerBase = 65521;
+
+inline uint32_t adler32(const uint8_t* bytes, int64_t count) {
+    uint32_t a = 1, b = 0;
+    while (count > 0) {
+        // Sums of 5,552 bytes and fewer stay below 2^32 (RFC 1950, Sect. 9).
+        int64_t left = count < 5536 ? count : 5536;
+        count -= left;
+        for (; left >= 16; left -= 16, bytes += 16) {
+            uint32_t sum = 0, weighted = 0;
+            for (uint32_t i = 0; i < 16; ++i) {
+                sum += bytes[i];
+                weighted += (16 - i) * bytes[i];
+            }
+            b += 16 * a + weighted;
+            a += sum;
+        }
+        for (; left > 0; --left) b += a += *bytes++;
+        a %= kAdlerBase;
+        b %= kAdlerBase;
+    }
+    return b << 16 | a;
+}
+
+// A table of one Huffman code: the entries of all codes up to kRoot bits, and behind them those of longer ones.
+// An entry is value << 8 | kind << 4 | bits: `bits` are taken; a kLink says where its second table begins.
+enum Kind : uint32_t { kLiteral = 0, kMatch = 1, kEnd = 2, kLink = 3, kInvalid = 4 };
+
+template <int kRootBits, int kEntries>
+struct HuffmanTable {
+    uint32_t entries[kEntries];
+
+    uint32_t find(uint64_t bits) const {
+        const uint32_t entry = entries[bits & ((1u << kRootBits) - 1)];
+        if ((entry >> 4 & 15) != kLink) return entry;
+        return entries[(entry >> 8) + (bits >> kRootBits & ((1u << (entry & 15)) - 1))];
+    }
+
+    // Fill the table for codes of `lengths`; false if they are no code, or one that zlib refuses.
+    template <class EntryOf>
+    bool fill(const uint8_t* lengths, int symbols, bool may_be_incomplete, EntryOf entry_of) {
+        int count[16] = {};
+        for (int symbol = 0; symbol < symbols; ++symbol) ++count[lengths[symbol]];
+        int longest = 15;
+        while (longest > 0 && count[longest] == 0) --longest;
+        int left = 1;
+        for (int length = 1; length <= 15; ++length) {
+            left = 2 * left - count[length];
+            if (left < 0) return false;
+        }
+        if (left > 0 && longest != 0 && !(may_be_incomplete && longest == 1)) return false;
+        if (left > 0) {
+            for (int i = 0; i < 1 << kRootBits; ++i) entries[i] = kInvalid << 4 | 1;
+        }
+        int offsets[16], sorted[320];
+        offsets[1] = 0;
+        for (int length = 1; length < 15; ++length) offsets[length + 1] = offsets[length] + count[length];
+        for (int symbol = 0; symbol < symbols; ++symbol) {
+            if (lengths[symbol] != 0) sorted[offsets[lengths[symbol]]++] = symbol;
+        }
+        uint32_t code = 0;  // with its first bit lowest, as it stands in the stream
+        int next = 0, begin = 1 << kRootBits, second_bits = 0;
+        uint32_t root = ~0u;
+        for (int length = 1; length <= longest; ++length) {
+            for (int remaining = count[length]; remaining > 0; --remaining, ++next) {
+                const int symbol = sorted[next];
+                const uint32_t entry = entry_of(symbol) | static_cast<uint32_t>(length);
+                if (length <= kRootBits) {
+                    for (uint32_t i = code; i < 1u << kRootBits; i += 1u << length) entries[i] = entry;
+                } else {
+                    const uint32_t low = code & ((1u << kRootBits) - 1);
+                    if (low != root) {
+                        if (root != ~0u) begin += 1 << second_bits;
+                        root = low;
+                        second_bits = length - kRootBits;
+                        for (int space = (1 << second_bits) - remaining, bits = length; space > 0 && bits < longest;) {
+                            ++second_bits;
+                            ++bits;
+                            space = 2 * space - count[bits];
+                        }
+                        if (begin + (1 << second_bits) > kEntries) return false;
+                        entries[low] = static_cast<uint32_t>(begin) << 8 | kLink << 4 |
+                                       static_cast<uint32_t>(second_bits);
+                    }
+                    for (uint32_t i = code >> kRootBits; i < 1u << second_bits; i += 1u << (length - kRootBits)) {
+                        entries[static_cast<uint32_t>(begin) + i] = entry;
+                    }
+                }
+                // The next code: add one at its last bit, which stands highest.
+                uint32_t bit = 1u << (length - 1);
+                while ((code & bit) != 0) bit >>= 1;
+                code = bit == 0 ? 0 : (code & (bit - 1)) | bit;
+            }
+        }
+        return true;
+    }
+};
+
+// At most 286 codes of 15 bits need 1,334 entries with a root of 10 bits, and 30 need 402 with one of 8 (zlib's
+// `enough.c`); `fill` refuses more in any case.
+typedef HuffmanTable<10, 1334> LiteralTable;
+typedef HuffmanTable<8, 402> DistanceTable;
+
+inline uint32_t literal_entry(int symbol) {
+    if (symbol < 256) return static_cast<uint32_t>(symbol) << 8 | kLiteral << 4;
+    if (symbol == 256) return kEnd << 4;
+    if (symbol > 285) return kInvalid << 4;
+    // The base length, and above it the number of extra bits.
+    static constexpr uint16_t kBases[29] = {3,  4,  5,  6,  7,  8,  9,  10, 11,  13,  15,  17,  19,  23, 27,
+                                            31, 35, 43, 51, 59, 67, 83, 99, 115, 131, 163, 195, 227, 258};
+    static constexpr uint8_t kExtra[29] = {0, 0, 0, 0, 0, 0, 0, 0, 1, 1, 1, 1, 2, 2, 2, 2, 3, 3, 3, 3, 4, 4, 4, 4, 5, 5, 5, 5, 0};
+    const int k = symbol - 257;
+    return static_cast<uint32_t>(kExtra[k]) << 24 | static_cast<uint32_t>(kBases[k]) << 8 | kMatch << 4;
+}
+
+inline uint32_t distance_entry(int symbol) {
+    if (symbol > 29) return kInvalid << 4;
+    const uint32_t extra = symbol < 4 ? 0u : static_cast<uint32_t>(symbol) / 2 - 1;
+    const uint32_t base = symbol < 4 ? static_cast<uint32_t>(symbol) + 1 : (2u + (static_cast<uint32_t>(symbol) & 1)) * (1u << extra) + 1;
+    return extra << 24 | base << 8 | kMatch << 4;
+}
+
+class Inflater {
+public:
+    Inflater(const uint8_t* data, int64_t bytes, const rse_pf_codec_budget& budget, uint8_t* text, int64_t room)
+        : begin_(data), in_(data), end_(data + bytes), text_(text), out_(text) {
+        const double by_ratio = static_cast<double>(bytes) * budget.inflate_ratio;
+        int64_t most = by_ratio < 9e15 ? static_cast<int64_t>(by_ratio) : int64_t{1} << 53;
+        if (most < budget.free_bytes) most = budget.free_bytes;
+        most_ = most < budget.inflated_bytes ? most : budget.inflated_bytes;
+        head_most_ = most_ < budget.free_bytes ? most_ : budget.free_bytes;
+        const double head = static_cast<double>(budget.free_bytes) / budget.inflate_ratio;
+        head_bytes_ = head < 9e15 ? static_cast<int64_t>(head) : int64_t{1} << 53;
+        room_ = room;
+        is_head_ = true;
+        set_stop();
+    }
+
+    int32_t inflate() {
+        if (end_ - in_ < 2) return RSE_PF_CODEC_NOT_ONE_STREAM;
+        const uint32_t header = static_cast<uint32_t>(in_[0]) << 8 | in_[1];
+        // Deflate with a window of at most 32 KiB, and no dictionary.
+        if (header % 31 != 0 || (in_[0] & 15) != 8 || in_[0] >> 4 > 7 || (in_[1] & 32) != 0) return RSE_PF_CODEC_NOT_ZLIB;
+        in_ += 2;
+        // Tables are made for each block: a stream of many tiny blocks would cost more than its bytes.
+        const int64_t most_blocks = 64 + (end_ - begin_) / 256;
+        int64_t blocks = 0;
+        for (bool is_last = false; !is_last;) {
+            if (++blocks > most_blocks) return RSE_PF_CODEC_UNKNOWN;
+            refill();
+            if (count_ < 3) return RSE_PF_CODEC_NOT_ONE_STREAM;
+            is_last = (bits_ & 1) != 0;
+            const uint32_t kind = static_cast<uint32_t>(bits_ >> 1 & 3);
+            drop(3);
+            int32_t status = RSE_PF_CODEC_NOT_ZLIB;
+            if (kind == 0) {
+                status = stored();
+            } else if (kind == 1) {
+                fixed_codes();
+                status = coded();
+            } else if (kind == 2) {
+                status = dynamic_codes();
+                if (status == RSE_PF_CODEC_READ) status = coded();
+            }
+            if (status != RSE_PF_CODEC_READ) return status;
+        }
+        drop(count_ & 7);
+        unread();
+        if (end_ - in_ < 4) return RSE_PF_CODEC_NOT_ONE_STREAM;
+        const uint32_t stated = static_cast<uint32_t>(in_[0]) << 24 | static_cast<uint32_t>(in_[1]) << 16 |
+                                static_cast<uint32_t>(in_[2]) << 8 | in_[3];
+        if (stated != adler32(text_, bytes())) return RSE_PF_CODEC_NOT_ZLIB;
+        return end_ - in_ == 4 ? RSE_PF_CODEC_READ : RSE_PF_CODEC_NOT_ONE_STREAM;
+    }
+
+    int64_t bytes() const { return out_ - text_; }
+    int64_t limit() const { return limit_; }
+
+private:
+    void refill() {
+        if (end_ - in_ >= 8) {
+            uint64_t more;
+            std::memcpy(&more, in_, 8);
+#if __BYTE_ORDER__ == __ORDER_BIG_ENDIAN__
+            more = __builtin_bswap64(more);
+#endif
+            bits_ |= more << count_;
+            in_ += (63 - count_) >> 3;
+            count_ |= 56;
+        } else {
+            while (count_ <= 56 && in_ < end_) {
+                bits_ |= static_cast<uint64_t>(*in_++) << count_;
+                count_ += 8;
+            }
+        }
+    }
+    void drop(int count) {
+        bits_ >>= count;
+        count_ -= count;
+    }
+    // Give whole bytes back to the input.
+    void unread() {
+        in_ -= count_ >> 3;
+        bits_ = 0;
+        count_ = 0;
+    }
+
+    void set_stop() {
+        int64_t most = is_head_ ? head_most_ : most_;
+        if (room_ < most) most = room_;
+        stop_ = text_ + most;
+    }
+    // Say what it means that `more` bytes do not fit before the stop; READ if they fit now.
+    int32_t beyond(int64_t more) {
+        if (is_head_ && bytes() + more > head_most_) {
+            // A bomb shows itself here, at a quarter of the cost of inflating all that is allowed.
+            const int64_t taken = (8 * (in_ - begin_) - count_ + 7) / 8;
+            if (taken <= head_bytes_ || head_most_ == most_) {
+                limit_ = head_most_;
+                return RSE_PF_CODEC_TOO_LARGE;
+            }
+            is_head_ = false;
+            set_stop();
+        }
+        if (out_ + more <= stop_) return RSE_PF_CODEC_READ;
+        if (bytes() + more > most_) {
+            limit_ = most_;
+            return RSE_PF_CODEC_TOO_LARGE;
+        }
+        return RSE_PF_CODEC_NEEDS_ROOM;
+    }
+
+    int32_t stored() {
+        drop(count_ & 7);
+        unread();
+        if (end_ - in_ < 4) return RSE_PF_CODEC_NOT_ONE_STREAM;
+        const int64_t size = in_[0] | in_[1] << 8, inverse = in_[2] | in_[3] << 8;
+        if (size != (inverse ^ 0xFFFF)) return RSE_PF_CODEC_NOT_ZLIB;
+        in_ += 4;
+        for (int64_t left = size; left > 0;) {
+            const int64_t there = end_ - in_ < left ? end_ - in_ : left;
+            if (there == 0) return RSE_PF_CODEC_NOT_ONE_STREAM;
+            const int64_t fits = stop_ - out_ < there ? stop_ - out_ : there;
+            std::memcpy(out_, in_, static_cast<size_t>(fits));
+            in_ += fits;
+            out_ += fits;
+            left -= fits;
+            if (fits < there) {
+                ++in_;
+                const int32_t status = beyond(1);
+                --in_;
+                if (status != RSE_PF_CODEC_READ) return status;
+            }
+        }
+        return RSE_PF_CODEC_READ;
+    }
+
+    void fixed_codes() {
+        uint8_t lengths[288];
+        std::memset(lengths, 8, 144);
+        std::memset(lengths + 144, 9, 112);
+        std::memset(lengths + 256, 7, 24);
+        std::memset(lengths + 280, 8, 8);
+        literals_.fill(lengths, 288, true, literal_entry);
+        std::memset(lengths, 5, 32);
+        distances_.fill(lengths, 32, true, distance_entry);
+    }
+
+    int32_t dynamic_codes() {
+        static constexpr uint8_t kOrder[19] = {16, 17, 18, 0, 8, 7, 9, 6, 10, 5, 11, 4, 12, 3, 13, 2, 14, 1, 15};
+        refill();
+        if (count_ < 14) return RSE_PF_CODEC_NOT_ONE_STREAM;
+        const int literals = static_cast<int>(bits_ & 31) + 257, distances = static_cast<int>(bits_ >> 5 & 31) + 1;
+        const int codes = static_cast<int>(bits_ >> 10 & 15) + 4;
+        drop(14);
+        if (literals > 286 || distances > 30) return RSE_PF_CODEC_NOT_ZLIB;
+        uint8_t lengths[320] = {};
+        for (int i = 0; i < codes; ++i) {
+            if (count_ < 3) refill();
+            if (count_ < 3) return RSE_PF_CODEC_NOT_ONE_STREAM;
+            lengths[kOrder[i]] = static_cast<uint8_t>(bits_ & 7);
+            drop(3);
+        }
+        HuffmanTable<7, 128> table;
+        if (!table.fill(lengths, 19, false, [](int symbol) { return static_cast<uint32_t>(symbol) << 8; })) {
+            return RSE_PF_CODEC_NOT_ZLIB;
+        }
+        std::memset(lengths, 0, sizeof lengths);
+        for (int at = 0; at < literals + distances;) {
+            refill();
+            const uint32_t entry = table.find(bits_);
+            const int taken = static_cast<int>(entry & 15);
+            const uint32_t symbol = entry >> 8;
+            if (taken > count_) return RSE_PF_CODEC_NOT_ONE_STREAM;
+            if (symbol < 16) {
+                drop(taken);
+                lengths[at++] = static_cast<uint8_t>(symbol);
+                continue;
+            }
+            const int extra = symbol == 16 ? 2 : symbol == 17 ? 3 : 7;
+            if (taken + extra > count_) return RSE_PF_CODEC_NOT_ONE_STREAM;
+            drop(taken);
+            if (symbol == 16 && at == 0) return RSE_PF_CODEC_NOT_ZLIB;
+            const int times = (symbol == 18 ? 11 : 3) + static_cast<int>(bits_ & ((1u << extra) - 1));
+            drop(extra);
+            if (at + times > literals + distances) return RSE_PF_CODEC_NOT_ZLIB;
+            std::memset(lengths + at, symbol == 16 ? lengths[at - 1] : 0, static_cast<size_t>(times));
+            at += times;
+        }
+        if (lengths[256] == 0) return RSE_PF_CODEC_NOT_ZLIB;
+        const bool is_code = literals_.fill(lengths, literals, true, literal_entry) &&
+                             distances_.fill(lengths + literals, distances, true, distance_entry);
+        return is_code ? RSE_PF_CODEC_READ : RSE_PF_CODEC_NOT_ZLIB;
+    }
+
+    int32_t coded() {
+        for (;;) {
+            refill();
+            uint32_t entry = literals_.find(bits_);
+            // Three literals of at most 15 bits, and a match of 48 bits, fit into 56 bits each.
+            for (int i = 0; i < 2 && (entry >> 4 & 15) == kLiteral && count_ >= 45 && out_ < stop_; ++i) {
+                *out_++ = static_cast<uint8_t>(entry >> 8);
+                drop(static_cast<int>(entry & 15));
+                entry = literals_.find(bits_);
+            }
+            if (count_ < 48) {
+                refill();
+                // The same entry: it was found by the bits that were there, or by zeros behind the end.
+                entry = literals_.find(bits_);
+            }
+            const int taken = static_cast<int>(entry & 15);
+            const uint32_t kind = entry >> 4 & 15;
+            if (taken > count_) return RSE_PF_CODEC_NOT_ONE_STREAM;
+            if (kind == kInvalid) return RSE_PF_CODEC_NOT_ZLIB;
+            drop(taken);
+            if (kind == kEnd) return RSE_PF_CODEC_READ;
+            if (kind == kLiteral) {
+                if (out_ == stop_) {
+                    const int32_t status = beyond(1);
+                    if (status != RSE_PF_CODEC_READ) return status;
+                }
+                *out_++ = static_cast<uint8_t>(entry >> 8);
+                continue;
+            }
+            const int extra = static_cast<int>(entry >> 24);
+            if (extra > count_) return RSE_PF_CODEC_NOT_ONE_STREAM;
+            const int64_t length = (entry >> 8 & 0xFFFF) + (static_cast<uint32_t>(bits_) & ((1u << extra) - 1));
+            drop(extra);
+            const int32_t status = copy(length);
+            if (status != RSE_PF_CODEC_READ) return status;
+        }
+    }
+
+    int32_t copy(int64_t length) {
+        const uint32_t entry = distances_.find(bits_);
+        const int taken = static_cast<int>(entry & 15), extra = static_cast<int>(entry >> 24);
+        if (taken > count_) return RSE_PF_CODEC_NOT_ONE_STREAM;
+        if ((entry >> 4 & 15) == kInvalid) return RSE_PF_CODEC_NOT_ZLIB;
+        drop(taken);
+        if (extra > count_) return RSE_PF_CODEC_NOT_ONE_STREAM;
+        const int64_t distance = (entry >> 8 & 0xFFFF) + (static_cast<uint32_t>(bits_) & ((1u << extra) - 1));
+        drop(extra);
+        if (distance > bytes()) return RSE_PF_CODEC_NOT_ZLIB;
+        if (length > stop_ - out_) {
+            const int32_t status = beyond(length);
+            if (status != RSE_PF_CODEC_READ) return status;
+        }
+        const uint8_t* from = out_ - distance;
+        uint8_t* const last = out_ + length;
+        if (distance >= 16) {
+            // Up to 15 bytes too many, which the slack behind the buffer takes.
+            for (uint8_t* to = out_; to < last; to += 16, from += 16) std::memcpy(to, from, 16);
+        } else if (distance == 1) {
+            std::memset(out_, *from, static_cast<size_t>(length));
+        } else {
+            for (uint8_t* to = out_; to < last;) *to++ = *from++;
+        }
+        out_ = last;
+        return RSE_PF_CODEC_READ;
+    }
+
+    const uint8_t* const begin_;
+    const uint8_t* in_;
+    const uint8_t* const end_;
+    uint8_t* const text_;
+    uint8_t* out_;
+    uint8_t* stop_ = nullptr;
+    int64_t room_ = 0, most_ = 0, head_most_ = 0, head_bytes_ = 0, limit_ = 0;
+    bool is_head_ = true;
+    uint64_t bits_ = 0;  // the next bits of the stream, the first one lowest
+    int count_ = 0;      // how many of them are valid
+    LiteralTable literals_;
+    DistanceTable distances_;
+};
+
+}  // namespace rse_pf_codec

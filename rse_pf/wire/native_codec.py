@@ -1,0 +1,239 @@
+"""The codecs' hot path in the native core: guards, inflating, and a `pnp` command as arrays, in one call.
+
+What the core does not plainly know it leaves to `rse_pf.wire.codec`, having judged it by the same budget; its
+refusals are those of `rse_pf.budget`.  Everything works without it.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import struct
+from collections.abc import Callable
+from functools import cache, lru_cache
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import msgspec
+import numpy as np
+
+from rse_pf.budget import Budget, Refusal, refusal
+from rse_pf.errors import ConfigurationError, RsePfError
+from rse_pf.native import find_library
+from rse_pf.native_buffers import SLACK, CallBuffers
+from rse_pf.wire.messages import Command
+
+__all__ = ["NativeCodec", "PnpTypes", "native_codec", "open_codec"]
+
+_ABI = 1
+_READ, _NOT_MINE, _NEEDS_ROOM, _UNKNOWN = 0, 1, 11, 12
+_ENCODINGS = {"json": 0, "zlib": 1, "bin": 2}
+_TEXT_ROOM, _NUMBERS_ROOM = 1 << 17, 1 << 16
+_HOLDS_LOCK_BYTES = 16384
+"""Shorter messages are read without giving the interpreter lock away, which others might keep for longer."""
+
+# rse_pf_codec_call: buffers | what was found | camera and options.
+_FOUND = struct.Struct("=qqqqqqdqqqqq")
+_HEAD = struct.Struct("=ddddqqqddqq16s")
+_FOUND_AT = CallBuffers.HEAD_BYTES
+_HEAD_AT = _FOUND_AT + _FOUND.size
+_CALL_BYTES = _HEAD_AT + _HEAD.size
+_HAS_DEADLINE, _HAS_KEEP, _HAS_OPTIONS, _HAS_ENGINE = 1, 2, 4, 8
+_OPTION_FIELDS = {16: "inlier_px", 128: "confidence", 32: "max_iterations", 64: "min_iterations"}
+
+_JSON_REFUSALS: dict[int, Refusal] = {
+    2: "json-containers", 3: "json-depth", 4: "values", 5: "memory", 8: "not-zlib", 9: "not-one-stream",
+    10: "bomb",
+}  # fmt: skip
+_MSGPACK_REFUSALS: dict[int, Refusal] = {
+    2: "containers",
+    3: "depth",
+    4: "values",
+    6: "cut-off",
+    7: "followed",
+}
+
+
+class PnpTypes(NamedTuple):
+    """The types of the service `pnp`, which stands above this package."""
+
+    request: Callable[..., Any]
+    camera: type[Any]
+    options: type[Any]
+    reply: type[Any]
+
+
+class NativeCodec:
+    """The codecs' part of one loaded library; every thread may call it."""
+
+    def __init__(self, path: Path) -> None:
+        self._short, self._long = _functions(ctypes.PyDLL(str(path))), _functions(ctypes.CDLL(str(path)))
+        self._buffers = CallBuffers(_CALL_BYTES, text_room=_TEXT_ROOM, numbers_room=_NUMBERS_ROOM)
+
+    def check(self, data: bytes | bytearray, encoding: str, budget: Budget) -> bool:
+        """Judge JSON text (``json``) or one MessagePack value (``bin``) by *budget*.
+
+        Returns:
+            Whether it was judged; deeper limits than 255 levels are not known here.
+
+        Raises:
+            LimitExceeded: It holds more than *budget* allows.
+            BadMessage: MessagePack that ends within a value, or that bytes follow.
+        """
+        calls = self._short if len(data) < _HOLDS_LOCK_BYTES else self._long
+        data = data if type(data) is bytes else bytes(data)
+        status = calls.check(data, len(data), _packed(budget), _ENCODINGS[encoding])
+        if status not in (_NOT_MINE, _UNKNOWN):
+            raise _refused(status, encoding, budget, len(data), 0)
+        return status == _NOT_MINE
+
+    def read(
+        self, data: bytes, encoding: str, budget: Budget, types: PnpTypes | None
+    ) -> Command | bytes | memoryview | None:
+        """Read a message from a robot: inflate it if it is deflated, and judge it by *budget*.
+
+        Args:
+            data: As received; its size is judged already.
+            encoding: ``json``, ``zlib`` or ``bin``.
+            budget: The limits.
+            types: What a `pnp` command is read as; without them no command is.
+
+        Returns:
+            The command, if it is a plain one of `pnp`; else the bytes that are to be decoded, until the next
+            call of this thread; None if they have to be judged elsewhere, too.
+
+        Raises:
+            LimitExceeded: It holds more than *budget* allows.
+            BadMessage: It is not one zlib stream, or ends within a value.
+        """
+        calls = self._short if len(data) < _HOLDS_LOCK_BYTES else self._long
+        data = data if type(data) is bytes else bytes(data)
+        buffers = self._buffers
+        code, text = _ENCODINGS[encoding], buffers.text_view
+        status = calls.read(data, len(data), _packed(budget), code, buffers.call_at)
+        if status == _NEEDS_ROOM:
+            # A bomb shows itself in the first part, so that no more memory is taken for it.
+            most = max(budget.free_bytes, int(len(data) * budget.inflate_ratio))
+            for room in (min(budget.inflated_bytes, budget.free_bytes), min(budget.inflated_bytes, most)):
+                larger = np.empty(room + SLACK, dtype=np.uint8)
+                buffers.lend(larger)
+                status = self._long.read(data, len(data), _packed(budget), code, buffers.call_at)
+                if status != _NEEDS_ROOM:
+                    break
+            buffers.lend(buffers.text)
+            text = memoryview(larger)  # type: ignore[arg-type]
+        if status == _READ and types is not None:
+            command = _command(buffers, data if encoding != "zlib" else text, types)
+            if command is not None:
+                return command
+        elif status == _UNKNOWN:
+            return None
+        elif status not in (_READ, _NOT_MINE):
+            limit = _FOUND.unpack_from(buffers.call, _FOUND_AT)[1]
+            raise _refused(status, encoding, budget, len(data), limit)
+        return text[: _FOUND.unpack_from(buffers.call, _FOUND_AT)[0]] if encoding == "zlib" else data
+
+    def deflate(self, text: bytes) -> bytes:
+        """Return *text*, mostly numbers, as a zlib stream of literals in a code of their own."""
+        room = 2 * len(text) + 256
+        deflated = ctypes.create_string_buffer(room)
+        size = self._short.deflate(text, len(text), deflated, room)
+        return deflated.raw[:size]
+
+
+class _Calls(NamedTuple):
+    check: Any
+    read: Any
+    deflate: Any
+
+
+def _functions(library: ctypes.CDLL) -> _Calls:
+    integer, pointer, text = ctypes.c_int64, ctypes.c_void_p, ctypes.c_char_p
+    check, read, deflate = library.rse_pf_codec_check, library.rse_pf_codec_read, library.rse_pf_codec_deflate
+    check.argtypes, check.restype = (text, integer, text, ctypes.c_int32), ctypes.c_int32
+    read.argtypes, read.restype = (text, integer, text, ctypes.c_int32, pointer), ctypes.c_int32
+    deflate.argtypes, deflate.restype = (text, integer, pointer, integer), integer
+    return _Calls(check, read, deflate)
+
+
+@lru_cache(maxsize=64)
+def _packed(budget: Budget) -> bytes:
+    return struct.pack(
+        "=qqdqqqqq", budget.inflated_bytes, budget.free_bytes, budget.inflate_ratio, budget.depth,
+        budget.containers, budget.values, budget.mixed_values, budget.memory_bytes,
+    )  # fmt: skip
+
+
+def _refused(status: int, encoding: str, budget: Budget, size: int, limit: int) -> RsePfError:
+    reason = (_MSGPACK_REFUSALS if encoding == "bin" else _JSON_REFUSALS)[status]
+    return refusal(reason, budget, size=size, max_bytes=limit)
+
+
+def _command(buffers: CallBuffers, text: bytes | memoryview, types: PnpTypes) -> Command | None:
+    """Return what a call has found; None if the camera or the options are refused by their types."""
+    (
+        _, _, points, pixels, identity, seq, deadline_ms, fields,
+        stream_at, stream_bytes, trace_at, trace_bytes,
+    ) = _FOUND.unpack_from(buffers.call, _FOUND_AT)  # fmt: skip
+    try:
+        camera, options = _head(types, bytes(buffers.call[_HEAD_AT:]))
+    except (RsePfError, msgspec.ValidationError):
+        return None
+    numbers = buffers.numbers[: points + pixels].copy()
+    return Command(
+        id=identity,
+        service="pnp",
+        payload=types.request(
+            camera=camera, points_world=numbers[:points], pixels=numbers[points:], options=options
+        ),
+        stream=str(text[stream_at : stream_at + stream_bytes], "ascii") if stream_bytes else "",
+        seq=seq,
+        keep=bool(fields & _HAS_KEEP),
+        deadline_ms=deadline_ms if fields & _HAS_DEADLINE else None,
+        trace=str(text[trace_at : trace_at + trace_bytes], "ascii") if trace_bytes else "",
+    )
+
+
+@lru_cache(maxsize=256)
+def _head(types: PnpTypes, head: bytes) -> tuple[Any, Any]:
+    """Return the camera and the options of a request; a robot sends the same ones with every frame."""
+    fx, fy, cx, cy, width, height, has, inlier_px, confidence, most, least, engine = _HEAD.unpack(head)
+    camera = msgspec.convert(
+        {"fx": fx, "fy": fy, "cx": cx, "cy": cy, "width": width, "height": height}, types.camera
+    )
+    if not has & _HAS_OPTIONS:
+        return camera, None
+    numbers = dict(zip(_OPTION_FIELDS, (inlier_px, confidence, most, least), strict=True))
+    given: dict[str, Any] = {name: numbers[bit] for bit, name in _OPTION_FIELDS.items() if has & bit}
+    if has & _HAS_ENGINE:
+        given["engine"] = engine.rstrip(b"\0").decode()
+    return camera, msgspec.convert(given, types.options)
+
+
+def open_codec(path: Path) -> NativeCodec:
+    """Load the codecs' part of the library at *path*.
+
+    Raises:
+        ConfigurationError: It cannot be loaded, or was built for another version of this package.
+    """
+    try:
+        abi = ctypes.CDLL(str(path)).rse_pf_codec_abi
+    except (OSError, AttributeError) as error:
+        raise ConfigurationError(
+            f"{path} cannot be loaded: {error}", hint="build it again: make -C native"
+        ) from error
+    abi.restype = ctypes.c_uint32
+    if abi() != _ABI:
+        raise ConfigurationError(
+            f"{path} has codec ABI {abi()}, this package needs {_ABI}", hint="build it again: make -C native"
+        )
+    return NativeCodec(path)
+
+
+@cache
+def native_codec() -> NativeCodec | None:
+    """Return the codec of the library that `find_library` finds, None if there is none that fits."""
+    path = find_library()
+    try:
+        return None if path is None else open_codec(path)
+    except ConfigurationError:
+        return None

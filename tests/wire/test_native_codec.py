@@ -1,0 +1,399 @@
+"""The native codec and the Python one: the same verdicts, the same values bit by bit."""
+
+from __future__ import annotations
+
+import json
+import math
+import random
+import struct
+import zlib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+
+from rse_pf.budget import Budget, check_json, check_msgpack, inflate_within
+from rse_pf.config import PlatformSettings, SessionSettings
+from rse_pf.errors import ConfigurationError, RsePfError
+from rse_pf.geometry import Camera
+from rse_pf.pnp import PnpOptions
+from rse_pf.pnp.problems import make_problem
+from rse_pf.service import Registry, dispatch
+from rse_pf.services.builtin import builtin_services
+from rse_pf.services.pnp import PnpReply, PnpRequest, make_request, wire_types
+from rse_pf.wire import CODECS, Command, Result, as_type, make_codec
+from rse_pf.wire.native_codec import PnpTypes, native_codec, open_codec
+
+NATIVE = native_codec()
+pytestmark = pytest.mark.skipif(NATIVE is None, reason="the native core is not built: make -C native")
+
+BUDGET = Budget.of_messages(SessionSettings())
+TYPES = PnpTypes(PnpRequest, Camera, PnpOptions, PnpReply)
+CAMERA = '{"fx":525.5,"fy":525,"cx":319.5,"cy":239.5,"width":640,"height":480}'
+HEAD = '{"type":"command","id":7,"service":"pnp","payload":{"camera":' + CAMERA
+
+
+class OwnRequest(msgspec.Struct):
+    """A request of a service that has the platform's name."""
+
+    camera: dict[str, float]
+
+
+class OwnReply(msgspec.Struct):
+    """Its reply."""
+
+    width: float
+
+
+def command_of(numbers: str, pixels: str = "1.5,2.5") -> bytes:
+    return (HEAD + f',"points_world":[{numbers}],"pixels":[{pixels}]' + "}}").encode()
+
+
+def outcome(codec: str, data: bytes, *, use_native: bool) -> tuple[Any, ...]:
+    """Return what became of *data*: an error, or the message, its arrays as bytes."""
+    wire = make_codec(codec, pnp=TYPES if use_native else None, use_native=use_native)
+    try:
+        message = wire.decode_from_robot(data)
+        if not isinstance(message, Command) or message.service != "pnp":
+            return ("message", repr(message))
+        try:
+            request = as_type({} if message.payload is None else message.payload, PnpRequest)
+        except RsePfError as error:
+            return ("request refused", error.code, error.message, error.hint)
+    except RsePfError as error:
+        return ("refused", error.code, error.message, error.hint)
+    arrays = request.points_world.tobytes(), request.pixels.tobytes()
+    plain = msgspec.structs.replace(message, payload=None)
+    return ("read", repr(plain), repr(request.camera), repr(request.options), *arrays)
+
+
+def assert_alike(codec: str, data: bytes) -> None:
+    assert outcome(codec, data, use_native=True) == outcome(codec, data, use_native=False), data[:2000]
+
+
+def is_fast(codec: str, data: bytes) -> bool:
+    assert NATIVE is not None
+    return isinstance(NATIVE.read(data, codec, BUDGET, TYPES), Command)
+
+
+def sample(codec: str, n: int = 20, options: PnpOptions | None = None) -> bytes:
+    problem = make_problem(seed=n, n=n)
+    request = make_request(
+        problem.points_world, problem.pixels, problem.camera, options, binary=codec == "bin"
+    )
+    return make_codec(codec).encode(
+        Command(id=n, service="pnp", payload=request, stream="front", seq=3, deadline_ms=250.0, trace="t-1")
+    )
+
+
+@pytest.mark.parametrize("codec", CODECS)
+@pytest.mark.parametrize("options", [None, PnpOptions(inlier_px=4.0, engine="poselib"), PnpOptions()])
+def test_a_plain_command_is_read_at_once_and_means_the_same(codec: str, options: PnpOptions | None) -> None:
+    data = sample(codec, 200, options)
+
+    assert is_fast(codec, data)
+    assert_alike(codec, data)
+
+
+NUMBERS = (
+    "0", "-0", "0.0", "-0.0", "1", "-1", "1e3", "1E+3", "1e-3", "12.5e1", "0.1", "0.3",
+    "1.7976931348623157e308", "1e309", "-1e999", "5e-324", "2.2250738585072011e-308",
+    "2.2250738585072014e-308", "1e-400", "1e22", "1e23", "9007199254740993", "9007199254740992.5",
+    "123456789012345678", "12345678901234567890", "1" * 30, "1" * 400,
+    "0.1000000000000000055511151231257827", "8.5", "7.2057594037927933e16", "1e100", "1.1e100", "1e0",
+    "1e00001", "0e5", "0.000e-9", "00", "01", "-01", "+1", ".5", "5.", "1e", "1e+", "-", "--1", "0x10",
+    "NaN", "Infinity", "-Infinity", "nan", "true", "null", '"1"', "[1]", "{}", "1 2", "", ",", "1,", ",1",
+    "1,,2", " 1 , 2 ", "1\t,\n2\r", "1\x0b", "١", "1e-22", "1e-23", "123456789012345680000", "4.35",
+    "0.29999999999999998",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("number", NUMBERS)
+def test_a_number_is_judged_and_read_as_before(number: str) -> None:
+    assert_alike("json", command_of(f"1.25,{number},-3"))
+    assert_alike("json", command_of(number))
+
+
+def test_random_decimals_are_the_nearest_doubles() -> None:
+    draw = random.Random(5)
+    texts = []
+    for _ in range(20_000):
+        value = struct.unpack("d", draw.randbytes(8))[0]
+        size = draw.choice(
+            (value, draw.uniform(-1e3, 1e3), draw.uniform(-1, 1) * 10.0 ** draw.randint(-40, 40))
+        )
+        if math.isfinite(size) and 1e-290 < abs(size) < 1e99:
+            texts += [repr(size), f"{size:.{draw.randint(0, 17)}g}"]
+    texts += [f"{draw.randrange(10**18)}e{draw.randint(-60, 60)}" for _ in range(5000)]
+    assert NATIVE is not None
+    for begin in range(0, len(texts), 8000):
+        some = texts[begin : begin + 8000]
+
+        command = NATIVE.read(command_of(",".join(some)), "json", BUDGET, TYPES)
+
+        assert isinstance(command, Command)
+        assert command.payload.points_world.tobytes() == np.array([float(text) for text in some]).tobytes()
+
+
+# Variants of one command that are no plain ones, or hardly.
+CHANGES = {
+    "duplicate id": ('"id":7', '"id":7,"id":8'),
+    "duplicate points": ('"pixels":', '"points_world":[1,2,3],"pixels":'),
+    "unknown field": ('"id":7', '"id":7,"new":1'),
+    "unknown field of the payload": ('"pixels":', '"depths_m":[1],"pixels":'),
+    "unknown field of the camera": ('"fx":', '"k1":0,"fx":'),
+    "pixels first": (HEAD[HEAD.index("{", 5) :], HEAD[HEAD.index("{", 5) :] + ',"pixels":[1.5,2.5]'),
+    "an escape": ('"pnp"', '"p\\u006ep"'),
+    "another service": ('"pnp"', '"icp"'),
+    "another type": ('"command"', '"hello"'),
+    "no id": ('"id":7,', ""),
+    "a negative id": ('"id":7', '"id":-7'),
+    "a real id": ('"id":7', '"id":7.0'),
+    "a large id": ('"id":7', '"id":9007199254740992'),
+    "the largest id": ('"id":7', '"id":9007199254740991'),
+    "a text for a number": ('"width":640', '"width":"640"'),
+    "a real width": ('"width":640', '"width":640.0'),
+    "an absurd camera": ('"fx":525.5', '"fx":0.001'),
+    "a null camera": (CAMERA, "null"),
+    "no camera": ('"camera":' + CAMERA + ",", ""),
+    "a stream": ('"id":7', '"id":7,"stream":"a b","seq":4,"keep":true'),
+    "a stream beyond ASCII": ('"id":7', '"id":7,"stream":"\u00e9\U0001f916"'),
+    "a long stream": ('"id":7', '"id":7,"stream":"' + 65 * "x" + '"'),
+    "the longest stream": ('"id":7', '"id":7,"stream":"' + 64 * "x" + '"'),
+    "a control character": ('"id":7', '"id":7,"trace":"a\x01"'),
+    "a deadline": ('"id":7', '"id":7,"deadline_ms":250'),
+    "no deadline": ('"id":7', '"id":7,"deadline_ms":null'),
+    "a deadline too far": ('"id":7', '"id":7,"deadline_ms":3.7e6'),
+    "a negative deadline": ('"id":7', '"id":7,"deadline_ms":-1e-300'),
+    "no options": ('"pixels":', '"options":null,"pixels":'),
+    "empty options": ('"pixels":', '"options":{},"pixels":'),
+    "an unknown engine": ('"pixels":', '"options":{"engine":"magic"},"pixels":'),
+    "an engine": ('"pixels":', '"options":{"engine":"opencv","confidence":0.9},"pixels":'),
+    "no engine": ('"pixels":', '"options":{"engine":null,"max_iterations":50},"pixels":'),
+    "a bad option": ('"pixels":', '"options":{"inlier_px":0},"pixels":'),
+    "real iterations": ('"pixels":', '"options":{"max_iterations":1.5},"pixels":'),
+    "spaces": (":", " :\n "),
+    "bytes behind": ("}}", "}}x"),
+    "spaces behind": ("}}", "}} \n"),
+    "cut off": ("}}", "}"),
+    "brackets in a stream": ('"id":7', '"id":7,"stream":"' + "[{" * 20 + '"'),
+}
+
+
+@pytest.mark.parametrize("change", CHANGES)
+def test_a_changed_command_means_the_same_or_is_refused_alike(change: str) -> None:
+    data = command_of("1,2.5,3").decode()
+    old, new = CHANGES[change]
+    assert old in data
+
+    assert_alike("json", data.replace(old, new).encode())
+    assert_alike("zlib", zlib.compress(data.replace(old, new).encode()))
+
+
+def mutated(data: bytes, draw: random.Random) -> bytes:
+    """Return *data* with a few bytes changed, removed, doubled or replaced by parts of itself."""
+    parts = bytearray(data)
+    for _ in range(draw.choice((1, 1, 2, 4))):
+        at = draw.randrange(len(parts) + 1)
+        match draw.randrange(5):
+            case 0:
+                parts[at : at + 1] = bytes([draw.randrange(256)])
+            case 1:
+                del parts[at : at + draw.choice((1, 2, 8, 64))]
+            case 2:
+                parts[at:at] = parts[at : at + draw.choice((1, 4, 32))]
+            case 3:
+                parts[at : at + 1] = draw.choice(
+                    (b"[", b"]", b"{", b'"', b"\\", b",", b"-", b"e", b"0", b"\xc7")
+                )
+            case _:
+                begin = draw.randrange(len(parts) + 1)
+                parts[at : at + 8] = parts[begin : begin + draw.choice((4, 8))]
+        if not parts:
+            return b"{"
+    return bytes(parts)
+
+
+@pytest.mark.parametrize("codec", CODECS)
+def test_damaged_messages_get_the_same_verdict(codec: str) -> None:
+    draw = random.Random(11)
+    seeds = [sample(codec), sample(codec, 4, PnpOptions(inlier_px=3.0))]
+
+    for number in range(1500):
+        data = seeds[number % len(seeds)]
+        if codec == "zlib" and number % 3:
+            data = zlib.compress(mutated(zlib.decompress(data), draw), draw.choice((0, 1, 6)))
+        assert_alike(codec, data if codec == "zlib" and number % 3 else mutated(data, draw))
+
+
+def corpus() -> Iterator[bytes]:
+    folder = Path(__file__).parents[2] / "fuzz" / "corpus" / "codec"
+    yield from (path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file())
+    yield from (b"", b"[" * 20, b"[" * 8000, b"[[]" * 8000, b'["]",' * 30, b'{"a":' * 17, b"[0]" * 7001)
+    yield from (
+        b'"' + b"[" * 9000 + b'"',
+        b'"\\"[' * 5000,
+        b'\\\\"[[' * 4000,
+        b"0," * 30_000,
+        b'"",' * 30_001,
+    )
+    yield from (b'["' + b"\\u0041" * 60_000 + b'"]', b'["' + b"x" * 900_000 + b'"]', b'"\xc3\xa9' * 90_000)
+    yield from (
+        b'"' + b"," * 40_000 + b'"',
+        b'"x\\"' * 80_000,
+        b"\xdf\xff\xff\xff\xff",
+        b"\x91" * 40,
+        b"\xc1" * 9000,
+    )
+    yield from (b"\xdd\x00\x01\x00\x00" + b"\x01" * 65536, b"\xdc\x7f\xff" + b"\xcb12345678" * 32767, b"\xd9")
+    yield from (
+        b"\x93" + b"\xc4\xff" * 3,
+        b"\xdd" + struct.pack(">I", 29_000) + b"\xa1x" * 29_000,
+        b"\x90" * 9000,
+    )
+    yield b"\xdc\x1b\x58" + b"\x90" * 7000
+
+
+@pytest.mark.parametrize("name", ["json", "bin"])
+def test_the_guards_give_the_verdicts_of_the_python_ones(name: str) -> None:
+    assert NATIVE is not None
+    budgets = [
+        BUDGET,
+        Budget.of_messages(SessionSettings(max_json_depth=5, max_json_lists=40, max_json_values=200)),
+    ]
+    draw = random.Random(3)
+
+    def verdict(check: Any, *args: Any) -> str:
+        try:
+            check(*args)
+        except RsePfError as error:
+            return f"{error.code}: {error.message}"
+        return "passed"
+
+    seen = set()
+    for data in corpus():
+        for text in (data, mutated(data, draw), mutated(data, draw)):
+            for budget in budgets:
+                if name == "json":
+                    expected = verdict(check_json, text, budget)
+                elif len(text) <= budget.containers and 6 * len(text) <= budget.mixed_values:
+                    continue  # the Python guard leaves it to the decoder
+                else:
+                    expected = verdict(check_msgpack, text, budget)
+                assert verdict(NATIVE.check, text, name, budget) == expected, text[:200]
+                seen.add(expected[:24])
+    assert len(seen) >= 4, seen
+
+
+def deflated(text: bytes, draw: random.Random) -> bytes:
+    stream = zlib.compressobj(
+        draw.randrange(10), zlib.DEFLATED, draw.choice((9, 12, 15)), draw.randint(1, 9), draw.randrange(5)
+    )
+    half = draw.randrange(len(text) + 1)
+    mode = draw.choice((zlib.Z_NO_FLUSH, zlib.Z_SYNC_FLUSH, zlib.Z_FULL_FLUSH, zlib.Z_PARTIAL_FLUSH))
+    return stream.compress(text[:half]) + stream.flush(mode) + stream.compress(text[half:]) + stream.flush()
+
+
+def inflated(data: bytes, budget: Budget, *, native: bool) -> tuple[str, bytes]:
+    assert NATIVE is not None
+    try:
+        if not native:
+            return "read", bytes(inflate_within(data, budget))
+        found = NATIVE.read(data, "zlib", budget, None)
+        return ("unknown", b"") if found is None else ("read", bytes(found))  # type: ignore[arg-type]
+    except RsePfError as error:
+        return f"{error.code}: {error.message}", b""
+
+
+def test_streams_are_inflated_or_refused_as_by_zlib() -> None:
+    draw = random.Random(2)
+    # Nothing here exceeds a count, so that only inflating is judged.
+    budget = Budget.of_messages(
+        SessionSettings(max_message_bytes=2048, max_inflated_bytes=9000, max_inflate_ratio=5.0)
+    )
+    texts = [
+        b"",
+        b"0",
+        b"1" * 3000,
+        draw.randbytes(500),
+        sample("json", 40),
+        b"12.5,-3.25," * 300,
+        b"ab" * 4000,
+    ]
+    seen = set()
+    for number in range(4000):
+        data = deflated(texts[number % len(texts)], draw)
+        if number % 2:
+            data = mutated(data, draw)
+        expected, got = inflated(data, budget, native=False), inflated(data, budget, native=True)
+        if got[0] != "unknown":
+            assert got == expected, data.hex()
+        seen.add(expected[0][:30])
+    assert len(seen) >= 4, seen
+
+
+@pytest.mark.parametrize("codec", CODECS)
+def test_a_reply_to_a_typed_command_is_the_one_to_a_plain_command(codec: str) -> None:
+    registry = builtin_services(PlatformSettings())
+    replies = []
+    for use_native in (False, True):
+        wire = make_codec(codec, pnp=wire_types(registry), use_native=use_native)
+        command = wire.decode_from_robot(sample(codec, 60))
+        assert isinstance(command, Command)
+        data = wire.encode(dispatch(registry, command, lambda: 0.0))
+        replies.append(zlib.decompress(data) if codec == "zlib" else data)
+        answer = wire.decode_from_server(data)
+        assert isinstance(answer, Result), answer
+
+    assert replies[0] == replies[1]
+
+
+def test_every_byte_can_be_deflated() -> None:
+    assert NATIVE is not None
+    text = bytes(range(256)) * 5
+
+    assert zlib.decompress(NATIVE.deflate(text)) == text
+    assert zlib.decompress(NATIVE.deflate(b"")) == b""
+
+
+def test_a_deflated_reply_is_no_longer_than_before() -> None:
+    registry = builtin_services(PlatformSettings())
+    wire, old = make_codec("zlib", pnp=wire_types(registry)), make_codec("zlib", use_native=False)
+    command = wire.decode_from_robot(sample("zlib", 200))
+    assert isinstance(command, Command)
+    result = dispatch(registry, command, lambda: 0.0)
+
+    assert len(wire.encode(result)) <= 1.05 * len(old.encode(result))
+
+
+def test_a_server_with_a_pnp_of_its_own_gets_plain_payloads() -> None:
+    registry = Registry()
+
+    @registry.service("pnp")
+    def pnp(request: OwnRequest) -> OwnReply:
+        """Return the width."""
+        return OwnReply(request.camera["width"])
+
+    wire = make_codec("json", pnp=wire_types(registry))
+    command = wire.decode_from_robot(sample("json"))
+
+    assert isinstance(command, Command)
+    assert isinstance(command.payload, dict)
+    assert wire_types(Registry()) is None
+
+
+def test_a_file_that_is_no_library_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "x.so").write_bytes(b"no library")
+
+    with pytest.raises(ConfigurationError, match="cannot be loaded"):
+        open_codec(tmp_path / "x.so")
+
+
+def test_json_dumps_of_a_robot_without_the_sdk_is_read_at_once() -> None:
+    plain = json.dumps(json.loads(command_of("1,2.5,-3e-2")))
+
+    assert is_fast("json", plain.encode())
+    assert_alike("json", plain.encode())
