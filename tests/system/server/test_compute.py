@@ -115,6 +115,7 @@ async def test_poses_are_answered_while_hostile_commands_end_their_processes(ser
     assert (line["robot"], line["service"], line["blocked"]) == ("hostile", "decode", False)
 
 
+@pytest.mark.slow
 @in_a_loop
 async def test_a_deadline_ends_the_work_and_is_no_evidence_against_the_robot(server):
     async with robot_of(server, "hasty") as robot:
