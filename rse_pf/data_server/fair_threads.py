@@ -24,7 +24,7 @@ __all__ = ["FairThreads", "check_wanted", "while_wanted"]
 
 _T = TypeVar("_T")
 _THREADS = 8
-_PER_ROBOT, _PER_TENANT = 2, 6
+_PER_ROBOT, _PER_TENANT = 1, 6
 
 
 @dataclass(slots=True, eq=False)

@@ -10,6 +10,7 @@ import asyncio
 import os
 import signal
 import socket
+import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -32,6 +33,8 @@ __all__ = ["KeysFile", "serve_data"]
 _SWEEP_S = 3600.0
 _BACKLOG = 1024
 _STOP_TIMEOUT_S = 10
+_SWITCH_S = 0.0005
+"""A PUT makes some twenty system calls, and after each it may wait this long for a thread that computes."""
 
 
 class KeysFile:
@@ -75,6 +78,7 @@ def serve_data(
         import uvicorn
     except ImportError as error:
         raise MissingExtra("uvicorn", "data") from error
+    sys.setswitchinterval(_SWITCH_S)
     log = None if audit is None else _audit_log(audit, settings)
     app = DataServer(settings, store, keys=keys, log=_write_line, audit=log)
     listening = _listen(settings)
