@@ -12,6 +12,7 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 
+from client_sdk.native_match import front_end_core
 from rse_pf.errors import MissingExtra, UsageError
 from rse_pf.geometry import Array, Camera, inverse, pose_difference
 
@@ -26,6 +27,7 @@ __all__ = [
     "extract",
     "load_opencv",
     "match",
+    "points_at",
     "round_for_wire",
 ]
 
@@ -161,9 +163,8 @@ def extract(frame: Frame, options: FrontEndOptions) -> Features:
     if not keypoints:
         empty = np.empty((0, 32), dtype=np.uint8)
         return Features(pixels=np.empty((0, 2)), descriptors=empty, points_camera=np.empty((0, 3)))
-    pixels = np.array([keypoint.pt for keypoint in keypoints], dtype=np.float64)
-    depth_m = _depth_at(frame.depth_m, pixels, options)
-    points_camera = frame.camera.back_project(pixels, depth_m)
+    pixels = cv2.KeyPoint_convert(keypoints).astype(np.float64)
+    points_camera = points_at(frame, pixels, options)
     return Features(pixels=pixels, descriptors=descriptors, points_camera=points_camera)
 
 
@@ -173,9 +174,19 @@ def match(reference: Features, frame: Features, options: FrontEndOptions) -> Cor
     Brute-force Hamming distance, ratio test, at most one match for each pixel of the frame.  Rows
     go from left to right: neighbours share digits, which makes the message 8 % smaller.
 
+    The native core gives the same rows in a tenth of the time where its library is built.
+
     Raises:
-        MissingExtra: OpenCV is not installed.
+        MissingExtra: Neither the native core nor OpenCV is installed.
     """
+    core = front_end_core()
+    if core is not None and len(frame.pixels) >= 2:
+        found = core.matches(
+            reference.descriptors, reference.points_camera, frame.descriptors, frame.pixels,
+            ratio=options.ratio, max_matches=options.max_matches,
+        )  # fmt: skip
+        if found is not None:
+            return Correspondences(points_world=found[0], pixels=found[1])
     known = np.flatnonzero(np.isfinite(reference.points_camera[:, 2]))
     if not len(known) or len(frame.pixels) < 2:
         return Correspondences(points_world=np.empty((0, 3)), pixels=np.empty((0, 2)))
@@ -378,6 +389,23 @@ class Tracker:
         view = self._last if which == "frame" else self._keyframe
         assert view is not None
         return view
+
+
+def points_at(frame: Frame, pixels: Array, options: FrontEndOptions) -> Array:
+    """Return the ``(n, 3)`` points of the camera frame that *frame* shows at ``(n, 2)`` pixels.
+
+    The depth of a pixel is the median of its 3x3 patch, NaN where that is sparse, spread, near or far.
+    """
+    core = front_end_core()
+    if core is not None:
+        found = core.points_at(
+            frame.depth_m, pixels, frame.camera,
+            min_depth_m=options.min_depth_m, max_depth_m=options.max_depth_m,
+            spread=options.depth_spread_percent / 100.0,
+        )  # fmt: skip
+        if found is not None:
+            return found
+    return frame.camera.back_project(pixels, _depth_at(frame.depth_m, pixels, options))
 
 
 def _depth_at(depth_m: npt.NDArray[np.float32], pixels: Array, options: FrontEndOptions) -> Array:

@@ -48,6 +48,7 @@ ONLY: dict[str, set[str]] = {
         "errors",
         "files",
         "geometry",
+        "native",
         "token_bucket",
         "maps",
         "wire",

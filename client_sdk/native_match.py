@@ -1,0 +1,163 @@
+"""The robot's front end in the native core: points at keypoints, and matches of ORB descriptors.
+
+The library is the one that `rse_pf.native` finds; without it, or with an older one, the front end does the
+same work in numpy and OpenCV, with the same numbers.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from rse_pf import native
+from rse_pf.errors import ConfigurationError
+from rse_pf.geometry import Array, Camera
+
+__all__ = ["FrontEndCore", "front_end_core", "open_front_end"]
+
+_ABI = 1
+_PORTABLE = 1
+_BYTES = 32
+
+
+class FrontEndCore:
+    """The front end of one loaded library; every thread may call it.
+
+    ``portable`` forbids AVX-512, which changes no byte of the results.
+    """
+
+    def __init__(
+        self, points_at: Callable[..., int], matches: Callable[..., int], *, portable: bool = False
+    ) -> None:
+        self._points_at = points_at
+        self._matches = matches
+        self._flags = _PORTABLE if portable else 0
+
+    def points_at(
+        self,
+        depth_m: npt.NDArray[np.float32],
+        pixels: Array,
+        camera: Camera,
+        *,
+        min_depth_m: float,
+        max_depth_m: float,
+        spread: float,
+    ) -> Array | None:
+        """Return the points of the camera frame that are seen at pixels.
+
+        Args:
+            depth_m: ``(h, w)``, metres along the optical axis, 0 where there is no reading.
+            pixels: ``(n, 2)``; the depth of one is the median of its 3x3 patch.
+            camera: Intrinsics of the depth image.
+            min_depth_m: A median below is not trusted.
+            max_depth_m: A median above is not trusted.
+            spread: Nor is a patch whose depths differ by more than this share of their median.
+
+        Returns:
+            ``(n, 3)`` metres, NaN where the depth cannot be trusted; None where the arrays are not float32
+            and float64 of these shapes.
+        """
+        if not (_is(depth_m, np.float32, 2) and _is(pixels, np.float64, 2) and pixels.shape[1] == 2):
+            return None
+        depth_m, pixels = np.ascontiguousarray(depth_m), np.ascontiguousarray(pixels)
+        points_camera = np.empty((len(pixels), 3))
+        height, width = depth_m.shape
+        done = self._points_at(
+            _address(depth_m), width, height, _address(pixels), len(pixels),
+            camera.fx, camera.fy, camera.cx, camera.cy, min_depth_m, max_depth_m, spread,
+            _address(points_camera),
+        )  # fmt: skip
+        return None if done < 0 else points_camera
+
+    def matches(
+        self,
+        reference: npt.NDArray[np.uint8],
+        points_camera: Array,
+        descriptors: npt.NDArray[np.uint8],
+        pixels: Array,
+        *,
+        ratio: float,
+        max_matches: int,
+    ) -> tuple[Array, Array] | None:
+        """Match the points of a reference view to the pixels of a frame.
+
+        Args:
+            reference: ``(n, 32)``, the descriptors of the reference view.
+            points_camera: ``(n, 3)`` metres; a point whose third coordinate is not finite is not matched.
+            descriptors: ``(m, 32)``, those of the frame.
+            pixels: ``(m, 2)``.
+            ratio: The nearest descriptor must be this much nearer than the second nearest.
+            max_matches: The nearest are kept.
+
+        Returns:
+            Points and pixels from left to right in the frame, rounded as they are sent; None where the arrays
+            are not uint8 and float64 of these shapes.
+        """
+        n, m = len(reference), len(descriptors)
+        if not (
+            _is(reference, np.uint8, 2) and _is(descriptors, np.uint8, 2)
+            and reference.shape == (n, _BYTES) and descriptors.shape == (m, _BYTES)
+            and _is(points_camera, np.float64, 2) and points_camera.shape == (n, 3)
+            and _is(pixels, np.float64, 2) and pixels.shape == (m, 2)
+        ):  # fmt: skip
+            return None
+        reference, points_camera = np.ascontiguousarray(reference), np.ascontiguousarray(points_camera)
+        descriptors, pixels = np.ascontiguousarray(descriptors), np.ascontiguousarray(pixels)
+        room = min(n, m, max(max_matches, 0))
+        points_world, matched = np.empty((room, 3)), np.empty((room, 2))
+        workspace = np.empty(3 * n + 5 * m + 64, dtype=np.uint64)
+        count = self._matches(
+            _address(reference), _address(points_camera), n, _address(descriptors), _address(pixels), m,
+            ratio, room, self._flags, _address(workspace), _address(points_world), _address(matched),
+        )  # fmt: skip
+        return None if count < 0 else (points_world[:count], matched[:count])
+
+
+def _is(array: npt.NDArray[Any], kind: type, dimensions: int) -> bool:
+    return array.dtype == kind and array.ndim == dimensions
+
+
+def _address(array: npt.NDArray[Any]) -> int:
+    address: int = array.__array_interface__["data"][0]
+    return address
+
+
+def open_front_end(path: Path, *, portable: bool = False) -> FrontEndCore:
+    """Load the library at *path*; *portable* forbids AVX-512.
+
+    Raises:
+        ConfigurationError: It cannot be loaded, or was built for another version of this package.
+    """
+    again = "build it again: make -C native"
+    try:
+        library = ctypes.CDLL(str(path))
+        abi, points_at, matches = library.rse_pf_match_abi, library.rse_pf_points_at, library.rse_pf_match
+    except (OSError, AttributeError) as error:
+        raise ConfigurationError(f"{path} cannot be loaded: {error}", hint=again) from error
+    abi.restype = ctypes.c_uint32
+    if abi() != _ABI:
+        raise ConfigurationError(f"{path} has the front end's ABI {abi()}, not {_ABI}", hint=again)
+    pointer, size, number = ctypes.c_void_p, ctypes.c_int64, ctypes.c_double
+    points_at.argtypes = (pointer, size, size, pointer, size, *[number] * 7, pointer)
+    points_at.restype = ctypes.c_int32
+    matches.argtypes = (
+        pointer, pointer, size, pointer, pointer, size, number, size, ctypes.c_uint32, *[pointer] * 3
+    )  # fmt: skip
+    matches.restype = size
+    return FrontEndCore(points_at, matches, portable=portable)
+
+
+@cache
+def front_end_core() -> FrontEndCore | None:
+    """Return the front end of the library that `rse_pf.native` finds; None without one that fits."""
+    path = native.find_library()
+    try:
+        return None if path is None else open_front_end(path)
+    except ConfigurationError:
+        return None

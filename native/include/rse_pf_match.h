@@ -1,0 +1,49 @@
+/* The C ABI of a robot's front end: points at keypoints, and matches of binary descriptors.
+ *
+ * Every function may be called from any thread, on arrays of its own.  Nothing is allocated, and equal
+ * arguments give equal bytes on every processor. */
+#ifndef RSE_PF_MATCH_H
+#define RSE_PF_MATCH_H
+
+#include <stdint.h>
+
+#ifdef __cplusplus
+extern "C" {
+#endif
+
+#define RSE_PF_MATCH_ABI 1
+
+#define RSE_PF_MATCH_PORTABLE 1u /* Use no AVX-512, for tests: the bytes of the result are the same. */
+
+/* Numbers of 8 bytes that rse_pf_match works in. */
+#define RSE_PF_MATCH_WORKSPACE(reference_rows, frame_rows) (3 * (reference_rows) + 5 * (frame_rows) + 64)
+
+/* Return RSE_PF_MATCH_ABI of the library, to compare with the header's. */
+uint32_t rse_pf_match_abi(void);
+
+/* Write the rows x 3 points of the camera frame that are seen at rows x 2 pixels, and return 0; -1 if a size
+ * does not fit.
+ *
+ * The depth of a pixel is the median of its 3x3 patch; it is NaN where fewer than five readings are finite and
+ * above 0, where they differ by more than spread * median, or where the median is out of range.
+ * depth_m: height x width, row-major, metres along the optical axis. */
+int32_t rse_pf_points_at(const float *depth_m, int64_t width, int64_t height, const double *pixels, int64_t rows,
+                         double fx, double fy, double cx, double cy, double min_depth_m, double max_depth_m,
+                         double spread, double *points_camera);
+
+/* Match points of a reference view to pixels of a frame; return the number of matches, -1 if a size does not fit.
+ *
+ * Descriptors have 256 bits.  A reference row whose third coordinate is finite takes the pixel at the least
+ * Hamming distance, the first one of equals, if that is less than ratio times the second least.  Of the rows
+ * that take one pixel the nearest stays, the first one of equals; of all the max_matches nearest stay.  Rows
+ * are written from left to right in the frame, points rounded to 0.1 mm, pixels to 0.01 px.
+ * points_world and matched have room for min(reference_rows, frame_rows, max_matches) rows. */
+int64_t rse_pf_match(const uint8_t *reference, const double *points_camera, int64_t reference_rows,
+                     const uint8_t *frame, const double *pixels, int64_t frame_rows, double ratio,
+                     int64_t max_matches, uint32_t flags, uint64_t *workspace, double *points_world,
+                     double *matched);
+
+#ifdef __cplusplus
+}
+#endif
+#endif

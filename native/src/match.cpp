@@ -1,0 +1,147 @@
+// A robot's front end: points at keypoints, and matches of 256-bit descriptors by Hamming distance.
+//
+// The caller lends all memory.  The results are integers, or single IEEE operations in one order, so the
+// instructions chosen below change no byte.
+#include "rse_pf_match.h"
+
+#include <cstring>
+
+#include "match_nearest.hpp"
+
+namespace {
+
+using namespace rse_pf_match_detail;
+
+constexpr int64_t kMaxRows = int64_t{1} << 24;
+constexpr int64_t kMaxSide = int64_t{1} << 16;
+constexpr int kPatch = 9, kLeastReadings = 5;
+
+double not_a_number() { return __builtin_nan(""); }
+
+// Return the median of the 3x3 patch at a column and a row, NaN where it cannot be trusted.
+double median_of_patch(const float* depth_m, int64_t width, int64_t column, int64_t row, double least, double most,
+                       double spread) {
+    float ascending[kPatch];
+    int count = 0;
+    for (int64_t y = row - 1; y <= row + 1; ++y)
+        for (int64_t x = column - 1; x <= column + 1; ++x) {
+            const float reading = depth_m[y * width + x];
+            if (!(reading > 0.0f && reading <= __FLT_MAX__)) continue;
+            int at = count++;
+            for (; at > 0 && ascending[at - 1] > reading; --at) ascending[at] = ascending[at - 1];
+            ascending[at] = reading;
+        }
+    if (count < kLeastReadings) return not_a_number();
+    const double median = static_cast<double>(ascending[(count - 1) / 2]);
+    const double apart = static_cast<double>(ascending[count - 1]) - static_cast<double>(ascending[0]);
+    const bool is_trusted = apart < median * spread && median >= least && median <= most;
+    return is_trusted ? median : not_a_number();
+}
+
+// NaN stands behind all numbers.
+bool is_left_of(double a, double b) { return a < b || (b != b && a == a); }
+
+// Sort reference rows by the column of their pixel, equals as they stand; return where the result is.
+uint64_t* left_to_right(uint64_t* rows, uint64_t* spare, int64_t count, const uint64_t* nearest, const double* pixels) {
+    for (int64_t run = 1; run < count; run *= 2) {
+        for (int64_t begin = 0; begin < count; begin += 2 * run) {
+            const int64_t middle = begin + run < count ? begin + run : count;
+            const int64_t end = begin + 2 * run < count ? begin + 2 * run : count;
+            int64_t left = begin, right = middle;
+            for (int64_t to = begin; to < end; ++to) {
+                const bool takes_right =
+                    left == middle ||
+                    (right < end && is_left_of(pixels[2 * nearest[rows[right]]], pixels[2 * nearest[rows[left]]]));
+                spare[to] = takes_right ? rows[right++] : rows[left++];
+            }
+        }
+        uint64_t* const sorted = spare;
+        spare = rows;
+        rows = sorted;
+    }
+    return rows;
+}
+
+double rounded(double value, double steps) { return __builtin_rint(value * steps) / steps; }
+
+}  // namespace
+
+extern "C" {
+
+__attribute__((visibility("default"))) uint32_t rse_pf_match_abi(void) { return RSE_PF_MATCH_ABI; }
+
+__attribute__((visibility("default"))) int32_t rse_pf_points_at(const float* depth_m, int64_t width, int64_t height,
+                                                                const double* pixels, int64_t rows, double fx,
+                                                                double fy, double cx, double cy, double min_depth_m,
+                                                                double max_depth_m, double spread,
+                                                                double* points_camera) {
+    if (depth_m == nullptr || pixels == nullptr || points_camera == nullptr || rows < 0 || rows > kMaxRows ||
+        width < 1 || height < 1 || width > kMaxSide || height > kMaxSide)
+        return -1;
+    for (int64_t i = 0; i < rows; ++i) {
+        const double column = __builtin_rint(pixels[2 * i]), row = __builtin_rint(pixels[2 * i + 1]);
+        const bool is_inside = column >= 1.0 && row >= 1.0 && column < static_cast<double>(width - 1) &&
+                               row < static_cast<double>(height - 1);
+        const double z = is_inside ? median_of_patch(depth_m, width, static_cast<int64_t>(column),
+                                                     static_cast<int64_t>(row), min_depth_m, max_depth_m, spread)
+                                   : not_a_number();
+        points_camera[3 * i] = (pixels[2 * i] - cx) / fx * z;
+        points_camera[3 * i + 1] = (pixels[2 * i + 1] - cy) / fy * z;
+        points_camera[3 * i + 2] = z;
+    }
+    return 0;
+}
+
+__attribute__((visibility("default"))) int64_t rse_pf_match(const uint8_t* reference, const double* points_camera,
+                                                            int64_t reference_rows, const uint8_t* frame,
+                                                            const double* pixels, int64_t frame_rows, double ratio,
+                                                            int64_t max_matches, uint32_t flags, uint64_t* workspace,
+                                                            double* points_world, double* matched) {
+    if (reference == nullptr || points_camera == nullptr || frame == nullptr || pixels == nullptr ||
+        workspace == nullptr || points_world == nullptr || matched == nullptr || reference_rows < 0 ||
+        reference_rows > kMaxRows || frame_rows < 0 || frame_rows > kMaxRows)
+        return -1;
+    if (frame_rows < 2) return 0;
+    uint64_t* const nearest = workspace;                // of each reference row
+    uint64_t* const sorted = nearest + reference_rows;  // reference rows
+    uint64_t* const spare = sorted + reference_rows;
+    uint64_t* const takers = spare + reference_rows;  // of each pixel: distance and reference row
+    const Search search = {frame, frame_rows, takers + frame_rows, (flags & RSE_PF_MATCH_PORTABLE) == 0};
+    prepare(search);
+
+    std::memset(takers, 0xff, static_cast<size_t>(frame_rows) * sizeof *takers);
+    for (int64_t row = 0; row < reference_rows; ++row) {
+        nearest[row] = kNone;
+        const double z = points_camera[3 * row + 2];
+        if (!(z - z == 0.0)) continue;
+        const Nearest found = two_nearest(search, reference + kBytes * row);
+        const double first = static_cast<double>(distance_of(found.first));
+        if (!(first < ratio * static_cast<double>(distance_of(found.second)))) continue;
+        nearest[row] = row_of(found.first);
+        const uint64_t taker = key(distance_of(found.first), static_cast<uint64_t>(row));
+        if (taker < takers[nearest[row]]) takers[nearest[row]] = taker;
+    }
+
+    // The rows that kept their pixel, the nearest first: one place for each distance.
+    int64_t places[kBits + 2] = {};
+    const auto has_kept = [&](int64_t row) {
+        return nearest[row] != kNone && row_of(takers[nearest[row]]) == static_cast<uint64_t>(row);
+    };
+    for (int64_t row = 0; row < reference_rows; ++row)
+        if (has_kept(row)) ++places[distance_of(takers[nearest[row]]) + 1];
+    for (int64_t distance = 0; distance <= kBits; ++distance) places[distance + 1] += places[distance];
+    int64_t count = places[kBits + 1];
+    for (int64_t row = 0; row < reference_rows; ++row)
+        if (has_kept(row)) sorted[places[distance_of(takers[nearest[row]])]++] = static_cast<uint64_t>(row);
+
+    count = count < max_matches ? count : (max_matches > 0 ? max_matches : 0);
+    const uint64_t* const rows = left_to_right(sorted, spare, count, nearest, pixels);
+    for (int64_t i = 0; i < count; ++i) {
+        const double* const point = points_camera + 3 * rows[i];
+        const double* const pixel = pixels + 2 * nearest[rows[i]];
+        for (int k = 0; k < 3; ++k) points_world[3 * i + k] = rounded(point[k], 1e4);
+        for (int k = 0; k < 2; ++k) matched[2 * i + k] = rounded(pixel[k], 1e2);
+    }
+    return count;
+}
+}

@@ -1,0 +1,213 @@
+"""The front end in the native core: the bytes of the numpy and OpenCV path, with and without AVX-512."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from client_sdk import frontend
+from client_sdk.datasets import open_dataset
+from client_sdk.frontend import Features, Frame, FrontEndOptions, extract, match
+from client_sdk.native_match import FrontEndCore, front_end_core, open_front_end
+from rse_pf import native
+from rse_pf.errors import ConfigurationError
+from rse_pf.geometry import Array, Camera
+
+pytest.importorskip("cv2", reason="pip install 'rse-pf[vision]'")
+
+LIBRARY = native.find_library()
+needs_library = pytest.mark.skipif(
+    front_end_core() is None, reason="the native core is not built: make -C native"
+)
+CAMERA = Camera(fx=500.0, fy=510.0, cx=31.5, cy=23.25, width=64, height=48)
+
+
+@pytest.fixture(params=["eight words at once", "portable"])
+def core(request: pytest.FixtureRequest) -> FrontEndCore:
+    assert LIBRARY is not None
+    return open_front_end(LIBRARY, portable=request.param == "portable")
+
+
+def use(monkeypatch: pytest.MonkeyPatch, core: FrontEndCore | None) -> None:
+    monkeypatch.setattr(frontend, "front_end_core", lambda: core)
+
+
+def features(rng: np.random.Generator, n: int, *, distinct: int, noise: int = 0) -> Features:
+    """Return features of which many have equal descriptors, columns and distances."""
+    descriptors = np.random.default_rng(3).integers(0, 256, (distinct, 32), dtype=np.uint8)
+    descriptors = descriptors[rng.integers(0, distinct, n)]
+    for _ in range(noise):
+        flipped = np.uint8(1) << rng.integers(0, 8, n).astype(np.uint8)
+        descriptors[np.arange(n), rng.integers(0, 32, n)] ^= flipped
+    points = rng.normal(size=(n, 3)) * 10.0 ** rng.integers(-6, 4, (n, 1))
+    points[rng.random(n) < 0.2, 2] = np.nan
+    points[rng.random(n) < 0.05, 2] = np.inf
+    pixels = np.round(rng.uniform(0, 640, (n, 2)) * rng.choice([1, 8])) / rng.choice([1, 8, 3])
+    return Features(pixels=pixels, descriptors=descriptors, points_camera=points)
+
+
+def pairs() -> Iterator[tuple[Features, Features, FrontEndOptions]]:
+    """Yield views of all sizes, from all descriptors alike to all different."""
+    for seed in range(60):
+        rng = np.random.default_rng(seed)
+        n, m = rng.integers(1, 90, 2) if seed % 3 else rng.integers(200, 900, 2)
+        distinct = int(rng.choice([1, 3, 20, 700]))
+        noise = int(rng.choice([0, 2, 12]))
+        options = FrontEndOptions(
+            ratio=float(rng.choice([0.5, 0.75, 0.8, 1.0])), max_matches=int(rng.choice([12, 40, 700]))
+        )
+        yield (
+            features(rng, n, distinct=distinct, noise=noise),
+            features(rng, m, distinct=distinct, noise=noise),
+            options,
+        )
+
+
+def assert_same_bytes(ours: Array, expected: Array) -> None:
+    assert ours.dtype == expected.dtype
+    assert ours.shape == expected.shape
+    assert ours.tobytes() == expected.tobytes()
+
+
+@needs_library
+def test_matches_are_those_of_opencv_to_the_last_bit_among_many_ties(core, monkeypatch):
+    counts = []
+    for reference, frame, options in pairs():
+        use(monkeypatch, core)
+        ours = match(reference, frame, options)
+        use(monkeypatch, None)
+        expected = match(reference, frame, options)
+
+        assert_same_bytes(ours.points_world, expected.points_world)
+        assert_same_bytes(ours.pixels, expected.pixels)
+        counts.append(len(ours))
+    assert min(counts) == 0
+    assert max(counts) > 100
+    assert {12, 40} <= set(counts)  # cut off at max_matches
+
+
+@needs_library
+@pytest.mark.parametrize("rows", [[0, 255], [255, 0], [255, 255], [0, 0]])
+def test_all_bits_and_no_bit_may_differ(core, monkeypatch, rows):
+    zeros = Features(
+        pixels=np.ones((1, 2)), descriptors=np.zeros((1, 32), np.uint8), points_camera=np.ones((1, 3))
+    )
+    frame = Features(
+        pixels=np.array([[1.0, 2.0], [3.0, 4.0]]),
+        descriptors=np.repeat(np.uint8(rows)[:, None], 32, axis=1),
+        points_camera=np.ones((2, 3)),
+    )
+    use(monkeypatch, core)
+
+    found = match(zeros, frame, FrontEndOptions(ratio=1.0))
+
+    # Two at one distance are no clear match.
+    assert found.pixels.tolist() == {(0, 255): [[1.0, 2.0]], (255, 0): [[3.0, 4.0]]}.get(tuple(rows), [])
+
+
+@needs_library
+@pytest.mark.parametrize("kind", ["plane", "holes", "edges", "nothing", "strange"])
+def test_points_are_those_of_numpy_to_the_last_bit(core, monkeypatch, kind):
+    rng = np.random.default_rng(7)
+    depth_m = rng.uniform(1.9, 2.1, (48, 64)).astype(np.float32)
+    if kind == "holes":
+        depth_m[rng.random(depth_m.shape) < 0.4] = 0.0
+    elif kind == "edges":
+        depth_m *= rng.choice([1.0, 1.02, 4.0], (48, 1)).astype(np.float32)
+    elif kind == "nothing":
+        depth_m[:] = 0.0
+    elif kind == "strange":
+        strange = np.float32([np.nan, np.inf, -np.inf, -2.0, -0.0, 1e-45, 3e38, 2.0])
+        depth_m = strange[rng.choice(8, (48, 64), p=[0.06] * 7 + [0.58])]
+    beyond = [[-5.0, 3.0], [0.5, 0.5], [1.5, 1.5], [62.5, 46.5], [62.4, 46.4], [1e9, 2.0], [64.0, 48.0]]
+    pixels = np.vstack((rng.uniform(-1, 65, (500, 2)), np.round(rng.uniform(0, 64, (99, 2))) - 0.5, beyond))
+    frame = Frame(timestamp_s=0.0, rgb=np.zeros((48, 64, 3), np.uint8), depth_m=depth_m, camera=CAMERA)
+    options = FrontEndOptions()
+
+    use(monkeypatch, core)
+    ours = frontend.points_at(frame, pixels, options)
+    use(monkeypatch, None)
+    expected = frontend.points_at(frame, pixels, options)
+
+    assert_same_bytes(ours, expected)
+    assert np.isfinite(ours).any() == (kind != "nothing")
+    assert np.isnan(ours).any()
+
+
+@needs_library
+def test_arrays_of_other_kinds_are_left_to_opencv(core):
+    rng = np.random.default_rng(1)
+    view = features(rng, 9, distinct=9)
+    give = {"ratio": 0.75, "max_matches": 9}
+
+    def matches(reference, points, descriptors, pixels):
+        return core.matches(reference, points, descriptors, pixels, **give)
+
+    good = (view.descriptors, view.points_camera, view.descriptors, view.pixels)
+    assert matches(*good) is not None
+    wide = np.zeros((9, 64), np.uint8)
+    for place, bad in [
+        (0, wide), (2, wide), (0, view.descriptors.astype(np.float32)), (1, view.points_camera[:8]),
+        (1, view.points_camera.astype(np.float32)), (3, view.pixels[:8]), (3, view.pixels[:, :1]),
+    ]:  # fmt: skip
+        assert matches(*good[:place], bad, *good[place + 1 :]) is None
+    limits = {"min_depth_m": 0.3, "max_depth_m": 6.0, "spread": 0.05}
+    assert core.points_at(np.ones((48, 64)), view.pixels, CAMERA, **limits) is None
+    assert core.points_at(np.ones((48, 64), np.float32), view.points_camera, CAMERA, **limits) is None
+
+
+@needs_library
+def test_arrays_need_not_be_contiguous(core, monkeypatch):
+    reference, frame, options = next(pairs())
+    spread = Features(
+        pixels=np.repeat(frame.pixels, 2, axis=0)[::2],
+        descriptors=np.asfortranarray(frame.descriptors),
+        points_camera=frame.points_camera[::-1][::-1],
+    )
+    use(monkeypatch, core)
+
+    ours, expected = match(reference, spread, options), match(reference, frame, options)
+
+    assert_same_bytes(ours.points_world, expected.points_world)
+    assert_same_bytes(ours.pixels, expected.pixels)
+
+
+@needs_library
+@pytest.mark.data
+@pytest.mark.parametrize("name", ["7scenes_redkitchen", "nyu_dining_room", "tum_fr1_xyz_start"])
+def test_the_front_end_of_a_recording_is_the_same_without_the_library(core, monkeypatch, recordings, name):
+    if not (recordings / name).exists():
+        pytest.skip(f"no recording {name}")
+    dataset = open_dataset(recordings / name)
+    options = FrontEndOptions.wide_baseline() if name.startswith("nyu") else FrontEndOptions()
+    found = []
+    for each in (core, None):
+        use(monkeypatch, each)
+        first, second = (extract(dataset.read(row), options) for row in (0, 1))
+        matches = match(first, second, options)
+        found.append((first.pixels, first.points_camera, matches.points_world, matches.pixels))
+
+    for ours, expected in zip(*found, strict=True):
+        assert_same_bytes(ours, expected)
+
+
+def test_a_missing_library_and_one_without_a_front_end_are_done_without(monkeypatch, tmp_path):
+    other = tmp_path / "other.so"
+    if shutil.which("gcc") is None:
+        other.write_bytes(b"no library")
+    else:
+        empty = tmp_path / "other.c"
+        empty.write_text("int other;\n")
+        subprocess.run(["gcc", "-shared", "-o", str(other), str(empty)], check=True)
+    with pytest.raises(ConfigurationError, match="cannot be loaded"):
+        open_front_end(other)
+    for path in (None, other, Path(tmp_path / "missing.so")):
+        monkeypatch.setattr(native, "find_library", lambda path=path: path)
+        front_end_core.cache_clear()
+        assert front_end_core() is None
+    front_end_core.cache_clear()
