@@ -11,6 +11,7 @@ import math
 
 import msgspec
 import numpy as np
+import numpy.typing as npt
 
 from rse_pf.errors import BadRequest
 from rse_pf.geometry import Array, Camera, exp_se3, transform
@@ -109,27 +110,42 @@ def refine_with_depth(
     has_depth = measured[:, 2] > 0.0
     if not has_depth.any():
         return solution
+    try:
+        fit = _fitted(solution, points, measured, has_depth, camera, noise)
+        covariance = fit.covariance()
+    except np.linalg.LinAlgError:
+        return solution
+    error = camera.project(fit.points_camera) - measured[:, :2]
+    rmse_px = math.sqrt(float(np.vdot(error, error)) / len(rows))
+    # Also false where a number is not finite.
+    if not (covariance is not None and rmse_px <= _MAX_GROWTH * max(_LEAST_RMSE_PX, solution.rmse_px)):
+        return solution
+    return msgspec.structs.replace(
+        solution, T_camera_world=fit.T_camera_reference, covariance=covariance, rmse_px=rmse_px
+    )
+
+
+def _fitted(
+    solution: PnpSolution,
+    points: Array,
+    measured: Array,
+    has_depth: npt.NDArray[np.bool_],
+    camera: Camera,
+    noise: DepthNoise,
+) -> _Fit:
+    """Return the fit at the best pose; raises LinAlgError where some motion is free."""
     pixel_px2 = max(_MIN_PIXEL_PX, 0.5 * solution.rmse_px) ** 2
     spread = _spread_of_reference(points, camera, noise, pixel_px2)
     T = solution.T_camera_world
     for _ in range(_MAX_ITERATIONS):
         fit = _Fit(T, points, measured, has_depth, spread, camera, noise, pixel_px2)
-        try:
-            xi = np.linalg.solve(fit.weighted_information, fit.gradient)
-        except np.linalg.LinAlgError:
-            return solution
+        xi = np.linalg.solve(fit.weighted_information, fit.gradient)
         if not np.isfinite(xi).all():
-            return solution
+            raise np.linalg.LinAlgError
         T = exp_se3(xi) @ T
         if np.abs(xi).max() < _CONVERGED:
             break
-    fit = _Fit(T, points, measured, has_depth, spread, camera, noise, pixel_px2)
-    error = camera.project(fit.points_camera) - measured[:, :2]
-    rmse_px = math.sqrt(float(np.vdot(error, error)) / len(rows))
-    covariance = fit.covariance()
-    if covariance is None or rmse_px > _MAX_GROWTH * max(_LEAST_RMSE_PX, solution.rmse_px):
-        return solution
-    return msgspec.structs.replace(solution, T_camera_world=T, covariance=covariance, rmse_px=rmse_px)
+    return _Fit(T, points, measured, has_depth, spread, camera, noise, pixel_px2)
 
 
 def _checked(points_reference: Array, depths_m: Array) -> Array:
@@ -173,12 +189,13 @@ class _Fit:
         T_camera_reference: Array,
         points: Array,
         measured: Array,
-        has_depth: np.ndarray,
+        has_depth: npt.NDArray[np.bool_],
         spread: Array,
         camera: Camera,
         noise: DepthNoise,
         pixel_px2: float,
     ) -> None:
+        self.T_camera_reference = T_camera_reference
         self.points_camera = transform(T_camera_reference, points)
         self.points_camera[:, 2] = np.maximum(self.points_camera[:, 2], _NEAR_M)
         x, y, z = self.points_camera.T
@@ -214,7 +231,7 @@ class _Fit:
         self.gradient: Array = np.einsum("k,kia,ki->a", self._weight, by_twist, weighed)
 
     def covariance(self) -> Array | None:
-        """Return the ``(6, 6)`` covariance of the twist left of the pose, None if some motion is free.
+        """Return the ``(6, 6)`` covariance of the twist left of the pose, None if there is none.
 
         The spread of the residuals scales it, so wrong noise of the sensor changes it less.
         """
@@ -224,10 +241,7 @@ class _Fit:
         if mean_slope <= 0.0:
             return None
         square = float((weight**2 * distance2).sum() / max(1.0, numbers.sum() - 6.0))
-        try:
-            covariance = np.linalg.inv(self._information.sum(axis=0))
-        except np.linalg.LinAlgError:
-            return None
+        covariance = np.linalg.inv(self._information.sum(axis=0))
         covariance *= max(_MIN_SCALE, square / mean_slope**2)
         covariance = 0.5 * (covariance + covariance.T)
         return covariance if (np.diag(covariance) > 0.0).all() else None

@@ -12,7 +12,7 @@ import numpy.typing as npt
 from rse_pf.config import PnpSettings
 from rse_pf.errors import LimitExceeded, TooFewCorrespondences
 from rse_pf.geometry import Camera
-from rse_pf.pnp import PnpOptions, PnpSolution, solve_pnp, usable_engine
+from rse_pf.pnp import DepthNoise, PnpOptions, PnpSolution, refine_with_depth, solve_pnp, usable_engine
 from rse_pf.service import Registry
 from rse_pf.wire.arrays import Array, reshaped
 from rse_pf.wire.native_codec import PnpTypes
@@ -23,6 +23,7 @@ _UPPER = np.triu_indices(6)
 _FLAT_UPPER = 6 * _UPPER[0] + _UPPER[1]
 _POINT_DECIMALS = 4
 _PIXEL_DECIMALS = 2
+_DEPTH_DECIMALS = 3
 
 
 class PnpRequest(msgspec.Struct, frozen=True, kw_only=True):
@@ -30,12 +31,18 @@ class PnpRequest(msgspec.Struct, frozen=True, kw_only=True):
 
     ``points_world`` holds ``3n`` metres, world frame, row after row; ``pixels`` holds ``2n``
     undistorted pixels in the same order.
+
+    ``depths_m``, which may be left out, holds the ``n`` depths that a depth camera measured at the pixels,
+    0 where there is none; the pose is then refined by the noise of both images.  The world frame of such a
+    request is the camera that measured the points.  ``depth_noise`` is that of both depth cameras.
     """
 
     camera: Camera
     points_world: Array
     pixels: Array
     options: PnpOptions | None = None
+    depths_m: Array | msgspec.UnsetType | None = msgspec.UNSET
+    depth_noise: DepthNoise | msgspec.UnsetType | None = msgspec.UNSET
 
 
 class PnpReply(msgspec.Struct, frozen=True, kw_only=True):
@@ -89,12 +96,14 @@ def make_request(
     camera: Camera,
     options: PnpOptions | None = None,
     *,
+    depths_m: npt.NDArray[np.float64] | None = None,
+    depth_noise: DepthNoise | None = None,
     binary: bool = False,
 ) -> PnpRequest:
     """Return the request of ``(n, 3)`` points and ``(n, 2)`` pixels, rounded for the wire.
 
     Rounds to 0.1 mm and 0.01 px, which is a third of the bytes and moves a pose by about
-    0.02 mm; *binary* makes the arrays float32.
+    0.02 mm, and the ``(n,)`` *depths_m*, if there are any, to 1 mm; *binary* makes the arrays float32.
     """
     kind = np.float32 if binary else np.float64
     return PnpRequest(
@@ -102,6 +111,12 @@ def make_request(
         points_world=np.round(np.asarray(points_world, dtype=np.float64), _POINT_DECIMALS).astype(kind),
         pixels=np.round(np.asarray(pixels, dtype=np.float64), _PIXEL_DECIMALS).astype(kind),
         options=options,
+        depths_m=(
+            msgspec.UNSET
+            if depths_m is None
+            else np.round(np.asarray(depths_m, dtype=np.float64), _DEPTH_DECIMALS).astype(kind)
+        ),
+        depth_noise=msgspec.UNSET if depth_noise is None else depth_noise,
     )
 
 
@@ -138,4 +153,10 @@ def register(registry: Registry, settings: PnpSettings) -> None:
                 f"{options.max_iterations} iterations are above {settings.max_iterations}",
                 hint="ask for fewer",
             )
-        return PnpReply.of(solve_pnp(points_world, pixels, request.camera, options, default_engine=engine))
+        solution = solve_pnp(points_world, pixels, request.camera, options, default_engine=engine)
+        if request.depths_m is not msgspec.UNSET and request.depths_m is not None:
+            solution = refine_with_depth(
+                solution, points_world, pixels, request.depths_m, request.camera,
+                request.depth_noise or DepthNoise(),
+            )  # fmt: skip
+        return PnpReply.of(solution)
