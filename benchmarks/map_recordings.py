@@ -19,7 +19,7 @@ from client_sdk.mapping import MapOptions, PointMap
 from rse_pf.errors import PnpError
 from rse_pf.geometry import Array, inverse
 from rse_pf.maps.format import Keyframe, MapVersion
-from rse_pf.pnp import PnpOptions, solve_pnp
+from rse_pf.pnp import PnpOptions, refine_with_depth, solve_pnp
 
 __all__ = ["Run", "ate_m", "cloud_of", "drive", "frame_poses", "keyframe_of", "red_kitchen", "truth_of"]
 
@@ -138,12 +138,12 @@ def cloud_of(dataset: Dataset, rows: Sequence[int], T_world_camera: Array, voxel
 
 def _answer(query: PoseQuery) -> tuple[Array | None, int]:
     options = PnpOptions(inlier_px=query.inlier_px, max_iterations=query.max_iterations)
+    matches = query.correspondences
     try:
-        found = solve_pnp(
-            query.correspondences.points_world, query.correspondences.pixels, query.camera, options
-        )
+        found = solve_pnp(matches.points_world, matches.pixels, query.camera, options)
     except PnpError:
         return None, 0
+    found = refine_with_depth(found, matches.points_world, matches.pixels, matches.depths_m, query.camera)
     return found.T_camera_world, len(found.inliers)
 
 

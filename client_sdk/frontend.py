@@ -31,6 +31,9 @@ __all__ = [
     "round_for_wire",
 ]
 
+# One number for each pixel in steps of 0.01 px.
+_BY_PIXEL = np.array([1 << 32, 1], dtype=np.int64)
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Frame:
@@ -137,11 +140,13 @@ class Correspondences:
     """Points of a reference view, seen in another one; rounded as they are sent.
 
     ``points_world`` ``(n, 3)``: metres, in the frame of the *reference camera*, which is the
-    world of this one query.  ``pixels`` ``(n, 2)``: row *i* observes point *i*.
+    world of this one query.  ``pixels`` ``(n, 2)``: row *i* observes point *i*, and ``depths_m``
+    ``(n,)`` is the depth measured there, 0 where it cannot be trusted.
     """
 
     points_world: Array
     pixels: Array
+    depths_m: Array
 
     def __len__(self) -> int:
         return len(self.pixels)
@@ -186,10 +191,10 @@ def match(reference: Features, frame: Features, options: FrontEndOptions) -> Cor
             ratio=options.ratio, max_matches=options.max_matches,
         )  # fmt: skip
         if found is not None:
-            return Correspondences(points_world=found[0], pixels=found[1])
+            return _with_depths(*found, frame)
     known = np.flatnonzero(np.isfinite(reference.points_camera[:, 2]))
     if not len(known) or len(frame.pixels) < 2:
-        return Correspondences(points_world=np.empty((0, 3)), pixels=np.empty((0, 2)))
+        return _with_depths(np.empty((0, 3)), np.empty((0, 2)), frame)
     cv2 = load_opencv()
     distances, neighbours = cv2.batchDistance(
         reference.descriptors[known], frame.descriptors, cv2.CV_32S, normType=cv2.NORM_HAMMING, K=2
@@ -202,7 +207,7 @@ def match(reference: Features, frame: Features, options: FrontEndOptions) -> Cor
     points_world, pixels = round_for_wire(
         reference.points_camera[known[chosen]], frame.pixels[neighbours[chosen, 0]]
     )
-    return Correspondences(points_world=points_world, pixels=pixels)
+    return _with_depths(points_world, pixels, frame)
 
 
 def round_for_wire(points_world: Array, pixels: Array) -> tuple[Array, Array]:
@@ -213,12 +218,21 @@ def round_for_wire(points_world: Array, pixels: Array) -> tuple[Array, Array]:
     return np.round(points_world, 4), np.round(pixels, 2)
 
 
+def _with_depths(points_world: Array, pixels: Array, frame: Features) -> Correspondences:
+    """Return the matches with the depth of the feature at each rounded pixel, in steps of 1 mm."""
+    known, wanted = (np.rint(each * 100.0).astype(np.int64) @ _BY_PIXEL for each in (frame.pixels, pixels))
+    order = np.argsort(known, kind="stable")
+    depths_m = frame.points_camera[order[np.searchsorted(known[order], wanted)], 2]
+    rounded: Array = np.round(np.where(np.isfinite(depths_m), depths_m, 0.0), 3)
+    return Correspondences(points_world=points_world, pixels=pixels, depths_m=rounded)
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class PoseQuery:
     """One query for the PnP service: the pose of this camera in the reference camera's frame.
 
-    Solve with ``correspondences``, ``camera``, ``inlier_px`` and ``max_iterations``, then pass the
-    answer to `Tracker.accept`.
+    Solve with ``correspondences`` (their depths, too), ``camera``, ``inlier_px`` and ``max_iterations``,
+    then pass the answer to `Tracker.accept`.
     """
 
     timestamp_s: float

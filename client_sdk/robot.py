@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     import numpy.typing as npt
 
     from rse_pf.geometry import Camera
-    from rse_pf.pnp import PnpOptions
+    from rse_pf.pnp import DepthNoise, PnpOptions
 
 __all__ = ["OnProgress", "Robot", "connect"]
 
@@ -150,6 +150,8 @@ class Robot:
         camera: Camera,
         options: PnpOptions | None = None,
         *,
+        depths_m: npt.NDArray[np.float64] | None = None,
+        depth_noise: DepthNoise | None = None,
         deadline_s: float | None = None,
         stream: str = "pose",
         keep: bool = False,
@@ -161,6 +163,9 @@ class Robot:
             pixels: ``(n, 2)``, undistorted pixels of the same points.
             camera: Intrinsics of the image.
             options: RANSAC settings; None means the server's.
+            depths_m: ``(n,)``, metres, what a depth camera measured at the pixels, 0 where there is none; the
+                pose is refined with it.  The world frame is then that of the camera that measured the points.
+            depth_noise: Of both depth cameras; None means a Kinect's.
             deadline_s: Seconds within which the answer is needed.
             stream: Within a stream the newest frame wins, and older answers are dropped.
             keep: Answer this frame even if newer ones follow.
@@ -172,8 +177,9 @@ class Robot:
         from rse_pf.services.pnp import PnpReply, make_request
 
         request = make_request(
-            points_world, pixels, camera, options, binary=self._session.codec.name == "bin"
-        )
+            points_world, pixels, camera, options, depths_m=depths_m, depth_noise=depth_noise,
+            binary=self._session.codec.name == "bin",
+        )  # fmt: skip
         answer = await self.call("pnp", request, PnpReply, deadline_s=deadline_s, stream=stream, keep=keep)
         return PoseAnswer.of(answer, answer.reply.solution())
 

@@ -27,7 +27,7 @@ from client_sdk.mapping import Trajectory
 from rse_pf.errors import PnpError, UsageError
 from rse_pf.experiments.results.trajectory_error import absolute_error, relative_error
 from rse_pf.geometry import Array, Camera, inverse, pose_difference, transform
-from rse_pf.pnp import PnpOptions, solve_pnp
+from rse_pf.pnp import PnpOptions, refine_with_depth, solve_pnp
 
 cv2 = pytest.importorskip("cv2", reason="pip install 'rse-pf[vision]'")
 
@@ -61,6 +61,7 @@ def answer(query: PoseQuery) -> tuple[Array | None, int]:
         solution = solve_pnp(found.points_world, found.pixels, query.camera, options)
     except PnpError:
         return None, 0
+    solution = refine_with_depth(solution, found.points_world, found.pixels, found.depths_m, query.camera)
     return solution.T_camera_world, len(solution.inliers)
 
 
@@ -90,6 +91,26 @@ def test_matches_of_a_known_motion_agree_with_it():
     assert len(found) > 150
     assert np.mean(errors < 3.0) > 0.85
     assert np.median(errors) < 1.0
+
+
+def test_matches_carry_the_depth_of_the_frame_in_millimetres():
+    frame = wall_frame(16)
+    frame.depth_m[:, :] += np.float32(0.12345)
+    frame.depth_m[:, 200:] = 0.0
+
+    found = match(extract(wall_frame(0), OPTIONS), extract(frame, OPTIONS), OPTIONS)
+
+    x, y = found.pixels.T
+    clear = (np.abs(y - 119.5) > 2.0) & (np.abs(x - 199.5) > 2.0)  # away from the edges of depth
+    expected = np.where(x > 199.5, 0.0, np.where(y < 119.5, 2.123, 1.123))
+    np.testing.assert_array_equal(found.depths_m[clear], expected[clear])
+    assert 0 < np.count_nonzero(found.depths_m[clear]) < np.count_nonzero(clear)
+
+
+def test_frames_without_matches_have_no_depths():
+    found = match(extract(blank_frame(), OPTIONS), extract(blank_frame(), OPTIONS), OPTIONS)
+
+    assert found.depths_m.shape == (0,)
 
 
 def test_points_are_where_the_depth_says():
@@ -277,12 +298,13 @@ def test_the_red_kitchen_is_tracked_as_well_as_when_it_was_measured(rate_hz, ate
     if not (RECORDED / "7scenes_redkitchen").exists():
         pytest.skip(f"no recordings at {RECORDED}")
     dataset = open_dataset(RECORDED / "7scenes_redkitchen")
-    tracker, sizes = Tracker(), []
+    tracker, sizes, sizes_with_depths = Tracker(), [], []
 
     def solve(query: PoseQuery) -> tuple[Array | None, int]:
         found = query.correspondences
         lists = {"points": found.points_world.ravel().tolist(), "pixels": found.pixels.ravel().tolist()}
-        sizes.append(len(zlib.compress(json.dumps(lists, separators=(",", ":")).encode())))
+        sizes.append(_deflated_bytes(lists))
+        sizes_with_depths.append(_deflated_bytes(lists | {"depths": found.depths_m.tolist()}))
         return answer(query)
 
     tracked = [run(tracker, frame, solve) for frame in dataset.thinned(rate_hz)]
@@ -296,7 +318,12 @@ def test_the_red_kitchen_is_tracked_as_well_as_when_it_was_measured(rate_hz, ate
     assert 100 * relative.rmse_m <= rpe_cm
     assert relative.rmse_deg <= rpe_deg
     assert np.median(sizes) < 5_000
-    assert max(sizes) < 10_000
+    assert max(sizes_with_depths) < 10_000
+    assert np.median(sizes_with_depths) < 1.2 * np.median(sizes)
+
+
+def _deflated_bytes(lists: dict[str, list[float]]) -> int:
+    return len(zlib.compress(json.dumps(lists, separators=(",", ":")).encode()))
 
 
 @pytest.mark.data

@@ -217,6 +217,7 @@ async def _solve(
             query.correspondences.pixels,
             query.camera,
             options,
+            depths_m=query.correspondences.depths_m,
             deadline_s=spec.session.answer_timeout_s,
             keep=True,
         )
