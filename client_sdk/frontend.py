@@ -222,9 +222,8 @@ def _with_depths(points_world: Array, pixels: Array, frame: Features) -> Corresp
     """Return the matches with the depth of the feature at each rounded pixel, in steps of 1 mm."""
     known, wanted = (np.rint(each * 100.0).astype(np.int64) @ _BY_PIXEL for each in (frame.pixels, pixels))
     order = np.argsort(known, kind="stable")
-    depths_m = frame.points_camera[order[np.searchsorted(known[order], wanted)], 2]
-    rounded: Array = np.round(np.where(np.isfinite(depths_m), depths_m, 0.0), 3)
-    return Correspondences(points_world=points_world, pixels=pixels, depths_m=rounded)
+    depths_m: Array = np.nan_to_num(frame.points_camera[order[np.searchsorted(known[order], wanted)], 2])
+    return Correspondences(points_world=points_world, pixels=pixels, depths_m=np.round(depths_m, 3))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
