@@ -11,7 +11,7 @@ import numpy.typing as npt
 from rse_pf.errors import PnpError
 from rse_pf.geometry import Array, Camera, inverse
 from rse_pf.maps.format import Keyframe
-from rse_pf.pnp import PnpOptions, PnpSolution, solve_pnp
+from rse_pf.pnp import PnpOptions, PnpSolution, refine_with_depth, solve_pnp
 from rse_pf.services.mapping.descriptors import Descriptors, hamming_matches
 
 Rows = npt.NDArray[np.int64]
@@ -24,6 +24,9 @@ __all__ = [
     "measure_relative_pose",
     "pose_of_view",
 ]
+
+# Depths that a depth camera may measure; the depth of anything else is left out.
+_NEAREST_M, _FARTHEST_M = 0.01, 100.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -42,11 +45,15 @@ class RelativePoseOptions:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class View:
-    """A camera image: ``(n, 2)`` undistorted pixels with their ``(n, 32)`` descriptors."""
+    """A camera image: ``(n, 2)`` undistorted pixels with their ``(n, 32)`` descriptors.
+
+    ``depths_m``, if there are any, are the ``(n,)`` depths at the pixels, 0 where there is none.
+    """
 
     camera: Camera
     pixels: Array
     descriptors: Descriptors
+    depths_m: Array | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -66,7 +73,12 @@ def measure_relative_pose(a: Keyframe, b: Keyframe, options: RelativePoseOptions
         The relative pose, or the reason why there is none: "no-matches", "no-pose", "few-inliers",
         "low-inlier-ratio".
     """
-    view = View(camera=b.camera, pixels=np.asarray(b.pixels, dtype=np.float64), descriptors=b.descriptors)
+    view = View(
+        camera=b.camera,
+        pixels=np.asarray(b.pixels, dtype=np.float64),
+        descriptors=b.descriptors,
+        depths_m=_depths_m(b),
+    )
     found = pose_of_view(a, view, options)
     if isinstance(found, str):
         return found
@@ -87,7 +99,10 @@ def measure_relative_pose(a: Keyframe, b: Keyframe, options: RelativePoseOptions
 def pose_of_view(
     reference: Keyframe, view: View, options: RelativePoseOptions
 ) -> tuple[PnpSolution, int] | str:
-    """Return ``T_view_reference`` by PnP with the number of matches, or the reason why there is none."""
+    """Return ``T_view_reference`` by PnP with the number of matches, or the reason why there is none.
+
+    The pose is refined with the depths of *view*, if it has any.
+    """
     points, rows, columns = matched_points(reference, view, options)
     if len(rows) < max(4, options.min_inliers // 2):
         return "no-matches"
@@ -97,6 +112,10 @@ def pose_of_view(
         )
     except PnpError:
         return "no-pose"
+    if view.depths_m is not None and points[:, 2].min() >= _NEAREST_M:
+        solution = refine_with_depth(
+            solution, points, view.pixels[columns], view.depths_m[columns], view.camera
+        )
     return solution, len(rows)
 
 
@@ -106,3 +125,10 @@ def matched_points(reference: Keyframe, view: View, options: RelativePoseOptions
     rows, columns = hamming_matches(reference.descriptors[known], view.descriptors, options.ratio)
     rows, columns = known[rows[: options.max_matches]], columns[: options.max_matches]
     return np.asarray(reference.points_camera[rows], dtype=np.float64), rows, columns
+
+
+def _depths_m(keyframe: Keyframe) -> Array:
+    """Return the depth of each feature, 0 where there is none that a depth camera could have measured."""
+    depths_m = np.asarray(keyframe.points_camera[:, 2], dtype=np.float64)
+    usable = (depths_m >= _NEAREST_M) & (depths_m <= _FARTHEST_M)
+    return np.where(usable, depths_m, 0.0)
