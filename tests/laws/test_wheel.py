@@ -21,6 +21,15 @@ HEAVY = (
 )  # fmt: skip
 IMPORT_S = 0.3
 
+ONE_POSE = """
+from rse_pf import native
+from rse_pf.pnp import solve_pnp
+from rse_pf.pnp.problems import make_problem
+problem = make_problem(seed=1)
+found = solve_pnp(problem.points_world, problem.pixels, problem.camera)
+print(native.find_library(), found.engine, found.verdict)
+"""
+
 IMPORT = """
 import sys, time
 started = time.perf_counter()
@@ -148,3 +157,41 @@ def test_a_robots_install_is_lean_and_quick_to_import(wheel: Path, tmp_path: Pat
     }
     assert all(names == [] for _, names in runs)
     assert best_s < IMPORT_S
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(300)
+def test_the_wheel_of_the_native_core_is_found_and_solves(
+    wheel: Path, repository: Path, tmp_path: Path
+) -> None:
+    if not any(map(shutil.which, ("c++", "g++", "clang++"))):
+        pytest.skip("no C++ compiler")
+    packed = subprocess.run(
+        [
+            sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "--no-build-isolation",
+            "--disable-pip-version-check", "--wheel-dir", str(tmp_path), str(repository / "native"),
+        ],
+        capture_output=True, text=True, timeout=200, check=False,
+    )  # fmt: skip
+    assert packed.returncode == 0, packed.stderr
+    (core,) = tmp_path.glob("rse_pf_native-*.whl")
+    subprocess.run([sys.executable, "-m", "venv", str(tmp_path / "venv")], check=True, timeout=120)
+    python = str(tmp_path / "venv" / "bin" / "python")
+    installed = subprocess.run(
+        [python, "-m", "pip", "install", "--quiet", "--disable-pip-version-check", str(wheel), str(core)],
+        capture_output=True, text=True, timeout=240, check=False,
+    )  # fmt: skip
+    if "No matching distribution" in installed.stderr or "connection" in installed.stderr.lower():
+        pytest.skip("no package index to install the three dependencies from")
+    assert installed.returncode == 0, installed.stderr
+
+    told = subprocess.run(
+        [python, "-c", ONE_POSE], cwd=tmp_path, capture_output=True, text=True, timeout=60, check=False,
+        env={name: value for name, value in os.environ.items() if name != "PYTHONPATH"},
+    )  # fmt: skip
+
+    assert told.stderr == ""
+    path, engine, verdict = told.stdout.split()
+    assert (engine, verdict) == ("native", "ok")
+    assert Path(path).parent.name == "rse_pf_native"
+    assert Path(path).is_relative_to(tmp_path / "venv")
