@@ -31,9 +31,6 @@ __all__ = [
     "round_for_wire",
 ]
 
-# One number for each pixel in steps of 0.01 px.
-_BY_PIXEL = np.array([1 << 32, 1], dtype=np.int64)
-
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Frame:
@@ -188,13 +185,13 @@ def match(reference: Features, frame: Features, options: FrontEndOptions) -> Cor
     if core is not None and len(frame.pixels) >= 2:
         found = core.matches(
             reference.descriptors, reference.points_camera, frame.descriptors, frame.pixels,
-            ratio=options.ratio, max_matches=options.max_matches,
+            frame.points_camera, ratio=options.ratio, max_matches=options.max_matches,
         )  # fmt: skip
         if found is not None:
-            return _with_depths(*found, frame)
+            return Correspondences(points_world=found[0], pixels=found[1], depths_m=found[2])
     known = np.flatnonzero(np.isfinite(reference.points_camera[:, 2]))
     if not len(known) or len(frame.pixels) < 2:
-        return _with_depths(np.empty((0, 3)), np.empty((0, 2)), frame)
+        return Correspondences(points_world=np.empty((0, 3)), pixels=np.empty((0, 2)), depths_m=np.empty(0))
     cv2 = load_opencv()
     distances, neighbours = cv2.batchDistance(
         reference.descriptors[known], frame.descriptors, cv2.CV_32S, normType=cv2.NORM_HAMMING, K=2
@@ -204,10 +201,11 @@ def match(reference: Features, frame: Features, options: FrontEndOptions) -> Cor
     _, firsts = np.unique(neighbours[best_first, 0], return_index=True)
     chosen = best_first[np.sort(firsts)][: options.max_matches]
     chosen = chosen[np.argsort(frame.pixels[neighbours[chosen, 0], 0], kind="stable")]
-    points_world, pixels = round_for_wire(
-        reference.points_camera[known[chosen]], frame.pixels[neighbours[chosen, 0]]
-    )
-    return _with_depths(points_world, pixels, frame)
+    seen = neighbours[chosen, 0]
+    points_world, pixels = round_for_wire(reference.points_camera[known[chosen]], frame.pixels[seen])
+    depths_m = frame.points_camera[seen, 2]
+    depths_m = np.round(np.where(np.isfinite(depths_m), depths_m, 0.0), 3)
+    return Correspondences(points_world=points_world, pixels=pixels, depths_m=depths_m)
 
 
 def round_for_wire(points_world: Array, pixels: Array) -> tuple[Array, Array]:
@@ -216,14 +214,6 @@ def round_for_wire(points_world: Array, pixels: Array) -> tuple[Array, Array]:
     The pose moves by about 0.02 mm, the message shrinks to a third.
     """
     return np.round(points_world, 4), np.round(pixels, 2)
-
-
-def _with_depths(points_world: Array, pixels: Array, frame: Features) -> Correspondences:
-    """Return the matches with the depth of the feature at each rounded pixel, in steps of 1 mm."""
-    known, wanted = (np.rint(each * 100.0).astype(np.int64) @ _BY_PIXEL for each in (frame.pixels, pixels))
-    order = np.argsort(known, kind="stable")
-    depths_m: Array = np.nan_to_num(frame.points_camera[order[np.searchsorted(known[order], wanted)], 2])
-    return Correspondences(points_world=points_world, pixels=pixels, depths_m=np.round(depths_m, 3))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

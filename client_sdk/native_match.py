@@ -10,7 +10,7 @@ import ctypes
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -21,23 +21,23 @@ from rse_pf.geometry import Array, Camera
 
 __all__ = ["FrontEndCore", "front_end_core", "open_front_end"]
 
-_ABI = 1
-_PORTABLE = 1
+_ABI = 2
+_FLAGS = {"portable": 1, "avx2": 2, "avx512": 0}
 _BYTES = 32
+
+Lanes = Literal["portable", "avx2", "avx512"]
 
 
 class FrontEndCore:
     """The front end of one loaded library; every thread may call it.
 
-    ``portable`` forbids AVX-512, which changes no byte of the results.
+    ``lanes`` are the widest instructions it may use, which changes no byte of the results.
     """
 
-    def __init__(
-        self, points_at: Callable[..., int], matches: Callable[..., int], *, portable: bool = False
-    ) -> None:
+    def __init__(self, points_at: Callable[..., int], matches: Callable[..., int], lanes: Lanes) -> None:
         self._points_at = points_at
         self._matches = matches
-        self._flags = _PORTABLE if portable else 0
+        self._flags = _FLAGS[lanes]
 
     def points_at(
         self,
@@ -81,10 +81,11 @@ class FrontEndCore:
         points_camera: Array,
         descriptors: npt.NDArray[np.uint8],
         pixels: Array,
+        frame_points: Array,
         *,
         ratio: float,
         max_matches: int,
-    ) -> tuple[Array, Array] | None:
+    ) -> tuple[Array, Array, Array] | None:
         """Match the points of a reference view to the pixels of a frame.
 
         Args:
@@ -92,12 +93,13 @@ class FrontEndCore:
             points_camera: ``(n, 3)`` metres; a point whose third coordinate is not finite is not matched.
             descriptors: ``(m, 32)``, those of the frame.
             pixels: ``(m, 2)``.
+            frame_points: ``(m, 3)`` metres, the points that the frame shows at *pixels*.
             ratio: The nearest descriptor must be this much nearer than the second nearest.
             max_matches: The nearest are kept.
 
         Returns:
-            Points and pixels from left to right in the frame, rounded as they are sent; None where the arrays
-            are not uint8 and float64 of these shapes.
+            Points, pixels, and depths of the pixels (0 where they are not finite), from left to right in the
+            frame, rounded as they are sent; None where the arrays are not uint8 and float64 of these shapes.
         """
         n, m = len(reference), len(descriptors)
         if not (
@@ -105,18 +107,21 @@ class FrontEndCore:
             and reference.shape == (n, _BYTES) and descriptors.shape == (m, _BYTES)
             and _is(points_camera, np.float64, 2) and points_camera.shape == (n, 3)
             and _is(pixels, np.float64, 2) and pixels.shape == (m, 2)
+            and _is(frame_points, np.float64, 2) and frame_points.shape == (m, 3)
         ):  # fmt: skip
             return None
         reference, points_camera = np.ascontiguousarray(reference), np.ascontiguousarray(points_camera)
         descriptors, pixels = np.ascontiguousarray(descriptors), np.ascontiguousarray(pixels)
+        frame_points = np.ascontiguousarray(frame_points)
         room = min(n, m, max(max_matches, 0))
-        points_world, matched = np.empty((room, 3)), np.empty((room, 2))
+        points_world, matched, depths_m = np.empty((room, 3)), np.empty((room, 2)), np.empty(room)
         workspace = np.empty(3 * n + 5 * m + 64, dtype=np.uint64)
         count = self._matches(
-            _address(reference), _address(points_camera), n, _address(descriptors), _address(pixels), m,
-            ratio, room, self._flags, _address(workspace), _address(points_world), _address(matched),
+            _address(reference), _address(points_camera), n, _address(descriptors), _address(pixels),
+            _address(frame_points), m, ratio, room, self._flags, _address(workspace),
+            _address(points_world), _address(matched), _address(depths_m),
         )  # fmt: skip
-        return None if count < 0 else (points_world[:count], matched[:count])
+        return None if count < 0 else (points_world[:count], matched[:count], depths_m[:count])
 
 
 def _is(array: npt.NDArray[Any], kind: type, dimensions: int) -> bool:
@@ -128,8 +133,8 @@ def _address(array: npt.NDArray[Any]) -> int:
     return address
 
 
-def open_front_end(path: Path, *, portable: bool = False) -> FrontEndCore:
-    """Load the library at *path*; *portable* forbids AVX-512.
+def open_front_end(path: Path, lanes: Lanes = "avx512") -> FrontEndCore:
+    """Load the library at *path*; *lanes* are the widest instructions it may use.
 
     Raises:
         ConfigurationError: It cannot be loaded, or was built for another version of this package.
@@ -147,10 +152,10 @@ def open_front_end(path: Path, *, portable: bool = False) -> FrontEndCore:
     points_at.argtypes = (pointer, size, size, pointer, size, *[number] * 7, pointer)
     points_at.restype = ctypes.c_int32
     matches.argtypes = (
-        pointer, pointer, size, pointer, pointer, size, number, size, ctypes.c_uint32, *[pointer] * 3
+        pointer, pointer, size, *[pointer] * 3, size, number, size, ctypes.c_uint32, *[pointer] * 4
     )  # fmt: skip
     matches.restype = size
-    return FrontEndCore(points_at, matches, portable=portable)
+    return FrontEndCore(points_at, matches, lanes)
 
 
 @cache

@@ -11,9 +11,11 @@
 extern "C" {
 #endif
 
-#define RSE_PF_MATCH_ABI 1
+#define RSE_PF_MATCH_ABI 2
 
-#define RSE_PF_MATCH_PORTABLE 1u /* Use no AVX-512, for tests: the bytes of the result are the same. */
+/* Use no AVX2 and AVX-512, or no AVX-512, for tests: the bytes of the result are the same. */
+#define RSE_PF_MATCH_PORTABLE 1u
+#define RSE_PF_MATCH_AVX2 2u
 
 /* Numbers of 8 bytes that rse_pf_match works in. */
 #define RSE_PF_MATCH_WORKSPACE(reference_rows, frame_rows) (3 * (reference_rows) + 5 * (frame_rows) + 64)
@@ -36,12 +38,14 @@ int32_t rse_pf_points_at(const float *depth_m, int64_t width, int64_t height, co
  * Descriptors have 256 bits.  A reference row whose third coordinate is finite takes the pixel at the least
  * Hamming distance, the first one of equals, if that is less than ratio times the second least.  Of the rows
  * that take one pixel the nearest stays, the first one of equals; of all the max_matches nearest stay.  Rows
- * are written from left to right in the frame, points rounded to 0.1 mm, pixels to 0.01 px.
- * points_world and matched have room for min(reference_rows, frame_rows, max_matches) rows. */
+ * are written from left to right in the frame, points rounded to 0.1 mm, pixels to 0.01 px, and the depths of
+ * the frame's points there to 1 mm, 0 where they are not finite.
+ * points_camera and frame_points are rows x 3.  points_world, matched and depths_m have room for
+ * min(reference_rows, frame_rows, max_matches) rows. */
 int64_t rse_pf_match(const uint8_t *reference, const double *points_camera, int64_t reference_rows,
-                     const uint8_t *frame, const double *pixels, int64_t frame_rows, double ratio,
-                     int64_t max_matches, uint32_t flags, uint64_t *workspace, double *points_world,
-                     double *matched);
+                     const uint8_t *frame, const double *pixels, const double *frame_points, int64_t frame_rows,
+                     double ratio, int64_t max_matches, uint32_t flags, uint64_t *workspace, double *points_world,
+                     double *matched, double *depths_m);
 
 #ifdef __cplusplus
 }

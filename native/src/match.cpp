@@ -16,6 +16,8 @@ constexpr int64_t kMaxRows = int64_t{1} << 24;
 constexpr int64_t kMaxSide = int64_t{1} << 16;
 constexpr int kPatch = 9, kLeastReadings = 5;
 
+bool is_finite(double value) { return value - value == 0.0; }
+
 double not_a_number() { return __builtin_nan(""); }
 
 // Return the median of the 3x3 patch at a column and a row, NaN where it cannot be trusted.
@@ -94,26 +96,28 @@ __attribute__((visibility("default"))) int32_t rse_pf_points_at(const float* dep
 
 __attribute__((visibility("default"))) int64_t rse_pf_match(const uint8_t* reference, const double* points_camera,
                                                             int64_t reference_rows, const uint8_t* frame,
-                                                            const double* pixels, int64_t frame_rows, double ratio,
-                                                            int64_t max_matches, uint32_t flags, uint64_t* workspace,
-                                                            double* points_world, double* matched) {
+                                                            const double* pixels, const double* frame_points,
+                                                            int64_t frame_rows, double ratio, int64_t max_matches,
+                                                            uint32_t flags, uint64_t* workspace, double* points_world,
+                                                            double* matched, double* depths_m) {
     if (reference == nullptr || points_camera == nullptr || frame == nullptr || pixels == nullptr ||
-        workspace == nullptr || points_world == nullptr || matched == nullptr || reference_rows < 0 ||
-        reference_rows > kMaxRows || frame_rows < 0 || frame_rows > kMaxRows)
+        frame_points == nullptr || workspace == nullptr || points_world == nullptr || matched == nullptr ||
+        depths_m == nullptr || reference_rows < 0 || reference_rows > kMaxRows || frame_rows < 0 || frame_rows > kMaxRows)
         return -1;
     if (frame_rows < 2) return 0;
     uint64_t* const nearest = workspace;                // of each reference row
     uint64_t* const sorted = nearest + reference_rows;  // reference rows
     uint64_t* const spare = sorted + reference_rows;
     uint64_t* const takers = spare + reference_rows;  // of each pixel: distance and reference row
-    const Search search = {frame, frame_rows, takers + frame_rows, (flags & RSE_PF_MATCH_PORTABLE) == 0};
-    prepare(search);
+    const Lanes most = (flags & RSE_PF_MATCH_PORTABLE) != 0 ? Lanes::words
+                       : (flags & RSE_PF_MATCH_AVX2) != 0   ? Lanes::avx2
+                                                            : Lanes::avx512;
+    const Search search = prepared(frame, frame_rows, takers + frame_rows, most);
 
     std::memset(takers, 0xff, static_cast<size_t>(frame_rows) * sizeof *takers);
     for (int64_t row = 0; row < reference_rows; ++row) {
         nearest[row] = kNone;
-        const double z = points_camera[3 * row + 2];
-        if (!(z - z == 0.0)) continue;
+        if (!is_finite(points_camera[3 * row + 2])) continue;
         const Nearest found = two_nearest(search, reference + kBytes * row);
         const double first = static_cast<double>(distance_of(found.first));
         if (!(first < ratio * static_cast<double>(distance_of(found.second)))) continue;
@@ -139,8 +143,10 @@ __attribute__((visibility("default"))) int64_t rse_pf_match(const uint8_t* refer
     for (int64_t i = 0; i < count; ++i) {
         const double* const point = points_camera + 3 * rows[i];
         const double* const pixel = pixels + 2 * nearest[rows[i]];
+        const double depth_m = frame_points[3 * nearest[rows[i]] + 2];
         for (int k = 0; k < 3; ++k) points_world[3 * i + k] = rounded(point[k], 1e4);
         for (int k = 0; k < 2; ++k) matched[2 * i + k] = rounded(pixel[k], 1e2);
+        depths_m[i] = is_finite(depth_m) ? rounded(depth_m, 1e3) : 0.0;
     }
     return count;
 }

@@ -1,8 +1,9 @@
 // The two nearest of many 256-bit descriptors; all of the front end's time but the features' goes here.
 //
 // A candidate is one number, its distance above its row, so the least number is the nearest one and the first
-// of equals, in any order of search.  Processors that count the bits of eight words at once take eight
-// candidates at a time, word by word of their descriptors; others count word after word.
+// of equals, in any order of search.  Processors that count the bits of eight words at once (AVX-512 VPOPCNTDQ)
+// take eight candidates at a time, word by word of their descriptors; those with AVX2 take 32, byte by byte,
+// and look up the bits of half a byte; others count word after word.
 #pragma once
 
 #include <cstdint>
@@ -10,23 +11,26 @@
 
 #if defined(__x86_64__)
 #include <immintrin.h>
+#define RSE_PF_AVX2 __attribute__((target("avx2")))
 #define RSE_PF_AVX512 __attribute__((target("avx512f,avx512vpopcntdq")))
 #endif
 
 namespace rse_pf_match_detail {
 
-constexpr int64_t kBits = 256, kBytes = 32, kWords = 4, kEight = 8;
+constexpr int64_t kBits = 256, kBytes = 32, kWords = 4, kEight = 8, kBlock = 32;
 constexpr uint64_t kNone = ~uint64_t{0};
 
 struct Nearest {
     uint64_t first, second;
 };
 
+enum class Lanes { words, avx2, avx512 };
+
 struct Search {
     const uint8_t* descriptors;
     int64_t rows;
-    uint64_t* words;  // kWords * (rows + 7) of the workspace
-    bool may_use_avx512;
+    uint64_t* room;  // kWords * (rows + 7) words of the workspace
+    Lanes lanes;
 };
 
 inline uint64_t key(uint64_t distance, uint64_t row) { return distance << 32 | row; }
@@ -41,23 +45,86 @@ inline void keep_two(Nearest& found, uint64_t candidate) {
     found.first = candidate < found.first ? candidate : found.first;
 }
 
-inline Nearest two_nearest_of_words(const Search& search, const uint64_t (&sought)[kWords]) {
-    Nearest found = {kNone, kNone};
-    const uint8_t* at = search.descriptors;
-    for (int64_t row = 0; row < search.rows; ++row, at += kBytes) {
-        uint64_t words[kWords];
-        std::memcpy(words, at, sizeof words);
-        const uint64_t distance = (bits(words[0] ^ sought[0]) + bits(words[1] ^ sought[1])) +
-                                  (bits(words[2] ^ sought[2]) + bits(words[3] ^ sought[3]));
+inline uint64_t word(const uint8_t* at) {
+    uint64_t value;
+    std::memcpy(&value, at, sizeof value);
+    return value;
+}
+
+inline Nearest two_nearest_of_words(const Search& search, const uint8_t* sought, int64_t begin, Nearest found) {
+    uint64_t second = found.second == kNone ? kBits + 1 : distance_of(found.second);
+    const uint64_t a = word(sought), b = word(sought + 8), c = word(sought + 16), d = word(sought + 24);
+    const uint8_t* at = search.descriptors + kBytes * begin;
+    for (int64_t row = begin; row < search.rows; ++row, at += kBytes) {
+        const uint64_t distance =
+            (bits(word(at) ^ a) + bits(word(at + 8) ^ b)) + (bits(word(at + 16) ^ c) + bits(word(at + 24) ^ d));
+        if (__builtin_expect(distance >= second, 1)) continue;  // a later one of equals is no candidate
         keep_two(found, key(distance, static_cast<uint64_t>(row)));
+        second = found.second == kNone ? kBits + 1 : distance_of(found.second);
     }
     return found;
 }
 
 #if defined(__x86_64__)
-inline bool has_avx512(const Search& search) {
-    return search.may_use_avx512 && __builtin_cpu_supports("avx512f") != 0 &&
-           __builtin_cpu_supports("avx512vpopcntdq") != 0;
+typedef uint8_t Block __attribute__((vector_size(32)));
+typedef uint16_t Halves __attribute__((vector_size(32)));
+typedef int16_t Distances __attribute__((vector_size(32)));
+
+constexpr int16_t kFar = 0x7fff;
+constexpr int64_t kMostBlocks = 0x3fff;
+
+// Per lane of 16: the two least distances, and which half of which block the first of them came from.
+struct Sixteen {
+    Distances first, second, half;
+};
+
+RSE_PF_AVX2 inline void keep_two(Sixteen& found, Distances distance, Distances half) {
+    const Distances farther = distance > found.first ? distance : found.first;
+    found.second = farther < found.second ? farther : found.second;
+    found.half = distance < found.first ? half : found.half;
+    found.first = distance < found.first ? distance : found.first;
+}
+
+RSE_PF_AVX2 inline Block bits_of_halves(Block bytes) {
+    const Block counts = {0, 1, 1, 2, 1, 2, 2, 3, 1, 2, 2, 3, 2, 3, 3, 4, 0, 1, 1, 2, 1, 2, 2, 3, 1, 2, 2, 3, 2, 3, 3, 4};
+    return reinterpret_cast<Block>(
+        _mm256_shuffle_epi8(reinterpret_cast<__m256i>(counts), reinterpret_cast<__m256i>(bytes)));
+}
+
+RSE_PF_AVX2 inline Nearest two_nearest_of_blocks(const Search& search, const uint8_t* sought) {
+    alignas(32) uint8_t each[kBytes * kBlock];
+    for (int64_t k = 0; k < kBytes; ++k) std::memset(each + kBlock * k, sought[k], kBlock);
+    const Distances far = {kFar, kFar, kFar, kFar, kFar, kFar, kFar, kFar, kFar, kFar, kFar, kFar, kFar, kFar, kFar, kFar};
+    Sixteen lanes = {far, far, Distances{}};
+    const int64_t blocks = search.rows / kBlock;
+    const uint8_t* at = reinterpret_cast<const uint8_t*>(search.room);
+    for (int64_t block = 0; block < blocks; ++block) {
+        Distances even = {}, odd = {};
+        for (int64_t part = 0; part < 2; ++part) {  // 128 bits fit a byte, 256 do not
+            Block sum = {};
+            for (int64_t k = 0; k < kBytes / 2; ++k, at += kBlock) {
+                Block bytes, other;
+                std::memcpy(&bytes, at, sizeof bytes);
+                std::memcpy(&other, each + kBlock * (kBytes / 2 * part + k), sizeof other);
+                bytes ^= other;
+                const Block high = reinterpret_cast<Block>(reinterpret_cast<Halves>(bytes) >> 4);
+                sum += bits_of_halves(bytes & 15) + bits_of_halves(high & 15);
+            }
+            even += reinterpret_cast<Distances>(reinterpret_cast<Halves>(sum) & 255);
+            odd += reinterpret_cast<Distances>(reinterpret_cast<Halves>(sum) >> 8);
+        }
+        const int16_t half = static_cast<int16_t>(2 * block);
+        keep_two(lanes, even, Distances{} + half);
+        keep_two(lanes, odd, Distances{} + static_cast<int16_t>(half + 1));
+    }
+    Nearest found = {kNone, kNone};
+    for (int lane = 0; blocks > 0 && lane < 16; ++lane) {
+        const int64_t half = lanes.half[lane];
+        const int64_t row = half / 2 * kBlock + 2 * lane + half % 2;
+        keep_two(found, key(static_cast<uint64_t>(lanes.first[lane]), static_cast<uint64_t>(row)));
+        keep_two(found, key(static_cast<uint64_t>(lanes.second[lane]), 0xffffffffu));  // of any row behind it
+    }
+    return two_nearest_of_words(search, sought, blocks * kBlock, found);
 }
 
 typedef uint64_t Eight __attribute__((vector_size(64)));
@@ -68,19 +135,20 @@ RSE_PF_AVX512 inline Eight bits_of_eight(const uint64_t* at, uint64_t sought) {
     return reinterpret_cast<Eight>(_mm512_popcnt_epi64(reinterpret_cast<__m512i>(words ^ sought)));
 }
 
-RSE_PF_AVX512 inline Nearest two_nearest_of_eights(const Search& search, const uint64_t (&sought)[kWords]) {
+RSE_PF_AVX512 inline Nearest two_nearest_of_eights(const Search& search, const uint8_t* sought) {
+    const uint64_t a = word(sought), b = word(sought + 8), c = word(sought + 16), d = word(sought + 24);
     const Eight none = {kNone, kNone, kNone, kNone, kNone, kNone, kNone, kNone};
     const uint64_t end = static_cast<uint64_t>(search.rows);
     Eight first = none, second = none, rows = {0, 1, 2, 3, 4, 5, 6, 7};
-    const uint64_t* at = search.words;
+    const uint64_t* at = search.room;
     for (int64_t row = 0; row < search.rows; row += kEight, at += kWords * kEight) {
-        const Eight distance = (bits_of_eight(at, sought[0]) + bits_of_eight(at + kEight, sought[1])) +
-                               (bits_of_eight(at + 2 * kEight, sought[2]) + bits_of_eight(at + 3 * kEight, sought[3]));
+        const Eight distance = (bits_of_eight(at, a) + bits_of_eight(at + kEight, b)) +
+                               (bits_of_eight(at + 2 * kEight, c) + bits_of_eight(at + 3 * kEight, d));
         const Eight candidate = rows < end ? (distance << 32 | rows) : none;
         const Eight farther = candidate < first ? first : candidate;
         second = farther < second ? farther : second;
         first = candidate < first ? candidate : first;
-        rows += kEight;
+        rows += static_cast<uint64_t>(kEight);
     }
     Nearest found = {kNone, kNone};
     for (int64_t lane = 0; lane < kEight; ++lane) {
@@ -91,31 +159,38 @@ RSE_PF_AVX512 inline Nearest two_nearest_of_eights(const Search& search, const u
 }
 #endif
 
-// Lay out the candidates' words for the search.
-inline void prepare(const Search& search) {
+// Choose the instructions, and lay out the candidates for them.
+inline Search prepared(const uint8_t* descriptors, int64_t rows, uint64_t* room, Lanes most) {
+    Search search = {descriptors, rows, room, Lanes::words};
 #if defined(__x86_64__)
-    if (!has_avx512(search)) return;
-    const int64_t eights = (search.rows + kEight - 1) / kEight;
-    std::memset(search.words, 0, static_cast<size_t>(eights * kEight * kBytes));
-    for (int64_t row = 0; row < search.rows; ++row) {
-        uint64_t words[kWords];
-        std::memcpy(words, search.descriptors + kBytes * row, sizeof words);
-        uint64_t* const to = search.words + row / kEight * kWords * kEight + row % kEight;
-        for (int64_t k = 0; k < kWords; ++k) to[k * kEight] = words[k];
+    const bool has_avx512 = __builtin_cpu_supports("avx512f") != 0 && __builtin_cpu_supports("avx512vpopcntdq") != 0;
+    if (most == Lanes::avx512 && has_avx512) {
+        search.lanes = Lanes::avx512;
+        const int64_t eights = (rows + kEight - 1) / kEight;
+        std::memset(room, 0, static_cast<size_t>(eights * kEight * kBytes));
+        for (int64_t row = 0; row < rows; ++row)
+            for (int64_t k = 0; k < kWords; ++k)
+                room[(row / kEight * kWords + k) * kEight + row % kEight] = word(descriptors + kBytes * row + 8 * k);
+    } else if (most != Lanes::words && __builtin_cpu_supports("avx2") != 0 && rows / kBlock <= kMostBlocks) {
+        search.lanes = Lanes::avx2;
+        uint8_t* const bytes = reinterpret_cast<uint8_t*>(room);
+        for (int64_t row = 0; row < rows / kBlock * kBlock; ++row)
+            for (int64_t k = 0; k < kBytes; ++k)
+                bytes[(row / kBlock * kBytes + k) * kBlock + row % kBlock] = descriptors[kBytes * row + k];
     }
 #else
-    static_cast<void>(search);
+    static_cast<void>(most);
 #endif
+    return search;
 }
 
-// Return the two candidates nearest to one descriptor; the search is prepared and has two rows and more.
-inline Nearest two_nearest(const Search& search, const uint8_t* descriptor) {
-    uint64_t sought[kWords];
-    std::memcpy(sought, descriptor, sizeof sought);
+// Return the two candidates nearest to one descriptor; of the second one the distance only.  There are two and more.
+inline Nearest two_nearest(const Search& search, const uint8_t* sought) {
 #if defined(__x86_64__)
-    if (has_avx512(search)) return two_nearest_of_eights(search, sought);
+    if (search.lanes == Lanes::avx512) return two_nearest_of_eights(search, sought);
+    if (search.lanes == Lanes::avx2) return two_nearest_of_blocks(search, sought);
 #endif
-    return two_nearest_of_words(search, sought);
+    return two_nearest_of_words(search, sought, 0, {kNone, kNone});
 }
 
 }  // namespace rse_pf_match_detail

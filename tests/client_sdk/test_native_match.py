@@ -1,4 +1,4 @@
-"""The front end in the native core: the bytes of the numpy and OpenCV path, with and without AVX-512."""
+"""The front end in the native core: the bytes of the numpy and OpenCV path, with any instructions."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ needs_library = pytest.mark.skipif(
 CAMERA = Camera(fx=500.0, fy=510.0, cx=31.5, cy=23.25, width=64, height=48)
 
 
-@pytest.fixture(params=["eight words at once", "portable"])
+@pytest.fixture(params=["portable", "avx2", "avx512"])
 def core(request: pytest.FixtureRequest) -> FrontEndCore:
     assert LIBRARY is not None
-    return open_front_end(LIBRARY, portable=request.param == "portable")
+    return open_front_end(LIBRARY, request.param)
 
 
 def use(monkeypatch: pytest.MonkeyPatch, core: FrontEndCore | None) -> None:
@@ -85,6 +85,7 @@ def test_matches_are_those_of_opencv_to_the_last_bit_among_many_ties(core, monke
 
         assert_same_bytes(ours.points_world, expected.points_world)
         assert_same_bytes(ours.pixels, expected.pixels)
+        assert_same_bytes(ours.depths_m, expected.depths_m)
         counts.append(len(ours))
     assert min(counts) == 0
     assert max(counts) > 100
@@ -145,15 +146,16 @@ def test_arrays_of_other_kinds_are_left_to_opencv(core):
     view = features(rng, 9, distinct=9)
     give = {"ratio": 0.75, "max_matches": 9}
 
-    def matches(reference, points, descriptors, pixels):
-        return core.matches(reference, points, descriptors, pixels, **give)
+    def matches(*arrays):
+        return core.matches(*arrays, **give)
 
-    good = (view.descriptors, view.points_camera, view.descriptors, view.pixels)
+    good = (view.descriptors, view.points_camera, view.descriptors, view.pixels, view.points_camera)
     assert matches(*good) is not None
     wide = np.zeros((9, 64), np.uint8)
     for place, bad in [
         (0, wide), (2, wide), (0, view.descriptors.astype(np.float32)), (1, view.points_camera[:8]),
         (1, view.points_camera.astype(np.float32)), (3, view.pixels[:8]), (3, view.pixels[:, :1]),
+        (4, view.points_camera[:8]), (4, view.pixels),
     ]:  # fmt: skip
         assert matches(*good[:place], bad, *good[place + 1 :]) is None
     limits = {"min_depth_m": 0.3, "max_depth_m": 6.0, "spread": 0.05}
@@ -190,7 +192,9 @@ def test_the_front_end_of_a_recording_is_the_same_without_the_library(core, monk
         use(monkeypatch, each)
         first, second = (extract(dataset.read(row), options) for row in (0, 1))
         matches = match(first, second, options)
-        found.append((first.pixels, first.points_camera, matches.points_world, matches.pixels))
+        found.append(
+            (first.pixels, first.points_camera, matches.points_world, matches.pixels, matches.depths_m)
+        )
 
     for ours, expected in zip(*found, strict=True):
         assert_same_bytes(ours, expected)
