@@ -32,7 +32,7 @@ class CallBuffers(threading.local):
         self.numbers = np.empty(numbers_room, dtype=np.float64)
         self.call = memoryview(call)  # type: ignore[arg-type]
         self.text_view = memoryview(self.text)  # type: ignore[arg-type]
-        self.call_at = _address(call)
+        self.call_at, self.text_at = _address(call), _address(self.text)
         self.lend(self.text)
 
     def lend(self, text: npt.NDArray[np.uint8]) -> None:

@@ -175,6 +175,8 @@ def failure_of(error: RsePfError, command: Command | None = None, *, server: str
 
 def request_of(payload: Any, service: Service) -> Any:
     """Return a command's *payload* as the request type of *service*; raises BadRequest."""
+    if type(payload) is service.request_type:
+        return payload
     try:
         return as_type({} if payload is None else payload, service.request_type)
     except BadMessage as error:

@@ -12,7 +12,7 @@
 extern "C" {
 #endif
 
-#define RSE_PF_CODEC_ABI 1
+#define RSE_PF_CODEC_ABI 2
 
 /* Bytes behind `text_room` and `deflated` that a call may write to. */
 #define RSE_PF_CODEC_SLACK 64
@@ -55,12 +55,12 @@ typedef struct rse_pf_codec_budget {
 typedef struct rse_pf_codec_call {
     uint8_t *text;    /* for what is inflated: text_room bytes and RSE_PF_CODEC_SLACK more */
     int64_t text_room;
-    double *numbers;  /* the points, then the pixels */
+    double *numbers;  /* the points, the pixels, the depths */
     int64_t numbers_room;
     /* What was found: */
     int64_t text_bytes; /* inflated */
     int64_t limit;
-    int64_t points, pixels; /* numbers of each */
+    int64_t points, pixels, depths; /* numbers of each */
     int64_t id, seq;
     double deadline_ms;
     int64_t fields; /* RSE_PF_CODEC_HAS_... */

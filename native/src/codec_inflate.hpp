@@ -6,40 +6,81 @@
 #include <cstdint>
 #include <cstring>
 
+#if defined(__SSSE3__)
+#include <tmmintrin.h>
+#endif
+
 #include "rse_pf_codec.h"
 
 namespace rse_pf_codec {
 
-constexpr uint32_t kAdlerBase = 65521;
+constexpr uint64_t kAdlerBase = 65521;
+
+// Add blocks of 32 bytes to both sums, at most 173 of them; return how many bytes were taken.
+#if defined(__SSSE3__)
+inline int64_t add_blocks(const uint8_t* bytes, int64_t count, uint64_t& a, uint64_t& b) {
+    const __m128i first = _mm_setr_epi8(32, 31, 30, 29, 28, 27, 26, 25, 24, 23, 22, 21, 20, 19, 18, 17);
+    const __m128i second = _mm_setr_epi8(16, 15, 14, 13, 12, 11, 10, 9, 8, 7, 6, 5, 4, 3, 2, 1);
+    const __m128i zero = _mm_setzero_si128(), ones = _mm_set1_epi16(1);
+    __m128i sum = zero, sums_before = zero, weighted = zero;
+    const int64_t blocks = count / 32;
+    for (int64_t i = 0; i < blocks; ++i, bytes += 32) {
+        const __m128i low = _mm_loadu_si128(reinterpret_cast<const __m128i*>(bytes));
+        const __m128i high = _mm_loadu_si128(reinterpret_cast<const __m128i*>(bytes + 16));
+        sums_before = _mm_add_epi64(sums_before, sum);
+        sum = _mm_add_epi64(sum, _mm_add_epi64(_mm_sad_epu8(low, zero), _mm_sad_epu8(high, zero)));
+        weighted = _mm_add_epi32(weighted, _mm_madd_epi16(_mm_maddubs_epi16(low, first), ones));
+        weighted = _mm_add_epi32(weighted, _mm_madd_epi16(_mm_maddubs_epi16(high, second), ones));
+    }
+    uint64_t of_bytes[2], before[2];
+    uint32_t by_place[4];
+    std::memcpy(of_bytes, &sum, 16);
+    std::memcpy(before, &sums_before, 16);
+    std::memcpy(by_place, &weighted, 16);
+    b += a * 32 * static_cast<uint64_t>(blocks) + 32 * (before[0] + before[1]);
+    for (const uint32_t lane : by_place) b += lane;
+    a += of_bytes[0] + of_bytes[1];
+    return 32 * blocks;
+}
+#else
+inline int64_t add_blocks(const uint8_t* bytes, int64_t count, uint64_t& a, uint64_t& b) {
+    int64_t at = 0;
+    for (; count - at >= 32; at += 32) {
+        uint32_t sum = 0, weighted = 0;
+        for (uint32_t i = 0; i < 32; ++i) {
+            sum += bytes[at + i];
+            weighted += (32 - i) * bytes[at + i];
+        }
+        b += 32 * a + weighted;
+        a += sum;
+    }
+    return at;
+}
+#endif
 
 inline uint32_t adler32(const uint8_t* bytes, int64_t count) {
-    uint32_t a = 1, b = 0;
+    constexpr int64_t kBlocks = 173 * 32;
+    uint64_t a = 1, b = 0;
     while (count > 0) {
-        // Sums of 5,552 bytes and fewer stay below 2^32 (RFC 1950, Sect. 9).
-        int64_t left = count < 5536 ? count : 5536;
-        count -= left;
-        for (; left >= 16; left -= 16, bytes += 16) {
-            uint32_t sum = 0, weighted = 0;
-            for (uint32_t i = 0; i < 16; ++i) {
-                sum += bytes[i];
-                weighted += (16 - i) * bytes[i];
-            }
-            b += 16 * a + weighted;
-            a += sum;
-        }
-        for (; left > 0; --left) b += a += *bytes++;
+        const int64_t some = count < kBlocks ? count : kBlocks;
+        int64_t taken = add_blocks(bytes, some, a, b);
+        for (; taken < some; ++taken) b += a += bytes[taken];
+        bytes += some;
+        count -= some;
         a %= kAdlerBase;
         b %= kAdlerBase;
     }
-    return b << 16 | a;
+    return static_cast<uint32_t>(b << 16 | a);
 }
 
 // A table of one Huffman code: the entries of all codes up to kRoot bits, and behind them those of longer ones.
-// An entry is value << 8 | kind << 4 | bits: `bits` are taken; a kLink says where its second table begins.
-enum Kind : uint32_t { kLiteral = 0, kMatch = 1, kEnd = 2, kLink = 3, kInvalid = 4 };
+// An entry is value << 8 | kind << 4 | bits: `bits` are taken; a kLink says where its second table begins.  A
+// kLiteral and a kTwoLiterals hold as many bytes as their kind, the first one lowest.
+enum Kind : uint32_t { kLiteral = 1, kTwoLiterals = 2, kMatch = 3, kEnd = 4, kLink = 5, kInvalid = 6 };
 
 template <int kRootBits, int kEntries>
 struct HuffmanTable {
+    static constexpr int kRoot = kRootBits;
     uint32_t entries[kEntries];
 
     uint32_t find(uint64_t bits) const {
@@ -106,11 +147,23 @@ struct HuffmanTable {
         }
         return true;
     }
+
+    // Let an entry that has room for the bits of two literals hold both; where its first one ends stands at 24.
+    void join_literals() {
+        for (uint32_t i = 1u << kRootBits; i-- > 0;) {
+            const uint32_t first = entries[i];
+            if ((first >> 4 & 15) != kLiteral) continue;
+            const uint32_t bits = first & 15, second = entries[i >> bits];
+            const uint32_t both = bits + (second & 15);
+            if ((second >> 4 & 15) != kLiteral || both > kRootBits) continue;
+            entries[i] = bits << 24 | (second >> 8 & 255) << 16 | (first & 0xFF00) | kTwoLiterals << 4 | both;
+        }
+    }
 };
 
-// At most 286 codes of 15 bits need 1,334 entries with a root of 10 bits, and 30 need 402 with one of 8 (zlib's
+// At most 286 codes of 15 bits need 852 entries with a root of 9 bits, and 30 need 402 with one of 8 (zlib's
 // `enough.c`); `fill` refuses more in any case.
-typedef HuffmanTable<10, 1334> LiteralTable;
+typedef HuffmanTable<9, 852> LiteralTable;
 typedef HuffmanTable<8, 402> DistanceTable;
 
 inline uint32_t literal_entry(int symbol) {
@@ -325,20 +378,80 @@ private:
         return is_code ? RSE_PF_CODEC_READ : RSE_PF_CODEC_NOT_ZLIB;
     }
 
+    // Inflate a block as long as no limit and no end is near; `coded` does the rest.
+    void coded_in_the_middle() {
+        // Bytes may be what a pointer points to: only locals stay in registers.
+        const uint8_t* in = in_;
+        uint8_t* out = out_;
+        uint64_t bits = bits_;
+        int count = count_;
+        const uint8_t* const in_stop = end_ - 16;
+        uint8_t* const out_stop = stop_ - (258 + 16);
+        constexpr uint64_t kMask = (1u << LiteralTable::kRoot) - 1;
+        const auto refilled = [&] {
+            uint64_t more;
+            std::memcpy(&more, in, 8);
+#if __BYTE_ORDER__ == __ORDER_BIG_ENDIAN__
+            more = __builtin_bswap64(more);
+#endif
+            bits |= more << count;
+            in += (63 - count) >> 3;
+            count |= 56;
+        };
+        while (in <= in_stop && out <= out_stop) {
+            refilled();
+            uint32_t entry = literals_.entries[bits & kMask];
+            // Five entries of at most 9 bits.
+            for (int i = 0; i < 5 && (entry >> 4 & 15) <= kTwoLiterals; ++i) {
+                const auto two = static_cast<uint16_t>(entry >> 8);
+                out[0] = static_cast<uint8_t>(two);
+                out[1] = static_cast<uint8_t>(two >> 8);
+                out += entry >> 4 & 15;
+                bits >>= entry & 15;
+                count -= static_cast<int>(entry & 15);
+                entry = literals_.entries[bits & kMask];
+            }
+            if ((entry >> 4 & 15) <= kTwoLiterals) continue;
+            refilled();
+            entry = literals_.find(bits);
+            const uint32_t kind = entry >> 4 & 15;
+            if (kind == kLiteral) {
+                *out++ = static_cast<uint8_t>(entry >> 8);
+                bits >>= entry & 15;
+                count -= static_cast<int>(entry & 15);
+                continue;
+            }
+            if (kind != kMatch) break;
+            // At most 48 of the 56 bits: a code and extra bits for the length, the same for the distance.
+            uint64_t rest = bits >> (entry & 15);
+            int taken = static_cast<int>((entry & 15) + (entry >> 24));
+            const int64_t length = (entry >> 8 & 0xFFFF) + (static_cast<uint32_t>(rest) & ((1u << (entry >> 24)) - 1));
+            rest >>= entry >> 24;
+            const uint32_t far = distances_.find(rest);
+            if ((far >> 4 & 15) != kMatch) break;
+            rest >>= far & 15;
+            const int64_t distance = (far >> 8 & 0xFFFF) + (static_cast<uint32_t>(rest) & ((1u << (far >> 24)) - 1));
+            if (distance > out - text_) break;
+            taken += static_cast<int>((far & 15) + (far >> 24));
+            bits >>= taken;
+            count -= taken;
+            out = copied(out, length, distance);
+        }
+        in_ = in;
+        out_ = out;
+        bits_ = bits;
+        count_ = count;
+    }
+
     int32_t coded() {
+        literals_.join_literals();
         for (;;) {
+            if (end_ - in_ >= 16 && stop_ - out_ >= 258 + 16) coded_in_the_middle();
             refill();
             uint32_t entry = literals_.find(bits_);
-            // Three literals of at most 15 bits, and a match of 48 bits, fit into 56 bits each.
-            for (int i = 0; i < 2 && (entry >> 4 & 15) == kLiteral && count_ >= 45 && out_ < stop_; ++i) {
-                *out_++ = static_cast<uint8_t>(entry >> 8);
-                drop(static_cast<int>(entry & 15));
-                entry = literals_.find(bits_);
-            }
-            if (count_ < 48) {
-                refill();
-                // The same entry: it was found by the bits that were there, or by zeros behind the end.
-                entry = literals_.find(bits_);
+            if ((entry >> 4 & 15) == kTwoLiterals) {
+                // One after the other, because a limit may lie between them.
+                entry = (entry & 0xFF00) | kLiteral << 4 | entry >> 24;
             }
             const int taken = static_cast<int>(entry & 15);
             const uint32_t kind = entry >> 4 & 15;
@@ -363,6 +476,20 @@ private:
         }
     }
 
+    // Copy bytes that may overlap, and up to 15 too many; return where the next one stands.
+    static uint8_t* copied(uint8_t* to, int64_t length, int64_t distance) {
+        const uint8_t* from = to - distance;
+        uint8_t* const last = to + length;
+        if (distance >= 16) {
+            for (; to < last; to += 16, from += 16) std::memcpy(to, from, 16);
+        } else if (distance == 1) {
+            std::memset(to, *from, static_cast<size_t>(length));
+        } else {
+            while (to < last) *to++ = *from++;
+        }
+        return last;
+    }
+
     int32_t copy(int64_t length) {
         const uint32_t entry = distances_.find(bits_);
         const int taken = static_cast<int>(entry & 15), extra = static_cast<int>(entry >> 24);
@@ -377,17 +504,8 @@ private:
             const int32_t status = beyond(length);
             if (status != RSE_PF_CODEC_READ) return status;
         }
-        const uint8_t* from = out_ - distance;
-        uint8_t* const last = out_ + length;
-        if (distance >= 16) {
-            // Up to 15 bytes too many, which the slack behind the buffer takes.
-            for (uint8_t* to = out_; to < last; to += 16, from += 16) std::memcpy(to, from, 16);
-        } else if (distance == 1) {
-            std::memset(out_, *from, static_cast<size_t>(length));
-        } else {
-            for (uint8_t* to = out_; to < last;) *to++ = *from++;
-        }
-        out_ = last;
+        // The slack behind the buffer takes what is too many.
+        out_ = copied(out_, length, distance);
         return RSE_PF_CODEC_READ;
     }
 

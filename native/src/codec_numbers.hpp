@@ -4,6 +4,10 @@
 #include <cstdint>
 #include <cstring>
 
+#if defined(__SSE2__)
+#include <emmintrin.h>
+#endif
+
 #include "powers_of_ten.hpp"
 
 namespace rse_pf_codec {
@@ -106,6 +110,73 @@ inline bool nearest_double(const Decimal& number, double& value) {
     if (number.is_negative) bits |= uint64_t{1} << 63;
     std::memcpy(&value, &bits, sizeof value);
     return true;
+}
+
+inline uint64_t eight_bytes(const uint8_t* at) {
+    uint64_t bytes;
+    std::memcpy(&bytes, at, 8);
+#if __BYTE_ORDER__ == __ORDER_BIG_ENDIAN__
+    bytes = __builtin_bswap64(bytes);
+#endif
+    return bytes;
+}
+
+// Return a bit for each of sixteen bytes that is no digit.
+inline uint32_t not_digits(const uint8_t* at) {
+#if defined(__SSE2__)
+    const __m128i bytes = _mm_loadu_si128(reinterpret_cast<const __m128i*>(at));
+    const __m128i values = _mm_sub_epi8(bytes, _mm_set1_epi8('0'));
+    const __m128i digits = _mm_cmpeq_epi8(_mm_min_epu8(values, _mm_set1_epi8(9)), values);
+    return static_cast<uint32_t>(_mm_movemask_epi8(digits)) ^ 0xFFFFu;
+#else
+    uint32_t others = 0;
+    for (int i = 0; i < 16; ++i) others |= static_cast<uint32_t>(!is_digit(at[i])) << i;
+    return others;
+#endif
+}
+
+// Return the number of `count` digits, 1 to 8, at the begin of eight bytes: pairs, then fours, then all.
+inline uint64_t value_of_digits(uint64_t bytes, int32_t count) {
+    bytes <<= 64 - 8 * count;
+    bytes = (bytes & 0x0F0F0F0F0F0F0F0Fu) * 2561 >> 8;
+    bytes = (bytes & 0x00FF00FF00FF00FFu) * 6553601 >> 16;
+    return (bytes & 0x0000FFFF0000FFFFu) * 42949672960001u >> 32;
+}
+
+// Read a number that ends within sixteen bytes, has at most eight digits before the point and seven behind it,
+// with no branch for each digit; return null for others, which `read_decimal` reads, and so near the end.
+inline const uint8_t* read_short(const uint8_t* at, const uint8_t* end, double& value) {
+    static constexpr double kPowers[] = {1, 1e1, 1e2, 1e3, 1e4, 1e5, 1e6, 1e7};
+    static constexpr uint32_t kWholePowers[] = {1, 10, 100, 1000, 10000, 100000, 1000000, 10000000};
+    if (end - at < 32) return nullptr;
+    const uint32_t others = not_digits(at);
+    const uint32_t is_negative = others & 1;
+    if (is_negative != 0 && *at != '-') return nullptr;
+    const uint32_t behind_sign = others & ~1u;
+    const uint32_t behind_point = behind_sign & (behind_sign - 1);
+    if (behind_point == 0) return nullptr;
+    const int32_t point = __builtin_ctz(behind_sign);
+    const int32_t whole_digits = point - static_cast<int32_t>(is_negative);
+    const uint8_t* const first = at + is_negative;
+    if (whole_digits == 0 || whole_digits > 8 || (*first == '0' && whole_digits > 1)) return nullptr;
+    uint64_t digits = value_of_digits(eight_bytes(first), whole_digits);
+    if (at[point] != '.') {
+        if (at[point] == 'e' || at[point] == 'E') return nullptr;
+        // An integer has no sign of zero.
+        const auto whole = static_cast<double>(static_cast<int64_t>(digits));
+        value = is_negative != 0 && digits != 0 ? -whole : whole;
+        return at + point;
+    }
+    const int32_t stop = __builtin_ctz(behind_point), decimals = stop - point - 1;
+    if (decimals == 0 || decimals > 7 || at[stop] == 'e' || at[stop] == 'E') return nullptr;
+    digits = digits * kWholePowers[decimals] + value_of_digits(eight_bytes(at + point + 1), decimals);
+    // Both are exact, so their quotient is the nearest double.
+    const double size = static_cast<double>(static_cast<int64_t>(digits)) / kPowers[decimals];
+    uint64_t bits;
+    std::memcpy(&bits, &size, 8);
+    bits |= static_cast<uint64_t>(is_negative) << 63;
+    std::memcpy(&value, &bits, 8);
+    return at + stop;
 }
 
 }  // namespace rse_pf_codec

@@ -93,18 +93,30 @@ public:
     bool array(double* numbers, int64_t room, int64_t& count) {
         if (!take('[')) return false;
         ++lists_;
-        count = 0;
-        do {
-            if (count == room) return false;
-            skip();
-            Decimal decimal;
-            const uint8_t* const next = read_decimal(at_, end_, decimal);
+        // Only locals stay in registers.
+        const uint8_t* at = at_;
+        const uint8_t* const end = end_;
+        int64_t read = 0;
+        for (;; ++read) {
+            if (read == room) return false;
+            if (at < end && *at <= ' ') at = behind_spaces(at, end);
             double value;
-            if (next == nullptr || !nearest_double(decimal, value)) return false;
-            if (!(value <= kMaxNumber && value >= -kMaxNumber)) return false;
-            at_ = next;
-            numbers[count++] = value;
-        } while (comma());
+            const uint8_t* next = read_short(at, end, value);
+            if (next == nullptr) {
+                Decimal decimal;
+                next = read_decimal(at, end, decimal);
+                if (next == nullptr || !nearest_double(decimal, value)) return false;
+                if (!(value <= kMaxNumber && value >= -kMaxNumber)) return false;
+            }
+            numbers[read] = value;
+            at = next;
+            if (at < end && *at <= ' ') at = behind_spaces(at, end);
+            if (at == end || *at != ',') break;
+            ++at;
+        }
+        at_ = at;
+        commas_ += read;
+        count = read + 1;
         return take(']');
     }
     bool ends() {
@@ -114,9 +126,11 @@ public:
     int64_t values() const { return commas_ + colons_ + kListValues * lists_ + kMapValues * maps_; }
 
 private:
-    void skip() {
-        while (at_ < end_ && (*at_ == ' ' || *at_ == '\n' || *at_ == '\r' || *at_ == '\t')) ++at_;
+    static const uint8_t* behind_spaces(const uint8_t* at, const uint8_t* end) {
+        while (at < end && (*at == ' ' || *at == '\n' || *at == '\r' || *at == '\t')) ++at;
+        return at;
     }
+    void skip() { at_ = behind_spaces(at_, end_); }
     uint8_t peek() {
         skip();
         return at_ < end_ ? *at_ : 0;
@@ -317,19 +331,23 @@ private:
         return reader_.number(call_.deadline_ms) && call_.deadline_ms >= 0 && call_.deadline_ms <= kMaxDeadlineMs;
     }
     bool payload() {
-        static constexpr const char* kNames[] = {"camera", "points_world", "pixels", "options"};
+        static constexpr const char* kNames[] = {"camera", "points_world", "pixels", "options", "depths_m"};
         uint32_t used = 0;
         const bool is_map = reader_.map([&](const Name& name) {
             switch (name.once(kNames, used)) {
                 case 0: return camera();
                 case 1:
-                    // The points stand first: where the pixels come first, their number is not known yet.
-                    if ((used & 4) != 0) return false;
+                    // The arrays stand in this order, so that each knows where the one before it ends.
+                    if ((used & 20) != 0) return false;
                     return reader_.array(call_.numbers, call_.numbers_room, call_.points);
                 case 2:
-                    if ((used & 2) == 0) return false;
+                    if ((used & 18) != 2) return false;
                     return reader_.array(call_.numbers + call_.points, call_.numbers_room - call_.points, call_.pixels);
                 case 3: return reader_.null() || options();
+                case 4:
+                    if ((used & 4) == 0) return false;
+                    return reader_.array(call_.numbers + call_.points + call_.pixels,
+                                         call_.numbers_room - call_.points - call_.pixels, call_.depths);
                 default: return false;
             }
         });

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import struct
+import sys
 from typing import Any
 
 import msgspec
@@ -23,6 +24,7 @@ Array = np.ndarray
 
 _EXTENSIONS: dict[int, np.dtype[Any]] = {1: np.dtype("<f4"), 2: np.dtype("<u4"), 3: np.dtype("<f8")}
 _F4, _U4, _F8 = 1, 2, 3
+_IS_LITTLE_ENDIAN = sys.byteorder == "little"
 _KINDS = {np.dtype(np.float32): _F4, np.dtype(np.uint32): _U4, np.dtype(np.float64): _F8}
 
 
@@ -37,6 +39,8 @@ def binary_encode_hook(value: Any) -> Any:
     """Return the MessagePack extension of an array: float32, uint32 if it fits, else float64."""
     if isinstance(value, np.ndarray):
         kind = _KINDS.get(value.dtype)
+        if kind is not None and _IS_LITTLE_ENDIAN:
+            return msgspec.msgpack.Ext(kind, value.tobytes())
         if kind is None and value.dtype.kind in "fiu":
             kind = _U4 if _fits_uint32(value) else _F8
         if kind is not None:

@@ -27,9 +27,9 @@ from rse_pf.config import SessionSettings
 from rse_pf.errors import BadMessage, LimitExceeded, RsePfError, UnsupportedProtocol
 from rse_pf.wire import arrays
 from rse_pf.wire.messages import Command, FromRobot, FromServer, Message, Result
-from rse_pf.wire.native_codec import NativeCodec, PnpTypes, native_codec
+from rse_pf.wire.native_codec import NativeCodec, NativeReader, PnpTypes, native_codec
 
-__all__ = ["CODECS", "SUBPROTOCOLS", "Codec", "as_type", "codec_for", "make_codec"]
+__all__ = ["CODECS", "SUBPROTOCOLS", "Codec", "as_type", "codec_for", "deflated", "make_codec"]
 
 T = TypeVar("T")
 
@@ -44,6 +44,9 @@ CODECS = tuple(SUBPROTOCOLS)
 
 # A robot's uplink is slower than its processor: at level 1 a command is 6 % longer.
 _LEVEL = 6
+# Decimal numbers hardly repeat.  Without a search for repetitions, a command of 200 matches is 1.5 % longer,
+# and takes the robot a quarter of the time and the server two thirds.
+_FEW_BYTES, _BYTES_PER_NUMBER = 32768, 16
 
 # A server's messages are short: level 6 saves 5 of 794 bytes and costs a third more time.
 _REPLY_LEVEL, _REPLY_WINDOW_BITS, _REPLY_MEMORY = 1, 12, 5
@@ -110,6 +113,14 @@ def codec_for(offered: list[str]) -> str | None:
     return next((names[protocol] for protocol in offered if protocol in names), None)
 
 
+def deflated(text: bytes, *, mode: int = zlib.Z_FINISH, window_bits: int = zlib.MAX_WBITS) -> bytes:
+    """Return the *text* of a robot as a deflate stream that ends as *mode* says, by default one of zlib."""
+    are_numbers = len(text) <= _FEW_BYTES and text.count(b",") * _BYTES_PER_NUMBER > len(text)
+    strategy = zlib.Z_HUFFMAN_ONLY if are_numbers else zlib.Z_DEFAULT_STRATEGY
+    stream = zlib.compressobj(_LEVEL, zlib.DEFLATED, window_bits, zlib.DEF_MEM_LEVEL, strategy)
+    return stream.compress(text) + stream.flush(mode)
+
+
 class _JsonCodec:
     def __init__(
         self,
@@ -124,6 +135,7 @@ class _JsonCodec:
         self._budget = Budget.of_messages(limits)
         self._compressed = compressed
         self._native, self._pnp = native, pnp
+        self._reader = None if native is None else NativeReader(native, self.name, self._budget, pnp)
         self._encode = msgspec.json.Encoder(enc_hook=arrays.json_encode_hook).encode
         self._from_robot = msgspec.json.Decoder(FromRobot).decode
         self._from_server = msgspec.json.Decoder(FromServer).decode
@@ -132,17 +144,17 @@ class _JsonCodec:
         data = _encoded(self._encode, message)
         if not self._compressed:
             return data
-        if isinstance(message, FromRobot):
-            return zlib.compress(data, _LEVEL)
         if self._native is not None and self._is_pose(message):
             return self._native.deflate(data)
+        if isinstance(message, FromRobot):
+            return deflated(data)
         stream = zlib.compressobj(_REPLY_LEVEL, zlib.DEFLATED, _REPLY_WINDOW_BITS, _REPLY_MEMORY)
         return stream.compress(data) + stream.flush()
 
     def decode_from_robot(self, data: bytes) -> FromRobot:
-        if self._native is not None:
+        if self._reader is not None:
             check_size(data, self._budget)
-            found = self._native.read(data, self.name, self._budget, self._pnp)
+            found = self._reader.read(data)
             if isinstance(found, Command):
                 return found
             if found is not None:
@@ -166,7 +178,7 @@ class _JsonCodec:
         )
 
     def _read(self, text: bytes | bytearray) -> FromRobot:
-        if self._native is None or not self._native.check(text, "json", self._budget):
+        if self._reader is None or not self._reader.check(text):
             check_json(text, self._budget)
         message: FromRobot = _guarded(self._from_robot, text)
         return message
@@ -181,8 +193,8 @@ class _BinaryCodec:
     is_text = False
 
     def __init__(self, limits: SessionSettings, native: NativeCodec | None, pnp: PnpTypes | None) -> None:
-        self._native, self._pnp = native, pnp
         self._budget = Budget.of_messages(limits)
+        self._reader = None if native is None else NativeReader(native, self.name, self._budget, pnp)
         self._encode = msgspec.msgpack.Encoder(enc_hook=arrays.binary_encode_hook).encode
         self._from_robot = msgspec.msgpack.Decoder(FromRobot, ext_hook=arrays.extension_hook).decode
         self._from_server = msgspec.msgpack.Decoder(FromServer, ext_hook=arrays.extension_hook).decode
@@ -193,8 +205,8 @@ class _BinaryCodec:
     def decode_from_robot(self, data: bytes) -> FromRobot:
         check_size(data, self._budget)
         is_checked = False
-        if self._native is not None:
-            found = self._native.read(data, self.name, self._budget, self._pnp)
+        if self._reader is not None:
+            found = self._reader.read(data)
             if isinstance(found, Command):
                 return found
             is_checked = found is not None

@@ -22,9 +22,9 @@ from rse_pf.native import find_library
 from rse_pf.native_buffers import SLACK, CallBuffers
 from rse_pf.wire.messages import Command
 
-__all__ = ["NativeCodec", "PnpTypes", "native_codec", "open_codec"]
+__all__ = ["NativeCodec", "NativeReader", "PnpTypes", "native_codec", "open_codec"]
 
-_ABI = 1
+_ABI = 2
 _READ, _NOT_MINE, _NEEDS_ROOM, _UNKNOWN = 0, 1, 11, 12
 _ENCODINGS = {"json": 0, "zlib": 1, "bin": 2}
 _TEXT_ROOM, _NUMBERS_ROOM = 1 << 17, 1 << 16
@@ -32,7 +32,7 @@ _HOLDS_LOCK_BYTES = 16384
 """Shorter messages are read without giving the interpreter lock away, which others might keep for longer."""
 
 # rse_pf_codec_call: buffers | what was found | camera and options.
-_FOUND = struct.Struct("=qqqqqqdqqqqq")
+_FOUND = struct.Struct("=qqqqqqqdqqqqq")
 _HEAD = struct.Struct("=ddddqqqddqq16s")
 _FOUND_AT = CallBuffers.HEAD_BYTES
 _HEAD_AT = _FOUND_AT + _FOUND.size
@@ -66,78 +66,111 @@ class NativeCodec:
     """The codecs' part of one loaded library; every thread may call it."""
 
     def __init__(self, path: Path) -> None:
-        self._short, self._long = _functions(ctypes.PyDLL(str(path))), _functions(ctypes.CDLL(str(path)))
-        self._buffers = CallBuffers(_CALL_BYTES, text_room=_TEXT_ROOM, numbers_room=_NUMBERS_ROOM)
+        self.short, self.long = _functions(ctypes.PyDLL(str(path))), _functions(ctypes.CDLL(str(path)))
+        """The functions that keep the interpreter's lock, and those that give it away."""
+        self.buffers = CallBuffers(_CALL_BYTES, text_room=_TEXT_ROOM, numbers_room=_NUMBERS_ROOM)
 
-    def check(self, data: bytes | bytearray, encoding: str, budget: Budget) -> bool:
-        """Judge JSON text (``json``) or one MessagePack value (``bin``) by *budget*.
+    def deflate(self, text: bytes) -> bytes:
+        """Return *text*, mostly numbers, as a zlib stream of literals in a code of their own."""
+        room, buffers = 2 * len(text) + 256, self.buffers
+        if room > _TEXT_ROOM:
+            larger = ctypes.create_string_buffer(room)
+            return larger.raw[: self.long.deflate(text, len(text), ctypes.addressof(larger), room)]
+        return bytes(buffers.text_view[: self.short.deflate(text, len(text), buffers.text_at, room)])
+
+
+class NativeReader:
+    """Read and judge what robots send in one encoding."""
+
+    def __init__(self, native: NativeCodec, encoding: str, budget: Budget, types: PnpTypes | None) -> None:
+        """Prepare to read.
+
+        Args:
+            native: The library.
+            encoding: ``json``, ``zlib`` or ``bin``.
+            budget: The limits.
+            types: What a `pnp` command is read as; without them no command is.
+        """
+        self._native, self._budget, self._types = native, budget, types
+        self._code, self._is_deflated, self._is_json = (
+            _ENCODINGS[encoding],
+            encoding == "zlib",
+            encoding != "bin",
+        )
+        self._limits = struct.pack(
+            "=qqdqqqqq", budget.inflated_bytes, budget.free_bytes, budget.inflate_ratio, budget.depth,
+            budget.containers, budget.values, budget.mixed_values, budget.memory_bytes,
+        )  # fmt: skip
+
+    def check(self, data: bytes | bytearray) -> bool:
+        """Judge JSON text, or one MessagePack value, by the budget.
 
         Returns:
             Whether it was judged; deeper limits than 255 levels are not known here.
 
         Raises:
-            LimitExceeded: It holds more than *budget* allows.
+            LimitExceeded: It holds more than the budget allows.
             BadMessage: MessagePack that ends within a value, or that bytes follow.
         """
-        calls = self._short if len(data) < _HOLDS_LOCK_BYTES else self._long
+        native = self._native
+        calls = native.short if len(data) < _HOLDS_LOCK_BYTES else native.long
         data = data if type(data) is bytes else bytes(data)
-        status = calls.check(data, len(data), _packed(budget), _ENCODINGS[encoding])
+        encoding = _ENCODINGS["json" if self._is_json else "bin"]
+        status = calls.check(data, len(data), self._limits, encoding)
         if status not in (_NOT_MINE, _UNKNOWN):
-            raise _refused(status, encoding, budget, len(data), 0)
-        return status == _NOT_MINE
+            raise self._refused(status, len(data), 0)
+        return bool(status == _NOT_MINE)
 
-    def read(
-        self, data: bytes, encoding: str, budget: Budget, types: PnpTypes | None
-    ) -> Command | bytes | memoryview | None:
-        """Read a message from a robot: inflate it if it is deflated, and judge it by *budget*.
+    def read(self, data: bytes) -> Command | bytes | memoryview | None:
+        """Inflate a message from a robot if it is deflated, judge it, and read it if it is a plain one.
 
         Args:
             data: As received; its size is judged already.
-            encoding: ``json``, ``zlib`` or ``bin``.
-            budget: The limits.
-            types: What a `pnp` command is read as; without them no command is.
 
         Returns:
             The command, if it is a plain one of `pnp`; else the bytes that are to be decoded, until the next
             call of this thread; None if they have to be judged elsewhere, too.
 
         Raises:
-            LimitExceeded: It holds more than *budget* allows.
+            LimitExceeded: It holds more than the budget allows.
             BadMessage: It is not one zlib stream, or ends within a value.
         """
-        calls = self._short if len(data) < _HOLDS_LOCK_BYTES else self._long
-        data = data if type(data) is bytes else bytes(data)
-        buffers = self._buffers
-        code, text = _ENCODINGS[encoding], buffers.text_view
-        status = calls.read(data, len(data), _packed(budget), code, buffers.call_at)
+        native = self._native
+        if type(data) is not bytes:
+            data = bytes(data)
+        size, buffers = len(data), native.buffers
+        calls = native.short if size < _HOLDS_LOCK_BYTES else native.long
+        text: bytes | memoryview = buffers.text_view if self._is_deflated else data
+        status = calls.read(data, size, self._limits, self._code, buffers.call_at)
         if status == _NEEDS_ROOM:
-            # A bomb shows itself in the first part, so that no more memory is taken for it.
-            most = max(budget.free_bytes, int(len(data) * budget.inflate_ratio))
-            for room in (min(budget.inflated_bytes, budget.free_bytes), min(budget.inflated_bytes, most)):
-                larger = np.empty(room + SLACK, dtype=np.uint8)
-                buffers.lend(larger)
-                status = self._long.read(data, len(data), _packed(budget), code, buffers.call_at)
-                if status != _NEEDS_ROOM:
-                    break
-            buffers.lend(buffers.text)
-            text = memoryview(larger)  # type: ignore[arg-type]
-        if status == _READ and types is not None:
-            command = _command(buffers, data if encoding != "zlib" else text, types)
+            status, text = self._with_more_room(data)
+        found = _FOUND.unpack_from(buffers.call, _FOUND_AT)
+        if status == _READ and self._types is not None:
+            command = _command(buffers, found, text, self._types)
             if command is not None:
                 return command
         elif status == _UNKNOWN:
             return None
         elif status not in (_READ, _NOT_MINE):
-            limit = _FOUND.unpack_from(buffers.call, _FOUND_AT)[1]
-            raise _refused(status, encoding, budget, len(data), limit)
-        return text[: _FOUND.unpack_from(buffers.call, _FOUND_AT)[0]] if encoding == "zlib" else data
+            raise self._refused(status, size, found[1])
+        return text[: found[0]] if self._is_deflated else data
 
-    def deflate(self, text: bytes) -> bytes:
-        """Return *text*, mostly numbers, as a zlib stream of literals in a code of their own."""
-        room = 2 * len(text) + 256
-        deflated = ctypes.create_string_buffer(room)
-        size = self._short.deflate(text, len(text), deflated, room)
-        return deflated.raw[:size]
+    def _with_more_room(self, data: bytes) -> tuple[int, memoryview]:
+        """Inflate again; a bomb shows itself in the first part, so that no more memory is taken for it."""
+        budget, buffers = self._budget, self._native.buffers
+        most = max(budget.free_bytes, int(len(data) * budget.inflate_ratio))
+        for room in (min(budget.inflated_bytes, budget.free_bytes), min(budget.inflated_bytes, most)):
+            text = np.empty(room + SLACK, dtype=np.uint8)
+            buffers.lend(text)
+            status: int = self._native.long.read(data, len(data), self._limits, self._code, buffers.call_at)
+            if status != _NEEDS_ROOM:
+                break
+        buffers.lend(buffers.text)
+        return status, memoryview(text)  # type: ignore[arg-type]
+
+    def _refused(self, status: int, size: int, limit: int) -> RsePfError:
+        reason = (_JSON_REFUSALS if self._is_json else _MSGPACK_REFUSALS)[status]
+        return refusal(reason, self._budget, size=size, max_bytes=limit)
 
 
 class _Calls(NamedTuple):
@@ -155,35 +188,28 @@ def _functions(library: ctypes.CDLL) -> _Calls:
     return _Calls(check, read, deflate)
 
 
-@lru_cache(maxsize=64)
-def _packed(budget: Budget) -> bytes:
-    return struct.pack(
-        "=qqdqqqqq", budget.inflated_bytes, budget.free_bytes, budget.inflate_ratio, budget.depth,
-        budget.containers, budget.values, budget.mixed_values, budget.memory_bytes,
-    )  # fmt: skip
-
-
-def _refused(status: int, encoding: str, budget: Budget, size: int, limit: int) -> RsePfError:
-    reason = (_MSGPACK_REFUSALS if encoding == "bin" else _JSON_REFUSALS)[status]
-    return refusal(reason, budget, size=size, max_bytes=limit)
-
-
-def _command(buffers: CallBuffers, text: bytes | memoryview, types: PnpTypes) -> Command | None:
+def _command(
+    buffers: CallBuffers, found: tuple[Any, ...], text: bytes | memoryview, types: PnpTypes
+) -> Command | None:
     """Return what a call has found; None if the camera or the options are refused by their types."""
-    (
-        _, _, points, pixels, identity, seq, deadline_ms, fields,
-        stream_at, stream_bytes, trace_at, trace_bytes,
-    ) = _FOUND.unpack_from(buffers.call, _FOUND_AT)  # fmt: skip
+    _, _, points, pixels, depths, identity, seq, deadline_ms, fields, *words = found
+    stream_at, stream_bytes, trace_at, trace_bytes = words
     try:
         camera, options = _head(types, bytes(buffers.call[_HEAD_AT:]))
     except (RsePfError, msgspec.ValidationError):
         return None
-    numbers = buffers.numbers[: points + pixels].copy()
+    pixels += points
+    numbers = buffers.numbers[: pixels + depths].copy()
+    more = {"depths_m": numbers[pixels:]} if depths else {}
     return Command(
         id=identity,
         service="pnp",
         payload=types.request(
-            camera=camera, points_world=numbers[:points], pixels=numbers[points:], options=options
+            camera=camera,
+            points_world=numbers[:points],
+            pixels=numbers[points:pixels],
+            options=options,
+            **more,
         ),
         stream=str(text[stream_at : stream_at + stream_bytes], "ascii") if stream_bytes else "",
         seq=seq,

@@ -13,12 +13,11 @@ import msgspec
 
 from rse_pf.errors import BadMessage
 from rse_pf.wire import arrays
-from rse_pf.wire.codec import Codec
+from rse_pf.wire.codec import Codec, deflated
 from rse_pf.wire.messages import Command
 
 __all__ = ["PreencodedCommand", "encode_command", "preencode"]
 
-_LEVEL = 6
 _ENVELOPE_LEVEL, _ENVELOPE_MEMORY = 1, 1
 _HEADER = b"\x78\x9c"
 _BEFORE, _AFTER = b',"payload":', b"}"
@@ -42,8 +41,8 @@ def preencode(codec: Codec, payload: Any) -> PreencodedCommand:
         encoded = _encode_binary(payload) if codec.name == "bin" else _encode_json(payload)
     except (RecursionError, ValueError, TypeError, OverflowError) as error:
         raise BadMessage(f"a payload cannot be encoded: {str(error)[:150]}") from error
-    deflated = _deflated(encoded, zlib.Z_SYNC_FLUSH) if codec.name == "zlib" else b""
-    return PreencodedCommand(codec=codec.name, encoded=encoded, deflated=deflated)
+    blocks = _blocks(encoded, zlib.Z_SYNC_FLUSH) if codec.name == "zlib" else b""
+    return PreencodedCommand(codec=codec.name, encoded=encoded, deflated=blocks)
 
 
 def encode_command(codec: Codec, command: Command) -> bytes:
@@ -83,10 +82,9 @@ def encode_command(codec: Codec, command: Command) -> bytes:
     )
 
 
-def _deflated(text: bytes, mode: int) -> bytes:
+def _blocks(text: bytes, mode: int) -> bytes:
     """Return *text* as deflate blocks that end as *mode* says and refer to nothing before them."""
-    deflate = zlib.compressobj(_LEVEL, zlib.DEFLATED, -zlib.MAX_WBITS)
-    return deflate.compress(text) + deflate.flush(mode)
+    return deflated(text, mode=mode, window_bits=-zlib.MAX_WBITS)
 
 
-_CLOSING = _deflated(_AFTER, zlib.Z_FINISH)
+_CLOSING = _blocks(_AFTER, zlib.Z_FINISH)

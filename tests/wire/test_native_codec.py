@@ -25,7 +25,7 @@ from rse_pf.service import Registry, dispatch
 from rse_pf.services.builtin import builtin_services
 from rse_pf.services.pnp import PnpReply, PnpRequest, make_request, wire_types
 from rse_pf.wire import CODECS, Command, Result, as_type, make_codec
-from rse_pf.wire.native_codec import PnpTypes, native_codec, open_codec
+from rse_pf.wire.native_codec import NativeReader, PnpTypes, native_codec, open_codec
 
 NATIVE = native_codec()
 pytestmark = pytest.mark.skipif(NATIVE is None, reason="the native core is not built: make -C native")
@@ -67,7 +67,9 @@ def outcome(codec: str, data: bytes, *, use_native: bool) -> tuple[Any, ...]:
         return ("refused", error.code, error.message, error.hint)
     arrays = request.points_world.tobytes(), request.pixels.tobytes()
     plain = msgspec.structs.replace(message, payload=None)
-    return ("read", repr(plain), repr(request.camera), repr(request.options), *arrays)
+    depths = request.depths_m
+    depths = depths.tobytes() if isinstance(depths, np.ndarray) else not depths
+    return ("read", repr(plain), repr(request.camera), repr(request.options), *arrays, depths)
 
 
 def assert_alike(codec: str, data: bytes) -> None:
@@ -76,13 +78,18 @@ def assert_alike(codec: str, data: bytes) -> None:
 
 def is_fast(codec: str, data: bytes) -> bool:
     assert NATIVE is not None
-    return isinstance(NATIVE.read(data, codec, BUDGET, TYPES), Command)
+    return isinstance(NativeReader(NATIVE, codec, BUDGET, TYPES).read(data), Command)
 
 
-def sample(codec: str, n: int = 20, options: PnpOptions | None = None) -> bytes:
+def sample(codec: str, n: int = 20, options: PnpOptions | None = None, *, deep: bool = False) -> bytes:
     problem = make_problem(seed=n, n=n)
     request = make_request(
-        problem.points_world, problem.pixels, problem.camera, options, binary=codec == "bin"
+        problem.points_world,
+        problem.pixels,
+        problem.camera,
+        options,
+        binary=codec == "bin",
+        depths_m=np.linspace(0.0, 4.0, n) if deep else None,
     )
     return make_codec(codec).encode(
         Command(id=n, service="pnp", payload=request, stream="front", seq=3, deadline_ms=250.0, trace="t-1")
@@ -92,7 +99,7 @@ def sample(codec: str, n: int = 20, options: PnpOptions | None = None) -> bytes:
 @pytest.mark.parametrize("codec", CODECS)
 @pytest.mark.parametrize("options", [None, PnpOptions(inlier_px=4.0, engine="poselib"), PnpOptions()])
 def test_a_plain_command_is_read_at_once_and_means_the_same(codec: str, options: PnpOptions | None) -> None:
-    data = sample(codec, 200, options)
+    data = sample(codec, 200, options, deep=options is None)
 
     assert is_fast(codec, data)
     assert_alike(codec, data)
@@ -132,7 +139,7 @@ def test_random_decimals_are_the_nearest_doubles() -> None:
     for begin in range(0, len(texts), 8000):
         some = texts[begin : begin + 8000]
 
-        command = NATIVE.read(command_of(",".join(some)), "json", BUDGET, TYPES)
+        command = NativeReader(NATIVE, "json", BUDGET, TYPES).read(command_of(",".join(some)))
 
         assert isinstance(command, Command)
         assert command.payload.points_world.tobytes() == np.array([float(text) for text in some]).tobytes()
@@ -143,7 +150,14 @@ CHANGES = {
     "duplicate id": ('"id":7', '"id":7,"id":8'),
     "duplicate points": ('"pixels":', '"points_world":[1,2,3],"pixels":'),
     "unknown field": ('"id":7', '"id":7,"new":1'),
-    "unknown field of the payload": ('"pixels":', '"depths_m":[1],"pixels":'),
+    "unknown field of the payload": ('"pixels":', '"new":[1],"pixels":'),
+    "depths first": ('"pixels":', '"depths_m":[1],"pixels":'),
+    "depths": ("2.5]", '2.5],"depths_m":[0, 1.25]'),
+    "depths twice": ("2.5]", '2.5],"depths_m":[1],"depths_m":[2]'),
+    "no depths": ("2.5]", '2.5],"depths_m":null'),
+    "empty depths": ("2.5]", '2.5],"depths_m":[]'),
+    "depths and options": ("2.5]", '2.5],"options":null,"depths_m":[3]'),
+    "a depth noise": ("2.5]", '2.5],"depths_m":[1],"depth_noise":null'),
     "unknown field of the camera": ('"fx":', '"k1":0,"fx":'),
     "pixels first": (HEAD[HEAD.index("{", 5) :], HEAD[HEAD.index("{", 5) :] + ',"pixels":[1.5,2.5]'),
     "an escape": ('"pnp"', '"p\\u006ep"'),
@@ -220,7 +234,7 @@ def mutated(data: bytes, draw: random.Random) -> bytes:
 @pytest.mark.parametrize("codec", CODECS)
 def test_damaged_messages_get_the_same_verdict(codec: str) -> None:
     draw = random.Random(11)
-    seeds = [sample(codec), sample(codec, 4, PnpOptions(inlier_px=3.0))]
+    seeds = [sample(codec), sample(codec, deep=True), sample(codec, 4, PnpOptions(inlier_px=3.0))]
 
     for number in range(1500):
         data = seeds[number % len(seeds)]
@@ -283,7 +297,7 @@ def test_the_guards_give_the_verdicts_of_the_python_ones(name: str) -> None:
                     continue  # the Python guard leaves it to the decoder
                 else:
                     expected = verdict(check_msgpack, text, budget)
-                assert verdict(NATIVE.check, text, name, budget) == expected, text[:200]
+                assert verdict(NativeReader(NATIVE, name, budget, None).check, text) == expected, text[:200]
                 seen.add(expected[:24])
     assert len(seen) >= 4, seen
 
@@ -302,7 +316,7 @@ def inflated(data: bytes, budget: Budget, *, native: bool) -> tuple[str, bytes]:
     try:
         if not native:
             return "read", bytes(inflate_within(data, budget))
-        found = NATIVE.read(data, "zlib", budget, None)
+        found = NativeReader(NATIVE, "zlib", budget, None).read(data)
         return ("unknown", b"") if found is None else ("read", bytes(found))  # type: ignore[arg-type]
     except RsePfError as error:
         return f"{error.code}: {error.message}", b""
