@@ -112,12 +112,16 @@ def golden_messages() -> dict[str, Any]:
 
 
 def golden_poses() -> dict[str, Any]:
-    """Return name -> pnp command and the reply that an ``ok`` server gives, as JSON values."""
+    """Return name -> pnp command and the reply that an ``ok`` server gives, as JSON values.
+
+    The engine is named, so that the poses are the same where the native core is not built.
+    """
+    options = PnpOptions(engine="poselib")
     found = {}
     for name, arguments in POSES.items():
         problem = make_problem(**arguments)  # type: ignore[arg-type]
-        request = make_request(problem.points_world, problem.pixels, problem.camera, PnpOptions())
-        solution = solve_pnp(request.points_world, request.pixels, problem.camera)
+        request = make_request(problem.points_world, problem.pixels, problem.camera, options)
+        solution = solve_pnp(request.points_world, request.pixels, problem.camera, options)
         command = Command(id=1, service="pnp", payload=request)
         found[name] = {"command": meaning(command), "reply": json.loads(_plain(PnpReply.of(solution)))}
     return found
