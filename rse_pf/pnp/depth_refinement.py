@@ -15,9 +15,10 @@ import numpy.typing as npt
 
 from rse_pf.errors import BadRequest
 from rse_pf.geometry import Array, Camera, exp_se3, transform
+from rse_pf.pnp.native_depth import depth_core
 from rse_pf.pnp.solver import PnpSolution
 
-__all__ = ["DepthNoise", "refine_with_depth"]
+__all__ = ["DepthNoise", "refine_by_numpy", "refine_with_depth"]
 
 # From the solver's pose, the third step is below 10 um as a rule.
 _MAX_ITERATIONS = 6
@@ -83,6 +84,7 @@ def refine_with_depth(
     A point is taken as seen in the reference camera with the noise of its depth and its pixel; the second
     camera's pixel and depth carry noise, too.  The pixel noise, equal in both images, is read off the errors
     that *solution* left.  Iterated least squares on these residuals with a Cauchy weight; deterministic.
+    A solution of the engine ``native`` is refined in the native core, others are by `refine_by_numpy`.
 
     Args:
         solution: Of `solve_pnp` for the same rows.
@@ -104,6 +106,35 @@ def refine_with_depth(
     Source:
         Errors in variables after Segal et al., Generalized-ICP (RSS 2009), here with pixels and depths;
         covariance after Huber, Robust Statistics (1981), Sect. 7.6.
+    """
+    core = depth_core() if solution.engine == "native" else None
+    if core is not None:
+        found = core.refine(
+            solution.T_camera_world, solution.rmse_px, solution.inliers, points_reference, pixels, depths_m,
+            camera, (noise.base_m, noise.growth_per_m, noise.from_m),
+        )  # fmt: skip
+        if found == "kept":
+            return solution
+        if found != "refused":
+            return msgspec.structs.replace(
+                solution, T_camera_world=found.T_camera_reference, covariance=found.covariance,
+                rmse_px=found.rmse_px,
+            )  # fmt: skip
+    return refine_by_numpy(solution, points_reference, pixels, depths_m, camera, noise)
+
+
+def refine_by_numpy(
+    solution: PnpSolution,
+    points_reference: Array,
+    pixels: Array,
+    depths_m: Array,
+    camera: Camera,
+    noise: DepthNoise = _KINECT,
+) -> PnpSolution:
+    """Return what `refine_with_depth` does, without the native core, whose oracle this is.
+
+    Raises:
+        BadRequest: Shapes do not fit, a depth is absurd, or a point is not before the reference camera.
     """
     depths_m = _checked(points_reference, depths_m)
     rows = solution.inliers

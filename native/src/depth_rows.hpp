@@ -1,0 +1,140 @@
+// The rows of a refinement with depth: residuals, their noise and the sums of the normal equations.
+//
+// Four rows at a time; a vector of four doubles is one AVX register or two narrower ones, with the same bytes,
+// because each operation is a single IEEE operation and lanes are added in one order.
+#pragma once
+
+#include <cstdint>
+
+namespace rse_pf_depth_detail {
+
+typedef double Four __attribute__((vector_size(32)));
+
+constexpr int64_t kFour = 4;
+constexpr int kColumns = 11;
+constexpr double kNearM = 1e-3;
+// Mahalanobis distance, squared, at which a row weighs half.
+constexpr double kCauchy2 = 6.25;
+
+// One inlier: its point, 1/z and variances in the reference image; pixel and depth in the second image; whether
+// there is a depth, and 1, or 0 for rows that fill up the last four.
+struct Rows {
+    int64_t count;  // a multiple of four
+    double *x, *y, *z, *z_inverse, *depth_variance, *z2, *u, *v, *depth, *has_depth, *is_real;
+};
+
+struct Sensor {
+    double fx, fy, cx, cy;
+    double base_m, growth_per_m, from_m;
+    double pixel_px2;
+};
+
+// P, M and D are the blocks of A = J^T W J: translation, mixed, rotation; upper triangles of P and D.
+struct Sums {
+    double P[6], M[9], D[6], b[6];
+    double weight2_distance2, slope, numbers, error2;
+};
+
+#define RSE_PF_ROWS_INLINE static inline __attribute__((always_inline))
+
+RSE_PF_ROWS_INLINE Four all(double value) { return Four{value, value, value, value}; }
+RSE_PF_ROWS_INLINE void load(const double* from, Four& lanes) { __builtin_memcpy(&lanes, from, sizeof lanes); }
+RSE_PF_ROWS_INLINE double total(const Four& lanes) { return (lanes[0] + lanes[1]) + (lanes[2] + lanes[3]); }
+
+// The last pass leaves the robust weights out of A, and has what the covariance and the rmse need instead of b.
+template <bool kIsLast>
+RSE_PF_ROWS_INLINE void add_rows(const Rows& rows, const double (&R)[3][3], const double (&t)[3],
+                                 const Sensor& sensor, Sums& sums) {
+    const Four zero = all(0.0), one = all(1.0), near = all(kNearM), pixel = all(sensor.pixel_px2);
+    const Four fx = all(sensor.fx), fy = all(sensor.fy), cx = all(sensor.cx), cy = all(sensor.cy);
+    const Four by_fx2 = all(sensor.pixel_px2 / (sensor.fx * sensor.fx));
+    const Four by_fy2 = all(sensor.pixel_px2 / (sensor.fy * sensor.fy));
+    Four P[6], M[9], D[6], b[6], squares = zero, slopes = zero, numbers = zero, errors = zero;
+    for (Four& each : P) each = zero;
+    for (Four& each : M) each = zero;
+    for (Four& each : D) each = zero;
+    for (Four& each : b) each = zero;
+    for (int64_t i = 0; i < rows.count; i += kFour) {
+        Four X, Y, Z, z_inverse, depth_variance, z2, u, v, depth, has, real;
+        load(rows.x + i, X), load(rows.y + i, Y), load(rows.z + i, Z), load(rows.z_inverse + i, z_inverse);
+        load(rows.depth_variance + i, depth_variance), load(rows.z2 + i, z2);
+        load(rows.u + i, u), load(rows.v + i, v), load(rows.depth + i, depth);
+        load(rows.has_depth + i, has), load(rows.is_real + i, real);
+        // The point without t first: divided by its old depth it is the ray that its depth noise lies along.
+        Four x = R[0][0] * X + R[0][1] * Y + R[0][2] * Z;
+        Four y = R[1][0] * X + R[1][1] * Y + R[1][2] * Z;
+        Four z = R[2][0] * X + R[2][1] * Y + R[2][2] * Z;
+        const Four rx = x * z_inverse, ry = y * z_inverse, rz = z * z_inverse;
+        x += all(t[0]);
+        y += all(t[1]);
+        z += all(t[2]);
+        z = z > near ? z : near;
+        const Four inverse = one / z, a = x * inverse, c = y * inverse;
+        const Four r0 = u - (fx * a + cx), r1 = v - (fy * c + cy), r2 = has * (depth - z);
+        // Covariance G of the point in this camera's frame, from the reference image.
+        const Four gx = by_fx2 * z2, gy = by_fy2 * z2;
+        const Four dx = depth_variance * rx, dy = depth_variance * ry, dz = depth_variance * rz;
+        const Four g00 = dx * rx + gx * (R[0][0] * R[0][0]) + gy * (R[0][1] * R[0][1]);
+        const Four g01 = dx * ry + gx * (R[0][0] * R[1][0]) + gy * (R[0][1] * R[1][1]);
+        const Four g02 = dx * rz + gx * (R[0][0] * R[2][0]) + gy * (R[0][1] * R[2][1]);
+        const Four g11 = dy * ry + gx * (R[1][0] * R[1][0]) + gy * (R[1][1] * R[1][1]);
+        const Four g12 = dy * rz + gx * (R[1][0] * R[2][0]) + gy * (R[1][1] * R[2][1]);
+        const Four g22 = dz * rz + gx * (R[2][0] * R[2][0]) + gy * (R[2][1] * R[2][1]);
+        // Slopes of (u, v, z) by the point: [h0 0 k0; 0 h1 k1; 0 0 has].
+        const Four h0 = fx * inverse, h1 = fy * inverse, k0 = -(h0 * a), k1 = -(h1 * c);
+        const Four e0 = h0 * g02 + k0 * g22, e1 = h1 * g12 + k1 * g22;
+        Four beyond = z - all(sensor.from_m);
+        beyond = beyond > zero ? beyond : zero;
+        const Four deviation = all(sensor.base_m) + all(sensor.growth_per_m) * (beyond * beyond);
+        const Four s00 = h0 * (h0 * g00 + k0 * g02) + k0 * e0 + pixel;
+        const Four s01 = h1 * (h0 * g01 + k0 * g12) + k1 * e0;
+        const Four s11 = h1 * (h1 * g11 + k1 * g12) + k1 * e1 + pixel;
+        const Four s02 = has * e0, s12 = has * e1;
+        const Four s22 = has * (g22 + deviation * deviation) + (one - has);
+        // Its inverse W.
+        const Four m00 = s11 * s22 - s12 * s12, m01 = s02 * s12 - s01 * s22, m02 = s01 * s12 - s02 * s11;
+        const Four scale = one / (s00 * m00 + s01 * m01 + s02 * m02);
+        const Four w00 = m00 * scale, w01 = m01 * scale, w02 = m02 * scale;
+        const Four w11 = (s00 * s22 - s02 * s02) * scale, w12 = (s01 * s02 - s00 * s12) * scale;
+        const Four w22 = (s00 * s11 - s01 * s01) * scale;
+        const Four q0 = w00 * r0 + w01 * r1 + w02 * r2, q1 = w01 * r0 + w11 * r1 + w12 * r2;
+        const Four q2 = w02 * r0 + w12 * r1 + w22 * r2;
+        const Four distance2 = r0 * q0 + r1 * q1 + r2 * q2;
+        const Four weight = one / (one + distance2 * (1.0 / kCauchy2));
+        const Four share = real * (kIsLast ? one : weight);
+        // Information of the point, then of the twist: the point moves by rho + phi x point.
+        const Four f0 = w00 * k0 + w01 * k1 + w02 * has, f1 = w01 * k0 + w11 * k1 + w12 * has;
+        const Four f2 = w02 * k0 + w12 * k1 + w22 * has;
+        const Four p00 = share * (h0 * h0 * w00), p01 = share * (h0 * h1 * w01), p02 = share * (h0 * f0);
+        const Four p11 = share * (h1 * h1 * w11), p12 = share * (h1 * f1);
+        const Four p22 = share * (k0 * f0 + k1 * f1 + has * f2);
+        const Four n00 = y * p02 - z * p01, n01 = z * p00 - x * p02, n02 = x * p01 - y * p00;
+        const Four n10 = y * p12 - z * p11, n11 = z * p01 - x * p12, n12 = x * p11 - y * p01;
+        const Four n20 = y * p22 - z * p12, n21 = z * p02 - x * p22, n22 = x * p12 - y * p02;
+        P[0] += p00, P[1] += p01, P[2] += p02, P[3] += p11, P[4] += p12, P[5] += p22;
+        M[0] += n00, M[1] += n01, M[2] += n02, M[3] += n10, M[4] += n11, M[5] += n12;
+        M[6] += n20, M[7] += n21, M[8] += n22;
+        D[0] += y * n20 - z * n10, D[1] += y * n21 - z * n11, D[2] += y * n22 - z * n12;
+        D[3] += z * n01 - x * n21, D[4] += z * n02 - x * n22, D[5] += x * n12 - y * n02;
+        if (kIsLast) {
+            const Four count = real * (all(2.0) + has), pulled = weight * weight * distance2;
+            squares += real * pulled;
+            slopes += count * weight - real * (all(2.0 / kCauchy2) * pulled);
+            numbers += count;
+            errors += real * (r0 * r0 + r1 * r1);
+        } else {
+            const Four b0 = share * (h0 * q0), b1 = share * (h1 * q1);
+            const Four b2 = share * (k0 * q0 + k1 * q1 + has * q2);
+            b[0] += b0, b[1] += b1, b[2] += b2;
+            b[3] += y * b2 - z * b1, b[4] += z * b0 - x * b2, b[5] += x * b1 - y * b0;
+        }
+    }
+    for (int i = 0; i < 6; ++i) sums.P[i] = total(P[i]), sums.D[i] = total(D[i]), sums.b[i] = total(b[i]);
+    for (int i = 0; i < 9; ++i) sums.M[i] = total(M[i]);
+    sums.weight2_distance2 = total(squares);
+    sums.slope = total(slopes);
+    sums.numbers = total(numbers);
+    sums.error2 = total(errors);
+}
+
+}  // namespace rse_pf_depth_detail
