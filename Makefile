@@ -9,7 +9,7 @@ SETUP := PYTHON=$(PYTHON) sh scripts/setup.sh
 PYTEST := $(BIN)/python -m pytest
 
 .DEFAULT_GOAL := help
-.PHONY: help setup assets synth demo test quick slow lint types bench docs lock fuzz sbom audit-deps clean
+.PHONY: help setup assets native sanitize synth demo test quick slow lint types bench docs lock fuzz sbom audit-deps clean
 
 help: ## show these targets
 	@awk -F':.*## ' '/^[a-z-]+:.*## /{printf "  make %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -19,9 +19,17 @@ setup: ## install everything a developer needs: Node, the CDK, the cloud's packa
 	@$(BIN)/python scripts/assets.py
 	@sh scripts/cdk.sh
 
-assets: ## build the packages for AWS into build/
+assets: ## build the packages for AWS into build/, and the native core for aarch64
 	@$(SETUP) dev infra
 	@$(BIN)/python scripts/assets.py
+	@$(BIN)/python scripts/assets.py --arm || echo "assets: the packages for AWS are complete, without a core for ARM"
+
+native: ## compile the native core into native/build, and run its C++ checks
+	@$(MAKE) --no-print-directory -C native all check
+
+sanitize: ## run the native core with the address and undefined-behaviour sanitizers
+	@$(SETUP) dev
+	@sh scripts/sanitize.sh
 
 synth: ## write the CloudFormation templates into cdk.out; needs no account, and no network after setup
 	@$(SETUP) dev infra

@@ -1,10 +1,14 @@
 """Build the packages of the cloud: a folder of wheels for the servers, an unpacked folder for the function.
 
-    python scripts/assets.py [--into build]
+    python scripts/assets.py [--into build] [--arm]
 
-Installs wheels only, by the hashes of the locks, and runs nothing that it downloads.  The build is
-reproducible: the time of every entry is SOURCE_DATE_EPOCH (default: the earliest of a zip file).  Nothing is
-built when neither a lock nor a source has changed; the network is needed only for a changed lock.
+Installs wheels only, by the hashes of the locks, and runs nothing that it downloads; with --arm it runs the
+compiler of locks/native.txt.  The build is reproducible: the time of every entry is SOURCE_DATE_EPOCH (by
+default the earliest of a zip file).  Nothing is built when neither a lock nor a source has changed; the
+network is needed only for a changed lock.
+
+The native core is compiled here and goes into both packages; without a C++ compiler they have PoseLib alone.
+With --arm its wheel for aarch64 is built, too, and lies with its hash in build/native.
 """
 
 from __future__ import annotations
@@ -28,13 +32,20 @@ UNUSED = ("tests", "__pycache__", "f2py", "_pyinstaller", "include", "testing")
 UNUSED_ENDINGS = (".pyi", ".pxd", ".c", ".h", ".a")
 DEBIAN_12 = ("3.11", 36)
 AMAZON_2023 = ("3.13", 34)
+NATIVE_SOURCES = ("src/*.cpp", "src/*.hpp", "include/*.h", "wheel_builder/*.py", "Makefile", "pyproject.toml")
 
 
 def main() -> int:
     """Build both folders, or print in two lines why that failed."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--into", type=Path, default=ROOT / "build", metavar="DIR")
-    into = parser.parse_args().into
+    parser.add_argument("--arm", action="store_true", help="build the native core for aarch64, too (100 MB)")
+    args = parser.parse_args()
+    status = _packages(args.into)
+    return status or (_native_for_arm(args.into) if args.arm else 0)
+
+
+def _packages(into: Path) -> int:
     stamp = into / "assets.sha256"
     wanted = _state_of_the_sources()
     if stamp.is_file() and stamp.read_text(encoding="utf-8") == wanted:
@@ -44,8 +55,9 @@ def main() -> int:
     try:
         with tempfile.TemporaryDirectory() as work:
             ours = _our_wheel(Path(work))
-            _wheelhouse(into / "wheelhouse", ours, into / "downloads" / "boot")
-            _function(into / "lambda", ours, into / "downloads" / "lambda")
+            core = _native_wheels(into / "native", "x86_64")
+            _wheelhouse(into / "wheelhouse", [ours, *core], into / "downloads" / "boot")
+            _function(into / "lambda", ours, core, into / "downloads" / "lambda")
     except subprocess.CalledProcessError as error:
         sys.stderr.write(
             f"assets: pip {error.cmd[3]} failed\n  hint: read the output above, and check the network\n"
@@ -71,7 +83,11 @@ def _sources() -> list[Path]:
 
 def _state_of_the_sources() -> str:
     state = hashlib.sha256(os.environ.get("SOURCE_DATE_EPOCH", EPOCH).encode())
-    for file in [*_sources(), Path(__file__), ROOT / "locks/boot.txt", ROOT / "locks/lambda.txt"]:
+    has_compiler = any(map(shutil.which, (os.environ.get("CXX", "c++"), "g++", "clang++")))
+    state.update(f"compiler: {has_compiler}\0".encode())
+    native = sorted(file for pattern in NATIVE_SOURCES for file in (ROOT / "native").glob(pattern))
+    locks = [ROOT / "locks/boot.txt", ROOT / "locks/lambda.txt"]
+    for file in [*_sources(), *native, Path(__file__), *locks]:
         state.update(f"{file.relative_to(ROOT)}\0".encode() + hashlib.sha256(file.read_bytes()).digest())
     return state.hexdigest() + "\n"
 
@@ -91,12 +107,57 @@ def _our_wheel(work: Path) -> Path:
     return wheel
 
 
-def _wheelhouse(folder: Path, ours: Path, wheels: Path) -> None:
+def _native_wheels(folder: Path, machine: str, *compiler: str) -> list[Path]:
+    """Return the wheel of the native core for *machine*; none where the builder says why it cannot be."""
+    command = [sys.executable, "-m", "native.wheel_builder", "--into", str(folder), "--machine", machine]
+    built = subprocess.run([*command, *compiler], cwd=ROOT, stdout=subprocess.PIPE, text=True, check=False)
+    return [Path(line) for line in built.stdout.splitlines()]
+
+
+def _native_for_arm(into: Path) -> int:
+    """Build the wheel for ARM robots and Graviton servers with the compiler in the wheel ziglang."""
+    zig = into / "ziglang"
+    stamp, wanted = zig / "lock.sha256", hashlib.sha256((ROOT / "locks/native.txt").read_bytes()).hexdigest()
+    if not stamp.is_file() or stamp.read_text(encoding="utf-8") != wanted:
+        sys.stderr.write("assets: installing the compiler for aarch64 (100 MB, once)\n")
+        _empty(zig)
+        try:
+            _pip(
+                "install", "--quiet", "--require-hashes", "--no-deps", "--only-binary=:all:", "--no-compile",
+                "--target", str(zig), "--requirement", str(ROOT / "locks/native.txt"),
+            )  # fmt: skip
+        except subprocess.CalledProcessError:
+            sys.stderr.write(
+                "assets: there is no wheel for aarch64\n"
+                "  hint: read pip's output above, and check the network\n"
+            )
+            return 2
+        stamp.write_text(wanted, encoding="utf-8")
+    os.environ.setdefault("ZIG_GLOBAL_CACHE_DIR", str((into / "zig-cache").resolve()))
+    os.environ.setdefault("ZIG_LOCAL_CACHE_DIR", os.environ["ZIG_GLOBAL_CACHE_DIR"])
+    program = (zig / "ziglang" / "zig").resolve()
+    compiler = f"{program} c++ -target aarch64-linux-gnu.2.28"
+    folder = into / "native"
+    if not _native_wheels(folder.resolve(), "aarch64", "--compiler", compiler):
+        return 2
+    _write_hashes(folder)
+    sys.stderr.write(
+        f"assets: {folder} holds {', '.join(file.name for file in sorted(folder.glob('*.whl')))}\n"
+    )
+    return 0
+
+
+def _wheelhouse(folder: Path, ours: list[Path], wheels: Path) -> None:
     """Put all wheels of a server into *folder*, with a list of their hashes for pip."""
     _empty(folder)
     _download(ROOT / "locks/boot.txt", wheels, *DEBIAN_12)
-    for wheel in (*wheels.glob("*.whl"), ours):
+    for wheel in (*wheels.glob("*.whl"), *ours):
         shutil.copyfile(wheel, folder / wheel.name)
+    _write_hashes(folder)
+
+
+def _write_hashes(folder: Path) -> None:
+    """Name every wheel of *folder* with its version and hash, as pip requires them."""
     lines = []
     for wheel in sorted(folder.glob("*.whl")):
         name, version, *_ = wheel.name.split("-")
@@ -104,11 +165,11 @@ def _wheelhouse(folder: Path, ours: Path, wheels: Path) -> None:
     (folder / "requirements.txt").write_text("".join(lines), encoding="utf-8")
 
 
-def _function(folder: Path, ours: Path, wheels: Path) -> None:
+def _function(folder: Path, ours: Path, core: list[Path], wheels: Path) -> None:
     """Unpack the function's wheels into *folder*, without files that are never used."""
     _empty(folder)
     _download(ROOT / "locks/lambda.txt", wheels, *AMAZON_2023)
-    for wheel in sorted(wheels.glob("*.whl")):
+    for wheel in (*sorted(wheels.glob("*.whl")), *core):
         _unpack(wheel, folder, None)
     _unpack(ours, folder, LAMBDA_PACKAGES)
 

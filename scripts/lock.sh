@@ -3,13 +3,15 @@
 set -eu
 cd "$(dirname "$0")/.."
 
+ours="--no-emit-package rse-pf --no-emit-package rse-pf-native"
+
 lock() { # lock FILE EXTRA...
   file=$1
   shift
   extras=$(for extra in "$@"; do printf -- '--extra %s ' "$extra"; done)
   # shellcheck disable=SC2086
   .venv/bin/uv pip compile pyproject.toml --quiet --universal --python-version 3.10 --generate-hashes \
-    --no-emit-index-url --no-emit-find-links --no-annotate --no-emit-package rse-pf \
+    --no-emit-index-url --no-emit-find-links --no-annotate $ours \
     --constraint locks/constraints.txt --custom-compile-command 'make lock' \
     $extras --output-file "locks/$file.txt"
 }
@@ -21,10 +23,16 @@ lock infra infra dev
 for_platform() { # for_platform FILE PYTHON INPUT...
   file=$1 python=$2
   shift 2
+  # shellcheck disable=SC2086
   .venv/bin/uv pip compile "$@" --quiet --python-version "$python" --python-platform x86_64-manylinux_2_28 \
-    --generate-hashes --no-emit-index-url --no-emit-find-links --no-annotate --no-emit-package rse-pf \
+    --generate-hashes --no-emit-index-url --no-emit-find-links --no-annotate $ours \
     --constraint locks/constraints.txt --custom-compile-command 'make lock' --output-file "locks/$file.txt"
 }
 
 for_platform boot 3.11 pyproject.toml --extra boot       # Debian 12
 for_platform lambda 3.13 lambda_pnp/requirements.txt     # the runtime of stacks/serverless_stack.py
+
+# The compiler of the native core for aarch64: scripts/assets.py --arm.
+.venv/bin/uv pip compile --group native/pyproject.toml:cross --quiet --universal --python-version 3.10 \
+  --generate-hashes --no-emit-index-url --no-emit-find-links --no-annotate \
+  --custom-compile-command 'make lock' --output-file locks/native.txt

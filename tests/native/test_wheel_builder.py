@@ -112,12 +112,14 @@ def test_the_same_library_gives_the_same_wheel(library: Path, tmp_path: Path) ->
 
 
 def test_the_core_has_the_version_of_the_platform(repository: Path) -> None:
-    versions = [
-        re.search(r'^version = "(.+)"$', (repository / name).read_text(encoding="utf-8"), re.M)
+    platform_file, core_file = (
+        (repository / name).read_text(encoding="utf-8")
         for name in ("pyproject.toml", "native/pyproject.toml")
-    ]
+    )
+    version = re.compile(r'^version = "(.+)"$', re.M)
 
-    assert versions[0][1] == versions[1][1]
+    assert version.findall(core_file) == version.findall(platform_file)
+    assert re.findall(r'"rse-pf-native==([^;]+);', platform_file) == version.findall(platform_file)
 
 
 def test_the_library_uses_avx2_where_the_processor_has_it(library: Path) -> None:
