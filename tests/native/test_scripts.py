@@ -1,0 +1,140 @@
+"""The setup compiles the native core where it can, once, and goes on where it cannot."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+COMPILER = """#!/bin/sh
+# Stands in for a compiler: writes what -o names.
+echo "$@" >> {log}
+[ "$1" = -dumpmachine ] && echo x86_64-linux-gnu && exit 0
+while [ $# -gt 0 ]; do [ "$1" = -o ] && : > "$2"; shift; done
+exit {status}
+"""
+TOOLS = ("sh", "make", "dirname", "mkdir", "rm", "mv")
+
+
+class Checkout:
+    """A copy of what the script needs, and a machine with few programs."""
+
+    def __init__(self, folder: Path, repository: Path) -> None:
+        self.folder, self.programs, self.log = folder / "checkout", folder / "bin", folder / "calls"
+        shutil.copytree(repository / "native", self.folder / "native", ignore=shutil.ignore_patterns("build"))
+        (self.folder / "scripts").mkdir()
+        shutil.copy(repository / "scripts/native.sh", self.folder / "scripts")
+        self.programs.mkdir()
+        for tool in TOOLS:
+            found = shutil.which(tool)
+            if found is None:
+                pytest.skip(f"no {tool}")
+            (self.programs / tool).symlink_to(found)
+
+    @property
+    def library(self) -> Path:
+        """Where the library is put."""
+        return self.folder / "native/build/librse_pf_native.so"
+
+    def add_compiler(self, name: str, status: int = 0) -> Path:
+        """Install a program that stands in for a compiler, and return its path."""
+        program = self.programs / name
+        program.write_text(COMPILER.format(log=self.log, status=status), encoding="utf-8")
+        program.chmod(0o755)
+        return program
+
+    def set_up(self, **variables: str) -> subprocess.CompletedProcess[str]:
+        """Run the script."""
+        return subprocess.run(
+            ["sh", "scripts/native.sh"], cwd=self.folder, capture_output=True, text=True, timeout=60,
+            check=False, env={"PATH": str(self.programs), **variables},
+        )  # fmt: skip
+
+    def compilations(self) -> int:
+        """Return how often a source was compiled."""
+        if not self.log.exists():
+            return 0
+        return sum(" -c " in line for line in self.log.read_text(encoding="utf-8").splitlines())
+
+
+@pytest.fixture
+def checkout(tmp_path: Path, repository: Path) -> Checkout:
+    return Checkout(tmp_path, repository)
+
+
+@pytest.mark.parametrize("name", ["c++", "g++", "clang++"])
+def test_any_compiler_is_found_and_its_library_is_put_where_it_is_looked_for(
+    checkout: Checkout, name: str
+) -> None:
+    checkout.add_compiler(name)
+
+    told = checkout.set_up()
+
+    assert (told.returncode, told.stderr) == (0, "")
+    assert f"with {name}" in told.stdout
+    assert checkout.library.is_file()
+
+
+def test_nothing_is_compiled_again_until_a_source_changes(checkout: Checkout) -> None:
+    checkout.add_compiler("c++")
+    checkout.set_up()
+    first = checkout.compilations()
+
+    again = checkout.set_up()
+    unchanged = checkout.compilations()
+    header = next(checkout.folder.glob("native/src/*.hpp"))
+    later = checkout.library.stat().st_mtime + 10
+    os.utime(header, (later, later))
+    checkout.set_up()
+
+    assert first > 1
+    assert again.stdout == ""
+    assert unchanged == first
+    assert checkout.compilations() == 2 * first
+
+
+def test_without_a_compiler_one_line_says_what_is_slower_and_the_setup_goes_on(checkout: Checkout) -> None:
+    told = checkout.set_up()
+
+    assert told.returncode == 0
+    assert told.stdout == ""
+    assert "no C++ compiler was found; PoseLib solves the poses instead" in told.stderr
+    assert "\n  hint: sudo apt-get install g++" in told.stderr
+
+
+@pytest.mark.parametrize("variables", [{}, {"CXX": "no-such-compiler"}])
+def test_a_compiler_that_fails_does_not_stop_the_setup_and_leaves_no_old_library(
+    checkout: Checkout, variables: dict[str, str]
+) -> None:
+    checkout.add_compiler("c++", status=1)
+    checkout.library.parent.mkdir()
+    checkout.library.write_bytes(b"of older sources")
+    os.utime(checkout.library, (0, 0))
+
+    told = checkout.set_up(**variables)
+
+    assert told.returncode == 0
+    assert "does not compile" in told.stderr
+    assert "build.log" in told.stderr
+    assert not checkout.library.exists()
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1500)
+def test_the_sanitizers_find_nothing(repository: Path) -> None:
+    told = subprocess.run(
+        ["sh", "scripts/sanitize.sh"],
+        cwd=repository,
+        capture_output=True,
+        text=True,
+        timeout=1400,
+        check=False,
+    )
+
+    if "sanitize: skipped" in told.stdout:
+        pytest.skip(told.stdout.strip())
+    assert told.returncode == 0, told.stdout[-3000:] + told.stderr[-3000:]
+    assert "sanitize: no findings" in told.stdout
