@@ -31,7 +31,7 @@ OUTLIER_RATIOS = (0.1, 0.3, 0.5, 0.7)
 RIGHT_M, RIGHT_DEG = 0.1, 2.0
 MAX_PROBLEMS = 2000
 MIN_PAIRS = 500
-PACKAGES = {"poselib": "poselib", "opencv": "opencv-python-headless"}
+PACKAGES = {"poselib": "poselib", "opencv": "opencv-python-headless", "native": "rse-pf"}
 
 
 def cpu_us(work: Callable[[], Any]) -> tuple[float, Any]:
