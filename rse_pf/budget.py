@@ -105,7 +105,7 @@ def _plain(*, size: int, depth: int, containers: int, values: int, mixed_values:
 
 Refusal = Literal[
     "json-containers", "json-depth", "containers", "depth", "values", "memory", "cut-off", "followed",
-    "not-zlib", "not-one-stream", "bomb",
+    "not-zlib", "not-one-stream", "bomb", "blocks",
 ]  # fmt: skip
 """Why bytes are refused."""
 
@@ -131,6 +131,7 @@ def refusal(reason: Refusal, budget: Budget, *, size: int, max_bytes: int) -> Rs
         "not-zlib": _not_zlib,
         "not-one-stream": _not_one_stream,
         "bomb": lambda: _bomb(size, max_bytes),
+        "blocks": _too_many_blocks,
     }
     return errors[reason]()
 
@@ -227,6 +228,10 @@ def _not_one_stream() -> BadMessage:
 
 def _bomb(size: int, max_bytes: int) -> LimitExceeded:
     return LimitExceeded(f"{size} bytes inflate to more than {max_bytes}", hint="send smaller messages")
+
+
+def _too_many_blocks() -> LimitExceeded:
+    return LimitExceeded("a zlib stream of many tiny blocks", hint="deflate a message as a whole")
 
 
 # --- MessagePack ----------------------------------------------------------------------------------

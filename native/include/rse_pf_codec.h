@@ -30,6 +30,7 @@ enum rse_pf_codec_status {
     RSE_PF_CODEC_NOT_ONE_STREAM = 9,
     RSE_PF_CODEC_TOO_LARGE = 10,  /* It inflates to more than `limit` of the call. */
     RSE_PF_CODEC_NEEDS_ROOM = 11, /* It inflates to more than `text_room`; ask again with more. */
+    RSE_PF_CODEC_MANY_BLOCKS = 13, /* A deflate stream of more blocks than its bytes explain. */
     RSE_PF_CODEC_UNKNOWN = 12     /* These limits are not known here; judge it elsewhere. */
 };
 

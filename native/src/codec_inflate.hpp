@@ -80,13 +80,14 @@ enum Kind : uint32_t { kLiteral = 1, kTwoLiterals = 2, kMatch = 3, kEnd = 4, kLi
 
 template <int kRootBits, int kEntries>
 struct HuffmanTable {
-    static constexpr int kRoot = kRootBits;
     uint32_t entries[kEntries];
+    int root_bits;  // at most kRootBits, and no more than the longest code has: short codes cost little
 
+    uint64_t root_mask() const { return (uint64_t{1} << root_bits) - 1; }
     uint32_t find(uint64_t bits) const {
-        const uint32_t entry = entries[bits & ((1u << kRootBits) - 1)];
+        const uint32_t entry = entries[bits & root_mask()];
         if ((entry >> 4 & 15) != kLink) return entry;
-        return entries[(entry >> 8) + (bits >> kRootBits & ((1u << (entry & 15)) - 1))];
+        return entries[(entry >> 8) + (bits >> root_bits & ((1u << (entry & 15)) - 1))];
     }
 
     // Fill the table for codes of `lengths`; false if they are no code, or one that zlib refuses.
@@ -102,8 +103,10 @@ struct HuffmanTable {
             if (left < 0) return false;
         }
         if (left > 0 && longest != 0 && !(may_be_incomplete && longest == 1)) return false;
+        const int root = longest > kRootBits ? kRootBits : longest > 0 ? longest : 1;
+        root_bits = root;
         if (left > 0) {
-            for (int i = 0; i < 1 << kRootBits; ++i) entries[i] = kInvalid << 4 | 1;
+            for (int i = 0; i < 1 << root; ++i) entries[i] = kInvalid << 4 | 1;
         }
         int offsets[16], sorted[320];
         offsets[1] = 0;
@@ -112,20 +115,20 @@ struct HuffmanTable {
             if (lengths[symbol] != 0) sorted[offsets[lengths[symbol]]++] = symbol;
         }
         uint32_t code = 0;  // with its first bit lowest, as it stands in the stream
-        int next = 0, begin = 1 << kRootBits, second_bits = 0;
-        uint32_t root = ~0u;
+        int next = 0, begin = 1 << root, second_bits = 0;
+        uint32_t prefix = ~0u;
         for (int length = 1; length <= longest; ++length) {
             for (int remaining = count[length]; remaining > 0; --remaining, ++next) {
                 const int symbol = sorted[next];
                 const uint32_t entry = entry_of(symbol) | static_cast<uint32_t>(length);
-                if (length <= kRootBits) {
-                    for (uint32_t i = code; i < 1u << kRootBits; i += 1u << length) entries[i] = entry;
+                if (length <= root) {
+                    for (uint32_t i = code; i < 1u << root; i += 1u << length) entries[i] = entry;
                 } else {
-                    const uint32_t low = code & ((1u << kRootBits) - 1);
-                    if (low != root) {
-                        if (root != ~0u) begin += 1 << second_bits;
-                        root = low;
-                        second_bits = length - kRootBits;
+                    const uint32_t low = code & ((1u << root) - 1);
+                    if (low != prefix) {
+                        if (prefix != ~0u) begin += 1 << second_bits;
+                        prefix = low;
+                        second_bits = length - root;
                         for (int space = (1 << second_bits) - remaining, bits = length; space > 0 && bits < longest;) {
                             ++second_bits;
                             ++bits;
@@ -135,7 +138,7 @@ struct HuffmanTable {
                         entries[low] = static_cast<uint32_t>(begin) << 8 | kLink << 4 |
                                        static_cast<uint32_t>(second_bits);
                     }
-                    for (uint32_t i = code >> kRootBits; i < 1u << second_bits; i += 1u << (length - kRootBits)) {
+                    for (uint32_t i = code >> root; i < 1u << second_bits; i += 1u << (length - root)) {
                         entries[static_cast<uint32_t>(begin) + i] = entry;
                     }
                 }
@@ -150,12 +153,13 @@ struct HuffmanTable {
 
     // Let an entry that has room for the bits of two literals hold both; where its first one ends stands at 24.
     void join_literals() {
-        for (uint32_t i = 1u << kRootBits; i-- > 0;) {
+        const auto root = static_cast<uint32_t>(root_bits);
+        for (uint32_t i = 1u << root; i-- > 0;) {
             const uint32_t first = entries[i];
             if ((first >> 4 & 15) != kLiteral) continue;
             const uint32_t bits = first & 15, second = entries[i >> bits];
             const uint32_t both = bits + (second & 15);
-            if ((second >> 4 & 15) != kLiteral || both > kRootBits) continue;
+            if ((second >> 4 & 15) != kLiteral || both > root) continue;
             entries[i] = bits << 24 | (second >> 8 & 255) << 16 | (first & 0xFF00) | kTwoLiterals << 4 | both;
         }
     }
@@ -165,6 +169,9 @@ struct HuffmanTable {
 // `enough.c`); `fill` refuses more in any case.
 typedef HuffmanTable<9, 852> LiteralTable;
 typedef HuffmanTable<8, 402> DistanceTable;
+
+// zlib with the least memory ends a block after 127 symbols; nobody has a reason to end it sooner.
+constexpr int64_t kFreeBlocks = 64, kBytesPerBlock = 100, kMaxBlocks = 2048;
 
 inline uint32_t literal_entry(int symbol) {
     if (symbol < 256) return static_cast<uint32_t>(symbol) << 8 | kLiteral << 4;
@@ -207,11 +214,7 @@ public:
         // Deflate with a window of at most 32 KiB, and no dictionary.
         if (header % 31 != 0 || (in_[0] & 15) != 8 || in_[0] >> 4 > 7 || (in_[1] & 32) != 0) return RSE_PF_CODEC_NOT_ZLIB;
         in_ += 2;
-        // Tables are made for each block: a stream of many tiny blocks would cost more than its bytes.
-        const int64_t most_blocks = 64 + (end_ - begin_) / 256;
-        int64_t blocks = 0;
         for (bool is_last = false; !is_last;) {
-            if (++blocks > most_blocks) return RSE_PF_CODEC_UNKNOWN;
             refill();
             if (count_ < 3) return RSE_PF_CODEC_NOT_ONE_STREAM;
             is_last = (bits_ & 1) != 0;
@@ -221,9 +224,15 @@ public:
             if (kind == 0) {
                 status = stored();
             } else if (kind == 1) {
-                fixed_codes();
+                if (!is_fixed_) fixed_codes();
+                is_fixed_ = true;
                 status = coded();
             } else if (kind == 2) {
+                // Tables are made for each block, so tiny blocks cost far more than their bytes.
+                if (++blocks_ > kFreeBlocks + bytes() / kBytesPerBlock || blocks_ > kMaxBlocks) {
+                    limit_ = blocks_ - 1;
+                    return RSE_PF_CODEC_MANY_BLOCKS;
+                }
                 status = dynamic_codes();
                 if (status == RSE_PF_CODEC_READ) status = coded();
             }
@@ -327,6 +336,7 @@ private:
         std::memset(lengths + 256, 7, 24);
         std::memset(lengths + 280, 8, 8);
         literals_.fill(lengths, 288, true, literal_entry);
+        literals_.join_literals();
         std::memset(lengths, 5, 32);
         distances_.fill(lengths, 32, true, distance_entry);
     }
@@ -375,6 +385,8 @@ private:
         if (lengths[256] == 0) return RSE_PF_CODEC_NOT_ZLIB;
         const bool is_code = literals_.fill(lengths, literals, true, literal_entry) &&
                              distances_.fill(lengths + literals, distances, true, distance_entry);
+        literals_.join_literals();
+        is_fixed_ = false;
         return is_code ? RSE_PF_CODEC_READ : RSE_PF_CODEC_NOT_ZLIB;
     }
 
@@ -387,7 +399,7 @@ private:
         int count = count_;
         const uint8_t* const in_stop = end_ - 16;
         uint8_t* const out_stop = stop_ - (258 + 16);
-        constexpr uint64_t kMask = (1u << LiteralTable::kRoot) - 1;
+        const uint64_t mask = literals_.root_mask();
         const auto refilled = [&] {
             uint64_t more;
             std::memcpy(&more, in, 8);
@@ -400,7 +412,7 @@ private:
         };
         while (in <= in_stop && out <= out_stop) {
             refilled();
-            uint32_t entry = literals_.entries[bits & kMask];
+            uint32_t entry = literals_.entries[bits & mask];
             // Five entries of at most 9 bits.
             for (int i = 0; i < 5 && (entry >> 4 & 15) <= kTwoLiterals; ++i) {
                 const auto two = static_cast<uint16_t>(entry >> 8);
@@ -409,7 +421,7 @@ private:
                 out += entry >> 4 & 15;
                 bits >>= entry & 15;
                 count -= static_cast<int>(entry & 15);
-                entry = literals_.entries[bits & kMask];
+                entry = literals_.entries[bits & mask];
             }
             if ((entry >> 4 & 15) <= kTwoLiterals) continue;
             refilled();
@@ -444,7 +456,6 @@ private:
     }
 
     int32_t coded() {
-        literals_.join_literals();
         for (;;) {
             if (end_ - in_ >= 16 && stop_ - out_ >= 258 + 16) coded_in_the_middle();
             refill();
@@ -516,7 +527,8 @@ private:
     uint8_t* out_;
     uint8_t* stop_ = nullptr;
     int64_t room_ = 0, most_ = 0, head_most_ = 0, head_bytes_ = 0, limit_ = 0;
-    bool is_head_ = true;
+    int64_t blocks_ = 0;  // those with codes of their own
+    bool is_head_ = true, is_fixed_ = false;
     uint64_t bits_ = 0;  // the next bits of the stream, the first one lowest
     int count_ = 0;      // how many of them are valid
     LiteralTable literals_;

@@ -42,7 +42,7 @@ _OPTION_FIELDS = {16: "inlier_px", 128: "confidence", 32: "max_iterations", 64: 
 
 _JSON_REFUSALS: dict[int, Refusal] = {
     2: "json-containers", 3: "json-depth", 4: "values", 5: "memory", 8: "not-zlib", 9: "not-one-stream",
-    10: "bomb",
+    10: "bomb", 13: "blocks",
 }  # fmt: skip
 _MSGPACK_REFUSALS: dict[int, Refusal] = {
     2: "containers",

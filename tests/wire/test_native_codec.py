@@ -17,7 +17,7 @@ import pytest
 
 from rse_pf.budget import Budget, check_json, check_msgpack, inflate_within
 from rse_pf.config import PlatformSettings, SessionSettings
-from rse_pf.errors import ConfigurationError, RsePfError
+from rse_pf.errors import ConfigurationError, LimitExceeded, RsePfError
 from rse_pf.geometry import Camera
 from rse_pf.pnp import PnpOptions
 from rse_pf.pnp.problems import make_problem
@@ -32,6 +32,7 @@ pytestmark = pytest.mark.skipif(NATIVE is None, reason="the native core is not b
 
 BUDGET = Budget.of_messages(SessionSettings())
 TYPES = PnpTypes(PnpRequest, Camera, PnpOptions, PnpReply)
+ORDER_OF_LENGTHS = (16, 17, 18, 0, 8, 7, 9, 6, 10, 5, 11, 4, 12, 3, 13, 2, 14, 1, 15)
 CAMERA = '{"fx":525.5,"fy":525,"cx":319.5,"cy":239.5,"width":640,"height":480}'
 HEAD = '{"type":"command","id":7,"service":"pnp","payload":{"camera":' + CAMERA
 
@@ -347,6 +348,30 @@ def test_streams_are_inflated_or_refused_as_by_zlib() -> None:
             assert got == expected, data.hex()
         seen.add(expected[0][:30])
     assert len(seen) >= 4, seen
+
+
+def bytes_of_bits(bits: str) -> bytes:
+    bits += "0" * (-len(bits) % 8)
+    return bytes(int(bits[at : at + 8][::-1], 2) for at in range(0, len(bits), 8))
+
+
+def test_a_stream_of_many_tiny_blocks_is_refused() -> None:
+    # A block with codes of its own and nothing in it (RFC 1951, Sect. 3.2.7): 256 zeros, one bit for the end.
+    lengths = "".join("100" if symbol in (18, 1) else "000" for symbol in ORDER_OF_LENGTHS[:18])
+    block = "0" + "01" + "00000" + "00000" + "0111" + lengths + "1" + "1111111" + "1" + "1101011" + "00" + "0"
+    stream = b"\x78\x9c" + bytes_of_bits(block * 20_000)
+
+    with pytest.raises(LimitExceeded, match="tiny blocks"):
+        make_codec("zlib").decode_from_robot(stream)
+
+
+def test_the_blocks_of_the_smallest_encoder_are_no_tiny_ones() -> None:
+    draw = random.Random(1)
+    text = json.dumps({"type": "ping", "sent_s": 1.5, "more": [draw.random() for _ in range(9000)]}).encode()
+    for strategy in (zlib.Z_DEFAULT_STRATEGY, zlib.Z_HUFFMAN_ONLY):
+        stream = zlib.compressobj(1, zlib.DEFLATED, 9, 1, strategy)
+
+        assert make_codec("zlib").decode_from_robot(stream.compress(text) + stream.flush())
 
 
 @pytest.mark.parametrize("codec", CODECS)
