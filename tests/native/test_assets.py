@@ -1,0 +1,60 @@
+"""The packages of the cloud hold the native core; `make slow` builds them first."""
+
+from __future__ import annotations
+
+import hashlib
+import zipfile
+from pathlib import Path
+
+import pytest
+
+from native.wheel_builder.backend import LIBRARY
+from native.wheel_builder.elf import complaints, read_library
+from rse_pf.native import open_solver
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture
+def build(repository: Path) -> Path:
+    """The folder of the packages."""
+    folder = repository / "build"
+    if not (folder / "assets.sha256").is_file():
+        pytest.skip("no packages: run make assets")
+    if not list((folder / "native").glob("*x86_64.whl")):
+        pytest.skip("the packages were built without a C++ compiler")
+    return folder
+
+
+def test_a_server_installs_the_core_by_its_hash(build: Path) -> None:
+    (wheel,) = (build / "wheelhouse").glob("rse_pf_native-*.whl")
+    version = wheel.name.split("-")[1]
+
+    lines = (build / "wheelhouse" / "requirements.txt").read_text(encoding="utf-8").splitlines()
+
+    digest = hashlib.sha256(wheel.read_bytes()).hexdigest()
+    assert f"rse_pf_native=={version} --hash=sha256:{digest}" in lines
+
+
+def test_the_function_and_the_servers_have_the_same_core_and_it_loads(build: Path) -> None:
+    (wheel,) = (build / "wheelhouse").glob("rse_pf_native-*.whl")
+    with zipfile.ZipFile(wheel) as archive:
+        of_servers = archive.read(f"rse_pf_native/{LIBRARY}")
+    of_the_function = build / "lambda" / "rse_pf_native" / LIBRARY
+
+    assert of_the_function.read_bytes() == of_servers
+    assert (build / "lambda" / "rse_pf_native" / "__init__.py").is_file()
+    assert complaints(read_library(of_servers), "x86_64") == []
+    assert open_solver(of_the_function).lanes in ("avx2", "portable")
+
+
+def test_the_wheel_for_arm_holds_a_library_for_arm(build: Path) -> None:
+    wheels = list((build / "native").glob("*aarch64.whl"))
+    if not wheels:
+        pytest.skip("no wheel for aarch64: run make assets")
+    with zipfile.ZipFile(wheels[0]) as archive:
+        data = archive.read(f"rse_pf_native/{LIBRARY}")
+
+    digest = hashlib.sha256(wheels[0].read_bytes()).hexdigest()
+    assert complaints(read_library(data), "aarch64") == []
+    assert digest in (build / "native" / "requirements.txt").read_text(encoding="utf-8")
