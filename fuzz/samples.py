@@ -208,4 +208,5 @@ def _clouds() -> list[bytes]:
 _MADE = {
     "codec": _messages, "frames": _frames, "stream": _streams, "geometry": _problems, "maps": _maps,
     "keyframes": _keyframes, "snapshots": _sandbox_messages, "graph": _graphs, "cloud": _clouds,
+    "native": _messages,
 }  # fmt: skip

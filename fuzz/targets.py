@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from fuzz import map_targets
+from fuzz import map_targets, native_targets
 from fuzz.checks import Target, TargetFailure, expect
 from fuzz.meter import Meter
 from rse_pf.backend.gateway.frames import (
@@ -211,5 +211,5 @@ def _numbers(kind: int, data: bytes, count: int) -> list[float]:
 TARGETS: dict[str, Target] = {
     "codec": codec, "frames": frames, "stream": stream, "geometry": geometry, "maps": map_targets.maps,
     "keyframes": map_targets.keyframes, "snapshots": map_targets.snapshots, "graph": map_targets.graph,
-    "cloud": map_targets.cloud,
+    "cloud": map_targets.cloud, "native": native_targets.native,
 }  # fmt: skip

@@ -81,7 +81,7 @@ enum Kind : uint32_t { kLiteral = 1, kTwoLiterals = 2, kMatch = 3, kEnd = 4, kLi
 template <int kRootBits, int kEntries>
 struct HuffmanTable {
     uint32_t entries[kEntries];
-    int root_bits;  // at most kRootBits, and no more than the longest code has: short codes cost little
+    int root_bits = 0;  // at most kRootBits, and no more than the longest code has: short codes cost little
 
     uint64_t root_mask() const { return (uint64_t{1} << root_bits) - 1; }
     uint32_t find(uint64_t bits) const {
@@ -385,7 +385,7 @@ private:
         if (lengths[256] == 0) return RSE_PF_CODEC_NOT_ZLIB;
         const bool is_code = literals_.fill(lengths, literals, true, literal_entry) &&
                              distances_.fill(lengths + literals, distances, true, distance_entry);
-        literals_.join_literals();
+        if (is_code) literals_.join_literals();
         is_fixed_ = false;
         return is_code ? RSE_PF_CODEC_READ : RSE_PF_CODEC_NOT_ZLIB;
     }

@@ -15,6 +15,7 @@ import msgspec
 import numpy as np
 import pytest
 
+from fuzz.native_targets import outcome
 from rse_pf.budget import Budget, check_json, check_msgpack, inflate_within
 from rse_pf.config import PlatformSettings, SessionSettings
 from rse_pf.errors import ConfigurationError, LimitExceeded, RsePfError
@@ -24,7 +25,7 @@ from rse_pf.pnp.problems import make_problem
 from rse_pf.service import Registry, dispatch
 from rse_pf.services.builtin import builtin_services
 from rse_pf.services.pnp import PnpReply, PnpRequest, make_request, wire_types
-from rse_pf.wire import CODECS, Command, Result, as_type, make_codec
+from rse_pf.wire import CODECS, Command, Result, make_codec
 from rse_pf.wire.native_codec import NativeReader, PnpTypes, native_codec, open_codec
 
 NATIVE = native_codec()
@@ -53,28 +54,9 @@ def command_of(numbers: str, pixels: str = "1.5,2.5") -> bytes:
     return (HEAD + f',"points_world":[{numbers}],"pixels":[{pixels}]' + "}}").encode()
 
 
-def outcome(codec: str, data: bytes, *, use_native: bool) -> tuple[Any, ...]:
-    """Return what became of *data*: an error, or the message, its arrays as bytes."""
-    wire = make_codec(codec, pnp=TYPES if use_native else None, use_native=use_native)
-    try:
-        message = wire.decode_from_robot(data)
-        if not isinstance(message, Command) or message.service != "pnp":
-            return ("message", repr(message))
-        try:
-            request = as_type({} if message.payload is None else message.payload, PnpRequest)
-        except RsePfError as error:
-            return ("request refused", error.code, error.message, error.hint)
-    except RsePfError as error:
-        return ("refused", error.code, error.message, error.hint)
-    arrays = request.points_world.tobytes(), request.pixels.tobytes()
-    plain = msgspec.structs.replace(message, payload=None)
-    depths = request.depths_m
-    depths = depths.tobytes() if isinstance(depths, np.ndarray) else not depths
-    return ("read", repr(plain), repr(request.camera), repr(request.options), *arrays, depths)
-
-
 def assert_alike(codec: str, data: bytes) -> None:
-    assert outcome(codec, data, use_native=True) == outcome(codec, data, use_native=False), data[:2000]
+    fast, plain = make_codec(codec, pnp=TYPES), make_codec(codec, use_native=False)
+    assert outcome(fast, data) == outcome(plain, data), data[:2000]
 
 
 def is_fast(codec: str, data: bytes) -> bool:
