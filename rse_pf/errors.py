@@ -191,7 +191,7 @@ class Crashed(CommandFailed, code="crashed"):
 
 
 class Poison(CommandFailed, code="poison"):
-    """This request crashed two sandboxes and is not tried again."""
+    """This request crashed two sandboxes and is not tried again within ten minutes."""
 
 
 class InternalError(CommandFailed, code="internal"):

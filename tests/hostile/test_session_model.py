@@ -97,7 +97,7 @@ class Platform(RuleBasedStateMachine):
         for older in self._open():
             self._close(older)
         server = ServerSession(
-            codec=CODEC, robot=claims.robot, server=f"s-{self.issued}", session="x", limits=LIMITS
+            codec=CODEC, robot=claims.robot.name, server=f"s-{self.issued}", session="x", limits=LIMITS
         )
         self.sockets.append(Socket(self.robot.open_connection(self.now), server))
         self._note([])

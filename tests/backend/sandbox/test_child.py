@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import shutil
 import socket
 import struct
@@ -16,7 +15,7 @@ from typing import Any
 import pytest
 
 from rse_pf.backend.sandbox import isolation
-from rse_pf.backend.sandbox.child import SandboxPlan, readable_paths, run_sandbox
+from rse_pf.backend.sandbox.child import readable_paths
 from rse_pf.backend.sandbox.ipc import encode_message, receive
 from rse_pf.services.custom.installed import read_service
 from rse_pf.services.custom.native import INCLUDE_FOLDER
@@ -24,6 +23,7 @@ from rse_pf.services.custom.native import INCLUDE_FOLDER
 pytestmark = pytest.mark.system
 
 MEMORY, SCRATCH = 536_870_912, 4_194_304
+ONE_SANDBOX = Path(__file__).with_name("one_sandbox.py")
 WAIT_S = 20
 ASK = """
 from __future__ import annotations
@@ -210,7 +210,7 @@ Ask = Callable[[Any], Any]
 @pytest.fixture
 def sandbox(tmp_path: Path) -> Iterator[Callable[[str, str, str], Ask]]:
     """A function that starts a sandbox with one service and returns what sends it a request."""
-    started: list[tuple[int, socket.socket]] = []
+    started: list[tuple[subprocess.Popen[bytes], socket.socket]] = []
 
     def start(language: str, entry: str, source: str = "") -> Ask:
         manifest = {"name": "tried", "language": language, "entry": entry}
@@ -218,23 +218,12 @@ def sandbox(tmp_path: Path) -> Iterator[Callable[[str, str, str], Ask]]:
         if source:
             (tmp_path / entry).write_text(source)
         tmp_path.chmod(0o755)
-        service = read_service(tmp_path)
-        plan = SandboxPlan(
-            services={"tried": service},
-            readable=readable_paths([service]),
-            memory_bytes=MEMORY,
-            scratch_bytes=SCRATCH,
-            max_bytes=1 << 24,
-            missing=(),
-        )
         ours, theirs = socket.socketpair()
-        first = os.fork()
-        if first == 0:
-            ours.close()
-            _become_sandbox(plan, theirs)
+        command = [sys.executable, ONE_SANDBOX, tmp_path, theirs.fileno(), MEMORY, SCRATCH]
+        process = subprocess.Popen([str(each) for each in command], pass_fds=(theirs.fileno(),))
         theirs.close()
         ours.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, struct.pack("@ll", WAIT_S, 0))
-        started.append((first, ours))
+        started.append((process, ours))
         assert receive(ours) == ["ready"]
 
         def ask(payload: Any) -> Any:
@@ -244,24 +233,9 @@ def sandbox(tmp_path: Path) -> Iterator[Callable[[str, str, str], Ask]]:
         return ask
 
     yield start
-    for pid, channel in started:
+    for process, channel in started:
         channel.close()  # at which a sandbox ends
-        os.waitpid(pid, 0)
-
-
-def _become_sandbox(plan: SandboxPlan, channel: socket.socket) -> None:
-    """Enter the namespaces and fork the sandbox, as the zygote does; exit as the sandbox did."""
-    code = 1
-    try:
-        isolation.enter_namespaces()
-        pid = os.fork()
-        if pid == 0:
-            uid = 3_000_000 + os.getppid() if os.getuid() == 0 else None
-            run_sandbox(plan, channel.fileno(), 2, uid)
-        channel.close()
-        code = abs(os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]))
-    finally:
-        os._exit(code)
+        process.wait(WAIT_S)
 
 
 @pytest.fixture
