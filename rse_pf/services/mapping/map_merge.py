@@ -33,6 +33,8 @@ _MAX_PAIRS = 500_000
 """Keyframe pairs that may be tried; each takes some milliseconds."""
 _MIN_LOOP_LENGTH = 3
 """Keyframes of one robot that are closer than this along its trajectory are not a loop."""
+_DRIFT = OdometryNoise(step_m=0.007, step_deg=0.5)
+"""The drift of a tracker with depth; whether a loop may be true is judged by the larger default."""
 
 
 class MergeOptions(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
@@ -313,8 +315,7 @@ def _odometry(
             a, b = atlas.row_of[which, edge.a], atlas.row_of[which, edge.b]
             edges.append((LoopClosure(a=a, b=b, T_a_b=edge.T_a_b, information=edge.information), edge.kind))
             known.add((min(a, b), max(a, b)))
-    noise = OdometryNoise()
-    spread = np.array([noise.step_m] * 3 + [math.radians(noise.step_deg)] * 3)
+    spread = np.array([_DRIFT.step_m] * 3 + [math.radians(_DRIFT.step_deg)] * 3)
     for a in range(len(atlas.keyframes) - 1):
         b = a + 1
         same = atlas.of_map[a] == atlas.of_map[b] and atlas.keyframes[a].robot == atlas.keyframes[b].robot
