@@ -81,7 +81,7 @@ enum Kind : uint32_t { kLiteral = 1, kTwoLiterals = 2, kMatch = 3, kEnd = 4, kLi
 template <int kRootBits, int kEntries>
 struct HuffmanTable {
     uint32_t entries[kEntries];
-    int root_bits = 0;  // at most kRootBits, and no more than the longest code has: short codes cost little
+    int root_bits;  // at most kRootBits, and no more than the longest code has: short codes cost little
 
     uint64_t root_mask() const { return (uint64_t{1} << root_bits) - 1; }
     uint32_t find(uint64_t bits) const {
@@ -92,7 +92,7 @@ struct HuffmanTable {
 
     // Fill the table for codes of `lengths`; false if they are no code, or one that zlib refuses.
     template <class EntryOf>
-    bool fill(const uint8_t* lengths, int symbols, bool may_be_incomplete, EntryOf entry_of) {
+    constexpr bool fill(const uint8_t* lengths, int symbols, bool may_be_incomplete, EntryOf entry_of) {
         int count[16] = {};
         for (int symbol = 0; symbol < symbols; ++symbol) ++count[lengths[symbol]];
         int longest = 15;
@@ -108,7 +108,7 @@ struct HuffmanTable {
         if (left > 0) {
             for (int i = 0; i < 1 << root; ++i) entries[i] = kInvalid << 4 | 1;
         }
-        int offsets[16], sorted[320];
+        int offsets[16] = {}, sorted[320] = {};
         offsets[1] = 0;
         for (int length = 1; length < 15; ++length) offsets[length + 1] = offsets[length] + count[length];
         for (int symbol = 0; symbol < symbols; ++symbol) {
@@ -152,7 +152,7 @@ struct HuffmanTable {
     }
 
     // Let an entry that has room for the bits of two literals hold both; where its first one ends stands at 24.
-    void join_literals() {
+    constexpr void join_literals() {
         const auto root = static_cast<uint32_t>(root_bits);
         for (uint32_t i = 1u << root; i-- > 0;) {
             const uint32_t first = entries[i];
@@ -173,24 +173,44 @@ typedef HuffmanTable<8, 402> DistanceTable;
 // zlib with the least memory ends a block after 127 symbols; nobody has a reason to end it sooner.
 constexpr int64_t kFreeBlocks = 64, kBytesPerBlock = 100, kMaxBlocks = 2048;
 
-inline uint32_t literal_entry(int symbol) {
+// Of each code for a length: the shortest one, and the number of extra bits.
+constexpr uint16_t kLengths[29] = {3,  4,  5,  6,  7,  8,  9,  10, 11,  13,  15,  17,  19,  23, 27,
+                                   31, 35, 43, 51, 59, 67, 83, 99, 115, 131, 163, 195, 227, 258};
+constexpr uint8_t kLengthBits[29] = {0, 0, 0, 0, 0, 0, 0, 0, 1, 1, 1, 1, 2, 2, 2, 2, 3, 3, 3, 3, 4, 4, 4, 4, 5, 5, 5, 5, 0};
+
+constexpr uint32_t literal_entry(int symbol) {
     if (symbol < 256) return static_cast<uint32_t>(symbol) << 8 | kLiteral << 4;
     if (symbol == 256) return kEnd << 4;
     if (symbol > 285) return kInvalid << 4;
-    // The base length, and above it the number of extra bits.
-    static constexpr uint16_t kBases[29] = {3,  4,  5,  6,  7,  8,  9,  10, 11,  13,  15,  17,  19,  23, 27,
-                                            31, 35, 43, 51, 59, 67, 83, 99, 115, 131, 163, 195, 227, 258};
-    static constexpr uint8_t kExtra[29] = {0, 0, 0, 0, 0, 0, 0, 0, 1, 1, 1, 1, 2, 2, 2, 2, 3, 3, 3, 3, 4, 4, 4, 4, 5, 5, 5, 5, 0};
     const int k = symbol - 257;
-    return static_cast<uint32_t>(kExtra[k]) << 24 | static_cast<uint32_t>(kBases[k]) << 8 | kMatch << 4;
+    return static_cast<uint32_t>(kLengthBits[k]) << 24 | static_cast<uint32_t>(kLengths[k]) << 8 | kMatch << 4;
 }
 
-inline uint32_t distance_entry(int symbol) {
+constexpr uint32_t distance_entry(int symbol) {
     if (symbol > 29) return kInvalid << 4;
-    const uint32_t extra = symbol < 4 ? 0u : static_cast<uint32_t>(symbol) / 2 - 1;
-    const uint32_t base = symbol < 4 ? static_cast<uint32_t>(symbol) + 1 : (2u + (static_cast<uint32_t>(symbol) & 1)) * (1u << extra) + 1;
+    const auto code = static_cast<uint32_t>(symbol);
+    const uint32_t extra = code < 4 ? 0 : code / 2 - 1;
+    const uint32_t base = code < 4 ? code + 1 : (2 + (code & 1)) * (1u << extra) + 1;
     return extra << 24 | base << 8 | kMatch << 4;
 }
+
+// Both codes of a block.
+struct Codes {
+    LiteralTable literals;
+    DistanceTable distances;
+};
+
+constexpr Codes fixed_codes() {
+    Codes codes = {};
+    uint8_t lengths[288] = {};
+    for (int symbol = 0; symbol < 288; ++symbol) lengths[symbol] = symbol < 144 ? 8 : symbol < 256 ? 9 : symbol < 280 ? 7 : 8;
+    codes.literals.fill(lengths, 288, true, literal_entry);
+    for (int symbol = 0; symbol < 32; ++symbol) lengths[symbol] = 5;
+    codes.distances.fill(lengths, 32, true, distance_entry);
+    return codes;
+}
+
+constexpr Codes kFixedCodes = fixed_codes();
 
 class Inflater {
 public:
@@ -224,8 +244,7 @@ public:
             if (kind == 0) {
                 status = stored();
             } else if (kind == 1) {
-                if (!is_fixed_) fixed_codes();
-                is_fixed_ = true;
+                codes_ = &kFixedCodes;
                 status = coded();
             } else if (kind == 2) {
                 // Tables are made for each block, so tiny blocks cost far more than their bytes.
@@ -329,18 +348,6 @@ private:
         return RSE_PF_CODEC_READ;
     }
 
-    void fixed_codes() {
-        uint8_t lengths[288];
-        std::memset(lengths, 8, 144);
-        std::memset(lengths + 144, 9, 112);
-        std::memset(lengths + 256, 7, 24);
-        std::memset(lengths + 280, 8, 8);
-        literals_.fill(lengths, 288, true, literal_entry);
-        literals_.join_literals();
-        std::memset(lengths, 5, 32);
-        distances_.fill(lengths, 32, true, distance_entry);
-    }
-
     int32_t dynamic_codes() {
         static constexpr uint8_t kOrder[19] = {16, 17, 18, 0, 8, 7, 9, 6, 10, 5, 11, 4, 12, 3, 13, 2, 14, 1, 15};
         refill();
@@ -383,11 +390,11 @@ private:
             at += times;
         }
         if (lengths[256] == 0) return RSE_PF_CODEC_NOT_ZLIB;
-        const bool is_code = literals_.fill(lengths, literals, true, literal_entry) &&
-                             distances_.fill(lengths + literals, distances, true, distance_entry);
-        if (is_code) literals_.join_literals();
-        is_fixed_ = false;
-        return is_code ? RSE_PF_CODEC_READ : RSE_PF_CODEC_NOT_ZLIB;
+        codes_ = &own_;
+        if (!own_.literals.fill(lengths, literals, true, literal_entry)) return RSE_PF_CODEC_NOT_ZLIB;
+        if (!own_.distances.fill(lengths + literals, distances, true, distance_entry)) return RSE_PF_CODEC_NOT_ZLIB;
+        own_.literals.join_literals();
+        return RSE_PF_CODEC_READ;
     }
 
     // Inflate a block as long as no limit and no end is near; `coded` does the rest.
@@ -399,7 +406,9 @@ private:
         int count = count_;
         const uint8_t* const in_stop = end_ - 16;
         uint8_t* const out_stop = stop_ - (258 + 16);
-        const uint64_t mask = literals_.root_mask();
+        const LiteralTable& literals = codes_->literals;
+        const DistanceTable& distances = codes_->distances;
+        const uint64_t mask = literals.root_mask();
         const auto refilled = [&] {
             uint64_t more;
             std::memcpy(&more, in, 8);
@@ -412,7 +421,7 @@ private:
         };
         while (in <= in_stop && out <= out_stop) {
             refilled();
-            uint32_t entry = literals_.entries[bits & mask];
+            uint32_t entry = literals.entries[bits & mask];
             // Five entries of at most 9 bits.
             for (int i = 0; i < 5 && (entry >> 4 & 15) <= kTwoLiterals; ++i) {
                 const auto two = static_cast<uint16_t>(entry >> 8);
@@ -421,11 +430,11 @@ private:
                 out += entry >> 4 & 15;
                 bits >>= entry & 15;
                 count -= static_cast<int>(entry & 15);
-                entry = literals_.entries[bits & mask];
+                entry = literals.entries[bits & mask];
             }
             if ((entry >> 4 & 15) <= kTwoLiterals) continue;
             refilled();
-            entry = literals_.find(bits);
+            entry = literals.find(bits);
             const uint32_t kind = entry >> 4 & 15;
             if (kind == kLiteral) {
                 *out++ = static_cast<uint8_t>(entry >> 8);
@@ -439,7 +448,7 @@ private:
             int taken = static_cast<int>((entry & 15) + (entry >> 24));
             const int64_t length = (entry >> 8 & 0xFFFF) + (static_cast<uint32_t>(rest) & ((1u << (entry >> 24)) - 1));
             rest >>= entry >> 24;
-            const uint32_t far = distances_.find(rest);
+            const uint32_t far = distances.find(rest);
             if ((far >> 4 & 15) != kMatch) break;
             rest >>= far & 15;
             const int64_t distance = (far >> 8 & 0xFFFF) + (static_cast<uint32_t>(rest) & ((1u << (far >> 24)) - 1));
@@ -459,7 +468,7 @@ private:
         for (;;) {
             if (end_ - in_ >= 16 && stop_ - out_ >= 258 + 16) coded_in_the_middle();
             refill();
-            uint32_t entry = literals_.find(bits_);
+            uint32_t entry = codes_->literals.find(bits_);
             if ((entry >> 4 & 15) == kTwoLiterals) {
                 // One after the other, because a limit may lie between them.
                 entry = (entry & 0xFF00) | kLiteral << 4 | entry >> 24;
@@ -502,7 +511,7 @@ private:
     }
 
     int32_t copy(int64_t length) {
-        const uint32_t entry = distances_.find(bits_);
+        const uint32_t entry = codes_->distances.find(bits_);
         const int taken = static_cast<int>(entry & 15), extra = static_cast<int>(entry >> 24);
         if (taken > count_) return RSE_PF_CODEC_NOT_ONE_STREAM;
         if ((entry >> 4 & 15) == kInvalid) return RSE_PF_CODEC_NOT_ZLIB;
@@ -528,11 +537,11 @@ private:
     uint8_t* stop_ = nullptr;
     int64_t room_ = 0, most_ = 0, head_most_ = 0, head_bytes_ = 0, limit_ = 0;
     int64_t blocks_ = 0;  // those with codes of their own
-    bool is_head_ = true, is_fixed_ = false;
+    bool is_head_ = true;
     uint64_t bits_ = 0;  // the next bits of the stream, the first one lowest
     int count_ = 0;      // how many of them are valid
-    LiteralTable literals_;
-    DistanceTable distances_;
+    const Codes* codes_ = &kFixedCodes;
+    Codes own_;
 };
 
 }  // namespace rse_pf_codec

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import msgspec
 
-from rse_pf.wire.codec import Codec
+from rse_pf.wire.codec import Codec, stored
 from rse_pf.wire.messages import Failure
 
 __all__ = ["Envelope", "encode_refusal", "peek"]
@@ -64,12 +64,7 @@ def peek(codec: Codec, data: bytes) -> Envelope | None:
 
 
 def encode_refusal(codec: Codec, failure: Failure) -> bytes:
-    """Return the message of *failure*; with zlib it is stored, not deflated: 180 bytes instead of 150.
-
-    Source:
-        RFC 1951, Sect. 3.2.4.
-    """
+    """Return the message of *failure*; with zlib it is stored, not deflated: 180 bytes instead of 150."""
     if codec.name != "zlib":
         return codec.encode(failure)
-    stream = zlib.compressobj(0, zlib.DEFLATED, 9, 1)
-    return stream.compress(_encode_json(failure)) + stream.flush()
+    return stored(_encode_json(failure))

@@ -31,6 +31,7 @@ from rse_pf.wire import (
     codec_for,
     make_codec,
 )
+from rse_pf.wire.codec import stored
 
 LIMITS = SessionSettings()
 
@@ -369,3 +370,13 @@ def test_messages_are_values() -> None:
 
     with pytest.raises(AttributeError):
         message.reason = "other"  # type: ignore[misc]
+
+
+@pytest.mark.parametrize("size", [0, 1, 255, 256, 65_535, 65_536, 100_000])
+def test_a_stored_text_is_one_stream_of_zlib(size: int) -> None:
+    text = bytes(k % 251 for k in range(size))
+    stream = zlib.decompressobj()
+
+    assert stream.decompress(stored(text)) == text
+    assert stream.eof
+    assert not stream.unused_data
