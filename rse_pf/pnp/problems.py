@@ -9,7 +9,15 @@ import numpy.typing as npt
 
 from rse_pf.geometry import Array, Camera, exp_se3, inverse, transform
 
-__all__ = ["DEGENERATE", "KINECT", "PnpProblem", "make_degenerate", "make_problem"]
+__all__ = [
+    "DEGENERATE",
+    "KINECT",
+    "PnpProblem",
+    "TwoViews",
+    "make_degenerate",
+    "make_problem",
+    "make_two_views",
+]
 
 KINECT = Camera(fx=518.86, fy=519.47, cx=325.58, cy=253.74, width=640, height=480)
 """The colour camera of NYU Depth V2 (its toolbox's calibration)."""
@@ -57,7 +65,7 @@ def make_problem(
     depth_m = rng.uniform(_MIN_DEPTH_M, _MAX_DEPTH_M, n)
     measured_m = depth_m
     if depth_noise:
-        measured_m = depth_m + rng.normal(size=n) * (0.0012 + 0.0019 * (depth_m - 0.4) ** 2)
+        measured_m = _with_depth_noise(rng, depth_m)
     points_world = transform(inverse(T_camera_world), camera.back_project(exact, measured_m))
     pixels = exact + rng.normal(size=(n, 2)) * noise_px
     wrong = rng.permutation(n)[: round(outlier_ratio * n)]
@@ -68,6 +76,47 @@ def make_problem(
         points_world=points_world, pixels=pixels, camera=camera, T_camera_world=T_camera_world,
         is_inlier=is_inlier,
     )  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class TwoViews:
+    """Matches of two depth images, rounded as they are sent; *depths_m* is 0 where there is none."""
+
+    points_reference: Array
+    pixels: Array
+    depths_m: Array
+    camera: Camera
+    T_camera_reference: Array
+
+
+def make_two_views(
+    *, seed: int, n: int = 150, noise_px: float = 1.0, outlier_ratio: float = 0.2, missing_ratio: float = 0.1
+) -> TwoViews:
+    """Return matches of two views some 0.2 m apart, both with pixel noise and a Kinect's depth error.
+
+    Points lie 1.5 to 4.5 m before the first camera; *missing_ratio* of the second one's depths are missing.
+    """
+    rng = np.random.default_rng(seed)
+    T = exp_se3(np.concatenate([rng.uniform(-0.17, 0.17, 3), rng.normal(size=3) * 0.08]))
+    exact, depth_m = rng.uniform(60.0, [580.0, 420.0], (n, 2)), rng.uniform(1.5, 4.5, n)
+    seen = transform(T, KINECT.back_project(exact, depth_m))
+    noisy = exact + rng.normal(size=(n, 2)) * noise_px
+    points = KINECT.back_project(noisy, _with_depth_noise(rng, depth_m))
+    pixels = KINECT.project(seen) + rng.normal(size=(n, 2)) * noise_px
+    depths_m = _with_depth_noise(rng, seen[:, 2])
+    wrong = rng.permutation(n)[: round(outlier_ratio * n)]
+    pixels[wrong] = rng.uniform(0.0, [KINECT.width, KINECT.height], (len(wrong), 2))
+    depths_m[wrong] = rng.uniform(1.0, 5.0, len(wrong))
+    depths_m[rng.random(n) < missing_ratio] = 0.0
+    return TwoViews(
+        points_reference=np.round(points, 4), pixels=np.round(pixels, 2), depths_m=np.round(depths_m, 3),
+        camera=KINECT, T_camera_reference=T,
+    )  # fmt: skip
+
+
+def _with_depth_noise(rng: np.random.Generator, depth_m: Array) -> Array:
+    noisy: Array = depth_m + rng.normal(size=len(depth_m)) * (0.0012 + 0.0019 * (depth_m - 0.4) ** 2)
+    return noisy
 
 
 def make_degenerate(kind: str, *, seed: int, n: int = 100, camera: Camera = KINECT) -> PnpProblem:

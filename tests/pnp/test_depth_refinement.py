@@ -2,57 +2,49 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from rse_pf.errors import BadRequest
-from rse_pf.geometry import Array, exp_se3, inverse, pose_difference, transform
-from rse_pf.pnp import DepthNoise, PnpOptions, PnpSolution, refine_with_depth, solve_pnp
-from rse_pf.pnp.problems import KINECT
+from rse_pf.geometry import Array, inverse, pose_difference
+from rse_pf.pnp import (
+    DepthNoise,
+    PnpOptions,
+    PnpSolution,
+    available_engines,
+    refine_with_depth,
+    solve_pnp,
+)
+from rse_pf.pnp.problems import KINECT, TwoViews, make_two_views
 
 pytest.importorskip("poselib")
 
 _NOISE = DepthNoise()
-_OPTIONS = PnpOptions(inlier_px=5.0)
+_options = PnpOptions(inlier_px=5.0)
 
 
-class TwoViews(NamedTuple):
-    """Matches of two depth images, rounded as they are sent."""
-
-    points: Array
-    pixels: Array
-    depths_m: Array
-    T_camera_reference: Array
-
-
-def two_views(seed: int, *, n: int = 150, outliers: float = 0.2, missing: float = 0.1) -> TwoViews:
-    """Return two views some 0.2 m apart, with 1 px and a Kinect's depth noise in both."""
-    rng = np.random.default_rng(seed)
-    T = exp_se3(np.concatenate([rng.uniform(-0.17, 0.17, 3), rng.normal(size=3) * 0.08]))
-    exact, depth_m = rng.uniform(60.0, [580.0, 420.0], (n, 2)), rng.uniform(1.5, 4.5, n)
-    seen = transform(T, KINECT.back_project(exact, depth_m))
-    points = KINECT.back_project(exact + rng.normal(size=(n, 2)), _noisy(rng, depth_m))
-    pixels, depths_m = KINECT.project(seen) + rng.normal(size=(n, 2)), _noisy(rng, seen[:, 2])
-    wrong = rng.permutation(n)[: round(outliers * n)]
-    pixels[wrong] = rng.uniform(0.0, [640.0, 480.0], (len(wrong), 2))
-    depths_m[wrong] = rng.uniform(1.0, 5.0, len(wrong))
-    depths_m[rng.random(n) < missing] = 0.0
-    return TwoViews(np.round(points, 4), np.round(pixels, 2), np.round(depths_m, 3), T)
+@pytest.fixture(autouse=True, params=["native", "poselib"])
+def options(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let both paths be tested: the core refines what it solved, numpy what PoseLib solved."""
+    if request.param not in available_engines():
+        pytest.skip("the native core is not built: make -C native")
+    monkeypatch.setitem(globals(), "_options", PnpOptions(inlier_px=5.0, engine=request.param))
 
 
-def _noisy(rng: np.random.Generator, depth_m: Array) -> Array:
-    noisy: Array = depth_m + rng.normal(size=len(depth_m)) * np.sqrt(_NOISE.variance_m2(depth_m))
-    return noisy
+def two_views(seed: int, *, missing: float = 0.1) -> TwoViews:
+    return make_two_views(seed=seed, missing_ratio=missing)
 
 
 def solved(views: TwoViews) -> PnpSolution:
-    return solve_pnp(views.points, views.pixels, KINECT, _OPTIONS)
+    return solve_pnp(views.points_reference, views.pixels, KINECT, _options)
 
 
 def refined(views: TwoViews, noise: DepthNoise = _NOISE) -> PnpSolution:
-    return refine_with_depth(solved(views), views.points, views.pixels, views.depths_m, KINECT, noise)
+    return refine_with_depth(
+        solved(views), views.points_reference, views.pixels, views.depths_m, KINECT, noise
+    )
 
 
 def error_m(T_camera_reference: Array, views: TwoViews) -> float:
@@ -89,7 +81,7 @@ def test_the_covariance_is_consistent_with_the_error(missing: float):
 
 def test_rows_without_depth_take_part_with_their_pixel():
     views = two_views(3)
-    half = views._replace(depths_m=np.where(np.arange(len(views.points)) % 2, views.depths_m, 0.0))
+    half = replace(views, depths_m=np.where(np.arange(len(views.points_reference)) % 2, views.depths_m, 0.0))
 
     with_half, with_all = refined(half), refined(views)
 
@@ -101,7 +93,7 @@ def test_without_any_depth_the_solution_stays_as_it_is():
     solution = solved(views)
 
     found = refine_with_depth(
-        solution, views.points, views.pixels, np.zeros(len(views.points)), KINECT, _NOISE
+        solution, views.points_reference, views.pixels, np.zeros(len(views.points_reference)), KINECT, _NOISE
     )
 
     assert found is solution
@@ -125,7 +117,7 @@ def test_equal_requests_give_equal_bytes():
 
 def test_a_fifth_of_wrong_depths_does_not_spoil_the_pose():
     views = [two_views(seed) for seed in range(40)]
-    spoilt = [each._replace(depths_m=_with_wrong_depths(each.depths_m)) for each in views]
+    spoilt = [replace(each, depths_m=_with_wrong_depths(each.depths_m)) for each in views]
 
     by_pnp = np.median([error_m(solved(each).T_camera_world, each) for each in views])
     by_depth = np.median([error_m(refined(each).T_camera_world, each) for each in spoilt])
@@ -143,7 +135,7 @@ def _with_wrong_depths(depths_m: Array) -> Array:
 def test_depths_in_a_wrong_unit_do_not_spoil_the_pose(factor: float):
     views = two_views(7)
 
-    found = refined(views._replace(depths_m=views.depths_m * factor))
+    found = refined(replace(views, depths_m=views.depths_m * factor))
 
     assert error_m(found.T_camera_world, views) < 0.02
 
@@ -172,12 +164,12 @@ def test_the_noise_of_the_right_sensor_gives_the_smaller_error():
 )
 def test_bad_depths_are_refused(change: dict[str, Array]):
     with pytest.raises(BadRequest, match="depths_m"):
-        refined(two_views(9)._replace(**change))
+        refined(replace(two_views(9), **change))
 
 
 def test_points_behind_the_reference_camera_are_refused():
     views = two_views(9)
-    points = views.points.copy()
+    points = views.points_reference.copy()
     points[0, 2] = -1.0
     with pytest.raises(BadRequest, match="reference camera"):
         refine_with_depth(solved(views), points, views.pixels, views.depths_m, KINECT)
