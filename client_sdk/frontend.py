@@ -203,9 +203,8 @@ def match(reference: Features, frame: Features, options: FrontEndOptions) -> Cor
     chosen = chosen[np.argsort(frame.pixels[neighbours[chosen, 0], 0], kind="stable")]
     seen = neighbours[chosen, 0]
     points_world, pixels = round_for_wire(reference.points_camera[known[chosen]], frame.pixels[seen])
-    depths_m = frame.points_camera[seen, 2]
-    depths_m = np.round(np.where(np.isfinite(depths_m), depths_m, 0.0), 3)
-    return Correspondences(points_world=points_world, pixels=pixels, depths_m=depths_m)
+    depths_m: Array = np.nan_to_num(frame.points_camera[seen, 2], posinf=0.0, neginf=0.0)
+    return Correspondences(points_world=points_world, pixels=pixels, depths_m=np.round(depths_m, 3))
 
 
 def round_for_wire(points_world: Array, pixels: Array) -> tuple[Array, Array]:
