@@ -2,8 +2,8 @@
 
 Defends: red kitchen at 10 Hz, ATE frame to frame <= 3.4 cm, with loops <= 3.0, merged in three <= 3.3; NYU,
 fr1 and redwood no worse than without depth; no lost frame; every command with JSON and zlib < 10 kB; mean
-normalised error squared near 6; the native core <= 60 us for 200 matches.  CPU figures are of this thread, native
-and numpy in turn; the load average stands beside them: discard those of a busy machine.
+normalised error squared near 6; the native core <= 60 us for 200 matches.  CPU figures are of this thread,
+native and numpy in turn; the load average stands beside them: discard those of a busy machine.
 
     python benchmarks/depth.py --recordings ../shared/data --out depth.json
 """
