@@ -18,7 +18,7 @@ import numpy as np
 
 from rse_pf.backend.sandbox.ipc import encode_message
 from rse_pf.maps.format import Edge, MapVersion, decode_map, encode_map
-from rse_pf.pnp.problems import DEGENERATE, KINECT, make_degenerate, make_problem
+from rse_pf.pnp.problems import DEGENERATE, KINECT, make_degenerate, make_problem, make_two_views
 from rse_pf.services.mapping.pose_graph import write_g2o
 from rse_pf.services.pnp import make_request
 from rse_pf.services.synthetic_maps import make_room, make_sphere, make_world
@@ -41,9 +41,13 @@ def samples(target: str) -> tuple[bytes, ...]:
 def _messages() -> list[bytes]:
     problem = make_problem(seed=3, n=12)
     asked = make_request(problem.points_world, problem.pixels, KINECT)
+    with_depth = make_request(
+        problem.points_world, problem.pixels, KINECT, depths_m=np.linspace(0.0, 3.0, 12)
+    )
     said = (
         Hello(sdk="fuzz", capabilities=("progress",)), Ping(sent_s=1.5), Cancel(id=3),
         Command(id=1, service="pnp", payload=asked, stream="camera", seq=4, deadline_ms=200.0, trace="t"),
+        Command(id=5, service="pnp", payload=with_depth),
         Command(id=2, service="echo", payload={"a": [1, "x", None, {"b": 2.5}]}),
         Result(id=1, reply=[1.0, 2.0]), Failure(id=2, code="busy", message="m", retry_after_ms=5.0),
     )  # fmt: skip
@@ -86,7 +90,9 @@ def _problems() -> list[bytes]:
         problem = make_problem(seed=k, n=20) if kind == "sound" else make_degenerate(kind, seed=k, n=20)
         numbers = problem.points_world.astype("<f8").tobytes() + problem.pixels.astype("<f8").tobytes()
         found += [bytes([engine, 20, 0, 64, 120, 250, 18, 19]) + numbers for engine in (0, 1)]
-    return found
+    views = make_two_views(seed=1, n=20)
+    numbers = views.points_reference.astype("<f8").tobytes() + views.pixels.astype("<f8").tobytes()
+    return [*found, *(bytes([engine, 20, 0, 64, 120, 250, 19, 19]) + numbers for engine in (0, 2))]
 
 
 def _json(payload: bytes) -> bytes:

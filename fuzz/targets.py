@@ -175,6 +175,9 @@ def geometry(data: bytes, meter: Meter) -> None:
     payload: dict[str, Any] = {"camera": camera, "points_world": points, "pixels": pixels}
     if data[3]:
         payload["options"] = options | ({"engine": engine} if engine else {})
+    if data[6] % 2:
+        payload["depths_m"] = [abs(number) for number in numbers[:n]]
+        payload["depth_noise"] = {"base_m": (1.0 + data[7]) / 256.0}
     command = Command(id=1, service="pnp", payload=payload)
     answer = meter.call(lambda _: dispatch(_REGISTRY, command, lambda: 0.0), data, ProtocolError)
     if isinstance(answer, Failure):
