@@ -121,8 +121,17 @@ def make_request(
 
 
 def wire_types(registry: Registry) -> PnpTypes | None:
-    """Return what the codecs of a server decode a `pnp` command to, None if *registry* offers another one."""
-    own = any(each.name == "pnp" and each.request_type is PnpRequest for each in registry)
+    """Return what the codecs of a server decode a `pnp` command to, None if *registry* offers another one.
+
+    What runs in another process is sent there as the robot sent it.
+    """
+    own = any(
+        each.name == "pnp"
+        and each.request_type is PnpRequest
+        and each.kind == "stateless"
+        and not each.limited
+        for each in registry
+    )
     return PnpTypes(PnpRequest, Camera, PnpOptions, PnpReply) if own else None
 
 

@@ -406,6 +406,18 @@ def test_a_server_with_a_pnp_of_its_own_gets_plain_payloads() -> None:
     assert wire_types(Registry()) is None
 
 
+@pytest.mark.parametrize("options", [{"kind": "per_robot_state"}, {"limited": True}])
+def test_what_runs_in_another_process_gets_plain_payloads(options: dict[str, Any]) -> None:
+    registry = Registry()
+
+    @registry.service("pnp", **options)
+    def pnp(request: PnpRequest) -> OwnReply:
+        """Return the width."""
+        return OwnReply(request.camera.width)
+
+    assert wire_types(registry) is None
+
+
 def test_a_file_that_is_no_library_is_refused(tmp_path: Path) -> None:
     (tmp_path / "x.so").write_bytes(b"no library")
 
