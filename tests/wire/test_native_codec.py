@@ -15,7 +15,10 @@ import msgspec
 import numpy as np
 import pytest
 
-from fuzz.native_targets import outcome
+from fuzz.damage import run_damaged
+from fuzz.meter import Meter
+from fuzz.native_targets import native, outcome
+from fuzz.samples import samples
 from rse_pf.budget import Budget, check_json, check_msgpack, inflate_within
 from rse_pf.config import PlatformSettings, SessionSettings
 from rse_pf.errors import ConfigurationError, LimitExceeded, RsePfError
@@ -224,6 +227,16 @@ def test_damaged_messages_get_the_same_verdict(codec: str) -> None:
         if codec == "zlib" and number % 3:
             data = zlib.compress(mutated(zlib.decompress(data), draw), draw.choice((0, 1, 6)))
         assert_alike(codec, data if codec == "zlib" and number % 3 else mutated(data, draw))
+
+
+def test_inputs_of_the_fuzz_target_get_the_same_verdict() -> None:
+    meter = Meter()
+
+    for data in samples("native"):
+        native(data, meter)
+    run_damaged("native", lambda data: native(data, meter), first=3, inputs=600)
+
+    assert meter.calls > 600
 
 
 def corpus() -> Iterator[bytes]:
