@@ -7,12 +7,14 @@ frames come out.  There is one query at a time.  Its numbers are rounded exactly
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
+from operator import attrgetter
 from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
 
-from client_sdk.native_match import front_end_core
+from client_sdk.native_match import FrontEndCore, front_end_core
 from rse_pf.errors import MissingExtra, UsageError
 from rse_pf.geometry import Array, Camera, inverse, pose_difference
 
@@ -30,6 +32,9 @@ __all__ = [
     "points_at",
     "round_for_wire",
 ]
+
+# ORB's pyramid.
+_SCALE, _LEVELS = 1.2, 8
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -159,15 +164,48 @@ def extract(frame: Frame, options: FrontEndOptions) -> Features:
         Rublee et al., ICCV 2011; scale 1.2, 8 levels, FAST threshold 10.
     """
     cv2 = load_opencv()
-    orb = cv2.ORB_create(nfeatures=options.features, scaleFactor=1.2, nlevels=8, fastThreshold=10)
+    orb = cv2.ORB_create(nfeatures=options.features, scaleFactor=_SCALE, nlevels=_LEVELS, fastThreshold=10)
     gray = cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY)
-    keypoints, descriptors = orb.detectAndCompute(gray, None)
-    if not keypoints:
-        empty = np.empty((0, 32), dtype=np.uint8)
-        return Features(pixels=np.empty((0, 2)), descriptors=empty, points_camera=np.empty((0, 3)))
-    pixels = cv2.KeyPoint_convert(keypoints).astype(np.float64)
+    core = front_end_core()
+    found = _described(cv2, orb, gray, core) if core is not None and _describes_alike(core) else None
+    pixels, descriptors = found or _described_by_opencv(cv2, orb, gray)
     points_camera = points_at(frame, pixels, options)
     return Features(pixels=pixels, descriptors=descriptors, points_camera=points_camera)
+
+
+_Described = tuple[Array, npt.NDArray[np.uint8]]
+
+
+def _described_by_opencv(cv2: Any, orb: Any, gray: npt.NDArray[np.uint8]) -> _Described:
+    """Return the pixels and the descriptors of an image's keypoints."""
+    keypoints, descriptors = orb.detectAndCompute(gray, None)
+    if not keypoints:
+        return np.empty((0, 2)), np.empty((0, 32), dtype=np.uint8)
+    return cv2.KeyPoint_convert(keypoints).astype(np.float64), descriptors
+
+
+def _described(cv2: Any, orb: Any, gray: npt.NDArray[np.uint8], core: FrontEndCore) -> _Described | None:
+    """Return the same, described by the native core; None where there is nothing that it can describe."""
+    keypoints = orb.detect(gray, None)
+    if not keypoints:
+        return None
+    n = len(keypoints)
+    pixels = cv2.KeyPoint_convert(keypoints)
+    angles_deg = np.fromiter(map(attrgetter("angle"), keypoints), np.float32, n)
+    octaves = np.fromiter(map(attrgetter("octave"), keypoints), np.int32, n)
+    descriptors = core.describe(gray, pixels, angles_deg, octaves, scale=_SCALE, levels=_LEVELS)
+    return None if descriptors is None else (pixels.astype(np.float64), descriptors)
+
+
+@cache
+def _describes_alike(core: FrontEndCore) -> bool:
+    """Say whether the core describes a picture as the installed OpenCV does, which may be another version."""
+    cv2 = load_opencv()
+    orb = cv2.ORB_create(nfeatures=500, scaleFactor=_SCALE, nlevels=_LEVELS, fastThreshold=10)
+    blocks = np.random.default_rng(1).integers(0, 256, (60, 80))
+    gray = np.kron(blocks, np.ones((5, 5))).astype(np.uint8)
+    ours = _described(cv2, orb, gray, core)
+    return ours is not None and bool(np.array_equal(ours[1], _described_by_opencv(cv2, orb, gray)[1]))
 
 
 def match(reference: Features, frame: Features, options: FrontEndOptions) -> Correspondences:

@@ -1,4 +1,4 @@
-"""The robot's front end in the native core: points at keypoints, and matches of ORB descriptors.
+"""The robot's front end in the native core: ORB descriptors, points at keypoints, and matches.
 
 The library is the one that `rse_pf.native` finds; without it, or with an older one, the front end does the
 same work in numpy and OpenCV, with the same numbers.
@@ -7,6 +7,8 @@ same work in numpy and OpenCV, with the same numbers.
 from __future__ import annotations
 
 import ctypes
+import math
+import threading
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
@@ -24,8 +26,21 @@ __all__ = ["FrontEndCore", "front_end_core", "open_front_end"]
 _ABI = 2
 _FLAGS = {"portable": 1, "avx2": 2, "avx512": 0}
 _BYTES = 32
+_RADIANS = np.float32(math.pi / 180)
 
 Lanes = Literal["portable", "avx2", "avx512"]
+
+
+class _Room(threading.local):
+    """What a thread lends to the library, so that a frame allocates no more than its results."""
+
+    _words = np.empty(0, dtype=np.uint64)
+
+    def words(self, count: int) -> npt.NDArray[np.uint64]:
+        """Return *count* numbers and more, whose values mean nothing."""
+        if len(self._words) < count:
+            self._words = np.empty(count, dtype=np.uint64)
+        return self._words
 
 
 class FrontEndCore:
@@ -34,10 +49,63 @@ class FrontEndCore:
     ``lanes`` are the widest instructions it may use, which changes no byte of the results.
     """
 
-    def __init__(self, points_at: Callable[..., int], matches: Callable[..., int], lanes: Lanes) -> None:
+    def __init__(
+        self,
+        describe: Callable[..., int],
+        points_at: Callable[..., int],
+        matches: Callable[..., int],
+        lanes: Lanes,
+    ) -> None:
+        self._describe = describe
         self._points_at = points_at
         self._matches = matches
+        self._room = _Room()
         self._flags = _FLAGS[lanes]
+
+    def describe(
+        self,
+        gray: npt.NDArray[np.uint8],
+        pixels: npt.NDArray[np.float32],
+        angles_deg: npt.NDArray[np.float32],
+        octaves: npt.NDArray[np.int32],
+        *,
+        scale: float,
+        levels: int,
+    ) -> npt.NDArray[np.uint8] | None:
+        """Return ORB's descriptors of keypoints, bit by bit those of OpenCV.
+
+        Args:
+            gray: ``(h, w)``.
+            pixels: ``(n, 2)``, where OpenCV found the keypoints.
+            angles_deg: ``(n,)``, how they are turned.
+            octaves: ``(n,)``, the levels that they were found in.
+            scale: From one level to the next.
+            levels: Of the pyramid.
+
+        Returns:
+            ``(n, 32)``; None where the processor lacks AVX2 or FMA, a keypoint is nearer than 22 px to the
+            edge of its level, or the arrays are not of these shapes and numbers.
+        """
+        n = len(pixels)
+        if not (
+            _is(gray, np.uint8, 2) and _is(pixels, np.float32, 2) and pixels.shape == (n, 2)
+            and _is(angles_deg, np.float32, 1) and _is(octaves, np.int32, 1)
+            and len(angles_deg) == len(octaves) == n
+        ):  # fmt: skip
+            return None
+        gray, pixels = np.ascontiguousarray(gray), np.ascontiguousarray(pixels)
+        octaves = np.ascontiguousarray(octaves)
+        height, width = gray.shape
+        turned = (angles_deg * _RADIANS).astype(np.float64)
+        cosines, sines = np.cos(turned).astype(np.float32), np.sin(turned).astype(np.float32)
+        scales = np.array([float(np.float32(scale)) ** level for level in range(levels)], dtype=np.float32)
+        descriptors = np.empty((n, _BYTES), dtype=np.uint8)
+        workspace = self._room.words(3 * width * height // 8 + 7 * width + 64)
+        done = self._describe(
+            _address(gray), width, height, _address(scales), levels, _address(pixels), _address(cosines),
+            _address(sines), _address(octaves), n, _address(workspace), _address(descriptors),
+        )  # fmt: skip
+        return None if done < 0 else descriptors
 
     def points_at(
         self,
@@ -115,7 +183,7 @@ class FrontEndCore:
         frame_points = np.ascontiguousarray(frame_points)
         room = min(n, m, max(max_matches, 0))
         points_world, matched, depths_m = np.empty((room, 3)), np.empty((room, 2)), np.empty(room)
-        workspace = np.empty(3 * n + 5 * m + 64, dtype=np.uint64)
+        workspace = self._room.words(3 * n + 5 * m + 64)
         count = self._matches(
             _address(reference), _address(points_camera), n, _address(descriptors), _address(pixels),
             _address(frame_points), m, ratio, room, self._flags, _address(workspace),
@@ -142,20 +210,25 @@ def open_front_end(path: Path, lanes: Lanes = "avx512") -> FrontEndCore:
     again = "build it again: make -C native"
     try:
         library = ctypes.CDLL(str(path))
-        abi, points_at, matches = library.rse_pf_match_abi, library.rse_pf_points_at, library.rse_pf_match
+        abi, describe = library.rse_pf_match_abi, library.rse_pf_describe
+        points_at, matches = library.rse_pf_points_at, library.rse_pf_match
     except (OSError, AttributeError) as error:
         raise ConfigurationError(f"{path} cannot be loaded: {error}", hint=again) from error
     abi.restype = ctypes.c_uint32
     if abi() != _ABI:
         raise ConfigurationError(f"{path} has the front end's ABI {abi()}, not {_ABI}", hint=again)
     pointer, size, number = ctypes.c_void_p, ctypes.c_int64, ctypes.c_double
+    describe.argtypes = (
+        pointer, size, size, pointer, ctypes.c_int32, *[pointer] * 4, size, pointer, pointer
+    )  # fmt: skip
+    describe.restype = ctypes.c_int32
     points_at.argtypes = (pointer, size, size, pointer, size, *[number] * 7, pointer)
     points_at.restype = ctypes.c_int32
     matches.argtypes = (
         pointer, pointer, size, *[pointer] * 3, size, number, size, ctypes.c_uint32, *[pointer] * 4
     )  # fmt: skip
     matches.restype = size
-    return FrontEndCore(points_at, matches, lanes)
+    return FrontEndCore(describe, points_at, matches, lanes)
 
 
 @cache

@@ -47,6 +47,18 @@ int64_t rse_pf_match(const uint8_t *reference, const double *points_camera, int6
                      double ratio, int64_t max_matches, uint32_t flags, uint64_t *workspace, double *points_world,
                      double *matched, double *depths_m);
 
+/* Numbers of 8 bytes that rse_pf_describe works in. */
+#define RSE_PF_DESCRIBE_WORKSPACE(width, height) ((3 * (width) * (height)) / 8 + 7 * (width) + 64)
+
+/* Write ORB's descriptors (rows x 32) of keypoints, bit by bit those of OpenCV, and return 0; -1 if a size does not
+ * fit, if a keypoint is nearer than 22 px to the edge of its level, or if the processor lacks AVX2 or FMA.
+ *
+ * gray: height x width, row-major.  scales: of each level, 1 and more.  pixels: rows x 2, of the whole image; the
+ * cosine, sine and octave (level) of each keypoint. */
+int32_t rse_pf_describe(const uint8_t *gray, int64_t width, int64_t height, const float *scales, int32_t levels,
+                        const float *pixels, const float *cosines, const float *sines, const int32_t *octaves,
+                        int64_t rows, uint64_t *workspace, uint8_t *descriptors);
+
 #ifdef __cplusplus
 }
 #endif

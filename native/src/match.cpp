@@ -15,25 +15,53 @@ using namespace rse_pf_match_detail;
 constexpr int64_t kMaxRows = int64_t{1} << 24;
 constexpr int64_t kMaxSide = int64_t{1} << 16;
 constexpr int kPatch = 9, kLeastReadings = 5;
+constexpr int64_t kAhead = 16;
 
 bool is_finite(double value) { return value - value == 0.0; }
 
 double not_a_number() { return __builtin_nan(""); }
 
-// Return the median of the 3x3 patch at a column and a row, NaN where it cannot be trusted.
-double median_of_patch(const float* depth_m, int64_t width, int64_t column, int64_t row, double least, double most,
-                       double spread) {
+// A sorting network of 25 exchanges for nine numbers (Floyd 1964; Knuth, TAOCP 3, sect. 5.3.4): no branches.
+constexpr int8_t kExchanges[][2] = {{0, 3}, {1, 7}, {2, 5}, {4, 8}, {0, 7}, {2, 4}, {3, 8}, {5, 6}, {0, 2},
+                                    {1, 3}, {4, 5}, {7, 8}, {1, 4}, {3, 6}, {5, 7}, {0, 1}, {2, 4}, {3, 5},
+                                    {6, 8}, {2, 3}, {4, 5}, {6, 7}, {1, 2}, {3, 4}, {5, 6}};
+
+struct DepthImage {
+    const float* depth_m;
+    int64_t width, height;
+};
+
+// Return the index of the first reading of a pixel's patch, -1 if the patch is not inside.
+int64_t patch_at(const DepthImage& image, const double* pixel) {
+    const double column = __builtin_rint(pixel[0]), row = __builtin_rint(pixel[1]);
+    const bool is_inside = column >= 1.0 && row >= 1.0 && column < static_cast<double>(image.width - 1) &&
+                           row < static_cast<double>(image.height - 1);
+    return is_inside ? (static_cast<int64_t>(row) - 1) * image.width + static_cast<int64_t>(column) - 1 : -1;
+}
+
+// A camera's image is in no cache, and its patches lie anywhere: fetch them while others are sorted.
+void fetch(const DepthImage& image, int64_t first) {
+    if (first < 0) return;
+    for (int64_t row = 0; row < 3; ++row) __builtin_prefetch(image.depth_m + first + row * image.width);
+}
+
+// Return the median of the 3x3 patch that begins at an index, NaN where it cannot be trusted.
+double median_of_patch(const DepthImage& image, int64_t first, double least, double most, double spread) {
     float ascending[kPatch];
     int count = 0;
-    for (int64_t y = row - 1; y <= row + 1; ++y)
-        for (int64_t x = column - 1; x <= column + 1; ++x) {
-            const float reading = depth_m[y * width + x];
-            if (!(reading > 0.0f && reading <= __FLT_MAX__)) continue;
-            int at = count++;
-            for (; at > 0 && ascending[at - 1] > reading; --at) ascending[at] = ascending[at - 1];
-            ascending[at] = reading;
-        }
+    for (int k = 0; k < kPatch; ++k) {
+        const float reading = image.depth_m[first + k / 3 * image.width + k % 3];
+        const bool is_valid = reading > 0.0f && reading <= __FLT_MAX__;
+        count += is_valid ? 1 : 0;
+        ascending[k] = is_valid ? reading : __builtin_inff();
+    }
     if (count < kLeastReadings) return not_a_number();
+#pragma GCC unroll 25
+    for (const auto& pair : kExchanges) {
+        const float a = ascending[pair[0]], b = ascending[pair[1]];
+        ascending[pair[0]] = b < a ? b : a;
+        ascending[pair[1]] = b < a ? a : b;
+    }
     const double median = static_cast<double>(ascending[(count - 1) / 2]);
     const double apart = static_cast<double>(ascending[count - 1]) - static_cast<double>(ascending[0]);
     const bool is_trusted = apart < median * spread && median >= least && median <= most;
@@ -80,13 +108,11 @@ __attribute__((visibility("default"))) int32_t rse_pf_points_at(const float* dep
     if (depth_m == nullptr || pixels == nullptr || points_camera == nullptr || rows < 0 || rows > kMaxRows ||
         width < 1 || height < 1 || width > kMaxSide || height > kMaxSide)
         return -1;
+    const DepthImage image = {depth_m, width, height};
     for (int64_t i = 0; i < rows; ++i) {
-        const double column = __builtin_rint(pixels[2 * i]), row = __builtin_rint(pixels[2 * i + 1]);
-        const bool is_inside = column >= 1.0 && row >= 1.0 && column < static_cast<double>(width - 1) &&
-                               row < static_cast<double>(height - 1);
-        const double z = is_inside ? median_of_patch(depth_m, width, static_cast<int64_t>(column),
-                                                     static_cast<int64_t>(row), min_depth_m, max_depth_m, spread)
-                                   : not_a_number();
+        if (i + kAhead < rows) fetch(image, patch_at(image, pixels + 2 * (i + kAhead)));
+        const int64_t first = patch_at(image, pixels + 2 * i);
+        const double z = first < 0 ? not_a_number() : median_of_patch(image, first, min_depth_m, max_depth_m, spread);
         points_camera[3 * i] = (pixels[2 * i] - cx) / fx * z;
         points_camera[3 * i + 1] = (pixels[2 * i + 1] - cy) / fy * z;
         points_camera[3 * i + 2] = z;

@@ -71,6 +71,8 @@ typedef uint16_t Halves __attribute__((vector_size(32)));
 typedef int16_t Distances __attribute__((vector_size(32)));
 
 constexpr int16_t kFar = 0x7fff;
+// After three quarters of their bytes most candidates are known to be too far.
+constexpr int64_t kMost = 24;
 constexpr int64_t kMostBlocks = 0x3fff;
 
 // Per lane of 16: the two least distances, and which half of which block the first of them came from.
@@ -91,31 +93,51 @@ RSE_PF_AVX2 inline Block bits_of_halves(Block bytes) {
         _mm256_shuffle_epi8(reinterpret_cast<__m256i>(counts), reinterpret_cast<__m256i>(bytes)));
 }
 
+// Add the bits of `count` bytes of each of 32 descriptors that differ from the sought one's; at most 31 bytes.
+RSE_PF_AVX2 inline Block differing(const uint8_t* descriptors, const uint8_t* sought, int64_t count) {
+    Block sum = {};
+    for (int64_t k = 0; k < count; ++k) {
+        Block bytes, other;
+        std::memcpy(&bytes, descriptors + kBlock * k, sizeof bytes);
+        std::memcpy(&other, sought + kBlock * k, sizeof other);
+        bytes ^= other;
+        const Block high = reinterpret_cast<Block>(reinterpret_cast<Halves>(bytes) >> 4);
+        sum += bits_of_halves(bytes & 15) + bits_of_halves(high & 15);
+    }
+    return sum;
+}
+
+RSE_PF_AVX2 inline int least_of_eight(__m128i numbers) { return _mm_extract_epi16(_mm_minpos_epu16(numbers), 0); }
+
+// Two candidates at least are as near as this: the nearest of either half of the lanes.
+RSE_PF_AVX2 inline int near_enough(const Sixteen& found) {
+    const __m256i first = reinterpret_cast<__m256i>(found.first);
+    const int low = least_of_eight(_mm256_castsi256_si128(first));
+    const int high = least_of_eight(_mm256_extracti128_si256(first, 1));
+    return low > high ? low : high;
+}
+
 RSE_PF_AVX2 inline Nearest two_nearest_of_blocks(const Search& search, const uint8_t* sought) {
     alignas(32) uint8_t each[kBytes * kBlock];
     for (int64_t k = 0; k < kBytes; ++k) std::memset(each + kBlock * k, sought[k], kBlock);
-    const Distances far = {kFar, kFar, kFar, kFar, kFar, kFar, kFar, kFar, kFar, kFar, kFar, kFar, kFar, kFar, kFar, kFar};
+    const Distances far = Distances{} + kFar;
     Sixteen lanes = {far, far, Distances{}};
+    Block limit = Block{} + static_cast<uint8_t>(255);
     const int64_t blocks = search.rows / kBlock;
     const uint8_t* at = reinterpret_cast<const uint8_t*>(search.room);
-    for (int64_t block = 0; block < blocks; ++block) {
-        Distances even = {}, odd = {};
-        for (int64_t part = 0; part < 2; ++part) {  // 128 bits fit a byte, 256 do not
-            Block sum = {};
-            for (int64_t k = 0; k < kBytes / 2; ++k, at += kBlock) {
-                Block bytes, other;
-                std::memcpy(&bytes, at, sizeof bytes);
-                std::memcpy(&other, each + kBlock * (kBytes / 2 * part + k), sizeof other);
-                bytes ^= other;
-                const Block high = reinterpret_cast<Block>(reinterpret_cast<Halves>(bytes) >> 4);
-                sum += bits_of_halves(bytes & 15) + bits_of_halves(high & 15);
-            }
-            even += reinterpret_cast<Distances>(reinterpret_cast<Halves>(sum) & 255);
-            odd += reinterpret_cast<Distances>(reinterpret_cast<Halves>(sum) >> 8);
-        }
+    for (int64_t block = 0; block < blocks; ++block, at += kBytes * kBlock) {
+        const Block most = differing(at, each, kMost);
+        if (_mm256_movemask_epi8(reinterpret_cast<__m256i>(most < limit)) == 0) continue;
+        const Block rest = differing(at + kMost * kBlock, each + kMost * kBlock, kBytes - kMost);
+        const Distances even = reinterpret_cast<Distances>((reinterpret_cast<Halves>(most) & 255) +
+                                                           (reinterpret_cast<Halves>(rest) & 255));
+        const Distances odd =
+            reinterpret_cast<Distances>((reinterpret_cast<Halves>(most) >> 8) + (reinterpret_cast<Halves>(rest) >> 8));
         const int16_t half = static_cast<int16_t>(2 * block);
         keep_two(lanes, even, Distances{} + half);
         keep_two(lanes, odd, Distances{} + static_cast<int16_t>(half + 1));
+        const int enough = near_enough(lanes);
+        limit = Block{} + static_cast<uint8_t>(enough < 255 ? enough : 255);
     }
     Nearest found = {kNone, kNone};
     for (int lane = 0; blocks > 0 && lane < 16; ++lane) {

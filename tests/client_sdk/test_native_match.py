@@ -6,8 +6,10 @@ import shutil
 import subprocess
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import pytest
 
 from client_sdk import frontend
@@ -18,7 +20,7 @@ from rse_pf import native
 from rse_pf.errors import ConfigurationError
 from rse_pf.geometry import Array, Camera
 
-pytest.importorskip("cv2", reason="pip install 'rse-pf[vision]'")
+cv2 = pytest.importorskip("cv2", reason="pip install 'rse-pf[vision]'")
 
 LIBRARY = native.find_library()
 needs_library = pytest.mark.skipif(
@@ -138,6 +140,106 @@ def test_points_are_those_of_numpy_to_the_last_bit(core, monkeypatch, kind):
     assert_same_bytes(ours, expected)
     assert np.isfinite(ours).any() == (kind != "nothing")
     assert np.isnan(ours).any()
+
+
+def picture(seed: int, height: int, width: int) -> npt.NDArray[np.uint8]:
+    """Return blocks and noise, with black and white areas."""
+    rng = np.random.default_rng(seed)
+    blocks = np.kron(rng.integers(-60, 316, (height // 7 + 1, width // 7 + 1)), np.ones((7, 7)))
+    noisy = blocks[:height, :width] + rng.normal(size=(height, width)) * rng.choice([0, 3, 40])
+    return np.clip(noisy, 0, 255).astype(np.uint8)
+
+
+def keypoints_of(gray: npt.NDArray[np.uint8], features: int) -> tuple[npt.NDArray[Any], ...]:
+    """Return pixels, angles, octaves and descriptors by OpenCV."""
+    orb = cv2.ORB_create(nfeatures=features, scaleFactor=1.2, nlevels=8, fastThreshold=10)
+    found, descriptors = orb.detectAndCompute(gray, None)
+    angles_deg = np.array([each.angle for each in found], np.float32)
+    octaves = np.array([each.octave for each in found], np.int32)
+    return cv2.KeyPoint_convert(found), angles_deg, octaves, descriptors
+
+
+def describes() -> FrontEndCore:
+    assert LIBRARY is not None
+    core = open_front_end(LIBRARY)
+    blank = np.zeros((100, 100), np.uint8), np.empty((0, 2), np.float32)
+    none = np.empty(0, np.float32), np.empty(0, np.int32)
+    if core.describe(*blank, *none, scale=1.2, levels=8) is None:
+        pytest.skip("this processor has no AVX2 or no FMA")
+    return core
+
+
+@needs_library
+@pytest.mark.parametrize(
+    ("height", "width"), [(480, 640), (479, 637), (240, 320), (301, 200), (90, 1000), (101, 110)]
+)
+def test_descriptors_are_those_of_opencv_to_the_last_bit(height, width):
+    core, count = describes(), 0
+    for seed in range(3):
+        gray = picture(seed, height, width)
+        *keypoints, expected = keypoints_of(gray, 2000)
+
+        assert_same_bytes(core.describe(gray, *keypoints, scale=1.2, levels=8), expected)
+        count += len(expected)
+    assert count > 50
+
+
+@needs_library
+def test_keypoints_that_opencv_would_not_find_are_not_described():
+    core, gray = describes(), picture(1, 240, 320)
+    good = np.float32([[160, 120]]), np.float32([30]), np.int32([0])
+
+    def described(pixels=good[0], angles_deg=good[1], octaves=good[2], levels=8, image=gray, scale=1.2):
+        return core.describe(image, pixels, angles_deg, octaves, scale=scale, levels=levels)
+
+    assert described() is not None
+    for x, y in [(22, 22), (297, 217)]:
+        assert described(np.float32([[x, y]])) is not None
+    for x, y in [
+        (21, 99),
+        (99, 21),
+        (298, 99),
+        (99, 218),
+        (-1e9, 99),
+        (np.nan, 99),
+        (99, np.inf),
+        (1e30, 99),
+    ]:
+        assert described(np.float32([[x, y]])) is None
+    assert described(octaves=np.int32([8])) is None
+    assert described(octaves=np.int32([-1])) is None
+    assert described(angles_deg=np.float32([np.nan])) is None
+    assert described(octaves=np.int32([40]), levels=41) is None
+    assert described(octaves=np.int32([1]), scale=0.5) is None
+    assert described(octaves=np.int32([1]), scale=np.nan) is None
+    assert described(octaves=np.int32([7]), scale=1000.0) is None
+    assert described(angles_deg=np.float32([1, 2])) is None
+    assert described(pixels=np.float64([[160, 120]])) is None
+    assert described(image=np.zeros((1, 1), np.uint8)) is None
+
+
+@needs_library
+def test_a_core_that_describes_otherwise_than_opencv_is_not_asked(monkeypatch):
+    core = describes()
+    camera = Camera(fx=300, fy=300, cx=160, cy=120, width=320, height=240)
+    rgb = np.repeat(picture(2, 240, 320)[..., None], 3, axis=2)
+    frame = Frame(timestamp_s=0.0, rgb=rgb, depth_m=np.ones((240, 320), np.float32), camera=camera)
+    use(monkeypatch, core)
+    right = core.describe
+    asked = []
+
+    def wrong(*arguments, **options):
+        asked.append(arguments)
+        return right(*arguments, **options) ^ 1
+
+    monkeypatch.setattr(core, "describe", wrong)
+    found = extract(frame, FrontEndOptions())
+    use(monkeypatch, None)
+    expected = extract(frame, FrontEndOptions())
+
+    assert len(asked) == 1  # for the comparison, and never again
+    assert len(expected.descriptors) > 20
+    assert_same_bytes(found.descriptors, expected.descriptors)
 
 
 @needs_library
