@@ -12,7 +12,7 @@
 extern "C" {
 #endif
 
-#define RSE_PF_CODEC_ABI 2
+#define RSE_PF_CODEC_ABI 3
 
 /* Bytes behind `text_room` and `deflated` that a call may write to. */
 #define RSE_PF_CODEC_SLACK 64
@@ -41,6 +41,7 @@ typedef struct rse_pf_codec_budget {
     int64_t inflated_bytes, free_bytes;
     double inflate_ratio;
     int64_t depth, containers, values, mixed_values, memory_bytes;
+    int64_t short_bytes; /* Above 0: what inflates to more is RSE_PF_CODEC_NEEDS_ROOM, however much room there is. */
 } rse_pf_codec_budget;
 
 /* Which fields of a command were there. */

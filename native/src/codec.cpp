@@ -62,7 +62,9 @@ RSE_PF_CODEC_VISIBLE int32_t rse_pf_codec_read(const uint8_t* data, int64_t byte
     if (encoding == RSE_PF_CODEC_MSGPACK) return read_msgpack(data, bytes, *budget, *call);
     if (encoding == RSE_PF_CODEC_JSON) return read_json(data, bytes, *budget, *call);
     if (encoding != RSE_PF_CODEC_ZLIB || !(budget->inflate_ratio >= 1.0)) return RSE_PF_CODEC_UNKNOWN;
-    Inflater inflater(data, bytes, *budget, call->text, call->text_room);
+    const bool is_limited = budget->short_bytes > 0 && budget->short_bytes < call->text_room;
+    const int64_t room = is_limited ? budget->short_bytes : call->text_room;
+    Inflater inflater(data, bytes, *budget, call->text, room);
     const int32_t status = inflater.inflate();
     call->text_bytes = inflater.bytes();
     call->limit = inflater.limit();

@@ -164,6 +164,7 @@ class _JsonCodec:
         self._compressed = compressed
         self._native, self._pnp = native, pnp
         self._reader = None if native is None else NativeReader(native, self.name, self._budget, pnp)
+        self._short_readers: dict[int, NativeReader] = {}
         self._encode = msgspec.json.Encoder(enc_hook=arrays.json_encode_hook).encode
         self._from_robot = msgspec.json.Decoder(FromRobot).decode
         self._from_server = msgspec.json.Decoder(FromServer).decode
@@ -182,24 +183,40 @@ class _JsonCodec:
         return stream.compress(data) + stream.flush()
 
     def decode_from_robot(self, data: bytes) -> FromRobot:
+        check_size(data, self._budget)
         if self._reader is not None:
-            check_size(data, self._budget)
             found = self._reader.read(data)
-            if isinstance(found, Command):
-                return found
-            if found is not None:
-                message: FromRobot = _guarded(self._from_robot, found)
-                return message
+            if found is not None and not isinstance(found, str):
+                return self._judged(found)
         return self._read(self._open(data))
 
     def decode_short_from_robot(self, data: bytes, max_bytes: int) -> FromRobot | None:
-        text = inflate_short(data, max_bytes) if self._compressed else data
+        if not self._compressed:
+            return None if len(data) > max_bytes else self.decode_from_robot(data)
+        if self._native is not None:
+            reader = self._short_readers.get(max_bytes)
+            if reader is None:
+                reader = NativeReader(self._native, self.name, self._budget, self._pnp, short_bytes=max_bytes)
+                self._short_readers[max_bytes] = reader
+            found = reader.read(data)
+            if isinstance(found, str):
+                return None
+            if found is not None:
+                return self._judged(found)
+        text = inflate_short(data, max_bytes)
         return None if text is None or len(text) > max_bytes else self._read(text)
 
     def decode_from_server(self, data: bytes) -> FromServer:
         text = self._open(data)
         check_json_containers(text, self._budget)
         message: FromServer = _guarded(self._from_server, text)
+        return message
+
+    def _judged(self, found: Command | bytes | memoryview) -> FromRobot:
+        """Return a message that the native core has read or judged."""
+        if isinstance(found, Command):
+            return found
+        message: FromRobot = _guarded(self._from_robot, found)
         return message
 
     def _is_pose(self, message: Message) -> bool:

@@ -11,7 +11,7 @@ import struct
 from collections.abc import Callable
 from functools import cache, lru_cache
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import msgspec
 import numpy as np
@@ -24,7 +24,7 @@ from rse_pf.wire.messages import Command
 
 __all__ = ["NativeCodec", "NativeReader", "PnpTypes", "native_codec", "open_codec"]
 
-_ABI = 2
+_ABI = 3
 _READ, _NOT_MINE, _NEEDS_ROOM, _UNKNOWN = 0, 1, 11, 12
 _ENCODINGS = {"json": 0, "zlib": 1, "bin": 2}
 _TEXT_ROOM, _NUMBERS_ROOM = 1 << 17, 1 << 16
@@ -82,7 +82,15 @@ class NativeCodec:
 class NativeReader:
     """Read and judge what robots send in one encoding."""
 
-    def __init__(self, native: NativeCodec, encoding: str, budget: Budget, types: PnpTypes | None) -> None:
+    def __init__(
+        self,
+        native: NativeCodec,
+        encoding: str,
+        budget: Budget,
+        types: PnpTypes | None,
+        *,
+        short_bytes: int = 0,
+    ) -> None:
         """Prepare to read.
 
         Args:
@@ -90,7 +98,9 @@ class NativeReader:
             encoding: ``json``, ``zlib`` or ``bin``.
             budget: The limits.
             types: What a `pnp` command is read as; without them no command is.
+            short_bytes: What inflates to more is not read; 0 is no such limit.
         """
+        self._short_bytes = short_bytes
         self._native, self._budget, self._types = native, budget, types
         self._code, self._is_deflated, self._is_json = (
             _ENCODINGS[encoding],
@@ -98,8 +108,8 @@ class NativeReader:
             encoding != "bin",
         )
         self._limits = struct.pack(
-            "=qqdqqqqq", budget.inflated_bytes, budget.free_bytes, budget.inflate_ratio, budget.depth,
-            budget.containers, budget.values, budget.mixed_values, budget.memory_bytes,
+            "=qqdqqqqqq", budget.inflated_bytes, budget.free_bytes, budget.inflate_ratio, budget.depth,
+            budget.containers, budget.values, budget.mixed_values, budget.memory_bytes, short_bytes,
         )  # fmt: skip
 
     def check(self, data: bytes | bytearray) -> bool:
@@ -121,7 +131,7 @@ class NativeReader:
             raise self._refused(status, len(data), 0)
         return bool(status == _NOT_MINE)
 
-    def read(self, data: bytes) -> Command | bytes | memoryview | None:
+    def read(self, data: bytes) -> Command | bytes | memoryview | Literal["longer"] | None:
         """Inflate a message from a robot if it is deflated, judge it, and read it if it is a plain one.
 
         Args:
@@ -129,7 +139,8 @@ class NativeReader:
 
         Returns:
             The command, if it is a plain one of `pnp`; else the bytes that are to be decoded, until the next
-            call of this thread; None if they have to be judged elsewhere, too.
+            call of this thread; ``longer`` if it inflates to more than *short_bytes*; None if it has to be
+            judged elsewhere.
 
         Raises:
             LimitExceeded: It holds more than the budget allows.
@@ -143,6 +154,8 @@ class NativeReader:
         text: bytes | memoryview = buffers.text_view if self._is_deflated else data
         status = calls.read(data, size, self._limits, self._code, buffers.call_at)
         if status == _NEEDS_ROOM:
+            if self._short_bytes:
+                return "longer"
             status, text = self._with_more_room(data)
         found = _FOUND.unpack_from(buffers.call, _FOUND_AT)
         if status == _READ and self._types is not None:

@@ -21,14 +21,14 @@ from fuzz.native_targets import native, outcome
 from fuzz.samples import samples
 from rse_pf.budget import Budget, check_json, check_msgpack, inflate_within
 from rse_pf.config import PlatformSettings, SessionSettings
-from rse_pf.errors import ConfigurationError, LimitExceeded, RsePfError
+from rse_pf.errors import BadMessage, ConfigurationError, LimitExceeded, RsePfError
 from rse_pf.geometry import Camera
 from rse_pf.pnp import PnpOptions
 from rse_pf.pnp.problems import make_problem
 from rse_pf.service import Registry, dispatch
 from rse_pf.services.builtin import builtin_services
 from rse_pf.services.pnp import PnpReply, PnpRequest, make_request, wire_types
-from rse_pf.wire import CODECS, Command, Result, make_codec
+from rse_pf.wire import CODECS, Command, Ping, Result, make_codec
 from rse_pf.wire.native_codec import NativeReader, PnpTypes, native_codec, open_codec
 
 NATIVE = native_codec()
@@ -227,6 +227,32 @@ def test_damaged_messages_get_the_same_verdict(codec: str) -> None:
         if codec == "zlib" and number % 3:
             data = zlib.compress(mutated(zlib.decompress(data), draw), draw.choice((0, 1, 6)))
         assert_alike(codec, data if codec == "zlib" and number % 3 else mutated(data, draw))
+
+
+@pytest.mark.parametrize("codec", CODECS)
+def test_a_short_message_is_read_at_once_and_a_longer_one_is_not(codec: str) -> None:
+    fast, plain = make_codec(codec, pnp=TYPES), make_codec(codec, use_native=False)
+    texts = [command_of("1,2.5,3"), json.dumps({"type": "ping", "sent_s": 1.5, "x": "y" * 500}).encode()]
+    messages = [zlib.compress(text) if codec == "zlib" else text for text in texts]
+    messages = [sample("bin"), make_codec("bin").encode(Ping(sent_s=1.5))] if codec == "bin" else messages
+    for data in messages:
+        text = zlib.decompress(data) if codec == "zlib" else data
+        for max_bytes in (1, len(text) - 1, len(text), len(text) + 1, 10**6):
+            expected = plain.decode_short_from_robot(data, max_bytes)
+            got = fast.decode_short_from_robot(data, max_bytes)
+
+            assert (got is None) == (expected is None) == (len(text) > max_bytes)
+            if got is not None and data is messages[0]:
+                assert isinstance(got, Command)
+                assert isinstance(got.payload, PnpRequest)
+            elif got is not None:
+                assert got == expected
+    if codec == "zlib":
+        for wrong in (b"", b"{}", messages[0][:-1], messages[0] + b"x", messages[0][:-1] + b"x"):
+            with pytest.raises(BadMessage) as refused:
+                plain.decode_short_from_robot(wrong, 10**6)
+            with pytest.raises(BadMessage, match=refused.value.message):
+                fast.decode_short_from_robot(wrong, 10**6)
 
 
 def test_inputs_of_the_fuzz_target_get_the_same_verdict() -> None:
