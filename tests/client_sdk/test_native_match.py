@@ -175,7 +175,7 @@ def describes() -> FrontEndCore:
 )
 def test_descriptors_are_those_of_opencv_to_the_last_bit(height, width):
     core, count = describes(), 0
-    for seed in range(3):
+    for seed in (0, 1, 2, 95, 153):  # in the last two, of 480x640, a product rounded for itself changes a bit
         gray = picture(seed, height, width)
         *keypoints, expected = keypoints_of(gray, 2000)
 
