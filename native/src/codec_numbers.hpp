@@ -151,14 +151,16 @@ inline const uint8_t* read_short(const uint8_t* at, const uint8_t* end, double& 
     if (end - at < 32) return nullptr;
     const uint32_t others = not_digits(at);
     const uint32_t is_negative = others & 1;
-    if (is_negative != 0 && *at != '-') return nullptr;
+    // Signs and leading zeros come at random: one condition of both halves is guessed right, two are not.
+    if ((is_negative & static_cast<uint32_t>(*at != '-')) != 0) return nullptr;
     const uint32_t behind_sign = others & ~1u;
     const uint32_t behind_point = behind_sign & (behind_sign - 1);
     if (behind_point == 0) return nullptr;
     const int32_t point = __builtin_ctz(behind_sign);
     const int32_t whole_digits = point - static_cast<int32_t>(is_negative);
     const uint8_t* const first = at + is_negative;
-    if (whole_digits == 0 || whole_digits > 8 || (*first == '0' && whole_digits > 1)) return nullptr;
+    const bool has_leading_zero = (static_cast<uint32_t>(*first == '0') & static_cast<uint32_t>(whole_digits > 1)) != 0;
+    if (whole_digits == 0 || whole_digits > 8 || has_leading_zero) return nullptr;
     uint64_t digits = value_of_digits(eight_bytes(first), whole_digits);
     if (at[point] != '.') {
         if (at[point] == 'e' || at[point] == 'E') return nullptr;
