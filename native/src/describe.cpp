@@ -330,6 +330,10 @@ extern "C" __attribute__((visibility("default"))) int32_t rse_pf_describe(
     return describe_all({gray, width, height}, scales, levels, {pixels, cosines, sines, octaves, rows}, work,
                         descriptors);
 #else
+    // Not written for other processors yet: the caller describes with OpenCV.
+    const void* const unused[] = {gray, scales, pixels, cosines, sines, octaves, workspace, descriptors};
+    static_cast<void>(unused);
+    static_cast<void>(width + height + levels + rows);
     return -1;
 #endif
 }
