@@ -18,6 +18,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -122,7 +123,7 @@ def measure(dataset: Dataset, compared: list[Way], pairs: int, *, wide: bool) ->
         features = 4000 if wide else 1000
         orb = cv2.ORB_create(nfeatures=features, scaleFactor=1.2, nlevels=8, fastThreshold=10)
         gray = cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY)
-        orb_us.append(cpu_us(lambda orb=orb, gray=gray: orb.detectAndCompute(gray, None))[0])
+        orb_us.append(cpu_us(partial(orb.detectAndCompute, gray, None))[0])
     whole = {way.name: np.add(way.extract_us, way.match_us) for way in compared}
     reference = np.median(whole[compared[0].name])
     found = [
