@@ -29,7 +29,7 @@ def test_three_robots_become_one_map_within_the_bar(recordings: Path) -> None:
     merged = merge_versions([robot.version for robot in robots.runs])
 
     assert merged.joined == (0, 1, 2)
-    assert robots.ate_m(joined_poses(robots.runs, merged)) <= 0.045
+    assert robots.ate_m(joined_poses(robots.runs, merged)) <= 0.033
     for metres, degrees in origin_errors(robots, merged):
         assert metres <= 0.07
         assert degrees <= 2.5
@@ -59,7 +59,7 @@ def test_closing_loops_reduces_the_error_of_one_robot(recordings: Path) -> None:
 
     ate_m = robots.ate_m(joined_poses(robots.runs, merged))
     assert merged.loops >= 3
-    assert ate_m <= 0.045
+    assert ate_m <= 0.030
     assert ate_m <= robots.ate_m(joined_poses(robots.runs, without))
 
 
