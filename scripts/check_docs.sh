@@ -1,0 +1,9 @@
+#!/bin/sh
+# Fail if `make docs` would change a page: somebody forgot to run it.
+set -eu
+cd "$(dirname "$0")/.."
+before=$(mktemp -d)
+trap 'rm -rf "$before"' EXIT
+cp -R docs "$before/docs"
+make --no-print-directory docs
+diff -r "$before/docs" docs || { echo "docs: run make docs, and commit what it writes" >&2; exit 1; }
