@@ -158,10 +158,12 @@ def _wheelhouse(folder: Path, ours: list[Path], wheels: Path) -> None:
 
 def _write_hashes(folder: Path) -> None:
     """Name every wheel of *folder* with its version and hash, as pip requires them."""
-    lines = []
+    hashes: dict[str, str] = {}
     for wheel in sorted(folder.glob("*.whl")):
         name, version, *_ = wheel.name.split("-")
-        lines.append(f"{name}=={version} --hash=sha256:{hashlib.sha256(wheel.read_bytes()).hexdigest()}\n")
+        hash_option = f" --hash=sha256:{hashlib.sha256(wheel.read_bytes()).hexdigest()}"
+        hashes[f"{name}=={version}"] = hashes.get(f"{name}=={version}", "") + hash_option
+    lines = [f"{package}{options}\n" for package, options in hashes.items()]
     (folder / "requirements.txt").write_text("".join(lines), encoding="utf-8")
 
 
