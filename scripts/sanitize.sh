@@ -18,7 +18,7 @@ ubsan=$("$compiler" -print-file-name=libubsan.so)
 [ -e "$asan" ] && [ -e "$ubsan" ] || skip "$compiler has no libasan.so and libubsan.so"
 
 folder=$PWD/build/sanitized
-flags="-O1 -g -fsanitize=address,undefined -fno-sanitize-recover=all"
+flags="-O1 -g -fsanitize=address,undefined -fno-sanitize-recover=all -ftrivial-auto-var-init=pattern"
 echo "sanitize: compiling"
 mkdir -p "$folder"
 make --no-print-directory -C native OUT="$folder/rse_pf_native" CXX="$compiler" EXTRA="$flags" all check > "$folder.log" 2>&1 \
