@@ -376,14 +376,65 @@ def bytes_of_bits(bits: str) -> bytes:
     return bytes(int(bits[at : at + 8][::-1], 2) for at in range(0, len(bits), 8))
 
 
+def number(value: int, bits: int) -> str:
+    """Return *value* as a field of a deflate block, lowest bit first."""
+    return "".join(str(value >> bit & 1) for bit in range(bits))
+
+
+def dynamic(literals: int, distances: int, used: tuple[int, ...], lengths: str) -> str:
+    """Return a last block with codes for *literals* and *distances*; the *used* length codes have one bit."""
+    own = "".join("100" if symbol in used else "000" for symbol in ORDER_OF_LENGTHS[:18])
+    return "1" + "01" + number(literals - 257, 5) + number(distances - 1, 5) + number(14, 4) + own + lengths
+
+
+# With the fixed codes of RFC 1951, Sect. 3.2.6, and with codes of their own.
+BLOCKS = {
+    "a match": "1" + "10" + "10010001" + "0000001" + "00000" + "0000000",
+    "a block of no kind": "1" + "11",
+    "a stored block whose sizes differ": "1"
+    + "00"
+    + "00000"
+    + number(1, 16)
+    + number(0xFFFF, 16)
+    + number(7, 8),
+    "a length that is not defined": "1" + "10" + "10010001" + "11000110" + "00000" + "0000000",
+    "a distance that is not defined": "1" + "10" + "10010001" + "0000001" + "11110" + "0000000",
+    "a distance before the beginning": "1" + "10" + "10010001" + "0000001" + "00001" + "0000000",
+    "287 literals": dynamic(
+        287, 1, (18, 1), "1" + number(127, 7) + "1" + number(107, 7) + "0" + "1" + number(18, 7) + "00"
+    ),
+    "31 distances": dynamic(
+        257, 31, (18, 1), "1" + number(127, 7) + "1" + number(107, 7) + "00" + "1" + number(19, 7)
+    ),
+    "no end": dynamic(257, 1, (18, 1), "1" + number(127, 7) + "1" + number(108, 7) + "0"),
+    "a repetition of nothing": dynamic(257, 1, (16, 1), "1" + "00" + "0" * 300),
+    "a repetition past the end": dynamic(257, 1, (18, 1), 2 * ("1" + number(127, 7))),
+    "three codes of one bit": dynamic(257, 1, (18, 1, 0), "0" * 300),
+    "one code for the lengths": dynamic(257, 1, (1,), "0" * 300),
+    "no code for the lengths": dynamic(257, 1, (), "0" * 300),
+}
+
+
+@pytest.mark.parametrize("block", BLOCKS)
+def test_a_malformed_block_is_refused_as_by_zlib(block: str) -> None:
+    data = b"\x78\x9c" + bytes_of_bits(BLOCKS[block])
+    ends = (b"", b"\0" * 12, zlib.adler32(b"aaaa").to_bytes(4, "big"))
+    for end in ends:
+        expected = inflated(data + end, BUDGET, native=False)
+
+        assert inflated(data + end, BUDGET, native=True) == expected
+        assert (expected == ("read", b"aaaa")) == (block == "a match" and end == ends[2])
+
+
 def test_a_stream_of_many_tiny_blocks_is_refused() -> None:
     # A block with codes of its own and nothing in it (RFC 1951, Sect. 3.2.7): 256 zeros, one bit for the end.
     lengths = "".join("100" if symbol in (18, 1) else "000" for symbol in ORDER_OF_LENGTHS[:18])
     block = "0" + "01" + "00000" + "00000" + "0111" + lengths + "1" + "1111111" + "1" + "1101011" + "00" + "0"
-    stream = b"\x78\x9c" + bytes_of_bits(block * 20_000)
+    for count in (70, 20_000):
+        stream = b"\x78\x9c" + bytes_of_bits(block * count)
 
-    with pytest.raises(LimitExceeded, match="tiny blocks"):
-        make_codec("zlib").decode_from_robot(stream)
+        with pytest.raises(LimitExceeded, match="tiny blocks"):
+            make_codec("zlib").decode_from_robot(stream)
 
 
 def test_the_blocks_of_the_smallest_encoder_are_no_tiny_ones() -> None:
