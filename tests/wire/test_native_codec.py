@@ -291,6 +291,8 @@ def corpus() -> Iterator[bytes]:
         b"\x90" * 9000,
     )
     yield b"\xdc\x1b\x58" + b"\x90" * 7000
+    # Marks in a string, behind an escaped quote and behind an escaped backslash.
+    yield from (b'["\\"' + b"[" * 8000 + b'"]', b'["\\"' + b"," * 40_000 + b'"]', b'["\\\\"' + b"," * 40_000)
 
 
 @pytest.mark.parametrize("name", ["json", "bin"])
