@@ -107,6 +107,8 @@ NUMBERS = (
 @pytest.mark.parametrize("number", NUMBERS)
 def test_a_number_is_judged_and_read_as_before(number: str) -> None:
     assert_alike("json", command_of(f"1.25,{number},-3"))
+    # Near the end of a message numbers are read in another way.
+    assert_alike("json", command_of(f"1.25,{number}," + "-3," * 20 + "0"))
     assert_alike("json", command_of(number))
 
 
