@@ -48,7 +48,7 @@ _DESCRIPTORS_PER_ROBOT = 2
 _OTHER_DESCRIPTORS = 256
 _LITTLE_MEMORY_MIB = 1024
 _ENVOY_ANSWERS_S = 10.0
-_NATIVE_FIX = "make -C native, which needs a C++ compiler, or pip install rse-pf-native"
+_NATIVE_FIX = "make -C native, which needs a C++ compiler"
 _ISOLATION_FIX = "allow user namespaces: sysctl -w user.max_user_namespaces=10000"
 
 
