@@ -14,7 +14,6 @@ typed failure for that tenant alone.
 
 from __future__ import annotations
 
-import argparse
 import asyncio
 import json
 import os
@@ -26,7 +25,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from benchmarks.sandboxes import KEY, Row, Server, percentile, serving
+from benchmarks.sandboxes import KEY, Row, Server, percentile, run_rows, serving
 from client_sdk import connect
 from rse_pf.errors import RsePfError
 from rse_pf.services.custom.installed import install
@@ -42,7 +41,7 @@ class Reply(msgspec.Struct):
     number: int
 
 def serve(request: Request) -> Reply:
-    time.sleep(0.3)
+    time.sleep(0.3)  # the service is slow and idle meanwhile, so that only its time is measured
     return Reply(number=request.number)
 """
 SERVICE, COMMON_PAYLOAD = "slow", {"number": 7}
@@ -119,6 +118,7 @@ async def deadlines(folder: Path, seconds: float, *, row: str, payload_of: Calla
                 number += 1
                 payload = payload_of(number)
                 code = await ask(robot, payload, HOSTILE_DEADLINE_S, time.perf_counter(), attacker)
+                # refused: the pace at which an expired call would have ended
                 await asyncio.sleep(0.0 if code == "expired" else HOSTILE_DEADLINE_S)
         await asyncio.gather(*others)
         status, blocks = server.control("/status"), server.control("/blocks")["blocks"]
@@ -199,16 +199,7 @@ async def measure(only: list[str], seconds: float) -> list[Row]:
 
 def main() -> None:
     """Measure, and write the rows."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--only", default="own,shared,sandboxes")
-    parser.add_argument("--seconds", type=float, default=120.0)
-    parser.add_argument("--out", type=Path)
-    args = parser.parse_args()
-    rows = asyncio.run(measure(args.only.split(","), args.seconds))
-    if args.out:
-        args.out.write_text(json.dumps(rows, indent=1) + "\n")
+    run_rows(measure, only="own,shared,sandboxes", seconds=120.0, doc=__doc__)
 
 
 if __name__ == "__main__":

@@ -9,7 +9,6 @@ The time of other robots is measured in turns with and without the hostile robot
 
 from __future__ import annotations
 
-import argparse
 import asyncio
 import json
 import tempfile
@@ -17,7 +16,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from benchmarks.sandboxes import Row, Server, percentile, serving
+from benchmarks.sandboxes import Row, Server, percentile, run_rows, serving
 from rse_pf.errors import RsePfError
 from rse_pf.linux import cpu_seconds, proportional_bytes
 from rse_pf.pnp.problems import make_problem
@@ -125,7 +124,7 @@ def serve(request: Request) -> Reply:
         if request.do == "work_in": burn(end)
     elif request.do != "look":
         globals()[request.do]()
-        time.sleep(request.seconds)
+        time.sleep(request.seconds)  # keeps what it took, so that it can be measured
     return Reply(got="no refusal")
 """
 MEMORY = (
@@ -275,16 +274,7 @@ async def measure(only: list[str], seconds: float) -> list[Row]:
 
 def main() -> None:
     """Measure, and write the rows."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--only", default="memory,cpu")
-    parser.add_argument("--seconds", type=float, default=60.0)
-    parser.add_argument("--out", type=Path)
-    args = parser.parse_args()
-    rows = asyncio.run(measure(args.only.split(","), args.seconds))
-    if args.out:
-        args.out.write_text(json.dumps(rows, indent=1) + "\n")
+    run_rows(measure, only="memory,cpu", seconds=60.0, doc=__doc__)
 
 
 if __name__ == "__main__":

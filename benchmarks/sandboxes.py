@@ -21,7 +21,7 @@ import tempfile
 import time
 import urllib.error
 import urllib.request
-from collections.abc import AsyncIterator, Iterator
+from collections.abc import AsyncIterator, Callable, Coroutine, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -435,18 +435,42 @@ async def measure(only: list[str], crash_s: float) -> list[Row]:
     return rows
 
 
-def main() -> None:
-    """Measure, and write the rows."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--only", default="cost,released,poison,state,crashes")
-    parser.add_argument("--crash-seconds", type=float, default=60.0)
+def run_rows(
+    measure: Callable[[list[str], float], Coroutine[Any, Any, list[Row]]],
+    *,
+    only: str,
+    seconds: float,
+    doc: str | None,
+    option: str = "--seconds",
+) -> None:
+    """Read the command line of a benchmark of rows, measure, and write the rows.
+
+    Args:
+        measure: Gets the names of the rows and the seconds of *option*.
+        only: All names, joined by commas.
+        seconds: Default of *option*.
+        doc: Help of the benchmark.
+        option: Name of the option that gives the seconds.
+    """
+    parser = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--only", default=only)
+    parser.add_argument(option, dest="seconds", type=float, default=seconds)
     parser.add_argument("--out", type=Path)
     args = parser.parse_args()
-    rows = asyncio.run(measure(args.only.split(","), args.crash_seconds))
+    rows = asyncio.run(measure(args.only.split(","), args.seconds))
     if args.out:
         args.out.write_text(json.dumps(rows, indent=1) + "\n")
+
+
+def main() -> None:
+    """Measure, and write the rows."""
+    run_rows(
+        measure,
+        only="cost,released,poison,state,crashes",
+        option="--crash-seconds",
+        seconds=60.0,
+        doc=__doc__,
+    )
 
 
 if __name__ == "__main__":

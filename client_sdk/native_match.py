@@ -17,9 +17,8 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 
-from rse_pf import native
-from rse_pf.errors import ConfigurationError
 from rse_pf.geometry import Array, Camera
+from rse_pf.native import address_of, load_part, open_found
 
 __all__ = ["FrontEndCore", "front_end_core", "open_front_end"]
 
@@ -102,8 +101,9 @@ class FrontEndCore:
         descriptors = np.empty((n, _BYTES), dtype=np.uint8)
         workspace = self._room.words(3 * width * height // 8 + 7 * width + 64)
         done = self._describe(
-            _address(gray), width, height, _address(scales), levels, _address(pixels), _address(cosines),
-            _address(sines), _address(octaves), n, _address(workspace), _address(descriptors),
+            address_of(gray), width, height, address_of(scales), levels, address_of(pixels),
+            address_of(cosines), address_of(sines), address_of(octaves), n, address_of(workspace),
+            address_of(descriptors),
         )  # fmt: skip
         return None if done < 0 else descriptors
 
@@ -137,9 +137,9 @@ class FrontEndCore:
         points_camera = np.empty((len(pixels), 3))
         height, width = depth_m.shape
         done = self._points_at(
-            _address(depth_m), width, height, _address(pixels), len(pixels),
+            address_of(depth_m), width, height, address_of(pixels), len(pixels),
             camera.fx, camera.fy, camera.cx, camera.cy, min_depth_m, max_depth_m, spread,
-            _address(points_camera),
+            address_of(points_camera),
         )  # fmt: skip
         return None if done < 0 else points_camera
 
@@ -185,9 +185,9 @@ class FrontEndCore:
         points_world, matched, depths_m = np.empty((room, 3)), np.empty((room, 2)), np.empty(room)
         workspace = self._room.words(3 * n + 5 * m + 64)
         count = self._matches(
-            _address(reference), _address(points_camera), n, _address(descriptors), _address(pixels),
-            _address(frame_points), m, ratio, room, self._flags, _address(workspace),
-            _address(points_world), _address(matched), _address(depths_m),
+            address_of(reference), address_of(points_camera), n, address_of(descriptors), address_of(pixels),
+            address_of(frame_points), m, ratio, room, self._flags, address_of(workspace),
+            address_of(points_world), address_of(matched), address_of(depths_m),
         )  # fmt: skip
         return None if count < 0 else (points_world[:count], matched[:count], depths_m[:count])
 
@@ -196,27 +196,14 @@ def _is(array: npt.NDArray[Any], kind: type, dimensions: int) -> bool:
     return array.dtype == kind and array.ndim == dimensions
 
 
-def _address(array: npt.NDArray[Any]) -> int:
-    address: int = array.__array_interface__["data"][0]
-    return address
-
-
 def open_front_end(path: Path, lanes: Lanes = "avx512") -> FrontEndCore:
     """Load the library at *path*; *lanes* are the widest instructions it may use.
 
     Raises:
-        ConfigurationError: It cannot be loaded, or was built for another version of this package.
+        ConfigurationError: As `load_part` says.
     """
-    again = "build it again: make -C native"
-    try:
-        library = ctypes.CDLL(str(path))
-        abi, describe = library.rse_pf_match_abi, library.rse_pf_describe
-        points_at, matches = library.rse_pf_points_at, library.rse_pf_match
-    except (OSError, AttributeError) as error:
-        raise ConfigurationError(f"{path} cannot be loaded: {error}", hint=again) from error
-    abi.restype = ctypes.c_uint32
-    if abi() != _ABI:
-        raise ConfigurationError(f"{path} has the front end's ABI {abi()}, not {_ABI}", hint=again)
+    names = "rse_pf_describe", "rse_pf_points_at", "rse_pf_match"
+    describe, points_at, matches = load_part(path, "match", _ABI, *names)
     pointer, size, number = ctypes.c_void_p, ctypes.c_int64, ctypes.c_double
     describe.argtypes = (
         pointer, size, size, pointer, ctypes.c_int32, *[pointer] * 4, size, pointer, pointer
@@ -234,8 +221,4 @@ def open_front_end(path: Path, lanes: Lanes = "avx512") -> FrontEndCore:
 @cache
 def front_end_core() -> FrontEndCore | None:
     """Return the front end of the library that `rse_pf.native` finds; None without one that fits."""
-    path = native.find_library()
-    try:
-        return None if path is None else open_front_end(path)
-    except ConfigurationError:
-        return None
+    return open_found(open_front_end)

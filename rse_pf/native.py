@@ -13,7 +13,7 @@ from collections.abc import Callable
 from functools import cache, lru_cache
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import msgspec
 import numpy as np
@@ -31,7 +31,19 @@ from rse_pf.errors import (
 )
 from rse_pf.geometry import Array, Camera
 
-__all__ = ["Evidence", "NativeOptions", "NativeSolver", "find_library", "native_solver", "open_solver"]
+__all__ = [
+    "Evidence",
+    "NativeOptions",
+    "NativeSolver",
+    "address_of",
+    "find_library",
+    "load_part",
+    "native_solver",
+    "open_found",
+    "open_solver",
+]
+
+Part = TypeVar("Part")
 
 _ABI = 1
 _FILE = "librse_pf_native.so"
@@ -91,14 +103,9 @@ class _Buffers(threading.local):
         result = np.zeros(_RESULT_BYTES, dtype=np.uint8)
         self.request = memoryview(request)  # type: ignore[arg-type]
         self.result = memoryview(result)  # type: ignore[arg-type]
-        self.request_at, self.result_at = _address(request), _address(result)
+        self.request_at, self.result_at = address_of(request), address_of(result)
         self.pose = result[_POSE_AT:_COVARIANCE_AT].view(np.float64).reshape(4, 4)
         self.covariance = result[_COVARIANCE_AT:].view(np.float64).reshape(6, 6)
-
-
-def _address(array: npt.NDArray[Any]) -> int:
-    address: int = array.__array_interface__["data"][0]
-    return address
 
 
 @lru_cache(maxsize=256)
@@ -151,7 +158,7 @@ class NativeSolver:
         n = len(pixels)
         inliers = np.empty(n, dtype=np.int64)
         values = self._run(
-            points_world, pixels, camera, options, 0, _address(inliers), deadline_ns, cancelled
+            points_world, pixels, camera, options, 0, address_of(inliers), deadline_ns, cancelled
         )
         status, reason, count, _, _, trials = values[:6]
         if status:
@@ -195,7 +202,7 @@ class NativeSolver:
         buffers = self._buffers
         request = buffers.request
         flags |= _PORTABLE if options.portable else 0
-        _HEAD.pack_into(request, 0, _ABI, flags, len(pixels), _address(points_world), _address(pixels))
+        _HEAD.pack_into(request, 0, _ABI, flags, len(pixels), address_of(points_world), address_of(pixels))
         request[_HEAD.size : _HEAD.size + _BODY.size] = _packed(camera, options)
         flag_at = 0 if cancelled is None else ctypes.addressof(cancelled)
         _TAIL.pack_into(request, _HEAD.size + _BODY.size, deadline_ns, flag_at)
@@ -271,8 +278,20 @@ def find_library() -> Path | None:
     return next((folder / _FILE for folder in folders if (folder / _FILE).is_file()), None)
 
 
-def open_solver(path: Path) -> NativeSolver:
-    """Load the library at *path*.
+def address_of(array: npt.NDArray[Any]) -> int:
+    """Return where the first number of *array* lies in memory."""
+    address: int = array.__array_interface__["data"][0]
+    return address
+
+
+def load_part(path: Path, part: str, abi: int, *functions: str) -> list[Any]:
+    """Return *functions* of the library at *path*, once the version of their part was checked.
+
+    Args:
+        path: Of the library.
+        part: ``native`` (the solver), ``codec``, ``depth`` or ``match``: ``rse_pf_PART_abi`` is its version.
+        abi: The version that the caller needs.
+        functions: Their names.
 
     Raises:
         ConfigurationError: It cannot be loaded, or was built for another version of this package.
@@ -280,12 +299,29 @@ def open_solver(path: Path) -> NativeSolver:
     again = "build it again: make -C native"
     try:
         library = ctypes.CDLL(str(path))
-        solve, abi, lanes = library.rse_pf_pnp_solve, library.rse_pf_native_abi, library.rse_pf_native_lanes
+        version = library[f"rse_pf_{part}_abi"]
+        found = [library[name] for name in functions]
     except (OSError, AttributeError) as error:
         raise ConfigurationError(f"{path} cannot be loaded: {error}", hint=again) from error
-    abi.restype, lanes.restype = ctypes.c_uint32, ctypes.c_char_p
-    if abi() != _ABI:
-        raise ConfigurationError(f"{path} has ABI {abi()}, this package needs {_ABI}", hint=again)
+    version.restype = ctypes.c_uint32
+    if version() != abi:
+        raise ConfigurationError(f"{path} has the {part} ABI {version()}, not {abi}", hint=again)
+    return found
+
+
+def open_found(open_part: Callable[[Path], Part]) -> Part | None:
+    """Return what *open_part* opens in the library that `find_library` finds; None without one that fits."""
+    path = find_library()
+    try:
+        return None if path is None else open_part(path)
+    except ConfigurationError:
+        return None
+
+
+def open_solver(path: Path) -> NativeSolver:
+    """Load the library at *path*; raises ConfigurationError as `load_part` says."""
+    solve, lanes = load_part(path, "native", _ABI, "rse_pf_pnp_solve", "rse_pf_native_lanes")
+    lanes.restype = ctypes.c_char_p
     solve.argtypes, solve.restype = (ctypes.c_void_p, ctypes.c_void_p, ctypes.c_void_p), None
     return NativeSolver(solve, lanes().decode())
 

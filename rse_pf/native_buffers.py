@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import struct
 import threading
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 import numpy.typing as npt
+
+from rse_pf.native import address_of
 
 __all__ = ["SLACK", "CallBuffers"]
 
@@ -32,16 +34,11 @@ class CallBuffers(threading.local):
         self.numbers = np.empty(numbers_room, dtype=np.float64)
         self.call = memoryview(call)  # type: ignore[arg-type]
         self.text_view = memoryview(self.text)  # type: ignore[arg-type]
-        self.call_at, self.text_at = _address(call), _address(self.text)
+        self.call_at, self.text_at = address_of(call), address_of(self.text)
         self.lend(self.text)
 
     def lend(self, text: npt.NDArray[np.uint8]) -> None:
         """Let the next calls write to *text*, whose last `SLACK` bytes are no room."""
         _HEAD.pack_into(
-            self.call, 0, _address(text), len(text) - SLACK, _address(self.numbers), len(self.numbers)
+            self.call, 0, address_of(text), len(text) - SLACK, address_of(self.numbers), len(self.numbers)
         )
-
-
-def _address(array: npt.NDArray[Any]) -> int:
-    address: int = array.__array_interface__["data"][0]
-    return address

@@ -11,14 +11,13 @@ import threading
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from rse_pf import native
-from rse_pf.errors import ConfigurationError
 from rse_pf.geometry import Array, Camera
+from rse_pf.native import address_of, load_part, open_found
 
 __all__ = ["DepthCore", "RefinedPose", "depth_core", "open_depth"]
 
@@ -52,7 +51,7 @@ class _Buffers(threading.local):
         request, result = np.zeros(_REQUEST_BYTES, np.uint8), np.zeros(_RESULT_BYTES, np.uint8)
         self.request = memoryview(request)  # type: ignore[arg-type]
         self.result = memoryview(result)  # type: ignore[arg-type]
-        self.request_at, self.result_at = _address(request), _address(result)
+        self.request_at, self.result_at = address_of(request), address_of(result)
         self.start = request[_POSE_AT:].view(np.float64).reshape(4, 4)
         self.pose = result[_FOUND_AT:_COVARIANCE_AT].view(np.float64).reshape(4, 4)
         self.covariance = result[_COVARIANCE_AT:].view(np.float64).reshape(6, 6)
@@ -61,7 +60,7 @@ class _Buffers(threading.local):
     def lend(self, rows: int) -> None:
         self.rows = rows
         self.workspace = np.empty(_COLUMNS * (rows + _SPARE_ROWS))
-        self.workspace_at = _address(self.workspace)
+        self.workspace_at = address_of(self.workspace)
 
 
 class DepthCore:
@@ -114,7 +113,7 @@ class DepthCore:
         if k > buffers.rows:
             buffers.lend(2 * k)
         _HEAD.pack_into(
-            buffers.request, 0, _ABI, self._flags, n, k, *map(_address, arrays), _address(rows),
+            buffers.request, 0, _ABI, self._flags, n, k, *map(address_of, arrays), address_of(rows),
             camera.fx, camera.fy, camera.cx, camera.cy, *noise, rmse_px,
         )  # fmt: skip
         buffers.start[:] = T_camera_reference
@@ -125,26 +124,9 @@ class DepthCore:
         return "kept" if status == _KEPT else "refused"
 
 
-def _address(array: npt.NDArray[Any]) -> int:
-    address: int = array.__array_interface__["data"][0]
-    return address
-
-
 def open_depth(path: Path, *, portable: bool = False) -> DepthCore:
-    """Load the library at *path*; *portable* forbids AVX2.
-
-    Raises:
-        ConfigurationError: It cannot be loaded, or was built for another version of this package.
-    """
-    again = "build it again: make -C native"
-    try:
-        library = ctypes.CDLL(str(path))
-        abi, refine = library.rse_pf_depth_abi, library.rse_pf_depth_refine
-    except (OSError, AttributeError) as error:
-        raise ConfigurationError(f"{path} cannot be loaded: {error}", hint=again) from error
-    abi.restype = ctypes.c_uint32
-    if abi() != _ABI:
-        raise ConfigurationError(f"{path} has the refinement's ABI {abi()}, not {_ABI}", hint=again)
+    """Load the library at *path*; *portable* forbids AVX2; raises ConfigurationError as `load_part` says."""
+    (refine,) = load_part(path, "depth", _ABI, "rse_pf_depth_refine")
     refine.argtypes, refine.restype = (ctypes.c_void_p,) * 3, None
     return DepthCore(refine, portable=portable)
 
@@ -152,8 +134,4 @@ def open_depth(path: Path, *, portable: bool = False) -> DepthCore:
 @cache
 def depth_core() -> DepthCore | None:
     """Return the refinement of the library that `rse_pf.native` finds; None without one that fits."""
-    path = native.find_library()
-    try:
-        return None if path is None else open_depth(path)
-    except ConfigurationError:
-        return None
+    return open_found(open_depth)

@@ -17,14 +17,15 @@ import msgspec
 import numpy as np
 
 from rse_pf.budget import Budget, Refusal, refusal
-from rse_pf.errors import ConfigurationError, RsePfError
-from rse_pf.native import find_library
+from rse_pf.errors import RsePfError
+from rse_pf.native import load_part, open_found
 from rse_pf.native_buffers import SLACK, CallBuffers
 from rse_pf.wire.messages import Command
 
 __all__ = ["NativeCodec", "NativeReader", "PnpTypes", "native_codec", "open_codec"]
 
 _ABI = 3
+_NAMES = "rse_pf_codec_check", "rse_pf_codec_read", "rse_pf_codec_deflate"
 _READ, _NOT_MINE, _NEEDS_ROOM, _UNKNOWN = 0, 1, 11, 12
 _ENCODINGS = {"json": 0, "zlib": 1, "bin": 2}
 _TEXT_ROOM, _NUMBERS_ROOM = 1 << 17, 1 << 16
@@ -194,7 +195,7 @@ class _Calls(NamedTuple):
 
 def _functions(library: ctypes.CDLL) -> _Calls:
     integer, pointer, text = ctypes.c_int64, ctypes.c_void_p, ctypes.c_char_p
-    check, read, deflate = library.rse_pf_codec_check, library.rse_pf_codec_read, library.rse_pf_codec_deflate
+    check, read, deflate = (library[name] for name in _NAMES)
     check.argtypes, check.restype = (text, integer, text, ctypes.c_int32), ctypes.c_int32
     read.argtypes, read.restype = (text, integer, text, ctypes.c_int32, pointer), ctypes.c_int32
     deflate.argtypes, deflate.restype = (text, integer, pointer, integer), integer
@@ -249,30 +250,12 @@ def _head(types: PnpTypes, head: bytes) -> tuple[Any, Any]:
 
 
 def open_codec(path: Path) -> NativeCodec:
-    """Load the codecs' part of the library at *path*.
-
-    Raises:
-        ConfigurationError: It cannot be loaded, or was built for another version of this package.
-    """
-    try:
-        abi = ctypes.CDLL(str(path)).rse_pf_codec_abi
-    except (OSError, AttributeError) as error:
-        raise ConfigurationError(
-            f"{path} cannot be loaded: {error}", hint="build it again: make -C native"
-        ) from error
-    abi.restype = ctypes.c_uint32
-    if abi() != _ABI:
-        raise ConfigurationError(
-            f"{path} has codec ABI {abi()}, this package needs {_ABI}", hint="build it again: make -C native"
-        )
+    """Load the codecs' part of the library at *path*; raises ConfigurationError as `load_part` says."""
+    load_part(path, "codec", _ABI, *_NAMES)
     return NativeCodec(path)
 
 
 @cache
 def native_codec() -> NativeCodec | None:
     """Return the codec of the library that `find_library` finds, None if there is none that fits."""
-    path = find_library()
-    try:
-        return None if path is None else open_codec(path)
-    except ConfigurationError:
-        return None
+    return open_found(open_codec)

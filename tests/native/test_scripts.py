@@ -35,7 +35,7 @@ class Checkout:
             (self.programs / tool).symlink_to(found)
 
     @property
-    def library(self) -> Path:
+    def built(self) -> Path:
         """Where the library is put."""
         return self.folder / "native/build/librse_pf_native.so"
 
@@ -75,7 +75,7 @@ def test_any_compiler_is_found_and_its_library_is_put_where_it_is_looked_for(
 
     assert (told.returncode, told.stderr) == (0, "")
     assert f"with {name}" in told.stdout
-    assert checkout.library.is_file()
+    assert checkout.built.is_file()
 
 
 def test_nothing_is_compiled_again_until_a_source_changes(checkout: Checkout) -> None:
@@ -86,7 +86,7 @@ def test_nothing_is_compiled_again_until_a_source_changes(checkout: Checkout) ->
     again = checkout.set_up()
     unchanged = checkout.compilations()
     header = next(checkout.folder.glob("native/src/*.hpp"))
-    later = checkout.library.stat().st_mtime + 10
+    later = checkout.built.stat().st_mtime + 10
     os.utime(header, (later, later))
     checkout.set_up()
 
@@ -110,16 +110,16 @@ def test_a_compiler_that_fails_does_not_stop_the_setup_and_leaves_no_old_library
     checkout: Checkout, variables: dict[str, str]
 ) -> None:
     checkout.add_compiler("c++", status=1)
-    checkout.library.parent.mkdir()
-    checkout.library.write_bytes(b"of older sources")
-    os.utime(checkout.library, (0, 0))
+    checkout.built.parent.mkdir()
+    checkout.built.write_bytes(b"of older sources")
+    os.utime(checkout.built, (0, 0))
 
     told = checkout.set_up(**variables)
 
     assert told.returncode == 0
     assert "does not compile" in told.stderr
     assert "build.log" in told.stderr
-    assert not checkout.library.exists()
+    assert not checkout.built.exists()
 
 
 @pytest.mark.slow

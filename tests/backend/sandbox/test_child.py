@@ -323,9 +323,10 @@ def test_the_readable_paths_hold_no_program_home_setting_or_other_service(tmp_pa
 
     secret = (
         "/usr/bin", "/usr/sbin", "/usr/local", "/usr/local/bin", "/usr/local/share", "/usr/share",
-        "/usr/src", "/bin", "/etc", "/etc/passwd", "/home", "/root", "/root/.ssh", "/proc",
+        "/usr/src", "/bin", "/etc", "/etc/passwd", "/home", "/proc",
         "/sys", "/var", "/opt", "/srv",
-        str(Path.cwd() / "tests"), sys.prefix, f"{sys.prefix}/bin", f"{sys.base_prefix}/bin",
+        str(Path.home()), str(Path.home() / ".ssh"), str(Path.cwd() / "tests"),
+        sys.prefix, f"{sys.prefix}/bin", f"{sys.base_prefix}/bin",
         str(tmp_path.parent), str(tmp_path.parent / "other-service"),
     )  # fmt: skip
     assert [name for name in secret if readable(name)] == []
