@@ -49,6 +49,11 @@ class Rejected:
     headers: Mapping[str, str] = field(default_factory=dict)
 
 
+def _offered_token(offered: list[str]) -> str:
+    """Return the token among the offered sub-protocols, as the header has it; a browser sets no header."""
+    return next((f"Bearer {each[7:]}" for each in offered if each.startswith("bearer.")), "")
+
+
 def _rejection(status: int, code: str, message: str, hint: str, **headers: str) -> Rejected:
     body = json.dumps({"code": code, "message": message, "hint": hint}, separators=(",", ":")).encode()
     named = {name.replace("_", "-"): value for name, value in headers.items()}
@@ -117,7 +122,7 @@ class HandshakePolicy:
             return self._full
         claims = None
         if self.keys is not None:
-            scheme, _, token = authorization.partition(" ")
+            scheme, _, token = (authorization or _offered_token(offered)).partition(" ")
             verified = self.verified(token.strip(), now_s) if scheme.lower() == "bearer" else "unknown"
             if isinstance(verified, str):
                 return replace(self._no_token, reason=verified)

@@ -56,6 +56,18 @@ def test_the_first_offered_subprotocol_that_the_server_speaks_is_chosen():
     assert verdict.codec == "json"
 
 
+def test_a_browser_may_offer_its_token_as_a_subprotocol_which_is_never_selected():
+    offered = [SUBPROTOCOLS["json"], f"bearer.{token()}"]
+
+    accepted = judge(authorization="", offered=offered)
+    wrong = judge(authorization="", offered=[SUBPROTOCOLS["json"], f"bearer.{token()}x"])
+
+    assert isinstance(accepted, Accepted)
+    assert (accepted.robot, accepted.subprotocol) == (RobotId("default", "robot-1"), SUBPROTOCOLS["json"])
+    assert isinstance(wrong, Rejected)
+    assert wrong.body == judge(authorization="").body
+
+
 @pytest.mark.parametrize(
     ("changed", "status", "result"),
     [
