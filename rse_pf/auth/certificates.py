@@ -1,0 +1,212 @@
+"""A certificate authority of one platform, and the server certificates that it issues (X.509, ECDSA P-256).
+
+The authority may vouch for addresses and for names under ``local`` only, so that a browser that trusts it
+cannot be misled about any other site by somebody who stole its key.  The time is an argument; keys come from
+the operating system through `cryptography`.  Files belong to the caller.
+
+Source:
+    RFC 5280, Sect. 4.2.1.6 (subject alternative names) and 4.2.1.10 (name constraints).
+"""
+
+from __future__ import annotations
+
+import datetime
+import hashlib
+import ipaddress
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from rse_pf.errors import MissingExtra, UsageError
+
+if TYPE_CHECKING:
+    from cryptography import x509
+    from cryptography.hazmat.primitives.asymmetric import ec
+
+__all__ = ["AUTHORITY_S", "SERVER_S", "CertificateWithKey", "issue_server_certificate", "make_authority"]
+
+AUTHORITY_S = 3650 * 86400
+"""How long an authority is valid: robots keep its certificate."""
+SERVER_S = 90 * 86400
+"""How long a server certificate is valid; browsers refuse more than 398 days."""
+_EARLIER_S = 86400
+"""A certificate is valid from so long before it was made: the clock of a robot may be slow."""
+_HINT = "remove the file; a new one is made, and robots must be enrolled again"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CertificateWithKey:
+    """A certificate and its private key, both PEM; ``private_key`` is a secret."""
+
+    certificate: str
+    private_key: str
+
+    @property
+    def pem(self) -> str:
+        """Certificate and key in one text, as a file holds them."""
+        return self.certificate + self.private_key
+
+    @classmethod
+    def from_pem(cls, text: str) -> CertificateWithKey:
+        """Return what `pem` wrote; raises UsageError."""
+        certificate, marker, key = text.partition("-----BEGIN PRIVATE KEY-----")
+        made = cls(certificate=certificate, private_key=marker + key)
+        made._read()
+        return made
+
+    @property
+    def expires_s(self) -> float:
+        """The Unix time at which the certificate ends."""
+        return self._read()[0].not_valid_after_utc.timestamp()
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The addresses and names that the certificate is for; empty for an authority."""
+        x509, _, _ = _cryptography()
+        try:
+            found = self._read()[0].extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+        except x509.ExtensionNotFound:
+            return ()
+        return tuple(str(each.value) for each in found)
+
+    @property
+    def fingerprint(self) -> str:
+        """The SHA-256 of the certificate, in pairs of hexadecimal digits, as browsers show it."""
+        _, _, serialization = _cryptography()
+        digest = hashlib.sha256(self._read()[0].public_bytes(serialization.Encoding.DER)).hexdigest().upper()
+        return ":".join(digest[at : at + 2] for at in range(0, len(digest), 2))
+
+    def is_issued_by(self, authority: CertificateWithKey) -> bool:
+        """Return whether *authority* signed this certificate."""
+        try:
+            self._read()[0].verify_directly_issued_by(authority._read()[0])
+        except Exception:  # noqa: BLE001  the library raises errors of several families for a wrong signature
+            return False
+        return True
+
+    def _read(self) -> tuple[x509.Certificate, ec.EllipticCurvePrivateKey]:
+        x509, ec, serialization = _cryptography()
+        try:
+            certificate = x509.load_pem_x509_certificate(self.certificate.encode())
+            key = serialization.load_pem_private_key(self.private_key.encode(), None)
+        except (ValueError, TypeError) as error:
+            raise UsageError("this is not a certificate with its key", hint=_HINT) from error
+        if not isinstance(key, ec.EllipticCurvePrivateKey) or key.public_key() != certificate.public_key():
+            raise UsageError("certificate and key do not belong together", hint=_HINT)
+        return certificate, key
+
+
+def make_authority(name: str, *, now_s: float) -> CertificateWithKey:
+    """Return a new authority for the platform called *name*, valid from *now_s* (Unix) for `AUTHORITY_S`.
+
+    Raises:
+        MissingExtra: ``cryptography`` is not installed.
+    """
+    x509, ec, _ = _cryptography()
+    key = ec.generate_private_key(ec.SECP256R1())
+    subject = _subject(f"RSE-PF authority of platform {name}")
+    everywhere = [ipaddress.ip_network("0.0.0.0/0"), ipaddress.ip_network("::/0")]
+    permitted = [
+        *map(x509.IPAddress, everywhere),
+        x509.DNSName("local"),
+        x509.DNSName("localhost"),
+    ]
+    builder = (
+        _builder(subject, subject, key, now_s, AUTHORITY_S)
+        .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
+        .add_extension(_usage(key_cert_sign=True, crl_sign=True), critical=True)
+        .add_extension(
+            x509.NameConstraints(permitted_subtrees=permitted, excluded_subtrees=None), critical=True
+        )
+    )
+    return _signed(builder, key, key)
+
+
+def issue_server_certificate(
+    authority: CertificateWithKey, names: Sequence[str], *, now_s: float
+) -> CertificateWithKey:
+    """Return a certificate for *names*, addresses or names under ``local``, valid for `SERVER_S`.
+
+    Args:
+        authority: Signs it.
+        names: What clients may connect to; at least one.
+        now_s: Unix seconds.
+
+    Raises:
+        MissingExtra: ``cryptography`` is not installed.
+        UsageError: *authority* is damaged.
+    """
+    x509, ec, _ = _cryptography()
+    signer, signing_key = authority._read()
+    key = ec.generate_private_key(ec.SECP256R1())
+    until_s = min(now_s + SERVER_S, authority.expires_s)
+    builder = (
+        _builder(_subject("RSE-PF platform"), signer.subject, key, now_s, until_s - now_s)
+        .add_extension(x509.SubjectAlternativeName([_general_name(name) for name in names]), critical=False)
+        .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
+        .add_extension(_usage(digital_signature=True), critical=True)
+        .add_extension(x509.ExtendedKeyUsage([x509.oid.ExtendedKeyUsageOID.SERVER_AUTH]), critical=False)
+        .add_extension(
+            x509.AuthorityKeyIdentifier.from_issuer_public_key(signing_key.public_key()), critical=False
+        )
+    )
+    return _signed(builder, key, signing_key)
+
+
+def _builder(subject: Any, issuer: Any, key: Any, now_s: float, valid_s: float) -> Any:
+    x509, _, _ = _cryptography()
+    utc = datetime.timezone.utc
+    return (
+        x509.CertificateBuilder()
+        .subject_name(subject)
+        .issuer_name(issuer)
+        .public_key(key.public_key())
+        .serial_number(x509.random_serial_number())
+        .not_valid_before(datetime.datetime.fromtimestamp(now_s - _EARLIER_S, utc))
+        .not_valid_after(datetime.datetime.fromtimestamp(now_s + valid_s, utc))
+        .add_extension(x509.SubjectKeyIdentifier.from_public_key(key.public_key()), critical=False)
+    )
+
+
+def _signed(builder: Any, key: Any, signing_key: Any) -> CertificateWithKey:
+    _, _, serialization = _cryptography()
+    from cryptography.hazmat.primitives import hashes
+
+    pem, pkcs8 = serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8
+    return CertificateWithKey(
+        certificate=builder.sign(signing_key, hashes.SHA256()).public_bytes(pem).decode("ascii"),
+        private_key=key.private_bytes(pem, pkcs8, serialization.NoEncryption()).decode("ascii"),
+    )
+
+
+def _usage(**allowed: bool) -> Any:
+    x509, _, _ = _cryptography()
+    kinds = (
+        "digital_signature", "content_commitment", "key_encipherment", "data_encipherment", "key_agreement",
+        "key_cert_sign", "crl_sign", "encipher_only", "decipher_only",
+    )  # fmt: skip
+    return x509.KeyUsage(**{kind: allowed.get(kind, False) for kind in kinds})
+
+
+def _subject(name: str) -> Any:
+    x509, _, _ = _cryptography()
+    return x509.Name([x509.NameAttribute(x509.oid.NameOID.COMMON_NAME, name)])
+
+
+def _general_name(name: str) -> Any:
+    x509, _, _ = _cryptography()
+    try:
+        return x509.IPAddress(ipaddress.ip_address(name))
+    except ValueError:
+        return x509.DNSName(name)
+
+
+def _cryptography() -> tuple[Any, Any, Any]:
+    """Return the modules x509, ec and serialization; raises MissingExtra."""
+    try:
+        from cryptography import x509
+        from cryptography.hazmat.primitives import serialization
+        from cryptography.hazmat.primitives.asymmetric import ec
+    except ImportError as error:
+        raise MissingExtra("cryptography", "keys") from error
+    return x509, ec, serialization
