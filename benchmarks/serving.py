@@ -1,0 +1,151 @@
+"""One backend server in processes of its own, and what its process tree uses: shared by benchmarks of load.
+
+It starts `rse-pf serve` with the settings that a benchmark names, on free ports of loopback, and measures
+nothing by itself.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import subprocess
+import sys
+import time
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+from rse_pf.auth.tokens import SigningKey
+from rse_pf.config import PlatformSettings
+from rse_pf.errors import ConfigurationError
+from rse_pf.linux import raise_descriptor_limit
+
+__all__ = ["UNLIMITED", "BenchServer", "cpu_of_tree_s", "machine", "private_bytes_of_tree", "tree"]
+
+UNLIMITED: dict[str, dict[str, Any]] = {
+    "auth": {"required": False},
+    "serving": {
+        "max_robots": 20_000, "max_accepts_per_s": 0.0, "max_handshakes_per_source_per_s": 0.0,
+        "max_unauthenticated": 2000, "max_unauthenticated_per_source": 0,
+    },
+    "session": {"max_commands_per_s": 0.0},
+}  # fmt: skip
+"""Settings for a benchmark that stands for many machines, without tokens, and sends faster than a robot."""
+
+_START_S = 30.0
+_KEY_BYTES = 32
+
+
+def tree(pid: int) -> list[int]:
+    """Return *pid* and the ids of all its living descendants."""
+    family = [pid]
+    for each in family:
+        try:
+            tasks = list(Path(f"/proc/{each}/task").iterdir())
+            family += [int(child) for task in tasks for child in (task / "children").read_text().split()]
+        except OSError:  # it ended meanwhile
+            continue
+    return family
+
+
+def cpu_of_tree_s(pid: int) -> float:
+    """Return the user and system CPU seconds of *pid* and its living descendants."""
+    ticks = 0
+    for each in tree(pid):
+        try:
+            fields = Path(f"/proc/{each}/stat").read_text().rpartition(")")[2].split()
+        except OSError:
+            continue
+        ticks += int(fields[11]) + int(fields[12])
+    return ticks / os.sysconf("SC_CLK_TCK")
+
+
+def private_bytes_of_tree(pid: int) -> int:
+    """Return the memory that only one of *pid* and its descendants uses."""
+    kilobytes = 0
+    for each in tree(pid):
+        try:
+            lines = Path(f"/proc/{each}/smaps_rollup").read_text().splitlines()
+        except OSError:
+            continue
+        kilobytes += sum(int(line.split()[1]) for line in lines if line.startswith("Private_"))
+    return 1024 * kilobytes
+
+
+def machine() -> dict[str, Any]:
+    """Return what a table of figures must say about the machine, now."""
+    return {
+        "cores": os.cpu_count(), "architecture": platform.machine(), "python": platform.python_version(),
+        "load_average": [round(each, 2) for each in os.getloadavg()],
+    }  # fmt: skip
+
+
+class BenchServer:
+    """``with BenchServer(folder, workers=2) as server``: a server of its own, ended with the block.
+
+    *groups* are settings beside the defaults, such as ``session={"max_in_flight": 4}``; `UNLIMITED` is a set
+    of them.  With ``auth.required``, `token` returns tokens that the server accepts.
+    """
+
+    def __init__(self, folder: Path, *, workers: int, **groups: dict[str, Any]) -> None:
+        self.settings = PlatformSettings.from_dict(groups)
+        self.workers = workers
+        self.port = self.control_port = self.pid = 0
+        self._folder = folder
+        self._groups = groups
+        self._key = SigningKey.from_seed(os.urandom(_KEY_BYTES), "bench-1")
+        self._issued = 0
+
+    def __enter__(self) -> BenchServer:
+        raise_descriptor_limit()
+        document = {"context": {"rse-pf": self._groups}}
+        announce = self._folder / "announce.json"
+        announce.unlink(missing_ok=True)
+        (self._folder / "settings.json").write_text(json.dumps(document), encoding="utf-8")
+        command: list[str | Path] = [
+            sys.executable, "-m", "rse_pf.cli.main", "serve", "--settings", self._folder / "settings.json",
+            "--port", "0", "--control-port", "0", "--workers", str(self.workers), "--announce", announce,
+        ]  # fmt: skip
+        if self.settings.auth.required:
+            keys = self._folder / "keys.json"
+            keys.write_text(self._key.key_set().to_json(), encoding="utf-8")
+            command += ["--keys", keys]
+        with self.log_file.open("wb") as log:
+            self._process = subprocess.Popen(command, stdout=log, stderr=log, cwd=self._folder)
+        until = time.monotonic() + _START_S
+        while not announce.exists():
+            if time.monotonic() > until or self._process.poll() is not None:
+                self._process.kill()
+                self._process.wait()
+                raise ConfigurationError(
+                    f"the server did not start within {_START_S:g} s",
+                    hint=self.log_file.read_text(encoding="utf-8", errors="replace")[-500:],
+                )
+            time.sleep(0.02)  # looks again, with a deadline
+        announced = json.loads(announce.read_text(encoding="utf-8"))
+        self.port, self.control_port = announced["port"], announced["control_port"]
+        self.pid = self._process.pid
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._process.terminate()
+        try:
+            self._process.wait(20.0)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+
+    @property
+    def log_file(self) -> Path:
+        """Where the server's log is."""
+        return self._folder / "server.log"
+
+    def token(self, robot: str) -> str:
+        """Return a new token of *robot*."""
+        self._issued += 1
+        return self._key.issue(
+            robot, now=time.time(), token_id=f"t-{self._issued}", settings=self.settings.auth
+        )
