@@ -72,6 +72,7 @@ bench: ## run every benchmark briefly; prints tables, writes JSON to out/bench
 docs: ## write the generated pages and the picture of the packages
 	@$(SETUP) dev
 	@$(BIN)/rse-pf settings --markdown > docs/settings.md
+	@$(BIN)/rse-pf errors --markdown > docs/errors.md
 	@$(BIN)/rse-pf data --openapi > docs/openapi.json
 	@$(BIN)/python scripts/asyncapi.py
 	@$(BIN)/python scripts/architecture.py

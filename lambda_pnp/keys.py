@@ -17,7 +17,7 @@ from typing import TypeVar
 
 from rse_pf.auth.roster import DenyList, Roster, from_json
 from rse_pf.auth.tokens import KeySet
-from rse_pf.errors import NotFound, RsePfError
+from rse_pf.errors import NotFound, RsePfError, message_of
 
 __all__ = ["KeyCache", "read_object", "signed_request"]
 
@@ -58,7 +58,8 @@ class KeyCache:
             except (OSError, RsePfError) as error:
                 self._due_s = clock_s + min(_RETRY_PAUSE_S, self._period_s)
                 sys.stderr.write(
-                    f"cannot fetch the keys: {error}; create them with rse-pf token init --cloud\n"
+                    f"cannot fetch the keys: {message_of(error)}; "
+                    "create them with rse-pf token init --cloud\n"
                 )
         return self._keys
 

@@ -1,13 +1,17 @@
 """The errors of the platform: one base class, stable wire codes, and a hint that is an action.
 
-This module imports nothing of the platform, so that every other one can use it.
+The docstring of each error says its cause, what to check and how to fix it; ``docs/errors.md`` and
+``rse-pf errors CODE`` show these texts.  This module imports nothing of the platform, so that every other
+one can use it.
 """
 
 from __future__ import annotations
 
+import errno
 from typing import ClassVar
 
 __all__ = [
+    "ERRORS_PAGE",
     "AuthError",
     "BadMessage",
     "BadRequest",
@@ -44,7 +48,12 @@ __all__ = [
     "UsageError",
     "WorkerLost",
     "error_from_code",
+    "error_of_system",
+    "message_of",
 ]
+
+ERRORS_PAGE = "docs/errors.md"
+"""The page of all errors; each code is an anchor on it."""
 
 
 class RsePfError(Exception):
@@ -52,6 +61,10 @@ class RsePfError(Exception):
 
     ``code`` is stable and travels on the wire; ``hint`` says what to do next.  A subclass without a code of
     its own has that of its base.
+
+    Cause: An error without a more exact code; its message says what happened.
+    Check: Read the message and the hint.
+    Fix: Do what the hint says; if there is none, report the message with the version of rse-pf.
     """
 
     code: ClassVar[str] = "error"
@@ -69,10 +82,17 @@ class RsePfError(Exception):
         self.retry_after_ms = retry_after_ms
 
     def __str__(self) -> str:
-        return self.message
+        """Return message, hint and the address of the code's explanation, one line each, for tracebacks."""
+        lines = [self.message, f"  hint: {self.hint}"] if self.hint else [self.message]
+        return "\n".join([*lines, f"  see: {self.address()}"])
 
     def __reduce__(self) -> tuple[object, ...]:
         return _bare, (type(self), self.message), self.__dict__
+
+    @classmethod
+    def address(cls) -> str:
+        """Return where the code is explained: the section of the documentation, and the command."""
+        return f"{ERRORS_PAGE}#{cls.code}, or run: rse-pf errors {cls.code}"
 
     def report(self) -> str:
         """Return the two lines shown to a user: what is wrong, and what to do."""
@@ -87,157 +107,342 @@ _KIND_OF_CODE = {RsePfError.code: RsePfError}
 
 
 class ConfigurationError(RsePfError, code="configuration"):
-    """The configuration or the call is invalid; nothing was started."""
+    """The configuration or the call is invalid; nothing was started.
+
+    Cause: Two options contradict each other, or a file or key that the call needs is missing or damaged.
+    Check: Read which option, file or key the message names.
+    Fix: Correct it, then start the command again; nothing has to be undone.
+    """
 
 
 class SettingsError(ConfigurationError, code="settings"):
-    """A setting is unknown, out of range or contradicts another one."""
+    """A setting is unknown, out of range or contradicts another one.
+
+    Cause: The settings file, or an option that is a setting, has an unknown name or a refused value.
+    Check: Run rse-pf settings GROUP: it shows each setting with its value, default and unit.
+    Fix: Correct the named setting in cdk.json, context."rse-pf", in the file of --settings, or in the
+        option.
+    """
 
 
 class UsageError(ConfigurationError, code="usage"):
-    """A command line, path or argument cannot be used."""
+    """A command line, path or argument cannot be used.
+
+    Cause: An option or argument has a wrong form, or names a file, folder or platform that does not exist.
+    Check: Compare the call with rse-pf VERB --help, and the path with what ls shows.
+    Fix: Correct the option, argument or path that the message names.
+    """
 
 
 class MissingExtra(ConfigurationError, code="missing-extra"):
-    """An optional dependency is not installed."""
+    """An optional dependency is not installed.
+
+    Cause: A package that only some users need is not installed in this Python environment.
+    Check: Run rse-pf doctor: it lists every extra, what it enables, and what is missing.
+    Fix: Install the extra with the pip command of the hint, in the environment that runs rse-pf.
+    """
 
     def __init__(self, package: str, extra: str) -> None:
-        super().__init__(f"{package} is not installed", hint=f"pip install 'rse-pf[{extra}]'")
+        super().__init__(
+            f"{package} is not installed: it is in the extra {extra!r}",
+            hint=f"pip install 'rse-pf[{extra}]'",
+        )
 
 
 # --- authentication --------------------------------------------------------------------------------
 
 
 class AuthError(RsePfError, code="auth"):
-    """A robot cannot be authenticated or is not authorized."""
+    """A robot cannot be authenticated or is not authorized.
+
+    Cause: A token, a key or the roster of enrolled robots does not let this robot in.
+    Check: Run rse-pf token inspect TOKEN, and rse-pf robot list.
+    Fix: Issue a new token, or enrol or enable the robot.
+    """
 
 
 class Unauthorized(AuthError, code="unauthorized"):
-    """The token is missing, wrong or expired; the cause is only in the server's log."""
+    """The token is missing, wrong or expired; the cause is only in the server's log.
+
+    Cause: There is no token, or it is expired, revoked, damaged or signed with another platform's key.
+    Check: Run rse-pf token inspect TOKEN: it shows the seconds that are left, and whether the signature is
+        valid.
+    Fix: Issue a new token with rse-pf token issue ROBOT; for runs of over 15 minutes pass an async function
+        that returns a fresh token, such as RobotKey(FILE, ROBOT).token.
+    """
 
 
 class Forbidden(AuthError, code="forbidden"):
-    """The robot is known, but its token does not allow this."""
+    """The robot is known, but its token does not allow this.
+
+    Cause: The robot is disabled, or the scopes of its token or of its entry in the roster do not allow the
+        service.
+    Check: Run rse-pf robot list, and rse-pf token inspect TOKEN: both show the scopes.
+    Fix: Enable the robot, or enrol it or issue its token with the scope that it needs, such as services:pnp.
+    """
 
 
 # --- the wire --------------------------------------------------------------------------------
 
 
 class ProtocolError(RsePfError, code="protocol"):
-    """Bytes or messages break the protocol of ``docs/protocol.md``."""
+    """Bytes or messages break the protocol of ``docs/protocol.md``.
+
+    Cause: One side sent what the protocol does not allow at this point.
+    Check: Compare the messages of your client with docs/protocol.md and its golden messages.
+    Fix: Correct the client; with the Python SDK, install the version of the platform on the robot.
+    """
 
 
 class BadMessage(ProtocolError, code="bad-message"):
-    """A message cannot be decoded."""
+    """A message cannot be decoded.
+
+    Cause: A message is not valid MessagePack or JSON, is not compressed as agreed, or lacks a field.
+    Check: Compare the message with the golden messages in tests/wire/golden, and the sub-protocol with the
+        codec.
+    Fix: Correct the encoder of the client, or request the sub-protocol that it speaks.
+    """
 
 
 class LimitExceeded(ProtocolError, code="too-large"):
-    """A message is larger, deeper or longer than a limit allows."""
+    """A message is larger, deeper or longer than a limit allows.
+
+    Cause: A message has more bytes, levels or values than the server accepts, before or after decompression.
+    Check: Compare both numbers of the message with rse-pf settings session.
+    Fix: Send fewer matches, or store large data through the data service and send its reference.
+    """
 
 
 class UnsupportedProtocol(ProtocolError, code="unsupported"):
-    """The two sides share no sub-protocol or version."""
+    """The two sides share no sub-protocol or version.
+
+    Cause: The server does not offer the requested sub-protocol, or the address is not one of RSE-PF.
+    Check: Check the address and its path /ws, and that robot and server have the same major version.
+    Fix: Correct the address, choose another codec, or upgrade the older side.
+    """
 
 
 class ConnectError(ProtocolError, code="connect"):
-    """The robot could not open or keep a connection."""
+    """The robot could not open or keep a connection.
+
+    Cause: No platform answers at the address, it is full, or a firewall or proxy is in between.
+    Check: Run rse-pf local status on the platform, and compare its address with that of the robot.
+    Fix: Start the platform with rse-pf local, correct the address, or try later if it is full.
+    """
 
 
 class Disconnected(ProtocolError, code="disconnected"):
-    """The connection ended before the answer came."""
+    """The connection ended before the answer came.
+
+    Cause: The connection was lost or closed, and the command did not survive the reconnection.
+    Check: Look at robot.stats: reconnects and last_error name the reason.
+    Fix: Send the command again on the next connection; keep the robot open while calls run.
+    """
 
 
 # --- a command that was not answered with a result ---------------------------------------------
 
 
 class CommandFailed(RsePfError, code="failed"):
-    """A command ended without a result."""
+    """A command ended without a result.
+
+    Cause: The service or the platform ended the command, with the reason in the message.
+    Check: Read the message; the server's log has the details under the trace id of the command.
+    Fix: Correct the request, or report the trace id to the operator of the service.
+    """
 
 
 class BadRequest(CommandFailed, code="bad-request"):
-    """The payload does not fit the service's request type."""
+    """The payload does not fit the service's request type.
+
+    Cause: A field of the request is missing, has a wrong type, or has a value that the service refuses.
+    Check: Compare the request with the request type of the service: docs/protocol.md, section 3, or its
+        source.
+    Fix: Send the field that the message names in the form that it asks for.
+    """
 
 
 class UnknownService(CommandFailed, code="unknown-service"):
-    """The server offers no service of that name."""
+    """The server offers no service of that name.
+
+    Cause: The name is misspelt, or the service is not installed on the servers of this platform.
+    Check: Compare the name with the services that the message lists.
+    Fix: Correct the name, or install the service: rse-pf service install FOLDER, then rse-pf local
+        --services.
+    """
 
 
 class Busy(CommandFailed, code="busy"):
-    """The server sheds load; retry after ``retry_after_ms``."""
+    """The server sheds load; retry after ``retry_after_ms``.
+
+    Cause: More commands arrive than the servers can answer within their deadlines.
+    Check: Run rse-pf local status: it shows the CPU time and the queue of each server.
+    Fix: Wait retry_after_ms before the next command, lower the frame rate, or add servers.
+    """
 
 
 class QuotaExceeded(CommandFailed, code="quota"):
-    """This robot or tenant exceeds its quota."""
+    """This robot or tenant exceeds its quota.
+
+    Cause: The robot sends faster than its rate limit, or it or its tenant has too many commands waiting.
+    Check: Compare the rate of the robot with rse-pf settings session and rse-pf settings serving.
+    Fix: Wait retry_after_ms and send less often, or raise the limit that the message names.
+    """
 
 
 class Stale(CommandFailed, code="stale"):
-    """A newer frame of the same stream replaced this one."""
+    """A newer frame of the same stream replaced this one.
+
+    Cause: The command belongs to a stream, and a newer frame arrived before this one was begun.
+    Check: Look at queue_ms in robot.stats: frames arrive faster than they are answered.
+    Fix: Nothing for live tracking, which wants the newest frame; pass keep=True for frames that must be
+        answered.
+    """
 
 
 class Expired(CommandFailed, code="expired"):
-    """The deadline passed before the work began or the answer came."""
+    """The deadline passed before the work began or the answer came.
+
+    Cause: The network, the queue or the service took longer than the deadline of the command.
+    Check: Compare round_trip_ms, queue_ms and compute_ms in robot.stats with deadline_s.
+    Fix: Raise deadline_s, send less often, add servers, or let the robot answer itself:
+        offload=CloudFirst().
+    """
 
 
 class Cancelled(CommandFailed, code="cancelled"):
-    """The robot or the operator cancelled the command."""
+    """The robot or the operator cancelled the command.
+
+    Cause: The call was cancelled on the robot, or an operator ended the job.
+    Check: Look for a cancelled task or a timeout in the robot's program.
+    Fix: Send the command again if its result is still needed.
+    """
 
 
 class WorkerLost(CommandFailed, code="worker-lost"):
-    """The process that worked on the command died."""
+    """The process that worked on the command died.
+
+    Cause: A worker process or its server was killed, or ran out of memory.
+    Check: Look at the server's log, and at the kernel's log for out of memory: dmesg.
+    Fix: Send the command again; another worker has taken over.
+    """
 
 
 class Crashed(CommandFailed, code="crashed"):
-    """The process of the command crashed, or exceeded its limit of memory or time."""
+    """The process of the command crashed, or exceeded its limit of memory or time.
+
+    Cause: The service's process ended by a signal, or exceeded its memory or twice its deadline.
+    Check: Repeat the request on your machine with rse-pf service test FOLDER: it shows what the process
+        wrote.
+    Fix: Correct the service, or raise the limit that the message names: rse-pf settings services.
+    """
 
 
 class Poison(CommandFailed, code="poison"):
-    """This request crashed two sandboxes and is not tried again within ten minutes."""
+    """This request crashed two sandboxes and is not tried again within ten minutes.
+
+    Cause: Two sandboxes crashed on this same request, so the circuit breaker refuses it for ten minutes.
+    Check: Run rse-pf service status: it shows what is refused, to whom and for how long.
+    Fix: Correct the service and install it again, then run rse-pf service unblock SERVICE.
+    """
 
 
 class InternalError(CommandFailed, code="internal"):
-    """A defect of the service or the server; the log has the details under the trace id."""
+    """A defect of the service or the server; the log has the details under the trace id.
+
+    Cause: The service or the server raised an error that it did not expect.
+    Check: Look in the server's log for the trace id of the command: the traceback is there.
+    Fix: Correct the service; if the traceback is in rse_pf, report it with the request.
+    """
 
 
 # --- perspective-n-point -----------------------------------------------------------------------
 
 
 class PnpError(RsePfError, code="pnp"):
-    """The correspondences give no reliable pose."""
+    """The correspondences give no reliable pose.
+
+    Cause: The matches of the frame do not determine the camera's pose.
+    Check: Compare matches and inliers with earlier frames, and the intrinsics with the image.
+    Fix: Skip the frame, or change the front end as the hint says.
+    """
 
 
 class TooFewCorrespondences(PnpError, code="too-few"):
-    """Fewer correspondences than a pose needs."""
+    """Fewer correspondences than a pose needs.
+
+    Cause: The image shows little texture, is blurred, or overlaps little with the map.
+    Check: Count the features and the matches of the frame.
+    Fix: Skip the frame, move more slowly, raise the frame rate, or use the wide-baseline front end.
+    """
 
 
 class DegenerateGeometry(PnpError, code="degenerate"):
-    """The points do not fix a pose: collinear, coincident or ambiguous."""
+    """The points do not fix a pose: collinear, coincident or ambiguous.
+
+    Cause: The matched points lie on a line or at one place, so that several poses fit.
+    Check: Plot the matched pixels: they lie in one corner or on one edge.
+    Fix: Skip the frame, or spread the features over the image.
+    """
 
 
 class NoConsensus(PnpError, code="no-consensus"):
-    """No pose agrees with more correspondences than chance would give."""
+    """No pose agrees with more correspondences than chance would give.
+
+    Cause: Most matches are wrong, or the intrinsics do not belong to the image.
+    Check: Check fx, fy, cx, cy and the image size, and the unit of the points: metres.
+    Fix: Correct the intrinsics, or use a stricter matcher; for frames far apart, the wide-baseline front
+        end.
+    """
 
 
 class InvalidCamera(PnpError, code="invalid-camera"):
-    """The camera's intrinsics describe no camera."""
+    """The camera's intrinsics describe no camera.
+
+    Cause: A focal length or size is not positive, or the principal point is far outside of the image.
+    Check: Print the camera: fx, fy, cx, cy, width and height are in pixels.
+    Fix: Calibrate the camera again, or correct intrinsics.json.
+    """
 
 
 # --- objects -----------------------------------------------------------------------------------
 
 
 class StoreError(RsePfError, code="store"):
-    """An object cannot be read or written."""
+    """An object cannot be read or written.
+
+    Cause: The disk or the bucket failed, or permissions forbid the access.
+    Check: Check the folder or bucket of data.store: permissions, free space, mount.
+    Fix: Correct the store, then try once more.
+    """
 
 
 class NotFound(StoreError, code="not-found"):
-    """No object of that name is visible to this robot."""
+    """No object of that name is visible to this robot.
+
+    Cause: The name is misspelt, the object belongs to another robot or tenant, or it was deleted.
+    Check: List what there is, for maps with rse-pf map list.
+    Fix: Correct the name, the tenant or the store.
+    """
 
 
 class Conflict(StoreError, code="conflict"):
-    """A compare-and-swap found a version other than the expected one."""
+    """A compare-and-swap found a version other than the expected one.
+
+    Cause: Another writer changed the same object or map first, or a second connection took this robot's
+        name.
+    Check: Read the newest version, and check that no other process has the same token.
+    Fix: Repeat the change on the newest version; give every robot a token of its own.
+    """
 
 
 class StoreFull(StoreError, code="store-full"):
-    """The disk or the quota is full; nothing was stored."""
+    """The disk or the quota is full; nothing was stored.
+
+    Cause: The disk of the store is full, or the robot's quota of bytes is used up.
+    Check: Run df on the folder of data.store, and compare the quota with data.quota_bytes.
+    Fix: Delete objects that are not needed, or raise the quota or the disk.
+    """
 
 
 def error_from_code(
@@ -247,6 +452,37 @@ def error_from_code(
     error = _bare(_KIND_OF_CODE.get(code, CommandFailed), message)
     error.hint, error.retry_after_ms = hint, retry_after_ms
     return error
+
+
+def error_of_system(error: OSError) -> RsePfError:
+    """Return what the operating system refused, with the file or address and a hint that fits."""
+    what = error.strerror or str(error) or type(error).__name__
+    named = "" if error.filename is None else f": {str(error.filename)!r}"
+    kind, hint = _OF_SYSTEM.get(
+        error.errno or 0, (RsePfError, "see what the system says about this file or address")
+    )
+    return kind(f"{what}{named}", hint=hint)
+
+
+_OF_SYSTEM: dict[int, tuple[type[RsePfError], str]] = {
+    errno.ENOSPC: (StoreFull, "free some space (df -h), or name a folder on another disk"),
+    errno.EDQUOT: (StoreFull, "free some of your quota, or name a folder on another disk"),
+    errno.EROFS: (RsePfError, "name a folder that can be written"),
+    errno.EACCES: (RsePfError, "name a file that this user may use, or change its permissions"),
+    errno.EPERM: (RsePfError, "this user may not do that: change its permissions, or name another file"),
+    errno.EADDRINUSE: (RsePfError, "end the program that has this port, or choose another port"),
+    errno.EADDRNOTAVAIL: (RsePfError, "name an address of this machine, such as 127.0.0.1"),
+    errno.ECONNREFUSED: (ConnectError, "start the platform with rse-pf local, or correct the address"),
+    errno.EMFILE: (RsePfError, "raise the limit of open files: ulimit -n 20000"),
+    errno.ENOTDIR: (RsePfError, "a part of this path is a file: name a folder"),
+    errno.EISDIR: (RsePfError, "this is a folder: name a file"),
+    errno.ENAMETOOLONG: (RsePfError, "use a shorter name"),
+}
+
+
+def message_of(error: BaseException) -> str:
+    """Return what *error* says in one sentence, without the hint and the address of an `RsePfError`."""
+    return error.message if isinstance(error, RsePfError) else str(error)
 
 
 def _bare(kind: type[RsePfError], message: str) -> RsePfError:

@@ -23,6 +23,7 @@ from typing import Any, TextIO
 from rse_pf.errors import RsePfError
 
 __all__ = [
+    "counted",
     "error_lines",
     "json_line",
     "printable",
@@ -55,6 +56,11 @@ def printable(text: str) -> str:
     return _NOT_ASCII.sub(_escape, text)
 
 
+def counted(number: int, noun: str) -> str:
+    """Return *number* with *noun* in the singular or with an s: ``1 robot``, ``1,200 points``."""
+    return f"{number:,} {noun}" if number == 1 else f"{number:,} {noun}s"
+
+
 def show(*lines: str, error: bool = False) -> None:
     """Write lines to standard output, each on one line whatever it holds.
 
@@ -83,7 +89,7 @@ def show_error(error: RsePfError) -> None:
 def error_lines(error: RsePfError) -> list[str]:
     """Return the report on *error* as lines; a message of several lines cannot pass for several reports."""
     first = f"{type(error).__name__}: {error.message}".rstrip("\n").replace("\n", f"\n{_CONTINUED}")
-    return first.split("\n") + ([f"  hint: {error.hint}"] if error.hint else [])
+    return [*first.split("\n"), f"  hint: {error.hint}" if error.hint else f"  see: {error.address()}"]
 
 
 def show_progress(text: str, *, is_over: bool) -> None:

@@ -7,7 +7,7 @@ import pickle
 import pytest
 
 from rse_pf import errors
-from rse_pf.errors import CommandFailed, MissingExtra, RsePfError, error_from_code
+from rse_pf.errors import CommandFailed, MissingExtra, RsePfError, error_from_code, message_of
 
 CODES = {
     "AuthError": "auth",
@@ -48,7 +48,7 @@ CODES = {
 }
 """Codes are on the wire: an entry may be added, never changed."""
 
-KINDS = [getattr(errors, name) for name in errors.__all__ if name != "error_from_code"]
+KINDS = [getattr(errors, name) for name in errors.__all__ if name[0].isupper() and name != "ERRORS_PAGE"]
 
 
 def test_every_error_keeps_its_code() -> None:
@@ -70,7 +70,21 @@ def test_a_code_gives_its_error_back_with_all_it_carried(kind: type[RsePfError])
 
     assert type(error) is kind
     assert (error.message, error.hint, error.retry_after_ms) == ("what went wrong", "do this", 20.0)
-    assert str(error) == "what went wrong"
+
+
+def test_an_exception_shows_message_hint_and_the_address_of_its_code() -> None:
+    assert str(errors.Busy("too much", hint="send less")) == (
+        "too much\n  hint: send less\n  see: docs/errors.md#busy, or run: rse-pf errors busy"
+    )
+    assert str(errors.Stale("a newer frame came")).splitlines() == [
+        "a newer frame came",
+        "  see: docs/errors.md#stale, or run: rse-pf errors stale",
+    ]
+
+
+def test_the_sentence_alone_is_what_is_passed_on() -> None:
+    assert message_of(errors.Busy("too much", hint="send less")) == "too much"
+    assert message_of(ValueError("no number")) == "no number"
 
 
 def test_an_unknown_code_of_a_newer_server_is_a_failed_command() -> None:
@@ -92,9 +106,10 @@ def test_a_report_without_a_hint_is_one_line() -> None:
     assert errors.Busy("too much").report() == "Busy: too much"
 
 
-def test_a_missing_extra_names_the_pip_command() -> None:
+def test_a_missing_extra_names_the_extra_and_the_pip_command() -> None:
     assert MissingExtra("picows", "backend").report() == (
-        "MissingExtra: picows is not installed\n  hint: pip install 'rse-pf[backend]'"
+        "MissingExtra: picows is not installed: it is in the extra 'backend'\n"
+        "  hint: pip install 'rse-pf[backend]'"
     )
 
 

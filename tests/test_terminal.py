@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 from rse_pf.errors import CommandFailed
 from rse_pf.terminal import (
+    counted,
     error_lines,
     json_line,
     printable,
@@ -99,7 +100,30 @@ def test_a_message_of_several_lines_cannot_pass_for_two_reports(capsys: pytest.C
 
     lines = ["CommandFailed: cmake failed:", "  | UsageError: x", r"  | \x1b[A", r"  hint: fix\nit"]
     assert capsys.readouterr().err.splitlines() == lines
-    assert error_lines(CommandFailed("short")) == ["CommandFailed: short"]
+    assert error_lines(CommandFailed("short", hint="do this")) == [
+        "CommandFailed: short",
+        "  hint: do this",
+    ]
+
+
+def test_an_error_without_a_hint_names_where_it_is_explained() -> None:
+    assert error_lines(CommandFailed("short")) == [
+        "CommandFailed: short",
+        "  see: docs/errors.md#failed, or run: rse-pf errors failed",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("number", "noun", "text"),
+    [
+        (0, "robot", "0 robots"),
+        (1, "robot", "1 robot"),
+        (2, "robot", "2 robots"),
+        (1200, "point", "1,200 points"),
+    ],
+)
+def test_a_number_and_its_noun_agree(number: int, noun: str, text: str) -> None:
+    assert counted(number, noun) == text
 
 
 def test_json_and_pages_are_written_whole(capsys: pytest.CaptureFixture[str]) -> None:

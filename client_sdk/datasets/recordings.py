@@ -45,7 +45,8 @@ class Dataset:
     """A recording: iterate over it to get its frames in order of time.
 
     ``truth_kind`` is ``reference`` if the poses came with the source as an estimate.  ``read`` reads one of
-    ``rows``; row *i* has the time stamp ``timestamps_s[i]`` of this dataset.
+    ``rows``; row *i* has the time stamp ``timestamps_s[i]`` of this dataset.  ``notes`` are sentences for the
+    user on what was assumed.
     """
 
     name: str
@@ -55,6 +56,7 @@ class Dataset:
     truth_kind: Literal["ground truth", "reference", "none"]
     rows: tuple[int, ...]
     read: Callable[[int], Frame]
+    notes: tuple[str, ...] = ()
 
     def __len__(self) -> int:
         return len(self.rows)
@@ -88,7 +90,7 @@ class Dataset:
         )
 
 
-def open_dataset(path: Path, *, scene: str | None = None) -> Dataset:
+def open_dataset(path: Path | str, *, scene: str | None = None) -> Dataset:
     """Detect the format of *path* and return its frames; images are read later.
 
     Accepts a folder in TUM layout (``rgb.txt``, ``depth.txt``, with or without ``intrinsics.json``),
@@ -99,6 +101,7 @@ def open_dataset(path: Path, *, scene: str | None = None) -> Dataset:
         UsageError: The path is none of these, or a part is missing or broken.
         MissingExtra: OpenCV or h5py is needed and not installed.
     """
+    path = Path(path)
     if path.is_file():
         if path.suffix != ".mat":
             raise UsageError(f"{path} is not a recording", hint="name a folder, or the labelled .mat file")
@@ -149,18 +152,25 @@ def _open_tum(folder: Path) -> Dataset:
     pairs = associate_stamps(
         [stamp for stamp, _ in colours], [stamp for stamp, _ in depths], _MAX_STAMP_DIFFERENCE_S
     )
+    for name, entries in (("rgb.txt", colours), ("depth.txt", depths)):
+        if not entries:
+            raise UsageError(
+                f"{folder / name} lists no image", hint="write a line for each image: timestamp filename"
+            )
     if not pairs:
         raise UsageError(
             f"no colour image of {folder} has a depth image within {_MAX_STAMP_DIFFERENCE_S:g} s",
             hint="check that rgb.txt and depth.txt use the same clock",
         )
-    camera, distortion, depth_scale = _intrinsics(folder)
+    camera, distortion, depth_scale, notes = _intrinsics(folder)
     undistort = _Undistortion(camera, distortion)
 
     def read(row: int) -> Frame:
         colour_row, depth_row = pairs[row]
         rgb = _read_image(folder / colours[colour_row][1], is_depth=False)
         png = _read_image(folder / depths[depth_row][1], is_depth=True)
+        _check_size(rgb, camera, folder / colours[colour_row][1])
+        _check_size(png, camera, folder / depths[depth_row][1])
         depth_m = png.astype(np.float32) / np.float32(depth_scale)
         depth_m[png == np.iinfo(png.dtype).max] = 0.0  # some recorders write "no reading" so
         _check_metres(depth_m, folder)
@@ -180,6 +190,7 @@ def _open_tum(folder: Path) -> Dataset:
         truth_kind=truth_kind,
         rows=tuple(range(len(pairs))),
         read=read,
+        notes=notes,
     )
 
 
@@ -204,13 +215,19 @@ def _read_list(folder: Path, name: str) -> list[tuple[float, str]]:
     return sorted(entries)
 
 
-def _intrinsics(folder: Path) -> tuple[Camera, _Distortion, float]:
+def _intrinsics(folder: Path) -> tuple[Camera, _Distortion, float, tuple[str, ...]]:
+    """Return camera, distortion, depth scale, and notes on what was assumed because the folder says nothing."""
     path = folder / "intrinsics.json"
     if not path.exists():
         name = next(key for key in _FREIBURG if key in folder.resolve().name)
         fx, fy, cx, cy, distortion = _FREIBURG[name]
         camera = Camera(fx=fx, fy=fy, cx=cx, cy=cy, width=640, height=480)
-        return camera, distortion, _FREIBURG_DEPTH_SCALE
+        whose = f"those of {name} are used" if name else "a Kinect's are assumed"
+        note = (
+            f"{folder} has no intrinsics.json, so {whose}: fx {fx:g} fy {fy:g} cx {cx:g} cy {cy:g}, "
+            f"{camera.width}x{camera.height} px, depth_scale {_FREIBURG_DEPTH_SCALE:g}"
+        )
+        return camera, distortion, _FREIBURG_DEPTH_SCALE, (note,)
     hint = "it needs fx fy cx cy width height distortion[k1 k2 p1 p2 k3] depth_scale"
     try:
         values = json.loads(path.read_text(encoding="utf-8"))
@@ -222,14 +239,14 @@ def _intrinsics(folder: Path) -> tuple[Camera, _Distortion, float]:
         distortion = tuple(float(value) for value in values.get("distortion", ()))
         depth_scale = float(values["depth_scale"])
     except InvalidCamera as error:
-        raise UsageError(f"{path}: {error}", hint=error.hint) from error
+        raise UsageError(f"{path}: {error.message}", hint=error.hint) from error
     except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
         raise UsageError(f"{path} cannot be used: {error!r}", hint=hint) from error
     if len(distortion) not in (0, 4, 5) or not (math.isfinite(depth_scale) and depth_scale > 0):
         raise UsageError(
             f"{path}: {len(distortion)} distortion numbers, depth_scale {depth_scale:g}", hint=hint
         )
-    return camera, distortion, depth_scale
+    return camera, distortion, depth_scale, ()
 
 
 def _read_truth(folder: Path) -> tuple[Trajectory | None, Literal["ground truth", "reference", "none"]]:
@@ -238,6 +255,16 @@ def _read_truth(folder: Path) -> tuple[Trajectory | None, Literal["ground truth"
     if (folder / "reference_poses.txt").exists():
         return read_trajectory(folder / "reference_poses.txt"), "reference"
     return None, "none"
+
+
+def _check_size(image: npt.NDArray[Any], camera: Camera, path: Path) -> None:
+    """Refuse an image of another size: the intrinsics would be those of another camera."""
+    height, width = image.shape[:2]
+    if (width, height) != (camera.width, camera.height):
+        raise UsageError(
+            f"{path} is {width}x{height} px, the camera of the recording {camera.width}x{camera.height} px",
+            hint="give colour and depth the size in intrinsics.json, and scale fx, fy, cx, cy with it",
+        )
 
 
 def _check_metres(depth_m: npt.NDArray[np.float32], folder: Path) -> None:

@@ -136,9 +136,9 @@ class BackgroundUploader:
             self._uploads.upload(path, self._between_parts)
         except (BadRequest, LimitExceeded, UsageError) as error:  # it is refused for good, or is missing
             self.dropped += 1
-            self.last_error = str(error)
+            self.last_error = error.message
         except RsePfError as error:
-            self.last_error = str(error)
+            self.last_error = error.message
             return False
         else:
             self.sent += 1

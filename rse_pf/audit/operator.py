@@ -33,7 +33,7 @@ def record(state: Path, action: str, subject: str, **detail: Value) -> None:
             **detail,
         )
     except ConfigurationError as error:
-        show(f"the command succeeded, but is missing in the audit log: {error}", error=True)
+        show(f"the command succeeded, but is missing in the audit log: {error.message}", error=True)
 
 
 def record_map_change(

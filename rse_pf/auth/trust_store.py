@@ -15,7 +15,7 @@ from typing import TypeVar
 from rse_pf.auth.roster import DenyList, Roster, from_json, to_json
 from rse_pf.auth.tokens import KeySet
 from rse_pf.config.resource_names import DENY_NAME, ROBOTS_NAME
-from rse_pf.errors import ConfigurationError, Conflict, NotFound, RsePfError
+from rse_pf.errors import ConfigurationError, Conflict, NotFound, RsePfError, message_of
 from rse_pf.object_store import DirectoryStore, ObjectStore
 
 __all__ = [
@@ -120,7 +120,7 @@ class TrustStore:
                 else:
                     parts[name] = "{}"
             except (RsePfError, OSError, UnicodeDecodeError) as error:
-                self.problem = f"{name}: {error}"[:200]
+                self.problem = f"{name}: {message_of(error)}"[:200]
         if parts == self._parts or len(parts) < 3:
             return False
         self._parts, self.snapshot = parts, json.dumps(parts)

@@ -12,17 +12,17 @@ examples:
 from __future__ import annotations
 
 import argparse
-import importlib.util
 import math
 from pathlib import Path
 
+from rse_pf.cli.extras import require
 from rse_pf.config import PlatformSettings
-from rse_pf.errors import MissingExtra, UsageError
+from rse_pf.errors import UsageError
+from rse_pf.terminal import counted, show
 
 __all__ = ["add_arguments", "run"]
 
 _MAX_ROBOTS = 32
-_MERGE_NEEDS = {"gtsam": "maps", "faiss": "maps", "uvicorn": "data"}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -75,24 +75,34 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
         args.robots if args.robots is not None else (1 if args.data is not None and not args.merge else 3)
     )
     if not 1 <= robots <= _MAX_ROBOTS:
-        raise UsageError(f"--robots {robots} is not within 1..{_MAX_ROBOTS}", hint="choose fewer robots")
+        hint = "choose at least one robot" if robots < 1 else "choose fewer robots"
+        raise UsageError(f"--robots {robots} is not within 1..{_MAX_ROBOTS}", hint=hint)
     if not (math.isfinite(args.rate) and 0.1 <= args.rate <= 60):
         raise UsageError(f"--rate {args.rate:g} is not within 0.1..60 Hz", hint="the paper uses 5")
     if args.frames is not None and not 2 <= args.frames <= 2000:
         raise UsageError(f"--frames {args.frames} is not within 2..2000", hint="80 is a path of 5.5 m")
+    if args.frames is not None and args.data is not None:
+        raise UsageError(
+            "--frames is for the rendered world: a recording is played whole",
+            hint="play fewer of its frames with --rate, or leave out one of them",
+        )
     if args.seed < 0:
         raise UsageError(f"--seed {args.seed} is below 0", hint="choose 0 or more")
-    if args.merge:
-        for package, extra in _MERGE_NEEDS.items():
-            if importlib.util.find_spec(package) is None:  # before the drive, not after it
-                raise MissingExtra(package, extra)
+    require("demo --merge" if args.merge else "demo")
     from rse_pf.experiments.demo.run import DemoOptions, run_demo
     from rse_pf.pnp import usable_engine
 
     if args.data is not None:
         from client_sdk.datasets import open_dataset
 
-        frames = len(open_dataset(args.data).thinned(args.rate).share(robots - 1, robots))
+        dataset = open_dataset(args.data)
+        show(*(f"note: {note}" for note in dataset.notes))
+        thinned = dataset.thinned(args.rate)
+        if len(thinned) < len(dataset):
+            show(
+                f"note: {len(thinned)} of {counted(len(dataset), 'frame')} are played at --rate {args.rate:g}"
+            )
+        frames = len(thinned.share(robots - 1, robots))
         if not frames:
             raise UsageError(f"{args.data} has too few frames for {robots} robots", hint="use fewer robots")
     options = DemoOptions(

@@ -22,6 +22,7 @@ from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
 
+from rse_pf.cli.extras import EXTRAS, VERBS_NEED, modules_of
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import ConfigurationError, MissingExtra
 from rse_pf.native import find_library, open_solver
@@ -29,21 +30,9 @@ from rse_pf.terminal import show
 
 __all__ = ["Finding", "add_arguments", "check_machine", "report", "run"]
 
-_EXTRAS: dict[str, tuple[tuple[str, ...], bool]] = {
-    "base": (("numpy", "websockets", "msgspec"), True),
-    "backend": (("picows", "aiofastnet", "uvloop", "prometheus_client", "jwt", "cryptography"), True),
-    "local": (("envoy", "rich", "PIL"), True),
-    "demo": (("cv2",), False),
-    "vision": (("h5py",), False),
-    "services": (("lupa",), False),
-    "experiments": (("matplotlib",), False),
-    "aws": (("boto3",), False),
-    "infra": (("aws_cdk", "cdk_nag"), False),
-}
-"""Modules of each extra, and whether the local platform needs them."""
-
-_STARTS_NODE = ("aws_cdk", "cdk_nag")
-"""Looked for but not imported: they start Node at once."""
+_NOT_IMPORTED = {"aws_cdk", "constructs", "cdk_nag", "viser"}
+"""Looked for only: they start Node at once, or take a second."""
+_DEVELOPERS = {module for extra in EXTRAS.values() if not extra.is_for_users for module in extra.modules}
 _DESCRIPTORS_PER_ROBOT = 2
 _OTHER_DESCRIPTORS = 256
 _LITTLE_MEMORY_MIB = 1024
@@ -101,11 +90,30 @@ def _system(settings: PlatformSettings) -> Iterator[Finding]:
 
 
 def _extras(settings: PlatformSettings) -> Iterator[Finding]:
-    for extra, (modules, required) in _EXTRAS.items():
-        missing = ", ".join(module for module in modules if not _has(module))
-        fix = "pip install rse-pf" if extra == "base" else f"pip install 'rse-pf[{extra}]'"
-        what = f"extra {extra}: {missing} cannot be imported" if missing else f"extra {extra}"
-        yield _finding(what, fix if missing else "", is_required=required)
+    """Yield a line for each extra, and then which verbs work and which do not."""
+    absent = {module for extra in EXTRAS.values() for module in extra.modules if not _has(module)}
+    for name, extra in EXTRAS.items():
+        missing = ", ".join(module for module in extra.modules if module in absent)
+        if missing and not extra.is_for_users:
+            yield _finding(f"extra {name}: not installed, and only for developers: {extra.enables}")
+            continue
+        fix = "pip install rse-pf" if name == "base" else f"pip install 'rse-pf[{name}]'"
+        what = f"extra {name}: {missing} cannot be imported" if missing else f"extra {name}"
+        yield _finding(f"{what}; for {extra.enables}", fix if missing else "", is_required=extra.is_required)
+    yield from _verbs(absent)
+
+
+def _verbs(absent: set[str]) -> Iterator[Finding]:
+    lacking = {
+        verb: [extra for extra in extras if absent & modules_of(extra).keys()]
+        for verb, extras in VERBS_NEED.items()
+    }
+    yield _finding(f"verbs that work here: {', '.join(verb for verb, lacks in lacking.items() if not lacks)}")
+    for verb, lacks in lacking.items():
+        if lacks:
+            missing = {module for extra in lacks for module in absent & modules_of(extra).keys()}
+            what = f"rse-pf {verb} does not work here: it needs {', '.join(sorted(missing))}"
+            yield _finding(what, f"pip install 'rse-pf[{','.join(lacks)}]'")
 
 
 def _native_library(settings: PlatformSettings) -> Iterator[Finding]:
@@ -231,7 +239,7 @@ def _finding(what: str, fix: str = "", *, is_required: bool = False) -> Finding:
 
 def _has(module: str) -> bool:
     """Whether *module* can be imported; a broken native library counts as absent."""
-    if module in _STARTS_NODE:
+    if module in _NOT_IMPORTED or module in _DEVELOPERS:
         return importlib.util.find_spec(module) is not None
     try:
         importlib.import_module(module)

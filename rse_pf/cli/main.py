@@ -19,7 +19,7 @@ from typing import Any, NoReturn
 from rse_pf.config import load_settings
 from rse_pf.config.renames import hint_for_old_option
 from rse_pf.config.validation import did_you_mean
-from rse_pf.errors import ConfigurationError, RsePfError, UsageError
+from rse_pf.errors import ConfigurationError, RsePfError, UsageError, error_of_system
 from rse_pf.terminal import show, show_error, show_page
 
 __all__ = ["VERBS", "Parser", "main"]
@@ -39,6 +39,7 @@ VERBS = {
     "cloud": "check the platform on AWS: doctor, cost, status, leftovers",
     "settings": "show every setting: value, default, unit, source",
     "doctor": "check what this machine needs, and say how to fix it",
+    "errors": "explain an error by its code: cause, check, fix",
 }
 """Verb and one line of help."""
 
@@ -81,8 +82,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         # The reader of our output is gone: the rest goes to /dev/null, so that the exit does not fail.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return _EXIT_PIPE
+    except ModuleNotFoundError as error:
+        return _report(_missing_extra(error))
     except OSError as error:
-        return _report(RsePfError(str(error), hint="see what the system says about this file or address"))
+        return _report(error_of_system(error))
     return code
 
 
@@ -138,6 +141,16 @@ def _version() -> str:
         return metadata.version("rse-pf")
     except metadata.PackageNotFoundError:
         return "(not installed)"
+
+
+def _missing_extra(error: ModuleNotFoundError) -> RsePfError:
+    """Return which extra lacks; raises *error* itself if the module belongs to none: that is a defect."""
+    from rse_pf.cli.extras import extra_of_module
+
+    missing = extra_of_module(error.name or "")
+    if missing is None:
+        raise error
+    return missing
 
 
 def _report(error: RsePfError) -> int:

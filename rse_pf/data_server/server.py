@@ -162,7 +162,7 @@ def _sweep(app: DataServer, store: ObjectStore, upload_ttl_s: float) -> None:
         if isinstance(store, DirectoryStore):
             files = store.sweep(now=time.time(), older_than_s=upload_ttl_s)
     except StoreError as error:
-        _write_line({"event": "sweep-failed", "error": str(error)})
+        _write_line({"event": "sweep-failed", "error": error.message})
         return
     if uploads or files:
         _write_line({"event": "swept", "uploads": uploads, "files": files})
@@ -173,7 +173,7 @@ def _move_old_objects(store: DirectoryStore) -> None:
     try:
         moved = store.move_old_objects()
     except StoreError as error:
-        _write_line({"event": "sweep-failed", "error": str(error)})
+        _write_line({"event": "sweep-failed", "error": error.message})
         return
     if moved:
         _write_line({"event": "moved", "objects": moved})

@@ -28,7 +28,7 @@ from rse_pf.budget import (
     measure_msgpack,
     small_text,
 )
-from rse_pf.errors import BadMessage, BadRequest, LimitExceeded, RsePfError
+from rse_pf.errors import BadMessage, BadRequest, LimitExceeded, RsePfError, message_of
 from rse_pf.geometry import Array, Camera
 
 __all__ = ["Edge", "EdgeKind", "Keyframe", "MapLimits", "MapVersion", "decode_map", "encode_map"]
@@ -237,7 +237,7 @@ def decode_map(data: bytes, max_bytes: int = _MAX_BYTES, limits: MapLimits | Non
     except (msgspec.MsgspecError, ValueError, RecursionError, BadMessage) as error:
         if isinstance(error, RsePfError) and not isinstance(error, BadMessage):
             raise
-        raise BadRequest(f"the map is damaged: {error}", hint="fetch it again") from error
+        raise BadRequest(f"the map is damaged: {message_of(error)}", hint="fetch it again") from error
 
 
 def _inflated(data: bytes, max_bytes: int) -> bytes | bytearray:
@@ -330,7 +330,7 @@ class _Provenance(Mapping[str, Any]):
             return msgspec.msgpack.decode(self._raw, type=dict[str, Any], ext_hook=_no_extension)
         except (msgspec.MsgspecError, ValueError, RecursionError) as error:
             raise BadRequest(
-                f"the provenance of the map is damaged: {error}", hint="fetch it again"
+                f"the provenance of the map is damaged: {message_of(error)}", hint="fetch it again"
             ) from error
 
 

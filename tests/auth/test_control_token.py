@@ -69,7 +69,7 @@ def test_a_file_without_a_valid_secret_is_refused_in_one_line(
         read_control_token(path)
 
     assert caught.value.hint
-    assert "\n" not in str(caught.value)
+    assert "\n" not in caught.value.message
     assert TOKEN[:31] not in caught.value.report()
 
 

@@ -15,7 +15,7 @@ from rse_pf.config import PlatformSettings, settings_page
 
 EMPTY = [
     "demo", "experiment", "local", "swarm", "token", "robot", "service", "serve", "data",
-    "map", "audit", "cloud", "settings", "doctor",
+    "map", "audit", "cloud", "settings", "doctor", "errors",
 ]  # fmt: skip
 HELP_S = 0.3
 
@@ -77,7 +77,7 @@ def _alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         ("doctor now", "unrecognized arguments: now", "rse-pf doctor --help"),
         ("demo --rate 0", "--rate 0 is not within", "the paper"),
         ("demo --rate nan", "--rate nan is not within", "the paper"),
-        ("demo --robots 0", "--robots 0 is not within", "robots"),
+        ("demo --robots 0", "--robots 0 is not within", "at least one robot"),
         ("demo --robots two", "argument --robots: invalid int value", "rse-pf demo --help"),
         ("demo --engine opencl", "'opencl' is not one of native, poselib, opencv", "did you mean opencv?"),
         ("demo --codec xml", "'xml' is not one of zlib, json, bin", "rse-pf demo --help"),

@@ -144,7 +144,7 @@ def test_a_cut_or_missing_ply_file_is_told_in_one_line(tmp_path: Path):
     for name in ("map.ply", "none.ply"):
         with pytest.raises(UsageError) as caught:
             read_ply(tmp_path / name)
-        assert "\n" not in str(caught.value)
+        assert "\n" not in caught.value.message
         assert caught.value.hint
 
 

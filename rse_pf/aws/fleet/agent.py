@@ -32,7 +32,7 @@ from rse_pf.aws.fleet.metrics import ServerMetrics, datums, read_page
 from rse_pf.aws.storage.audit_archive import Shipper
 from rse_pf.aws.storage.s3_store import open_bucket
 from rse_pf.config import PlatformSettings, load_settings
-from rse_pf.errors import NotFound, RsePfError
+from rse_pf.errors import NotFound, RsePfError, message_of
 from rse_pf.files import replace_file
 from rse_pf.object_store import ObjectStore
 from rse_pf.scaling.alarms import NAMESPACE
@@ -164,7 +164,7 @@ class Agent:
         try:
             work()
         except (RsePfError, OSError) as error:
-            self._log("failed", task=task, error=str(error)[:200])
+            self._log("failed", task=task, error=message_of(error)[:200])
 
 
 def main(arguments: list[str] | None = None) -> int:

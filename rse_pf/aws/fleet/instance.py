@@ -43,7 +43,7 @@ class Instance:
             try:
                 headers["Authorization"] = bearer(read_control_token(self._token_file))
             except UsageError as error:  # the token is made before the server starts, so no server runs
-                raise Disconnected(str(error)) from error
+                raise Disconnected(error.message) from error
         return _ask(f"{self._base}{target}", method, headers)
 
     def instance_id(self) -> str:

@@ -72,7 +72,7 @@ def _all_of_ours(account: Account, unread: dict[str, str]) -> Iterator[tuple[str
         try:
             is_ours = _is_tagged(account, row["Name"])
         except ConfigurationError as error:
-            unread[row["Name"]] = f"perhaps not ours, it cannot be looked into: {error}"
+            unread[row["Name"]] = f"perhaps not ours, it cannot be looked into: {error.message}"
             is_ours = True
         if is_ours:
             yield "bucket", row["Name"], ""

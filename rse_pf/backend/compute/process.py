@@ -17,7 +17,7 @@ from rse_pf.aws.storage import open_data_store
 from rse_pf.backend.object_refs import resolve
 from rse_pf.backend.robot_store import is_shared
 from rse_pf.config import PlatformSettings
-from rse_pf.errors import BadRequest, InternalError, LimitExceeded, MissingExtra, RsePfError
+from rse_pf.errors import BadRequest, InternalError, LimitExceeded, MissingExtra, RsePfError, message_of
 from rse_pf.identity import RobotId
 from rse_pf.limited_process import Handler
 from rse_pf.object_store import ObjectStore
@@ -43,7 +43,7 @@ def encode_request(command: Command, robot: RobotId) -> bytes:
     try:
         return _encode([command.service, command.payload, command.trace, list(robot)])
     except (RsePfError, TypeError, ValueError, OverflowError, RecursionError) as error:
-        raise BadRequest(f"the payload cannot be passed on: {str(error)[:150]}") from error
+        raise BadRequest(f"the payload cannot be passed on: {message_of(error)[:150]}") from error
 
 
 def decode_reply(data: bytes, command: Command, *, server: str) -> tuple[Result | Failure, str]:
@@ -91,7 +91,7 @@ def _answer(registry: Registry, settings: PlatformSettings, store: ObjectStore |
         encoded = _encode([answer.compute_ms, answer.reply, None, ""])
     except (RsePfError, TypeError, ValueError, OverflowError, RecursionError) as error:
         defect = InternalError(f"the reply of {name!r} cannot be encoded")
-        return _encode_failure(failure_of(defect), str(error))
+        return _encode_failure(failure_of(defect), message_of(error))
     limit = settings.session.max_inflated_bytes
     if len(encoded) > limit:
         too_large = LimitExceeded(f"the reply has {len(encoded)} bytes, above {limit}", hint="ask for less")

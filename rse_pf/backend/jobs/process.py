@@ -27,7 +27,15 @@ from rse_pf.backend.object_refs import named_in, resolve
 from rse_pf.backend.robot_store import check_quota, is_shared, store_within_quota
 from rse_pf.backend.sandbox.ipc import encode_message, receive
 from rse_pf.config import PlatformSettings
-from rse_pf.errors import BadMessage, Cancelled, Crashed, LimitExceeded, RsePfError, StoreError
+from rse_pf.errors import (
+    BadMessage,
+    Cancelled,
+    Crashed,
+    LimitExceeded,
+    RsePfError,
+    StoreError,
+    message_of,
+)
 from rse_pf.identity import RobotId
 from rse_pf.linux import die_with_parent, run_when_idle
 from rse_pf.service import dispatch, failure_of
@@ -200,7 +208,7 @@ def _encode_answer(answer: Result | Failure) -> list[Any]:
     try:
         reply = msgspec.msgpack.encode(answer.reply, enc_hook=binary_encode_hook)
     except (BadMessage, TypeError, ValueError, OverflowError) as error:
-        return ["failed", "internal", f"the reply cannot be encoded: {str(error)[:150]}", ""]
+        return ["failed", "internal", f"the reply cannot be encoded: {message_of(error)[:150]}", ""]
     return ["done", answer.compute_ms, reply]
 
 

@@ -23,7 +23,7 @@ from typing import Any
 
 from rse_pf.backend.sandbox import isolation
 from rse_pf.backend.sandbox.ipc import encode_message, encode_reply, receive
-from rse_pf.errors import ConfigurationError, InternalError, LimitExceeded, RsePfError
+from rse_pf.errors import ConfigurationError, InternalError, LimitExceeded, RsePfError, message_of
 from rse_pf.linux import die_with_parent
 from rse_pf.services.custom.installed import InstalledService
 from rse_pf.services.custom.runtime import Runtime, open_runtime
@@ -176,7 +176,7 @@ def _encode_within(answer: list[Any], max_bytes: int) -> bytes:
         data = encode_reply(answer)
         problem = f"a reply of {len(data)} bytes is above {max_bytes}" if len(data) > max_bytes else ""
     except (TypeError, ValueError, OverflowError, RsePfError) as error:
-        problem = f"the reply cannot be encoded: {str(error)[:150]}"
+        problem = f"the reply cannot be encoded: {message_of(error)[:150]}"
     if problem:
         return encode_message([False, LimitExceeded.code, problem, "reply with less", answer[-1]])
     return data

@@ -14,8 +14,14 @@ from rse_pf.experiments.results.markdown import failures, page, slashed, table, 
 from rse_pf.experiments.results.records import CommandRecord
 from rse_pf.experiments.results.summary import PAPER, summarise
 from rse_pf.experiments.results.trajectory_error import trajectory_figures
+from rse_pf.terminal import counted
 
-__all__ = ["closing_lines", "demo_page", "make_report"]
+__all__ = ["advice", "closing_lines", "demo_page", "is_lost", "make_report"]
+
+_SOME = 0.1
+"""Share of lost frames from which the demo says what helps."""
+_MOST = 0.5
+"""Share of lost frames above which a run has failed."""
 
 
 def make_report(
@@ -71,7 +77,7 @@ def demo_page(report: Mapping[str, Any]) -> str:
     options = ", ".join(f"{name} {value}" for name, value in report["asked"].items() if value is not None)
     return page(
         "# RSE-PF demo",
-        f"{report['robots']} robots, {report['frames']} frames; {options}.",
+        f"{counted(report['robots'], 'robot')}, {counted(report['frames'], 'frame')}; {options}.",
         table(["figure", "here, one machine", "paper, Sect. 6 (Shenzhen to Seoul)"], rows),
         *([merged_table(report["merged"])] if "merged" in report else []),
         f"Commands: {commands['sent']} sent, {commands['answered']} answered, {failures(report)} failed, "
@@ -86,10 +92,11 @@ def demo_page(report: Mapping[str, Any]) -> str:
 def closing_lines(report: Mapping[str, Any], folder: Path) -> str:
     """Return what the terminal shows at the end; the last line names the files."""
     trip, commands = report["round_trip_ms"], report["commands"]
+    times = f"round trip p50 {trip['p50']} ms, p99 {trip['p99']} ms"
     first = (
-        f"{report['robots']} robots tracked {report['frames']} frames, {report['lost_frames']} lost; "
-        f"round trip p50 {trip['p50']} ms, p99 {trip['p99']} ms; "
-        f"{commands['answered']} of {commands['sent']} commands answered, {commands['lost']} lost"
+        f"{counted(report['robots'], 'robot')} tracked {counted(report['frames'], 'frame')}, "
+        f"{report['lost_frames']} lost; {times if trip['p50'] is not None else 'no command was answered'}; "
+        f"{commands['answered']} of {counted(commands['sent'], 'command')} answered, {commands['lost']} lost"
     )
     known = [value for value in report["ate_cm"] if value is not None]
     second = f"ATE {_list(known)} cm over paths of {_list(report['path_m'])} m\n" if known else ""
@@ -101,9 +108,26 @@ def closing_lines(report: Mapping[str, Any], folder: Path) -> str:
         files = f"{shown}/map_merged.png, {shown}/merged.ply, "
         third += f"show the merged map: rse-pf map show merged --store dir:{shown}/platform/objects\n"
     return (
-        f"{first}\n{second}{third}results: {files}{shown}/robot-*/{{map.ply,map.png,trajectory.txt}}; "
+        f"{first}\n{second}{third}{advice(report)}"
+        f"results: {files}{shown}/robot-*/{{map.ply,map.png,trajectory.txt}}; "
         f"{shown}/report.md, report.json, commands.csv, events.jsonl, samples.csv"
     )
+
+
+def is_lost(report: Mapping[str, Any]) -> bool:
+    """Return whether a command got no answer, or most frames got no pose."""
+    return bool(report["commands"]["lost"] > 0 or report["lost_frames"] > _MOST * report["frames"])
+
+
+def advice(report: Mapping[str, Any]) -> str:
+    """Return a line that says what helps if many frames were lost, with its newline; else nothing."""
+    asked = report["asked"]
+    if report["lost_frames"] < _SOME * report["frames"] or not report["lost_frames"]:
+        return ""
+    rate = "" if asked.get("data") is None else f"play more of its frames (--rate above {asked['rate_hz']:g})"
+    wide = "match over larger steps (--frontend wide-baseline)" * (asked.get("frontend") != "wide-baseline")
+    ways = " or ".join(filter(None, (rate, wide))) or "let the robots drive more slowly"
+    return f"many frames were lost, because they overlap too little with the frame before: {ways}\n"
 
 
 def _errors(robot: RobotFinished) -> dict[str, float | None]:

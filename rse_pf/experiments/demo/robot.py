@@ -19,7 +19,7 @@ import numpy as np
 from client_sdk.frontend import Frame, FrontEndOptions, PoseQuery, TrackedFrame, Tracker
 from client_sdk.mapping import MapOptions, PointMap, Trajectory, write_ply, write_trajectory
 from rse_pf.config import DataSettings, SessionSettings
-from rse_pf.errors import RsePfError
+from rse_pf.errors import RsePfError, error_of_system
 from rse_pf.experiments.child_process import ChildFailed, ChildReady, ParentPipe
 from rse_pf.experiments.demo.keyframes import KeyframeCollector, KeyframeUploads
 from rse_pf.experiments.demo.merge import MAP_FILE
@@ -121,6 +121,8 @@ def run_robot(spec: RobotSpec, pipe: Connection) -> None:
         asyncio.run(_run(spec, parent))
     except RsePfError as error:
         parent.send(ChildFailed(error.report()))
+    except OSError as error:
+        parent.send(ChildFailed(error_of_system(error).report()))
     except KeyboardInterrupt:
         pass
 

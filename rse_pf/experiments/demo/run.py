@@ -29,7 +29,7 @@ from rse_pf.experiments.child_process import (
     start_process,
 )
 from rse_pf.experiments.demo.merge import MERGED_MAP, merge_on_platform, print_tenths, write_merged
-from rse_pf.experiments.demo.report import closing_lines, demo_page, make_report
+from rse_pf.experiments.demo.report import closing_lines, demo_page, is_lost, make_report
 from rse_pf.experiments.demo.robot import DemoOptions, FrameDone, RobotFinished, RobotSpec, run_robot
 from rse_pf.experiments.plots.map_image import RobotPath, draw_map
 from rse_pf.experiments.results.records import COMMANDS, EVENTS, SAMPLES, EventLog, write_commands
@@ -66,7 +66,7 @@ class _Robot:
 
 
 def run_demo(options: DemoOptions, settings: PlatformSettings) -> int:
-    """Run the demo; return 0 if every command was answered or failed."""
+    """Run the demo; return 0 if every command was answered or failed, and most frames have poses."""
     folder = fresh_folder(
         options.out,
         [
@@ -83,7 +83,7 @@ def run_demo(options: DemoOptions, settings: PlatformSettings) -> int:
     with (folder / EVENTS).open("w", encoding="utf-8") as file:
         report = asyncio.run(_run(options, chosen, folder, EventLog(file)))
     show_page(closing_lines(report, folder))
-    return 0 if report["commands"]["lost"] == 0 else 1
+    return 1 if is_lost(report) else 0
 
 
 async def _run(

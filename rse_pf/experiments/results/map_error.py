@@ -133,9 +133,10 @@ def merged_lines(section: Mapping[str, Any]) -> str:
     )
     lines = [f"merged {', '.join(joined)}: {section['keyframes']} keyframes, {what}"]
     if section["ate_cm"] is not None:
-        alone = ", each robot aligned to the truth by itself" if len(joined) > 1 else ""
+        alone = ", each robot aligned to the truth by itself, which is easier" if len(joined) > 1 else ""
+        together = ", all robots aligned to the truth as one" if len(joined) > 1 else ""
         lines.append(
-            f"ATE {section['ate_cm']:.2f} cm in the merged map "
+            f"ATE {section['ate_cm']:.2f} cm in the merged map{together} "
             f"(before: {section['ate_before_cm']:.2f} cm{alone})"
         )
     lines += [f"{each['robot']} not joined: {each['reason']}" for each in section["not_joined"]]

@@ -294,6 +294,6 @@ class ControlPlane:
                 await self._load_balancer.wait_live(self._settings.local.start_timeout_s)
                 return
             except ConfigurationError as error:
-                self._emit("balancer-failed", reason=str(error), wait_s=pause_s)
+                self._emit("balancer-failed", reason=error.message, wait_s=pause_s)
             await asyncio.sleep(pause_s)
             pause_s = min(2 * pause_s, _MAX_PAUSE_S)

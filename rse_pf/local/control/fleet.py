@@ -350,7 +350,7 @@ class Fleet:
         try:
             await self.bring_up(member, self._settings.local.start_timeout_s)
         except ConfigurationError as error:
-            self._emit("server-failed", server=member.name, reason=str(error))
+            self._emit("server-failed", server=member.name, reason=error.message)
             if member.server is not None:  # announced, but never healthy: `_watch` handles its end
                 self._backend_servers.send(member.name, signal.SIGKILL)
             elif not member.out and not member.leaving:

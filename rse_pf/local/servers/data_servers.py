@@ -151,7 +151,7 @@ class LocalDataServers:
                 await self._launch()
                 pause_s = _FIRST_PAUSE_S
             except ConfigurationError as error:
-                self._emit("data-server-failed", name=self.process.name, error=str(error))
+                self._emit("data-server-failed", name=self.process.name, error=error.message)
                 await asyncio.sleep(pause_s)
                 pause_s = min(2 * pause_s, _MAX_PAUSE_S)
                 self.port = 0  # another program may hold the old port

@@ -14,7 +14,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Protocol
 
-from rse_pf.errors import ConfigurationError, RsePfError
+from rse_pf.errors import ConfigurationError, InternalError, RsePfError, message_of
 from rse_pf.service import Registry, request_of
 from rse_pf.services.custom.installed import InstalledService
 
@@ -75,10 +75,24 @@ class _PythonRuntime:
         )
 
     def call(self, payload: Any) -> Any:
-        return self._service.function(request_of(payload, self._service))
+        service = self._service
+        reply = service.function(request_of(payload, service))
+        if not isinstance(reply, service.reply_type):
+            raise InternalError(
+                f"service {service.name!r} replied with a value of type {type(reply).__name__}, not with its "
+                f"{service.reply_type.__name__}",
+                hint="return from serve what it is annotated with",
+            )
+        return reply
 
     def snapshot(self) -> bytes:
-        return bytes(self._object.snapshot())
+        state = self._object.snapshot()
+        if not isinstance(state, (bytes, bytearray, memoryview)):
+            raise InternalError(
+                f"the snapshot of service {self._service.name!r} is of type {type(state).__name__}, not bytes",
+                hint="encode it, for example with msgspec.msgpack.encode(state)",
+            )
+        return bytes(state)
 
     def restore(self, data: bytes) -> None:
         self._object.restore(data)
@@ -92,7 +106,7 @@ def _load(service: InstalledService) -> Any:
     except RsePfError:
         raise
     except Exception as error:
-        where = f"{type(error).__name__}: {error}"
+        where = f"{type(error).__name__}: {message_of(error)}"
         raise ConfigurationError(
             f"{service.name} cannot be loaded: {where}", hint="fix the service"
         ) from error

