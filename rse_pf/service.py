@@ -68,6 +68,8 @@ class Registry:
 
     def __init__(self) -> None:
         self._services: dict[str, Service] = {}
+        self.others: tuple[str, ...] = ()
+        """Services that this server runs elsewhere, in sandboxes; named to who asks for an unknown one."""
 
     def service(
         self,
@@ -113,7 +115,7 @@ class Registry:
         found = self._services.get(name)
         if found is None:
             raise UnknownService(
-                f"no service named {name!r}; this server offers {', '.join(self._services)}",
+                f"no service named {name!r}; this server offers {', '.join((*self._services, *self.others))}",
                 hint="check the spelling, or install the service on the server",
             )
         return found

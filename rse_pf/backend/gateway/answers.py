@@ -109,7 +109,9 @@ class Answers:
         """Send what a sandbox or a job answered."""
         now = self._context.clocks.monotonic()
         if isinstance(message, Result):
-            queue_ms = (queued.started_s - queued.received_s) * 1e3
+            # A job does not say when it began, only how long it took.
+            waited_s = (queued.started_s or now - message.compute_ms / 1e3) - queued.received_s
+            queue_ms = max(0.0, waited_s) * 1e3
             message = msgspec.structs.replace(
                 message, queue_ms=queue_ms, received_s=queued.received_s, sent_s=now
             )

@@ -171,6 +171,7 @@ class _Worker:
             admission=Admission(settings.session, settings.serving),
             scheduler=Scheduler(settings.serving),
             throttle=CpuThrottle(
+        registry.others = tuple(service.name for service in installed)
                 settings.serving.emulated_cores, now=time.monotonic(), cpu=time.process_time
             ),
             decoder=DecoderThread(loop.call_soon_threadsafe),

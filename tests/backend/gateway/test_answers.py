@@ -1,0 +1,34 @@
+"""What an answer says besides the reply: how long its command waited, and what else the server offers."""
+
+from __future__ import annotations
+
+import pytest
+from backend.gateway.worker_parts import worker_parts
+
+from rse_pf.backend.scheduling.scheduler import QueuedCommand
+from rse_pf.wire import Command, Result
+
+
+def test_the_time_that_a_job_waited_is_not_the_servers_clock() -> None:
+    with worker_parts() as worker:
+        connection, wire = worker.join()
+        command = Command(id=7, service="merge", payload={})
+        received_s = worker.loop.now
+        queued = QueuedCommand(connection, connection.robot, command, 9, received_s, 1e9)
+        worker.loop.now += 5.0
+
+        worker.answers.send_message(queued, Result(id=7, reply={}, compute_ms=3000.0))
+
+        (result,) = [each for each in wire.sent if isinstance(each, Result)]
+        assert result.queue_ms == pytest.approx(2000.0)
+
+
+def test_an_unknown_service_is_answered_with_all_that_the_server_offers() -> None:
+    with worker_parts() as worker:
+        worker.registry.others = ("centroid",)
+        connection, wire = worker.join()
+
+        worker.say(connection, Command(id=3, service="centriod", payload={}))
+
+        assert wire.sent[-1].code == "unknown-service"
+        assert wire.sent[-1].message == "no service named 'centriod'; this server offers echo, centroid"
