@@ -145,6 +145,7 @@ class _Worker:
         )
         connections = set[RobotConnection]()
         store = open_data_store(settings) if is_shared(settings) else None
+        registry.others = tuple(service.name for service in installed)
         answers = Answers(
             context,
             registry=registry,
@@ -171,7 +172,6 @@ class _Worker:
             admission=Admission(settings.session, settings.serving),
             scheduler=Scheduler(settings.serving),
             throttle=CpuThrottle(
-        registry.others = tuple(service.name for service in installed)
                 settings.serving.emulated_cores, now=time.monotonic(), cpu=time.process_time
             ),
             decoder=DecoderThread(loop.call_soon_threadsafe),
