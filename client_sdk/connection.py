@@ -17,6 +17,7 @@ from websockets.asyncio.client import connect as websocket_connect
 from websockets.exceptions import ConnectionClosed, InvalidStatus, WebSocketException
 from websockets.typing import Subprotocol
 
+from client_sdk.token_text import checked_token
 from rse_pf.config import SessionSettings
 from rse_pf.errors import (
     Conflict,
@@ -67,6 +68,10 @@ _MIN_TICK_S = 0.001
 _LATE_WELCOME_S = 60.0
 _CHECK_RUNNING = "is the platform running? start it with rse-pf local start"
 _CHECK_ADDRESS = "is it an RSE-PF server?"
+_ISSUE = (
+    "issue one: rse-pf token issue ROBOT; it is valid for 15 minutes, so a longer run passes an async "
+    "function that returns a fresh one"
+)
 
 
 def websocket_options(settings: SessionSettings) -> dict[str, Any]:
@@ -136,11 +141,14 @@ class Connection:
         self._main_tasks: list[asyncio.Task[None]] = []
         self._closed = False
 
-    async def open(self) -> None:
+    async def open(self, *, may_be_down: bool = False) -> None:
         """Connect to a server, with a few attempts.
 
+        Args:
+            may_be_down: Return after a first attempt that no server answered, and go on in the background.
+
         Raises:
-            Unauthorized: The token is failed.
+            Unauthorized: The token is missing, wrong or expired.
             UnsupportedProtocol: Client and server share no sub-protocol.
             ConnectError: No server answers at the address.
         """
@@ -149,7 +157,12 @@ class Connection:
                 self._adopt(await self._dial())
                 break
             except DialError as failed:
-                if attempt == _FIRST_TRIES or failed.is_final or failed.is_wrong_address:
+                if failed.is_final or failed.is_wrong_address:
+                    raise failed.error from None
+                if may_be_down:
+                    self._on_change("link-lost", failed.error.message)
+                    break
+                if attempt == _FIRST_TRIES:
                     raise failed.error from None
                 await asyncio.sleep(self._pause_s(failed.after_s))
         self._main_tasks = [self._spawn(self._tick()), self._spawn(self._keep_connected())]
@@ -302,15 +315,24 @@ class Connection:
         return websocket
 
     async def _read_token(self) -> str | None:
+        """Return the token without the white space around it, which files and shells add."""
         if not callable(self._token):
-            return self._token
+            token = self._token
+        else:
+            try:
+                token = await self._token()
+            except Exception as error:
+                told = ConnectError(
+                    f"no token: the token callable raised {type(error).__name__}",
+                    hint="fix the token callable",
+                )
+                raise DialError(told) from error
+        if token is None:
+            return None
         try:
-            return await self._token()
-        except Exception as error:
-            told = ConnectError(
-                f"no token: the token callable raised {type(error).__name__}", hint="fix the token callable"
-            )
-            raise DialError(told) from error
+            return checked_token(token)
+        except Unauthorized as error:
+            raise DialError(error, is_final=True) from None
 
     async def _renew(self, socket: _Socket) -> None:
         """Send a fresh token on a live socket; without one, the robot reconnects when the socket expires."""
@@ -502,7 +524,7 @@ def dial_error_of(address: str, status: int, retry_after: str) -> DialError:
     """
     if status == 401:
         message = "the token is missing, wrong or expired"
-        return DialError(Unauthorized(message, hint="issue one: rse-pf token issue ROBOT"), is_final=True)
+        return DialError(Unauthorized(message, hint=_ISSUE), is_final=True)
     if status == 403:
         message = f"{address} forbids this robot to connect"
         return DialError(Forbidden(message, hint="ask the operator"), is_final=True)

@@ -109,11 +109,17 @@ class Robot:
         self._open = False
 
     async def __aenter__(self) -> Robot:
-        """Connect; raises Unauthorized or ConnectError, and MissingExtra with an offload."""
+        """Connect; with an offload, return also while no server answers: the robot answers until one does.
+
+        Raises:
+            Unauthorized: The token is missing, wrong or expired.
+            ConnectError: No server answers, and there is no offload.
+            MissingExtra: There is an offload, and no solver for it.
+        """
         try:
             if self._local is not None:
                 await self._local.prepare()
-            await self._connection.open()
+            await self._connection.open(may_be_down=self._offload is not None)
         except BaseException:
             await self.close()
             raise

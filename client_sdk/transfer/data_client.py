@@ -13,6 +13,7 @@ import http.client
 import json
 import os
 import random
+import ssl
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -21,6 +22,7 @@ from pathlib import Path
 from typing import Any, BinaryIO
 from urllib.parse import urlsplit
 
+from client_sdk.token_text import checked_token
 from rse_pf.errors import (
     BadRequest,
     CommandFailed,
@@ -50,7 +52,10 @@ Response = tuple[int, http.client.HTTPMessage, bytes]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DataOptions:
-    """Timeouts and retries of a client; ``deadline_s`` limits the time without any progress."""
+    """Timeouts and retries of a client; ``deadline_s`` limits the time without any progress.
+
+    ``ssl_context`` is for ``https:``; None trusts the authorities of the machine.
+    """
 
     timeout_s: float = 10.0
     deadline_s: float = 60.0
@@ -60,6 +65,7 @@ class DataOptions:
     clock: Callable[[], float] = time.monotonic
     sleep: Callable[[float], None] = time.sleep
     random: random.Random = field(default_factory=random.Random)
+    ssl_context: ssl.SSLContext | None = None
 
 
 class DataClient:
@@ -284,11 +290,19 @@ class DataClient:
             options.sleep(wait_s)
             pause = min(2 * pause, options.max_pause_s)
 
+    def _new_connection(self) -> http.client.HTTPConnection:
+        host, port, timeout_s = self._host, self._port, self._options.timeout_s
+        if self._secure and self._options.ssl_context is not None:
+            return http.client.HTTPSConnection(
+                host, port, timeout=timeout_s, context=self._options.ssl_context
+            )
+        made: http.client.HTTPConnection = _CONNECTIONS[self._secure](host, port, timeout=timeout_s)
+        return made
+
     def _request_once(self, method: str, path: str, body: bytes | None, headers: dict[str, str]) -> Response:
         if self._connection is None:
-            kind = _CONNECTIONS[self._secure]
-            self._connection = kind(self._host, self._port, timeout=self._options.timeout_s)
-        token = self._token if isinstance(self._token, str) else self._token()
+            self._connection = self._new_connection()
+        token = checked_token(self._token() if callable(self._token) else self._token)
         self._connection.request(method, path, body, {"Authorization": f"Bearer {token}", **headers})
         answer = self._connection.getresponse()
         content = answer.read()
