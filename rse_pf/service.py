@@ -132,6 +132,7 @@ def dispatch(
     server: str = "",
     on_defect: Callable[[Command, Exception], None] | None = None,
     report: Report | None = None,
+    received_s: float | None = None,
 ) -> Result | Failure:
     """Answer *command* with a result or a failure; never raise.
 
@@ -142,13 +143,17 @@ def dispatch(
         server: Name of the server in the answer.
         on_defect: Called with unexpected exceptions of the service, for the server's log.
         report: Passed to a service that reports progress.
+        received_s: When the command arrived at a server, by *clock*; None leaves the times of the server out
+            of the result.
     """
     started = clock()
     try:
         service = registry.get(command.service)
         request = request_of(command.payload, service)
-        options = {_REPORT: report} if service.reports and report is not None else {}
-        reply = service.function(request, **options)
+        if service.reports and report is not None:
+            reply = service.function(request, **{_REPORT: report})
+        else:
+            reply = service.function(request)
     except RsePfError as error:
         return failure_of(error, command, server=server)
     except (Exception, SystemExit) as error:  # noqa: BLE001  a service is untrusted code
@@ -159,7 +164,14 @@ def dispatch(
             f"service {command.service!r} failed", hint="see the server's log under this trace id"
         )
         return failure_of(defect, command, server=server)
-    return Result(id=command.id, reply=reply, server=server, compute_ms=(clock() - started) * 1e3)
+    ended = clock()
+    compute_ms = (ended - started) * 1e3
+    if received_s is None:
+        return Result(id=command.id, reply=reply, server=server, compute_ms=compute_ms)
+    return Result(
+        id=command.id, reply=reply, server=server, compute_ms=compute_ms,
+        queue_ms=(started - received_s) * 1e3, received_s=received_s, sent_s=ended,
+    )  # fmt: skip
 
 
 def failure_of(error: RsePfError, command: Command | None = None, *, server: str = "") -> Failure:

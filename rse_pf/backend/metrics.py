@@ -69,8 +69,10 @@ class LongestRecently:
 
     def note(self, duration_s: float, now: float) -> None:
         """Take one more, noted at *now* (s, monotonic)."""
-        self._turn(now)
-        self._longest_s[1] = max(self._longest_s[1], duration_s)
+        if int(now // _RECENT_S) != self._second:
+            self._turn(now)
+        if duration_s > self._longest_s[1]:
+            self._longest_s[1] = duration_s
 
     def longest_s(self, now: float) -> float:
         """Return the longest, 0 if nothing was noted recently."""

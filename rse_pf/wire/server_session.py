@@ -6,8 +6,9 @@ Messages and the time go in, decisions come out (`Send`, `Submit`, `Close` ...).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Literal
+
+import msgspec
 
 from rse_pf.config import SessionSettings
 from rse_pf.errors import (
@@ -77,37 +78,32 @@ CLOSE_RATE = 4429
 _BAD_MESSAGE_BYTES = 65_536
 
 
-@dataclass(frozen=True, slots=True)
-class Send:
+class Send(msgspec.Struct, frozen=True, gc=False):
     """Write this WebSocket message."""
 
     data: bytes
 
 
-@dataclass(frozen=True, slots=True)
-class Submit:
+class Submit(msgspec.Struct, frozen=True, gc=False):
     """Hand this command to the scheduler."""
 
     command: Command
 
 
-@dataclass(frozen=True, slots=True)
-class Close:
+class Close(msgspec.Struct, frozen=True, gc=False):
     """Close the socket with this code."""
 
     code: int
     reason: str
 
 
-@dataclass(frozen=True, slots=True)
-class Withdraw:
+class Withdraw(msgspec.Struct, frozen=True, gc=False):
     """The robot cancels this command."""
 
     id: int
 
 
-@dataclass(frozen=True, slots=True)
-class Renewal:
+class Renewal(msgspec.Struct, frozen=True, gc=False):
     """Verify this fresh token and answer with `ServerSession.renewed`."""
 
     token: str
@@ -158,6 +154,8 @@ class ServerSession:
             message = self.codec.decode_short_from_robot(data, max_bytes)
         except ProtocolError as error:
             return self.take(error, now, len(data))
+        if type(message) is Command and self.state == "open":
+            return self._command(message)
         return None if message is None else self.take(message, now)
 
     def take(self, message: FromRobot | ProtocolError, now: float, size_bytes: int = 0) -> list[Decision]:

@@ -72,6 +72,10 @@ class Admission:
         share = _SUSPECTS_SHARE if bad_messages else 1.0
         return not unread_bytes or unread_bytes + size_bytes <= share * self._max_unread_bytes
 
+    def is_in_scope(self, service: str, claims: Claims) -> bool:
+        """Return whether a token allows commands to *service*."""
+        return not claims.scopes or scopes_allow(claims.scopes, f"services:{service}")
+
     def judge(
         self,
         queued: QueuedCommand,
@@ -90,7 +94,7 @@ class Admission:
             max_delay_s: How long commands may wait now; see `Scheduler.max_delay_s`.
         """
         service = queued.command.service
-        if claims is not None and not scopes_allow(claims.scopes, f"services:{service}"):
+        if claims is not None and not self.is_in_scope(service, claims):
             forbidden = Forbidden(
                 f"this token does not hold the scope services:{service}", hint="issue one that does"
             )

@@ -7,13 +7,12 @@ Neither a payload nor a token reaches the log.
 from __future__ import annotations
 
 import traceback
-from dataclasses import dataclass
 
 import msgspec
 
 from rse_pf.backend.gateway.admission import UnreadRefusal
 from rse_pf.backend.gateway.connection import RobotConnection
-from rse_pf.backend.object_refs import ObjectRefs
+from rse_pf.backend.object_refs import ObjectRefs, takes_objects
 from rse_pf.backend.ports import WorkerContext
 from rse_pf.backend.scheduling.scheduler import QueuedCommand, RefusedCommand
 from rse_pf.errors import Busy, InternalError, LimitExceeded, RsePfError
@@ -28,8 +27,7 @@ _FREQUENT = ("ok", Busy.code, "stale")
 """Results that come hundreds of times a second: counted, and logged for developers only."""
 
 
-@dataclass(frozen=True, slots=True)
-class EncodedAnswer:
+class EncodedAnswer(msgspec.Struct, frozen=True):
     """The final answer to a command, and its bytes."""
 
     queued: QueuedCommand
@@ -52,21 +50,43 @@ class Answers:
             objects: Puts stored objects into payloads, and large replies into the store.
         """
         self.objects = objects
+        self.with_objects = frozenset(
+            service.name
+            for service in registry
+            if objects.store is not None and takes_objects(service.request_type)
+        )
+        """Services whose payloads may name stored objects."""
         self._context = context
         self._registry = registry
         self._services = services
+        self._monotonic = context.clocks.monotonic
+        self._logs_frequent = context.log.writes("debug")
 
     def compute(self, queued: QueuedCommand) -> EncodedAnswer:
         """Call the service and encode its answer; runs in the loop or in a thread, and touches nothing
         shared."""
-        monotonic, command = self._context.clocks.monotonic, queued.command
-        started = monotonic()
+        command = queued.command
+        if command.service in self.with_objects:
+            return self._compute_with_objects(queued)
+        message = dispatch(
+            self._registry, command, self._monotonic, server=self._context.server_id,
+            on_defect=self._log_defect, received_s=queued.received_s,
+        )  # fmt: skip
+        return self._fitting(queued, message)
+
+    def _compute_with_objects(self, queued: QueuedCommand) -> EncodedAnswer:
+        """Do the same for a service whose payload may name stored objects."""
+        started = self._monotonic()
         try:
-            command = self.objects.put_in(command, self._registry, queued.owner)
+            command = self.objects.put_in(queued.command, self._registry, queued.owner)
         except RsePfError as error:
             return self._failed(queued, error)
         message = dispatch(
-            self._registry, command, monotonic, server=self._context.server_id, on_defect=self._log_defect
+            self._registry,
+            command,
+            self._monotonic,
+            server=self._context.server_id,
+            on_defect=self._log_defect,
         )
         return self.encode(queued, message, started)
 
@@ -80,11 +100,9 @@ class Answers:
                 message,
                 queue_ms=(started_s - queued.received_s) * 1e3,
                 received_s=queued.received_s,
-                sent_s=self._context.clocks.monotonic(),
+                sent_s=self._monotonic(),
             )
-        answer = self._encoded(queued, message)
-        kept = self.objects.kept(message, answer.message, queued.owner)
-        return answer if kept is answer.message else self._encoded(queued, kept)
+        return self._fitting(queued, message)
 
     def send(self, answer: EncodedAnswer, now: float) -> None:
         """Write *answer*, unless its robot is gone; count and log it in any case."""
@@ -155,6 +173,14 @@ class Answers:
         """Return the name of *service* for metrics and log, the same for all that this server does not
         offer."""
         return service if service in self._services else _UNKNOWN
+
+    def _fitting(self, queued: QueuedCommand, message: Result | Failure) -> EncodedAnswer:
+        """Encode *message*; blocks for the store if the reply is too large for a message."""
+        answer = self._encoded(queued, message)
+        if answer.message is message:
+            return answer
+        kept = self.objects.kept(message, answer.message, queued.owner)
+        return answer if kept is answer.message else self._encoded(queued, kept)
 
     def _encoded(self, queued: QueuedCommand, message: Result | Failure) -> EncodedAnswer:
         codec, command = queued.owner.session.codec, queued.command

@@ -99,7 +99,7 @@ class RobotConnection:
         self._context = handler.context
         self._wire = wire
         self._assembler = FrameAssembler(handler.context.settings.session)
-        self._deferred: deque[tuple[Received, float]] | None = None
+        self._deferred: deque[tuple[bytes, bool, float]] | None = None
         """Messages that arrived while the decoder thread has one of this robot; None if it has none."""
 
     @property
@@ -120,9 +120,12 @@ class RobotConnection:
     def frame(self, opcode: int, fin: bool, rsv: bool, payload: bytes) -> None:
         """Take one unmasked frame."""
         now = self._context.clocks.monotonic()
+        if self._assembler.is_whole(opcode, fin, rsv, len(payload)):
+            self._take(payload, False, now)
+            return
         decision = self._assembler.receive(opcode, fin, rsv, payload, now)
         if isinstance(decision, Received):
-            self._take(decision, now)
+            self._take(decision.data, decision.is_text, now)
         elif isinstance(decision, SendPong):
             self._wire.send_pong(decision.data)
         elif isinstance(decision, CloseSocket):
@@ -131,9 +134,12 @@ class RobotConnection:
 
     def answer(self, data: bytes) -> None:
         """Write the final answer to a command; does nothing if the socket is gone."""
-        if self.is_connected and self.session is not None:
-            self.session.in_flight -= 1
-            self.write(data)
+        session = self.session
+        if self.is_connected and session is not None:
+            session.in_flight -= 1
+            if not self._assembler.closed:
+                self._context.metrics.bytes_out += len(data)
+                self._wire.send(data, session.codec.is_text)
 
     def write(self, data: bytes) -> None:
         """Write one message, unless the connection is closing."""
@@ -168,18 +174,18 @@ class RobotConnection:
         self.is_connected = False
         self._handler.disconnect(self)
 
-    def _take(self, received: Received, now: float) -> None:
+    def _take(self, data: bytes, is_text: bool, now: float) -> None:
         """Take one whole message: defer, echo, refuse, decode at once, or pass to the decoder thread."""
         self.last_heard_s = now
-        handler, session, data = self._handler, self.session, received.data
+        handler, session = self._handler, self.session
         if self._deferred is not None:
-            self._deferred.append((received, now))
+            self._deferred.append((data, is_text, now))
             return
         metrics = self._context.metrics
         metrics.bytes_in += len(data)
         if session is None:
             metrics.bytes_out += len(data)
-            self._wire.send(data, received.is_text)
+            self._wire.send(data, is_text)
             return
         if session.state == "open" and handler.refuses_unread(self, session, data, now):
             return
@@ -187,7 +193,9 @@ class RobotConnection:
         decoder, decisions = handler.decoder, None
         if len(data) <= decoder.short_bytes:
             decisions = session.receive_short(data, now, decoder.short_inflated_bytes)
-        if decisions is not None:
+        if decisions is not None and len(decisions) == 1 and type(decisions[0]) is Submit:
+            handler.submit(self, decisions[0].command, len(data), now)
+        elif decisions is not None:
             self._follow(session, decisions, len(data), now, state, bad_messages)
         elif not handler.refuses_long(self, session, data):
             self._decode_in_thread(session, data, now)
@@ -200,9 +208,9 @@ class RobotConnection:
             if self.is_connected and not self._assembler.closed:
                 decisions = session.take(message, now, len(data))
                 self._follow(session, decisions, len(data), now, state, bad_messages)
-            for received, arrived in deferred or ():
+            for waiting, was_text, arrived in deferred or ():
                 if not self._assembler.closed:
-                    self._take(received, arrived)
+                    self._take(waiting, was_text, arrived)
             self._wire.read_on()
 
         self._deferred = deque()

@@ -6,7 +6,7 @@ allowed size is held.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import msgspec
 
 from rse_pf.config import SessionSettings
 from rse_pf.token_bucket import TokenBucket
@@ -38,23 +38,20 @@ _MAX_CONTROL = 125
 _KNOWN_CLOSE_CODES = frozenset({1000, 1001, 1002, 1003, 1007, 1008, 1009, 1010, 1011, 1012, 1013, 1014})
 
 
-@dataclass(frozen=True, slots=True)
-class Received:
+class Received(msgspec.Struct, frozen=True, gc=False):
     """One whole message; text is valid UTF-8."""
 
     data: bytes
     is_text: bool
 
 
-@dataclass(frozen=True, slots=True)
-class SendPong:
+class SendPong(msgspec.Struct, frozen=True, gc=False):
     """Answer a ping frame."""
 
     data: bytes
 
 
-@dataclass(frozen=True, slots=True)
-class CloseSocket:
+class CloseSocket(msgspec.Struct, frozen=True, gc=False):
     """Send this close code, then end the connection."""
 
     code: int
@@ -85,6 +82,17 @@ class FrameAssembler:
         self._count = 0
         self._size = 0
         self._control_frames = TokenBucket(limits.max_control_per_s, limits.max_control_per_s)
+
+    def is_whole(self, opcode: int, fin: bool, rsv: bool, size_bytes: int) -> bool:
+        """Return whether a frame is a binary message that `receive` would return as it is, as most are."""
+        return (
+            opcode == BINARY
+            and fin
+            and not rsv
+            and not self.closed
+            and self._message is None
+            and size_bytes <= self._limits.max_message_bytes
+        )
 
     def receive(self, opcode: int, fin: bool, rsv: bool, payload: bytes, now: float) -> FrameDecision | None:
         """Return what one frame, unmasked, that arrived at *now* (s) means; None: wait for more."""
@@ -175,18 +183,20 @@ class CloseBorder:
         self._left = 0
         self._is_close = False
 
-    def wanted(self, data: memoryview) -> int:
-        """Return how many of the next bytes of the stream stand before the end of the CLOSE frame."""
+    def wanted(self, data: memoryview, n: int) -> int:
+        """Return how many of the next bytes, the first *n* of *data*, stand before the end of the CLOSE."""
         if self.shut:
             return 0
-        start = 0
-        if not self.is_upgraded:
-            start = self._end_of_request(data)
-            if start < 0:
-                return len(data)
-        elif not self._left and not self._head and _is_one_data_frame(data):
-            return len(data)
-        return self._walk(data, start)
+        left = self._left
+        if left:
+            if n <= left and not self._is_close:
+                self._left = left - n
+                return n
+        elif self.is_upgraded and not self._head and _is_one_data_frame(data, n):
+            return n
+        data = data[:n]
+        start = 0 if self.is_upgraded else self._end_of_request(data)
+        return n if start < 0 else self._walk(data, start)
 
     def _end_of_request(self, data: memoryview) -> int:
         seen = self._head + bytes(data)
@@ -239,8 +249,11 @@ def _payload_length(head: bytes | memoryview) -> int:
     return int.from_bytes(head[2:10], "big") if size == 127 else size
 
 
-def _is_one_data_frame(data: memoryview) -> bool:
-    if len(data) < 2 or data[0] & 8:
+def _is_one_data_frame(data: memoryview, n: int) -> bool:
+    """Return whether the first *n* bytes are one whole masked data frame of less than 64 KiB."""
+    if n < 6 or data[0] & 8:
         return False
-    length = _head_length(data)
-    return length <= len(data) and length + _payload_length(data) == len(data)
+    size = data[1] - 128
+    if size < 126:
+        return n == 6 + size
+    return size == 126 and n == 8 + (data[2] << 8) + data[3]

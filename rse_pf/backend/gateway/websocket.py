@@ -239,7 +239,8 @@ def protocol_type(picows: Any) -> Any:
             self._pending.connected(transport)
 
         def get_buffer(self, hint: int) -> memoryview:
-            self._buffer = get_buffer(self, hint)[:_MAX_READ_BYTES]
+            buffer: memoryview = get_buffer(self, hint)
+            self._buffer = buffer if len(buffer) <= _MAX_READ_BYTES else buffer[:_MAX_READ_BYTES]
             return self._buffer
 
         def buffer_updated(self, n: int) -> None:
@@ -247,7 +248,7 @@ def protocol_type(picows: Any) -> Any:
                 return
             if self.transport is not None and self.transport.is_close_frame_sent:
                 return
-            wanted = self._border.wanted(self._buffer[:n])
+            wanted = self._border.wanted(self._buffer, n)
             if wanted:
                 buffer_updated(self, wanted)
 
@@ -262,7 +263,7 @@ def protocol_type(picows: Any) -> Any:
 
 def listener_type(picows: Any, loop: asyncio.AbstractEventLoop, serving: ServingSettings) -> Any:
     """Return the subclass of picows' listener that passes frames between a socket and the dispatcher."""
-    kinds = picows.WSMsgType
+    text, binary = int(picows.WSMsgType.TEXT), int(picows.WSMsgType.BINARY)
 
     class Listener(picows.WSListener):  # type: ignore[misc]
         """One robot's socket: passes frames to its connection, and is the connection's `Wire`."""
@@ -286,7 +287,7 @@ def listener_type(picows: Any, loop: asyncio.AbstractEventLoop, serving: Serving
             if self._connection is not None:
                 rsv = bool(frame.rsv1 or frame.rsv2 or frame.rsv3)
                 payload = frame.get_payload_as_bytes()
-                self._connection.frame(int(frame.msg_type), bool(frame.fin), rsv, payload)
+                self._connection.frame(frame.msg_type, bool(frame.fin), rsv, payload)
 
         def on_ws_disconnected(self, transport: Any) -> None:
             if self._cut is not None:
@@ -309,7 +310,7 @@ def listener_type(picows: Any, loop: asyncio.AbstractEventLoop, serving: Serving
 
         def send(self, data: bytes, is_text: bool) -> None:
             if self._connection is not None:
-                self._transport.send(kinds.TEXT if is_text else kinds.BINARY, data)
+                self._transport.send(text if is_text else binary, data)
 
         def send_pong(self, data: bytes) -> None:
             self._transport.send_pong(data)

@@ -22,7 +22,7 @@ less CPU than one at a time."""
 class CpuThrottle:
     """The bucket of one worker."""
 
-    __slots__ = ("_at", "_burst_s", "_cores", "_cpu", "_cpu_s", "_level_s")
+    __slots__ = ("_at", "_burst_s", "_cores", "_cpu", "_cpu_s", "_level_s", "is_on")
 
     def __init__(
         self, cores: float, *, now: float, cpu: Callable[[], float], burst_s: float = _BURST_S
@@ -35,6 +35,7 @@ class CpuThrottle:
             cpu: Returns the CPU seconds that the process has used.
             burst_s: Size of the bucket, CPU seconds.
         """
+        self.is_on = cores > 0
         self._cores = cores
         self._burst_s = self._level_s = burst_s
         self._at = now

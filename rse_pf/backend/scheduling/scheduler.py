@@ -14,6 +14,8 @@ from collections import deque
 from dataclasses import dataclass, field
 from typing import Any
 
+import msgspec
+
 from rse_pf.config import ServingSettings
 from rse_pf.errors import Busy, Expired, RsePfError, Stale
 from rse_pf.identity import RobotId
@@ -63,12 +65,13 @@ QUEUE_TARGET_S, QUEUE_INTERVAL_S = 0.05, 0.1
 Source:
     CoDel, Nichols and Jacobson 2012.
 """
+_SHORT_COMPUTE_S = 0.001
+"""Passing a command to a thread takes 0.1 ms of CPU, and up to 5 ms until the thread has the lock."""
 INLINE_BYTES = 16_384
 """A command up to this size is computed in the event loop when nothing waits."""
 
 
-@dataclass(slots=True, eq=False)
-class QueuedCommand:
+class QueuedCommand(msgspec.Struct, eq=False):
     """One command from its arrival to its answer; ``owner`` is the connection that waits for the answer."""
 
     owner: Any
@@ -204,11 +207,30 @@ class Scheduler:
         self._note_turn_wait(0.0, now)
         return None, refusals
 
+    def start_alone(self, queued: QueuedCommand, now: float) -> bool:
+        """Start *queued*, which was admitted, without a place in the queue; False if others wait or run.
+
+        The same as `submit` and `start` for a command that finds the server idle; `done_alone` ends it.
+        """
+        if self._robots or queued.deadline_s <= now:
+            return False
+        waited_s = now - queued.received_s
+        self._note_turn_wait(waited_s, now)
+        queued.started_s = now
+        self.running += 1
+        self._started += 1
+        self._measure_turn(waited_s, now)
+        return True
+
+    def done_alone(self, queued: QueuedCommand, now: float) -> None:
+        """Note that the compute of a command that `start_alone` had started ended."""
+        self.running -= 1
+        self._note_service(now - queued.started_s)
+
     def done(self, queued: QueuedCommand, now: float) -> None:
         """Note that the compute of *queued* ended; its robot may take another turn."""
         self.running -= 1
-        spent_s = now - queued.started_s
-        self._service_s = _averaged(self._service_s, spent_s) if self._service_s else spent_s
+        self._note_service(now - queued.started_s)
         robot = self._robots[queued.robot]
         robot.running, robot.free_since = None, now
         if robot.waiting:
@@ -254,9 +276,11 @@ class Scheduler:
         time.
 
         While the server is behind, a single solver thread and a server of one core have nothing to overlap
-        with but refusals, which cost less than passing the command to the thread.
+        with but refusals, which cost less than passing the command to the thread.  So it is with services
+        that answer sooner than two threads pass the interpreter lock to each other.
         """
-        saves_time = self.waiting == 0 or (self.is_behind and self._is_serial)
+        is_short = 0.0 < self._service_s <= _SHORT_COMPUTE_S
+        saves_time = self.waiting == 0 or is_short or (self.is_behind and self._is_serial)
         return cheap and size_bytes <= INLINE_BYTES and saves_time and self.running <= 1
 
     def _delay_s(self, robot: _Robot | None) -> float:
@@ -291,7 +315,7 @@ class Scheduler:
         """Enter *behind* after an interval above the target."""
         if self.is_behind:
             self._judge(now)
-        elif wait_s <= self._wanted_s:
+        elif wait_s <= QUEUE_TARGET_S or wait_s <= self._wanted_s:
             self._late_since = None
         elif self._late_since is None:
             self._late_since = now
@@ -307,6 +331,9 @@ class Scheduler:
         if now - self._judged_s >= QUEUE_INTERVAL_S:
             self.is_behind = self._refused > _MAX_REFUSED_SHARE * (self._refused + self._started)
             self._judged_s, self._started, self._refused = now, 0, 0
+
+    def _note_service(self, spent_s: float) -> None:
+        self._service_s = _averaged(self._service_s, spent_s) if self._service_s else spent_s
 
     def _measure_turn(self, waited_s: float, now: float) -> None:
         """Average the time between two starts while robots wait."""
