@@ -14,7 +14,10 @@ if TYPE_CHECKING:
     from client_sdk.blocking import BlockingRobot, connect_blocking
     from client_sdk.datasets import Dataset, open_dataset
     from client_sdk.frontend import Frame, FrontEndOptions, PoseQuery, TrackedFrame, Tracker
+    from client_sdk.mapper import BlockingMapper, Mapper
     from client_sdk.mapping import MapOptions, PointMap, Trajectory
+    from client_sdk.monocular.scale import MarkerScale, OdometryScale
+    from client_sdk.monocular_tracker import MonocularOptions
     from client_sdk.offload import CloudFirst
     from client_sdk.robot import Robot, connect
     from client_sdk.stats import Stats
@@ -24,6 +27,7 @@ if TYPE_CHECKING:
 __all__ = [
     "Answer",
     "BackgroundUploader",
+    "BlockingMapper",
     "BlockingRobot",
     "CloudFirst",
     "DataClient",
@@ -32,6 +36,10 @@ __all__ = [
     "Frame",
     "FrontEndOptions",
     "MapOptions",
+    "Mapper",
+    "MarkerScale",
+    "MonocularOptions",
+    "OdometryScale",
     "PointMap",
     "PoseAnswer",
     "PoseQuery",
@@ -49,6 +57,7 @@ __all__ = [
 _HOMES = {
     "Answer": "answers",
     "BackgroundUploader": "transfer.background_upload",
+    "BlockingMapper": "mapper",
     "BlockingRobot": "blocking",
     "CloudFirst": "offload",
     "DataClient": "transfer.data_client",
@@ -57,6 +66,10 @@ _HOMES = {
     "Frame": "frontend",
     "FrontEndOptions": "frontend",
     "MapOptions": "mapping",
+    "Mapper": "mapper",
+    "MarkerScale": "monocular.scale",
+    "MonocularOptions": "monocular_tracker",
+    "OdometryScale": "monocular.scale",
     "PointMap": "mapping",
     "PoseAnswer": "answers",
     "PoseQuery": "frontend",

@@ -10,11 +10,14 @@ import functools
 import threading
 from collections.abc import Callable, Coroutine
 from types import TracebackType
-from typing import Any, Concatenate, ParamSpec, TypeVar
+from typing import TYPE_CHECKING, Any, Concatenate, ParamSpec, TypeVar
 
 from client_sdk.robot import Robot, connect
 from client_sdk.stats import Stats
 from rse_pf.errors import Disconnected
+
+if TYPE_CHECKING:
+    from client_sdk.mapper import BlockingMapper, Mapper
 
 __all__ = ["BlockingRobot", "connect_blocking"]
 
@@ -32,6 +35,20 @@ def _blocking(
         return self._wait(method(self._robot, *args, **kwargs))
 
     return call
+
+
+def _blocking_mapper(
+    make: Callable[Concatenate[Robot, P], Mapper],
+) -> Callable[Concatenate[BlockingRobot, P], BlockingMapper]:
+    """Return `Robot.mapper` for a `BlockingRobot`, whose mapper runs in the robot's event loop."""
+
+    @functools.wraps(make)
+    def mapper(self: BlockingRobot, /, *args: P.args, **kwargs: P.kwargs) -> BlockingMapper:
+        from client_sdk.mapper import BlockingMapper
+
+        return BlockingMapper(make(self._robot, *args, **kwargs), self._wait)
+
+    return mapper
 
 
 class BlockingRobot:
@@ -73,6 +90,7 @@ class BlockingRobot:
 
     solve_pnp = _blocking(Robot.solve_pnp)
     call = _blocking(Robot.call)
+    mapper = _blocking_mapper(Robot.mapper)
 
     @property
     def stats(self) -> Stats:

@@ -271,13 +271,27 @@ class PoseQuery:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class TrackedFrame:
-    """The result for one frame; a lost one has no pose and must not be drawn."""
+    """The result for one frame; a lost one has no pose and must not be drawn.
+
+    ``T_world_camera`` ``(4, 4)`` is in metres, unless ``scale`` says ``up to scale``.  ``status`` is
+    ``starting`` before a camera without depth has moved enough; ``reason`` says why there is no pose, or why
+    it is weak.  `Mapper.track` fills the rest: ``covariance`` ``(6, 6)`` of the twist (metres, radians) on
+    the left of the pose of the last query, who solved it, and how long that took.  ``corrected`` says that
+    poses that were returned before have changed: read the trajectory again.
+    """
 
     frame: Frame
     T_world_camera: Array | None
     keyframe: bool
     inliers: int
     matches: int
+    status: Literal["first", "tracked", "lost", "starting"] = "tracked"
+    reason: str = ""
+    scale: Literal["metric", "up to scale"] = "metric"
+    covariance: Array | None = None
+    source: Literal["cloud", "robot", "none"] = "none"
+    round_trip_ms: float | None = None
+    corrected: bool = False
 
     @property
     def lost(self) -> bool:

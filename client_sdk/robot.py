@@ -28,6 +28,11 @@ if TYPE_CHECKING:
     import numpy as np
     import numpy.typing as npt
 
+    from client_sdk.frontend import FrontEndOptions
+    from client_sdk.mapper import Mapper
+    from client_sdk.mapping import MapOptions
+    from client_sdk.monocular.scale import MarkerScale, OdometryScale
+    from client_sdk.monocular_tracker import MonocularOptions
     from rse_pf.geometry import Camera
     from rse_pf.pnp import DepthNoise, PnpOptions
 
@@ -249,6 +254,29 @@ class Robot:
         except RsePfError as error:
             self._keeper.failures[error.code] += 1
             raise
+
+    def mapper(
+        self,
+        *,
+        deadline_s: float | None = None,
+        camera: Camera | None = None,
+        options: FrontEndOptions | None = None,
+        monocular: MonocularOptions | None = None,
+        depth: bool | None = None,
+        scale: OdometryScale | MarkerScale | None = None,
+        map_options: MapOptions | None = None,
+        T_world_start: npt.NDArray[np.float64] | None = None,
+    ) -> Mapper:
+        """Return a `Mapper` that asks this robot for its poses, within *deadline_s* each.
+
+        The other arguments are those of `Mapper`.
+        """
+        from client_sdk.mapper import Mapper, ask_robot
+
+        return Mapper(
+            ask=ask_robot(self, deadline_s), camera=camera, options=options, monocular=monocular,
+            depth=depth, scale=scale, map_options=map_options, T_world_start=T_world_start,
+        )  # fmt: skip
 
     def post(
         self,

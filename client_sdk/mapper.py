@@ -1,0 +1,345 @@
+"""From frames to a trajectory and a map: the one object that a robot with a camera needs.
+
+`Mapper` sends each frame's matches to the PnP service and keeps what comes back.  It opens no connection and
+no camera: it is given a function that answers pose queries, such as that of a connected robot.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from collections import Counter
+from collections.abc import Awaitable, Callable, Coroutine
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Protocol, TypeVar
+
+import numpy as np
+
+from client_sdk.answers import PoseAnswer
+from client_sdk.frontend import Frame, FrontEndOptions, PoseQuery, TrackedFrame, Tracker
+from client_sdk.mapping import MapOptions, PointMap, Trajectory, write_ply, write_trajectory
+from client_sdk.monocular.scale import MarkerScale, OdometryScale
+from client_sdk.monocular_tracker import MonocularOptions, MonocularTracker
+from rse_pf.errors import ConfigurationError, RsePfError, UsageError
+from rse_pf.geometry import Array, Camera
+from rse_pf.pnp import PnpOptions
+
+__all__ = ["AskPose", "BlockingMapper", "Mapper", "PoseSolver", "ask_robot"]
+
+T = TypeVar("T")
+
+AskPose = Callable[[PoseQuery], Awaitable[PoseAnswer]]
+"""Answers one pose query, or raises an RsePfError, with which the query counts as not answered."""
+
+_MIN_READINGS = 2
+
+
+class PoseSolver(Protocol):
+    """What `ask_robot` needs of a robot."""
+
+    async def solve_pnp(
+        self, points_world: Array, pixels: Array, camera: Camera, options: PnpOptions | None = None, *,
+        depths_m: Array | None = None, deadline_s: float | None = None, keep: bool = False,
+    ) -> PoseAnswer:  # fmt: skip
+        """Estimate the camera pose of one frame."""
+
+
+def ask_robot(robot: PoseSolver, deadline_s: float | None = None) -> AskPose:
+    """Return a function that answers pose queries by a connected robot, within *deadline_s* each."""
+
+    async def ask(query: PoseQuery) -> PoseAnswer:
+        found = query.correspondences
+        return await robot.solve_pnp(
+            found.points_world,
+            found.pixels,
+            query.camera,
+            PnpOptions(inlier_px=query.inlier_px, max_iterations=query.max_iterations),
+            depths_m=found.depths_m if found.depths_m.any() else None,
+            deadline_s=deadline_s,
+            keep=True,
+        )
+
+    return ask
+
+
+class Mapper:
+    """Tracks a camera frame by frame, and keeps its trajectory and its map.
+
+    ::
+
+        async with connect(url, token=token) as robot:
+            mapper = robot.mapper()
+            for frame in open_camera("0", intrinsics=Path("intrinsics.json")):
+                tracked = await mapper.track(frame)
+            mapper.save(Path("out"))
+
+    Frames with depth give a dense map in metres.  Frames without depth (all zero) give landmarks, up to scale
+    unless *scale* knows a length.
+    """
+
+    def __init__(
+        self,
+        *,
+        ask: AskPose,
+        camera: Camera | None = None,
+        options: FrontEndOptions | None = None,
+        monocular: MonocularOptions | None = None,
+        depth: bool | None = None,
+        scale: OdometryScale | MarkerScale | None = None,
+        map_options: MapOptions | None = None,
+        T_world_start: Array | None = None,
+    ) -> None:
+        """Start without frames.
+
+        Args:
+            ask: Answers pose queries.
+            camera: Frames of another camera are refused; None takes that of the first frame.
+            options: For frames with depth.
+            monocular: For frames without depth.
+            depth: Whether to use depth; None means: if the first frame has some.
+            scale: For frames without depth: where metres come from; None means "up to scale".
+            map_options: Density of the map of frames with depth.
+            T_world_start: ``(4, 4)``, pose of the first camera; None means the identity.
+        """
+        self.camera = camera
+        self._ask = ask
+        self._options = options
+        self._monocular = monocular
+        self._depth = depth
+        self._scale = scale
+        self._map_options = map_options or MapOptions()
+        self._T_world_start = T_world_start
+        self._tracker: Tracker | MonocularTracker | None = None
+        self._dense = PointMap(self._map_options)
+        self._stamps: list[float] = []
+        self._poses: list[Array] = []
+        self._is_metric = False
+        self._one_frame = asyncio.Lock()
+        self._round_trips_ms: list[float] = []
+        self._sources: Counter[str] = Counter()
+        self._reasons: Counter[str] = Counter()
+
+    async def track(self, frame: Frame, *, position_m: Array | None = None) -> TrackedFrame:
+        """Return the pose of the next frame, or why there is none; the work is done in a thread.
+
+        Args:
+            frame: Of the same camera as all others, in the order of time.
+            position_m: ``(3,)``, position of the camera by the robot's odometry, for `OdometryScale`.
+
+        Raises:
+            UsageError: The frame is of another camera.
+            ConfigurationError: The function that answers cannot work at all, such as without a package.
+        """
+        async with self._one_frame:
+            tracker = self._tracker_for(frame)
+            step = await asyncio.to_thread(tracker.prepare, frame)
+            answer: PoseAnswer | None = None
+            failure = ""
+            while isinstance(step, PoseQuery):
+                try:
+                    answer, failure = await self._ask(step), ""
+                except ConfigurationError:
+                    _give_up(tracker, step)
+                    raise
+                except RsePfError as error:
+                    answer, failure = None, f"{error.code}: {error.message}"
+                except BaseException:
+                    _give_up(tracker, step)
+                    raise
+                solution = None if answer is None else answer.solution
+                step = await asyncio.to_thread(
+                    tracker.accept,
+                    step,
+                    None if solution is None else solution.T_camera_world,
+                    0 if solution is None else len(solution.inliers),
+                )
+            return await asyncio.to_thread(self._finished, step, answer, failure, position_m)
+
+    @property
+    def map(self) -> PointMap:
+        """The map so far: dense with depth, else its landmarks."""
+        tracker = self._tracker
+        if not isinstance(tracker, MonocularTracker):
+            return self._dense
+        sparse = PointMap(self._map_options)
+        sparse.add_points(*tracker.points())
+        return sparse
+
+    @property
+    def trajectory(self) -> Trajectory:
+        """The poses so far, with all corrections."""
+        if isinstance(self._tracker, MonocularTracker):
+            return self._tracker.trajectory()
+        return Trajectory(np.array(self._stamps), np.array(self._poses).reshape(-1, 4, 4))
+
+    @property
+    def frames(self) -> int:
+        """The number of frames tracked so far."""
+        return 0 if self._tracker is None else self._tracker.frames
+
+    @property
+    def lost_frames(self) -> int:
+        """The number of frames without a pose, but for those before the start of a camera without depth."""
+        return 0 if self._tracker is None else self._tracker.lost_frames
+
+    @property
+    def keyframes(self) -> int:
+        """The number of keyframes."""
+        return 0 if self._tracker is None else self._tracker.keyframes
+
+    @property
+    def scale(self) -> str:
+        """Where metres come from: ``metric, by depth``, ``metric, by ...``, or ``up to scale``."""
+        if self._tracker is None or isinstance(self._tracker, Tracker):
+            return "metric, by depth" if self._tracker is not None else "unknown: no frame yet"
+        return f"metric, by {self._scale.name}" if self._is_metric and self._scale else "up to scale"
+
+    def report(self) -> dict[str, Any]:
+        """Return the figures of the drive, as for ``report.json``."""
+        trips = np.array(self._round_trips_ms)
+        starting = self._tracker.starting_frames if isinstance(self._tracker, MonocularTracker) else 0
+        trajectory = self.trajectory
+        return {
+            "frames": self.frames,
+            "lost_frames": self.lost_frames,
+            "frames_before_start": starting,
+            "keyframes": self.keyframes,
+            "scale": self.scale,
+            "unit": "unit of the map" if self.scale == "up to scale" else "m",
+            "path": round(trajectory.length_m, 3) if len(trajectory) > 1 else 0.0,
+            "map_points": len(self.map),
+            "answered_by": dict(self._sources),
+            "round_trip_ms": {
+                f"p{q}": round(float(np.percentile(trips, q)), 2) if len(trips) else None
+                for q in (50, 95, 99)
+            },
+            "lost_because": dict(self._reasons.most_common(5)),
+        }
+
+    def save(self, folder: Path) -> dict[str, Any]:
+        """Write ``map.ply``, ``trajectory.txt`` and ``report.json``; return the report.
+
+        Raises:
+            UsageError: The folder cannot be written.
+        """
+        report = self.report()
+        # Several views have triangulated a landmark; a voxel of a dense map is trusted if it was read twice.
+        least = 1 if isinstance(self._tracker, MonocularTracker) else _MIN_READINGS
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            write_ply(folder / "map.ply", *self.map.points(min_readings=least))
+            write_trajectory(folder / "trajectory.txt", self.trajectory)
+            text = json.dumps(report, indent=2) + "\n"
+            (folder / "report.json").write_text(text, encoding="utf-8")
+        except OSError as error:
+            raise UsageError(
+                f"cannot write {folder}: {error.strerror}", hint="name another folder"
+            ) from error
+        return report
+
+    def _tracker_for(self, frame: Frame) -> Tracker | MonocularTracker:
+        self.camera = self.camera or frame.camera
+        if frame.camera != self.camera:
+            raise UsageError(
+                f"a frame of {frame.camera.width}x{frame.camera.height} px is of another camera",
+                hint="use one mapper for each camera, and give it the intrinsics of the frames",
+            )
+        if self._tracker is None:
+            if bool(frame.depth_m.any()) if self._depth is None else self._depth:
+                self._tracker = Tracker(self._options, T_world_start=self._T_world_start)
+            else:
+                self._tracker = MonocularTracker(self._monocular, T_world_start=self._T_world_start)
+        return self._tracker
+
+    def _finished(
+        self, tracked: TrackedFrame, answer: PoseAnswer | None, failure: str, position_m: Array | None
+    ) -> TrackedFrame:
+        """Complete the result of a frame, and add it to trajectory and map."""
+        tracker, pose = self._tracker, tracked.T_world_camera
+        is_first = isinstance(tracker, Tracker) and pose is not None and not self._poses
+        reason = tracked.reason or (failure if pose is None else "")
+        if pose is None and not reason:
+            reason = f"only {tracked.matches} matches, or their pose is not plausible"
+        if pose is not None and answer is not None and answer.solution.verdict == "weak":
+            reason = answer.solution.reason
+        status = tracked.status
+        if pose is None and status == "tracked":
+            status = "lost"
+        if answer is not None:
+            self._round_trips_ms.append(answer.round_trip_ms)
+            self._sources[answer.source] += 1
+        if status == "lost":
+            self._reasons[reason] += 1
+        done = replace(
+            tracked,
+            status="first" if is_first else status,
+            reason=reason,
+            covariance=None if answer is None or pose is None else answer.solution.covariance,
+            source="none" if answer is None else answer.source,
+            round_trip_ms=None if answer is None else answer.round_trip_ms,
+        )
+        if isinstance(tracker, MonocularTracker):
+            return self._with_scale(tracker, done, position_m)
+        if pose is not None:
+            self._stamps.append(done.frame.timestamp_s)
+            self._poses.append(pose)
+            self._dense.add(done.frame, pose)
+        return done
+
+    def _with_scale(
+        self, tracker: MonocularTracker, done: TrackedFrame, position_m: Array | None
+    ) -> TrackedFrame:
+        """Return the result in metres where they are known; a keyframe corrects poses that were returned."""
+        source, frame = self._scale, done.frame
+        corrected = done.keyframe
+        if source is not None and not self._is_metric:
+            source.observe(frame.timestamp_s, frame.rgb, position_m)
+            if done.T_world_camera is not None:
+                path = tracker.trajectory()
+                scale = source.metres_per_unit(path.timestamps_s, path.T_world_camera, frame.camera)
+                if scale is not None:
+                    tracker.rescale(scale)
+                    self._is_metric = corrected = True
+                    done = replace(done, T_world_camera=tracker.trajectory().T_world_camera[-1])
+        return replace(done, corrected=corrected, scale="metric" if self._is_metric else "up to scale")
+
+
+class BlockingMapper:
+    """A `Mapper` whose `track` blocks; everything else is that of the mapper."""
+
+    def __init__(self, mapper: Mapper, wait: Callable[[Coroutine[Any, Any, Any]], Any] = asyncio.run) -> None:
+        """Wrap *mapper*; *wait* runs a coroutine to its end, such as in the event loop of a robot."""
+        self.mapper = mapper
+        self._wait = wait
+
+    def track(self, frame: Frame, *, position_m: Array | None = None) -> TrackedFrame:
+        """Return the pose of the next frame; see `Mapper.track`."""
+        tracked: TrackedFrame = self._wait(self.mapper.track(frame, position_m=position_m))
+        return tracked
+
+    @property
+    def map(self) -> PointMap:
+        """The map so far; see `Mapper.map`."""
+        return self.mapper.map
+
+    @property
+    def trajectory(self) -> Trajectory:
+        """The poses so far; see `Mapper.trajectory`."""
+        return self.mapper.trajectory
+
+    @property
+    def scale(self) -> str:
+        """Where metres come from; see `Mapper.scale`."""
+        return self.mapper.scale
+
+    def save(self, folder: Path) -> dict[str, Any]:
+        """Write the map, the trajectory and the report; see `Mapper.save`."""
+        return self.mapper.save(folder)
+
+
+def _give_up(tracker: Tracker | MonocularTracker, query: PoseQuery) -> None:
+    """Close the open query, so that the next frame can be tracked after a cancellation."""
+    step: PoseQuery | TrackedFrame = query
+    while isinstance(step, PoseQuery):
+        step = tracker.accept(step, None)

@@ -1,0 +1,4 @@
+"""Geometry of one camera without depth: two-view start, triangulation, bundle adjustment, scale.
+
+Functions over arrays of pixels, points and poses belong here; frames, features and queries do not.
+"""

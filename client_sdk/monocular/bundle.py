@@ -1,0 +1,220 @@
+"""Bundle adjustment over few keyframes: poses and points that agree best with all pixels.
+
+Levenberg-Marquardt with Huber weights; the points are eliminated by the Schur complement, so that the linear
+system has six rows for each free camera.  Deterministic.  It does not decide what is adjusted.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from rse_pf.geometry import Array, Camera, exp_se3
+
+__all__ = ["Bundle", "adjust", "refine_pose", "reprojection_errors"]
+
+Rows = npt.NDArray[np.int64]
+
+# Huber's threshold in standard deviations: 95 % of the residuals of a 2-D Gaussian are below.
+_HUBER = 2.45
+_MIN_DEPTH = 1e-3
+_FIRST_DAMPING, _MAX_DAMPING = 1e-4, 1e6
+_CONVERGED = 1e-4
+"""The adjustment ends when a step lowers the cost by less than this share."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Bundle:
+    """Cameras, points, and which camera sees which point where.
+
+    Attributes:
+        T_camera_world: ``(c, 4, 4)``.
+        is_fixed: ``(c,)``, cameras that keep their poses; two or more of them fix position and scale.
+        points_world: ``(p, 3)``.
+        cameras: ``(n,)``, row of the camera of each observation.
+        points: ``(n,)``, row of the point of each observation; a camera sees a point at most once.
+        pixels: ``(n, 2)``, undistorted.
+        sigma_px: ``(n,)``, standard deviation of each pixel.
+    """
+
+    T_camera_world: Array
+    is_fixed: npt.NDArray[np.bool_]
+    points_world: Array
+    cameras: Rows
+    points: Rows
+    pixels: Array
+    sigma_px: Array
+
+
+def reprojection_errors(
+    T_camera_world: Array, points_world: Array, pixels: Array, camera: Camera
+) -> tuple[Array, Array]:
+    """Return the ``(n,)`` distances in pixels and depths of ``(n, 3)`` points, each with its own pose.
+
+    *T_camera_world* is ``(n, 4, 4)`` or ``(4, 4)``; the distance of a point behind the camera is infinite.
+    """
+    points = _moved(T_camera_world, points_world)
+    z = points[:, 2]
+    residuals = _residuals(points, pixels, camera)
+    distances = np.where(z > _MIN_DEPTH, np.hypot(residuals[:, 0], residuals[:, 1]), np.inf)
+    return distances, z
+
+
+def refine_pose(
+    T_camera_world: Array,
+    points_world: Array,
+    pixels: Array,
+    sigma_px: Array,
+    camera: Camera,
+    *,
+    iterations: int = 8,
+) -> Array:
+    """Return the pose of one camera that agrees best with ``(n, 3)`` points, robustly (Gauss-Newton)."""
+    pose = T_camera_world
+    for _ in range(iterations):
+        points = _moved(pose, points_world)
+        J, _ = _jacobians(points, pose[:3, :3], camera)
+        residuals = _residuals(points, pixels, camera) / sigma_px[:, None]
+        J = J / sigma_px[:, None, None]
+        weights = _huber_weights(residuals) * (points[:, 2] > _MIN_DEPTH)
+        weighted = J * weights[:, None, None]
+        H = np.einsum("nij,nik->jk", weighted, J)
+        step = np.linalg.lstsq(H, -np.einsum("nij,ni->j", weighted, residuals), rcond=None)[0]
+        pose = exp_se3(step) @ pose
+        if np.abs(step).max() < 1e-7:
+            break
+    return pose
+
+
+def adjust(bundle: Bundle, camera: Camera, *, iterations: int = 8) -> tuple[Array, Array]:
+    """Return adjusted poses ``(c, 4, 4)`` and points ``(p, 3)`` of *bundle*; its cost never grows.
+
+    Source:
+        Triggs et al., "Bundle Adjustment - A Modern Synthesis", 2000, Sect. 6.1 (Schur complement).
+    """
+    order = np.argsort(bundle.points, kind="stable")
+    system = _System(bundle, order, camera)
+    poses, points = bundle.T_camera_world.copy(), bundle.points_world.copy()
+    cost, damping = system.cost(poses, points), _FIRST_DAMPING
+    for _ in range(iterations):
+        system.linearise(poses, points)
+        while True:
+            try:
+                moved_poses, moved_points = system.step(poses, points, damping)
+                moved_cost = system.cost(moved_poses, moved_points)
+            except np.linalg.LinAlgError:
+                moved_cost = np.inf
+            if moved_cost < cost or damping > _MAX_DAMPING:
+                break
+            damping *= 10.0
+        if not moved_cost < cost:
+            break
+        is_done = cost - moved_cost < _CONVERGED * cost
+        poses, points, cost = moved_poses, moved_points, moved_cost
+        damping = max(damping * 0.1, 1e-9)
+        if is_done:
+            break
+    return poses, points
+
+
+class _System:
+    """The normal equations of a bundle, with observations in the order of their points."""
+
+    def __init__(self, bundle: Bundle, order: Rows, camera: Camera) -> None:
+        self._camera = camera
+        self._cameras, self._points = bundle.cameras[order], bundle.points[order]
+        self._pixels, self._sigma_px = bundle.pixels[order], bundle.sigma_px[order]
+        self._seen, self._starts = np.unique(self._points, return_index=True)
+        self._slot = np.searchsorted(self._seen, self._points)
+        self._free = np.flatnonzero(~bundle.is_fixed)
+        column = np.full(len(bundle.is_fixed), -1)
+        column[self._free] = np.arange(len(self._free))
+        self._column = column[self._cameras]
+
+    def cost(self, poses: Array, points: Array) -> float:
+        """Return the sum of Huber's function over the observations."""
+        camera_points = _moved(poses[self._cameras], points[self._points])
+        squared = np.square(_residuals(camera_points, self._pixels, self._camera)).sum(axis=1)
+        squared /= np.square(self._sigma_px)
+        norm = np.sqrt(squared)
+        each = np.where(norm <= _HUBER, squared, 2 * _HUBER * norm - _HUBER**2)
+        each = np.where(camera_points[:, 2] > _MIN_DEPTH, each, 1e4)
+        return float(each.sum())
+
+    def linearise(self, poses: Array, points: Array) -> None:
+        """Take the Jacobians at these poses and points."""
+        camera_points = _moved(poses[self._cameras], points[self._points])
+        Jc, Jp = _jacobians(camera_points, poses[self._cameras, :3, :3], self._camera)
+        residuals = _residuals(camera_points, self._pixels, self._camera) / self._sigma_px[:, None]
+        weights = np.sqrt(_huber_weights(residuals) * (camera_points[:, 2] > _MIN_DEPTH))
+        scale = (weights / self._sigma_px)[:, None, None]
+        Jc, Jp, residuals = Jc * scale, Jp * scale, residuals * weights[:, None]
+        n = len(self._free)
+        self._Hpp = np.add.reduceat(Jp.transpose(0, 2, 1) @ Jp, self._starts, axis=0)
+        self._bp = np.add.reduceat(np.einsum("nij,ni->nj", Jp, residuals), self._starts, axis=0)
+        self._Hcc = np.zeros((n, 6, 6))
+        self._bc = np.zeros((n, 6))
+        self._E = np.zeros((n, 6, len(self._seen), 3))
+        for column in range(n):
+            own = self._column == column
+            J = Jc[own].reshape(-1, 6)
+            self._Hcc[column] = J.T @ J
+            self._bc[column] = J.T @ residuals[own].ravel()
+            self._E[column][:, self._slot[own]] = (Jc[own].transpose(0, 2, 1) @ Jp[own]).transpose(1, 0, 2)
+
+    def step(self, poses: Array, points: Array, damping: float) -> tuple[Array, Array]:
+        """Return the poses and points after one damped step."""
+        n, p = len(self._free), len(self._seen)
+        damped = self._Hpp * (1.0 + damping * np.eye(3)) + 1e-9 * np.eye(3)
+        Hpp_inverse = np.linalg.inv(damped)
+        E = self._E.reshape(6 * n, 3 * p)
+        Y = (self._E.transpose(0, 2, 1, 3) @ Hpp_inverse).transpose(0, 2, 1, 3).reshape(6 * n, 3 * p)
+        S = -Y @ E.T
+        for column in range(n):
+            rows = slice(6 * column, 6 * column + 6)
+            S[rows, rows] += self._Hcc[column] * (1.0 + damping * np.eye(6)) + 1e-9 * np.eye(6)
+        dc = np.linalg.solve(S, Y @ self._bp.ravel() - self._bc.ravel())
+        back = -self._bp - (E.T @ dc).reshape(p, 3)
+        dp = np.einsum("pij,pj->pi", Hpp_inverse, back)
+        moved_poses, moved_points = poses.copy(), points.copy()
+        for column, row in enumerate(self._free):
+            moved_poses[row] = exp_se3(dc[6 * column : 6 * column + 6]) @ poses[row]
+        moved_points[self._seen] += dp
+        return moved_poses, moved_points
+
+
+def _moved(T_camera_world: Array, points_world: Array) -> Array:
+    rotation, translation = T_camera_world[..., :3, :3], T_camera_world[..., :3, 3]
+    moved: Array = np.einsum("...ij,...j->...i", rotation, points_world) + translation
+    return moved
+
+
+def _residuals(points_camera: Array, pixels: Array, camera: Camera) -> Array:
+    z = np.maximum(points_camera[:, 2], _MIN_DEPTH)
+    residuals = np.empty((len(pixels), 2))
+    residuals[:, 0] = camera.fx * points_camera[:, 0] / z + camera.cx - pixels[:, 0]
+    residuals[:, 1] = camera.fy * points_camera[:, 1] / z + camera.cy - pixels[:, 1]
+    return residuals
+
+
+def _jacobians(points_camera: Array, rotation: Array, camera: Camera) -> tuple[Array, Array]:
+    """Return the derivatives of the pixels by the twist ``(n, 2, 6)`` and by the point ``(n, 2, 3)``."""
+    x, y = points_camera[:, 0], points_camera[:, 1]
+    z = np.maximum(points_camera[:, 2], _MIN_DEPTH)
+    Jc = np.zeros((len(points_camera), 2, 6))
+    Jc[:, 0, 0] = camera.fx / z
+    Jc[:, 0, 2] = -camera.fx * x / z**2
+    Jc[:, 1, 1] = camera.fy / z
+    Jc[:, 1, 2] = -camera.fy * y / z**2
+    Jc[:, :, 3] = Jc[:, :, 2] * y[:, None] - Jc[:, :, 1] * z[:, None]
+    Jc[:, :, 4] = Jc[:, :, 0] * z[:, None] - Jc[:, :, 2] * x[:, None]
+    Jc[:, :, 5] = Jc[:, :, 1] * x[:, None] - Jc[:, :, 0] * y[:, None]
+    return Jc, Jc[:, :, :3] @ rotation
+
+
+def _huber_weights(residuals: Array) -> Array:
+    norm = np.hypot(residuals[:, 0], residuals[:, 1])
+    weights: Array = np.minimum(1.0, _HUBER / np.maximum(norm, 1e-12))
+    return weights

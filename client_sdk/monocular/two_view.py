@@ -1,0 +1,154 @@
+"""Two views of one camera without depth: relative pose, triangulation, and whether they suffice for a start.
+
+The length of the translation is unknown to two views; it is 1 here.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from rse_pf.errors import MissingExtra
+from rse_pf.geometry import Array, Camera, inverse, transform
+
+__all__ = ["TwoViewStart", "load_opencv", "parallax_deg", "start_from_two_views", "triangulate"]
+
+_CONFIDENCE = 0.9999
+_MIN_SHARE = 0.5
+"""Of the matches that must agree with the relative pose, lie before both cameras and have parallax."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class TwoViewStart:
+    """The pose of the second view and the points that both see, in the frame of the first camera.
+
+    ``rows`` are the rows of the matches whose points are good; ``points`` ``(len(rows), 3)``.  *reason* is
+    empty if the views suffice for a start.
+    """
+
+    T_second_first: Array
+    rows: npt.NDArray[np.int64]
+    points: Array
+    parallax_deg: float
+    reason: str = ""
+
+
+def start_from_two_views(
+    first: Array,
+    second: Array,
+    camera: Camera,
+    *,
+    inlier_px: float = 1.0,
+    min_points: int = 80,
+    min_parallax_deg: float = 1.5,
+) -> TwoViewStart:
+    """Estimate the relative pose of two views and the points that both see.
+
+    Args:
+        first: ``(n, 2)`` undistorted pixels of the first view.
+        second: ``(n, 2)``, row *i* shows the same point.
+        camera: Intrinsics of both.
+        inlier_px: Largest distance from the epipolar line, and largest reprojection error over 2.
+        min_points: Fewer good points are no start.
+        min_parallax_deg: Median angle between the rays; below it depth is noise.
+
+    Returns:
+        The views; ``reason`` says why they are no start.
+
+    Raises:
+        MissingExtra: OpenCV is not installed.
+
+    Source:
+        Nister, PAMI 2004 (five points); MAGSAC++, Barath et al., CVPR 2020, as OpenCV implements them.
+    """
+    cv2 = load_opencv()
+    nothing = np.empty(0, dtype=np.int64)
+    none = TwoViewStart(
+        T_second_first=np.eye(4), rows=nothing, points=np.empty((0, 3)), parallax_deg=0.0,
+        reason=f"only {len(first)} matches with the first view",
+    )  # fmt: skip
+    if len(first) < min_points:
+        return none
+    cv2.setRNGSeed(1)
+    essential, mask = cv2.findEssentialMat(
+        first, second, camera.matrix, cv2.USAC_MAGSAC, _CONFIDENCE, inlier_px
+    )
+    if essential is None or essential.shape != (3, 3):
+        return none
+    rows = np.flatnonzero(mask.ravel())
+    if len(rows) < min_points:
+        return none
+    _, rotation, translation, _ = cv2.recoverPose(essential, first[rows], second[rows], camera.matrix)
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = rotation, translation.ravel()
+    points, good = triangulate(np.eye(4), pose, first[rows], second[rows], camera, max_error_px=2 * inlier_px)
+    angles = parallax_deg(points, np.zeros(3), inverse(pose)[:3, 3])
+    median = float(np.median(angles[good])) if good.any() else 0.0
+    kept = good & (angles > 0.3 * min_parallax_deg)
+    reason = ""
+    if median < min_parallax_deg:
+        reason = f"the camera has moved too little sideways: {median:.1f} of {min_parallax_deg:g} deg"
+    elif kept.sum() < max(min_points, _MIN_SHARE * len(rows)):
+        reason = f"only {int(kept.sum())} of {len(rows)} points lie before both views"
+    return TwoViewStart(
+        T_second_first=pose, rows=rows[kept], points=points[kept], parallax_deg=median, reason=reason
+    )
+
+
+def triangulate(
+    T_first_world: Array,
+    T_second_world: Array,
+    first: Array,
+    second: Array,
+    camera: Camera,
+    *,
+    max_error_px: float | Array = 2.0,
+) -> tuple[Array, npt.NDArray[np.bool_]]:
+    """Return the ``(n, 3)`` points that two views see, and which lie before both and agree with both.
+
+    Source:
+        Hartley and Zisserman 2004, Sect. 12.2 (linear triangulation, in normalised coordinates).
+    """
+    rays = [_normalised(pixels, camera) for pixels in (first, second)]
+    A = np.empty((len(first), 4, 4))
+    for row, (pose, ray) in enumerate(zip((T_first_world, T_second_world), rays, strict=True)):
+        A[:, 2 * row] = ray[:, :1] * pose[2] - pose[0]
+        A[:, 2 * row + 1] = ray[:, 1:] * pose[2] - pose[1]
+    # The smallest eigenvector of A^T A: with four well-scaled rows as good as the SVD, and faster.
+    homogeneous = np.linalg.eigh(A.transpose(0, 2, 1) @ A)[1][:, :, 0]
+    w = homogeneous[:, 3]
+    far = np.abs(w) < 1e-9
+    points = homogeneous[:, :3] / np.where(far, 1.0, w)[:, None]
+    good = ~far
+    for pose, pixels in ((T_first_world, first), (T_second_world, second)):
+        moved = transform(pose, points)
+        ahead = moved[:, 2] > 1e-3
+        moved[~ahead, 2] = 1.0
+        errors = np.linalg.norm(camera.project(moved) - pixels, axis=1)
+        good &= ahead & (errors <= max_error_px)
+    return points, good
+
+
+def parallax_deg(points: Array, first_centre: Array, second_centre: Array) -> Array:
+    """Return the ``(n,)`` degrees between the rays from two camera centres to ``(n, 3)`` points."""
+    one, two = points - first_centre, points - second_centre
+    lengths = np.linalg.norm(one, axis=1) * np.linalg.norm(two, axis=1)
+    cosines = np.einsum("ij,ij->i", one, two) / np.maximum(lengths, 1e-12)
+    angles: Array = np.degrees(np.arccos(np.clip(cosines, -1.0, 1.0)))
+    return angles
+
+
+def _normalised(pixels: Array, camera: Camera) -> Array:
+    return (pixels - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
+
+
+def load_opencv() -> Any:
+    """Return the module ``cv2``; raises MissingExtra."""
+    try:
+        import cv2
+    except ImportError as error:
+        raise MissingExtra("opencv-python-headless", "vision") from error
+    return cv2

@@ -1,0 +1,219 @@
+"""From frames to a trajectory and a map, with and without depth, and when nobody answers."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from client_sdk.answers import PoseAnswer
+from client_sdk.datasets import open_dataset
+from client_sdk.frontend import PoseQuery, TrackedFrame
+from client_sdk.mapper import BlockingMapper, Mapper
+from client_sdk.mapping import Trajectory, read_ply, read_trajectory
+from client_sdk.monocular.scale import OdometryScale
+from rse_pf.errors import Busy, MissingExtra, UsageError
+from rse_pf.experiments.results.trajectory_error import absolute_error
+from rse_pf.geometry import Camera
+from rse_pf.pnp import PnpOptions, refine_with_depth, solve_pnp
+from tests.client_sdk.mapper.flat_world import STEP_M, frame_at
+
+pytest.importorskip("cv2", reason="pip install 'rse-pf[vision]'")
+
+
+async def solve(query: PoseQuery) -> PoseAnswer:
+    """Answer as the PnP service does."""
+    found = query.correspondences
+    options = PnpOptions(inlier_px=query.inlier_px, max_iterations=query.max_iterations)
+    solution = solve_pnp(found.points_world, found.pixels, query.camera, options)
+    if found.depths_m.any():
+        solution = refine_with_depth(solution, found.points_world, found.pixels, found.depths_m, query.camera)
+    return PoseAnswer(
+        solution=solution, source="cloud", server="s1", round_trip_ms=3.0, queue_ms=0.0, compute_ms=1.0
+    )
+
+
+def drive(mapper: Mapper, rows: range, *, depth: bool, odometry: bool = False) -> list[TrackedFrame]:
+    async def all_frames() -> list[TrackedFrame]:
+        return [
+            await mapper.track(
+                frame_at(row, depth=depth),
+                position_m=np.array([STEP_M * row, 0.0, 0.0]) if odometry else None,
+            )
+            for row in rows
+        ]
+
+    return asyncio.run(all_frames())
+
+
+def test_frames_with_depth_give_metric_poses_and_a_dense_map() -> None:
+    mapper = Mapper(ask=solve)
+
+    done = drive(mapper, range(4), depth=True)
+
+    assert [each.status for each in done] == ["first", "tracked", "tracked", "tracked"]
+    assert mapper.trajectory.positions[:, 0] == pytest.approx(STEP_M * np.arange(4), abs=0.01)
+    assert len(mapper.map) > 5000
+    assert mapper.scale == "metric, by depth"
+    assert done[3].covariance is not None
+    assert (done[3].source, done[3].round_trip_ms) == ("cloud", 3.0)
+
+
+def test_a_frame_that_nobody_answers_is_lost_with_the_reason_and_the_next_one_is_tracked() -> None:
+    async def refuses_once(query: PoseQuery) -> PoseAnswer:
+        if query.timestamp_s == pytest.approx(0.1):
+            raise Busy("the server is busy")
+        return await solve(query)
+
+    mapper = Mapper(ask=refuses_once)
+
+    done = drive(mapper, range(3), depth=True)
+
+    assert [each.status for each in done] == ["first", "lost", "tracked"]
+    assert done[1].reason == "busy: the server is busy"
+    assert mapper.lost_frames == 1
+    assert mapper.report()["lost_because"] == {"busy: the server is busy": 1}
+
+
+def test_a_robot_that_cannot_ask_at_all_says_so_and_may_go_on() -> None:
+    fails = True
+
+    async def ask(query: PoseQuery) -> PoseAnswer:
+        if fails:
+            raise MissingExtra("poselib", "solver")
+        return await solve(query)
+
+    mapper = Mapper(ask=ask)
+    drive(mapper, range(1), depth=True)
+    with pytest.raises(MissingExtra):
+        drive(mapper, range(1, 2), depth=True)
+    fails = False
+
+    assert drive(mapper, range(2, 3), depth=True)[0].status == "tracked"
+
+
+def test_a_cancelled_frame_leaves_the_mapper_usable() -> None:
+    async def cancel_one() -> TrackedFrame:
+        asked, never = asyncio.Event(), asyncio.Event()
+
+        async def ask(query: PoseQuery) -> PoseAnswer:
+            if not asked.is_set():
+                asked.set()
+                await never.wait()
+            return await solve(query)
+
+        mapper = Mapper(ask=ask)
+        await mapper.track(frame_at(0, depth=True))
+        task = asyncio.create_task(mapper.track(frame_at(1, depth=True)))
+        await asyncio.wait_for(asked.wait(), 10)
+        task.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await task
+        return await mapper.track(frame_at(2, depth=True))
+
+    assert asyncio.run(cancel_one()).status == "tracked"
+
+
+def test_a_frame_of_another_camera_is_refused() -> None:
+    mapper = Mapper(ask=solve, camera=Camera(fx=400.0, fy=400.0, cx=160.0, cy=120.0, width=320, height=240))
+
+    with pytest.raises(UsageError, match="another camera"):
+        drive(mapper, range(1), depth=True)
+
+
+def test_frames_without_depth_give_a_map_up_to_scale_and_say_so() -> None:
+    mapper = Mapper(ask=solve)
+
+    done = drive(mapper, range(10), depth=False)
+
+    assert (done[0].status, done[0].reason) == ("starting", "the first frame")
+    assert [each.status for each in done[4:]] == ["tracked"] * 6
+    assert {each.scale for each in done} == {"up to scale"}
+    report = mapper.report()
+    assert (report["scale"], report["unit"], report["lost_frames"]) == ("up to scale", "unit of the map", 0)
+    x = mapper.trajectory.positions[:, 0]
+    assert len(x) == 10  # the frames before the start got their poses later
+    assert x / x[-1] == pytest.approx(np.arange(10) / 9, abs=0.02)
+    assert len(mapper.map) > 300
+
+
+def test_odometry_makes_a_camera_without_depth_metric() -> None:
+    mapper = Mapper(ask=solve, scale=OdometryScale(first_m=0.2))
+
+    done = drive(mapper, range(9), depth=False, odometry=True)
+
+    metric = [each.scale == "metric" for each in done]
+    assert metric == sorted(metric)
+    assert done[metric.index(True)].corrected
+    assert mapper.scale == "metric, by the first 0.2 m of odometry"
+    assert mapper.trajectory.positions[:, 0] == pytest.approx(STEP_M * np.arange(9), abs=0.01)
+    last = done[-1].T_world_camera
+    assert last is not None
+    assert last[:3, 3] == pytest.approx(mapper.trajectory.positions[-1], abs=1e-9)
+    depths = mapper.map.points()[0][:, 2]
+    assert np.median(np.abs(depths[:, None] - [2.0, 4 / 3, 1.0]).min(axis=1)) < 0.1
+
+
+def test_a_lost_camera_without_depth_is_found_again_where_it_was() -> None:
+    mapper = Mapper(ask=solve)
+    drive(mapper, range(6), depth=False)
+    blank = frame_at(8, depth=False)
+    blank = replace(blank, rgb=np.full_like(blank.rgb, 128))
+
+    async def go_on() -> list[TrackedFrame]:
+        return [await mapper.track(blank), await mapper.track(frame_at(5, depth=False))]
+
+    lost, found = asyncio.run(go_on())
+
+    assert (lost.status, lost.T_world_camera) == ("lost", None)
+    assert "matches" in lost.reason
+    assert found.status == "tracked"
+    assert mapper.lost_frames == 1
+
+
+def test_saves_files_that_other_programs_read(tmp_path: Path) -> None:
+    mapper = Mapper(ask=solve)
+    drive(mapper, range(3), depth=True)
+
+    mapper.save(tmp_path / "out")
+
+    assert len(read_ply(tmp_path / "out" / "map.ply")[0]) > 1000
+    assert len(read_trajectory(tmp_path / "out" / "trajectory.txt")) == 3
+    assert json.loads((tmp_path / "out" / "report.json").read_text())["frames"] == 3
+    with pytest.raises(UsageError, match="cannot write"):
+        mapper.save(tmp_path / "out" / "map.ply")
+
+
+def test_the_blocking_twin_gives_the_same() -> None:
+    mapper = BlockingMapper(Mapper(ask=solve))
+
+    done = [mapper.track(frame_at(row, depth=True)) for row in range(2)]
+
+    assert [each.status for each in done] == ["first", "tracked"]
+    assert mapper.trajectory.positions[1, 0] == pytest.approx(STEP_M, abs=5e-3)
+    assert len(mapper.map) > 1000
+    assert mapper.scale == "metric, by depth"
+
+
+@pytest.mark.slow
+def test_the_kitchen_without_its_depth_is_mapped_within_8_cm(recordings: Path) -> None:
+    dataset = open_dataset(recordings / "7scenes_redkitchen")
+    assert dataset.truth is not None
+    truth = dataset.truth
+    mapper = Mapper(ask=solve, depth=False, scale=OdometryScale(truth.timestamps_s, truth.positions))
+
+    async def run() -> None:
+        for frame in dataset:
+            await mapper.track(replace(frame, depth_m=np.zeros_like(frame.depth_m)))
+
+    asyncio.run(run())
+
+    path: Trajectory = mapper.trajectory
+    assert mapper.scale.startswith("metric")
+    assert mapper.lost_frames <= 0.05 * len(dataset)
+    assert len(path) >= 0.95 * len(dataset)
+    assert absolute_error(path, truth).rmse_m <= 0.08
