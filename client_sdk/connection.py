@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import random as random_module
+import ssl
 from collections.abc import Awaitable, Callable, Coroutine, Iterable
 from typing import Any
 from urllib.parse import urlsplit
@@ -52,6 +53,7 @@ __all__ = [
     "cancel_all",
     "dial_error_of",
     "shown_address",
+    "untrusted",
     "websocket_options",
 ]
 
@@ -68,6 +70,8 @@ _MIN_TICK_S = 0.001
 _LATE_WELCOME_S = 60.0
 _CHECK_RUNNING = "is the platform running? start it with rse-pf local start"
 _CHECK_ADDRESS = "is it an RSE-PF server?"
+_TIMES = (9, 10)
+"""Of X509_verify_cert_error_string(3): not yet valid, expired."""
 _ISSUE = (
     "issue one: rse-pf token issue ROBOT; it is valid for 15 minutes, so a longer run passes an async "
     "function that returns a fresh one"
@@ -121,7 +125,8 @@ class Connection:
         self.bytes_out = 0
         self.last_error = ""
         self.fatal: RsePfError | None = None
-        self._address = shown_address(url)
+        self._address = shown_address(url) if url else ""
+        self._ssl_context: ssl.SSLContext | None = None
         self._token = token
         self._session = session
         self._settings = session.settings
@@ -140,6 +145,12 @@ class Connection:
         self._late_welcome_until = float("-inf")
         self._main_tasks: list[asyncio.Task[None]] = []
         self._closed = False
+
+    def use(self, url: str, token: Token, ssl_context: ssl.SSLContext | None) -> None:
+        """Connect to *url* from now on, trust what *ssl_context* trusts, and use *token*."""
+        self.url, self._token = url, token
+        self._ssl_context = ssl_context if url.startswith("wss:") else None
+        self._address = shown_address(url)
 
     async def open(self, *, may_be_down: bool = False) -> None:
         """Connect to a server, with a few attempts.
@@ -290,16 +301,21 @@ class Connection:
     async def _handshake(self) -> ClientConnection:
         subprotocol = SUBPROTOCOLS[self._session.codec.name]
         token = await self._read_token()
+        options = websocket_options(self._settings)
+        if self._ssl_context is not None:
+            options["ssl"] = self._ssl_context
         try:
             websocket = await websocket_connect(
                 self.url,
                 subprotocols=[Subprotocol(subprotocol)],
                 additional_headers={} if token is None else {"Authorization": f"Bearer {token}"},
-                **websocket_options(self._settings),
+                **options,
             )
         except InvalidStatus as error:
             retry_after = error.response.headers.get("Retry-After", "")
             raise dial_error_of(self._address, error.response.status_code, retry_after) from error
+        except ssl.SSLCertVerificationError as error:
+            raise untrusted(self._address, error) from error
         except (OSError, asyncio.TimeoutError, WebSocketException, EOFError) as error:
             self._late_welcome_until = self._clock() + _LATE_WELCOME_S
             cause = getattr(error, "strerror", None) or str(error) or type(error).__name__
@@ -512,6 +528,19 @@ class DialError(Exception):
         self.after_s = after_s
         self.is_wrong_address = is_wrong_address
         self.is_final = is_final
+
+
+def untrusted(address: str, error: ssl.SSLCertVerificationError) -> DialError:
+    """Return the error of a server whose certificate this robot does not trust, or not now.
+
+    A later attempt may succeed: in some networks another machine answers first, and clocks are set.
+    """
+    hint = "connect by the file of rse-pf robot enrol ROBOT --out FILE, made by this platform"
+    if error.verify_code in _TIMES:
+        hint = "check the clock of this robot; a platform renews its certificate by itself"
+    why = error.verify_message.rstrip(".")
+    message = f"{address} shows a certificate that this robot does not trust: {why}"
+    return DialError(ConnectError(message, hint=hint), is_wrong_address=True)
 
 
 def dial_error_of(address: str, status: int, retry_after: str) -> DialError:

@@ -11,11 +11,13 @@ import time
 from collections.abc import Callable, Coroutine, Generator
 from dataclasses import dataclass, replace
 from importlib import metadata
+from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from client_sdk.answers import Answer, PoseAnswer
 from client_sdk.connection import Connection, OnChange, Token, cancel_all
+from client_sdk.enrolment import read_enrolment
 from client_sdk.local_services import LocalServices
 from client_sdk.offload import CloudFirst
 from client_sdk.stats import Stats, StatsKeeper
@@ -64,9 +66,10 @@ class Robot:
 
     def __init__(
         self,
-        url: str,
+        url: str = "",
         *,
         token: Token = None,
+        enrolment: str | Path | None = None,
         codec: str = "zlib",
         settings: SessionSettings | None = None,
         offload: CloudFirst | None = None,
@@ -79,6 +82,7 @@ class Robot:
         Args:
             url: ``ws://HOST:PORT/ws`` or ``wss://HOST/ws``.
             token: The robot's token, or an async callable that gives one (a run outlives a token).
+            enrolment: File of ``rse-pf robot enrol --out``, instead of *url* and *token*.
             codec: ``zlib`` (the paper's), ``json`` or ``bin``.
             settings: Limits and timeouts; None means the defaults.
             offload: `CloudFirst` lets the robot answer itself when the cloud cannot.
@@ -87,8 +91,13 @@ class Robot:
             on_change: Called with ``link-lost``, ``link-back`` or ``moved``, and the reason or the server.
 
         Raises:
-            UsageError: The address or the codec cannot be used.
+            UsageError: The address or the codec cannot be used, or there are an address and an enrolment.
         """
+        if bool(url) == (enrolment is not None) or (token is not None and enrolment is not None):
+            raise UsageError(
+                "connect needs either an address or an enrolment",
+                hint="connect(url, token=...) or connect(enrolment=FILE)",
+            )
         if codec not in CODECS:
             raise UsageError(f"no codec named {codec!r}", hint=f"choose one of {', '.join(CODECS)}")
         settings, random = settings or SessionSettings(), random or random_module.Random()
@@ -104,6 +113,7 @@ class Robot:
             random=random,
             on_change=on_change,
         )
+        self._enrolment = enrolment
         self._offload = offload
         self._clock = clock
         self._local = None if offload is None else LocalServices(offload.registry, clock)
@@ -120,8 +130,12 @@ class Robot:
             Unauthorized: The token is missing, wrong or expired.
             ConnectError: No server answers, and there is no offload.
             MissingExtra: There is an offload, and no solver for it.
+            UsageError: The file of the enrolment cannot be used.
         """
         try:
+            if self._enrolment is not None:
+                access = read_enrolment(self._enrolment)
+                self._connection.use(access.url, access.token, access.ssl_context)
             if self._local is not None:
                 await self._local.prepare()
             await self._connection.open(may_be_down=self._offload is not None)

@@ -5,7 +5,7 @@ cannot be misled about any other site by somebody who stole its key.  The time i
 the operating system through `cryptography`.  Files belong to the caller.
 
 Source:
-    RFC 5280, Sect. 4.2.1.6 (subject alternative names) and 4.2.1.10 (name constraints).
+    RFC 5280, chapter "Certificate Extensions": subject alternative name, name constraints.
 """
 
 from __future__ import annotations

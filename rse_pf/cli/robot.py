@@ -1,15 +1,18 @@
 """Enrol robots that have keys of their own, and disable or enable robots.
 
-A robot creates its own key and keeps the private half; the operator enrols the public half.  An enrolled
-robot signs its own short-lived tokens.  Every change reaches all servers of the platform within 2 s; --cloud
-means the deployment on AWS.  remove deletes the public key, so tokens signed by the robot are refused;
-disable refuses all tokens of the robot, also those of rse-pf token issue.
+enrol --out makes a key and writes one file with address, authority and key of the robot: carry it there, and
+connect with client_sdk.connect(enrolment=FILE).  Where a private key must not travel, the robot makes its own
+with keygen, and the operator enrols the public half.  An enrolled robot signs its own short-lived tokens.
+Every change reaches all servers of the platform within 2 s; --cloud means the deployment on AWS.  remove
+deletes the public key, so tokens signed by the robot are refused; disable refuses all tokens of the robot,
+also those of rse-pf token issue.
 
 A name with another key is another robot, which sees nothing of the one before.  adopt gives the robot that
 has the name now what was stored under the name before robots' keys counted (versions before 0.3), or, with
 --from-key, under its earlier key.
 
 examples:
+  rse-pf robot enrol robot-2 --out robot-2.enrolment
   rse-pf robot keygen --out robot.key > robot.json
   rse-pf robot enrol robot-1 --public-key robot.json --scope services:pnp
   rse-pf robot list
@@ -41,6 +44,7 @@ from rse_pf.auth.roster import (
     public_key_of,
 )
 from rse_pf.auth.trust_store import AccessControlStore
+from rse_pf.cli.robot_enrolment import enrolment_lines, make_enrolment
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import UsageError
 from rse_pf.terminal import show, show_json
@@ -57,7 +61,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "robot", nargs="?", metavar="ROBOT", help="name of the robot, as in its tokens and logs"
     )
-    parser.add_argument("--out", type=Path, metavar="FILE", help="keygen: file for the private key")
+    parser.add_argument(
+        "--out", type=Path, metavar="FILE",
+        help="keygen: file for the private key; enrol: file with all that the robot needs to connect",
+    )  # fmt: skip
+    parser.add_argument(
+        "--url", help="enrol --out: where the robot connects (default: the address of the local platform)"
+    )
+    parser.add_argument(
+        "--authority", type=Path, metavar="FILE",
+        help="enrol --out: certificate (PEM) of the authority to trust (default: the local platform's)",
+    )  # fmt: skip
     parser.add_argument(
         "--public-key",
         type=Path,
@@ -180,13 +194,19 @@ def _check(args: argparse.Namespace) -> None:
     if named != (args.robot is not None):
         what = "needs the name of a robot" if named else "names no robot"
         raise UsageError(f"rse-pf robot {args.action} {what}", hint="see rse-pf robot --help")
-    if (args.action == "keygen") != (args.out is not None):
-        raise UsageError("--out belongs to keygen, which needs it", hint="for example: --out robot.key")
-    if (args.action == "enrol") != (args.public_key is not None):
+    if args.action == "keygen" and args.out is None:
+        raise UsageError("keygen needs --out", hint="for example: --out robot.key")
+    if args.action not in ("keygen", "enrol") and args.out is not None:
+        raise UsageError("--out is for keygen and enrol", hint="see rse-pf robot --help")
+    if args.action != "enrol" and args.public_key is not None:
+        raise UsageError("--public-key is for enrol", hint="see rse-pf robot --help")
+    if args.action == "enrol" and (args.public_key is None) == (args.out is None):
         raise UsageError(
-            "--public-key belongs to enrol, which needs it",
-            hint="name the file with the public key that keygen printed",
+            "enrol needs either --out or --public-key",
+            hint="--out FILE makes a key and the file for the robot; --public-key takes what keygen printed",
         )
+    if (args.url or args.authority) and (args.action != "enrol" or args.out is None):
+        raise UsageError("--url and --authority are for enrol --out", hint="see rse-pf robot --help")
     if args.action != "adopt" and (args.from_key or args.store):
         raise UsageError("--from-key and --store are for adopt", hint="see rse-pf robot --help")
     if args.action != "enrol" and (args.scope or args.quota):
@@ -196,20 +216,30 @@ def _check(args: argparse.Namespace) -> None:
 def _enrol(
     args: argparse.Namespace, access: AccessControlStore, now: float, settings: PlatformSettings
 ) -> int:
+    made = None if args.out is None else make_enrolment(args, settings)
     robot = EnrolledRobot(
         robot=args.robot,
         tenant=args.tenant,
-        x=public_key_of(_text(args.public_key)),
+        x=public_key_of(_text(args.public_key)) if made is None else str(made.key["x"]),
         scopes=check_scopes(tuple(args.scope)),
         quotas=check_quotas(dict(_quota(each) for each in args.quota)),
         enrolled_s=round(now, 3),
     )
-    access.change_roster(lambda roster: roster.enrolled(robot))
+    if made is not None:
+        made.write(args.out)
+    try:
+        access.change_roster(lambda roster: roster.enrolled(robot))
+    except BaseException:
+        if made is not None:  # a file whose key no platform knows
+            args.out.unlink(missing_ok=True)
+        raise
     allowed = " ".join(robot.scopes) or "everything"
     record_action(
         args, settings, "robot.enrolled", robot.robot, tenant=robot.tenant, key=robot.key_id, scopes=allowed
     )
     show(f"robot {robot.robot!r} is enrolled with {robot.key_id}; it may use {allowed}")
+    if made is not None:
+        show(*enrolment_lines(made, args.out))
     return 0
 
 

@@ -15,7 +15,7 @@ import pytest
 ORDER = (
     "rse_pf", "errors", "terminal", "linux", "limited_process", "files", "geometry", "native",
     "native_buffers", "token_bucket", "config", "budget", "wire", "scaling", "object_store", "identity",
-    "crash_record", "maps", "auth", "audit", "service",
+    "crash_record", "maps", "auth", "enrolment", "audit", "service",
     "pnp", "services.mapping", "services.custom", "services",
     "aws", "aws.storage", "aws.fleet", "aws.money",
     "backend", "backend.scheduling", "backend.sandbox", "backend.jobs", "backend.compute",
@@ -47,6 +47,7 @@ ONLY: dict[str, set[str]] = {
     "local": {"config", "scaling", "errors", "auth", "object_store", "audit", "linux", "files", "terminal"},
     "client_sdk": {
         "config",
+        "enrolment",
         "errors",
         "files",
         "geometry",
@@ -79,10 +80,12 @@ PACKAGES: dict[str, tuple[str, ...]] = {
     "picows": ("rse_pf/backend/gateway/websocket.py",),
     "aiofastnet": ("rse_pf/backend/",),
     "uvloop": ("rse_pf/backend/",),
-    "prometheus_client": ("rse_pf/backend/", "rse_pf/data_server/"),
+    "prometheus_client": (
+        "rse_pf/backend/", "rse_pf/data_server/", "rse_pf/local/control/federation.py",
+    ),
     "uvicorn": ("rse_pf/data_server/server.py",),
     "jwt": ("rse_pf/auth/tokens.py",),
-    "cryptography": ("rse_pf/auth/tokens.py",),
+    "cryptography": ("rse_pf/auth/tokens.py", "rse_pf/auth/certificates.py"),
     "boto3": ("rse_pf/aws/",),
     "botocore": ("rse_pf/aws/",),
     "aws_cdk": ("stacks/", "app.py"),
@@ -98,6 +101,7 @@ PACKAGES: dict[str, tuple[str, ...]] = {
     "small_gicp": ("rse_pf/services/mapping/icp.py",),
     "faiss": ("rse_pf/services/mapping/descriptors.py", "rse_pf/services/mapping/place.py"),
     "envoy": ("rse_pf/local/",),
+    "segno": ("rse_pf/cli/",),
 }
 BASE = {"numpy", "msgspec", "websockets"}
 BASE_ROOMS = ONLY["client_sdk"] | {"client_sdk", "rse_pf", "auth", "scaling", "object_store"}

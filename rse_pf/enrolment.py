@@ -1,0 +1,100 @@
+"""One file that holds all a robot needs to connect: address, authority of the platform, and its own key.
+
+An operator writes it with ``rse-pf robot enrol ROBOT --out FILE`` and carries it to the robot.  It contains a
+private key: it is created with mode 0600, and refused if others may read it.  JSON, one object:
+
+- ``format``: ``rse-pf-enrolment``; ``version``: 1.  Readers ignore unknown members.
+- ``url``: where robots connect, ``wss://`` or ``ws://``.
+- ``authority``: certificate (PEM) that alone may vouch for the address; empty: those of the machine.
+- ``robot``, ``tenant``: the name under which the robot is enrolled.
+- ``key``: the private key, a JWK (RFC 8037).
+- ``issuer``, ``audience``, ``token_ttl_s``: of the tokens that the robot signs with it.
+"""
+
+from __future__ import annotations
+
+import secrets
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Literal
+
+import msgspec
+
+from rse_pf.auth.tokens import SigningKey
+from rse_pf.config import AuthSettings
+from rse_pf.errors import UsageError
+from rse_pf.files import create_private_file, read_private_file
+from rse_pf.identity import DEFAULT_TENANT
+
+__all__ = ["Enrolment", "EnrolmentFile"]
+
+_ID_BYTES = 12
+_HINT = "make one with rse-pf robot enrol ROBOT --out FILE"
+
+
+class Enrolment(msgspec.Struct, frozen=True, kw_only=True):
+    """The content of the file."""
+
+    format: Literal["rse-pf-enrolment"] = "rse-pf-enrolment"
+    version: Literal[1] = 1
+    url: str
+    authority: str = ""
+    robot: str
+    tenant: str = DEFAULT_TENANT
+    key: dict[str, Any]
+    issuer: str = "rse-pf"
+    audience: str = "rse-pf"
+    token_ttl_s: int = 900
+
+    @classmethod
+    def read(cls, path: str | Path) -> Enrolment:
+        """Return the enrolment in *path*.
+
+        Raises:
+            UsageError: There is no such file, others may read it, or it holds no enrolment.
+        """
+        data = read_private_file(Path(path), "the enrolment", hint=_HINT)
+        try:
+            return msgspec.json.decode(data, type=cls)
+        except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
+            raise UsageError(f"{path} is not an enrolment: {str(error)[:150]}", hint=_HINT) from error
+
+    def write(self, path: Path) -> None:
+        """Write a new file that only its owner can read; raises UsageError if it exists already."""
+        try:
+            create_private_file(
+                path, msgspec.json.format(msgspec.json.encode(self), indent=1).decode() + "\n"
+            )
+        except OSError as error:
+            problem = "exists already" if isinstance(error, FileExistsError) else error.strerror
+            raise UsageError(
+                f"cannot write {path}: {problem}", hint="name another file with --out"
+            ) from error
+
+    def token(self, *, now_s: float, token_id: str) -> str:
+        """Return a token that the robot signs, valid from *now_s* (Unix); raises UsageError for a bad key."""
+        settings = AuthSettings(issuer=self.issuer, audience=self.audience, token_ttl_s=self.token_ttl_s)
+        key = SigningKey.from_json(msgspec.json.encode(self.key))
+        return key.issue(self.robot, now=now_s, token_id=token_id, settings=settings)
+
+
+class EnrolmentFile:
+    """The enrolment in a file, read anew for each token, so that a replaced key takes effect at once."""
+
+    def __init__(self, path: str | Path, *, clock: Callable[[], float] = time.time) -> None:
+        """Store the path; *clock* returns Unix seconds."""
+        self._path = Path(path)
+        self._clock = clock
+
+    def read(self) -> Enrolment:
+        """Return what the file holds; raises UsageError."""
+        return Enrolment.read(self._path)
+
+    def fresh_token(self) -> str:
+        """Return a fresh token; raises UsageError if the file holds no enrolment."""
+        return self.read().token(now_s=self._clock(), token_id=secrets.token_hex(_ID_BYTES))
+
+    async def token(self) -> str:
+        """Return a fresh token, for `client_sdk.connect`; raises UsageError like `fresh_token`."""
+        return self.fresh_token()
