@@ -14,11 +14,32 @@ from typing import Any
 
 from rse_pf.errors import MissingExtra
 
-__all__ = ["BUCKETS_S", "LongestRecently", "Metrics", "merge", "merge_isolation", "render"]
+__all__ = ["BUCKETS_S", "GAUGE_HELP", "LongestRecently", "Metrics", "merge", "merge_isolation", "render"]
 
 BUCKETS_S = (0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0)
 """Upper bounds of the duration histogram; the last bucket is open."""
 
+GAUGE_HELP = {
+    "robots": "robots that are connected to the server now",
+    "queue": "commands that wait for a solver thread",
+    "queue_oldest_s": "age of the command that has waited longest, in seconds",
+    "queue_ms": "longest wait of a command in the last second or two, in milliseconds",
+    "in_flight": "commands that a solver thread computes now",
+    "loop_lag_s": "longest delay of a worker's event loop since the last report, in seconds",
+    "cpu_s": "processor time of all processes of the server since its start, in seconds",
+    "log_lines_dropped": "log lines that were lost because they came faster than they were written",
+    "compute_queue": "commands that wait for a limited process",
+    "compute_running": "commands that a limited process computes now",
+    "compute_cpu_s": "processor time of the limited processes since the start, in seconds",
+    "compute_blocked_robots": "robots that are refused limited services because their commands crashed",
+    "sandboxes": "sandboxes of installed services that exist now",
+    "moved": "robots that were asked to move to another server since the start",
+    "resident_bytes": "memory of the server's processes that is resident, in bytes",
+    "ready": "whether the server accepts robots: 1, or 0 while it starts or drains",
+    "accept_pauses": "pauses of accepting because sockets arrived faster than max_accepts_per_s",
+    "control_refused": "requests to the control port that were refused for lack of its token",
+}
+"""What each gauge means; a new gauge needs a line here."""
 _GAUGES_OF_WORST = ("queue_oldest_s", "queue_ms", "loop_lag_s")
 _RECENT_S = 1.0
 
@@ -149,19 +170,37 @@ def render(merged: Mapping[str, Any]) -> bytes:
     class Families:
         def collect(self) -> Iterable[Metric]:
             requests = CounterMetricFamily(
-                "rse_pf_requests", "final answers by service and result", labels=["service", "result"]
+                "rse_pf_requests",
+                "final answers to commands, by service and result (ok or the code of a failure)",
+                labels=["service", "result"],
             )
             for service, result, n in merged["requests"]:
                 requests.add_metric([service, result], n)
             yield requests
-            yield counter("shed", "commands refused for lack of time or capacity", "reason", merged["shed"])
-            yield counter("handshakes", "handshakes by result", "result", merged["handshakes"])
-            yield counter("closed", "sockets closed by the server", "reason", merged["closed"])
-            yield counter("bytes", "bytes of messages", "direction", merged["bytes"])
+            yield counter(
+                "shed",
+                "commands that were refused before they were computed, by reason",
+                "reason",
+                merged["shed"],
+            )
+            yield counter(
+                "handshakes", "WebSocket handshakes of robots, by result", "result", merged["handshakes"]
+            )
+            yield counter(
+                "closed", "sockets of robots that the server closed, by reason", "reason", merged["closed"]
+            )
+            yield counter(
+                "bytes",
+                "bytes of protocol messages, by direction as the server sees it",
+                "direction",
+                merged["bytes"],
+            )
             for name, value in merged["gauges"].items():
-                yield GaugeMetricFamily(f"rse_pf_{name}", name.replace("_", " "), value=value)
+                yield GaugeMetricFamily(f"rse_pf_{name}", GAUGE_HELP.get(name, name), value=value)
             histogram = HistogramMetricFamily(
-                "rse_pf_duration_seconds", "arrival to answer, in the server", labels=["service"]
+                "rse_pf_duration_seconds",
+                "time from the arrival of a command to its answer in the server, in seconds",
+                labels=["service"],
             )
             for service, buckets in merged["durations"].items():
                 histogram.add_metric([service], _cumulated(buckets), merged["duration_sum_s"][service])

@@ -242,6 +242,7 @@ def test_the_control_port_serves_health_status_and_metrics(start_server):
     assert handshakes["ok"] == 2
     for gauge in ("robots", "queue", "queue_oldest_s", "in_flight", "loop_lag_s", "cpu_s", "resident_bytes"):
         assert f"rse_pf_{gauge}" in families
+    assert [name for name, family in families.items() if len(family.documentation.split()) < 3] == []
     status = server.status()
     assert (status["pid"], status["workers"]) == (server.process.pid, server.workers)
     assert (status["requests"], status["state"]) == (2, "ready")
