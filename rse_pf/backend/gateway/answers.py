@@ -112,6 +112,10 @@ class Answers:
         self._context.metrics.answered(service, code, now - queued.received_s)
         connection: RobotConnection = queued.owner
         connection.answer(answer.data)
+        connection.commands += 1
+        connection.last_result = code
+        if code in _FREQUENT and not self._logs_frequent:
+            return
         log = self._context.log
         level, write = ("debug", log.debug) if code in _FREQUENT else ("info", log.info)
         if log.writes(level):

@@ -61,8 +61,9 @@ class RobotConnection:
     """One robot's connection between its handshake and its end."""
 
     __slots__ = (
-        "_assembler", "_context", "_deferred", "_handler", "_wire", "allowed_s", "claims", "is_connected",
-        "last_heard_s", "moving_until_s", "number", "opened_s", "robot", "session",
+        "_assembler", "_context", "_deferred", "_handler", "_wire", "allowed_s", "claims", "commands",
+        "is_connected", "last_heard_s", "last_result", "moving_until_s", "number", "opened_s",
+        "robot", "session",
     )  # fmt: skip
 
     def __init__(
@@ -93,6 +94,9 @@ class RobotConnection:
         self.opened_s = self.last_heard_s = now
         self.allowed_s: float | None = None
         """Time that the last command had, from its arrival to its deadline."""
+        self.commands = 0
+        """How many of its commands were answered; ``last_result`` is ``ok`` or the code of the last one."""
+        self.last_result = ""
         self.moving_until_s = float("-inf")
         self.is_connected = True
         self._handler = handler

@@ -5,8 +5,8 @@ from __future__ import annotations
 import msgspec
 
 __all__ = [
-    "BlocksOrder", "DrainOrder", "LeaveOrder", "MigrateOrder", "ReplaceOrder", "ReportOrder", "TrustOrder",
-    "UnblockOrder", "WorkerOrder", "decode_order", "encode_order",
+    "BlocksOrder", "DrainOrder", "LeaveOrder", "MigrateOrder", "ReplaceOrder", "ReportOrder", "RobotsOrder",
+    "TrustOrder", "UnblockOrder", "WorkerOrder", "decode_order", "encode_order",
 ]  # fmt: skip
 
 
@@ -45,6 +45,12 @@ class BlocksOrder(msgspec.Struct, tag="blocks", tag_field="do", frozen=True):
     number: int
 
 
+class RobotsOrder(msgspec.Struct, tag="robots", tag_field="do", frozen=True):
+    """Tell in an answer with this *number* which robots are connected."""
+
+    number: int
+
+
 class UnblockOrder(msgspec.Struct, tag="unblock", tag_field="do", frozen=True):
     """Lift what is refused, and tell in an answer with this *number* what it was.
 
@@ -70,6 +76,7 @@ WorkerOrder = (
     | TrustOrder
     | ReplaceOrder
     | BlocksOrder
+    | RobotsOrder
     | UnblockOrder
     | LeaveOrder
 )

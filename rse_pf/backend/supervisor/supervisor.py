@@ -17,6 +17,7 @@ import time
 from collections.abc import Awaitable, Callable, Mapping
 from contextlib import suppress
 from importlib import metadata
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -30,11 +31,18 @@ from rse_pf.backend.log import JsonLog
 from rse_pf.backend.metrics import merge, merge_isolation, render
 from rse_pf.backend.supervisor.control_http import ControlReply, ControlRequest, serve_control
 from rse_pf.backend.supervisor.listener import bound_socket, check_authentication
-from rse_pf.backend.supervisor.orders import BlocksOrder, DrainOrder, LeaveOrder, MigrateOrder, UnblockOrder
+from rse_pf.backend.supervisor.orders import (
+    BlocksOrder,
+    DrainOrder,
+    LeaveOrder,
+    MigrateOrder,
+    RobotsOrder,
+    UnblockOrder,
+)
 from rse_pf.backend.supervisor.session_registry import SessionRegistry
 from rse_pf.backend.supervisor.trust_poller import poll_trust
-from rse_pf.backend.supervisor.worker import WorkerPlan
-from rse_pf.backend.supervisor.worker_handle import BUILTIN, WorkerProcess, fork_workers
+from rse_pf.backend.supervisor.worker import WorkerPlan, run_in_loop
+from rse_pf.backend.supervisor.worker_handle import BUILTIN, RowsOrder, WorkerProcess, fork_workers
 from rse_pf.config import PlatformSettings
 from rse_pf.config.placement import ServerPlacement
 from rse_pf.errors import ConfigurationError
@@ -49,10 +57,11 @@ _ACCEPT_PAUSE_S = 0.1
 _MIN_PAUSE_S = 0.01
 _FRESH_S = 0.25
 _REPORT_S = 0.3
-_BLOCKS_S = 2.0
+_ROWS_S = 2.0
 _LEAVE_S = 3.0
 _MAX_MOVES = 10000
 _MAX_BLOCKS = 2000
+_MAX_ROBOTS = 1000
 _MAX_SPREAD_S = _MAX_DRAIN_WAIT_S = 3600.0
 _EXIT_OK, _EXIT_LOST = 0, 1
 _PUBLIC_PAGES = ("/healthz", "/readyz")
@@ -121,7 +130,7 @@ def serve(
                     listener=listener, digest=digest, records=records,
                     control_token=control_token,
                 )  # fmt: skip
-                return asyncio.run(supervisor.run())
+                return run_in_loop(supervisor.run())
         finally:
             for worker in workers:
                 worker.kill()
@@ -152,8 +161,8 @@ class _Supervisor:
         self._began = time.monotonic()
         self._reported = float("-inf")
         self._reporting = asyncio.Lock()
-        self._asking_blocks = asyncio.Lock()
-        self._asked_blocks = 0
+        self._asking_rows = asyncio.Lock()
+        self._asked_rows = 0
         self._tasks: set[asyncio.Task[None]] = set()
         self._control_port = 0
         self._moving_until = 0.0
@@ -250,7 +259,8 @@ class _Supervisor:
                 self._pause_accepting(max(wait_s, _MIN_PAUSE_S))
                 return
             try:
-                accepted, _ = self._listener.accept()
+                # A descriptor is enough: `accept` would make an object that is closed at once.
+                fd, address = self._listener._accept()
             except BlockingIOError:
                 return
             except OSError as error:  # out of descriptors, or the robot is gone already
@@ -258,12 +268,17 @@ class _Supervisor:
                 self._pause_accepting(_ACCEPT_PAUSE_S)
                 return
             self._accepted += 1
-            with accepted:
-                if not any(
-                    worker.give(accepted, self._accepted)
-                    for worker in sorted(self._workers, key=lambda w: w.load)
-                ):
-                    self._refused_full += 1
+            try:
+                self._pass_on(fd, address[0])
+            finally:
+                os.close(fd)
+
+    def _pass_on(self, fd: int, peer: str) -> None:
+        """Send an accepted socket to the worker with the fewest."""
+        for worker in sorted(self._workers, key=_load_of):
+            if worker.give(fd, self._accepted, peer):
+                return
+        self._refused_full += 1
 
     def _pause_accepting(self, pause_s: float) -> None:
         """Stop watching the listener for *pause_s*; it stays readable meanwhile."""
@@ -339,6 +354,7 @@ class _Supervisor:
             ("GET", "/metrics"): self._metrics,
             ("GET", "/status"): self._status,
             ("GET", "/blocks"): self._blocks,
+            ("GET", "/robots"): self._robots,
             ("POST", "/unblock"): self._post_unblock,
             ("POST", "/drain"): self._post_drain,
             ("POST", "/move"): self._post_move,
@@ -426,7 +442,11 @@ class _Supervisor:
         )
 
     async def _blocks(self, ask: ControlRequest) -> ControlReply:
-        return _json(await self._ask_blocks(BlocksOrder))
+        return _json(await self._ask_rows("blocks", BlocksOrder, _MAX_BLOCKS))
+
+    async def _robots(self, ask: ControlRequest) -> ControlReply:
+        """Tell which robots are connected, at most `_MAX_ROBOTS` of them; ``count`` is of all."""
+        return _json(await self._ask_rows("robots", RobotsOrder, _MAX_ROBOTS))
 
     async def _post_unblock(self, ask: ControlRequest) -> ControlReply:
         """Lift what is refused after crashes: all, or that of a service, a tenant, or a robot of a tenant."""
@@ -437,22 +457,24 @@ class _Supervisor:
             return _refused(
                 400, "bad-request", "name a service, a tenant, a robot of that tenant, or nothing"
             )
-        told = await self._ask_blocks(lambda number: UnblockOrder(number, **wanted))
+        told = await self._ask_rows("blocks", lambda number: UnblockOrder(number, **wanted), _MAX_BLOCKS)
         self._log.info("unblock", **wanted, lifted=told["count"])
         self._records.note("server.unblock", **wanted, lifted=told["count"])
         return _json(told)
 
-    async def _ask_blocks(self, make_order: Callable[[int], BlocksOrder | UnblockOrder]) -> dict[str, Any]:
+    async def _ask_rows(
+        self, what: str, make_order: Callable[[int], RowsOrder], most: int
+    ) -> dict[str, Any]:
         """Return what all workers tell; the same thing of several workers is listed several times."""
-        async with self._asking_blocks:
-            self._asked_blocks += 1
-            order = make_order(self._asked_blocks)
-            told = await asyncio.gather(*(worker.ask_blocks(order, _BLOCKS_S) for worker in self._workers))
+        async with self._asking_rows:
+            self._asked_rows += 1
+            order = make_order(self._asked_rows)
+            told = await asyncio.gather(*(worker.ask_rows(order, _ROWS_S) for worker in self._workers))
         answers = [each for each in told if each is not None]
-        blocks = [block for each in answers for block in each["blocks"]]
+        rows = [row for each in answers for row in each["rows"]]
         return {
             "server": self._server_id,
-            "blocks": blocks[:_MAX_BLOCKS],
+            what: rows[:most],
             "count": sum(each["count"] for each in answers),
             "silent_workers": len(told) - len(answers),
         }
@@ -521,6 +543,9 @@ class _Supervisor:
     def _cpu_s(self, gauges: Mapping[str, float]) -> float:
         """Return the CPU seconds of the server and of its limited processes, which the workers report."""
         return round(sum(map(cpu_seconds, self._pids())) + gauges.get("compute_cpu_s", 0.0), 3)
+
+
+_load_of = attrgetter("load")
 
 
 def _json(value: Any, *, status: int = 200, headers: dict[str, str] | None = None) -> ControlReply:

@@ -14,11 +14,12 @@ import os
 import secrets
 import signal
 import socket
+import struct
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Coroutine, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from rse_pf.auth.tokens import KeySet
 from rse_pf.auth.trust_store import key_set_from_snapshot
@@ -54,11 +55,13 @@ from rse_pf.backend.supervisor.orders import (
     MigrateOrder,
     ReplaceOrder,
     ReportOrder,
+    RobotsOrder,
     TrustOrder,
     UnblockOrder,
     WorkerOrder,
     decode_order,
 )
+from rse_pf.backend.supervisor.robot_rows import MAX_ROBOT_ROWS, robot_rows
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import MissingExtra
 from rse_pf.linux import die_with_parent, set_process_name
@@ -66,11 +69,18 @@ from rse_pf.service import Registry
 from rse_pf.services.custom.installed import InstalledService, installed_services, published_services
 from rse_pf.services.loading import load_services
 
-__all__ = ["NUMBER_BYTES", "WorkerPlan", "event_loop_maker", "run_worker"]
+__all__ = ["HANDOVER", "WorkerPlan", "event_loop_maker", "run_in_loop", "run_worker"]
 
-NUMBER_BYTES = 8
-"""Length of a socket's number, which travels with its descriptor."""
+HANDOVER = struct.Struct("!Q46s")
+"""A socket's number and the address of its peer, which travel with its descriptor."""
+_DESCRIPTOR = struct.Struct("@i")
+_ANCILLARY_BYTES = socket.CMSG_SPACE(_DESCRIPTOR.size)
+_T = TypeVar("_T")
 _POLL_S = 0.01
+_GATHER_S = 0.01
+"""Each message to the supervisor wakes it, which costs more than what it says."""
+_MAX_EVENTS = 500
+"""In one message; a line of the channel may have 1 MiB."""
 _MAX_LINE_BYTES = 1 << 26
 """A `TrustOrder` names every robot that is enrolled."""
 _CLOSE_TIMEOUT_S = 1.0
@@ -104,6 +114,21 @@ def event_loop_maker() -> Callable[[], asyncio.AbstractEventLoop]:
     return make
 
 
+def run_in_loop(main: Coroutine[Any, Any, _T]) -> _T:
+    """Return what *main* returns, run like by `asyncio.run` in an event loop of `event_loop_maker`."""
+    loop = event_loop_maker()()
+    asyncio.set_event_loop(loop)
+    try:
+        return loop.run_until_complete(main)
+    finally:
+        left = asyncio.all_tasks(loop)
+        for task in left:
+            task.cancel()
+        loop.run_until_complete(asyncio.gather(*left, return_exceptions=True))
+        asyncio.set_event_loop(None)
+        loop.close()
+
+
 def run_worker(plan: WorkerPlan, data: socket.socket, control: socket.socket) -> None:
     """Serve robots until the worker is told to leave or its supervisor is gone."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -130,6 +155,7 @@ class _Worker:
         self._loop = loop
         self._ended = 0
         self._flushing = False
+        self._robot_events: list[dict[str, Any]] = []
         self._tasks: set[asyncio.Task[None]] = set()
         self._log = JsonLog(level=settings.serving.log_level, server=plan.server_id, wall_clock=time.time)
         registry = load_services(plan.services, settings)
@@ -158,7 +184,7 @@ class _Worker:
             context,
             connections,
             handshake,
-            tell=self._say,
+            tell=self._say_of_robot,
             recorder=self._recorder,
         )
         self._sandboxes = (
@@ -254,6 +280,7 @@ class _Worker:
                 await self._leave(order.held_s)
                 break
         self._recorder.flush()
+        self._flush_robot_events()
         self._log.close()
         os._exit(0)  # nobody waits for the sockets and threads that are left
 
@@ -272,6 +299,9 @@ class _Worker:
                 self._token_watch.replace(order.number)
             case BlocksOrder():
                 self._tell_blocks(order.number, [] if self._sandboxes is None else self._sandboxes.blocks())
+            case RobotsOrder():
+                rows = robot_rows(self._dispatcher.connections, time.monotonic())
+                self._tell_rows(order.number, len(rows), rows[:MAX_ROBOT_ROWS])
             case UnblockOrder(number, service, tenant, robot):
                 sandboxes = self._sandboxes
                 lifted = [] if sandboxes is None else sandboxes.unblock(service, tenant, robot)
@@ -283,8 +313,10 @@ class _Worker:
         return report
 
     def _tell_blocks(self, number: int, blocks: list[Block]) -> None:
-        told = [asdict(block) for block in blocks[:_MAX_BLOCKS]]
-        self._say(event="blocks", number=number, count=len(blocks), blocks=told)
+        self._tell_rows(number, len(blocks), [asdict(block) for block in blocks[:_MAX_BLOCKS]])
+
+    def _tell_rows(self, number: int, count: int, rows: list[dict[str, Any]]) -> None:
+        self._say(event="rows", number=number, count=count, rows=rows)
 
     async def _tell_when_empty(self) -> None:
         while self._dispatcher.connections:
@@ -303,20 +335,22 @@ class _Worker:
     def _take_sockets(self) -> None:
         while True:
             try:
-                message, fds, _, _ = socket.recv_fds(self._data, NUMBER_BYTES, 1)
+                message, ancillary, _, _ = self._data.recvmsg(HANDOVER.size, _ANCILLARY_BYTES)
             except BlockingIOError:
                 return
             if not message:
                 self._loop.remove_reader(self._data.fileno())
                 return
-            for fd in fds:
-                self._sockets.take(fd, self._count_end, int.from_bytes(message, "big"))
+            number, peer = HANDOVER.unpack(message)
+            for _, _, packed in ancillary:
+                (fd,) = _DESCRIPTOR.unpack(packed)
+                self._sockets.take(fd, self._count_end, number, peer.rstrip(b"\0").decode())
 
     def _count_end(self) -> None:
         self._ended += 1
         if not self._flushing:
             self._flushing = True
-            self._loop.call_soon(self._flush_ends)
+            self._loop.call_later(_GATHER_S, self._flush_ends)
 
     def _flush_ends(self) -> None:
         """Send the supervisor one byte for each socket that ended, so that it knows this worker's load."""
@@ -332,6 +366,17 @@ class _Worker:
     def _new_name(self) -> str:
         self._named += 1
         return f"anonymous-{(self._named - 1) * self._workers + self._index + 1}"
+
+    def _say_of_robot(self, **message: Any) -> None:
+        """Say what concerns one robot together with what happens to others within `_GATHER_S`."""
+        if not self._robot_events:
+            self._loop.call_later(_GATHER_S, self._flush_robot_events)
+        self._robot_events.append(message)
+
+    def _flush_robot_events(self) -> None:
+        events, self._robot_events = self._robot_events, []
+        for first in range(0, len(events), _MAX_EVENTS):
+            self._say(event="robots", robots=events[first : first + _MAX_EVENTS])
 
     def _say(self, **message: Any) -> None:
         self._writer.write(json.dumps(message).encode() + b"\n")

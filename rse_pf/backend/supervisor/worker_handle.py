@@ -13,6 +13,7 @@ import json
 import os
 import signal
 import socket
+import struct
 import sys
 import traceback
 from collections.abc import Callable, Sequence
@@ -21,18 +22,22 @@ from typing import Any, NoReturn
 from rse_pf.backend.supervisor.orders import (
     BlocksOrder,
     ReportOrder,
+    RobotsOrder,
     UnblockOrder,
     WorkerOrder,
     encode_order,
 )
-from rse_pf.backend.supervisor.worker import NUMBER_BYTES, WorkerPlan, event_loop_maker, run_worker
+from rse_pf.backend.supervisor.worker import HANDOVER, WorkerPlan, event_loop_maker, run_worker
 from rse_pf.config import PlatformSettings
 from rse_pf.services.loading import load_services
 
-__all__ = ["BUILTIN", "WorkerProcess", "fork_workers", "warm_up"]
+__all__ = ["BUILTIN", "RowsOrder", "WorkerProcess", "fork_workers", "warm_up"]
 
+RowsOrder = BlocksOrder | RobotsOrder | UnblockOrder
+"""Orders that a worker answers with rows."""
 BUILTIN = "rse_pf.services.builtin:builtin_services"
 """The platform's own services."""
+_DESCRIPTOR = struct.Struct("@i")
 _MAX_LINE_BYTES = 1 << 20
 _READ_BYTES = 4096
 
@@ -94,8 +99,8 @@ class WorkerProcess:
         self._writer: asyncio.StreamWriter | None = None
         self._reading: asyncio.Task[None] | None = None
         self._reported: asyncio.Future[None] | None = None
-        self._told_blocks: asyncio.Future[dict[str, Any]] | None = None
-        self._blocks_number = 0
+        self._told_rows: asyncio.Future[dict[str, Any]] | None = None
+        self._rows_number = 0
 
     def exit_code(self, how: int = os.WNOHANG) -> int | None:
         """Return how the process ended (negative: by which signal), None while it runs.
@@ -126,10 +131,17 @@ class WorkerProcess:
         await ready.wait()
         loop.add_reader(self._data.fileno(), self._count_ended)
 
-    def give(self, accepted: socket.socket, number: int) -> bool:
-        """Send the worker the *number*-th accepted socket; False if its channel is full or closed."""
+    def give(self, fd: int, number: int, peer: str) -> bool:
+        """Send the worker the *number*-th accepted socket, which comes from the address *peer*.
+
+        Returns:
+            False if its channel is full or closed.  The descriptor *fd* stays open in both cases.
+        """
         try:
-            socket.send_fds(self._data, [number.to_bytes(NUMBER_BYTES, "big")], [accepted.fileno()])
+            self._data.sendmsg(
+                [HANDOVER.pack(number, peer.encode())],
+                [(socket.SOL_SOCKET, socket.SCM_RIGHTS, _DESCRIPTOR.pack(fd))],
+            )
         except OSError:
             return False
         self.load += 1
@@ -146,13 +158,13 @@ class WorkerProcess:
         self.order(ReportOrder())
         await asyncio.wait([self._reported], timeout=timeout_s)
 
-    async def ask_blocks(self, order: BlocksOrder | UnblockOrder, timeout_s: float) -> dict[str, Any] | None:
+    async def ask_rows(self, order: RowsOrder, timeout_s: float) -> dict[str, Any] | None:
         """Return the worker's answer to *order*, None if there is none in time; one order at a time."""
-        self._told_blocks = asyncio.get_running_loop().create_future()
-        self._blocks_number = order.number
+        self._told_rows = asyncio.get_running_loop().create_future()
+        self._rows_number = order.number
         self.order(order)
-        await asyncio.wait([self._told_blocks], timeout=timeout_s)
-        return self._told_blocks.result() if self._told_blocks.done() else None
+        await asyncio.wait([self._told_rows], timeout=timeout_s)
+        return self._told_rows.result() if self._told_rows.done() else None
 
     def kill(self) -> None:
         """Kill the process and close the channels; a second call does nothing."""
@@ -185,10 +197,13 @@ class WorkerProcess:
             ready.set()
         elif message["event"] == "empty":
             self.empty.set()
-        elif message["event"] == "blocks":
-            told = self._told_blocks
-            if told is not None and not told.done() and message["number"] == self._blocks_number:
+        elif message["event"] == "rows":
+            told = self._told_rows
+            if told is not None and not told.done() and message["number"] == self._rows_number:
                 told.set_result(message)
+        elif message["event"] == "robots":
+            for told in message["robots"]:
+                self._on_robot(self, told)
         elif message["event"] != "report":
             self._on_robot(self, message)
         else:

@@ -12,6 +12,7 @@ from rse_pf.backend.supervisor.orders import (
     MigrateOrder,
     ReplaceOrder,
     ReportOrder,
+    RobotsOrder,
     TrustOrder,
     UnblockOrder,
     WorkerOrder,
@@ -24,7 +25,8 @@ from rse_pf.backend.supervisor.orders import (
     "order",
     [
         ReportOrder(), DrainOrder(200.0), MigrateOrder([0.1, 0.5], 200.0), TrustOrder('{"keys": "a\\nb"}'),
-        ReplaceOrder(7), LeaveOrder(0.5), BlocksOrder(1), UnblockOrder(2), UnblockOrder(3, "icp", "a", "b\n"),
+        ReplaceOrder(7), LeaveOrder(0.5), BlocksOrder(1), RobotsOrder(4), UnblockOrder(2),
+        UnblockOrder(3, "icp", "a", "b\n"),
     ],
 )  # fmt: skip
 def test_an_order_travels_as_one_line(order: WorkerOrder) -> None:
