@@ -23,6 +23,7 @@ from typing import Any, TextIO
 from rse_pf.errors import RsePfError
 
 __all__ = [
+    "can_draw",
     "counted",
     "error_lines",
     "json_line",
@@ -56,9 +57,9 @@ def printable(text: str) -> str:
     return _NOT_ASCII.sub(_escape, text)
 
 
-def counted(number: int, noun: str) -> str:
-    """Return *number* with *noun* in the singular or with an s: ``1 robot``, ``1,200 points``."""
-    return f"{number:,} {noun}" if number == 1 else f"{number:,} {noun}s"
+def counted(number: float, noun: str, plural: str = "") -> str:
+    """Return *number* with *noun* in the singular or plural: ``1 robot``, ``2 robots``, ``0 entries``."""
+    return f"{number:g} {noun}" if number == 1 else f"{number} {plural or f'{noun}s'}"
 
 
 def show(*lines: str, error: bool = False) -> None:
@@ -90,6 +91,15 @@ def error_lines(error: RsePfError) -> list[str]:
     """Return the report on *error* as lines; a message of several lines cannot pass for several reports."""
     first = f"{type(error).__name__}: {error.message}".rstrip("\n").replace("\n", f"\n{_CONTINUED}")
     return [*first.split("\n"), f"  hint: {error.hint}" if error.hint else f"  see: {error.address()}"]
+
+
+def can_draw(text: str) -> bool:
+    """Return whether standard output is a terminal that has the characters of *text*."""
+    try:
+        text.encode(sys.stdout.encoding or "ascii")
+    except (UnicodeEncodeError, LookupError):
+        return False
+    return sys.stdout.isatty()
 
 
 def show_progress(text: str, *, is_over: bool) -> None:

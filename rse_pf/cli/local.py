@@ -1,12 +1,19 @@
 """Run the platform on this machine until Ctrl-C: a load balancer, and backend servers behind it.
 
 Each box is a separate process; Ctrl-C, closing the terminal and rse-pf local stop end all of them.  The
-platform grows, shrinks and replaces what breaks.  The other actions show its state, or inject a fault.
+platform grows, shrinks and replaces what breaks.  --lan opens it to the machines of this network, by TLS and
+with tokens.  The other actions show its state, replace servers without loss, or inject a fault: a server that
+is stopped, slow or cut off for too long is replaced.
 
 examples:
   rse-pf local --servers 2
+  rse-pf local --lan
   rse-pf local status
-  rse-pf local pause server-1 --for 5
+  rse-pf local robots
+  rse-pf local logs --server server-1 --follow
+  rse-pf local drain server-1
+  rse-pf local roll
+  rse-pf local pause server-1 --for 0.5
   rse-pf local slow server-2 --percent 10 --for 30
   rse-pf local stop
 """
@@ -24,7 +31,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from rse_pf.config import PlatformSettings
+from rse_pf.config import HealthSettings, PlatformSettings
 from rse_pf.errors import UsageError
 from rse_pf.terminal import show, show_json, show_page
 
@@ -32,7 +39,10 @@ __all__ = ["DEFAULT_NAME", "add_arguments", "run"]
 
 DEFAULT_NAME = "default"
 _FAULTS = ("kill", "pause", "resume", "slow", "partition")
-_ACTIONS = ("start", "stop", "status", *_FAULTS, "kill-balancer")
+_OF_A_SERVER = (*_FAULTS, "drain")
+_ACTIONS = ("start", "stop", "status", "robots", "logs", "drain", "roll", *_FAULTS, "kill-balancer")
+_LINES = 100
+_FOLLOW_S = 0.2
 _SAMPLE_S = 0.5
 _STOPPERS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
@@ -44,9 +54,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "action", nargs="?", choices=_ACTIONS, default="start", help="what to do (default: start)"
     )
     parser.add_argument(
-        "server", nargs="?", metavar="SERVER", help="the server to kill, pause, resume, slow, ..."
+        "server", nargs="?", metavar="SERVER", help="the server to drain, kill, pause, resume, slow, ..."
     )
-    parser.add_argument("--json", action="store_true", help="status: as JSON")
+    parser.add_argument("--json", action="store_true", help="status, robots: as JSON")
     parser.add_argument(
         "--for", dest="for_s", type=float, metavar="S",
         help="pause, slow, partition: end after S seconds (without: pause stays, the others end with Ctrl-C)",
@@ -64,6 +74,21 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--port", type=int, metavar="P",
         help=f"port that robots connect to; 0 takes a free one (local.port, default {defaults.port})",
+    )  # fmt: skip
+    parser.add_argument(
+        "--lan", nargs="?", const="", metavar="ADDRESS",
+        help="listen on ADDRESS of this machine (default: a detected one) with TLS, for other machines",
+    )  # fmt: skip
+    parser.add_argument(
+        "--metrics-port", type=int, metavar="P",
+        help="port on loopback of the metrics of all servers; 0 takes a free one (local.metrics_port, "
+        f"default {defaults.metrics_port})",
+    )  # fmt: skip
+    parser.add_argument("--server", dest="of_server", metavar="ID", help="logs: of this process only")
+    parser.add_argument("--follow", action="store_true", help="logs: go on with new lines until Ctrl-C")
+    parser.add_argument(
+        "--level", choices=("debug", "info", "warning", "error"), default="debug",
+        help="logs: lines of at least this level (default: all)",
     )  # fmt: skip
     parser.add_argument(
         "--no-data", action="store_true", help="start no data service (large data by HTTP under /data/)"
@@ -90,12 +115,17 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
         stopped = stop_platform(folder)
         show(f"platform {args.name!r} {'is stopped' if stopped else 'was not running'}")
         return 0
+    if args.action == "logs":
+        return _logs(args, folder)
     if args.action != "start":
         return _on_running(args, folder)
-    wanted = {"servers": args.servers, "port": args.port}
+    from rse_pf.cli.local_platform.lan import chosen_address
+
+    wanted = {"servers": args.servers, "port": args.port, "metrics_port": args.metrics_port}
     chosen = settings.replace(local={name: value for name, value in wanted.items() if value is not None})
-    work = _foreground(args.name, folder, _with_services(chosen, args), data=not args.no_data)
-    return asyncio.run(work)
+    chosen = _with_services(chosen, args)
+    lan = chosen_address(args.lan)
+    return asyncio.run(_foreground(args.name, folder, chosen, data=not args.no_data, lan=lan))
 
 
 def _with_services(settings: PlatformSettings, args: argparse.Namespace) -> PlatformSettings:
@@ -112,12 +142,19 @@ def _with_services(settings: PlatformSettings, args: argparse.Namespace) -> Plat
 
 def _check(args: argparse.Namespace) -> None:
     """Raise UsageError for options that the action does not take."""
-    if args.action in _FAULTS and args.server is None:
+    if args.action in _OF_A_SERVER and args.server is None:
         raise UsageError(
             f"rse-pf local {args.action} needs a server", hint="rse-pf local status shows their names"
         )
-    if args.action not in _FAULTS and args.server is not None:
-        raise UsageError(f"rse-pf local {args.action} takes no server", hint="leave the name out")
+    if args.action not in _OF_A_SERVER and args.server is not None:
+        hint = "name it with --server" if args.action == "logs" else "leave the name out"
+        raise UsageError(f"rse-pf local {args.action} takes no server", hint=hint)
+    if args.action != "logs" and (args.of_server or args.follow):
+        raise UsageError("--server and --follow are for logs", hint="see rse-pf local --help")
+    if args.action != "start" and (args.lan is not None or args.metrics_port is not None):
+        raise UsageError(
+            "--lan and --metrics-port are for the start of a platform", hint="see rse-pf local --help"
+        )
     if args.for_s is not None and (args.action not in ("pause", "slow", "partition") or not args.for_s > 0):
         raise UsageError(
             "--for takes a positive number of seconds, for pause, slow and partition", hint="leave it out"
@@ -141,21 +178,27 @@ def _on_running(args: argparse.Namespace, folder: Any) -> int:
         else:
             show_page(status_table(status))
         return 0
+    if args.action == "robots":
+        return _robots(args, state)
+    if args.action in ("drain", "roll"):
+        return _operate(args, state)
     if args.action == "kill-balancer":
         show(f"killed the load balancer (pid {faults.kill_balancer(state)})")
         return 0
     server = faults.find_server(state, args.server)
+    if args.action == "pause" and args.for_s is not None:
+        _check_pause(args.for_s, faults.longest_pause_s(state, server, _health(folder)), server.name)
     signal.pthread_sigmask(signal.SIG_BLOCK, _STOPPERS)
     wait = functools.partial(_wait, math.inf if args.for_s is None else time.monotonic() + args.for_s)
     if args.action == "slow":
         show(f"{server.name} has {args.percent:g} % of its time; Ctrl-C ends that")
         faults.slow_down(server.process, args.percent, wait)
-        show(f"{server.name} has all of its time again")
+        show(f"{server.name} {_afterwards(server, 'has all of its time again')}")
     elif args.action == "partition":
         with faults.cut_off(server, args.name):
             show(f"{server.name} is cut off; Ctrl-C ends that")
             wait(math.inf)
-        show(f"{server.name} is reachable again")
+        show(f"{server.name} {_afterwards(server, 'is reachable again')}")
     else:
         number = {"kill": signal.SIGKILL, "pause": signal.SIGSTOP, "resume": signal.SIGCONT}[args.action]
         count = faults.signal_tree(server.process, number)
@@ -163,8 +206,71 @@ def _on_running(args: argparse.Namespace, folder: Any) -> int:
         show(f"{done}: {server.name} (pid {server.process.pid}, {count} processes)")
         if args.action == "pause" and args.for_s is not None:
             wait(math.inf)
-            left = faults.signal_tree(server.process, signal.SIGCONT)
-            show(f"{server.name} {'goes on' if left else 'is gone: it was replaced meanwhile'}")
+            faults.signal_tree(server.process, signal.SIGCONT)
+            show(f"{server.name} {_afterwards(server, 'goes on')}")
+    return 0
+
+
+def _health(folder: Path) -> HealthSettings:
+    from rse_pf.local.state import platform_settings
+
+    return (platform_settings(folder) or PlatformSettings()).health
+
+
+def _check_pause(for_s: float, longest_s: float, server: str) -> None:
+    """Refuse a pause that would never end, because the server is replaced first."""
+    if for_s >= longest_s:
+        raise UsageError(
+            f"{server} would not go on after {for_s:g} s: a server that is stopped is replaced after "
+            f"{longest_s:g} s (health.unhealthy_checks)",
+            hint=f"pause it for less than {longest_s:g} s, or leave --for out to see it replaced",
+        )
+
+
+def _afterwards(server: Any, done: str) -> str:
+    """Return what became of a server after a fault: *done*, or that it is gone."""
+    from rse_pf.local.processes import is_alive
+
+    return done if is_alive(server.process) else "is gone: it was replaced meanwhile"
+
+
+def _logs(args: argparse.Namespace, folder: Path) -> int:
+    from rse_pf.cli.local_platform.logs import LogFollower, last_lines, log_files, shown_line
+
+    follower = LogFollower(folder, args.of_server, args.level)
+    for line in last_lines(log_files(folder, args.of_server), args.level, _LINES):
+        show(shown_line(line))
+    if args.follow:
+        signal.pthread_sigmask(signal.SIG_BLOCK, _STOPPERS)
+        wait = functools.partial(_wait, math.inf, _FOLLOW_S)
+        follower.follow(lambda line: show(shown_line(line)), wait)
+    return 0
+
+
+def _robots(args: argparse.Namespace, state: Any) -> int:
+    from rse_pf.cli.local_platform.robots import connected_robots, robots_table
+
+    told = connected_robots(state)
+    if args.json:
+        show_json(told, indent=2)
+    else:
+        show(*robots_table(told))
+        for name in told["silent"]:
+            show(f"no answer from {name}", error=True)
+    return 1 if told["silent"] else 0
+
+
+def _operate(args: argparse.Namespace, state: Any) -> int:
+    """Drain a server or replace all; Ctrl-C ends only the report."""
+    from rse_pf.cli.local_platform.operations import operate
+
+    parameters = {} if args.server is None else {"server": args.server}
+    try:
+        operate(state, args.action, _show, **parameters)
+    except KeyboardInterrupt:
+        show("the platform goes on with it; rse-pf local status shows how far it is", error=True)
+        return 130
+    show(f"{args.server} has left" if args.action == "drain" else "every server was replaced")
     return 0
 
 
@@ -177,7 +283,7 @@ def _wait(end_s: float, seconds: float) -> bool:
     return signal.sigtimedwait(_STOPPERS, left_s) is not None or time.monotonic() >= end_s
 
 
-async def _foreground(name: str, folder: Any, settings: PlatformSettings, *, data: bool) -> int:
+async def _foreground(name: str, folder: Any, settings: PlatformSettings, *, data: bool, lan: str) -> int:
     from rse_pf.local.control.control_plane import ControlOptions
     from rse_pf.local.control.platform import LocalPlatform
 
@@ -203,6 +309,8 @@ async def _foreground(name: str, folder: Any, settings: PlatformSettings, *, dat
         data=data,
         on_event=_show,
         control=ControlOptions(elastic=True),
+        lan=lan,
+        metrics_port=settings.local.metrics_port,
     )
     try:
         async with platform:
@@ -223,13 +331,27 @@ def _welcome(platform: Any, name: str) -> None:
     has_data = platform.data_servers.process.is_running()
     show(
         "",
-        f"robots connect to  {platform.url}",
-        *([f"large data goes to {data_url(platform.url)}"] if has_data else []),
-        f"a robot's token    rse-pf token issue robot-1{which}",
-        f"to stop            Ctrl-C, or rse-pf local stop{which}",
-        f"logs and state     {platform.state}",
+        f"robots connect to   {platform.url}",
+        *([f"large data goes to  {data_url(platform.url)}"] if has_data else []),
+        f"a robot's token     rse-pf token issue robot-1{which}",
+        *_lan_lines(platform, which),
+        f"metrics             {platform.metrics_url}",
+        f"to stop             Ctrl-C, or rse-pf local stop{which}",
+        f"logs and state      {platform.state}",
         "",
     )
+
+
+def _lan_lines(platform: Any, which: str) -> list[str]:
+    """Return what other machines need, and show a QR code; nothing without --lan."""
+    from rse_pf.cli.local_platform.lan import browser_url, lan_lines, show_qr_code
+
+    if platform.lan is None:
+        return []
+    from rse_pf.local.lan.listener import authority_file
+
+    show_qr_code(browser_url(platform.url))
+    return lan_lines(platform.url, platform.lan.authority(), authority_file(platform.state), which)
 
 
 def _show(event: Any) -> None:
@@ -255,10 +377,13 @@ _TEXTS = {
     "drain-over": "{server} has left after {seconds} s",
     "drain-start": "{server} drains ({reason}); its robots move",
     "grow": "{servers} more: {reason}",
+    "certificate-renewed": "the certificate was renewed; robots notice nothing",
+    "metrics-port-taken": "port {port} is taken: metrics are on another port",
     "not-written": "{reason}",
     "platform-ready": "the platform is ready after {seconds:.1f} s",
     "rebalance": "{robots} robots of {server} are asked to move",
     "replace": "{server} is replaced by {by}: {reason}",
+    "roll-step": "{server} is replaced ({number} of {of})",
     "server-failed": "{server} did not start: {reason}",
     "server-gone": "{server} ended (exit code {exit_code})",
     "server-ready": "{server} is ready (pid {pid})",

@@ -1,10 +1,12 @@
-"""The firewall box on one machine: a listener on loopback only, and the key that signs robots' tokens.
+"""The firewall box on one machine: what may be listened on, and the key that signs robots' tokens.
 
-The private key is in a file that only its owner can read.
+The listener is on loopback, or, if an operator asks for it, on an address of the network, by TLS and with
+tokens.  The private key is in a file that only its owner can read.
 """
 
 from __future__ import annotations
 
+import errno
 import socket
 from pathlib import Path
 
@@ -13,8 +15,12 @@ from rse_pf.config import PlatformSettings
 from rse_pf.config.placement import is_loopback
 from rse_pf.errors import ConfigurationError, UsageError
 from rse_pf.files import OWNER_ONLY, read_private_file, replace_file
+from rse_pf.local.lan.listener import LanListener
 
-__all__ = ["check_listener", "ensure_key", "key_file", "key_set_file", "read_key", "robots_url"]
+__all__ = [
+    "check_lan_settings", "check_listener", "ensure_key", "key_file", "key_set_file", "read_key",
+    "robots_url",
+]  # fmt: skip
 
 
 def key_file(folder: Path) -> Path:
@@ -27,23 +33,31 @@ def key_set_file(folder: Path) -> Path:
     return folder / "keys.json"
 
 
-def robots_url(settings: PlatformSettings, port: int) -> str:
+def robots_url(settings: PlatformSettings, port: int, lan: LanListener | None = None) -> str:
     """Return the address that robots connect to: ``ws://``, or ``wss://`` if there is a certificate."""
-    host = f"[{settings.serving.host}]" if ":" in settings.serving.host else settings.serving.host
-    scheme = "wss" if settings.local.certificate else "ws"
+    address = settings.serving.host if lan is None else lan.address
+    host = f"[{address}]" if ":" in address else address
+    scheme = "wss" if settings.local.certificate or lan is not None else "ws"
     return f"{scheme}://{host}:{port}{settings.serving.path}"
 
 
-def check_listener(host: str, port: int) -> None:
+def check_listener(host: str, port: int, *, is_protected: bool = False) -> None:
     """Refuse a listener that other machines could reach, or whose port is taken.
 
+    Args:
+        host: An address of this machine.
+        port: 0 is always free.
+        is_protected: Whether it has TLS and requires tokens (`check_lan_settings`), so that others may
+            reach it.
+
     Raises:
-        ConfigurationError: *host* is not a loopback address, or something listens on *port*.
+        ConfigurationError: *host* is not a loopback address and not protected, it is no address of this
+            machine, or something listens on *port*.
     """
-    if not is_loopback(host):
+    if not is_protected and not is_loopback(host):
         raise ConfigurationError(
             f"serving.host = {host} would open the local platform to other machines",
-            hint="set serving.host to 127.0.0.1",
+            hint="set serving.host to 127.0.0.1; rse-pf local --lan opens it with certificate and tokens",
         )
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     with socket.socket(family, socket.SOCK_STREAM) as trial:
@@ -51,10 +65,32 @@ def check_listener(host: str, port: int) -> None:
         try:
             trial.bind((host, port))
         except OSError as error:
+            if error.errno == errno.EADDRNOTAVAIL:
+                raise ConfigurationError(
+                    f"{host} is no address of this machine", hint="ip address shows them"
+                ) from error
             raise ConfigurationError(
                 f"cannot listen on {host}:{port}: {error.strerror}",
                 hint="choose another port with --port; --port 0 takes a free one",
             ) from error
+
+
+def check_lan_settings(settings: PlatformSettings) -> None:
+    """Refuse settings under which no other machine may reach the platform.
+
+    Raises:
+        ConfigurationError: Robots need no token, or the listener has a certificate from elsewhere.
+    """
+    if not settings.auth.required:
+        raise ConfigurationError(
+            "auth.required = false would open the platform to every machine of the network",
+            hint="remove auth.required from the settings, or leave --lan out",
+        )
+    if settings.local.certificate:
+        raise ConfigurationError(
+            "--lan makes a certificate of its own, and local.certificate is set",
+            hint="remove local.certificate and local.private_key from the settings",
+        )
 
 
 def ensure_key(folder: Path, *, seed: bytes, key_id: str) -> SigningKey:

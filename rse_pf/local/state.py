@@ -37,6 +37,8 @@ __all__ = [
 
 _FILE = "platform.json"
 _LOCK = "lock"
+_LATER = ("lan", "authority_file")
+"""Left out while they are empty: earlier versions refuse fields that they do not know."""
 _NAME = re.compile(r"[a-z0-9][a-z0-9-]{0,31}")
 
 
@@ -56,6 +58,8 @@ class PlatformState:
 
     ``status_port`` is where the control plane answers ``GET /status``, ``launched`` the highest number that
     a server's name ever had; ``control_token_file`` is empty if the control ports ask for no token.
+    ``lan`` is the address at which other machines connect, empty if none can; ``authority_file`` is then the
+    certificate by which they know the platform.
     """
 
     name: str
@@ -71,6 +75,8 @@ class PlatformState:
     port: int = 0
     status_port: int = 0
     launched: int = 0
+    lan: str = ""
+    authority_file: str = ""
 
     def processes(self) -> tuple[ProcessMark, ...]:
         """Return the data path: everything but the control plane."""
@@ -84,7 +90,11 @@ class PlatformState:
 
     def to_json(self) -> str:
         """Return the content of the file."""
-        return json.dumps(asdict(self), indent=2) + "\n"
+        document = asdict(self)
+        for name in _LATER:
+            if not document[name]:
+                del document[name]
+        return json.dumps(document, indent=2) + "\n"
 
 
 class PlatformLock:

@@ -14,6 +14,8 @@ from typing import Any
 
 from rse_pf.config import PlatformSettings
 from rse_pf.config.resource_names import HEALTH_PATH, READY_PATH
+from rse_pf.local.lan.connect_page import connect_page, page_headers
+from rse_pf.local.lan.listener import CERTIFICATE_NAME, LanListener, secret_file
 from rse_pf.scaling.health import HEALTHY_CHECKS, LOCAL_INTERVAL_S, LOCAL_TIMEOUT_S
 
 __all__ = ["ADMIN_SOCKET", "CLUSTER", "DATA_CLUSTER", "Target", "endpoints", "envoy_config"]
@@ -48,7 +50,12 @@ class Target:
 
 
 def envoy_config(
-    settings: PlatformSettings, *, port: int, endpoints_file: Path, data_endpoints_file: Path
+    settings: PlatformSettings,
+    *,
+    port: int,
+    endpoints_file: Path,
+    data_endpoints_file: Path,
+    lan: LanListener | None = None,
 ) -> dict[str, Any]:
     """Return the static configuration.
 
@@ -57,13 +64,14 @@ def envoy_config(
         port: Of the listener; 0 takes a free one.
         endpoints_file: What `endpoints` returned, as JSON; replaced by rename, never written in place.
         data_endpoints_file: The same for the data servers; without targets ``/data/`` is answered with 503.
+        lan: Listens on its address instead, with TLS and its certificate, and answers ``/`` with a page.
     """
     return {
         "node": {"id": "front-door", "cluster": "rse-pf"},  # endpoint files are refused without
         "admin": {"address": {"pipe": {"path": ADMIN_SOCKET, "mode": 0o600}}},
         "overload_manager": _max_connections(_MAX_CONNECTIONS),
         "static_resources": {
-            "listeners": [_listener(settings, port)],
+            "listeners": [_listener(settings, port, lan)],
             "clusters": [
                 _cluster(settings, CLUSTER, endpoints_file, READY_PATH, panic_percent=0),
                 # One data server, and its successor on the same port: better asked in vain than not asked.
@@ -96,7 +104,7 @@ def endpoints(targets: Sequence[Target], cluster: str = CLUSTER) -> dict[str, An
     }
 
 
-def _listener(settings: PlatformSettings, port: int) -> dict[str, Any]:
+def _listener(settings: PlatformSettings, port: int, lan: LanListener | None) -> dict[str, Any]:
     manager = {
         "@type": f"{_TYPES}.extensions.filters.network.http_connection_manager.v3.HttpConnectionManager",
         "stat_prefix": "robots",
@@ -123,7 +131,7 @@ def _listener(settings: PlatformSettings, port: int) -> dict[str, Any]:
         "merge_slashes": True,
         "path_with_escaped_slashes_action": "REJECT_REQUEST",
         "upgrade_configs": [{"upgrade_type": "websocket"}],
-        "route_config": {"virtual_hosts": [_virtual_host(settings)]},
+        "route_config": {"virtual_hosts": [_virtual_host(settings, lan)]},
         "http_filters": [
             {
                 "name": "router",
@@ -136,22 +144,20 @@ def _listener(settings: PlatformSettings, port: int) -> dict[str, Any]:
     }
     return {
         "name": "front-door",
-        "address": _address(settings.serving.host, port),
+        "address": _address(settings.serving.host if lan is None else lan.address, port),
         # With the default a second Envoy would share a taken port in silence.
         "enable_reuse_port": False,
         # Behind a slow reader no more is kept, here and in the kernel, than a server would keep itself.
         "per_connection_buffer_limit_bytes": settings.serving.write_buffer_bytes,
         "socket_options": [_kernel_buffer(socket.SO_SNDBUF, settings), _unread_timeout(settings)],
-        "filter_chains": [{"filters": [{"name": "http", "typed_config": manager}], **_tls(settings)}],
+        "filter_chains": [{"filters": [{"name": "http", "typed_config": manager}], **_tls(settings, lan)}],
     }
 
 
-def _tls(settings: PlatformSettings) -> dict[str, Any]:
+def _tls(settings: PlatformSettings, lan: LanListener | None) -> dict[str, Any]:
     """Return the transport of the listener: none, or TLS 1.2 and 1.3 with authenticated ciphers only."""
-    local = settings.local
-    if not local.certificate:
+    if lan is None and not settings.local.certificate:
         return {}
-    files = {"certificate_chain": local.certificate, "private_key": local.private_key}
     context = {
         "@type": f"{_TYPES}.extensions.transport_sockets.tls.v3.DownstreamTlsContext",
         # A stolen ticket would resume a session for hours, and a robot connects seldom.
@@ -163,12 +169,26 @@ def _tls(settings: PlatformSettings) -> dict[str, Any]:
                 "cipher_suites": list(_CIPHERS),
             },
             "alpn_protocols": ["http/1.1"],
-            "tls_certificates": [
-                {what: {"filename": str(Path(file).absolute())} for what, file in files.items()}
-            ],
+            **(_certificate_files(settings) if lan is None else _watched_certificate(lan)),
         },
     }
     return {"transport_socket": {"name": "envoy.transport_sockets.tls", "typed_config": context}}
+
+
+def _certificate_files(settings: PlatformSettings) -> dict[str, Any]:
+    local = settings.local
+    files = {"certificate_chain": local.certificate, "private_key": local.private_key}
+    return {
+        "tls_certificates": [{what: {"filename": str(Path(file).absolute())} for what, file in files.items()}]
+    }
+
+
+def _watched_certificate(lan: LanListener) -> dict[str, Any]:
+    """Return where Envoy finds the certificate; a renewed one serves new connections at once."""
+    file = secret_file(lan.folder)
+    source = {"path": str(file), "watched_directory": {"path": str(file.parent)}}
+    config = {"path_config_source": source, "resource_api_version": "V3"}
+    return {"tls_certificate_sds_secret_configs": [{"name": CERTIFICATE_NAME, "sds_config": config}]}
 
 
 def _kernel_buffer(name: int, settings: PlatformSettings) -> dict[str, Any]:
@@ -198,7 +218,7 @@ def _max_connections(most: int) -> dict[str, Any]:
     }
 
 
-def _virtual_host(settings: PlatformSettings) -> dict[str, Any]:
+def _virtual_host(settings: PlatformSettings, lan: LanListener | None) -> dict[str, Any]:
     retry = {
         "retry_on": "connect-failure,refused-stream,reset-before-request,reset",
         "num_retries": 3,
@@ -230,6 +250,20 @@ def _virtual_host(settings: PlatformSettings) -> dict[str, Any]:
             # Each would ask the store; the balancer's own checks do not pass the listener.
             {"match": {"path": _DATA_READY}, "direct_response": {"status": 404}},
             {"match": {"prefix": _DATA_PATH}, "route": data_route},
+            *(() if lan is None else (_page(settings),)),
+        ],
+    }
+
+
+def _page(settings: PlatformSettings) -> dict[str, Any]:
+    """Return the route of the page that tests the connection of a browser."""
+    headers = [{"header": {"key": name, "value": value}} for name, value in page_headers().items()]
+    body = {"inline_string": connect_page(settings.serving.path)}
+    return {
+        "match": {"path": "/"},
+        "direct_response": {"status": 200, "body": body},
+        "response_headers_to_add": [
+            {**each, "append_action": "OVERWRITE_IF_EXISTS_OR_ADD"} for each in headers
         ],
     }
 

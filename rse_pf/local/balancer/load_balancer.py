@@ -29,6 +29,7 @@ from rse_pf.local.balancer.envoy_config import (
     endpoints,
     envoy_config,
 )
+from rse_pf.local.lan.listener import LanListener
 from rse_pf.local.latest_file import LatestFile
 from rse_pf.local.processes import ProcessMark, ServerProcess, last_line
 
@@ -66,6 +67,7 @@ class EnvoyLoadBalancer:
         port: int,
         dies_with_parent: bool = True,
         on_problem: Callable[[str], None] = lambda problem: None,
+        lan: LanListener | None = None,
     ) -> None:
         """Describe one; nothing is started.
 
@@ -75,6 +77,7 @@ class EnvoyLoadBalancer:
             port: Where robots connect; 0 takes a free one.
             dies_with_parent: Whether it ends with this process.
             on_problem: Called with a sentence when the disk refuses a list of targets, which is retried.
+            lan: Where it listens instead of loopback, with TLS; its files are there before `launch`.
         """
         self.port = 0
         self.process = ServerProcess("load-balancer", folder)
@@ -82,6 +85,7 @@ class EnvoyLoadBalancer:
         self._folder = folder
         self._wanted_port = port
         self._dies_with_parent = dies_with_parent
+        self._lan = lan
         self._endpoints = folder / "endpoints.json"
         self._data_endpoints = folder / "data-endpoints.json"
         self._targets = LatestFile(self._endpoints, on_problem=on_problem)
@@ -105,7 +109,7 @@ class EnvoyLoadBalancer:
         (self._folder / ADMIN_SOCKET).unlink(missing_ok=True)
         made = envoy_config(
             self._settings, port=self._wanted_port, endpoints_file=self._endpoints,
-            data_endpoints_file=self._data_endpoints,
+            data_endpoints_file=self._data_endpoints, lan=self._lan,
         )  # fmt: skip
         try:
             replace_json(config, made, indent=1)

@@ -10,6 +10,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import dataclasses
+import functools
 import os
 import secrets
 import signal
@@ -22,18 +23,24 @@ from typing import Any
 from rse_pf.auth.control_token import ensure_control_token
 from rse_pf.auth.tokens import SigningKey
 from rse_pf.config import PlatformSettings, ScalingSettings
-from rse_pf.config.placement import ServerPlacement
 from rse_pf.errors import ConfigurationError, UsageError
 from rse_pf.files import replace_json
 from rse_pf.local.balancer.load_balancer import EnvoyLoadBalancer
 from rse_pf.local.control.audit_recorder import PlatformAudit
 from rse_pf.local.control.control_plane import ControlOptions, ControlPlane
-from rse_pf.local.control.fleet import Fleet
-from rse_pf.local.control.status import serve_status
-from rse_pf.local.firewall import check_listener, ensure_key, key_file, robots_url
+from rse_pf.local.control.federation import service_discovery
+from rse_pf.local.control.fleet import Fleet, Member
+from rse_pf.local.control.operator_port import OperatorPort
+from rse_pf.local.firewall import check_lan_settings, check_listener, ensure_key, key_file, robots_url
+from rse_pf.local.lan.listener import LanListener, authority_file
 from rse_pf.local.latest_file import LatestFile
 from rse_pf.local.processes import STOP_TIMEOUT_S, is_alive, mark_of, rotate_logs, send_signal
-from rse_pf.local.servers.backend_servers import RSE_PF, BackendServer, LocalBackendServers
+from rse_pf.local.servers.backend_servers import (
+    RSE_PF,
+    BackendServer,
+    LocalBackendServers,
+    local_placement,
+)
 from rse_pf.local.servers.data_servers import LocalDataServers
 from rse_pf.local.state import (
     PlatformLock,
@@ -53,6 +60,8 @@ Event = Mapping[str, Any]
 _LOOPBACK = "127.0.0.1"
 _ASK_S = 1.0
 _LAST_EVENTS = 50
+_TARGETS_FILE = "prometheus_sd.json"
+"""Beside the state file, for ``file_sd_configs`` of Prometheus."""
 _LOG_FILE_BYTES = 64 << 20
 """A log that has grown longer is set aside, in place of the one set aside before."""
 
@@ -73,6 +82,8 @@ class LocalPlatform:
         control: ControlOptions | None = None,
         on_event: Callable[[Event], None] | None = None,
         program: Sequence[str] = RSE_PF,
+        lan: str = "",
+        metrics_port: int = 0,
     ) -> None:
         """Describe a platform; nothing is started.
 
@@ -89,6 +100,10 @@ class LocalPlatform:
             control: What the control plane does by itself; None means nothing.
             on_event: Called with each event, at once.
             program: The command that ``serve`` follows.
+            lan: Address of this machine at which robots of its network connect, by TLS; empty means
+                ``serving.host``, which is loopback.
+            metrics_port: Port of the control plane on loopback: /metrics of all servers, /status; 0 takes a
+                free one, and so does a port that is taken, with the event ``metrics-port-taken``.
         """
         control = control or ControlOptions()
         self.events: list[Event] = []
@@ -96,17 +111,19 @@ class LocalPlatform:
         self.name = name or state.name
         self.state = state.absolute()
         self.settings = settings
-        self._placement = _local_placement(settings, self.state)
+        self._placement = local_placement(settings, self.state)
         self._count = settings.local.servers if servers is None else servers
         self._wanted_port = settings.local.port if port is None else port
         self._has_data = settings.data.enabled if data is None else data
         self._adoptable = adoptable
         self._on_event = on_event
+        self.lan = LanListener(address=lan, folder=self.state) if lan else None
         self._lock = PlatformLock(self.state)
         self._audit = PlatformAudit(self.state)
         self._state_file = LatestFile(state_file(self.state), on_problem=self._not_written)
+        self._targets_file = LatestFile(self.state / _TARGETS_FILE, on_problem=self._not_written)
+        self._metrics_port = metrics_port
         self._key: SigningKey | None = None
-        self._status: asyncio.Server | None = None
         self.backend_servers = LocalBackendServers(
             folder=self.state,
             dies_with_parent=not adoptable,
@@ -115,7 +132,7 @@ class LocalPlatform:
         )
         self.load_balancer = EnvoyLoadBalancer(
             settings, folder=self.state, port=self._wanted_port, dies_with_parent=not adoptable,
-            on_problem=self._not_written,
+            on_problem=self._not_written, lan=self.lan,
         )  # fmt: skip
         self.data_servers = LocalDataServers(
             settings,
@@ -130,6 +147,7 @@ class LocalPlatform:
             self.backend_servers, self.load_balancer, settings,
             compress=control.compress, emit=self._emit, changed=self._write_state,
         )  # fmt: skip
+        self._operator_port = OperatorPort(self, metrics=self.backend_servers.metrics, keep=self._fleet.keep)
         self._control = ControlPlane(
             self._fleet, self.load_balancer, settings, _bounds(settings.scaling, self._count), control,
             emit=self._emit, changed=self._write_state,
@@ -139,6 +157,11 @@ class LocalPlatform:
     def servers(self) -> tuple[BackendServer, ...]:
         """The servers that have announced themselves, and neither ended nor are to leave."""
         return self._fleet.serving
+
+    @property
+    def metrics_url(self) -> str:
+        """Where Prometheus finds the metrics of all servers."""
+        return f"http://{_LOOPBACK}:{self._operator_port.port}/metrics"
 
     @property
     def port(self) -> int:
@@ -166,7 +189,16 @@ class LocalPlatform:
         try:
             left = self._leftovers()
             if left is None:
-                check_listener(self.settings.serving.host, self._wanted_port)
+                host = self._wanted_address or self.settings.serving.host
+                check_listener(host, self._wanted_port, is_protected=self.lan is not None)
+            elif left.lan != self._wanted_address:
+                raise ConfigurationError(
+                    f"servers of platform {self.name!r} still run, with {left.lan or 'loopback'} as address",
+                    hint=f"end them with: rse-pf local stop --name {self.name}",
+                )
+            if self.lan is not None:
+                check_lan_settings(self.settings)
+                self.lan.prepare(self.name, now_s=time.time())
             self._audit.open()
         except ConfigurationError:
             self._lock.release()
@@ -251,15 +283,23 @@ class LocalPlatform:
         Raises:
             UsageError: There is no such server, or it is the last one.
         """
-        member = self._fleet.member(name)
-        if all(server.name == name for server in self.servers):
-            raise UsageError(f"{name} is the last server", hint="grow or roll the platform instead")
+        member = self.check_drain(name)
         began = time.monotonic()
         if member.leaving:
             await member.over.wait()
             return {"server": name, "seconds": round(time.monotonic() - began, 3), "clean": True}
         self._fleet.begin_drain(member, reason)
         return await self._fleet.finish_drain(member, began)
+
+    def check_drain(self, name: str) -> Member:
+        """Return the server *name* that may be drained; raises UsageError as `drain` does."""
+        member = self._fleet.member(name)
+        if all(server.name == name for server in self.servers):
+            raise UsageError(
+                f"{name} is the last server",
+                hint="rse-pf local roll starts another one first",
+            )
+        return member
 
     async def replace(self, name: str, reason: str) -> str:
         """Cut *name* off, and wait until robots are sent to a server in its place; return the new name.
@@ -282,7 +322,9 @@ class LocalPlatform:
         """
         self._control.hold = True
         try:
-            for old in [server.name for server in self.servers]:
+            servers = [server.name for server in self.servers]
+            for number, old in enumerate(servers, 1):
+                self._emit("roll-step", server=old, number=number, of=len(servers))
                 await self.backend_servers.standby.wait_warm(self.settings.local.start_timeout_s)
                 names = list(self._fleet.grow(1, "rolling replacement"))
                 await self._until_healthy(names)
@@ -339,6 +381,10 @@ class LocalPlatform:
                 hint="make it writable for you, or set XDG_STATE_HOME",
             ) from error
 
+    @property
+    def _wanted_address(self) -> str:
+        return "" if self.lan is None else self.lan.address
+
     def _leftovers(self) -> PlatformState | None:
         """Return the state that an earlier control plane left; None if none of its processes still runs."""
         state = read_state(self.state)
@@ -360,10 +406,13 @@ class LocalPlatform:
             await self._begin(end)
         else:
             await _all(self._adopt(left, end), self._adopt_data(left.data_server))
-        self.url = robots_url(self.settings, self.port)
-        self._status = await serve_status(self.status_document, token)
+        self.url = robots_url(self.settings, self.port, self.lan)
+        await self._open_operator_port(token, 0 if left is None else left.status_port)
         self._fleet.keep(self._audit.watch())
         self._fleet.keep(rotate_logs(self.state, _LOG_FILE_BYTES))
+        if self.lan is not None:
+            renewed = functools.partial(self._emit, "certificate-renewed")
+            self._fleet.keep(self.lan.keep_valid(self.name, renewed, self._not_written))
         self._control.start()
         self._write_state()
 
@@ -440,6 +489,14 @@ class LocalPlatform:
         if self._has_data:
             await self.data_servers.start(0 if left is None else left.port)
 
+    async def _open_operator_port(self, token: str, earlier: int) -> None:
+        """Listen on the wanted port, or on that of an earlier control plane, or on a free one."""
+        await self._operator_port.open(
+            token, ports=[port for port in (self._metrics_port, earlier) if port] + [0]
+        )
+        if self._metrics_port not in (0, self._operator_port.port):
+            self._emit("metrics-port-taken", port=self._metrics_port)
+
     def _write_state(self) -> None:
         control_plane = mark_of(os.getpid())
         assert control_plane is not None
@@ -463,10 +520,13 @@ class LocalPlatform:
             data_server=self.data_servers.state,
             load_balancer=self.load_balancer.process.mark,
             port=self.load_balancer.port,
-            status_port=0 if self._status is None else self._status.sockets[0].getsockname()[1],
+            status_port=self._operator_port.port,
             launched=self._fleet.launched,
+            lan=self._wanted_address,
+            authority_file="" if self.lan is None else str(authority_file(self.state)),
         )
         self._state_file.write(state.to_json())
+        self._targets_file.write(service_discovery(self.name, state.servers))
 
     def _data_changed(self, event: str, **details: Any) -> None:
         self._emit(event, **details)
@@ -481,8 +541,7 @@ class LocalPlatform:
         try:
             self._control.stop()
             await self._fleet.close()
-            if self._status is not None:
-                self._status.close()
+            self._operator_port.close()
             await asyncio.gather(
                 self.backend_servers.stop(STOP_TIMEOUT_S), self.data_servers.stop(STOP_TIMEOUT_S)
             )
@@ -492,9 +551,11 @@ class LocalPlatform:
             self.data_servers.kill_all()
             self.load_balancer.kill()
             self._state_file.close()
+            self._targets_file.close()
             self._fleet.members.clear()
             with contextlib.suppress(OSError):  # the folder may have been removed meanwhile
                 remove_state(self.state)
+                (self.state / _TARGETS_FILE).unlink(missing_ok=True)
                 if not self._adoptable:  # no one can adopt this platform: its tokens are worthless
                     key_file(self.state).unlink(missing_ok=True)
                     control_token_file(self.state).unlink(missing_ok=True)
@@ -509,6 +570,7 @@ class LocalPlatform:
         entry = {"event": event, **details}
         self.events.append(entry)
         self._audit.record(entry)
+        self._operator_port.heard(entry)
         if self._on_event is not None:
             self._on_event(entry)
 
@@ -517,23 +579,6 @@ def _bounds(scaling: ScalingSettings, count: int) -> ScalingSettings:
     """Return *scaling* with bounds that allow *count* servers."""
     return dataclasses.replace(
         scaling, min_servers=min(scaling.min_servers, count), max_servers=max(scaling.max_servers, count)
-    )
-
-
-def _local_placement(settings: PlatformSettings, state: Path) -> ServerPlacement:
-    """Return the placement of every local server: loopback, free ports, the workers of this machine.
-
-    Servers come and go, so objects are in the folder of the platform if they were to be in memory.
-    """
-    store = settings.data.store
-    return ServerPlacement.of(
-        settings,
-        host=_LOOPBACK,
-        port=0,
-        control_host=_LOOPBACK,
-        control_port=0,
-        workers=settings.local.workers,
-        store=f"dir:{state / 'objects'}" if store == "memory:" else store,
     )
 
 

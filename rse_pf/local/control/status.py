@@ -1,4 +1,4 @@
-"""The state of a platform: the table of ``rse-pf local status``, and the page of its control plane.
+"""The state of a platform: the table of ``rse-pf local status``.
 
 The table works without the control plane: the state file names the processes, and each server answers on its
 control port.  Nothing is changed, and a server that is stopped or cut off delays the answer by the timeout at
@@ -8,25 +8,21 @@ most.
 from __future__ import annotations
 
 import asyncio
-import json
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
-from rse_pf.auth.control_token import carries_token, read_control_token
+from rse_pf.auth.control_token import read_control_token
 from rse_pf.local.processes import ProcessMark, is_alive
 from rse_pf.local.servers.control_client import ControlPort
 from rse_pf.local.state import PlatformState, ServerState
 from rse_pf.terminal import printable
 
-__all__ = ["data_url", "platform_status", "serve_status", "status_table"]
+__all__ = ["data_url", "platform_status", "status_table"]
 
-_LOOPBACK = "127.0.0.1"
 _TIMEOUT_S = 0.5
-_SERVE_TIMEOUT_S = 5.0
-_MAX_HEAD_BYTES = 16384
 _COLUMNS = ("server", "pid", "state", "robots", "CPU %", "requests/s", "queue")
 
 
@@ -83,26 +79,6 @@ def data_url(url: str) -> str:
     """Return the address of the data service, from the address *url* that robots connect to."""
     parts = urlsplit(url)
     return f"{'https' if parts.scheme == 'wss' else 'http'}://{parts.netloc}/data/"
-
-
-async def serve_status(document: Callable[[], Mapping[str, Any]], token: str) -> asyncio.Server:
-    """Listen on a free loopback port; ``GET /status`` with *token* is answered with what *document* returns.
-
-    A request without the token, or from a web page of another origin, is refused.  A slow or malformed
-    request ends its own connection only.
-    """
-
-    async def talk(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        try:
-            head = await asyncio.wait_for(reader.readuntil(b"\r\n\r\n"), _SERVE_TIMEOUT_S)
-            writer.write(_answer(head.decode("latin-1"), document, token))
-            await asyncio.wait_for(writer.drain(), _SERVE_TIMEOUT_S)
-        except (OSError, ValueError, EOFError, asyncio.LimitOverrunError, asyncio.TimeoutError):
-            pass  # a malformed request ends its own connection only
-        finally:
-            writer.close()
-
-    return await asyncio.start_server(talk, _LOOPBACK, 0, limit=_MAX_HEAD_BYTES)
 
 
 async def _data_server(server: ServerState) -> dict[str, Any]:
@@ -172,29 +148,3 @@ def _is_stopped(pid: int) -> bool:
     except OSError:
         return False
     return text.rpartition(")")[2].split()[0] in "Tt"
-
-
-def _answer(head: str, document: Callable[[], Mapping[str, Any]], token: str) -> bytes:
-    request, *lines = head.split("\r\n")
-    method, target, _ = request.split(" ")
-    headers = {
-        name.strip().lower(): value.strip() for name, _, value in (line.partition(":") for line in lines)
-    }
-    if not carries_token(headers.get("authorization", ""), token):
-        return _page("401 Unauthorized\r\nWWW-Authenticate: Bearer", {"code": "unauthorized"})
-    if "origin" in headers:
-        return _page("403 Forbidden", {"code": "forbidden"})
-    if target != "/status":
-        return _page("404 Not Found", {"code": "not-found"})
-    if method != "GET":
-        return _page("405 Method Not Allowed", {"code": "method"})
-    return _page("200 OK", document())
-
-
-def _page(status: str, value: Mapping[str, Any]) -> bytes:
-    body = json.dumps(value).encode() + b"\n"
-    head = (
-        f"HTTP/1.1 {status}\r\nContent-Type: application/json\r\nContent-Length: {len(body)}\r\n"
-        "Cache-Control: no-store\r\nConnection: close\r\n\r\n"
-    )
-    return head.encode() + body

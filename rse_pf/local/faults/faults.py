@@ -8,6 +8,7 @@ when the call ends, also if this process is killed inside `cut_off`.
 from __future__ import annotations
 
 import contextlib
+import math
 import os
 import shutil
 import signal
@@ -15,11 +16,23 @@ import subprocess
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
+from rse_pf.config import HealthSettings
 from rse_pf.errors import ConfigurationError, UsageError
 from rse_pf.local.processes import ProcessMark, is_alive, mark_of, send_signal
+from rse_pf.local.servers.data_servers import DATA_CHECK_S
 from rse_pf.local.state import PlatformState, ServerState
+from rse_pf.scaling.health import LOCAL_INTERVAL_S
 
-__all__ = ["cut_off", "find_server", "kill_balancer", "nft_commands", "signal_tree", "slow_down", "tree"]
+__all__ = [
+    "cut_off",
+    "find_server",
+    "kill_balancer",
+    "longest_pause_s",
+    "nft_commands",
+    "signal_tree",
+    "slow_down",
+    "tree",
+]
 
 PERIOD_S = 0.04
 """One round of stopping and going on: long against a switch of processes, short against a health check."""
@@ -36,6 +49,17 @@ def find_server(state: PlatformState, name: str) -> ServerState:
             return server
     running = ", ".join(server.name for server in alive) or "none"
     raise UsageError(f"no server named {name[:80]!r} is running", hint=f"running: {running}")
+
+
+def longest_pause_s(state: PlatformState, server: ServerState, health: HealthSettings) -> float:
+    """Return for how long *server* may be stopped before the control plane may replace it, in seconds.
+
+    Without a control plane nothing is replaced: infinite.
+    """
+    if not is_alive(state.control_plane):
+        return math.inf
+    is_data = state.data_server is not None and server.name == state.data_server.name
+    return health.unhealthy_checks * (DATA_CHECK_S if is_data else LOCAL_INTERVAL_S)
 
 
 def tree(root: ProcessMark) -> list[ProcessMark]:

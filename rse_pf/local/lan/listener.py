@@ -21,14 +21,14 @@ from rse_pf.auth.certificates import (
     issue_server_certificate,
     make_authority,
 )
-from rse_pf.errors import UsageError
+from rse_pf.errors import ConfigurationError, UsageError
 from rse_pf.files import OWNER_ONLY, read_private_file, replace_file
 from rse_pf.local.lan.addresses import host_names
 
-__all__ = ["SECRET", "LanListener", "authority_file", "secret_document", "secret_file"]
+__all__ = ["CERTIFICATE_NAME", "LanListener", "authority_file", "secret_document", "secret_file"]
 
-SECRET = "front-door"
-"""Name of the certificate in Envoy's file."""
+CERTIFICATE_NAME = "front-door"
+"""Of the listener's certificate in Envoy's file."""
 _RENEW_S = SERVER_S / 3
 """A certificate that is valid for less than this is replaced."""
 _LOOK_EVERY_S = 3600.0
@@ -53,7 +53,7 @@ def secret_document(server: CertificateWithKey) -> dict[str, Any]:
         "certificate_chain": {"inline_string": server.certificate},
         "private_key": {"inline_string": server.private_key},
     }
-    return {"resources": [{"@type": kind, "name": SECRET, "tls_certificate": certificate}]}
+    return {"resources": [{"@type": kind, "name": CERTIFICATE_NAME, "tls_certificate": certificate}]}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -76,9 +76,19 @@ class LanListener:
             now_s: Unix seconds.
 
         Raises:
-            UsageError: The file of the authority cannot be read, is damaged, or others may read it.
-            OSError: A file cannot be written.
+            ConfigurationError: The file of the authority cannot be read, is damaged, or others may read it;
+                a file cannot be written.
         """
+        try:
+            return self._prepare(platform, now_s)
+        except UsageError as error:
+            raise ConfigurationError(error.message, hint=error.hint) from error
+        except OSError as error:
+            raise ConfigurationError(
+                f"the certificates cannot be written: {error.strerror}", hint="free some space"
+            ) from error
+
+    def _prepare(self, platform: str, now_s: float) -> bool:
         authority, is_new = self._authority(platform, now_s)
         current = None if is_new else self._current()
         if (
@@ -110,8 +120,8 @@ class LanListener:
             try:
                 if self.prepare(platform, now_s=time.time()):
                     renewed()
-            except (OSError, UsageError) as error:
-                problem(f"the certificate cannot be renewed: {error}")
+            except ConfigurationError as error:
+                problem(f"the certificate is not renewed yet: {error.message}")
 
     def _authority(self, platform: str, now_s: float) -> tuple[CertificateWithKey, bool]:
         path = self.folder / "authority.pem"

@@ -16,6 +16,8 @@ from typing import Any
 
 from rse_pf.audit.log import audit_folder
 from rse_pf.auth.control_token import read_control_token
+from rse_pf.config import PlatformSettings
+from rse_pf.config.placement import ServerPlacement
 from rse_pf.local.balancer.envoy_config import Target
 from rse_pf.local.firewall import key_set_file
 from rse_pf.local.processes import ProcessMark, ServerProcess, mark_of
@@ -23,11 +25,12 @@ from rse_pf.local.servers.control_client import ControlPort
 from rse_pf.local.servers.warm_standby import STANDBY, WarmStandby
 from rse_pf.local.state import control_token_file, settings_file
 
-__all__ = ["RSE_PF", "BackendServer", "LocalBackendServers"]
+__all__ = ["RSE_PF", "BackendServer", "LocalBackendServers", "local_placement"]
 
 RSE_PF = (sys.executable, "-m", "rse_pf.cli.main")
 """The program; ``serve`` and its options follow."""
 
+_LOOPBACK = "127.0.0.1"
 _ASK_S = 1.0
 
 
@@ -126,6 +129,11 @@ class LocalBackendServers:
         reply = await self.control(server.control_port).ask_once("/status", timeout_s=_ASK_S)
         return None if reply is None or reply.status != 200 else reply.document()
 
+    async def metrics(self, server: BackendServer) -> str | None:
+        """Return the server's page for Prometheus; None when it does not answer."""
+        reply = await self.control(server.control_port).ask_once("/metrics", timeout_s=_ASK_S)
+        return None if reply is None or reply.status != 200 else reply.body.decode("utf-8", "replace")
+
     async def wait_over(self, name: str) -> int | None:
         """Wait until the process of *name* has ended; return its exit code, negative for a signal.
 
@@ -158,3 +166,20 @@ class LocalBackendServers:
             process.send(signal.SIGKILL)
         for name in list(self._processes):
             self.forget(name)
+
+
+def local_placement(settings: PlatformSettings, state: Path) -> ServerPlacement:
+    """Return the placement of every local server: loopback, free ports, the workers of this machine.
+
+    Servers come and go, so objects are in the folder of the platform if they were to be in memory.
+    """
+    store = settings.data.store
+    return ServerPlacement.of(
+        settings,
+        host=_LOOPBACK,
+        port=0,
+        control_host=_LOOPBACK,
+        control_port=0,
+        workers=settings.local.workers,
+        store=f"dir:{state / 'objects'}" if store == "memory:" else store,
+    )

@@ -23,11 +23,12 @@ from rse_pf.local.servers.backend_servers import RSE_PF
 from rse_pf.local.servers.control_client import ControlPort
 from rse_pf.local.state import ServerState, settings_file
 
-__all__ = ["NICENESS", "LocalDataServers"]
+__all__ = ["DATA_CHECK_S", "NICENESS", "LocalDataServers"]
 
 _LOOPBACK = "127.0.0.1"
 _LOOK_AGAIN_S = 0.01
-_ASK_S = 1.0
+DATA_CHECK_S = 1.0
+"""Between two checks of the service, and how long one may take."""
 _READY, _ALIVE = "/data/readyz", "/data/healthz"
 _FIRST_PAUSE_S, _MAX_PAUSE_S = 0.1, 5.0
 NICENESS = 10
@@ -162,7 +163,7 @@ class LocalDataServers:
         failed = 0
         try:
             while not over.done():
-                await asyncio.wait({over}, timeout=_ASK_S)
+                await asyncio.wait({over}, timeout=DATA_CHECK_S)
                 failed = 0 if await self._answers(_ALIVE) else failed + 1
                 if failed > self._settings.health.unhealthy_checks and self._replaces and not over.done():
                     self._emit("data-server-silent", name=self.process.name, pid=self.process.pid)
@@ -172,7 +173,7 @@ class LocalDataServers:
             over.cancel()
 
     async def _answers(self, path: str) -> bool:
-        reply = await ControlPort(self.port).ask_once(path, timeout_s=_ASK_S)
+        reply = await ControlPort(self.port).ask_once(path, timeout_s=DATA_CHECK_S)
         return reply is not None and reply.status == 200
 
     async def _launch(self) -> None:

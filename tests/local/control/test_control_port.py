@@ -7,7 +7,7 @@ import json
 
 import pytest
 
-from rse_pf.local.control.status import serve_status
+from rse_pf.local.control.control_port import serve_control_port
 
 SOON_S = 10.0
 TOKEN = "0123456789abcdef" * 4
@@ -16,7 +16,10 @@ CARRIED = b"Authorization: Bearer %s\r\n" % TOKEN.encode()
 
 def answer(request: bytes) -> bytes:
     async def run() -> bytes:
-        server = await serve_status(lambda: {"platform": "a"}, TOKEN)
+        async def page() -> tuple[str, bytes]:
+            return "application/json", b'{"platform": "a"}'
+
+        server = await serve_control_port({"/status": page}, {}, TOKEN)
         reader, writer = await asyncio.open_connection(*server.sockets[0].getsockname())
         try:
             writer.write(request)

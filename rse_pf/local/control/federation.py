@@ -1,0 +1,72 @@
+"""The metrics of all servers as one page for Prometheus, and the file by which Prometheus finds the servers.
+
+Every sample gets the label ``server``.  A server that does not answer is missing from the page, except for
+``rse_pf_server_up``, which is 0 for it.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+from rse_pf.errors import MissingExtra
+from rse_pf.local.state import ServerState
+
+__all__ = ["federated", "service_discovery"]
+
+_LOOPBACK = "127.0.0.1"
+_LABEL = "server"
+
+
+def federated(pages: Mapping[str, str | None]) -> bytes:
+    """Return one page in the text format of Prometheus.
+
+    Args:
+        pages: The page of each server by its name; None if it did not answer.
+
+    Raises:
+        MissingExtra: ``prometheus_client`` is not installed.
+    """
+    try:
+        from prometheus_client import CollectorRegistry, generate_latest
+        from prometheus_client.core import GaugeMetricFamily
+        from prometheus_client.metrics_core import Metric
+        from prometheus_client.parser import text_string_to_metric_families
+    except ImportError as error:
+        raise MissingExtra("prometheus-client", "backend") from error
+
+    up = GaugeMetricFamily(
+        "rse_pf_server_up", "whether the server answered when it was asked for metrics", labels=[_LABEL]
+    )
+    families: dict[str, Metric] = {}
+    for server, page in pages.items():
+        up.add_metric([server], float(page is not None))
+        for family in text_string_to_metric_families(page or ""):
+            known = families.setdefault(
+                family.name, Metric(family.name, family.documentation, family.type, family.unit)
+            )
+            known.samples += [
+                each._replace(labels={_LABEL: server, **each.labels}) for each in family.samples
+            ]
+
+    class Families:
+        def collect(self) -> Iterable[Any]:
+            return [up, *families.values()]
+
+    registry = CollectorRegistry()
+    registry.register(Families())
+    return generate_latest(registry)
+
+
+def service_discovery(platform: str, servers: Iterable[ServerState]) -> str:
+    """Return the file for ``file_sd_configs``: the control ports of *servers* that are ready."""
+    groups = [
+        {
+            "targets": [f"{_LOOPBACK}:{server.control_port}"],
+            "labels": {"platform": platform, _LABEL: server.name},
+        }
+        for server in servers
+        if server.control_port
+    ]
+    return json.dumps(groups, indent=2) + "\n"
