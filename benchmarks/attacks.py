@@ -70,7 +70,10 @@ class AttackTarget:
         """Shake hands and say hello; raises ConnectionError with the status line where refused."""
         reader, writer = await self.open_tcp()
         writer.write(self.head(token, codec))
-        head = await asyncio.wait_for(reader.readuntil(b"\r\n\r\n"), LONG_S)
+        try:
+            head = await asyncio.wait_for(reader.readuntil(b"\r\n\r\n"), LONG_S)
+        except asyncio.IncompleteReadError:
+            raise ConnectionError("HTTP/1.1 cut") from None
         if not head.startswith(b"HTTP/1.1 101"):
             writer.transport.abort()
             raise ConnectionError(head.split(b"\r\n")[0].decode("latin-1"))

@@ -1,6 +1,6 @@
 """Uploads through the load balancer while robots request poses and the data server is killed repeatedly.
 
-    python benchmarks/data_faults.py [--uploads 200] [--kills 3] [--robots 20] [--seconds 15] [--out FILE]
+    python -m benchmarks.data_faults [--uploads 200] [--kills 3] [--robots 20] [--seconds 15] [--out FILE]
 
 One local platform (two servers, one data server) behind the load balancer; robots request 5 poses per
 second (200 matches, 30 % wrong, every frame kept).  First without uploads; then a process of four robots
@@ -33,8 +33,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from windows import poses
 
+from benchmarks.windows import poses
 from client_sdk.transfer.data_client import DataClient, DataOptions
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import RsePfError

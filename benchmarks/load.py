@@ -252,18 +252,28 @@ class LoadReport:
 class LoadProcess:
     """``with LoadProcess(plan) as load``: a generator that runs until `stop`, or for the plan's time.
 
-    *on_mark* is called in a thread with ``begin`` and ``end`` when the window begins and ends.
+    *on_mark* is called in a thread with ``begin`` and ``end`` when the window begins and ends.  *prefix*
+    starts the generator, such as ``("nice", "-n", "19")``.
     """
 
-    def __init__(self, plan: LoadPlan, on_mark: Callable[[str], None] = lambda mark: None) -> None:
+    def __init__(
+        self,
+        plan: LoadPlan,
+        on_mark: Callable[[str], None] = lambda mark: None,
+        prefix: Sequence[str] = (),
+    ) -> None:
         self.plan = plan
+        self._prefix = prefix
         self._on_mark = on_mark
         self._begun = threading.Event()
         self._errors: list[str] = []
 
     def __enter__(self) -> LoadProcess:
         self._process = subprocess.Popen(
-            self.plan.command(compiled()), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+            [*self._prefix, *self.plan.command(compiled())],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
         )
         self._marks = threading.Thread(target=self._read_marks, daemon=True)
         self._marks.start()
@@ -318,9 +328,11 @@ class LoadProcess:
         self._begun.set()
 
 
-def run_load(plan: LoadPlan, on_mark: Callable[[str], None] = lambda mark: None) -> LoadReport:
+def run_load(
+    plan: LoadPlan, on_mark: Callable[[str], None] = lambda mark: None, prefix: Sequence[str] = ()
+) -> LoadReport:
     """Run *plan* to its end and return the report; raises ConfigurationError if the generator fails."""
-    with LoadProcess(plan, on_mark) as load:
+    with LoadProcess(plan, on_mark, prefix) as load:
         return load.result()
 
 
