@@ -14,6 +14,8 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
+from rse_pf.auth import tokens
+from rse_pf.auth.roster import DenyList, EnrolledRobot, Roster
 from rse_pf.auth.tokens import Claims, KeySet, SigningKey, token_problem, verify_token
 from rse_pf.config import AuthSettings
 from rse_pf.errors import Unauthorized, UsageError
@@ -274,3 +276,128 @@ def test_a_plain_jwt_library_accepts_our_tokens() -> None:
     )
 
     assert claims["sub"] == "robot-7"
+
+
+# --- tokens that were verified before ---------------------------------------------------------------
+
+ROBOT_KEY = SigningKey.of_robot(bytes(range(2, 34)))
+ENROLLED = EnrolledRobot(robot="robot-7", x=json.loads(ROBOT_KEY.public_json())["x"])
+
+
+class Counting(KeySet):
+    """Counts how often a key was taken, to verify a signature."""
+
+    taken = 0
+
+    def get(self, key_id: Any) -> Any:
+        self.taken += 1
+        return super().get(key_id)
+
+
+def trusted(roster: Roster | None = None, denied: DenyList | None = None) -> Counting:
+    return Counting(KEYS._keys, roster=roster, denied=denied)
+
+
+def test_the_signature_of_a_token_is_verified_once():
+    keys, token = trusted(), issue()
+
+    first = verify_token(token, keys=keys, now=NOW, settings=SETTINGS)
+
+    assert verify_token(token, keys=keys, now=NOW + 1, settings=SETTINGS) == first
+    assert keys.taken == 1
+
+
+def test_the_times_of_a_verified_token_are_judged_every_time():
+    keys, token = trusted(), issue(ttl_s=60.0)
+    verify_token(token, keys=keys, now=NOW, settings=SETTINGS)
+
+    for now, reason in ((NOW + 200, "expired"), (NOW - 200, "not-yet-valid")):
+        with pytest.raises(Unauthorized) as caught:
+            verify_token(token, keys=keys, now=now, settings=SETTINGS)
+        assert token_problem(caught.value) == reason
+
+
+def test_a_verified_token_counts_for_the_issuer_and_the_audience_that_it_was_verified_for():
+    keys, token = trusted(), issue()
+    verify_token(token, keys=keys, now=NOW, settings=SETTINGS)
+
+    with pytest.raises(Unauthorized):
+        verify_token(token, keys=keys, now=NOW, settings=AuthSettings(audience="another"))
+
+
+def test_another_roster_or_deny_list_remembers_no_token():
+    token = issue()
+    verify_token(token, keys=(keys := trusted()), now=NOW, settings=SETTINGS)
+
+    denied = DenyList().with_token("default", "robot-7", "t1", NOW + 600)
+    with pytest.raises(Unauthorized) as caught:
+        verify_token(token, keys=keys.with_access_control(Roster(), denied), now=NOW, settings=SETTINGS)
+    assert token_problem(caught.value) == "revoked"
+
+
+def test_tokens_that_are_refused_are_not_remembered():
+    keys = trusted(Roster(robots=(ENROLLED,)))
+    wrong = ROBOT_KEY.issue("robot-8", now=NOW, token_id="t", settings=SETTINGS)
+    for token in (wrong, sign(GOOD, key=OTHER), issue()[:-4] + "AAAA"):
+        for _ in range(2):
+            with pytest.raises(Unauthorized):
+                verify_token(token, keys=keys, now=NOW, settings=SETTINGS)
+
+    assert (len(keys._signed), len(keys._digests)) == (0, 0)
+
+
+def test_a_robot_has_one_place_among_the_remembered_tokens_and_their_number_is_bounded(monkeypatch):
+    monkeypatch.setattr(tokens, "_MAX_REMEMBERED", 3)
+    keys = trusted()
+    mine = [KEY.issue("robot-7", now=NOW, token_id=f"t{n}", settings=SETTINGS) for n in range(9)]
+    other = KEY.issue("robot-8", now=NOW, token_id="t", settings=SETTINGS)
+    for token in (other, *mine):
+        verify_token(token, keys=keys, now=NOW, settings=SETTINGS)
+    verify_token(other, keys=keys, now=NOW, settings=SETTINGS)
+
+    assert keys.taken == 10, "the tokens of robot-7 did not drive out that of robot-8"
+    for n in range(9):
+        token = KEY.issue(f"r{n}", now=NOW, token_id="t", settings=SETTINGS)
+        verify_token(token, keys=keys, now=NOW, settings=SETTINGS)
+    assert len(keys._signed) == len(keys._digests) == 3
+
+
+CLAIMS = st.fixed_dictionaries(
+    {},
+    optional={
+        "iss": st.sampled_from(["rse-pf", "rse", 1, None]),
+        "aud": st.sampled_from(["rse-pf", ["rse-pf", "x"], ["x"], [1, "rse-pf"], "x", None, {}]),
+        "sub": st.sampled_from(["robot-7", 7, "", None]),
+        "jti": st.sampled_from(["t1", 1, None, [""]]),
+        "iat": st.sampled_from([int(NOW), None, "1", True, NOW + 0.5]),
+        "exp": st.sampled_from([int(NOW) + 600, None, "1", NOW - 900]),
+    },
+)
+HEADERS = st.fixed_dictionaries(
+    {},
+    optional={
+        "kid": st.sampled_from(["key-1", "key-2", 1, None]),
+        "alg": st.sampled_from(["EdDSA", "none", "HS256"]),
+        "crit": st.just(["exp"]),
+        "b64": st.booleans(),
+    },
+)
+
+
+@given(CLAIMS, HEADERS)
+@example({"aud": ["rse-pf", "x"]}, {})
+def test_a_token_that_is_accepted_is_valid_for_the_library_as_well(claims, header):
+    token = sign({**GOOD, **claims}, {**HEADER, **header})
+
+    try:
+        found = verify_token(token, keys=KEYS, now=NOW, settings=SETTINGS)
+    except Unauthorized:
+        return
+    public = KEYS.get("key-1")
+    assert public is not None
+    told = jwt.decode(
+        token, public, algorithms=["EdDSA"], audience="rse-pf", issuer="rse-pf",
+        options={"require": ["iss", "aud", "sub", "exp", "iat", "jti"], "verify_exp": False,
+                 "verify_iat": False, "verify_nbf": False},
+    )  # fmt: skip
+    assert (told["sub"], told["jti"]) == (found.robot.name, found.token_id)

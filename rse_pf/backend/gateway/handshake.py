@@ -1,15 +1,18 @@
 """Judge a WebSocket handshake: path, capacity, token and sub-protocol, before anything is accepted.
 
 Every rejection has a fixed body; the cause of a rejected token goes to the log only.  What a robot sent and
-the time come in, `Accepted` or `Rejected` goes out.
+the time come in, `Accepted` or `Rejected` goes out.  The head of a request is read here, too: most refusals
+need no WebSocket library then.
 """
 
 from __future__ import annotations
 
 import json
 import math
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from http import HTTPStatus
 
 from rse_pf.auth.tokens import Claims, KeySet, token_problem, verify_token
 from rse_pf.config import PlatformSettings
@@ -18,13 +21,22 @@ from rse_pf.errors import Unauthorized
 from rse_pf.identity import DEFAULT_TENANT, RobotId
 from rse_pf.wire import SUBPROTOCOLS, codec_for
 
-__all__ = ["HEALTH", "Accepted", "HandshakePolicy", "Rejected"]
+__all__ = ["HEALTH", "Accepted", "HandshakePolicy", "Rejected", "RequestHead"]
 
 HEALTH = "health"
 """Result of a request for the health page."""
 
 _RETRY_AFTER_S = 2
 _JSON = {"Content-Type": "application/json"}
+_HEAD = re.compile(
+    rb"GET ([\x21-\x7e\x80-\xff]+) HTTP/1\.1((?:\r\n[0-9A-Za-z!#$%&'*+.^_`|~-]+:[\t\x20-\x7e\x80-\xff]*)*)"
+)
+"""RFC 9112, without the folded lines that it calls obsolete."""
+_MAX_HEADERS = 128
+_SINGLE = (b"content-length", b"sec-websocket-key", b"sec-websocket-version")
+_WEBSOCKET_KEY = re.compile(rb"[A-Za-z0-9+/]{22}==")
+_VERSIONS = (b"13", b"8", b"7")
+_TOO_LONG = b"HTTP/1.1 431 Request Header Fields Too Large\r\nConnection: close\r\nContent-Length: 0\r\n\r\n"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -47,6 +59,65 @@ class Rejected:
     result: str
     reason: str = ""
     headers: Mapping[str, str] = field(default_factory=dict)
+    answer: bytes = field(default=b"", compare=False, repr=False)
+    """The whole HTTP answer; the connection is closed behind it."""
+
+
+class RequestHead:
+    """The head of an HTTP request that was checked line by line.  A header that is repeated is one list."""
+
+    __slots__ = ("_headers", "path")
+
+    def __init__(self, path: bytes, headers: dict[bytes, bytes]) -> None:
+        self.path = path
+        self._headers = headers
+
+    @classmethod
+    def parse(cls, data: bytes) -> RequestHead | None:
+        """Return the head *data*, without its empty line; None if it is no GET that has no body.
+
+        Source:
+            RFC 9112, 3 and 5; RFC 6455, 4.2.1.
+        """
+        lines = data.split(b"\r\n")
+        found = _HEAD.fullmatch(data)
+        if found is None or len(lines) - 1 > _MAX_HEADERS:
+            return None
+        headers: dict[bytes, bytes] = {}
+        for line in lines[1:]:
+            name, _, value = line.partition(b":")
+            name, value = name.lower(), value.strip(b" \t")
+            if name in headers:
+                if name in _SINGLE:
+                    return None
+                value = headers[name] + b"," + value
+            headers[name] = value
+        length = headers.get(b"content-length", b"0")
+        if b"transfer-encoding" in headers or not length or length.strip(b"0"):
+            return None
+        return cls(found[1], headers)
+
+    def text(self, name: bytes) -> str:
+        """Return the header *name*, in lower case letters, "" if it is absent."""
+        value = self._headers.get(name)
+        return "" if value is None else value.decode("ascii", "surrogateescape")
+
+    def words(self, name: bytes) -> list[str]:
+        """Return the entries of the list *name*."""
+        return [word.strip() for word in self.text(name).split(",")]
+
+    @property
+    def websocket_key(self) -> bytes:
+        """The key of a valid request for an upgrade to WebSocket, empty if this is none."""
+        headers = self._headers
+        key = headers.get(b"sec-websocket-key", b"")
+        is_upgrade = (
+            headers.get(b"upgrade", b"").lower() == b"websocket"
+            and "upgrade" in self.text(b"connection").lower().replace(" ", "").replace("\t", "").split(",")
+            and headers.get(b"sec-websocket-version") in _VERSIONS
+            and _WEBSOCKET_KEY.fullmatch(key)
+        )
+        return key if is_upgrade else b""
 
 
 def _offered_token(offered: list[str]) -> str:
@@ -56,8 +127,14 @@ def _offered_token(offered: list[str]) -> str:
 
 def _rejection(status: int, code: str, message: str, hint: str, **headers: str) -> Rejected:
     body = json.dumps({"code": code, "message": message, "hint": hint}, separators=(",", ":")).encode()
-    named = {name.replace("_", "-"): value for name, value in headers.items()}
-    return Rejected(status=status, body=body, result=code, headers={**_JSON, **named})
+    return _answered(status, code, body, {**_JSON, **{k.replace("_", "-"): v for k, v in headers.items()}})
+
+
+def _answered(status: int, result: str, body: bytes, headers: Mapping[str, str]) -> Rejected:
+    lines = {**headers, "Content-Length": str(len(body)), "Connection": "close"}
+    head = "".join(f"{name}: {value}\r\n" for name, value in lines.items())
+    answer = f"HTTP/1.1 {status} {HTTPStatus(status).phrase}\r\n{head}\r\n".encode() + body
+    return Rejected(status=status, body=body, result=result, headers=headers, answer=answer)
 
 
 class HandshakePolicy:
@@ -71,7 +148,7 @@ class HandshakePolicy:
         self._conformance_echo = conformance_echo
         path = settings.serving.path
         self._path = path.encode()
-        self._healthy = Rejected(status=200, body=b'{"status":"ok"}', result=HEALTH, headers=_JSON)
+        self._healthy = _answered(200, HEALTH, b'{"status":"ok"}', _JSON)
         self.defect = _rejection(500, "internal", "the handshake failed", "try again")
         self._not_found = _rejection(404, "not-found", "nothing is served here", f"connect to {path}")
         self._full = _rejection(
@@ -86,6 +163,10 @@ class HandshakePolicy:
             401, "unauthorized", "the token is missing or not valid",
             "issue one with rse-pf token issue ROBOT", WWW_Authenticate="Bearer",
         )  # fmt: skip
+        self.no_request = _rejection(
+            400, "bad-message", "this is not a request for a WebSocket", "send an upgrade as in RFC 6455"
+        )
+        self.too_long = Rejected(status=431, body=b"", result="too-long", answer=_TOO_LONG)
         self._no_subprotocol = _rejection(
             400, "unsupported", "no sub-protocol that this server speaks was offered",
             f"offer one of {', '.join(SUBPROTOCOLS.values())}",

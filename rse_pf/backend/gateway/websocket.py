@@ -11,14 +11,13 @@ import asyncio
 import contextlib
 import socket
 from collections.abc import Callable
-from functools import partial
 from typing import Any
 
 from rse_pf.backend.gateway.audit_recorder import AuditRecorder
 from rse_pf.backend.gateway.connection import RobotConnection
 from rse_pf.backend.gateway.dispatcher import Dispatcher
 from rse_pf.backend.gateway.frames import CloseBorder
-from rse_pf.backend.gateway.handshake import HEALTH, Accepted, HandshakePolicy, Rejected
+from rse_pf.backend.gateway.handshake import HEALTH, Accepted, HandshakePolicy, Rejected, RequestHead
 from rse_pf.backend.gateway.rate_limits import PendingHandshakes, SourceRates
 from rse_pf.config import ServingSettings
 from rse_pf.errors import MissingExtra
@@ -26,7 +25,12 @@ from rse_pf.errors import MissingExtra
 __all__ = ["PendingSocket", "RobotSockets", "listener_type", "protocol_type"]
 
 _MAX_CLOSE_REASON_BYTES = 123
-_TOO_LONG = b"HTTP/1.1 431 Request Header Fields Too Large\r\nConnection: close\r\nContent-Length: 0\r\n\r\n"
+_UPGRADE = (
+    b"GET / HTTP/1.1\r\nUpgrade: websocket\r\nConnection: upgrade\r\n"
+    b"Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: %b\r\n\r\n"
+)
+"""What picows reads of a request that was judged before: it keeps what it reads as long as the connection."""
+_SWITCHING = 101
 _MAX_READ_BYTES = 16384
 """Bytes read at once: thousands of the smallest frames fit in, and the other robots wait meanwhile."""
 _LINGER_S = 2.0
@@ -47,38 +51,56 @@ class _NoLogger:
 
 
 class PendingSocket:
-    """A socket until its handshake is judged."""
+    """An accepted socket until its handshake is judged.
 
-    __slots__ = ("_is_cut", "_left_bytes", "_transport", "number", "peer", "source")
+    Attributes:
+        peer: Address of the other end of the TCP connection.
+        number: Which socket of the server it is.
+        ended: Called once, at the end of the socket.
+        seen: What was read of its request.
+        timeout: Ends it; None while nobody had to wait for its request.
+    """
 
-    def __init__(self, peer: str, max_head_bytes: int, number: int = 0) -> None:
-        self.peer = self.source = peer
+    __slots__ = ("accepted", "ended", "number", "peer", "seen", "timeout")
+
+    def __init__(
+        self, accepted: socket.socket, peer: str, ended: Callable[[], None], number: int = 0
+    ) -> None:
+        self.accepted = accepted
+        self.peer = peer
+        self.ended = ended
         self.number = number
-        self._left_bytes = max_head_bytes
-        self._transport: Any = None
-        self._is_cut = False
+        self.seen = b""
+        self.timeout: asyncio.TimerHandle | None = None
 
-    def connected(self, transport: Any) -> None:
-        """Know the transport; the socket may have been cut before."""
-        self._transport = transport
-        if self._is_cut:
-            transport.abort()
+    def close(self, answer: bytes = b"") -> None:
+        """End the socket, with *answer* if there is one."""
+        if answer:
+            # An answer is far shorter than what the kernel buffers; a robot that is gone gets none.
+            with contextlib.suppress(OSError):
+                self.accepted.send(answer)
+        self.accepted.close()
+        self.ended()
 
-    def cut(self) -> None:
-        """End the socket without an answer."""
-        self._is_cut = True
-        if self._transport is not None:
-            self._transport.abort()
 
-    def is_too_long(self, size: int) -> bool:
-        """Count *size* more bytes of the request head; answer one that is too long."""
-        self._left_bytes -= size
-        if self._left_bytes < 0 and not self._is_cut:
-            self._is_cut = True
-            self._transport.write(_TOO_LONG)
-            self._transport.close()
-            return True
-        return self._is_cut
+class _Upgrade:
+    """The answer that picows sends to an accepted handshake, without the cost of its own class."""
+
+    __slots__ = ("_subprotocol", "headers")
+    status = _SWITCHING
+
+    def __init__(self, subprotocol: str) -> None:
+        self._subprotocol = subprotocol
+        self.headers: dict[str, str] = {}
+
+    def to_bytes(self) -> bytearray:
+        """Return the answer; picows has added the header ``Sec-WebSocket-Accept``."""
+        chosen = f"Sec-WebSocket-Protocol: {self._subprotocol}\r\n" if self._subprotocol else ""
+        accept = self.headers["Sec-WebSocket-Accept"]
+        return bytearray(
+            "HTTP/1.1 101 Switching Protocols\r\nConnection: upgrade\r\nUpgrade: websocket\r\n"
+            f"{chosen}Sec-WebSocket-Accept: {accept}\r\n\r\n".encode()
+        )
 
 
 class RobotSockets:
@@ -106,116 +128,147 @@ class RobotSockets:
         )
         self._new_name = new_name
         self._recorder = recorder
-        self._tasks: set[asyncio.Task[None]] = set()
-        picows, self._connect_accepted_socket = _libraries()
+        picows, self._transport = _libraries()
         self._picows = picows
         self._protocol = protocol_type(picows)
         self._listener = listener_type(picows, self._context.loop, serving)
         self._arguments = (
-            _NoLogger(), True, serving.handshake_timeout_s,
+            _NoLogger(), True, None,
             False, 20.0, 20.0, picows.WSAutoPingStrategy.PING_WHEN_IDLE, False,
             self._context.settings.session.max_message_bytes, None, _READ_BUFFER_BYTES,
         )  # fmt: skip
 
-    def take(self, fd: int, ended: Callable[[], None], number: int) -> None:
-        """Serve the accepted socket *fd*, the server's *number*-th; *ended* is called once, at its end."""
-        accepted = socket.socket(fileno=fd)
+    def take(self, fd: int, ended: Callable[[], None], number: int, peer: str) -> None:
+        """Serve the accepted socket *fd*.
+
+        Args:
+            fd: The descriptor, which belongs to this object from now on.
+            ended: Called once, at the end of the socket.
+            number: Which socket of the server it is, in the order of acceptance.
+            peer: Address of the other end of the TCP connection.
+        """
+        family = socket.AF_INET6 if ":" in peer else socket.AF_INET
+        accepted = socket.socket(family, socket.SOCK_STREAM, 0, fileno=fd)
         accepted.setblocking(False)
-        # Otherwise the kernel buffers megabytes for a slow reader, unnoticed.
-        serving = self._context.settings.serving
-        accepted.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, serving.write_buffer_bytes)
-        pending = PendingSocket(_peer(accepted), serving.max_handshake_bytes, number)
-        surplus = self._pending.enter(pending, pending.peer)
+        pending = PendingSocket(accepted, peer, ended, number)
+        if self._read(pending):
+            return
+        loop, serving = self._context.loop, self._context.settings.serving
+        pending.timeout = loop.call_later(serving.handshake_timeout_s, self._cut, pending)
+        loop.add_reader(fd, self._read_on, pending)
+        surplus = self._pending.enter(pending, peer)
         if surplus is not None:
             self._context.metrics.closed["unauthenticated"] += 1
-            surplus.cut()
+            self._cut(surplus)
 
-        def gone() -> None:
+    def _cut(self, pending: PendingSocket) -> None:
+        """End a socket without an answer."""
+        self._forget(pending)
+        pending.close()
+
+    def _forget(self, pending: PendingSocket) -> None:
+        if pending.timeout is not None:
+            pending.timeout.cancel()
+            pending.timeout = None
+            self._context.loop.remove_reader(pending.accepted.fileno())
             self._pending.leave(pending)
-            ended()
 
-        task = self._context.loop.create_task(self._serve(accepted, pending, gone))
-        self._tasks.add(task)
-        task.add_done_callback(self._tasks.discard)
+    def _read_on(self, pending: PendingSocket) -> None:
+        # One that was cut in the same round of the event loop is not read.
+        if pending.timeout is not None:
+            self._read(pending)
 
-    async def _serve(
-        self, accepted: socket.socket, pending: PendingSocket, ended: Callable[[], None]
-    ) -> None:
-        judge = partial(self._judge, pending)
+    def _read(self, pending: PendingSocket) -> bool:
+        """Read of the request what is there; return whether the socket is no longer pending."""
+        max_bytes = self._context.settings.serving.max_handshake_bytes
         try:
-            await self._connect_accepted_socket(
-                self._context.loop,
-                lambda: self._protocol(pending, ended, None, None, False, judge, *self._arguments),
-                accepted,
-            )
+            # Closing with unread bytes would reset the connection, and its answer would be lost.
+            data = pending.accepted.recv(_MAX_READ_BYTES)
+        except BlockingIOError:
+            return False
         except OSError:
-            accepted.close()
-            ended()
+            data = b""
+        pending.seen += data
+        end = pending.seen.find(b"\r\n\r\n")
+        if data and end < 0 and len(pending.seen) <= max_bytes:
+            return False
+        self._forget(pending)
+        if not data:
+            pending.close()
+        elif end < 0:
+            self._refuse(pending, self._handshake.too_long)
+        else:
+            self._judge(pending, RequestHead.parse(pending.seen[:end]), pending.seen[end + 4 :])
+        return True
 
-    def _judge(self, pending: PendingSocket, request: Any) -> Any:
-        """Answer a handshake; picows would send the text of an exception, so none may pass."""
-        self._pending.leave(pending)
+    def _judge(self, pending: PendingSocket, head: RequestHead | None, rest: bytes) -> None:
+        """Answer a handshake; *rest* was read behind its head.  No exception passes: the worker serves on."""
         try:
-            verdict = self._verdict(pending, request)
-            self._recorder.judged(verdict, pending.source, request.headers.get("Authorization", ""))
+            verdict: Accepted | Rejected = self._handshake.no_request
+            if head is not None:
+                verdict = self._verdict(pending, head)
         except Exception as error:  # noqa: BLE001  see above
             self._context.log.error("defect", at="handshake", traceback=repr(error))
             verdict = self._handshake.defect
-        if isinstance(verdict, Rejected):
-            self._context.metrics.handshakes[verdict.result] += 1
-            kinds = self._picows.WSUpgradeResponse
-            if verdict.result == HEALTH:
-                response = kinds.create_ok_response(verdict.body, dict(verdict.headers))
-            else:
-                self._context.log.info("refused", result=verdict.result, reason=verdict.reason)
-                response = kinds.create_error_response(verdict.status, verdict.body, dict(verdict.headers))
-            return self._picows.WSUpgradeResponseWithListener(response, None)
-        self._context.metrics.handshakes["ok"] += 1
-        chosen = {"Sec-WebSocket-Protocol": verdict.subprotocol} if verdict.subprotocol else None
-        response = self._picows.WSUpgradeResponse.create_101_response(chosen)
-        return self._picows.WSUpgradeResponseWithListener(
-            response, self._listener(self._dispatcher, verdict, pending.number)
-        )
+        if isinstance(verdict, Accepted):
+            assert head is not None
+            self._context.metrics.handshakes["ok"] += 1
+            self._serve(pending, verdict, (_UPGRADE % head.websocket_key, rest))
+        else:
+            self._refuse(pending, verdict)
 
-    def _verdict(self, pending: PendingSocket, request: Any) -> Accepted | Rejected:
-        headers, now = request.headers, self._context.clocks.monotonic()
-        source = pending.source = self._sources.source(
-            pending.peer, ",".join(headers.getall("X-Forwarded-For", []))
-        )
+    def _refuse(self, pending: PendingSocket, verdict: Rejected) -> None:
+        self._context.metrics.handshakes[verdict.result] += 1
+        if verdict.result != HEALTH:
+            self._context.log.info("refused", result=verdict.result, reason=verdict.reason)
+        pending.close(verdict.answer)
+
+    def _serve(self, pending: PendingSocket, verdict: Accepted, request: tuple[bytes, bytes]) -> None:
+        serving, kinds = self._context.settings.serving, self._picows
+        listener = self._listener(self._dispatcher, verdict, pending.number)
+        answer = kinds.WSUpgradeResponseWithListener(_Upgrade(verdict.subprotocol), listener)
+        accepted = pending.accepted
+        try:
+            # Otherwise the kernel buffers megabytes for a slow reader, unnoticed.
+            accepted.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, serving.write_buffer_bytes)
+            protocol = self._protocol(
+                pending.ended, request, None, None, False, lambda _: answer, *self._arguments
+            )
+            self._transport(self._context.loop, accepted, protocol)
+        except OSError:
+            pending.close()
+
+    def _verdict(self, pending: PendingSocket, head: RequestHead) -> Accepted | Rejected:
+        now = self._context.clocks.monotonic()
+        source = self._sources.source(pending.peer, head.text(b"x-forwarded-for"))
         if self._sources.wait_s(source, now) > 0:
             return self._handshake.too_fast
-        connection = [word.strip().lower() for word in ",".join(headers.getall("Connection", [])).split(",")]
-        if "upgrade" in connection:
-            headers["Connection"] = "upgrade"
-        offered = ",".join(headers.getall("Sec-WebSocket-Protocol", [])).split(",")
+        authorization = head.text(b"authorization")
         verdict = self._handshake.judge(
-            path=bytes(request.path),
-            authorization=headers.get("Authorization", ""),
-            offered=[word.strip() for word in offered],
+            path=head.path,
+            authorization=authorization,
+            offered=head.words(b"sec-websocket-protocol"),
             is_full=len(self._dispatcher.connections) >= self._max_robots,
             anonymous=self._new_name(),
             now_s=self._context.clocks.wall(),
         )
-        if not isinstance(verdict, Accepted):
-            return verdict
-        banned_s = self._dispatcher.rates.banned_s(verdict.robot, now)
-        return self._handshake.too_fast if banned_s > 0 else verdict
-
-
-def _peer(accepted: socket.socket) -> str:
-    try:
-        return str(accepted.getpeername()[0])
-    except OSError:
-        return ""  # gone already
+        if isinstance(verdict, Accepted):
+            if self._dispatcher.rates.banned_s(verdict.robot, now) > 0:
+                verdict = self._handshake.too_fast
+            elif not head.websocket_key:
+                verdict = self._handshake.no_request
+        self._recorder.judged(verdict, source, authorization)
+        return verdict
 
 
 def _libraries() -> tuple[Any, Any]:
     try:
-        import aiofastnet
+        # Its function connect_accepted_socket costs a task and two futures for each socket.
+        from aiofastnet.selector_transport import SelectorSocketTransport
         from picows import picows
     except ImportError as error:
         raise MissingExtra("picows", "backend") from error
-    return picows, aiofastnet.connect_accepted_socket
+    return picows, SelectorSocketTransport
 
 
 def protocol_type(picows: Any) -> Any:
@@ -227,16 +280,24 @@ def protocol_type(picows: Any) -> Any:
     class Protocol(base):  # type: ignore[misc, valid-type]
         """Passes nothing behind the first CLOSE to picows, and tells when the socket is gone."""
 
-        def __init__(self, pending: PendingSocket, ended: Callable[[], None], *arguments: Any) -> None:
+        def __init__(self, ended: Callable[[], None], request: tuple[bytes, bytes], *arguments: Any) -> None:
             super().__init__(*arguments)
-            self._pending = pending
+            self._request = request
             self._ended = ended
-            self._border = CloseBorder()
+            self._border = CloseBorder(upgraded=True)
             self._buffer = memoryview(b"")
 
         def connection_made(self, transport: Any) -> None:
             connection_made(self, transport)
-            self._pending.connected(transport)
+            request, rest = self._request
+            self._request = (b"", b"")
+            get_buffer(self, -1)[: len(request)] = request
+            buffer_updated(self, len(request))
+            while rest:
+                size = min(len(self.get_buffer(-1)), len(rest))
+                self._buffer[:size] = rest[:size]
+                self.buffer_updated(size)
+                rest = rest[size:]
 
         def get_buffer(self, hint: int) -> memoryview:
             buffer: memoryview = get_buffer(self, hint)
@@ -244,8 +305,6 @@ def protocol_type(picows: Any) -> Any:
             return self._buffer
 
         def buffer_updated(self, n: int) -> None:
-            if not self._border.is_upgraded and self._pending.is_too_long(n):
-                return
             if self.transport is not None and self.transport.is_close_frame_sent:
                 return
             wanted = self._border.wanted(self._buffer, n)

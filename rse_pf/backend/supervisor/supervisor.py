@@ -260,7 +260,7 @@ class _Supervisor:
                 return
             try:
                 # A descriptor is enough: `accept` would make an object that is closed at once.
-                fd, address = self._listener._accept()
+                fd, address = self._listener._accept()  # type: ignore[attr-defined]
             except BlockingIOError:
                 return
             except OSError as error:  # out of descriptors, or the robot is gone already

@@ -5,9 +5,12 @@ from __future__ import annotations
 import json
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from picows import picows
 
 from rse_pf.auth.tokens import SigningKey
-from rse_pf.backend.gateway.handshake import HEALTH, Accepted, HandshakePolicy, Rejected
+from rse_pf.backend.gateway.handshake import HEALTH, Accepted, HandshakePolicy, Rejected, RequestHead
 from rse_pf.config import PlatformSettings
 from rse_pf.identity import RobotId
 from rse_pf.wire import SUBPROTOCOLS
@@ -126,3 +129,87 @@ def test_the_health_page_has_one_answer_also_when_the_server_is_full():
     assert isinstance(answers[0], Rejected)
     assert (answers[0].status, answers[0].body, answers[0].result) == (200, b'{"status":"ok"}', HEALTH)
     assert judge(path=b"/healthz?x").status == 404
+
+
+# --- the head of a request -------------------------------------------------------------------------
+
+HEAD = (
+    b"GET /ws HTTP/1.1\r\nHost: h\r\nUpgrade: WebSocket\r\nConnection: keep-alive, Upgrade\r\n"
+    b"Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\n"
+    b"Sec-WebSocket-Protocol: a, b\r\nSEC-WEBSOCKET-PROTOCOL:\tc "
+)
+
+
+def test_the_head_of_a_request_gives_its_path_its_headers_and_the_key_of_its_upgrade():
+    head = RequestHead.parse(HEAD)
+
+    assert head is not None
+    assert (head.path, head.text(b"host"), head.text(b"authorization")) == (b"/ws", "h", "")
+    assert head.words(b"sec-websocket-protocol") == ["a", "b", "c"]
+    assert head.websocket_key == b"AAAAAAAAAAAAAAAAAAAAAA=="
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        (b"Upgrade: WebSocket", b"Upgrade: h2c"),
+        (b"keep-alive, Upgrade", b"keep-alive, Upgrades"),
+        (b"Version: 13", b"Version: 12"),
+        (b"AAAAAA==", b"AAAA=="),
+        (b"AAAAAA==", b"AAAAA*=="),
+        (b"Sec-WebSocket-Key", b"Sec-WebSocket-Keys"),
+    ],
+)
+def test_a_head_that_asks_for_no_websocket_has_no_key(old, new):
+    head = RequestHead.parse(HEAD.replace(old, new))
+
+    assert head is not None
+    assert head.websocket_key == b""
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        b"", b"GET /ws HTTP/1.0", b"POST /ws HTTP/1.1", b"GET  HTTP/1.1", b"GET /a b HTTP/1.1",
+        b"GET /ws HTTP/1.1\r\nbroken", b"GET /ws HTTP/1.1\r\nA: b\r\n c", b"GET /ws HTTP/1.1\r\nA : b",
+        b"GET /ws HTTP/1.1\r\n: b", b"GET /ws HTTP/1.1\r\nA: \x00", b"GET /ws HTTP/1.1\r\nA: b\nC: d",
+        b"GET /ws HTTP/1.1\r\nTransfer-Encoding: chunked", b"GET /ws HTTP/1.1\r\nContent-Length: 1",
+        b"GET /ws HTTP/1.1\r\nContent-Length: 0\r\nContent-Length: 0", b"GET /ws HTTP/1.1\r\nContent-Length:",
+        b"GET /ws HTTP/1.1" + b"\r\nA: b" * 129,
+    ],
+)  # fmt: skip
+def test_what_is_no_plain_request_is_none(data):
+    assert RequestHead.parse(data) is None
+
+
+LINES = st.lists(
+    st.sampled_from(
+        [b"A: b", b"A:b ", b"Content-Length: 0", b"Content-Length: 00", b"Content-Length: 7", b"x", b" y: z",
+         b"Transfer-Encoding: x", b"Host: \xff", b"B: \x01", b"C:\td", b"Ups\xff: a", b"a: b\r", b""]
+    )
+    | st.binary(max_size=6),
+    max_size=5,
+)  # fmt: skip
+STARTS = st.sampled_from([b"GET / HTTP/1.1", b"GET /ws?a HTTP/1.1", b"HEAD / HTTP/1.1", b"GET /", b"G"])
+
+
+@given(STARTS, LINES)
+def test_every_head_that_is_taken_is_one_for_the_websocket_library_too(start, lines):
+    data = b"\r\n".join([start, *lines])
+
+    head = RequestHead.parse(data)
+
+    if head is not None:
+        request = picows._parse_http_request(data)
+        assert (head.path, head.text(b"a")) == (request.path, ",".join(request.headers.getall("a", [])))
+
+
+def test_a_rejection_is_one_whole_answer_that_ends_the_connection():
+    verdict = judge(authorization="")
+
+    assert isinstance(verdict, Rejected)
+    head, _, body = verdict.answer.partition(b"\r\n\r\n")
+    lines = head.decode().split("\r\n")
+    assert lines[0] == "HTTP/1.1 401 Unauthorized"
+    assert {"WWW-Authenticate: Bearer", "Connection: close", f"Content-Length: {len(body)}"} <= {*lines}
+    assert body == verdict.body

@@ -10,15 +10,15 @@ from types import SimpleNamespace
 from fakes import FakeLoop
 from picows import picows
 
-from rse_pf.backend.gateway.websocket import PendingSocket, listener_type, protocol_type
+from rse_pf.backend.gateway.websocket import listener_type, protocol_type
 from rse_pf.config import ServingSettings
 
 
 def test_the_protocol_takes_the_fifteen_arguments_that_we_give_it():
     async def make() -> object:
         return protocol_type(picows)(
-            PendingSocket("127.0.0.1", 8192), lambda: None, None, None, False, lambda request: None,
-            logging.getLogger("t"), True, 5.0, False, 20.0, 20.0, picows.WSAutoPingStrategy.PING_WHEN_IDLE,
+            lambda: None, (b"", b""), None, None, False, lambda request: None,
+            logging.getLogger("t"), True, None, False, 20.0, 20.0, picows.WSAutoPingStrategy.PING_WHEN_IDLE,
             False, 1000, None, 2048,
         )  # fmt: skip
 
