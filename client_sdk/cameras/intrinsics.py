@@ -1,0 +1,137 @@
+"""``intrinsics.json``: a camera with its lens, as calibration writes it and every source reads it.
+
+::
+
+    {"fx": 525.1, "fy": 525.3, "cx": 319.8, "cy": 240.1, "width": 640, "height": 480,
+     "distortion": [k1, k2, p1, p2, k3], "depth_scale": 1000, "rms_px": 0.31, "views": 24}
+
+Lengths are pixels.  ``distortion`` (OpenCV's order), ``depth_scale`` (units of a 16-bit depth image in a
+metre), ``rms_px`` and ``views`` (of the calibration) may be left out.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from client_sdk.frontend import load_opencv
+from rse_pf.errors import InvalidCamera, UsageError
+from rse_pf.geometry import Camera
+
+__all__ = ["Intrinsics", "Undistortion", "read_intrinsics", "write_intrinsics"]
+
+_HINT = "it needs fx fy cx cy width height, and may have distortion [k1 k2 p1 p2 k3] and depth_scale"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Intrinsics:
+    """A camera, the distortion of its lens (0, 4 or 5 numbers) and the scale of its 16-bit depth images.
+
+    ``rms_px`` and ``views`` tell how it was calibrated; None if unknown.
+
+    Raises:
+        UsageError: A number is impossible.
+    """
+
+    camera: Camera
+    distortion: tuple[float, ...] = ()
+    depth_scale: float = 1000.0
+    rms_px: float | None = None
+    views: int | None = None
+
+    def __post_init__(self) -> None:
+        if len(self.distortion) not in (0, 4, 5) or not all(math.isfinite(each) for each in self.distortion):
+            raise UsageError(
+                f"{len(self.distortion)} distortion numbers, or one that is not finite", hint=_HINT
+            )
+        if not (math.isfinite(self.depth_scale) and self.depth_scale > 0):
+            raise UsageError(
+                f"depth_scale {self.depth_scale:g} is not above 0", hint="1000 for mm, 5000 for TUM"
+            )
+
+
+def read_intrinsics(path: Path | str) -> Intrinsics:
+    """Return the intrinsics of a file.
+
+    Raises:
+        UsageError: The file is missing, or lacks a number, or a number is impossible.
+    """
+    path = Path(path)
+    try:
+        values = json.loads(path.read_text(encoding="utf-8"))
+        camera = Camera(
+            **{name: float(values[name]) for name in ("fx", "fy", "cx", "cy")},
+            width=int(values["width"]),
+            height=int(values["height"]),
+        )
+        return Intrinsics(
+            camera=camera,
+            distortion=tuple(float(value) for value in values.get("distortion", ())),
+            depth_scale=float(values.get("depth_scale", 1000.0)),
+            rms_px=values.get("rms_px"),
+            views=values.get("views"),
+        )
+    except FileNotFoundError as error:
+        raise UsageError(
+            f"there is no {path}", hint="make one: rse-pf camera calibrate SOURCE --board 9x6 --square-mm 25"
+        ) from error
+    except (InvalidCamera, UsageError) as error:
+        raise UsageError(f"{path}: {error.message}", hint=error.hint) from error
+    except KeyError as error:
+        raise UsageError(f"{path} has no {error.args[0]}", hint=_HINT) from error
+    except (OSError, ValueError, TypeError, AttributeError) as error:
+        raise UsageError(f"{path} is not a file of intrinsics", hint=_HINT) from error
+
+
+def write_intrinsics(path: Path | str, intrinsics: Intrinsics) -> None:
+    """Write the file that `read_intrinsics` reads; raises UsageError where it cannot be written."""
+    camera = intrinsics.camera
+    values: dict[str, Any] = {
+        "fx": camera.fx, "fy": camera.fy, "cx": camera.cx, "cy": camera.cy,
+        "width": camera.width, "height": camera.height,
+        "distortion": list(intrinsics.distortion), "depth_scale": intrinsics.depth_scale,
+    }  # fmt: skip
+    if intrinsics.rms_px is not None:
+        values["rms_px"] = round(intrinsics.rms_px, 4)
+    if intrinsics.views is not None:
+        values["views"] = intrinsics.views
+    try:
+        Path(path).write_text(json.dumps(values, indent=2) + "\n", encoding="utf-8")
+    except OSError as error:
+        raise UsageError(f"cannot write {path}: {error.strerror}", hint="name another file") from error
+
+
+class Undistortion:
+    """Map images of a distorted lens to the pinhole camera of the same intrinsics."""
+
+    def __init__(self, intrinsics: Intrinsics) -> None:
+        self._maps: tuple[Any, Any] | None = None
+        camera = intrinsics.camera
+        if any(intrinsics.distortion):
+            cv2 = load_opencv()
+            self._maps = cv2.initUndistortRectifyMap(
+                camera.matrix, np.array(intrinsics.distortion), None, camera.matrix,
+                (camera.width, camera.height), cv2.CV_32FC1,
+            )  # fmt: skip
+
+    def colour(self, rgb: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
+        """Return a colour image, interpolated."""
+        if self._maps is None:
+            return rgb
+        cv2 = load_opencv()
+        mapped: npt.NDArray[np.uint8] = cv2.remap(rgb, *self._maps, cv2.INTER_LINEAR)
+        return mapped
+
+    def depth(self, depth_m: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+        """Return a depth image with the nearest readings: a mean of two surfaces lies on neither."""
+        if self._maps is None:
+            return depth_m
+        cv2 = load_opencv()
+        mapped: npt.NDArray[np.float32] = cv2.remap(depth_m, *self._maps, cv2.INTER_NEAREST)
+        return mapped

@@ -1,0 +1,75 @@
+"""Cameras and videos that OpenCV opens: a device number, a video file, or the address of a stream.
+
+The time stamps of a file are its own, those of a device are the clock's.  There is no depth.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+from client_sdk.cameras.source import RawFrame, colour_of
+from client_sdk.frontend import load_opencv
+from rse_pf.errors import UsageError
+
+__all__ = ["open_video"]
+
+_MAX_MISSES = 30
+"""A device that gives no image so many times in a row has gone."""
+
+
+def open_video(
+    source: str, clock: Callable[[], float] = time.monotonic
+) -> tuple[Iterator[RawFrame], Callable[[], None]]:
+    """Open a device (``0``), a video file or a stream; return its images and how to close it.
+
+    Raises:
+        UsageError: There is no such device or file, or OpenCV cannot read it.
+        MissingExtra: OpenCV is not installed.
+    """
+    cv2 = load_opencv()
+    is_device = source.isdigit()
+    is_file = not is_device and "://" not in source
+    if is_file and not Path(source).is_file():
+        raise UsageError(f"there is no video {source}", hint="name a device number, a video or a folder")
+    cv2.setLogLevel(0)  # OpenCV would print warnings of its own beside ours
+    capture = cv2.VideoCapture(int(source) if is_device else source)
+    if not capture.isOpened():
+        capture.release()
+        if is_device:
+            raise UsageError(
+                f"camera {source} cannot be opened",
+                hint="see ls /dev/video*; close other programs that use it; add yourself to the group video",
+            )
+        raise UsageError(f"{source} is not a video that OpenCV can read", hint="convert it, such as to mp4")
+    if is_device:
+        capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)
+    images = _file_images(cv2, capture, source) if is_file else _device_images(capture, source, clock)
+    return images, capture.release
+
+
+def _file_images(cv2: Any, capture: Any, name: str) -> Iterator[RawFrame]:
+    rate_hz = float(capture.get(cv2.CAP_PROP_FPS))
+    period_s = 1.0 / rate_hz if 0.1 <= rate_hz <= 1000 else 1.0 / 30.0
+    row = 0
+    while True:
+        good, image = capture.read()
+        if not good:
+            if row == 0:
+                raise UsageError(f"{name} holds no image", hint="record it again")
+            return
+        # By number: the position that containers report is 0 in some of them.
+        yield row * period_s, colour_of(image, name), None
+        row += 1
+
+
+def _device_images(capture: Any, name: str, clock: Callable[[], float]) -> Iterator[RawFrame]:
+    misses = 0
+    while misses < _MAX_MISSES:
+        good, image = capture.read()
+        misses = 0 if good else misses + 1
+        if good:
+            yield clock(), colour_of(image, name), None
+    raise UsageError(f"camera {name} gives no more images", hint="check its cable")
