@@ -34,6 +34,7 @@ VERBS = {
     "service": "write, test, run and install a service of your own: Python, C/C++ or Lua",
     "serve": "run one backend server, as EC2 runs it",
     "data": "run the data service: images, keyframes, clouds and maps by HTTP",
+    "camera": "calibrate a camera, print a board for it, check what it gives",
     "map": "show, merge, localise in, roll back and export the maps that robots share",
     "audit": "show the audit log of robots and changes, and check that it is unchanged",
     "cloud": "check the platform on AWS: doctor, cost, status, leftovers",

@@ -1,0 +1,206 @@
+"""Calibrate a camera, print a board for it, or check what a camera gives.
+
+SOURCE is a device number (0), a video, or images; check takes folders and recordings as well.  calibrate
+writes intrinsics.json, which every command that opens a camera reads.  A board of 9x6 has 9 by 6 inner
+corners.
+
+examples:
+  rse-pf camera board --board 9x6 --square-mm 25 --out board.pdf
+  rse-pf camera calibrate 0 --board 9x6 --square-mm 25 --out intrinsics.json
+  rse-pf camera calibrate images/*.png --board 9x6 --square-mm 25
+  rse-pf camera check 0
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import math
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from rse_pf.config import PlatformSettings
+from rse_pf.errors import UsageError
+from rse_pf.terminal import show, show_json, show_progress
+
+if TYPE_CHECKING:
+    import numpy.typing as npt
+
+    from client_sdk.cameras.board import Board
+
+__all__ = ["add_arguments", "run"]
+
+_WANTED_VIEWS = 25
+_LIVE_IMAGES = 3000
+"""A live calibration ends after so many images even if there are too few views."""
+_BLURRED = 60.0
+"""Variance of the Laplacian below which an image is likely blurred, or shows nothing."""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the actions and their options."""
+    actions = parser.add_subparsers(dest="action", required=True, metavar="ACTION")
+    board = argparse.ArgumentParser(add_help=False)
+    board.add_argument("--board", default="9x6", metavar="CxR", help="inner corners (default: %(default)s)")
+    board.add_argument(
+        "--square-mm", type=float, default=25.0, metavar="MM", help="edge of a square (default: 25)"
+    )
+    board.add_argument("--charuco", action="store_true", help="a ChArUco board instead of a chessboard")
+    calibrate = actions.add_parser("calibrate", parents=[board], help="write the intrinsics of a camera")
+    calibrate.add_argument("sources", nargs="+", metavar="SOURCE", help="a device number, a video, or images")
+    calibrate.add_argument(
+        "--out", type=Path, default=Path("intrinsics.json"), metavar="FILE", help="default: %(default)s"
+    )
+    calibrate.add_argument(
+        "--max-rms-px", type=float, default=1.0, metavar="PX", help="refuse a larger error (default: 1)"
+    )
+    calibrate.add_argument(
+        "--depth-scale", type=float, default=1000.0, metavar="N",
+        help="units of a 16-bit depth image in a metre (default: 1000)",
+    )  # fmt: skip
+    write = actions.add_parser("board", parents=[board], help="write a board to print")
+    write.add_argument("--out", type=Path, default=Path("board.pdf"), metavar="FILE", help=".pdf or .png")
+    check = actions.add_parser("check", help="say what a camera gives: size, rate, depth, blur")
+    check.add_argument("source", metavar="SOURCE", help="a device, a video, a folder or a recording")
+    check.add_argument("--frames", type=int, default=60, metavar="N", help="frames to look at (default: 60)")
+    check.add_argument("--json", action="store_true", help="print JSON")
+
+
+def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
+    """Do one action and return the exit code."""
+    if args.action == "check":
+        return _check(args)
+    from client_sdk.cameras.board import Board, write_board
+
+    board = Board.parse(args.board, args.square_mm, charuco=args.charuco)
+    if args.action == "calibrate":
+        return _calibrate(args, board)
+    write_board(args.out, board)
+    show(
+        f"{args.out}: {board.columns}x{board.rows} inner corners, squares of {args.square_mm:g} mm",
+        "print it at 100 %, measure a square, and fix it to something flat",
+    )
+    return 0
+
+
+def _calibrate(args: argparse.Namespace, board: Board) -> int:
+    from client_sdk.cameras.calibration import BoardViews, calibrate
+    from client_sdk.cameras.intrinsics import write_intrinsics
+
+    if not args.max_rms_px > 0:
+        raise UsageError(f"--max-rms-px {args.max_rms_px:g} is not above 0", hint="good cameras reach 0.5")
+    if not args.out.absolute().parent.is_dir():
+        raise UsageError(f"there is no folder {args.out.absolute().parent}", hint="create it")
+    views = BoardViews(board)
+    is_live = len(args.sources) == 1 and args.sources[0].isdigit()
+    for image in _raw_images(args.sources):
+        views.add(image)
+        show_progress(
+            f"{len(views.found)} of {_WANTED_VIEWS} views in {views.images} images; move and tilt the board",
+            is_over=False,
+        )
+        if len(views.found) >= _WANTED_VIEWS or (is_live and views.images >= _LIVE_IMAGES):
+            break
+    show_progress(f"{len(views.found)} views in {views.images} images; computing", is_over=True)
+    found = calibrate(views, max_rms_px=args.max_rms_px, depth_scale=args.depth_scale)
+    write_intrinsics(args.out, found)
+    camera = found.camera
+    show(
+        f"{args.out}: fx {camera.fx:.2f}  fy {camera.fy:.2f}  cx {camera.cx:.2f}  cy {camera.cy:.2f}, "
+        f"{camera.width}x{camera.height} px",
+        f"reprojection error {found.rms_px:.3f} px rms over {found.views} views",
+    )
+    return 0
+
+
+def _raw_images(sources: list[str]) -> Iterator[npt.NDArray[np.uint8]]:
+    """Yield grey images as the lens gives them."""
+    from client_sdk.cameras.folder import image_files, is_image, read_raw_image
+    from client_sdk.cameras.opencv_video import open_video
+    from client_sdk.cameras.source import colour_of
+
+    paths = [
+        each
+        for word in sources
+        for each in (image_files(Path(word)) if Path(word).is_dir() else [Path(word)])
+        if is_image(each)
+    ]
+    for path in paths:
+        yield _gray(colour_of(read_raw_image(path), str(path)))
+    if paths:
+        return
+    if len(sources) > 1 or Path(sources[0]).is_dir():
+        raise UsageError(f"there is no image {sources[0]}", hint="name images, one video, or one device")
+    images, close = open_video(sources[0])
+    try:
+        for _, rgb, _ in images:
+            yield _gray(rgb)
+    finally:
+        close()
+
+
+def _check(args: argparse.Namespace) -> int:
+    """Look at some frames and say what they are; the exit code is 1 if most are blurred."""
+    if args.frames < 2:
+        raise UsageError(f"--frames {args.frames} is below 2", hint="60 is two seconds of a webcam")
+    stamps, blur, size, with_depth = [], [], (0, 0), 0
+    for stamp, rgb, has_depth in itertools.islice(_frames(args.source), args.frames):
+        stamps.append(stamp)
+        blur.append(_sharpness(_gray(rgb)))
+        size, with_depth = (rgb.shape[1], rgb.shape[0]), with_depth + has_depth
+    if len(stamps) < 2:
+        raise UsageError(f"{args.source} gives {len(stamps)} frames", hint="a check needs 2 or more")
+    blurred = int(np.sum(np.array(blur) < _BLURRED))
+    rate_hz = (len(stamps) - 1) / max(stamps[-1] - stamps[0], 1e-9)
+    figures: dict[str, Any] = {
+        "source": args.source, "width": size[0], "height": size[1], "frames": len(stamps),
+        "rate_hz": round(rate_hz, 2), "with_depth": with_depth, "blurred": blurred,
+        "sharpness_median": round(float(np.median(blur)), 1),
+    }  # fmt: skip
+    if args.json:
+        show_json(figures)
+    else:
+        depth = "depth" if with_depth else "no depth"
+        show(
+            f"{args.source}: {size[0]}x{size[1]} px, {rate_hz:.1f} frames per second, {depth}",
+            f"{blurred} of {len(stamps)} frames are blurred or empty",
+        )
+    return 1 if blurred > len(stamps) / 2 else 0
+
+
+def _frames(source: str) -> Iterator[tuple[float, npt.NDArray[np.uint8], bool]]:
+    """Yield time stamp, colours and whether there is depth; a video and a device need no intrinsics here."""
+    from client_sdk.cameras import open_camera
+    from client_sdk.cameras.folder import open_folder
+    from client_sdk.cameras.opencv_video import open_video
+
+    path = Path(source)
+    if path.is_dir() and not (path / "rgb.txt").exists() and not any(path.glob("d-*.pgm")):
+        images, _ = open_folder(path, 1000.0)
+        yield from ((stamp, rgb, depth_m is not None) for stamp, rgb, depth_m in images)
+    elif source == "realsense" or path.is_dir() or path.suffix in (".bag", ".mat", ".mcap", ".db3"):
+        with open_camera(source) as frames:
+            yield from ((frame.timestamp_s, frame.rgb, bool(frame.depth_m.any())) for frame in frames)
+    else:
+        images, close = open_video(source)
+        try:
+            yield from ((stamp, rgb, False) for stamp, rgb, _ in images)
+        finally:
+            close()
+
+
+def _gray(rgb: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
+    """Return the luminance, ITU-R BT.601, as OpenCV does."""
+    gray: npt.NDArray[np.uint8] = np.rint(rgb @ np.array([0.299, 0.587, 0.114])).astype(np.uint8)
+    return gray
+
+
+def _sharpness(gray: npt.NDArray[np.uint8]) -> float:
+    """Return the variance of the Laplacian: low where there are no sharp edges."""
+    g = gray.astype(np.float32)
+    laplacian = g[1:-1, :-2] + g[1:-1, 2:] + g[:-2, 1:-1] + g[2:, 1:-1] - 4 * g[1:-1, 1:-1]
+    value = float(laplacian.var())
+    return value if math.isfinite(value) else 0.0
