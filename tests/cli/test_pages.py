@@ -32,7 +32,7 @@ from rse_pf.object_store import DirectoryStore
 PAGES = (
     "README.md", "docs/architecture.md", "docs/data.md", "docs/design.md", "docs/map_services.md",
     "docs/operations.md", "docs/protocol.md", "docs/results/README.md", "docs/security.md",
-    "docs/services.md", "docs/errors.md",
+    "docs/services.md", "docs/errors.md", "docs/local.md",
 )  # fmt: skip
 OTHER_PROGRAMS = ("npx", "aws", "python", ".", "grep")
 BLOCK = re.compile(r"^```(\w*)\n(.*?)^```", re.DOTALL | re.MULTILINE)

@@ -12,7 +12,7 @@ from rse_pf.config import setting_rows
 PAGES = (
     "README.md", "CONTRIBUTING.md", "docs/architecture.md", "docs/data.md", "docs/design.md",
     "docs/map_services.md", "docs/operations.md", "docs/protocol.md", "docs/security.md",
-    "docs/services.md", "docs/results/README.md", "docs/errors.md",
+    "docs/services.md", "docs/results/README.md", "docs/errors.md", "docs/local.md",
 )  # fmt: skip
 """CHANGELOG.md is left out: it names what is gone."""
 FOLDERS = "rse_pf|tests|docs|client_sdk|lambda_pnp|stacks|benchmarks|scripts|fuzz|locks|examples"

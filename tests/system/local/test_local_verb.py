@@ -270,7 +270,7 @@ def test_a_data_server_that_died_without_a_control_plane_is_started_by_the_next_
     terminal: Terminal,
 ) -> None:
     process, before, said = terminal.platform()
-    assert "large data goes to http://127.0.0.1:" in said
+    assert "large data goes to  http://127.0.0.1:" in said
     process.kill()
     process.wait(SOON_S)
     assert before.data_server is not None
