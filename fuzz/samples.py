@@ -121,6 +121,7 @@ _COUNT, _ALL, _VALUES = 24_900, 1_048_000, 29_900
 _PACKED_KEYS = b"".join(b"\xa5k%04x\1" % k for k in range(14_900))
 _KEYS = b",".join(b'"k%d":%d' % (i, i + 1000) for i in range(_COUNT))
 _NUMBERED = b"".join(b"\xcd%c%c\x90" % divmod(i, 256) for i in range(_COUNT))
+_DIGITS = b"".join(b"0.%016d," % (k * k * 2654435761 % 10**16) for k in range(29_000))
 
 EXPENSIVE: dict[str, tuple[str, bytes]] = {
     "empty lists": ("bin", _array(b"\x90", 262_000)),
@@ -139,6 +140,15 @@ EXPENSIVE: dict[str, tuple[str, bytes]] = {
     "json lists": ("json", _json(b"[" + b"[]," * 9_900 + b"1]")),
     "json brackets in words": ("json", _json(b"[" + b'"",' * 80_000 + b'"",' + b"[" * 20 + b"]" * 21)),
     "json long integers": ("json", _json(b"[" + (b"9" * 4300 + b",") * 55 + b"1]")),
+    "json smallest numbers": ("json", _json(b"[" + b"5e-324," * 29_000 + b"1]")),
+    "json largest numbers": ("json", _json(b"[" + b"1.797e308," * 24_000 + b"1]")),
+    "json middles": ("json", _json(b"[" + b"1e23," * 29_000 + b"1]")),
+    "json long middles": ("json", _json(b"[" + b"9007199254740993.0," * 13_000 + b"1]")),
+    "json negative integers": ("json", _json(b"[" + b"-9999999999999999999," * 11_000 + b"1]")),
+    "json costly numbers that may be": ("json", _json(b"[" + b"1.797e308," * 185 + b"1]")),
+    "json middles that may be": ("json", _json(b"[" + b"1e23," * 2700 + b"1]")),
+    "deflated digits": ("zlib", zlib.compress(_json(b"[" + _DIGITS + b"1]"), 9)),
+    "exponents in words": ("zlib", zlib.compress(_json(b'["' + _DIGITS.replace(b".", b"e") + b'"]'), 9)),
     "json backslashes": ("json", _json(b'"' + b"\\\\" * 120_000 + b'"')),
     "deflated keys": ("zlib", zlib.compress(_json(b"{" + _KEYS + b"}"), 9)),
     "deflated small maps": ("zlib", zlib.compress(_json(b"[" + b'{"a":1},' * 9_900 + b"1]"), 9)),

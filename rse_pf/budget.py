@@ -10,8 +10,10 @@ Source:
 
 from __future__ import annotations
 
+import itertools
+import re
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -45,7 +47,7 @@ Text = bytes | bytearray
 LIST_VALUES, MAP_VALUES = 3, 6
 """How many values a list and a map count as, according to the memory that they take."""
 
-_PIECE_BYTES = 65536
+_PIECE_BYTES = 32768
 # Bytes in memory per string, per number, per character of a text beyond ASCII, and per byte at worst.
 _STRING_BYTES, _NUMBER_BYTES, _WIDE, _MAX_BYTES_PER_BYTE = 60, 32, 7, 8
 _FEW_STRINGS = 2000
@@ -54,6 +56,17 @@ _FLAT_FROM = 32
 _NOT_BRACKETS = bytes(set(range(256)) - set(b"[]{}"))
 _NOT_BRACKETS_OR_QUOTES = bytes(set(range(256)) - set(b'[]{}"'))
 _NOT_MARKS_OR_QUOTES = bytes(set(range(256)) - set(b',:[]{}"'))
+# How many values a number counts as beyond its own, because decoders need longer for it: many digits, the
+# middle between two doubles, and what is about as small or large as a double can be.
+_LONG_DIGITS, _WIDE_DIGITS, _MIDDLE_DIGITS, _MIDDLE_WHOLE_DIGITS, _MIDDLE_POWER = 19, 32, 16, 12, -4
+_MIDDLE_VALUES, _FAR_VALUES, _MOST_VALUES_PER_BYTE = 10, 160, 40
+_EXPONENT_DIGITS, _MOST_EXPONENT = 9, 10**9
+_COSTLY_EXPONENT = re.compile(rb"e(?<=[0-9.]e)(?:[+-]?0*([1-9][0-9]{2})|\+?0*[2-9][0-9](?![0-9]))")
+_MANY_DIGITS = re.compile(rb"([0-9.]{16,})(?=(?:e([+-]?)([0-9]+))?)")
+_DIGITS = bytes(ord("0") if k in b"0123456789." else ord(" ") for k in range(256))
+_MARKS_OF_NUMBERS = bytes(
+    k if k in b"0123456789.e+-" else ord("e" if k == ord("E") else " ") for k in range(256)
+)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -68,7 +81,7 @@ class Budget:
         depth: Levels of nesting; a list of numbers has one.
         containers: Lists and maps, at any depth.
         values: Values outside of raw arrays; a list counts as `LIST_VALUES`, a map as `MAP_VALUES`, and a
-            long text or a raw array as two.
+            long text or a raw array as two.  In JSON, a number that takes long to read counts as several.
         mixed_values: MessagePack only: those of the values that are not in a flat list of numbers of one
             kind, and therefore have to be read one by one.
         memory_bytes: JSON only: estimated memory of the decoded objects.
@@ -387,7 +400,8 @@ def _cut_off() -> BadMessage:
 
 def _too_many_values(max_values: int) -> LimitExceeded:
     return LimitExceeded(
-        f"more than {max_values} values in one message", hint="send large data to the data server"
+        f"more than {max_values} values in one message",
+        hint="send large data to the data server, and numbers of at most 18 digits",
     )
 
 
@@ -424,7 +438,7 @@ def check_json_containers(text: Text, budget: Budget) -> None:
         return
     if count <= max_lists and _depth(text.translate(None, _NOT_BRACKETS)) <= max_depth:
         return
-    brackets = _without_strings(text, _NOT_BRACKETS_OR_QUOTES)
+    brackets = b"".join(_without_strings(text, _NOT_BRACKETS_OR_QUOTES))
     if brackets.count(b"[") + brackets.count(b"{") > max_lists:
         raise _too_many_json_containers(max_lists)
     if _depth(brackets) > max_depth:
@@ -433,8 +447,66 @@ def check_json_containers(text: Text, budget: Budget) -> None:
 
 def _check_values(text: Text, max_values: int) -> None:
     """Check the number of values before any is created; strings are told apart only above the limit."""
-    if _values(text) >= max_values and _values(_without_strings(text, _NOT_MARKS_OR_QUOTES)) >= max_values:
+    left = max_values - _values(text)
+    # Many words may hold many digits: they are told apart at once.
+    if left > 0 and (
+        len(text) * _MOST_VALUES_PER_BYTE < left
+        or (text.count(b'"') < _FEW_STRINGS and _more_values(_pieces(text), left) < left)
+    ):
+        return
+    outside = b"".join(_without_strings(text, _NOT_MARKS_OR_QUOTES))
+    left = max_values - _values(outside)
+    if left <= 0 or _more_values(_without_strings(text, b"", is_separated=True), left) >= left:
         raise _too_many_values(max_values)
+
+
+def _pieces(text: Text) -> Iterator[Text]:
+    for begin in range(0, len(text), _PIECE_BYTES):
+        yield text[begin : begin + _PIECE_BYTES]
+
+
+def _more_values(pieces: Iterable[Text], enough: int) -> int:
+    """Return for how many more values the numbers in *pieces* of a text count, or at least *enough*.
+
+    Decoders take 0.1 us for most numbers, 0.2 to 1 us for many digits and for the middle between two doubles,
+    and up to 14 us near the smallest and the largest double.
+    """
+    values, rest = 0, b""
+    for piece in itertools.chain(pieces, (b" ",)):
+        marks = rest + piece.translate(_MARKS_OF_NUMBERS)
+        # What may continue in the next piece is read there.
+        cut = marks.rfind(b" ") + 1
+        whole, rest = marks[:cut], marks[cut:]
+        for found in _COSTLY_EXPONENT.finditer(whole):
+            values += _FAR_VALUES if found[1] else _MIDDLE_VALUES
+            if values >= enough:
+                return values
+        if b"0" * _MIDDLE_DIGITS not in whole.translate(_DIGITS):
+            continue
+        for token in whole.split():
+            if len(token) < _MIDDLE_DIGITS:
+                continue
+            # Most numbers have fewer digits, or are real ones with many decimals.
+            is_short = len(token) < _LONG_DIGITS and b"e" not in token
+            if not (is_short and token.find(b".") < _MIDDLE_WHOLE_DIGITS):
+                values += sum(map(_values_of_digits, _MANY_DIGITS.finditer(token)))
+        if values >= enough:
+            break
+    return values
+
+
+def _values_of_digits(found: re.Match[bytes]) -> int:
+    run, sign, exponent = found.groups()
+    number = run.replace(b".", b"")
+    digits, significant = len(number), len(number.lstrip(b"0"))
+    more = digits // 2 if significant >= _LONG_DIGITS or digits >= _WIDE_DIGITS else 0
+    decimals = len(run) - 1 - run.find(b".") if digits < len(run) else 0
+    if significant < _MIDDLE_DIGITS or (exponent is None and digits == len(run)):
+        return more
+    exponent = (exponent or b"").lstrip(b"0")
+    power = _MOST_EXPONENT if len(exponent) > _EXPONENT_DIGITS else int(exponent or b"0")
+    power = (-power if sign == b"-" else power) - decimals
+    return more + _MIDDLE_VALUES if power >= _MIDDLE_POWER else more
 
 
 def _check_memory(text: Text, max_bytes: int) -> None:
@@ -472,16 +544,21 @@ def _depth(brackets: Text) -> int:
     return int(np.cumsum(np.where(opening, np.int8(1), np.int8(-1)), dtype=np.int32).max(initial=0))
 
 
-def _without_strings(text: Text, dropped: bytes) -> bytes:
-    marks = text.replace(b"\\\\", b"").replace(b'\\"', b"").translate(None, dropped)
-    kept, is_inside = [], False
-    for begin in range(0, len(marks), _PIECE_BYTES):
-        signs: npt.NDArray[np.uint8] = np.frombuffer(marks[begin : begin + _PIECE_BYTES], np.uint8)
+def _without_strings(text: Text, dropped: bytes, *, is_separated: bool = False) -> Iterator[bytes]:
+    """Yield *text* without its strings and the bytes *dropped*, on request with a space for each string."""
+    marks = text.translate(None, dropped) if dropped else text
+    if b"\\" in text:
+        marks = text.replace(b"\\\\", b"  ").replace(b'\\"', b"  ").translate(None, dropped)
+    is_inside = False
+    for piece in _pieces(marks):
+        signs: npt.NDArray[np.uint8] = np.frombuffer(piece, np.uint8)
         quotes = signs == ord('"')
         inside = np.logical_xor.accumulate(quotes) ^ is_inside
-        kept.append(signs[~(inside | quotes)].tobytes())
+        if is_separated:
+            yield np.where(quotes, np.uint8(ord(" ")), signs)[~inside].tobytes()
+        else:
+            yield signs[~(inside | quotes)].tobytes()
         is_inside = bool(inside[-1])
-    return b"".join(kept)
 
 
 def _too_many_json_containers(most: int) -> LimitExceeded:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import struct
 import zlib
+from dataclasses import replace
 from typing import Any
 
 import msgspec
@@ -16,6 +17,7 @@ from rse_pf.budget import (
     LIST_VALUES,
     MAP_VALUES,
     Budget,
+    check_json,
     check_msgpack,
     inflate_within,
     measure_msgpack,
@@ -112,6 +114,52 @@ def test_marks_within_a_word_are_no_values():
     decoded = codec.decode_from_robot(codec.encode(Command(id=1, service="echo", payload=text)))
 
     assert decoded.payload == text
+
+
+# A number, and how many values it counts as beyond its own.
+COSTLY_NUMBERS = (
+    ("0", 0), ("-1.5", 0), ("1234567890123456", 0), ("-922337203685477580", 0), ("0.1234567890123456", 0),
+    ("0.00012345678901234567", 0), ("1.2345678901234567e-05", 0), ("1.2345678901234567e+00", 0),
+    ("0.0000000000000000000", 0), ("1e-99", 0), ("6.5E+19", 0), ("1e-005", 0), ("1e+007", 0),
+    ("-9999999999999999999", 9), ("1" * 4300, 2150), ("0." + "0" * 308 + "1", 155),
+    ("0.50000000000000002775", 10), ("1e23", 10), ("1E+23", 10), ("9007199254740993.0", 10),
+    ("9007199.254740993e5", 10), ("0.9007199254740993e16", 10), ("9007199254740993e-4", 10),
+    ("9007199254740993e-5", 0), ("9007199254740993000.0", 20), ("5e-324", 160), ("1.797e308", 160),
+    ("1e-0000000000000000308", 160), ("1e99999999999999999999", 160 + 10),
+)  # fmt: skip
+
+
+def has_at_most(text: bytes, values: int) -> bool:
+    try:
+        check_json(text, replace(Budget.of_messages(SessionSettings()), values=values + 1))
+    except LimitExceeded:
+        return False
+    return True
+
+
+@pytest.mark.parametrize(("number", "more"), COSTLY_NUMBERS)
+def test_a_number_that_takes_long_to_read_counts_as_several_values(number, more):
+    text = f"[{number},{number}]".encode()
+
+    assert has_at_most(text, 4 + 2 * more)
+    assert not has_at_most(text, 4 + 2 * more - 1)
+
+
+@pytest.mark.parametrize("number", ["5e-324", "1e23", "1" * 4300])
+def test_numbers_within_a_word_are_no_values(number):
+    words = '["' + '\\\\ \\" '.join([number] * 20) + '"]'
+
+    assert has_at_most(words.encode(), 3)
+    assert not has_at_most(f'["",{number}]'.encode(), 4)
+
+
+@pytest.mark.parametrize("gap", [1, 32_740, 65_500])
+def test_a_long_number_is_counted_wherever_it_stands(gap):
+    for near in range(25):
+        text = b"[" + b" " * (gap + near) + b"1234567890123456789012,1]"
+
+        assert has_at_most(text, 4 + 11)
+        assert not has_at_most(text, 4 + 10)
 
 
 WIDE = Budget(

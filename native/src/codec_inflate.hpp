@@ -108,11 +108,12 @@ struct HuffmanTable {
         if (left > 0) {
             for (int i = 0; i < 1 << root; ++i) entries[i] = kInvalid << 4 | 1;
         }
-        int offsets[16] = {}, sorted[320] = {};
+        int offsets[16] = {};
+        uint16_t sorted[320] = {};
         offsets[1] = 0;
         for (int length = 1; length < 15; ++length) offsets[length + 1] = offsets[length] + count[length];
         for (int symbol = 0; symbol < symbols; ++symbol) {
-            if (lengths[symbol] != 0) sorted[offsets[lengths[symbol]]++] = symbol;
+            if (lengths[symbol] != 0) sorted[offsets[lengths[symbol]]++] = static_cast<uint16_t>(symbol);
         }
         uint32_t code = 0;  // with its first bit lowest, as it stands in the stream
         int next = 0, begin = 1 << root, second_bits = 0;
@@ -172,6 +173,10 @@ typedef HuffmanTable<8, 402> DistanceTable;
 
 // zlib with the least memory ends a block after 127 symbols; nobody has a reason to end it sooner.
 constexpr int64_t kFreeBlocks = 64, kBytesPerBlock = 100, kMaxBlocks = 2048;
+// Blocks of fewer bytes, at the mean, are not worth the larger part of their tables.
+constexpr int64_t kBytesToJoin = 2048;
+// The time that a table takes follows the symbols in it; a block of numbers has about 40.
+constexpr int64_t kMaxSymbols = 32 * kMaxBlocks;
 
 // Of each code for a length: the shortest one, and the number of extra bits.
 constexpr uint16_t kLengths[29] = {3,  4,  5,  6,  7,  8,  9,  10, 11,  13,  15,  17,  19,  23, 27,
@@ -390,10 +395,16 @@ private:
             at += times;
         }
         if (lengths[256] == 0) return RSE_PF_CODEC_NOT_ZLIB;
+        for (int symbol = 0; symbol < literals + distances; ++symbol) symbols_ += lengths[symbol] != 0;
+        if (symbols_ > kMaxSymbols) {
+            limit_ = blocks_ - 1;
+            return RSE_PF_CODEC_MANY_BLOCKS;
+        }
         codes_ = &own_;
         if (!own_.literals.fill(lengths, literals, true, literal_entry)) return RSE_PF_CODEC_NOT_ZLIB;
         if (!own_.distances.fill(lengths + literals, distances, true, distance_entry)) return RSE_PF_CODEC_NOT_ZLIB;
-        own_.literals.join_literals();
+        // Two bytes at once pay in long blocks only.
+        if (blocks_ == 1 || bytes() >= blocks_ * kBytesToJoin) own_.literals.join_literals();
         return RSE_PF_CODEC_READ;
     }
 
@@ -536,7 +547,8 @@ private:
     uint8_t* out_;
     uint8_t* stop_ = nullptr;
     int64_t room_ = 0, most_ = 0, head_most_ = 0, head_bytes_ = 0, limit_ = 0;
-    int64_t blocks_ = 0;  // those with codes of their own
+    int64_t blocks_ = 0;   // those with codes of their own
+    int64_t symbols_ = 0;  // in those codes
     bool is_head_ = true;
     uint64_t bits_ = 0;  // the next bits of the stream, the first one lowest
     int count_ = 0;      // how many of them are valid

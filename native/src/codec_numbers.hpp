@@ -8,6 +8,7 @@
 #include <emmintrin.h>
 #endif
 
+#include "codec_guards.hpp"
 #include "powers_of_ten.hpp"
 
 namespace rse_pf_codec {
@@ -18,9 +19,8 @@ struct Decimal {
     int32_t exponent;
     bool is_negative;
     bool is_integer;  // neither a point nor an exponent was written
+    bool has_exponent;
 };
-
-inline bool is_digit(uint8_t byte) { return static_cast<uint8_t>(byte - '0') < 10; }
 
 // Read the number at `at` (RFC 8259, Sect. 6) of at most 19 significant digits; return null for anything else.
 inline const uint8_t* read_decimal(const uint8_t* at, const uint8_t* end, Decimal& number) {
@@ -39,6 +39,7 @@ inline const uint8_t* read_decimal(const uint8_t* at, const uint8_t* end, Decima
         significant = static_cast<int32_t>(at - begin);
     }
     number.is_integer = true;
+    number.has_exponent = false;
     if (at < end && *at == '.') {
         number.is_integer = false;
         const uint8_t* const point = ++at;
@@ -52,6 +53,7 @@ inline const uint8_t* read_decimal(const uint8_t* at, const uint8_t* end, Decima
     }
     if (at < end && (*at == 'e' || *at == 'E')) {
         number.is_integer = false;
+        number.has_exponent = true;
         ++at;
         const bool is_small = at < end && *at == '-';
         if (at < end && (*at == '-' || *at == '+')) ++at;

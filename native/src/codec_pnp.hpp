@@ -72,6 +72,7 @@ public:
         Decimal decimal;
         const uint8_t* const next = read_decimal(at_, end_, decimal);
         if (next == nullptr || !nearest_double(decimal, value)) return false;
+        more_ += more_values(decimal, at_, next);
         at_ = next;
         return true;
     }
@@ -81,6 +82,7 @@ public:
         const uint8_t* const next = read_decimal(at_, end_, decimal);
         if (next == nullptr || !decimal.is_integer || decimal.is_negative || decimal.digits > kMaxIdentifier) return false;
         value = static_cast<int64_t>(decimal.digits);
+        more_ += more_values(decimal, at_, next);
         at_ = next;
         return true;
     }
@@ -96,7 +98,7 @@ public:
         // Only locals stay in registers.
         const uint8_t* at = at_;
         const uint8_t* const end = end_;
-        int64_t read = 0;
+        int64_t read = 0, more = 0;
         for (;; ++read) {
             if (read == room) return false;
             if (at < end && *at <= ' ') at = behind_spaces(at, end);
@@ -107,6 +109,7 @@ public:
                 next = read_decimal(at, end, decimal);
                 if (next == nullptr || !nearest_double(decimal, value)) return false;
                 if (!(value <= kMaxNumber && value >= -kMaxNumber)) return false;
+                more += more_values(decimal, at, next);
             }
             numbers[read] = value;
             at = next;
@@ -116,6 +119,7 @@ public:
         }
         at_ = at;
         commas_ += read;
+        more_ += more;
         count = read + 1;
         return take(']');
     }
@@ -123,9 +127,15 @@ public:
         skip();
         return at_ == end_;
     }
-    int64_t values() const { return commas_ + colons_ + kListValues * lists_ + kMapValues * maps_; }
+    int64_t values() const { return commas_ + colons_ + kListValues * lists_ + kMapValues * maps_ + more_; }
 
 private:
+    static int64_t more_values(const Decimal& number, const uint8_t* at, const uint8_t* next) {
+        constexpr uint64_t kMiddle = 1000000000000000u, kLong = 1000000000000000000u;
+        const bool may_be_middle = number.digits >= kMiddle && number.exponent >= kMiddlePower;
+        const bool may_count = number.digits >= kLong || number.has_exponent || next - at >= kWideDigits;
+        return may_count || may_be_middle ? more_values_between(at, next, kFarValues) : 0;
+    }
     static const uint8_t* behind_spaces(const uint8_t* at, const uint8_t* end) {
         while (at < end && (*at == ' ' || *at == '\n' || *at == '\r' || *at == '\t')) ++at;
         return at;
@@ -155,7 +165,7 @@ private:
 
     const uint8_t* at_;
     const uint8_t* const end_;
-    int64_t commas_ = 0, colons_ = 0, lists_ = 0, maps_ = 0;
+    int64_t commas_ = 0, colons_ = 0, lists_ = 0, maps_ = 0, more_ = 0;
 };
 
 class MsgpackReader {

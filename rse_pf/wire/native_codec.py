@@ -28,7 +28,7 @@ _ABI = 3
 _NAMES = "rse_pf_codec_check", "rse_pf_codec_read", "rse_pf_codec_deflate"
 _READ, _NOT_MINE, _NEEDS_ROOM, _UNKNOWN = 0, 1, 11, 12
 _ENCODINGS = {"json": 0, "zlib": 1, "bin": 2}
-_TEXT_ROOM, _NUMBERS_ROOM = 1 << 17, 1 << 16
+_TEXT_ROOM, _NUMBERS_ROOM = 1 << 20, 1 << 16
 _HOLDS_LOCK_BYTES = 16384
 """Shorter messages are read without giving the interpreter lock away, which others might keep for longer."""
 

@@ -8,6 +8,7 @@ import random
 import struct
 import zlib
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +36,8 @@ NATIVE = native_codec()
 pytestmark = pytest.mark.skipif(NATIVE is None, reason="the native core is not built: make -C native")
 
 BUDGET = Budget.of_messages(SessionSettings())
+# Long numbers count as several values.
+MANY_VALUES = replace(BUDGET, values=10**7)
 TYPES = PnpTypes(PnpRequest, Camera, PnpOptions, PnpReply)
 ORDER_OF_LENGTHS = (16, 17, 18, 0, 8, 7, 9, 6, 10, 5, 11, 4, 12, 3, 13, 2, 14, 1, 15)
 CAMERA = '{"fx":525.5,"fy":525,"cx":319.5,"cy":239.5,"width":640,"height":480}'
@@ -127,7 +130,7 @@ def test_random_decimals_are_the_nearest_doubles() -> None:
     for begin in range(0, len(texts), 8000):
         some = texts[begin : begin + 8000]
 
-        command = NativeReader(NATIVE, "json", BUDGET, TYPES).read(command_of(",".join(some)))
+        command = NativeReader(NATIVE, "json", MANY_VALUES, TYPES).read(command_of(",".join(some)))
 
         assert isinstance(command, Command)
         assert command.payload.points_world.tobytes() == np.array([float(text) for text in some]).tobytes()
@@ -209,7 +212,20 @@ def mutated(data: bytes, draw: random.Random) -> bytes:
                 parts[at:at] = parts[at : at + draw.choice((1, 4, 32))]
             case 3:
                 parts[at : at + 1] = draw.choice(
-                    (b"[", b"]", b"{", b'"', b"\\", b",", b"-", b"e", b"0", b"\xc7")
+                    (
+                        b"[",
+                        b"]",
+                        b"{",
+                        b'"',
+                        b"\\",
+                        b",",
+                        b"-",
+                        b"e",
+                        b"0",
+                        b"\xc7",
+                        b"e300",
+                        b"." + b"7" * 19,
+                    )
                 )
             case _:
                 begin = draw.randrange(len(parts) + 1)
@@ -293,6 +309,8 @@ def corpus() -> Iterator[bytes]:
         b"\x90" * 9000,
     )
     yield b"\xdc\x1b\x58" + b"\x90" * 7000
+    yield from (b"5e-324,1E300," * 90, b'["' + b"1e23 " * 4000 + b'",1e23,9007199254740993.0]', b"1" * 70_000)
+    yield from (b"[" + b"-0.00012345678901234567e-05," * 900, b"1e+0023,1e-00000000300,1.5e20e300," * 90)
     # Marks in a string, behind an escaped quote and behind an escaped backslash.
     yield from (b'["\\"' + b"[" * 8000 + b'"]', b'["\\"' + b"," * 40_000 + b'"]', b'["\\\\"' + b"," * 40_000)
 
