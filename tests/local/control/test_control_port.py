@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import asyncio
 import json
+from collections.abc import AsyncIterator, Mapping
 
 import pytest
 
+from rse_pf.errors import UsageError
 from rse_pf.local.control.control_port import serve_control_port
 
 SOON_S = 10.0
@@ -19,7 +21,12 @@ def answer(request: bytes) -> bytes:
         async def page() -> tuple[str, bytes]:
             return "application/json", b'{"platform": "a"}'
 
-        server = await serve_control_port({"/status": page}, {}, TOKEN)
+        def drain(query: Mapping[str, str]) -> AsyncIterator[Mapping[str, object]]:
+            if query["server"] != "server-1":
+                raise UsageError(f"no server named {query['server']!r} is running")
+            return steps()
+
+        server = await serve_control_port({"/status": page}, {"/drain": drain}, TOKEN)
         reader, writer = await asyncio.open_connection(*server.sockets[0].getsockname())
         try:
             writer.write(request)
@@ -59,3 +66,31 @@ def test_everything_else_is_refused(request_: bytes, status: bytes) -> None:
 @pytest.mark.parametrize("broken", [b"", b"nonsense\r\n\r\n", b"GET /status"])
 def test_a_broken_question_ends_its_own_connection(broken: bytes) -> None:
     assert answer(broken) == b""
+
+
+async def steps() -> AsyncIterator[dict[str, object]]:
+    yield {"event": "drain-start", "server": "server-1"}
+    yield {"event": "operation-over"}
+
+
+def test_an_operation_is_answered_with_a_line_for_each_event() -> None:
+    head, _, body = answer(b"POST /drain?server=server-1 HTTP/1.1\r\n%s\r\n" % CARRIED).partition(b"\r\n\r\n")
+
+    assert head.startswith(b"HTTP/1.1 200 OK\r\n")
+    events = [json.loads(line)["event"] for line in body.splitlines()]
+    assert events == ["drain-start", "operation-over"]
+
+
+def test_a_refused_operation_says_why() -> None:
+    told = answer(b"POST /drain?server=server-9 HTTP/1.1\r\n%s\r\n" % CARRIED)
+
+    assert told.startswith(b"HTTP/1.1 409 Conflict\r\n")
+    assert json.loads(told.partition(b"\r\n\r\n")[2])["message"] == "no server named 'server-9' is running"
+
+
+@pytest.mark.parametrize("header", [b"", b"Origin: https://example.org\r\n%s" % CARRIED])
+def test_an_operation_without_the_token_or_from_a_web_page_does_nothing(header: bytes) -> None:
+    told = answer(b"POST /drain?server=server-1 HTTP/1.1\r\n%s\r\n" % header)
+
+    assert told.split(b" ")[1] in (b"401", b"403")
+    assert b"drain-start" not in told
