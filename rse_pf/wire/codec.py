@@ -198,8 +198,11 @@ class _JsonCodec:
         check_size(data, self._budget)
         if self._reader is not None:
             found = self._reader.read(data)
+            if isinstance(found, Command):
+                return found
             if found is not None and not isinstance(found, str):
-                return self._judged(found)
+                message: FromRobot = _guarded(self._from_robot, found)
+                return message
         return self._read(self._open(data))
 
     def decode_short_from_robot(self, data: bytes, max_bytes: int) -> FromRobot | None:
@@ -211,12 +214,13 @@ class _JsonCodec:
                 reader = NativeReader(self._native, self.name, self._budget, self._pnp, short_bytes=max_bytes)
                 self._short_readers[max_bytes] = reader
             found = reader.read(data)
-            if type(found) is Command:
+            if isinstance(found, Command):
                 return found
             if isinstance(found, str):
                 return None
             if found is not None:
-                return self._judged(found)
+                message: FromRobot = _guarded(self._from_robot, found)
+                return message
         text = inflate_short(data, max_bytes)
         return None if text is None or len(text) > max_bytes else self._read(text)
 
@@ -224,13 +228,6 @@ class _JsonCodec:
         text = self._open(data)
         check_json_containers(text, self._budget)
         message: FromServer = _guarded(self._from_server, text)
-        return message
-
-    def _judged(self, found: Command | bytes | memoryview) -> FromRobot:
-        """Return a message that the native core has read or judged."""
-        if isinstance(found, Command):
-            return found
-        message: FromRobot = _guarded(self._from_robot, found)
         return message
 
     def _is_pose(self, message: Message) -> bool:
@@ -267,7 +264,8 @@ class _BinaryCodec:
             raise _unencodable(message, error) from error
 
     def decode_from_robot(self, data: bytes) -> FromRobot:
-        check_size(data, self._budget)
+        if len(data) > self._budget.wire_bytes:
+            check_size(data, self._budget)
         is_checked = False
         if self._reader is not None and len(data) >= _SHORTEST_POSE_BYTES:
             found = self._reader.read(data)

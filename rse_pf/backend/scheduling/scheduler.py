@@ -65,8 +65,9 @@ QUEUE_TARGET_S, QUEUE_INTERVAL_S = 0.05, 0.1
 Source:
     CoDel, Nichols and Jacobson 2012.
 """
-_SHORT_COMPUTE_S = 0.001
-"""Passing a command to a thread takes 0.1 ms of CPU, and up to 5 ms until the thread has the lock."""
+_SHORT_COMPUTE_S, _SHORT_SHARE = 0.001, 0.8
+"""Passing a command to a thread takes 0.1 ms of CPU, and up to 5 ms until the thread has the lock.  A share and
+not an average decides, because a process that others interrupt is no slow service."""
 INLINE_BYTES = 16_384
 """A command up to this size is computed in the event loop when nothing waits."""
 
@@ -115,6 +116,7 @@ class Scheduler:
         self._judged_s = 0.0
         self._started = self._refused = 0
         self._service_s = 0.0
+        self._short_share = 0.0
         self._last_start = -math.inf
 
     @property
@@ -210,16 +212,20 @@ class Scheduler:
     def start_alone(self, queued: QueuedCommand, now: float) -> bool:
         """Start *queued*, which was admitted, without a place in the queue; False if others wait or run.
 
-        The same as `submit` and `start` for a command that finds the server idle; `done_alone` ends it.
+        Decides and counts as `submit` and `start` do for a command that finds the server idle; `done_alone`
+        ends it.
         """
         if self._robots or queued.deadline_s <= now:
             return False
         waited_s = now - queued.received_s
-        self._note_turn_wait(waited_s, now)
+        if self.is_behind or waited_s > _IMMEDIATE_S:
+            self._note_turn_wait(waited_s, now)
+            self._measure_turn(waited_s, now)
+        else:  # the same, for a command that did not wait
+            self._late_since, self._last_start = None, now
         queued.started_s = now
         self.running += 1
         self._started += 1
-        self._measure_turn(waited_s, now)
         return True
 
     def done_alone(self, queued: QueuedCommand, now: float) -> None:
@@ -279,7 +285,7 @@ class Scheduler:
         with but refusals, which cost less than passing the command to the thread.  So it is with services
         that answer sooner than two threads pass the interpreter lock to each other.
         """
-        is_short = 0.0 < self._service_s <= _SHORT_COMPUTE_S
+        is_short = self._short_share >= _SHORT_SHARE
         saves_time = self.waiting == 0 or is_short or (self.is_behind and self._is_serial)
         return cheap and size_bytes <= INLINE_BYTES and saves_time and self.running <= 1
 
@@ -333,6 +339,7 @@ class Scheduler:
             self._judged_s, self._started, self._refused = now, 0, 0
 
     def _note_service(self, spent_s: float) -> None:
+        self._short_share += _SMOOTHING * ((spent_s <= _SHORT_COMPUTE_S) - self._short_share)
         self._service_s = _averaged(self._service_s, spent_s) if self._service_s else spent_s
 
     def _measure_turn(self, waited_s: float, now: float) -> None:

@@ -1,0 +1,87 @@
+"""What an idle server does without its queue is what its queue would do."""
+
+from __future__ import annotations
+
+import random
+from typing import Any
+
+import pytest
+from backend.scheduling.admitted import queued
+
+from rse_pf.backend.scheduling.scheduler import Scheduler
+from rse_pf.config import ServingSettings
+
+SETTINGS = ServingSettings()
+
+
+def state(scheduler: Scheduler) -> dict[str, Any]:
+    return dict(vars(scheduler))
+
+
+def compute(scheduler: Scheduler, wait_s: float, spent_s: float, now: float, *, alone: bool) -> None:
+    """Let one command arrive *wait_s* before *now*, start at *now* and take *spent_s*."""
+    work = queued("a", at=now - wait_s)
+    if alone:
+        assert scheduler.start_alone(work, now)
+        scheduler.done_alone(work, now + spent_s)
+    else:
+        scheduler.submit(work)
+        started, refusals = scheduler.start(now)
+        assert (started, refusals) == (work, [])
+        scheduler.done(work, now + spent_s)
+    assert work.started_s == now
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_a_command_that_starts_alone_leaves_the_scheduler_as_the_queue_would(seed: int) -> None:
+    chance = random.Random(seed)
+    alone, by_queue = Scheduler(SETTINGS), Scheduler(SETTINGS)
+    now, was_behind = 100.0, 0
+    for _ in range(300):
+        now += chance.choice((0.0001, 0.002, 0.08, 0.3))
+        wait_s = chance.choice((0.0, 0.0001, 0.0004, 0.0006, 0.04, 0.2, 0.3))
+        spent_s = chance.choice((0.00001, 0.0009, 0.0011, 0.02, 0.5))
+        compute(alone, wait_s, spent_s, now, alone=True)
+        compute(by_queue, wait_s, spent_s, now, alone=False)
+
+        assert state(alone) == state(by_queue)
+        was_behind += alone.is_behind
+    assert 0 < was_behind < 300
+
+
+def test_nothing_starts_alone_while_another_command_waits_or_runs_or_when_it_is_too_late() -> None:
+    scheduler, first, second = Scheduler(SETTINGS), queued("a"), queued("b")
+    assert not scheduler.start_alone(queued("a", within=1.0), 1.0), "its deadline has passed"
+
+    scheduler.submit(first)
+    assert not scheduler.start_alone(second, 0.0), "the other one waits"
+    scheduler.start(0.0)
+    assert not scheduler.start_alone(second, 0.0), "the other one runs"
+
+    scheduler.done(first, 0.1)
+    assert scheduler.start_alone(second, 0.1)
+
+
+def test_services_that_answer_within_a_millisecond_stay_in_the_loop_although_others_wait() -> None:
+    scheduler = Scheduler(SETTINGS)
+
+    def runs_inline_when_another_waits() -> bool:
+        scheduler.submit(queued("a"))
+        scheduler.submit(queued("b"))
+        started, _ = scheduler.start(0.0)
+        assert started is not None
+        inline = scheduler.runs_inline(cheap=True, size_bytes=1)
+        scheduler.leave("a")
+        scheduler.leave("b")
+        scheduler.done(started, 0.0005)
+        return inline
+
+    assert not runs_inline_when_another_waits(), "nothing is known of the services yet"
+    for _ in range(30):
+        compute(scheduler, 0.0, 0.0005, 0.0, alone=True)
+    assert runs_inline_when_another_waits()
+    compute(scheduler, 0.0, 0.2, 0.0, alone=True)
+    assert runs_inline_when_another_waits(), "the process was interrupted once"
+    for _ in range(10):
+        compute(scheduler, 0.0, 0.002, 0.0, alone=True)
+    assert not runs_inline_when_another_waits()
