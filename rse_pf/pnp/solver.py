@@ -97,7 +97,8 @@ def solve_pnp(
     points_world, pixels = _checked(points_world, pixels)
     engine = options.engine or default_engine or usable_engine("native")
     if engine == "native":
-        return _solved_natively(points_world, pixels, camera, options, weak)
+        return _solved_natively(points_world, pixels, camera, options, weak)  # which checks the numbers
+    _check_numbers(points_world, pixels)
     propose = engine_for(engine)
     n = len(pixels)
     T_camera_world = _proposed(propose, points_world, pixels, camera, options)
@@ -167,6 +168,10 @@ def _checked(points_world: Array, pixels: Array) -> tuple[Array, Array]:
             f"got {len(points)} correspondences, a pose needs at least 4",
             hint="loosen the matcher, or skip this frame",
         )
+    return points, pixels
+
+
+def _check_numbers(points: Array, pixels: Array) -> None:
     # vdot of a row of numbers with itself is their sum of squares; it overflows without a warning.
     if not (np.vdot(points, points) < _MAX_ABS**2 and np.vdot(pixels, pixels) < _MAX_ABS**2):
         for name, rows in (("points_world", points), ("pixels", pixels)):
@@ -175,7 +180,6 @@ def _checked(points_world: Array, pixels: Array) -> tuple[Array, Array]:
                     f"{name} holds a number that is not finite or is beyond {_MAX_ABS:g}",
                     hint="leave such rows out",
                 )
-    return points, pixels
 
 
 def _proposed(
