@@ -281,7 +281,7 @@ def find_library() -> Path | None:
 def address_of(array: npt.NDArray[Any]) -> int:
     """Return where the first number of *array* lies in memory."""
     try:
-        return ctypes.addressof(ctypes.c_char.from_buffer(array))
+        return ctypes.addressof(ctypes.c_char.from_buffer(array))  # type: ignore[arg-type]
     except (TypeError, ValueError):  # read-only, with gaps or empty: numpy tells it, in ten times the time
         address: int = array.__array_interface__["data"][0]
         return address
