@@ -69,13 +69,15 @@ from rse_pf.service import Registry
 from rse_pf.services.custom.installed import InstalledService, installed_services, published_services
 from rse_pf.services.loading import load_services
 
-__all__ = ["HANDOVER", "WorkerPlan", "event_loop_maker", "run_in_loop", "run_worker"]
+__all__ = ["HANDOVER", "WorkerPlan", "event_loop_maker", "repeat_for", "run_in_loop", "run_worker"]
 
 HANDOVER = struct.Struct("!Q46s")
 """A socket's number and the address of its peer, which travel with its descriptor."""
 _DESCRIPTOR = struct.Struct("@i")
 _ANCILLARY_BYTES = socket.CMSG_SPACE(_DESCRIPTOR.size)
 _T = TypeVar("_T")
+_TAKE_S = 0.0005
+"""New sockets are taken for so long in one round of the event loop; then it serves robots before the next."""
 _POLL_S = 0.01
 _GATHER_S = 0.01
 """Each message to the supervisor wakes it, which costs more than what it says."""
@@ -112,6 +114,13 @@ def event_loop_maker() -> Callable[[], asyncio.AbstractEventLoop]:
         raise MissingExtra("uvloop", "backend") from error
     make: Callable[[], asyncio.AbstractEventLoop] = uvloop.new_event_loop
     return make
+
+
+def repeat_for(seconds: float, step: Callable[[], bool], clock: Callable[[], float]) -> None:
+    """Call *step* once, and again until it returns False or *seconds* have passed."""
+    until = clock() + seconds
+    while step() and clock() < until:
+        pass
 
 
 def run_in_loop(main: Coroutine[Any, Any, _T]) -> _T:
@@ -333,18 +342,22 @@ class _Worker:
             await asyncio.sleep(_POLL_S)
 
     def _take_sockets(self) -> None:
-        while True:
-            try:
-                message, ancillary, _, _ = self._data.recvmsg(HANDOVER.size, _ANCILLARY_BYTES)
-            except BlockingIOError:
-                return
-            if not message:
-                self._loop.remove_reader(self._data.fileno())
-                return
-            number, peer = HANDOVER.unpack(message)
-            for _, _, packed in ancillary:
-                (fd,) = _DESCRIPTOR.unpack(packed)
-                self._sockets.take(fd, self._count_end, number, peer.rstrip(b"\0").decode())
+        repeat_for(_TAKE_S, self._take_socket, time.monotonic)
+
+    def _take_socket(self) -> bool:
+        """Take one socket from the supervisor; return whether there may be more."""
+        try:
+            message, ancillary, _, _ = self._data.recvmsg(HANDOVER.size, _ANCILLARY_BYTES)
+        except BlockingIOError:
+            return False
+        if not message:
+            self._loop.remove_reader(self._data.fileno())
+            return False
+        number, peer = HANDOVER.unpack(message)
+        for _, _, packed in ancillary:
+            (fd,) = _DESCRIPTOR.unpack(packed)
+            self._sockets.take(fd, self._count_end, number, peer.rstrip(b"\0").decode())
+        return True
 
     def _count_end(self) -> None:
         self._ended += 1
