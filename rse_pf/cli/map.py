@@ -5,6 +5,7 @@ VERSION is head, or six or more digits of an id; show --all lists the ids.  roll
 earlier version and deletes nothing.  Each action has its own help page: rse-pf map merge --help.
 
 examples:
+  rse-pf map from-camera 0 --intrinsics intrinsics.json --out out-camera
   rse-pf map list --store dir:objects
   rse-pf map show kitchen --store dir:objects --png kitchen.png
   rse-pf map merge robot-1 robot-2 robot-3 --into kitchen --store dir:objects
@@ -32,6 +33,7 @@ import numpy as np
 
 from rse_pf.audit.operator import record_map_change
 from rse_pf.aws.storage import open_data_store
+from rse_pf.cli.map_from_camera import add_from_camera_arguments, run_from_camera
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import CommandFailed, NotFound, UsageError
 from rse_pf.files import replace_file
@@ -110,6 +112,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     made["export"].add_argument("--format", choices=tuple(FORMATS), required=True, help="the format")
     made["export"].add_argument("--out", type=Path, required=True, metavar="FILE", help="the file to write")
     made["export"].add_argument("--robot", help="tum: only the keyframes of this robot")
+    add_from_camera_arguments(
+        actions.add_parser(
+            "from-camera", help="make a map from a camera, a video or images",
+            description="Make a map from a camera, a video or images, through a platform.",
+            epilog="example:\n  rse-pf map from-camera 0 --intrinsics intrinsics.json --scale marker:100",
+            formatter_class=argparse.RawDescriptionHelpFormatter,
+        )
+    )  # fmt: skip
     merge, localise = made["merge"], made["localise"]
     merge.add_argument(
         "names",
@@ -135,6 +145,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
     """Do one action and return the exit code."""
+    if args.action == "from-camera":
+        return run_from_camera(args, settings)
     chosen = settings if args.store is None else settings.replace(data={"store": args.store})
     if chosen.data.store == "memory:":
         raise UsageError("a store in memory belongs to another process", hint="name --store dir:PATH")

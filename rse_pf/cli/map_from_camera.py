@@ -1,0 +1,221 @@
+"""Make a map from a camera: ``rse-pf map from-camera``.
+
+Starts a platform on this machine unless it is told of another one, tracks the camera until it ends or Ctrl-C
+is pressed, and writes map, trajectory, report and picture.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import contextlib
+import signal
+import sys
+from collections.abc import AsyncIterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+from urllib.parse import urlsplit
+
+from rse_pf.config import PlatformSettings
+from rse_pf.errors import CommandFailed, UsageError
+from rse_pf.terminal import show, show_progress
+
+if TYPE_CHECKING:
+    from client_sdk import MarkerScale, OdometryScale, Robot, TrackedFrame
+    from client_sdk.cameras import FrameSource
+    from client_sdk.mapper import Mapper
+
+__all__ = ["add_from_camera_arguments", "run_from_camera"]
+
+_ROBOT = "camera"
+_EVERY_S = 2.0
+_MOST = 0.5
+"""Share of frames without a pose above which the command has failed."""
+
+
+def add_from_camera_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options of ``map from-camera``."""
+    add = parser.add_argument
+    add(
+        "source",
+        metavar="SOURCE",
+        help="a device number (0), a video, a folder of images, a recording, or realsense",
+    )
+    add("--intrinsics", type=Path, metavar="FILE", help="of the camera: see rse-pf camera calibrate")
+    add(
+        "--scale",
+        metavar="SOURCE",
+        help="without depth: marker:MM (edge of an ArUco 4x4_50 marker) or odometry:FILE (TUM format)",
+    )
+    add("--no-depth", action="store_true", help="use the colours only")
+    add("--rate", type=float, metavar="HZ", help="leave out frames beyond this rate")
+    add("--frames", type=int, metavar="N", help="stop after so many frames")
+    add("--out", type=Path, default=Path("out-camera"), metavar="DIR", help="results (default: out-camera)")
+    add("--url", help="use the platform at this address, with --token-file")
+    add("--token-file", type=Path, metavar="FILE", help="with --url: file that holds the robot's token")
+    add("--enrolment", type=Path, metavar="FILE", help="use the platform of rse-pf robot enrol --out FILE")
+
+
+def run_from_camera(args: argparse.Namespace, settings: PlatformSettings) -> int:
+    """Track the camera and write the results; the exit code is 1 if most frames have no pose."""
+    _check(args)
+    scale = _scale(args.scale)
+    from client_sdk.cameras import open_camera
+
+    with open_camera(
+        args.source, intrinsics=args.intrinsics, rate_hz=args.rate, depth=not args.no_depth
+    ) as source:
+        if scale is not None and source.has_depth:
+            raise UsageError(
+                f"{args.source} has depth, so that its scale is known",
+                hint="leave out --scale, or add --no-depth",
+            )
+        from rse_pf.experiments.plots.map_image import RobotPath, draw_map
+
+        _make_folder(args.out)
+        mapper = asyncio.run(_drive(args, settings, source, scale))
+    report = mapper.save(args.out)
+    points, colours = mapper.map.points()
+    path = mapper.trajectory
+    unit = "m" if report["unit"] == "m" else "units"
+    if len(path) and len(points):
+        caption = f"{args.source}: {report['frames']} frames, {report['map_points']:,} points, {mapper.scale}"
+        drawn = RobotPath(name=_ROBOT, T_world_camera=path.T_world_camera)
+        draw_map(args.out / "map.png", points, colours, [drawn], caption)
+    posed = len(path)
+    trip = report["round_trip_ms"]["p50"]
+    show(
+        f"{report['frames']} frames, {report['lost_frames']} lost, {report['keyframes']} keyframes, "
+        f"{report['map_points']} points; path {report['path']:.2f} {unit}; scale: {mapper.scale}"
+        + ("" if trip is None else f"; round trip p50 {trip} ms"),
+        *(["lost because: " + next(iter(report["lost_because"]))] if report["lost_because"] else []),
+        f"results: {args.out}/map.ply, map.png, trajectory.txt, report.json",
+    )
+    if posed <= (1 - _MOST) * report["frames"]:
+        raise CommandFailed(
+            f"{report['frames'] - posed} of {report['frames']} frames have no pose", hint=_advice(mapper)
+        )
+    return 0
+
+
+def _check(args: argparse.Namespace) -> None:
+    if args.frames is not None and args.frames < 2:
+        raise UsageError(f"--frames {args.frames} is below 2", hint="leave it out to use all frames")
+    if args.enrolment is not None and (args.url is not None or args.token_file is not None):
+        raise UsageError("--enrolment names address and key", hint="leave out --url and --token-file")
+    if (args.url is None) != (args.token_file is None):
+        raise UsageError("--url and --token-file need each other", hint="get a token: rse-pf token")
+    if args.url is not None and urlsplit(args.url).scheme not in ("ws", "wss"):
+        raise UsageError(f"{args.url!r} is not a WebSocket address", hint="write ws://HOST:PORT/ws")
+
+
+def _scale(word: str | None) -> OdometryScale | MarkerScale | None:
+    """Return the source of metres that ``marker:MM`` or ``odometry:FILE`` names."""
+    from client_sdk import MarkerScale, OdometryScale
+    from client_sdk.mapping import read_trajectory
+
+    if word is None:
+        return None
+    kind, _, value = word.partition(":")
+    if kind == "odometry" and value:
+        path = read_trajectory(Path(value))
+        if len(path) < 2:
+            raise UsageError(f"{value} holds {len(path)} poses", hint="odometry needs a metre of them")
+        return OdometryScale(path.timestamps_s, path.positions)
+    with contextlib.suppress(ValueError):
+        if kind == "marker":
+            return MarkerScale(float(value) / 1e3)
+    raise UsageError(f"--scale {word} is unknown", hint="write marker:100 (mm) or odometry:FILE")
+
+
+def _make_folder(folder: Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UsageError(f"cannot make {folder}: {error.strerror}", hint="name another --out") from error
+
+
+async def _drive(
+    args: argparse.Namespace, settings: PlatformSettings, source: FrameSource, scale: Any
+) -> Mapper:
+    """Track all frames; Ctrl-C ends the drive, and what was mapped is kept."""
+    stop = asyncio.Event()
+    with contextlib.suppress(NotImplementedError, ValueError, RuntimeError):  # not in the main thread
+        asyncio.get_running_loop().add_signal_handler(signal.SIGINT, stop.set)
+    async with _robot(args, settings) as robot:
+        mapper = robot.mapper(scale=scale, depth=source.has_depth)
+        status = _Status()
+        while not stop.is_set() and (args.frames is None or mapper.frames < args.frames):
+            frame = await asyncio.to_thread(next, source, None)
+            if frame is None:
+                break
+            status.show(mapper, await mapper.track(frame))
+        status.end()
+    if not mapper.frames:
+        raise UsageError(f"{args.source} gives no frame", hint="look at it: rse-pf camera check")
+    return mapper
+
+
+@contextlib.asynccontextmanager
+async def _robot(args: argparse.Namespace, settings: PlatformSettings) -> AsyncIterator[Robot]:
+    """Connect to the named platform, or to one that is started for the drive."""
+    from client_sdk import connect
+
+    if args.enrolment is not None:
+        async with connect(enrolment=args.enrolment, settings=settings.session) as robot:
+            yield robot
+    elif args.url is not None:
+        try:
+            token = args.token_file.read_text(encoding="ascii").strip()
+        except (OSError, UnicodeDecodeError) as error:
+            raise UsageError(f"cannot read the token in {args.token_file}", hint="rse-pf token") from error
+        async with connect(args.url, token=token, settings=settings.session) as robot:
+            yield robot
+    else:
+        from rse_pf.experiments.results.result_folder import remove_keys
+        from rse_pf.local.control.platform import LocalPlatform
+
+        folder = args.out / "platform"
+        show("starting the platform: Envoy and backend servers")
+        try:
+            async with LocalPlatform(settings, port=0, state=folder, name="from-camera") as platform:
+
+                async def fresh() -> str:
+                    return platform.issue_token(_ROBOT)
+
+                async with connect(platform.url, token=fresh, settings=settings.session) as robot:
+                    yield robot
+        finally:
+            remove_keys(folder)
+
+
+class _Status:
+    """The line of a drive: rewritten on a terminal, written at times elsewhere."""
+
+    def __init__(self) -> None:
+        self._shown_s = -_EVERY_S
+        self._last = ""
+
+    def show(self, mapper: Mapper, done: TrackedFrame) -> None:
+        """Say how the last frame went."""
+        trip = "" if done.round_trip_ms is None else f", {done.round_trip_ms:.1f} ms ({done.source})"
+        how = f"{done.inliers} inliers{trip}" if done.T_world_camera is not None else done.reason
+        scale = "" if done.scale == "metric" else ", up to scale"
+        self._last = (
+            f"frame {mapper.frames}: {done.status}{scale}, {how}; {mapper.keyframes} keyframes, "
+            f"{mapper.lost_frames} lost"
+        )
+        show_progress(self._last, is_over=False)
+        if not sys.stderr.isatty() and done.frame.timestamp_s - self._shown_s >= _EVERY_S:
+            self._shown_s = done.frame.timestamp_s
+            show(self._last)
+
+    def end(self) -> None:
+        """End the line."""
+        show_progress(self._last, is_over=True)
+
+
+def _advice(mapper: Mapper) -> str:
+    if mapper.keyframes == 0:
+        return "without depth the camera must move sideways, over things with texture; or use a depth camera"
+    return "move more slowly, with more light, and check the intrinsics; see report.json for the reasons"

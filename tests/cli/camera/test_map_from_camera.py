@@ -1,0 +1,165 @@
+"""The verb map from-camera: a video becomes a map, and wrong calls get one line."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+from collections.abc import AsyncIterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import client_sdk
+from client_sdk.answers import PoseAnswer
+from client_sdk.cameras.intrinsics import Intrinsics, write_intrinsics
+from client_sdk.mapper import Mapper, ask_robot
+from client_sdk.mapping import Trajectory, read_ply, read_trajectory, write_trajectory
+from rse_pf.cli.main import main
+from rse_pf.pnp import refine_with_depth, solve_pnp
+from tests.client_sdk.mapper.flat_world import CAMERA, STEP_M, frame_at
+
+cv2 = pytest.importorskip("cv2", reason="pip install 'rse-pf[vision]'")
+
+
+class SolvingRobot:
+    """A connected robot whose platform answers in this process."""
+
+    async def solve_pnp(
+        self, points_world: Any, pixels: Any, camera: Any, options: Any, **more: Any
+    ) -> PoseAnswer:
+        solution = solve_pnp(points_world, pixels, camera, options)
+        if more["depths_m"] is not None:
+            solution = refine_with_depth(solution, points_world, pixels, more["depths_m"], camera)
+        return PoseAnswer(
+            solution=solution, source="cloud", server="s", round_trip_ms=2.0, queue_ms=0.0, compute_ms=1.0
+        )
+
+    def mapper(self, **options: Any) -> Mapper:
+        return Mapper(ask=ask_robot(self), **options)
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The working folder, with a video, intrinsics, a token, and a platform that answers at ws://p/ws."""
+
+    @contextlib.asynccontextmanager
+    async def connect(url: str, **options: Any) -> AsyncIterator[SolvingRobot]:
+        assert (url, options["token"]) == ("ws://p/ws", "secret")
+        yield SolvingRobot()
+
+    monkeypatch.setattr(client_sdk, "connect", connect, raising=False)
+    monkeypatch.chdir(tmp_path)
+    writer = cv2.VideoWriter("v.avi", cv2.VideoWriter_fourcc(*"FFV1"), 10.0, (320, 240))
+    for row in range(9):
+        writer.write(np.ascontiguousarray(frame_at(row, depth=False).rgb[:, :, ::-1]))
+    writer.release()
+    write_intrinsics("i.json", Intrinsics(camera=CAMERA))
+    Path("token").write_text("secret\n")
+    return tmp_path
+
+
+PLATFORM = ("--url", "ws://p/ws", "--token-file", "token")
+
+
+def test_a_video_becomes_a_map_in_metres_by_odometry(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    poses = np.tile(np.eye(4), (60, 1, 1))
+    poses[:, 0, 3] = 5 * STEP_M * np.arange(60)  # one metre is seven of the frames
+    write_trajectory(Path("odometry.txt"), Trajectory(np.arange(60) / 10, poses))
+
+    code = main(
+        [
+            "map",
+            "from-camera",
+            "v.avi",
+            "--intrinsics",
+            "i.json",
+            "--scale",
+            "odometry:odometry.txt",
+            *PLATFORM,
+        ]
+    )
+
+    report = json.loads(Path("out-camera/report.json").read_text())
+    out = capsys.readouterr().out
+    assert code == 0, out
+    assert report["scale"] == "metric, by the first 1 m of odometry"
+    assert read_trajectory(Path("out-camera/trajectory.txt")).length_m == pytest.approx(
+        8 * 5 * STEP_M, rel=0.05
+    )
+    assert len(read_ply(Path("out-camera/map.ply"))[0]) > 300
+    assert Path("out-camera/map.png").stat().st_size > 1000
+    assert "9 frames, 0 lost" in out
+
+
+def test_without_a_scale_the_command_says_so(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    code = main(["map", "from-camera", "v.avi", "--intrinsics", "i.json", "--frames", "7", *PLATFORM])
+
+    out = capsys.readouterr().out
+    assert code == 0
+    assert "units; scale: up to scale" in out
+    assert json.loads(Path("out-camera/report.json").read_text())["scale"] == "up to scale"
+
+
+def test_a_camera_that_does_not_move_is_no_map(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    writer = cv2.VideoWriter("still.avi", cv2.VideoWriter_fourcc(*"FFV1"), 10.0, (320, 240))
+    for _ in range(3):
+        writer.write(frame_at(0, depth=False).rgb)
+    writer.release()
+
+    code = main(["map", "from-camera", "still.avi", "--intrinsics", "i.json", *PLATFORM])
+
+    error = capsys.readouterr().err
+    assert code == 1
+    assert "3 of 3 frames have no pose" in error
+    assert "must move sideways" in error
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (["v.avi"], "the intrinsics of v.avi are not known"),
+        (["none.avi", "--intrinsics", "i.json"], "there is no video none.avi"),
+        (["v.avi", "--intrinsics", "none.json"], "there is no none.json"),
+        (["v.avi", "--intrinsics", "i.json", "--scale", "marker:big"], "--scale marker:big is unknown"),
+        (["v.avi", "--intrinsics", "i.json", "--scale", "marker:99999"], "not within 5..5000 mm"),
+        (["v.avi", "--intrinsics", "i.json", "--scale", "odometry:none.txt"], "cannot read none.txt"),
+        (["v.avi", "--intrinsics", "i.json", "--rate", "0"], "rate 0 is not above 0"),
+        (["v.avi", "--intrinsics", "i.json", "--frames", "1"], "--frames 1 is below 2"),
+        (["v.avi", "--intrinsics", "i.json", "--url", "ws://p/ws"], "need each other"),
+        (["v.avi", "--url", "p", "--token-file", "token"], "is not a WebSocket address"),
+        (["v.avi", "--enrolment", "e", *PLATFORM], "--enrolment names address and key"),
+        (["v.avi", "--intrinsics", "i.json", "--out", "v.avi", *PLATFORM], "cannot make v.avi"),
+        (
+            ["v.avi", "--intrinsics", "i.json", "--url", "ws://p/ws", "--token-file", "no"],
+            "cannot read the token in no",
+        ),
+    ],
+)
+def test_a_wrong_call_gets_one_line_and_a_hint(
+    words: list[str], sentence: str, folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["map", "from-camera", *words]) == 2
+
+    lines = capsys.readouterr().err.splitlines()
+    assert sentence in lines[0]
+    assert lines[1].startswith("  hint: ")
+
+
+@pytest.mark.slow
+@pytest.mark.system
+def test_a_video_becomes_a_map_through_a_platform_of_its_own(tmp_path: Path, recordings: Path) -> None:
+    kitchen = recordings / "7scenes_redkitchen"
+
+    code = main(
+        ["map", "from-camera", str(kitchen), "--no-depth", "--frames", "40", "--out", str(tmp_path / "out"),
+         "--scale", f"odometry:{kitchen / 'groundtruth.txt'}"]
+    )  # fmt: skip
+
+    report = json.loads((tmp_path / "out" / "report.json").read_text())
+    assert code == 0
+    assert report["lost_frames"] == 0
+    assert set(report["answered_by"]) == {"cloud"}
