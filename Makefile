@@ -67,7 +67,7 @@ bench: ## run every benchmark briefly; prints tables, writes JSON to out/bench
 	@$(SETUP) dev
 	@mkdir -p out/bench
 	@for each in $$(grep -l -- '"--out"' benchmarks/*.py); do \
-	  echo "== $$each"; $(BIN)/python $$each --out out/bench/$$(basename $$each .py).json || exit 1; done
+	  echo "== $$each"; PYTHONPATH=. $(BIN)/python $$each --out out/bench/$$(basename $$each .py).json || exit 1; done
 
 docs: ## write the generated pages and the picture of the packages
 	@$(SETUP) dev
