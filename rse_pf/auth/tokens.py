@@ -140,7 +140,7 @@ class SigningKey:
         if not 0 < ttl_s <= settings.token_ttl_s:
             raise UsageError(
                 f"a time to live of {ttl_s:g} s is not within {settings.token_ttl_s} s",
-                hint="choose a shorter time to live",
+                hint=f"give 1 to {settings.token_ttl_s} s, or leave it out; auth.token_ttl_s is the limit",
             )
         claims = {
             "iss": settings.issuer,

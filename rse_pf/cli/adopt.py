@@ -21,7 +21,7 @@ from rse_pf.errors import Conflict, NotFound, UsageError
 from rse_pf.identity import RobotId
 from rse_pf.local.state import state_folder
 from rse_pf.object_store import ObjectStore, is_name, put_pieces, read_range
-from rse_pf.terminal import show
+from rse_pf.terminal import counted, show
 
 __all__ = ["Adopted", "adopt", "run_adopt"]
 
@@ -58,8 +58,9 @@ def run_adopt(args: argparse.Namespace, settings: PlatformSettings, roster: Rost
     source = robot._replace(enrolment=_thumbprint(args.from_key))
     adopted = adopt(_open_store(args, settings), robot, source=source)
     show(
-        f"robot {str(robot)!r} has {adopted.objects} objects more, {adopted.object_bytes} bytes, and "
-        f"{adopted.snapshots} snapshots of services"
+        f"robot {str(robot)!r} has {counted(adopted.objects, 'object')} more, "
+        f"{counted(adopted.object_bytes, 'byte')}, and "
+        f"{counted(adopted.snapshots, 'snapshot')} of services"
     )
     for service in adopted.kept:
         show(f"its snapshot of service {service!r} is newer than the one that was to be moved, and stays")

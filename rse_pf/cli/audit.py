@@ -34,7 +34,7 @@ from rse_pf.audit.log import audit_folder, chain_names, files_of
 from rse_pf.audit.verify import Verdict, check_chain, check_folder, entries_of
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import UsageError
-from rse_pf.terminal import show
+from rse_pf.terminal import counted, show
 
 __all__ = ["add_arguments", "run"]
 
@@ -157,7 +157,7 @@ def _print_verdict(verdict: Verdict) -> None:
         show(f"{verdict.who}: BROKEN in {verdict.file}: {verdict.problem}")
         return
     notes = "".join(f"; {note}" for note in verdict.notes)
-    show(f"{verdict.who}: {verdict.entries} entries good, head {verdict.head}{notes}")
+    show(f"{verdict.who}: {counted(verdict.entries, 'entry', 'entries')} good, head {verdict.head}{notes}")
 
 
 def _heads(words: Sequence[str]) -> dict[str, Head]:

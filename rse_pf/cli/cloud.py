@@ -28,7 +28,7 @@ from pathlib import Path
 from rse_pf.cli.doctor import Finding, report
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import RsePfError, UsageError
-from rse_pf.terminal import show
+from rse_pf.terminal import counted, show
 
 __all__ = ["add_arguments", "check_tools", "run"]
 
@@ -39,6 +39,7 @@ _PINNED = Path("package.json")
 _PACKAGES = Path("build")
 _SCHEMA = "@aws-cdk/cloud-assembly-schema"
 _MAX_ROBOTS = 1_000_000
+_MAX_FPS = 1000
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -143,10 +144,16 @@ def _cost(args: argparse.Namespace, settings: PlatformSettings) -> int:
     from rse_pf.aws.money.prices import load_prices
 
     if not 1 <= args.robots <= _MAX_ROBOTS:
-        raise UsageError(f"--robots is not within 1 and {_MAX_ROBOTS}", hint="name how many robots there are")
-    if not (math.isfinite(args.fps) and 0 < args.fps <= 1000 and 0 < args.hours_per_day <= 24):
         raise UsageError(
-            "--fps or --hours-per-day is out of range", hint="up to 1000 a second, up to 24 hours"
+            f"--robots {args.robots} is not within 1..{_MAX_ROBOTS}", hint="name how many robots there are"
+        )
+    if not (math.isfinite(args.fps) and 0 < args.fps <= _MAX_FPS):
+        raise UsageError(
+            f"--fps {args.fps:g} is not within 0..{_MAX_FPS}", hint="name frames per second, such as 5"
+        )
+    if not 0 < args.hours_per_day <= 24:
+        raise UsageError(
+            f"--hours-per-day {args.hours_per_day:g} is not within 0..24", hint="24 is all day and night"
         )
     load = Load(robots=args.robots, fps=args.fps, hours_per_day=args.hours_per_day)
     prices, cloud = load_prices(args.prices), settings.cloud
@@ -156,11 +163,11 @@ def _cost(args: argparse.Namespace, settings: PlatformSettings) -> int:
         (f"{prices.currency} a month", "EC2 fleet", "Lambda"),
         ("idle", f"{costs.floor:.2f}", "0.00"),
         ("this load", f"{costs.fleet:.2f}", f"{costs.serverless:.2f}"),
-        ("needs", f"{costs.servers} servers", f"{costs.executions:.1f} executions"),
-        ("may have", f"{most} servers", f"{executions} executions"),
+        ("needs", counted(costs.servers, "server"), f"{costs.executions:.1f} executions"),
+        ("may have", counted(most, "server"), f"{executions} executions"),
     ]
     show(
-        f"{load.robots} robots, {load.fps:g} commands/s each, {load.hours_per_day:g} h a day: "
+        f"{counted(load.robots, 'robot')}, {load.fps:g} commands/s each, {load.hours_per_day:g} h a day: "
         f"{load.commands_per_s:g} commands/s of {prices.command_cpu_ms:g} ms",
         "",
     )
@@ -169,9 +176,10 @@ def _cost(args: argparse.Namespace, settings: PlatformSettings) -> int:
     rate = costs.crossing_commands_per_s
     show(
         "",
-        f"the fleet is cheaper from {rate:.1f} commands/s, {math.ceil(rate / load.fps)} such robots"
+        f"the fleet is cheaper from {rate:.1f} commands/s, "
+        f"{counted(math.ceil(rate / load.fps), 'such robot')}"
         if rate is not None
-        else f"the Lambda is cheaper up to {most} servers",
+        else f"the Lambda is cheaper up to {counted(most, 'server')}",
     )
     if costs.servers > most or costs.executions > executions:
         show("more than scaling.max_servers or cloud.lambda_concurrency allows: robots would be refused")
@@ -193,17 +201,18 @@ def _status(args: argparse.Namespace, settings: PlatformSettings) -> int:
     account = open_account(settings.cloud.region)
     fleet = read_group(account, settings, now=datetime.now(timezone.utc))
     show(
-        f"{len(fleet.servers)} servers, wanted {fleet.wanted_servers}"
+        f"{counted(len(fleet.servers), 'server')}, wanted {fleet.wanted_servers}"
         f" of {fleet.min_servers} to {fleet.max_servers}"
     )
     for each in fleet.servers:
         health = ", ".join(each.targets) or "in no target group"
-        robots = "robots: not told" if each.robots is None else f"{each.robots:g} robots"
+        robots = "robots: not told" if each.robots is None else counted(int(each.robots), "robot")
         show(f"  {each.name}  {each.zone}  {each.state:<12}  {health:<20}  {robots}")
     if fleet.robots:
         told = fleet.robots
         of = f" of {len(fleet.servers)}" if len(told) < len(fleet.servers) else ""
-        show(f"{sum(told):g} robots on {len(told)}{of} servers, {min(told):g} to {max(told):g} on each")
+        servers = "server" if len(told) == 1 and not of else "servers"
+        show(f"{sum(told):g} robots on {len(told)}{of} {servers}, {min(told):g} to {max(told):g} on each")
     else:
         show("robots: no server told how many it has")
     for name, state in sorted(fleet.alarms.items()):

@@ -78,7 +78,9 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
         hint = "choose at least one robot" if robots < 1 else "choose fewer robots"
         raise UsageError(f"--robots {robots} is not within 1..{_MAX_ROBOTS}", hint=hint)
     if not (math.isfinite(args.rate) and 0.1 <= args.rate <= 60):
-        raise UsageError(f"--rate {args.rate:g} is not within 0.1..60 Hz", hint="the paper uses 5")
+        raise UsageError(
+            f"--rate {args.rate:g} is not within 0.1..60 Hz", hint="5 is the paper's; most recordings have 30"
+        )
     if args.frames is not None and not 2 <= args.frames <= 2000:
         raise UsageError(f"--frames {args.frames} is not within 2..2000", hint="80 is a path of 5.5 m")
     if args.frames is not None and args.data is not None:

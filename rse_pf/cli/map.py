@@ -19,6 +19,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import os
 import re
 import threading
 import time
@@ -38,10 +39,11 @@ from rse_pf.config import PlatformSettings
 from rse_pf.errors import CommandFailed, NotFound, UsageError
 from rse_pf.files import replace_file
 from rse_pf.geometry import Camera, rotation_angle_deg, to_quaternion
+from rse_pf.local.state import state_folder
 from rse_pf.maps.export import FORMATS, export_map
 from rse_pf.maps.format import MapVersion
 from rse_pf.maps.registry import MapRecord, MapRegistry, difference
-from rse_pf.terminal import show, show_json, show_progress
+from rse_pf.terminal import counted, show, show_json, show_progress
 
 if TYPE_CHECKING:
     from rse_pf.services.mapping.localise import LocaliseReply
@@ -149,11 +151,16 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
         return run_from_camera(args, settings)
     chosen = settings if args.store is None else settings.replace(data={"store": args.store})
     if chosen.data.store == "memory:":
-        raise UsageError("a store in memory belongs to another process", hint="name --store dir:PATH")
+        kept = state_folder("default", os.environ) / "objects"
+        raise UsageError(
+            "no store is named, and one in memory belongs to another process",
+            hint=f"name --store dir:PATH; that of rse-pf local is dir:{kept}",
+        )
 
     def record(action: str, name: str, made: MapRecord) -> None:
         record_map_change(chosen, action, name, version=made.id, number=made.number)
 
+    _check_store(chosen.data.store)
     max_bytes = 4 * chosen.data.max_object_bytes
     maps = MapRegistry(open_data_store(chosen), args.tenant, max_bytes=max_bytes, on_change=record)
     actions = {
@@ -169,6 +176,24 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
     return actions[args.action](args, maps) or 0
 
 
+def _check_store(store: str) -> None:
+    """Refuse a folder that is not there: an empty list of maps would look like an answer."""
+    kind, _, path = store.partition(":")
+    if kind == "dir" and not Path(path).is_dir():
+        raise UsageError(
+            f"there is no folder {path[:200]}",
+            hint="check --store; rse-pf local keeps its maps in the folder objects of its state",
+        )
+
+
+def _check_folder(file: Path) -> None:
+    folder = file.absolute().parent
+    if not folder.is_dir():
+        raise UsageError(
+            f"there is no folder {folder}", hint=f"create it (mkdir -p {folder}), or name another file"
+        )
+
+
 def _list(args: argparse.Namespace, maps: MapRegistry) -> None:
     heads = {name: maps.head(name) for name in maps.names()}
     _print(
@@ -179,6 +204,8 @@ def _list(args: argparse.Namespace, maps: MapRegistry) -> None:
 
 
 def _show(args: argparse.Namespace, maps: MapRegistry) -> None:
+    if args.png is not None:
+        _check_folder(args.png)
     if args.all:
         head = _id_of_head(args.name, maps)
         records = maps.versions(args.name)
@@ -280,8 +307,9 @@ def _merge(args: argparse.Namespace, maps: MapRegistry) -> int:
             "loops": reply.loops,
             "seconds": seconds,
         },
-        f"{args.into} is now version {made.number}, {made.id[:12]}: {made.keyframes} keyframes, "
-        f"{made.points} points, {reply.merges} links between maps, {reply.loops} loops",
+        f"{args.into} is now version {made.number}, {made.id[:12]}: {counted(made.keyframes, 'keyframe')}, "
+        f"{counted(made.points, 'point')}, {counted(reply.merges, 'link')} between maps, "
+        f"{counted(reply.loops, 'loop')}",
         *_rows(
             ("joined", ", ".join(joined)),
             *(("not joined", f"{name}: {reason}") for name, reason in not_joined),
@@ -344,8 +372,7 @@ def _rollback(args: argparse.Namespace, maps: MapRegistry) -> None:
 
 
 def _export(args: argparse.Namespace, maps: MapRegistry) -> None:
-    if not args.out.absolute().parent.is_dir():
-        raise UsageError(f"there is no folder {args.out.absolute().parent}", hint="create it")
+    _check_folder(args.out)
     data = export_map(maps.load(args.name, args.version), args.format, args.robot)
     replace_file(args.out, data)
     _print(args, {"file": str(args.out), "bytes": len(data)}, f"{args.out}: {len(data)} bytes")
@@ -354,8 +381,7 @@ def _export(args: argparse.Namespace, maps: MapRegistry) -> None:
 def _draw(args: argparse.Namespace, maps: MapRegistry, record: MapRecord) -> None:
     from rse_pf.experiments.plots.map_image import RobotPath, draw_map
 
-    if not args.png.absolute().parent.is_dir():
-        raise UsageError(f"there is no folder {args.png.absolute().parent}", hint="create it")
+    _check_folder(args.png)
     version = maps.load(args.name, record.id)
     if not version.keyframes:
         raise UsageError("a map without keyframes cannot be drawn", hint="export its cloud as ply")
@@ -363,7 +389,8 @@ def _draw(args: argparse.Namespace, maps: MapRegistry, record: MapRecord) -> Non
     for robot in record.robots:
         own = sorted((k for k in version.keyframes if k.robot == robot), key=lambda k: k.timestamp_s)
         robots.append(RobotPath(name=robot, T_world_camera=np.stack([k.T_world_camera for k in own])))
-    caption = f"{args.name}, version {record.number}: {record.keyframes} keyframes, {record.points:,} points"
+    caption = f"{args.name}, version {record.number}: {counted(record.keyframes, 'keyframe')}, "
+    caption += f"{record.points:,} point{'s' * (record.points != 1)}"
     draw_map(args.png, version.points, version.colours, robots, caption)
 
 
@@ -497,7 +524,13 @@ def _progress(done: float, what: str) -> None:
 
 
 def _record_line(record: MapRecord) -> str:
-    counts = f"{record.keyframes} keyframes, {record.edges} edges, {record.points} points"
+    counts = ", ".join(
+        (
+            counted(record.keyframes, "keyframe"),
+            counted(record.edges, "edge"),
+            counted(record.points, "point"),
+        )
+    )
     columns = (f"{record.number:>4}", record.id[:_SHORT], _when(record.created_s), counts, record.note)
     return "  ".join(columns).rstrip()
 

@@ -39,7 +39,7 @@ from rse_pf.errors import CommandFailed, RsePfError, UsageError
 from rse_pf.local.state import read_state, state_folder
 from rse_pf.services.custom.installed import install, installed_services, read_service
 from rse_pf.services.custom.native import INCLUDE_FOLDER
-from rse_pf.terminal import error_lines, show, show_json
+from rse_pf.terminal import counted, error_lines, show, show_json
 
 __all__ = ["add_arguments", "run"]
 
@@ -88,9 +88,10 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
     if args.action == "unblock":
         return unblock(args)
     if args.what is None:
+        what = "name" if args.action in ("new", "call") else "folder"
         raise UsageError(
-            f"rse-pf service {args.action} needs a name or folder",
-            hint=f"write rse-pf service {args.action} NAME",
+            f"rse-pf service {args.action} needs the {what} of a service",
+            hint=f"write rse-pf service {args.action} {what.upper()}",
         )
     if args.action == "new":
         return _new(args.what, args.lang, Path.cwd())
@@ -118,7 +119,7 @@ def _new(name: str, language: str, where: Path) -> int:
         raise UsageError(f"{folder} exists already", hint="choose another name, or remove it")
     template = INCLUDE_FOLDER.parent / "templates" / language
     (folder / "requests").mkdir(parents=True)
-    for path in sorted(template.iterdir()):
+    for path in sorted(path for path in template.iterdir() if path.is_file() and path.suffix != ".pyc"):
         text = path.read_text(encoding="utf-8").replace("@NAME@", name)
         target = folder / "requests" / path.name if path.name == "example.json" else folder / path.name
         target.write_text(text, encoding="utf-8")
@@ -206,7 +207,7 @@ def _test(source: Path, settings: PlatformSettings) -> int:
             good = "failure" not in each and not detail
         wrong += not good
         show(f"{name:<28} {'ok' if good else 'WRONG':<6} {each_run.took_ms:8.1f} ms  {detail}")
-    show(f"{len(runs) - wrong} of {len(runs)} recorded requests as expected")
+    show(f"{len(runs) - wrong} of {counted(len(runs), 'recorded request')} as expected")
     return 1 if wrong else 0
 
 

@@ -2,14 +2,17 @@
 
 examples:
   rse-pf settings scaling
+  rse-pf settings scaling.min_servers
   rse-pf settings --json
 """
 
 from __future__ import annotations
 
 import argparse
+from typing import Any
 
 from rse_pf.config import PlatformSettings, setting_rows, settings_page
+from rse_pf.config.validation import did_you_mean
 from rse_pf.errors import UsageError
 from rse_pf.terminal import show, show_json, show_page
 
@@ -18,7 +21,11 @@ __all__ = ["add_arguments", "run"]
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
-    parser.add_argument("group", nargs="?", help="show one group only, such as scaling; or: digest")
+    parser.add_argument(
+        "group",
+        nargs="?",
+        help="show one group only, such as scaling; or one setting: scaling.min_servers; or: digest",
+    )
     shape = parser.add_mutually_exclusive_group()
     shape.add_argument("--json", action="store_true", help="print all values as JSON")
     shape.add_argument("--markdown", action="store_true", help="print docs/settings.md")
@@ -34,16 +41,28 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
         show_page(settings_page())
         return 0
     if args.group is not None:
-        if args.group not in values:
-            raise UsageError(f"no group named {args.group!r}", hint=f"groups are {', '.join(values)}")
-        values = {args.group: values[args.group]}
+        values = _chosen(args.group, values)
     if args.json:
         show_json(values, indent=2)
         return 0
     for row in setting_rows(settings):
-        if row.group not in values:
+        if row.name not in values.get(row.group, ()):
             continue
         changed = "" if row.value == row.default else f"  (default {row.default})"
         unit = f" {row.unit}" if row.unit else ""
         show(f"{row.group}.{row.name} = {row.value}{unit}{changed}", f"    {row.doc} [{row.source}]")
     return 0
+
+
+def _chosen(word: str, values: dict[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
+    """Return the group, or the single setting ``group.name``, that *word* names."""
+    group, dot, name = word.partition(".")
+    if group not in values:
+        raise UsageError(f"no group named {group[:80]!r}", hint=f"groups are {', '.join(values)}")
+    if not dot:
+        return {group: values[group]}
+    if name not in values[group]:
+        full = f"{group}.{name[:80]}"
+        known = [f"{group}.{each}" for each in values[group]]
+        raise UsageError(f"no setting named {full!r}", hint=did_you_mean(full, known))
+    return {group: {name: values[group][name]}}

@@ -112,7 +112,7 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
 def _issue(args: argparse.Namespace, settings: PlatformSettings) -> int:
     now, token_id = time.time(), secrets.token_hex(8)
     token = _signing_key(args, settings, now).issue(
-        args.subject,
+        check_robot(args.subject),
         now=now,
         token_id=token_id,
         settings=settings.auth,

@@ -324,9 +324,8 @@ class MapRegistry:
             raise NotFound(f"no version {beginning[:80]!r}", hint=f"give {_MIN_ID} or more hex digits")
         found = [info.name.removeprefix(prefix) for info in self._store.list(prefix + beginning)]
         if len(found) != 1:
-            raise NotFound(
-                f"{len(found)} versions begin with {beginning!r}", hint="see rse-pf map show NAME --all"
-            )
+            how_many = f"{len(found)} versions begin" if found else "no version begins"
+            raise NotFound(f"{how_many} with {beginning!r}", hint="see rse-pf map show NAME --all")
         return found[0]
 
 

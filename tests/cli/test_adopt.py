@@ -54,7 +54,7 @@ def test_a_name_with_another_key_sees_nothing_and_after_adoption_everything(
     said = run(capsys, "robot", "adopt", "robot-1", "--from-key", f"robot:{first.enrolment}")
 
     assert before == []
-    assert "1 objects more, 9 bytes, and 1 snapshots" in said
+    assert "1 object more, 9 bytes, and 1 snapshot of" in said
     assert store.get(object_name(second, digest_of(DATA))) == DATA
     assert store.get(state_name(second, "counter")) == b"7"
     assert {info.name.split("/")[0] for info in store.list()} == {"objects", "charges", "states"}

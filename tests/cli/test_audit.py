@@ -32,7 +32,7 @@ def test_verify_prints_a_line_for_each_chain(folder: Path, capsys: pytest.Captur
 
     lines = capsys.readouterr().out.splitlines()
     assert [line.rpartition(":")[0] for line in lines] == [
-        "operator: 1 entries good, head 1", "server-1: 2 entries good, head 2",
+        "operator: 1 entry good, head 1", "server-1: 2 entries good, head 2",
     ]  # fmt: skip
 
 

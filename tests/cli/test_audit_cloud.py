@@ -40,7 +40,7 @@ def test_verify_judges_each_servers_chain(two_servers: Any, capsys: Capture) -> 
     assert main(["audit", "verify", "--cloud"]) == 0
 
     lines = capsys.readouterr().out.splitlines()
-    assert [line.partition(",")[0] for line in lines] == ["i-1: 3 entries good", "i-2: 1 entries good"]
+    assert [line.partition(",")[0] for line in lines] == ["i-1: 3 entries good", "i-2: 1 entry good"]
 
 
 def test_a_deleted_part_is_detected(two_servers: Any, capsys: Capture) -> None:

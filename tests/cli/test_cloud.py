@@ -244,8 +244,8 @@ def test_the_status_of_a_well_fleet(
     assert main(["cloud", "status"]) == 0
 
     page = capsys.readouterr().out
-    assert "1 servers, wanted 1 of 1 to 4" in page
-    assert "7 robots on 1 servers, 7 to 7 on each" in page
+    assert "1 server, wanted 1 of 1 to 4" in page
+    assert "7 robots on 1 server, 7 to 7 on each" in page
     assert "alarm idle         OK\n" in page
 
 

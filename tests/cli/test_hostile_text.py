@@ -29,6 +29,8 @@ HOSTILE = (
 )
 NAME = HOSTILE[:60]
 SHOWS_NO_TEXT_OF_ROBOTS = {
+    "camera": "shows what was typed, and figures of its images",
+    "errors": "shows texts of this package",
     "demo": "its robots have names that it makes itself",
     "swarm": "the same",
     "settings": "shows the operator's own file",

@@ -15,7 +15,7 @@ from rse_pf.config import PlatformSettings, settings_page
 
 EMPTY = [
     "demo", "experiment", "local", "swarm", "token", "robot", "service", "serve", "data",
-    "map", "audit", "cloud", "settings", "doctor", "errors",
+    "camera", "map", "audit", "cloud", "settings", "doctor", "errors",
 ]  # fmt: skip
 HELP_S = 0.3
 
@@ -47,9 +47,9 @@ def _alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         ("serve --prot=1", "unrecognized arguments: --prot", "did you mean --port?"),
         ("serve --port one", "argument --port: invalid int value: 'one'", "rse-pf serve --help"),
         ("serve --port", "argument --port: expected one argument", "rse-pf serve --help"),
-        ("serve --port 99999", "serving.port = 99999 is above 65535", "lower it"),
+        ("serve --port 99999", "serving.port = 99999 is above 65535", "lower --port"),
         ("serve --size 0.25", "unrecognized arguments: --size", "write --emulated-cores"),
-        ("serve --emulated-cores -1", "serving.emulated_cores = -1", "raise it"),
+        ("serve --emulated-cores -1", "serving.emulated_cores = -1", "raise --emulated-cores"),
         ("serve --log-level inf", "'inf' is not one of debug, info", "did you mean info?"),
         ("serve --keys none.json", "cannot read the keys none.json: No such file", "JWKS"),
         ("serve --keys .", "cannot read the keys .: Is a directory", "JWKS"),
@@ -61,8 +61,8 @@ def _alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         ("serve --settings empty", "empty is not JSON", "correct the file"),
         ("local strat", "'strat' is not one of start, stop", "did you mean start?"),
         ("local --name ../x", "'../x' is no name for a platform", "1 to 32"),
-        ("local --servers 0", "local.servers = 0 is below 1", "raise it"),
-        ("local --port -1", "local.port = -1 is below 0", "raise it"),
+        ("local --servers 0", "local.servers = 0 is below 1", "raise --servers"),
+        ("local --port -1", "local.port = -1 is below 0", "raise --port"),
         ("local --settings open.json", "serving.host = 0.0.0.0 would open", "127.0.0.1"),
         ("token", "arguments are required", "rse-pf token --help"),
         ("token isue robot-1", "'isue' is not one of issue, inspect", "did you mean issue?"),
@@ -74,8 +74,8 @@ def _alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         ("token inspect a.b.c --ttl 3", "are for issue only", "--keys"),
         ("settings scalign", "no group named 'scalign'", "groups are serving"),
         ("settings --json --markdown", "not allowed with", "rse-pf settings --help"),
-        ("doctor now", "unrecognized arguments: now", "rse-pf doctor --help"),
-        ("demo --rate 0", "--rate 0 is not within", "the paper"),
+        ("doctor now", "unrecognized arguments: now", "leave it out"),
+        ("demo --rate 0", "--rate 0 is not within", "the paper's"),
         ("demo --rate nan", "--rate nan is not within", "the paper"),
         ("demo --robots 0", "--robots 0 is not within", "at least one robot"),
         ("demo --robots two", "argument --robots: invalid int value", "rse-pf demo --help"),

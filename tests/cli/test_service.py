@@ -10,6 +10,7 @@ import pytest
 
 from rse_pf.cli.main import main
 from rse_pf.services.custom.installed import read_service
+from rse_pf.services.custom.native import INCLUDE_FOLDER
 
 
 @pytest.fixture(autouse=True)
@@ -131,3 +132,20 @@ def test_run_shows_the_reason_of_a_failure_to_the_author_and_not_to_the_robot(
     (to_robot,) = (line for line in told if line.startswith("example.json"))
     assert "SyntaxError" not in to_robot
     assert any("SyntaxError" in line and "service.py, line 1" in line for line in told)
+
+
+def test_what_an_installation_compiled_among_the_templates_is_not_copied(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    installed = tmp_path / "installed"
+    shutil.copytree(INCLUDE_FOLDER.parent / "templates", installed / "templates")
+    compiled = installed / "templates" / "python" / "__pycache__"
+    compiled.mkdir(exist_ok=True)
+    (compiled / "service.cpython-311.pyc").write_bytes(b"\xff\x00")
+    (installed / "templates" / "python" / "service.pyc").write_bytes(b"\xff\x00")
+    monkeypatch.setattr("rse_pf.cli.service.INCLUDE_FOLDER", installed / "include")
+
+    assert main(["service", "new", "mine"]) == 0
+    assert sorted(each.name for each in Path("mine").iterdir()) == [
+        "README.md", "requests", "service.json", "service.py",
+    ]  # fmt: skip

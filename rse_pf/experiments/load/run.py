@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 
+from client_sdk import connect
 from rse_pf.config import PlatformSettings
 from rse_pf.experiments.load.swarm import Swarm, SwarmOptions, SwarmResult
 from rse_pf.experiments.load.swarm_process import ResultRows
@@ -62,6 +63,8 @@ def run_swarm(
 
     Returns 0 if every command was answered or failed, once, and all poses were right.
     """
+    if platform is not None:
+        asyncio.run(_check(platform, settings))
     folder = fresh_folder(out, ["report.json", COMMANDS, EVENTS])
     before = environment(settings)
     with (folder / EVENTS).open("w", encoding="utf-8") as file:
@@ -130,9 +133,8 @@ async def _run(
                 )
             )
             platform = TargetPlatform(local.url, local.issue_token)
-        _say(
-            quiet, f"{options.robots} robots send {options.fps:g} commands per second each to {platform.url}"
-        )
+        who = "1 robot sends" if options.robots == 1 else f"{options.robots} robots send"
+        _say(quiet, f"{who} {options.fps:g} commands per second each to {platform.url}")
         swarm = await stack.enter_async_context(
             Swarm(
                 options,
@@ -151,6 +153,12 @@ async def _run(
         return await swarm.finish(options.deadline_s)
 
 
+async def _check(platform: TargetPlatform, settings: PlatformSettings) -> None:
+    """Connect once: the robots would wait 30 s for a platform that does not answer, and not say why."""
+    async with connect(platform.url, token=platform.token_of("swarm-check"), settings=settings.session):
+        pass
+
+
 async def _show(swarm: Swarm, quiet: bool) -> None:
     """Print one line per second: what was answered since the last line."""
     seen, last_s = 0, time.monotonic()
@@ -159,7 +167,8 @@ async def _show(swarm: Swarm, quiet: bool) -> None:
         fresh, seen = swarm.rows[seen:], len(swarm.rows)
         elapsed_s, last_s = time.monotonic() - last_s, time.monotonic()
         trips = np.concatenate([_round_trips_ms(rows) for rows in fresh] or [np.empty(0)])
-        line = f"{len(swarm.joined) - len(swarm.left):5} robots {len(trips) / elapsed_s:7.0f} answered/s"
+        count = len(swarm.joined) - len(swarm.left)
+        line = f"{count:5} {'robot ' if count == 1 else 'robots'} {len(trips) / elapsed_s:7.0f} answered/s"
         if len(trips):
             p50, p99 = np.percentile(trips, [50, 99])
             line += f"   p50 {p50:7.1f} ms   p99 {p99:7.1f} ms"

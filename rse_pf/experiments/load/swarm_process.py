@@ -472,5 +472,6 @@ class _Robot:
 def _within(name: str, value: float, low: float, high: float) -> None:
     if not low <= value <= high:
         raise UsageError(
-            f"{name} = {value:g} is not within {low:g}..{high:g}", hint=f"choose {name} within that range"
+            f"{name} = {value:g} is not within {low:g}..{high:g}",
+            hint=f"give a value from {low:g} to {high:g}",
         )

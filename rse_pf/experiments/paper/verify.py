@@ -197,7 +197,8 @@ def _read_report(folder: Path) -> dict[str, Any]:
     try:
         report = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
-        raise UsageError(f"cannot read {path}: {error}", hint=_HINT) from error
+        why = getattr(error, "strerror", None) or error
+        raise UsageError(f"cannot read {path}: {why}", hint=_HINT) from error
     if not isinstance(report, dict):
         raise UsageError(f"{path} is not a report", hint=_HINT)
     return report

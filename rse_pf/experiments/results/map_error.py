@@ -19,6 +19,7 @@ from rse_pf.experiments.results.trajectory_error import align, associate
 from rse_pf.geometry import Array, inverse, pose_difference
 from rse_pf.maps.format import MapVersion
 from rse_pf.services.mapping.merge import MergeReply
+from rse_pf.terminal import counted
 
 __all__ = ["JoinedRobot", "joined_robots", "merge_section", "merged_lines", "merged_table", "move_frames"]
 
@@ -127,11 +128,12 @@ def merged_lines(section: Mapping[str, Any]) -> str:
     """Return the lines that the terminal shows of ``merged``; each ends with a newline."""
     joined = section["joined"]
     what = (
-        f"{section['links_between_robots']} links between them and {section['loops']} loops"
+        f"{counted(section['links_between_robots'], 'link')} between them and "
+        f"{counted(section['loops'], 'loop')}"
         if len(joined) > 1
-        else f"{section['loops']} loops closed"
+        else f"{counted(section['loops'], 'loop')} closed"
     )
-    lines = [f"merged {', '.join(joined)}: {section['keyframes']} keyframes, {what}"]
+    lines = [f"merged {', '.join(joined)}: {counted(section['keyframes'], 'keyframe')}, {what}"]
     if section["ate_cm"] is not None:
         alone = ", each robot aligned to the truth by itself, which is easier" if len(joined) > 1 else ""
         together = ", all robots aligned to the truth as one" if len(joined) > 1 else ""
@@ -145,7 +147,12 @@ def merged_lines(section: Mapping[str, Any]) -> str:
         reasons[each["reason"]] += each["count"]
     if reasons:
         counts = ", ".join(f"{count} {reason}" for reason, count in sorted(reasons.items()))
-        lines.append(f"{reasons.total()} pairs of keyframes were not linked ({counts})")
+        pairs = (
+            "1 pair of keyframes was"
+            if reasons.total() == 1
+            else f"{reasons.total()} pairs of keyframes were"
+        )
+        lines.append(f"{pairs} not linked ({counts})")
     return "".join(f"{line}\n" for line in lines)
 
 

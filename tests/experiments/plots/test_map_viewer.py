@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import sys
 import threading
 from types import SimpleNamespace
@@ -11,7 +12,7 @@ import numpy as np
 import pytest
 
 from rse_pf.errors import MissingExtra, UsageError
-from rse_pf.experiments.plots.map_viewer import browse_map
+from rse_pf.experiments.plots.map_viewer import browse_map, first_view
 from rse_pf.maps.format import MapVersion
 from rse_pf.services.synthetic_maps import make_world
 
@@ -23,6 +24,7 @@ class Page:
         self.host, self.port, self.stopped = host, port, False
         self.calls: list[tuple[str, tuple[Any, ...], dict[str, Any]]] = []
         self.scene = self
+        self.initial_camera = SimpleNamespace()
 
     def __getattr__(self, name: str) -> Any:
         return lambda *words, **options: self.calls.append((name, words, options))
@@ -74,3 +76,42 @@ def test_without_viser_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> No
 def test_a_number_that_is_no_port_is_refused() -> None:
     with pytest.raises(UsageError, match="port 70000"):
         browse_map(MapVersion(keyframes=()), 70000, print, threading.Event())
+
+
+def room() -> MapVersion:
+    """A room of 6 x 3 x 8 m with a camera that looks along +z of a world whose down is +y, and an outlier."""
+    a, _ = make_world(1).walk("a", np.linspace(0.0, 0.2, 3), seed=1)
+    turned = [dataclasses.replace(each, T_world_camera=np.eye(4)) for each in a.keyframes]
+    points = np.random.default_rng(1).uniform([-3, -2, 0], [3, 1, 8], (4000, 3)).astype(np.float32)
+    points[0] = 500.0
+    return MapVersion(keyframes=tuple(turned), points=points, colours=np.zeros((4000, 3), np.uint8))
+
+
+def test_the_first_view_is_upright_outside_of_the_cloud_and_above_it() -> None:
+    version = room()
+    position, look_at, up = first_view(version)
+
+    np.testing.assert_allclose(up, [0, -1, 0], atol=1e-9)
+    np.testing.assert_allclose(look_at, [0, -0.5, 4], atol=0.2)
+    assert (position - look_at) @ up > 2.0, "above"
+    assert position[2] < 0.0, "on the side from which the camera looks into the room"
+    assert np.all(np.linalg.norm(version.points[1:] - position, axis=1) > 1.0)
+    towards = (look_at - position) / np.linalg.norm(look_at - position)
+    inside = (version.points[1:] - position) @ towards / np.linalg.norm(version.points[1:] - position, axis=1)
+    assert np.mean(inside > np.cos(np.deg2rad(75 / 2))) > 0.95
+
+
+@pytest.mark.parametrize("points", [np.zeros((0, 3), np.float32), np.zeros((1, 3), np.float32)])
+def test_a_map_of_nothing_has_a_first_view_too(points: Any) -> None:
+    for keyframes in ((), room().keyframes):
+        made = MapVersion(keyframes=keyframes, points=points, colours=np.zeros(points.shape, np.uint8))
+        assert all(np.all(np.isfinite(each)) for each in first_view(made))
+
+
+def test_the_page_opens_with_the_first_view() -> None:
+    page, _ = browse(room())
+
+    assert page.initial_camera.up == pytest.approx((0.0, -1.0, 0.0))
+    assert page.initial_camera.position == pytest.approx(tuple(first_view(room())[0]))
+    assert page.initial_camera.look_at == pytest.approx(tuple(first_view(room())[1]))
+    assert ("set_up_direction", (page.initial_camera.up,), {}) in page.calls

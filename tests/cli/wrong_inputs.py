@@ -1,0 +1,219 @@
+"""One hundred wrong inputs of the command line, as a table; tests/cli/words/test_wrong_inputs.py runs them.
+
+Each row is what a user typed, the exit code, words of the line that says what is wrong, and words of the hint
+that says what to do.  The files that rows name are made by `make_files`.
+"""
+
+# ruff: noqa: E501  a table: one row, one line
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from rse_pf.geometry import Camera
+from rse_pf.local.firewall import ensure_key
+from rse_pf.maps.format import Keyframe, MapVersion, encode_map
+from rse_pf.maps.registry import MapRegistry
+from rse_pf.object_store import DirectoryStore
+
+__all__ = ["FAILED", "USAGE", "WRONG_INPUTS", "WrongInput", "make_files"]
+
+FAILED, USAGE = 1, 2
+
+
+@dataclass(frozen=True, slots=True)
+class WrongInput:
+    """What was typed, and what the answer must hold."""
+
+    typed: str
+    code: int
+    says: str
+    hint: str
+
+
+def make_files(folder: Path) -> None:
+    """Write the files that the rows name into *folder*, and a platform that is not running to its state."""
+    for name, settings in _SETTINGS.items():
+        (folder / name).write_text(json.dumps({"context": {"rse-pf": settings}}), encoding="utf-8")
+    for name, text in _TEXTS.items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_text(text, encoding="utf-8")
+    (folder / "open.key").chmod(0o644)
+    for name in ("nothing", "new-service", "rec-empty", "rec-unpaired", "rec-words"):
+        (folder / name).mkdir(exist_ok=True)
+    state = folder / "state" / "rse-pf" / "default"
+    state.mkdir(parents=True)
+    ensure_key(state, seed=b"s" * 32, key_id="k")
+    maps = MapRegistry(DirectoryStore(folder / "store"))
+    maps.commit("hall", _map(2), parent=None, author="a test", created_s=1.0)
+
+
+_SETTINGS: dict[str, dict[str, object]] = {
+    "open.json": {"serving": {"host": "0.0.0.0"}},
+    "misspelt.json": {"scaling": {"min_server": 1}},
+    "no-group.json": {"scalling": {"min_servers": 1}},
+    "text.json": {"scaling": {"min_servers": "two"}},
+    "crossed.json": {"scaling": {"min_servers": 9, "max_servers": 3}},
+    "range.json": {"scaling": {"busy_cpu_percent": 900}},
+}
+_TEXTS = {
+    "empty": "",
+    "broken.json": "{",
+    "open.key": "{}",
+    "picture.png": "no picture",
+    "recording.zip": "no recording",
+    "results/notes.txt": "mine",
+    "rec-empty/rgb.txt": "# timestamp filename\n",
+    "rec-empty/depth.txt": "# timestamp filename\n",
+    "rec-unpaired/rgb.txt": "1.0 rgb/1.png\n",
+    "rec-unpaired/depth.txt": "2.0 depth/1.png\n",
+    "rec-words/rgb.txt": "first rgb/1.png\n",
+    "rec-words/depth.txt": "1.0 depth/1.png\n",
+    "bare/service.py": "",
+    "odd/service.json": '{"name": "odd", "language": "cobol", "entry": "a.cob", "kind": "stateless"}',
+    "broken-service/service.json": "{",
+    "unasked/service.json": '{"name": "unasked", "language": "lua", "entry": "s.lua", "kind": "stateless"}',
+    "unasked/s.lua": "return function(request) return request end",
+    "audit/control-plane.jsonl": "no entry\n",
+}
+
+
+def _map(keyframes: int) -> bytes:
+    camera = Camera(fx=500.0, fy=500.0, cx=320.0, cy=240.0, width=640, height=480)
+    frames = tuple(
+        Keyframe(
+            id=n, robot="robot-1", timestamp_s=float(n), T_world_camera=np.eye(4), camera=camera,
+            pixels=np.zeros((0, 2), np.float32), descriptors=np.zeros((0, 32), np.uint8),
+            points_camera=np.zeros((0, 3), np.float32),
+        )
+        for n in range(keyframes)
+    )  # fmt: skip
+    points = np.zeros((5, 3), np.float32)
+    return encode_map(MapVersion(keyframes=frames, points=points, colours=np.zeros((5, 3), np.uint8)))
+
+
+WRONG_INPUTS: tuple[WrongInput, ...] = (
+    WrongInput("demos", USAGE, "no verb 'demos'", "did you mean demo?"),
+    WrongInput("xyzzy", USAGE, "no verb 'xyzzy'", "known are demo, experiment"),
+    WrongInput("--out x demo", USAGE, "--out stands before the verb", "rse-pf VERB OPTIONS"),
+    WrongInput("demo --robots 0", USAGE, "--robots 0 is not within 1..32", "at least one robot"),
+    WrongInput("demo --robots 33", USAGE, "--robots 33 is not within 1..32", "fewer robots"),
+    WrongInput("demo --robots two", USAGE, "--robots: invalid int value: 'two'", "rse-pf demo --help"),
+    WrongInput("demo --rate nan", USAGE, "--rate nan is not within", "5 is the paper's"),
+    WrongInput("demo --frames 5 --data rec-empty", USAGE, "--frames is for the rendered world", "with --rate"),
+    WrongInput("demo --data typo", USAGE, "no folder typo", "rgb.txt, depth.txt"),
+    WrongInput("demo --data recording.zip", USAGE, "recording.zip is not a recording", "name a folder"),
+    WrongInput("demo --data nothing", USAGE, "no rgb.txt in nothing", "TUM layout"),
+    WrongInput("demo --data rec-empty", USAGE, "rec-empty/rgb.txt lists no image", "a line for each image"),
+    WrongInput("demo --data rec-unpaired", USAGE, "no colour image of rec-unpaired has a depth image within 0.02 s", "same clock"),
+    WrongInput("demo --data rec-words", USAGE, "rec-words/rgb.txt, line 1 is not an image", "timestamp filename"),
+    WrongInput("demo --frontend wide", USAGE, "'wide' is not one of standard, wide-baseline", "--help"),
+    WrongInput("demo --out results", USAGE, "results holds other files", "an empty folder"),
+    WrongInput("demo --out empty", USAGE, "empty is a file", "--out"),
+    WrongInput("experiment latencies", USAGE, "'latencies' is not one of latency", "did you mean latency?"),
+    WrongInput("experiment latency --robots 0", USAGE, "--robots 0 is not within 1..2000", "100"),
+    WrongInput("experiment latency --link lan", USAGE, "no link named 'lan'", "none, paper, wifi-bad, lte"),
+    WrongInput("experiment latency --seconds inf", USAGE, "--seconds inf is not within", "30 is enough"),
+    WrongInput("experiment elasticity --speed 0.5", USAGE, "--speed 0.5 is not within 1..100", "1 takes as long as the paper"),
+    WrongInput("experiment robustness --only kill,sleep", USAGE, "there is no fault 'sleep'", "known are kill"),
+    WrongInput("experiment verify", USAGE, "verify needs a folder", "rse-pf experiment verify DIR"),
+    WrongInput("experiment verify typo", USAGE, "cannot read typo/report.json: No such file", "--out of an experiment"),
+    WrongInput("local strat", USAGE, "'strat' is not one of start, stop", "did you mean start?"),
+    WrongInput("local --servers 0", USAGE, "local.servers = 0 is below 1", "raise --servers"),
+    WrongInput("local --port 70000", USAGE, "local.port = 70000 is above 65535", "lower --port"),
+    WrongInput("local --name ../x", USAGE, "'../x' is no name for a platform", "small letters"),
+    WrongInput("local --settings open.json", USAGE, "serving.host = 0.0.0.0 would open the local platform", "127.0.0.1"),
+    WrongInput("local kill", USAGE, "needs a server", "rse-pf local status"),
+    WrongInput("local status", USAGE, "platform 'default' is not running", "rse-pf local"),
+    WrongInput("local stop --for 2", USAGE, "--for takes a positive number", "leave it out"),
+    WrongInput("local --services typo", USAGE, "there is no services folder", "rse-pf service install FOLDER"),
+    WrongInput("swarm --robots 0", USAGE, "robots = 0 is not within 1..5000", "from 1 to 5000"),
+    WrongInput("swarm --fps nan", USAGE, "fps = nan is not within", "from 0.01 to 200"),
+    WrongInput("swarm --codec xml", USAGE, "no codec named 'xml'", "zlib, json, bin"),
+    WrongInput("swarm --servers 0", USAGE, "local.servers = 0 is below 1", "raise --servers"),
+    WrongInput("swarm --name default", USAGE, "no platform 'default' is running", "rse-pf local --name default"),
+    WrongInput("swarm --url http://127.0.0.1:8700 --token-from default", USAGE, "is not a WebSocket address", "ws://HOST:PORT/ws"),
+    WrongInput("swarm --url ws://127.0.0.1:8700/ws", USAGE, "--url needs --token-from", "name a local platform"),
+    WrongInput("swarm --quiet --url ws://127.0.0.1:9/ws --token-from default", FAILED, "cannot connect to ws://127.0.0.1:9/ws", "is the platform running?"),
+    WrongInput("swarm --out results", USAGE, "results holds other files", "an empty folder"),
+    WrongInput("camera calibrat", USAGE, "'calibrat' is not one of calibrate, board, check", "did you mean calibrate?"),
+    WrongInput("camera calibrate", USAGE, "arguments are required: SOURCE", "rse-pf camera calibrate --help"),
+    WrongInput("camera check typo", USAGE, "there is no video typo", "name a device number, a video or a folder"),
+    WrongInput("token isue robot-1", USAGE, "'isue' is not one of issue", "did you mean issue?"),
+    WrongInput("token issue", USAGE, "needs the name of a robot", "--help"),
+    WrongInput("token issue robot-1 --ttl 1e9", USAGE, "a time to live of 1e+09 s is not within 900 s", "auth.token_ttl_s"),
+    WrongInput("token issue robot-1 --name other", USAGE, "cannot read the key", "start a platform with rse-pf local"),
+    WrongInput("token issue robot-1 --ttl 0", USAGE, "a time to live of 0 s is not within 900 s", "give 1 to 900 s"),
+    WrongInput("token issue robot-1 --scope everything", USAGE, "'everything' is not a scope", "services:NAME"),
+    WrongInput("token issue robot-1 --key open.key", USAGE, "others may read the key open.key", "chmod 600 open.key"),
+    WrongInput("token inspect abc", USAGE, "this is not a token", "rse-pf token issue"),
+    WrongInput("token revoke", USAGE, "needs a token, or --all-of ROBOT", "comes last"),
+    WrongInput("token retire", USAGE, "is for a cloud", "--cloud"),
+    WrongInput("robot list --name other", USAGE, "there is no platform 'other'", "rse-pf local"),
+    WrongInput("robot disable", USAGE, "needs the name of a robot", "--help"),
+    WrongInput("robot enrol robot-1 --public-key typo", USAGE, "cannot read typo", "public key that keygen printed"),
+    WrongInput("robot enrol robot-1 --public-key broken.json", USAGE, "this is not a public key", "rse-pf robot keygen"),
+    WrongInput("robot enable robot-1", USAGE, "robot 'robot-1' is not disabled", "rse-pf robot list"),
+    WrongInput("robot remove robot-9", USAGE, "robot 'robot-9' is not enrolled", "rse-pf robot list"),
+    WrongInput("robot keygen", USAGE, "keygen needs --out", "--out robot.key"),
+    WrongInput("service nwe x", USAGE, "'nwe' is not one of new", "did you mean new?"),
+    WrongInput("service new", USAGE, "needs the name of a service", "rse-pf service new NAME"),
+    WrongInput("service new Mine", USAGE, "'Mine' is not a valid service name", "lower-case letters"),
+    WrongInput("service new new-service", USAGE, "new-service exists already", "another name"),
+    WrongInput("service test", USAGE, "needs the folder of a service", "rse-pf service test FOLDER"),
+    WrongInput("service test typo", USAGE, "cannot read typo/service.json", "rse-pf service new NAME"),
+    WrongInput("service test odd", USAGE, "Invalid enum value 'cobol'", '"language": "python"'),
+    WrongInput("service test unasked", USAGE, "unasked has no recorded requests", "unasked/requests/NAME.json"),
+    WrongInput("service call echo", USAGE, "no platform named 'default' is running", "rse-pf local"),
+    WrongInput("service call echo --request {points", USAGE, "--request is not JSON", "write --request"),
+    WrongInput("service status --control-port 9", FAILED, "no answer from port 9", "rse-pf local status"),
+    WrongInput("serve", USAGE, "there are no keys", "name a key set file"),
+    WrongInput("serve --keys typo", USAGE, "cannot read the keys typo: No such file", "rse-pf local writes one"),
+    WrongInput("serve --keys empty", USAGE, "this is not a key set", "check empty"),
+    WrongInput("serve --port 99999", USAGE, "serving.port = 99999 is above 65535", "lower --port"),
+    WrongInput("serve --prot 1", USAGE, "unrecognized arguments: --prot", "did you mean --port?"),
+    WrongInput("serve --announce typo/a.json", USAGE, "there is no folder", "name another --announce"),
+    WrongInput("data", USAGE, "--keys is missing", "give a JWKS"),
+    WrongInput("data --port 99999 --keys empty", USAGE, "data.port = 99999 is above 65535", "lower --port"),
+    WrongInput("data --store tape:x --keys empty", USAGE, "'tape:x' is not a store", "dir:PATH, s3:BUCKET"),
+    WrongInput("data --announce typo/a.json --keys empty", USAGE, "there is no folder", "create the folder"),
+    WrongInput("map lst", USAGE, "'lst' is not one of list", "did you mean list?"),
+    WrongInput("map list", USAGE, "no store is named", "that of rse-pf local is dir:"),
+    WrongInput("map list --store dir:/typo", USAGE, "there is no folder /typo", "check --store"),
+    WrongInput("map list --store typo", USAGE, "'typo' is not a store", "dir:PATH"),
+    WrongInput("map show attic --store dir:store", FAILED, "there is no map 'attic'", "rse-pf map list"),
+    WrongInput("map show hall 3f9bd1 --store dir:store", FAILED, "no version begins with '3f9bd1'", "map show NAME --all"),
+    WrongInput("map show hall --png typo/a.png --store dir:store", USAGE, "there is no folder", "create it"),
+    WrongInput("map view hall --browser --port 0 --store dir:store", USAGE, "port 0 is not within 1..65535", "leave --port out"),
+    WrongInput("map merge hall attic --into one --store dir:store", FAILED, "there is no map 'attic'", "rse-pf map list"),
+    WrongInput("map localise hall rec-empty --every 0 --store dir:store", USAGE, "--every 0 is below 1", "every frame"),
+    WrongInput("map export hall --format stl --out a.stl --store dir:store", USAGE, "'stl' is not one of ply", "--help"),
+    WrongInput("map export hall --format ply --out typo/a.ply --store dir:store", USAGE, "there is no folder", "create it"),
+    WrongInput("map export hall --format tum --out a.txt --robot robot-9 --store dir:store", USAGE, "no keyframe of robot 'robot-9'", "rse-pf map show"),
+    WrongInput("audit shw", USAGE, "'shw' is not one of show, verify", "did you mean show?"),
+    WrongInput("audit verify", USAGE, "there is no audit log in", "start rse-pf local"),
+    WrongInput("audit verify typo", USAGE, "there is no typo", "name the files of one chain"),
+    WrongInput("audit show --last 3 audit", USAGE, "unrecognized arguments: audit", "before the options"),
+    WrongInput("audit verify --head xyz", USAGE, "there is no audit log", "start rse-pf local"),
+    WrongInput("cloud doctr", USAGE, "'doctr' is not one of doctor", "did you mean doctor?"),
+    WrongInput("cloud cost --robots 0", USAGE, "--robots 0 is not within", "how many robots"),
+    WrongInput("cloud cost --hours-per-day 25", USAGE, "--hours-per-day 25 is not within 0..24", "24 is all day"),
+    WrongInput("cloud cost --prices broken.json", USAGE, "broken.json holds no prices", "a JSON object"),
+    WrongInput("settings scalign", USAGE, "no group named 'scalign'", "groups are serving"),
+    WrongInput("settings scaling.min_server", USAGE, "no setting named 'scaling.min_server'", "did you mean scaling.min_servers?"),
+    WrongInput("settings --settings typo.json", USAGE, "cannot read typo.json: No such file", "an existing file"),
+    WrongInput("settings --settings broken.json", USAGE, "broken.json is not JSON", "correct the file"),
+    WrongInput("settings --settings misspelt.json", USAGE, "unknown setting scaling.min_server", "did you mean min_servers?"),
+    WrongInput("settings --settings crossed.json", USAGE, "scaling.max_servers = 3 is less than scaling.min_servers = 9", "raise scaling.max_servers"),
+    WrongInput("settings --settings range.json", USAGE, "scaling.busy_cpu_percent = 900.0 is above 100", "lower it in cdk.json"),
+    WrongInput("doctor now", USAGE, "unrecognized arguments: now", "leave it out"),
+    WrongInput("doctor --fix", USAGE, "unrecognized arguments: --fix", "rse-pf doctor --help"),
+    WrongInput("doctor --settings typo.json", USAGE, "cannot read typo.json", "an existing file"),
+    WrongInput("errors no-consnsus", USAGE, "there is no error 'no-consnsus'", "did you mean no-consensus?"),
+    WrongInput("errors 404", USAGE, "there is no error '404'", "rse-pf errors"),
+    WrongInput("errors busy --markdown", USAGE, "--markdown prints all codes", "leave out the code"),
+)  # fmt: skip
