@@ -252,11 +252,12 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=5.0, help="of each step")
     parser.add_argument("--out", type=Path, help="write the figures as JSON")
     asked = parser.parse_args()
-    report: dict[str, Any] = {"machine": machine(), "settings": SETTINGS, "codec": asked.codec}
+    settings = {"serving": SETTINGS["serving"]} if asked.balancer else SETTINGS
+    report: dict[str, Any] = {"machine": machine(), "settings": settings, "codec": asked.codec}
     report |= {"balancer": asked.balancer, "seconds": asked.seconds, "searches": []}
     try:
         compiled()
-        print(f"{report['machine']}; settings {SETTINGS}; {asked.codec}, steps of {asked.seconds:g} s")
+        print(f"{report['machine']}; settings {settings}; {asked.codec}, steps of {asked.seconds:g} s")
         for workers in asked.workers:
             print(f"{workers} workers{', through the balancer' if asked.balancer else ''}", flush=True)
             if asked.balancer:
