@@ -17,7 +17,7 @@ import platform
 import sys
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from types import ModuleType
@@ -50,7 +50,8 @@ class Way:
     def step(self, frame: Any, *, wide: bool) -> list[bytes]:
         """Do the work of one frame and return its bytes; the first frame has no matches."""
         make = self.module.FrontEndOptions
-        options = make.wide_baseline() if wide else make()
+        # As many as 0.1.0 sent, so that all matches are compared.
+        options = replace(make.wide_baseline() if wide else make(), max_matches=700)
         self.module.front_end_core = lambda: self.core  # type: ignore[attr-defined]
         spent_us, features = cpu_us(lambda: self.module.extract(frame, options))
         results: list[Array] = [features.pixels, features.descriptors, features.points_camera]

@@ -6,7 +6,7 @@ frames come out.  There is one query at a time.  Its numbers are rounded exactly
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from operator import attrgetter
 from typing import Any, Literal
@@ -32,6 +32,10 @@ __all__ = [
     "points_at",
     "round_for_wire",
 ]
+
+# So many matches fit into a command of 10 kB.  Each takes 14 to 15 bytes with zlib in recordings, and 18 if
+# all digits are random; 24 with MessagePack; 40 with plain JSON, 43 at most.
+_MATCHES_OF_CODEC = {"zlib": 530, "bin": 400, "json": 220}
 
 # ORB's pyramid.
 _SCALE, _LEVELS = 1.2, 8
@@ -69,7 +73,8 @@ class FrontEndOptions:
     Attributes:
         features: How many ORB features are sought in a frame.
         ratio: Lowe's ratio test: the best match must be this much closer than the second best.
-        max_matches: The best by descriptor distance are sent, so that a command stays under 10 kB.
+        max_matches: The best by descriptor distance are sent, so that a command stays under 10 kB with zlib;
+            other codecs need more bytes a match, see `sent_with`.
         min_depth_m: Nearer depth readings are not used.
         max_depth_m: Farther depth readings are not used.
         depth_spread_percent: A 3x3 patch whose depths differ by more of their median lies on an edge and is
@@ -86,7 +91,7 @@ class FrontEndOptions:
 
     features: int = 1000
     ratio: float = 0.75
-    max_matches: int = 700
+    max_matches: int = 530
     min_depth_m: float = 0.3
     max_depth_m: float = 6.0
     depth_spread_percent: float = 5.0
@@ -112,6 +117,21 @@ class FrontEndOptions:
                 f"inlier_px = {self.inlier_px:g} cannot be used",
                 hint="leave them out to get the defaults",
             )
+
+    def sent_with(self, codec: str) -> FrontEndOptions:
+        """Return these options with as many matches as fit into a command of 10 kB.
+
+        Args:
+            codec: ``zlib``, ``json`` or ``bin``, as the robot's connection has it.
+
+        Raises:
+            UsageError: There is no such codec.
+        """
+        if codec not in _MATCHES_OF_CODEC:
+            raise UsageError(
+                f"no codec named {codec!r}", hint=f"choose one of {', '.join(_MATCHES_OF_CODEC)}"
+            )
+        return replace(self, max_matches=min(self.max_matches, _MATCHES_OF_CODEC[codec]))
 
     @classmethod
     def wide_baseline(cls) -> FrontEndOptions:

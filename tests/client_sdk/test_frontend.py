@@ -28,6 +28,8 @@ from rse_pf.errors import PnpError, UsageError
 from rse_pf.experiments.results.trajectory_error import absolute_error, relative_error
 from rse_pf.geometry import Array, Camera, inverse, pose_difference, transform
 from rse_pf.pnp import PnpOptions, refine_with_depth, solve_pnp
+from rse_pf.services.pnp import make_request
+from rse_pf.wire import Command, make_codec
 
 cv2 = pytest.importorskip("cv2", reason="pip install 'rse-pf[vision]'")
 
@@ -287,6 +289,33 @@ def test_options_that_cannot_work_and_frames_that_do_not_fit_are_refused():
             depth_m=np.zeros((4, 4), np.float32),
             camera=CAMERA,
         )
+
+
+@pytest.mark.parametrize("codec", ["zlib", "json", "bin"])
+@pytest.mark.parametrize(
+    "preset", [FrontEndOptions(), FrontEndOptions.wide_baseline()], ids=["default", "wide"]
+)
+def test_a_command_with_all_matches_is_below_10_kb(codec: str, preset: FrontEndOptions):
+    options = preset.sent_with(codec)
+    n = options.max_matches
+    rng = np.random.default_rng(5)
+    # Random digits, of which only the columns ascend; a sign or three digits wherever there can be.
+    camera = Camera(fx=525.25, fy=525.25, cx=719.75, cy=539.75, width=1440, height=1080)
+    pixels = np.column_stack([np.sort(rng.uniform(100.0, 700.0, n)), rng.uniform(100.0, 530.0, n)])
+    depth_m = rng.uniform(3.0, options.max_depth_m, n)
+    request = make_request(
+        camera.back_project(pixels, depth_m), pixels, camera,
+        PnpOptions(inlier_px=options.inlier_px, max_iterations=options.max_iterations),
+        depths_m=depth_m + rng.normal(size=n) * 0.01, binary=codec == "bin",
+    )  # fmt: skip
+    command = Command(id=10**6, service="pnp", payload=request, stream="pose", keep=True, trace="f" * 32)
+
+    assert len(make_codec(codec).encode(command)) < 10_000
+
+
+def test_an_unknown_codec_is_refused():
+    with pytest.raises(UsageError, match="no codec named 'xml'"):
+        FrontEndOptions().sent_with("xml")
 
 
 @pytest.mark.data
