@@ -13,7 +13,7 @@ examples:
   rse-pf local logs --server server-1 --follow
   rse-pf local drain server-1
   rse-pf local roll
-  rse-pf local pause server-1 --for 0.5
+  rse-pf local pause server-1 --for 0.3
   rse-pf local slow server-2 --percent 10 --for 30
   rse-pf local stop
 """
@@ -51,8 +51,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     defaults = PlatformSettings().local
     parser.add_argument(
-        "action", nargs="?", choices=_ACTIONS, default="start", help="what to do (default: start)"
-    )
+        "action", nargs="?", choices=_ACTIONS, default="start", metavar="ACTION",
+        help=f"what to do: {', '.join(_ACTIONS)} (default: start)",
+    )  # fmt: skip
     parser.add_argument(
         "server", nargs="?", metavar="SERVER", help="the server to drain, kill, pause, resume, slow, ..."
     )
