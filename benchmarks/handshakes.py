@@ -57,17 +57,17 @@ sys.exit(serve(PlatformSettings.from_dict(told["settings"]), keys=keys, server_i
 """
 UNLIMITED = {
     "max_accepts_per_s": 1e6, "max_handshakes_per_source_per_s": 1e6, "handshake_burst": 1_000_000,
-    "max_unauthenticated_per_source": 0,
+    "max_unauthenticated_per_source": 0, "max_robots": 100_000,
 }  # fmt: skip
 """Limits that are counted, but never reached."""
 
 
-def settings_of(workers: int, *, tokens: bool) -> dict[str, Any]:
-    """Return the settings of a server, as a document."""
+def settings_of(workers: int, *, tokens: bool, **session: float) -> dict[str, Any]:
+    """Return the settings of a server, as a document; *session* is added to the group of that name."""
     return {
         "serving": {"port": 0, "control_port": 0, "workers": workers, "trusted_proxies": 0, **UNLIMITED},
         "auth": {"required": tokens},
-        "session": {"rate_ban_s": 3600.0},
+        "session": {"rate_ban_s": 3600.0, **session},
     }
 
 
@@ -76,22 +76,26 @@ class Server:
 
     def __init__(self, identity: dict[str, Any]) -> None:
         self.address = ("127.0.0.1", int(identity["port"]))
+        self.pids = [identity["pid"], *identity["workers"]]
         self._control_port = identity["control_port"]
         # The kernel's clock of another process, in nanoseconds: CPUCLOCK_SCHED of its pid.
-        self._clocks = [~pid << 3 | 2 for pid in (identity["pid"], *identity["workers"])]
+        self._clocks = [~pid << 3 | 2 for pid in self.pids]
 
     def cpu_s(self) -> float:
         """Return the CPU seconds of all processes."""
         return sum(map(time.clock_gettime, self._clocks))
 
-    def robots(self) -> int:
-        """Return how many sockets are open."""
+    def status(self) -> dict[str, Any]:
+        """Return the server's own numbers."""
         with urllib.request.urlopen(f"http://127.0.0.1:{self._control_port}/status") as answer:
-            return sum(json.loads(answer.read())["robots_of_workers"])
+            found: dict[str, Any] = json.loads(answer.read())
+        return found
 
 
 @contextmanager
-def served(tree: Path | None, workers: int, *, tokens: bool, audit: bool) -> Iterator[Server]:
+def served(
+    tree: Path | None, workers: int, *, tokens: bool, audit: bool, **session: float
+) -> Iterator[Server]:
     """Start a server of *tree* (None: this one), and end it."""
     with tempfile.TemporaryDirectory() as folder:
         announce = Path(folder) / "announce.json"
@@ -99,7 +103,7 @@ def served(tree: Path | None, workers: int, *, tokens: bool, audit: bool) -> Ite
         told = {
             "announce": str(announce),
             "audit": str(Path(folder) / "audit") if audit else "",
-            "settings": settings_of(workers, tokens=tokens),
+            "settings": settings_of(workers, tokens=tokens, **session),
             "keys": SigningKey.from_seed(PLATFORM_SEED, "platform").key_set().to_json() if tokens else "",
             "robots": json.dumps({"robots": [{"robot": enrolled.robot, "x": enrolled.x}]}),
         }
@@ -150,8 +154,8 @@ def request(address: tuple[str, int], token: str, path: str = "/ws") -> bytes:
 class Client:
     """A socket of a robot, without the cost of a library."""
 
-    def __init__(self, address: tuple[str, int]) -> None:
-        self._socket = socket.create_connection(address, timeout=WAIT_S)
+    def __init__(self, address: tuple[str, int], source: str = "127.0.0.1") -> None:
+        self._socket = socket.create_connection(address, timeout=WAIT_S, source_address=(source, 0))
         self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         self._seen = b""
 

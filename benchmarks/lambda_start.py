@@ -1,7 +1,9 @@
 """CPU time of a cold start of the serverless PnP: import, set-up, first solve.
 
-Each run is a fresh process; fetching the keys from S3 is left out, because it takes time but no CPU.
-``python benchmarks/lambda_start.py --out FILE``; run it in build/lambda's own Python for its own figures.
+Each run is a fresh process; fetching the keys from S3 is left out: it takes time, but no CPU.  Runs with
+bytecode, as the package of the function has it, and runs that compile all sources take turns.
+``python benchmarks/lambda_start.py --out FILE``; ``--folder build/lambda --python python3.13`` measures the
+package itself, and `--base TREE` another tree of the sources beside it.
 """
 
 from __future__ import annotations
@@ -12,7 +14,9 @@ import os
 import statistics
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
+from typing import Any
 
 RUNS = 10
 BAR_S = 0.5
@@ -54,28 +58,56 @@ def order() -> str:
     return json.dumps({"keys": key.key_set().to_json(), "event": event, "now_s": now_s})
 
 
+def start(python: str, folder: Path, bytecode: Path | None, sent: str) -> dict[str, Any]:
+    """Return the figures of one process in *folder*; its bytecode is in *bytecode*, or nowhere."""
+    environment = {"PATH": os.environ["PATH"], "PYTHONPYCACHEPREFIX": str(bytecode or "/nonexistent")}
+    if bytecode is None:
+        environment["PYTHONDONTWRITEBYTECODE"] = "1"
+    done = subprocess.run(
+        [python, "-c", ONE_START], input=sent, capture_output=True, text=True, check=True,
+        cwd=folder, env=environment,
+    )  # fmt: skip
+    row: dict[str, Any] = json.loads(done.stdout)
+    assert row["result"]
+    assert not row["cv2"]
+    return row
+
+
 def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--folder", type=Path, default=Path.cwd(), help="the sources that are measured")
+    parser.add_argument("--base", type=Path, help="other sources, measured in turns")
+    parser.add_argument("--python", default=sys.executable)
     parser.add_argument("--out", type=Path)
     args = parser.parse_args()
-    sent, rows, load = order(), [], os.getloadavg()
-    for _ in range(RUNS):
-        done = subprocess.run(
-            [sys.executable, "-c", ONE_START], input=sent, capture_output=True, text=True, check=True
-        )
-        rows.append(json.loads(done.stdout))
-    assert all(row["result"] and not row["cv2"] for row in rows)
+    sent, load = order(), os.getloadavg()
+    trees = {"": args.folder, **({"base, ": args.base} if args.base else {})}
+    rows: dict[str, list[dict[str, Any]]] = {}
+    with tempfile.TemporaryDirectory() as bytecode:
+        for number in range(-1, RUNS):
+            for name, tree in trees.items():
+                for kind, kept in (("bytecode", Path(bytecode)), ("compiling", None)):
+                    row = start(args.python, tree, kept, sent)
+                    if number >= 0:  # the first run writes the bytecode
+                        rows.setdefault(name + kind, []).append(row)
     figures = {
-        name: {
-            "p50": round(statistics.median(row[name] for row in rows), 3),
-            "max": round(max(row[name] for row in rows), 3),
+        kind: {
+            name: {
+                "p50": round(statistics.median(row[name] for row in taken), 3),
+                "max": round(max(row[name] for row in taken), 3),
+            }
+            for name in ("import_s", "first_s", "all_s")
         }
-        for name in ("import_s", "first_s", "all_s")
+        for kind, taken in rows.items()
     }
-    for name, each in figures.items():
-        print(f"{name:<10} p50 {each['p50']:.3f}  max {each['max']:.3f} s of processor time (n = {RUNS})")
-    print(f"bar: import and first solve within {BAR_S} s; load average before: {load[0]:.2f}")
+    for kind, each in figures.items():
+        for name, found in each.items():
+            print(
+                f"{kind:<16} {name:<9} p50 {found['p50']:.3f}  max {found['max']:.3f} s of processor time "
+                f"(n = {RUNS})"
+            )
+    print(f"bar: all_s with bytecode within {BAR_S} s; load average before: {load[0]:.2f}")
     if args.out:
         args.out.write_text(json.dumps({"runs": RUNS, "load_average": load, **figures}, indent=2) + "\n")
 

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import hashlib
+import importlib.util
 import json
 import shutil
+import sys
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
@@ -134,3 +136,42 @@ def test_an_instance_may_complete_the_hook_of_its_own_group_only(assembly: Any) 
 
     (statement,) = statements
     assert json.dumps(statement["Resource"]).rstrip('"}]').endswith(":autoScalingGroupName/rse-pf")
+
+
+def test_the_function_carries_the_bytecode_of_its_python_and_the_same_each_time(
+    repository: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    builder = _builder(repository)
+    monkeypatch.setattr(builder, "AMAZON_2023", (f"{sys.version_info[0]}.{sys.version_info[1]}", 34))
+    found = []
+    for name in ("a", "b"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "thing.py").write_text('"""Docs."""\nWORDS = {"x", "y", "z"}\n')
+        builder._compile(tmp_path / name)
+        (file,) = (tmp_path / name / "__pycache__").glob("thing.*.pyc")
+        found.append(file.read_bytes())
+
+    assert found[0] == found[1]
+    assert found[0][4] == 1, "Lambda does not compare it with the source (PEP 552)"
+    assert b"/var/task/thing.py" in found[0]
+
+
+def test_without_a_python_of_the_functions_version_a_line_says_what_is_slower(
+    repository: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    builder = _builder(repository)
+    monkeypatch.setattr(builder, "AMAZON_2023", ("3.0", 34))
+
+    builder._compile(tmp_path)
+
+    assert "cold start" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
+def _builder(repository: Path) -> Any:
+    spec = importlib.util.spec_from_file_location("assets_builder", repository / "scripts" / "assets.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module

@@ -31,6 +31,7 @@ _UPGRADE = (
 )
 """What picows reads of a request that was judged before: it keeps what it reads as long as the connection."""
 _SWITCHING = 101
+_NO_HEADERS: dict[str, str] = {}
 _MAX_READ_BYTES = 16384
 """Bytes read at once: thousands of the smallest frames fit in, and the other robots wait meanwhile."""
 _LINGER_S = 2.0
@@ -97,6 +98,7 @@ class _Upgrade:
         """Return the answer; picows has added the header ``Sec-WebSocket-Accept``."""
         chosen = f"Sec-WebSocket-Protocol: {self._subprotocol}\r\n" if self._subprotocol else ""
         accept = self.headers["Sec-WebSocket-Accept"]
+        self.headers = _NO_HEADERS  # picows keeps this object as long as the connection
         return bytearray(
             "HTTP/1.1 101 Switching Protocols\r\nConnection: upgrade\r\nUpgrade: websocket\r\n"
             f"{chosen}Sec-WebSocket-Accept: {accept}\r\n\r\n".encode()
@@ -293,6 +295,7 @@ def protocol_type(picows: Any) -> Any:
             self._request = (b"", b"")
             get_buffer(self, -1)[: len(request)] = request
             buffer_updated(self, len(request))
+            self.transport.request.headers = None  # picows keeps them as long as the connection
             while rest:
                 size = min(len(self.get_buffer(-1)), len(rest))
                 self._buffer[:size] = rest[:size]
