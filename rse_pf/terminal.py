@@ -17,12 +17,14 @@ import json
 import re
 import sys
 import unicodedata
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any, TextIO
 
 from rse_pf.errors import RsePfError
 
 __all__ = [
+    "at_work",
     "can_draw",
     "counted",
     "error_lines",
@@ -107,6 +109,16 @@ def show_progress(text: str, *, is_over: bool) -> None:
     if sys.stderr.isatty():
         end = "\n" if is_over else ""
         _write(sys.stderr, f"{_CLEAR_LINE}{printable(text)}{end}")
+
+
+@contextmanager
+def at_work(text: str) -> Iterator[None]:
+    """Show *text* as the last line of a terminal while the body works, and clear it at its end."""
+    show_progress(f"{text} ...", is_over=False)
+    try:
+        yield
+    finally:
+        show_progress("", is_over=False)
 
 
 def json_line(value: Any, encode: Callable[[Any], bytes]) -> bytes:

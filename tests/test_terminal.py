@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
 import json
 import unicodedata
@@ -13,6 +14,7 @@ from hypothesis import strategies as st
 
 from rse_pf.errors import CommandFailed
 from rse_pf.terminal import (
+    at_work,
     counted,
     error_lines,
     json_line,
@@ -119,7 +121,7 @@ def test_an_error_without_a_hint_names_where_it_is_explained() -> None:
         (0, "robot", "0 robots"),
         (1, "robot", "1 robot"),
         (2, "robot", "2 robots"),
-        (1200, "point", "1,200 points"),
+        (1200, "point", "1200 points"),
     ],
 )
 def test_a_number_and_its_noun_agree(number: int, noun: str, text: str) -> None:
@@ -154,3 +156,16 @@ def test_progress_rewrites_a_line_of_a_terminal_only(
     show_progress("done", is_over=True)
 
     assert screen.getvalue() == ("\r\033[K50 %\\n\\x1b\r\033[Kdone\n" if is_terminal else "")
+
+
+@pytest.mark.parametrize("fails", [True, False])
+def test_what_is_at_work_is_shown_until_its_end(fails: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    screen = io.StringIO()
+    monkeypatch.setattr(screen, "isatty", lambda: True, raising=False)
+    monkeypatch.setattr("sys.stderr", screen)
+
+    with contextlib.suppress(ValueError), at_work("drawing the map"):
+        if fails:
+            raise ValueError
+
+    assert screen.getvalue() == "\r\033[Kdrawing the map ...\r\033[K"

@@ -43,7 +43,7 @@ from rse_pf.local.state import state_folder
 from rse_pf.maps.export import FORMATS, export_map
 from rse_pf.maps.format import MapVersion
 from rse_pf.maps.registry import MapRecord, MapRegistry, difference
-from rse_pf.terminal import counted, show, show_json, show_progress
+from rse_pf.terminal import at_work, counted, show, show_json, show_progress
 
 if TYPE_CHECKING:
     from rse_pf.services.mapping.localise import LocaliseReply
@@ -334,7 +334,8 @@ def _localise(args: argparse.Namespace, maps: MapRegistry) -> int:
         raise UsageError(f"--every {args.every} is below 1", hint="1 takes every frame")
     name, version = _version_of(args.name)
     data = maps.data(name, version)
-    version_map, index = open_map(data)
+    with at_work(f"reading {args.name}"):
+        version_map, index = open_map(data)
     frames = [each for word in args.frames for each in _frames(word, args.every)]
     found: list[dict[str, Any]] = []
     for each in frames:
@@ -391,7 +392,8 @@ def _draw(args: argparse.Namespace, maps: MapRegistry, record: MapRecord) -> Non
         robots.append(RobotPath(name=robot, T_world_camera=np.stack([k.T_world_camera for k in own])))
     caption = f"{args.name}, version {record.number}: {counted(record.keyframes, 'keyframe')}, "
     caption += f"{record.points:,} point{'s' * (record.points != 1)}"
-    draw_map(args.png, version.points, version.colours, robots, caption)
+    with at_work("drawing the map"):
+        draw_map(args.png, version.points, version.colours, robots, caption)
 
 
 def _id_of_head(name: str, maps: MapRegistry) -> str | None:

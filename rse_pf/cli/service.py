@@ -39,7 +39,7 @@ from rse_pf.errors import CommandFailed, RsePfError, UsageError
 from rse_pf.local.state import read_state, state_folder
 from rse_pf.services.custom.installed import install, installed_services, read_service
 from rse_pf.services.custom.native import INCLUDE_FOLDER
-from rse_pf.terminal import counted, error_lines, show, show_json
+from rse_pf.terminal import at_work, counted, error_lines, show, show_json, show_progress
 
 __all__ = ["add_arguments", "run"]
 
@@ -169,7 +169,8 @@ def _build(source: Path) -> None:
             "cmake is not installed, so the service cannot be built", hint="apt install cmake g++"
         )
     for command in (["cmake", "-S", ".", "-B", "build"], ["cmake", "--build", "build"]):
-        done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+        with at_work(f"building {folder.name}"):
+            done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
         if done.returncode != 0:
             output = (done.stderr or done.stdout).strip()[-1500:]
             raise CommandFailed(f"{' '.join(command)} failed:\n{output}", hint=f"fix the sources in {folder}")
@@ -265,9 +266,11 @@ async def _run(source: Path, settings: PlatformSettings, *, once: bool) -> int:
         stopped = asyncio.Event()
         for number in (signal.SIGINT, signal.SIGTERM):
             asyncio.get_running_loop().add_signal_handler(number, stopped.set)
+        show_progress("starting a platform ...", is_over=False)
         async with LocalPlatform(
             chosen, state=place / "platform", servers=1, port=0, name="service"
         ) as platform:
+            show_progress("", is_over=False)
             show(f"{service.name} is served at {platform.url}")
             good = await _ask_recorded(platform, service, recorded, settings)
             if once:
