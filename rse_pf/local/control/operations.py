@@ -29,7 +29,7 @@ class Operations:
         self._running = ""
 
     def heard(self, event: Event) -> None:
-        """Take an event of the platform, and pass it on to whoever asked for an operation."""
+        """Take an event of the platform, and pass it on to the commands that wait for an operation."""
         for listener in list(self._listeners):
             listener(event)
 
