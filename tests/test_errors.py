@@ -2,12 +2,20 @@
 
 from __future__ import annotations
 
+import errno
 import pickle
 
 import pytest
 
 from rse_pf import errors
-from rse_pf.errors import CommandFailed, MissingExtra, RsePfError, error_from_code, message_of
+from rse_pf.errors import (
+    CommandFailed,
+    MissingExtra,
+    RsePfError,
+    error_from_code,
+    error_of_system,
+    message_of,
+)
 
 CODES = {
     "AuthError": "auth",
@@ -123,3 +131,21 @@ def test_an_error_survives_the_way_between_processes(error: RsePfError) -> None:
         error.hint,
         error.retry_after_ms,
     )
+
+
+@pytest.mark.parametrize(
+    ("number", "kind", "hint"),
+    [
+        (errno.ENOSPC, errors.StoreFull, "free some space"),
+        (errno.EACCES, RsePfError, "permissions"),
+        (errno.EADDRINUSE, RsePfError, "another port"),
+        (errno.ECONNREFUSED, errors.ConnectError, "rse-pf local"),
+        (errno.EIO, RsePfError, "see what the system says"),
+    ],
+)
+def test_what_the_system_refuses_has_a_hint_that_fits(number: int, kind: type[RsePfError], hint: str) -> None:
+    error = error_of_system(OSError(number, "Refused", "out/map.ply"))
+
+    assert type(error) is kind
+    assert error.message == "Refused: 'out/map.ply'"
+    assert hint in error.hint
