@@ -4,6 +4,7 @@
 #include <cstdlib>
 #include <cstring>
 
+#include "processor.hpp"
 #include "workspace.hpp"
 
 extern "C" {
@@ -98,7 +99,7 @@ int32_t checked(const rse_pf_pnp_request& request, const int64_t* inliers) {
 
 bool has_avx2() {
 #if defined(__x86_64__)
-    return __builtin_cpu_supports("avx2") != 0;
+    return rse_pf::processor().avx2;
 #else
     return false;
 #endif

@@ -7,6 +7,7 @@
 #define RSE_PF_ISA rse_pf_depth_detail
 #pragma GCC diagnostic push
 #pragma GCC diagnostic ignored "-Wunused-function"
+#include "processor.hpp"
 #include "small.hpp"
 #pragma GCC diagnostic pop
 
@@ -51,7 +52,7 @@ void add(const Rows& rows, const Pose& pose, const Sensor& sensor, bool has_avx2
 
 bool may_use_avx2(uint32_t flags) {
 #if defined(__x86_64__)
-    return (flags & RSE_PF_DEPTH_PORTABLE) == 0 && __builtin_cpu_supports("avx2") != 0;
+    return (flags & RSE_PF_DEPTH_PORTABLE) == 0 && rse_pf::processor().avx2;
 #else
     (void)flags;
     return false;

@@ -8,6 +8,7 @@
 #include <cstring>
 
 #include "orb_pattern.hpp"
+#include "processor.hpp"
 #include "rse_pf_match.h"
 
 #if defined(__x86_64__)
@@ -314,7 +315,7 @@ extern "C" __attribute__((visibility("default"))) int32_t rse_pf_describe(
     if (gray == nullptr || scales == nullptr || pixels == nullptr || cosines == nullptr || sines == nullptr ||
         octaves == nullptr || workspace == nullptr || descriptors == nullptr || width < 2 || height < 2 ||
         width > kMaxSide || height > kMaxSide || levels < 1 || levels > kMaxLevels || rows < 0 || rows > kMaxRows ||
-        __builtin_cpu_supports("avx2") == 0 || __builtin_cpu_supports("fma") == 0)
+        !rse_pf::processor().avx2 || !rse_pf::processor().fma)
         return -1;
     // The widest numbers first, so that all are aligned: eights to 16 bytes, then numbers of 4, 2 and 1.
     Workspace work;

@@ -9,6 +9,8 @@
 #include <cstdint>
 #include <cstring>
 
+#include "processor.hpp"
+
 #if defined(__x86_64__)
 #include <immintrin.h>
 #define RSE_PF_AVX2 __attribute__((target("avx2")))
@@ -185,7 +187,7 @@ RSE_PF_AVX512 inline Nearest two_nearest_of_eights(const Search& search, const u
 inline Search prepared(const uint8_t* descriptors, int64_t rows, uint64_t* room, Lanes most) {
     Search search = {descriptors, rows, room, Lanes::words};
 #if defined(__x86_64__)
-    const bool has_avx512 = __builtin_cpu_supports("avx512f") != 0 && __builtin_cpu_supports("avx512vpopcntdq") != 0;
+    const bool has_avx512 = rse_pf::processor().avx512_popcount;
     if (most == Lanes::avx512 && has_avx512) {
         search.lanes = Lanes::avx512;
         const int64_t eights = (rows + kEight - 1) / kEight;
@@ -193,7 +195,7 @@ inline Search prepared(const uint8_t* descriptors, int64_t rows, uint64_t* room,
         for (int64_t row = 0; row < rows; ++row)
             for (int64_t k = 0; k < kWords; ++k)
                 room[(row / kEight * kWords + k) * kEight + row % kEight] = word(descriptors + kBytes * row + 8 * k);
-    } else if (most != Lanes::words && __builtin_cpu_supports("avx2") != 0 && rows / kBlock <= kMostBlocks) {
+    } else if (most != Lanes::words && rse_pf::processor().avx2 && rows / kBlock <= kMostBlocks) {
         search.lanes = Lanes::avx2;
         uint8_t* const bytes = reinterpret_cast<uint8_t*>(room);
         for (int64_t row = 0; row < rows / kBlock * kBlock; ++row)
