@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -16,8 +16,11 @@ from typing import Any
 
 import numpy as np
 
-from client_sdk.frontend import Frame, FrontEndOptions, PoseQuery, TrackedFrame, Tracker
-from client_sdk.mapping import MapOptions, PointMap, Trajectory, write_ply, write_trajectory
+from client_sdk.answers import PoseAnswer
+from client_sdk.frontend import Frame, FrontEndOptions, PoseQuery, TrackedFrame
+from client_sdk.mapper import Mapper, ask_robot
+from client_sdk.mapping import PointMap, Trajectory, write_ply, write_trajectory
+from client_sdk.robot import Robot
 from rse_pf.config import DataSettings, SessionSettings
 from rse_pf.errors import RsePfError, error_of_system
 from rse_pf.experiments.child_process import ChildFailed, ChildReady, ParentPipe
@@ -140,32 +143,34 @@ async def _run(spec: RobotSpec, pipe: ParentPipe) -> None:
         pipe.send(ChildReady(len(frames)))
         began = await asyncio.to_thread(pipe.wait_start)
         start = np.eye(4) if truth is None or options.merge else truth.T_world_camera[0]
-        tracker = Tracker(options.frontend_options, T_world_start=start)
-        point_map = PointMap(MapOptions())
         drive = _Drive()
+        planned = began
+
+        async def ask(query: PoseQuery) -> PoseAnswer:
+            return await _solve(robot, query, planned, began, spec, drive)
+
+        mapper = Mapper(ask=ask, depth=True, options=options.frontend_options, T_world_start=start)
         collector = _collector(spec, pipe.token, lambda: drive.asking)
         first_s = time.monotonic()
         for row, frame in enumerate(frames):
             planned = began + (row + spec.number / options.robots) / options.rate_hz
             await asyncio.sleep(max(0.0, planned - time.monotonic()))
-            done = await _track(robot, tracker, frame, planned, began, spec, drive)
-            if done.T_world_camera is not None:
-                await asyncio.to_thread(point_map.add, frame, done.T_world_camera)
-                if collector is not None:
-                    await asyncio.to_thread(collector.add, done)
+            done = await mapper.track(frame)
+            if done.T_world_camera is not None and collector is not None:
+                await asyncio.to_thread(collector.add, done)
             drive.tracked.append(done)
             pipe.send(FrameDone(row + 1))
         took_s = time.monotonic() - first_s
-        trajectory = _trajectory(drive.tracked)
-        uploaded = await asyncio.to_thread(_write, spec.folder, point_map, trajectory, collector)
+        trajectory = mapper.trajectory
+        uploaded = await asyncio.to_thread(_write, spec.folder, mapper.map, trajectory, collector)
         pipe.send(
             RobotFinished(
-                frames=tracker.frames,
-                lost_frames=tracker.lost_frames,
-                keyframes=tracker.keyframes,
+                frames=mapper.frames,
+                lost_frames=mapper.lost_frames,
+                keyframes=mapper.keyframes,
                 weak_poses=drive.weak_poses,
-                map_points=len(point_map),
-                fps=tracker.frames / max(took_s, 1e-9),
+                map_points=len(mapper.map),
+                fps=mapper.frames / max(took_s, 1e-9),
                 matches=[done.matches for done in drive.tracked[1:]],
                 inliers=[done.inliers for done in drive.tracked[1:]],
                 commands=drive.commands,
@@ -181,27 +186,10 @@ async def _run(spec: RobotSpec, pipe: ParentPipe) -> None:
         )
 
 
-async def _track(
-    robot: Any,
-    tracker: Tracker,
-    frame: Frame,
-    planned: float,
-    began: float,
-    spec: RobotSpec,
-    drive: _Drive,
-) -> TrackedFrame:
-    """Request poses from the platform until the frame has one or is lost."""
-    step = await asyncio.to_thread(tracker.prepare, frame)
-    while isinstance(step, PoseQuery):
-        T_camera_world, inliers = await _solve(robot, step, planned, began, spec, drive)
-        step = await asyncio.to_thread(tracker.accept, step, T_camera_world, inliers)
-    return step
-
-
 async def _solve(
-    robot: Any, query: PoseQuery, planned: float, began: float, spec: RobotSpec, drive: _Drive
-) -> tuple[Array | None, int]:
-    options = PnpOptions(inlier_px=query.inlier_px, max_iterations=query.max_iterations)
+    robot: Robot, query: PoseQuery, planned: float, began: float, spec: RobotSpec, drive: _Drive
+) -> PoseAnswer:
+    """Request one pose from the platform, and record how that went."""
     sent = time.monotonic()
     record = CommandRecord(
         id=len(drive.commands) + 1,
@@ -214,18 +202,10 @@ async def _solve(
     )
     drive.asking = True
     try:
-        answer = await robot.solve_pnp(
-            query.correspondences.points_world,
-            query.correspondences.pixels,
-            query.camera,
-            options,
-            depths_m=query.correspondences.depths_m,
-            deadline_s=spec.session.answer_timeout_s,
-            keep=True,
-        )
+        answer = await ask_robot(robot, spec.session.answer_timeout_s)(query)
     except RsePfError as error:
         drive.commands.append(replace(record, answered=_since(began), code=error.code))
-        return None, 0
+        raise
     finally:
         drive.asking = False
     drive.commands.append(
@@ -244,7 +224,7 @@ async def _solve(
         )
     )
     drive.weak_poses += answer.solution.verdict == "weak"
-    return answer.solution.T_camera_world, len(answer.solution.inliers)
+    return answer
 
 
 def _since(began: float) -> float:
