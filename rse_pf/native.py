@@ -339,7 +339,7 @@ def native_solver() -> NativeSolver:
     """
     path = find_library()
     if path is None:
-        error = MissingExtra("the native solver", "solver")
-        error.hint = "build it: make -C native; or choose the engine poselib"
+        error = MissingExtra("the native solver", "native")
+        error.hint = "build it: make -C native, or pip install ./native; or choose the engine poselib"
         raise error
     return open_solver(path)

@@ -2,17 +2,26 @@
 
 from __future__ import annotations
 
+import time
+import zlib
+from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import replace
+from typing import cast
 
+import numpy as np
 import pytest
 
 from fuzz.meter import MAX_MIB, MAX_MS, Meter
 from fuzz.samples import EXPENSIVE, MAX_INPUT_BYTES
-from rse_pf.config import SessionSettings
+from rse_pf.config import PlatformSettings, SessionSettings
 from rse_pf.errors import ProtocolError
 from rse_pf.pnp.problems import KINECT, make_problem
-from rse_pf.services.pnp import make_request
+from rse_pf.service import dispatch
+from rse_pf.services.builtin import builtin_services
+from rse_pf.services.pnp import make_request, wire_types
 from rse_pf.wire import CODECS, Command, make_codec
+from rse_pf.wire.native_codec import native_codec
 
 _SLOW_MACHINE = 6.0
 
@@ -51,3 +60,30 @@ def test_messages_of_the_sdk_are_far_below_the_limits(name: str, matches: int, s
         return
 
     assert isinstance(make_codec(name, tight).decode_from_robot(data), Command)
+
+
+@pytest.mark.skipif(native_codec() is None, reason="the native core is not built: make -C native")
+@pytest.mark.parametrize("inside", [b"[", b'{"type":"command","id":1,"service":"pnp","payload":"'])
+def test_refusing_a_bomb_costs_less_than_a_pose(inside: bytes) -> None:
+    registry = builtin_services(PlatformSettings())
+    codec = make_codec("zlib", pnp=wire_types(registry))
+    problem = make_problem(seed=1, n=200)
+    request = make_request(problem.points_world, problem.pixels, KINECT)
+    pose = codec.encode(Command(id=1, service="pnp", payload=request))
+    bomb = zlib.compress(inside + b"x" * 10**7, 9)
+
+    def answer(data: bytes) -> None:
+        dispatch(registry, cast(Command, codec.decode_from_robot(data)), lambda: 0.0)
+
+    # In turns: a pause of the machine meets both.
+    costs = [[cpu_s(answer, data) for data in (bomb, pose)] for _ in range(20)]
+
+    of_bomb, of_pose = np.min(costs, axis=0)
+    assert of_bomb < of_pose, costs
+
+
+def cpu_s(call: Callable[[bytes], None], data: bytes) -> float:
+    begin = time.thread_time()
+    with suppress(ProtocolError):
+        call(data)
+    return time.thread_time() - begin
