@@ -73,7 +73,6 @@ def test_a_second_operation_is_refused_and_the_first_goes_on_without_a_listener(
             done.set()
 
         operations.begin("roll", work)
-        await asyncio.tasks.sleep(0)
         with pytest.raises(UsageError, match="'roll' is under way"):
             operations.begin("drain", work)
         go.set()

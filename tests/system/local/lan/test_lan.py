@@ -45,6 +45,7 @@ async def ask(moves=0, **how):
                 if answer.server not in servers:
                     servers.append(answer.server)
                     print("pose by", answer.server, answer.solution.T_camera_world.shape, flush=True)
+                await asyncio.sleep(0.05 * (moves > 0))  # the rate of a camera
             print("sent - answered =", robot.stats.sent - answered, "failed =", robot.stats.failed)
     except RsePfError as error:
         print(type(error).__name__, error.message, "/", error.hint)
