@@ -36,7 +36,7 @@ class MonocularOptions:
 
     Attributes:
         features: Features of a frame, spread over its cells.
-        max_matches: The closest in appearance are sent, so that a command stays under 10 kB.
+        max_matches: An even sample of so many is sent: a command stays under 10 kB in every codec.
         inlier_px: Largest reprojection error of an inlier.
         max_iterations: Of RANSAC.
         min_inliers: A pose with fewer is not accepted.
@@ -49,7 +49,7 @@ class MonocularOptions:
     """
 
     features: int = 1000
-    max_matches: int = 400
+    max_matches: int = 250
     inlier_px: float = 3.0
     max_iterations: int = 1000
     min_inliers: int = 20
@@ -166,11 +166,6 @@ class MonocularTracker:
         for row, each in enumerate(self._posed):
             self._posed[row] = replace(each, T_keyframe_camera=_scaled(each.T_keyframe_camera, scale))
         self._last, self._motion = _scaled(self._last, scale), _scaled(self._motion, scale)
-
-    def finish(self) -> None:
-        """Adjust all keyframes and landmarks together once more, which takes seconds."""
-        if self.map is not None:
-            self.map.adjust_all()
 
     # --- the start ---
 

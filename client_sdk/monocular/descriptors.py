@@ -18,6 +18,7 @@ __all__ = ["match_all", "match_near"]
 Descriptors = npt.NDArray[np.uint8]
 Rows = npt.NDArray[np.int64]
 
+_BAND = 1e6
 _BITS = np.array([bin(value).count("1") for value in range(256)], dtype=np.uint8)
 
 
@@ -78,17 +79,33 @@ def match_near(
 
 
 def _pairs_within(predicted: Array, pixels: Array, limit: Array) -> tuple[Rows, Rows]:
-    """Return all pairs (row of predicted, row of pixels) within the limit, by a sweep over columns."""
-    order = np.argsort(pixels[:, 0], kind="stable")
-    x = pixels[order, 0]
-    first = np.searchsorted(x, predicted[:, 0] - limit)
-    last = np.searchsorted(x, predicted[:, 0] + limit, side="right")
-    counts = last - first
-    rows = np.repeat(np.arange(len(predicted)), counts)
-    offsets = np.arange(len(rows)) - np.repeat(np.cumsum(counts) - counts, counts)
-    columns = order[np.repeat(first, counts) + offsets]
-    near = np.square(pixels[columns] - predicted[rows]).sum(axis=1) <= np.square(limit[rows])
-    return rows[near], columns[near].astype(np.int64)
+    """Return all pairs (row of predicted, row of pixels) within the limit.
+
+    The pixels are sorted by bands of rows, and by column within a band, so that each prediction looks at a
+    stretch of three bands only.
+    """
+    height = max(float(limit.max()), 1.0)
+    key = _key(np.floor(pixels[:, 1] / height), pixels[:, 0])
+    order = np.argsort(key, kind="stable")
+    key = key[order]
+    band = np.floor(predicted[:, 1] / height)
+    found: list[tuple[Rows, Rows]] = []
+    for offset in (-1, 0, 1):
+        first = np.searchsorted(key, _key(band + offset, predicted[:, 0] - limit))
+        last = np.searchsorted(key, _key(band + offset, predicted[:, 0] + limit), side="right")
+        counts = last - first
+        rows = np.repeat(np.arange(len(predicted)), counts)
+        offsets = np.arange(len(rows)) - np.repeat(np.cumsum(counts) - counts, counts)
+        columns = order[np.repeat(first, counts) + offsets]
+        near = np.square(pixels[columns] - predicted[rows]).sum(axis=1) <= np.square(limit[rows])
+        found.append((rows[near], columns[near].astype(np.int64)))
+    return np.concatenate([rows for rows, _ in found]), np.concatenate([columns for _, columns in found])
+
+
+def _key(band: Array, x: Array) -> Array:
+    """Return numbers that sort by band, then by column; columns far outside stay in their band."""
+    key: Array = band * _BAND + np.clip(x, -0.4 * _BAND, 0.4 * _BAND)
+    return key
 
 
 def _one_to_one(rows: Rows, columns: Rows, distances: npt.NDArray[Any]) -> tuple[Rows, Rows]:

@@ -10,7 +10,6 @@ import argparse
 import asyncio
 import contextlib
 import signal
-import sys
 from collections.abc import AsyncIterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -28,7 +27,6 @@ if TYPE_CHECKING:
 __all__ = ["add_from_camera_arguments", "run_from_camera"]
 
 _ROBOT = "camera"
-_EVERY_S = 2.0
 _MOST = 0.5
 """Share of frames without a pose above which the command has failed."""
 
@@ -190,10 +188,9 @@ async def _robot(args: argparse.Namespace, settings: PlatformSettings) -> AsyncI
 
 
 class _Status:
-    """The line of a drive: rewritten on a terminal, written at times elsewhere."""
+    """The line of a drive, rewritten on a terminal."""
 
     def __init__(self) -> None:
-        self._shown_s = -_EVERY_S
         self._last = ""
 
     def show(self, mapper: Mapper, done: TrackedFrame) -> None:
@@ -206,9 +203,6 @@ class _Status:
             f"{mapper.lost_frames} lost"
         )
         show_progress(self._last, is_over=False)
-        if not sys.stderr.isatty() and done.frame.timestamp_s - self._shown_s >= _EVERY_S:
-            self._shown_s = done.frame.timestamp_s
-            show(self._last)
 
     def end(self) -> None:
         """End the line."""

@@ -10,7 +10,8 @@ import pytest
 from rse_pf.config import setting_rows
 
 PAGES = (
-    "README.md", "CONTRIBUTING.md", "docs/architecture.md", "docs/data.md", "docs/design.md",
+    "README.md", "CONTRIBUTING.md", "docs/architecture.md", "docs/cameras.md", "docs/data.md",
+    "docs/design.md",
     "docs/map_services.md", "docs/operations.md", "docs/protocol.md", "docs/security.md",
     "docs/services.md", "docs/results/README.md", "docs/errors.md", "docs/local.md",
 )  # fmt: skip

@@ -189,3 +189,16 @@ def test_a_marker_gives_the_scale() -> None:
 def test_a_length_that_cannot_be_is_refused(make: object) -> None:
     with pytest.raises(UsageError):
         make()  # type: ignore[operator]
+
+
+def test_the_search_near_pixels_finds_what_a_search_of_all_pairs_finds() -> None:
+    rng = np.random.default_rng(8)
+    descriptors = rng.integers(0, 256, (300, 32), dtype=np.uint8)
+    pixels = rng.uniform([0, 0], [640, 480], (300, 2))
+    predicted = pixels + rng.uniform(-30, 30, (300, 2))
+    near = np.linalg.norm(predicted - pixels, axis=1) <= 20.0
+
+    rows, columns = match_near(predicted, descriptors, pixels, descriptors, radius_px=20.0, max_distance=0)
+
+    np.testing.assert_array_equal(rows, columns)
+    np.testing.assert_array_equal(np.sort(rows), np.flatnonzero(near))
