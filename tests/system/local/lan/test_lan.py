@@ -6,9 +6,12 @@ import io
 import json
 import os
 import signal
+import socket
+import ssl
 import stat
 import subprocess
 import sys
+import time
 import urllib.request
 from collections.abc import Iterator
 from contextlib import redirect_stderr, redirect_stdout
@@ -19,8 +22,10 @@ import pytest
 from prometheus_client.parser import text_string_to_metric_families
 from system.local.lan.conftest import OtherMachine
 
+from rse_pf.auth.certificates import SERVER_S
 from rse_pf.auth.control_token import bearer, read_control_token
 from rse_pf.cli.main import main
+from rse_pf.local.lan.listener import LanListener
 from rse_pf.local.processes import send_signal
 from rse_pf.local.state import PlatformState, read_state
 
@@ -243,3 +248,34 @@ def test_the_last_server_and_an_unknown_one_are_not_drained_and_a_long_pause_is_
     assert told[1][0] == "UsageError: no server named 'server-99' is running"
     assert f"{server} would not go on after 2 s" in told[2][0]
     assert lan.state.servers[0].name == server
+
+
+def test_a_renewed_certificate_is_served_without_a_restart_and_open_connections_stay(
+    lan: Lan, other_machine: OtherMachine
+) -> None:
+    context = ssl.create_default_context(cafile=str(lan.folder / "authority.crt"))
+    unchecked = ssl.create_default_context()
+    unchecked.check_hostname, unchecked.verify_mode = False, ssl.CERT_NONE
+    where = (other_machine.here, lan.state.port)
+
+    def served() -> bytes | None:
+        with (
+            socket.create_connection(where, timeout=SOON_S) as plain,
+            unchecked.wrap_socket(plain) as secured,
+        ):
+            return secured.getpeercert(binary_form=True)
+
+    before, balancer = served(), lan.state.load_balancer
+    with (
+        socket.create_connection(where, timeout=SOON_S) as plain,
+        context.wrap_socket(plain, server_hostname=other_machine.here) as opened,
+    ):
+        later_s = time.time() + 0.7 * SERVER_S
+        assert LanListener(address=other_machine.here, folder=lan.folder).prepare("default", now_s=later_s)
+        end = time.monotonic() + SOON_S
+        while served() == before:
+            assert time.monotonic() < end, "the balancer still serves the old certificate"
+
+        opened.sendall(b"GET /healthz HTTP/1.1\r\nHost: a\r\nConnection: close\r\n\r\n")
+        assert opened.recv(12) == b"HTTP/1.1 200"
+    assert lan.state.load_balancer == balancer
