@@ -27,8 +27,6 @@ from rse_pf.experiments.child_process import ChildFailed, ChildReady, ParentPipe
 from rse_pf.experiments.demo.keyframes import KeyframeCollector, KeyframeUploads
 from rse_pf.experiments.demo.merge import MAP_FILE
 from rse_pf.experiments.results.records import CommandRecord
-from rse_pf.geometry import Array
-from rse_pf.pnp import PnpOptions
 
 __all__ = ["DemoOptions", "FrameDone", "RobotFinished", "RobotSpec", "run_robot"]
 
@@ -247,15 +245,6 @@ def _load(spec: RobotSpec, pipe: ParentPipe) -> tuple[Any, Trajectory | None, st
         frames.append(frame)
         pipe.send(FrameDone(len(frames)))
     return frames, truth, "ground truth"
-
-
-def _trajectory(tracked: Iterable[TrackedFrame]) -> Trajectory:
-    posed = [done for done in tracked if done.T_world_camera is not None]
-    poses = [done.T_world_camera for done in posed]
-    return Trajectory(
-        np.array([done.frame.timestamp_s for done in posed]),
-        np.array(poses, dtype=np.float64).reshape(-1, 4, 4),
-    )
 
 
 def _collector(
