@@ -283,12 +283,14 @@ class Robot:
     ) -> Mapper:
         """Return a `Mapper` that asks this robot for its poses, within *deadline_s* each.
 
-        The other arguments are those of `Mapper`.
+        The other arguments are those of `Mapper`; *options* are bounded for the codec of this robot.
         """
+        from client_sdk.frontend import FrontEndOptions
         from client_sdk.mapper import Mapper, ask_robot
 
+        bounded = (options or FrontEndOptions()).sent_with(self._session.codec.name)
         return Mapper(
-            ask=ask_robot(self, deadline_s), camera=camera, options=options, monocular=monocular,
+            ask=ask_robot(self, deadline_s), camera=camera, options=bounded, monocular=monocular,
             depth=depth, scale=scale, map_options=map_options, T_world_start=T_world_start,
         )  # fmt: skip
 

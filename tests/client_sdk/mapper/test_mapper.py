@@ -6,16 +6,18 @@ import asyncio
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from client_sdk.answers import PoseAnswer
 from client_sdk.datasets import open_dataset
-from client_sdk.frontend import PoseQuery, TrackedFrame
+from client_sdk.frontend import FrontEndOptions, PoseQuery, TrackedFrame
 from client_sdk.mapper import BlockingMapper, Mapper
 from client_sdk.mapping import Trajectory, read_ply, read_trajectory
 from client_sdk.monocular.scale import OdometryScale
+from client_sdk.robot import Robot, connect
 from rse_pf.errors import Busy, MissingExtra, UsageError
 from rse_pf.experiments.results.trajectory_error import absolute_error
 from rse_pf.geometry import Camera
@@ -217,3 +219,25 @@ def test_the_kitchen_without_its_depth_is_mapped_within_8_cm(recordings: Path) -
     assert mapper.lost_frames <= 0.05 * len(dataset)
     assert len(path) >= 0.95 * len(dataset)
     assert absolute_error(path, truth).rmse_m <= 0.08
+
+
+def test_the_mapper_of_a_robot_asks_it_and_keeps_commands_of_its_codec_small(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    asked: list[tuple[int, object]] = []
+
+    async def answered(
+        self: Robot, points: Any, pixels: Any, camera: Any, options: Any, **more: Any
+    ) -> PoseAnswer:
+        asked.append((len(points), more["deadline_s"]))
+        solution = solve_pnp(points, pixels, camera, options)
+        return PoseAnswer(
+            solution=solution, source="cloud", server="s", round_trip_ms=1.0, queue_ms=0.0, compute_ms=0.0
+        )
+
+    monkeypatch.setattr(Robot, "solve_pnp", answered)
+    mapper = connect("ws://127.0.0.1:1/ws", codec="json").mapper(deadline_s=0.5)
+
+    assert [each.status for each in drive(mapper, range(2), depth=True)] == ["first", "tracked"]
+    assert asked[0][0] <= FrontEndOptions().sent_with("json").max_matches
+    assert asked[0][1] == 0.5
