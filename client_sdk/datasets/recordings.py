@@ -216,7 +216,7 @@ def _read_list(folder: Path, name: str) -> list[tuple[float, str]]:
 
 
 def _intrinsics(folder: Path) -> tuple[Camera, _Distortion, float, tuple[str, ...]]:
-    """Return camera, distortion, depth scale, and notes on what was assumed because the folder says nothing."""
+    """Return camera, distortion, depth scale, and notes on what was assumed without intrinsics.json."""
     path = folder / "intrinsics.json"
     if not path.exists():
         name = next(key for key in _FREIBURG if key in folder.resolve().name)

@@ -135,7 +135,8 @@ def installed_services(folder: Path) -> list[InstalledService]:
     """
     if not folder.is_dir():
         raise ConfigurationError(
-            f"there is no services folder {folder}", hint=f"install one there: rse-pf service install FOLDER --services {folder}"
+            f"there is no services folder {folder}",
+            hint=f"install one there: rse-pf service install FOLDER --services {folder}",
         )
     found = []
     for target in sorted(folder.iterdir()):

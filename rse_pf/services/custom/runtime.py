@@ -89,7 +89,8 @@ class _PythonRuntime:
         state = self._object.snapshot()
         if not isinstance(state, (bytes, bytearray, memoryview)):
             raise InternalError(
-                f"the snapshot of service {self._service.name!r} is of type {type(state).__name__}, not bytes",
+                f"the snapshot of service {self._service.name!r} is of type {type(state).__name__}, "
+                "not bytes",
                 hint="encode it, for example with msgspec.msgpack.encode(state)",
             )
         return bytes(state)
