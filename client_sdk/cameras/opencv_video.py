@@ -34,7 +34,7 @@ def open_video(
     is_file = not is_device and "://" not in source
     if is_file and not Path(source).is_file():
         raise UsageError(f"there is no video {source}", hint="name a device number, a video or a folder")
-    cv2.setLogLevel(0)  # OpenCV would print warnings of its own beside ours
+    _silence(cv2)
     capture = cv2.VideoCapture(int(source) if is_device else source)
     if not capture.isOpened():
         capture.release()
@@ -48,6 +48,12 @@ def open_video(
         capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)
     images = _file_images(cv2, capture, source) if is_file else _device_images(capture, source, clock)
     return images, capture.release
+
+
+def _silence(cv2: Any) -> None:
+    """Keep OpenCV from printing warnings of its own beside ours; 4.14 has the function in another module."""
+    logging = cv2 if hasattr(cv2, "setLogLevel") else cv2.utils.logging
+    logging.setLogLevel(0)
 
 
 def _file_images(cv2: Any, capture: Any, name: str) -> Iterator[RawFrame]:

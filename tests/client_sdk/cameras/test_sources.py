@@ -180,6 +180,23 @@ def test_a_device_that_ends_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
     close()
 
 
+@pytest.mark.parametrize("place", ["cv2", "cv2.utils.logging"])
+def test_opencv_is_silenced_where_its_version_has_the_function(
+    place: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    levels: list[int] = []
+    holder = SimpleNamespace(setLogLevel=levels.append)
+    if place == "cv2":
+        monkeypatch.setattr(cv2, "setLogLevel", levels.append, raising=False)
+    else:  # 4.14
+        monkeypatch.delattr(cv2, "setLogLevel", raising=False)
+        monkeypatch.setattr(cv2.utils, "logging", holder, raising=False)
+
+    with open_camera(video(tmp_path), intrinsics=INTRINSICS) as source:
+        assert len(list(source)) == FRAMES
+    assert levels == [0]
+
+
 def test_a_distorted_lens_is_straightened(tmp_path: Path) -> None:
     bent = Intrinsics(camera=CAMERA, distortion=(-0.4, 0.1, 0.0, 0.0, 0.0))
     path = video(tmp_path)
