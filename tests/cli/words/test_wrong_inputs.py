@@ -15,7 +15,7 @@ from cli.wrong_inputs import FAILED, WRONG_INPUTS, WrongInput, make_files
 
 from rse_pf.cli.main import VERBS, main
 
-TYPED_IN_A_SHELL = ("demos", "demo --data rec-empty", "map list --store dir:/typo")
+TYPED_IN_A_SHELL = ("demos", "settings --settings misspelt.json", "map list --store dir:/typo")
 AS_PROCESSES = [each for each in WRONG_INPUTS if each.typed in TYPED_IN_A_SHELL]
 
 
