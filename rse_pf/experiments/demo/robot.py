@@ -61,7 +61,8 @@ class DemoOptions:
     def frontend_options(self) -> FrontEndOptions:
         """The options of the trackers."""
         wide = self.frontend == "wide-baseline"
-        return FrontEndOptions.wide_baseline() if wide else FrontEndOptions()
+        options = FrontEndOptions.wide_baseline() if wide else FrontEndOptions()
+        return options.sent_with(self.codec)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
