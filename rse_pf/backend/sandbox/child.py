@@ -6,6 +6,7 @@ complete, and whatever a service raises becomes a typed failure.
 
 from __future__ import annotations
 
+import ctypes
 import io
 import os
 import re
@@ -30,6 +31,10 @@ from rse_pf.services.custom.runtime import Runtime, open_runtime
 
 __all__ = ["SandboxPlan", "readable_paths", "run_sandbox"]
 
+_UNBUFFERED = 2
+"""``_IONBF`` of the GNU C library and of musl."""
+_MAX_PROBLEM = 150
+_REPLY_HINT = "reply with numbers, text, bytes, lists, maps and arrays of numbers"
 _FRAMES_SHOWN = -3
 """The last ones: those of the service."""
 _LOADER_CACHE = Path("/etc/ld.so.cache")
@@ -115,10 +120,28 @@ def _reset_process(output: int) -> None:
     null = os.open("/dev/null", os.O_RDWR)
     for fd, source in ((0, null), (1, output), (2, output)):
         os.dup2(source, fd)
-    if isinstance(sys.stdout, io.TextIOWrapper):
-        sys.stdout.reconfigure(line_buffering=True)  # a process that is killed flushes nothing
+    _unbuffer_output()
     os.environ.clear()
     os.environ.update(HOME="/scratch", TMPDIR="/scratch", PATH="/usr/bin", LANG="C.UTF-8")
+
+
+class _WrittenAtOnce(io.BufferedWriter):
+    """Keeps nothing back; unlike a raw file it writes all of what a full pipe takes in parts."""
+
+    def write(self, data: Any, /) -> int:
+        count = super().write(data)
+        self.flush()
+        return count
+
+
+def _unbuffer_output() -> None:
+    """Write what Python, C, C++ and Lua print at once: a process that is killed flushes nothing."""
+    for name, fd in (("stdout", 1), ("stderr", 2)):
+        writer = _WrittenAtOnce(io.FileIO(fd, "w", closefd=False))
+        stream = io.TextIOWrapper(writer, "utf-8", "backslashreplace", "\n", write_through=True)
+        setattr(sys, name, stream)
+    libc = ctypes.CDLL(None)
+    libc.setvbuf(ctypes.c_void_p.in_dll(libc, "stdout"), None, _UNBUFFERED, ctypes.c_size_t(0))
 
 
 def _isolate(plan: SandboxPlan, uid: int | None) -> None:
@@ -172,11 +195,16 @@ def _answer(plan: SandboxPlan, runtimes: dict[str, Runtime], kind: str, name: st
 
 
 def _encode_within(answer: list[Any], max_bytes: int) -> bytes:
+    """Return the message of *answer*, or of a failure: it is too large, or holds what no message can."""
     try:
         data = encode_reply(answer)
-        problem = f"a reply of {len(data)} bytes is above {max_bytes}" if len(data) > max_bytes else ""
-    except (TypeError, ValueError, OverflowError, RsePfError) as error:
-        problem = f"the reply cannot be encoded: {message_of(error)[:150]}"
-    if problem:
+    except LimitExceeded as error:
+        problem = f"the reply cannot be encoded: {message_of(error)[:_MAX_PROBLEM]}"
+        return encode_message([False, error.code, problem, "reply with less", answer[-1]])
+    except (TypeError, ValueError, OverflowError, RecursionError, RsePfError) as error:
+        problem = f"the reply cannot be encoded: {message_of(error)[:_MAX_PROBLEM]}"
+        return encode_message([False, InternalError.code, problem, _REPLY_HINT, answer[-1]])
+    if len(data) > max_bytes:
+        problem = f"a reply of {len(data)} bytes is above {max_bytes}"
         return encode_message([False, LimitExceeded.code, problem, "reply with less", answer[-1]])
     return data

@@ -18,14 +18,13 @@ import msgspec
 
 from rse_pf.budget import SERVICE_REPLY, check_msgpack
 from rse_pf.errors import BadMessage, LimitExceeded, RsePfError
+from rse_pf.services.custom.output import OutputLines
 from rse_pf.wire.arrays import binary_encode_hook, extension_hook
 
 __all__ = ["FrameReader", "IpcChannel", "encode_message", "encode_reply", "receive"]
 
 _HEADER = struct.Struct("<I")
 _READ_BYTES = 1 << 18
-_MAX_LINES = 200
-_MAX_LINE = 256
 _NO_MESSAGE = object()
 
 
@@ -104,7 +103,7 @@ class IpcChannel:
             on_message: Called with each message.
             on_fault: Called once with the reason when the sandbox sent an invalid message, with "" when
                 it closed the socket.
-            on_line: Called with each line that the service printed, up to a limit.
+            on_line: Called with each line that the service printed, as `OutputLines` bounds them.
         """
         self._loop = loop
         self._frames = FrameReader(max_bytes)
@@ -114,7 +113,7 @@ class IpcChannel:
         self._socket, self.theirs = socket.socketpair()
         self._output, self.their_output = os.pipe()
         self._unsent = bytearray()
-        self._lines = 0
+        self._lines = OutputLines()
         self._is_reading = True
         self._socket.setblocking(False)
         os.set_blocking(self._output, False)
@@ -143,6 +142,8 @@ class IpcChannel:
             return
         self.stop_reading()
         self._read_output()
+        for line in self._lines.end(self._loop.time()):
+            self._on_line(line)
         self._loop.remove_reader(self._output)
         self._loop.remove_writer(self._socket.fileno())
         self._socket.close()
@@ -198,10 +199,8 @@ class IpcChannel:
         if not text:
             self._loop.remove_reader(self._output)
             return
-        for line in text.decode("utf-8", "replace").splitlines():
-            self._lines += 1
-            if self._lines <= _MAX_LINES:
-                self._on_line(line[:_MAX_LINE])
+        for line in self._lines.feed(text, self._loop.time()):
+            self._on_line(line)
 
 
 def _decode(body: bytes) -> Any:

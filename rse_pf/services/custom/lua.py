@@ -16,7 +16,6 @@ import numpy as np
 
 from rse_pf.errors import (
     BadRequest,
-    CommandFailed,
     ConfigurationError,
     InternalError,
     MissingExtra,
@@ -29,6 +28,8 @@ from rse_pf.wire.arrays import json_encode_hook
 __all__ = ["LuaRuntime", "warm_up"]
 
 _MAX_INFLATED = 1 << 24
+_MAX_LEVELS = 64
+"""Of tables inside tables, so that one that holds itself ends; a message takes fewer levels."""
 _SETUP = """
 local json_decode, json_encode, inflate, deflate, folder = ...
 package.preload.json = function() return {decode = json_decode, encode = json_encode} end
@@ -90,8 +91,8 @@ class LuaRuntime:
         return self._from_lua(self._run("serve", self._to_lua(payload)))
 
     def snapshot(self) -> bytes:
-        """Return what the script's ``snapshot`` returned, as JSON."""
-        return msgspec.json.encode(self._from_lua(self._run("snapshot")))
+        """Return what the script's ``snapshot`` returned, as JSON; raises InternalError if it cannot."""
+        return msgspec.json.encode(self._from_lua(self._run("snapshot"), "snapshot"))
 
     def restore(self, data: bytes) -> None:
         """Give a snapshot to the script's ``restore``."""
@@ -120,26 +121,44 @@ class LuaRuntime:
         return InternalError(f"{self._name}: {_text(error)[:300]}")
 
     def _parse(self, text: Any) -> Any:
+        hint = "return json.encode(reply), or leave takes_text out"
+        if not isinstance(text, bytes):
+            raise InternalError(
+                f"service {self._name!r} replied with {self._kind(text)}, not with JSON text", hint=hint
+            )
         try:
             return msgspec.json.decode(text)
-        except (msgspec.DecodeError, TypeError) as error:
-            raise CommandFailed(f"{self._name} replied with text that is not JSON: {error}") from error
+        except msgspec.DecodeError as error:
+            raise InternalError(
+                f"service {self._name!r} replied with text that is not JSON: {error}", hint=hint
+            ) from error
 
     def _to_lua(self, value: Any) -> Any:
         value = _encode_text(value)
         return self._lua.table_from(value, recursive=True) if isinstance(value, dict | list) else value
 
-    def _from_lua(self, value: Any) -> Any:
+    def _from_lua(self, value: Any, what: str = "reply", level: int = 0) -> Any:
         if self._lupa.lua_type(value) != "table":
             if value is None or isinstance(value, bool | int | float):
                 return value
             if isinstance(value, bytes):
                 return _text(value)
-            raise CommandFailed(f"{self._name} replied with a {self._lupa.lua_type(value)}")
+            raise self._wrong(what, self._kind(value))
+        if level == _MAX_LEVELS:
+            raise self._wrong(what, f"tables in more than {_MAX_LEVELS} levels, or a table that holds itself")
         length = len(value)
         if length and sum(1 for _ in value.keys()) == length:  # noqa: SIM118  a Lua table is not a mapping
-            return [self._from_lua(value[i]) for i in range(1, length + 1)]
-        return {_text(key): self._from_lua(each) for key, each in value.items()}
+            return [self._from_lua(value[i], what, level + 1) for i in range(1, length + 1)]
+        return {_text(key): self._from_lua(each, what, level + 1) for key, each in value.items()}
+
+    def _kind(self, value: Any) -> str:
+        return f"a {self._lupa.lua_type(value) or type(value).__name__}"
+
+    def _wrong(self, what: str, held: str) -> InternalError:
+        return InternalError(
+            f"the {what} of service {self._name!r} holds {held}, which no message can hold",
+            hint="return nil, booleans, numbers, strings, and tables of these",
+        )
 
     def _decode(self, text: bytes) -> Any:
         try:

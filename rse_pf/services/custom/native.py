@@ -7,6 +7,7 @@ freed at once.
 from __future__ import annotations
 
 import ctypes
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,14 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from rse_pf.errors import BadRequest, CommandFailed, ConfigurationError, DegenerateGeometry, RsePfError
+from rse_pf.errors import (
+    BadRequest,
+    CommandFailed,
+    ConfigurationError,
+    DegenerateGeometry,
+    InternalError,
+    RsePfError,
+)
 from rse_pf.services.custom.installed import InstalledService
 from rse_pf.wire.arrays import json_encode_hook
 
@@ -91,7 +99,10 @@ class NativeRuntime:
         try:
             return msgspec.json.decode(reply)
         except msgspec.DecodeError as error:
-            raise CommandFailed(f"{self._name} replied with text that is not JSON: {error}") from error
+            raise InternalError(
+                f"service {self._name!r} replied with text that is not JSON: {error}",
+                hint="pass JSON out of rse_pf_service_call, or use rse_pf_service_call_arrays",
+            ) from error
 
     def _call_with_arrays(self, payload: Any) -> Any:
         request, buffers = _encode_fields(payload)
@@ -102,8 +113,12 @@ class NativeRuntime:
         del buffers  # the library reads the request's memory until here
         self._check(code)
         try:
-            if count.value > _MAX_FIELDS:
-                raise CommandFailed(f"{self._name} replied with {count.value} fields")
+            if count.value > _MAX_FIELDS or (count.value and not reply):
+                where = "at most" if reply else "at an address, not NULL, and at most"
+                raise InternalError(
+                    f"service {self._name!r} replied with {count.value} fields{'' if reply else ' at NULL'}",
+                    hint=f"pass them out {where} {_MAX_FIELDS}",
+                )
             return dict(_decode_field(reply[i], self._name) for i in range(count.value))
         finally:
             self._free(self._state, reply)
@@ -112,8 +127,13 @@ class NativeRuntime:
         data, size = ctypes.POINTER(ctypes.c_uint8)(), ctypes.c_uint64()
         self._check(function(*arguments, ctypes.byref(data), ctypes.byref(size)))
         try:
-            if size.value > _MAX_BYTES:
-                raise CommandFailed(f"{self._name} returned {size.value} bytes")
+            if size.value > _MAX_BYTES or (size.value and not data):
+                what = "a snapshot" if function is self._snapshot else "a reply"
+                raise InternalError(
+                    f"service {self._name!r} passed out {what} of {size.value} bytes"
+                    f"{'' if data else ' at NULL'}",
+                    hint=f"set the data and its size together, at most {_MAX_BYTES} bytes",
+                )
             return ctypes.string_at(data, size.value)
         finally:
             self._free(self._state, data)
@@ -185,10 +205,30 @@ def _as_array(name: str, value: Any) -> Any:
 
 
 def _decode_field(field: Any, service: str) -> tuple[str, Any]:
-    name = field.name.decode("utf-8", "replace")
-    if field.count * (8 if field.type == _FLOAT64 else 1) > _MAX_BYTES:
-        raise CommandFailed(f"{service}: reply field {name!r} is too large")
+    """Return name and value of one field of a reply; what cannot be read is refused before it is read."""
+    name = (field.name or b"").decode("utf-8", "replace")
+    problem = _problem_of(field)
+    if problem:
+        raise InternalError(
+            f"service {service!r} replied with a field {name!r} {problem}", hint="see rse_pf_service.h"
+        )
     if field.type == _TEXT:
         return name, ctypes.string_at(field.data, field.count).decode("utf-8", "replace")
     values = np.frombuffer(ctypes.string_at(field.data, field.count * 8), np.float64)
     return name, float(values[0]) if field.rank == 0 and values.size == 1 else values
+
+
+def _problem_of(field: Any) -> str:
+    if field.name is None:
+        return "without a name"
+    if field.type not in (_FLOAT64, _TEXT):
+        return f"of type {field.type}, not of RSE_PF_FLOAT64 or RSE_PF_TEXT"
+    if field.count * (8 if field.type == _FLOAT64 else 1) > _MAX_BYTES:
+        return f"of {field.count} values, which is too large"
+    if field.count and not field.data:
+        return f"of {field.count} values at NULL"
+    if field.rank > _MAX_RANK:
+        return f"of rank {field.rank}, above {_MAX_RANK}"
+    if field.type == _FLOAT64 and field.rank and field.count != math.prod(field.shape[: field.rank]):
+        return f"of {field.count} values, which its shape does not hold"
+    return ""

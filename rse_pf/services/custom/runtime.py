@@ -6,19 +6,35 @@ and arrays.
 
 from __future__ import annotations
 
+import collections.abc
 import importlib
 import importlib.util
 import inspect
 import sys
+import types
+import typing
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Protocol
+
+import msgspec
+import numpy as np
 
 from rse_pf.errors import ConfigurationError, InternalError, RsePfError, message_of
 from rse_pf.service import Registry, request_of
 from rse_pf.services.custom.installed import InstalledService
 
 __all__ = ["Runtime", "open_runtime"]
+
+
+_BYTES = (bytes, bytearray, memoryview)
+_ROWS = (list, tuple, np.ndarray)
+_KINDS: dict[Any, tuple[type, ...]] = {
+    float: (float, int, np.floating), int: (int, np.integer), str: (str,), bool: (bool,), bytes: _BYTES,
+    list: _ROWS, tuple: _ROWS, np.ndarray: _ROWS, dict: (dict,), types.NoneType: (types.NoneType,),
+    None: (types.NoneType,),
+}  # fmt: skip
+"""Annotation of a field of a reply, and what a robot can read as that."""
 
 
 class Runtime(Protocol):
@@ -70,6 +86,7 @@ class _PythonRuntime:
         registry = Registry()
         registry.service(service.name)(function)
         self._service = registry.get(service.name)
+        self._fields = _checked_fields(self._service.reply_type)
         self.has_snapshots = all(
             inspect.ismethod(getattr(self._object, name, None)) for name in ("snapshot", "restore")
         )
@@ -83,6 +100,14 @@ class _PythonRuntime:
                 f"{service.reply_type.__name__}",
                 hint="return from serve what it is annotated with",
             )
+        for field, kinds, declared in self._fields:
+            value = getattr(reply, field)
+            if not isinstance(value, kinds) or (isinstance(value, bool) and bool not in kinds):
+                raise InternalError(
+                    f"service {service.name!r} replied with a {field} of type {type(value).__name__}, "
+                    f"not with its {declared}",
+                    hint=f"give {field} of {service.reply_type.__name__} what it is annotated with",
+                )
         return reply
 
     def snapshot(self) -> bytes:
@@ -97,6 +122,31 @@ class _PythonRuntime:
 
     def restore(self, data: bytes) -> None:
         self._object.restore(data)
+
+
+def _checked_fields(reply_type: type[Any]) -> list[tuple[str, tuple[type, ...], str]]:
+    """Return each field whose type can be told at once: its name, its classes, and its annotation.
+
+    What lists and maps hold is not looked at: that would cost as much as encoding them.
+    """
+    checked = []
+    for field, annotation in typing.get_type_hints(reply_type).items():
+        kinds = _kinds_of(annotation)
+        if kinds:
+            declared = annotation.__name__ if isinstance(annotation, type) else str(annotation)
+            checked.append((field, kinds, declared))
+    return checked
+
+
+def _kinds_of(annotation: Any) -> tuple[type, ...]:
+    """Return the classes of values that fit *annotation*, () if that cannot be told."""
+    origin = typing.get_origin(annotation) or annotation
+    if origin in (typing.Union, types.UnionType):
+        arms = [_kinds_of(arm) for arm in typing.get_args(annotation)]
+        return tuple(kind for arm in arms for kind in arm) if all(arms) else ()
+    if isinstance(origin, type) and issubclass(origin, msgspec.Struct):
+        return (origin,)
+    return _KINDS.get(origin, ()) if isinstance(origin, collections.abc.Hashable) else ()
 
 
 def _load(service: InstalledService) -> Any:
