@@ -28,7 +28,9 @@ class Service:
     def restore(self, data): self.count = int(data)
     def serve(self, request: Request) -> Reply:
         print("asked to", request.do)
-        if request.do == "crash": os.abort()
+        if request.do == "crash":
+            print("begun", end="")
+            os.abort()
         if request.do == "raise": raise ValueError("no")
         self.count += 1
         return Reply(count=self.count)
@@ -76,3 +78,17 @@ def test_state_is_restored_after_a_crash_and_the_crash_is_shown(try_it):
     assert isinstance(runs[2].answer, Result)
     assert runs[2].answer.reply == {"count": 2}
     assert sum("sandbox-crashed" in line for line in lines) == 2
+    assert lines.count("begun") == 2, "what was printed without a newline before the crash"
+
+
+def test_what_a_script_prints_without_flushing_is_shown(tmp_path: Path):
+    manifest = {"name": "loud", "language": "lua", "entry": "service.lua"}
+    (tmp_path / "service.json").write_text(json.dumps(manifest))
+    (tmp_path / "service.lua").write_text(
+        "return function(request) print('a line') io.write('begun') return {} end"
+    )
+    lines: list[str] = []
+
+    dry_run(read_service(tmp_path), [{}, {}], PlatformSettings(), lines.append)
+
+    assert lines == ["a line", "beguna line", "begun"]

@@ -281,3 +281,127 @@ def test_a_snapshot_that_is_not_bytes_is_refused_as_such(tmp_path, state):
     with pytest.raises(InternalError, match="not bytes") as told:
         service.snapshot()
     assert "msgpack" in told.value.hint
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "says"),
+    [
+        ("total=request.values.sum()", 'total="many"', "a total of type str, not with its float"),
+        ("count=self.count", "count=1.5", "a count of type float, not with its int"),
+        ("count=self.count", "count=True", "a count of type bool, not with its int"),
+        ("label=request.label", "label=None", "a label of type NoneType, not with its str"),
+    ],
+)
+def test_a_field_of_another_type_than_declared_is_refused_by_its_name(tmp_path, old, new, says):
+    service = opened(tmp_path, "python", "service.py", PYTHON.replace(old, new))
+
+    with pytest.raises(InternalError, match=says) as told:
+        service.call({"values": [1.0]})
+    assert "annotated" in told.value.hint
+
+
+FITTING = """
+from __future__ import annotations
+import typing
+import msgspec
+import numpy as np
+from rse_pf.wire.arrays import Array
+
+class Request(msgspec.Struct): pass
+class Part(msgspec.Struct): x: float = 1.0
+class Reply(msgspec.Struct):
+    a: float = 1
+    b: float = np.float32(1)
+    c: Array = msgspec.field(default_factory=lambda: [1.0])
+    d: list[float] = msgspec.field(default_factory=lambda: np.zeros(2))
+    e: str | None = None
+    f: typing.Optional[Part] = None
+    g: typing.Any = None
+    h: dict[str, float] = {}
+    i: bytes = msgspec.field(default_factory=lambda: memoryview(b"x"))
+    j: Part = msgspec.field(default_factory=Part)
+    k: typing.Literal["a", "b"] = "a"
+
+def serve(request: Request) -> Reply: return Reply()
+"""
+
+
+def test_what_fits_on_the_wire_fits_its_annotation(tmp_path):
+    assert opened(tmp_path, "python", "service.py", FITTING).call({}).a == 1
+
+
+@pytest.mark.parametrize(
+    ("script", "says"),
+    [
+        ("return function() return {f = print} end", "the reply of service 'adder' holds a function"),
+        ("local t = {} t.t = t return function() return t end", "a table that holds itself"),
+        ("return {takes_text = true, serve = function() return {} end}", "with a table, not with JSON text"),
+        ("return {takes_text = true, serve = function() return 'x' end}", "text that is not JSON"),
+    ],
+)
+def test_a_reply_of_a_script_that_no_message_can_hold_is_refused_as_such(tmp_path, script, says):
+    with pytest.raises(InternalError, match=says) as told:
+        opened(tmp_path, "lua", "service.lua", script).call({})
+    assert told.value.hint
+
+
+def test_a_snapshot_of_a_script_that_cannot_be_kept_is_refused_as_such(tmp_path):
+    service = opened(
+        tmp_path, "lua", "service.lua", LUA.replace("return {count = count} end", "return print end")
+    )
+
+    with pytest.raises(InternalError, match="the snapshot of service 'adder' holds a function") as told:
+        service.snapshot()
+    assert told.value.hint
+
+
+C_WRONG = """
+#include <stddef.h>
+#include "rse_pf_service.h"
+static double number = 7;
+static rse_pf_field field;
+uint32_t rse_pf_service_abi(void) { return RSE_PF_SERVICE_ABI; }
+int rse_pf_service_open(const char *scratch, void **state) { (void)scratch; *state = 0; return 0; }
+void rse_pf_service_close(void *state) { (void)state; }
+void rse_pf_service_free(void *state, void *memory) { (void)state; (void)memory; }
+int rse_pf_service_snapshot(void *state, uint8_t **data, uint64_t *size) {
+  (void)state; *data = NULL; *size = 5; return 0;
+}
+int rse_pf_service_restore(void *state, const uint8_t *data, uint64_t size) {
+  (void)state; (void)data; return size == 0;
+}
+int rse_pf_service_call_arrays(void *state, const rse_pf_field *request, uint32_t count, rse_pf_field **reply,
+                               uint32_t *fields) {
+  (void)state; (void)count;
+  field = (rse_pf_field){"x", RSE_PF_FLOAT64, 1, {1}, 1, &number};
+  *reply = &field; *fields = 1;
+  switch ((int)*(const double *)request[0].data) {
+    case 1: field.type = 9; break;
+    case 2: field.data = NULL; break;
+    case 3: field.name = NULL; break;
+    case 4: field.rank = 9; break;
+    case 5: field.shape[0] = 3; break;
+    case 6: field.count = 1ull << 60; break;
+    case 7: *reply = NULL; break;
+    case 8: *fields = 5000; break;
+  }
+  return RSE_PF_OK;
+}
+"""
+
+
+def test_a_wrong_reply_of_a_library_is_refused_before_it_is_read(tmp_path):
+    compiled(tmp_path, C_WRONG, "wrong.c")
+    service = opened(tmp_path, "cpp", "lib.so")
+    says = (
+        "of type 9", "at NULL", "without a name", "of rank 9", "its shape does not hold", "too large",
+        "1 fields at NULL", "5000 fields",
+    )  # fmt: skip
+
+    assert service.call({"case": 0}) == {"x": [7.0]}
+    for case, each in enumerate(says, 1):
+        with pytest.raises(InternalError, match=each) as told:
+            service.call({"case": case})
+        assert told.value.hint
+    with pytest.raises(InternalError, match="a snapshot of 5 bytes at NULL"):
+        service.snapshot()
