@@ -83,12 +83,14 @@ def test_state_is_restored_after_a_crash_and_the_crash_is_shown(try_it):
 
 def test_what_a_script_prints_without_flushing_is_shown(tmp_path: Path):
     manifest = {"name": "loud", "language": "lua", "entry": "service.lua"}
-    (tmp_path / "service.json").write_text(json.dumps(manifest))
-    (tmp_path / "service.lua").write_text(
+    folder = tmp_path / "loud"
+    folder.mkdir()
+    (folder / "service.json").write_text(json.dumps(manifest))
+    (folder / "service.lua").write_text(
         "return function(request) print('a line') io.write('begun') return {} end"
     )
     lines: list[str] = []
 
-    dry_run(read_service(tmp_path), [{}, {}], PlatformSettings(), lines.append)
+    dry_run(read_service(folder), [{}, {}], PlatformSettings(), lines.append)
 
     assert lines == ["a line", "beguna line", "begun"]
