@@ -247,10 +247,10 @@ static void read_tokens(const char *file) {
   if (!stream) fail("cannot read %s", file);
   char *line = NULL;
   size_t capacity = 0;
-  ssize_t size;
+  ssize_t length;
   int room = 0;
-  while ((size = getline(&line, &capacity, stream)) > 0) {
-    while (size && (line[size - 1] == '\n' || line[size - 1] == '\r')) line[--size] = 0;
+  while ((length = getline(&line, &capacity, stream)) > 0) {
+    while (length && (line[length - 1] == '\n' || line[length - 1] == '\r')) line[--length] = 0;
     if (token_count == room) tokens = realloc(tokens, sizeof *tokens * (size_t)(room = room ? 2 * room : 64));
     if (!tokens || !(tokens[token_count++] = strdup(line))) fail("out of memory");
   }
