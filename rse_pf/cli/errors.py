@@ -65,7 +65,7 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
         return 0
     if args.code is None:
         width = max(len(each.code) for each in known)
-        show(*(f"{each.code:<{width}}  {each.meaning}" for each in known))
+        show(*(f"{each.code:<{width}}  {each.meaning}".replace("``", "") for each in known))
         return 0
     found = [each for each in known if args.code in (each.code, each.name)]
     if not found:
@@ -74,8 +74,13 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
             f"there is no error {args.code[:80]!r}", hint=did_you_mean(args.code, codes, "see rse-pf errors")
         )
     (each,) = found
-    show(f"{each.code} ({each.name}): {each.meaning}")
-    show(f"  cause  {each.cause}", f"  check  {each.check}", f"  fix    {each.fix}")
+    lines = (
+        f"{each.code} ({each.name}): {each.meaning}",
+        f"  cause  {each.cause}",
+        f"  check  {each.check}",
+        f"  fix    {each.fix}",
+    )
+    show(*(line.replace("``", "") for line in lines))  # a terminal does not set code in another type
     return 0
 
 

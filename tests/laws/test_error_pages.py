@@ -71,3 +71,14 @@ def test_the_command_line_lists_all_codes(capsys: pytest.CaptureFixture[str]) ->
     assert [line.split()[0] for line in capsys.readouterr().out.splitlines()] == [
         each.code for each in explanations()
     ]
+
+
+@pytest.mark.parametrize("words", [["errors"], ["errors", "busy"]])
+def test_the_command_line_shows_no_marks_of_a_page(
+    capsys: pytest.CaptureFixture[str], words: list[str]
+) -> None:
+    assert any("``" in each.meaning for each in explanations())
+
+    assert main(words) == 0
+
+    assert "``" not in capsys.readouterr().out
