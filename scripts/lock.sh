@@ -4,6 +4,7 @@ set -eu
 cd "$(dirname "$0")/.."
 
 ours="--no-emit-package rse-pf --no-emit-package rse-pf-native"
+constraints="--constraint locks/constraints.txt"
 
 lock() { # lock FILE EXTRA...
   file=$1
@@ -12,13 +13,16 @@ lock() { # lock FILE EXTRA...
   # shellcheck disable=SC2086
   .venv/bin/uv pip compile pyproject.toml --quiet --universal --python-version 3.10 --generate-hashes \
     --no-emit-index-url --no-emit-find-links --no-annotate $ours \
-    --constraint locks/constraints.txt --custom-compile-command 'make lock' \
+    $constraints --custom-compile-command 'make lock' \
     $extras --output-file "locks/$file.txt"
 }
 
 lock demo demo build
 lock dev dev
 lock infra infra dev
+# What one .venv holds beside the packages of developers has the same versions as they.
+constraints="$constraints --constraint locks/infra.txt"
+lock docs docs build
 # What boots has one platform, so its locks have no conditions.
 for_platform() { # for_platform FILE PYTHON INPUT...
   file=$1 python=$2

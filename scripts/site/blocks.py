@@ -1,0 +1,132 @@
+"""The code blocks of the pages: which a test executes, and which are parsed only and say why.
+
+    python scripts/site/blocks.py
+
+prints how many there are of each kind.  A block is a command block (no language, or ``sh``), or code (python,
+json, yaml, ...); ``text`` is no code.  A comment before a block marks it: ``<!-- needs an account -->``; a
+paragraph before it that contains the words marks it as well.  ``<!-- file: NAME -->`` names the file in which
+a program is saved.
+"""
+
+from __future__ import annotations
+
+import re
+import sys
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+__all__ = [
+    "MARKS",
+    "RUN_BY_OTHERS",
+    "Block",
+    "all_blocks",
+    "commands_of",
+    "how",
+    "main",
+    "pages",
+    "read_blocks",
+]
+
+MARKS = (
+    "needs an account", "needs a device", "needs a recording", "takes long", "part of a program",
+)  # fmt: skip
+"""Why a block is not executed; it is still parsed."""
+RUN_BY_OTHERS = {"docs/operations.md": "tests/stacks/test_operations.py"}
+"""Page -> test that executes its blocks without a mark; `tests/docs/test_run_pages.py` runs the others."""
+NO_CODE = ("text",)
+
+_FENCE = re.compile(r"^(`{3,}|~{3,})(\w*)[^\n]*\n(.*?)^\1[ \t]*$", re.DOTALL | re.MULTILINE)
+_INDENTED = re.compile(r"(?:^[ \t]*\n)((?:^    (?![-*] |\d+\. )[^\n]*\n)+)", re.MULTILINE)
+_COMMENT = re.compile(r"<!-- ([^>]*?) -->")
+_GENERATED = ("docs/settings.md",)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Block:
+    """One block: *mark* is why it is not executed, or empty; *file* is where it is saved, or empty."""
+
+    page: str
+    line: int
+    language: str
+    text: str
+    mark: str = ""
+    file: str = ""
+
+
+def pages(root: Path) -> list[str]:
+    """Return README.md and all pages of ``docs``, by path, without the reports of experiments."""
+    found = [path.relative_to(root).as_posix() for path in sorted((root / "docs").rglob("*.md"))]
+    return ["README.md", *(each for each in found if not each.endswith("/report.md"))]
+
+
+def read_blocks(page: str, text: str) -> Iterator[Block]:
+    """Yield the blocks of a page that hold code, fenced or indented, in their order."""
+    spans: list[tuple[int, str, str]] = []
+    for found in _FENCE.finditer(text):
+        spans.append((found.start(), found[2], found[3]))
+    without = _FENCE.sub(lambda found: re.sub(r"[^\n]", "x", found[0]), text)
+    for found in _INDENTED.finditer(without):
+        body = "".join(line[4:] + "\n" for line in found[1].splitlines())
+        spans.append((found.start(1), _language_of(body), body))
+    for start, language, body in sorted(spans):
+        if language in NO_CODE:
+            continue
+        before = re.split(r"\n[ \t]*\n|```", text[:start].rstrip("\n"))[-1].lower()
+        comments = _COMMENT.findall(before)
+        told = [comment.removeprefix("file: ") for comment in comments if comment.startswith("file: ")]
+        mark = next((mark for mark in MARKS if mark in before), "")
+        if told:
+            # The words were compared in small letters; names are not.
+            told = [re.findall(r"<!-- file: (\S+) -->", text[:start])[-1]]
+        yield Block(
+            page=page, line=text.count("\n", 0, start) + 1, language=language, text=body, mark=mark,
+            file=told[0] if told else "",
+        )  # fmt: skip
+
+
+def _language_of(body: str) -> str:
+    first = body.lstrip().partition("\n")[0]
+    if re.match(r"[a-z_]+:", first):
+        return "yaml"
+    return "python" if re.match(r"(async |import |from |with |def )", first) else ""
+
+
+def commands_of(block: Block) -> list[str]:
+    """Return the commands of a command block, without comments, redirections and assignments."""
+    lines = [line.partition(" #")[0].partition(" > ")[0].strip() for line in block.text.splitlines()]
+    return [re.sub(r"^\w+=\$\((.*)\)$", r"\1", line) for line in lines if line and not line.startswith("#")]
+
+
+def how(block: Block) -> str:
+    """Return how a block is tested: ``executed``, ``parsed``, or its mark."""
+    if block.mark:
+        return block.mark
+    return "parsed" if block.language in ("json", "yaml") else "executed"
+
+
+def all_blocks(root: Path) -> list[Block]:
+    """Return the blocks of all pages that are written by hand."""
+    return [
+        block
+        for page in pages(root)
+        if page not in _GENERATED
+        for block in read_blocks(page, (root / page).read_text(encoding="utf-8"))
+    ]
+
+
+def main() -> int:
+    """Print the number of blocks, and of commands in them, of each kind."""
+    root = Path(__file__).resolve().parents[2]
+    blocks, commands = Counter[str](), Counter[str]()
+    for block in all_blocks(root):
+        blocks[how(block)] += 1
+        commands[how(block)] += len(commands_of(block)) if not block.language else 0
+    for kind, count in blocks.most_common():
+        print(f"{count:4d} blocks with {commands[kind]:3d} commands: {kind}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

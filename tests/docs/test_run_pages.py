@@ -1,0 +1,175 @@
+"""The pages as a reader follows them: each block that is not marked runs, in the order of its page.
+
+Every page has an empty folder, a home and a platform of its own, and a network namespace of its own where the
+user may make one, so that the ports of the pages are free.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from queue import Empty, Queue
+
+import pytest
+
+from scripts.site.blocks import RUN_BY_OTHERS, Block, all_blocks, how
+
+pytestmark = [pytest.mark.system, pytest.mark.slow, pytest.mark.timeout(400)]
+
+ROOT = Path(__file__).parents[2]
+SOON_S = 120.0
+WHILE_A_PLATFORM_RUNS = ("docs/local.md", "docs/howto/robot_keys.md", "docs/howto/load_and_faults.md")
+IN_THE_CHECKOUT = ("docs/architecture.md",)
+RUN_BY_CI = ("make demo", "make test", ". .venv/bin/activate", "cd ")
+"""`.ci/run` executes them; here the environment is active already."""
+EXECUTED_IN = {
+    "rse-pf data --keys": "tests/cli/test_pages.py",
+    "rse-pf map list": "tests/cli/test_pages.py",
+    "rse-pf map show": "tests/cli/test_pages.py",
+    "rse-pf map diff": "tests/cli/test_pages.py",
+    "rse-pf map rollback": "tests/cli/test_pages.py",
+    "rse-pf map export": "tests/cli/test_pages.py",
+    "rse-pf robot adopt": "tests/cli/test_adopt.py",
+}
+"""Commands that need a store or a robot with a past: another test makes it, and runs them."""
+_START = re.compile(r"rse-pf local(?= --(?!lan)| *$)")
+_READY = re.compile(r"wss?://\S+")
+
+
+def todo() -> dict[str, list[Block]]:
+    """Return the blocks that this module executes, by page."""
+    found: dict[str, list[Block]] = {}
+    for block in all_blocks(ROOT):
+        if how(block) == "executed" and block.page not in RUN_BY_OTHERS:
+            found.setdefault(block.page, []).append(block)
+    return found
+
+
+class Reader:
+    """One reader of one page: a folder, a home, and the platforms that the page starts."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        (folder / "examples").symlink_to(ROOT / "examples")
+        binaries = str(Path(sys.executable).parent)
+        self.environment = {
+            **os.environ,
+            "PATH": f"{binaries}:{os.environ['PATH']}",
+            "PYTHONPATH": str(ROOT),
+            "PYTHONUNBUFFERED": "1",
+            "XDG_STATE_HOME": str(folder / ".state"),
+            "HOME": str(folder),
+        }
+        self._started: list[subprocess.Popen[str]] = []
+
+    def start_platform(self, command: str, within: Path) -> None:
+        """Start a platform instead of the one that runs, and wait until it prints its address."""
+        self.leave()
+        process = subprocess.Popen(
+            ["bash", "-c", f"exec {command}"], cwd=within, env=self.environment, text=True,
+            stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
+        )  # fmt: skip
+        self._started.append(process)
+        lines: Queue[str] = Queue()
+
+        def read() -> None:
+            assert process.stdout is not None
+            for line in process.stdout:
+                lines.put(line)
+            lines.put("")
+
+        threading.Thread(target=read, daemon=True).start()
+        told = ""
+        while not _READY.search(told):
+            try:
+                line = lines.get(timeout=SOON_S)
+            except Empty:
+                pytest.fail(f"{command} is not ready after {SOON_S:g} s: {told}")
+            if not line:
+                pytest.fail(f"{command} ended: {told}")
+            told += line
+
+    def run(self, script: str, within: Path) -> str:
+        """Run lines of a shell; return what they print."""
+        done = subprocess.run(
+            ["bash", "-euo", "pipefail", "-c", script], cwd=within, env=self.environment, check=False,
+            text=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, timeout=SOON_S * 2,
+        )  # fmt: skip
+        assert done.returncode == 0, f"{script}\n{done.stdout}"
+        return done.stdout
+
+    def follow(self, block: Block) -> None:
+        """Do what a block says."""
+        within = ROOT if block.page in IN_THE_CHECKOUT else self.folder
+        if block.language == "python":
+            (self.folder / (block.file or "block.py")).write_text(block.text, encoding="utf-8")
+            if not block.file:
+                self.run("python block.py", within)
+            return
+        script = []
+        for line in block.text.splitlines():
+            if line.startswith((*RUN_BY_CI, *EXECUTED_IN)):
+                continue
+            if _START.match(line):
+                self.run("\n".join(script), within)
+                script = []
+                self.start_platform(line.partition(" #")[0], within)
+            elif line.endswith("--follow"):
+                script.append(f"timeout --signal=INT 3 {line} || [ $? -eq 124 ]")
+            else:
+                script.append(line)
+        self.run("\n".join(script), within)
+
+    def leave(self) -> None:
+        """End the platforms."""
+        for process in self._started:
+            process.send_signal(signal.SIGINT)
+        for process in self._started:
+            try:
+                process.wait(30)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
+        self._started = []
+
+
+@pytest.fixture
+def reader(tmp_path: Path) -> Iterator[Reader]:
+    """A reader in an empty folder."""
+    one = Reader(tmp_path)
+    try:
+        yield one
+    finally:
+        one.leave()
+
+
+def may_have_a_network() -> bool:
+    """Say whether this user may make a network namespace."""
+    if shutil.which("unshare") is None or shutil.which("ip") is None:
+        return False
+    tried = ["unshare", "--net", "ip", "link", "set", "lo", "up"]
+    return subprocess.run(tried, capture_output=True, check=False).returncode == 0
+
+
+@pytest.mark.parametrize("page", todo())
+def test_what_a_page_says_works(page: str, reader: Reader) -> None:
+    if os.environ.get("RSE_PF_OWN_NETWORK") != "1" and may_have_a_network():
+        one = f"{__file__}::test_what_a_page_says_works[{page}]"
+        inner = f"ip link set lo up && exec {sys.executable} -m pytest -q -x -p no:cacheprovider '{one}'"
+        done = subprocess.run(
+            ["unshare", "--net", "sh", "-c", inner], cwd=ROOT, env={**os.environ, "RSE_PF_OWN_NETWORK": "1"},
+            stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, check=False,
+        )  # fmt: skip
+        assert done.returncode == 0, done.stdout
+        return
+    if page in WHILE_A_PLATFORM_RUNS:
+        reader.start_platform("rse-pf local", reader.folder)
+    for block in todo()[page]:
+        reader.follow(block)
