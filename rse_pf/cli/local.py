@@ -31,6 +31,7 @@ import time
 from pathlib import Path
 from typing import Any
 
+from rse_pf.cli.extras import require
 from rse_pf.config import HealthSettings, PlatformSettings
 from rse_pf.errors import UsageError
 from rse_pf.terminal import show, show_json, show_page
@@ -120,6 +121,7 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
         return _logs(args, folder)
     if args.action != "start":
         return _on_running(args, folder)
+    require("local")
     from rse_pf.cli.local_platform.lan import chosen_address
 
     wanted = {"servers": args.servers, "port": args.port, "metrics_port": args.metrics_port}

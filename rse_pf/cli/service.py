@@ -33,6 +33,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+from rse_pf.cli.extras import require
 from rse_pf.cli.service_blocks import add_block_arguments, show_blocks, unblock
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import CommandFailed, RsePfError, UsageError
@@ -102,6 +103,7 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
         return _install(source, folder)
     if args.action == "test":
         return _test(source, settings)
+    require("service")
     return asyncio.run(_run(source, settings, once=args.once))
 
 

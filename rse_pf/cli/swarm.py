@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 from urllib.parse import urlsplit
 
+from rse_pf.cli.extras import require
 from rse_pf.config import PlatformSettings, load_settings
 from rse_pf.errors import UsageError
 
@@ -95,6 +96,8 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
         link=args.link,
     )
     platform = _platform(args, settings)
+    if platform is None:
+        require("swarm")
     if args.servers is not None:
         if platform is not None:
             raise UsageError(

@@ -68,6 +68,24 @@ def test_a_missing_package_is_named_before_any_work(
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.parametrize(
+    "typed", [["local"], ["local", "--lan"], ["swarm", "--robots", "2"], ["service", "run", "x"]]
+)
+def test_a_verb_that_starts_a_platform_names_the_extra_that_holds_all_of_it(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path, typed: list[str]
+) -> None:
+    found = importlib.util.find_spec
+    monkeypatch.setattr(
+        extras.importlib.util, "find_spec", lambda name: None if name == "cryptography" else found(name)
+    )
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+
+    assert main(typed) == 2
+    first, hint = capsys.readouterr().err.splitlines()
+    assert first == "MissingExtra: cryptography is not installed: it is in the extra 'local'"
+    assert hint == "  hint: pip install 'rse-pf[local]'"
+
+
 def test_a_module_that_cannot_be_imported_is_reported_as_its_extra(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
