@@ -37,7 +37,7 @@ DEBIAN_12 = ("3.11", 36)
 AMAZON_2023 = ("3.13", 34)
 FUNCTION_FOLDER = "/var/task"
 """Where Lambda puts the function, for its tracebacks."""
-NATIVE_SOURCES = ("src/*.cpp", "src/*.hpp", "include/*.h", "wheel_builder/*.py", "Makefile", "pyproject.toml")
+NATIVE_SOURCES = ("src/*.cpp", "src/*.hpp", "include/*.h", "wheel_builder/*.py", "Makefile", "*.toml", "*.md")
 
 
 def main() -> int:
@@ -80,7 +80,7 @@ def _sources() -> list[Path]:
         file
         for package in PACKAGES
         for file in (ROOT / package).rglob("*")
-        if file.suffix in (".py", ".typed")
+        if file.is_file() and file.suffix != ".pyc"
     ]
     files += [ROOT / name for name in ("pyproject.toml", "README.md", "LICENSE")]
     return sorted(file for file in files if "__pycache__" not in file.parts)
@@ -119,8 +119,8 @@ def _native_wheels(folder: Path, machine: str, *compiler: str) -> list[Path]:
     return [Path(line) for line in built.stdout.splitlines()]
 
 
-def _native_for_arm(into: Path) -> int:
-    """Build the wheel for ARM robots and Graviton servers with the compiler in the wheel ziglang."""
+def arm_compiler(into: Path) -> str | None:
+    """Install the wheel ziglang into *into* and return its compiler command; None where that fails."""
     zig = into / "ziglang"
     stamp, wanted = zig / "lock.sha256", hashlib.sha256((ROOT / "locks/native.txt").read_bytes()).hexdigest()
     if not stamp.is_file() or stamp.read_text(encoding="utf-8") != wanted:
@@ -136,12 +136,19 @@ def _native_for_arm(into: Path) -> int:
                 "assets: there is no wheel for aarch64\n"
                 "  hint: read pip's output above, and check the network\n"
             )
-            return 2
+            return None
         stamp.write_text(wanted, encoding="utf-8")
     os.environ.setdefault("ZIG_GLOBAL_CACHE_DIR", str((into / "zig-cache").resolve()))
     os.environ.setdefault("ZIG_LOCAL_CACHE_DIR", os.environ["ZIG_GLOBAL_CACHE_DIR"])
     program = (zig / "ziglang" / "zig").resolve()
-    compiler = f"{program} c++ -target aarch64-linux-gnu.2.28"
+    return f"{program} c++ -target aarch64-linux-gnu.2.28"
+
+
+def _native_for_arm(into: Path) -> int:
+    """Build the wheel for ARM robots and Graviton servers."""
+    compiler = arm_compiler(into)
+    if compiler is None:
+        return 2
     folder = into / "native"
     if not _native_wheels(folder.resolve(), "aarch64", "--compiler", compiler):
         return 2

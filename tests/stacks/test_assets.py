@@ -156,6 +156,14 @@ def test_the_function_carries_the_bytecode_of_its_python_and_the_same_each_time(
     assert b"/var/task/thing.py" in found[0]
 
 
+def test_the_wheel_of_the_packages_is_built_from_all_files_of_the_platform(repository: Path) -> None:
+    held = {file.relative_to(repository).as_posix() for file in _builder(repository)._sources()}
+
+    assert {"rse_pf/cli/main.py", "rse_pf/py.typed", "rse_pf/aws/money/prices.json"} <= held
+    assert {"rse_pf/config/renamed.json", "rse_pf/services/custom/templates/lua/service.lua"} <= held
+    assert not [name for name in held if name.endswith(".pyc")]
+
+
 def test_without_a_python_of_the_functions_version_a_line_says_what_is_slower(
     repository: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
