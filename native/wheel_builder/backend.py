@@ -105,10 +105,12 @@ def pack(library: Path, machine: str, into: Path) -> Path:
         "rse_pf_native/__init__.py": _MODULE.encode(),
         f"rse_pf_native/{LIBRARY}": data,
         f"{information}/METADATA": (
-            f"Metadata-Version: 2.1\nName: rse-pf-native\nVersion: {version}\n"
-            f"Summary: {_project('description')}\nLicense: {_project('license')}\n"
-            f"Requires-Python: {_project('requires-python')}\n"
+            f"Metadata-Version: 2.4\nName: rse-pf-native\nVersion: {version}\n"
+            f"Summary: {_project('description')}\nLicense-Expression: {_project('license')}\n"
+            f"License-File: LICENSE\nRequires-Python: {_project('requires-python')}\n"
+            f"Description-Content-Type: text/markdown\n\n{_text(NATIVE / 'README.md')}"
         ).encode(),
+        f"{information}/licenses/LICENSE": _text(NATIVE.parent / "LICENSE").encode(),
         f"{information}/WHEEL": (
             f"Wheel-Version: 1.0\nGenerator: rse-pf wheel_builder\nRoot-Is-Purelib: false\nTag: {tag}\n"
         ).encode(),
@@ -129,9 +131,18 @@ def _own_compiler() -> str | None:
     return next((each for each in _COMPILERS if shutil.which(each)), None)
 
 
+def _text(path: Path) -> str:
+    try:
+        return path.read_text(encoding="utf-8")
+    except OSError as error:
+        raise BuildError(
+            f"{path} cannot be read: {error.strerror}", "build it in a checkout: the wheel holds the licence"
+        ) from error
+
+
 def _project(field: str) -> str:
     """Return *field* of the project's table; Python 3.10 has no parser of TOML."""
-    found = re.search(rf'^{field} = "(.+)"$', (NATIVE / "pyproject.toml").read_text(encoding="utf-8"), re.M)
+    found = re.search(rf'^{field} = "(.+)"$', _text(NATIVE / "pyproject.toml"), re.M)
     assert found is not None, field
     return found[1]
 

@@ -98,7 +98,7 @@ def test_the_wheel_is_for_every_python_and_its_record_is_right(library: Path, tm
 
     (record,) = [name for name in held if name.endswith("/RECORD")]
     lines = dict(line.split(",", 1) for line in held[record].decode().splitlines())
-    assert re.fullmatch(rf"rse_pf_native-[0-9.]+-py3-none-manylinux_2_28_{MACHINE}\.whl", wheel.name)
+    assert re.fullmatch(rf"rse_pf_native-[0-9][0-9a-z.]*-py3-none-manylinux_2_28_{MACHINE}\.whl", wheel.name)
     assert [name for name in held if name.endswith(".so")] == [f"rse_pf_native/{LIBRARY}"]
     assert held[f"rse_pf_native/{LIBRARY}"] == library.read_bytes()
     assert lines.pop(record) == ","
