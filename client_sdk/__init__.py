@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from client_sdk.stats import Stats
     from client_sdk.transfer.background_upload import BackgroundUploader
     from client_sdk.transfer.data_client import DataClient, DataOptions
+    from client_sdk.transfer.map_merge import merge_maps
 
 __all__ = [
     "Answer",
@@ -51,6 +52,7 @@ __all__ = [
     "connect",
     "connect_blocking",
     "decode_reply",
+    "merge_maps",
     "open_dataset",
 ]
 
@@ -81,6 +83,7 @@ _HOMES = {
     "connect": "robot",
     "connect_blocking": "blocking",
     "decode_reply": "answers",
+    "merge_maps": "transfer.map_merge",
     "open_dataset": "datasets",
 }
 

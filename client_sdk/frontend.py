@@ -359,6 +359,11 @@ class Tracker:
         self._query: PoseQuery | None = None
         self._to_try: list[Literal["frame", "keyframe"]] = []
 
+    @property
+    def keyframe_features(self) -> Features | None:
+        """The features of the last keyframe, None before the first."""
+        return None if self._keyframe is None else self._keyframe.features
+
     def prepare(self, frame: Frame) -> PoseQuery | TrackedFrame:
         """Take the next frame; return a query, or the result for the frame if none is needed.
 

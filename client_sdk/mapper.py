@@ -17,12 +17,13 @@ from typing import Any, Protocol, TypeVar
 import numpy as np
 
 from client_sdk.answers import PoseAnswer
-from client_sdk.frontend import Frame, FrontEndOptions, PoseQuery, TrackedFrame, Tracker
+from client_sdk.frontend import Features, Frame, FrontEndOptions, PoseQuery, TrackedFrame, Tracker
 from client_sdk.mapping import MapOptions, PointMap, Trajectory, write_ply, write_trajectory
 from client_sdk.monocular.scale import MarkerScale, OdometryScale
 from client_sdk.monocular_tracker import MonocularOptions, MonocularTracker
 from rse_pf.errors import ConfigurationError, RsePfError, UsageError
 from rse_pf.geometry import Array, Camera
+from rse_pf.maps.format import Keyframe, MapVersion, encode_map
 from rse_pf.pnp import PnpOptions
 
 __all__ = ["AskPose", "BlockingMapper", "Mapper", "PoseSolver", "ask_robot"]
@@ -70,7 +71,7 @@ class Mapper:
 
         async with connect(url, token=token) as robot:
             mapper = robot.mapper()
-            for frame in open_camera("0", intrinsics=Path("intrinsics.json")):
+            async for frame in open_camera("0", intrinsics=Path("intrinsics.json")):
                 tracked = await mapper.track(frame)
             mapper.save(Path("out"))
 
@@ -89,6 +90,7 @@ class Mapper:
         scale: OdometryScale | MarkerScale | None = None,
         map_options: MapOptions | None = None,
         T_world_start: Array | None = None,
+        keyframes_of: str = "",
     ) -> None:
         """Start without frames.
 
@@ -101,6 +103,8 @@ class Mapper:
             scale: For frames without depth: where metres come from; None means "up to scale".
             map_options: Density of the map of frames with depth.
             T_world_start: ``(4, 4)``, pose of the first camera; None means the identity.
+            keyframes_of: Name of the robot under which keyframes with depth are kept, about 50 kB each, for
+                `encoded_map`; empty keeps none.
         """
         self.camera = camera
         self._ask = ask
@@ -112,6 +116,8 @@ class Mapper:
         self._T_world_start = T_world_start
         self._tracker: Tracker | MonocularTracker | None = None
         self._dense = PointMap(self._map_options)
+        self._keyframes_of = keyframes_of
+        self._kept: list[Keyframe] = []
         self._stamps: list[float] = []
         self._poses: list[Array] = []
         self._is_metric = False
@@ -217,6 +223,24 @@ class Mapper:
             "lost_because": dict(self._reasons.most_common(5)),
         }
 
+    def encoded_map(self) -> bytes:
+        """Return cloud and keyframes as one map that others can merge with theirs, or be found in.
+
+        `DataClient.update_map` shares it; `merge_maps` makes one map of several.
+
+        Raises:
+            UsageError: No keyframe was kept: the frames have no depth, or *keyframes_of* is empty.
+        """
+        if not self._kept:
+            raise UsageError(
+                "no keyframe was kept, so there is no map to share",
+                hint="make the mapper with keyframes_of=ROBOT, and give it frames with depth",
+            )
+        points, colours = self._dense.points(min_readings=_MIN_READINGS)
+        made_by = {"made_by": "mapper", "robot": self._keyframes_of}
+        version = MapVersion(keyframes=tuple(self._kept), points=points, colours=colours, provenance=made_by)
+        return encode_map(version)
+
     def save(self, folder: Path) -> dict[str, Any]:
         """Write ``map.ply``, ``trajectory.txt`` and ``report.json``; return the report.
 
@@ -285,7 +309,19 @@ class Mapper:
             self._stamps.append(done.frame.timestamp_s)
             self._poses.append(pose)
             self._dense.add(done.frame, pose)
+            if done.keyframe and self._keyframes_of and tracker is not None:
+                self._keep(done, pose, tracker.keyframe_features)
         return done
+
+    def _keep(self, done: TrackedFrame, pose: Array, features: Features | None) -> None:
+        """Keep a keyframe for `encoded_map`."""
+        if features is not None:
+            keyframe = Keyframe(
+                id=len(self._kept), robot=self._keyframes_of, timestamp_s=done.frame.timestamp_s,
+                T_world_camera=pose, camera=done.frame.camera, pixels=features.pixels.astype(np.float32),
+                descriptors=features.descriptors, points_camera=features.points_camera.astype(np.float32),
+            )  # fmt: skip
+            self._kept.append(keyframe)
 
     def _with_scale(
         self, tracker: MonocularTracker, done: TrackedFrame, position_m: Array | None
@@ -332,6 +368,10 @@ class BlockingMapper:
     def scale(self) -> str:
         """Where metres come from; see `Mapper.scale`."""
         return self.mapper.scale
+
+    def encoded_map(self) -> bytes:
+        """Return a map that others can merge with theirs; see `Mapper.encoded_map`."""
+        return self.mapper.encoded_map()
 
     def save(self, folder: Path) -> dict[str, Any]:
         """Write the map, the trajectory and the report; see `Mapper.save`."""

@@ -280,6 +280,7 @@ class Robot:
         scale: OdometryScale | MarkerScale | None = None,
         map_options: MapOptions | None = None,
         T_world_start: npt.NDArray[np.float64] | None = None,
+        keyframes_of: str = "",
     ) -> Mapper:
         """Return a `Mapper` that asks this robot for its poses, within *deadline_s* each.
 
@@ -292,6 +293,7 @@ class Robot:
         return Mapper(
             ask=ask_robot(self, deadline_s), camera=camera, options=bounded, monocular=monocular,
             depth=depth, scale=scale, map_options=map_options, T_world_start=T_world_start,
+            keyframes_of=keyframes_of,
         )  # fmt: skip
 
     def post(

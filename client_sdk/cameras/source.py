@@ -5,6 +5,7 @@ It knows no device and no file format.
 
 from __future__ import annotations
 
+import asyncio
 import math
 from collections.abc import Callable, Iterator
 from types import TracebackType
@@ -13,7 +14,7 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 import numpy.typing as npt
 
-from client_sdk.cameras.intrinsics import Intrinsics, Undistortion
+from client_sdk.datasets.intrinsics import Intrinsics, Undistortion
 from client_sdk.frontend import Frame
 from rse_pf.errors import UsageError
 from rse_pf.geometry import Camera
@@ -79,6 +80,16 @@ class RawSource:
 
     def __iter__(self) -> RawSource:
         return self
+
+    def __aiter__(self) -> RawSource:
+        return self
+
+    async def __anext__(self) -> Frame:
+        """Return the next frame; the camera is read in a thread, so that the connection is served."""
+        frame = await asyncio.to_thread(next, self, None)
+        if frame is None:
+            raise StopAsyncIteration
+        return frame
 
     def __next__(self) -> Frame:
         if self._raw is None:

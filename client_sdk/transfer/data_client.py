@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import Any, BinaryIO
 from urllib.parse import urlsplit
 
+from client_sdk.enrolment import read_enrolment
 from client_sdk.token_text import checked_token
 from rse_pf.errors import (
     BadRequest,
@@ -91,6 +92,16 @@ class DataClient:
         self._options = options or DataOptions()
         self._connection: http.client.HTTPConnection | None = None
         self._lock = threading.Lock()
+
+    @classmethod
+    def enrolled(cls, enrolment: str | Path) -> DataClient:
+        """Return the client of a robot by its file of ``rse-pf robot enrol --out``.
+
+        Raises:
+            UsageError: The file cannot be used.
+        """
+        access = read_enrolment(enrolment)
+        return cls(access.url, access.fresh_token, DataOptions(ssl_context=access.ssl_context))
 
     def close(self) -> None:
         """Close the connection; the next call opens another."""
@@ -173,6 +184,18 @@ class DataClient:
         with self._lock:
             made = self._json("POST", f"/data/v1/maps/{name}/versions", json.dumps(body).encode())
         return str(made["id"])
+
+    def update_map(self, name: str, data: bytes, *, note: str = "") -> str:
+        """Upload the bytes of a map and make them the head, whatever it was; return the version's id.
+
+        Raises:
+            Conflict: Another robot committed at the same moment.
+        """
+        try:
+            parent: str | None = self.map_version(name)["id"]
+        except NotFound:
+            parent = None
+        return self.commit_map(name, data, parent=parent, note=note)
 
     def _upload_parts(self, opened: _Source, digest: str, progress: OnBytes | None) -> None:
         path, size = f"/data/v1/uploads/{digest}", opened.size
