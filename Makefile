@@ -9,7 +9,7 @@ SETUP := PYTHON=$(PYTHON) sh scripts/setup.sh
 PYTEST := $(BIN)/python -m pytest
 
 .DEFAULT_GOAL := help
-.PHONY: help setup assets native sanitize synth demo test quick slow lint types bench docs site lock fuzz sbom audit-deps clean
+.PHONY: help setup assets native sanitize synth demo test quick slow lint types bench docs site release lock fuzz sbom audit-deps clean
 
 help: ## show these targets
 	@awk -F':.*## ' '/^[a-z-]+:.*## /{printf "  make %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -80,6 +80,10 @@ docs: ## write the generated pages and the picture of the packages
 site: ## build the documentation site into build/site; needs no network after setup
 	@$(SETUP) docs
 	@sh scripts/site.sh
+
+release: ## build the packages that can be published, twice, and check them; writes build/release
+	@$(SETUP) dev release
+	@$(BIN)/python scripts/release.py $(ARGS)
 
 fuzz: ## fuzz each target for FUZZ_S seconds (600), with atheris where it is installed, else Hypothesis
 	@$(SETUP) dev

@@ -23,6 +23,7 @@ lock infra infra dev
 # What one .venv holds beside the packages of developers has the same versions as they.
 constraints="$constraints --constraint locks/infra.txt"
 lock docs docs build
+lock release release build
 # What boots has one platform, so its locks have no conditions.
 for_platform() { # for_platform FILE PYTHON INPUT...
   file=$1 python=$2
