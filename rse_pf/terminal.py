@@ -104,11 +104,16 @@ def can_draw(text: str) -> bool:
     return sys.stdout.isatty()
 
 
-def show_progress(text: str, *, is_over: bool) -> None:
-    """Rewrite the last line of a terminal on standard error with *text*; write nothing to a file or pipe."""
-    if sys.stderr.isatty():
-        end = "\n" if is_over else ""
-        _write(sys.stderr, f"{_CLEAR_LINE}{printable(text)}{end}")
+def show_progress(text: str, *, is_over: bool) -> bool:
+    """Rewrite the last line of a terminal on standard error with *text*; return whether it is a terminal.
+
+    Nothing is written to a file or pipe.
+    """
+    if not sys.stderr.isatty():
+        return False
+    end = "\n" if is_over else ""
+    _write(sys.stderr, f"{_CLEAR_LINE}{printable(text)}{end}")
+    return True
 
 
 @contextmanager

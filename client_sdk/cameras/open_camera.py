@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 
 from client_sdk.cameras.folder import open_folder
-from client_sdk.cameras.intrinsics import Intrinsics, read_intrinsics
 from client_sdk.cameras.opencv_video import open_video
 from client_sdk.cameras.realsense import open_realsense
 from client_sdk.cameras.source import RawFrame, RawSource
 from client_sdk.datasets import open_dataset
+from client_sdk.datasets.intrinsics import Intrinsics, read_intrinsics
 from client_sdk.frontend import Frame
 from rse_pf.errors import UsageError
 

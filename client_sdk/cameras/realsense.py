@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from client_sdk.cameras.intrinsics import Intrinsics
 from client_sdk.cameras.source import RawFrame
+from client_sdk.datasets.intrinsics import Intrinsics
 from rse_pf.errors import MissingExtra, UsageError
 from rse_pf.geometry import Camera
 

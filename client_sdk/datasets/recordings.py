@@ -6,7 +6,6 @@ An image is read only when its frame is needed.  A path that cannot be used is r
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -17,9 +16,10 @@ import numpy as np
 import numpy.typing as npt
 
 from client_sdk.datasets import nyu
+from client_sdk.datasets.intrinsics import Intrinsics, Undistortion, read_intrinsics
 from client_sdk.frontend import Frame, load_opencv
 from client_sdk.mapping import Trajectory, read_trajectory
-from rse_pf.errors import InvalidCamera, UsageError
+from rse_pf.errors import UsageError
 from rse_pf.geometry import Camera
 
 __all__ = ["Dataset", "associate_stamps", "open_dataset", "read_colour"]
@@ -28,10 +28,8 @@ _MAX_STAMP_DIFFERENCE_S = 0.02
 # The raw dump's two streams run freely; the nearest images are at most half a period apart.
 _MAX_RAW_STAMP_DIFFERENCE_S = 0.05
 
-_Distortion = tuple[float, ...]
-
 # Intrinsics of the TUM benchmark by folder name; the last is its default for unnamed cameras.
-_FREIBURG: dict[str, tuple[float, float, float, float, _Distortion]] = {
+_FREIBURG: dict[str, tuple[float, float, float, float, tuple[float, ...]]] = {
     "freiburg1": (517.3, 516.5, 318.6, 255.3, (0.2624, -0.9531, -0.0054, 0.0026, 1.1633)),
     "freiburg2": (520.9, 521.0, 325.1, 249.7, (0.2312, -0.7849, -0.0033, -0.0001, 0.9172)),
     "freiburg3": (535.4, 539.2, 320.1, 247.6, ()),
@@ -162,8 +160,8 @@ def _open_tum(folder: Path) -> Dataset:
             f"no colour image of {folder} has a depth image within {_MAX_STAMP_DIFFERENCE_S:g} s",
             hint="check that rgb.txt and depth.txt use the same clock",
         )
-    camera, distortion, depth_scale, notes = _intrinsics(folder)
-    undistort = _Undistortion(camera, distortion)
+    intrinsics, notes = _intrinsics(folder)
+    camera, undistort = intrinsics.camera, Undistortion(intrinsics)
 
     def read(row: int) -> Frame:
         colour_row, depth_row = pairs[row]
@@ -171,7 +169,7 @@ def _open_tum(folder: Path) -> Dataset:
         png = _read_image(folder / depths[depth_row][1], is_depth=True)
         _check_size(rgb, camera, folder / colours[colour_row][1])
         _check_size(png, camera, folder / depths[depth_row][1])
-        depth_m = png.astype(np.float32) / np.float32(depth_scale)
+        depth_m = png.astype(np.float32) / np.float32(intrinsics.depth_scale)
         depth_m[png == np.iinfo(png.dtype).max] = 0.0  # some recorders write "no reading" so
         _check_metres(depth_m, folder)
         return Frame(
@@ -215,38 +213,21 @@ def _read_list(folder: Path, name: str) -> list[tuple[float, str]]:
     return sorted(entries)
 
 
-def _intrinsics(folder: Path) -> tuple[Camera, _Distortion, float, tuple[str, ...]]:
-    """Return camera, distortion, depth scale, and notes on what was assumed without intrinsics.json."""
+def _intrinsics(folder: Path) -> tuple[Intrinsics, tuple[str, ...]]:
+    """Return the intrinsics, and notes on what was assumed without intrinsics.json."""
     path = folder / "intrinsics.json"
-    if not path.exists():
-        name = next(key for key in _FREIBURG if key in folder.resolve().name)
-        fx, fy, cx, cy, distortion = _FREIBURG[name]
-        camera = Camera(fx=fx, fy=fy, cx=cx, cy=cy, width=640, height=480)
-        whose = f"those of {name} are used" if name else "a Kinect's are assumed"
-        note = (
-            f"{folder} has no intrinsics.json, so {whose}: fx {fx:g} fy {fy:g} cx {cx:g} cy {cy:g}, "
-            f"{camera.width}x{camera.height} px, depth_scale {_FREIBURG_DEPTH_SCALE:g}"
-        )
-        return camera, distortion, _FREIBURG_DEPTH_SCALE, (note,)
-    hint = "it needs fx fy cx cy width height distortion[k1 k2 p1 p2 k3] depth_scale"
-    try:
-        values = json.loads(path.read_text(encoding="utf-8"))
-        camera = Camera(
-            **{name: float(values[name]) for name in ("fx", "fy", "cx", "cy")},
-            width=int(values["width"]),
-            height=int(values["height"]),
-        )
-        distortion = tuple(float(value) for value in values.get("distortion", ()))
-        depth_scale = float(values["depth_scale"])
-    except InvalidCamera as error:
-        raise UsageError(f"{path}: {error.message}", hint=error.hint) from error
-    except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
-        raise UsageError(f"{path} cannot be used: {error!r}", hint=hint) from error
-    if len(distortion) not in (0, 4, 5) or not (math.isfinite(depth_scale) and depth_scale > 0):
-        raise UsageError(
-            f"{path}: {len(distortion)} distortion numbers, depth_scale {depth_scale:g}", hint=hint
-        )
-    return camera, distortion, depth_scale, ()
+    if path.exists():
+        return read_intrinsics(path, with_depth_scale=True), ()
+    name = next(key for key in _FREIBURG if key in folder.resolve().name)
+    fx, fy, cx, cy, distortion = _FREIBURG[name]
+    camera = Camera(fx=fx, fy=fy, cx=cx, cy=cy, width=640, height=480)
+    whose = f"those of {name} are used" if name else "a Kinect's are assumed"
+    note = (
+        f"{folder} has no intrinsics.json, so {whose}: fx {fx:g} fy {fy:g} cx {cx:g} cy {cy:g}, "
+        f"{camera.width}x{camera.height} px, depth_scale {_FREIBURG_DEPTH_SCALE:g}"
+    )
+    assumed = Intrinsics(camera=camera, distortion=distortion, depth_scale=_FREIBURG_DEPTH_SCALE)
+    return assumed, (note,)
 
 
 def _read_truth(folder: Path) -> tuple[Trajectory | None, Literal["ground truth", "reference", "none"]]:
@@ -292,8 +273,8 @@ def _open_raw(folder: Path) -> Dataset:
             f"no depth image of {folder} has a colour image within {_MAX_RAW_STAMP_DIFFERENCE_S:g} s",
             hint="unpack the whole scene: r-*.ppm and d-*.pgm",
         )
-    colour = _Undistortion(nyu.COLOUR_CAMERA, nyu.COLOUR_DISTORTION)
-    depth = _Undistortion(nyu.DEPTH_CAMERA, nyu.DEPTH_DISTORTION)
+    colour = Undistortion(Intrinsics(camera=nyu.COLOUR_CAMERA, distortion=nyu.COLOUR_DISTORTION))
+    depth = Undistortion(Intrinsics(camera=nyu.DEPTH_CAMERA, distortion=nyu.DEPTH_DISTORTION))
 
     def read(row: int) -> Frame:
         depth_row, colour_row = pairs[row]
@@ -337,32 +318,6 @@ def _open_labelled(path: Path, scene: str | None) -> Dataset:
 
 
 # --- images ------------------------------------------------------------------------------------
-
-
-class _Undistortion:
-    """Map images of a distorted lens to the pinhole camera of the same intrinsics."""
-
-    def __init__(self, camera: Camera, distortion: _Distortion) -> None:
-        self._maps: tuple[Any, Any] | None = None
-        if any(distortion):
-            size = (camera.width, camera.height)
-            cv2 = load_opencv()
-            self._maps = cv2.initUndistortRectifyMap(
-                camera.matrix, np.array(distortion), None, camera.matrix, size, cv2.CV_32FC1
-            )
-
-    def colour(self, rgb: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
-        return rgb if self._maps is None else self._remap(rgb, "INTER_LINEAR")
-
-    def depth(self, depth_m: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
-        """Take the nearest reading: a mean of two surfaces, or with a hole, lies on neither."""
-        return depth_m if self._maps is None else self._remap(depth_m, "INTER_NEAREST")
-
-    def _remap(self, image: npt.NDArray[Any], interpolation: str) -> npt.NDArray[Any]:
-        cv2 = load_opencv()
-        assert self._maps is not None
-        mapped: npt.NDArray[Any] = cv2.remap(image, *self._maps, getattr(cv2, interpolation))
-        return mapped
 
 
 def _read_image(path: Path, *, is_depth: bool) -> npt.NDArray[Any]:

@@ -10,7 +10,8 @@ import argparse
 import asyncio
 import contextlib
 import signal
-from collections.abc import AsyncIterator
+import time
+from collections.abc import AsyncIterator, Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
@@ -29,6 +30,8 @@ __all__ = ["add_from_camera_arguments", "run_from_camera"]
 _ROBOT = "camera"
 _MOST = 0.5
 """Share of frames without a pose above which the command has failed."""
+_LINE_EVERY_S = 5.0
+"""Time between two lines of progress in a file or pipe."""
 
 
 def add_from_camera_arguments(parser: argparse.ArgumentParser) -> None:
@@ -142,7 +145,7 @@ async def _drive(
         asyncio.get_running_loop().add_signal_handler(signal.SIGINT, stop.set)
     async with _robot(args, settings) as robot:
         mapper = robot.mapper(scale=scale, depth=source.has_depth)
-        status = _Status()
+        status = _Status(time.monotonic)
         while not stop.is_set() and (args.frames is None or mapper.frames < args.frames):
             frame = await asyncio.to_thread(next, source, None)
             if frame is None:
@@ -188,9 +191,11 @@ async def _robot(args: argparse.Namespace, settings: PlatformSettings) -> AsyncI
 
 
 class _Status:
-    """The line of a drive, rewritten on a terminal."""
+    """The line of a drive: rewritten on a terminal, written every few seconds to a file or pipe."""
 
-    def __init__(self) -> None:
+    def __init__(self, now: Callable[[], float]) -> None:
+        self._now = now
+        self._due_s = now() + _LINE_EVERY_S
         self._last = ""
 
     def show(self, mapper: Mapper, done: TrackedFrame) -> None:
@@ -202,7 +207,9 @@ class _Status:
             f"frame {mapper.frames}: {done.status}{scale}, {how}; {mapper.keyframes} keyframes, "
             f"{mapper.lost_frames} lost"
         )
-        show_progress(self._last, is_over=False)
+        if not show_progress(self._last, is_over=False) and self._now() >= self._due_s:
+            show(self._last, error=True)
+            self._due_s = self._now() + _LINE_EVERY_S
 
     def end(self) -> None:
         """End the line."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import json
 from collections.abc import AsyncIterator
@@ -13,9 +14,10 @@ import pytest
 
 import client_sdk
 from client_sdk.answers import PoseAnswer
-from client_sdk.cameras.intrinsics import Intrinsics, write_intrinsics
+from client_sdk.datasets.intrinsics import Intrinsics, write_intrinsics
 from client_sdk.mapper import Mapper, ask_robot
 from client_sdk.mapping import Trajectory, read_ply, read_trajectory, write_trajectory
+from rse_pf.cli import map_from_camera
 from rse_pf.cli.main import main
 from rse_pf.pnp import refine_with_depth, solve_pnp
 from tests.client_sdk.mapper.flat_world import CAMERA, STEP_M, frame_at
@@ -102,6 +104,22 @@ def test_without_a_scale_the_command_says_so(folder: Path, capsys: pytest.Captur
     assert code == 0
     assert "units; scale: up to scale" in out
     assert json.loads(Path("out-camera/report.json").read_text())["scale"] == "up to scale"
+
+
+def test_a_pipe_gets_a_line_of_progress_every_five_seconds(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    status = map_from_camera._Status(now=iter([0.0, 4.9, 5.0, 5.0, 9.9, 10.0, 10.0]).__next__)
+    mapper = Mapper(ask=ask_robot(SolvingRobot()))
+    done = asyncio.run(mapper.track(frame_at(0, depth=True)))
+
+    for _ in range(4):
+        status.show(mapper, done)
+    status.end()
+
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 2
+    assert lines[0].startswith("frame 1: first, ")
 
 
 def test_a_camera_that_does_not_move_is_no_map(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -56,8 +56,12 @@ class Intrinsics:
             )
 
 
-def read_intrinsics(path: Path | str) -> Intrinsics:
+def read_intrinsics(path: Path | str, *, with_depth_scale: bool = False) -> Intrinsics:
     """Return the intrinsics of a file.
+
+    Args:
+        path: The file.
+        with_depth_scale: Refuse a file without ``depth_scale``, instead of taking 1000.
 
     Raises:
         UsageError: The file is missing, or lacks a number, or a number is impossible.
@@ -70,10 +74,11 @@ def read_intrinsics(path: Path | str) -> Intrinsics:
             width=int(values["width"]),
             height=int(values["height"]),
         )
+        depth_scale = values["depth_scale"] if with_depth_scale else values.get("depth_scale", 1000.0)
         return Intrinsics(
             camera=camera,
             distortion=tuple(float(value) for value in values.get("distortion", ())),
-            depth_scale=float(values.get("depth_scale", 1000.0)),
+            depth_scale=float(depth_scale),
             rms_px=values.get("rms_px"),
             views=values.get("views"),
         )
