@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import inspect
 import typing
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any, Literal, TypeVar
 
@@ -25,7 +25,7 @@ from rse_pf.errors import (
 )
 from rse_pf.wire import Command, Failure, Result, as_type
 
-__all__ = ["Kind", "Registry", "Report", "Service", "dispatch", "failure_of", "request_of"]
+__all__ = ["Kind", "Registry", "Report", "Service", "dispatch", "failure_of", "request_of", "unknown_service"]
 
 Kind = Literal["stateless", "per_robot_state", "long"]
 
@@ -114,11 +114,13 @@ class Registry:
         """Return the service called *name*, or raise UnknownService with what is offered."""
         found = self._services.get(name)
         if found is None:
-            raise UnknownService(
-                f"no service named {name!r}; this server offers {', '.join((*self._services, *self.others))}",
-                hint="check the spelling, or install the service on the server",
-            )
+            raise unknown_service(name, self.names)
         return found
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of all services of this server, those that run in sandboxes included."""
+        return (*self._services, *self.others)
 
     def __iter__(self) -> Iterator[Service]:
         return iter(self._services.values())
@@ -172,6 +174,14 @@ def dispatch(
         id=command.id, reply=reply, server=server, compute_ms=compute_ms,
         queue_ms=(started - received_s) * 1e3, received_s=received_s, sent_s=ended,
     )  # fmt: skip
+
+
+def unknown_service(name: str, offered: Iterable[str]) -> UnknownService:
+    """Return the error that *name* is none of the services *offered*."""
+    return UnknownService(
+        f"no service named {name!r}; this server offers {', '.join(offered) or 'none to you'}",
+        hint="check the spelling, or install the service on the server",
+    )
 
 
 def failure_of(error: RsePfError, command: Command | None = None, *, server: str = "") -> Failure:

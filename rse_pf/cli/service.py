@@ -4,6 +4,11 @@ new creates a folder with a working service; test replays its recorded requests 
 server; run serves it from a local platform until Ctrl-C and loads every saved change; install copies it for
 rse-pf local --services; call sends a request to a running local platform.
 
+lock writes the versions and hashes of the Python packages in requirements.in to requirements.txt; build
+installs them once, and compiles C and C++; test, run and install build, too.  record writes the requests that
+robots send to a service of a running platform to a file, test --requests replays it, and debug calls the
+service with one of them outside of the sandbox, under a debugger.
+
 A server refuses a service or a request after crashes: to the robot whose sandboxes crashed, and to others if
 theirs crashed as well.  status shows what is refused to whom and for how long, unblock lifts it.
 
@@ -11,6 +16,10 @@ examples:
   rse-pf service new centroid --lang lua
   rse-pf service test centroid
   rse-pf service run centroid
+  rse-pf service lock centroid
+  rse-pf service record centroid --out live.jsonl --count 20
+  rse-pf service test centroid --requests live.jsonl --compare
+  rse-pf service debug centroid --request live.jsonl --number 3
   rse-pf service status
   rse-pf service unblock centroid --robot robot-1
 """
@@ -20,38 +29,44 @@ from __future__ import annotations
 import argparse
 import asyncio
 import json
-import math
 import os
 import re
 import secrets
 import shutil
 import signal
-import subprocess
 import tempfile
 import time
-from collections.abc import Iterable
+from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 from rse_pf.cli.extras import require
-from rse_pf.cli.service_blocks import add_block_arguments, show_blocks, unblock
+from rse_pf.cli.local_platform.logs import LogFollower, LogLine
+from rse_pf.cli.service_blocks import add_block_arguments, chosen_servers, show_blocks, unblock
+from rse_pf.cli.service_tools.building import build_service, built_service, changed_s, lock_service
+from rse_pf.cli.service_tools.debugging import DebugOptions, debug_service
+from rse_pf.cli.service_tools.recorder import RecordLimits, record_service
+from rse_pf.cli.service_tools.replaying import Recorded, plain, recorded_requests, replay, requests_of
 from rse_pf.config import PlatformSettings
-from rse_pf.errors import CommandFailed, RsePfError, UsageError
+from rse_pf.errors import RsePfError, UsageError
 from rse_pf.local.state import read_state, state_folder
-from rse_pf.services.custom.installed import install, installed_services, read_service
+from rse_pf.services.custom.installed import install, installed_services
 from rse_pf.services.custom.native import INCLUDE_FOLDER
-from rse_pf.terminal import at_work, counted, error_lines, show, show_json, show_progress
+from rse_pf.services.custom.output import shown_output
+from rse_pf.terminal import error_lines, show, show_json, show_progress
 
 __all__ = ["add_arguments", "run"]
 
-Recorded = list[tuple[str, dict[str, Any]]]
-"""File name and content of each recorded request."""
-
-_ACTIONS = ("new", "test", "run", "install", "list", "call", "status", "unblock")
+_ACTIONS = (
+    "new", "test", "run", "lock", "build", "install", "list", "call", "record", "debug", "status", "unblock",
+)  # fmt: skip
+_OF_A_NAME = ("new", "call", "record")
 _LANGUAGES = ("python", "cpp", "lua")
 _NAME = re.compile(r"[a-z][a-z0-9_-]{0,39}")
+_OUTPUT = re.compile(r"service-output robot=(?P<robot>\S+) text=(?P<text>.*) tenant=\S+")
 _POLL_S = 0.3
-_DEFAULT_TOLERANCE = 1e-9
+_CLIENT_PORT = 5678
 _RECORDED_FIELDS = {"request", "reply", "tolerance", "failure"}
 
 
@@ -60,51 +75,98 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("action", choices=_ACTIONS, help="what to do")
     parser.add_argument(
         "what", nargs="?", metavar="NAME|FOLDER",
-        help="new, call: a name; test, run, install: the folder; unblock: only this service",
+        help="new, call, record: a name; test, run, lock, build, install, debug: the folder; unblock: only "
+        "this service",
     )  # fmt: skip
     parser.add_argument(
         "--lang", choices=_LANGUAGES, default="python", help="new: language (default: python)"
     )
     parser.add_argument("--services", type=Path, metavar="DIR", help="install, list: the services folder")
     parser.add_argument(
-        "--request",
-        metavar="JSON",
-        help="call: the request as JSON; @FILE reads it from a file, which may be a recorded request",
-    )
+        "--request", metavar="JSON|FILE",
+        help="call: the request as JSON; @FILE reads it from a file, which may be a recorded request; "
+        "debug: the file",
+    )  # fmt: skip
     parser.add_argument(
         "--name", default="default",
-        help="call, status, unblock: name of the local platform (default: default)",
+        help="call, record, status, unblock: name of the local platform (default: default)",
     )  # fmt: skip
     add_block_arguments(parser)
     parser.add_argument("--once", action="store_true", help="run: answer the recorded requests, then end")
+    _add_recording_arguments(parser)
+    _add_debug_arguments(parser)
+
+
+def _add_recording_arguments(parser: argparse.ArgumentParser) -> None:
+    limits = RecordLimits()
+    parser.add_argument("--out", type=Path, metavar="FILE", help="record: the file to write")
+    parser.add_argument(
+        "--record", type=Path, metavar="FILE",
+        help="test: record from the running platform to FILE, as record does, and replay that",
+    )  # fmt: skip
+    parser.add_argument(
+        "--requests", type=Path, metavar="FILE", help="test: replay the requests of this file"
+    )
+    parser.add_argument(
+        "--compare",
+        action="store_true",
+        help="test: compare with the replies in the file of --requests or --record",
+    )
+    parser.add_argument(
+        "--count", type=int, default=limits.calls, help=f"record: end after so many (default: {limits.calls})"
+    )
+    parser.add_argument(
+        "--seconds", type=float, default=limits.seconds,
+        help=f"record: end after this time (default: {limits.seconds:g})",
+    )  # fmt: skip
+    parser.add_argument(
+        "--max-mib", type=int, default=limits.max_mib,
+        help=f"record: what each process of a server may keep (default: {limits.max_mib})",
+    )  # fmt: skip
+
+
+def _add_debug_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--number", type=int, default=1, help="debug: which request of the file (default: 1)")
+    parser.add_argument(
+        "--no-debugger", action="store_true", help="debug: run without a debugger, outside of the sandbox"
+    )
+    parser.add_argument(
+        "--wait-for-client", type=int, nargs="?", const=_CLIENT_PORT, metavar="PORT",
+        help=f"debug: wait for a debugger that speaks to debugpy (default port: {_CLIENT_PORT})",
+    )  # fmt: skip
+    parser.add_argument("--gdb", action="store_true", help="debug: run gdb, for C and C++")
 
 
 def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
     """Do one of the actions."""
-    folder = args.services or _services_folder(settings)
-    if args.action == "list":
-        return _list(folder)
-    if args.action == "status":
-        return show_blocks(args)
-    if args.action == "unblock":
-        return unblock(args)
+    without_what: dict[str, Callable[[], int]] = {
+        "list": lambda: _list(args.services or _services_folder(settings)),
+        "status": lambda: show_blocks(args),
+        "unblock": lambda: unblock(args),
+    }
+    if args.action in without_what:
+        return without_what[args.action]()
     if args.what is None:
-        what = "name" if args.action in ("new", "call") else "folder"
+        what = "name" if args.action in _OF_A_NAME else "folder"
         raise UsageError(
             f"rse-pf service {args.action} needs the {what} of a service",
             hint=f"write rse-pf service {args.action} {what.upper()}",
         )
-    if args.action == "new":
-        return _new(args.what, args.lang, Path.cwd())
-    if args.action == "call":
-        return asyncio.run(_call(args.what, args.request, args.name, settings))
     source = Path(args.what)
-    if args.action == "install":
-        return _install(source, folder)
-    if args.action == "test":
-        return _test(source, settings)
-    require("service")
-    return asyncio.run(_run(source, settings, once=args.once))
+    actions: dict[str, Callable[[], int]] = {
+        "new": lambda: _new(args.what, args.lang, Path.cwd()),
+        "call": lambda: asyncio.run(_call(args.what, args.request, args.name, settings)),
+        "install": lambda: _install(source, args.services or _services_folder(settings)),
+        "lock": lambda: lock_service(source),
+        "build": lambda: build_service(source),
+        "record": lambda: _record(args),
+        "debug": lambda: debug_service(source, _debug_options(args)),
+        "test": lambda: _test(source, args, settings),
+        "run": lambda: asyncio.run(_run(source, settings, once=args.once)),
+    }
+    if args.action == "run":
+        require("service")
+    return actions[args.action]()
 
 
 # --- new, install, list ---------------------------------------------------------------------------
@@ -137,8 +199,8 @@ def _new(name: str, language: str, where: Path) -> int:
 
 
 def _install(source: Path, folder: Path) -> int:
-    _build(source)
-    service = install(read_service(source).folder, folder)
+    built, dependencies = built_service(source)
+    service = install(built.folder, folder, dependencies)
     show(
         f"{service.name} ({service.language}) is installed in {folder}",
         f"serve it with: rse-pf local --services {folder}",
@@ -148,7 +210,8 @@ def _install(source: Path, folder: Path) -> int:
 
 def _list(folder: Path) -> int:
     for service in installed_services(folder):
-        show(f"{service.name:<24} {service.language:<8} {service.kind:<18} {service.folder}")
+        about = f"{service.name:<24} {service.language:<8} {service.kind:<18} {service.identity[:12]}"
+        show(f"{about}  {service.folder}")
     return 0
 
 
@@ -158,99 +221,42 @@ def _services_folder(settings: PlatformSettings) -> Path:
     return state_folder("default", os.environ).parent / "services"
 
 
-def _build(source: Path) -> None:
-    """Build a service that has a CMakeLists.txt and sources newer than its libraries."""
-    folder = read_service(source).folder
-    if not (folder / "CMakeLists.txt").exists():
-        return
-    libraries = [path.stat().st_mtime for path in (folder / "build").glob("*.so")]
-    if libraries and max(_mtimes(folder, without="build")) <= max(libraries):
-        return
-    if shutil.which("cmake") is None:
+# --- test, record, debug ----------------------------------------------------------------------------
+
+
+def _test(source: Path, args: argparse.Namespace, settings: PlatformSettings) -> int:
+    if args.record is not None and args.requests is not None:
+        raise UsageError("--record and --requests exclude each other", hint="leave one of them out")
+    service, _ = built_service(source)
+    file = args.requests
+    if args.record is not None:
+        record_service(service.name, chosen_servers(args), _limits(args), args.record)
+        file = args.record
+    if file is None:
+        return replay(service, recorded_requests(source), settings, compare=True)
+    return replay(service, requests_of(file, service.name), settings, compare=args.compare)
+
+
+def _record(args: argparse.Namespace) -> int:
+    if args.out is None:
+        raise UsageError("record needs a file to write", hint=f"add --out {args.what}.jsonl")
+    record_service(args.what, chosen_servers(args), _limits(args), args.out)
+    return 0
+
+
+def _limits(args: argparse.Namespace) -> RecordLimits:
+    return RecordLimits(calls=args.count, seconds=args.seconds, max_mib=args.max_mib)
+
+
+def _debug_options(args: argparse.Namespace) -> DebugOptions:
+    if args.request is None:
         raise UsageError(
-            "cmake is not installed, so the service cannot be built", hint="apt install cmake g++"
+            "debug needs a recorded request", hint=f"add --request {args.what}/requests/example.json"
         )
-    for command in (["cmake", "-S", ".", "-B", "build"], ["cmake", "--build", "build"]):
-        with at_work(f"building {folder.name}"):
-            done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
-        if done.returncode != 0:
-            output = (done.stderr or done.stdout).strip()[-1500:]
-            raise CommandFailed(f"{' '.join(command)} failed:\n{output}", hint=f"fix the sources in {folder}")
-    show(f"built {folder / 'build'}")
-
-
-def _mtimes(folder: Path, *, without: str) -> Iterable[float]:
-    for path in folder.rglob("*"):
-        inside = path.relative_to(folder).parts
-        if path.is_file() and inside[0] not in (without, "requests") and "__pycache__" not in inside:
-            yield path.stat().st_mtime
-
-
-# --- test -------------------------------------------------------------------------------------------
-
-
-def _test(source: Path, settings: PlatformSettings) -> int:
-    from rse_pf.backend.sandbox.dry_run import dry_run
-    from rse_pf.wire import Failure
-
-    _build(source)
-    service, recorded = read_service(source), _recorded(source)
-    missing, runs = dry_run(service, [each["request"] for _, each in recorded], settings, show)
-    if missing:
-        show(f"note: this machine lacks isolation that a server has: {', '.join(missing)}")
-    wrong = 0
-    for (name, each), each_run in zip(recorded, runs, strict=True):
-        answer, expected = each_run.answer, each.get("reply")
-        if isinstance(answer, Failure):
-            detail = f"{answer.code}: {answer.message}"
-            good = each.get("failure") == answer.code
-        else:
-            tolerance = each.get("tolerance", _DEFAULT_TOLERANCE)
-            detail = _difference(_plain(answer.reply), expected, tolerance) if "reply" in each else ""
-            good = "failure" not in each and not detail
-        wrong += not good
-        show(f"{name:<28} {'ok' if good else 'WRONG':<6} {each_run.took_ms:8.1f} ms  {detail}")
-    show(f"{len(runs) - wrong} of {counted(len(runs), 'recorded request')} as expected")
-    return 1 if wrong else 0
-
-
-def _recorded(source: Path) -> Recorded:
-    found = []
-    for path in sorted((source / "requests").glob("*.json")):
-        try:
-            each = json.loads(path.read_text(encoding="utf-8"))
-        except ValueError as error:
-            raise UsageError(f"{path} is not JSON: {error}", hint="correct the file") from error
-        if not isinstance(each, dict) or "request" not in each:
-            raise UsageError(f"{path} holds no request", hint='write {"request": {...}, "reply": {...}}')
-        found.append((path.name, each))
-    if not found:
-        raise UsageError(
-            f"{source} has no recorded requests", hint=f"write one to {source / 'requests'}/NAME.json"
-        )
-    return found
-
-
-def _plain(value: Any) -> Any:
-    """Return *value* as JSON gives it back: arrays are lists, and what JSON cannot hold is text."""
-    return json.loads(json.dumps(value, default=lambda each: getattr(each, "tolist", each.__repr__)()))
-
-
-def _difference(got: Any, expected: Any, tolerance: float, path: str = "reply") -> str:
-    """Return the first difference of *got* from *expected*, "" if there is none."""
-    if isinstance(expected, dict) and isinstance(got, dict):
-        if set(got) != set(expected):
-            return f"{path} has {', '.join(sorted(got))}, expected {', '.join(sorted(expected))}"
-        found = (_difference(got[key], expected[key], tolerance, f"{path}.{key}") for key in expected)
-        return next(filter(None, found), "")
-    if isinstance(expected, list) and isinstance(got, list):
-        if len(got) != len(expected):
-            return f"{path} has {len(got)} values, expected {len(expected)}"
-        pairs = enumerate(zip(got, expected, strict=True))
-        return next(filter(None, (_difference(g, e, tolerance, f"{path}[{i}]") for i, (g, e) in pairs)), "")
-    numbers = all(isinstance(each, int | float) and not isinstance(each, bool) for each in (got, expected))
-    equal = math.isclose(got, expected, rel_tol=tolerance, abs_tol=tolerance) if numbers else got == expected
-    return "" if equal else f"{path} is {got!r}, expected {expected!r}"
+    return DebugOptions(
+        request=Path(args.request.removeprefix("@")), number=args.number, debugger=not args.no_debugger,
+        gdb=args.gdb, client_port=args.wait_for_client,
+    )  # fmt: skip
 
 
 # --- run, call --------------------------------------------------------------------------------------
@@ -259,43 +265,66 @@ def _difference(got: Any, expected: Any, tolerance: float, path: str = "reply") 
 async def _run(source: Path, settings: PlatformSettings, *, once: bool) -> int:
     from rse_pf.local.control.platform import LocalPlatform
 
-    _build(source)
-    service, recorded = read_service(source), _recorded(source)
+    service, dependencies = built_service(source)
+    recorded = recorded_requests(source)
     with tempfile.TemporaryDirectory(prefix="rse-pf-service-") as temporary:
         place = Path(temporary)
-        install(service.folder, place / "services")
+        install(service.folder, place / "services", dependencies)
         chosen = settings.replace(services={"folder": str(place / "services"), "accept_weak_isolation": True})
+        output = LogFollower(place / "platform", None, "info")
         stopped = asyncio.Event()
         for number in (signal.SIGINT, signal.SIGTERM):
             asyncio.get_running_loop().add_signal_handler(number, stopped.set)
         show_progress("starting a platform ...", is_over=False)
-        async with LocalPlatform(
-            chosen, state=place / "platform", servers=1, port=0, name="service"
-        ) as platform:
-            show_progress("", is_over=False)
-            show(f"{service.name} is served at {platform.url}")
-            good = await _ask_recorded(platform, service, recorded, settings)
-            if once:
-                return 0 if good else 1
-            show(f"save a file in {source} to load it anew; Ctrl-C ends")
-            seen = max(_mtimes(service.folder, without="build"))
-            while not stopped.is_set():
-                try:
-                    await asyncio.wait_for(stopped.wait(), _POLL_S)
-                except asyncio.TimeoutError:
-                    newest = max(_mtimes(service.folder, without="build"))
-                    if newest > seen:
-                        seen = newest
-                        await _reload(platform, source, place / "services", recorded, settings)
+        try:
+            async with LocalPlatform(
+                chosen, state=place / "platform", servers=1, port=0, name="service"
+            ) as platform:
+                show_progress("", is_over=False)
+                show(f"{service.name} is served at {platform.url}")
+                good = await _ask_recorded(platform, service, recorded, settings)
+                if once:
+                    return 0 if good else 1
+                show(f"save a file in {source} to load it anew; Ctrl-C ends")
+                seen = changed_s(service.folder)
+                while not stopped.is_set():
+                    _show_output(output)
+                    try:
+                        await asyncio.wait_for(stopped.wait(), _POLL_S)
+                    except asyncio.TimeoutError:
+                        newest = changed_s(service.folder)
+                        if newest > seen:
+                            seen = newest
+                            await _reload(platform, source, place / "services", recorded, settings)
+        finally:
+            _show_output(output)  # what the servers wrote until they ended
     return 0
+
+
+def _show_output(output: LogFollower) -> None:
+    """Show what the service has printed since the last call."""
+    for line in output.new_lines():
+        shown = _shown(line)
+        if shown:
+            show(shown)
+
+
+def _shown(line: LogLine) -> str:
+    printed = _OUTPUT.fullmatch(line.text)
+    if printed is None:
+        return ""
+    text = printed["text"]
+    with suppress(ValueError):  # a text with spaces is quoted
+        text = str(json.loads(text)) if text.startswith('"') else text
+    return shown_output(line.time_s, printed["robot"], text)
 
 
 async def _reload(
     platform: Any, source: Path, services: Path, recorded: Recorded, settings: PlatformSettings
 ) -> None:
     try:
-        _build(source)
-        service = install(read_service(source).folder, services)
+        built, dependencies = built_service(source)
+        service = install(built.folder, services, dependencies)
         await platform.roll()
         await _ask_recorded(platform, service, recorded, settings)
     except RsePfError as error:  # the author corrects it and saves again
@@ -319,9 +348,10 @@ async def _ask_recorded(platform: Any, service: Any, recorded: Recorded, setting
             except RsePfError as error:
                 if each.get("failure") != error.code:
                     failed.append(each["request"])
-                show(f"{path}: {error.code}: {error.message}")
+                hint = f" ({error.hint})" if error.hint else ""
+                show(f"{path}: {error.code}: {error.message}{hint}")
                 continue
-            shown = json.dumps(_plain(answer.reply))
+            shown = json.dumps(plain(answer.reply))
             show(f"{path}: {shown[:500]}  ({answer.round_trip_ms:.1f} ms)")
     if failed:
         await asyncio.to_thread(dry_run, service, failed[:1], settings, lambda line: show(f"  {line}"))
@@ -341,7 +371,7 @@ async def _call(name: str, request: str | None, platform: str, settings: Platfor
     )
     async with connect(state.url, token=token) as robot:
         answer = await robot.call(name, payload)
-    show_json(_plain(answer.reply))
+    show_json(plain(answer.reply))
     return 0
 
 

@@ -12,7 +12,7 @@ import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
-from urllib.parse import urlencode
+from urllib.parse import urlencode, urlsplit
 
 from rse_pf.auth.control_token import read_control_token
 from rse_pf.errors import CommandFailed, UsageError
@@ -21,9 +21,10 @@ from rse_pf.local.servers.control_client import ControlPort, ControlPortReply
 from rse_pf.local.state import read_state, state_folder
 from rse_pf.terminal import show
 
-__all__ = ["add_block_arguments", "show_blocks", "unblock"]
+__all__ = ["Server", "add_block_arguments", "chosen_servers", "show_blocks", "unblock"]
 
 _TIMEOUT_S = 5.0
+_LOOPBACK = ("127.0.0.1", "localhost", "::1")
 _COLUMNS = ("server", "service", "refused to", "because of", "for another")
 Server = tuple[str, int, str | None]
 """What it is called, its control port, and the token of that port."""
@@ -37,16 +38,23 @@ def add_block_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--robot", metavar="NAME", help="unblock: only for this robot of the tenant")
     parser.add_argument(
         "--control-port", type=int, metavar="PORT",
-        help="status, unblock: ask the server on this machine with this control port, not a local platform",
+        help="status, unblock, record: ask the server on this machine with this control port, "
+        "not a local platform",
     )  # fmt: skip
     parser.add_argument(
-        "--control-token", type=Path, metavar="FILE", help="status, unblock: token file of that server"
+        "--control-token",
+        type=Path,
+        metavar="FILE",
+        help="status, unblock, record: token file of that server",
+    )
+    parser.add_argument(
+        "--url", help="status, unblock, record: the same as --control-port, as in http://127.0.0.1:PORT"
     )
 
 
 def show_blocks(args: argparse.Namespace) -> int:
     """Show what is refused, to whom, and for how long; return 1 if a server did not answer."""
-    told, silent = asyncio.run(_ask_all(_servers(args), "GET", "/blocks"))
+    told, silent = asyncio.run(_ask_all(chosen_servers(args), "GET", "/blocks"))
     rows = [_row(server, block) for server, each in told for block in each["blocks"]]
     left_out = sum(each["count"] - len(each["blocks"]) for _, each in told)
     if rows:
@@ -64,7 +72,7 @@ def unblock(args: argparse.Namespace) -> int:
     wanted = {"service": args.what, "tenant": tenant, "robot": args.robot}
     query = urlencode({name: value for name, value in wanted.items() if value})
     target = f"/unblock?{query}" if query else "/unblock"
-    told, silent = asyncio.run(_ask_all(_servers(args), "POST", target))
+    told, silent = asyncio.run(_ask_all(chosen_servers(args), "POST", target))
     for server, each in told:
         for block in each["blocks"]:
             _, service, whom, why, _ = _row(server, block)
@@ -77,12 +85,18 @@ def unblock(args: argparse.Namespace) -> int:
     return _show_silent(silent, told)
 
 
-def _servers(args: argparse.Namespace) -> list[Server]:
-    if args.control_port is not None:
-        if not 0 < args.control_port < 65536:
-            raise UsageError(f"{args.control_port} is no port", hint="name a port from 1 to 65535")
+def chosen_servers(args: argparse.Namespace) -> list[Server]:
+    """Return the servers that the options name: those of a platform, or one by its control port.
+
+    Raises:
+        UsageError: There is none, the port or address is none, or a token file is refused.
+    """
+    named = args.control_port if args.url is None else _port_of(args.url)
+    if named is not None:
+        if not 0 < named < 65536:
+            raise UsageError(f"{named} is no port", hint="name a port from 1 to 65535")
         token = None if args.control_token is None else read_control_token(args.control_token)
-        return [(f"port {args.control_port}", args.control_port, token)]
+        return [(f"port {named}", named, token)]
     state = read_state(state_folder(args.name, os.environ))
     servers = [] if state is None else [each for each in state.servers if each.control_port]
     if state is None or not servers:
@@ -92,6 +106,20 @@ def _servers(args: argparse.Namespace) -> list[Server]:
         )
     token = read_control_token(Path(state.control_token_file)) if state.control_token_file else None
     return [(server.name, server.control_port, token) for server in servers]
+
+
+def _port_of(url: str) -> int:
+    try:
+        parts = urlsplit(url)
+        host, port = parts.hostname, parts.port
+    except ValueError:
+        host, port = None, None
+    if host not in _LOOPBACK or port is None or parts.scheme != "http":
+        raise UsageError(
+            f"{url[:80]!r} is no control port of this machine",
+            hint="write --url http://127.0.0.1:PORT, on the machine of the server",
+        )
+    return port
 
 
 async def _ask_all(

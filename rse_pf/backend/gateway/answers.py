@@ -10,13 +10,14 @@ import traceback
 
 import msgspec
 
+from rse_pf.auth.roster import scopes_allow
 from rse_pf.backend.gateway.admission import UnreadRefusal
 from rse_pf.backend.gateway.connection import RobotConnection
 from rse_pf.backend.object_refs import ObjectRefs, takes_objects
 from rse_pf.backend.ports import WorkerContext
 from rse_pf.backend.scheduling.scheduler import QueuedCommand, RefusedCommand
-from rse_pf.errors import Busy, InternalError, LimitExceeded, RsePfError
-from rse_pf.service import Registry, dispatch, failure_of
+from rse_pf.errors import Busy, InternalError, LimitExceeded, RsePfError, UnknownService
+from rse_pf.service import Registry, dispatch, failure_of, unknown_service
 from rse_pf.wire import Codec, Command, Failure, Result
 from rse_pf.wire.envelope import Envelope, encode_refusal
 
@@ -72,7 +73,16 @@ class Answers:
             self._registry, command, self._monotonic, server=self._context.server_id,
             on_defect=self._log_defect, received_s=queued.received_s,
         )  # fmt: skip
+        if isinstance(message, Failure) and message.code == UnknownService.code:
+            return self._failed(queued, self._unknown(queued))
         return self._fitting(queued, message)
+
+    def _unknown(self, queued: QueuedCommand) -> RsePfError:
+        """Return the error of a service that is not there; it names what the robot's token allows."""
+        owner: RobotConnection = queued.owner
+        scopes = () if owner.claims is None else owner.claims.scopes
+        offered = [name for name in self._registry.names if scopes_allow(scopes, f"services:{name}")]
+        return unknown_service(queued.command.service, offered)
 
     def _compute_with_objects(self, queued: QueuedCommand) -> EncodedAnswer:
         """Do the same for a service whose payload may name stored objects."""

@@ -73,7 +73,8 @@ def readable_paths(services: Sequence[InstalledService]) -> list[Path]:
     if sys.base_prefix not in _SHARED_PREFIXES:
         modules.append(f"{sys.base_prefix}/lib")  # libraries that its modules link to, as in conda
     names = [*_SYSTEM_PATHS, *_library_folders(), *modules, *site.getsitepackages()]
-    return [*map(Path, names), package, *(service.folder for service in services)]
+    packages = [service.dependencies for service in services if service.dependencies is not None]
+    return [*map(Path, names), package, *(service.folder for service in services), *packages]
 
 
 def run_sandbox(plan: SandboxPlan, channel: int, output: int, uid: int | None) -> None:

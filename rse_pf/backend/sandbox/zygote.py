@@ -60,7 +60,9 @@ class _Zygote:
     def __init__(self, worker: socket.socket, config: dict[str, Any]) -> None:
         self._worker = worker
         services = {
-            each["name"]: InstalledService(**{**each, "folder": Path(each["folder"])})
+            each["name"]: InstalledService(
+                **{**each, **{name: each[name] and Path(each[name]) for name in ("folder", "dependencies")}}
+            )
             for each in config["services"]
         }
         _warm_up({service.language for service in services.values()})

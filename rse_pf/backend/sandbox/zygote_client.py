@@ -111,7 +111,7 @@ class ZygoteClient:
             "services": [
                 {
                     "name": s.name, "language": s.language, "entry": s.entry, "kind": s.kind,
-                    "folder": str(s.folder),
+                    "folder": str(s.folder), "dependencies": s.dependencies and str(s.dependencies),
                 }
                 for s in self._services
             ],

@@ -5,8 +5,9 @@ from __future__ import annotations
 import msgspec
 
 __all__ = [
-    "BlocksOrder", "DrainOrder", "LeaveOrder", "MigrateOrder", "ReplaceOrder", "ReportOrder", "RobotsOrder",
-    "TrustOrder", "UnblockOrder", "WorkerOrder", "decode_order", "encode_order",
+    "BlocksOrder", "DrainOrder", "LeaveOrder", "MigrateOrder", "RecordOrder", "ReplaceOrder", "ReportOrder",
+    "RobotsOrder", "TakeRecordedOrder", "TrustOrder", "UnblockOrder", "WorkerOrder", "decode_order",
+    "encode_order",
 ]  # fmt: skip
 
 
@@ -63,6 +64,25 @@ class UnblockOrder(msgspec.Struct, tag="unblock", tag_field="do", frozen=True):
     robot: str | None = None
 
 
+class RecordOrder(msgspec.Struct, tag="record", tag_field="do", frozen=True):
+    """Record requests to *service* under this *number*, or, with *ends*, end the recording of that number."""
+
+    number: int
+    service: str = ""
+    calls: int = 0
+    max_bytes: int = 0
+    seconds: float = 0.0
+    ends: int | None = None
+
+
+class TakeRecordedOrder(msgspec.Struct, tag="take-recorded", tag_field="do", frozen=True):
+    """Tell in an answer with this *number* the next bytes of *recording*, at most *max_bytes*."""
+
+    number: int
+    recording: int
+    max_bytes: int
+
+
 class LeaveOrder(msgspec.Struct, tag="leave", tag_field="do", frozen=True):
     """Wait at most *held_s* for commands that are held, close every socket, and end."""
 
@@ -78,6 +98,8 @@ WorkerOrder = (
     | BlocksOrder
     | RobotsOrder
     | UnblockOrder
+    | RecordOrder
+    | TakeRecordedOrder
     | LeaveOrder
 )
 

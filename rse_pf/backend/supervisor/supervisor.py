@@ -16,6 +16,7 @@ import socket
 import time
 from collections.abc import Awaitable, Callable, Mapping
 from contextlib import suppress
+from functools import partial
 from importlib import metadata
 from operator import attrgetter
 from pathlib import Path
@@ -37,8 +38,10 @@ from rse_pf.backend.supervisor.orders import (
     LeaveOrder,
     MigrateOrder,
     RobotsOrder,
+    TakeRecordedOrder,
     UnblockOrder,
 )
+from rse_pf.backend.supervisor.record_query import NOT_FOR_YOU, WRONG_RECORDING, may_record, record_query
 from rse_pf.backend.supervisor.session_registry import SessionRegistry
 from rse_pf.backend.supervisor.trust_poller import poll_trust
 from rse_pf.backend.supervisor.worker import WorkerPlan, run_in_loop
@@ -62,6 +65,8 @@ _LEAVE_S = 3.0
 _MAX_MOVES = 10000
 _MAX_BLOCKS = 2000
 _MAX_ROBOTS = 1000
+_RECORDED_BYTES = 500_000
+"""Of all workers in one answer, which has at most 1 MiB in base64."""
 _MAX_SPREAD_S = _MAX_DRAIN_WAIT_S = 3600.0
 _EXIT_OK, _EXIT_LOST = 0, 1
 _PUBLIC_PAGES = ("/healthz", "/readyz")
@@ -356,6 +361,8 @@ class _Supervisor:
             ("GET", "/blocks"): self._blocks,
             ("GET", "/robots"): self._robots,
             ("POST", "/unblock"): self._post_unblock,
+            ("POST", "/record"): self._post_record,
+            ("POST", "/record/take"): self._post_take_recorded,
             ("POST", "/drain"): self._post_drain,
             ("POST", "/move"): self._post_move,
         }
@@ -462,9 +469,28 @@ class _Supervisor:
         self._records.note("server.unblock", **wanted, lifted=told["count"])
         return _json(told)
 
-    async def _ask_rows(
-        self, what: str, make_order: Callable[[int], RowsOrder], most: int
-    ) -> dict[str, Any]:
+    async def _post_record(self, ask: ControlRequest) -> ControlReply:
+        """Begin to record requests to an installed service, or end it."""
+        if not may_record(ask, self._control_token):
+            return _refused(403, "forbidden", NOT_FOR_YOU)
+        try:
+            wanted = record_query(ask)
+        except ValueError:
+            return _refused(400, "bad-request", WRONG_RECORDING)
+        told = await self._ask_rows("workers", wanted.order, len(self._workers))
+        self._log.info("record", service=wanted.service, calls=wanted.calls, ends=wanted.ends)
+        self._records.note("server.record", service=wanted.service, calls=wanted.calls, ends=wanted.ends)
+        return _json({**told, "recording": told["order"]})
+
+    async def _post_take_recorded(self, ask: ControlRequest) -> ControlReply:
+        """Tell the next bytes of a recording, once."""
+        number, workers = ask.query.get("recording", ""), len(self._workers)
+        if not may_record(ask, self._control_token) or not number.isdecimal():
+            return _refused(403, "forbidden", NOT_FOR_YOU)
+        order = partial(TakeRecordedOrder, recording=int(number), max_bytes=_RECORDED_BYTES // workers)
+        return _json(await self._ask_rows("workers", order, workers))
+
+    async def _ask_rows(self, what: str, make_order: Callable[[int], RowsOrder], most: int) -> dict[str, Any]:
         """Return what all workers tell; the same thing of several workers is listed several times."""
         async with self._asking_rows:
             self._asked_rows += 1
@@ -474,6 +500,7 @@ class _Supervisor:
         rows = [row for each in answers for row in each["rows"]]
         return {
             "server": self._server_id,
+            "order": order.number,
             what: rows[:most],
             "count": sum(each["count"] for each in answers),
             "silent_workers": len(told) - len(answers),

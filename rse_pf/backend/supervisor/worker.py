@@ -8,6 +8,7 @@ ignores the signals of a terminal or a service manager: they are for the supervi
 from __future__ import annotations
 
 import asyncio
+import base64
 import gc
 import json
 import os
@@ -53,14 +54,17 @@ from rse_pf.backend.supervisor.orders import (
     DrainOrder,
     LeaveOrder,
     MigrateOrder,
+    RecordOrder,
     ReplaceOrder,
     ReportOrder,
     RobotsOrder,
+    TakeRecordedOrder,
     TrustOrder,
     UnblockOrder,
     WorkerOrder,
     decode_order,
 )
+from rse_pf.backend.supervisor.robot_events import RobotEvents
 from rse_pf.backend.supervisor.robot_rows import MAX_ROBOT_ROWS, robot_rows
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import MissingExtra
@@ -81,8 +85,6 @@ _TAKE_S = 0.0005
 _POLL_S = 0.01
 _GATHER_S = 0.01
 """Each message to the supervisor wakes it, which costs more than what it says."""
-_MAX_EVENTS = 500
-"""In one message; a line of the channel may have 1 MiB."""
 _MAX_LINE_BYTES = 1 << 26
 """A `TrustOrder` names every robot that is enrolled."""
 _CLOSE_TIMEOUT_S = 1.0
@@ -164,7 +166,7 @@ class _Worker:
         self._loop = loop
         self._ended = 0
         self._flushing = False
-        self._robot_events: list[dict[str, Any]] = []
+        self._robot_events = RobotEvents(loop, self._say)
         self._tasks: set[asyncio.Task[None]] = set()
         self._log = JsonLog(level=settings.serving.log_level, server=plan.server_id, wall_clock=time.time)
         registry = load_services(plan.services, settings)
@@ -193,7 +195,7 @@ class _Worker:
             context,
             connections,
             handshake,
-            tell=self._say_of_robot,
+            tell=self._robot_events.add,
             recorder=self._recorder,
         )
         self._sandboxes = (
@@ -289,7 +291,7 @@ class _Worker:
                 await self._leave(order.held_s)
                 break
         self._recorder.flush()
-        self._flush_robot_events()
+        self._robot_events.flush()
         self._log.close()
         os._exit(0)  # nobody waits for the sockets and threads that are left
 
@@ -315,6 +317,29 @@ class _Worker:
                 sandboxes = self._sandboxes
                 lifted = [] if sandboxes is None else sandboxes.unblock(service, tenant, robot)
                 self._tell_blocks(number, lifted)
+            case RecordOrder():
+                self._tell_rows(order.number, 1, [{"worker": self._index, "offers": self._record(order)}])
+            case TakeRecordedOrder(number, recording, max_bytes):
+                self._tell_rows(number, 1, [self._recorded(recording, max_bytes)])
+
+    def _record(self, order: RecordOrder) -> bool:
+        """Begin or end a recording; return whether its service is an installed one."""
+        if self._sandboxes is None:
+            return False
+        if order.ends is not None:
+            self._sandboxes.end_recording(order.ends)
+            return True
+        return self._sandboxes.record(
+            order.number, order.service, calls=order.calls, max_bytes=order.max_bytes, seconds=order.seconds
+        )
+
+    def _recorded(self, recording: int, max_bytes: int) -> dict[str, Any]:
+        taken = (
+            (b"", 0, True) if self._sandboxes is None else self._sandboxes.take_recorded(recording, max_bytes)
+        )
+        data, waiting, is_over = taken
+        text = base64.b64encode(data).decode("ascii")
+        return {"worker": self._index, "data": text, "waiting": waiting, "is_over": is_over}
 
     def _report(self) -> dict[str, Any]:
         report = self._dispatcher.snapshot()
@@ -357,7 +382,7 @@ class _Worker:
         for _, _, packed in ancillary:
             (fd,) = _DESCRIPTOR.unpack(packed)
             self._sockets.take(fd, self._count_end, number, peer.rstrip(b"\0").decode())
-        return True
+        return not self._sockets.is_behind
 
     def _count_end(self) -> None:
         self._ended += 1
@@ -379,17 +404,6 @@ class _Worker:
     def _new_name(self) -> str:
         self._named += 1
         return f"anonymous-{(self._named - 1) * self._workers + self._index + 1}"
-
-    def _say_of_robot(self, **message: Any) -> None:
-        """Say what concerns one robot together with what happens to others within `_GATHER_S`."""
-        if not self._robot_events:
-            self._loop.call_later(_GATHER_S, self._flush_robot_events)
-        self._robot_events.append(message)
-
-    def _flush_robot_events(self) -> None:
-        events, self._robot_events = self._robot_events, []
-        for first in range(0, len(events), _MAX_EVENTS):
-            self._say(event="robots", robots=events[first : first + _MAX_EVENTS])
 
     def _say(self, **message: Any) -> None:
         self._writer.write(json.dumps(message).encode() + b"\n")

@@ -21,8 +21,10 @@ from typing import Any, NoReturn
 
 from rse_pf.backend.supervisor.orders import (
     BlocksOrder,
+    RecordOrder,
     ReportOrder,
     RobotsOrder,
+    TakeRecordedOrder,
     UnblockOrder,
     WorkerOrder,
     encode_order,
@@ -33,7 +35,7 @@ from rse_pf.services.loading import load_services
 
 __all__ = ["BUILTIN", "RowsOrder", "WorkerProcess", "fork_workers", "warm_up"]
 
-RowsOrder = BlocksOrder | RobotsOrder | UnblockOrder
+RowsOrder = BlocksOrder | RobotsOrder | UnblockOrder | RecordOrder | TakeRecordedOrder
 """Orders that a worker answers with rows."""
 BUILTIN = "rse_pf.services.builtin:builtin_services"
 """The platform's own services."""

@@ -12,7 +12,7 @@ import json
 import re
 import shutil
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
 from importlib import metadata
 from pathlib import Path
 from typing import Annotated, Literal, get_args
@@ -21,6 +21,13 @@ import msgspec
 
 from rse_pf.errors import ConfigurationError, UsageError
 from rse_pf.service import Kind
+from rse_pf.services.custom.dependencies import (
+    Dependencies,
+    check_dependencies,
+    check_together,
+    copy_dependencies,
+    read_lock,
+)
 
 __all__ = [
     "ENTRY_POINTS",
@@ -38,10 +45,13 @@ LANGUAGES: tuple[str, ...] = get_args(_Language)
 ENTRY_POINTS = "rse_pf.services"
 """Entry-point group by which Python packages publish services: ``name = "package.module"``."""
 
-_MANIFEST, _PINS = "service.json", "pins.json"
+_MANIFEST, _PINS, _DEPENDENCIES = "service.json", "pins.json", "dependencies.json"
+_STORE = ".dependencies"
+"""Folder beside the services: their packages, each set named by its digest."""
 _NAME = re.compile(r"[a-z][a-z0-9_-]{0,39}")
+_DIGEST = re.compile(r"[0-9a-f]{64}")
 _IGNORED = {
-    "__pycache__", ".git", ".pytest_cache", "requests", "tests", _PINS,
+    "__pycache__", ".git", ".pytest_cache", "requests", "tests", _PINS, _DEPENDENCIES,
     "CMakeFiles", "CMakeCache.txt", "cmake_install.cmake", "Makefile",
 }  # fmt: skip
 """Not installed: recorded requests, tests and temporary files of a build."""
@@ -61,7 +71,8 @@ class InstalledService:
     ``entry`` is the file that is run: a Python or Lua source, or a shared library; for a service that a
     Python package publishes (language ``package``) it is the module's dotted name.  A command to a
     ``stateless`` service may be retried in another sandbox; a ``per_robot_state`` one keeps state as long
-    as the robot is connected.
+    as the robot is connected.  ``dependencies`` is the folder of its own Python packages; ``identity`` is the
+    SHA-256 of all that was installed, its packages included, and empty for a folder that was only read.
     """
 
     name: str
@@ -69,6 +80,8 @@ class InstalledService:
     entry: str
     kind: Kind
     folder: Path
+    dependencies: Path | None = None
+    identity: str = ""
 
     @property
     def entry_path(self) -> Path:
@@ -101,11 +114,18 @@ def read_service(folder: Path) -> InstalledService:
     return InstalledService(**msgspec.structs.asdict(manifest), folder=folder.absolute())
 
 
-def install(folder: Path, into: Path) -> InstalledService:
+def install(folder: Path, into: Path, dependencies: Dependencies | None = None) -> InstalledService:
     """Copy the service in *folder* below *into* and pin every file; an older copy is replaced.
 
+    Args:
+        folder: The service.
+        into: The services folder.
+        dependencies: The packages that `build_dependencies` installed for it; they are copied, too.
+
     Raises:
-        UsageError: The folder is not a service, or its entry is missing (a library that was not built).
+        UsageError: The folder is not a service, its entry is missing (a library that was not built), or it
+            locks packages and *dependencies* is None.
+        ConfigurationError: An installed service needs another version of one of the packages.
     """
     service = read_service(folder)
     if not service.entry_path.is_file():
@@ -113,25 +133,39 @@ def install(folder: Path, into: Path) -> InstalledService:
         raise UsageError(
             f"{service.name}: {service.entry_path} is missing", hint=built or "correct entry in service.json"
         )
+    if dependencies is None and read_lock(folder):
+        raise UsageError(
+            f"the packages of {service.name} are not installed", hint=f"rse-pf service build {folder}"
+        )
     into.mkdir(parents=True, exist_ok=True)
+    if dependencies is not None:
+        others = {name: each for name, each in _dependencies_in(into) if name != service.name}
+        check_together({**others, service.name: dependencies})
+        copy_dependencies(dependencies, into / _STORE)
     fresh, old, target = (into / f"{mark}{service.name}" for mark in (".new-", ".old-", ""))
     for leftover in (fresh, old):
         shutil.rmtree(leftover, ignore_errors=True)
     shutil.copytree(folder, fresh, ignore=lambda _, names: _IGNORED & set(names))
+    if dependencies is not None:
+        document = asdict(dependencies) | {"folder": None}
+        (fresh / _DEPENDENCIES).write_text(
+            json.dumps(document, indent=1, sort_keys=True) + "\n", encoding="utf-8"
+        )
     pins = {path: _sha256(fresh / path) for path in _files(fresh)}
     (fresh / _PINS).write_text(json.dumps(pins, indent=1, sort_keys=True) + "\n", encoding="utf-8")
     if target.exists():
         target.rename(old)
     fresh.rename(target)
     shutil.rmtree(old, ignore_errors=True)
-    return read_service(target)
+    return _read_installed(target)
 
 
 def installed_services(folder: Path) -> list[InstalledService]:
     """Return the services installed below *folder*, sorted by name, every file checked against its pin.
 
     Raises:
-        ConfigurationError: The folder is missing, or a file was changed, added or removed.
+        ConfigurationError: The folder is missing, a file of a service or of its packages was changed, added
+            or removed, or two services need different versions of one package.
     """
     if not folder.is_dir():
         raise ConfigurationError(
@@ -142,7 +176,11 @@ def installed_services(folder: Path) -> list[InstalledService]:
     for target in sorted(folder.iterdir()):
         if target.is_dir() and not target.name.startswith("."):
             _check_pins(target)
-            found.append(read_service(target))
+            found.append(_read_installed(target))
+    built = dict(_dependencies_in(folder))
+    for name, dependencies in built.items():
+        check_dependencies(dependencies, name)
+    check_together(built)
     return found
 
 
@@ -168,6 +206,39 @@ def published_services() -> list[InstalledService]:
             name=point.name, language="package", entry=point.value, kind="per_robot_state", folder=folder
         )
     return sorted(found.values(), key=lambda service: service.name)
+
+
+def _read_installed(target: Path) -> InstalledService:
+    service, dependencies = read_service(target), _dependencies_of(target)
+    return replace(
+        service,
+        dependencies=None if dependencies is None else dependencies.folder,
+        identity=_sha256(target / _PINS),
+    )
+
+
+def _dependencies_in(folder: Path) -> Iterator[tuple[str, Dependencies]]:
+    """Yield name and packages of every installed service that has some."""
+    for target in sorted(folder.iterdir()):
+        dependencies = None if target.name.startswith(".") else _dependencies_of(target)
+        if dependencies is not None:
+            yield target.name, dependencies
+
+
+def _dependencies_of(target: Path) -> Dependencies | None:
+    path = target / _DEPENDENCIES
+    if not path.is_file() or not (target / _PINS).is_file():
+        return None
+    try:
+        document = json.loads(path.read_text(encoding="utf-8"))
+        digest = str(document["digest"])
+        if not _DIGEST.fullmatch(digest):
+            raise ValueError("its digest is none")
+        return Dependencies(**{**document, "folder": target.parent.absolute() / _STORE / digest})
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise ConfigurationError(
+            f"{path} is damaged: {error!r}", hint="install it again with: rse-pf service install FOLDER"
+        ) from error
 
 
 def _check_pins(target: Path) -> None:

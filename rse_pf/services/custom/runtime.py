@@ -7,6 +7,7 @@ and arrays.
 from __future__ import annotations
 
 import collections.abc
+import functools
 import importlib
 import importlib.util
 import inspect
@@ -14,6 +15,7 @@ import sys
 import types
 import typing
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -110,6 +112,10 @@ class _PythonRuntime:
                 )
         return reply
 
+    def run_by(self, runner: Callable[..., Any]) -> None:
+        """Call the service as ``runner(function, request)`` from now on, such as by a debugger."""
+        self._service = replace(self._service, function=functools.partial(runner, self._service.function))
+
     def snapshot(self) -> bytes:
         state = self._object.snapshot()
         if not isinstance(state, (bytes, bytearray, memoryview)):
@@ -172,7 +178,8 @@ def _load_file(service: InstalledService) -> Any:
         )
     module = importlib.util.module_from_spec(spec)
     sys.modules[name] = module
-    if str(service.folder) not in sys.path:
-        sys.path.insert(0, str(service.folder))
+    for folder in (service.folder, service.dependencies):  # the service's own packages come first
+        if folder is not None and str(folder) not in sys.path:
+            sys.path.insert(0, str(folder))
     spec.loader.exec_module(module)
     return module

@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 from backend.gateway.worker_parts import worker_parts
 
+from rse_pf.auth.tokens import Claims
 from rse_pf.backend.scheduling.scheduler import QueuedCommand
 from rse_pf.wire import Command, Result
 
@@ -32,3 +33,28 @@ def test_an_unknown_service_is_answered_with_all_that_the_server_offers() -> Non
 
         assert wire.sent[-1].code == "unknown-service"
         assert wire.sent[-1].message == "no service named 'centriod'; this server offers echo, centroid"
+
+
+@pytest.mark.parametrize(
+    ("scopes", "offered"),
+    [
+        ((), "echo, centroid, secret-survey"),
+        (("services:*",), "echo, centroid, secret-survey"),
+        (("services:centriod", "services:centroid"), "centroid"),
+        (("services:centriod",), "none to you"),
+    ],
+)
+def test_an_unknown_service_is_answered_with_what_the_token_allows_and_nothing_else(
+    scopes: tuple[str, ...], offered: str
+) -> None:
+    with worker_parts() as worker:
+        worker.registry.others = ("centroid", "secret-survey")
+        connection, wire = worker.join()
+        connection.claims = Claims(
+            robot=connection.robot, token_id="t", issued_s=0.0, expires_s=1e12, key_id="k", scopes=scopes
+        )
+
+        worker.say(connection, Command(id=3, service="centriod", payload={}))
+
+        assert wire.sent[-1].code == "unknown-service"
+        assert wire.sent[-1].message == f"no service named 'centriod'; this server offers {offered}"

@@ -1,0 +1,119 @@
+"""The action test: replay requests in the sandbox of a server, and compare the answers with the expected."""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from rse_pf.config import PlatformSettings
+from rse_pf.errors import UsageError
+from rse_pf.services.custom.installed import InstalledService
+from rse_pf.services.custom.output import shown_output
+from rse_pf.services.custom.request_files import read_requests
+from rse_pf.terminal import counted, show
+
+__all__ = ["Recorded", "plain", "recorded_requests", "replay", "requests_of"]
+
+Recorded = Sequence[tuple[str, Mapping[str, Any]]]
+"""Name and content of each recorded request: ``request``, ``reply``, ``failure``, ``tolerance``."""
+
+_DEFAULT_TOLERANCE = 1e-9
+_DRY_RUN = "dry-run"
+
+
+def recorded_requests(source: Path) -> Recorded:
+    """Return the recorded requests of the service in *source*; raises UsageError if there are none."""
+    found: list[tuple[str, Mapping[str, Any]]] = []
+    for path in sorted((source / "requests").glob("*.json")):
+        found += read_requests(path).calls
+    if not found:
+        raise UsageError(
+            f"{source} has no recorded requests", hint=f"write one to {source / 'requests'}/NAME.json"
+        )
+    return found
+
+
+def requests_of(path: Path, service: str) -> Recorded:
+    """Return the requests in *path*; raises UsageError if there are none, or of another service."""
+    read = read_requests(path)
+    if read.service not in ("", service):
+        raise UsageError(
+            f"{path} holds requests to {read.service!r}, not to {service!r}",
+            hint="record those of this service",
+        )
+    if not read.calls:
+        raise UsageError(f"{path} holds no request", hint="record while robots call the service")
+    return read.calls
+
+
+def replay(
+    service: InstalledService, recorded: Recorded, settings: PlatformSettings, *, compare: bool
+) -> int:
+    """Send *recorded* to *service* in one sandbox, show what became of each; return 1 if one is wrong.
+
+    Args:
+        service: Built.
+        recorded: Sent one after the other, as one robot.
+        settings: Limits of the sandbox.
+        compare: Whether replies are compared; failures always are.
+    """
+    from rse_pf.backend.sandbox.dry_run import dry_run
+
+    requests = [each["request"] for _, each in recorded]
+    missing, runs = dry_run(
+        service, requests, settings, lambda line: show(shown_output(time.time(), _DRY_RUN, line))
+    )
+    if missing:
+        show(f"note: this machine lacks isolation that a server has: {', '.join(missing)}")
+    wrong = 0
+    for (name, each), each_run in zip(recorded, runs, strict=True):
+        problem, detail = _judged(each, each_run.answer, compare=compare)
+        wrong += problem
+        show(f"{name:<28} {'WRONG' if problem else 'ok':<6} {each_run.took_ms:8.1f} ms  {detail}".rstrip())
+    secrets = sum(bool(each.get("secrets")) for _, each in recorded)
+    if secrets:
+        show(f"note: {counted(secrets, 'request')} held secrets, which were left out of the recording")
+    show(f"{len(runs) - wrong} of {counted(len(runs), 'recorded request')} as expected")
+    return 1 if wrong else 0
+
+
+def plain(value: Any) -> Any:
+    """Return *value* as JSON gives it back: arrays are lists, and what JSON cannot hold is text."""
+    return json.loads(json.dumps(value, default=lambda each: getattr(each, "tolist", each.__repr__)()))
+
+
+def _judged(expected: Mapping[str, Any], answer: Any, *, compare: bool) -> tuple[bool, str]:
+    """Return whether *answer* is wrong, and what to say about it."""
+    from rse_pf.wire import Failure
+
+    if isinstance(answer, Failure):
+        hint = f" ({answer.hint})" if answer.hint else ""
+        return expected.get("failure") != answer.code, f"{answer.code}: {answer.message}{hint}"
+    if "failure" in expected:
+        return True, f"it was answered, expected {expected['failure']}"
+    if not compare or "reply" not in expected:
+        return False, ""
+    tolerance = expected.get("tolerance", _DEFAULT_TOLERANCE)
+    found = _difference(plain(answer.reply), plain(expected["reply"]), tolerance)
+    return bool(found), found
+
+
+def _difference(got: Any, expected: Any, tolerance: float, path: str = "reply") -> str:
+    """Return the first difference of *got* from *expected*, "" if there is none."""
+    if isinstance(expected, dict) and isinstance(got, dict):
+        if set(got) != set(expected):
+            return f"{path} has {', '.join(sorted(got))}, expected {', '.join(sorted(expected))}"
+        found = (_difference(got[key], expected[key], tolerance, f"{path}.{key}") for key in expected)
+        return next(filter(None, found), "")
+    if isinstance(expected, list) and isinstance(got, list):
+        if len(got) != len(expected):
+            return f"{path} has {len(got)} values, expected {len(expected)}"
+        pairs = enumerate(zip(got, expected, strict=True))
+        return next(filter(None, (_difference(g, e, tolerance, f"{path}[{i}]") for i, (g, e) in pairs)), "")
+    numbers = all(isinstance(each, int | float) and not isinstance(each, bool) for each in (got, expected))
+    equal = math.isclose(got, expected, rel_tol=tolerance, abs_tol=tolerance) if numbers else got == expected
+    return "" if equal else f"{path} is {got!r}, expected {expected!r}"

@@ -1,0 +1,282 @@
+"""Packages of a service's own: what a lock may hold, how it is installed, and who may change it."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import subprocess
+import zipfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from rse_pf.backend.sandbox.dry_run import dry_run
+from rse_pf.config import PlatformSettings
+from rse_pf.errors import CommandFailed, ConfigurationError, UsageError
+from rse_pf.services.custom import dependencies
+from rse_pf.services.custom.dependencies import (
+    Dependencies,
+    build_dependencies,
+    check_together,
+    lock_dependencies,
+    platform_tag,
+    read_lock,
+    tree_digest,
+)
+from rse_pf.services.custom.installed import install, installed_services, read_service
+from rse_pf.wire import Result
+
+HASH = "--hash=sha256:" + "a" * 64
+SOURCE = """
+import errno, os, sys
+import msgspec
+import greeting
+
+class Request(msgspec.Struct): pass
+class Reply(msgspec.Struct):
+    said: str
+    first: str
+    write: str
+    make: str
+
+def why(function, *arguments):
+    try: function(*arguments)
+    except OSError as error: return errno.errorcode[error.errno]
+    return "done"
+
+def serve(request: Request) -> Reply:
+    folder = os.path.dirname(greeting.__file__)
+    return Reply(said=greeting.SAID, first=sys.path[0], write=why(open, greeting.__file__, "a"),
+                 make=why(os.mkdir, os.path.join(folder, "more")))
+"""
+
+
+def make_wheel(folder: Path, name: str, version: str, source: str) -> Path:
+    """Write a wheel with one package into *folder*."""
+    path = folder / f"{name}-{version}-py3-none-any.whl"
+    about = f"{name}-{version}.dist-info"
+    files = {
+        f"{name}/__init__.py": source,
+        f"{about}/METADATA": f"Metadata-Version: 2.1\nName: {name}\nVersion: {version}\n",
+        f"{about}/WHEEL": "Wheel-Version: 1.0\nGenerator: test\nRoot-Is-Purelib: true\nTag: py3-none-any\n",
+    }
+    files[f"{about}/RECORD"] = "".join(f"{each},,\n" for each in (*files, f"{about}/RECORD"))
+    with zipfile.ZipFile(path, "w") as wheel:
+        for each, text in files.items():
+            wheel.writestr(each, text)
+    return path
+
+
+def write_service(folder: Path, name: str, source: str = SOURCE) -> Path:
+    made = folder / name
+    made.mkdir()
+    (made / "service.json").write_text(
+        json.dumps({"name": name, "language": "python", "entry": "service.py"})
+    )
+    (made / "service.py").write_text(source)
+    return made
+
+
+@pytest.fixture(scope="module")
+def index(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """A folder of wheels that pip takes for the only index."""
+    folder = tmp_path_factory.mktemp("index")
+    make_wheel(folder, "greeting", "1.2", "SAID = 'hello'\n")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("PIP_NO_INDEX", "1")
+        patch.setenv("PIP_FIND_LINKS", str(folder))
+        patch.setenv("PIP_CONFIG_FILE", "/dev/null")
+        yield folder
+
+
+@pytest.fixture(scope="module")
+def built(index: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, Dependencies]:
+    """A service that locks a package, the folder of packages, and what was installed there."""
+    folder = tmp_path_factory.mktemp("author")
+    service = write_service(folder, "polite")
+    (service / "requirements.txt").write_text("greeting>=1\n")
+    lock_dependencies(service)
+    made = build_dependencies(service, folder / "packages")
+    assert made is not None
+    return service, folder / "packages", made
+
+
+@pytest.mark.parametrize(
+    ("line", "says"),
+    [
+        ("greeting", "not locked to one version"),
+        ("greeting>=1.0", "not locked to one version"),
+        ("greeting==1.2", "has no sha256 hash"),
+        ("greeting==1.2 --hash=md5:00", "has no sha256 hash"),
+        (f"greeting==1.* {HASH}", "has no sha256 hash"),
+        ("-e .", "an option of pip"),
+        ("--index-url http://127.0.0.1/", "an option of pip"),
+        ("-r more.txt", "an option of pip"),
+        (f"greeting==1.2 {HASH} --global-option=x", "has no sha256 hash"),
+        ("greeting @ http://127.0.0.1/greeting.whl", "is an address"),
+        ("./greeting", "is an address"),
+        (f"numpy==1.26.0 {HASH}", "every sandbox has numpy"),
+        (f"greeting==1.2 {HASH}\nGreeting==1.3 {HASH}", "locked twice"),
+    ],
+)
+def test_what_is_not_locked_is_refused_with_its_line_and_how_to_lock_it(
+    tmp_path: Path, line: str, says: str
+) -> None:
+    (tmp_path / "requirements.txt").write_text(f"# a comment\n{line}\n")
+
+    with pytest.raises(UsageError, match=says) as told:
+        read_lock(tmp_path)
+    assert "requirements.txt, line " in told.value.message
+    assert "rse-pf service lock" in told.value.hint
+
+
+def test_a_lock_may_continue_lines_and_hold_comments_extras_and_several_hashes(tmp_path: Path) -> None:
+    (tmp_path / "requirements.txt").write_text(
+        f"# head\nB.b[fast]==2.0 \\\n    {HASH} \\\n    {HASH}\n    # via a\n"
+        f"a==1.0 ; python_version > '3' {HASH}  # x\n"
+    )
+
+    assert [(each.name, each.version) for each in read_lock(tmp_path)] == [("a", "1.0"), ("b-b", "2.0")]
+
+
+def test_a_service_without_a_lock_has_no_packages(tmp_path: Path) -> None:
+    assert build_dependencies(tmp_path, tmp_path / "store") is None
+    assert not (tmp_path / "store").exists()
+
+
+def test_a_lock_holds_versions_and_hashes_and_the_wish_is_kept(
+    built: tuple[Path, Path, Dependencies],
+) -> None:
+    service, _, made = built
+
+    (locked,) = read_lock(service)
+    assert (locked.name, locked.version) == ("greeting", "1.2")
+    assert (service / "requirements.in").read_text() == "greeting>=1\n"
+    assert (made.packages, made.platform) == ({"greeting": "1.2"}, platform_tag())
+    assert made.folder.name == made.digest == tree_digest(made.folder)
+
+
+def test_packages_are_installed_once(
+    built: tuple[Path, Path, Dependencies], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    service, store, made = built
+    monkeypatch.setattr(subprocess, "run", lambda *_, **__: pytest.fail("pip was run again"))
+
+    assert build_dependencies(service, store) == made
+
+
+def test_packages_that_were_changed_are_installed_again(
+    built: tuple[Path, Path, Dependencies], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    service, store, made = built
+    (made.folder / "greeting" / "more.py").write_text("")
+    monkeypatch.setattr(dependencies, "_install", lambda *_: made)
+
+    build_dependencies(service, store)
+
+    (made.folder / "greeting" / "more.py").unlink()
+    assert tree_digest(made.folder) == made.digest
+
+
+def run_it(service: Path, made: Dependencies) -> Any:
+    """Return the reply of the service in a sandbox."""
+    chosen = dataclasses.replace(read_service(service), dependencies=made.folder)
+    _, (run,) = dry_run(chosen, [{}], PlatformSettings(), lambda _: None)
+    assert isinstance(run.answer, Result), run.answer
+    return run.answer.reply
+
+
+@pytest.mark.system
+def test_a_sandbox_imports_the_packages_first_and_cannot_change_them(
+    built: tuple[Path, Path, Dependencies],
+) -> None:
+    service, _, made = built
+
+    reply = run_it(service, made)
+
+    assert reply == {"said": "hello", "first": str(made.folder), "write": reply["write"], "make": "EROFS"}
+    assert reply["write"] in ("EROFS", "EACCES")
+
+
+def test_an_installed_service_carries_its_packages_in_its_identity(
+    built: tuple[Path, Path, Dependencies], tmp_path: Path
+) -> None:
+    service, _, made = built
+
+    with pytest.raises(UsageError, match="packages of polite are not installed"):
+        install(service, tmp_path)
+    installed = install(service, tmp_path, made)
+
+    assert installed.dependencies == tmp_path / ".dependencies" / made.digest
+    assert installed_services(tmp_path) == [installed]
+    other = dataclasses.replace(made, digest="0" * 64)
+    (tmp_path / ".dependencies" / other.digest).mkdir()
+    assert install(service, tmp_path, other).identity != installed.identity
+
+
+@pytest.mark.parametrize("change", ["a byte", "a file", "a missing folder"])
+def test_a_server_refuses_packages_that_were_changed_after_the_installation(
+    built: tuple[Path, Path, Dependencies], tmp_path: Path, change: str
+) -> None:
+    service, _, made = built
+    folder = install(service, tmp_path, made).dependencies
+    assert folder is not None
+    source = folder / "greeting" / "__init__.py"
+    source.chmod(0o644)
+    if change == "a byte":
+        source.write_text("SAID = 'hullo'\n")
+    elif change == "a file":
+        (folder / "more.py").write_text("")
+    else:
+        folder.rename(tmp_path / ".away")
+
+    with pytest.raises(ConfigurationError, match=r"packages of polite (were changed|are missing)") as told:
+        installed_services(tmp_path)
+    assert "rse-pf service install" in told.value.hint
+
+
+def test_packages_of_another_interpreter_are_refused(
+    built: tuple[Path, Path, Dependencies], tmp_path: Path
+) -> None:
+    service, _, made = built
+    install(service, tmp_path, dataclasses.replace(made, platform="cp27-linux-sparc"))
+
+    with pytest.raises(ConfigurationError, match=r"are for cp27-linux-sparc, this server is cp3"):
+        installed_services(tmp_path)
+
+
+def test_two_services_of_one_server_agree_on_versions() -> None:
+    def needs(**packages: str) -> Dependencies:
+        return Dependencies(folder=Path(), digest="", packages=packages, platform="")
+
+    check_together({"a": needs(x="1", y="2"), "b": needs(x="1")})
+    with pytest.raises(ConfigurationError, match="a needs x 1 and b needs x 2"):
+        check_together({"a": needs(x="1"), "b": needs(x="2")})
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("wrong", ["another hash", "no wheel"])
+def test_what_has_no_wheel_or_another_hash_is_not_installed(index: Path, tmp_path: Path, wrong: str) -> None:
+    service = write_service(tmp_path, "rude")
+    name = "greeting" if wrong == "another hash" else "sourceonly"
+    (index / "sourceonly-1.2.tar.gz").write_bytes(b"an archive of sources")
+    (service / "requirements.txt").write_text(f"{name}==1.2 {HASH}\n")
+
+    with pytest.raises(CommandFailed, match="pip: ") as told:
+        build_dependencies(service, tmp_path / "store")
+
+    assert "only wheels with the hashes of the lock" in told.value.hint
+    assert "\n" not in told.value.message
+    assert list((tmp_path / "store").iterdir()) == []
+
+
+@pytest.mark.slow
+def test_a_package_that_no_index_has_cannot_be_locked(index: Path, tmp_path: Path) -> None:
+    service = write_service(tmp_path, "rude")
+    (service / "requirements.in").write_text("no-such-package-of-anybody\n")
+
+    with pytest.raises(CommandFailed, match="no-such-package-of-anybody"):
+        lock_dependencies(service)
+    assert not (service / "requirements.txt").exists()
