@@ -19,6 +19,7 @@ from rse_pf.backend.gateway.dispatcher import Dispatcher
 from rse_pf.backend.gateway.frames import CloseBorder
 from rse_pf.backend.gateway.handshake import HEALTH, Accepted, HandshakePolicy, Rejected, RequestHead
 from rse_pf.backend.gateway.rate_limits import PendingHandshakes, SourceRates
+from rse_pf.backend.scheduling.deferred_work import DeferredWork
 from rse_pf.config import ServingSettings
 from rse_pf.errors import MissingExtra
 
@@ -34,6 +35,12 @@ _SWITCHING = 101
 _NO_HEADERS: dict[str, str] = {}
 _MAX_READ_BYTES = 16384
 """Bytes read at once: thousands of the smallest frames fit in, and the other robots wait meanwhile."""
+_HANDSHAKES_S = 0.0005
+"""Handshakes are read, judged and ended for so long in one round of the event loop."""
+_MAX_WAITING = 8
+"""New sockets that wait for their first look; the supervisor's channel holds the others."""
+_MAX_LONG_READS = 4
+"""Sockets of long messages that are read in one round of the event loop, `_MAX_READ_BYTES` each."""
 _LINGER_S = 2.0
 """Time that a robot has to read the CLOSE frame and to end its side; then the socket is cut."""
 _READ_BUFFER_BYTES = 2048
@@ -132,6 +139,11 @@ class RobotSockets:
         self._recorder = recorder
         picows, self._transport = _libraries()
         self._picows = picows
+        clock = self._context.clocks.monotonic
+        self._steps = DeferredWork(self._context.loop, clock=clock, bound_s=_HANDSHAKES_S)
+        self._long_reads = DeferredWork(
+            self._context.loop, clock=clock, bound_s=_HANDSHAKES_S, max_steps=_MAX_LONG_READS
+        )
         self._protocol = protocol_type(picows)
         self._listener = listener_type(picows, self._context.loop, serving)
         self._arguments = (
@@ -139,6 +151,11 @@ class RobotSockets:
             False, 20.0, 20.0, picows.WSAutoPingStrategy.PING_WHEN_IDLE, False,
             self._context.settings.session.max_message_bytes, None, _READ_BUFFER_BYTES,
         )  # fmt: skip
+
+    @property
+    def is_behind(self) -> bool:
+        """Whether so many handshakes wait that no further socket should be taken in this round."""
+        return len(self._steps) >= _MAX_WAITING
 
     def take(self, fd: int, ended: Callable[[], None], number: int, peer: str) -> None:
         """Serve the accepted socket *fd*.
@@ -152,16 +169,25 @@ class RobotSockets:
         family = socket.AF_INET6 if ":" in peer else socket.AF_INET
         accepted = socket.socket(family, socket.SOCK_STREAM, 0, fileno=fd)
         accepted.setblocking(False)
-        pending = PendingSocket(accepted, peer, ended, number)
+        self._steps.add(self._read_first, PendingSocket(accepted, peer, ended, number))
+
+    def _read_first(self, pending: PendingSocket) -> None:
         if self._read(pending):
             return
         loop, serving = self._context.loop, self._context.settings.serving
-        pending.timeout = loop.call_later(serving.handshake_timeout_s, self._cut, pending)
-        loop.add_reader(fd, self._read_on, pending)
-        surplus = self._pending.enter(pending, peer)
+        pending.timeout = loop.call_later(
+            serving.handshake_timeout_s, self._steps.add, self._cut_late, pending
+        )
+        loop.add_reader(pending.accepted.fileno(), self._on_readable, pending)
+        surplus = self._pending.enter(pending, pending.peer)
         if surplus is not None:
             self._context.metrics.closed["unauthenticated"] += 1
             self._cut(surplus)
+
+    def _cut_late(self, pending: PendingSocket) -> None:
+        """End a socket whose time is over, unless its request came meanwhile."""
+        if pending.timeout is not None:
+            self._cut(pending)
 
     def _cut(self, pending: PendingSocket) -> None:
         """End a socket without an answer."""
@@ -175,10 +201,15 @@ class RobotSockets:
             self._context.loop.remove_reader(pending.accepted.fileno())
             self._pending.leave(pending)
 
+    def _on_readable(self, pending: PendingSocket) -> None:
+        # A thousand sockets may be readable, or ended, in the same round of the event loop.
+        self._context.loop.remove_reader(pending.accepted.fileno())
+        self._steps.add(self._read_on, pending)
+
     def _read_on(self, pending: PendingSocket) -> None:
-        # One that was cut in the same round of the event loop is not read.
-        if pending.timeout is not None:
-            self._read(pending)
+        # One that was cut while it waited for its turn is not read.
+        if pending.timeout is not None and not self._read(pending):
+            self._context.loop.add_reader(pending.accepted.fileno(), self._on_readable, pending)
 
     def _read(self, pending: PendingSocket) -> bool:
         """Read of the request what is there; return whether the socket is no longer pending."""
@@ -234,11 +265,25 @@ class RobotSockets:
             # Otherwise the kernel buffers megabytes for a slow reader, unnoticed.
             accepted.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, serving.write_buffer_bytes)
             protocol = self._protocol(
-                pending.ended, request, None, None, False, lambda _: answer, *self._arguments
+                pending.ended,
+                request,
+                self._read_later(listener),
+                None,
+                None,
+                False,
+                lambda _: answer,
+                *self._arguments,
             )
             self._transport(self._context.loop, accepted, protocol)
         except OSError:
             pending.close()
+
+    def _read_later(self, listener: Any) -> Callable[[], None]:
+        def read_later() -> None:
+            listener.hold()
+            self._long_reads.add(listener.read_on)
+
+        return read_later
 
     def _verdict(self, pending: PendingSocket, head: RequestHead) -> Accepted | Rejected:
         now = self._context.clocks.monotonic()
@@ -282,9 +327,17 @@ def protocol_type(picows: Any) -> Any:
     class Protocol(base):  # type: ignore[misc, valid-type]
         """Passes nothing behind the first CLOSE to picows, and tells when the socket is gone."""
 
-        def __init__(self, ended: Callable[[], None], request: tuple[bytes, bytes], *arguments: Any) -> None:
+        def __init__(
+            self,
+            ended: Callable[[], None],
+            request: tuple[bytes, bytes],
+            read_later: Callable[[], None],
+            *arguments: Any,
+        ) -> None:
             super().__init__(*arguments)
             self._request = request
+            self._read_later = read_later
+            self._is_made = False
             self._ended = ended
             self._border = CloseBorder(upgraded=True)
             self._buffer = memoryview(b"")
@@ -301,6 +354,7 @@ def protocol_type(picows: Any) -> Any:
                 self._buffer[:size] = rest[:size]
                 self.buffer_updated(size)
                 rest = rest[size:]
+            self._is_made = True
 
         def get_buffer(self, hint: int) -> memoryview:
             buffer: memoryview = get_buffer(self, hint)
@@ -310,9 +364,13 @@ def protocol_type(picows: Any) -> Any:
         def buffer_updated(self, n: int) -> None:
             if self.transport is not None and self.transport.is_close_frame_sent:
                 return
+            is_full = n == len(self._buffer)
             wanted = self._border.wanted(self._buffer, n)
             if wanted:
                 buffer_updated(self, wanted)
+            if is_full and self._is_made:
+                # The transport would read on up to 256 KiB, and then the next socket, in the same round.
+                self._read_later()
 
         def connection_lost(self, error: Exception | None) -> None:
             try:

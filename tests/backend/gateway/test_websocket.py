@@ -17,7 +17,7 @@ from rse_pf.config import ServingSettings
 def test_the_protocol_takes_the_fifteen_arguments_that_we_give_it():
     async def make() -> object:
         return protocol_type(picows)(
-            lambda: None, (b"", b""), None, None, False, lambda request: None,
+            lambda: None, (b"", b""), lambda: None, None, None, False, lambda request: None,
             logging.getLogger("t"), True, None, False, 20.0, 20.0, picows.WSAutoPingStrategy.PING_WHEN_IDLE,
             False, 1000, None, 2048,
         )  # fmt: skip
