@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rse_pf.geometry import Array, Camera
-from rse_pf.native import address_of, load_part, open_found
+from rse_pf.native import address_of, aligned, load_part, open_found
 
 __all__ = ["FrontEndCore", "front_end_core", "open_front_end"]
 
@@ -26,6 +26,8 @@ _ABI = 2
 _FLAGS = {"portable": 1, "avx2": 2, "avx512": 0}
 _BYTES = 32
 _RADIANS = np.float32(math.pi / 180)
+# Of the library, which refuses a level of this scale.
+_MOST_SCALE, _MOST_LEVELS = 1e4, 32
 
 Lanes = Literal["portable", "avx2", "avx512"]
 
@@ -90,14 +92,16 @@ class FrontEndCore:
             _is(gray, np.uint8, 2) and _is(pixels, np.float32, 2) and pixels.shape == (n, 2)
             and _is(angles_deg, np.float32, 1) and _is(octaves, np.int32, 1)
             and len(angles_deg) == len(octaves) == n
+            and 1.0 <= scale < _MOST_SCALE and 1 <= levels <= _MOST_LEVELS
         ):  # fmt: skip
             return None
-        gray, pixels = np.ascontiguousarray(gray), np.ascontiguousarray(pixels)
-        octaves = np.ascontiguousarray(octaves)
+        gray, pixels, octaves = aligned(gray), aligned(pixels), aligned(octaves)
         height, width = gray.shape
         turned = (angles_deg * _RADIANS).astype(np.float64)
-        cosines, sines = np.cos(turned).astype(np.float32), np.sin(turned).astype(np.float32)
-        scales = np.array([float(np.float32(scale)) ** level for level in range(levels)], dtype=np.float32)
+        with np.errstate(invalid="ignore"):  # what is not finite, the library refuses
+            cosines, sines = np.cos(turned).astype(np.float32), np.sin(turned).astype(np.float32)
+        powers = (float(np.float32(scale)) ** level for level in range(levels))
+        scales = np.array([min(power, _MOST_SCALE) for power in powers], dtype=np.float32)
         descriptors = np.empty((n, _BYTES), dtype=np.uint8)
         workspace = self._room.words(3 * width * height // 8 + 7 * width + 64)
         done = self._describe(
@@ -133,7 +137,7 @@ class FrontEndCore:
         """
         if not (_is(depth_m, np.float32, 2) and _is(pixels, np.float64, 2) and pixels.shape[1] == 2):
             return None
-        depth_m, pixels = np.ascontiguousarray(depth_m), np.ascontiguousarray(pixels)
+        depth_m, pixels = aligned(depth_m), aligned(pixels)
         points_camera = np.empty((len(pixels), 3))
         height, width = depth_m.shape
         done = self._points_at(
@@ -178,9 +182,9 @@ class FrontEndCore:
             and _is(frame_points, np.float64, 2) and frame_points.shape == (m, 3)
         ):  # fmt: skip
             return None
-        reference, points_camera = np.ascontiguousarray(reference), np.ascontiguousarray(points_camera)
-        descriptors, pixels = np.ascontiguousarray(descriptors), np.ascontiguousarray(pixels)
-        frame_points = np.ascontiguousarray(frame_points)
+        reference, points_camera = aligned(reference), aligned(points_camera)
+        descriptors, pixels = aligned(descriptors), aligned(pixels)
+        frame_points = aligned(frame_points)
         room = min(n, m, max(max_matches, 0))
         points_world, matched, depths_m = np.empty((room, 3)), np.empty((room, 2)), np.empty(room)
         workspace = self._room.words(3 * n + 5 * m + 64)

@@ -221,8 +221,34 @@ def _clouds() -> list[bytes]:
     ]
 
 
+def _views() -> list[bytes]:
+    rng = np.random.default_rng(2)
+    points = rng.normal(size=300).astype("<f8").tobytes()
+    return [
+        head + bits + points
+        for head in (bytes([40, 40, 0, 100, 40, 0, 9, 9]), bytes([9, 47, 1, 127, 255, 1, 3, 8]))
+        for bits in (rng.bytes(256), bytes(256))
+    ] + [bytes([0, 0, 0, 255, 0, 0, 0, 0])]
+
+
+def _depths() -> list[bytes]:
+    views = make_two_views(seed=1, n=40, outlier_ratio=0.0)
+    numbers = (views.T_camera_reference, views.points_reference, views.pixels, views.depths_m)
+    whole = b"".join(np.asarray(each, dtype="<f8").tobytes() for each in numbers)
+    return [bytes([40, inliers, kind, 12, 120, 16, misaligned, 0]) + whole
+            for inliers in (40, 33, 0) for kind, misaligned in ((0, 0), (1, 1), (9, 0), (8, 1))]  # fmt: skip
+
+
+def _pictures() -> list[bytes]:
+    noise = np.random.default_rng(4).bytes(3000)
+    return [bytes([height, width, rows, 51, levels, kind, misaligned, 0]) + noise
+            for height, width, rows, levels, kind, misaligned in (
+                (160, 170, 12, 8, 5, 0), (170, 150, 30, 4, 6, 1), (45, 45, 1, 1, 5, 0), (1, 0, 5, 8, 1, 0),
+                (120, 90, 6, 3, 0, 1), (100, 33, 0, 8, 4, 0))]  # fmt: skip
+
+
 _MADE = {
     "codec": _messages, "frames": _frames, "stream": _streams, "geometry": _problems, "maps": _maps,
     "keyframes": _keyframes, "snapshots": _sandbox_messages, "graph": _graphs, "cloud": _clouds,
-    "native": _messages,
+    "native": _messages, "match": _views, "depth": _depths, "describe": _pictures,
 }  # fmt: skip

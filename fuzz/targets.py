@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from fuzz import map_targets, native_targets
+from fuzz import core_targets, map_targets, native_targets
 from fuzz.checks import Target, TargetFailure, expect
 from fuzz.meter import Meter
 from rse_pf.backend.gateway.frames import (
@@ -214,5 +214,6 @@ def _numbers(kind: int, data: bytes, count: int) -> list[float]:
 TARGETS: dict[str, Target] = {
     "codec": codec, "frames": frames, "stream": stream, "geometry": geometry, "maps": map_targets.maps,
     "keyframes": map_targets.keyframes, "snapshots": map_targets.snapshots, "graph": map_targets.graph,
-    "cloud": map_targets.cloud, "native": native_targets.native,
+    "cloud": map_targets.cloud, "native": native_targets.native, "match": core_targets.match,
+    "depth": core_targets.depth, "describe": core_targets.describe,
 }  # fmt: skip

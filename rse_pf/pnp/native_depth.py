@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rse_pf.geometry import Array, Camera
-from rse_pf.native import address_of, load_part, open_found
+from rse_pf.native import address_of, aligned, load_part, open_found
 
 __all__ = ["DepthCore", "RefinedPose", "depth_core", "open_depth"]
 
@@ -102,13 +102,11 @@ class DepthCore:
             shapes or hold numbers that the reference refuses, too.
         """
         n, k = len(depths_m), len(inliers)
-        arrays = [
-            np.ascontiguousarray(each, dtype=np.float64) for each in (points_reference, pixels, depths_m)
-        ]
+        arrays = [aligned(each, np.float64) for each in (points_reference, pixels, depths_m)]
         shapes = [each.shape for each in arrays]
         if shapes != [(n, 3), (n, 2), (n,)] or T_camera_reference.shape != (4, 4) or inliers.shape != (k,):
             return "refused"
-        rows = np.ascontiguousarray(inliers, dtype=np.int64)
+        rows = aligned(inliers, np.int64)
         buffers = self._buffers
         if k > buffers.rows:
             buffers.lend(2 * k)

@@ -213,6 +213,8 @@ def test_keypoints_that_opencv_would_not_find_are_not_described():
     assert described(octaves=np.int32([1]), scale=0.5) is None
     assert described(octaves=np.int32([1]), scale=np.nan) is None
     assert described(octaves=np.int32([7]), scale=1000.0) is None
+    assert described(octaves=np.int32([1]), levels=32, scale=1e30) is None
+    assert described(angles_deg=np.float32([np.inf])) is None
     assert described(angles_deg=np.float32([1, 2])) is None
     assert described(pixels=np.float64([[160, 120]])) is None
     assert described(image=np.zeros((1, 1), np.uint8)) is None

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import hashlib
+import os
+import platform
+import subprocess
 import zipfile
 from pathlib import Path
 
 import pytest
 
-from native.wheel_builder.backend import LIBRARY
+from native.wheel_builder.backend import LIBRARY, NATIVE
 from native.wheel_builder.elf import complaints, read_library
 from rse_pf.native import open_solver
 
@@ -58,3 +61,19 @@ def test_the_wheel_for_arm_holds_a_library_for_arm(build: Path) -> None:
     digest = hashlib.sha256(wheels[0].read_bytes()).hexdigest()
     assert complaints(read_library(data), "aarch64") == []
     assert digest in (build / "native" / "requirements.txt").read_text(encoding="utf-8")
+
+
+def test_the_compiler_for_arm_builds_a_core_with_the_instructions_of_the_processor(
+    build: Path, tmp_path: Path
+) -> None:
+    zig = build / "ziglang" / "ziglang" / "zig"
+    if not zig.is_file() or platform.machine() != "x86_64":
+        pytest.skip("no compiler of the wheel ziglang: run make assets on x86-64")
+    command = ["make", "-C", str(NATIVE), f"OUT={tmp_path}", "ARCH=x86_64"]
+    caches = {"ZIG_GLOBAL_CACHE_DIR": str(tmp_path), "ZIG_LOCAL_CACHE_DIR": str(tmp_path)}
+    subprocess.run(
+        [*command, f"CXX={zig} c++ -target x86_64-linux-gnu.2.28"], check=True, env=os.environ | caches
+    )
+
+    has_avx2 = " avx2 " in Path("/proc/cpuinfo").read_text(encoding="ascii").replace("\n", " ")
+    assert open_solver(tmp_path / LIBRARY).lanes == ("avx2" if has_avx2 else "portable")

@@ -243,3 +243,13 @@ def test_a_file_that_is_no_library_is_refused(tmp_path: Path) -> None:
     path.write_bytes(b"no library")
     with pytest.raises(ConfigurationError, match="cannot be loaded"):
         open_depth(path)
+
+
+def test_numbers_at_odd_addresses_are_copied_for_the_library():
+    numbers = np.arange(5.0)
+    moved = np.frombuffer(b"\0" + numbers.tobytes(), np.uint8)[1:].view(np.float64)
+
+    assert not moved.flags.aligned
+    assert native.aligned(moved).flags.aligned
+    assert native.aligned(moved).tolist() == numbers.tolist()
+    assert native.aligned(numbers) is numbers
