@@ -12,7 +12,10 @@ import numpy.typing as npt
 from rse_pf.config import PnpSettings
 from rse_pf.errors import LimitExceeded, TooFewCorrespondences
 from rse_pf.geometry import Camera
+from rse_pf.native import native_solver
 from rse_pf.pnp import DepthNoise, PnpOptions, PnpSolution, refine_with_depth, solve_pnp, usable_engine
+from rse_pf.pnp.engines import native_options
+from rse_pf.pnp.options import WeakLimits
 from rse_pf.service import Registry
 from rse_pf.wire.arrays import Array, reshaped
 from rse_pf.wire.native_codec import PnpTypes
@@ -139,10 +142,27 @@ def register(registry: Registry, settings: PnpSettings) -> None:
     """Add ``pnp`` to *registry*, with the limits and the engine of *settings*."""
     defaults = PnpOptions(max_iterations=settings.max_iterations)
     engine = usable_engine(settings.engine)
+    solver = native_solver() if engine == "native" else None
+    plain, most = native_options(defaults, WeakLimits()), settings.max_correspondences
 
     @registry.service("pnp", cheap=True)
     def pnp(request: PnpRequest) -> PnpReply:
         """Estimate the camera pose of one frame."""
+        # What nearly all robots send goes from arrays to arrays; what the rest of this function refuses,
+        # or another engine solves, is left to it.
+        if (
+            solver is not None
+            and request.options is None
+            and (request.depths_m is msgspec.UNSET or request.depths_m is None)
+            and 8 <= request.pixels.size <= 2 * most
+        ):
+            found = solver.solve_flat(request.points_world, request.pixels, request.camera, plain)
+            if found is not None:
+                pose, inliers, rmse_px, covariance, reason = found
+                return PnpReply(
+                    T_camera_world=pose, inliers=inliers, rmse_px=rmse_px, covariance=covariance,
+                    verdict="weak" if reason else "ok", reason=reason, engine="native",
+                )  # fmt: skip
         points_world = reshaped("points_world", request.points_world, 3)
         pixels = reshaped("pixels", request.pixels, 2)
         n = len(points_world)

@@ -31,7 +31,7 @@ _KINDS = {np.dtype(np.float32): _F4, np.dtype(np.uint32): _U4, np.dtype(np.float
 def json_encode_hook(value: Any) -> Any:
     """Return *value* as JSON can represent it: arrays become flat lists."""
     if isinstance(value, np.ndarray) and value.dtype.kind in "fiu":
-        return value.ravel().tolist()
+        return value.tolist() if value.ndim == 1 else value.ravel().tolist()
     raise _unknown(value)
 
 

@@ -38,6 +38,7 @@ _HEAD = struct.Struct("=ddddqqqddqq16s")
 _FOUND_AT = CallBuffers.HEAD_BYTES
 _HEAD_AT = _FOUND_AT + _FOUND.size
 _CALL_BYTES = _HEAD_AT + _HEAD.size
+_FOUND_WITH_HEAD = struct.Struct(f"{_FOUND.format}{_HEAD.size}s")
 _HAS_DEADLINE, _HAS_KEEP, _HAS_OPTIONS, _HAS_ENGINE = 1, 2, 4, 8
 _OPTION_FIELDS = {16: "inlier_px", 128: "confidence", 32: "max_iterations", 64: "min_iterations"}
 
@@ -158,7 +159,7 @@ class NativeReader:
             if self._short_bytes:
                 return "longer"
             status, text = self._with_more_room(data)
-        found = _FOUND.unpack_from(buffers.call, _FOUND_AT)
+        found = _FOUND_WITH_HEAD.unpack_from(buffers.call, _FOUND_AT)
         if status == _READ and self._types is not None:
             command = _command(buffers, found, text, self._types)
             if command is not None:
@@ -206,25 +207,28 @@ def _command(
     buffers: CallBuffers, found: tuple[Any, ...], text: bytes | memoryview, types: PnpTypes
 ) -> Command | None:
     """Return what a call has found; None if the camera or the options are refused by their types."""
-    _, _, points, pixels, depths, identity, seq, deadline_ms, fields, *words = found
-    stream_at, stream_bytes, trace_at, trace_bytes = words
+    (
+        _, _, points, pixels, depths, identity, seq, deadline_ms, fields,
+        stream_at, stream_bytes, trace_at, trace_bytes, head,
+    ) = found  # fmt: skip
     try:
-        camera, options = _head(types, bytes(buffers.call[_HEAD_AT:]))
+        camera, options = _head(types, head)
     except (RsePfError, msgspec.ValidationError):
         return None
     pixels += points
     numbers = buffers.numbers[: pixels + depths].copy()
-    more = {"depths_m": numbers[pixels:]} if depths else {}
+    points_world, pixel_rows = numbers[:points], numbers[points:pixels]
+    if depths:
+        payload = types.request(
+            camera=camera, points_world=points_world, pixels=pixel_rows, options=options,
+            depths_m=numbers[pixels:],
+        )  # fmt: skip
+    else:
+        payload = types.request(camera=camera, points_world=points_world, pixels=pixel_rows, options=options)
     return Command(
         id=identity,
         service="pnp",
-        payload=types.request(
-            camera=camera,
-            points_world=numbers[:points],
-            pixels=numbers[points:pixels],
-            options=options,
-            **more,
-        ),
+        payload=payload,
         stream=str(text[stream_at : stream_at + stream_bytes], "ascii") if stream_bytes else "",
         seq=seq,
         keep=bool(fields & _HAS_KEEP),
