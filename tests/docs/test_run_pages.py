@@ -81,8 +81,9 @@ class Reader:
 
         def read() -> None:
             assert process.stdout is not None
-            for line in process.stdout:
-                lines.put(line)
+            with process.stdout:
+                for line in process.stdout:
+                    lines.put(line)
             lines.put("")
 
         threading.Thread(target=read, daemon=True).start()
