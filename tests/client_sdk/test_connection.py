@@ -338,10 +338,15 @@ def test_an_address_without_a_server_is_one_line_with_a_hint():
     run(test())
 
 
-@pytest.mark.parametrize("url", ["http://localhost/ws", "localhost:8700", "ws://", "ws://h:99999/ws", ""])
+@pytest.mark.parametrize("url", ["http://localhost/ws", "localhost:8700", "ws://", "ws://h:99999/ws"])
 def test_an_invalid_address_is_refused_before_anything_is_opened(url):
     with pytest.raises(UsageError, match="not a WebSocket address"):
         robot(url)
+
+
+def test_neither_an_address_nor_an_enrolment_is_refused_with_both_ways():
+    with pytest.raises(UsageError, match="either an address or an enrolment"):
+        robot("")
 
 
 def test_an_unknown_codec_is_refused_with_the_choices():
