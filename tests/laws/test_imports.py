@@ -71,7 +71,9 @@ PACKAGES: dict[str, tuple[str, ...]] = {
     "msgspec": ("rse_pf/", "client_sdk/", "lambda_pnp/"),
     "websockets": ("client_sdk/connection.py",),
     "cv2": (
-        "rse_pf/pnp/engines.py", "client_sdk/frontend.py", "client_sdk/datasets/recordings.py",
+        "rse_pf/pnp/engines.py",
+        "client_sdk/frontend.py",
+        "client_sdk/datasets/recordings.py",
         "client_sdk/monocular/",
     ),
     "pyrealsense2": ("client_sdk/cameras/realsense.py",),
@@ -81,7 +83,9 @@ PACKAGES: dict[str, tuple[str, ...]] = {
     "aiofastnet": ("rse_pf/backend/",),
     "uvloop": ("rse_pf/backend/",),
     "prometheus_client": (
-        "rse_pf/backend/", "rse_pf/data_server/", "rse_pf/local/control/federation.py",
+        "rse_pf/backend/",
+        "rse_pf/data_server/",
+        "rse_pf/local/control/federation.py",
     ),
     "uvicorn": ("rse_pf/data_server/server.py",),
     "jwt": ("rse_pf/auth/tokens.py",),
