@@ -66,8 +66,8 @@ Source:
     CoDel, Nichols and Jacobson 2012.
 """
 _SHORT_COMPUTE_S, _SHORT_SHARE = 0.001, 0.8
-"""Passing a command to a thread takes 0.1 ms of CPU, and up to 5 ms until the thread has the lock.  A share and
-not an average decides, because a process that others interrupt is no slow service."""
+"""Passing a command to a thread takes 0.1 ms of CPU, and up to 5 ms until the thread has the lock.  A share
+and not an average decides, because a process that others interrupt is no slow service."""
 INLINE_BYTES = 16_384
 """A command up to this size is computed in the event loop when nothing waits."""
 
