@@ -33,7 +33,7 @@ def make(configuration):
         if word == "size":
             return str(len(rest)).encode()
         if word == "lists":
-            kept.append([[] for _ in range(20_000_000)])
+            kept.append([bytearray(16_384) for _ in range(1_000_000)])
         if word == "keep":
             kept.append(bytearray(int(rest)))
         if word == "signal":
