@@ -37,7 +37,7 @@ def make(settings):
     @registry.service("decode", limited=True)
     def decode(request: Hostile) -> Pid:
         if request.what == "memory":
-            return [[] for _ in range(10_000_000)]
+            return [bytearray(16_384) for _ in range(1_000_000)]
         if request.what == "signal":
             os.kill(os.getpid(), signal.SIGSEGV)
         while request.what == "loop":
