@@ -16,7 +16,7 @@ ORDER = (
     "rse_pf", "errors", "terminal", "linux", "limited_process", "files", "geometry", "native",
     "native_buffers", "token_bucket", "config", "budget", "wire", "scaling", "object_store", "identity",
     "crash_record", "maps", "auth", "enrolment", "audit", "service",
-    "pnp", "services.mapping", "services.custom", "services",
+    "pnp", "services.mapping", "live_map", "services.custom", "services",
     "aws", "aws.storage", "aws.fleet", "aws.money",
     "backend", "backend.scheduling", "backend.sandbox", "backend.jobs", "backend.compute",
     "backend.gateway",
