@@ -22,6 +22,7 @@ __all__ = [
     "CloudSettings",
     "DataSettings",
     "HealthSettings",
+    "LiveSettings",
     "LocalSettings",
     "PlatformSettings",
     "PnpSettings",
@@ -194,6 +195,22 @@ class ServiceSettings:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class LiveSettings:
+    """Maps that robots make together while they drive; each has an owner process on one server."""
+
+    host: str = setting("127.0.0.1", doc="address on which owners of live maps listen for the other servers; 0.0.0.0 listens on all and tells the main one")
+    first_port: int = setting(0, doc="first port of owners of live maps; 0 takes any free one", low=0, high=65535)
+    ports: int = setting(64, doc="number of ports from live.first_port on", low=1, high=10000)
+    max_owners: int = setting(4, doc="owner processes of one worker; further maps are refused until another server takes them", low=1, high=64)
+    max_memory_bytes: int = setting(2147483648, unit="bytes", doc="memory of one owner process; one that needs more is ended", low=134217728)
+    heartbeat_s: float = setting(0.5, unit="s", doc="time between two renewals of a live map's lease", low=0.05)
+    lease_s: float = setting(1.5, unit="s", doc="another server takes a live map over when its lease was not renewed for this long", low=0.1)
+    publish_s: float = setting(600.0, unit="s", doc="time between two versions that a live map publishes while it changes; 0: only when the last robot leaves, or on request", low=0)
+    idle_s: float = setting(60.0, unit="s", doc="the owner of a map that nobody uses for this long publishes it and ends", low=1)
+    keep_log: bool = setting(False, doc="keep all entries of a live map's log, which experiments replay; else those before the older snapshot are deleted")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class LocalSettings:
     """The platform on one machine."""
 
@@ -243,6 +260,7 @@ class PlatformSettings:
     data: DataSettings = field(default_factory=DataSettings)
     auth: AuthSettings = field(default_factory=AuthSettings)
     services: ServiceSettings = field(default_factory=ServiceSettings)
+    live: LiveSettings = field(default_factory=LiveSettings)
     local: LocalSettings = field(default_factory=LocalSettings)
     cloud: CloudSettings = field(default_factory=CloudSettings)
 
@@ -295,6 +313,7 @@ def _check_contradictions(s: PlatformSettings) -> None:
         ("session", "max_message_bytes", "max_inflated_bytes"),
         ("session", "reconnect_base_s", "reconnect_max_s"),
         ("services", "scratch_bytes", "memory_bytes"),
+        ("live", "heartbeat_s", "lease_s"),
     ]
     for group, small, large in pairs:
         low, high = (getattr(getattr(s, group), name) for name in (small, large))

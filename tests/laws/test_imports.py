@@ -18,7 +18,7 @@ ORDER = (
     "crash_record", "maps", "auth", "enrolment", "audit", "service",
     "pnp", "services.mapping", "live_map", "services.custom", "services",
     "aws", "aws.storage", "aws.fleet", "aws.money",
-    "backend", "backend.scheduling", "backend.sandbox", "backend.jobs", "backend.compute",
+    "backend", "backend.scheduling", "backend.sandbox", "backend.jobs", "backend.live_map", "backend.compute",
     "backend.gateway",
     "backend.supervisor",
     "data_server",
