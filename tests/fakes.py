@@ -176,10 +176,14 @@ class FakeWire:
         self.closed: tuple[int, str] | None = None
         self.pauses: list[float] = []
         self.holds = 0
+        self.unsent = 0
         self._codec = codec or make_codec("bin")
 
     def send(self, data: bytes, is_text: bool) -> None:
         self.sent.append(self._codec.decode_from_server(data))
+
+    def unsent_bytes(self) -> int:
+        return self.unsent
 
     def send_pong(self, data: bytes) -> None:
         self.sent.append(data)

@@ -20,6 +20,9 @@ class Wire(Protocol):
     def send(self, data: bytes, is_text: bool) -> None:
         """Write one message; does nothing on a socket that ended."""
 
+    def unsent_bytes(self) -> int:
+        """Return how many bytes wait in this process, because the kernel does not take more."""
+
     def send_pong(self, data: bytes) -> None:
         """Write one pong frame."""
 

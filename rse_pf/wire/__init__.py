@@ -21,6 +21,9 @@ from rse_pf.wire.messages import (
     Renew,
     Renewed,
     Result,
+    Subscribe,
+    Unsubscribe,
+    Update,
     Welcome,
 )
 
@@ -44,6 +47,9 @@ __all__ = [
     "Renew",
     "Renewed",
     "Result",
+    "Subscribe",
+    "Unsubscribe",
+    "Update",
     "Welcome",
     "as_type",
     "codec_for",

@@ -16,6 +16,7 @@ import msgspec
 
 from rse_pf.config import SessionSettings
 from rse_pf.errors import LimitExceeded
+from rse_pf.wire.client_subscriptions import ClientSubscriptions, SubscriptionEnded, Updated
 from rse_pf.wire.clock_offset import ClockOffset, Exchange
 from rse_pf.wire.codec import Codec
 from rse_pf.wire.messages import (
@@ -23,6 +24,7 @@ from rse_pf.wire.messages import (
     Command,
     Failure,
     Hello,
+    Message,
     Move,
     Ping,
     Pong,
@@ -30,11 +32,13 @@ from rse_pf.wire.messages import (
     Renew,
     Renewed,
     Result,
+    Update,
     Welcome,
 )
 from rse_pf.wire.preencoded import encode_command
 from rse_pf.wire.rate_limit import Backlog, RateLimiter, is_long_outage, send_order
-from rse_pf.wire.server_session import PROGRESS
+from rse_pf.wire.renewal_timer import RenewalTimer
+from rse_pf.wire.server_session import PROGRESS, UPDATES
 
 __all__ = [
     "Answered",
@@ -46,19 +50,14 @@ __all__ = [
     "Notice",
     "Progressed",
     "RenewalDue",
-    "RenewalTimer",
     "Welcomed",
 ]
 
+_CAPABILITIES = ("move", PROGRESS, UPDATES)
 _MAX_TRIES_AFTER_LOSS = 2
 _RETRY_BURST = 5.0
 _PINGS_PER_STALL_TIMEOUT = 3.0
 _MAX_DEADLINE_MS = 3.6e6
-# Share of a token's remaining time; the rest is for a second and a third attempt.
-_RENEW_AFTER = 0.8
-# Above the server's minimum pause between two renewals.
-_MIN_RENEWAL_PAUSE_S = 1.5
-_MAX_TTL_S = 3600.0
 RETRY_SHARE = 0.1
 """Retries after busy, as a share of the commands.  Source: Google SRE book, ch. 21."""
 
@@ -122,30 +121,17 @@ class RenewalDue:
     """The connection expires soon unless a fresh token is sent: see `ClientSession.renew`."""
 
 
-Event = RenewalDue | Answered | Welcomed | MoveRequested | ConnectionLost | Notice | Progressed
-
-
-@dataclass(slots=True)
-class RenewalTimer:
-    """When a connection expires and when to renew its token; seconds of the robot's clock.
-
-    A renewal without a reply is repeated, but never faster than the server accepts renewals.
-    """
-
-    ends_s: float | None = None
-    _due_s: float = 0.0
-
-    def expires_in(self, token_s: float, now: float) -> None:
-        """Record that the connection expires in *token_s*; a value outside 0..3600 counts as 3600."""
-        left_s = token_s if 0.0 <= token_s <= _MAX_TTL_S else _MAX_TTL_S
-        self.ends_s, self._due_s = now + left_s, now + _RENEW_AFTER * left_s
-
-    def is_due(self, now: float) -> bool:
-        """Return whether to renew now; the next attempt is due after half of the remaining time."""
-        if self.ends_s is None or now < self._due_s:
-            return False
-        self._due_s = now + max(_MIN_RENEWAL_PAUSE_S, (self.ends_s - now) / 2)
-        return True
+Event = (
+    RenewalDue
+    | Answered
+    | Welcomed
+    | MoveRequested
+    | ConnectionLost
+    | Notice
+    | Progressed
+    | Updated
+    | SubscriptionEnded
+)
 
 
 @dataclass(slots=True, kw_only=True)
@@ -203,6 +189,7 @@ class ClientSession:
         self._sequence: dict[str, int] = {}
         self._delivered: dict[str, int] = {}
         self._retry_tokens = _RETRY_BURST
+        self.subscriptions = ClientSubscriptions()
 
     @property
     def unanswered(self) -> int:
@@ -260,6 +247,16 @@ class ClientSession:
             self._write(pending, self.current, now, data)
         return command.id
 
+    def subscribe(self, topic: str, now: float) -> int:
+        """Ask for the updates of *topic*, on this connection and all later ones; return the id."""
+        identity, self._next_id = self._next_id, self._next_id + 1
+        self._say(self.subscriptions.add(identity, topic, now), now)
+        return identity
+
+    def unsubscribe(self, identity: int, now: float) -> None:
+        """End a subscription; does nothing if it has ended."""
+        self._say(self.subscriptions.remove(identity), now)
+
     def cancel(self, identity: int) -> None:
         """Forget a command that its caller gave up; its answer, if one comes, is dropped.
 
@@ -278,12 +275,15 @@ class ClientSession:
     def open_connection(self, now: float) -> ConnectionState:
         """Return the state of a WebSocket that was just opened, with a Hello to send."""
         connection = ConnectionState(opened=now, last_heard=now, last_checked=now)
-        connection.outgoing.append(self.codec.encode(Hello(sdk=self._sdk, capabilities=("move", PROGRESS))))
+        connection.outgoing.append(
+            self.codec.encode(Hello(sdk=self._sdk, capabilities=("move", PROGRESS, UPDATES)))
+        )
         return connection
 
     def close_connection(self, connection: ConnectionState) -> None:
         """Record that the WebSocket of *connection* ended; its commands wait for the next connection."""
         connection.lost = True
+        self.subscriptions.lose(connection)
         if self.current is connection:
             self.current = None
         for identity, pending in list(self._pending.items()):
@@ -310,6 +310,7 @@ class ClientSession:
             for pending in self._pending.values():
                 if pending.connection is before and pending.is_long and not pending.cancelled:
                     pending.connection = None  # the job continues on any server; the old one can close now
+        self._say(self.subscriptions.adopt(connection, now), now)
         frames = [each for each in self._pending.values() if _is_frame(each) and each.connection is None]
         if (
             before is None
@@ -336,6 +337,10 @@ class ClientSession:
                 return []
             case Failure(id=None):
                 return [Notice(message)]
+            case Failure() if message.id in self.subscriptions:
+                return [*self.subscriptions.refuse(connection, message)]
+            case Update():
+                return [*self.subscriptions.update(connection, message)]
             case Progress():
                 return self._progress(connection, message)
             case _:
@@ -347,7 +352,9 @@ class ClientSession:
 
     def due(self, now: float) -> list[Event]:
         """End the commands whose deadline has passed, and send those that may be sent (again) now."""
-        events: list[Event] = []
+        again, ended = self.subscriptions.due(now)
+        self._say(again, now)
+        events: list[Event] = [*ended]
         for identity, pending in list(self._pending.items()):
             if now >= pending.deadline:
                 waited = now - pending.submitted
@@ -360,7 +367,7 @@ class ClientSession:
 
     def abandon(self, code: str, message: str, hint: str = "") -> list[Event]:
         """End every command with a failure, because no further connection will be opened."""
-        events: list[Event] = []
+        events: list[Event] = [*self.subscriptions.abandon(code, message, hint)]
         for identity, pending in list(self._pending.items()):
             failure = Failure(id=identity, code=code, message=message, hint=hint, trace=pending.command.trace)
             events += self._end(identity, failure)
@@ -447,6 +454,13 @@ class ClientSession:
         limit = connection.welcome.limits.max_in_flight if connection.welcome else self.settings.max_in_flight
         free = max(1, limit) - sum(pending.connection is connection for pending in self._pending.values())
         return min(free, connection.rate_limiter.available(now))
+
+    def _say(self, messages: list[Message], now: float) -> None:
+        """Write *messages* on the current connection, whatever the rate limit says."""
+        if self.current is not None:
+            self.current.outgoing += [self.codec.encode(message) for message in messages]
+            for _ in messages:
+                self.current.rate_limiter.spend(now)
 
     def _check_size(self, data: bytes) -> None:
         max_bytes = self.settings.max_message_bytes

@@ -26,6 +26,9 @@ __all__ = [
     "Renew",
     "Renewed",
     "Result",
+    "Subscribe",
+    "Unsubscribe",
+    "Update",
     "Welcome",
 ]
 
@@ -33,6 +36,9 @@ PROTOCOL_VERSION = 1
 
 Word = Annotated[str, msgspec.Meta(max_length=64)]
 """A name of at most 64 characters."""
+
+Topic = Annotated[str, msgspec.Meta(min_length=1, max_length=128)]
+"""What updates are about, such as ``live/MAP``."""
 
 Identifier = Annotated[int, msgspec.Meta(ge=0, le=2**53 - 1)]
 """A counter that every language's number type can hold."""
@@ -171,6 +177,37 @@ class Renewed(_Message, frozen=True, kw_only=True, tag="renewed"):
     token_s: float
 
 
-FromRobot = Hello | Command | Ping | Cancel | Renew
-FromServer = Welcome | Result | Failure | Move | Pong | Progress | Renewed
+class Subscribe(_Message, frozen=True, kw_only=True, tag="subscribe"):
+    """Robot wants the updates of a topic, from its present state on.
+
+    Only from robots whose Hello names the capability ``updates``.  A refusal is a Failure with this ``id``,
+    which no command of the robot has.
+    """
+
+    id: Identifier
+    topic: Topic
+
+
+class Unsubscribe(_Message, frozen=True, kw_only=True, tag="unsubscribe"):
+    """Robot wants no more updates of this subscription; one that is on its way may still come."""
+
+    id: Identifier
+
+
+class Update(_Message, frozen=True, kw_only=True, tag="update"):
+    """Server tells the newest value of one *key* of a topic; older values of the key are void.
+
+    ``seq`` counts all values of the subscription from 1, so that a gap says how many were replaced by newer
+    ones before they could be sent.
+    """
+
+    id: int
+    topic: str
+    seq: int
+    key: str = ""
+    payload: Any = None
+
+
+FromRobot = Hello | Command | Ping | Cancel | Renew | Subscribe | Unsubscribe
+FromServer = Welcome | Result | Failure | Move | Pong | Progress | Renewed | Update
 Message = FromRobot | FromServer

@@ -13,10 +13,12 @@ import msgspec
 from rse_pf.config import SessionSettings
 from rse_pf.errors import (
     BadMessage,
+    BadRequest,
     Busy,
     InternalError,
     LimitExceeded,
     ProtocolError,
+    QuotaExceeded,
     RsePfError,
     Unauthorized,
     UnsupportedProtocol,
@@ -37,6 +39,8 @@ from rse_pf.wire.messages import (
     Renew,
     Renewed,
     Result,
+    Subscribe,
+    Unsubscribe,
     Welcome,
 )
 
@@ -49,10 +53,14 @@ __all__ = [
     "CLOSE_REVOKED",
     "CLOSE_TOKEN_OVER",
     "CLOSE_UNSUPPORTED",
+    "MAX_SUBSCRIPTIONS",
     "PROGRESS",
     "RENEWAL_PAUSE_S",
+    "UPDATES",
+    "BeginUpdates",
     "Close",
     "Decision",
+    "EndUpdates",
     "Renewal",
     "Send",
     "ServerSession",
@@ -62,6 +70,12 @@ __all__ = [
 
 PROGRESS = "progress"
 """Capability of a robot that accepts progress messages and may cancel commands."""
+
+UPDATES = "updates"
+"""Capability of a robot that may subscribe to topics."""
+
+MAX_SUBSCRIPTIONS = 8
+"""Subscriptions of one connection; a robot needs one for each map that it drives in."""
 
 RENEWAL_PAUSE_S = 1.0
 """Minimum pause between two renewals, because each one costs a signature check."""
@@ -109,7 +123,20 @@ class Renewal(msgspec.Struct, frozen=True, gc=False):
     token: str
 
 
-Decision = Send | Submit | Withdraw | Renewal | Close
+class BeginUpdates(msgspec.Struct, frozen=True, gc=False):
+    """Send the updates of this topic, or refuse with `ServerSession.refuse_updates`."""
+
+    id: int
+    topic: str
+
+
+class EndUpdates(msgspec.Struct, frozen=True, gc=False):
+    """Send no more updates of this subscription."""
+
+    id: int
+
+
+Decision = Send | Submit | Withdraw | Renewal | Close | BeginUpdates | EndUpdates
 
 
 class ServerSession:
@@ -118,6 +145,8 @@ class ServerSession:
     Attributes:
         ends_s: When the robot's token expires, on the server's clock; set after authentication.
         hears_progress: Whether the robot announced the capability `PROGRESS`.
+        hears_updates: Whether it announced the capability `UPDATES`.
+        topics: The topic of each live subscription, by its id.
         bad_messages: How many invalid messages arrived; a long one counts several times.
     """
 
@@ -128,7 +157,8 @@ class ServerSession:
         self.state: Literal["opening", "open", "closed"] = "opening"
         self.in_flight = 0
         self.ends_s: float | None = None
-        self.hears_progress = False
+        self.hears_progress = self.hears_updates = False
+        self.topics: dict[int, str] = {}
         self.codec = codec
         self._server = server
         self._session = session
@@ -175,6 +205,10 @@ class ServerSession:
                 return [self._send(Pong(sent_s=message.sent_s, received_s=now, answered_s=now))]
             case Cancel():
                 return [Withdraw(message.id)]
+            case Subscribe():
+                return self._subscribe(message)
+            case Unsubscribe():
+                return [] if self.topics.pop(message.id, None) is None else [EndUpdates(message.id)]
             case _:
                 return self._renew(message, now)
 
@@ -212,6 +246,29 @@ class ServerSession:
         )
         return [self._send(self._failure(error))]
 
+    def refuse_updates(self, identity: int, error: RsePfError) -> Send:
+        """End the subscription *identity* because of *error*, and return the message that says so."""
+        self.topics.pop(identity, None)
+        return self._send(self._failure(error, identity=identity))
+
+    def _subscribe(self, message: Subscribe) -> list[Decision]:
+        """Begin one more subscription; one of the same id ends, as after a robot lost count."""
+        if not self.hears_updates:
+            unheard = BadRequest(
+                f"this connection did not announce the capability {UPDATES}", hint="name it in hello"
+            )
+            return [self._send(self._failure(unheard, identity=message.id))]
+        ended: list[Decision] = []
+        if self.topics.pop(message.id, None) is not None:
+            ended.append(EndUpdates(message.id))
+        if len(self.topics) >= MAX_SUBSCRIPTIONS:
+            full = QuotaExceeded(
+                f"this connection has {len(self.topics)} subscriptions already", hint="end one of them first"
+            )
+            return [*ended, self._send(self._failure(full, identity=message.id))]
+        self.topics[message.id] = message.topic
+        return [*ended, BeginUpdates(message.id, message.topic)]
+
     def _renew(self, message: Renew, now: float) -> list[Decision]:
         if now < self._next_renewal_s:
             error = Busy(
@@ -245,6 +302,7 @@ class ServerSession:
             return [self._send(self._failure(error)), *self._close(CLOSE_UNSUPPORTED, "unsupported protocol")]
         self.state = "open"
         self.hears_progress = PROGRESS in hello.capabilities
+        self.hears_updates = UPDATES in hello.capabilities
         welcome = Welcome(
             server=self._server,
             session=self._session,

@@ -41,7 +41,15 @@ def bytes_of(name: str, codec: str) -> bytes:
 
 def decoded(name: str, codec: str) -> Message:
     wire = make_codec(codec)
-    from_robot = MESSAGES[name]["meaning"]["type"] in ("hello", "command", "cancel", "ping", "renew")
+    from_robot = MESSAGES[name]["meaning"]["type"] in (
+        "hello",
+        "command",
+        "cancel",
+        "ping",
+        "renew",
+        "subscribe",
+        "unsubscribe",
+    )
     return (wire.decode_from_robot if from_robot else wire.decode_from_server)(bytes_of(name, codec))
 
 

@@ -8,7 +8,8 @@ import pytest
 
 from rse_pf.config import SessionSettings
 from rse_pf.wire import Failure, Hello, Limits, Renew, Renewed, Welcome, make_codec
-from rse_pf.wire.client_session import ClientSession, ConnectionState, RenewalDue, RenewalTimer
+from rse_pf.wire.client_session import ClientSession, ConnectionState, RenewalDue
+from rse_pf.wire.renewal_timer import RenewalTimer
 from rse_pf.wire.server_session import RENEWAL_PAUSE_S, Renewal, Send, ServerSession
 
 SETTINGS = SessionSettings()

@@ -15,10 +15,19 @@ from rse_pf.backend.gateway.frames import CloseSocket, FrameAssembler, Received,
 from rse_pf.backend.gateway.handshake import Accepted
 from rse_pf.backend.gateway.rate_limits import RobotRates
 from rse_pf.backend.ports import Wire, WorkerContext
-from rse_pf.errors import ProtocolError
+from rse_pf.errors import ProtocolError, RsePfError
 from rse_pf.wire import Command, Progress
 from rse_pf.wire.messages import FromRobot
-from rse_pf.wire.server_session import Decision, Renewal, Send, ServerSession, Submit, Withdraw
+from rse_pf.wire.server_session import (
+    BeginUpdates,
+    Close,
+    Decision,
+    Renewal,
+    Send,
+    ServerSession,
+    Submit,
+    Withdraw,
+)
 
 __all__ = ["CommandHandler", "RobotConnection"]
 
@@ -49,6 +58,12 @@ class CommandHandler(Protocol):
 
     def renew(self, connection: RobotConnection, token: str) -> None:
         """Judge a fresh token."""
+
+    def subscribe(self, connection: RobotConnection, identity: int, topic: str) -> None:
+        """Begin the updates of *topic* for the subscription *identity*, or refuse it."""
+
+    def unsubscribe(self, connection: RobotConnection, identity: int) -> None:
+        """End a subscription."""
 
     def opened(self, connection: RobotConnection, now: float) -> None:
         """Take that the robot said Hello."""
@@ -156,6 +171,16 @@ class RobotConnection:
         if self.is_connected and self.session is not None and self.session.hears_progress:
             self.write(self.session.codec.encode(progress))
 
+    @property
+    def unsent_bytes(self) -> int:
+        """How much was written that the kernel has not taken, because the robot reads slowly."""
+        return self._wire.unsent_bytes()
+
+    def refuse_updates(self, identity: int, error: RsePfError) -> None:
+        """Write that a subscription ends because of *error*."""
+        if self.is_connected and self.session is not None:
+            self.write(self.session.refuse_updates(identity, error).data)
+
     def move(self, reason: str, within_ms: float, now: float) -> None:
         """Ask the robot to leave for another server."""
         if self.session is not None:
@@ -254,5 +279,9 @@ class RobotConnection:
                 handler.renew(self, decision.token)
             elif isinstance(decision, Withdraw):
                 handler.withdraw(self, decision.id)
-            else:
+            elif isinstance(decision, Close):
                 self.close(decision.code, decision.reason)
+            elif isinstance(decision, BeginUpdates):
+                handler.subscribe(self, decision.id, decision.topic)
+            else:
+                handler.unsubscribe(self, decision.id)

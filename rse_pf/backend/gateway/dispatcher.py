@@ -33,7 +33,7 @@ from rse_pf.backend.scheduling.scheduler import (
     Scheduler,
 )
 from rse_pf.backend.scheduling.thread_pool import SolverThreads
-from rse_pf.errors import UnknownService
+from rse_pf.errors import NotFound, UnknownService
 from rse_pf.identity import RobotId
 from rse_pf.service import Registry
 from rse_pf.services.pnp import wire_types
@@ -76,10 +76,16 @@ class NoQueue:
         """Return nothing."""
         return {}
 
+    def subscribe(self, connection: RobotConnection, identity: int, topic: str) -> None:
+        """Refuse every topic."""
+        error = NotFound("this server offers no updates", hint="the operator has switched live maps off")
+        connection.refuse_updates(identity, error)
+
     def ignore(self, *_: Any) -> None:
         """Do nothing."""
 
     submit = connected = disconnected = left = withdraw = give_up = close = note_refused = ignore
+    unsubscribe = ignore
 
 
 ComputeQueue = ComputeLane[EncodedAnswer] | NoQueue
@@ -138,6 +144,7 @@ class Dispatcher:
         self._compute = compute
         self._sandboxes = sandboxes
         self._jobs = jobs
+        self._live_maps = NoQueue()
         self._token_watch = token_watch
         self._codecs: dict[str, Codec] = {
             name: make_codec(name, settings.session, pnp=wire_types(registry)) for name in CODECS
@@ -316,6 +323,14 @@ class Dispatcher:
     def withdraw(self, connection: RobotConnection, command_id: int) -> None:
         """Cancel a long command; any other is answered soon in any case."""
         self._jobs.withdraw(connection, command_id)
+
+    def subscribe(self, connection: RobotConnection, identity: int, topic: str) -> None:
+        """Begin the updates of *topic* for the subscription *identity*, or refuse it."""
+        self._live_maps.subscribe(connection, identity, topic)
+
+    def unsubscribe(self, connection: RobotConnection, identity: int) -> None:
+        """End a subscription."""
+        self._live_maps.unsubscribe(connection, identity)
 
     def renew(self, connection: RobotConnection, token: str) -> None:
         """Judge a fresh token of a live connection."""

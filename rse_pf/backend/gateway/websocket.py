@@ -432,6 +432,12 @@ def listener_type(picows: Any, loop: asyncio.AbstractEventLoop, serving: Serving
             if self._connection is not None:
                 self._transport.send(text if is_text else binary, data)
 
+        def unsent_bytes(self) -> int:
+            if self._connection is None:
+                return 0
+            size: int = self._transport.underlying_transport.get_write_buffer_size()
+            return size
+
         def send_pong(self, data: bytes) -> None:
             self._transport.send_pong(data)
 

@@ -33,6 +33,9 @@ from rse_pf.wire import (
     Renew,
     Renewed,
     Result,
+    Subscribe,
+    Unsubscribe,
+    Update,
     Welcome,
     make_codec,
 )
@@ -83,6 +86,41 @@ MESSAGES: dict[str, Message] = {
     "progress": Progress(id=7, done=0.25, what="3 of 12 keyframe pairs"),
     "result-as-object": Result(id=7, server="server-1", object="ab" * 32),
     "pong": Pong(sent_s=10.25, received_s=1300.5, answered_s=1300.75),
+    "hello-with-updates": Hello(sdk="rse-pf 0.1.0", capabilities=("updates",)),
+    "subscribe": Subscribe(id=8, topic="live/warehouse"),
+    "unsubscribe": Unsubscribe(id=8),
+    "update-of-an-alignment": Update(
+        id=8, topic="live/warehouse", seq=3, key="alignment/robot-7",
+        payload={
+            "kind": "alignment", "robot": "robot-7", "segment": 0, "aligned": True, "reason": "",
+            "T_map_odom": np.array([1, 0, 0, 0.5, 0, 1, 0, -2.0, 0, 0, 1, 0.25, 0, 0, 0, 1.0]),
+            "covariance": np.arange(1, 22) / 64, "version": 1234,
+            "cause": {"robot": "robot-2", "number": 17},
+        },
+    ),
+    "update-of-an-unaligned-robot": Update(
+        id=8, topic="live/warehouse", seq=4, key="alignment/robot-7",
+        payload={
+            "kind": "alignment", "robot": "robot-7", "segment": 1, "aligned": False,
+            "reason": "no link is believed yet", "T_map_odom": None, "covariance": None, "version": 1240,
+            "cause": None,
+        },
+    ),
+    "update-of-a-pose": Update(
+        id=8, topic="live/warehouse", seq=5, key="pose/robot-2",
+        payload={
+            "kind": "pose", "robot": "robot-2", "segment": 0, "timestamp_s": 1311868164.25,
+            "T_map_camera": np.array([1, 0, 0, 1.5, 0, 1, 0, 0.0, 0, 0, 1, 3.25, 0, 0, 0, 1.0]),
+        },
+    ),
+    "update-of-a-map": Update(
+        id=8, topic="live/warehouse", seq=9, key="map",
+        payload={"kind": "map", "keyframes": 231, "version": 1250, "owner": "server-1", "state": "live"},
+    ),
+    "failure-of-a-subscription": Failure(
+        id=8, code="forbidden", message="this token does not hold the scope maps:live/warehouse",
+        hint="issue one that does", server="server-1",
+    ),
 }  # fmt: skip
 
 POSES = {
