@@ -8,60 +8,39 @@ from __future__ import annotations
 
 import ctypes
 import math
-import threading
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from rse_pf.geometry import Array, Camera
 from rse_pf.native import address_of, aligned, load_part, open_found
+from rse_pf.native_matcher import MATCH_ABI, Lanes, MatchCore, Workspace, open_matcher
 
 __all__ = ["FrontEndCore", "front_end_core", "open_front_end"]
 
-_ABI = 2
-_FLAGS = {"portable": 1, "avx2": 2, "avx512": 0}
 _BYTES = 32
 _RADIANS = np.float32(math.pi / 180)
 # Of the library, which refuses a level of this scale.
 _MOST_SCALE, _MOST_LEVELS = 1e4, 32
 
-Lanes = Literal["portable", "avx2", "avx512"]
-
-
-class _Room(threading.local):
-    """What a thread lends to the library, so that a frame allocates no more than its results."""
-
-    _words = np.empty(0, dtype=np.uint64)
-
-    def words(self, count: int) -> npt.NDArray[np.uint64]:
-        """Return *count* numbers and more, whose values mean nothing."""
-        if len(self._words) < count:
-            self._words = np.empty(count, dtype=np.uint64)
-        return self._words
-
 
 class FrontEndCore:
-    """The front end of one loaded library; every thread may call it.
-
-    ``lanes`` are the widest instructions it may use, which changes no byte of the results.
-    """
+    """The front end of one loaded library; every thread may call it."""
 
     def __init__(
         self,
         describe: Callable[..., int],
         points_at: Callable[..., int],
-        matches: Callable[..., int],
-        lanes: Lanes,
+        matcher: MatchCore,
     ) -> None:
         self._describe = describe
         self._points_at = points_at
-        self._matches = matches
-        self._room = _Room()
-        self._flags = _FLAGS[lanes]
+        self._matcher = matcher
+        self._workspace = Workspace()
 
     def describe(
         self,
@@ -103,7 +82,7 @@ class FrontEndCore:
         powers = (float(np.float32(scale)) ** level for level in range(levels))
         scales = np.array([min(power, _MOST_SCALE) for power in powers], dtype=np.float32)
         descriptors = np.empty((n, _BYTES), dtype=np.uint8)
-        workspace = self._room.words(3 * width * height // 8 + 7 * width + 64)
+        workspace = self._workspace.words(3 * width * height // 8 + 7 * width + 64)
         done = self._describe(
             address_of(gray), width, height, address_of(scales), levels, address_of(pixels),
             address_of(cosines), address_of(sines), address_of(octaves), n, address_of(workspace),
@@ -158,42 +137,10 @@ class FrontEndCore:
         ratio: float,
         max_matches: int,
     ) -> tuple[Array, Array, Array] | None:
-        """Match the points of a reference view to the pixels of a frame.
-
-        Args:
-            reference: ``(n, 32)``, the descriptors of the reference view.
-            points_camera: ``(n, 3)`` metres; a point whose third coordinate is not finite is not matched.
-            descriptors: ``(m, 32)``, those of the frame.
-            pixels: ``(m, 2)``.
-            frame_points: ``(m, 3)`` metres, the points that the frame shows at *pixels*.
-            ratio: The nearest descriptor must be this much nearer than the second nearest.
-            max_matches: The nearest are kept.
-
-        Returns:
-            Points, pixels, and depths of the pixels (0 where they are not finite), from left to right in the
-            frame, rounded as they are sent; None where the arrays are not uint8 and float64 of these shapes.
-        """
-        n, m = len(reference), len(descriptors)
-        if not (
-            _is(reference, np.uint8, 2) and _is(descriptors, np.uint8, 2)
-            and reference.shape == (n, _BYTES) and descriptors.shape == (m, _BYTES)
-            and _is(points_camera, np.float64, 2) and points_camera.shape == (n, 3)
-            and _is(pixels, np.float64, 2) and pixels.shape == (m, 2)
-            and _is(frame_points, np.float64, 2) and frame_points.shape == (m, 3)
-        ):  # fmt: skip
-            return None
-        reference, points_camera = aligned(reference), aligned(points_camera)
-        descriptors, pixels = aligned(descriptors), aligned(pixels)
-        frame_points = aligned(frame_points)
-        room = min(n, m, max(max_matches, 0))
-        points_world, matched, depths_m = np.empty((room, 3)), np.empty((room, 2)), np.empty(room)
-        workspace = self._room.words(3 * n + 5 * m + 64)
-        count = self._matches(
-            address_of(reference), address_of(points_camera), n, address_of(descriptors), address_of(pixels),
-            address_of(frame_points), m, ratio, room, self._flags, address_of(workspace),
-            address_of(points_world), address_of(matched), address_of(depths_m),
-        )  # fmt: skip
-        return None if count < 0 else (points_world[:count], matched[:count], depths_m[:count])
+        """Match the points of a reference view to the pixels of a frame, as `MatchCore.matches` does."""
+        return self._matcher.matches(
+            reference, points_camera, descriptors, pixels, frame_points, ratio=ratio, max_matches=max_matches
+        )
 
 
 def _is(array: npt.NDArray[Any], kind: type, dimensions: int) -> bool:
@@ -206,8 +153,7 @@ def open_front_end(path: Path, lanes: Lanes = "avx512") -> FrontEndCore:
     Raises:
         ConfigurationError: As `load_part` says.
     """
-    names = "rse_pf_describe", "rse_pf_points_at", "rse_pf_match"
-    describe, points_at, matches = load_part(path, "match", _ABI, *names)
+    describe, points_at = load_part(path, "match", MATCH_ABI, "rse_pf_describe", "rse_pf_points_at")
     pointer, size, number = ctypes.c_void_p, ctypes.c_int64, ctypes.c_double
     describe.argtypes = (
         pointer, size, size, pointer, ctypes.c_int32, *[pointer] * 4, size, pointer, pointer
@@ -215,11 +161,7 @@ def open_front_end(path: Path, lanes: Lanes = "avx512") -> FrontEndCore:
     describe.restype = ctypes.c_int32
     points_at.argtypes = (pointer, size, size, pointer, size, *[number] * 7, pointer)
     points_at.restype = ctypes.c_int32
-    matches.argtypes = (
-        pointer, pointer, size, *[pointer] * 3, size, number, size, ctypes.c_uint32, *[pointer] * 4
-    )  # fmt: skip
-    matches.restype = size
-    return FrontEndCore(describe, points_at, matches, lanes)
+    return FrontEndCore(describe, points_at, open_matcher(path, lanes))
 
 
 @cache

@@ -14,8 +14,8 @@ import pytest
 
 ORDER = (
     "rse_pf", "errors", "terminal", "linux", "limited_process", "files", "geometry", "native",
-    "native_buffers", "token_bucket", "config", "budget", "wire", "scaling", "object_store", "identity",
-    "crash_record", "maps", "auth", "enrolment", "audit", "service",
+    "native_buffers", "native_matcher", "token_bucket", "config", "budget", "wire", "scaling",
+    "object_store", "identity", "crash_record", "maps", "auth", "enrolment", "audit", "service",
     "pnp", "services.mapping", "live_map", "services.custom", "services",
     "aws", "aws.storage", "aws.fleet", "aws.money",
     "backend", "backend.scheduling", "backend.sandbox", "backend.jobs", "backend.live_map", "backend.compute",
@@ -52,6 +52,7 @@ ONLY: dict[str, set[str]] = {
         "files",
         "geometry",
         "native",
+        "native_matcher",
         "token_bucket",
         "maps",
         "wire",

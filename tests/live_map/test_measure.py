@@ -1,0 +1,104 @@
+"""Relative poses of keyframes by their features."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import rse_pf.live_map.measure as measure
+from rse_pf.geometry import inverse, pose_difference
+from rse_pf.live_map.events import matrix_of
+from rse_pf.live_map.keyframe_code import KeyframeFeatures, decode_features, encode_features
+from rse_pf.live_map.measure import MeasureOptions, measure_links
+from rse_pf.maps.format import Keyframe
+from rse_pf.services.synthetic_maps import make_world
+
+WORLD, TRUTH = make_world(3, points=4000).walk("r", np.array([0.0, 0.02, 0.04, 0.5]), seed=1)
+CAMERA = WORLD.keyframes[0].camera
+
+
+def coded(keyframe: Keyframe) -> KeyframeFeatures:
+    depths_m = keyframe.points_camera[:, 2]
+    return decode_features(encode_features(keyframe.pixels, depths_m, keyframe.descriptors), CAMERA)
+
+
+FEATURES = [coded(each) for each in WORLD.keyframes]
+
+
+def numbered(number: int):
+    return number, FEATURES[number], CAMERA
+
+
+def test_a_link_is_the_pose_of_the_other_in_the_frame_of_the_keyframe():
+    found = measure_links(numbered(0), [numbered(1), numbered(2)])
+
+    assert [link.other for link in found.links] == [1, 2]
+    for link in found.links:
+        T = matrix_of(link.T_keyframe_other, 4, 4)
+        metres, degrees = pose_difference(T, inverse(TRUTH[0]) @ TRUTH[link.other])
+        assert metres < 0.02
+        assert degrees < 0.3
+        assert 40 <= link.inliers <= link.matches
+
+
+def test_the_information_is_that_of_an_edge_with_the_floor():
+    options = MeasureOptions()
+    (link,) = measure_links(numbered(0), [numbered(1)], options).links
+
+    covariance = np.linalg.inv(matrix_of(link.information, 6, 6))
+
+    deviations = np.sqrt(np.diag(covariance))
+    assert (deviations[:3] >= 0.02).all()
+    assert (deviations[:3] < 0.04).all()
+    assert (deviations[3:] >= np.radians(0.7)).all()
+
+
+def test_places_that_have_nothing_in_common_fail_with_their_reason():
+    found = measure_links(numbered(0), [numbered(3), numbered(1)])
+
+    assert [link.other for link in found.links] == [1]
+    assert found.failed == {"no-matches": 1}
+
+
+def test_too_few_inliers_are_no_link():
+    found = measure_links(numbered(0), [numbered(1)], MeasureOptions(min_inliers=700))
+
+    assert found.links == ()
+    assert sum(found.failed.values()) == 1
+
+
+def test_a_pose_that_the_evidence_calls_weak_is_no_link():
+    near = FEATURES[0].pixels[:, 0] < 25  # a narrow column of the image
+    narrow = KeyframeFeatures(
+        pixels=FEATURES[0].pixels[near], depths_m=FEATURES[0].depths_m[near],
+        descriptors=FEATURES[0].descriptors[near],
+    )  # fmt: skip
+
+    found = measure_links((0, narrow, CAMERA), [numbered(1)], MeasureOptions(min_inliers=8))
+
+    assert found.links == ()
+    assert found.failed == {"nearly-collinear": 1}
+
+
+def test_the_same_keyframes_give_the_same_bytes():
+    once, again = (measure_links(numbered(0), [numbered(2), numbered(1)]) for _ in range(2))
+
+    assert once == again
+
+
+@pytest.mark.skipif(measure.match_core() is None, reason="the native core is not built: make -C native")
+def test_without_the_native_core_the_links_are_the_same(monkeypatch):
+    native = measure_links(numbered(0), [numbered(1), numbered(3)])
+    monkeypatch.setattr(measure, "match_core", lambda: None)
+
+    assert measure_links(numbered(0), [numbered(1), numbered(3)]) == native
+
+
+def test_a_view_of_fewer_than_two_features_gives_no_link():
+    one = KeyframeFeatures(
+        pixels=FEATURES[0].pixels[:1], depths_m=FEATURES[0].depths_m[:1],
+        descriptors=FEATURES[0].descriptors[:1],
+    )  # fmt: skip
+
+    assert measure_links((0, one, CAMERA), [numbered(1)]).failed == {"no-matches": 1}
+    assert measure_links(numbered(1), [(0, one, CAMERA)]).failed == {"no-matches": 1}
