@@ -177,6 +177,7 @@ class FakeWire:
         self.pauses: list[float] = []
         self.holds = 0
         self.unsent = 0
+        self.max_unsent: int | None = None
         self._codec = codec or make_codec("bin")
 
     def send(self, data: bytes, is_text: bool) -> None:
@@ -184,6 +185,9 @@ class FakeWire:
 
     def unsent_bytes(self) -> int:
         return self.unsent
+
+    def bound_unsent(self, max_bytes: int) -> None:
+        self.max_unsent = max_bytes
 
     def send_pong(self, data: bytes) -> None:
         self.sent.append(data)

@@ -23,6 +23,9 @@ class Wire(Protocol):
     def unsent_bytes(self) -> int:
         """Return how many bytes wait in this process, because the kernel does not take more."""
 
+    def bound_unsent(self, max_bytes: int) -> None:
+        """Let the kernel take no more than *max_bytes* that the network has not taken."""
+
     def send_pong(self, data: bytes) -> None:
         """Write one pong frame."""
 

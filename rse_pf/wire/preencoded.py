@@ -16,7 +16,7 @@ from rse_pf.wire import arrays
 from rse_pf.wire.codec import Codec, deflated
 from rse_pf.wire.messages import Command
 
-__all__ = ["PreencodedCommand", "encode_command", "preencode"]
+__all__ = ["PreencodedCommand", "encode_command", "encode_payload", "preencode"]
 
 _ENVELOPE_LEVEL, _ENVELOPE_MEMORY = 1, 1
 _HEADER = b"\x78\x9c"
@@ -37,12 +37,17 @@ class PreencodedCommand:
 
 def preencode(codec: Codec, payload: Any) -> PreencodedCommand:
     """Encode *payload* for *codec*; raises BadMessage if it cannot be encoded."""
-    try:
-        encoded = _encode_binary(payload) if codec.name == "bin" else _encode_json(payload)
-    except (RecursionError, ValueError, TypeError, OverflowError) as error:
-        raise BadMessage(f"a payload cannot be encoded: {str(error)[:150]}") from error
+    encoded = encode_payload(codec, payload)
     blocks = _blocks(encoded, zlib.Z_SYNC_FLUSH) if codec.name == "zlib" else b""
     return PreencodedCommand(codec=codec.name, encoded=encoded, deflated=blocks)
+
+
+def encode_payload(codec: Codec, payload: Any) -> bytes:
+    """Return *payload* as a message of *codec* contains it, not deflated; raises BadMessage."""
+    try:
+        return _encode_binary(payload) if codec.name == "bin" else _encode_json(payload)
+    except (RecursionError, ValueError, TypeError, OverflowError) as error:
+        raise BadMessage(f"a payload cannot be encoded: {str(error)[:150]}") from error
 
 
 def encode_command(codec: Codec, command: Command) -> bytes:

@@ -176,6 +176,10 @@ class RobotConnection:
         """How much was written that the kernel has not taken, because the robot reads slowly."""
         return self._wire.unsent_bytes()
 
+    def bound_unsent(self, max_bytes: int) -> None:
+        """Let the kernel take no more than *max_bytes* that the network has not taken."""
+        self._wire.bound_unsent(max_bytes)
+
     def refuse_updates(self, identity: int, error: RsePfError) -> None:
         """Write that a subscription ends because of *error*."""
         if self.is_connected and self.session is not None:

@@ -21,6 +21,7 @@ from rse_pf.backend.gateway.idle_timeouts import IdleTimeouts
 from rse_pf.backend.gateway.rate_limits import CUT_OFF
 from rse_pf.backend.gateway.token_watch import TokenWatch
 from rse_pf.backend.jobs.manager import JobManager
+from rse_pf.backend.live_map.router import LIVE_SERVICES, LiveMapRouter
 from rse_pf.backend.metrics import LongestRecently
 from rse_pf.backend.ports import Wire, WorkerContext
 from rse_pf.backend.sandbox.manager import SandboxManager
@@ -41,7 +42,7 @@ from rse_pf.wire import CODECS, Codec, Command, make_codec
 from rse_pf.wire.envelope import Envelope, peek
 from rse_pf.wire.server_session import CLOSE_GOING_AWAY, CLOSE_RATE, ServerSession
 
-__all__ = ["ComputeQueue", "Dispatcher", "JobQueue", "NoQueue", "SandboxQueue"]
+__all__ = ["ComputeQueue", "Dispatcher", "JobQueue", "LiveMapQueue", "NoQueue", "SandboxQueue"]
 
 _DECODER_RETRY_MS = 500.0
 _UNMEASURED_TURN_S = 0.125
@@ -91,6 +92,7 @@ class NoQueue:
 ComputeQueue = ComputeLane[EncodedAnswer] | NoQueue
 SandboxQueue = SandboxManager | NoQueue
 JobQueue = JobManager | NoQueue
+LiveMapQueue = LiveMapRouter | NoQueue
 
 
 class Dispatcher:
@@ -111,6 +113,7 @@ class Dispatcher:
         compute: ComputeQueue,
         sandboxes: SandboxQueue,
         jobs: JobQueue,
+        live_maps: LiveMapQueue,
         token_watch: TokenWatch,
     ) -> None:
         """Take no connection yet; start the solver threads and the timer of idle connections.
@@ -128,6 +131,7 @@ class Dispatcher:
             compute: Runs limited services.
             sandboxes: Runs installed services.
             jobs: Runs long services.
+            live_maps: Takes commands and subscriptions to live maps.
             token_watch: Ends connections whose token is no longer valid.
         """
         settings, monotonic = context.settings, context.clocks.monotonic
@@ -144,7 +148,7 @@ class Dispatcher:
         self._compute = compute
         self._sandboxes = sandboxes
         self._jobs = jobs
-        self._live_maps = NoQueue()
+        self._live_maps = live_maps
         self._token_watch = token_watch
         self._codecs: dict[str, Codec] = {
             name: make_codec(name, settings.session, pnp=wire_types(registry)) for name in CODECS
@@ -162,6 +166,7 @@ class Dispatcher:
             service.name: "compute" if compute.offers(service.name) else of_kind.get(service.kind, "refused")
             for service in registry
         }
+        self._queues |= {name: "live-maps" for name in LIVE_SERVICES if live_maps.offers(name)}
         self._cheap = frozenset(
             service.name
             for service in registry
@@ -187,7 +192,7 @@ class Dispatcher:
     def held(self) -> int:
         """Commands that wait or run."""
         held = self._scheduler.waiting + self._scheduler.running
-        return held + self._compute.held + self._sandboxes.held
+        return held + self._compute.held + self._sandboxes.held + self._live_maps.held
 
     def connect(self, wire: Wire, accepted: Accepted, number: int = 0) -> RobotConnection:
         """Return the connection of a robot whose handshake is done; *number* says which socket it is."""
@@ -218,6 +223,7 @@ class Dispatcher:
         self.connections.discard(connection)
         self._token_watch.left(connection)
         self._jobs.left(connection)
+        self._live_maps.left(connection)
         for queued in self._scheduler.leave(connection) + self._compute.leave(connection):
             self.context.metrics.requests[self._answers.label(queued.command.service), "disconnected"] += 1
         self.context.log.debug("disconnected", robot=connection.robot)
@@ -233,6 +239,7 @@ class Dispatcher:
         """Ask every robot, now and from now on, to leave for another server."""
         self._move = (reason, within_ms)
         self._jobs.give_up()
+        self._live_maps.give_up()
         now = self.context.clocks.monotonic()
         for connection in list(self.connections):
             connection.move(reason, within_ms, now)
@@ -296,9 +303,9 @@ class Dispatcher:
             return
         queue = self._queue_of(command.service)
         turns = self._compute if queue == "compute" else self._scheduler
-        refusal = self._admission.judge(
-            queued, connection.claims, self._backlog(queued, queue), turns.max_delay_s
-        )
+        # A live map judges the scope by its name.
+        claims = None if queue == "live-maps" else connection.claims
+        refusal = self._admission.judge(queued, claims, self._backlog(queued, queue), turns.max_delay_s)
         if refusal is not None:
             if refusal.reason == "behind":
                 turns.note_refused(now)
@@ -312,6 +319,8 @@ class Dispatcher:
             self._sandboxes.submit(queued)
         elif queue == "jobs":
             self._jobs.submit(queued)
+        elif queue == "live-maps":
+            self._live_maps.submit(queued)
         elif queue == "refused":
             error = UnknownService(
                 f"this server cannot run {command.service!r}", hint="choose a stateless service"
@@ -351,6 +360,7 @@ class Dispatcher:
             "cpu_s": self.context.clocks.cpu(),
             "log_lines_dropped": float(self.context.log.dropped),
             **self._compute.report(),
+            **self._live_maps.report(),
             **({"sandboxes": float(isolation["sandboxes"])} if isolation else {}),
         }
         self._lag_s = 0.0
@@ -450,7 +460,11 @@ class Dispatcher:
             return self._scheduler.backlog(queued)
         if queue == "compute":
             return self._compute.backlog(queued)
-        waiting_of = {"sandboxes": self._sandboxes.waiting_of, "jobs": self._jobs.waiting_of}.get(queue)
+        waiting_of = {
+            "sandboxes": self._sandboxes.waiting_of,
+            "jobs": self._jobs.waiting_of,
+            "live-maps": self._live_maps.waiting_of,
+        }.get(queue)
         return (0 if waiting_of is None else waiting_of(queued.robot), 0.0, _UNMEASURED_TURN_S)
 
     # --- timers --------------------------------------------------------------------------------

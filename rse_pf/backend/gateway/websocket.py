@@ -438,6 +438,11 @@ def listener_type(picows: Any, loop: asyncio.AbstractEventLoop, serving: Serving
             size: int = self._transport.underlying_transport.get_write_buffer_size()
             return size
 
+        def bound_unsent(self, max_bytes: int) -> None:
+            accepted = self._transport.underlying_transport.get_extra_info("socket")
+            if accepted is not None:
+                accepted.setsockopt(socket.IPPROTO_TCP, socket.TCP_NOTSENT_LOWAT, max_bytes)
+
         def send_pong(self, data: bytes) -> None:
             self._transport.send_pong(data)
 

@@ -216,6 +216,7 @@ class _Worker:
             compute=self._compute(plan, context, registry, answers),
             sandboxes=self._sandboxes or NoQueue(),
             jobs=self._jobs(plan, answers) if settings.serving.max_running_jobs else NoQueue(),
+            live_maps=NoQueue(),
             token_watch=self._token_watch,
         )
         self._migration = Migration(connections, loop=loop, now=time.monotonic, choose=secrets.choice)

@@ -17,7 +17,13 @@ from rse_pf.backend.gateway.answers import Answers, EncodedAnswer
 from rse_pf.backend.gateway.audit_recorder import AuditRecorder
 from rse_pf.backend.gateway.connection import RobotConnection
 from rse_pf.backend.gateway.decoder_thread import DecoderThread
-from rse_pf.backend.gateway.dispatcher import Dispatcher, JobQueue, NoQueue, SandboxQueue
+from rse_pf.backend.gateway.dispatcher import (
+    Dispatcher,
+    JobQueue,
+    LiveMapQueue,
+    NoQueue,
+    SandboxQueue,
+)
 from rse_pf.backend.gateway.handshake import Accepted, HandshakePolicy
 from rse_pf.backend.gateway.token_watch import TokenWatch
 from rse_pf.backend.log import JsonLog
@@ -51,6 +57,7 @@ class WorkerParts:
         store: MemoryStore | None = None,
         sandboxes: SandboxQueue | None = None,
         jobs: JobQueue | None = None,
+        live_maps: Callable[[WorkerContext, Answers], LiveMapQueue] | None = None,
         processes: LimitedProcesses | None = None,
         emulated_cores: float = 0.0,
     ) -> None:
@@ -104,6 +111,7 @@ class WorkerParts:
             compute=NoQueue() if processes is None else self._lane(processes),
             sandboxes=sandboxes or NoQueue(),
             jobs=jobs or NoQueue(),
+            live_maps=NoQueue() if live_maps is None else live_maps(self.context, self.answers),
             token_watch=self.token_watch,
         )
 

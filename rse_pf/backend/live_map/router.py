@@ -1,0 +1,362 @@
+"""Bring robots' commands to the owners of live maps, and the owners' updates to the robots of one worker.
+
+The worker judges the right, the size and the form of a command; what it means is judged by the map's owner.
+A robot that sends garbage loses the live maps for a while, and nothing else.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import math
+import traceback
+from collections.abc import Callable, Mapping
+from typing import Any, Protocol
+
+import msgspec
+import numpy as np
+
+from rse_pf.auth.roster import scopes_allow
+from rse_pf.auth.tokens import Claims
+from rse_pf.backend.live_map.garbage import GarbageCounts
+from rse_pf.backend.live_map.subscriptions import Reader, Subscriptions
+from rse_pf.backend.ports import WorkerContext
+from rse_pf.backend.scheduling.scheduler import QueuedCommand
+from rse_pf.errors import (
+    BadMessage,
+    BadRequest,
+    Busy,
+    Expired,
+    Forbidden,
+    InternalError,
+    InvalidCamera,
+    LimitExceeded,
+    RsePfError,
+)
+from rse_pf.identity import RobotId
+from rse_pf.service import failure_of
+from rse_pf.wire import Failure, Result, as_type
+from rse_pf.wire.live_map import (
+    MAX_FEATURES_BYTES,
+    KeyframeRequest,
+    LiveForget,
+    LiveMapRequest,
+    LiveRelocalise,
+    LiveStart,
+    map_of_topic,
+)
+
+__all__ = ["LIVE_LIST", "LIVE_SERVICES", "LiveMapRouter", "MapOwners"]
+
+LIVE_LIST = "live-list"
+_REQUESTS: dict[str, type[Any]] = {
+    "live-keyframe": KeyframeRequest,
+    "live-relocalise": LiveRelocalise,
+    "live-leave": LiveMapRequest,
+    "live-show": LiveMapRequest,
+    "live-publish": LiveMapRequest,
+    "live-stop": LiveMapRequest,
+    "live-forget": LiveForget,
+    "live-start": LiveStart,
+}
+LIVE_SERVICES = frozenset((*_REQUESTS, LIVE_LIST))
+"""The commands that go to the owner of a live map."""
+
+_FOR_OPERATORS = frozenset(("live-publish", "live-stop", "live-forget", "live-start"))
+_MAX_HELD_BYTES = 64 << 20
+"""Size of all messages that wait for owners; while a store is slow, robots keep the others."""
+_BUSY_RETRY_MS = 500.0
+_IS_GARBAGE = (BadRequest.code, BadMessage.code, LimitExceeded.code, InvalidCamera.code)
+_RIGID = 1e-3
+"""How far a rotation may be from one, in any number of R^T R - I; float32 and decimal digits stay below."""
+
+
+class MapOwners(Protocol):
+    """What is needed of the owners of maps; `rse_pf.backend.live_map.link.OwnerLinks` is one."""
+
+    async def request(
+        self,
+        tenant: str,
+        map_name: str,
+        robot: RobotId,
+        operation: str,
+        payload: dict[str, Any],
+        deadline_s: float,
+    ) -> dict[str, Any]:
+        """Return the owner's answer; raises RsePfError."""
+
+    async def list_maps(self, tenant: str) -> list[dict[str, Any]]:
+        """Return the live maps of *tenant*; raises RsePfError."""
+
+    def watch(self, tenant: str, map_name: str) -> None:
+        """Ask for the updates of a map."""
+
+    def unwatch(self, tenant: str, map_name: str) -> None:
+        """Ask for no more updates of a map."""
+
+    def give_up(self) -> None:
+        """Release the maps of this server, which drains."""
+
+    async def close(self) -> None:
+        """End all connections to owners."""
+
+
+class LiveMapRouter:
+    """The live maps as the robots of one worker see them."""
+
+    def __init__(
+        self,
+        context: WorkerContext,
+        *,
+        owners: Callable[[Callable[[str, str, dict[str, Any]], None]], MapOwners],
+        answer: Callable[[QueuedCommand, Result | Failure], None],
+    ) -> None:
+        """Ask no owner yet.
+
+        Args:
+            context: Of the worker.
+            owners: Makes the connections to owners; is given what takes an update: tenant, map, payload.
+            answer: Called exactly once for each submitted command.
+        """
+        self._context = context
+        self._monotonic = context.clocks.monotonic
+        self._answer = answer
+        self._owners = owners(self.update)
+        self._garbage = GarbageCounts()
+        self._tasks: dict[asyncio.Task[None], QueuedCommand] = {}
+        self._held_bytes = 0
+        self._waiting: dict[RobotId, int] = {}
+        self._subscriptions = Subscriptions(
+            loop=context.loop, log=context.log, watch=self._owners.watch, unwatch=self._owners.unwatch
+        )
+
+    @property
+    def held(self) -> int:
+        """Commands that have no answer yet."""
+        return len(self._tasks)
+
+    def offers(self, service: str) -> bool:
+        """Return whether *service* is a command to a live map."""
+        return service in LIVE_SERVICES
+
+    def waiting_of(self, robot: RobotId) -> int:
+        """Return how many commands of *robot* have no answer yet."""
+        return self._waiting.get(robot, 0)
+
+    # --- commands ------------------------------------------------------------------------------
+
+    def submit(self, queued: QueuedCommand) -> None:
+        """Pass a command to the owner of its map; the answer comes later, or at once if it is refused."""
+        now = self._monotonic()
+        try:
+            self._check_garbage(queued.robot, now)
+            if self._held_bytes + queued.size_bytes > _MAX_HELD_BYTES:
+                raise Busy(
+                    "too many commands wait for live maps", hint="try again later",
+                    retry_after_ms=_BUSY_RETRY_MS,
+                )  # fmt: skip
+            work = self._judged(queued, now)
+        except RsePfError as error:
+            self._fail(queued, error)
+            return
+        task = self._context.loop.create_task(self._follow(queued, work))
+        self._tasks[task] = queued
+        self._held_bytes += queued.size_bytes
+        self._waiting[queued.robot] = self._waiting.get(queued.robot, 0) + 1
+        task.add_done_callback(self._done)
+
+    def _judged(self, queued: QueuedCommand, now: float) -> Callable[[], Any]:
+        """Return what asks the owner; raises RsePfError for a request that is not allowed or not valid."""
+        command, claims = queued.command, queued.owner.claims
+        robot, service = queued.robot, command.service
+        deadline_s = queued.deadline_s - now
+        if service == LIVE_LIST:
+            return lambda: self._list(robot.tenant, claims)
+        _check_features(command.payload)
+        try:
+            request = as_type({} if command.payload is None else command.payload, _REQUESTS[service])
+        except BadMessage as error:
+            raise BadRequest(f"{service}: {error.message}", hint=error.hint) from error
+        right = "maps:write" if service in _FOR_OPERATORS else "maps:live"
+        forbidden = _forbidden(claims, right, request.map)
+        if forbidden is not None:
+            raise forbidden
+        payload = _payload_of(request)
+        return lambda: self._owners.request(robot.tenant, request.map, robot, service, payload, deadline_s)
+
+    async def _list(self, tenant: str, claims: Claims | None) -> dict[str, Any]:
+        """Return the maps of a tenant that a robot may enter."""
+        maps = await self._owners.list_maps(tenant)
+        return {
+            "maps": [each for each in maps if _forbidden(claims, "maps:live", str(each.get("map"))) is None]
+        }
+
+    async def _follow(self, queued: QueuedCommand, work: Callable[[], Any]) -> None:
+        """Answer one command with what its owner says, within its deadline."""
+        started = self._monotonic()
+        command, server = queued.command, self._context.server_id
+        queued.started_s = started
+        try:
+            reply = await asyncio.wait_for(work(), max(0.0, queued.deadline_s - started))
+        except asyncio.TimeoutError:
+            late = Expired("the live map did not answer in time", hint="send it again: nothing counts twice")
+            self._fail(queued, late)
+        except RsePfError as error:
+            self._fail(queued, error)
+        except Exception as error:  # noqa: BLE001  a defect must not leave the robot without an answer
+            text = "".join(traceback.format_exception(type(error), error, error.__traceback__))
+            self._context.log.error("defect", service=command.service, trace=command.trace, traceback=text)
+            self._fail(queued, InternalError("the live map failed", hint="see the server's log"))
+        else:
+            compute_ms = (self._monotonic() - started) * 1e3
+            result = Result(id=command.id, reply=_with_arrays(reply), server=server, compute_ms=compute_ms)
+            self._answer(queued, result)
+
+    def _done(self, task: asyncio.Task[None]) -> None:
+        queued = self._tasks.pop(task)
+        self._held_bytes -= queued.size_bytes
+        left = self._waiting.pop(queued.robot) - 1
+        if left:
+            self._waiting[queued.robot] = left
+
+    def _fail(self, queued: QueuedCommand, error: RsePfError) -> None:
+        if error.code in _IS_GARBAGE:
+            self._garbage.note(queued.robot, self._monotonic())
+        self._answer(queued, failure_of(error, queued.command, server=self._context.server_id))
+
+    def _check_garbage(self, robot: RobotId, now: float) -> None:
+        left_s = self._garbage.cut_off_s(robot, now)
+        if left_s > 0:
+            self._context.metrics.shed["live-garbage"] += 1
+            raise Forbidden(
+                f"this robot sent too many invalid requests to live maps; they are closed to it for "
+                f"{left_s:.0f} s",
+                hint="update the robot's SDK, or correct what it sends",
+            )
+
+    # --- updates -------------------------------------------------------------------------------
+
+    def subscribe(self, connection: Any, identity: int, topic: str) -> None:
+        """Begin the updates of a live map for a robot's connection, or refuse them."""
+        tenant, reader = connection.robot.tenant, connection
+        try:
+            map_name = map_of_topic(topic)
+            forbidden = _forbidden(connection.claims, "maps:live", map_name)
+            if forbidden is not None:
+                raise forbidden
+        except RsePfError as error:
+            connection.refuse_updates(identity, error)
+            return
+        judged = connection.claims
+
+        def may_go_on() -> RsePfError | None:
+            nonlocal judged
+            if connection.claims is judged:
+                return None
+            judged = connection.claims
+            return _forbidden(judged, "maps:live", map_name)
+
+        first = {"kind": "map", "keyframes": 0, "version": 0, "owner": "", "state": "moving"}
+        self._subscriptions.begin(reader, identity, tenant, map_name, first=first, may_go_on=may_go_on)
+
+    def unsubscribe(self, connection: Reader, identity: int) -> None:
+        """End a subscription."""
+        self._subscriptions.end(connection, identity)
+
+    def left(self, connection: Reader) -> None:
+        """Forget the subscriptions of a connection that ended; its keyframes go on to their map."""
+        self._subscriptions.left(connection)
+
+    def update(self, tenant: str, map_name: str, payload: dict[str, Any]) -> None:
+        """Take an update of an owner; ``key`` is that of "latest wins" and no part of the payload."""
+        told = _with_arrays(payload)
+        kind, robot = str(told.get("kind", "")), told.get("robot")
+        key = told.pop("key", None) or (kind if robot is None else f"{kind}/{robot}")
+        self._subscriptions.update(tenant, map_name, str(key), told)
+
+    # --- the whole -----------------------------------------------------------------------------
+
+    def report(self) -> dict[str, float]:
+        """Return the gauges of this worker."""
+        subscriptions = self._subscriptions
+        return {
+            "subscriptions": float(len(subscriptions)),
+            "updates": float(subscriptions.sent),
+            "updates_replaced": float(subscriptions.replaced),
+            "live_waiting": float(self.held),
+        }
+
+    def give_up(self) -> None:
+        """Leave the maps of this server to others: it drains."""
+        self._owners.give_up()
+
+    async def close(self) -> None:
+        """End what waits, and the connections to owners."""
+        for task in list(self._tasks):
+            task.cancel()
+        await asyncio.gather(*self._tasks, return_exceptions=True)
+        await self._owners.close()
+
+
+def _forbidden(claims: Claims | None, right: str, map_name: str) -> RsePfError | None:
+    """Return why a token does not give *right* on a map; None if it does, or if none is required."""
+    if claims is None or scopes_allow(claims.scopes, right, map_name):
+        return None
+    return Forbidden(f"this token does not hold the scope {right}/{map_name}", hint="issue one that does")
+
+
+def _check_features(payload: Any) -> None:
+    """Raise LimitExceeded if the features are too long, before anything is made from them."""
+    features = payload.get("features") if isinstance(payload, dict) else None
+    size = 0
+    if isinstance(features, str):  # base64: four characters for three bytes
+        size = len(features) // 4 * 3 - 2
+    elif isinstance(features, bytes | bytearray | memoryview):
+        size = len(features)
+    if size > MAX_FEATURES_BYTES:
+        raise LimitExceeded(
+            f"the features of a keyframe are {size} bytes, above {MAX_FEATURES_BYTES}",
+            hint="send fewer features",
+        )
+
+
+def _payload_of(request: Any) -> dict[str, Any]:
+    """Return a judged request as the owner's link takes it: plain values, matrices as bytes."""
+    payload: dict[str, Any] = msgspec.structs.asdict(request)
+    del payload["map"]
+    if isinstance(request, KeyframeRequest):
+        if not math.isfinite(request.timestamp_s):
+            raise BadRequest("timestamp_s is no finite number", hint="send seconds")
+        payload["T_odom_camera"] = _rigid(request.T_odom_camera)
+    if isinstance(request, KeyframeRequest | LiveRelocalise):
+        camera = request.camera
+        payload["camera"] = [camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height]
+    if isinstance(request, LiveStart):
+        payload["from"] = payload.pop("source")
+    return payload
+
+
+def _rigid(numbers: Any) -> bytes:
+    """Return a pose as its 16 float64, little-endian; raises BadRequest if it is none."""
+    if numbers.size == 16:
+        T = numbers.reshape(4, 4)
+        turn = T[:3, :3]
+        if (
+            np.abs(turn.T @ turn - np.eye(3)).max() < _RIGID
+            and np.linalg.det(turn) > 0
+            and np.array_equal(T[3], (0.0, 0.0, 0.0, 1.0))
+        ):
+            return bytes(T.astype("<f8").tobytes())
+    raise BadRequest(
+        "T_odom_camera is no pose: it takes 16 numbers of a rotation and a translation",
+        hint="send it row after row, the last row 0 0 0 1",
+    )
+
+
+def _with_arrays(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return *values* with matrices that came as bytes as arrays, which every codec can encode."""
+    return {
+        name: np.frombuffer(value, "<f8")
+        if isinstance(value, bytes) and (name.startswith("T_") or name == "covariance")
+        else value
+        for name, value in values.items()
+    }

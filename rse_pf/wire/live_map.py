@@ -1,0 +1,163 @@
+"""What robots and live maps tell each other: the requests of the services ``live-*``, replies and updates.
+
+``docs/protocol.md`` describes the same in words.  Poses are ``(4, 4)``, row-major, flat; a covariance holds
+the 21 numbers of the upper triangle, row after row, of the ``(6, 6)`` covariance of the twist (metres, then
+radians) on the left of its pose.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+import msgspec
+
+from rse_pf.errors import BadRequest
+from rse_pf.geometry import Camera
+from rse_pf.wire.arrays import Array
+
+__all__ = [
+    "LIVE_TOPIC",
+    "MAX_FEATURES_BYTES",
+    "AlignmentUpdate",
+    "KeyframeKept",
+    "KeyframeRequest",
+    "LiveForget",
+    "LiveMapRequest",
+    "LiveRelocalise",
+    "LiveStart",
+    "MapCause",
+    "MapUpdate",
+    "PoseUpdate",
+    "RelocaliseReply",
+    "live_topic",
+    "map_of_topic",
+]
+
+LIVE_TOPIC = "live/"
+"""Beginning of the topics of live maps; the name of the map follows."""
+MAX_FEATURES_BYTES = 34_000
+"""The encoded features of one keyframe."""
+
+_MapName = Annotated[str, msgspec.Meta(pattern=r"^[a-z0-9][a-z0-9-]{0,63}\Z")]
+_Count = Annotated[int, msgspec.Meta(ge=0, le=2**53 - 1)]
+
+
+class _Value(msgspec.Struct, frozen=True, kw_only=True):
+    """Unknown fields are ignored."""
+
+
+class LiveMapRequest(_Value, frozen=True, kw_only=True):
+    """``live-leave``, ``live-show``, ``live-publish`` and ``live-stop``: the name of a map of the tenant."""
+
+    map: _MapName
+
+
+class KeyframeRequest(_Value, frozen=True, kw_only=True):
+    """``live-keyframe``: one keyframe of the robot that sends it.
+
+    ``segment`` counts the robot's odometry frames, ``number`` its keyframes over all segments, both from 0.
+    ``features`` is encoded as `rse_pf.live_map.keyframe_code` says.
+    """
+
+    map: _MapName
+    segment: _Count
+    number: _Count
+    timestamp_s: float
+    T_odom_camera: Array
+    camera: Camera
+    features: Annotated[bytes, msgspec.Meta(max_length=MAX_FEATURES_BYTES)]
+
+
+class KeyframeKept(_Value, frozen=True, kw_only=True):
+    """The keyframe is durable: the ``number`` that comes next, and the position in the map's log."""
+
+    number: int
+    version: int
+
+
+class LiveRelocalise(_Value, frozen=True, kw_only=True):
+    """``live-relocalise``: where in the map is the camera that sees these features?"""
+
+    map: _MapName
+    camera: Camera
+    features: Annotated[bytes, msgspec.Meta(max_length=MAX_FEATURES_BYTES)]
+
+
+class RelocaliseReply(_Value, frozen=True, kw_only=True):
+    """The pose with its verdict, and why it is not ``ok``; ``none`` comes without a pose."""
+
+    verdict: Literal["ok", "weak", "none"]
+    reason: str = ""
+    T_map_camera: Array | None = None
+    covariance: Array | None = None
+    inliers: int = 0
+    matches: int = 0
+    version: int = 0
+
+
+class LiveForget(_Value, frozen=True, kw_only=True):
+    """``live-forget``: take out of the map what one robot contributed."""
+
+    map: _MapName
+    robot: Annotated[str, msgspec.Meta(min_length=1, max_length=64)]
+
+
+class LiveStart(_Value, frozen=True, kw_only=True):
+    """``live-start``: begin the map with a version of the registry, NAME or NAME@VERSION."""
+
+    map: _MapName
+    source: Annotated[str, msgspec.Meta(min_length=1, max_length=160)] = msgspec.field(name="from")
+
+
+class MapCause(_Value, frozen=True, kw_only=True):
+    """The keyframe that caused a correction."""
+
+    robot: str
+    number: int
+
+
+class AlignmentUpdate(_Value, frozen=True, kw_only=True):
+    """Payload of the key ``alignment/ROBOT``: where a robot's odometry frame lies in the map."""
+
+    robot: str
+    segment: int
+    aligned: bool
+    reason: str = ""
+    T_map_odom: Array | None = None
+    covariance: Array | None = None
+    version: int = 0
+    cause: MapCause | None = None
+
+
+class PoseUpdate(_Value, frozen=True, kw_only=True):
+    """Payload of the key ``pose/ROBOT``: where a robot's newest keyframe was made."""
+
+    robot: str
+    segment: int
+    timestamp_s: float
+    T_map_camera: Array
+
+
+class MapUpdate(_Value, frozen=True, kw_only=True):
+    """Payload of the key ``map``: its size, and who serves it."""
+
+    keyframes: int
+    version: int
+    owner: str = ""
+    state: str = "live"
+
+
+def live_topic(map_name: str) -> str:
+    """Return the topic of the updates of a live map."""
+    return LIVE_TOPIC + map_name
+
+
+def map_of_topic(topic: str) -> str:
+    """Return the name of the live map that *topic* is about; raises BadRequest."""
+    name = topic.removeprefix(LIVE_TOPIC)
+    try:
+        if name == topic:
+            raise ValueError
+        return msgspec.convert(name, _MapName)
+    except (ValueError, msgspec.ValidationError) as error:
+        raise BadRequest(f"no topic {topic[:80]!r}", hint="topics of live maps are live/NAME") from error

@@ -1,0 +1,405 @@
+"""Commands to live maps: their rights, sizes and forms, their answers, and who is cut off."""
+
+from __future__ import annotations
+
+import asyncio
+import base64
+import time
+from collections.abc import Awaitable, Callable
+from contextlib import suppress
+from typing import Any
+
+import numpy as np
+import pytest
+from backend.gateway.worker_parts import quiet_log
+from backend.live_map.fake_owners import FakeOwners, FakeReader
+
+from rse_pf.auth.tokens import Claims
+from rse_pf.backend.live_map.router import LiveMapRouter
+from rse_pf.backend.ports import Clocks, WorkerContext
+from rse_pf.backend.scheduling.scheduler import QueuedCommand
+from rse_pf.config import PlatformSettings
+from rse_pf.errors import BadRequest, Busy
+from rse_pf.identity import RobotId
+from rse_pf.wire import Command, Failure, Result, Update
+
+CAMERA = {"fx": 525.0, "fy": 525.0, "cx": 319.5, "cy": 239.5, "width": 640, "height": 480}
+POSE = [1, 0, 0, 0.5, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]
+
+
+def keyframe(number: int = 0, **changes: Any) -> dict[str, Any]:
+    return {
+        "map": "m", "segment": 0, "number": number, "timestamp_s": 1.5, "T_odom_camera": POSE,
+        "camera": CAMERA, "features": b"\x01" * 100, **changes,
+    }  # fmt: skip
+
+
+def claims(*scopes: str, tenant: str = "default") -> Claims:
+    return Claims(
+        robot=RobotId(tenant, "r"), token_id="t", issued_s=0.0, expires_s=1e9, key_id="k", scopes=scopes
+    )
+
+
+class Parts:
+    """A router in the running event loop; its clock moves only when a test says so."""
+
+    def __init__(self, context: WorkerContext) -> None:
+        self.context = context
+        self.answers: list[Result | Failure] = []
+        self.router = LiveMapRouter(
+            context, owners=self._owners, answer=lambda queued, message: self.answers.append(message)
+        )
+
+    def _owners(self, on_update: Any) -> FakeOwners:
+        self.owners = FakeOwners(on_update)
+        return self.owners
+
+    def submit(
+        self,
+        service: str,
+        payload: Any,
+        *,
+        connection: FakeReader | None = None,
+        allowed_s: float = 5.0,
+        size_bytes: int = 40_000,
+    ) -> None:
+        owner = connection or FakeReader()
+        now = self.context.clocks.monotonic()
+        command = Command(id=len(self.answers), service=service, payload=payload, trace="t")
+        self.router.submit(QueuedCommand(owner, owner.robot, command, size_bytes, now, now + allowed_s))
+
+    async def ask(self, service: str, payload: Any, **more: Any) -> Result | Failure:
+        before = len(self.answers)
+        self.submit(service, payload, **more)
+        while len(self.answers) == before:
+            await asyncio.sleep(0)
+        return self.answers[-1]
+
+
+def with_router(test: Callable[[Parts], Awaitable[None]], now: list[float] | None = None) -> None:
+    """Run *test* with a router; its clock shows ``now[0]``, or the real time."""
+    monotonic = time.monotonic if now is None else lambda: now[0]
+
+    async def run() -> None:
+        with quiet_log() as log:
+            context = WorkerContext(
+                settings=PlatformSettings(), server_id="s-1", log=log, loop=asyncio.get_running_loop(),
+                clocks=Clocks(monotonic=monotonic, wall=time.time, cpu=time.process_time),
+            )  # fmt: skip
+            parts = Parts(context)
+            await asyncio.wait_for(test(parts), 20.0)
+            await parts.router.close()
+            assert parts.owners.closed
+
+    asyncio.run(run())
+
+
+def test_a_keyframe_goes_to_the_owner_of_its_tenants_map_and_the_reply_comes_back() -> None:
+    async def test(parts: Parts) -> None:
+        answer = await parts.ask("live-keyframe", keyframe(), connection=FakeReader("bob", tenant="acme"))
+
+        assert isinstance(answer, Result)
+        assert answer.reply == {"number": 1, "version": 1}
+        assert answer.server == "s-1"
+        [(tenant, name, robot, operation, payload, deadline_s)] = parts.owners.asked
+        assert (tenant, name, robot, operation) == ("acme", "m", RobotId("acme", "bob"), "live-keyframe")
+        assert 4.0 < deadline_s <= 5.0
+        assert payload == {
+            "segment": 0, "number": 0, "timestamp_s": 1.5, "features": b"\x01" * 100,
+            "T_odom_camera": np.array(POSE, "<f8").tobytes(),
+            "camera": [525.0, 525.0, 319.5, 239.5, 640, 480],
+        }  # fmt: skip
+
+    with_router(test)
+
+
+def test_features_arrive_the_same_from_json_and_from_messagepack() -> None:
+    async def test(parts: Parts) -> None:
+        features = bytes(range(256)) * 100
+        for number, sent in enumerate((features, base64.b64encode(features).decode())):
+            await parts.ask("live-keyframe", keyframe(number, features=sent))
+
+        assert [asked[4]["features"] for asked in parts.owners.asked] == [features] * 2
+
+    with_router(test)
+
+
+def test_a_keyframe_ahead_of_the_next_number_is_a_conflict_and_no_garbage() -> None:
+    async def test(parts: Parts) -> None:
+        for _ in range(20):
+            answer = await parts.ask("live-keyframe", keyframe(5))
+
+            assert isinstance(answer, Failure)
+            assert (answer.code, answer.trace) == ("conflict", "t")
+            assert answer.hint
+
+    with_router(test)
+
+
+TOO_LONG = 34_001
+WRONG = [
+    ({"map": "Kitchen"}, "bad-request"),
+    ({"map": "../x"}, "bad-request"),
+    ({"segment": -1}, "bad-request"),
+    ({"number": 1.5}, "bad-request"),
+    ({"timestamp_s": float("nan")}, "bad-request"),
+    ({"T_odom_camera": POSE[:12]}, "bad-request"),
+    ({"T_odom_camera": [2 * each for each in POSE]}, "bad-request"),
+    ({"T_odom_camera": [-1, *POSE[1:]]}, "bad-request"),
+    ({"T_odom_camera": [float("inf"), *POSE[1:]]}, "bad-request"),
+    ({"camera": {**CAMERA, "fx": -1.0}}, "invalid-camera"),
+    ({"features": 7}, "bad-request"),
+    ({"features": "no base64!"}, "bad-request"),
+    ({"features": b"x" * TOO_LONG}, "too-large"),
+    ({"features": "eHh4" * (TOO_LONG // 3 + 2)}, "too-large"),
+]
+
+
+@pytest.mark.parametrize(("changes", "code"), WRONG)
+def test_an_invalid_keyframe_is_refused_before_any_owner_sees_it(changes: Any, code: str) -> None:
+    async def test(parts: Parts) -> None:
+        answer = await parts.ask("live-keyframe", keyframe(**changes))
+
+        assert isinstance(answer, Failure)
+        assert (answer.code, bool(answer.hint)) == (code, True), answer
+        assert parts.owners.asked == []
+
+    with_router(test)
+
+
+@pytest.mark.parametrize("payload", [None, 3, [], "m", {}])
+def test_a_payload_of_another_form_is_a_bad_request(payload: Any) -> None:
+    async def test(parts: Parts) -> None:
+        answer = await parts.ask("live-show", payload)
+
+        assert isinstance(answer, Failure)
+        assert answer.code == "bad-request"
+
+    with_router(test)
+
+
+RIGHTS = [
+    ("live-keyframe", ("maps:live/m",), True),
+    ("live-keyframe", ("maps:live",), True),
+    ("live-keyframe", ("maps:*",), True),
+    ("live-keyframe", (), True),
+    ("live-keyframe", ("maps:live/other",), False),
+    ("live-keyframe", ("maps:write", "services:*"), False),
+    ("live-show", ("maps:read",), False),
+    ("live-forget", ("maps:live/m",), False),
+    ("live-forget", ("maps:write/m",), True),
+    ("live-stop", ("maps:live",), False),
+    ("live-publish", ("maps:write",), True),
+    ("live-start", ("maps:write/other",), False),
+]
+
+
+@pytest.mark.parametrize(("service", "scopes", "allowed"), RIGHTS)
+def test_the_scope_of_the_map_decides(service: str, scopes: tuple[str, ...], allowed: bool) -> None:
+    async def test(parts: Parts) -> None:
+        connection = FakeReader()
+        connection.claims = claims(*scopes)
+        payload = {**keyframe(), "robot": "bob", "from": "m@ab12"}
+        parts.owners.answer = lambda operation, payload: {}
+
+        answer = await parts.ask(service, payload, connection=connection)
+
+        assert isinstance(answer, Result) is allowed
+        assert len(parts.owners.asked) == allowed
+        assert allowed or (isinstance(answer, Failure) and answer.code == "forbidden")
+
+    with_router(test)
+
+
+def test_a_robot_lists_the_maps_of_its_tenant_that_it_may_enter() -> None:
+    async def test(parts: Parts) -> None:
+        parts.owners.maps = {"default": [{"map": "a"}, {"map": "b"}], "acme": [{"map": "secret"}]}
+        connection = FakeReader()
+        connection.claims = claims("maps:live/b")
+
+        answer = await parts.ask("live-list", None, connection=connection)
+
+        assert isinstance(answer, Result)
+        assert answer.reply == {"maps": [{"map": "b"}]}
+
+    with_router(test)
+
+
+def test_an_owner_that_does_not_answer_ends_with_the_deadline() -> None:
+    async def test(parts: Parts) -> None:
+        parts.owners.answer = lambda operation, payload: None
+
+        answer = await parts.ask("live-show", {"map": "m"}, allowed_s=0.02)
+
+        assert isinstance(answer, Failure)
+        assert answer.code == "expired"
+        assert (parts.router.held, parts.router.waiting_of(RobotId("default", "r"))) == (1, 1)
+        await asyncio.sleep(0)
+        assert (parts.router.held, parts.router.waiting_of(RobotId("default", "r"))) == (0, 0)
+
+    with_router(test)
+
+
+def test_while_the_owner_changes_a_robot_is_told_when_to_ask_again() -> None:
+    async def test(parts: Parts) -> None:
+        parts.owners.answer = lambda *_: Busy("the owner changes", hint="wait", retry_after_ms=300.0)
+
+        answer = await parts.ask("live-show", {"map": "m"})
+
+        assert isinstance(answer, Failure)
+        assert (answer.code, answer.retry_after_ms) == ("busy", 300.0)
+
+    with_router(test)
+
+
+def test_a_defect_is_an_internal_failure_without_its_text() -> None:
+    async def test(parts: Parts) -> None:
+        def broken(operation: str, payload: dict[str, Any]) -> dict[str, Any]:
+            raise ZeroDivisionError("secret")
+
+        parts.owners.answer = broken
+
+        answer = await parts.ask("live-show", {"map": "m"})
+
+        assert isinstance(answer, Failure)
+        assert answer.code == "internal"
+        assert "secret" not in answer.message + answer.hint
+
+    with_router(test)
+
+
+def test_a_sender_of_garbage_loses_the_live_maps_for_a_while_and_the_others_do_not() -> None:
+    now = [100.0]
+
+    async def test(parts: Parts) -> None:
+        hostile, good = FakeReader("hostile"), FakeReader("good")
+        parts.owners.answer = lambda operation, payload: (
+            BadRequest("these are no features") if payload["features"][:1] == b"\x00" else {}
+        )
+        for _ in range(9):
+            await parts.ask("live-keyframe", keyframe(features=b"\x00"), connection=hostile)
+        assert isinstance(await parts.ask("live-keyframe", keyframe(), connection=hostile), Result)
+
+        await parts.ask("live-keyframe", keyframe(features=5), connection=hostile)
+        asked = len(parts.owners.asked)
+        refused = await parts.ask("live-keyframe", keyframe(), connection=hostile)
+
+        assert isinstance(refused, Failure)
+        assert refused.code == "forbidden"
+        assert len(parts.owners.asked) == asked
+        assert isinstance(await parts.ask("live-keyframe", keyframe(), connection=good), Result)
+        now[0] += 61.0
+        assert isinstance(await parts.ask("live-keyframe", keyframe(), connection=hostile), Result)
+
+    with_router(test, now)
+
+
+def test_more_bytes_than_one_worker_holds_are_busy() -> None:
+    async def test(parts: Parts) -> None:
+        parts.owners.answer = lambda operation, payload: None
+        for _ in range(2):
+            parts.submit("live-show", {"map": "m"}, size_bytes=30 << 20)
+
+        answer = await parts.ask("live-show", {"map": "m"}, size_bytes=30 << 20)
+
+        assert isinstance(answer, Failure)
+        assert answer.code == "busy"
+        assert answer.retry_after_ms
+        assert parts.router.held == 2
+
+    with_router(test)
+
+
+async def settled(reader: FakeReader, count: int) -> list[Update]:
+    """Return what *reader* got once it got *count* messages."""
+    deadline = time.monotonic() + 10.0
+    while len(reader.written) < count:
+        assert time.monotonic() < deadline
+        await asyncio.sleep(0.001)
+    return reader.written
+
+
+def test_two_workers_tell_their_robots_the_same() -> None:
+    async def test(parts: Parts) -> None:
+        other = Parts(parts.context)
+        here, there = FakeReader("here", codec="bin"), FakeReader("there")
+        parts.router.subscribe(here, 1, "live/m")
+        other.router.subscribe(there, 2, "live/m")
+        payload = {
+            "kind": "alignment", "robot": "here", "aligned": True,
+            "T_map_odom": np.eye(4).astype("<f8").tobytes(), "covariance": np.arange(21.0).tobytes(),
+        }  # fmt: skip
+        for each in (parts, other):
+            assert each.owners.watched == [("default", "m")]
+            each.owners.on_update("default", "m", payload)
+            each.owners.on_update("default", "m", {"kind": "map", "keyframes": 3, "key": "map"})
+
+        for reader in (here, there):
+            updates = {each.key: each.payload for each in await settled(reader, 2)}
+            assert updates.keys() == {"map", "alignment/here"}
+            assert updates["map"] == {"kind": "map", "keyframes": 3}
+            np.testing.assert_array_equal(updates["alignment/here"]["T_map_odom"], np.eye(4).ravel())
+            np.testing.assert_array_equal(updates["alignment/here"]["covariance"], np.arange(21.0))
+        assert parts.router.report()["subscriptions"] == 1.0
+        assert parts.router.report()["updates"] == 2.0
+        await other.router.close()
+
+    with_router(test)
+
+
+@pytest.mark.parametrize(
+    ("topic", "scopes", "code"),
+    [
+        ("live/m", ("maps:live/other",), "forbidden"),
+        ("live/m", ("maps:write",), "forbidden"),
+        ("platform", (), "bad-request"),
+        ("live/../m", (), "bad-request"),
+    ],
+)
+def test_a_subscription_that_is_not_allowed_is_refused_by_its_id(
+    topic: str, scopes: tuple[str, ...], code: str
+) -> None:
+    async def test(parts: Parts) -> None:
+        reader = FakeReader()
+        reader.claims = claims(*scopes)
+
+        parts.router.subscribe(reader, 9, topic)
+
+        [failure] = reader.written
+        assert (failure.id, failure.code) == (9, code)
+        assert parts.owners.watched == []
+
+    with_router(test)
+
+
+def test_a_right_that_a_fresh_token_does_not_give_ends_the_subscription() -> None:
+    async def test(parts: Parts) -> None:
+        reader = FakeReader()
+        reader.claims = claims("maps:live/m")
+        parts.router.subscribe(reader, 9, "live/m")
+        await settled(reader, 1)
+
+        reader.claims = claims("maps:live/other")
+        parts.owners.on_update("default", "m", {"kind": "map", "keyframes": 1})
+
+        failure: Any = (await settled(reader, 2))[1]
+        assert (failure.id, failure.code) == (9, "forbidden")
+        assert parts.owners.unwatched == [("default", "m")]
+
+    with_router(test)
+
+
+def test_closing_ends_what_waits() -> None:
+    async def test(parts: Parts) -> None:
+        parts.owners.answer = lambda operation, payload: None
+        parts.submit("live-show", {"map": "m"})
+        await asyncio.sleep(0)
+        parts.router.give_up()
+
+        with suppress(asyncio.CancelledError):
+            await parts.router.close()
+
+        assert parts.owners.gave_up
+        assert parts.router.held == 0
+
+    with_router(test)
