@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from client_sdk.blocking import BlockingRobot, connect_blocking
     from client_sdk.datasets import Dataset, open_dataset
     from client_sdk.frontend import Frame, FrontEndOptions, PoseQuery, TrackedFrame, Tracker
+    from client_sdk.live import Correction, LiveMapper, LiveOptions, OtherRobot
     from client_sdk.mapper import BlockingMapper, Mapper
     from client_sdk.mapping import MapOptions, PointMap, Trajectory
     from client_sdk.monocular.scale import MarkerScale, OdometryScale
@@ -31,16 +32,20 @@ __all__ = [
     "BlockingMapper",
     "BlockingRobot",
     "CloudFirst",
+    "Correction",
     "DataClient",
     "DataOptions",
     "Dataset",
     "Frame",
     "FrontEndOptions",
+    "LiveMapper",
+    "LiveOptions",
     "MapOptions",
     "Mapper",
     "MarkerScale",
     "MonocularOptions",
     "OdometryScale",
+    "OtherRobot",
     "PointMap",
     "PoseAnswer",
     "PoseQuery",
@@ -62,16 +67,20 @@ _HOMES = {
     "BlockingMapper": "mapper",
     "BlockingRobot": "blocking",
     "CloudFirst": "offload",
+    "Correction": "live",
     "DataClient": "transfer.data_client",
     "DataOptions": "transfer.data_client",
     "Dataset": "datasets",
     "Frame": "frontend",
     "FrontEndOptions": "frontend",
+    "LiveMapper": "live",
+    "LiveOptions": "live",
     "MapOptions": "mapping",
     "Mapper": "mapper",
     "MarkerScale": "monocular.scale",
     "MonocularOptions": "monocular_tracker",
     "OdometryScale": "monocular.scale",
+    "OtherRobot": "live",
     "PointMap": "mapping",
     "PoseAnswer": "answers",
     "PoseQuery": "frontend",

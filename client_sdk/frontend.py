@@ -298,6 +298,9 @@ class TrackedFrame:
     it is weak.  `Mapper.track` fills the rest: ``covariance`` ``(6, 6)`` of the twist (metres, radians) on
     the left of the pose of the last query, who solved it, and how long that took.  ``corrected`` says that
     poses that were returned before have changed: read the trajectory again.
+
+    In a live map, ``T_map_camera`` is the pose in the map, None until ``segment``, the present odometry
+    frame, is aligned; ``corrected`` says that its alignment has changed since the last frame.
     """
 
     frame: Frame
@@ -312,6 +315,8 @@ class TrackedFrame:
     source: Literal["cloud", "robot", "none"] = "none"
     round_trip_ms: float | None = None
     corrected: bool = False
+    T_map_camera: Array | None = None
+    segment: int = 0
 
     @property
     def lost(self) -> bool:
@@ -364,6 +369,22 @@ class Tracker:
         """The features of the last keyframe, None before the first."""
         return None if self._keyframe is None else self._keyframe.features
 
+    @property
+    def last_features(self) -> Features | None:
+        """The features of the last frame that has a pose, None before the first."""
+        return None if self._last is None else self._last.features
+
+    def restart(self, T_world_start: Array) -> None:
+        """Forget what frames are matched against: the next frame with enough features is at *T_world_start*.
+
+        Raises:
+            UsageError: A query is open.
+        """
+        self._refuse_open_query()
+        self._T_world_start = T_world_start
+        self._last = self._keyframe = None
+        self._lost_in_a_row = 0
+
     def prepare(self, frame: Frame) -> PoseQuery | TrackedFrame:
         """Take the next frame; return a query, or the result for the frame if none is needed.
 
@@ -373,11 +394,7 @@ class Tracker:
         Raises:
             UsageError: The last query was not answered yet.
         """
-        if self._query is not None:
-            raise UsageError(
-                f"the query of frame {self._query.timestamp_s:.3f} s is open",
-                hint="call accept with its answer, or with None",
-            )
+        self._refuse_open_query()
         self.frames += 1
         self._frame, self._features = frame, extract(frame, self.options)
         if self._last is None:
@@ -414,6 +431,13 @@ class Tracker:
                 keyframe = self._is_keyframe(T_world_camera, inliers)
                 return self._keep(T_world_camera, inliers=inliers, matches=matches, keyframe=keyframe)
         return self._next_query(matches)
+
+    def _refuse_open_query(self) -> None:
+        if self._query is not None:
+            raise UsageError(
+                f"the query of frame {self._query.timestamp_s:.3f} s is open",
+                hint="call accept with its answer, or with None",
+            )
 
     def _next_query(self, matches: int) -> PoseQuery | TrackedFrame:
         while self._to_try:

@@ -201,6 +201,21 @@ class Mapper:
             return "metric, by depth" if self._tracker is not None else "unknown: no frame yet"
         return f"metric, by {self._scale.name}" if self._is_metric and self._scale else "up to scale"
 
+    @property
+    def features(self) -> Features | None:
+        """The features of the last frame that has a pose; None before it, and without depth."""
+        return self._tracker.last_features if isinstance(self._tracker, Tracker) else None
+
+    def restart(self, T_world_start: Array) -> None:
+        """Begin a new odometry frame: the next frame is at *T_world_start*, whatever was seen before.
+
+        Raises:
+            UsageError: The frames have no depth, or a frame is being tracked.
+        """
+        if not isinstance(self._tracker, Tracker):
+            raise UsageError("only a camera with depth can start anew", hint="make another mapper")
+        self._tracker.restart(T_world_start)
+
     def report(self) -> dict[str, Any]:
         """Return the figures of the drive, as for ``report.json``."""
         trips = np.array(self._round_trips_ms)

@@ -53,6 +53,7 @@ ONLY: dict[str, set[str]] = {
         "geometry",
         "native",
         "native_matcher",
+        "live_map",
         "token_bucket",
         "maps",
         "wire",

@@ -1,0 +1,534 @@
+"""A mapper that shares one live map with other robots.
+
+`LiveMapper` tracks as `client_sdk.mapper.Mapper` does, sends a keyframe each 0.1 m or 6 degrees in the
+background, and knows where its odometry frame lies in the map.
+
+**Poses never jump unannounced.**  ``tracked.T_world_camera`` stays in the robot's odometry frame: nothing
+that the map finds moves it.  ``tracked.T_map_camera`` is the same pose in the map, None until the segment is
+aligned.  It uses the alignment of the moment, and whatever changes that is a `Correction`: it is in
+`LiveMapper.corrections` before a pose uses it, and the first such pose says ``corrected``.  A new ``segment``
+begins when tracking was lost: it continues at the last known pose, and is aligned on its own.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import time
+from collections import Counter, deque
+from collections.abc import AsyncIterator, Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Protocol
+
+import numpy as np
+
+from client_sdk.answers import PoseAnswer
+from client_sdk.frontend import Features, Frame, FrontEndOptions, PoseQuery, TrackedFrame
+from client_sdk.live.alignments import Alignments, Correction, OtherRobot
+from client_sdk.live.sender import REFUSALS, KeyframeSender, LiveCaller, Myself, camera_request
+from client_sdk.live.waiting_keyframes import Base, KeyframeWaits, WaitingKeyframes
+from client_sdk.mapper import AskPose, Mapper
+from client_sdk.mapping import MapOptions, PointMap, Trajectory
+from rse_pf.errors import BadMessage, BadRequest, RsePfError, UnsupportedProtocol, UsageError
+from rse_pf.geometry import Array, Camera, pose_difference
+from rse_pf.live_map.keyframe_code import encode_features
+from rse_pf.wire.live_map import RelocaliseReply, live_topic
+
+__all__ = ["KeyframeSent", "LiveMapper", "LiveOptions", "LiveRobot"]
+
+_FINAL = (*REFUSALS, BadRequest, UnsupportedProtocol)
+"""A live map that answers so will not be joined by trying again."""
+_RETRY_S = 1.0
+_MAX_CORRECTIONS = 1000
+_MAX_SENT = 100_000
+
+
+class LiveRobot(LiveCaller, Protocol):
+    """What a live mapper needs of a robot."""
+
+    @property
+    def connected(self) -> bool:
+        """Whether there is a connection to a server now."""
+
+    def subscribe(self, topic: str) -> Any:
+        """Return an async iterator of keys and payloads."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LiveOptions:
+    """How a robot takes part in a live map.
+
+    Attributes:
+        keyframe_m: A frame farther from the last keyframe becomes one,
+        keyframe_deg: or turned further; the tracker's own keyframes are apart from these.
+        features: The nearest so many features of a keyframe are sent.
+        segment_after: A new segment begins after so many lost frames in a row.
+        relocalise_s: While a segment is not aligned, the robot asks for its place so often at most.
+        bytes_per_s: Share of the link that keyframes may take.
+        deadline_s: Of one attempt to send a keyframe, and of a relocalisation.
+        leave_s: How long leaving waits until the map has every keyframe.
+    """
+
+    keyframe_m: float = 0.1
+    keyframe_deg: float = 6.0
+    features: int = 870
+    segment_after: int = 5
+    relocalise_s: float = 2.0
+    bytes_per_s: float = 262_144.0
+    deadline_s: float = 5.0
+    leave_s: float = 5.0
+
+    def __post_init__(self) -> None:
+        numbers = (
+            self.keyframe_m, self.keyframe_deg, self.features, self.segment_after, self.relocalise_s,
+            self.bytes_per_s, self.deadline_s,
+        )  # fmt: skip
+        if min(numbers) <= 0 or self.leave_s < 0:
+            raise UsageError("a number of LiveOptions is not above 0", hint="leave it out for the default")
+
+
+@dataclass(frozen=True, slots=True)
+class KeyframeSent:
+    """A keyframe that the map keeps: its number in the map, and when it was sent and acknowledged."""
+
+    number: int
+    sent_s: float
+    kept_s: float
+
+
+class LiveMapper:
+    """A `Mapper` whose map is shared with other robots; made by `Robot.live_map`.
+
+    ::
+
+        async with robot.live_map("warehouse", camera=camera) as mapper:
+            async for frame in frames:
+                tracked = await mapper.track(frame)
+                show(tracked.T_map_camera, mapper.others)
+    """
+
+    def __init__(
+        self,
+        robot: LiveRobot,
+        name: str,
+        *,
+        ask: AskPose,
+        camera: Camera | None = None,
+        spool: Path | None = None,
+        options: FrontEndOptions | None = None,
+        live: LiveOptions | None = None,
+        map_options: MapOptions | None = None,
+        T_world_start: Array | None = None,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        """Describe the robot's part of a live map; ``async with`` joins it.
+
+        Args:
+            robot: Connected, or with an offload and not connected yet.
+            name: Of the map: small letters, digits and hyphens.
+            ask: Answers pose queries.
+            camera: Frames of another camera are refused; None takes that of the first frame.
+            spool: Folder of keyframes that wait for the map, which survive a restart of this program; None
+                keeps them in memory.
+            options: Of the tracker.
+            live: Of keyframes and their sending.
+            map_options: Density of the robot's own cloud.
+            T_world_start: ``(4, 4)``, pose of the first camera in the odometry frame; None: the identity.
+            clock: Seconds, monotonic.
+        """
+        self.name = name
+        self.options = live or LiveOptions()
+        self.sent_keyframes: deque[KeyframeSent] = deque(maxlen=_MAX_SENT)
+        self._robot, self._clock = robot, clock
+        self._waiting = WaitingKeyframes(None if spool is None else spool / name)
+        self._sender: KeyframeSender
+        self._ask = ask
+        self._mapper = Mapper(
+            ask=self._ask_first, camera=camera, options=options, depth=True, map_options=map_options,
+            T_world_start=T_world_start,
+        )  # fmt: skip
+        self._alignments = Alignments()
+        self._segment = 0
+        self._last_keyframe: Array | None = None
+        self._lost_in_a_row = 0
+        self._is_corrected = False
+        self._poses: list[tuple[float, int, Array]] = []
+        self._made, self._dropped = 0, 0
+        self._verdicts: Counter[str] = Counter()
+        self._relocalised_at = float("-inf")
+        self._relocalising: asyncio.Task[None] | None = None
+        self._listeners: list[asyncio.Queue[Correction | None]] = []
+        self._corrections: deque[Correction] = deque(maxlen=_MAX_CORRECTIONS)
+        self._tasks: list[asyncio.Task[None]] = []
+        self._trouble = ""
+        self._one_frame = asyncio.Lock()
+        self._is_known = False
+        self._is_open = False
+        self._is_over = False
+
+    async def __aenter__(self) -> LiveMapper:
+        """Join the map; without a connection, join it as soon as there is one.
+
+        Raises:
+            Forbidden: The token has no scope for this map.
+            UnknownService: The platform has no live maps.
+            BadRequest: The name cannot be used.
+            UsageError: The spool cannot be used.
+        """
+        self._segment = await asyncio.to_thread(self._waiting.open)
+        self._sender = KeyframeSender(
+            self._robot, self.name, self._waiting, deadline_s=self.options.deadline_s,
+            bytes_per_s=self.options.bytes_per_s, clock=self._clock, on_known=self._known,
+            on_sent=lambda *sent: self.sent_keyframes.append(KeyframeSent(*sent)),
+        )  # fmt: skip
+        self._sender.current_segment = self._segment
+        if self._robot.connected:
+            try:
+                await self._sender.introduce()
+            except _FINAL:
+                raise
+            except RsePfError as error:
+                self._trouble = f"{error.code}: {error.message}"
+        if len(self._waiting):
+            self._sender.added()
+        self._is_open = True
+        self._tasks = [asyncio.create_task(self._sender.run()), asyncio.create_task(self._follow())]
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Send what waits, for `LiveOptions.leave_s` at most, and leave the map.
+
+        What was not sent stays in the spool, or is lost if there is none: see `keyframes_waiting`.
+        """
+        self._is_open = False
+        try:
+            if self._robot.connected and not isinstance(error, asyncio.CancelledError):
+                with contextlib.suppress(asyncio.TimeoutError):
+                    await asyncio.wait_for(self._sender.wait_empty(), self.options.leave_s)
+                with contextlib.suppress(RsePfError):
+                    await self._robot.call("live-leave", {"map": self.name}, deadline_s=_RETRY_S, keep=True)
+        finally:
+            ending = [*self._tasks, *([self._relocalising] if self._relocalising else [])]
+            for task in ending:
+                task.cancel()
+            await asyncio.gather(*ending, return_exceptions=True)
+            self._is_over = True
+            for listener in self._listeners:
+                listener.put_nowait(None)
+
+    async def track(self, frame: Frame) -> TrackedFrame:
+        """Return the pose of the next frame in the odometry frame and in the map, or why there is none.
+
+        Raises:
+            UsageError: The frame is of another camera, or the first one has no depth; or the spool's disk is
+                full.
+        """
+        if not self._is_open:
+            raise UsageError("this live map is not joined", hint="use async with robot.live_map(...)")
+        async with self._one_frame:
+            if self.frames == 0 and not frame.depth_m.any():
+                raise UsageError(
+                    "a live map needs frames with depth", hint="use robot.mapper() for this camera"
+                )
+            if self._lost_in_a_row >= self.options.segment_after and self._poses:
+                self._begin_segment()
+            done = await self._mapper.track(frame)
+            pose = done.T_world_camera
+            if pose is None:
+                self._lost_in_a_row += 1
+            else:
+                self._lost_in_a_row = 0
+                self._poses.append((frame.timestamp_s, self._segment, pose))
+                features = self._mapper.features
+                if features is not None and self._is_keyframe(pose):
+                    await self._keep(done, pose, features)
+            return self._placed(done)
+
+    @property
+    def aligned(self) -> bool:
+        """Whether it is known where the present segment lies in the map; `reason` says why not."""
+        return self.T_map_odom is not None
+
+    @property
+    def reason(self) -> str:
+        """Why the present segment is not aligned, empty if it is."""
+        return self._alignments.of(self._segment).reason
+
+    @property
+    def T_map_odom(self) -> Array | None:
+        """``(4, 4)``: where the present odometry frame lies in the map; None while that is unknown."""
+        return self._alignments.of(self._segment).T_map_odom
+
+    @property
+    def covariance(self) -> Array | None:
+        """``(6, 6)`` of the twist (metres, radians) on the left of `T_map_odom`, None if unknown."""
+        return self._alignments.of(self._segment).covariance
+
+    @property
+    def aligned_by(self) -> str:
+        """Who aligned the present segment: ``map``, ``relocalisation``, or ``nothing``."""
+        return self._alignments.of(self._segment).by
+
+    @property
+    def segment(self) -> int:
+        """The number of the present odometry frame, from 0; tracking that was lost begins a new one."""
+        return self._segment
+
+    @property
+    def others(self) -> dict[str, OtherRobot]:
+        """The other robots of the map by their names."""
+        return dict(self._alignments.others)
+
+    @property
+    def version(self) -> int:
+        """The position in the log of the map that this robot has heard of."""
+        return self._alignments.version
+
+    @property
+    def map_keyframes(self) -> int:
+        """The number of keyframes of the whole map, of all robots."""
+        return self._alignments.map_keyframes
+
+    @property
+    def owner(self) -> str:
+        """Who serves the map."""
+        return self._alignments.owner
+
+    @property
+    def state(self) -> str:
+        """The state of the map as this robot sees it.
+
+        ``joining``, ``live``, ``waiting for the store`` or ``moving`` (to another server), as the map says;
+        ``offline`` without a connection; ``refused: ...`` if the platform takes no keyframe of this robot.
+        """
+        if self._is_open and self._sender.is_refused:
+            return f"refused: {self._sender.trouble}"
+        if not self._robot.connected:
+            return "offline"
+        return self._alignments.map_state or "joining"
+
+    @property
+    def trouble(self) -> str:
+        """Why the oldest waiting keyframe is not kept yet, or updates do not come; empty if all is well."""
+        return (self._sender.trouble if self._is_open else "") or self._trouble
+
+    @property
+    def keyframes_waiting(self) -> int:
+        """The number of keyframes that the map has not acknowledged."""
+        return len(self._waiting)
+
+    @property
+    def map(self) -> PointMap:
+        """The robot's own cloud, in its odometry frame."""
+        return self._mapper.map
+
+    @property
+    def trajectory(self) -> Trajectory:
+        """The poses so far, in the odometry frame."""
+        return self._mapper.trajectory
+
+    @property
+    def map_trajectory(self) -> Trajectory:
+        """The poses of all segments that are aligned, in the map, by the newest alignment of each."""
+        placed = [
+            (stamp, T_map_odom @ pose)
+            for stamp, segment, pose in self._poses
+            if (T_map_odom := self._alignments.of(segment).T_map_odom) is not None
+        ]
+        return Trajectory(
+            np.array([stamp for stamp, _ in placed]), np.array([pose for _, pose in placed]).reshape(-1, 4, 4)
+        )
+
+    @property
+    def frames(self) -> int:
+        """The number of frames tracked so far."""
+        return self._mapper.frames
+
+    @property
+    def lost_frames(self) -> int:
+        """The number of frames without a pose."""
+        return self._mapper.lost_frames
+
+    @property
+    def keyframes(self) -> int:
+        """The number of keyframes made for the map in this run."""
+        return self._made
+
+    @property
+    def scale(self) -> str:
+        """Where metres come from."""
+        return self._mapper.scale
+
+    def report(self) -> dict[str, Any]:
+        """Return the figures of the drive: those of `Mapper.report`, and ``live``."""
+        return {
+            **self._mapper.report(),
+            "live": {
+                "map": self.name,
+                "state": self.state,
+                "segments": self._segment + 1,
+                "aligned": self.aligned,
+                "aligned_by": self.aligned_by,
+                "reason": self.reason,
+                "keyframes": self._made,
+                "keyframes_kept": len(self.sent_keyframes),
+                "keyframes_waiting": len(self._waiting),
+                "keyframes_dropped": self._dropped,
+                "keyframes_refused": self._sender.refused if self._is_open else 0,
+                "relocalisations": dict(self._verdicts),
+                "others": sorted(self._alignments.others),
+            },
+        }
+
+    def save(self, folder: Path) -> dict[str, Any]:
+        """Write the robot's own cloud and trajectory as `Mapper.save` does; return its report."""
+        return self._mapper.save(folder)
+
+    async def corrections(self) -> AsyncIterator[Correction]:
+        """Yield each change of an alignment, those before the call first; ends with the ``async with``.
+
+        A reader that is more than 1,000 behind misses the oldest.
+        """
+        queue: asyncio.Queue[Correction | None] = asyncio.Queue()
+        for known in self._corrections:
+            queue.put_nowait(known)
+        if self._is_over:
+            queue.put_nowait(None)
+        self._listeners.append(queue)
+        try:
+            while (correction := await queue.get()) is not None:
+                yield correction
+        finally:
+            self._listeners.remove(queue)
+
+    async def _ask_first(self, query: PoseQuery) -> PoseAnswer:
+        """Ask for a pose while keyframes wait."""
+        self._sender.pose_asked()
+        try:
+            return await self._ask(query)
+        finally:
+            self._sender.pose_answered()
+
+    def _begin_segment(self) -> None:
+        """Begin an odometry frame of its own at the last known pose."""
+        self._mapper.restart(self._poses[-1][2])
+        self._segment += 1
+        self._sender.current_segment = self._segment
+        self._last_keyframe, self._lost_in_a_row = None, 0
+        self._relocalised_at = float("-inf")
+
+    def _is_keyframe(self, pose: Array) -> bool:
+        if self._last_keyframe is None:
+            return True
+        moved_m, turned_deg = pose_difference(pose, self._last_keyframe)
+        return moved_m > self.options.keyframe_m or turned_deg > self.options.keyframe_deg
+
+    async def _keep(self, done: TrackedFrame, pose: Array, features: Features) -> None:
+        """Make a keyframe of a tracked frame, and queue it for the map."""
+        waiting = self._waiting
+        data = await asyncio.to_thread(self._encoded, features)
+        camera = done.frame.camera
+        keyframe = KeyframeWaits(
+            index=waiting.next_index,
+            segment=self._segment,
+            timestamp_s=done.frame.timestamp_s,
+            T_odom_camera=tuple(pose.ravel().tolist()),
+            camera=(camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height),
+            features=data,
+        )
+        self._last_keyframe = pose
+        if not await asyncio.to_thread(waiting.add, keyframe):
+            self._dropped += 1
+            return
+        self._made += 1
+        self._sender.added()
+        self._relocalise(keyframe, pose)
+
+    def _encoded(self, features: Features) -> bytes:
+        """Return the nearest features that have depth."""
+        depths_m = features.points_camera[:, 2]
+        rows = np.flatnonzero(np.isfinite(depths_m))
+        if len(rows) > self.options.features:
+            nearest = np.argsort(depths_m[rows], kind="stable")[: self.options.features]
+            rows = rows[np.sort(nearest)]
+        return encode_features(features.pixels[rows], depths_m[rows], features.descriptors[rows])
+
+    def _relocalise(self, keyframe: KeyframeWaits, pose: Array) -> None:
+        """Ask where in the map a keyframe is, if its segment is not aligned and the map has others."""
+        now = self._clock()
+        if (
+            self.aligned
+            or not self._robot.connected
+            or self._alignments.map_keyframes <= len(self.sent_keyframes)
+            or now < self._relocalised_at + self.options.relocalise_s
+            or (self._relocalising is not None and not self._relocalising.done())
+        ):
+            return
+        self._relocalised_at = now
+        self._relocalising = asyncio.create_task(self._ask_place(keyframe, pose))
+
+    async def _ask_place(self, keyframe: KeyframeWaits, pose: Array) -> None:
+        request = {
+            "map": self.name, "camera": camera_request(keyframe.camera), "features": keyframe.features
+        }  # fmt: skip
+        try:
+            answer = await self._robot.call(
+                "live-relocalise", request, RelocaliseReply, deadline_s=self.options.deadline_s, keep=True
+            )
+            self._verdicts[answer.reply.verdict] += 1
+            self._announce(self._alignments.relocalised(keyframe.segment, pose, answer.reply))
+        except RsePfError as error:
+            self._verdicts[error.code] += 1
+
+    async def _follow(self) -> None:
+        """Follow the updates of the map until cancelled."""
+        while True:
+            try:
+                if not self._is_known:
+                    await self._sender.introduce()
+                async for key, payload in self._robot.subscribe(live_topic(self.name)):
+                    self._trouble = ""
+                    await self._take(key, payload)
+            except RsePfError as error:
+                self._trouble = f"{error.code}: {error.message}"
+            await asyncio.sleep(_RETRY_S)
+
+    async def _take(self, key: str, payload: Any) -> None:
+        try:
+            self._announce(self._alignments.updated(key, payload))
+        except BadMessage as error:
+            self._trouble = f"{error.code}: {error.message}"
+
+    def _known(self, myself: Myself, base: Base) -> None:
+        """Take how the map knows this robot."""
+        self._is_known = True
+        if myself.robot:
+            for correction in self._alignments.know_myself(myself.robot, base.segment):
+                self._announce(correction)
+        self._alignments.map_keyframes = max(self._alignments.map_keyframes, myself.keyframes)
+
+    def _announce(self, correction: Correction | None) -> None:
+        if correction is None:
+            return
+        self._is_corrected |= correction.segment == self._segment
+        self._corrections.append(correction)
+        for listener in self._listeners:
+            if listener.qsize() >= _MAX_CORRECTIONS:
+                listener.get_nowait()
+            listener.put_nowait(correction)
+
+    def _placed(self, done: TrackedFrame) -> TrackedFrame:
+        """Return the result with its place in the map by the alignment of this moment."""
+        T_map_odom, pose = self.T_map_odom, done.T_world_camera
+        placed = replace(
+            done,
+            segment=self._segment,
+            T_map_camera=None if T_map_odom is None or pose is None else T_map_odom @ pose,
+            corrected=self._is_corrected,
+        )
+        self._is_corrected = False
+        return placed

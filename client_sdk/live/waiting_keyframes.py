@@ -1,0 +1,188 @@
+"""The keyframes of a robot that a live map has not acknowledged: in order, none lost, none twice.
+
+They are kept in memory, or in a folder that survives a restart of the robot.  Numbers that the map knows are
+given when a keyframe is sent: a robot that is offline does not know the first of them yet.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+from collections import deque
+from dataclasses import dataclass
+from pathlib import Path
+
+import msgspec
+
+from rse_pf.errors import UsageError
+from rse_pf.files import TEMPORARY_PREFIX, replace_file
+
+__all__ = ["Base", "KeyframeWaits", "WaitingKeyframes", "rebased"]
+
+_SUFFIX = ".keyframe"
+_STATE = "state.json"
+_MEMORY_BYTES = 64 << 20
+_DISK_BYTES = 1 << 30
+
+
+class KeyframeWaits(msgspec.Struct, frozen=True, kw_only=True):
+    """A keyframe that waits; ``index`` and ``segment`` count from the start of this robot's records.
+
+    ``T_odom_camera`` holds 16 numbers, ``camera`` fx fy cx cy width height, ``features`` what `keyframe_code`
+    encodes.
+    """
+
+    index: int
+    segment: int
+    timestamp_s: float
+    T_odom_camera: tuple[float, ...]
+    camera: tuple[float, float, float, float, int, int]
+    features: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class Base:
+    """What the map calls keyframe 0 and segment 0 of this robot's records."""
+
+    number: int
+    segment: int
+
+
+class WaitingKeyframes:
+    """Keyframes in the order in which they were made."""
+
+    def __init__(self, folder: Path | None, *, max_bytes: int | None = None) -> None:
+        """Describe the queue; `open` reads what an earlier run left.
+
+        Args:
+            folder: Keeps the keyframes of one robot and one map; None keeps them in memory.
+            max_bytes: `add` refuses more; None means 64 MiB in memory, 1 GiB in a folder.
+        """
+        self._folder = folder
+        self._max_bytes = max_bytes or (_MEMORY_BYTES if folder is None else _DISK_BYTES)
+        self._held: deque[tuple[int, int, bytes | None]] = deque()  # index, bytes, data unless on disk
+        self._bytes = 0
+        self._next_index = 0
+        self._first_segment = 0
+        self._base: Base | None = None
+
+    def __len__(self) -> int:
+        return len(self._held)
+
+    @property
+    def base(self) -> Base | None:
+        """What the map calls keyframe 0 and segment 0; None until it was asked."""
+        return self._base
+
+    @property
+    def first_index(self) -> int:
+        """The index of the keyframe that is sent next."""
+        return self._held[0][0] if self._held else self._next_index
+
+    @property
+    def next_index(self) -> int:
+        """The index of the keyframe that is added next."""
+        return self._next_index
+
+    def open(self) -> int:
+        """Take over what an earlier run left; return the segment that this run begins with.
+
+        Raises:
+            UsageError: The folder cannot be read or written.
+        """
+        folder = self._folder
+        if folder is None:
+            return 0
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            for part in folder.glob(f"{TEMPORARY_PREFIX}*"):
+                part.unlink()
+            for path in sorted(folder.glob(f"*{_SUFFIX}")):
+                self._held.append((int(path.name.removesuffix(_SUFFIX)), path.stat().st_size, None))
+            if not self._held:
+                (folder / _STATE).unlink(missing_ok=True)
+                return 0
+            self._bytes = sum(size for _, size, _ in self._held)
+            self._next_index = self._held[-1][0] + 1
+            if (folder / _STATE).exists():
+                self._base = Base(**json.loads((folder / _STATE).read_text(encoding="utf-8")))
+            self._first_segment = self._read(self._held[-1][0], None).segment + 1
+        except (OSError, ValueError, TypeError, msgspec.MsgspecError) as error:
+            raise UsageError(
+                f"cannot use the keyframes in {folder}: {error}", hint="name another folder as spool"
+            ) from error
+        return self._first_segment
+
+    def add(self, keyframe: KeyframeWaits) -> bool:
+        """Keep *keyframe*, whose index is `next_index`; return False if there is no space for it.
+
+        Raises:
+            UsageError: The folder cannot be written.
+        """
+        data = msgspec.msgpack.encode(keyframe)
+        if self._bytes + len(data) > self._max_bytes:
+            return False
+        if self._folder is not None:
+            try:
+                replace_file(self._path(keyframe.index), data)
+            except OSError as error:
+                raise UsageError(
+                    f"cannot keep a keyframe in {self._folder}: {error.strerror}",
+                    hint="free space on this disk",
+                ) from error
+        self._held.append((keyframe.index, len(data), data if self._folder is None else None))
+        self._bytes += len(data)
+        self._next_index = keyframe.index + 1
+        return True
+
+    def first(self) -> KeyframeWaits:
+        """Return the oldest keyframe; raises UsageError if its file is gone or damaged."""
+        index, _, data = self._held[0]
+        try:
+            return self._read(index, data)
+        except (OSError, msgspec.MsgspecError) as error:
+            raise UsageError(
+                f"keyframe {index} in {self._folder} cannot be read: {error}", hint="leave the spool alone"
+            ) from error
+
+    def remove_first(self) -> None:
+        """Forget the oldest keyframe: the map has it, or refused it for good."""
+        index, size, _ = self._held.popleft()
+        self._bytes -= size
+        if self._folder is not None:
+            with contextlib.suppress(OSError):
+                self._path(index).unlink()
+
+    def set_base(self, base: Base) -> None:
+        """Keep what the map calls keyframe 0 and segment 0; raises UsageError."""
+        self._base = base
+        if self._folder is not None:
+            text = json.dumps({"number": base.number, "segment": base.segment})
+            try:
+                replace_file(self._folder / _STATE, text)
+            except OSError as error:
+                raise UsageError(
+                    f"cannot write {self._folder}: {error.strerror}", hint="free space on this disk"
+                ) from error
+
+    def _read(self, index: int, data: bytes | None) -> KeyframeWaits:
+        raw = self._path(index).read_bytes() if data is None else data
+        return msgspec.msgpack.decode(raw, type=KeyframeWaits)
+
+    def _path(self, index: int) -> Path:
+        assert self._folder is not None
+        return self._folder / f"{index:012d}{_SUFFIX}"
+
+
+def rebased(base: Base | None, first: Base, end: int, wanted: Base) -> tuple[Base, int]:
+    """Return the base to send with, and how many of the oldest waiting keyframes the map has already.
+
+    Args:
+        base: The present one.
+        first: Index and segment of the keyframe that is sent next.
+        end: The index of the keyframe that is added next.
+        wanted: What the map expects next: a number, and a segment that it does not know.
+    """
+    if base is not None and base.number + first.number <= wanted.number <= base.number + end:
+        return base, wanted.number - base.number - first.number
+    return Base(wanted.number - first.number, wanted.segment - first.segment), 0

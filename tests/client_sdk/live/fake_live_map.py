@@ -1,0 +1,143 @@
+"""A robot whose platform is a few lines: it keeps keyframes by number, and tells what the test says."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator, Callable
+from typing import Any
+
+import numpy as np
+
+from client_sdk.answers import Answer, PoseAnswer
+from client_sdk.frontend import PoseQuery
+from rse_pf.errors import Conflict, Expired, NotFound, RsePfError
+from rse_pf.geometry import Array
+from rse_pf.pnp import PnpOptions, refine_with_depth, solve_pnp
+from rse_pf.wire import as_type
+from rse_pf.wire.live_map import KeyframeRequest, LiveRelocalise
+
+__all__ = ["FakeLiveRobot", "alignment", "solve"]
+
+
+def alignment(robot: str, T_map_odom: Array | None, *, segment: int = 0, reason: str = "") -> dict[str, Any]:
+    """Return the payload of an alignment; None is none."""
+    return {
+        "kind": "alignment", "robot": robot, "segment": segment, "aligned": T_map_odom is not None,
+        "reason": reason, "T_map_odom": None if T_map_odom is None else T_map_odom.ravel().tolist(),
+        "covariance": None if T_map_odom is None else (1e-4 * np.eye(6))[np.triu_indices(6)].tolist(),
+        "version": 7, "cause": {"robot": "other", "number": 3},
+    }  # fmt: skip
+
+
+async def solve(query: PoseQuery) -> PoseAnswer:
+    """Answer as the PnP service does."""
+    found = query.correspondences
+    options = PnpOptions(inlier_px=query.inlier_px, max_iterations=query.max_iterations)
+    solution = solve_pnp(found.points_world, found.pixels, query.camera, options)
+    solution = refine_with_depth(solution, found.points_world, found.pixels, found.depths_m, query.camera)
+    return PoseAnswer(
+        solution=solution, source="cloud", server="s1", round_trip_ms=3.0, queue_ms=0.0, compute_ms=1.0
+    )
+
+
+class FakeLiveRobot:
+    """The robot ``me`` and its platform; `kept` are the keyframes that its map has."""
+
+    def __init__(self) -> None:
+        self.connected = True
+        self.kept: list[KeyframeRequest] = []
+        self.before_answer: Callable[[str], None] = lambda service: None
+        """Called before a service answers; may raise."""
+        self.lose_answer = False
+        self.asked: list[str] = []
+        self.relocalised: dict[str, Any] = {"verdict": "none", "reason": "nothing alike"}
+        self.foreign_keyframes = 0
+        self.changed = asyncio.Event()
+        self._updates: asyncio.Queue[tuple[str, Any]] = asyncio.Queue()
+
+    async def call(
+        self, service: str, request: Any, reply_type: Any = None, *,
+        deadline_s: float | None = None, keep: bool = False,
+    ) -> Answer:  # fmt: skip
+        """Answer as the platform would."""
+        self.asked.append(service)
+        await asyncio.sleep(0)
+        try:
+            if not self.connected:
+                raise Expired("no server")
+            self.before_answer(service)
+            reply = getattr(self, "_" + service.partition("-")[2])(request)
+        finally:
+            self.changed.set()
+        if self.lose_answer:
+            self.lose_answer = False
+            raise Expired("the answer was lost")
+        return Answer(
+            reply=reply if reply_type is None else as_type(reply, reply_type),
+            source="cloud", server="s1", round_trip_ms=1.0, queue_ms=0.0, compute_ms=0.0,
+        )  # fmt: skip
+
+    async def subscribe(self, topic: str) -> AsyncIterator[tuple[str, Any]]:
+        """Yield what `tell` was given."""
+        assert topic == "live/lab"
+        while True:
+            yield await self._updates.get()
+
+    def tell(self, key: str, payload: Any) -> None:
+        """Push an update."""
+        self._updates.put_nowait((key, payload))
+
+    async def until(self, true: Callable[[], bool]) -> None:
+        """Wait until *true*, looking after each call."""
+
+        async def wait() -> None:
+            while not true():
+                self.changed.clear()
+                try:
+                    await asyncio.wait_for(self.changed.wait(), 0.02)
+                except asyncio.TimeoutError:
+                    continue
+
+        await asyncio.wait_for(wait(), 10.0)
+
+    def restart_map(self) -> None:
+        """Begin the map anew, as after ``live-stop``."""
+        self.kept.clear()
+
+    def _show(self, request: Any) -> Any:
+        if not self.kept and not self.foreign_keyframes:
+            raise NotFound("no such map")
+        you = {
+            "robot": "me",
+            "number": len(self.kept),
+            "segment": max((each.segment for each in self.kept), default=-1) + 1,
+        }
+        return {"keyframes": len(self.kept) + self.foreign_keyframes, "you": you}
+
+    def _keyframe(self, request: Any) -> Any:
+        keyframe = as_type(request, KeyframeRequest)
+        if keyframe.number > len(self.kept):
+            raise Conflict(f"keyframe {len(self.kept)} comes next")
+        if keyframe.number == len(self.kept):
+            self.kept.append(keyframe)
+        return {"number": len(self.kept), "version": len(self.kept)}
+
+    def _relocalise(self, request: Any) -> Any:
+        as_type(request, LiveRelocalise)
+        return self.relocalised
+
+    def _leave(self, request: Any) -> Any:
+        return {}
+
+
+def failing(error: RsePfError, service: str, times: int) -> Callable[[str], None]:
+    """Return a function that raises *error* for the first *times* calls of *service*."""
+    left = times
+
+    def fail(called: str) -> None:
+        nonlocal left
+        if called == service and left > 0:
+            left -= 1
+            raise error
+
+    return fail

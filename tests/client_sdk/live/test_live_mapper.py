@@ -1,0 +1,347 @@
+"""A live map from the side of one robot: keyframes up, alignments down, and every fault between them."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Awaitable, Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from client_sdk.answers import PoseAnswer
+from client_sdk.frontend import Frame, PoseQuery, TrackedFrame
+from client_sdk.live import Correction, LiveMapper, LiveOptions
+from client_sdk.live.waiting_keyframes import Base, WaitingKeyframes, rebased
+from rse_pf.errors import BadRequest, Busy, Forbidden, UsageError
+from rse_pf.geometry import exp_se3
+from rse_pf.live_map.keyframe_code import decode_features
+from tests.client_sdk.live.fake_live_map import FakeLiveRobot, alignment, failing, solve
+from tests.client_sdk.mapper.flat_world import CAMERA, STEP_M, frame_at
+
+pytest.importorskip("cv2", reason="pip install 'rse-pf[vision]'")
+
+QUICK = LiveOptions(leave_s=0.2, bytes_per_s=1e9, segment_after=2, relocalise_s=0.001)
+T_MAP_ODOM = exp_se3([1.0, 2.0, 3.0, 0.1, 0.2, 0.3])
+
+
+def run(work: Callable[[FakeLiveRobot], Awaitable[None]]) -> None:
+    async def bounded() -> None:
+        await asyncio.wait_for(work(FakeLiveRobot()), 30.0)
+
+    asyncio.run(bounded())
+
+
+def live_map(robot: Any, **options: Any) -> LiveMapper:
+    return LiveMapper(robot, "lab", ask=solve, live=QUICK, **options)
+
+
+async def drive(mapper: LiveMapper, rows: range) -> list[TrackedFrame]:
+    return [await mapper.track(frame_at(row, depth=True)) for row in rows]
+
+
+def dark(row: int) -> Frame:
+    """Return a frame without features."""
+    frame = frame_at(row, depth=True)
+    return Frame(
+        timestamp_s=frame.timestamp_s, rgb=np.zeros_like(frame.rgb), depth_m=frame.depth_m, camera=CAMERA
+    )
+
+
+def test_a_keyframe_each_10_cm_is_kept_by_the_map_in_order() -> None:
+    async def work(robot: FakeLiveRobot) -> None:
+        async with live_map(robot) as mapper:
+            await drive(mapper, range(9))
+            await robot.until(lambda: mapper.keyframes_waiting == 0)
+
+            assert [each.number for each in robot.kept] == [0, 1, 2]
+            assert [each.timestamp_s for each in robot.kept] == [0.0, 0.4, 0.8]  # 4 steps are 12.8 cm
+            pose = robot.kept[2].T_odom_camera.reshape(4, 4)
+            np.testing.assert_allclose(pose[:3, 3], [8 * STEP_M, 0, 0], atol=0.02)
+            features = decode_features(robot.kept[2].features, CAMERA)
+            assert 100 < len(features) <= QUICK.features
+            assert mapper.keyframes == 3
+            assert mapper.report()["live"]["keyframes_kept"] == 3
+        assert "live-leave" in robot.asked
+
+    run(work)
+
+
+def test_an_alignment_is_an_event_before_a_pose_uses_it() -> None:
+    async def work(robot: FakeLiveRobot) -> None:
+        async with live_map(robot) as mapper:
+            heard: list[Correction] = []
+
+            async def listen() -> None:
+                async for correction in mapper.corrections():
+                    heard.append(correction)
+                    robot.changed.set()
+
+            listening = asyncio.create_task(listen())
+            first, second = await drive(mapper, range(2))
+            assert first.T_map_camera is None
+            assert not mapper.aligned
+            assert mapper.reason
+            await robot.until(lambda: len(robot.kept) == 1 and robot.asked[-1] == "live-show")
+
+            robot.tell("alignment/me", alignment("me", T_MAP_ODOM))
+            await robot.until(lambda: len(heard) == 1)
+            third, fourth = await drive(mapper, range(2, 4))
+
+            assert heard[0].before is None
+            assert heard[0].cause == ("other", 3)
+            assert heard[0].by == "map"
+            np.testing.assert_array_equal(heard[0].after, T_MAP_ODOM)
+            assert (third.corrected, fourth.corrected) == (True, False)
+            assert third.T_world_camera is not None
+            assert second.T_world_camera is not None
+            np.testing.assert_allclose(third.T_map_camera, T_MAP_ODOM @ third.T_world_camera)
+            moved_m = np.linalg.norm(third.T_world_camera[:3, 3] - second.T_world_camera[:3, 3])
+            assert abs(moved_m - STEP_M) < 0.005  # the odometry frame does not jump
+            np.testing.assert_allclose(mapper.covariance, 1e-4 * np.eye(6))
+            assert mapper.aligned
+            assert mapper.version == 7
+            assert len(mapper.map_trajectory) == 4
+        await asyncio.wait_for(listening, 5.0)  # it ends with the live map
+
+    run(work)
+
+
+def test_others_and_the_state_of_the_map_are_known() -> None:
+    async def work(robot: FakeLiveRobot) -> None:
+        async with live_map(robot) as mapper:
+            pose = {"kind": "pose", "robot": "r2", "segment": 0, "timestamp_s": 4.0}
+            robot.tell("pose/r2", {**pose, "T_map_camera": T_MAP_ODOM.ravel().tolist()})
+            robot.tell("alignment/r3", alignment("r3", None, reason="too few links"))
+            robot.tell("map", {"kind": "map", "keyframes": 9, "version": 12, "owner": "o", "state": "moving"})
+            await robot.until(lambda: mapper.state == "moving")
+
+            np.testing.assert_allclose(mapper.others["r2"].T_map_camera, T_MAP_ODOM)
+            assert mapper.others["r3"].reason == "too few links"
+            assert (mapper.map_keyframes, mapper.version, mapper.owner) == (9, 12, "o")
+
+            robot.tell("pose/r2", {"robot": "r2"})  # damaged: told, and nothing else
+            await robot.until(lambda: "bad-message" in mapper.trouble)
+            assert "r2" in mapper.others
+            robot.connected = False
+            assert mapper.state == "offline"
+
+    run(work)
+
+
+def test_keyframes_wait_on_disk_while_offline_and_arrive_once_in_order(tmp_path: Path) -> None:
+    async def work(robot: FakeLiveRobot) -> None:
+        async with live_map(robot, spool=tmp_path) as mapper:
+            await drive(mapper, range(1))
+            await robot.until(lambda: len(robot.kept) == 1)
+            robot.connected = False
+            await drive(mapper, range(1, 14))
+            assert mapper.keyframes_waiting == 3
+            assert len(list((tmp_path / "lab").glob("*.keyframe"))) == 3
+            assert mapper.lost_frames == 0
+
+            robot.connected = robot.lose_answer = True
+            await robot.until(lambda: mapper.keyframes_waiting == 0)
+
+            assert [each.number for each in robot.kept] == [0, 1, 2, 3]
+            assert sorted(each.timestamp_s for each in robot.kept) == [0.0, 0.4, 0.8, 1.2]
+            assert not list((tmp_path / "lab").glob("*.keyframe"))
+
+    run(work)
+
+
+def test_a_program_that_starts_again_sends_what_waited_and_begins_a_new_segment(tmp_path: Path) -> None:
+    async def work(robot: FakeLiveRobot) -> None:
+        async with live_map(robot, spool=tmp_path) as mapper:
+            await drive(mapper, range(1))
+            await robot.until(lambda: len(robot.kept) == 1)
+            robot.connected = False
+            await drive(mapper, range(1, 6))
+        assert len(robot.kept) == 1
+
+        robot.connected = True
+        async with live_map(robot, spool=tmp_path) as mapper:
+            await drive(mapper, range(6, 7))
+            await robot.until(lambda: mapper.keyframes_waiting == 0)
+
+            assert [(each.number, each.segment) for each in robot.kept] == [(0, 0), (1, 0), (2, 1)]
+
+    run(work)
+
+
+def test_a_program_that_starts_again_without_a_spool_asks_for_its_numbers() -> None:
+    async def work(robot: FakeLiveRobot) -> None:
+        for _ in range(2):
+            async with live_map(robot) as mapper:
+                await drive(mapper, range(6))
+                await robot.until(lambda mapper=mapper: mapper.keyframes_waiting == 0)
+
+        assert [(each.number, each.segment) for each in robot.kept] == [(0, 0), (1, 0), (2, 1), (3, 1)]
+
+    run(work)
+
+
+def test_a_map_that_begins_anew_gets_new_numbers_and_old_alignments_are_forgotten() -> None:
+    async def work(robot: FakeLiveRobot) -> None:
+        async with live_map(robot) as mapper:
+            await drive(mapper, range(5))
+            await robot.until(lambda: len(robot.kept) == 2)
+            robot.tell("alignment/me", alignment("me", T_MAP_ODOM))
+            await robot.until(lambda: mapper.aligned)
+
+            robot.restart_map()
+            await mapper.track(dark(5))
+            await mapper.track(dark(6))
+            (again,) = await drive(mapper, range(7, 8))
+            await robot.until(lambda: mapper.keyframes_waiting == 0)
+
+            assert again.segment == 1
+            assert [(each.number, each.segment) for each in robot.kept] == [(0, 0)]
+            robot.tell("alignment/me", alignment("me", T_MAP_ODOM, segment=0))
+            await robot.until(lambda: mapper.aligned)
+            assert len(mapper.map_trajectory) == 1  # the first segment was of the old map
+
+    run(work)
+
+
+def test_a_lost_robot_begins_a_segment_and_asks_where_it_is() -> None:
+    async def work(robot: FakeLiveRobot) -> None:
+        robot.foreign_keyframes = 50
+        T_map_camera = exp_se3([5.0, 0, 0, 0, 0, 0])
+        async with live_map(robot) as mapper:
+            await drive(mapper, range(3))
+            await robot.until(lambda: "live-relocalise" in robot.asked)
+            assert mapper.reason == "not relocalised: nothing alike"
+
+            robot.relocalised = {
+                "verdict": "ok",
+                "T_map_camera": T_map_camera.ravel().tolist(),
+                "inliers": 80,
+            }
+            assert [(await mapper.track(dark(row))).status for row in (3, 4)] == ["lost", "lost"]
+            before = mapper.trajectory.T_world_camera[-1]
+            (found,) = await drive(mapper, range(5, 6))
+            assert found.segment == 1
+            assert not found.lost
+            np.testing.assert_allclose(found.T_world_camera, before)
+            await robot.until(lambda: mapper.aligned)
+
+            (placed,) = await drive(mapper, range(6, 7))
+            assert mapper.aligned_by == "relocalisation"
+            assert placed.T_map_camera is not None
+            np.testing.assert_allclose(placed.T_map_camera[:3, 3], [5 + STEP_M, 0, 0], atol=0.01)
+
+            robot.tell("alignment/me", alignment("me", None, segment=1, reason="too few links"))
+            robot.tell("alignment/me", alignment("me", T_MAP_ODOM, segment=1))
+            await robot.until(lambda: mapper.aligned_by == "map")  # what the map found wins
+
+    run(work)
+
+
+def test_an_ambiguous_place_ends_a_relocalisation() -> None:
+    async def work(robot: FakeLiveRobot) -> None:
+        robot.foreign_keyframes = 50
+        robot.relocalised = {"verdict": "ok", "T_map_camera": np.eye(4).ravel().tolist()}
+        async with live_map(robot) as mapper:
+            await drive(mapper, range(1))
+            await robot.until(lambda: mapper.aligned)
+            robot.tell("alignment/me", alignment("me", None, reason="ambiguous: two places look alike"))
+            await robot.until(lambda: not mapper.aligned)
+
+            assert mapper.reason == "ambiguous: two places look alike"
+
+    run(work)
+
+
+def test_a_busy_map_is_asked_again_and_a_refused_keyframe_leaves_no_gap() -> None:
+    async def work(robot: FakeLiveRobot) -> None:
+        async with live_map(robot) as mapper:
+            robot.before_answer = failing(Busy("moving", retry_after_ms=1.0), "live-keyframe", 1)
+            await drive(mapper, range(1))
+            await robot.until(lambda: len(robot.kept) == 1)
+            robot.before_answer = failing(BadRequest("garbage"), "live-keyframe", 1)
+            await drive(mapper, range(1, 9))
+            await robot.until(lambda: mapper.keyframes_waiting == 0)
+
+            assert [each.number for each in robot.kept] == [0, 1]
+            assert [each.timestamp_s for each in robot.kept] == [0.0, 0.8]
+            assert mapper.report()["live"]["keyframes_refused"] == 1
+
+    run(work)
+
+
+def test_a_robot_without_the_right_is_told_at_once() -> None:
+    async def work(robot: FakeLiveRobot) -> None:
+        robot.before_answer = failing(Forbidden("no scope maps:live/lab"), "live-show", 1)
+        with pytest.raises(Forbidden, match="maps:live/lab"):
+            async with live_map(robot):
+                pass
+
+    run(work)
+
+
+def test_a_keyframe_waits_while_a_pose_is_asked_for() -> None:
+    async def work(robot: FakeLiveRobot) -> None:
+        order: list[str] = []
+        asked, answer = asyncio.Event(), asyncio.Event()
+
+        async def slow(query: PoseQuery) -> PoseAnswer:
+            asked.set()
+            await answer.wait()
+            order.append("pose")
+            return await solve(query)
+
+        async with LiveMapper(robot, "lab", ask=slow, live=QUICK) as mapper:
+            robot.connected = False
+            await mapper.track(frame_at(0, depth=True))
+            await robot.until(lambda: "expired" in mapper.trouble)
+            tracking = asyncio.create_task(mapper.track(frame_at(1, depth=True)))
+            await asked.wait()
+            robot.before_answer = order.append
+            robot.connected = True
+            asyncio.get_running_loop().call_later(0.5, answer.set)  # the keyframe would be sent by then
+            await robot.until(lambda: len(robot.kept) == 1)
+            await tracking
+
+        assert order[:2] == ["pose", "live-keyframe"]
+
+    run(work)
+
+
+def test_frames_without_depth_and_a_map_that_is_not_joined_are_refused() -> None:
+    async def work(robot: FakeLiveRobot) -> None:
+        mapper = live_map(robot)
+        with pytest.raises(UsageError, match="not joined"):
+            await mapper.track(frame_at(0, depth=True))
+        async with mapper:
+            with pytest.raises(UsageError, match="with depth"):
+                await mapper.track(frame_at(0, depth=False))
+
+    run(work)
+
+
+def test_a_full_spool_drops_the_newest_and_a_damaged_one_is_told(tmp_path: Path) -> None:
+    waiting = WaitingKeyframes(tmp_path, max_bytes=10)
+    waiting.open()
+    assert waiting.next_index == 0
+    assert not len(waiting)
+    (tmp_path / "000000000000.keyframe").write_bytes(b"no keyframe")
+    with pytest.raises(UsageError, match="cannot use the keyframes in"):
+        WaitingKeyframes(tmp_path).open()
+
+
+@pytest.mark.parametrize(
+    ("base", "wanted", "expected"),
+    [
+        (None, Base(7, 2), (Base(3, 1), 0)),  # never asked before: index 4 of segment 1 becomes 7 of 2
+        (Base(0, 0), Base(4, 3), (Base(0, 0), 0)),  # as expected
+        (Base(0, 0), Base(6, 3), (Base(0, 0), 2)),  # two acknowledgements were lost
+        (Base(0, 0), Base(0, 0), (Base(-4, -1), 0)),  # the map began anew
+        (Base(0, 0), Base(10, 5), (Base(6, 4), 0)),  # more than this robot has sent
+    ],
+)
+def test_numbers_follow_what_the_map_expects(
+    base: Base | None, wanted: Base, expected: tuple[Base, int]
+) -> None:
+    assert rebased(base, Base(4, 1), 9, wanted) == expected
