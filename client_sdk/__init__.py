@@ -25,12 +25,14 @@ if TYPE_CHECKING:
     from client_sdk.transfer.background_upload import BackgroundUploader
     from client_sdk.transfer.data_client import DataClient, DataOptions
     from client_sdk.transfer.map_merge import merge_maps
+    from client_sdk.updates import BlockingUpdates, Updates
 
 __all__ = [
     "Answer",
     "BackgroundUploader",
     "BlockingMapper",
     "BlockingRobot",
+    "BlockingUpdates",
     "CloudFirst",
     "Correction",
     "DataClient",
@@ -54,6 +56,7 @@ __all__ = [
     "TrackedFrame",
     "Tracker",
     "Trajectory",
+    "Updates",
     "connect",
     "connect_blocking",
     "decode_reply",
@@ -66,6 +69,7 @@ _HOMES = {
     "BackgroundUploader": "transfer.background_upload",
     "BlockingMapper": "mapper",
     "BlockingRobot": "blocking",
+    "BlockingUpdates": "updates",
     "CloudFirst": "offload",
     "Correction": "live",
     "DataClient": "transfer.data_client",
@@ -89,6 +93,7 @@ _HOMES = {
     "TrackedFrame": "frontend",
     "Tracker": "frontend",
     "Trajectory": "mapping",
+    "Updates": "updates",
     "connect": "robot",
     "connect_blocking": "blocking",
     "decode_reply": "answers",

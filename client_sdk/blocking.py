@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, Concatenate, ParamSpec, TypeVar
 
 from client_sdk.robot import Robot, connect
 from client_sdk.stats import Stats
+from client_sdk.updates import BlockingUpdates, Updates
 from rse_pf.errors import Disconnected
 
 if TYPE_CHECKING:
@@ -91,6 +92,14 @@ class BlockingRobot:
     solve_pnp = _blocking(Robot.solve_pnp)
     call = _blocking(Robot.call)
     mapper = _blocking_mapper(Robot.mapper)
+
+    def subscribe(self, topic: str) -> BlockingUpdates:
+        """Ask for the updates of *topic*; iterate over what is returned.  See `Robot.subscribe`."""
+
+        async def begin() -> Updates:
+            return self._robot.subscribe(topic)
+
+        return BlockingUpdates(self._wait(begin()), self._wait)
 
     @property
     def stats(self) -> Stats:

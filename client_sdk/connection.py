@@ -43,11 +43,13 @@ from rse_pf.wire.client_session import (
     RenewalDue,
     Welcomed,
 )
+from rse_pf.wire.client_subscriptions import SubscriptionEnded, Updated
 from rse_pf.wire.server_session import CLOSE_RATE, CLOSE_REPLACED
 
 __all__ = [
     "Connection",
     "DialError",
+    "ForRobot",
     "OnChange",
     "Token",
     "cancel_all",
@@ -59,6 +61,9 @@ __all__ = [
 
 Token = str | Callable[[], Awaitable[str]] | None
 """A robot's token, or an async callable that returns a fresh one for each connect and each renewal."""
+
+ForRobot = Answered | Progressed | Updated | SubscriptionEnded
+"""What concerns a command or a subscription, and not a connection."""
 
 OnChange = Callable[[str, str], None] | None
 """Called with ``link-lost`` and a reason, or with ``link-back`` or ``moved`` and the server's name."""
@@ -113,7 +118,7 @@ class Connection:
         *,
         token: Token,
         session: ClientSession,
-        on_answer: Callable[[Answered | Progressed], None],
+        on_answer: Callable[[ForRobot], None],
         clock: Callable[[], float],
         random: random_module.Random,
         on_change: OnChange = None,
@@ -409,7 +414,7 @@ class Connection:
 
     def _handle(self, socket: _Socket | None, events: list[Event]) -> None:
         for event in events:
-            if isinstance(event, Answered | Progressed):
+            if isinstance(event, ForRobot):
                 self._on_answer(event)
             elif socket is not None:
                 self._handle_socket_event(socket, event)

@@ -16,21 +16,24 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from client_sdk.answers import Answer, PoseAnswer
-from client_sdk.connection import Connection, OnChange, Token, cancel_all
+from client_sdk.connection import Connection, ForRobot, OnChange, Token, cancel_all
 from client_sdk.enrolment import read_enrolment
 from client_sdk.local_services import LocalServices
 from client_sdk.offload import CloudFirst
 from client_sdk.stats import Stats, StatsKeeper
+from client_sdk.updates import RobotSubscriptions, Updates
 from rse_pf.config import SessionSettings
 from rse_pf.errors import Disconnected, RsePfError, UsageError, error_from_code
 from rse_pf.wire import CODECS, Command, Failure, Result, as_type, make_codec
 from rse_pf.wire.client_session import Answered, ClientSession, Progressed
+from rse_pf.wire.client_subscriptions import SubscriptionEnded, Updated
 
 if TYPE_CHECKING:
     import numpy as np
     import numpy.typing as npt
 
     from client_sdk.frontend import FrontEndOptions
+    from client_sdk.live.mapper import LiveMapper, LiveOptions
     from client_sdk.mapper import Mapper
     from client_sdk.mapping import MapOptions
     from client_sdk.monocular.scale import MarkerScale, OdometryScale
@@ -119,6 +122,7 @@ class Robot:
         self._local = None if offload is None else LocalServices(offload.registry, clock)
         self._waiting: dict[int, asyncio.Future[Answered] | Callable[[Answered], None]] = {}
         self._on_progress: dict[int, OnProgress] = {}
+        self._subscriptions = RobotSubscriptions(self._session, self._connection.flush, clock)
         self._tasks: set[asyncio.Task[Answer | Failure]] = set()
         self._keeper = StatsKeeper(random)
         self._open = False
@@ -161,7 +165,7 @@ class Robot:
         """Close the connection; unanswered commands end with Disconnected."""
         self._open = False
         for event in self._session.abandon("disconnected", "the robot closed its connection"):
-            if isinstance(event, Answered):
+            if isinstance(event, Answered | SubscriptionEnded):
                 self._answered(event)
         await self._connection.close()
         await cancel_all(self._tasks)
@@ -296,6 +300,39 @@ class Robot:
             keyframes_of=keyframes_of,
         )  # fmt: skip
 
+    def live_map(
+        self,
+        name: str,
+        *,
+        deadline_s: float | None = None,
+        camera: Camera | None = None,
+        spool: str | Path | None = None,
+        options: FrontEndOptions | None = None,
+        live: LiveOptions | None = None,
+        map_options: MapOptions | None = None,
+        T_world_start: npt.NDArray[np.float64] | None = None,
+    ) -> LiveMapper:
+        """Return a `LiveMapper` for ``async with robot.live_map(name) as mapper``.
+
+        It asks this robot for its poses, within *deadline_s* each, and shares the map *name* with all robots
+        of the tenant that do the same.  The other arguments are those of `LiveMapper`.
+        """
+        from client_sdk.frontend import FrontEndOptions
+        from client_sdk.live.mapper import LiveMapper
+        from client_sdk.mapper import ask_robot
+
+        bounded = (options or FrontEndOptions()).sent_with(self._session.codec.name)
+        return LiveMapper(
+            self, name, ask=ask_robot(self, deadline_s), camera=camera, options=bounded, live=live,
+            spool=None if spool is None else Path(spool), map_options=map_options,
+            T_world_start=T_world_start, clock=self._clock,
+        )  # fmt: skip
+
+    @property
+    def connected(self) -> bool:
+        """Whether there is a connection to a server now; without one, commands wait for the next."""
+        return self._session.current is not None
+
     def post(
         self,
         service: str,
@@ -324,6 +361,19 @@ class Robot:
         self._waiting[identity] = on_end
         self._connection.flush()
         return identity
+
+    def subscribe(self, topic: str) -> Updates:
+        """Ask for the updates of *topic*, such as ``live/MAP``; call it in the robot's event loop.
+
+        ``async for key, value in robot.subscribe(topic)`` gets the present values first, and then each newer
+        one.  The subscription survives reconnects and moves.
+
+        Raises:
+            Disconnected: The robot is not open, or has stopped reconnecting.
+        """
+        if not self._open or self._connection.fatal is not None:
+            raise Disconnected("the robot is not connected", hint="use async with client_sdk.connect(...)")
+        return self._subscriptions.begin(topic)
 
     @property
     def stats(self) -> Stats:
@@ -498,7 +548,10 @@ class Robot:
                 keeper.add(name, getattr(answer, name))
         return answer
 
-    def _answered(self, event: Answered | Progressed) -> None:
+    def _answered(self, event: ForRobot) -> None:
+        if isinstance(event, Updated | SubscriptionEnded):
+            self._subscriptions.take(event)
+            return
         if isinstance(event, Progressed):
             if event.id in self._on_progress:
                 self._on_progress[event.id](event.done, event.what)

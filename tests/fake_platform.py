@@ -19,8 +19,8 @@ from websockets.http11 import Request, Response
 from rse_pf.config import SessionSettings
 from rse_pf.service import Registry, dispatch
 from rse_pf.services import echo
-from rse_pf.wire import SUBPROTOCOLS, Command, Failure, Result, codec_for, make_codec
-from rse_pf.wire.server_session import Close, Send, ServerSession, Submit
+from rse_pf.wire import SUBPROTOCOLS, Command, Failure, Result, Update, codec_for, make_codec
+from rse_pf.wire.server_session import BeginUpdates, Close, EndUpdates, Send, ServerSession, Submit
 
 __all__ = ["FakePlatform", "FakeSocket", "echo_services"]
 
@@ -49,8 +49,10 @@ class FakeSocket:
             limits=platform.settings,
         )
         self.commands: list[Command] = []
+        self.topics: dict[int, str] = {}
         self.muted = False
         self._platform = platform
+        self._seq = 0
 
     async def serve(self) -> None:
         """Answer until the socket ends."""
@@ -71,6 +73,19 @@ class FakeSocket:
             elif isinstance(decision, Submit):
                 self.commands.append(decision.command)
                 self._platform.submitted(self, decision.command)
+            elif isinstance(decision, BeginUpdates):
+                self.topics[decision.id] = decision.topic
+                self._platform.noticed()
+            elif isinstance(decision, EndUpdates):
+                del self.topics[decision.id]
+                self._platform.noticed()
+
+    async def update(self, key: str, value: Any) -> None:
+        """Send a value to every subscription of the socket."""
+        self._seq += 1
+        for identity, topic in self.topics.items():
+            message = Update(id=identity, topic=topic, seq=self._seq, key=key, payload=value)
+            await self.send(self.session.codec.encode(message))
 
     async def answer(self, message: Answer) -> None:
         """Send the final answer to a command, as the session would."""
@@ -183,6 +198,10 @@ class FakePlatform:
                 await self._changed.wait_for(true)
 
         await asyncio.wait_for(wait(), within_s)
+
+    def noticed(self) -> None:
+        """Let `until` look again."""
+        self._spawn(self._notify())
 
     def submitted(self, socket: FakeSocket, command: Command) -> None:
         """Answer *command* in a task of its own, unless commands are held."""
