@@ -7,6 +7,8 @@ BIN := $(VENV)/bin
 # setup.sh prints one line with the fix when something is missing.
 SETUP := PYTHON=$(PYTHON) sh scripts/setup.sh
 PYTEST := $(BIN)/python -m pytest
+# Tests start hundreds of processes: without this each of them compiles every module again where the variable is set.
+export PYTHONDONTWRITEBYTECODE :=
 
 .DEFAULT_GOAL := help
 .PHONY: help setup assets native sanitize synth demo test quick slow lint types bench docs site release lock fuzz sbom audit-deps clean

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import ast
+import functools
 import re
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import pytest
@@ -34,22 +35,35 @@ def unread(tree: Mapping[str, str]) -> set[tuple[str, str]]:
     """Return the settings, as ``(group, name)``, that no source of *tree* reads."""
     seen: set[tuple[str, str]] = set()
     for path, text in tree.items():
-        if path == "rse_pf/config/settings.py":
-            continue
-        only = {kind for kind in KINDS if re.search(rf"\b{kind}\b", text)}
-        group = KINDS[only.pop()] if len(only) == 1 else ""
-        for node in ast.walk(ast.parse(text)):
-            if isinstance(node, ast.Attribute) and isinstance(node.ctx, ast.Load):
-                base = ast.unparse(node.value).rpartition(".")[2].lstrip("_")
-                if base in GROUPS:
-                    seen.add((base, node.attr))
-                elif base in SPELLINGS:
-                    seen |= {(group, node.attr), ("", node.attr)}
+        if path != "rse_pf/config/settings.py":
+            seen |= _read_in(text)
     return {
         (group, name)
         for group, name in NAMES
         if (group, name) not in seen and not (OWNERS[name] == 1 and ("", name) in seen)
     }
+
+
+@functools.cache
+def _read_in(text: str) -> frozenset[tuple[str, str]]:
+    """Return the settings that one source reads; the group is empty where it does not say which."""
+    seen: set[tuple[str, str]] = set()
+    only = {kind for kind in KINDS if kind in text and re.search(rf"\b{kind}\b", text)}
+    group = KINDS[only.pop()] if len(only) == 1 else ""
+    for node in ast.walk(ast.parse(text)):
+        if isinstance(node, ast.Attribute) and isinstance(node.ctx, ast.Load):
+            base = _last_name(node.value)
+            if base in GROUPS:
+                seen.add((base, node.attr))
+            elif base in SPELLINGS:
+                seen |= {(group, node.attr), ("", node.attr)}
+    return frozenset(seen)
+
+
+def _last_name(node: ast.expr) -> str:
+    """Return ``b`` of ``b`` and of ``a.b``."""
+    name = node.attr if isinstance(node, ast.Attribute) else node.id if isinstance(node, ast.Name) else ""
+    return name.lstrip("_")
 
 
 def written_elsewhere(tree: Mapping[str, str]) -> list[str]:
@@ -59,25 +73,20 @@ def written_elsewhere(tree: Mapping[str, str]) -> list[str]:
         for path, text in tree.items()
         if path != "rse_pf/config/settings.py"
         and path.startswith(("rse_pf/", "client_sdk/", "stacks/", "app.py"))
-        for found in LITERALS.finditer(_without_comments(text))
+        for literal in _literals(ast.parse(text))
+        for found in LITERALS.finditer(literal)
     ]
 
 
-def _without_comments(text: str) -> str:
-    tree = ast.parse(text)
+def _literals(tree: ast.Module) -> Iterator[str]:
+    """Yield each number and each quoted string of the code; strings that stand alone are comments."""
+    comments = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
     for node in ast.walk(tree):
-        body = getattr(node, "body", None)
-        if isinstance(body, list):
-            node.body = [each for each in body if not _is_string(each)]  # type: ignore[attr-defined]
-    return ast.unparse(tree).replace("'", '"')
-
-
-def _is_string(node: ast.AST) -> bool:
-    return (
-        isinstance(node, ast.Expr)
-        and isinstance(node.value, ast.Constant)
-        and isinstance(node.value.value, str)
-    )
+        if isinstance(node, ast.Constant) and id(node) not in comments:
+            if isinstance(node.value, str):
+                yield f'"{node.value}"'
+            elif isinstance(node.value, int):
+                yield str(node.value)
 
 
 def test_every_setting_is_read_or_is_on_the_waiting_list(sources: Mapping[str, str]) -> None:

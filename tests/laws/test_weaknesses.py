@@ -1,4 +1,7 @@
-"""bandit and detect-secrets find nothing that nobody has judged; what was judged is listed, with why."""
+"""bandit and detect-secrets find nothing that nobody has judged; what was judged is listed, with why.
+
+bandit takes ten seconds of CPU: it runs with the slow tests, and ruff's edition of its rules by default.
+"""
 
 from __future__ import annotations
 
@@ -6,11 +9,16 @@ import json
 import re
 import subprocess
 import sys
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 
 import pytest
 from detect_secrets.core.secrets_collection import SecretsCollection
+from detect_secrets.plugins.aws import AWSKeyDetector
+from detect_secrets.plugins.base import RegexBasedDetector
+from detect_secrets.plugins.basic_auth import BasicAuthDetector
+from detect_secrets.plugins.jwt import JwtTokenDetector
+from detect_secrets.plugins.private_key import PrivateKeyDetector
 from detect_secrets.settings import transient_settings
 
 SOURCES = ("rse_pf", "client_sdk", "lambda_pnp", "stacks", "scripts", "app.py")
@@ -55,8 +63,8 @@ NO_SECRETS: Mapping[tuple[str, str], str] = {
 }
 """File and kind of detect-secrets to why it is none."""
 
-_QUICK = ("AWSKeyDetector", "PrivateKeyDetector", "JwtTokenDetector", "BasicAuthDetector")
-"""Each plugin costs half a second a hundred files; all of them run with the slow tests."""
+_QUICK = (AWSKeyDetector, PrivateKeyDetector, JwtTokenDetector, BasicAuthDetector)
+"""Patterns of a line; all plugins, which cost half a second a hundred files each, run with the slow tests."""
 
 
 def weaknesses(repository: Path, files: Iterable[str]) -> set[tuple[str, str]]:
@@ -69,11 +77,31 @@ def weaknesses(repository: Path, files: Iterable[str]) -> set[tuple[str, str]]:
     return {(each["filename"].removeprefix("./"), each["test_id"]) for each in report["results"]}
 
 
-def secrets(repository: Path, files: Iterable[str], *plugins: str) -> set[tuple[str, str]]:
+def weaknesses_by_ruff(repository: Path, files: Iterable[str]) -> set[tuple[str, str]]:
+    """Return file and rule, as bandit calls it, of what ruff finds in *files* with the rules of bandit."""
+    configuration = (repository / "pyproject.toml").read_text(encoding="utf-8")
+    skipped = re.search(r"^skips = \[(.*)\]", configuration, re.M)
+    assert skipped is not None
+    ignored = ",".join(f"S{number}" for number in re.findall(r"B(\d+)", skipped[1]))
+    options = ["--isolated", "--no-cache", "--select", "S", "--ignore", ignored, "--output-format", "json"]
+    command = [sys.executable, "-m", "ruff", "check", *options, *files]
+    done = subprocess.run(command, cwd=repository, capture_output=True, text=True, check=False)
+    names = ((Path(each["filename"]), each["code"]) for each in json.loads(done.stdout))
+    return {
+        (str(name.relative_to(repository) if name.is_relative_to(repository) else name), "B" + rule[1:])
+        for name, rule in names
+    }
+
+
+def secrets(
+    repository: Path, files: Iterable[str], *plugins: type[RegexBasedDetector]
+) -> set[tuple[str, str]]:
     """Return file and kind of what detect-secrets finds in *files*: with *plugins*, or all it has."""
     configuration = json.loads((repository / ".secrets.baseline").read_text(encoding="utf-8"))
     if plugins:
-        configuration["plugins_used"] = [{"name": name} for name in plugins]
+        configuration["plugins_used"] = [{"name": plugin.__name__} for plugin in plugins]
+        patterns = [pattern for plugin in plugins for pattern in plugin.denylist]
+        files = [file for file in files if matches_a_line(repository / file, patterns)]
     found = set()
     with transient_settings(configuration):
         collection = SecretsCollection(root=str(repository))
@@ -82,6 +110,12 @@ def secrets(repository: Path, files: Iterable[str], *plugins: str) -> set[tuple[
         for file, secret in collection:
             found.add((file, secret.type))
     return found
+
+
+def matches_a_line(file: Path, patterns: Iterable[re.Pattern[str]]) -> bool:
+    """Whether a plugin of *patterns* has anything to judge in *file*; twenty times as quick as the plugin."""
+    text = file.read_text(encoding="utf-8", errors="replace")
+    return any(pattern.search(line) for pattern in patterns for line in text.splitlines())
 
 
 def text_files(repository: Path) -> list[str]:
@@ -95,13 +129,16 @@ def text_files(repository: Path) -> list[str]:
     ]
 
 
-def test_bandit_finds_only_what_was_judged_and_sees_a_shell_and_an_eval(
-    repository: Path, tmp_path: Path
+@pytest.mark.parametrize(
+    "search", [weaknesses_by_ruff, pytest.param(weaknesses, marks=pytest.mark.slow)], ids=["ruff", "bandit"]
+)
+def test_only_what_was_judged_is_found_and_a_shell_and_an_eval_are_seen(
+    repository: Path, tmp_path: Path, search: Callable[[Path, Iterable[str]], set[tuple[str, str]]]
 ) -> None:
     file = tmp_path / "bad.py"
     file.write_text("import subprocess\nsubprocess.run(input(), shell=True)\neval(input())\n")
 
-    found = weaknesses(repository, [*SOURCES, str(file)])
+    found = search(repository, [*SOURCES, str(file)])
 
     assert {rule for name, rule in found if name == str(file)} == {"B602", "B307"}
     assert {each for each in found if each[0] != str(file)} <= HARMLESS.keys()
