@@ -3,6 +3,20 @@
 Rendering and trajectories belong here; reading recordings belongs to `datasets`.
 """
 
-from client_sdk.simulator.drive import RATE_HZ, SIMULATED_CAMERA, STEP_M, render_frames, true_trajectory
+from client_sdk.simulator.drive import (
+    RATE_HZ,
+    SIMULATED_CAMERA,
+    STEP_M,
+    frames_to_overlap,
+    render_frames,
+    true_trajectory,
+)
 
-__all__ = ["RATE_HZ", "SIMULATED_CAMERA", "STEP_M", "render_frames", "true_trajectory"]
+__all__ = [
+    "RATE_HZ",
+    "SIMULATED_CAMERA",
+    "STEP_M",
+    "frames_to_overlap",
+    "render_frames",
+    "true_trajectory",
+]

@@ -6,6 +6,7 @@ overlap.  The same arguments give the same frames.  No image library is needed.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 
 import numpy as np
@@ -17,12 +18,16 @@ from client_sdk.simulator.world import make_world
 from rse_pf.errors import UsageError
 from rse_pf.geometry import Array, Camera
 
-__all__ = ["RATE_HZ", "SIMULATED_CAMERA", "STEP_M", "render_frames", "true_trajectory"]
+__all__ = [
+    "RATE_HZ", "SIMULATED_CAMERA", "STEP_M", "frames_to_overlap", "render_frames", "true_trajectory"
+]  # fmt: skip
 
 RATE_HZ = 5.0
 """The paper's frame rate (Sect. 6.2)."""
 STEP_M = 0.068
 """Distance between frames: a robot that drives at 0.34 m/s."""
+_OVERLAP_M = 0.6
+"""Path that a robot drives beyond the start of the next one, so that their maps can be merged."""
 SIMULATED_CAMERA = Camera(fx=525.0, fy=525.0, cx=319.5, cy=239.5, width=640, height=480)
 
 # Corners of the loop: through both doors, around the tables of the outer rooms, and back.
@@ -71,6 +76,14 @@ def true_trajectory(robot: int, robots: int, frames: int, seed: int) -> Trajecto
     travelled_m = STEP_M * np.arange(frames) + length_m * robot / robots
     poses = np.array([_pose_at(path, length_m, s, phase) for s in travelled_m])
     return Trajectory(np.arange(frames) / RATE_HZ, poses)
+
+
+def frames_to_overlap(robots: int) -> int:
+    """Return the frames with which each robot reaches the start of the next one, and drives past it.
+
+    One robot alone reaches its own start.
+    """
+    return math.ceil((_loop()[1] / robots + _OVERLAP_M) / STEP_M)
 
 
 def _loop() -> tuple[Array, float]:

@@ -54,7 +54,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--out", type=Path, default=Path("out"), metavar="DIR", help="folder of results (default: out)"
     )
     parser.add_argument(
-        "--frames", type=int, help="frames per robot in the rendered world (default: 80, with --merge: 150)"
+        "--frames",
+        type=int,
+        help="frames per robot in the rendered world (default: 80; with --merge, what a merge needs)",
     )
     parser.add_argument("--seed", type=int, default=0, help="seed of the rendered world (default: 0)")
     parser.add_argument(

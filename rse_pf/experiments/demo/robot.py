@@ -32,8 +32,7 @@ __all__ = ["DemoOptions", "FrameDone", "RobotFinished", "RobotSpec", "run_robot"
 
 _MIN_READINGS = 2
 _DEFAULT_FRAMES = 80
-_MERGE_FRAMES = 150
-"""Enough for each of three robots to see what the next one saw at its start."""
+_LEAST_MERGE_FRAMES = 150
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -54,8 +53,12 @@ class DemoOptions:
 
     @property
     def frame_count(self) -> int:
-        """The frames of each robot in the rendered world."""
-        return self.frames or (_MERGE_FRAMES if self.merge else _DEFAULT_FRAMES)
+        """The frames of each robot in the rendered world; to merge, it must see what the next one saw."""
+        from client_sdk.simulator import frames_to_overlap
+
+        if self.frames or not self.merge:
+            return self.frames or _DEFAULT_FRAMES
+        return max(_LEAST_MERGE_FRAMES, frames_to_overlap(self.robots))
 
     @property
     def frontend_options(self) -> FrontEndOptions:

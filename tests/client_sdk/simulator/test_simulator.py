@@ -11,7 +11,7 @@ import pytest
 import client_sdk.simulator
 from client_sdk.frontend import PoseQuery, Tracker
 from client_sdk.mapping import Trajectory
-from client_sdk.simulator import SIMULATED_CAMERA, render_frames, true_trajectory
+from client_sdk.simulator import SIMULATED_CAMERA, frames_to_overlap, render_frames, true_trajectory
 from client_sdk.simulator.camera import Painter, add_depth_noise
 from client_sdk.simulator.world import DEPTH_M, HEIGHT_M, ROOM_M, make_world
 from rse_pf.errors import UsageError
@@ -47,6 +47,17 @@ def test_robots_move_smoothly_inside_the_rooms(robots: int, seed: int):
         assert (low > [0.5, 0.5, 1.0]).all()
         assert (high < [3 * ROOM_M - 0.5, DEPTH_M - 0.5, 1.5]).all()
         np.testing.assert_allclose(np.linalg.det(truth.T_world_camera[:, :3, :3]), 1.0)
+
+
+@pytest.mark.parametrize("robots", [1, 2, 3, 5])
+def test_robots_that_merge_drive_past_the_start_of_the_next_one(robots: int):
+    frames = frames_to_overlap(robots)
+
+    paths = [true_trajectory(robot, robots, frames, 0).positions for robot in range(robots)]
+
+    for own, following in zip(paths, paths[1:] + paths[:1], strict=True):
+        for seen in (following[0], following[6]):
+            assert np.linalg.norm(own[frames // 2 :] - seen, axis=1).min() < 0.1
 
 
 def test_every_ray_ends_on_a_surface_of_the_world(painter: Painter):
