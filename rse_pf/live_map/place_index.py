@@ -1,0 +1,170 @@
+"""Find the keyframes that look like a view: one short vector for each, and a search over all of them.
+
+The vocabulary is fixed and comes with the package, so a vector never changes when a map grows.  Vectors are
+computed in whole numbers: the same descriptors give the same bytes on every machine.  A search only proposes;
+poses decide.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from rse_pf.errors import BadRequest
+
+__all__ = ["PLACE_NUMBERS", "PLACE_WORDS_FILE", "LivePlaceIndex", "PlaceVector", "place_vector"]
+
+WORDS, PARTS = 32, 16
+_BITS, _SCALE, _FINENESS = 256, 127, 16
+PLACE_NUMBERS = WORDS * PARTS
+"""Of one vector."""
+PLACE_WORDS_FILE = Path(__file__).with_name("place_words.bin")
+"""``(32, 256)`` centres of descriptors' bits (-1, 1) and ``(256, 16)`` directions of what is left, as int8;
+written by ``scripts/train_places.py``."""
+_FIRST_ROWS = 64
+_ROW_BYTES = 8 + 4 * PLACE_NUMBERS
+
+PlaceVector = npt.NDArray[np.float32]
+
+
+def place_vector(descriptors: npt.NDArray[np.uint8]) -> PlaceVector:
+    """Return the ``(512,)`` unit vector of a view with ``(n, 32)`` binary descriptors; zero without any.
+
+    Source:
+        Jegou et al., Aggregating local descriptors (VLAD), CVPR 2010, with their reduction by principal
+        components (PAMI 2012) for each residual, its square root, and the intra-normalisation of Arandjelovic
+        and Zisserman, CVPR 2013.
+    """
+    words, directions, squares = _vocabulary()
+    bits = np.unpackbits(descriptors, axis=1).astype(np.float32)
+    bits += bits
+    bits -= 1.0
+    # Whole numbers below 2**24, so float32 is exact, in whatever order a machine adds them.
+    nearest = np.argmin(squares - (2.0 * _SCALE) * (bits @ words.T), axis=1)
+    of_word = np.zeros((len(bits), WORDS), dtype=np.float32)
+    of_word[np.arange(len(bits)), nearest] = 1.0
+    residuals = _SCALE * (of_word.T @ bits).astype(np.float64)
+    residuals -= of_word.sum(axis=0, dtype=np.float64)[:, None] * words
+    parts = np.matmul(residuals[:, None, :], directions)[:, 0]
+    parts = np.sign(parts) * np.rint(np.sqrt(np.abs(parts)))
+    lengths = np.sqrt((parts * parts).sum(axis=1))
+    parts /= np.maximum(lengths, 1.0)[:, None] * math.sqrt(max(1, int(np.count_nonzero(lengths))))
+    vector: PlaceVector = parts.astype(np.float32).ravel()
+    return vector
+
+
+class LivePlaceIndex:
+    """The vectors of keyframes by id, which is a position in the log; rows have no order of their own."""
+
+    def __init__(self) -> None:
+        self._count = 0
+        self._ids = np.empty(_FIRST_ROWS, dtype=np.int64)
+        self._vectors = np.empty((_FIRST_ROWS, PLACE_NUMBERS), dtype=np.float32)
+        self._row_of = np.full(_FIRST_ROWS, -1, dtype=np.int64)
+
+    @classmethod
+    def from_bytes(cls, data: bytes) -> LivePlaceIndex:
+        """Return the index that `to_bytes` was called on; raises BadRequest."""
+        count, odd = divmod(len(data), _ROW_BYTES)
+        if odd:
+            raise BadRequest(
+                f"{len(data)} bytes are not an index of places", hint="restore the map from another snapshot"
+            )
+        ids = np.frombuffer(data, dtype="<i8", count=count)
+        vectors = np.frombuffer(data, dtype="<f4", offset=8 * count).reshape(count, PLACE_NUMBERS)
+        index = cls()
+        for number, vector in zip(ids.tolist(), vectors, strict=True):
+            index.add(number, vector)
+        return index
+
+    def to_bytes(self) -> bytes:
+        """Return ids and vectors in the order of the ids: equal for equal contents."""
+        order = np.argsort(self._ids[: self._count])
+        ids, vectors = self._ids[order].astype("<i8"), self._vectors[order].astype("<f4")
+        return ids.tobytes() + vectors.tobytes()
+
+    def __len__(self) -> int:
+        return self._count
+
+    def __contains__(self, number: int) -> bool:
+        return 0 <= number < len(self._row_of) and self._row_of[number] >= 0
+
+    @staticmethod
+    def vector(descriptors: npt.NDArray[np.uint8]) -> PlaceVector:
+        """Return `place_vector` of *descriptors*."""
+        return place_vector(descriptors)
+
+    def vector_of(self, number: int) -> PlaceVector:
+        """Return the vector of keyframe *number*; raises KeyError."""
+        if number not in self:
+            raise KeyError(number)
+        found: PlaceVector = self._vectors[self._row_of[number]].copy()
+        return found
+
+    def add(self, number: int, vector: PlaceVector) -> None:
+        """Add keyframe *number*, which is not there yet."""
+        if number in self:
+            raise ValueError(f"keyframe {number} is there already")
+        if self._count == len(self._ids):
+            self._ids = np.concatenate([self._ids, np.empty_like(self._ids)])
+            self._vectors = np.concatenate([self._vectors, np.empty_like(self._vectors)])
+        if number >= len(self._row_of):
+            more = np.full(number + 1, -1, dtype=np.int64)
+            self._row_of = np.concatenate([self._row_of, more])
+        self._ids[self._count], self._vectors[self._count] = number, vector
+        self._row_of[number] = self._count
+        self._count += 1
+
+    def remove(self, number: int) -> None:
+        """Remove keyframe *number*, if it is there."""
+        if number not in self:
+            return
+        row, last = int(self._row_of[number]), self._count - 1
+        self._ids[row], self._vectors[row] = self._ids[last], self._vectors[last]
+        self._row_of[self._ids[row]] = row
+        self._row_of[number] = -1
+        self._count = last
+
+    def nearest(
+        self, vector: PlaceVector, count: int, allowed: npt.NDArray[np.int64] | None = None
+    ) -> list[tuple[int, float]]:
+        """Return up to *count* ``(id, cosine)``, the most similar first, equals by id.
+
+        *allowed* are ids; those that are not in the index are ignored.
+        """
+        rows: npt.NDArray[np.int64] | None = None
+        if allowed is not None:
+            rows = self._row_of[allowed[allowed < len(self._row_of)]]
+            rows = rows[rows >= 0]
+        among = self._count if rows is None else len(rows)
+        count = min(count, among)
+        if count <= 0:
+            return []
+        # All rows at once: to pick rows out of the matrix first would copy them.
+        similarity, ids = self._vectors[: self._count] @ vector, self._ids[: self._count]
+        if rows is not None:
+            similarity, ids = similarity[rows], ids[rows]
+        least = np.partition(similarity, among - count)[among - count]
+        best = np.flatnonzero(similarity >= least)
+        best = best[np.lexsort((ids[best], -similarity[best]))][:count]
+        return [(int(ids[row]), float(similarity[row])) for row in best]
+
+
+@functools.cache
+def _vocabulary() -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float64], npt.NDArray[np.float32]]:
+    """Return ``(32, 256)`` words, ``(32, 256, 16)`` directions, and the squared lengths of the words.
+
+    The directions of a word are rounded to whole numbers, and lie across it: descriptors of another kind than
+    those of the training are all nearer to a word or farther from it, which tells no place from another.
+    """
+    numbers = np.frombuffer(PLACE_WORDS_FILE.read_bytes(), dtype=np.int8)
+    words = numbers[: WORDS * _BITS].reshape(WORDS, _BITS).astype(np.float64)
+    common = numbers[WORDS * _BITS :].reshape(_BITS, PARTS).astype(np.float64)
+    squares = (words**2).sum(axis=1)
+    along = words[:, :, None] * (words @ common)[:, None, :] / squares[:, None, None]
+    directions = np.rint(_FINENESS * (common - along))
+    return words.astype(np.float32), directions, squares.astype(np.float32)

@@ -1,0 +1,81 @@
+"""Train the vocabulary of `rse_pf.live_map.place_index` from rendered worlds, and write it to its file.
+
+No recording takes part, so the package carries nobody's images.  The worlds' seeds are used by no test and no
+benchmark.  It takes about two minutes on one core:
+
+    python scripts/train_places.py
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from client_sdk.frontend import Frame, FrontEndOptions, extract
+from client_sdk.simulator import SIMULATED_CAMERA, true_trajectory
+from client_sdk.simulator.camera import Painter, add_depth_noise, add_image_noise
+from client_sdk.simulator.world import make_world
+from rse_pf.live_map.place_index import PARTS, PLACE_WORDS_FILE, WORDS
+from rse_pf.services.mapping.descriptors import Descriptors, train_words
+
+WORLDS = range(101, 107)
+FRAMES, EACH = 410, 8
+"""One round through a world, of which each eighth frame is rendered."""
+SEED = 1
+
+
+def main() -> None:
+    """Render, train and write."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--out", type=Path, default=PLACE_WORDS_FILE)
+    out = parser.parse_args().out
+    views = [view for world in WORLDS for view in rendered_views(world)]
+    words = train_words(views, WORDS, SEED)
+    data = _int8(words, 1.0) + _int8(directions_of(views, words, PARTS), None)
+    out.write_bytes(data)
+    print(f"{out}: {len(data)} bytes from {len(views)} views, sha256 {hashlib.sha256(data).hexdigest()}")
+
+
+def rendered_views(seed: int) -> list[Descriptors]:
+    """Return the descriptors with depth of the frames of one world."""
+    poses = true_trajectory(0, 1, FRAMES, seed).T_world_camera
+    painter, options = Painter(make_world(seed), SIMULATED_CAMERA), FrontEndOptions()
+    views = []
+    for row in range(0, FRAMES, EACH):
+        rng = np.random.default_rng([seed, row])
+        colour, depth_m, cosine = painter.draw(poses[row])
+        frame = Frame(
+            timestamp_s=0.0, rgb=add_image_noise(colour, rng), depth_m=add_depth_noise(depth_m, cosine, rng),
+            camera=SIMULATED_CAMERA,
+        )  # fmt: skip
+        found = extract(frame, options)
+        views.append(found.descriptors[np.isfinite(found.points_camera[:, 2])])
+    return views
+
+
+def directions_of(
+    views: list[Descriptors], words: npt.NDArray[np.float32], count: int
+) -> npt.NDArray[np.float64]:
+    """Return the ``(256, count)`` principal directions of descriptors around their nearest word."""
+    scatter = np.zeros((words.shape[1], words.shape[1]))
+    for view in views:
+        bits = np.unpackbits(view, axis=1) * 2.0 - 1.0
+        nearest = np.argmin((words**2).sum(axis=1) - 2.0 * bits @ words.T, axis=1)
+        residuals = bits - words[nearest]
+        scatter += residuals.T @ residuals
+    _, directions = np.linalg.eigh(scatter)
+    return np.asarray(directions[:, : -count - 1 : -1], dtype=np.float64)
+
+
+def _int8(numbers: npt.NDArray[np.floating], largest: float | None) -> bytes:
+    scale = 127.0 / (np.abs(numbers).max() if largest is None else largest)
+    whole: npt.NDArray[np.int8] = np.rint(numbers * scale).clip(-127, 127).astype(np.int8)
+    return whole.tobytes()
+
+
+if __name__ == "__main__":
+    main()
