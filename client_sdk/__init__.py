@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from client_sdk.blocking import BlockingRobot, connect_blocking
     from client_sdk.datasets import Dataset, open_dataset
     from client_sdk.frontend import Frame, FrontEndOptions, PoseQuery, TrackedFrame, Tracker
-    from client_sdk.live import Correction, LiveMapper, LiveOptions, OtherRobot
+    from client_sdk.live import BlockingLiveMapper, Correction, LiveMapper, LiveOptions, OtherRobot
     from client_sdk.mapper import BlockingMapper, Mapper
     from client_sdk.mapping import MapOptions, PointMap, Trajectory
     from client_sdk.monocular.scale import MarkerScale, OdometryScale
@@ -30,6 +30,7 @@ if TYPE_CHECKING:
 __all__ = [
     "Answer",
     "BackgroundUploader",
+    "BlockingLiveMapper",
     "BlockingMapper",
     "BlockingRobot",
     "BlockingUpdates",
@@ -67,6 +68,7 @@ __all__ = [
 _HOMES = {
     "Answer": "answers",
     "BackgroundUploader": "transfer.background_upload",
+    "BlockingLiveMapper": "live",
     "BlockingMapper": "mapper",
     "BlockingRobot": "blocking",
     "BlockingUpdates": "updates",

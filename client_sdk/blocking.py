@@ -18,6 +18,8 @@ from client_sdk.updates import BlockingUpdates, Updates
 from rse_pf.errors import Disconnected
 
 if TYPE_CHECKING:
+    from client_sdk.live.blocking import BlockingLiveMapper
+    from client_sdk.live.mapper import LiveMapper
     from client_sdk.mapper import BlockingMapper, Mapper
 
 __all__ = ["BlockingRobot", "connect_blocking"]
@@ -50,6 +52,20 @@ def _blocking_mapper(
         return BlockingMapper(make(self._robot, *args, **kwargs), self._wait)
 
     return mapper
+
+
+def _blocking_live_map(
+    make: Callable[Concatenate[Robot, P], LiveMapper],
+) -> Callable[Concatenate[BlockingRobot, P], BlockingLiveMapper]:
+    """Return `Robot.live_map` for a `BlockingRobot`, whose mapper runs in the robot's event loop."""
+
+    @functools.wraps(make)
+    def live_map(self: BlockingRobot, /, *args: P.args, **kwargs: P.kwargs) -> BlockingLiveMapper:
+        from client_sdk.live.blocking import BlockingLiveMapper
+
+        return BlockingLiveMapper(make(self._robot, *args, **kwargs), self._wait)
+
+    return live_map
 
 
 class BlockingRobot:
@@ -92,6 +108,7 @@ class BlockingRobot:
     solve_pnp = _blocking(Robot.solve_pnp)
     call = _blocking(Robot.call)
     mapper = _blocking_mapper(Robot.mapper)
+    live_map = _blocking_live_map(Robot.live_map)
 
     def subscribe(self, topic: str) -> BlockingUpdates:
         """Ask for the updates of *topic*; iterate over what is returned.  See `Robot.subscribe`."""
@@ -100,6 +117,11 @@ class BlockingRobot:
             return self._robot.subscribe(topic)
 
         return BlockingUpdates(self._wait(begin()), self._wait)
+
+    @property
+    def connected(self) -> bool:
+        """Whether there is a connection to a server now; without one, commands wait for the next."""
+        return self._robot.connected
 
     @property
     def stats(self) -> Stats:

@@ -4,6 +4,7 @@ Tracking belongs to `client_sdk.mapper`; the map itself and its owner belong to 
 """
 
 from client_sdk.live.alignments import Correction, OtherRobot
+from client_sdk.live.blocking import BlockingLiveMapper
 from client_sdk.live.mapper import LiveMapper, LiveOptions
 
-__all__ = ["Correction", "LiveMapper", "LiveOptions", "OtherRobot"]
+__all__ = ["BlockingLiveMapper", "Correction", "LiveMapper", "LiveOptions", "OtherRobot"]

@@ -12,7 +12,7 @@ import pytest
 
 from client_sdk.answers import PoseAnswer
 from client_sdk.frontend import Frame, PoseQuery, TrackedFrame
-from client_sdk.live import Correction, LiveMapper, LiveOptions
+from client_sdk.live import BlockingLiveMapper, Correction, LiveMapper, LiveOptions
 from client_sdk.live.waiting_keyframes import Base, WaitingKeyframes, rebased
 from rse_pf.errors import BadRequest, Busy, Forbidden, UsageError
 from rse_pf.geometry import exp_se3
@@ -307,6 +307,22 @@ def test_a_keyframe_waits_while_a_pose_is_asked_for() -> None:
         assert order[:2] == ["pose", "live-keyframe"]
 
     run(work)
+
+
+def test_a_program_without_asyncio_uses_the_same_mapper() -> None:
+    loop = asyncio.new_event_loop()
+    robot = FakeLiveRobot()
+    try:
+        with BlockingLiveMapper(live_map(robot), loop.run_until_complete) as blocking:
+            blocking.track(frame_at(0, depth=True))
+            loop.run_until_complete(robot.until(lambda: len(robot.kept) == 1))
+            robot.tell("alignment/me", alignment("me", T_MAP_ODOM))
+            corrections = blocking.corrections()
+            assert next(corrections).by == "map"
+            assert blocking.track(frame_at(1, depth=True)).corrected
+        assert list(corrections) == []  # they end with the live map
+    finally:
+        loop.close()
 
 
 def test_frames_without_depth_and_a_map_that_is_not_joined_are_refused() -> None:
