@@ -33,6 +33,7 @@ from rse_pf.errors import (
     RsePfError,
 )
 from rse_pf.identity import RobotId
+from rse_pf.live_map.keyframe_code import decode_features
 from rse_pf.service import failure_of
 from rse_pf.wire import Failure, Result, as_type
 from rse_pf.wire.live_map import (
@@ -329,6 +330,7 @@ def _payload_of(request: Any) -> dict[str, Any]:
         payload["T_odom_camera"] = _rigid(request.T_odom_camera)
     if isinstance(request, KeyframeRequest | LiveRelocalise):
         camera = request.camera
+        decode_features(request.features, camera)  # the owner, which others share, decodes no garbage
         payload["camera"] = [camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height]
     if isinstance(request, LiveStart):
         payload["from"] = payload.pop("source")

@@ -21,16 +21,22 @@ from rse_pf.backend.scheduling.scheduler import QueuedCommand
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import BadRequest, Busy
 from rse_pf.identity import RobotId
+from rse_pf.live_map.keyframe_code import encode_features
 from rse_pf.wire import Command, Failure, Result, Update
 
 CAMERA = {"fx": 525.0, "fy": 525.0, "cx": 319.5, "cy": 239.5, "width": 640, "height": 480}
 POSE = [1, 0, 0, 0.5, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]
 
 
+FEATURES = encode_features(
+    np.full((300, 2), 7.5), np.full(300, 2.0), np.arange(9600, dtype=np.uint8).reshape(300, 32)
+)
+
+
 def keyframe(number: int = 0, **changes: Any) -> dict[str, Any]:
     return {
         "map": "m", "segment": 0, "number": number, "timestamp_s": 1.5, "T_odom_camera": POSE,
-        "camera": CAMERA, "features": b"\x01" * 100, **changes,
+        "camera": CAMERA, "features": FEATURES, **changes,
     }  # fmt: skip
 
 
@@ -105,7 +111,7 @@ def test_a_keyframe_goes_to_the_owner_of_its_tenants_map_and_the_reply_comes_bac
         assert (tenant, name, robot, operation) == ("acme", "m", RobotId("acme", "bob"), "live-keyframe")
         assert 4.0 < deadline_s <= 5.0
         assert payload == {
-            "segment": 0, "number": 0, "timestamp_s": 1.5, "features": b"\x01" * 100,
+            "segment": 0, "number": 0, "timestamp_s": 1.5, "features": FEATURES,
             "T_odom_camera": np.array(POSE, "<f8").tobytes(),
             "camera": [525.0, 525.0, 319.5, 239.5, 640, 480],
         }  # fmt: skip
@@ -115,11 +121,10 @@ def test_a_keyframe_goes_to_the_owner_of_its_tenants_map_and_the_reply_comes_bac
 
 def test_features_arrive_the_same_from_json_and_from_messagepack() -> None:
     async def test(parts: Parts) -> None:
-        features = bytes(range(256)) * 100
-        for number, sent in enumerate((features, base64.b64encode(features).decode())):
+        for number, sent in enumerate((FEATURES, base64.b64encode(FEATURES).decode())):
             await parts.ask("live-keyframe", keyframe(number, features=sent))
 
-        assert [asked[4]["features"] for asked in parts.owners.asked] == [features] * 2
+        assert [asked[4]["features"] for asked in parts.owners.asked] == [FEATURES] * 2
 
     with_router(test)
 
@@ -149,6 +154,9 @@ WRONG = [
     ({"T_odom_camera": [float("inf"), *POSE[1:]]}, "bad-request"),
     ({"camera": {**CAMERA, "fx": -1.0}}, "invalid-camera"),
     ({"features": 7}, "bad-request"),
+    ({"features": b"\x01" * 100}, "bad-request"),
+    ({"features": FEATURES[:-1]}, "bad-request"),
+    ({"features": b""}, "bad-request"),
     ({"features": "no base64!"}, "bad-request"),
     ({"features": b"x" * TOO_LONG}, "too-large"),
     ({"features": "eHh4" * (TOO_LONG // 3 + 2)}, "too-large"),
@@ -274,10 +282,10 @@ def test_a_sender_of_garbage_loses_the_live_maps_for_a_while_and_the_others_do_n
     async def test(parts: Parts) -> None:
         hostile, good = FakeReader("hostile"), FakeReader("good")
         parts.owners.answer = lambda operation, payload: (
-            BadRequest("these are no features") if payload["features"][:1] == b"\x00" else {}
+            BadRequest("a keyframe of 10 km away") if payload["segment"] else {}
         )
         for _ in range(9):
-            await parts.ask("live-keyframe", keyframe(features=b"\x00"), connection=hostile)
+            await parts.ask("live-keyframe", keyframe(segment=1), connection=hostile)
         assert isinstance(await parts.ask("live-keyframe", keyframe(), connection=hostile), Result)
 
         await parts.ask("live-keyframe", keyframe(features=5), connection=hostile)
