@@ -34,6 +34,7 @@ AskPose = Callable[[PoseQuery], Awaitable[PoseAnswer]]
 """Answers one pose query, or raises an RsePfError, with which the query counts as not answered."""
 
 _MIN_READINGS = 2
+_UP_TO_SCALE = "up to scale"
 
 
 class PoseSolver(Protocol):
@@ -199,7 +200,7 @@ class Mapper:
         """Where metres come from: ``metric, by depth``, ``metric, by ...``, or ``up to scale``."""
         if self._tracker is None or isinstance(self._tracker, Tracker):
             return "metric, by depth" if self._tracker is not None else "unknown: no frame yet"
-        return f"metric, by {self._scale.name}" if self._is_metric and self._scale else "up to scale"
+        return f"metric, by {self._scale.name}" if self._is_metric and self._scale else _UP_TO_SCALE
 
     @property
     def features(self) -> Features | None:
@@ -227,7 +228,7 @@ class Mapper:
             "frames_before_start": starting,
             "keyframes": self.keyframes,
             "scale": self.scale,
-            "unit": "unit of the map" if self.scale == "up to scale" else "m",
+            "unit": "unit of the map" if self.scale == _UP_TO_SCALE else "m",
             "path": round(trajectory.length_m, 3) if len(trajectory) > 1 else 0.0,
             "map_points": len(self.map),
             "answered_by": dict(self._sources),
@@ -259,16 +260,21 @@ class Mapper:
     def save(self, folder: Path) -> dict[str, Any]:
         """Write ``map.ply``, ``trajectory.txt`` and ``report.json``; return the report.
 
+        A map with depth has the points that were read at least twice; the report counts those.
+
         Raises:
             UsageError: The folder cannot be written.
         """
         report = self.report()
         # Several views have triangulated a landmark; a voxel of a dense map is trusted if it was read twice.
         least = 1 if isinstance(self._tracker, MonocularTracker) else _MIN_READINGS
+        points, colours = self.map.points(min_readings=least)
+        report["map_points"] = len(points)
+        is_metric = self.scale != _UP_TO_SCALE
         try:
             folder.mkdir(parents=True, exist_ok=True)
-            write_ply(folder / "map.ply", *self.map.points(min_readings=least))
-            write_trajectory(folder / "trajectory.txt", self.trajectory)
+            write_ply(folder / "map.ply", points, colours, is_metric=is_metric)
+            write_trajectory(folder / "trajectory.txt", self.trajectory, is_metric=is_metric)
             text = json.dumps(report, indent=2) + "\n"
             (folder / "report.json").write_text(text, encoding="utf-8")
         except OSError as error:
@@ -300,6 +306,8 @@ class Mapper:
         reason = tracked.reason or (failure if pose is None else "")
         if pose is None and not reason:
             reason = f"only {tracked.matches} matches, or their pose is not plausible"
+            if not tracked.matches:
+                reason = "no matches: a dark or blurred image, or a place that was not seen just before"
         if pose is not None and answer is not None and answer.solution.verdict == "weak":
             reason = answer.solution.reason
         status = tracked.status

@@ -214,8 +214,13 @@ def _hash(keys: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
     return hashes
 
 
-def write_ply(path: Path, points: npt.ArrayLike, colours: npt.NDArray[np.uint8]) -> None:
-    """Write ``(n, 3)`` points in metres and ``(n, 3)`` uint8 colours as a binary PLY file."""
+def write_ply(
+    path: Path, points: npt.ArrayLike, colours: npt.NDArray[np.uint8], *, is_metric: bool = True
+) -> None:
+    """Write ``(n, 3)`` points in metres and ``(n, 3)`` uint8 colours as a binary PLY file.
+
+    *is_metric* says whether the unit is metres, or arbitrary: the file says the same in a comment.
+    """
     vertices = np.empty(len(colours), dtype=_VERTEX)
     positions = np.asarray(points, dtype=np.float32)
     for column, name in enumerate(("x", "y", "z")):
@@ -223,7 +228,7 @@ def write_ply(path: Path, points: npt.ArrayLike, colours: npt.NDArray[np.uint8])
     for column, name in enumerate(("red", "green", "blue")):
         vertices[name] = colours[:, column]
     with path.open("wb") as file:
-        file.write(_ply_header(len(vertices)))
+        file.write(_ply_header(len(vertices), is_metric))
         file.write(vertices.tobytes())
 
 
@@ -239,15 +244,24 @@ def read_ply(path: Path) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.uint8]
         raise UsageError(f"cannot read {path}: {error.strerror}", hint="name a .ply file") from error
     head, mark, body = content.partition(b"end_header\n")
     count = next((int(line.split()[2]) for line in head.splitlines() if line[:15] == b"element vertex "), -1)
-    if count < 0 or head + mark != _ply_header(count) or len(body) != count * _VERTEX.itemsize:
+    if (
+        count < 0
+        or head + mark not in (_ply_header(count), _ply_header(count, False))
+        or len(body) != count * _VERTEX.itemsize
+    ):
         raise UsageError(f"{path} is not a map of this program", hint="name a .ply file that it wrote")
     vertices = np.frombuffer(body, dtype=_VERTEX)
     points = np.column_stack([vertices[name] for name in ("x", "y", "z")])
     return points, np.column_stack([vertices[name] for name in ("red", "green", "blue")])
 
 
-def _ply_header(count: int) -> bytes:
-    lines = ["ply", "format binary_little_endian 1.0", "comment metres", f"element vertex {count}"]
+def _unit(is_metric: bool) -> str:
+    return "metres" if is_metric else "up to scale: the unit is arbitrary"
+
+
+def _ply_header(count: int, is_metric: bool = True) -> bytes:
+    unit = _unit(is_metric)
+    lines = ["ply", "format binary_little_endian 1.0", f"comment {unit}", f"element vertex {count}"]
     lines += [f"property float {name}" for name in ("x", "y", "z")]
     lines += [f"property uchar {name}" for name in ("red", "green", "blue")]
     return ("\n".join([*lines, "end_header"]) + "\n").encode("ascii")
@@ -282,9 +296,12 @@ class Trajectory:
         return float(np.linalg.norm(np.diff(self.positions, axis=0), axis=1).sum())
 
 
-def write_trajectory(path: Path, trajectory: Trajectory) -> None:
-    """Write a trajectory in TUM format: ``timestamp tx ty tz qx qy qz qw``, metres."""
-    lines = ["# timestamp tx ty tz qx qy qz qw  (T_world_camera, metres)"]
+def write_trajectory(path: Path, trajectory: Trajectory, *, is_metric: bool = True) -> None:
+    """Write a trajectory in TUM format: ``timestamp tx ty tz qx qy qz qw``.
+
+    *is_metric* says whether the unit is metres, or arbitrary: the file says the same in a comment.
+    """
+    lines = [f"# timestamp tx ty tz qx qy qz qw  (T_world_camera, {_unit(is_metric)})"]
     for timestamp_s, pose in zip(trajectory.timestamps_s, trajectory.T_world_camera, strict=True):
         numbers = [*pose[:3, 3], *to_quaternion(pose[:3, :3])]
         lines.append(f"{timestamp_s:.6f} " + " ".join(f"{number:.9f}" for number in numbers))

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
+from rse_pf.cli.frame_table import FRAMES_FILE, FrameTable
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import CommandFailed, UsageError
 from rse_pf.terminal import show, show_progress
@@ -74,23 +75,25 @@ def run_from_camera(args: argparse.Namespace, settings: PlatformSettings) -> int
         from rse_pf.experiments.plots.map_image import RobotPath, draw_map
 
         _make_folder(args.out)
-        mapper = asyncio.run(_drive(args, settings, source, scale))
+        frames = FrameTable()
+        mapper = asyncio.run(_drive(args, settings, source, scale, frames))
     report = mapper.save(args.out)
+    frames.write(args.out / FRAMES_FILE)
     points, colours = mapper.map.points()
     path = mapper.trajectory
     unit = "m" if report["unit"] == "m" else "units"
     if len(path) and len(points):
         caption = f"{args.source}: {report['frames']} frames, {report['map_points']:,} points, {mapper.scale}"
         drawn = RobotPath(name=_ROBOT, T_world_camera=path.T_world_camera)
-        draw_map(args.out / "map.png", points, colours, [drawn], caption)
+        draw_map(args.out / "map.png", points, colours, [drawn], caption, unit=unit)
     posed = len(path)
     trip = report["round_trip_ms"]["p50"]
     show(
         f"{report['frames']} frames, {report['lost_frames']} lost, {report['keyframes']} keyframes, "
         f"{report['map_points']} points; path {report['path']:.2f} {unit}; scale: {mapper.scale}"
         + ("" if trip is None else f"; round trip p50 {trip} ms"),
-        *(["lost because: " + next(iter(report["lost_because"]))] if report["lost_because"] else []),
-        f"results: {args.out}/map.ply, map.png, trajectory.txt, report.json",
+        *frames.lines(),
+        f"results: {args.out}/map.ply, map.png, trajectory.txt, {FRAMES_FILE}, report.json",
     )
     if posed <= (1 - _MOST) * report["frames"]:
         raise CommandFailed(
@@ -137,7 +140,11 @@ def _make_folder(folder: Path) -> None:
 
 
 async def _drive(
-    args: argparse.Namespace, settings: PlatformSettings, source: FrameSource, scale: Any
+    args: argparse.Namespace,
+    settings: PlatformSettings,
+    source: FrameSource,
+    scale: Any,
+    frames: FrameTable,
 ) -> Mapper:
     """Track all frames; Ctrl-C ends the drive, and what was mapped is kept."""
     stop = asyncio.Event()
@@ -150,7 +157,9 @@ async def _drive(
             frame = await asyncio.to_thread(next, source, None)
             if frame is None:
                 break
-            status.show(mapper, await mapper.track(frame))
+            tracked = await mapper.track(frame)
+            frames.add(tracked)
+            status.show(mapper, tracked)
         status.end()
     if not mapper.frames:
         raise UsageError(f"{args.source} gives no frame", hint="look at it: rse-pf camera check")
@@ -219,4 +228,4 @@ class _Status:
 def _advice(mapper: Mapper) -> str:
     if mapper.keyframes == 0:
         return "without depth the camera must move sideways, over things with texture; or use a depth camera"
-    return "move more slowly, with more light, and check the intrinsics; see report.json for the reasons"
+    return "move more slowly, with more light, and check the intrinsics; see frames.csv for the reasons"

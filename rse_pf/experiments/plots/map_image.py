@@ -50,8 +50,12 @@ def draw_map(
     colours: npt.NDArray[np.uint8],
     robots: list[RobotPath],
     caption: str,
+    *,
+    unit: str = "m",
 ) -> None:
     """Write a PNG that shows ``(n, 3)`` points obliquely from above, with the paths of the robots.
+
+    *unit* is that of the points, as the scale bar names it.
 
     Raises:
         MissingExtra: Pillow is not installed.
@@ -74,7 +78,7 @@ def draw_map(
             draw.text(
                 place, robot.name, fill=_INK, font=small, anchor="mm", stroke_width=4, stroke_fill=_WHITE
             )
-    scale_left = _draw_scale(draw, view, small)
+    scale_left = _draw_scale(draw, view, small, unit)
     text = _fitting(draw, printable(caption), big, _WIDTH - 2 * _MARGIN)
     draw.text((_MARGIN, 18), text, fill=_INK, font=big)
     _draw_legend(draw, robots, small, scale_left - _MARGIN)
@@ -250,12 +254,12 @@ def _draw_camera(draw: Any, view: _Observer, T_world_camera: Array, colour: tupl
     draw.line([*flat[1:], flat[1]], fill=colour, width=2)
 
 
-def _draw_scale(draw: Any, view: _Observer, font: Any) -> float:
+def _draw_scale(draw: Any, view: _Observer, font: Any, unit: str) -> float:
     """Draw a bar of a round length, as long as it appears at the centre; return its left end."""
     ends = view.project(np.stack([view.centre, view.centre + view.axis_x]))
     one_px = max(float(np.linalg.norm(ends[1] - ends[0])), 1e-9)
-    metres = next((m for m in _SCALES_M if _SCALE_PX[0] <= m * one_px <= _SCALE_PX[1]), 1.0)
-    length, label = min(metres * one_px, _WIDTH / 2), f"{metres:g} m"
+    units = next((m for m in _SCALES_M if _SCALE_PX[0] <= m * one_px <= _SCALE_PX[1]), 1.0)
+    length, label = min(units * one_px, _WIDTH / 2), f"{units:g} {unit}"
     right, y = _WIDTH - _MARGIN, _HEIGHT - 34
     draw.line([(right - length, y), (right, y)], fill=_INK, width=3)
     for x in (right - length, right):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import csv
 import json
 from collections.abc import AsyncIterator
 from pathlib import Path
@@ -15,9 +16,11 @@ import pytest
 import client_sdk
 from client_sdk.answers import PoseAnswer
 from client_sdk.datasets.intrinsics import Intrinsics, write_intrinsics
+from client_sdk.frontend import TrackedFrame
 from client_sdk.mapper import Mapper, ask_robot
 from client_sdk.mapping import Trajectory, read_ply, read_trajectory, write_trajectory
 from rse_pf.cli import map_from_camera
+from rse_pf.cli.frame_table import FrameTable
 from rse_pf.cli.main import main
 from rse_pf.pnp import refine_with_depth, solve_pnp
 from tests.client_sdk.mapper.flat_world import CAMERA, STEP_M, frame_at
@@ -104,6 +107,49 @@ def test_without_a_scale_the_command_says_so(folder: Path, capsys: pytest.Captur
     assert code == 0
     assert "units; scale: up to scale" in out
     assert json.loads(Path("out-camera/report.json").read_text())["scale"] == "up to scale"
+    assert "metres" not in Path("out-camera/trajectory.txt").read_text()
+    assert b"comment up to scale" in Path("out-camera/map.ply").read_bytes()[:200]
+    assert len(read_ply(Path("out-camera/map.ply"))[0]) > 100
+
+
+def test_each_frame_has_a_row_that_says_why_it_has_no_pose(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    writer = cv2.VideoWriter("dark.avi", cv2.VideoWriter_fourcc(*"FFV1"), 10.0, (320, 240))
+    for row in range(9):
+        image = frame_at(row, depth=False).rgb[:, :, ::-1]
+        writer.write(np.ascontiguousarray(image if row != 7 else 0 * image))
+    writer.release()
+
+    code = main(["map", "from-camera", "dark.avi", "--intrinsics", "i.json", *PLATFORM])
+
+    rows = list(csv.DictReader(Path("out-camera/frames.csv").read_text().splitlines()))
+    assert code == 0
+    assert [row["frame"] for row in rows] == [str(number) for number in range(1, 10)]
+    assert (rows[7]["status"], rows[7]["verdict"]) == ("lost", "none")
+    assert rows[8]["verdict"] == "ok"
+    assert float(rows[8]["sigma_position"]) > 0
+    assert f"lost: frame 8; because: {rows[7]['reason']}" in capsys.readouterr().out
+
+
+def test_many_lost_frames_are_named_in_short() -> None:
+    table, lost, good = FrameTable(), tracked("few matches", None), tracked("", np.eye(4))
+    weak = tracked("clustered", np.eye(4))
+    for done in (good, lost, lost, good, lost, *([good, weak] * 9)):
+        table.add(done)
+
+    assert list(table.lines()) == [
+        "lost: frames 2-3, 5; because: few matches",
+        "weak poses: frames 7, 9, 11, 13, 15, 17, 19, 21, ...; frames.csv says why",
+    ]
+
+
+def tracked(reason: str, pose: Any) -> TrackedFrame:
+    status = "lost" if pose is None else "tracked"
+    return TrackedFrame(
+        frame=frame_at(0, depth=True), T_world_camera=pose, keyframe=False, inliers=9, matches=9,
+        status=status, reason=reason,
+    )  # fmt: skip
 
 
 def test_a_pipe_gets_a_line_of_progress_every_five_seconds(
