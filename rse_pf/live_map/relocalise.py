@@ -1,0 +1,159 @@
+"""Find the place of one view among placed keyframes: a pose with its verdict and reason.
+
+Each candidate proposes a placement by PnP and depth; placements that agree support each other, and one that
+contradicts them makes the place ambiguous.  Which keyframes are candidates is decided elsewhere.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+
+from rse_pf.geometry import Array, Camera, exp_se3, inverse, pose_difference, skew
+from rse_pf.live_map.keyframe_code import KeyframeFeatures
+from rse_pf.live_map.measure import MeasuredPose, MeasureOptions, measure_pose
+from rse_pf.services.mapping.pose_graph import log_se3
+
+__all__ = ["RelocaliseOptions", "Relocalised", "relocalise"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RelocaliseOptions:
+    """When a placement counts, and when it is ok.
+
+    Attributes:
+        measured: Of matches; a pose is ok from its ``min_inliers`` and ``min_inlier_ratio`` on.
+        least_inliers: A candidate with fewer proposes nothing.
+        agree_m: Placements closer than this,
+        agree_deg: and turned less than this, support each other.
+        alone_inliers: One keyframe alone is enough from so many inliers on.
+        rival: A contradicting placement with this share of the inliers makes a place ambiguous.
+    """
+
+    measured: MeasureOptions = field(default_factory=lambda: MeasureOptions(min_inliers=30))
+    least_inliers: int = 15
+    agree_m: float = 0.2
+    agree_deg: float = 6.0
+    alone_inliers: int = 80
+    rival: float = 0.5
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Relocalised:
+    """Where a camera is in the map.
+
+    ``verdict`` is ``ok``; ``weak`` with a reason ("ambiguous", "few-inliers", "low-inlier-ratio",
+    "one-keyframe", or one of PnP); or ``none`` with a reason ("no-candidates", "no-pose") and without a pose.
+    ``covariance`` ``(6, 6)`` is of the twist (metres, radians) on the left of ``T_map_camera``.  ``inliers``
+    and ``matches`` are those of the best keyframe, ``keyframes`` the ids of those that agree, best first.
+    """
+
+    verdict: Literal["ok", "weak", "none"]
+    reason: str = ""
+    T_map_camera: Array | None = None
+    covariance: Array | None = None
+    inliers: int = 0
+    matches: int = 0
+    keyframes: tuple[int, ...] = ()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Placement:
+    """The pose of the view that one keyframe proposes, with its covariance on the right."""
+
+    keyframe: int
+    T_map_camera: Array
+    covariance: Array
+    found: MeasuredPose
+
+
+_DEFAULT = RelocaliseOptions()
+
+
+def relocalise(
+    candidates: Sequence[tuple[int, KeyframeFeatures, Camera, Array]],
+    features: KeyframeFeatures,
+    camera: Camera,
+    options: RelocaliseOptions = _DEFAULT,
+) -> Relocalised:
+    """Return the place of a view among *candidates*; deterministic.
+
+    Args:
+        candidates: Id, features, camera and ``T_map_keyframe`` of keyframes that look alike.  Those of one
+            place say nothing against another one: give some of each place that looks alike.
+        features: Of the view.
+        camera: Of the view.
+        options: When a placement is ok.
+    """
+    if not candidates:
+        return Relocalised(verdict="none", reason="no-candidates")
+    placements = []
+    for number, known, known_camera, T_map_keyframe in candidates:
+        points = known.points_camera(known_camera)
+        found = measure_pose(points, known, features, camera, options.measured)
+        if isinstance(found, str) or found.inliers < options.least_inliers:
+            continue
+        placements.append(
+            _Placement(
+                keyframe=number, T_map_camera=T_map_keyframe @ inverse(found.solution.T_camera_world),
+                covariance=found.solution.covariance + options.measured.floor(), found=found,
+            )
+        )  # fmt: skip
+    if not placements:
+        return Relocalised(verdict="none", reason="no-pose")
+    placements.sort(key=lambda each: (-each.found.inliers, each.keyframe))
+    best = placements[0]
+    agreeing = [each for each in placements if _agree(each, best, options)]
+    others = [each for each in placements if not _agree(each, best, options)]
+    reason = _weakness(agreeing, others, options)
+    T_map_camera, covariance = _fused(agreeing)
+    return Relocalised(
+        verdict="weak" if reason else "ok", reason=reason, T_map_camera=T_map_camera, covariance=covariance,
+        inliers=best.found.inliers, matches=best.found.matches,
+        keyframes=tuple(each.keyframe for each in agreeing),
+    )  # fmt: skip
+
+
+def _agree(one: _Placement, other: _Placement, options: RelocaliseOptions) -> bool:
+    metres, degrees = pose_difference(one.T_map_camera, other.T_map_camera)
+    return metres <= options.agree_m and degrees <= options.agree_deg
+
+
+def _weakness(
+    agreeing: Sequence[_Placement], others: Sequence[_Placement], options: RelocaliseOptions
+) -> str:
+    """Return why the placement of *agreeing* (best first) is not ok, "" if it is."""
+    best = agreeing[0].found
+    if others and others[0].found.inliers >= options.rival * best.inliers:
+        return "ambiguous"
+    if best.inliers < options.measured.min_inliers:
+        return "few-inliers"
+    if best.inliers < options.measured.min_inlier_ratio * best.matches:
+        return "low-inlier-ratio"
+    if best.solution.reason:
+        return best.solution.reason
+    if len(agreeing) < 2 and best.inliers < options.alone_inliers:
+        return "one-keyframe"
+    return ""
+
+
+def _fused(placements: Sequence[_Placement]) -> tuple[Array, Array]:
+    """Return the mean of placements that agree, weighted by their information, and its covariance.
+
+    Keyframes that lie together share the errors of the map, so the covariance is that of the best one.
+    """
+    best = placements[0]
+    back = inverse(best.T_map_camera)
+    twists = log_se3(np.array([back @ each.T_map_camera for each in placements]))
+    information = np.array([np.linalg.inv(each.covariance) for each in placements])
+    twist = np.linalg.solve(information.sum(axis=0), np.einsum("kij,kj->i", information, twists))
+    T_map_camera: Array = best.T_map_camera @ exp_se3(twist)
+    moved = np.zeros((6, 6))
+    rotation = T_map_camera[:3, :3]
+    moved[:3, :3] = moved[3:, 3:] = rotation
+    moved[:3, 3:] = skew(T_map_camera[:3, 3]) @ rotation
+    covariance: Array = moved @ best.covariance @ moved.T
+    return T_map_camera, 0.5 * (covariance + covariance.T)

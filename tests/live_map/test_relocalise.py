@@ -1,0 +1,130 @@
+"""The place of one view among placed keyframes."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from rse_pf.geometry import exp_se3, inverse, pose_difference
+from rse_pf.live_map.keyframe_code import KeyframeFeatures, decode_features, encode_features
+from rse_pf.live_map.relocalise import RelocaliseOptions, relocalise
+from rse_pf.services.synthetic_maps import make_world
+
+
+def coded(keyframe) -> KeyframeFeatures:
+    depths_m = keyframe.points_camera[:, 2]
+    return decode_features(encode_features(keyframe.pixels, depths_m, keyframe.descriptors), keyframe.camera)
+
+
+def candidates_of(seed: int, turns, T_map_world=None):
+    """Return keyframes of a hall, placed without error, and the pose of the one at 0.03 turns."""
+    T_map_world = np.eye(4) if T_map_world is None else T_map_world
+    version, truth = make_world(seed, points=4000).walk("r", np.asarray(turns), seed=5)
+    return [
+        (number, coded(keyframe), keyframe.camera, T_map_world @ truth[number])
+        for number, keyframe in enumerate(version.keyframes)
+    ]
+
+
+TURNS = (0.0, 0.02, 0.05, 0.3, 0.6)
+MAP = candidates_of(3, TURNS)
+_, VIEW, CAMERA, T_VIEW = candidates_of(3, (0.0, 0.035))[1]
+ELSEWHERE = exp_se3([12.0, 1.0, 0.0, 0.0, 0.0, 1.0])
+
+
+def renumbered(candidates, first: int):
+    return [(first + number, *rest) for number, *rest in candidates]
+
+
+def test_a_view_finds_its_place():
+    found = relocalise(MAP, VIEW, CAMERA)
+
+    assert (found.verdict, found.reason) == ("ok", "")
+    metres, degrees = pose_difference(found.T_map_camera, T_VIEW)
+    assert metres < 0.01
+    assert degrees < 0.2
+    assert set(found.keyframes) == {0, 1, 2}
+    assert found.inliers <= found.matches
+
+
+def test_the_covariance_is_that_of_the_twist_on_the_left():
+    far = exp_se3([100.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+    here = relocalise(MAP, VIEW, CAMERA).covariance
+    there = relocalise([(n, f, c, far @ T) for n, f, c, T in MAP], VIEW, CAMERA).covariance
+
+    deviations = np.sqrt(np.diag(there))
+    assert np.allclose(there, there.T)
+    assert np.linalg.eigvalsh(here).min() > 0
+    # 0.7 degrees at least, and 100 m from the origin as its lever.
+    assert deviations[1] > 100.0 * np.radians(0.7)
+    assert 0.02 < deviations[0] < 1.0
+
+
+def test_without_candidates_there_is_no_place():
+    found = relocalise([], VIEW, CAMERA)
+
+    assert (found.verdict, found.reason, found.T_map_camera) == ("none", "no-candidates", None)
+
+
+def test_a_foreign_view_has_no_place():
+    _, foreign, camera, _ = candidates_of(4, (0.0,))[0]
+
+    found = relocalise(MAP, foreign, camera)
+
+    assert (found.verdict, found.reason, found.T_map_camera) == ("none", "no-pose", None)
+
+
+def test_two_places_that_look_alike_are_ambiguous():
+    twice = MAP + renumbered([(n, f, c, ELSEWHERE @ T) for n, f, c, T in MAP], 10)
+
+    found = relocalise(twice, VIEW, CAMERA)
+
+    assert (found.verdict, found.reason) == ("weak", "ambiguous")
+    assert found.T_map_camera is not None
+
+
+def test_a_place_that_looks_alike_only_in_part_does_not_make_it_ambiguous():
+    keyframe = MAP[1][1]
+    part = KeyframeFeatures(
+        pixels=keyframe.pixels[:60], depths_m=keyframe.depths_m[:60], descriptors=keyframe.descriptors[:60]
+    )
+
+    found = relocalise([*MAP, (10, part, CAMERA, ELSEWHERE @ MAP[1][3])], VIEW, CAMERA)
+
+    assert (found.verdict, found.reason) == ("ok", "")
+    assert 10 not in found.keyframes
+
+
+@pytest.mark.parametrize(
+    ("options", "reason"),
+    [
+        ({"alone_inliers": 1000}, "one-keyframe"),
+        ({"alone_inliers": 10}, ""),
+    ],
+)
+def test_one_keyframe_alone_needs_more_inliers(options, reason):
+    found = relocalise(MAP[1:2], VIEW, CAMERA, RelocaliseOptions(**options))
+
+    assert found.reason == reason
+    assert found.verdict == ("weak" if reason else "ok")
+
+
+def test_few_inliers_are_weak():
+    options = RelocaliseOptions()
+    strict = replace(options, measured=replace(options.measured, min_inliers=200))
+
+    found = relocalise(MAP[:1], VIEW, CAMERA, strict)
+
+    assert found.inliers < 200
+    assert (found.verdict, found.reason) == ("weak", "few-inliers")
+
+
+def test_a_view_far_from_its_keyframes_by_metres_is_still_relative_to_them():
+    moved = [(n, f, c, ELSEWHERE @ T) for n, f, c, T in MAP]
+
+    found = relocalise(moved, VIEW, CAMERA)
+
+    metres, _ = pose_difference(inverse(ELSEWHERE) @ found.T_map_camera, T_VIEW)
+    assert metres < 0.01
