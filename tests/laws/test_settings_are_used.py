@@ -20,12 +20,7 @@ SPELLINGS = {"settings", "limits", "s"}
 """What a group is called where it is an argument on its own."""
 OWNERS = Counter(name for _, name in NAMES)
 
-WAITING: dict[str, set[str]] = {
-    "live": {
-        "first_port", "heartbeat_s", "host", "idle_s", "keep_log", "lease_s", "max_memory_bytes",
-        "max_owners", "ports", "publish_s",
-    }
-}  # fmt: skip
+WAITING: dict[str, set[str]] = {}
 """Settings whose readers are not written yet; the reader's author removes them here."""
 
 LITERALS = re.compile(r"(?<![\w.])(?:8700|8765|8766|8767)(?![\w.])|\"/ws\"")

@@ -1,0 +1,183 @@
+"""The owner processes that a worker has started: each is prepared, claims one map, and ends."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import functools
+from collections.abc import Callable
+from typing import Any, Literal, Protocol
+
+from rse_pf.backend.live_map.owner.process import OwnerOrder
+from rse_pf.backend.sandbox.ipc import FrameReader
+
+__all__ = ["ChildProcess", "OwnerChild", "OwnerChildren"]
+
+_READ_BYTES = 1 << 16
+_NEXT_SPARE_S = 10.0
+"""After a process was taken the next one is prepared so much later: a takeover needs the processors."""
+
+
+class ChildProcess(Protocol):
+    """What is needed of an `OwnerProcess`."""
+
+    connection: Any
+    pid: int
+
+    def claim(self, order: OwnerOrder) -> None:
+        """Let it claim a map."""
+
+    def release(self) -> None:
+        """Let it release its map, and end."""
+
+    def kill(self) -> int:
+        """Kill it unless it has ended, reap it and return the exit code."""
+
+
+class OwnerChild:
+    """One owner process, in the event loop of its worker."""
+
+    def __init__(self, process: ChildProcess) -> None:
+        """Read what the process says."""
+        self.epoch: int | None = None
+        """Of the owner, while it serves."""
+        self.on_end: Callable[[OwnerChild, int], None] = lambda child, code: None
+        """Gets this object and the exit code."""
+        self._process = process
+        loop = asyncio.get_running_loop()
+        self._ready: asyncio.Future[bool] = loop.create_future()
+        self._outcome: asyncio.Future[Literal["serving", "lost"]] = loop.create_future()
+        self.ended: asyncio.Future[int] = loop.create_future()
+        self._reader = loop.create_task(self._read())
+
+    @property
+    def pid(self) -> int:
+        """Of the process."""
+        return self._process.pid
+
+    async def claim(self, order: OwnerOrder) -> bool:
+        """Let it claim a map; return whether it serves it now."""
+        if not await asyncio.shield(self._ready):
+            return False
+        self._process.claim(order)
+        return await asyncio.shield(self._outcome) == "serving"
+
+    def release(self) -> None:
+        """Let it release its map, and end."""
+        self._process.release()
+
+    def kill(self) -> None:
+        """End it at once, as it is not needed."""
+        self._reader.cancel()
+        self._finish()
+
+    async def _read(self) -> None:
+        loop = asyncio.get_running_loop()
+        self._process.connection.setblocking(False)
+        frames = FrameReader(_READ_BYTES)
+        with contextlib.suppress(OSError):
+            while data := await loop.sock_recv(self._process.connection, _READ_BYTES):
+                for message in frames.feed(data):
+                    self._take(message)
+        self._finish()
+
+    def _take(self, message: list[Any]) -> None:
+        match message:
+            case ["ready"]:
+                self._ready.set_result(True)
+            case ["serving", int(epoch)]:
+                self.epoch = epoch
+                self._outcome.set_result("serving")
+            case ["lost"]:
+                self._outcome.set_result("lost")
+
+    def _finish(self) -> None:
+        """Reap the process, which has ended or is killed."""
+        if self.ended.done():
+            return
+        code = self._process.kill()
+        if not self._ready.done():
+            self._ready.set_result(False)
+        if not self._outcome.done():
+            self._outcome.set_result("lost")
+        self.ended.set_result(code)
+        self.on_end(self, code)
+
+
+class OwnerChildren:
+    """The owner processes of one worker: those in use, and one that waits for a map."""
+
+    def __init__(self, spawn: Callable[[], ChildProcess], *, max_owners: int, keeps_spare: bool) -> None:
+        """Start none yet.
+
+        Args:
+            spawn: Starts a process.
+            max_owners: Of them are in use at the same time.
+            keeps_spare: Whether one waits for a map as soon as `use` was called.
+        """
+        self.is_giving_up = False
+        """The server drains: no further map is taken."""
+        self._spawn = spawn
+        self._max_owners = max_owners
+        self._keeps_spare = keeps_spare
+        self._used: set[OwnerChild] = set()
+        self._spare: OwnerChild | None = None
+        self._timer: asyncio.TimerHandle | None = None
+
+    @property
+    def used(self) -> list[OwnerChild]:
+        """Those that claim or serve a map."""
+        return list(self._used)
+
+    def take(self, on_end: Callable[[OwnerChild, int], None]) -> OwnerChild | None:
+        """Return a process that may claim a map, None if no more are allowed; *on_end* learns of its end."""
+        self.prepare()
+        child, self._spare = self._spare, None
+        if child is not None:
+            self._used.add(child)
+            child.on_end = functools.partial(self._lose, on_end)
+            self._prepare_later()
+        return child
+
+    def prepare(self) -> None:
+        """Start a process that waits for a map, if one more may be used."""
+        if self._spare is None and len(self._used) < self._max_owners and not self.is_giving_up:
+            self._spare = OwnerChild(self._spawn())
+            self._spare.on_end = self._lose_spare
+
+    def use(self, *, is_used: bool) -> None:
+        """Keep a process ready while live maps are used, none otherwise."""
+        if is_used:
+            self._prepare_later()
+        else:
+            self.drop_spare()
+
+    def release(self) -> None:
+        """Take no further map, and release those that are served."""
+        self.is_giving_up = True
+        self.drop_spare()
+        for child in self.used:
+            child.release()
+
+    def drop_spare(self) -> None:
+        """End the process that waits for a map."""
+        if self._timer is not None:
+            self._timer.cancel()
+            self._timer = None
+        if self._spare is not None:
+            self._spare.kill()
+
+    def _lose(self, on_end: Callable[[OwnerChild, int], None], child: OwnerChild, code: int) -> None:
+        self._used.discard(child)
+        on_end(child, code)
+
+    def _lose_spare(self, child: OwnerChild, code: int) -> None:
+        self._spare = None
+
+    def _prepare_later(self) -> None:
+        if self._keeps_spare and self._timer is None and self._spare is None:
+            self._timer = asyncio.get_running_loop().call_later(_NEXT_SPARE_S, self._prepare_now)
+
+    def _prepare_now(self) -> None:
+        self._timer = None
+        self.prepare()

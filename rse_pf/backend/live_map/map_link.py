@@ -1,0 +1,417 @@
+"""The way from one worker to the owner of one live map: find it, connect, start one, and connect again.
+
+It lasts while somebody waits for an answer or for updates, and a little longer.  A request that was not
+answered when a connection ended is sent again on the next one.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import itertools
+from collections.abc import Awaitable, Callable
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+from rse_pf.backend.live_map.children import OwnerChild
+from rse_pf.backend.live_map.owner.lease import LeaseRecord, LeaseWatch, lease_name, verdict_on
+from rse_pf.backend.live_map.owner.link_security import (
+    TOKEN_S,
+    LinkClaims,
+    check_certificate,
+    client_context,
+    make_token,
+)
+from rse_pf.backend.live_map.owner.process import OwnerOrder
+from rse_pf.backend.live_map.owner.replies import show_missing
+from rse_pf.backend.live_map.owner.requests import SHOW, begins_a_map
+from rse_pf.backend.live_map.owner.server import MAX_LINK_BYTES
+from rse_pf.backend.log import JsonLog
+from rse_pf.backend.sandbox.ipc import FrameReader, encode_message
+from rse_pf.config import LiveSettings
+from rse_pf.errors import Busy, Conflict, NotFound, RsePfError, StoreError, Unauthorized, error_from_code
+from rse_pf.identity import RobotId
+from rse_pf.object_store import ObjectStore
+
+__all__ = ["LinkContext", "MapLink"]
+
+_READ_BYTES = 1 << 18
+_CONNECT_S = 1.0
+_POLL_S = 0.1
+_RETRY_S = 0.02
+"""An owner that is about to give its map up is asked again so often."""
+_WATCH_POLL_S = 1.0
+"""A map that nobody may begin is looked for so often."""
+_LINGER_S = 10.0
+_PREPARE_SHARE = 0.66
+"""After this share of the lease without a renewal a process is started, so that it is ready in time."""
+_BUSY_RETRY_MS = 500.0
+_T = TypeVar("_T")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LinkContext:
+    """What all links of a worker share.
+
+    Attributes:
+        call: Runs a blocking function in a thread.
+        key: Returns the key of the tokens between servers; blocking.
+        take_child: Returns a process that may claim a map, None if this worker may start none; what is
+            passed is called when it ends.
+        prepare: Starts a process that `take_child` will return, so that it is ready in time.
+        clock: Seconds, monotonic.
+        wall_clock: Unix seconds.
+        leeway_s: Of the clocks of two servers.
+    """
+
+    store: ObjectStore
+    settings: LiveSettings
+    server_id: str
+    log: JsonLog
+    call: Callable[[Callable[[], Any]], Awaitable[Any]]
+    key: Callable[[], bytes]
+    take_child: Callable[[Callable[[OwnerChild, int], None]], OwnerChild | None]
+    prepare: Callable[[], None]
+    clock: Callable[[], float]
+    wall_clock: Callable[[], float]
+
+
+@dataclass(slots=True, eq=False)
+class _Pending:
+    robot: RobotId
+    operation: str
+    payload: dict[str, Any]
+    future: asyncio.Future[dict[str, Any]]
+
+    @property
+    def begins(self) -> bool:
+        return begins_a_map(self.operation, self.payload)
+
+
+class MapLink:
+    """One map of one tenant, as one worker uses it."""
+
+    def __init__(
+        self,
+        context: LinkContext,
+        tenant: str,
+        map_name: str,
+        *,
+        on_update: Callable[[dict[str, Any]], None],
+        on_end: Callable[[MapLink], None],
+    ) -> None:
+        """Begin to look for the owner.
+
+        Args:
+            context: Of the worker.
+            tenant: Whose map.
+            map_name: Its name.
+            on_update: Gets each update while the map is watched.
+            on_end: Called when nobody has needed the map for a while.
+
+        Raises:
+            BadRequest: The name is not valid.
+        """
+        self.tenant, self.map_name = tenant, map_name
+        self.is_watched = False
+        self.child: OwnerChild | None = None
+        self._context = context
+        self._on_update = on_update
+        self._on_end = on_end
+        self._watch = LeaseWatch(lease_name(tenant, map_name), context.clock)
+        self._numbers = itertools.count(1)
+        self._pending: dict[int, _Pending] = {}
+        self._writer: asyncio.StreamWriter | None = None
+        self._dead_epoch: int | None = None
+        self._newest_map: dict[str, Any] = {}
+        self._used_s = context.clock()
+        self._wake = asyncio.Event()
+        self._task = asyncio.get_running_loop().create_task(self._run())
+
+    async def request(
+        self, robot: RobotId, operation: str, payload: dict[str, Any], deadline_s: float
+    ) -> dict[str, Any]:
+        """Return the answer of the owner; raises Busy after *deadline_s*, and what the owner refused."""
+        number = next(self._numbers)
+        pending = _Pending(robot, operation, payload, asyncio.get_running_loop().create_future())
+        self._pending[number] = pending
+        self._send(number, pending)
+        self._wake.set()
+        try:
+            return await asyncio.wait_for(pending.future, deadline_s)
+        except asyncio.TimeoutError:
+            raise Busy(
+                f"the live map {self.map_name!r} did not answer within {deadline_s:.1f} s",
+                hint="try again; if it lasts, look at the servers' logs and the store",
+                retry_after_ms=_BUSY_RETRY_MS,
+            ) from None
+        finally:
+            del self._pending[number]
+            self._used_s = self._context.clock()
+
+    def set_watched(self, is_watched: bool) -> None:
+        """Ask for updates from now on, or for none."""
+        self.is_watched = is_watched
+        self._used_s = self._context.clock()
+        self._say(["watch" if is_watched else "unwatch"])
+        self._wake.set()
+
+    async def close(self) -> None:
+        """Close the connection; what is waited for ends with Busy."""
+        self._task.cancel()
+        with contextlib.suppress(asyncio.CancelledError):
+            await self._task
+        self._refuse_all(lambda _: self._no_owner("the server ends"))
+
+    # --- the owner ------------------------------------------------------------------------------------
+
+    async def _run(self) -> None:
+        try:
+            while self._is_needed():
+                try:
+                    self._watch.note(await self._context.call(self._read_lease))
+                    await self._advance()
+                except StoreError as error:
+                    self._tell_state("waiting for the store")
+                    self._context.log.warning("live-link-store", map=self.map_name, error=error.message)
+                    await self._pause(_POLL_S)
+        finally:
+            self._on_end(self)
+
+    async def _advance(self) -> None:
+        """Do what the lease asks for: connect, take the map over, or wait."""
+        record, lease_s = self._watch.record, self._context.settings.lease_s
+        if record is None or record.state == "stopped":
+            self._refuse_what_needs_a_map(is_stopped=record is not None)
+            if not any(each.begins for each in self._pending.values()):
+                await self._pause(_WATCH_POLL_S)
+                return
+        is_dead = record is not None and record.epoch == self._dead_epoch
+        unchanged_s = max(lease_s, self._watch.unchanged_s) if is_dead else self._watch.unchanged_s
+        verdict = verdict_on(record, unchanged_s=unchanged_s, lease_s=lease_s)
+        if verdict == "claim" and not (self._pending or self.is_watched):
+            await self._pause(_WATCH_POLL_S)  # nobody needs an owner
+        elif verdict == "claim":
+            await self._take_over()
+        elif verdict == "connect" and record is not None:
+            if await self._use(record):
+                await asyncio.sleep(_RETRY_S)
+            else:
+                self._context.prepare()
+                await self._pause(_POLL_S)
+        else:
+            self._tell_state("moving")
+            await self._pause(_POLL_S)
+
+    async def _take_over(self) -> None:
+        """Start an owner here, unless another process is first."""
+        self._tell_state("moving")
+        child = self._context.take_child(self._note_end)
+        if child is None:
+            self._refuse_all(lambda _: self._no_owner("this server takes no further live map"))
+            await self._pause(_POLL_S)
+            return
+        order = OwnerOrder(
+            tenant=self.tenant, map_name=self.map_name, server=self._context.server_id, known=self._watch.data
+        )
+        self.child = child
+        if not await child.claim(order):
+            child.kill()
+
+    def _note_end(self, child: OwnerChild, code: int) -> None:
+        """A process of this worker has ended: if it owned the map, nobody does."""
+        if child.epoch is not None:
+            self._dead_epoch = child.epoch
+            self._context.log.info("live-owner-ended", map=self.map_name, epoch=child.epoch, code=code)
+        if self.child is child:
+            self.child = None
+        self._wake.set()
+
+    # --- the connection -------------------------------------------------------------------------------
+
+    async def _use(self, record: LeaseRecord) -> bool:
+        """Connect to the owner and pass on requests until the connection or the lease ends.
+
+        Returns:
+            Whether there was a connection.
+        """
+        opened = await self._open(record)
+        if opened is None:
+            return False
+        reader, writer, frames = opened
+        self._writer = writer
+        try:
+            for number, pending in self._pending.items():
+                self._send(number, pending)
+            if self.is_watched:
+                self._say(["watch"])
+            await self._listen(record, reader, frames)
+        finally:
+            self._writer = None
+            writer.close()
+        return True
+
+    async def _open(
+        self, record: LeaseRecord
+    ) -> tuple[asyncio.StreamReader, asyncio.StreamWriter, FrameReader] | None:
+        try:
+            reader, writer = await asyncio.wait_for(
+                asyncio.open_connection(record.address, record.port, ssl=client_context()), _CONNECT_S
+            )
+        except (OSError, asyncio.TimeoutError):
+            return None
+        try:
+            check_certificate(writer.get_extra_info("ssl_object"), record.certificate)
+            claims = LinkClaims(
+                tenant=self.tenant, map_name=self.map_name, epoch=record.epoch,
+                certificate=record.certificate, expires_s=self._context.wall_clock() + TOKEN_S,
+            )  # fmt: skip
+            key = await self._context.call(self._context.key)
+            writer.write(encode_message(["hello", make_token(key, claims)]))
+            frames = FrameReader(MAX_LINK_BYTES)
+            welcome = await asyncio.wait_for(_next_messages(reader, frames), _CONNECT_S)
+            if welcome[0] == ["welcome"]:
+                for message in welcome[1:]:
+                    self._take(message)
+                return reader, writer, frames
+            self._context.log.warning("live-link-refused", map=self.map_name, why=str(welcome[0])[:200])
+        except (OSError, asyncio.TimeoutError, Unauthorized) as error:
+            self._context.log.warning("live-link-failed", map=self.map_name, why=str(error)[:200])
+        writer.close()
+        return None
+
+    async def _listen(self, record: LeaseRecord, reader: asyncio.StreamReader, frames: FrameReader) -> None:
+        """Take messages until the owner is gone, moves the map, or another one has it."""
+        lease_s = self._context.settings.lease_s
+        reading: asyncio.Task[bytes] | None = None
+        try:
+            while self._is_needed():
+                reading = reading or asyncio.ensure_future(reader.read(_READ_BYTES))
+                silent_s = self._watch.unchanged_s
+                await asyncio.wait({reading}, timeout=max(_POLL_S, _PREPARE_SHARE * lease_s - silent_s))
+                if reading.done():
+                    with contextlib.suppress(OSError):
+                        data = reading.result()
+                        reading = None
+                        goes_on = bool(data)
+                        for message in frames.feed(data):
+                            goes_on &= self._take(message)
+                        if goes_on:
+                            continue
+                    return
+                if self._watch.unchanged_s >= _PREPARE_SHARE * lease_s:
+                    self._context.prepare()
+                    if await self._is_given_up(record):
+                        return
+        finally:
+            if reading is not None:
+                reading.cancel()
+
+    async def _is_given_up(self, record: LeaseRecord) -> bool:
+        """Whether the owner, which is silent, is the owner no more, or may be replaced.
+
+        While the store fails it stays the owner: nobody can replace it.
+        """
+        try:
+            self._watch.note(await self._context.call(self._read_lease))
+        except StoreError:
+            self._tell_state("waiting for the store")
+            return False
+        now = self._watch.record
+        if now is None or now.owner != record.owner or now.state != record.state:
+            return True
+        return self._watch.unchanged_s >= self._context.settings.lease_s
+
+    def _take(self, message: list[Any]) -> bool:
+        """Take a message of the owner; return False if it gives the map up."""
+        match message:
+            case ["answer", int(number), dict(reply)]:
+                pending = self._pending.get(number)
+                if pending is not None and not pending.future.done():
+                    pending.future.set_result(reply)
+            case ["refused", int(number), str(code), str(text), str(hint), retry_after_ms]:
+                pending = self._pending.get(number)
+                if pending is not None and not pending.future.done():
+                    error = error_from_code(code, text, hint=hint, retry_after_ms=retry_after_ms)
+                    pending.future.set_exception(error)
+            case ["again", int()]:
+                return False
+            case ["update", dict(payload)]:
+                if payload.get("kind") == "map":
+                    self._newest_map = payload
+                if self.is_watched:
+                    self._on_update(payload)
+            case ["beat", int(beat)]:
+                self._watch.note_beat(beat)
+            case ["moving"]:
+                return False
+        return True
+
+    def _send(self, number: int, pending: _Pending) -> None:
+        self._say(["request", number, list(pending.robot), pending.operation, pending.payload])
+
+    def _say(self, message: list[Any]) -> None:
+        if self._writer is not None:
+            self._writer.write(encode_message(message))
+
+    # --- what is not passed on ------------------------------------------------------------------------
+
+    def _refuse_what_needs_a_map(self, *, is_stopped: bool) -> None:
+        for pending in self._pending.values():
+            if pending.future.done() or pending.begins:
+                continue
+            if pending.operation == SHOW:
+                pending.future.set_result(show_missing(pending.robot))
+            elif is_stopped:
+                stopped = f"the live map {self.map_name!r} was stopped"
+                pending.future.set_exception(
+                    Conflict(stopped, hint="begin it again with keyframe 0 of segment 0")
+                )
+            else:
+                missing = f"there is no live map {self.map_name!r}"
+                pending.future.set_exception(NotFound(missing, hint="see rse-pf map live list"))
+
+    def _refuse_all(self, error: Callable[[_Pending], RsePfError]) -> None:
+        for pending in self._pending.values():
+            if not pending.future.done():
+                pending.future.set_exception(error(pending))
+
+    def _no_owner(self, why: str) -> Busy:
+        return Busy(
+            f"the live map {self.map_name!r} has no owner now: {why}",
+            hint="try again", retry_after_ms=_BUSY_RETRY_MS,
+        )  # fmt: skip
+
+    def _tell_state(self, state: str) -> None:
+        """Tell the robots of this worker what they wait for, while there is no owner to tell it."""
+        if self.is_watched and self._newest_map and self._newest_map["state"] != state:
+            self._newest_map = {**self._newest_map, "state": state}
+            self._on_update(self._newest_map)
+
+    def _is_needed(self) -> bool:
+        if self._pending or self.is_watched:
+            return True
+        return self._context.clock() - self._used_s < _LINGER_S
+
+    def _read_lease(self) -> bytes | None:
+        try:
+            return self._context.store.get(self._watch.name)
+        except NotFound:
+            return None
+
+    async def _pause(self, seconds: float) -> None:
+        """Wait, but not longer than until something is asked for."""
+        self._wake.clear()
+        with contextlib.suppress(asyncio.TimeoutError):
+            await asyncio.wait_for(self._wake.wait(), seconds)
+
+
+async def _next_messages(reader: asyncio.StreamReader, frames: FrameReader) -> list[Any]:
+    """Return the next messages, one at least; raises OSError at the end."""
+    while True:
+        data = await reader.read(_READ_BYTES)
+        if not data:
+            raise ConnectionResetError
+        messages = list(frames.feed(data))
+        if messages:
+            return messages

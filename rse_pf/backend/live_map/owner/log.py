@@ -1,0 +1,190 @@
+"""The log of a live map in the object store: numbered entries that are written once, and snapshots.
+
+An entry is created by compare-and-swap, so that two owners never write one number: an owner that finds its
+number taken is the owner no longer.  Nothing is changed after it was written.  Snapshots shorten a restart;
+entries before the older one are deleted.
+
+Layout, below ``live/TENANT/MAP/``: ``log/NUMBER`` from 1 on, ``snapshot/NUMBER`` after that entry.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import msgspec
+
+from rse_pf.errors import Conflict, NotFound, StoreError
+from rse_pf.object_store import ObjectStore, digest_of
+
+__all__ = ["SNAPSHOT_ENTRIES", "LiveLog", "LogEntry", "MapSnapshot", "OwnershipLost", "is_snapshot_due"]
+
+SNAPSHOT_ENTRIES = 200
+"""A snapshot is made after each entry whose number is a multiple of this: by position, never by time."""
+_KEPT_SNAPSHOTS = 2
+
+
+class OwnershipLost(Conflict):
+    """Another process owns the map: it wrote the entry, or the lease, that this one was about to write.
+
+    Cause: The owner was paused or cut off from the store for longer than live.lease_s.
+    Check: The log of the servers: which one owns the map now.
+    Fix: Nothing; robots are served by the new owner.
+    """
+
+
+class LogEntry(msgspec.Struct, frozen=True, array_like=True):
+    """One entry: who wrote it, and its events as `encode_events` returns them."""
+
+    epoch: int
+    owner: str
+    events: bytes
+
+
+class _Stored(msgspec.Struct, frozen=True, array_like=True):
+    digest: str
+    unmeasured: tuple[int, ...]
+    data: bytes
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MapSnapshot:
+    """The map after the entry ``position``; ``unmeasured`` are its keyframes whose links are not logged."""
+
+    position: int
+    unmeasured: tuple[int, ...]
+    data: bytes
+
+
+_encode = msgspec.msgpack.Encoder().encode
+_decode_entry = msgspec.msgpack.Decoder(LogEntry).decode
+_decode_snapshot = msgspec.msgpack.Decoder(_Stored).decode
+
+
+def is_snapshot_due(position: int) -> bool:
+    """Return whether a snapshot follows the entry *position*."""
+    return position % SNAPSHOT_ENTRIES == 0
+
+
+class LiveLog:
+    """The entries and snapshots of one map.  Blocking; entries and snapshots may have a thread each."""
+
+    def __init__(
+        self,
+        store: ObjectStore,
+        folder: str,
+        *,
+        owner: str,
+        epoch: int,
+        base: int = 0,
+        keeps_all: bool = False,
+    ) -> None:
+        """Read nothing yet.
+
+        Args:
+            store: Shared by all servers.
+            folder: `map_folder` of the map.
+            owner: Who writes.
+            epoch: Its number.
+            base: Entries up to this position do not belong to the map.
+            keeps_all: Delete no entry.
+        """
+        self.position = base
+        self._store = store
+        self._entries, self._snapshots = f"{folder}log/", f"{folder}snapshot/"
+        self._owner, self._epoch = owner, epoch
+        self._base = base
+        self._keeps_all = keeps_all
+
+    def newest_snapshot(self) -> MapSnapshot | None:
+        """Return the newest snapshot that is whole, and continue after it; raises StoreError."""
+        names = [info.name for info in self._store.list(self._snapshots, self._snapshot_name(self._base))]
+        for name in reversed(names):
+            with contextlib.suppress(NotFound, msgspec.MsgspecError):
+                stored = _decode_snapshot(self._store.get(name))
+                if digest_of(stored.data) == stored.digest:
+                    self.position = _number_of(name)
+                    return MapSnapshot(position=self.position, unmeasured=stored.unmeasured, data=stored.data)
+        self.position = self._base
+        return None
+
+    def entries(self) -> Iterator[LogEntry]:
+        """Yield the entries after `position`, which follows them.
+
+        Raises:
+            StoreError: The store fails, or an entry is missing or damaged.
+        """
+        for info in self._store.list(self._entries, self._entry_name(self.position)):
+            number = _number_of(info.name)
+            if number != self.position + 1:
+                raise StoreError(
+                    f"entry {self.position + 1} of the log is missing, but {number} is there",
+                    hint="restore the store from a backup, or stop the live map",
+                )
+            entry = self._read(info.name)
+            self.position = number
+            yield entry
+
+    def write(self, events: bytes) -> int:
+        """Write the next entry durably and return its number.
+
+        After a StoreError the same events must be written again: the entry may be there.
+
+        Raises:
+            OwnershipLost: Another process wrote this number.
+            StoreError: The store fails.
+        """
+        number = self.position + 1
+        name = self._entry_name(number)
+        data = _encode(LogEntry(self._epoch, self._owner, events))
+        try:
+            self._store.compare_and_swap(name, None, data)
+        except Conflict as error:
+            if self._store.get(name) != data:  # else an earlier write whose answer was lost
+                raise OwnershipLost(f"entry {number} of the log was written by another owner") from error
+        self.position = number
+        return number
+
+    def write_snapshot(self, snapshot: MapSnapshot) -> None:
+        """Write a snapshot durably, and delete what a restart no longer needs; raises StoreError."""
+        stored = _Stored(digest_of(snapshot.data), snapshot.unmeasured, snapshot.data)
+        self._store.put(self._snapshot_name(snapshot.position), _encode(stored))
+        numbers = sorted(_number_of(info.name) for info in self._store.list(self._snapshots))
+        kept = [number for number in numbers if number > self._base][-_KEPT_SNAPSHOTS:]
+        for number in set(numbers) - set(kept):
+            self._store.delete(self._snapshot_name(number))
+        if len(kept) == _KEPT_SNAPSHOTS:
+            self._delete_entries(kept[0])
+
+    def delete_until(self, number: int) -> None:
+        """Delete entries and snapshots up to *number*: the map was stopped there; raises StoreError."""
+        for prefix in (self._entries, self._snapshots):
+            for info in list(self._store.list(prefix)):
+                if _number_of(info.name) <= number:
+                    self._store.delete(info.name)
+
+    def _delete_entries(self, until: int) -> None:
+        if self._keeps_all:
+            until = min(until, self._base)
+        last = self._entry_name(until)
+        for info in list(self._store.list(self._entries)):
+            if info.name > last:
+                break
+            self._store.delete(info.name)
+
+    def _read(self, name: str) -> LogEntry:
+        try:
+            return _decode_entry(self._store.get(name))
+        except msgspec.MsgspecError as error:
+            raise StoreError(f"{name!r} is damaged", hint="restore the store from a backup") from error
+
+    def _entry_name(self, number: int) -> str:
+        return f"{self._entries}{number:012d}"
+
+    def _snapshot_name(self, number: int) -> str:
+        return f"{self._snapshots}{number:012d}"
+
+
+def _number_of(name: str) -> int:
+    return int(name.rpartition("/")[2])

@@ -1,0 +1,291 @@
+"""The process of an owner: a worker starts it with `OwnerProcess`, it claims one map, serves it and ends.
+
+It is started before it is known whether it is needed, and says ``ready`` when all is imported; ordered to
+claim a map, it says ``serving`` or ``lost``.  It runs within its memory limit, does not outlive its worker,
+and ignores the signals of a terminal: they are for the server.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import importlib
+import ipaddress
+import os
+import resource
+import secrets
+import signal
+import socket
+import ssl
+import subprocess
+import sys
+import time
+import traceback
+from collections.abc import Awaitable, Callable
+from typing import Any, TypeVar
+
+import msgspec
+
+from rse_pf.aws.storage import open_data_store
+from rse_pf.backend.live_map.owner.lease import OwnerLease, lease_name, map_folder
+from rse_pf.backend.live_map.owner.link_security import (
+    LinkClaims,
+    check_token,
+    internal_key,
+    server_context,
+)
+from rse_pf.backend.live_map.owner.live_owner import LiveOwner, OwnerContext
+from rse_pf.backend.live_map.owner.log import LiveLog, OwnershipLost
+from rse_pf.backend.live_map.owner.server import OwnerServer, listen
+from rse_pf.backend.live_map.owner.state import MapKind, MapState, take_over
+from rse_pf.backend.live_map.owner.threads import OwnerThreads, Urgency
+from rse_pf.backend.log import JsonLog
+from rse_pf.backend.sandbox.ipc import FrameReader, encode_message, receive
+from rse_pf.config import PlatformSettings
+from rse_pf.errors import StoreError
+from rse_pf.linux import die_with_parent, set_process_name
+from rse_pf.maps.registry import MapRegistry
+from rse_pf.object_store import ObjectStore
+
+__all__ = ["MAP_KIND", "OwnerOrder", "OwnerProcess", "advertised_address", "main"]
+
+MAP_KIND = "rse_pf.backend.live_map.owner.map_kind:LIVE_MAP"
+"""Where the `MapKind` of real maps is, as ``module:name``."""
+_ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
+_READ_BYTES = 1 << 16
+_RETRY_S = 0.1
+_ANYWHERE = ("0.0.0.0", "::")
+_OUTSIDE = ("192.0.2.1", 9)
+"""An address of documentation: nothing is sent there, but the route to it names the main interface."""
+_T = TypeVar("_T")
+
+
+class OwnerOrder(msgspec.Struct, frozen=True, kw_only=True):
+    """Claim this map if its lease still holds ``known``."""
+
+    tenant: str
+    map_name: str
+    server: str
+    known: bytes | None
+
+
+class OwnerProcess:
+    """A started process and the socket to it; only for the main thread of a process, with which it ends."""
+
+    def __init__(self, settings: PlatformSettings, kind: str = MAP_KIND) -> None:
+        self.connection, theirs = socket.socketpair()
+        with theirs:
+            self._process = subprocess.Popen(
+                [sys.executable, "-m", "rse_pf.backend.live_map.owner.process", str(theirs.fileno())],
+                pass_fds=(theirs.fileno(),), stdin=subprocess.DEVNULL, env={**os.environ, **_ONE_THREAD},
+            )  # fmt: skip
+        self.pid = self._process.pid
+        self.say({"worker": os.getpid(), "settings": settings.to_dict(), "kind": kind})
+
+    def claim(self, order: OwnerOrder) -> None:
+        """Let it claim a map."""
+        self.say(msgspec.structs.asdict(order))
+
+    def release(self) -> None:
+        """Let it release its map, and end."""
+        self.say({"do": "release"})
+
+    def say(self, message: dict[str, Any]) -> None:
+        """Send an order; it is lost if the process has ended, which the next read shows."""
+        with contextlib.suppress(OSError):
+            self.connection.sendall(encode_message(message))
+
+    def kill(self) -> int:
+        """Kill it unless it has ended, reap it and return the exit code; negative for a signal."""
+        self._process.kill()
+        self.connection.close()
+        return self._process.wait()
+
+
+def advertised_address(host: str) -> str:
+    """Return the address under which other servers reach a socket that listens on *host*."""
+    try:
+        is_anywhere = ipaddress.ip_address(host).is_unspecified
+    except ValueError:
+        is_anywhere = False
+    if not is_anywhere:
+        return host
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    with socket.socket(family, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.connect(_OUTSIDE if family == socket.AF_INET else ("2001:db8::1", 9))
+        except OSError:
+            return "127.0.0.1" if family == socket.AF_INET else "::1"
+        return str(probe.getsockname()[0])
+
+
+def main(arguments: list[str]) -> None:
+    """Claim and serve the map that the worker orders over the socket with this number."""
+    worker = socket.socket(fileno=int(arguments[0]))
+    order = receive(worker)
+    if order is None or not die_with_parent(order["worker"]):
+        return
+    settings = PlatformSettings.from_dict(order["settings"])
+    resource.setrlimit(resource.RLIMIT_DATA, (settings.live.max_memory_bytes,) * 2)
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_IGN)
+    set_process_name("rse-pf live map")
+    module, _, name = order["kind"].partition(":")
+    kind: MapKind = getattr(importlib.import_module(module), name)
+    store = open_data_store(settings)
+    address = advertised_address(settings.live.host)
+    listener = listen(settings.live.host, settings.live.first_port, settings.live.ports)
+    context, certificate = server_context(address, now_s=time.time())
+    worker.sendall(encode_message(["ready"]))
+    claim = receive(worker)
+    if claim is None:
+        return
+    process = _Process(
+        worker,
+        settings,
+        store,
+        kind,
+        msgspec.convert(claim, OwnerOrder),
+        (address, listener, context, certificate),
+    )
+    code = 1
+    try:
+        asyncio.new_event_loop().run_until_complete(process.run())
+        code = 0
+    except MemoryError:
+        pass
+    except Exception:  # noqa: BLE001  the log of the server has the reason
+        traceback.print_exc()
+    finally:
+        os._exit(code)  # threads may wait for the store for long
+
+
+class _Process:
+    def __init__(
+        self, worker: socket.socket, settings: PlatformSettings, store: ObjectStore, kind: MapKind,
+        order: OwnerOrder,
+        socket_: tuple[str, Any, ssl.SSLContext, str],
+    ) -> None:  # fmt: skip
+        self._worker = worker
+        self._settings = settings
+        self._store = store
+        self._kind = kind
+        self._order = order
+        self._socket = socket_
+        self._name = f"{order.server}-{secrets.token_hex(8)}"
+        self._threads = OwnerThreads()
+        self._log = JsonLog(level=settings.serving.log_level, server=order.server, wall_clock=time.time)
+        self._lease = OwnerLease(
+            store, lease_name(order.tenant, order.map_name), owner=self._name, server=order.server,
+            clock=time.monotonic,
+        )  # fmt: skip
+
+    async def run(self) -> None:
+        if not await self._retry(self._threads.lease, lambda: self._lease.claim(self._order.known)):
+            self._worker.sendall(encode_message(["lost"]))
+            return
+        renewing = asyncio.ensure_future(self._renew())
+        taking = asyncio.ensure_future(self._take_over())
+        await asyncio.wait({renewing, taking}, return_when=asyncio.FIRST_COMPLETED)
+        if not taking.done() or taking.exception() is not None:
+            self._worker.sendall(encode_message(["lost"]))
+            if taking.done() and not isinstance(taking.exception(), OwnershipLost):
+                await taking
+            return
+        renewing.cancel()
+        await self._serve(*taking.result())
+
+    async def _renew(self) -> None:
+        """Renew the lease while the map is being restored; return when it is lost."""
+        settings = self._settings.live
+        while await self._retry(self._threads.lease, self._lease.renew):
+            await asyncio.sleep(settings.heartbeat_s)
+
+    async def _take_over(self) -> tuple[MapState, LiveLog]:
+        record = self._lease.record
+        log = LiveLog(
+            self._store, map_folder(self._order.tenant, self._order.map_name), owner=self._name,
+            epoch=record.epoch, base=record.base, keeps_all=self._settings.live.keep_log,
+        )  # fmt: skip
+        began_s = time.monotonic()
+
+        def take() -> MapState:
+            return take_over(log, self._kind, owner=self._name, epoch=record.epoch)
+
+        state = await self._retry(lambda act: self._threads.compute(Urgency.APPLY, act), take)
+        self._log.info(
+            "live-map-owned", map=self._order.map_name, tenant=self._order.tenant, epoch=record.epoch,
+            version=state.position, keyframes=state.keyframes, seconds=round(time.monotonic() - began_s, 3),
+        )  # fmt: skip
+        return state, log
+
+    async def _serve(self, state: MapState, log: LiveLog) -> None:
+        settings, order = self._settings, self._order
+        address, listener, context, certificate = self._socket
+        key = await self._retry(self._threads.store, lambda: internal_key(self._store))
+        claims = LinkClaims(
+            tenant=order.tenant, map_name=order.map_name, epoch=self._lease.record.epoch,
+            certificate=certificate, expires_s=0.0,
+        )  # fmt: skip
+        owner = LiveOwner(
+            self._context(lambda payload: server.tell(payload), lambda n: server.beat(n)),
+            state,
+            log,
+            self._lease,
+        )
+        server = OwnerServer(
+            owner,
+            check=lambda token: check_token(
+                key, token, claims, now_s=time.time(), leeway_s=settings.auth.leeway_s
+            ),
+            on_defect=traceback.print_exception,
+        )
+        await server.open(listener, context)
+        port = listener.getsockname()[1]
+        if not await self._retry(self._threads.lease, lambda: self._lease.serve(address, port, certificate)):
+            self._worker.sendall(encode_message(["lost"]))
+            return
+        self._worker.sendall(encode_message(["serving", self._lease.record.epoch]))
+        orders = asyncio.ensure_future(self._obey(owner))
+        how = await owner.run()
+        orders.cancel()
+        if how != "lost":
+            await server.close()
+        self._log.info("live-map-given-up", map=order.map_name, tenant=order.tenant, how=how)
+        self._log.close()
+
+    def _context(
+        self, tell: Callable[[dict[str, Any]], None], on_beat: Callable[[int], None]
+    ) -> OwnerContext:
+        maps = MapRegistry(
+            self._store, self._order.tenant, max_bytes=4 * self._settings.data.max_object_bytes
+        )
+        return OwnerContext(
+            map_name=self._order.map_name, settings=self._settings.live, kind=self._kind,
+            threads=self._threads, maps=maps, clock=time.monotonic, wall_clock=time.time,
+            sleep=asyncio.sleep, log=self._log, tell=tell, on_beat=on_beat,
+        )  # fmt: skip
+
+    async def _obey(self, owner: LiveOwner) -> None:
+        """Release the map when the worker says so."""
+        self._worker.setblocking(False)
+        frames = FrameReader(_READ_BYTES)
+        while data := await asyncio.get_running_loop().sock_recv(self._worker, _READ_BYTES):
+            if any(message == {"do": "release"} for message in frames.feed(data)):
+                await owner.release()
+
+    async def _retry(self, where: Callable[[Callable[[], _T]], Awaitable[_T]], act: Callable[[], _T]) -> _T:
+        """Return what *act* returns, however long the store fails; ownership that is lost stays lost."""
+        while True:
+            try:
+                return await where(act)
+            except OwnershipLost:
+                raise
+            except StoreError as error:
+                self._log.warning("live-store-retry", map=self._order.map_name, error=error.message)
+                await asyncio.sleep(_RETRY_S)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

@@ -1,0 +1,65 @@
+"""Versions of a live map in the map registry: publish one, and read the one to begin with.  Blocking."""
+
+from __future__ import annotations
+
+import re
+
+from rse_pf.errors import Conflict, NotFound
+from rse_pf.maps.format import MapVersion, encode_map
+from rse_pf.maps.registry import MapRecord, MapRegistry
+from rse_pf.object_store import digest_of
+
+__all__ = ["publish_version", "version_to_start_from"]
+
+_TRIES = 5
+_VERSION = re.compile(r"head|[0-9a-f]{6,64}")
+
+
+def publish_version(
+    maps: MapRegistry, name: str, version: MapVersion, *, author: str, created_s: float, note: str
+) -> MapRecord:
+    """Make *version* the head of map *name* and return its record; the head itself if it is the same map.
+
+    Raises:
+        Conflict: Others move the head all the time.
+        StoreError: The store fails.
+    """
+    data = encode_map(version)
+    digest = digest_of(data)
+    for tries_left in reversed(range(_TRIES)):
+        try:
+            head: MapRecord | None = maps.head(name)
+        except NotFound:
+            head = None
+        if head is not None and head.digest == digest:
+            return head
+        parent = None if head is None else head.id
+        try:
+            return maps.commit(name, data, parent=parent, author=author, created_s=created_s, note=note)
+        except Conflict:
+            if not tries_left:
+                raise
+    raise AssertionError("the last try returns or raises")
+
+
+def version_to_start_from(maps: MapRegistry, map_name: str, source: str) -> tuple[MapVersion, str]:
+    """Return the version that *source* names, and its full name ``MAP@ID``.
+
+    Args:
+        maps: Of the tenant.
+        map_name: Of the live map.
+        source: ``MAP@VERSION``, a version of the map *map_name*, or another map, whose head is meant; "" is
+            the head of *map_name*.
+
+    Raises:
+        NotFound: There is no such map or version.
+    """
+    name, at, version = source.partition("@")
+    if not at:
+        name, version = (map_name, source or "head") if _is_version(source) else (source, "head")
+    record = maps.record(name, version)
+    return maps.load(name, record.id), f"{name}@{record.id}"
+
+
+def _is_version(source: str) -> bool:
+    return not source or _VERSION.fullmatch(source) is not None

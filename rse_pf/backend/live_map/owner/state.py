@@ -1,0 +1,195 @@
+"""A live map as its owner holds it: restored from the log, changed by entries only.
+
+Two processes that read the same log hold the same map; `MapState.digest` shows it.  No store, no thread.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal, Protocol
+
+from rse_pf.backend.live_map.owner.log import LiveLog, MapSnapshot, OwnershipLost, is_snapshot_due
+from rse_pf.geometry import Camera
+from rse_pf.live_map.events import (
+    Event,
+    KeyframeAdded,
+    LinksMeasured,
+    MapStarted,
+    Optimised,
+    OwnerChanged,
+    RobotLeft,
+    decode_events,
+    encode_events,
+)
+from rse_pf.live_map.outcomes import Added, Alignment, Outcome
+from rse_pf.maps.format import MapVersion
+
+__all__ = ["Applied", "MapKind", "MapLogic", "MapState", "size_of", "take_over"]
+
+_UNCHANGING = (OwnerChanged, RobotLeft)
+
+
+class MapLogic(Protocol):
+    """What the owner needs of `rse_pf.live_map.live_map.LiveMap`."""
+
+    def snapshot(self) -> bytes:
+        """Return the whole state."""
+
+    def digest(self) -> str:
+        """Return the digest of the whole state."""
+
+    def judge(self, event: KeyframeAdded) -> Literal["new", "known", "ahead"]:
+        """Judge a keyframe before it is logged; raises BadRequest."""
+
+    def next_number(self, robot: str) -> int:  # a `RobotId.folder`
+        """Return the number of the next keyframe of a robot."""
+
+    def next_segment(self, robot: str) -> int:  # a `RobotId.folder`
+        """Return a number that no segment of the robot has; 0 if it has none."""
+
+    def apply(self, event: Event) -> list[Outcome]:
+        """Change the map by an event of the log."""
+
+    def measure(self, keyframe: int) -> LinksMeasured:
+        """Look for links of a keyframe; changes nothing."""
+
+    def optimise(self) -> Optimised:
+        """Optimise the whole graph; changes nothing."""
+
+    def relocalise(self, camera: Camera, features: bytes) -> Any:
+        """Find where an image was taken; changes nothing."""
+
+    def alignments(self) -> list[Alignment]:
+        """Return where the newest segment of each robot lies."""
+
+    def to_version(self) -> MapVersion:
+        """Return the map for the registry."""
+
+    @property
+    def keyframes(self) -> Any:
+        """The keyframes, something with a length."""
+
+    @property
+    def robots(self) -> Any:
+        """`RobotId.folder` of each robot that drives."""
+
+    @property
+    def contributors(self) -> Any:
+        """`RobotId.folder` of each robot that contributed, also of those that left."""
+
+    @property
+    def links_believed(self) -> Any:
+        """Number of links that hold the poses together."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MapKind:
+    """How a map is made: empty, from a snapshot, and from a version of the registry."""
+
+    empty: Callable[[], MapLogic]
+    restore: Callable[[bytes], MapLogic]
+    started_from: Callable[[MapVersion, str], MapStarted]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Applied:
+    """What an entry changed: outcomes and defects by event, and the snapshot that is due after it."""
+
+    outcomes: list[list[Outcome]]
+    defects: list[Exception | None]
+    snapshot: MapSnapshot | None
+
+
+class MapState:
+    """The map, and which of its keyframes still have to be measured.  For one thread at a time."""
+
+    def __init__(self, live_map: MapLogic, position: int, unmeasured: Sequence[int] = ()) -> None:
+        """Begin with the map after the entry *position*."""
+        self.live_map = live_map
+        self.position = position
+        self.unmeasured = dict.fromkeys(unmeasured)
+        self.changes = 0
+        """How many events have changed the map since this object was made."""
+        self.keyframes = size_of(live_map.keyframes)
+
+    def apply(self, position: int, events: Sequence[Event]) -> Applied:
+        """Change the map by the entry *position*, which is durable.
+
+        A defect of the map's logic stops one event, here and in every replay; lack of memory ends the
+        process.
+        """
+        outcomes: list[list[Outcome]] = []
+        defects: list[Exception | None] = []
+        for event in events:
+            found, defect = self._apply(event)
+            outcomes.append(found)
+            defects.append(defect)
+        self.position = position
+        self.keyframes = size_of(self.live_map.keyframes)
+        snapshot = self.snapshot() if is_snapshot_due(position) else None
+        return Applied(outcomes=outcomes, defects=defects, snapshot=snapshot)
+
+    def measure(self, keyframe: int) -> LinksMeasured:
+        """Return the links of a keyframe; after a defect none, with the reason ``defect``."""
+        try:
+            return self.live_map.measure(keyframe)
+        except MemoryError:
+            raise
+        except Exception:  # noqa: BLE001  the keyframe must not be measured again and again
+            return LinksMeasured(keyframe=keyframe, failed={"defect": 1})
+
+    def snapshot(self) -> MapSnapshot:
+        """Return the snapshot after the last entry."""
+        return MapSnapshot(
+            position=self.position, unmeasured=tuple(self.unmeasured), data=self.live_map.snapshot()
+        )
+
+    def digest(self) -> str:
+        """Return the digest of the map."""
+        return self.live_map.digest()
+
+    def _apply(self, event: Event) -> tuple[list[Outcome], Exception | None]:
+        try:
+            outcomes = self.live_map.apply(event)
+        except MemoryError:
+            raise
+        except Exception as error:  # noqa: BLE001  every replay must get past it, too
+            return [], error
+        if isinstance(event, KeyframeAdded):
+            self.unmeasured |= dict.fromkeys(each.id for each in outcomes if isinstance(each, Added))
+        elif isinstance(event, LinksMeasured):
+            self.unmeasured.pop(event.keyframe, None)
+        self.changes += not isinstance(event, _UNCHANGING)
+        return outcomes, None
+
+
+def size_of(value: Any) -> int:
+    """Return a number as it is, and of anything else the length."""
+    return value if isinstance(value, int) else len(value)
+
+
+def take_over(log: LiveLog, kind: MapKind, *, owner: str, epoch: int) -> MapState:
+    """Return the map that the log holds, with the entry that says who owns it from here on.
+
+    Until that entry is written the previous owner may still write; afterwards it cannot.
+
+    Raises:
+        OwnershipLost: A later owner has written.
+        StoreError: The store fails, or the log is damaged.
+    """
+    snapshot = log.newest_snapshot()
+    live_map = kind.empty() if snapshot is None else kind.restore(snapshot.data)
+    state = MapState(live_map, log.position, () if snapshot is None else snapshot.unmeasured)
+    change = [OwnerChanged(owner=owner, epoch=epoch)]
+    data = encode_events(change)
+    while True:
+        for entry in log.entries():
+            if entry.epoch > epoch:
+                raise OwnershipLost(f"owner {entry.owner} has taken the map over")
+            state.apply(log.position, decode_events(entry.events))
+        try:
+            state.apply(log.write(data), change)
+        except OwnershipLost:
+            continue  # the previous owner has just written; read on
+        return state

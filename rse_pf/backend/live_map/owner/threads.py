@@ -1,0 +1,88 @@
+"""The threads of an owner process: one that computes by urgency, and some that wait for the store."""
+
+from __future__ import annotations
+
+import asyncio
+import enum
+import itertools
+import threading
+from collections.abc import Awaitable, Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from queue import PriorityQueue
+from typing import Any, Protocol, TypeVar
+
+__all__ = ["OwnerThreads", "Threads", "Urgency"]
+
+_T = TypeVar("_T")
+
+
+class Urgency(enum.IntEnum):
+    """What is computed first when several things wait."""
+
+    APPLY = 0
+    JUDGE = 1
+    ANSWER = 2
+    MEASURE = 3
+    BACKGROUND = 4
+
+
+class Threads(Protocol):
+    """Where an owner computes and waits; each of the four does one thing at a time."""
+
+    def compute(self, urgency: Urgency, act: Callable[[], _T]) -> Awaitable[_T]:
+        """Call *act* in the thread of the map."""
+
+    def store(self, act: Callable[[], _T]) -> Awaitable[_T]:
+        """Call *act* in the thread that writes the log."""
+
+    def lease(self, act: Callable[[], _T]) -> Awaitable[_T]:
+        """Call *act* in the thread that renews the lease."""
+
+    def background(self, act: Callable[[], _T]) -> Awaitable[_T]:
+        """Call *act* in the thread for snapshots and versions."""
+
+
+class OwnerThreads:
+    """Real threads; they end with the process."""
+
+    def __init__(self) -> None:
+        self._store, self._lease, self._background = (
+            ThreadPoolExecutor(1, thread_name_prefix=name) for name in ("store", "lease", "background")
+        )
+        self._waiting: PriorityQueue[tuple[int, int, Callable[[], None]]] = PriorityQueue()
+        self._count = itertools.count()
+        threading.Thread(target=self._compute_on, name="map", daemon=True).start()
+
+    def compute(self, urgency: Urgency, act: Callable[[], _T]) -> Awaitable[_T]:
+        """Call *act* in the thread of the map, after what is more urgent or came before."""
+        future: Future[_T] = Future()
+
+        def run() -> None:
+            try:
+                result = act()
+            except BaseException as error:  # noqa: BLE001  it is the caller's
+                future.set_exception(error)
+            else:
+                future.set_result(result)
+
+        self._waiting.put((urgency, next(self._count), run))
+        return asyncio.shield(asyncio.wrap_future(future))
+
+    def store(self, act: Callable[[], _T]) -> Awaitable[_T]:
+        """Call *act* in the thread that writes the log."""
+        return self._run(self._store, act)
+
+    def lease(self, act: Callable[[], _T]) -> Awaitable[_T]:
+        """Call *act* in the thread that renews the lease."""
+        return self._run(self._lease, act)
+
+    def background(self, act: Callable[[], _T]) -> Awaitable[_T]:
+        """Call *act* in the thread for snapshots and versions."""
+        return self._run(self._background, act)
+
+    def _run(self, pool: ThreadPoolExecutor, act: Callable[[], Any]) -> Awaitable[Any]:
+        return asyncio.get_running_loop().run_in_executor(pool, act)
+
+    def _compute_on(self) -> None:
+        while True:
+            self._waiting.get()[2]()

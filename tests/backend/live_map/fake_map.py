@@ -1,0 +1,164 @@
+"""A map for tests of its owner: it numbers keyframes, and its digest depends on every event in its order."""
+
+from __future__ import annotations
+
+import hashlib
+from typing import Any, Literal
+
+import msgspec
+import numpy as np
+
+from rse_pf.backend.live_map.owner.state import MapKind
+from rse_pf.errors import BadRequest
+from rse_pf.geometry import Camera
+from rse_pf.live_map.events import (
+    Event,
+    KeyframeAdded,
+    LinksMeasured,
+    MapStarted,
+    Optimised,
+    RobotForgotten,
+    encode_events,
+    matrix_bytes,
+)
+from rse_pf.live_map.outcomes import Added, Alignment, Corrected, Outcome
+from rse_pf.maps.format import Keyframe, MapVersion
+
+__all__ = ["FAKE_MAP", "FakeMap", "keyframe_payload"]
+
+_CAMERA = (500.0, 500.0, 320.0, 240.0, 640, 480)
+
+
+class FakeMap:
+    """Keyframes with features ``bad`` are garbage, with ``defect`` they break the map's logic."""
+
+    def __init__(self) -> None:
+        self._state: dict[str, Any] = {"digest": "", "keyframes": [], "numbers": {}, "segments": {}}
+
+    @classmethod
+    def restore(cls, snapshot: bytes) -> FakeMap:
+        restored = cls()
+        restored._state = msgspec.msgpack.decode(snapshot)
+        return restored
+
+    def snapshot(self) -> bytes:
+        return msgspec.msgpack.encode(self._state)
+
+    def digest(self) -> str:
+        return str(self._state["digest"])
+
+    def judge(self, event: KeyframeAdded) -> Literal["new", "known", "ahead"]:
+        expected = self.next_number(event.robot)
+        if event.number != expected:
+            return "known" if event.number < expected else "ahead"
+        if event.features == b"bad":
+            raise BadRequest("garbage")
+        return "new"
+
+    def next_number(self, robot: str) -> int:
+        return int(self._state["numbers"].get(robot, 0))
+
+    def next_segment(self, robot: str) -> int:
+        return int(self._state["segments"].get(robot, -1)) + 1
+
+    def apply(self, event: Event) -> list[Outcome]:
+        if isinstance(event, KeyframeAdded) and event.features == b"defect":
+            raise ZeroDivisionError
+        self._state["digest"] = hashlib.sha256(
+            self.digest().encode() + encode_events([event])
+        ).hexdigest()
+        if isinstance(event, KeyframeAdded):
+            self._state["keyframes"].append([event.robot, event.number, event.timestamp_s])
+            self._state["numbers"][event.robot] = event.number + 1
+            self._state["segments"][event.robot] = event.segment
+            return [Added(id=len(self._state["keyframes"]) - 1)]
+        if isinstance(event, LinksMeasured):
+            robot, number, _ = self._state["keyframes"][event.keyframe]
+            T = np.eye(4)
+            T[0, 3] = len(self._state["keyframes"])
+            return [
+                Corrected(
+                    robot=robot, segment=0, T_map_odom=T, covariance=np.eye(6), cause=(robot, number)
+                )
+            ]
+        if isinstance(event, MapStarted):
+            self._state["keyframes"] += [[each.robot, -1, 0.0] for each in event.keyframes]
+        if isinstance(event, RobotForgotten):
+            rows = self._state["keyframes"]
+            self._state["keyframes"] = [each for each in rows if each[0] != event.robot]
+            for table in ("numbers", "segments"):
+                self._state[table].pop(event.robot, None)
+        return []
+
+    def measure(self, keyframe: int) -> LinksMeasured:
+        return LinksMeasured(keyframe=keyframe)
+
+    def optimise(self) -> Optimised:
+        return Optimised(up_to=0, ids=(), T_map_camera=b"")
+
+    def relocalise(self, camera: Camera, features: bytes) -> Any:
+        raise BadRequest("the fake map cannot relocalise")
+
+    def alignments(self) -> list[Alignment]:
+        T = np.eye(4)
+        T[0, 3] = len(self._state["keyframes"])
+        return [
+            Alignment(
+                robot=robot, segment=segment, aligned=True, reason="", T_map_odom=T, covariance=np.eye(6)
+            )
+            for robot, segment in self._state["segments"].items()
+        ]
+
+    def to_version(self) -> MapVersion:
+        camera = Camera(fx=500.0, fy=500.0, cx=320.0, cy=240.0, width=640, height=480)
+        keyframes = [
+            Keyframe(
+                id=row, robot=robot, timestamp_s=timestamp_s, T_world_camera=np.eye(4), camera=camera,
+                pixels=np.zeros((0, 2), np.float32), descriptors=np.zeros((0, 32), np.uint8),
+                points_camera=np.zeros((0, 3), np.float32),
+            )
+            for row, (robot, _, timestamp_s) in enumerate(self._state["keyframes"])
+        ]  # fmt: skip
+        return MapVersion(keyframes=tuple(keyframes), edges=(), points=np.zeros((0, 3), np.float32))
+
+    @property
+    def keyframes(self) -> int:
+        return len(self._state["keyframes"])
+
+    @property
+    def robots(self) -> tuple[str, ...]:
+        return tuple(self._state["numbers"])
+
+    @property
+    def contributors(self) -> tuple[str, ...]:
+        return tuple(self._state["numbers"])
+
+    @property
+    def links_believed(self) -> int:
+        return 0
+
+
+def _started(version: MapVersion, source: str) -> MapStarted:
+    from rse_pf.live_map.events import StartKeyframe
+
+    return MapStarted(
+        source=source,
+        keyframes=tuple(
+            StartKeyframe(
+                robot=each.robot, timestamp_s=0.0, T_map_camera=matrix_bytes(np.eye(4)), camera=_CAMERA,
+                features=b"",
+            )
+            for each in version.keyframes
+        ),
+    )  # fmt: skip
+
+
+FAKE_MAP = MapKind(empty=FakeMap, restore=FakeMap.restore, started_from=_started)
+
+
+def keyframe_payload(number: int, features: bytes = b"good", segment: int = 0) -> dict[str, Any]:
+    """Return what a robot sends with keyframe *number*."""
+    return {
+        "segment": segment, "number": number, "timestamp_s": float(number), "camera": list(_CAMERA),
+        "T_odom_camera": matrix_bytes(np.eye(4)), "features": features,
+    }  # fmt: skip
