@@ -1,12 +1,14 @@
 """Run robots that build point-cloud maps with the PnP service, all on this machine.
 
 Without --data, robots drive through a rendered world whose true poses are known.  With --merge each robot
-starts in a world frame of its own, and at the end their maps are merged into one.
+starts in a world frame of its own, and at the end their maps are merged into one.  With --live they make one
+map together while they drive.
 
 examples:
   rse-pf demo --out out
   rse-pf demo --data recordings/kitchen --rate 10 --robots 1 --out out-kitchen
   rse-pf demo --data recordings/kitchen --rate 10 --robots 3 --merge --out out-merged
+  rse-pf demo --data recordings/kitchen --rate 10 --robots 3 --live --out out-live
 """
 
 from __future__ import annotations
@@ -33,7 +35,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--robots",
         type=int,
-        help="number of robots that share the recording (default: 3; with --data and no --merge: 1)",
+        help="robots that share the recording (default: 3; with --data, but neither --merge nor --live: 1)",
     )
     parser.add_argument(
         "--rate", type=float, default=5.0, metavar="HZ", help="frames per second (default: 5)"
@@ -56,7 +58,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--frames",
         type=int,
-        help="frames per robot in the rendered world (default: 80; with --merge, what a merge needs)",
+        help="frames per robot in the rendered world (default: 80; with --merge or --live, what it needs)",
     )
     parser.add_argument("--seed", type=int, default=0, help="seed of the rendered world (default: 0)")
     parser.add_argument(
@@ -68,13 +70,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="merge the maps of all robots at the end; of one robot, close its loops",
     )
+    parser.add_argument(
+        "--live", action="store_true", help="all robots make one live map, and correct each other at once"
+    )
     parser.add_argument("--quiet", action="store_true", help="no progress bars")
 
 
 def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
     """Check the options and run the demo."""
     robots = (
-        args.robots if args.robots is not None else (1 if args.data is not None and not args.merge else 3)
+        args.robots
+        if args.robots is not None
+        else (1 if args.data is not None and not (args.merge or args.live) else 3)
     )
     if not 1 <= robots <= _MAX_ROBOTS:
         hint = "choose at least one robot" if robots < 1 else "choose fewer robots"
@@ -92,6 +99,8 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
         )
     if args.seed < 0:
         raise UsageError(f"--seed {args.seed} is below 0", hint="choose 0 or more")
+    if args.live and args.merge:
+        raise UsageError("--live and --merge exclude each other", hint="a live map needs no merge")
     require("demo --merge" if args.merge else "demo")
     from rse_pf.experiments.demo.run import DemoOptions, run_demo
     from rse_pf.pnp import usable_engine
@@ -120,6 +129,7 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
         seed=args.seed,
         frontend=args.frontend,
         merge=args.merge,
+        live=args.live,
         quiet=args.quiet,
     )
     return run_demo(options, settings)

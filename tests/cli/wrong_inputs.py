@@ -105,6 +105,7 @@ WRONG_INPUTS: tuple[WrongInput, ...] = (
     WrongInput("demo --robots two", USAGE, "--robots: invalid int value: 'two'", "rse-pf demo --help"),
     WrongInput("demo --rate nan", USAGE, "--rate nan is not within", "5 is the paper's"),
     WrongInput("demo --frames 5 --data rec-empty", USAGE, "--frames is for the rendered world", "with --rate"),
+    WrongInput("demo --live --merge", USAGE, "--live and --merge exclude each other", "needs no merge"),
     WrongInput("demo --data typo", USAGE, "no folder typo", "rgb.txt, depth.txt"),
     WrongInput("demo --data recording.zip", USAGE, "recording.zip is not a recording", "name a folder"),
     WrongInput("demo --data nothing", USAGE, "no rgb.txt in nothing", "TUM layout"),

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from rse_pf.experiments.demo.robot import RobotFinished
+from rse_pf.experiments.results.live_error import live_lines, live_table
 from rse_pf.experiments.results.map_error import merged_lines, merged_table
 from rse_pf.experiments.results.markdown import failures, page, slashed, table, three
 from rse_pf.experiments.results.records import CommandRecord
@@ -80,6 +81,7 @@ def demo_page(report: Mapping[str, Any]) -> str:
         f"{counted(report['robots'], 'robot')}, {counted(report['frames'], 'frame')}; {options}.",
         table(["figure", "here, one machine", "paper, Sect. 6 (Shenzhen to Seoul)"], rows),
         *([merged_table(report["merged"])] if "merged" in report else []),
+        *([live_table(report["live"])] if "live" in report else []),
         f"Commands: {commands['sent']} sent, {commands['answered']} answered, {failures(report)} failed, "
         f"{commands['lost']} lost, {commands['twice']} answered twice.",
         f"Truth: {report['truth']}. Load average before the run {about['load_average']}, after "
@@ -107,6 +109,8 @@ def closing_lines(report: Mapping[str, Any], folder: Path) -> str:
         third = merged_lines(report["merged"])
         files = f"{shown}/map_merged.png, {shown}/merged.ply, "
         third += f"show the merged map: rse-pf map show merged --store dir:{shown}/platform/objects\n"
+    if "live" in report:
+        third += live_lines(report["live"], report["robots"])
     return (
         f"{first}\n{second}{third}{advice(report)}"
         f"results: {files}{shown}/robot-*/{{map.ply,map.png,trajectory.txt}}; "

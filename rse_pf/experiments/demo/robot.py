@@ -9,6 +9,7 @@ from __future__ import annotations
 import asyncio
 import time
 from collections.abc import Callable
+from contextlib import AsyncExitStack
 from dataclasses import dataclass, field, replace
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -18,6 +19,7 @@ import numpy as np
 
 from client_sdk.answers import PoseAnswer
 from client_sdk.frontend import Frame, FrontEndOptions, PoseQuery, TrackedFrame
+from client_sdk.live import LiveMapper
 from client_sdk.mapper import Mapper, ask_robot
 from client_sdk.mapping import PointMap, Trajectory, write_ply, write_trajectory
 from client_sdk.robot import Robot
@@ -25,7 +27,9 @@ from rse_pf.config import DataSettings, SessionSettings
 from rse_pf.errors import RsePfError, error_of_system
 from rse_pf.experiments.child_process import ChildFailed, ChildReady, ParentPipe
 from rse_pf.experiments.demo.keyframes import KeyframeCollector, KeyframeUploads
+from rse_pf.experiments.demo.live import LIVE_NAME, LiveRecorder
 from rse_pf.experiments.demo.merge import MAP_FILE
+from rse_pf.experiments.results.live_error import TRUTH
 from rse_pf.experiments.results.records import CommandRecord
 
 __all__ = ["DemoOptions", "FrameDone", "RobotFinished", "RobotSpec", "run_robot"]
@@ -49,6 +53,7 @@ class DemoOptions:
     seed: int = 0
     frontend: str = "standard"
     merge: bool = False
+    live: bool = False
     quiet: bool = False
 
     @property
@@ -56,7 +61,7 @@ class DemoOptions:
         """The frames of each robot in the rendered world; to merge, it must see what the next one saw."""
         from client_sdk.simulator import frames_to_overlap
 
-        if self.frames or not self.merge:
+        if self.frames or not (self.merge or self.live):
             return self.frames or _DEFAULT_FRAMES
         return max(_LEAST_MERGE_FRAMES, frames_to_overlap(self.robots))
 
@@ -144,25 +149,39 @@ async def _run(spec: RobotSpec, pipe: ParentPipe) -> None:
     async with connect(spec.url, token=token, codec=options.codec, settings=spec.session) as robot:
         pipe.send(ChildReady(len(frames)))
         began = await asyncio.to_thread(pipe.wait_start)
-        start = np.eye(4) if truth is None or options.merge else truth.T_world_camera[0]
+        unknown = truth is None or options.merge or options.live
+        start = np.eye(4) if truth is None or unknown else truth.T_world_camera[0]
         drive = _Drive()
         planned = began
 
         async def ask(query: PoseQuery) -> PoseAnswer:
             return await _solve(robot, query, planned, began, spec, drive)
 
-        mapper = Mapper(ask=ask, depth=True, options=options.frontend_options, T_world_start=start)
         collector = _collector(spec, pipe.token, lambda: drive.asking)
-        first_s = time.monotonic()
-        for row, frame in enumerate(frames):
-            planned = began + (row + spec.number / options.robots) / options.rate_hz
-            await asyncio.sleep(max(0.0, planned - time.monotonic()))
-            done = await mapper.track(frame)
-            if done.T_world_camera is not None and collector is not None:
-                await asyncio.to_thread(collector.add, done)
-            drive.tracked.append(done)
-            pipe.send(FrameDone(row + 1))
-        took_s = time.monotonic() - first_s
+        async with AsyncExitStack() as stack:
+            mapper: Mapper | LiveMapper
+            if options.live:
+                shared = LiveMapper(robot, LIVE_NAME, ask=ask, options=options.frontend_options)
+                mapper = await stack.enter_async_context(shared)
+                recorder = LiveRecorder(shared, time.monotonic, began)
+            else:
+                mapper = Mapper(ask=ask, depth=True, options=options.frontend_options, T_world_start=start)
+            first_s = time.monotonic()
+            for row, frame in enumerate(frames):
+                planned = began + (row + spec.number / options.robots) / options.rate_hz
+                await asyncio.sleep(max(0.0, planned - time.monotonic()))
+                done = await mapper.track(frame)
+                if options.live:
+                    recorder.frame(done)
+                if done.T_world_camera is not None and collector is not None:
+                    await asyncio.to_thread(collector.add, done)
+                drive.tracked.append(done)
+                pipe.send(FrameDone(row + 1))
+            took_s = time.monotonic() - first_s
+        if options.live:
+            await recorder.finish(spec.folder)
+            if truth is not None:
+                write_trajectory(spec.folder / TRUTH, truth)
         trajectory = mapper.trajectory
         uploaded = await asyncio.to_thread(_write, spec.folder, mapper.map, trajectory, collector)
         pipe.send(

@@ -28,10 +28,12 @@ from rse_pf.experiments.child_process import (
     end_process,
     start_process,
 )
+from rse_pf.experiments.demo.live import fetch_live_map
 from rse_pf.experiments.demo.merge import MERGED_MAP, merge_on_platform, print_tenths, write_merged
 from rse_pf.experiments.demo.report import closing_lines, demo_page, is_lost, make_report
 from rse_pf.experiments.demo.robot import DemoOptions, FrameDone, RobotFinished, RobotSpec, run_robot
 from rse_pf.experiments.plots.map_image import RobotPath, draw_map
+from rse_pf.experiments.results.live_error import LIVE_MAP, live_figures, read_live_drives, read_live_map
 from rse_pf.experiments.results.records import COMMANDS, EVENTS, SAMPLES, EventLog, write_commands
 from rse_pf.experiments.results.result_folder import (
     RUN_FILES,
@@ -75,6 +77,7 @@ def run_demo(options: DemoOptions, settings: PlatformSettings) -> int:
             "map_merged.png",
             "merged.ply",
             MERGED_MAP,
+            LIVE_MAP,
             "robot-[1-9]",
             "robot-[1-9][0-9]",
         ],
@@ -103,7 +106,7 @@ async def _run(
             state=folder / "platform",
             name="demo",
             on_event=lambda event: events.copy(event, now()),
-            data=options.merge,
+            data=options.merge or options.live,
         ) as platform:
             pids = ", ".join(f"{server.name} {server.pid}" for server in platform.servers)
             screen.print(f"running at {platform.url}: {pids}")
@@ -126,6 +129,12 @@ async def _run(
                 screen.print("merging the maps")
                 merged = await asyncio.to_thread(_merge, settings, folder, finished, platform, screen)
                 events.write(now(), "merged", joined=merged["joined"])
+            if options.live:
+                screen.print("publishing the live map")
+                why = await fetch_live_map(
+                    platform.url, platform.issue_token("operator"), folder, settings.session
+                )
+                events.write(now(), "published", trouble=why)
     remove_keys(folder / "platform")
     screen.print("drawing the maps")
     return _write_results(options, folder, finished, before, merged)
@@ -275,6 +284,9 @@ def _write_results(
     report = make_report(finished, commands, asked, before, load_average())
     if merged is not None:
         report["merged"] = merged
+    if options.live:
+        drives = read_live_drives(folder, [_name(number) for number in range(len(finished))])
+        report["live"] = live_figures(drives, read_live_map(folder))
     write_json(folder / "report.json", report)
     (folder / "report.md").write_text(demo_page(report), encoding="utf-8")
     paths = [
@@ -285,8 +297,9 @@ def _write_results(
     for path, (points, colours), robot in zip(paths, clouds, finished, strict=True):
         caption = f"{path.name}: {robot.frames} frames, {robot.lost_frames} lost, {len(points):,} points"
         draw_map(folder / path.name / "map.png", points, colours, [path], caption)
-    # Robots that merge start in world frames of their own, so that their clouds do not share a frame.
-    if len(paths) > 1 and not options.merge and all(robot.truth is not None for robot in finished):
+    # Robots that merge, or share a live map, start in world frames of their own: their clouds do not fit.
+    in_one_frame = not options.merge and not options.live
+    if len(paths) > 1 and in_one_frame and all(robot.truth is not None for robot in finished):
         points = np.concatenate([points for points, _ in clouds])
         colours = np.concatenate([colours for _, colours in clouds])
         caption = f"{len(paths)} robots, {sum(robot.frames for robot in finished)} frames, one world"
