@@ -188,7 +188,7 @@ class LiveMapRouter:
         """Return the maps of a tenant that a robot may enter."""
         maps = await self._owners.list_maps(tenant)
         return {
-            "maps": [each for each in maps if _forbidden(claims, "maps:live", str(each.get("map"))) is None]
+            "maps": [each for each in maps if _forbidden(claims, "maps:live", str(each.get("name"))) is None]
         }
 
     async def _follow(self, queued: QueuedCommand, work: Callable[[], Any]) -> None:

@@ -221,14 +221,14 @@ def test_the_scope_of_the_map_decides(service: str, scopes: tuple[str, ...], all
 
 def test_a_robot_lists_the_maps_of_its_tenant_that_it_may_enter() -> None:
     async def test(parts: Parts) -> None:
-        parts.owners.maps = {"default": [{"map": "a"}, {"map": "b"}], "acme": [{"map": "secret"}]}
+        parts.owners.maps = {"default": [{"name": "a"}, {"name": "b"}], "acme": [{"name": "secret"}]}
         connection = FakeReader()
         connection.claims = claims("maps:live/b")
 
         answer = await parts.ask("live-list", None, connection=connection)
 
         assert isinstance(answer, Result)
-        assert answer.reply == {"maps": [{"map": "b"}]}
+        assert answer.reply == {"maps": [{"name": "b"}]}
 
     with_router(test)
 
