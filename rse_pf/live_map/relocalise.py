@@ -6,6 +6,7 @@ contradicts them makes the place ambiguous.  Which keyframes are candidates is d
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Literal
@@ -17,7 +18,7 @@ from rse_pf.live_map.keyframe_code import KeyframeFeatures
 from rse_pf.live_map.measure import MeasuredPose, MeasureOptions, measure_pose
 from rse_pf.services.mapping.pose_graph import log_se3
 
-__all__ = ["RelocaliseOptions", "Relocalised", "relocalise"]
+__all__ = ["RelocaliseOptions", "Relocalised", "relocalise", "spread_candidates"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -30,7 +31,11 @@ class RelocaliseOptions:
         agree_m: Placements closer than this,
         agree_deg: and turned less than this, support each other.
         alone_inliers: One keyframe alone is enough from so many inliers on.
-        rival: A contradicting placement with this share of the inliers makes a place ambiguous.
+        rival: A contradicting placement with this share of the inliers makes a place ambiguous: where a room
+            is unique, none was ever found.
+        place_m: Candidates closer than this,
+        place_deg: and turned less than this, are of one place,
+        of_place: of which so many are compared.
     """
 
     measured: MeasureOptions = field(default_factory=lambda: MeasureOptions(min_inliers=30))
@@ -38,7 +43,10 @@ class RelocaliseOptions:
     agree_m: float = 0.2
     agree_deg: float = 6.0
     alone_inliers: int = 80
-    rival: float = 0.5
+    rival: float = 0.1
+    place_m: float = 1.5
+    place_deg: float = 45.0
+    of_place: int = 4
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -115,6 +123,32 @@ def relocalise(
         inliers=best.found.inliers, matches=best.found.matches,
         keyframes=tuple(each.keyframe for each in agreeing),
     )  # fmt: skip
+
+
+def spread_candidates(
+    found: Sequence[tuple[int, float]], T_map_camera: Array, count: int, options: RelocaliseOptions = _DEFAULT
+) -> list[int]:
+    """Return up to *count* ids of *found* (best first), only a few of each place.
+
+    So a second place that looks alike is compared, too, though the first one has more keyframes.
+
+    Args:
+        found: Ids and similarities, of about six times *count* keyframes.
+        T_map_camera: ``(n, 4, 4)``, by id.
+        count: How many to compare.
+        options: What is one place.
+    """
+    chosen: list[int] = []
+    least_trace = 1.0 + 2.0 * math.cos(math.radians(options.place_deg))
+    for number, _ in found:
+        here, others = T_map_camera[number], T_map_camera[chosen]
+        near = np.linalg.norm(others[:, :3, 3] - here[:3, 3], axis=1) <= options.place_m
+        near &= np.einsum("kij,ij->k", others[:, :3, :3], here[:3, :3]) >= least_trace
+        if np.count_nonzero(near) < options.of_place:
+            chosen.append(number)
+        if len(chosen) == count:
+            break
+    return chosen
 
 
 def _agree(one: _Placement, other: _Placement, options: RelocaliseOptions) -> bool:

@@ -9,7 +9,7 @@ import pytest
 
 from rse_pf.geometry import exp_se3, inverse, pose_difference
 from rse_pf.live_map.keyframe_code import KeyframeFeatures, decode_features, encode_features
-from rse_pf.live_map.relocalise import RelocaliseOptions, relocalise
+from rse_pf.live_map.relocalise import RelocaliseOptions, relocalise, spread_candidates
 from rse_pf.services.synthetic_maps import make_world
 
 
@@ -88,7 +88,7 @@ def test_two_places_that_look_alike_are_ambiguous():
 def test_a_place_that_looks_alike_only_in_part_does_not_make_it_ambiguous():
     keyframe = MAP[1][1]
     part = KeyframeFeatures(
-        pixels=keyframe.pixels[:60], depths_m=keyframe.depths_m[:60], descriptors=keyframe.descriptors[:60]
+        pixels=keyframe.pixels[:16], depths_m=keyframe.depths_m[:16], descriptors=keyframe.descriptors[:16]
     )
 
     found = relocalise([*MAP, (10, part, CAMERA, ELSEWHERE @ MAP[1][3])], VIEW, CAMERA)
@@ -128,3 +128,21 @@ def test_a_view_far_from_its_keyframes_by_metres_is_still_relative_to_them():
 
     metres, _ = pose_difference(inverse(ELSEWHERE) @ found.T_map_camera, T_VIEW)
     assert metres < 0.01
+
+
+def test_candidates_are_spread_over_places_in_the_order_of_similarity():
+    at_m = [0.0, 0.2, 0.4, 0.6, 0.8, 1.0, 30.0, 30.2]
+    poses = np.array([exp_se3([x, 0.0, 0.0, 0.0, 0.0, 0.0]) for x in at_m])
+    found = [(number, 1.0 - 0.01 * number) for number in (5, 4, 3, 2, 1, 0, 7, 6)]
+
+    assert spread_candidates(found, poses, 5) == [5, 4, 3, 2, 7]
+    assert spread_candidates(found, poses, 10) == [5, 4, 3, 2, 7, 6]
+    assert spread_candidates([], poses, 5) == []
+
+
+def test_candidates_that_look_another_way_are_of_another_place():
+    poses = np.array([exp_se3([0.0, 0.0, 0.0, 0.0, np.radians(90.0) * (n // 4), 0.0]) for n in range(8)])
+
+    found = [(number, 0.5) for number in range(8)]
+
+    assert spread_candidates(found, poses, 6, RelocaliseOptions(of_place=2)) == [0, 1, 4, 5]
