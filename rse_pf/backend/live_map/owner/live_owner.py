@@ -130,9 +130,8 @@ class LiveOwner:
         self._book = UpdateBook(self._name_of)
         self._queue: deque[_Waiting] = deque()
         self._queued = asyncio.Event()
-        self._next_numbers: dict[str, int] = {}
+        self._adding: dict[tuple[str, int], asyncio.Task[None]] = {}
         self._outstanding: set[asyncio.Future[list[Outcome]]] = set()
-        self._in_writing: dict[tuple[str, int], asyncio.Future[list[Outcome]]] = {}
         self._measurable = deque(state.unmeasured)
         self._measuring = asyncio.Event()
         self._optimise_wanted = False
@@ -227,37 +226,35 @@ class LiveOwner:
 
     async def _take_keyframe(self, robot: RobotId, payload: dict[str, Any]) -> dict[str, Any]:
         event = requests.keyframe_event(robot, payload)
-        folder, number = event.robot, event.number
+        key = event.robot, event.number
+        adding = self._adding.get(key)  # the robot has sent it twice
+        if adding is None:
+            self._present[event.robot] = None
+            adding = self._adding[key] = asyncio.ensure_future(self._add(event))
+            adding.add_done_callback(lambda _: self._adding.pop(key))
+        await asyncio.shield(adding)
+        return {"number": event.number + 1, "version": self._state.position}
+
+    async def _add(self, event: KeyframeAdded) -> None:
+        """Return when a keyframe is durable; those before it that are on their way come first."""
+        compute, live_map = self._context.threads.compute, self._state.live_map
         while True:
-            verdict = await self._context.threads.compute(
-                Urgency.JUDGE, functools.partial(self._state.live_map.judge, event)
-            )
-            if verdict == "known" or number < self._next_numbers.get(folder, 0):
-                break
+            verdict = await compute(Urgency.JUDGE, functools.partial(live_map.judge, event))
+            if verdict == "known":
+                return
             if verdict == "new":
-                self._present[folder] = None
-                written = self._submit(event, len(event.features))
-                self._next_numbers[folder] = number + 1
-                self._in_writing[folder, number] = written
-                written.add_done_callback(lambda _: self._in_writing.pop((folder, number), None))
-                break
-            if number > self._next_numbers.get(folder, 0):
-                expected = await self._context.threads.compute(
-                    Urgency.JUDGE, functools.partial(self._state.live_map.next_number, folder)
-                )
+                await asyncio.shield(self._submit(event, len(event.features)))
+                return
+            before = self._adding.get((event.robot, event.number - 1))
+            if before is not None:
+                await asyncio.wait({before})
+                continue
+            expected = await compute(Urgency.JUDGE, functools.partial(live_map.next_number, event.robot))
+            if event.number > expected:
                 raise Conflict(
-                    f"keyframe {number} arrived, but {expected} is the next one",
+                    f"keyframe {event.number} arrived, but {expected} is the next one",
                     hint=f"send keyframe {expected} first",
                 )
-            await self._written(folder, number - 1)  # it can be judged when the one before is in the map
-        await self._written(folder, number)
-        return {"number": number + 1, "version": self._state.position}
-
-    async def _written(self, folder: str, number: int) -> None:
-        """Wait until a keyframe that is being written is in the map."""
-        pending = self._in_writing.get((folder, number))
-        if pending is not None:
-            await asyncio.shield(pending)
 
     async def _relocalise(self, payload: dict[str, Any]) -> dict[str, Any]:
         request = requests.to_request(payload, requests.RelocaliseRequest)
@@ -289,7 +286,6 @@ class LiveOwner:
             )
         for folder in folders:
             await asyncio.shield(self._submit(RobotForgotten(robot=folder)))
-            self._next_numbers.pop(folder, None)
         return {"forgotten": len(folders), "version": self._state.position}
 
     async def _start_from(self, request: requests.StartRequest) -> dict[str, Any]:
@@ -375,8 +371,6 @@ class LiveOwner:
         for each, outcomes, defect in zip(batch, applied.outcomes, applied.defects, strict=True):
             if defect is not None:
                 self._context.log.error("live-map-defect", map=self._context.map_name, error=repr(defect))
-                if isinstance(each.event, KeyframeAdded):
-                    self._next_numbers.pop(each.event.robot, None)
                 each.done.set_exception(InternalError("the map failed on this event", hint="report it"))
             elif not each.done.done():
                 each.done.set_result(outcomes)
@@ -538,8 +532,8 @@ class LiveOwner:
             return
         self._is_closing = True
         self._describe()
-        if self._in_writing or self._queue:
-            await asyncio.wait({each.done for each in self._queue} | set(self._in_writing.values()))
+        if self._outstanding:
+            await asyncio.wait(set(self._outstanding))
         snapshot = await self._context.threads.compute(Urgency.APPLY, self._state.snapshot)
         if how == "released" and snapshot.position > self._wrote_snapshot:
             await self._write_snapshot(snapshot)
