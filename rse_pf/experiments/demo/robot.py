@@ -29,7 +29,6 @@ from rse_pf.experiments.child_process import ChildFailed, ChildReady, ParentPipe
 from rse_pf.experiments.demo.keyframes import KeyframeCollector, KeyframeUploads
 from rse_pf.experiments.demo.live import LIVE_NAME, LiveRecorder
 from rse_pf.experiments.demo.merge import MAP_FILE
-from rse_pf.experiments.results.live_error import TRUTH
 from rse_pf.experiments.results.records import CommandRecord
 
 __all__ = ["DemoOptions", "FrameDone", "RobotFinished", "RobotSpec", "run_robot"]
@@ -147,41 +146,38 @@ async def _run(spec: RobotSpec, pipe: ParentPipe) -> None:
         return await asyncio.to_thread(pipe.fresh_token)
 
     async with connect(spec.url, token=token, codec=options.codec, settings=spec.session) as robot:
-        pipe.send(ChildReady(len(frames)))
-        began = await asyncio.to_thread(pipe.wait_start)
-        unknown = truth is None or options.merge or options.live
-        start = np.eye(4) if truth is None or unknown else truth.T_world_camera[0]
+        began = planned = 0.0
         drive = _Drive()
-        planned = began
 
         async def ask(query: PoseQuery) -> PoseAnswer:
             return await _solve(robot, query, planned, began, spec, drive)
 
-        collector = _collector(spec, pipe.token, lambda: drive.asking)
+        mapper: Mapper | LiveMapper
         async with AsyncExitStack() as stack:
-            mapper: Mapper | LiveMapper
             if options.live:
                 shared = LiveMapper(robot, LIVE_NAME, ask=ask, options=options.frontend_options)
                 mapper = await stack.enter_async_context(shared)
-                recorder = LiveRecorder(shared, time.monotonic, began)
             else:
+                start = np.eye(4) if truth is None or options.merge else truth.T_world_camera[0]
                 mapper = Mapper(ask=ask, depth=True, options=options.frontend_options, T_world_start=start)
+            pipe.send(ChildReady(len(frames)))
+            began = planned = await asyncio.to_thread(pipe.wait_start)
+            collector = _collector(spec, pipe.token, lambda: drive.asking)
+            recorder = LiveRecorder(shared, time.monotonic, began) if options.live else None
             first_s = time.monotonic()
             for row, frame in enumerate(frames):
                 planned = began + (row + spec.number / options.robots) / options.rate_hz
                 await asyncio.sleep(max(0.0, planned - time.monotonic()))
                 done = await mapper.track(frame)
-                if options.live:
+                if recorder is not None:
                     recorder.frame(done)
                 if done.T_world_camera is not None and collector is not None:
                     await asyncio.to_thread(collector.add, done)
                 drive.tracked.append(done)
                 pipe.send(FrameDone(row + 1))
             took_s = time.monotonic() - first_s
-        if options.live:
-            await recorder.finish(spec.folder)
-            if truth is not None:
-                write_trajectory(spec.folder / TRUTH, truth)
+        if recorder is not None:
+            await recorder.finish(spec.folder, truth)
         trajectory = mapper.trajectory
         uploaded = await asyncio.to_thread(_write, spec.folder, mapper.map, trajectory, collector)
         pipe.send(

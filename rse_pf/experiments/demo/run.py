@@ -54,6 +54,9 @@ __all__ = ["DemoOptions", "run_demo"]
 T = TypeVar("T")
 
 _EXIT_TIMEOUT_S = 5.0
+_START_S = 0.2
+_LIVE_START_S = 3.0
+"""Robots join a live map when they are switched on, and drive a moment later; a server starts its owner."""
 
 
 @dataclass(slots=True, kw_only=True)
@@ -172,8 +175,9 @@ async def _follow(
     ready = await asyncio.gather(
         *(_wait_for(ChildReady, *pair, platform, screen) for pair in zip(robots, inboxes, strict=True))
     )
-    began = time.monotonic() + 0.2
-    events.write(now(), "robots-start", robots=len(robots))
+    start_after_s = _LIVE_START_S if robots[0].spec.options.live else _START_S
+    began = time.monotonic() + start_after_s
+    events.write(now(), "robots-start", robots=len(robots), after_s=start_after_s)
     screen.print("the robots start")
     for robot, message in zip(robots, ready, strict=True):
         screen.reset(robot.bar, description=f"{robot.spec.name}  mapping", total=message.frames)

@@ -7,6 +7,7 @@ Records are in the folder of each robot: ``live.jsonl`` has a line for each fram
 from __future__ import annotations
 
 import json
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -51,6 +52,7 @@ class LiveDrive:
     frames: list[dict[str, Any]]
     corrections: list[dict[str, Any]]
     keyframes: list[dict[str, Any]]
+    end: dict[str, Any]
     truth: Trajectory | None
 
 
@@ -95,6 +97,8 @@ def live_figures(drives: Sequence[LiveDrive], version: MapVersion | None) -> dic
             )
             for drive in drives
         ],
+        "relocalisations": _summed(drive.end["relocalisations"] for drive in drives),
+        "keyframes_waiting": sum(drive.end["keyframes_waiting"] for drive in drives),
         "by_relocalisation": sum(frame["by"] == "relocalisation" for frame in given),
         "correction_ms": {
             **{
@@ -211,17 +215,18 @@ def live_table(live: Mapping[str, Any]) -> list[str]:
 
 def _read_drive(folder: Path, name: str) -> LiveDrive:
     path = folder / LIVE_RECORDS
-    kinds: dict[str, list[dict[str, Any]]] = {"frame": [], "correction": [], "keyframe": []}
+    kinds: dict[str, list[dict[str, Any]]] = {"frame": [], "correction": [], "keyframe": [], "end": []}
     try:
         for line in path.read_text(encoding="utf-8").splitlines():
             event = json.loads(line)
             kinds[event.pop("event")].append(event)
-    except (OSError, ValueError, KeyError, AttributeError) as error:
+        end = kinds["end"][-1]
+    except (OSError, ValueError, LookupError, AttributeError) as error:
         raise UsageError(f"cannot read {path}: {error}", hint="name the --out of a run") from error
     truth = read_trajectory(folder / TRUTH) if (folder / TRUTH).exists() else None
     return LiveDrive(
         name=name, frames=kinds["frame"], corrections=kinds["correction"], keyframes=kinds["keyframe"],
-        truth=truth,
+        end=end, truth=truth,
     )  # fmt: skip
 
 
@@ -269,6 +274,13 @@ def _owners(drives: Sequence[LiveDrive]) -> list[str]:
         (frame["t"], frame["owner"]) for drive in drives for frame in drive.frames if frame["owner"]
     )
     return list(dict.fromkeys(owner for _, owner in seen))
+
+
+def _summed(counts: Iterable[Mapping[str, int]]) -> dict[str, int]:
+    total = Counter[str]()
+    for each in counts:
+        total.update(each)
+    return dict(sorted(total.items()))
 
 
 def _percent(part: int, whole: int) -> float | None:
