@@ -62,7 +62,7 @@ def encode_features(
     """Return the features of a keyframe as bytes; rows without a usable depth are left out.
 
     Pixels are rounded to 1/16 px (images wider than 4,095 px: 1/8, 1/4), depths to 1 mm.  Where there are too
-    many features, those that lie farthest are left out: their depth says least.
+    many features, the first are kept: ORB gives those of the finest level first, which keep most links.
 
     Args:
         pixels: ``(n, 2)``, undistorted; rows outside 0..16383 px are left out.
@@ -83,10 +83,7 @@ def encode_features(
         largest_px = pixels.max(axis=1, initial=-1.0)
         usable = (depths_mm >= _NEAREST_MM) & (depths_mm <= _FARTHEST_MM)
         usable &= (pixels.min(axis=1, initial=np.inf) >= 0.0) & (largest_px <= _largest_px(_COARSEST))
-    rows = np.flatnonzero(usable)
-    if len(rows) > MAX_FEATURES:
-        nearest = np.argsort(depths_mm[rows], kind="stable")[:MAX_FEATURES]
-        rows = rows[np.sort(nearest)]
+    rows = np.flatnonzero(usable)[:MAX_FEATURES]
     widest_px = float(largest_px[rows].max(initial=0.0))
     fraction = next(f for f in range(_FINEST, _COARSEST - 1, -1) if widest_px <= _largest_px(f))
     units = np.rint(pixels[rows].astype(np.float64) * 2.0**fraction).astype("<u2")
