@@ -17,6 +17,7 @@ import msgspec
 import numpy as np
 
 from rse_pf.backend.sandbox.ipc import encode_message
+from rse_pf.live_map.keyframe_code import encode_features
 from rse_pf.maps.format import Edge, MapVersion, decode_map, encode_map
 from rse_pf.pnp.problems import DEGENERATE, KINECT, make_degenerate, make_problem, make_two_views
 from rse_pf.services.mapping.pose_graph import write_g2o
@@ -247,8 +248,17 @@ def _pictures() -> list[bytes]:
                 (120, 90, 6, 3, 0, 1), (100, 33, 0, 8, 4, 0))]  # fmt: skip
 
 
+def _live_keyframes() -> list[bytes]:
+    version, _ = make_world(7, points=1500).walk("robot-1", np.linspace(0.0, 0.05, 2), seed=2)
+    coded = [
+        encode_features(each.pixels, each.points_camera[:, 2], each.descriptors) for each in version.keyframes
+    ]
+    return [head + each[skipped:] for each in coded for head, skipped in ((b"\x00", 0), (b"\x05", 4))]
+
+
 _MADE = {
     "codec": _messages, "frames": _frames, "stream": _streams, "geometry": _problems, "maps": _maps,
     "keyframes": _keyframes, "snapshots": _sandbox_messages, "graph": _graphs, "cloud": _clouds,
     "native": _messages, "match": _views, "depth": _depths, "describe": _pictures,
+    "live": _live_keyframes,
 }  # fmt: skip

@@ -19,7 +19,7 @@ pytest.importorskip("faiss", reason="needs the extra 'maps'")
 
 _SLOW_MACHINE = 3.0
 """The bar is for a quiet core."""
-_NEW = ("maps", "keyframes", "snapshots", "graph", "cloud")
+_NEW = ("maps", "keyframes", "snapshots", "graph", "cloud", "live")
 
 
 def fuzzed(target: str, *, inputs: int) -> Meter:
@@ -29,7 +29,8 @@ def fuzzed(target: str, *, inputs: int) -> Meter:
 
 
 @pytest.mark.parametrize(
-    ("target", "inputs"), [("maps", 200), ("snapshots", 200), ("keyframes", 10), ("graph", 15), ("cloud", 15)]
+    ("target", "inputs"),
+    [("maps", 200), ("snapshots", 200), ("keyframes", 10), ("graph", 15), ("cloud", 15), ("live", 60)],
 )
 def test_damaged_bytes_give_an_answer_or_a_typed_error(target: str, inputs: int) -> None:
     meter = fuzzed(target, inputs=inputs)
