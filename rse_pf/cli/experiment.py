@@ -6,6 +6,7 @@ time and warm-up (elasticity), and the duration of faults (robustness).
 
 examples:
   rse-pf experiment elasticity --speed 30 --robots 40 --out fig8
+  rse-pf experiment live --data recordings/kitchen --fps 10 --out live
   rse-pf experiment robustness --only kill,stop --repeat 3 --out faults
   rse-pf experiment verify fig8
 """
@@ -26,9 +27,9 @@ __all__ = ["KINDS", "add_arguments", "run"]
 
 T = TypeVar("T")
 
-KINDS = ("latency", "elasticity", "robustness", "map", "verify")
-_ROBOTS = {"latency": 100, "elasticity": 100, "robustness": 100, "map": 3}
-_MAX_ROBOTS = {"latency": 2000, "elasticity": 2000, "robustness": 2000, "map": 32}
+KINDS = ("latency", "elasticity", "robustness", "map", "live", "verify")
+_ROBOTS = {"latency": 100, "elasticity": 100, "robustness": 100, "map": 3, "live": 3}
+_MAX_ROBOTS = {"latency": 2000, "elasticity": 2000, "robustness": 2000, "map": 32, "live": 32}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -38,7 +39,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "folder", nargs="?", type=Path, metavar="DIR", help="verify: results of one or more runs"
     )
     parser.add_argument("--out", type=Path, metavar="DIR", help="folder of results (default: out-KIND)")
-    parser.add_argument("--robots", type=int, metavar="N", help="number of robots (default: 100; map: 3)")
+    parser.add_argument("--robots", type=int, metavar="N", help="robots (default: 100; map and live: 3)")
     parser.add_argument("--fps", type=float, default=5.0, help="frames per second of each robot (default: 5)")
     parser.add_argument("--speed", type=float, default=1.0, metavar="K", help="compress times (default: 1)")
     parser.add_argument("--codec", choices=("zlib", "json", "bin"), default="zlib", help="default: zlib")
@@ -59,7 +60,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     latency = parser.add_argument_group("latency")
     latency.add_argument("--link", default="paper", help="a link profile, or none (default: paper)")
     latency.add_argument("--seconds", type=float, default=30.0, help="duration with all robots (default: 30)")
-    mapping = parser.add_argument_group("map")
+    mapping = parser.add_argument_group("map and live")
     mapping.add_argument("--data", type=Path, metavar="DIR", help="a recording (default: a rendered world)")
     mapping.add_argument(
         "--frames", type=int, default=80, help="frames per robot, rendered world (default: 80)"
@@ -77,9 +78,13 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
     if args.robots is None:
         args.robots = _ROBOTS[args.kind]
     _check(args)
-    return {"elasticity": _elasticity, "latency": _latency, "robustness": _robustness, "map": _map}[
-        args.kind
-    ](args, settings)
+    return {
+        "elasticity": _elasticity,
+        "latency": _latency,
+        "robustness": _robustness,
+        "map": _map,
+        "live": _live,
+    }[args.kind](args, settings)
 
 
 def _check(args: argparse.Namespace) -> None:
@@ -134,6 +139,13 @@ def _map(args: argparse.Namespace, settings: PlatformSettings) -> int:
     from rse_pf.experiments.paper.mapping import run_map
 
     return run_map(_options(DemoOptions, args, rate_hz=args.fps, quiet=True), settings)
+
+
+def _live(args: argparse.Namespace, settings: PlatformSettings) -> int:
+    from rse_pf.experiments.demo.run import DemoOptions
+    from rse_pf.experiments.paper.live_map import run_live
+
+    return run_live(_options(DemoOptions, args, rate_hz=args.fps, live=True, quiet=True), settings)
 
 
 def _options(kind: type[T], args: argparse.Namespace, **changed: Any) -> T:

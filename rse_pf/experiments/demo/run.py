@@ -81,6 +81,7 @@ def run_demo(options: DemoOptions, settings: PlatformSettings) -> int:
             "merged.ply",
             MERGED_MAP,
             LIVE_MAP,
+            "live.png",
             "robot-[1-9]",
             "robot-[1-9][0-9]",
         ],

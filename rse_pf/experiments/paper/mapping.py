@@ -33,7 +33,7 @@ from rse_pf.experiments.results.trajectory_error import trajectory_figures
 from rse_pf.local.control.monitor import MonitorSample, ServerSample
 from rse_pf.terminal import show_page
 
-__all__ = ["map_figures", "map_page", "run_map"]
+__all__ = ["complete_records", "frames_of", "map_figures", "map_page", "run_map"]
 
 
 def run_map(options: DemoOptions, settings: PlatformSettings) -> int:
@@ -41,7 +41,7 @@ def run_map(options: DemoOptions, settings: PlatformSettings) -> int:
     load_before = load_average()
     code = run_demo(options, settings)
     folder = options.out.resolve()
-    _complete_records(options, settings, folder, _write_truth(options, folder))
+    complete_records(options, settings, folder, _write_truth(options, folder), kind="map")
     asked = {
         "out": options.out.name,
         "robots": options.robots,
@@ -79,14 +79,19 @@ def _truth(options: DemoOptions, row: int) -> tuple[Trajectory | None, int]:
     return share.truth, len(share)
 
 
-def _complete_records(
-    options: DemoOptions, settings: PlatformSettings, folder: Path, frames: dict[str, int]
+def frames_of(options: DemoOptions) -> dict[str, int]:
+    """Return the number of frames that each robot plays."""
+    return {f"robot-{row + 1}": _truth(options, row)[1] for row in range(options.robots)}
+
+
+def complete_records(
+    options: DemoOptions, settings: PlatformSettings, folder: Path, frames: dict[str, int], *, kind: str
 ) -> None:
     """Write the parameters before the events of the demo, and its samples in the format of the monitor."""
     first = {
         "time": 0.0,
         "action": "experiment",
-        "kind": "map",
+        "kind": kind,
         "robots": options.robots,
         "fps": options.rate_hz,
         "frames": frames,

@@ -15,6 +15,7 @@ from typing import Any
 from rse_pf.errors import UsageError
 from rse_pf.experiments.paper.elasticity import elasticity_figures, unjustified_scale_outs
 from rse_pf.experiments.paper.latency import latency_figures
+from rse_pf.experiments.paper.live_map import live_experiment_figures
 from rse_pf.experiments.paper.mapping import map_figures
 from rse_pf.experiments.paper.robustness import robustness_figures
 from rse_pf.experiments.results.records import (
@@ -36,6 +37,7 @@ FIGURES: dict[str, Callable[[Records], dict[str, Any]]] = {
     "latency": latency_figures,
     "robustness": robustness_figures,
     "map": map_figures,
+    "live": live_experiment_figures,
 }
 
 
@@ -153,7 +155,7 @@ def _prefixed(name: str, check: FigureCheck) -> FigureCheck:
 
 
 def _wrong_round_trip(records: Records) -> str:
-    mapping = parameters_of(records)["kind"] == "map"  # a mapping robot plans frames, not commands
+    mapping = parameters_of(records)["kind"] in ("map", "live")  # a mapping robot plans frames, not commands
     for command in records.commands:
         if command.code != "ok" or command.answered is None or command.round_trip_ms is None:
             continue

@@ -12,10 +12,18 @@ from typing import Any
 import numpy as np
 
 from rse_pf.errors import MissingExtra
+from rse_pf.experiments.results.live_error import (
+    LiveDrive,
+    alignment_errors,
+    correction_delays_ms,
+    final_trajectory,
+    online_trajectory,
+)
 from rse_pf.experiments.results.records import CommandRecord, Records, parameters_of
 from rse_pf.experiments.results.summary import PAPER, ROUND_TRIP_PARTS
+from rse_pf.maps.format import MapVersion
 
-__all__ = ["draw_elasticity", "draw_latency", "draw_robustness", "require_matplotlib"]
+__all__ = ["draw_elasticity", "draw_latency", "draw_live", "draw_robustness", "require_matplotlib"]
 
 _BLUE, _ORANGE, _GREEN, _RED, _GREY = "#1f5fa8", "#d9822b", "#3a8f4d", "#c0392b", "#8a8f98"
 _PARTS_COLOURS = {"up_ms": "#7aa6d6", "queue_ms": _ORANGE, "compute_ms": _GREEN, "down_ms": _BLUE}
@@ -105,6 +113,56 @@ def draw_robustness(path: Path, runs: Mapping[str, Records], rows: Mapping[str, 
         path,
         "RSE-PF, robustness: each dot is a command, a line the start (red) or end (green) of a fault",
     )
+
+
+def draw_live(
+    path: Path, drives: Sequence[LiveDrive], version: MapVersion | None, live: Mapping[str, Any]
+) -> None:
+    """Draw the paths in a live map, the errors of the poses as given out, and the delays of corrections."""
+    figure, (paths, errors, delays) = _pyplot().subplots(
+        1, 3, figsize=(15.0, 4.8), layout="constrained", width_ratios=(1.2, 1.2, 0.8)
+    )
+    colours = (_BLUE, _ORANGE, _GREEN, _RED, "#7b4fa3", "#4aa3a2")
+    final = [final_trajectory(drive, version) for drive in drives]
+    across, up = _widest_axes([each.positions for each in final if len(each)])
+    for row, (drive, path_in_map) in enumerate(zip(drives, final, strict=True)):
+        colour = colours[row % len(colours)]
+        aligned = {frame["stamp"] for frame in drive.frames if frame["T_map"] is not None}
+        was_aligned = np.array([stamp in aligned for stamp in path_in_map.timestamps_s], dtype=bool)
+        positions = path_in_map.positions
+        for shown, style, label in (
+            (~was_aligned, ":", ""), (was_aligned, "-", drive.name)
+        ):  # fmt: skip
+            line = np.where(shown[:, None], positions[:, [across, up]], np.nan)
+            paths.plot(line[:, 0], line[:, 1], style, color=colour, linewidth=1.6, label=label or None)
+        given = online_trajectory(drive).positions
+        paths.plot(given[:, across], given[:, up], ".", color=colour, markersize=2.5, alpha=0.5)
+    paths.set(
+        aspect="equal", xlabel="m", ylabel="m", title="paths: dotted before the join; dots: as given out"
+    )
+    paths.legend(fontsize=8)
+    for row, (times_s, distances_cm) in enumerate(alignment_errors(drives, version)):
+        errors.plot(times_s, distances_cm, color=colours[row % len(colours)], linewidth=1.2)
+    errors.set(xlabel="time, s", ylabel="cm", title="error of the poses as given out")
+    found_ms = np.sort(correction_delays_ms(drives))
+    if len(found_ms):
+        delays.step(found_ms, np.arange(1, len(found_ms) + 1) / len(found_ms), where="post", color=_BLUE)
+    delay = live["correction_ms"]
+    delays.set(
+        xlabel="ms", ylabel="share", ylim=(0, 1.02),
+        title=f"keyframe sent to correction: p50 {delay['p50']}, p99 {delay['p99']}, n {delay['n']}",
+    )  # fmt: skip
+    _plain(paths, errors, delays)
+    _save(figure, path, "RSE-PF, live map")
+
+
+def _widest_axes(positions: Sequence[Any]) -> tuple[int, int]:
+    """Return the two axes along which the robots moved most."""
+    if not positions:
+        return 0, 2
+    spread = np.ptp(np.concatenate(positions), axis=0)
+    first, second = sorted(int(axis) for axis in np.argsort(spread)[1:])
+    return first, second
 
 
 # --- elasticity ------------------------------------------------------------------------------

@@ -29,6 +29,7 @@ __all__ = [
     "TRUTH",
     "LiveDrive",
     "alignment_errors",
+    "correction_delays_ms",
     "final_trajectory",
     "live_figures",
     "live_lines",
