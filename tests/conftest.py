@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import signal
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -11,6 +13,13 @@ from hypothesis import settings
 
 settings.register_profile("rse-pf", deadline=None)  # a crowded machine is no defect
 settings.load_profile("rse-pf")
+
+# moto makes 1,300 images, which no test looks at, for each of its EC2 regions: most of a second each time.
+os.environ.setdefault("MOTO_EC2_LOAD_DEFAULT_AMIS", "false")
+
+# Programs that tests start and interrupt would ignore SIGINT, as they inherit it of a shell's background job.
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 _REPOSITORY = Path(__file__).resolve().parents[1]
 _SOURCES = ("rse_pf", "client_sdk", "lambda_pnp", "stacks")

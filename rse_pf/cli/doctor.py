@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import functools
 import importlib
 import importlib.util
 import os
@@ -17,7 +18,7 @@ import platform
 import re
 import resource
 import subprocess
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
@@ -249,5 +250,11 @@ def _has(module: str) -> bool:
 
 
 def _version_of(module: str) -> str:
-    names = metadata.packages_distributions().get(module, [])
+    names = _distributions().get(module, [])
     return metadata.version(names[0]) if names else ""
+
+
+@functools.cache
+def _distributions() -> Mapping[str, list[str]]:
+    """Return the packages of each module; they are read once, as it takes 0.2 s."""
+    return metadata.packages_distributions()

@@ -52,17 +52,16 @@ OPTIONS = engines.native_options(PnpOptions(), WeakLimits())
 
 
 @pytest.fixture(scope="module")
-def library(tmp_path_factory: pytest.TempPathFactory, repository: Path) -> Path:
-    """The library, built from today's sources."""
+def library(repository: Path) -> Path:
+    """The library of the checkout; what has changed in its sources is compiled first."""
     if shutil.which(COMPILER) is None or shutil.which("make") is None:
         pytest.skip(f"no C++ compiler ({COMPILER}) or no make")
-    out = tmp_path_factory.mktemp("native")
     built = subprocess.run(
-        ["make", "-C", str(repository / "native"), f"OUT={out}", f"CXX={COMPILER}"],
+        ["make", "-C", str(repository / "native"), f"CXX={COMPILER}"],
         capture_output=True, text=True, check=False,
     )  # fmt: skip
     assert built.returncode == 0, built.stderr
-    return out / "librse_pf_native.so"
+    return repository / "native" / "build" / "librse_pf_native.so"
 
 
 @pytest.fixture
@@ -96,10 +95,10 @@ def assert_meets_the_bars(report):
 
 
 def test_no_less_success_and_accuracy_than_poselib_and_the_same_bytes_without_avx2(solver):
-    report = compare(map(case, range(500)))
+    report = compare(map(case, range(200)))
 
     assert_meets_the_bars(report)
-    assert report["all"]["native right"] > 400
+    assert report["all"]["native right"] > 160
 
 
 @pytest.mark.slow
@@ -111,7 +110,7 @@ def test_no_less_success_and_accuracy_than_poselib_on_ten_thousand_problems(solv
 @pytest.mark.usefixtures("solver")
 def test_the_evidence_says_of_its_pose_what_the_python_evidence_says(make):
     # The last five have a second pose near the first, by the distance that pose_difference measures.
-    for each in map(make, [*range(300), 331, 471, 667, 681, 849]):
+    for each in map(make, [*range(100), 331, 471, 667, 681, 849]):
         with references():
             _, ours, _, python = judgements(each)
 
@@ -357,7 +356,7 @@ def test_the_file_needs_the_c_library_of_2018_and_nothing_else(library):
 
 def test_the_checks_in_cpp_pass(repository, library):
     done = subprocess.run(
-        ["make", "-C", str(repository / "native"), f"OUT={library.parent}", f"CXX={COMPILER}", "check"],
+        ["make", "-C", str(repository / "native"), f"CXX={COMPILER}", "check"],
         capture_output=True, text=True, check=False,
     )  # fmt: skip
 

@@ -75,7 +75,7 @@ def refined(core: DepthCore, case: Problem) -> RefinedPose | str:
 @needs_library
 def test_the_poses_are_those_of_numpy(core: DepthCore) -> None:
     kept = 0
-    for seed in range(200):
+    for seed in range(80):
         case = problem(seed)
         expected = refine_by_numpy(case.solution, *case.arguments, KINECT)
 
@@ -89,7 +89,7 @@ def test_the_poses_are_those_of_numpy(core: DepthCore) -> None:
         scale = np.abs(expected.covariance).max()
         np.testing.assert_allclose(found.covariance, expected.covariance, rtol=0, atol=1e-7 * scale)
         assert found.rmse_px == pytest.approx(expected.rmse_px, rel=1e-9)
-    assert 0 < kept < 100
+    assert 0 < kept < 40
 
 
 @needs_library

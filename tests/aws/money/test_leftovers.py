@@ -112,7 +112,7 @@ def test_a_volume_in_use_is_no_leftover(region: str, state: str) -> None:
         TagSpecifications=[{"ResourceType": "volume", "Tags": [TAG]}],
     )["VolumeId"]  # fmt: skip
     if state == "in-use":
-        image = ec2.describe_images()["Images"][0]["ImageId"]
+        image = ec2.register_image(Name="image")["ImageId"]
         (instance,) = ec2.run_instances(ImageId=image, MinCount=1, MaxCount=1)["Instances"]
         ec2.attach_volume(VolumeId=volume, InstanceId=instance["InstanceId"], Device="/dev/sdf")
 

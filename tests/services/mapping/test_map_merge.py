@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import functools
+
 import numpy as np
 import pytest
+from default_cases import first_by_default
 
 from rse_pf.errors import Cancelled, MissingExtra
 from rse_pf.geometry import Array, exp_se3, inverse, pose_difference
@@ -28,11 +31,18 @@ for package in ("faiss", "gtsam"):
 WORLD = make_world(1)
 
 
+@functools.cache
 def two_robots() -> tuple[list[MapVersion], list[Array]]:
     """Return the maps and true poses of two robots that both see the second quarter of the hall."""
     a, truth_a = WORLD.walk("a", np.linspace(0.0, 0.5, 13), seed=1)
     b, truth_b = WORLD.walk("b", np.linspace(0.3, 0.8, 13), seed=2)
     return [a, b], [truth_a, truth_b]
+
+
+@functools.cache
+def merged_without_wrong_links() -> MergedMap:
+    """Return the map of `two_robots`."""
+    return merge_versions(two_robots()[0])
 
 
 def rmse_m(merged: MergedMap, truth: Array) -> float:
@@ -45,9 +55,9 @@ def rmse_m(merged: MergedMap, truth: Array) -> float:
 
 
 def test_two_maps_that_share_views_become_one() -> None:
-    maps, truths = two_robots()
+    _, truths = two_robots()
 
-    merged = merge_versions(maps)
+    merged = merged_without_wrong_links()
 
     assert merged.joined == (0, 1)
     assert merged.merges >= 3
@@ -62,7 +72,7 @@ def test_two_maps_that_share_views_become_one() -> None:
 def test_the_same_maps_give_the_same_map() -> None:
     maps, _ = two_robots()
 
-    assert encode_map(merge_versions(maps).version) == encode_map(merge_versions(maps).version)
+    assert encode_map(merge_versions(maps).version) == encode_map(merged_without_wrong_links().version)
 
 
 def test_maps_that_share_no_view_are_not_joined_and_the_reason_is_reported() -> None:
@@ -94,12 +104,12 @@ def planted(share: float, seed: int):  # type: ignore[no-untyped-def]
     return propose
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", first_by_default(1, range(3)))
 def test_wrong_loops_are_refused_and_do_not_deform_the_map(seed: int) -> None:
     maps, truths = two_robots()
     truth = np.concatenate(truths)
 
-    clean, wrong = merge_versions(maps), merge_versions(maps, propose=planted(0.1, seed))
+    clean, wrong = merged_without_wrong_links(), merge_versions(maps, propose=planted(0.1, seed))
 
     assert wrong.joined == (0, 1)
     assert rmse_m(wrong, truth) <= max(1.1 * rmse_m(clean, truth), rmse_m(clean, truth) + 0.005)

@@ -13,6 +13,7 @@ from rse_pf.services.mapping.wifi import (
     AccessPointReading,
     Fingerprint,
     Locator,
+    WifiOptions,
     WifiReply,
     WifiRequest,
     fingerprint_of,
@@ -60,8 +61,9 @@ def test_more_noise_gives_a_larger_radius() -> None:
     radii = []
     for noise_db in (1.0, 8.0):
         building = make_building(1, noise_db=noise_db)
-        survey = [(each.position, each.rssi_dbm) for each in surveyed(building, 5, pitch_m=4.0)]
-        radii.append(np.median(located(building, Locator(survey), 30, 6)[1]))  # type: ignore[arg-type]
+        survey = [(each.position, each.rssi_dbm) for each in surveyed(building, 5, pitch_m=5.0)]
+        locator = Locator(survey, WifiOptions(grid_m=1.0))  # type: ignore[arg-type]
+        radii.append(np.median(located(building, locator, 20, 6)[1]))
 
     assert radii[1] > 1.5 * radii[0]
 
@@ -69,7 +71,7 @@ def test_more_noise_gives_a_larger_radius() -> None:
 def test_the_service_answers_with_a_position_and_a_radius() -> None:
     building = make_building(2)
     scan = fingerprint_of(building.scan(np.array([10.0, 10.0, 0.3]), np.random.default_rng(1)), KEY)
-    request = WifiRequest(scan=scan, survey=surveyed(building, 3, pitch_m=4.0))
+    request = WifiRequest(scan=scan, survey=surveyed(building, 3, pitch_m=5.0))
 
     answer = dispatch(
         builtin_services(PlatformSettings()), Command(id=1, service="wifi", payload=request), lambda: 0.0
@@ -82,7 +84,7 @@ def test_the_service_answers_with_a_position_and_a_radius() -> None:
 
 
 def test_a_scan_of_unknown_access_points_has_no_position() -> None:
-    survey = surveyed(make_building(2), 3, pitch_m=4.0)
+    survey = surveyed(make_building(2), 3, pitch_m=8.0)
     request = WifiRequest(scan=Fingerprint(rssi_dbm={"nobody": -50.0}), survey=survey)
 
     answer = dispatch(
