@@ -1,0 +1,199 @@
+"""Which measured links are believed: those that agree with others, and with the graph.
+
+Links between two connected components are compared pairwise, links within one with what the graph says.
+Links that contradict the graph, but not each other, are evidence against those that were believed before.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Sequence
+
+import numpy as np
+import numpy.typing as npt
+
+from rse_pf.geometry import Array, inverse
+from rse_pf.live_map.graph import Graph, LiveLink
+from rse_pf.live_map.options import LiveMapOptions
+from rse_pf.live_map.smoother import log_se3_many
+from rse_pf.services.mapping.loop_consistency import largest_clique
+from rse_pf.services.mapping.pose_graph import inverses
+
+__all__ = ["agreeing_between", "agreeing_by_odometry", "has_enough_ends", "judge_within"]
+
+_CHI2_3_99 = 11.345
+"""99 % of the squared Mahalanobis norms of a 3-vector lie below."""
+_WIDE_STEPS = 12.0
+"""Beyond so many steps, the graph is too vague to confirm a single link."""
+_CONTRARY_LINKS = 24
+
+
+def agreeing_between(
+    graph: Graph, one: int, other: int, options: LiveMapOptions, leave_out: frozenset[int] = frozenset()
+) -> list[int]:
+    """Return the numbers of the largest set of open links between two components that agree pairwise.
+
+    Two links agree if the round trip over both is the identity, as in `loop_consistency.consistent`; the
+    poses within a component are those of the graph.  Links whose agreement is known are not compared again.
+
+    Source:
+        Mangelson et al., Pairwise consistent measurement set maximization, ICRA 2018.
+    """
+    pair = {one, other}
+    numbers = [
+        number for number in graph.open
+        if number not in leave_out
+        and {graph.component_of(graph.links[number].a), graph.component_of(graph.links[number].b)} == pair
+    ]  # fmt: skip
+    numbers = _tested(graph, numbers, options)
+    if len(numbers) < options.min_links:
+        return []
+    for place, number in enumerate(numbers):
+        unknown = [each for each in numbers[:place] if (each, number) not in graph.agreements]
+        if unknown:
+            for each, agrees in zip(unknown, _compare(graph, number, unknown, one, options), strict=True):
+                graph.agreements[each, number] = agrees
+    agree = np.zeros((len(numbers), len(numbers)), dtype=np.bool_)
+    for j, later in enumerate(numbers):
+        for i, earlier in enumerate(numbers[:j]):
+            agree[i, j] = agree[j, i] = graph.agreements[earlier, later]
+    return [numbers[row] for row in largest_clique(agree).tolist()]
+
+
+def has_enough_ends(graph: Graph, numbers: Sequence[int], options: LiveMapOptions) -> bool:
+    """Return whether links are many enough, and from different keyframes on both sides.
+
+    The sides are components; or segments, within one component; or the keyframes that were measured and those
+    they were compared with, within one segment.
+    """
+    if len(numbers) < options.min_links:
+        return False
+    first = graph.links[numbers[0]]
+    is_within = graph.component_of(first.a) == graph.component_of(first.b)
+    row, component = int(graph.of_segment[first.a]), graph.component_of(first.a)
+    measured: set[int] = set()
+    others: set[int] = set()
+    for number in numbers:
+        a, b = graph.links[number].a, graph.links[number].b
+        on_side = graph.of_segment[a] == row if is_within else graph.component_of(a) == component
+        measured.add(a if on_side else b)
+        others.add(b if on_side else a)
+    return min(len(measured), len(others)) >= options.min_ends
+
+
+def judge_within(
+    graph: Graph, numbers: Sequence[int], walked: Sequence[float], options: LiveMapOptions
+) -> list[str]:
+    """Compare links within one component with the graph: "agrees", "contrary", or "vague" for each.
+
+    The graph is vague where the way between both ends, *walked* steps, is long.
+    """
+    links = [graph.links[number] for number in numbers]
+    predicted = inverses(graph.T[[link.a for link in links]]) @ graph.T[[link.b for link in links]]
+    off = log_se3_many(inverses(np.array([link.T_a_b for link in links])) @ predicted)
+    spread = np.array([link.variances for link in links])
+    steps = np.maximum(np.array(walked), 1.0)
+    # On a round way of a given length no point is farther than its diameter.
+    apart_m = np.sqrt((predicted[:, :3, 3] ** 2).sum(axis=1))
+    lever_m = np.maximum(apart_m, options.spacing_m * steps / math.pi)
+    turned2 = steps * math.radians(options.judged.step_deg) ** 2
+    rad2 = spread[:, 3:].mean(axis=1) + turned2
+    m2 = spread[:, :3].mean(axis=1) + steps * options.judged.step_m**2 + turned2 * lever_m**2
+    agrees = ((off[:, :3] ** 2).sum(axis=1) <= _CHI2_3_99 * m2) & (
+        (off[:, 3:] ** 2).sum(axis=1) <= _CHI2_3_99 * rad2
+    )
+    return [
+        "contrary" if not ok else "vague" if far else "agrees"
+        for ok, far in zip(agrees.tolist(), (steps > _WIDE_STEPS).tolist(), strict=True)
+    ]
+
+
+def agreeing_by_odometry(
+    graph: Graph, number: int, numbers: Sequence[int], options: LiveMapOptions
+) -> list[int]:
+    """Return the largest set of links between two segments that agree pairwise by odometry alone.
+
+    The set holds *number*, or is empty; *numbers* are other links between the same two segments.
+    """
+    others = _tested(graph, sorted({*numbers} - {number}), options)[-_CONTRARY_LINKS:]
+    if not others:
+        return [number]
+    row = int(graph.of_segment[graph.links[number].a])
+    ends = [_ends(graph, each, row) for each in others]
+    last = _ends(graph, number, row)
+    near = np.flatnonzero(_trips_close(graph, graph.T_odom, ends, last, None, None, options))
+    agree = np.zeros((len(near), len(near)), dtype=np.bool_)
+    for j in range(1, len(near)):
+        before = [ends[each] for each in near[:j]]
+        agree[j, :j] = _trips_close(graph, graph.T_odom, before, ends[near[j]], None, None, options)
+    clique = largest_clique(agree | agree.T) if len(near) else near
+    return sorted([number, *(others[near[each]] for each in clique.tolist())])
+
+
+_Ends = tuple[int, int, Array, Array]
+
+
+def _tested(graph: Graph, numbers: list[int], options: LiveMapOptions) -> list[int]:
+    """Return the newest of *numbers*, at most a few for each keyframe, those with most inliers."""
+    count: Counter[int] = Counter()
+    kept = []
+    for number in sorted(numbers, key=lambda each: (-graph.links[each].inliers, each)):
+        link = graph.links[number]
+        if max(count[link.a], count[link.b]) < options.links_of_keyframe:
+            count[link.a] += 1
+            count[link.b] += 1
+            kept.append(number)
+    return sorted(kept)[-options.tested_links :]
+
+
+def _compare(graph: Graph, number: int, others: list[int], one: int, options: LiveMapOptions) -> list[bool]:
+    """Return whether each of *others* agrees with link *number*; all connect component *one* with another."""
+    last = _ends_between(graph, number, one)
+    ends = [_ends_between(graph, each, one) for each in others]
+    along_a = graph.walks(last[0], [each[0] for each in ends])
+    along_b = graph.walks(last[1], [each[1] for each in ends])
+    found = _trips_close(graph, graph.T, ends, last, along_a, along_b, options)
+    return [bool(each) for each in found]
+
+
+def _trips_close(
+    graph: Graph, T: Array, ends: Sequence[_Ends], last: _Ends, along_a: dict[int, float] | None,
+    along_b: dict[int, float] | None, options: LiveMapOptions,
+) -> npt.NDArray[np.bool_]:  # fmt: skip
+    """Return whether the round trips over link *last* and each of *ends* are close to the identity."""
+    a, b = np.array([each[0] for each in ends]), np.array([each[1] for each in ends])
+    steps = np.array([each[2] for each in ends])
+    spread = np.array([each[3] for each in ends])
+    way_b = inverse(T[last[1]]) @ T[b]
+    way_a = inverses(T[a]) @ T[last[0]]
+    trip = log_se3_many(last[2] @ way_b @ inverses(steps) @ way_a)
+    if along_a is None or along_b is None:
+        walked = np.abs(graph.way[a] - graph.way[last[0]]) + np.abs(graph.way[b] - graph.way[last[1]])
+    else:
+        walked = np.array([along_a[each[0]] + along_b[each[1]] for each in ends])
+    lever_m2 = (way_a[:, :3, 3] ** 2).sum(axis=1) + (way_b[:, :3, 3] ** 2).sum(axis=1)
+    noise = options.judged
+    rad2 = spread[:, 3:].mean(axis=1) + last[3][3:].mean() + walked * math.radians(noise.step_deg) ** 2
+    m2 = spread[:, :3].mean(axis=1) + last[3][:3].mean() + walked * noise.step_m**2 + rad2 * lever_m2
+    close: npt.NDArray[np.bool_] = ((trip[:, :3] ** 2).sum(axis=1) <= _CHI2_3_99 * m2) & (
+        (trip[:, 3:] ** 2).sum(axis=1) <= _CHI2_3_99 * rad2
+    )
+    return close
+
+
+def _ends_between(graph: Graph, number: int, one: int) -> _Ends:
+    link = graph.links[number]
+    return _oriented(link, graph.component_of(link.a) == one)
+
+
+def _ends(graph: Graph, number: int, row: int) -> _Ends:
+    link = graph.links[number]
+    return _oriented(link, int(graph.of_segment[link.a]) == row)
+
+
+def _oriented(link: LiveLink, forward: bool) -> _Ends:
+    """Return both ends of a link, its step from the first to the second, and its variances."""
+    if forward:
+        return link.a, link.b, link.T_a_b, link.variances
+    return link.b, link.a, inverse(link.T_a_b), link.variances

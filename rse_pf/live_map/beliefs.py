@@ -1,0 +1,245 @@
+"""What new links change: which are believed, which components they join, and which old links they refute."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from rse_pf.geometry import Array, inverse
+from rse_pf.live_map.agreement import (
+    agreeing_between,
+    agreeing_by_odometry,
+    has_enough_ends,
+    judge_within,
+)
+from rse_pf.live_map.graph import Graph
+from rse_pf.live_map.options import LiveMapOptions
+from rse_pf.live_map.outcomes import LinkBelieved, LinkRemoved, Outcome
+
+__all__ = ["Changes", "judge_links", "remove_doubted"]
+
+_DOUBTFUL = 30.0
+"""Squared misfit of a link, six degrees of freedom: one true link in 25,000 has more."""
+_JUDGED_AFTER_JOIN = 48
+
+
+@dataclass(slots=True)
+class Changes:
+    """What happened to links: outcomes, and the keyframes around which the graph must be smoothed."""
+
+    outcomes: list[Outcome] = field(default_factory=list)
+    moved: list[int] = field(default_factory=list)
+
+    def touch(self, *keyframes: int) -> None:
+        """Note keyframes to smooth around, each once."""
+        self.moved += [i for i in keyframes if i not in self.moved]
+
+
+def judge_links(graph: Graph, keyframe: int, numbers: list[int], options: LiveMapOptions) -> Changes:
+    """Judge the new links *numbers* of *keyframe*: believe, join, or refute; the graph changes."""
+    changes = Changes()
+    here = graph.component_of(keyframe)
+    others = {number: _other_end(graph, number, keyframe) for number in numbers}
+    within = [number for number in numbers if graph.component_of(others[number]) == here]
+    _judge_within(graph, within, options, changes)
+    for component in sorted({graph.component_of(i) for i in others.values()} - {here}):
+        _try_join(graph, graph.component_of(keyframe), component, options, changes)
+    return changes
+
+
+def remove_doubted(
+    graph: Graph, squares: dict[int, float], options: LiveMapOptions, changes: Changes
+) -> bool:
+    """Count the updates in which links contradicted the graph, remove those with too many; say if there were.
+
+    *squares* has the squared misfit of each believed link that was smoothed.
+    """
+    gone = []
+    for number, square in squares.items():
+        link = graph.links[number]
+        link.doubts = link.doubts + 1 if square > _DOUBTFUL and not link.fixed else 0
+        if link.doubts >= options.doubts:
+            gone.append(number)
+    _remove(graph, gone, "contrary to the graph", changes)
+    return bool(gone)
+
+
+def _judge_within(graph: Graph, numbers: list[int], options: LiveMapOptions, changes: Changes) -> None:
+    walks: dict[int, dict[int, float]] = {}
+    for number in numbers:
+        link = graph.links[number]
+        if link.a not in walks:
+            ends = [graph.links[each].b for each in numbers if graph.links[each].a == link.a]
+            walks[link.a] = graph.walks(link.a, ends)
+    if not numbers:
+        return
+    walked = [walks[graph.links[number].a][graph.links[number].b] for number in numbers]
+    verdicts = judge_within(graph, numbers, walked, options)
+    _believe(graph, [n for n, verdict in zip(numbers, verdicts, strict=True) if verdict == "agrees"], changes)
+    for number, verdict in zip(numbers, verdicts, strict=True):
+        if verdict == "agrees" or number not in graph.links or graph.links[number].state != "open":
+            continue
+        link = graph.links[number]
+        if graph.component_of(link.a) != graph.component_of(link.b):
+            continue
+        if verdict == "vague":
+            agreeing = agreeing_by_odometry(graph, number, _open_beside(graph, number), options)
+            if has_enough_ends(graph, agreeing, options):
+                _believe(graph, agreeing, changes)
+        else:
+            _refute(graph, number, options, changes)
+
+
+def _refute(graph: Graph, number: int, options: LiveMapOptions, changes: Changes) -> None:
+    """Remove believed links that fewer links support than those that agree with the contrary *number*."""
+    agreeing = agreeing_by_odometry(graph, number, _open_beside(graph, number), options)
+    if not has_enough_ends(graph, agreeing, options):
+        return
+    link = graph.links[number]
+    one, other = int(graph.of_segment[link.a]), int(graph.of_segment[link.b])
+    reason = f"{len(agreeing)} later links agree with each other and contradict it"
+    if one == other:
+        contrary = [
+            each for each in _loops(graph, one)
+            if each not in agreeing_by_odometry(graph, number, [each], options)
+        ]  # fmt: skip
+        if contrary and len(contrary) < len(agreeing):
+            _remove(graph, contrary, reason, changes)
+            _believe(graph, agreeing, changes)
+        return
+    refuted = False
+    while graph.segments[one].component == graph.segments[other].component:
+        weakest = _weakest_bridge(graph, one, other)
+        if not weakest or len(weakest) >= len(agreeing):
+            break
+        _remove(graph, weakest, reason, changes)
+        refuted = True
+    if refuted and graph.segments[one].component != graph.segments[other].component:
+        _try_join(graph, graph.segments[one].component, graph.segments[other].component, options, changes)
+
+
+def _loops(graph: Graph, row: int) -> list[int]:
+    """Return the believed links within a segment."""
+    return [
+        number for number, link in graph.links.items()
+        if link.state == "believed" and not link.fixed
+        and graph.of_segment[link.a] == graph.of_segment[link.b] == row
+    ]  # fmt: skip
+
+
+def _weakest_bridge(graph: Graph, one: int, other: int) -> list[int]:
+    """Return the fewest links that connect two segments on the path between *one* and *other* that has most.
+
+    Links of the version that the map started from are never removed.
+    """
+    bridges = {pair: numbers for pair, numbers in graph.bridges().items() if pair[0] != pair[1]}
+    strength = {
+        pair: len(numbers) + (10**9 if any(graph.links[n].fixed for n in numbers) else 0)
+        for pair, numbers in bridges.items()
+    }
+    for least in sorted(set(strength.values()), reverse=True):
+        path = _path(one, other, [pair for pair in strength if strength[pair] >= least])
+        if path:
+            pair = min(path, key=lambda each: (strength[each], each))
+            return [] if strength[pair] >= 10**9 else bridges[pair]
+    return []
+
+
+def _path(one: int, other: int, pairs: list[tuple[int, int]]) -> list[tuple[int, int]]:
+    """Return the pairs on the shortest path, [] if there is none."""
+    came: dict[int, tuple[int, tuple[int, int]]] = {one: (one, (one, one))}
+    front = [one]
+    while front and other not in came:
+        following = []
+        for row in front:
+            for pair in sorted(pairs):
+                if row in pair:
+                    beyond = pair[1] if pair[0] == row else pair[0]
+                    if beyond not in came:
+                        came[beyond] = (row, pair)
+                        following.append(beyond)
+        front = following
+    path = []
+    while other in came and other != one:
+        other, pair = came[other]
+        path.append(pair)
+    return path
+
+
+def _try_join(graph: Graph, one: int, other: int, options: LiveMapOptions, changes: Changes) -> None:
+    """Join two components if enough open links between them agree."""
+    agreeing = agreeing_between(graph, one, other, options)
+    if not has_enough_ends(graph, agreeing, options):
+        return
+    root = graph.segments[graph.root].component if graph.root >= 0 else -1
+    stay, moving = (other, one) if other == root or (one != root and other < one) else (one, other)
+    T_stay_moving = _median_pose([_proposed(graph, number, stay) for number in agreeing])
+    for segment in graph.segments:
+        if segment.component == moving and segment.keyframes:
+            graph.T[segment.keyframes] = T_stay_moving @ graph.T[segment.keyframes]
+    _believe(graph, agreeing, changes)
+    graph.connect()
+    graph.forget_agreements()
+    joined = graph.segments[min(stay, moving)].component
+    beside = [
+        number for number in graph.open
+        if graph.component_of(graph.links[number].a) == graph.component_of(graph.links[number].b) == joined
+    ]  # fmt: skip
+    _judge_within(graph, beside[-_JUDGED_AFTER_JOIN:], options, changes)
+
+
+def _proposed(graph: Graph, number: int, stay: int) -> Array:
+    """Return the pose of the moving component's frame in that of the staying one, by one link."""
+    link = graph.links[number]
+    a, b, T_a_b = link.a, link.b, link.T_a_b
+    if graph.component_of(a) != stay:
+        a, b, T_a_b = b, a, inverse(T_a_b)
+    T_stay_moving: Array = graph.T[a] @ T_a_b @ inverse(graph.T[b])
+    return T_stay_moving
+
+
+def _median_pose(poses: list[Array]) -> Array:
+    """Return the pose that differs least from the others."""
+    stack = np.array(poses)
+    apart_m = np.sqrt(((stack[:, None, :3, 3] - stack[None, :, :3, 3]) ** 2).sum(axis=2))
+    turned = np.sqrt(((stack[:, None, :3, :3] - stack[None, :, :3, :3]) ** 2).sum(axis=(2, 3)))
+    return poses[int(np.argmin((apart_m + turned).sum(axis=1)))]
+
+
+def _believe(graph: Graph, numbers: list[int], changes: Changes) -> None:
+    for number in numbers:
+        link = graph.links[number]
+        if link.state == "open":
+            graph.believe(number)
+            changes.outcomes.append(LinkBelieved(a=link.a, b=link.b))
+            changes.touch(link.a, link.b)
+
+
+def _remove(graph: Graph, numbers: list[int], reason: str, changes: Changes) -> None:
+    crossed = False
+    for number in numbers:
+        link = graph.links[number]
+        graph.remove_link(number)
+        changes.outcomes.append(LinkRemoved(a=link.a, b=link.b, reason=reason))
+        changes.touch(link.a, link.b)
+        crossed |= bool(graph.of_segment[link.a] != graph.of_segment[link.b])
+    if crossed:
+        graph.connect()
+        graph.forget_agreements()
+
+
+def _open_beside(graph: Graph, number: int) -> list[int]:
+    """Return the open links between the same two segments as *number*."""
+    link = graph.links[number]
+    pair = {int(graph.of_segment[link.a]), int(graph.of_segment[link.b])}
+    return [
+        each for each in graph.open
+        if each != number
+        and {int(graph.of_segment[graph.links[each].a]), int(graph.of_segment[graph.links[each].b])} == pair
+    ]  # fmt: skip
+
+
+def _other_end(graph: Graph, number: int, keyframe: int) -> int:
+    link = graph.links[number]
+    return link.b if link.a == keyframe else link.a

@@ -1,0 +1,444 @@
+"""The state of a live map: keyframes, segments of odometry, links, and how they are connected.
+
+Explicit numbers only, in the order of the events: the same events, or a snapshot and the events after it,
+give the same bytes.  Nothing here decides; `agreement` and `live_map` do.
+"""
+
+from __future__ import annotations
+
+import heapq
+import math
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
+from typing import Literal
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+
+from rse_pf.errors import BadRequest, message_of
+from rse_pf.geometry import Array, Camera
+from rse_pf.live_map.events import CameraNumbers
+
+__all__ = ["Graph", "LiveKeyframe", "LiveLink", "Segment", "camera_of"]
+
+LinkState = Literal["open", "believed", "removed"]
+
+_VERSION = 1
+_MAX_WALK = 200.0
+"""Steps of odometry beyond which two keyframes tell nothing about each other."""
+_MAX_VISITED = 250
+
+
+_FLOOR: Array = np.diag([0.02**2] * 3 + [math.radians(0.7) ** 2] * 3)
+"""Covariance of a relative pose at least: errors of depth and calibration are correlated."""
+
+
+@dataclass(slots=True, eq=False)
+class LiveKeyframe:
+    """What does not change of a keyframe; ``features`` is None when it was culled or forgotten."""
+
+    robot: str
+    segment: int
+    number: int
+    timestamp_s: float
+    camera: CameraNumbers
+    features: bytes | None
+
+
+@dataclass(slots=True, eq=False)
+class Segment:
+    """Keyframes of one robot in one odometry frame, by id, oldest first.
+
+    ``told`` is the alignment that was last told, None while it has none; ``reason`` says why.
+    """
+
+    robot: str
+    segment: int
+    keyframes: list[int] = field(default_factory=list)
+    component: int = 0
+    told: Array | None = None
+    covariance: Array = field(default_factory=lambda: _FLOOR.copy())
+    reason: str = "no link of it is believed yet"
+    version: bool = False
+    """Whether these are keyframes of the version that the map started from."""
+
+
+@dataclass(slots=True, eq=False)
+class LiveLink:
+    """A measured relative pose of keyframes ``a`` and ``b``; ``a`` is the one that was measured.
+
+    ``doubts`` counts the updates in a row in which the link contradicted the graph.
+    """
+
+    a: int
+    b: int
+    T_a_b: Array
+    information: Array
+    inliers: int
+    matches: int
+    fixed: bool = False
+    state: LinkState = "open"
+    doubts: int = 0
+    variances: Array = field(init=False)
+    """``(6,)``, of the twist (square metres, square radians)."""
+
+    def __post_init__(self) -> None:
+        self.variances = np.diag(np.linalg.inv(self.information))
+
+
+class Graph:
+    """All that a live map knows; `encode` and `decode` are a snapshot's content.
+
+    Attributes:
+        keyframes: By id.
+        T: ``(n, 4, 4)``, pose of each keyframe in the frame of its component; `T_odom` that of its odometry.
+        way: ``(n,)``, steps of odometry from the begin of its segment.
+        of_segment: ``(n,)``, row of its segment, -1 when it was forgotten.
+        held: ``(n,)``, whether its features are kept.
+        links: By number, in the order in which they were measured; `open` are those not believed.
+    """
+
+    def __init__(self) -> None:
+        self.keyframes: list[LiveKeyframe] = []
+        self.segments: list[Segment] = []
+        self.links: dict[int, LiveLink] = {}
+        self.open: list[int] = []
+        self.agreements: dict[tuple[int, int], bool] = {}
+        self.next_link = 0
+        self.root = -1
+        self.events = 0
+        self.next_numbers: dict[str, int] = {}
+        self.newest: dict[str, int] = {}
+        self.left: list[str] = []
+        self.optimised_at = 0
+        self.source = ""
+        self._links_of: dict[int, list[int]] = {}
+        self._size = 0
+        self._T = np.empty((64, 4, 4))
+        self._T_odom = np.empty((64, 4, 4))
+        self._way = np.empty(64)
+        self._of_segment = np.empty(64, dtype=np.int64)
+        self._place = np.empty(64, dtype=np.int64)
+        self._held = np.empty(64, dtype=np.bool_)
+
+    def __len__(self) -> int:
+        return self._size
+
+    @property
+    def T(self) -> Array:
+        """``(n, 4, 4)``, pose of each keyframe in the frame of its component."""
+        return self._T[: self._size]
+
+    @property
+    def T_odom(self) -> Array:
+        """``(n, 4, 4)``, pose of each keyframe in the frame of its odometry."""
+        return self._T_odom[: self._size]
+
+    @property
+    def way(self) -> Array:
+        """``(n,)``, steps of odometry from the begin of the segment."""
+        return self._way[: self._size]
+
+    @property
+    def of_segment(self) -> npt.NDArray[np.int64]:
+        """``(n,)``, row of the segment; -1 when the keyframe was forgotten."""
+        return self._of_segment[: self._size]
+
+    @property
+    def held(self) -> npt.NDArray[np.bool_]:
+        """``(n,)``, whether the features are kept."""
+        return self._held[: self._size]
+
+    def add(self, keyframe: LiveKeyframe, row: int, T_odom: Array, T: Array, way: float) -> int:
+        """Append a keyframe to segment *row*; return its id."""
+        if self._size == len(self._way):
+            for name in ("_T", "_T_odom", "_way", "_of_segment", "_place", "_held"):
+                old = getattr(self, name)
+                new = np.empty((2 * len(old), *old.shape[1:]), dtype=old.dtype)
+                new[: self._size] = old[: self._size]
+                setattr(self, name, new)
+        i = self._size
+        self._size += 1
+        self.keyframes.append(keyframe)
+        self._T[i], self._T_odom[i], self._way[i] = T, T_odom, way
+        self._of_segment[i], self._place[i], self._held[i] = row, len(self.segments[row].keyframes), True
+        self.segments[row].keyframes.append(i)
+        return i
+
+    def drop_features(self, i: int) -> None:
+        """Forget what keyframe *i* saw; its pose and its links stay."""
+        self.keyframes[i].features = None
+        self._held[i] = False
+
+    def add_link(self, link: LiveLink) -> int:
+        """Keep *link*; return its number."""
+        number = self.next_link
+        self.next_link += 1
+        self.links[number] = link
+        if link.state == "believed":
+            self._connect(number, link)
+        else:
+            self.open.append(number)
+        return number
+
+    def believe(self, number: int) -> None:
+        """Let an open link hold poses together."""
+        link = self.links[number]
+        link.state, link.doubts = "believed", 0
+        self.open.remove(number)
+        self._connect(number, link)
+
+    def remove_link(self, number: int) -> None:
+        """Take a link out, believed or not."""
+        link = self.links.pop(number)
+        if link.state == "believed":
+            self._links_of[link.a].remove(number)
+            self._links_of[link.b].remove(number)
+        else:
+            self.open.remove(number)
+        link.state = "removed"
+
+    def forget(self, robot: str) -> list[int]:
+        """Take out the keyframes of *robot* with their links; return their ids."""
+        gone = [
+            i
+            for segment in self.segments
+            if segment.robot == robot and not segment.version
+            for i in segment.keyframes
+        ]
+        members = set(gone)
+        for number in [n for n, link in self.links.items() if link.a in members or link.b in members]:
+            self.remove_link(number)
+        for segment in self.segments:
+            if segment.robot == robot and not segment.version:
+                segment.keyframes = []
+                segment.told = None
+        for i in gone:
+            self.drop_features(i)
+            self._of_segment[i] = -1
+        self.forget_agreements()
+        return gone
+
+    def forget_agreements(self) -> None:
+        """Drop what is known of links that are no longer open."""
+        still = set(self.open)
+        self.agreements = {
+            pair: agrees for pair, agrees in self.agreements.items() if pair[0] in still and pair[1] in still
+        }
+
+    def links_at(self, i: int) -> list[int]:
+        """Return the numbers of the believed links of keyframe *i*."""
+        return self._links_of.get(i, [])
+
+    def neighbours(self, i: int) -> Iterator[tuple[int, float]]:
+        """Yield the keyframes that odometry or a believed link connects with *i*, and how far they are.
+
+        A link counts as one step.
+        """
+        row = self._of_segment[i]
+        segment = self.segments[row]
+        if not segment.version:
+            place = int(self._place[i])
+            for near in (place - 1, place + 1):
+                if 0 <= near < len(segment.keyframes):
+                    other = segment.keyframes[near]
+                    yield other, abs(float(self._way[other] - self._way[i]))
+        for number in self._links_of.get(i, []):
+            link = self.links[number]
+            yield (link.b if link.a == i else link.a), 1.0
+
+    def steps_at(self, i: int) -> list[tuple[int, int]]:
+        """Return the pairs of consecutive keyframes of odometry that *i* belongs to."""
+        segment = self.segments[self._of_segment[i]]
+        if segment.version:
+            return []
+        place, ids = int(self._place[i]), segment.keyframes
+        return [(ids[near], ids[near + 1]) for near in (place - 1, place) if 0 <= near < len(ids) - 1]
+
+    def next_in_segment(self, i: int) -> int:
+        """Return the keyframe after *i* in its segment, -1 if it is the last."""
+        ids, place = self.segments[self._of_segment[i]].keyframes, int(self._place[i])
+        return int(ids[place + 1]) if place + 1 < len(ids) else -1
+
+    def walks(self, start: int, targets: Iterable[int]) -> dict[int, float]:
+        """Return how many steps of odometry each target is away from *start*, along the shortest path.
+
+        The search is bounded; a target beyond it is as far as the farthest that was seen, or farther.
+        """
+        wanted = set(targets)
+        found: dict[int, float] = {}
+        done: set[int] = set()
+        heap = [(0.0, start)]
+        far = 0.0
+        while heap and len(found) < len(wanted) and len(done) < _MAX_VISITED:
+            far, i = heapq.heappop(heap)
+            if i in done:
+                continue
+            done.add(i)
+            if i in wanted:
+                found[i] = far
+            for other, length in self.neighbours(i):
+                if other not in done:
+                    heapq.heappush(heap, (far + length, other))
+        for i in wanted - found.keys():
+            apart = abs(float(self._way[i] - self._way[start]))
+            is_one = self._of_segment[i] == self._of_segment[start]
+            found[i] = min(apart, _MAX_WALK) if is_one else max(far, _MAX_WALK)
+        return found
+
+    def component_of(self, i: int) -> int:
+        """Return the component of keyframe *i*: the row of its first segment."""
+        return self.segments[int(self._of_segment[i])].component
+
+    def connect(self) -> None:
+        """Compute the components anew: of segments, connected by believed links."""
+        root = list(range(len(self.segments)))
+
+        def find(row: int) -> int:
+            while root[row] != row:
+                root[row] = root[root[row]]
+                row = root[row]
+            return row
+
+        for link in self.links.values():
+            if link.state == "believed":
+                one, other = find(int(self._of_segment[link.a])), find(int(self._of_segment[link.b]))
+                root[max(one, other)] = min(one, other)
+        for row, segment in enumerate(self.segments):
+            segment.component = find(row)
+
+    def bridges(self) -> dict[tuple[int, int], list[int]]:
+        """Return the numbers of believed links by the pair of segments that they connect."""
+        found: dict[tuple[int, int], list[int]] = {}
+        for number, link in self.links.items():
+            if link.state == "believed":
+                one, other = int(self._of_segment[link.a]), int(self._of_segment[link.b])
+                found.setdefault((min(one, other), max(one, other)), []).append(number)
+        return found
+
+    def camera(self, i: int) -> Camera:
+        """Return the camera of keyframe *i*."""
+        return camera_of(self.keyframes[i].camera)
+
+    def _connect(self, number: int, link: LiveLink) -> None:
+        self._links_of.setdefault(link.a, []).append(number)
+        self._links_of.setdefault(link.b, []).append(number)
+
+    def encode(self, extra: dict[str, bytes]) -> bytes:
+        """Return everything as bytes, with *extra* byte strings beside it."""
+        believed = {str(i): numbers for i, numbers in self._links_of.items() if numbers}
+        packed = _Packed(
+            version=_VERSION,
+            keyframes=[
+                (k.robot, k.segment, k.number, k.timestamp_s, k.camera, k.features) for k in self.keyframes
+            ],
+            segments=[
+                (
+                    s.robot, s.segment, s.keyframes, s.component,
+                    None if s.told is None else s.told.tobytes(), s.covariance.tobytes(), s.reason, s.version,
+                )
+                for s in self.segments
+            ],
+            links=[
+                (
+                    number, link.a, link.b, link.T_a_b.tobytes(), link.information.tobytes(), link.inliers,
+                    link.matches, link.fixed, link.state, link.doubts,
+                )
+                for number, link in self.links.items()
+            ],
+            open=self.open,
+            agreements=[(*pair, agrees) for pair, agrees in self.agreements.items()],
+            numbers=(self.next_link, self.root, self.events, self.optimised_at),
+            next_numbers=list(self.next_numbers.items()),
+            newest=list(self.newest.items()),
+            left=self.left,
+            source=self.source,
+            links_of=list(believed.items()),
+            arrays=[
+                np.ascontiguousarray(each).tobytes()
+                for each in (self.T, self.T_odom, self.way, self.of_segment, self._place[: self._size])
+            ],
+            extra=list(extra.items()),
+        )  # fmt: skip
+        return msgspec.msgpack.encode(packed)
+
+    @classmethod
+    def decode(cls, data: bytes) -> tuple[Graph, dict[str, bytes]]:
+        """Return what `encode` was given.
+
+        Raises:
+            BadRequest: The snapshot is damaged, or of another version.
+        """
+        try:
+            packed = msgspec.msgpack.decode(data, type=_Packed)
+        except (msgspec.MsgspecError, ValueError) as error:
+            raise BadRequest(
+                f"the snapshot is damaged: {message_of(error)}", hint="take the older one"
+            ) from error
+        if packed.version != _VERSION:
+            raise BadRequest(
+                f"the snapshot is of version {packed.version}, not {_VERSION}",
+                hint="publish the map with the release that wrote it, and start a new one from the version",
+            )
+        graph = cls()
+        graph.keyframes = [LiveKeyframe(*each) for each in packed.keyframes]
+        n = graph._size = len(graph.keyframes)
+        capacity = max(64, n)
+        kinds = (("<f8", (4, 4)), ("<f8", (4, 4)), ("<f8", ()), ("<i8", ()), ("<i8", ()))
+        names = ("_T", "_T_odom", "_way", "_of_segment", "_place")
+        for name, (kind, shape), raw in zip(names, kinds, packed.arrays, strict=True):
+            array = np.empty((capacity, *shape), dtype=np.dtype(kind))
+            array[:n] = np.frombuffer(raw, dtype=np.dtype(kind)).reshape(n, *shape)
+            setattr(graph, name, array)
+        graph._held = np.zeros(capacity, dtype=np.bool_)
+        graph._held[:n] = [keyframe.features is not None for keyframe in graph.keyframes]
+        graph.segments = [
+            Segment(
+                robot=robot, segment=segment, keyframes=keyframes, component=component,
+                told=None if told is None else _matrix(told, 4), covariance=_matrix(covariance, 6),
+                reason=reason, version=version,
+            )
+            for robot, segment, keyframes, component, told, covariance, reason, version in packed.segments
+        ]  # fmt: skip
+        for number, a, b, step, information, inliers, matches, fixed, state, doubts in packed.links:
+            graph.links[number] = LiveLink(
+                a=a, b=b, T_a_b=_matrix(step, 4), information=_matrix(information, 6), inliers=inliers,
+                matches=matches, fixed=fixed, state=state, doubts=doubts,
+            )  # fmt: skip
+        graph.open = packed.open
+        graph.agreements = {(i, j): agrees for i, j, agrees in packed.agreements}
+        graph.next_link, graph.root, graph.events, graph.optimised_at = packed.numbers
+        graph.next_numbers = dict(packed.next_numbers)
+        graph.newest = dict(packed.newest)
+        graph.left, graph.source = packed.left, packed.source
+        graph._links_of = {int(i): numbers for i, numbers in packed.links_of}
+        return graph, dict(packed.extra)
+
+
+class _Packed(msgspec.Struct, kw_only=True):
+    version: int
+    keyframes: list[tuple[str, int, int, float, CameraNumbers, bytes | None]]
+    segments: list[tuple[str, int, list[int], int, bytes | None, bytes, str, bool]]
+    links: list[tuple[int, int, int, bytes, bytes, int, int, bool, LinkState, int]]
+    open: list[int]
+    agreements: list[tuple[int, int, bool]]
+    numbers: tuple[int, int, int, int]
+    next_numbers: list[tuple[str, int]]
+    newest: list[tuple[str, int]]
+    left: list[str]
+    source: str
+    links_of: list[tuple[str, list[int]]]
+    arrays: list[bytes]
+    extra: list[tuple[str, bytes]]
+
+
+def camera_of(numbers: CameraNumbers) -> Camera:
+    """Return the camera of six numbers; raises InvalidCamera."""
+    fx, fy, cx, cy, width, height = numbers
+    return Camera(fx=fx, fy=fy, cx=cx, cy=cy, width=width, height=height)
+
+
+def _matrix(raw: bytes, n: int) -> Array:
+    matrix: Array = np.frombuffer(raw, dtype="<f8").reshape(n, n)
+    return matrix

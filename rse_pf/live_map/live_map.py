@@ -1,0 +1,521 @@
+"""The live map: events in, outcomes out; the same events give the same map, byte for byte.
+
+`apply` alone changes it.  `measure`, `optimise` and `relocalise` only look: what they find becomes an event.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from typing import Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from rse_pf.errors import BadRequest, InvalidCamera
+from rse_pf.geometry import Array, Camera, inverse, pose_difference
+from rse_pf.live_map.beliefs import Changes, judge_links, remove_doubted
+from rse_pf.live_map.events import (
+    Event,
+    KeyframeAdded,
+    LinksMeasured,
+    MapStarted,
+    Optimised,
+    RobotForgotten,
+    RobotLeft,
+    matrix_bytes,
+    matrix_of,
+)
+from rse_pf.live_map.graph import Graph, LiveKeyframe, LiveLink, Segment, camera_of
+from rse_pf.live_map.keyframe_code import KeyframeFeatures, decode_features
+from rse_pf.live_map.measure import measure_links
+from rse_pf.live_map.options import LiveMapOptions
+from rse_pf.live_map.outcomes import (
+    Added,
+    Alignment,
+    Corrected,
+    Culled,
+    Joined,
+    OptimiseWanted,
+    Outcome,
+    Unaligned,
+)
+from rse_pf.live_map.place_index import LivePlaceIndex
+from rse_pf.live_map.relocalise import Relocalised, relocalise
+from rse_pf.live_map.smoother import SmoothedWindows, odometry_step, smooth_around
+from rse_pf.live_map.versions import version_of, whole_graph
+from rse_pf.maps.format import MapVersion
+from rse_pf.services.mapping.optimise import OptimiseOptions, optimise_graph
+
+__all__ = ["LiveMap"]
+
+_MAX_M, _MAX_TIME_S = 1e6, 1e12
+_MAX_SEGMENT = 2**31
+
+
+class LiveMap:
+    """One map that several robots make together.
+
+    Ids of keyframes are their positions in order of arrival.  The map's frame is that of the first segment,
+    or of the version that it starts from.
+    """
+
+    def __init__(self, options: LiveMapOptions | None = None) -> None:
+        self.options = options or LiveMapOptions()
+        self._graph = Graph()
+        self._places = LivePlaceIndex()
+
+    @classmethod
+    def restore(cls, snapshot: bytes, options: LiveMapOptions | None = None) -> LiveMap:
+        """Return the map that `snapshot` was called on.
+
+        Raises:
+            BadRequest: The snapshot is damaged, or of another version.
+        """
+        restored = cls(options)
+        restored._graph, extra = Graph.decode(snapshot)
+        restored._places = LivePlaceIndex.from_bytes(extra["places"])
+        return restored
+
+    def snapshot(self) -> bytes:
+        """Return all that the map knows."""
+        return self._graph.encode({"places": self._places.to_bytes()})
+
+    def digest(self) -> str:
+        """Return the SHA-256 of all that the map knows: equal for equal maps."""
+        return hashlib.sha256(self._graph.encode({})).hexdigest()
+
+    @property
+    def keyframes(self) -> int:
+        """The number of keyframes whose features are kept."""
+        return int(self._graph.held.sum())
+
+    @property
+    def robots(self) -> tuple[str, ...]:
+        """The robots that are in the map and have not left."""
+        return tuple(self._graph.newest)
+
+    @property
+    def contributors(self) -> tuple[str, ...]:
+        """The robots whose keyframes are in the map, also of those that left."""
+        segments = self._graph.segments
+        return tuple(dict.fromkeys(each.robot for each in segments if each.keyframes and not each.version))
+
+    @property
+    def links_believed(self) -> int:
+        """The number of measured links that hold poses together."""
+        return len(self._graph.links) - len(self._graph.open)
+
+    @property
+    def events(self) -> int:
+        """The number of events that were applied."""
+        return self._graph.events
+
+    def next_number(self, robot: str) -> int:
+        """Return the number that the robot's next keyframe must have."""
+        return self._graph.next_numbers.get(robot, 0)
+
+    def next_segment(self, robot: str) -> int:
+        """Return a number that no segment of the robot has; 0 if it has none."""
+        own = [each.segment for each in self._graph.segments if each.robot == robot and not each.version]
+        return max(own, default=-1) + 1
+
+    def pose(self, keyframe: int) -> Array:
+        """Return the ``(4, 4)`` pose of a keyframe in the frame of its component."""
+        pose: Array = self._graph.T[keyframe].copy()
+        return pose
+
+    def is_in_map(self, keyframe: int) -> bool:
+        """Return whether a keyframe is connected with the map's frame."""
+        row = int(self._graph.of_segment[keyframe])
+        return row >= 0 and self._is_aligned(row)
+
+    def judge(self, event: KeyframeAdded) -> Literal["new", "known", "ahead"]:
+        """Say whether a keyframe is the robot's next one; the map does not change.
+
+        Raises:
+            BadRequest: It cannot be a keyframe: a pose, a camera, features, a time or a segment is absurd.
+        """
+        expected = self.next_number(event.robot)
+        if event.number != expected:
+            return "known" if 0 <= event.number < expected else "ahead"
+        oldest = max(0, self.next_segment(event.robot) - 1)
+        if not oldest <= event.segment < _MAX_SEGMENT:
+            raise BadRequest(
+                f"segment {event.segment} is not within {oldest}..{_MAX_SEGMENT - 1}",
+                hint="count segments upwards, one for each time that tracking starts again",
+            )
+        if not abs(event.timestamp_s) <= _MAX_TIME_S:
+            raise BadRequest("the time of the keyframe is absurd", hint="send seconds since 1970")
+        _check_rigid(matrix_of(event.T_odom_camera, 4, 4))
+        try:
+            camera = camera_of(event.camera)
+        except InvalidCamera as error:
+            raise BadRequest(error.message, hint=error.hint) from error
+        decode_features(event.features, camera)
+        return "new"
+
+    def apply(self, event: Event) -> list[Outcome]:
+        """Change the map by *event*; deterministic.
+
+        Events about keyframes that are gone change nothing.
+        """
+        self._graph.events += 1
+        match event:
+            case KeyframeAdded():
+                return self._add(event)
+            case LinksMeasured():
+                return self._take_links(event)
+            case Optimised():
+                return self._take_poses(event)
+            case RobotForgotten():
+                return self._forget(event.robot)
+            case RobotLeft():
+                self._graph.newest.pop(event.robot, None)
+            case MapStarted():
+                return self._start(event)
+        return []
+
+    def measure(self, keyframe: int) -> LinksMeasured:
+        """Compare a keyframe with others that may show the same place; changes nothing."""
+        graph = self._graph
+        if graph.keyframes[keyframe].features is None:
+            return LinksMeasured(keyframe=keyframe)
+        others = [self._view(i) for i in self._candidates(keyframe)]
+        return measure_links(self._view(keyframe), others, self.options.measured)
+
+    def optimise(self) -> Optimised:
+        """Fit the whole graph to all links; changes nothing.
+
+        Raises:
+            MissingExtra: gtsam is not installed.
+        """
+        graph, ids = whole_graph(self._graph, self.options)
+        found = optimise_graph(graph, OptimiseOptions(cauchy=self.options.cauchy))
+        poses = found.T_world_pose
+        anchor = ids.index(self._anchor(self._graph.root))
+        poses = graph.T_world_pose[anchor] @ inverse(poses[anchor]) @ poses
+        return Optimised(up_to=self._graph.events, ids=tuple(ids), T_map_camera=matrix_bytes(poses))
+
+    def relocalise(self, camera: Camera, features: bytes) -> Relocalised:
+        """Find the place of a view in the map; changes nothing.
+
+        Raises:
+            BadRequest: The features are malformed.
+        """
+        decoded = decode_features(features, camera)
+        graph = self._graph
+        aligned = np.flatnonzero(graph.held & self._aligned_mask())
+        found = self._places.nearest(
+            LivePlaceIndex.vector(decoded.descriptors), self.options.candidates, aligned
+        )
+        candidates = [(*self._view(i), graph.T[i].copy()) for i, _ in found]
+        return relocalise(candidates, decoded, camera)
+
+    def alignments(self) -> list[Alignment]:
+        """Return where the newest segment of each robot lies."""
+        return [self._alignment(self._graph.segments[row]) for row in self._graph.newest.values()]
+
+    def alignment_of(self, robot: str, segment: int) -> Alignment | None:
+        """Return where a segment lies, None if nothing of it is in the map."""
+        for each in self._graph.segments:
+            if (each.robot, each.segment) == (robot, segment) and each.keyframes:
+                return self._alignment(each)
+        return None
+
+    def to_version(self) -> MapVersion:
+        """Return the keyframes and links that are connected with the map's frame, as a version."""
+        return version_of(self._graph, self.options)
+
+    # --- events -------------------------------------------------------------------------------
+
+    def _add(self, event: KeyframeAdded) -> list[Outcome]:
+        graph, options = self._graph, self.options
+        row = self._segment_of(event.robot, event.segment)
+        segment = graph.segments[row]
+        T_odom = np.array(matrix_of(event.T_odom_camera, 4, 4))
+        T, way = T_odom, 0.0
+        if segment.keyframes:
+            last = segment.keyframes[-1]
+            step = inverse(graph.T_odom[last]) @ T_odom
+            T = graph.T[last] @ step
+            way = float(graph.way[last]) + odometry_step(step, options)
+        i = graph.add(
+            LiveKeyframe(
+                robot=event.robot, segment=event.segment, number=event.number,
+                timestamp_s=event.timestamp_s, camera=event.camera, features=event.features,
+            ),
+            row, T_odom, T, way,
+        )  # fmt: skip
+        self._place(i)
+        graph.next_numbers[event.robot] = event.number + 1
+        graph.newest[event.robot] = row
+        if graph.root < 0:
+            graph.root = row
+        return [Added(id=i), *self._tell((event.robot, event.number))]
+
+    def _take_links(self, event: LinksMeasured) -> list[Outcome]:
+        graph, k = self._graph, event.keyframe
+        if not self._exists(k):
+            return []
+        numbers = []
+        for link in event.links:
+            if link.other != k and self._exists(link.other):
+                numbers.append(
+                    graph.add_link(
+                        LiveLink(
+                            a=k, b=link.other, T_a_b=np.array(matrix_of(link.T_keyframe_other, 4, 4)),
+                            information=np.array(matrix_of(link.information, 6, 6)), inliers=link.inliers,
+                            matches=link.matches,
+                        )
+                    )
+                )  # fmt: skip
+        changes = judge_links(graph, k, numbers, self.options)
+        window = self._smooth(changes)
+        self._forget_old_links()
+        mine = graph.keyframes[k]
+        told = self._tell((mine.robot, mine.number), window)
+        return [*changes.outcomes, *told, *self._cull(k)]
+
+    def _take_poses(self, event: Optimised) -> list[Outcome]:
+        graph = self._graph
+        T_new = np.frombuffer(event.T_map_camera, dtype="<f8").reshape(-1, 4, 4)
+        placed = {i: row for row, i in enumerate(event.ids) if self._exists(i) and self.is_in_map(i)}
+        moves: dict[int, Array] = {}
+        for row, segment in enumerate(graph.segments):
+            if not segment.keyframes or not self._is_aligned(row):
+                continue
+            move: Array | None = None
+            for i in segment.keyframes:
+                if i in placed:
+                    move = T_new[placed[i]] @ inverse(graph.T[i])
+                    graph.T[i] = T_new[placed[i]]
+                elif move is not None:
+                    graph.T[i] = move @ graph.T[i]
+            if move is not None:
+                moves[row] = move
+        changes = Changes(moved=self._follow(moves))
+        window = self._smooth(changes)
+        return [*changes.outcomes, *self._tell(None, window)]
+
+    def _follow(self, moves: dict[int, Array]) -> list[int]:
+        """Move segments that joined after the optimisation began with those they are linked to."""
+        graph = self._graph
+        seeds = []
+        for (one, other), numbers in sorted(graph.bridges().items()):
+            for new, old in ((one, other), (other, one)):
+                ids = graph.segments[new].keyframes
+                if new not in moves and old in moves and ids:
+                    moves[new] = moves[old]
+                    graph.T[ids] = moves[old] @ graph.T[ids]
+                    seeds += [graph.links[numbers[0]].a, graph.links[numbers[0]].b]
+        return seeds
+
+    def _forget(self, robot: str) -> list[Outcome]:
+        graph = self._graph
+        was_root = graph.segments[graph.root].component if graph.root >= 0 else -1
+        beside = [row for row, each in enumerate(graph.segments) if each.component == was_root]
+        for i in graph.forget(robot):
+            self._places.remove(i)
+        graph.newest.pop(robot, None)
+        if graph.root < 0 or not graph.segments[graph.root].keyframes:
+            alive = [row for row, each in enumerate(graph.segments) if each.keyframes]
+            graph.root = next((row for row in alive if row in beside), alive[0] if alive else -1)
+        graph.connect()
+        return self._tell(None)
+
+    def _start(self, event: MapStarted) -> list[Outcome]:
+        graph = self._graph
+        if len(graph):
+            raise BadRequest("the map has keyframes already", hint="start a new map from the version")
+        graph.source = event.source
+        graph.segments.append(Segment(robot="", segment=-1, version=True))
+        graph.root = 0
+        outcomes: list[Outcome] = []
+        for number, each in enumerate(event.keyframes):
+            T = np.array(matrix_of(each.T_map_camera, 4, 4))
+            keyframe = LiveKeyframe(
+                robot=each.robot, segment=-1, number=number, timestamp_s=each.timestamp_s, camera=each.camera,
+                features=each.features,
+            )  # fmt: skip
+            i = graph.add(keyframe, 0, T, T, 0.0)
+            self._place(i)
+            outcomes.append(Added(id=i))
+        for link in event.links:
+            graph.add_link(
+                LiveLink(
+                    a=link.a, b=link.b, T_a_b=np.array(matrix_of(link.T_a_b, 4, 4)),
+                    information=np.array(matrix_of(link.information, 6, 6)), inliers=0, matches=0, fixed=True,
+                    state="believed",
+                )
+            )  # fmt: skip
+        graph.connect()
+        return outcomes
+
+    # --- parts of events -------------------------------------------------------------------------------
+
+    def _smooth(self, changes: Changes) -> SmoothedWindows | None:
+        """Smooth around what changed; links that contradict the graph for long are removed."""
+        graph = self._graph
+        if not changes.moved:
+            return None
+        anchors = {self._anchor(row) for row in range(len(graph.segments))}
+        window = smooth_around(graph, changes.moved, anchors, self.options)
+        if remove_doubted(graph, window.squares, self.options, changes):
+            anchors = {self._anchor(row) for row in range(len(graph.segments))}
+            window = smooth_around(graph, changes.moved, anchors, self.options)
+        due = len(graph) - graph.optimised_at >= self.options.optimise_every
+        if window.strained and due:
+            graph.optimised_at = len(graph)
+            changes.outcomes.append(OptimiseWanted(misfit=window.misfit))
+        return window
+
+    def _tell(self, cause: tuple[str, int] | None, window: SmoothedWindows | None = None) -> list[Outcome]:
+        """Return what robots must know about the alignments of their newest segments."""
+        graph, options = self._graph, self.options
+        outcomes: list[Outcome] = []
+        for row in graph.newest.values():
+            segment = graph.segments[row]
+            if not segment.keyframes:
+                continue
+            if not self._is_aligned(row):
+                if segment.told is not None:
+                    segment.told, segment.reason = None, "the links that aligned it were removed"
+                    outcomes.append(
+                        Unaligned(robot=segment.robot, segment=segment.segment, reason=segment.reason)
+                    )
+                continue
+            T_map_odom = self._T_map_odom(segment)
+            if segment.told is None:
+                links = sum(len(each) for pair, each in graph.bridges().items() if row in pair)
+                outcomes.append(Joined(robot=segment.robot, segment=segment.segment, links=links))
+            elif not _differs(segment.told, T_map_odom, options):
+                continue
+            segment.told, segment.reason = T_map_odom, ""
+            covariance = window.covariance(graph, segment.keyframes[-1]) if window is not None else None
+            if covariance is not None:
+                segment.covariance = covariance
+            outcomes.append(
+                Corrected(
+                    robot=segment.robot, segment=segment.segment, T_map_odom=T_map_odom,
+                    covariance=segment.covariance, cause=cause,
+                )
+            )  # fmt: skip
+        return outcomes
+
+    def _cull(self, k: int) -> list[Outcome]:
+        """Drop the features of the oldest keyframe at a place that enough others have seen."""
+        graph, options = self._graph, self.options
+        if not self.is_in_map(k):
+            return []
+        held = graph.held
+        near = np.flatnonzero(
+            held & (np.abs(graph.T[:, :3, 3] - graph.T[k, :3, 3]).max(axis=1) <= options.same_place_m)
+        )
+        turned = np.einsum("nij,ij->n", graph.T[near, :3, :3], graph.T[k, :3, :3])
+        near = near[turned >= 1.0 + 2.0 * math.cos(math.radians(options.same_place_deg))]
+        near = near[[self.is_in_map(int(i)) for i in near]] if len(near) else near
+        surplus = len(near) - options.same_place_most
+        gone = tuple(int(i) for i in near[: max(0, surplus)] if i != k)
+        for i in gone:
+            graph.drop_features(i)
+            self._places.remove(i)
+        return [Culled(ids=gone)] if gone else []
+
+    def _forget_old_links(self) -> None:
+        graph = self._graph
+        surplus = len(graph.open) - self.options.open_links
+        if surplus > 0:
+            for number in graph.open[:surplus]:
+                graph.remove_link(number)
+            graph.forget_agreements()
+
+    def _segment_of(self, robot: str, number: int) -> int:
+        """Return the row of a robot's segment; it begins if there is none."""
+        graph = self._graph
+        newest = graph.newest.get(robot)
+        for row in range(len(graph.segments)) if newest is None else (newest,):
+            segment = graph.segments[row]
+            if (segment.robot, segment.segment) == (robot, number) and not segment.version:
+                return row
+        row = len(graph.segments)
+        graph.segments.append(Segment(robot=robot, segment=number, component=row))
+        return row
+
+    def _place(self, i: int) -> None:
+        """Add keyframe *i* to the index of places."""
+        keyframe = self._graph.keyframes[i]
+        assert keyframe.features is not None
+        features = decode_features(keyframe.features, self._graph.camera(i))
+        self._places.add(i, LivePlaceIndex.vector(features.descriptors))
+
+    def _candidates(self, k: int) -> list[int]:
+        """Return the keyframes to compare with *k*: some of its own component, some of others."""
+        graph, options = self._graph, self.options
+        vector = self._places.vector_of(k)
+        component = np.array([segment.component for segment in graph.segments])[graph.of_segment]
+        own = component == graph.component_of(k)
+        held = graph.held.copy()
+        held[k] = False
+        close = graph.of_segment == graph.of_segment[k]
+        close &= np.abs(graph.way - graph.way[k]) < options.apart_steps
+        here = np.flatnonzero(held & own & ~close)
+        there = np.flatnonzero(held & ~own)
+        most = options.candidates
+        found_there = self._places.nearest(vector, most // 2, there)
+        found_here = self._places.nearest(vector, most - len(found_there), here)
+        return sorted(i for i, _ in found_here + found_there)
+
+    def _view(self, i: int) -> tuple[int, KeyframeFeatures, Camera]:
+        keyframe, camera = self._graph.keyframes[i], self._graph.camera(i)
+        assert keyframe.features is not None
+        return i, decode_features(keyframe.features, camera), camera
+
+    def _exists(self, i: int) -> bool:
+        return 0 <= i < len(self._graph) and bool(self._graph.of_segment[i] >= 0)
+
+    def _anchor(self, row: int) -> int:
+        """Return the keyframe that defines the frame of a segment's component, -1 if it is gone."""
+        graph = self._graph
+        root = graph.segments[graph.root].component if graph.root >= 0 else -1
+        component = graph.segments[row].component
+        ids = graph.segments[graph.root if component == root else component].keyframes
+        return ids[0] if ids else -1
+
+    def _is_aligned(self, row: int) -> bool:
+        graph = self._graph
+        return graph.root >= 0 and graph.segments[row].component == graph.segments[graph.root].component
+
+    def _aligned_mask(self) -> npt.NDArray[np.bool_]:
+        graph = self._graph
+        aligned = np.array([self._is_aligned(row) for row in range(len(graph.segments))] + [False])
+        mask: npt.NDArray[np.bool_] = aligned[graph.of_segment]
+        return mask
+
+    def _T_map_odom(self, segment: Segment) -> Array:
+        newest = segment.keyframes[-1]
+        T_map_odom: Array = self._graph.T[newest] @ inverse(self._graph.T_odom[newest])
+        return T_map_odom
+
+    def _alignment(self, segment: Segment) -> Alignment:
+        aligned = segment.told is not None
+        return Alignment(
+            robot=segment.robot, segment=segment.segment, aligned=aligned, reason=segment.reason,
+            T_map_odom=segment.told, covariance=segment.covariance if aligned else None,
+        )  # fmt: skip
+
+
+def _differs(old: Array, new: Array, options: LiveMapOptions) -> bool:
+    moved_m, turned_deg = pose_difference(old, new)
+    return moved_m > options.told_m or turned_deg > options.told_deg
+
+
+def _check_rigid(T: Array) -> None:
+    """Raise BadRequest unless *T* is a rigid motion of sensible size."""
+    R = T[:3, :3]
+    is_rigid = (
+        bool((np.abs(T) <= _MAX_M).all()) and np.array_equal(T[3], (0.0, 0.0, 0.0, 1.0))
+        and float(np.abs(R @ R.T - np.eye(3)).max()) <= 1e-4 and float(np.linalg.det(R)) > 0
+    )  # fmt: skip
+    if not is_rigid:
+        raise BadRequest("T_odom_camera is not a rigid motion", hint="send a (4, 4) matrix of finite numbers")

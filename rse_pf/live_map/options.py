@@ -1,0 +1,72 @@
+"""The numbers of a live map; each was measured with `benchmarks/live_map.py`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from rse_pf.errors import ConfigurationError
+from rse_pf.live_map.measure import MeasureOptions
+from rse_pf.services.mapping.loop_consistency import OdometryNoise
+
+__all__ = ["LiveMapOptions"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LiveMapOptions:
+    """How a live map decides; an owner never changes them while a map lives.
+
+    Attributes:
+        min_links: Two components are joined by so many links that agree pairwise.
+        min_ends: From so many different keyframes on both sides.
+        tested_links: At most so many links of a pair of components are compared, the newest.
+        links_of_keyframe: At most so many of them may share a keyframe.
+        spacing_m: Odometry noise is stated for steps of this length,
+        spacing_deg: or of this rotation; it grows with the square root of the way.
+        drift: Of odometry in the graph.
+        judged: Of odometry when links are compared: larger, since a true link must not be refused.
+        cauchy: Width of the robust kernel on links, in standard deviations.
+        windows: Numbers of keyframes that the smoother moves; the next larger one is taken if the border of
+            the window would move by more than ``border_m`` or ``border_deg``.
+        told_m: A correction is told from this change of the alignment on,
+        told_deg: or from this rotation.
+        doubts: A link that contradicts the graph in so many updates is removed.
+        open_links: So many links that are not believed are kept, the newest.
+        measured: What a measured relative pose needs to become a link.
+        candidates: So many keyframes are compared with a new one.
+        apart_steps: Keyframes of one segment that are closer than this along the way are no loop.
+        same_place_m: Keyframes closer than this,
+        same_place_deg: and turned less than this,
+        same_place_most: of which there are more than so many, are redundant.
+        optimise_every: A whole optimisation is wanted at most once in so many keyframes.
+    """
+
+    min_links: int = 3
+    min_ends: int = 2
+    tested_links: int = 48
+    links_of_keyframe: int = 4
+    spacing_m: float = 0.25
+    spacing_deg: float = 15.0
+    drift: OdometryNoise = field(default_factory=lambda: OdometryNoise(step_m=0.007, step_deg=0.5))
+    judged: OdometryNoise = field(default_factory=OdometryNoise)
+    cauchy: float = 3.0
+    windows: tuple[int, ...] = (20, 50, 120)
+    border_m: float = 0.002
+    border_deg: float = 0.1
+    told_m: float = 0.001
+    told_deg: float = 0.05
+    doubts: int = 8
+    open_links: int = 400
+    measured: MeasureOptions = field(default_factory=lambda: MeasureOptions(min_inliers=30))
+    candidates: int = 10
+    apart_steps: float = 1.5
+    same_place_m: float = 0.12
+    same_place_deg: float = 8.0
+    same_place_most: int = 2
+    optimise_every: int = 20
+
+    def __post_init__(self) -> None:
+        if self.min_links < 1 or self.min_ends < 1 or not self.windows or min(self.windows) < 2:
+            raise ConfigurationError(
+                "min_links and min_ends must not be below 1, nor a window below 2 keyframes",
+                hint="leave them out for the defaults",
+            )

@@ -1,0 +1,393 @@
+"""Fit the poses around what changed to their edges by robust Gauss-Newton, those farther away held.
+
+Pure numbers, by one thread and in a fixed order: the same numbers give the same bytes.  It is for some dozens
+of poses; `rse_pf.services.mapping.optimise` fits a whole graph.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+
+from rse_pf.geometry import Array, rotation_angle_deg
+from rse_pf.live_map.graph import Graph
+from rse_pf.live_map.options import LiveMapOptions
+from rse_pf.services.mapping.loop_consistency import OdometryNoise
+from rse_pf.services.mapping.pose_graph import inverses
+
+__all__ = [
+    "Edges",
+    "SmoothedPoses",
+    "SmoothedWindows",
+    "edges_of",
+    "exp_se3_many",
+    "log_se3_many",
+    "odometry_step",
+    "smooth",
+    "smooth_around",
+]
+
+Rows = npt.NDArray[np.int64]
+
+_LEAST_STEP = 0.05
+_ITERATIONS = 6
+_CONVERGED_M, _CONVERGED_RAD = 5e-5, 5e-5
+_LITTLE = 1e-3
+"""Share of the cost below which another step is not worth its time."""
+_DAMPING = 1e-6
+"""Of the diagonal; a free pose without an edge to a held one stays where it is."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class SmoothedPoses:
+    """The result of `smooth`.
+
+    ``T`` ``(n, 4, 4)``; ``squares`` ``(m,)`` the squared Mahalanobis norm of each edge's residual;
+    ``information`` ``(6 f, 6 f)`` of the ``f`` free poses, of twists on the right of a pose.
+    """
+
+    T: Array
+    squares: Array
+    information: Array
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Edges:
+    """Edges between keyframes ``a`` and ``b`` (ids); ``numbers`` are those of links, -1 for odometry."""
+
+    a: Rows
+    b: Rows
+    T_a_b: Array
+    information: Array
+    numbers: Rows
+
+
+@dataclass(slots=True, kw_only=True, eq=False)
+class SmoothedWindows:
+    """What `smooth_around` did.
+
+    ``strained`` says that even the largest window was too small; ``misfit`` is the mean squared misfit of the
+    links; ``squares`` that of each believed link that was smoothed.
+    """
+
+    strained: bool = False
+    misfit: float = 0.0
+    squares: dict[int, float] = field(default_factory=dict)
+    _information: list[tuple[dict[int, int], Array]] = field(default_factory=list)
+
+    def covariance(self, graph: Graph, keyframe: int) -> Array | None:
+        """Return the ``(6, 6)`` covariance of a pose that moved, given those that were held.
+
+        It is of the twist (metres, radians) on the left of the pose, in the frame of the map.
+        """
+        for rows, information in self._information:
+            row = rows.get(keyframe)
+            if row is not None:
+                unit = np.zeros((len(information), 6))
+                unit[6 * row : 6 * row + 6] = np.eye(6)
+                right = np.linalg.solve(information, unit)[6 * row : 6 * row + 6]
+                adjoint = _adjoints(graph.T[keyframe][None])[0]
+                left: Array = adjoint @ (0.5 * (right + right.T)) @ adjoint.T
+                return left
+        return None
+
+
+def smooth_around(
+    graph: Graph, moved: Sequence[int], anchors: Iterable[int], options: LiveMapOptions
+) -> SmoothedWindows:
+    """Smooth *graph* around the keyframes *moved*, one component after the other; the graph changes.
+
+    The window grows while its border moves.  *anchors* are keyframes that define the frame of a component.
+    """
+    done = SmoothedWindows()
+    held = set(anchors)
+    groups: dict[int, list[int]] = {}
+    for i in moved:
+        if graph.of_segment[i] >= 0:
+            groups.setdefault(graph.component_of(i), []).append(i)
+    total = 0.0
+    for _, seeds in sorted(groups.items()):
+        for size in options.windows:
+            ids, is_whole = _window(graph, seeds, size, held)
+            if not ids:
+                break
+            edges = edges_of(graph, ids, options)
+            if not len(edges.a):
+                break
+            found, border, rows = _fit(graph, ids, edges, options)
+            if is_whole or not _is_moved(graph, border, found, rows, options) or size == options.windows[-1]:
+                done.strained |= not is_whole and _is_moved(graph, border, found, rows, options)
+                graph.T[ids] = found.T[: len(ids)]
+                squares = {
+                    int(number): float(square)
+                    for number, square in zip(edges.numbers, found.squares, strict=True) if number >= 0
+                }  # fmt: skip
+                done.squares |= squares
+                total += sum(squares.values())
+                done._information.append((rows, found.information))
+                break
+    done.misfit = total / max(1, len(done.squares))
+    return done
+
+
+def edges_of(graph: Graph, ids: Iterable[int], options: LiveMapOptions) -> Edges:
+    """Return odometry and believed links that touch one of the keyframes *ids*."""
+    links: set[int] = set()
+    steps: set[tuple[int, int]] = set()
+    for i in ids:
+        links.update(graph.links_at(i))
+        steps.update(graph.steps_at(i))
+    numbers = sorted(links)
+    pairs = np.array(sorted(steps), dtype=np.int64).reshape(-1, 2)
+    a, b = pairs[:, 0], pairs[:, 1]
+    walked = graph.way[b] - graph.way[a]
+    drift: OdometryNoise = options.drift
+    spread = np.array([drift.step_m] * 3 + [math.radians(drift.step_deg)] * 3) ** -2.0
+    chain = np.zeros((len(a), 6, 6))
+    chain[:, range(6), range(6)] = spread / walked[:, None]
+    measured = [graph.links[number] for number in numbers]
+    if not measured:
+        T_a_b, information = np.empty((0, 4, 4)), np.empty((0, 6, 6))
+    else:
+        T_a_b = np.array([link.T_a_b for link in measured])
+        information = np.array([link.information for link in measured])
+    return Edges(
+        a=np.concatenate([a, np.array([link.a for link in measured], dtype=np.int64)]),
+        b=np.concatenate([b, np.array([link.b for link in measured], dtype=np.int64)]),
+        T_a_b=np.concatenate([inverses(graph.T_odom[a]) @ graph.T_odom[b], T_a_b]),
+        information=np.concatenate([chain, information]),
+        numbers=np.concatenate([np.full(len(a), -1), np.array(numbers, dtype=np.int64)]),
+    )
+
+
+def odometry_step(T_from_to: Array, options: LiveMapOptions) -> float:
+    """Return how many steps of the odometry's noise a motion is."""
+    moved = float(np.sqrt((T_from_to[:3, 3] ** 2).sum())) / options.spacing_m
+    turned = rotation_angle_deg(T_from_to[:3, :3]) / options.spacing_deg
+    return max(moved, turned, _LEAST_STEP)
+
+
+def smooth(
+    T: Array, free: int, a: Rows, b: Rows, T_a_b: Array, information: Array, robust: npt.NDArray[np.bool_],
+    *, cauchy: float,
+) -> SmoothedPoses:  # fmt: skip
+    """Fit the first *free* of the poses to the edges; the others are held.
+
+    Minimises ``sum of squares`` of the edges that are not robust, and the sum of
+    ``cauchy**2 log(1 + squares / cauchy**2)`` of the others.
+
+    Args:
+        T: ``(n, 4, 4)`` poses, metres.
+        free: How many of them may move; at least 1.
+        a, b: ``(m,)`` row numbers of the poses of each edge.
+        T_a_b: ``(m, 4, 4)``, measured.
+        information: ``(m, 6, 6)``, of the twist (metres, radians).
+        robust: ``(m,)``, whether the edge may be wrong.
+        cauchy: Width of the kernel, standard deviations.
+
+    Source:
+        Dellaert and Kaess, Factor Graphs for Robot Perception (2017), chapter 6.
+    """
+    T = T.copy()
+    back = inverses(T_a_b)
+    error, squares = _residuals(T, a, b, back, information)
+    cost = _cost(squares, robust, cauchy)
+    H = np.zeros((6 * free, 6 * free))
+    for _ in range(_ITERATIONS):
+        H, gradient = _normal_equations(T, free, a, b, error, information, _weights(squares, robust, cauchy))
+        step = _bounded(np.linalg.solve(H, -gradient).reshape(free, 6).astype(np.float64))
+        for _ in range(4):
+            moved = T.copy()
+            moved[:free] = _orthonormal(T[:free] @ exp_se3_many(step))
+            new_error, new_squares = _residuals(moved, a, b, back, information)
+            new_cost = _cost(new_squares, robust, cauchy)
+            if new_cost <= cost:
+                break
+            step = 0.25 * step
+        else:
+            break
+        little = cost - new_cost <= _LITTLE * cost
+        T, error, squares, cost = moved, new_error, new_squares, new_cost
+        moved_m, turned_rad = np.abs(step[:, :3]).max(), np.abs(step[:, 3:]).max()
+        if little or (moved_m < _CONVERGED_M and turned_rad < _CONVERGED_RAD):
+            break
+    return SmoothedPoses(T=T, squares=squares, information=H)
+
+
+def exp_se3_many(xi: Array) -> Array:
+    """Return the ``(n, 4, 4)`` poses of ``(n, 6)`` twists (metres, radians); as `geometry.exp_se3`."""
+    rho, phi = xi[:, :3], xi[:, 3:]
+    angle = np.sqrt((phi**2).sum(axis=1))
+    small = angle < 1e-6
+    safe = np.where(small, 1.0, angle)
+    a = np.where(small, 1.0 - angle**2 / 6.0, np.sin(safe) / safe)
+    b = np.where(small, 0.5 - angle**2 / 24.0, 2.0 * (np.sin(0.5 * safe) / safe) ** 2)
+    c = np.where(small, 1.0 / 6.0, (1.0 - a) / safe**2)
+    K = _skews(phi)
+    KK = K @ K
+    T = np.zeros((len(xi), 4, 4))
+    T[:, :3, :3] = np.eye(3) + a[:, None, None] * K + b[:, None, None] * KK
+    jacobian = np.eye(3) + b[:, None, None] * K + c[:, None, None] * KK
+    T[:, :3, 3] = (jacobian @ rho[:, :, None])[:, :, 0]
+    T[:, 3, 3] = 1.0
+    return T
+
+
+def log_se3_many(T: Array) -> Array:
+    """Return the ``(n, 6)`` twists of ``(n, 4, 4)`` poses; as `pose_graph.log_se3`, in half the time.
+
+    Less exact where a rotation is within 0.1 degrees of half a turn.
+    """
+    R = T[:, :3, :3]
+    v = 0.5 * np.stack([R[:, 2, 1] - R[:, 1, 2], R[:, 0, 2] - R[:, 2, 0], R[:, 1, 0] - R[:, 0, 1]], axis=1)
+    sine = np.sqrt((v * v).sum(axis=1))
+    angle = np.arctan2(sine, 0.5 * (R[:, 0, 0] + R[:, 1, 1] + R[:, 2, 2] - 1.0))
+    small = sine < 1e-5
+    phi = v * np.where(small & (angle < 1.0), 1.0, angle / np.maximum(sine, 1e-12))[:, None]
+    half = np.where(angle < 1e-4, 1.0, 0.5 * angle)
+    c = np.where(angle < 1e-4, 1.0 / 12.0, (1.0 - half / np.tan(half)) / (4.0 * half**2))
+    K = _skews(phi)
+    across = K @ T[:, :3, 3:]
+    rho = T[:, :3, 3:] - 0.5 * across + c[:, None, None] * (K @ across)
+    return np.concatenate([rho[:, :, 0], phi], axis=1)
+
+
+def _window(graph: Graph, seeds: Sequence[int], size: int, held: set[int]) -> tuple[list[int], bool]:
+    """Return up to *size* keyframes around *seeds*, nearest first, and whether they are the whole component.
+
+    Where there are more seeds, the newest are taken.
+    """
+    front = [i for i in seeds if i not in held][-size:]
+    seen = set(front)
+    ids = list(front)
+    while front:
+        following: list[int] = []
+        for i in front:
+            for other, _ in graph.neighbours(i):
+                if other not in seen and other not in held:
+                    if len(ids) == size:
+                        return ids, False
+                    seen.add(other)
+                    ids.append(other)
+                    following.append(other)
+        front = following
+    return ids, len(front) == 0 and len(seeds) <= size
+
+
+def _fit(
+    graph: Graph, ids: list[int], edges: Edges, options: LiveMapOptions
+) -> tuple[SmoothedPoses, list[int], dict[int, int]]:
+    """Return the smoothed poses, the keyframes of the window that touch its border, and rows by id."""
+    rows = {i: row for row, i in enumerate(ids)}
+    border = []
+    beyond: list[int] = []
+    for one, other in zip(edges.a.tolist(), edges.b.tolist(), strict=True):
+        for inner, outer in ((one, other), (other, one)):
+            if inner in rows and rows[inner] < len(ids) and (outer not in rows or rows[outer] >= len(ids)):
+                border.append(inner)
+                if outer not in rows:
+                    rows[outer] = len(ids) + len(beyond)
+                    beyond.append(outer)
+    found = smooth(
+        graph.T[ids + beyond], len(ids), np.array([rows[i] for i in edges.a.tolist()]),
+        np.array([rows[i] for i in edges.b.tolist()]), edges.T_a_b, edges.information, edges.numbers >= 0,
+        cauchy=options.cauchy,
+    )  # fmt: skip
+    return found, border, {i: row for i, row in rows.items() if row < len(ids)}
+
+
+def _is_moved(
+    graph: Graph, border: list[int], found: SmoothedPoses, rows: dict[int, int], options: LiveMapOptions
+) -> bool:
+    """Return whether a keyframe at the border of the window moved by more than it may."""
+    if not border:
+        return False
+    old, new = graph.T[border], found.T[[rows[i] for i in border]]
+    off = log_se3_many(inverses(old) @ new)
+    return bool(
+        np.sqrt((off[:, :3] ** 2).sum(axis=1)).max() > options.border_m
+        or np.sqrt((off[:, 3:] ** 2).sum(axis=1)).max() > math.radians(options.border_deg)
+    )
+
+
+def _residuals(T: Array, a: Rows, b: Rows, back: Array, information: Array) -> tuple[Array, Array]:
+    error = log_se3_many(back @ inverses(T[a]) @ T[b])
+    weighted = (information @ error[:, :, None])[:, :, 0]
+    return error, (error * weighted).sum(axis=1)
+
+
+def _weights(squares: Array, robust: npt.NDArray[np.bool_], cauchy: float) -> Array:
+    return np.where(robust, 1.0 / (1.0 + squares / cauchy**2), 1.0)
+
+
+def _cost(squares: Array, robust: npt.NDArray[np.bool_], cauchy: float) -> float:
+    return float(np.where(robust, cauchy**2 * np.log1p(squares / cauchy**2), squares).sum())
+
+
+def _normal_equations(
+    T: Array, free: int, a: Rows, b: Rows, error: Array, information: Array, weights: Array
+) -> tuple[Array, Array]:
+    """Return the matrix ``(6 f, 6 f)`` and the gradient ``(6 f,)`` of the free poses."""
+    J_b = np.eye(6) + 0.5 * _small_adjoints(error)
+    J_a = -J_b @ _adjoints(inverses(T[b]) @ T[a])
+    W = weights[:, None, None] * information
+    WJ_a, WJ_b = W @ J_a, W @ J_b
+    Jt_a, Jt_b = np.swapaxes(J_a, 1, 2), np.swapaxes(J_b, 1, 2)
+    H = np.zeros((free, free, 6, 6))
+    gradient = np.zeros((free, 6))
+    column = error[:, :, None]
+    a_moves, b_moves = a < free, b < free
+    both = a_moves & b_moves
+    np.add.at(H, (a[a_moves], a[a_moves]), (Jt_a @ WJ_a)[a_moves])
+    np.add.at(H, (b[b_moves], b[b_moves]), (Jt_b @ WJ_b)[b_moves])
+    cross = (Jt_a @ WJ_b)[both]
+    np.add.at(H, (a[both], b[both]), cross)
+    np.add.at(H, (b[both], a[both]), np.swapaxes(cross, 1, 2))
+    np.add.at(gradient, a[a_moves], (np.swapaxes(WJ_a, 1, 2) @ column)[a_moves, :, 0])
+    np.add.at(gradient, b[b_moves], (np.swapaxes(WJ_b, 1, 2) @ column)[b_moves, :, 0])
+    flat = np.ascontiguousarray(H.transpose(0, 2, 1, 3)).reshape(6 * free, 6 * free)
+    diagonal = np.arange(6 * free)
+    flat[diagonal, diagonal] += _DAMPING * (flat[diagonal, diagonal] + 1.0)
+    return flat, gradient.reshape(-1)
+
+
+def _bounded(step: Array) -> Array:
+    """Return the step, shortened where a rotation is beyond what a linear step means."""
+    largest = float(np.abs(step[:, 3:]).max())
+    return step * (0.5 / largest) if largest > 0.5 else step
+
+
+def _orthonormal(T: Array) -> Array:
+    """Return poses whose rotations are orthonormal again, by one Newton step of the polar form."""
+    R = T[:, :3, :3]
+    T = T.copy()
+    T[:, :3, :3] = 1.5 * R - 0.5 * R @ np.swapaxes(R, 1, 2) @ R
+    return T
+
+
+def _skews(v: Array) -> Array:
+    K = np.zeros((len(v), 3, 3))
+    K[:, 0, 1], K[:, 0, 2], K[:, 1, 2] = -v[:, 2], v[:, 1], -v[:, 0]
+    K[:, 1, 0], K[:, 2, 0], K[:, 2, 1] = v[:, 2], -v[:, 1], v[:, 0]
+    return K
+
+
+def _adjoints(T: Array) -> Array:
+    """Return ``(n, 6, 6)``: what a twist (rho, phi) in the frame on the right is in that on the left."""
+    R = T[:, :3, :3]
+    adjoint = np.zeros((len(T), 6, 6))
+    adjoint[:, :3, :3] = adjoint[:, 3:, 3:] = R
+    adjoint[:, :3, 3:] = _skews(T[:, :3, 3]) @ R
+    return adjoint
+
+
+def _small_adjoints(xi: Array) -> Array:
+    """Return ``(n, 6, 6)``: the commutator with a twist, for the first order of a Jacobian."""
+    small = np.zeros((len(xi), 6, 6))
+    small[:, :3, :3] = small[:, 3:, 3:] = _skews(xi[:, 3:])
+    small[:, :3, 3:] = _skews(xi[:, :3])
+    return small

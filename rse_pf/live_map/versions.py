@@ -1,0 +1,128 @@
+"""Between a live map and versions of the registry: publish what is connected, and start from one."""
+
+from __future__ import annotations
+
+import math
+from itertools import pairwise
+
+import numpy as np
+
+from rse_pf.geometry import Array, inverse
+from rse_pf.live_map.events import CameraNumbers, MapStarted, StartKeyframe, StartLink, matrix_bytes
+from rse_pf.live_map.graph import Graph, Segment
+from rse_pf.live_map.keyframe_code import decode_features, encode_features
+from rse_pf.live_map.options import LiveMapOptions
+from rse_pf.live_map.smoother import edges_of
+from rse_pf.maps.format import Edge, EdgeKind, Keyframe, MapVersion
+from rse_pf.services.mapping.pose_graph import PoseGraph
+
+__all__ = ["started_from", "version_of", "whole_graph"]
+
+
+def started_from(version: MapVersion, source: str) -> MapStarted:
+    """Return the event by which a live map starts from *version*, which is called *source*.
+
+    Features without a depth are left out; the cloud of points is not taken over.
+    """
+    row = {keyframe.id: number for number, keyframe in enumerate(version.keyframes)}
+    return MapStarted(
+        source=source,
+        keyframes=tuple(
+            StartKeyframe(
+                robot=each.robot, timestamp_s=each.timestamp_s,
+                T_map_camera=matrix_bytes(each.T_world_camera), camera=_numbers(each),
+                features=encode_features(each.pixels, each.points_camera[:, 2], each.descriptors),
+            )
+            for each in version.keyframes
+        ),
+        links=tuple(
+            StartLink(
+                a=row[each.a], b=row[each.b], T_a_b=matrix_bytes(each.T_a_b),
+                information=matrix_bytes(each.information),
+            )
+            for each in version.edges
+        ),
+    )  # fmt: skip
+
+
+def version_of(graph: Graph, options: LiveMapOptions) -> MapVersion:
+    """Return the keyframes that are connected with the map's frame and keep their features, and their edges.
+
+    Odometry leads from each such keyframe of a segment to the next one.
+    """
+    ids = [i for i in _aligned(graph) if graph.held[i]]
+    keyframes = []
+    for i in ids:
+        each, camera = graph.keyframes[i], graph.camera(i)
+        assert each.features is not None
+        features = decode_features(each.features, camera)
+        keyframes.append(
+            Keyframe(
+                id=i, robot=_shown(each.robot), timestamp_s=each.timestamp_s,
+                T_world_camera=graph.T[i].copy(), camera=camera, pixels=features.pixels,
+                descriptors=features.descriptors,
+                points_camera=features.points_camera(camera).astype(np.float32),
+            )
+        )  # fmt: skip
+    kept = set(ids)
+    edges = []
+    for segment in _aligned_segments(graph):
+        if not segment.version:
+            edges += _odometry(graph, [i for i in segment.keyframes if i in kept], options)
+    for link in graph.links.values():
+        if link.state == "believed" and link.a in kept and link.b in kept:
+            across = graph.of_segment[link.a] != graph.of_segment[link.b]
+            kind: EdgeKind = "odometry" if link.fixed else "merge" if across else "loop"
+            edges.append(
+                Edge(a=link.a, b=link.b, T_a_b=link.T_a_b, information=link.information, kind=kind)
+            )  # fmt: skip
+    provenance = {"made_by": "live", "from": graph.source, "events": graph.events}
+    return MapVersion(keyframes=tuple(keyframes), edges=tuple(edges), provenance=provenance)
+
+
+def whole_graph(graph: Graph, options: LiveMapOptions) -> tuple[PoseGraph, list[int]]:
+    """Return all that is connected with the map's frame as a pose graph, and the ids of its rows."""
+    ids = _aligned(graph)
+    rows = np.full(len(graph), -1, dtype=np.int64)
+    rows[ids] = np.arange(len(ids))
+    edges = edges_of(graph, ids, options)
+    pose_graph = PoseGraph(
+        T_world_pose=graph.T[ids].copy(), a=rows[edges.a], b=rows[edges.b], T_a_b=edges.T_a_b,
+        information=edges.information, robust=edges.numbers >= 0, ids=np.array(ids, dtype=np.int64),
+    )  # fmt: skip
+    return pose_graph, ids
+
+
+def _aligned_segments(graph: Graph) -> list[Segment]:
+    if graph.root < 0:
+        return []
+    root = graph.segments[graph.root].component
+    return [segment for segment in graph.segments if segment.component == root and segment.keyframes]
+
+
+def _aligned(graph: Graph) -> list[int]:
+    return sorted(i for segment in _aligned_segments(graph) for i in segment.keyframes)
+
+
+def _odometry(graph: Graph, ids: list[int], options: LiveMapOptions) -> list[Edge]:
+    """Return edges between consecutive keyframes of a segment, as the graph has them.
+
+    Where keyframes in between are gone, the pose is that of the graph, which knew more than odometry.
+    """
+    spread = np.array([options.drift.step_m] * 3 + [math.radians(options.drift.step_deg)] * 3) ** -2.0
+    edges = []
+    for a, b in pairwise(ids):
+        T: Array = graph.T_odom if graph.next_in_segment(a) == b else graph.T
+        walked = float(graph.way[b] - graph.way[a])
+        edges.append(Edge(a=a, b=b, T_a_b=inverse(T[a]) @ T[b], information=np.diag(spread / walked)))
+    return edges
+
+
+def _numbers(keyframe: Keyframe) -> CameraNumbers:
+    camera = keyframe.camera
+    return camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height
+
+
+def _shown(folder: str) -> str:
+    """Return the name of a robot without its tenant and its enrolment."""
+    return folder.rpartition("/")[2].partition("=")[0][:64]
