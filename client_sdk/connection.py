@@ -78,8 +78,8 @@ _CHECK_ADDRESS = "is it an RSE-PF server?"
 _TIMES = (9, 10)
 """Of X509_verify_cert_error_string(3): not yet valid, expired."""
 _ISSUE = (
-    "issue one: rse-pf token issue ROBOT; it is valid for 15 minutes, so a longer run passes an async "
-    "function that returns a fresh one"
+    "a token of rse-pf token issue is valid for 15 minutes: issue another one, or give the robot a key by "
+    "rse-pf robot enrol; if it has one, rse-pf robot list shows whether it was disabled or has a newer key"
 )
 
 

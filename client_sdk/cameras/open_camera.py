@@ -69,8 +69,8 @@ def open_camera(
     if own is None:
         raise UsageError(
             f"the intrinsics of {word} are not known",
-            hint=f"calibrate once: rse-pf camera calibrate {word} --board 9x6 --square-mm 25; then name "
-            "intrinsics.json",
+            hint="show this camera a board, and calibrate it once: rse-pf camera calibrate 0 (or BOARD.mp4); "
+            "or write the file by hand (docs/cameras.md); then --intrinsics intrinsics.json",
         )
     raw, close = open_video(word)
     return RawSource(word, raw, own, has_depth=False, rate_hz=rate_hz, close=close)

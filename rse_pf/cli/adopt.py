@@ -80,7 +80,13 @@ def _thumbprint(key_id: str) -> str:
 def _open_store(args: argparse.Namespace, settings: PlatformSettings) -> ObjectStore:
     location = args.store or settings.data.store
     if location == _PRIVATE_STORE:
-        objects = state_folder(args.name, os.environ) / "objects"
+        state = state_folder(args.name, os.environ)
+        objects = state / "objects"
+        if not args.cloud and state.is_dir() and not objects.is_dir():
+            raise UsageError(
+                f"the platform {args.name!r} of this machine has stored nothing yet",
+                hint="so there is nothing to adopt; or name another store: --store dir:PATH",
+            )
         if args.cloud or not objects.is_dir():
             raise UsageError("a store in memory belongs to another process", hint="name --store dir:PATH")
         location = f"dir:{objects}"

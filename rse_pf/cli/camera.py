@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from rse_pf.cli.frame_table import named_frames
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import UsageError
 from rse_pf.terminal import show, show_json, show_progress
@@ -153,11 +154,11 @@ def _check(args: argparse.Namespace) -> int:
         size, with_depth = (rgb.shape[1], rgb.shape[0]), with_depth + has_depth
     if len(stamps) < 2:
         raise UsageError(f"{args.source} gives {len(stamps)} frames", hint="a check needs 2 or more")
-    blurred = int(np.sum(np.array(blur) < _BLURRED))
+    unsharp = [number for number, value in enumerate(blur, 1) if value < _BLURRED]
     rate_hz = (len(stamps) - 1) / max(stamps[-1] - stamps[0], 1e-9)
     figures: dict[str, Any] = {
         "source": args.source, "width": size[0], "height": size[1], "frames": len(stamps),
-        "rate_hz": round(rate_hz, 2), "with_depth": with_depth, "blurred": blurred,
+        "rate_hz": round(rate_hz, 2), "with_depth": with_depth, "blurred": len(unsharp),
         "sharpness_median": round(float(np.median(blur)), 1),
     }  # fmt: skip
     if args.json:
@@ -166,9 +167,10 @@ def _check(args: argparse.Namespace) -> int:
         depth = "depth" if with_depth else "no depth"
         show(
             f"{args.source}: {size[0]}x{size[1]} px, {rate_hz:.1f} frames per second, {depth}",
-            f"{blurred} of {len(stamps)} frames are blurred or empty",
+            f"{len(unsharp)} of the first {len(stamps)} frames are blurred or empty"
+            + (f": {named_frames(unsharp)}" if unsharp else ""),
         )
-    return 1 if blurred > len(stamps) / 2 else 0
+    return 1 if len(unsharp) > len(stamps) / 2 else 0
 
 
 def _frames(source: str) -> Iterator[tuple[float, npt.NDArray[np.uint8], bool]]:

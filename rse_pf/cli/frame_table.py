@@ -17,7 +17,7 @@ from rse_pf.terminal import counted
 if TYPE_CHECKING:
     from client_sdk import TrackedFrame
 
-__all__ = ["FRAMES_FILE", "FrameTable"]
+__all__ = ["FRAMES_FILE", "FrameTable", "named_frames"]
 
 FRAMES_FILE = "frames.csv"
 _COLUMNS = (
@@ -62,9 +62,9 @@ class FrameTable:
         if self._lost:
             (reason, _), *others = self._reasons.most_common()
             more = f" (and {counted(len(others), 'other reason')}: see {FRAMES_FILE})" if others else ""
-            yield f"lost: {_ranges(self._lost)}; because: {reason}{more}"
+            yield f"lost: {named_frames(self._lost)}; because: {reason}{more}"
         if self._weak:
-            yield f"weak poses: {_ranges(self._weak)}; {FRAMES_FILE} says why"
+            yield f"weak poses: {named_frames(self._weak)}; {FRAMES_FILE} says why"
 
     def write(self, path: Path) -> None:
         """Write the rows.
@@ -81,8 +81,8 @@ class FrameTable:
             raise UsageError(f"cannot write {path}: {error.strerror}", hint="name another --out") from error
 
 
-def _ranges(numbers: list[int]) -> str:
-    """Return ``frames 3, 7-9`` for sorted numbers, and how many there are if they are many."""
+def named_frames(numbers: list[int]) -> str:
+    """Return ``frames 3, 7-9`` for sorted numbers; the first few of many."""
     found = []
     for _, group in itertools.groupby(enumerate(numbers), lambda pair: pair[1] - pair[0]):
         run = [number for _, number in group]

@@ -227,6 +227,7 @@ def _enrol(
     )
     if made is not None:
         made.write(args.out)
+    before = access.roster().find(args.tenant, args.robot)
     try:
         access.change_roster(lambda roster: roster.enrolled(robot))
     except BaseException:
@@ -238,6 +239,12 @@ def _enrol(
         args, settings, "robot.enrolled", robot.robot, tenant=robot.tenant, key=robot.key_id, scopes=allowed
     )
     show(f"robot {robot.robot!r} is enrolled with {robot.key_id}; it may use {allowed}")
+    if before is not None and before.x != robot.x:
+        tenant = "" if robot.tenant == _DEFAULT else f" --tenant {robot.tenant}"
+        show(
+            "its earlier key is refused within 2 s; to give it what it stored under that key:  "
+            f"rse-pf robot adopt {robot.robot} --from-key {before.key_id}{tenant}"
+        )
     if made is not None:
         show(*enrolment_lines(made, args.out))
     return 0

@@ -61,6 +61,27 @@ def test_a_name_with_another_key_sees_nothing_and_after_adoption_everything(
     assert all(second.folder in info.name for info in store.list())
 
 
+def test_a_second_enrolment_names_the_command_that_keeps_what_was_stored(
+    capsys: Capture, platform: Path
+) -> None:
+    first = enrol(capsys)
+    (platform / "objects").mkdir(exist_ok=True)
+    stored_for(DirectoryStore(platform / "objects"), first)
+
+    Path("second.json").write_text(run(capsys, "robot", "keygen", "--out", "second.key"))
+    said = run(capsys, "robot", "enrol", "robot-1", "--public-key", "second.json")
+
+    command = said.splitlines()[1].split("rse-pf ")[1].split()
+    assert "1 object more" in run(capsys, *command)
+
+
+def test_a_platform_that_stored_nothing_says_so(capsys: Capture, platform: Path) -> None:
+    enrol(capsys)
+
+    assert main(["robot", "adopt", "robot-1"]) == 2
+    assert "the platform 'default' of this machine has stored nothing yet" in capsys.readouterr().err
+
+
 def test_what_versions_without_keys_stored_is_adopted(capsys: Capture, platform: Path) -> None:
     store, robot = DirectoryStore(platform / "objects"), enrol(capsys)
     old = platform / "objects" / "objects" / "default" / "robot-1" / digest_of(DATA)

@@ -23,6 +23,7 @@ Recorded = Sequence[tuple[str, Mapping[str, Any]]]
 
 _DEFAULT_TOLERANCE = 1e-9
 _DRY_RUN = "dry-run"
+_MOST_LETTERS = 300
 
 
 def recorded_requests(source: Path) -> Recorded:
@@ -95,11 +96,17 @@ def _judged(expected: Mapping[str, Any], answer: Any, *, compare: bool) -> tuple
         return expected.get("failure") != answer.code, f"{answer.code}: {answer.message}{hint}"
     if "failure" in expected:
         return True, f"it was answered, expected {expected['failure']}"
-    if not compare or "reply" not in expected:
+    if compare and "reply" not in expected:
+        return False, f"no reply is expected; it is {_shortened(json.dumps(plain(answer.reply)))}"
+    if not compare:
         return False, ""
     tolerance = expected.get("tolerance", _DEFAULT_TOLERANCE)
     found = _difference(plain(answer.reply), plain(expected["reply"]), tolerance)
     return bool(found), found
+
+
+def _shortened(text: str) -> str:
+    return text if len(text) <= _MOST_LETTERS else f"{text[:_MOST_LETTERS]}..."
 
 
 def _difference(got: Any, expected: Any, tolerance: float, path: str = "reply") -> str:

@@ -84,10 +84,10 @@ def read_requests(path: Path) -> RequestFile:
             f"{path} is of version {head.get('version')}, this program reads {_VERSION}",
             hint="record it again",
         )
+    lines = [(number, line) for number, line in enumerate(rest.splitlines(), 2) if line.strip()]
     calls = [
-        (f"{path.name}:{number}", _call(_object(line, path, number), path, number))
-        for number, line in enumerate(rest.splitlines(), 2)
-        if line.strip()
+        (f"{path.name} number {count}", _call(_object(line, path, number), path, number))
+        for count, (number, line) in enumerate(lines, 1)
     ]
     return RequestFile(service=str(head.get("service", "")), calls=calls)
 

@@ -170,7 +170,7 @@ def test_check_says_size_rate_depth_and_blur(tmp_path: Path, capsys: pytest.Capt
         0,
         0,
     )
-    assert "3 of 3 frames are blurred or empty" in out
+    assert "3 of the first 3 frames are blurred or empty: frames 1-3" in out
 
 
 @pytest.mark.parametrize(

@@ -197,6 +197,6 @@ def test_a_recording_is_replayed_and_compared_if_that_is_wanted(
 
     compared = told(capsys, "test", "mine", "--requests", "live.jsonl", "--compare", code=1)
 
-    assert "live.jsonl:2" in compared
+    assert "live.jsonl number 1" in compared  # as --number of debug counts
     assert "reply.centroid[0] is 1.0, expected 9" in compared
     assert "1 of 2 recorded requests as expected" in compared

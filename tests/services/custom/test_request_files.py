@@ -48,7 +48,7 @@ def test_a_recording_is_a_file_of_its_owner_and_comes_back(tmp_path: Path) -> No
     assert stat.S_IMODE(path.stat().st_mode) == 0o600
     assert read.service == "icp"
     (first, good), (second, bad) = read.calls
-    assert (first, second) == ("live.jsonl:2", "live.jsonl:3")
+    assert (first, second) == ("live.jsonl number 1", "live.jsonl number 2")
     np.testing.assert_array_equal(good["request"]["p"], [0.0, 0.0])
     assert (good["reply"], good["compute_ms"], bad["failure"], bad["secrets"]) == (
         {"x": 1},
