@@ -1,0 +1,154 @@
+"""Events of robots that drive through a generated building, with links measured from their true poses.
+
+No image is made: features are random, and what PnP would have measured is the truth with noise.  So a map of
+10,000 keyframes is made in seconds, and every wrong link is known.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from itertools import pairwise
+
+import numpy as np
+
+from rse_pf.geometry import Array, exp_se3, inverse
+from rse_pf.live_map.events import KeyframeAdded, LinksMeasured, MeasuredLink, matrix_bytes
+from rse_pf.live_map.keyframe_code import encode_features
+
+__all__ = ["GeneratedDrive", "GeneratedWorld", "measured_link"]
+
+CAMERA = (525.0, 525.0, 319.5, 239.5, 640, 480)
+STEP_M = 0.1
+LINK_SIGMA_M, LINK_SIGMA_DEG = 0.01, 0.4
+INFORMATION = np.diag([0.02**-2] * 3 + [math.radians(0.7) ** -2] * 3)
+
+
+@dataclass(slots=True, eq=False)
+class GeneratedDrive:
+    """A robot that follows a path: its true poses, and its odometry, which drifts."""
+
+    robot: str
+    T_world_camera: Array
+    T_odom_camera: Array
+    segment: int = 0
+
+
+@dataclass(eq=False)
+class GeneratedWorld:
+    """Robots in one building; ``seen`` has the true pose of each keyframe in the map, by id."""
+
+    seed: int
+    features: int = 20
+    reach_m: float = 0.6
+    links: int = 4
+    drift_m: float = 0.003
+    drift_deg: float = 0.15
+    seen: list[Array] = field(default_factory=list)
+    owners: list[tuple[str, int]] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self.rng = np.random.default_rng(self.seed)
+        descriptors = self.rng.integers(0, 256, (self.features, 32), dtype=np.uint8)
+        self._descriptors = descriptors
+
+    def drive(self, robot: str, positions: Array, segment: int = 0) -> GeneratedDrive:
+        """Return a robot's drive through ``(n, 2)`` positions, looking where it goes."""
+        ahead = np.diff(positions, axis=0, append=positions[-1:] + (positions[-1:] - positions[-2:-1]))
+        headings = np.unwrap(np.arctan2(ahead[:, 1], ahead[:, 0]))
+        true = np.array([_pose(x, y, yaw) for (x, y), yaw in zip(positions, headings, strict=True)])
+        odometry = [np.eye(4)]
+        sigma = np.array([self.drift_m] * 3 + [math.radians(self.drift_deg)] * 3)
+        for one, other in pairwise(true):
+            odometry.append(odometry[-1] @ inverse(one) @ other @ exp_se3(sigma * self.rng.normal(size=6)))
+        return GeneratedDrive(
+            robot=robot, T_world_camera=true, T_odom_camera=np.array(odometry), segment=segment
+        )  # fmt: skip
+
+    def keyframe(self, drive: GeneratedDrive, number: int, first: int = 0) -> KeyframeAdded:
+        """Return keyframe *number* of a drive as an event, and note its true pose."""
+        self.seen.append(drive.T_world_camera[number])
+        self.owners.append((drive.robot, number))
+        pixels = self.rng.uniform(0, 470, (self.features, 2))
+        return KeyframeAdded(
+            robot=drive.robot, segment=drive.segment, number=first + number, timestamp_s=0.2 * number,
+            T_odom_camera=matrix_bytes(drive.T_odom_camera[number]), camera=CAMERA,
+            features=encode_features(pixels, self.rng.uniform(1, 4, self.features), self._descriptors),
+        )  # fmt: skip
+
+    def links_of(self, keyframe: int, wrong: float = 0.0) -> LinksMeasured:
+        """Return the links of the newest keyframe to those that it truly overlaps; some may be wrong.
+
+        *wrong* is the share of links, measured in addition, that are random.
+        """
+        poses = np.array(self.seen[:keyframe])
+        links = []
+        if len(poses):
+            apart = np.sqrt(((poses[:, :3, 3] - self.seen[keyframe][:3, 3]) ** 2).sum(axis=1))
+            facing = poses[:, :3, 2] @ self.seen[keyframe][:3, 2]
+            near = np.flatnonzero((apart < self.reach_m) & (facing > math.cos(math.radians(40.0))))
+            near = near[near < keyframe - 3]
+            chosen = near[np.argsort(apart[near], kind="stable")[: self.links]]
+            links = [self.true_link(keyframe, int(i)) for i in chosen]
+            if self.rng.uniform() < wrong:
+                other = int(self.rng.integers(0, keyframe))
+                off = exp_se3(np.r_[self.rng.uniform(-3, 3, 3), self.rng.uniform(-1.5, 1.5, 3)])
+                links.append(measured_link(other, self.step(keyframe, other) @ off))
+        return LinksMeasured(keyframe=keyframe, links=tuple(links))
+
+    def step(self, keyframe: int, other: int) -> Array:
+        """Return the true pose of *other* relative to *keyframe*."""
+        step: Array = inverse(self.seen[keyframe]) @ self.seen[other]
+        return step
+
+    def true_link(self, keyframe: int, other: int) -> MeasuredLink:
+        """Return a link as PnP measures it."""
+        sigma = np.array([LINK_SIGMA_M] * 3 + [math.radians(LINK_SIGMA_DEG)] * 3)
+        return measured_link(other, self.step(keyframe, other) @ exp_se3(sigma * self.rng.normal(size=6)))
+
+    def play(
+        self, drives: list[GeneratedDrive], wrong: float = 0.0
+    ) -> Iterator[KeyframeAdded | LinksMeasured]:
+        """Yield the events of robots that drive at the same time."""
+        for number in range(max(len(drive.T_world_camera) for drive in drives)):
+            for drive in drives:
+                if number < len(drive.T_world_camera):
+                    yield self.keyframe(drive, number)
+                    yield self.links_of(len(self.seen) - 1, wrong)
+
+
+def measured_link(other: int, T_keyframe_other: Array) -> MeasuredLink:
+    """Return a link with the noise that the map expects."""
+    return MeasuredLink(
+        other=other, T_keyframe_other=matrix_bytes(T_keyframe_other), information=matrix_bytes(INFORMATION),
+        inliers=100, matches=150,
+    )  # fmt: skip
+
+
+def circle(radius_m: float, rounds: float, phase: float = 0.0, x: float = 0.0, y: float = 0.0) -> Array:
+    """Return ``(n, 2)`` positions, a step apart, on a circle."""
+    count = int(2 * math.pi * radius_m * rounds / STEP_M)
+    angles = phase + np.arange(count) * STEP_M / radius_m
+    return np.column_stack([x + radius_m * np.cos(angles), y + radius_m * np.sin(angles)])
+
+
+def meander(length_m: float, rows: int, apart_m: float = 3.0, x: float = 0.0) -> Array:
+    """Return ``(n, 2)`` positions, a step apart, on a way to and fro that never comes back."""
+    corners: list[tuple[float, float]] = []
+    for row in range(rows):
+        ends = (x, x + length_m) if row % 2 == 0 else (x + length_m, x)
+        corners += [(ends[0], row * apart_m), (ends[1], row * apart_m)]
+    points = np.array(corners)
+    along = np.r_[0.0, np.cumsum(np.sqrt((np.diff(points, axis=0) ** 2).sum(axis=1)))]
+    at = np.arange(0.0, along[-1], STEP_M)
+    return np.column_stack([np.interp(at, along, points[:, 0]), np.interp(at, along, points[:, 1])])
+
+
+def _pose(x: float, y: float, yaw: float) -> Array:
+    """Return the pose of a camera that looks along *yaw*; z of the world points up."""
+    c, s = math.cos(yaw), math.sin(yaw)
+    T = np.eye(4)
+    T[:3, :3] = np.array([[s, 0.0, c], [-c, 0.0, s], [0.0, -1.0, 0.0]])
+    T[:3, 3] = (x, y, 1.2)
+    return T
