@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import asyncio
 import base64
+import contextlib
 import gc
 import json
 import os
@@ -41,6 +42,8 @@ from rse_pf.backend.jobs.manager import JobManager
 from rse_pf.backend.jobs.process import spawner
 from rse_pf.backend.jobs.runner import JobContext
 from rse_pf.backend.jobs.slots import JobSlots
+from rse_pf.backend.live_map.link import OwnerLinks
+from rse_pf.backend.live_map.router import LIVE_SERVICES, LiveMapRouter
 from rse_pf.backend.log import JsonLog
 from rse_pf.backend.object_refs import ObjectRefs
 from rse_pf.backend.ports import Clocks, WorkerContext
@@ -69,6 +72,7 @@ from rse_pf.backend.supervisor.robot_rows import MAX_ROBOT_ROWS, robot_rows
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import MissingExtra
 from rse_pf.linux import die_with_parent, set_process_name
+from rse_pf.object_store import ObjectStore
 from rse_pf.service import Registry
 from rse_pf.services.custom.installed import InstalledService, installed_services, published_services
 from rse_pf.services.loading import load_services
@@ -186,7 +190,7 @@ class _Worker:
         answers = Answers(
             context,
             registry=registry,
-            services=frozenset(service.name for service in (*registry, *installed)),
+            services=frozenset(service.name for service in (*registry, *installed)) | LIVE_SERVICES,
             objects=ObjectRefs(store, settings.serving, settings.data.quota_bytes),
         )
         handshake = HandshakePolicy(settings, plan.keys, conformance_echo=plan.conformance_echo)
@@ -200,6 +204,9 @@ class _Worker:
         )
         self._sandboxes = (
             self._make_sandboxes(plan, installed, answers) if chosen.folder or chosen.published else None
+        )
+        self._live_maps = (
+            None if store is None or not settings.live.max_owners else _live_maps(context, answers, store)
         )
         self._dispatcher = Dispatcher(
             context,
@@ -216,7 +223,7 @@ class _Worker:
             compute=self._compute(plan, context, registry, answers),
             sandboxes=self._sandboxes or NoQueue(),
             jobs=self._jobs(plan, answers) if settings.serving.max_running_jobs else NoQueue(),
-            live_maps=NoQueue(),
+            live_maps=self._live_maps or NoQueue(),
             token_watch=self._token_watch,
         )
         self._migration = Migration(connections, loop=loop, now=time.monotonic, choose=secrets.choice)
@@ -363,6 +370,9 @@ class _Worker:
         while self._dispatcher.held and time.monotonic() < until:
             await asyncio.sleep(_POLL_S)
         self._dispatcher.close_all()
+        if self._live_maps is not None:
+            with contextlib.suppress(asyncio.TimeoutError):
+                await asyncio.wait_for(self._live_maps.close(), _CLOSE_TIMEOUT_S)
         until = time.monotonic() + _CLOSE_TIMEOUT_S
         while self._dispatcher.connections and time.monotonic() < until:
             await asyncio.sleep(_POLL_S)
@@ -413,3 +423,13 @@ class _Worker:
         task = self._loop.create_task(work)
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
+
+
+def _live_maps(context: WorkerContext, answers: Answers, store: ObjectStore) -> LiveMapRouter:
+    def owners(on_update: Callable[[str, str, dict[str, Any]], None]) -> OwnerLinks:
+        return OwnerLinks(
+            store=store, settings=context.settings, server_id=context.server_id, loop=context.loop,
+            log=context.log, on_update=on_update,
+        )  # fmt: skip
+
+    return LiveMapRouter(context, owners=owners, answer=answers.send_message)
