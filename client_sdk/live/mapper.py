@@ -63,7 +63,7 @@ class LiveOptions:
     Attributes:
         keyframe_m: A frame farther from the last keyframe becomes one,
         keyframe_deg: or turned further; the tracker's own keyframes are apart from these.
-        features: The nearest so many features of a keyframe are sent.
+        features: At most so many features of a keyframe are sent; 870 take 34 kB with zlib.
         segment_after: A new segment begins after so many lost frames in a row.
         relocalise_s: While a segment is not aligned, the robot asks for its place so often at most.
         bytes_per_s: Share of the link that keyframes may take.
@@ -449,12 +449,9 @@ class LiveMapper:
         self._relocalise(keyframe, pose)
 
     def _encoded(self, features: Features) -> bytes:
-        """Return the nearest features that have depth."""
+        """Return the first features that have depth: those of the finest levels of the pyramid."""
         depths_m = features.points_camera[:, 2]
-        rows = np.flatnonzero(np.isfinite(depths_m))
-        if len(rows) > self.options.features:
-            nearest = np.argsort(depths_m[rows], kind="stable")[: self.options.features]
-            rows = rows[np.sort(nearest)]
+        rows = np.flatnonzero(np.isfinite(depths_m))[: self.options.features]
         return encode_features(features.pixels[rows], depths_m[rows], features.descriptors[rows])
 
     def _relocalise(self, keyframe: KeyframeWaits, pose: Array) -> None:

@@ -120,7 +120,7 @@ def draw_live(
 ) -> None:
     """Draw the paths in a live map, the errors of the poses as given out, and the delays of corrections."""
     figure, (paths, errors, delays) = _pyplot().subplots(
-        1, 3, figsize=(15.0, 4.8), layout="constrained", width_ratios=(1.2, 1.2, 0.8)
+        1, 3, figsize=(16.0, 4.8), layout="constrained", width_ratios=(1.2, 1.1, 1.1)
     )
     colours = (_BLUE, _ORANGE, _GREEN, _RED, "#7b4fa3", "#4aa3a2")
     final = [final_trajectory(drive, version) for drive in drives]
@@ -150,7 +150,7 @@ def draw_live(
     delay = live["correction_ms"]
     delays.set(
         xlabel="ms", ylabel="share", ylim=(0, 1.02),
-        title=f"keyframe sent to correction: p50 {delay['p50']}, p99 {delay['p99']}, n {delay['n']}",
+        title=f"keyframe to correction: p50 {delay['p50']}, p99 {delay['p99']}, n {delay['n']}",
     )  # fmt: skip
     _plain(paths, errors, delays)
     _save(figure, path, "RSE-PF, live map")
