@@ -37,7 +37,10 @@ class GeneratedDrive:
 
 @dataclass(eq=False)
 class GeneratedWorld:
-    """Robots in one building; ``seen`` has the true pose of each keyframe in the map, by id."""
+    """Robots in one building; ``seen`` has the true pose of each keyframe in the map, by id.
+
+    With ``twin_m``, what is at x looks like what is at x + ``twin_m``.
+    """
 
     seed: int
     features: int = 20
@@ -45,6 +48,7 @@ class GeneratedWorld:
     links: int = 4
     drift_m: float = 0.003
     drift_deg: float = 0.15
+    twin_m: float | None = None
     seen: list[Array] = field(default_factory=list)
     owners: list[tuple[str, int]] = field(default_factory=list)
 
@@ -91,11 +95,26 @@ class GeneratedWorld:
             near = near[near < keyframe - 3]
             chosen = near[np.argsort(apart[near], kind="stable")[: self.links]]
             links = [self.true_link(keyframe, int(i)) for i in chosen]
+            for shift in () if self.twin_m is None else (-self.twin_m, self.twin_m):
+                links += self._links_to_twin(keyframe, poses, shift)
             if self.rng.uniform() < wrong:
                 other = int(self.rng.integers(0, keyframe))
                 off = exp_se3(np.r_[self.rng.uniform(-3, 3, 3), self.rng.uniform(-1.5, 1.5, 3)])
                 links.append(measured_link(other, self.step(keyframe, other) @ off))
         return LinksMeasured(keyframe=keyframe, links=tuple(links))
+
+    def _links_to_twin(self, keyframe: int, poses: Array, shift: float) -> list[MeasuredLink]:
+        """Return links to keyframes of the place that looks like that of *keyframe*."""
+        shifted = self.seen[keyframe].copy()
+        shifted[0, 3] += shift
+        apart = np.sqrt(((poses[:, :3, 3] - shifted[:3, 3]) ** 2).sum(axis=1))
+        near = np.flatnonzero((apart < self.reach_m) & (poses[:, :3, 2] @ shifted[:3, 2] > 0.77))
+        chosen = near[np.argsort(apart[near], kind="stable")[: self.links]]
+        sigma = np.array([LINK_SIGMA_M] * 3 + [math.radians(LINK_SIGMA_DEG)] * 3)
+        return [
+            measured_link(int(i), inverse(shifted) @ poses[i] @ exp_se3(sigma * self.rng.normal(size=6)))
+            for i in chosen
+        ]
 
     def step(self, keyframe: int, other: int) -> Array:
         """Return the true pose of *other* relative to *keyframe*."""

@@ -15,7 +15,7 @@ from rse_pf.live_map.agreement import (
 )
 from rse_pf.live_map.graph import Graph
 from rse_pf.live_map.options import LiveMapOptions
-from rse_pf.live_map.outcomes import LinkBelieved, LinkRemoved, Outcome
+from rse_pf.live_map.outcomes import Ambiguous, LinkBelieved, LinkRemoved, Outcome
 
 __all__ = ["Changes", "judge_links", "remove_doubted"]
 
@@ -100,6 +100,11 @@ def _refute(graph: Graph, number: int, options: LiveMapOptions, changes: Changes
     one, other = int(graph.of_segment[link.a]), int(graph.of_segment[link.b])
     reason = f"{len(agreeing)} later links agree with each other and contradict it"
     if one == other:
+        apart_m = _apart_m(graph, number)
+        walked = abs(float(graph.way[link.a] - graph.way[link.b]))
+        if apart_m > max(options.lookalike_m, walked * options.spacing_m * options.worst_drift):
+            _note_lookalikes(graph, agreeing, apart_m, options, changes)
+            return
         contrary = [
             each for each in _loops(graph, one)
             if each not in agreeing_by_odometry(graph, number, [each], options)
@@ -107,6 +112,8 @@ def _refute(graph: Graph, number: int, options: LiveMapOptions, changes: Changes
         if contrary and len(contrary) < len(agreeing):
             _remove(graph, contrary, reason, changes)
             _believe(graph, agreeing, changes)
+        return
+    if _is_lookalike(graph, number):
         return
     refuted = False
     while graph.segments[one].component == graph.segments[other].component:
@@ -126,6 +133,13 @@ def _loops(graph: Graph, row: int) -> list[int]:
         if link.state == "believed" and not link.fixed
         and graph.of_segment[link.a] == graph.of_segment[link.b] == row
     ]  # fmt: skip
+
+
+def _apart_m(graph: Graph, number: int) -> float:
+    """Return by how much odometry contradicts a link within a segment."""
+    link = graph.links[number]
+    off = inverse(link.T_a_b) @ inverse(graph.T_odom[link.a]) @ graph.T_odom[link.b]
+    return float(np.sqrt((off[:3, 3] ** 2).sum()))
 
 
 def _weakest_bridge(graph: Graph, one: int, other: int) -> list[int]:
@@ -172,6 +186,10 @@ def _try_join(graph: Graph, one: int, other: int, options: LiveMapOptions, chang
     agreeing = agreeing_between(graph, one, other, options)
     if not has_enough_ends(graph, agreeing, options):
         return
+    reason = _ambiguity(graph, one, other, agreeing, options)
+    if reason:
+        _call_ambiguous(graph, agreeing, reason, changes)
+        return
     root = graph.segments[graph.root].component if graph.root >= 0 else -1
     stay, moving = (other, one) if other == root or (one != root and other < one) else (one, other)
     T_stay_moving = _median_pose([_proposed(graph, number, stay) for number in agreeing])
@@ -187,6 +205,58 @@ def _try_join(graph: Graph, one: int, other: int, options: LiveMapOptions, chang
         if graph.component_of(graph.links[number].a) == graph.component_of(graph.links[number].b) == joined
     ]  # fmt: skip
     _judge_within(graph, beside[-_JUDGED_AFTER_JOIN:], options, changes)
+
+
+def _ambiguity(graph: Graph, one: int, other: int, agreeing: list[int], options: LiveMapOptions) -> str:
+    """Return why links that agree cannot tell which of several equal places is seen, "" if they can."""
+    telling = [number for number in agreeing if not _is_lookalike(graph, number)]
+    if not has_enough_ends(graph, telling, options):
+        return "ambiguous: what it sees is in the map at several places"
+    rivals = agreeing_between(graph, one, other, options, frozenset(agreeing))
+    if 2 * len(rivals) >= len(agreeing) and has_enough_ends(graph, rivals, options):
+        first, second = (
+            _median_pose([_proposed(graph, n, one) for n in each]) for each in (agreeing, rivals)
+        )
+        if float(np.sqrt(((first - second)[:3, 3] ** 2).sum())) > options.lookalike_m:
+            return f"ambiguous: {len(agreeing)} links say one place, {len(rivals)} another"
+    return ""
+
+
+def _call_ambiguous(graph: Graph, numbers: list[int], reason: str, changes: Changes) -> None:
+    """Tell the newest of the segments that links would have joined why it is not aligned."""
+    root = graph.segments[graph.root].component if graph.root >= 0 else -1
+    for i in sorted({end for n in numbers for end in (graph.links[n].a, graph.links[n].b)}, reverse=True):
+        segment = graph.segments[int(graph.of_segment[i])]
+        if segment.component != root and segment.reason != reason:
+            segment.reason = reason
+            changes.outcomes.append(Ambiguous(robot=segment.robot, segment=segment.segment, reason=reason))
+
+
+def _note_lookalikes(
+    graph: Graph, numbers: list[int], apart_m: float, options: LiveMapOptions, changes: Changes
+) -> None:
+    """Note two places that look the same but are *apart_m* apart; undo the joins that rest on them.
+
+    All that is nearer to them than half of that may have a twin, too.
+    """
+    radius_m = min(0.5 * apart_m, options.lookalike_most_m)
+    ends = [end for number in numbers for end in (graph.links[number].a, graph.links[number].b)]
+    here = np.array([graph.component_of(i) if graph.of_segment[i] >= 0 else -1 for i in range(len(graph))])
+    for i in sorted(set(ends)):
+        off_m = np.sqrt(((graph.T[:, :3, 3] - graph.T[i, :3, 3]) ** 2).sum(axis=1))
+        near = np.flatnonzero((off_m < radius_m) & (here == here[i]))
+        graph.lookalikes.update(near.tolist())
+    for pair, beside in sorted(graph.bridges().items()):
+        fixed = any(graph.links[number].fixed for number in beside)
+        telling = [number for number in beside if not _is_lookalike(graph, number)]
+        if pair[0] != pair[1] and not fixed and len(telling) < options.min_links:
+            _remove(graph, beside, "ambiguous: both ends look like another place", changes)
+            for row in pair:
+                graph.segments[row].reason = "ambiguous: what it saw is in the map at several places"
+
+
+def _is_lookalike(graph: Graph, number: int) -> bool:
+    return graph.links[number].a in graph.lookalikes or graph.links[number].b in graph.lookalikes
 
 
 def _proposed(graph: Graph, number: int, stay: int) -> Array:

@@ -97,6 +97,7 @@ class Graph:
         of_segment: ``(n,)``, row of its segment, -1 when it was forgotten.
         held: ``(n,)``, whether its features are kept.
         links: By number, in the order in which they were measured; `open` are those not believed.
+        lookalikes: Keyframes at places of which the map knows another one that looks the same.
     """
 
     def __init__(self) -> None:
@@ -112,6 +113,7 @@ class Graph:
         self.newest: dict[str, int] = {}
         self.left: list[str] = []
         self.optimised_at = 0
+        self.lookalikes: set[int] = set()
         self.source = ""
         self._links_of: dict[int, list[int]] = {}
         self._size = 0
@@ -217,6 +219,7 @@ class Graph:
         for i in gone:
             self.drop_features(i)
             self._of_segment[i] = -1
+        self.lookalikes -= members
         self.forget_agreements()
         return gone
 
@@ -354,6 +357,7 @@ class Graph:
             newest=list(self.newest.items()),
             left=self.left,
             source=self.source,
+            lookalikes=sorted(self.lookalikes),
             links_of=list(believed.items()),
             arrays=[
                 np.ascontiguousarray(each).tobytes()
@@ -412,6 +416,7 @@ class Graph:
         graph.next_numbers = dict(packed.next_numbers)
         graph.newest = dict(packed.newest)
         graph.left, graph.source = packed.left, packed.source
+        graph.lookalikes = set(packed.lookalikes)
         graph._links_of = {int(i): numbers for i, numbers in packed.links_of}
         return graph, dict(packed.extra)
 
@@ -428,6 +433,7 @@ class _Packed(msgspec.Struct, kw_only=True):
     newest: list[tuple[str, int]]
     left: list[str]
     source: str
+    lookalikes: list[int]
     links_of: list[tuple[str, list[int]]]
     arrays: list[bytes]
     extra: list[tuple[str, bytes]]

@@ -41,7 +41,7 @@ from rse_pf.live_map.outcomes import (
     Unaligned,
 )
 from rse_pf.live_map.place_index import LivePlaceIndex
-from rse_pf.live_map.relocalise import Relocalised, relocalise
+from rse_pf.live_map.relocalise import Relocalised, relocalise, spread_candidates
 from rse_pf.live_map.smoother import SmoothedWindows, odometry_step, smooth_around
 from rse_pf.live_map.versions import version_of, whole_graph
 from rse_pf.maps.format import MapVersion
@@ -206,11 +206,11 @@ class LiveMap:
         decoded = decode_features(features, camera)
         graph = self._graph
         aligned = np.flatnonzero(graph.held & self._aligned_mask())
-        found = self._places.nearest(
-            LivePlaceIndex.vector(decoded.descriptors), self.options.candidates, aligned
-        )
-        candidates = [(*self._view(i), graph.T[i].copy()) for i, _ in found]
-        return relocalise(candidates, decoded, camera)
+        most = self.options.candidates
+        # More are looked at, so that a second place that looks alike is compared, too.
+        found = self._places.nearest(LivePlaceIndex.vector(decoded.descriptors), 6 * most, aligned)
+        chosen = spread_candidates(found, graph.T, most)
+        return relocalise([(*self._view(i), graph.T[i].copy()) for i in chosen], decoded, camera)
 
     def alignments(self) -> list[Alignment]:
         """Return where the newest segment of each robot lies."""
@@ -380,7 +380,9 @@ class LiveMap:
                 continue
             if not self._is_aligned(row):
                 if segment.told is not None:
-                    segment.told, segment.reason = None, "the links that aligned it were removed"
+                    segment.told = None
+                    if not segment.reason:
+                        segment.reason = "the links that aligned it were removed"
                     outcomes.append(
                         Unaligned(robot=segment.robot, segment=segment.segment, reason=segment.reason)
                     )

@@ -37,6 +37,9 @@ class LiveMapOptions:
         same_place_m: Keyframes closer than this,
         same_place_deg: and turned less than this,
         same_place_most: of which there are more than so many, are redundant.
+        lookalike_m: Two places that look the same are told apart from this distance on.
+        lookalike_most_m: What is nearer to them than this may look like something else, too.
+        worst_drift: Share of the way that odometry may be wrong by; beyond it, a place is another one.
         optimise_every: A whole optimisation is wanted at most once in so many keyframes.
     """
 
@@ -62,6 +65,9 @@ class LiveMapOptions:
     same_place_m: float = 0.12
     same_place_deg: float = 8.0
     same_place_most: int = 2
+    lookalike_m: float = 1.0
+    lookalike_most_m: float = 5.0
+    worst_drift: float = 0.15
     optimise_every: int = 20
 
     def __post_init__(self) -> None:
