@@ -22,8 +22,6 @@ TOPS = ("rse_pf", "client_sdk", "lambda_pnp", "stacks")
 PROCESSES = {"backend", "data_server", "local", "client_sdk", "lambda_pnp", "stacks"}
 ABOVE = {"cli", "experiments"}
 
-_ABOVE, _BELOW = "  above", "  below"
-"""Modules at the root of a package: those that use its folders, and those that its folders use."""
 _TITLE_PX, _LINE_PX, _PAD_PX = 22, 15, 10
 _LETTER_PX, _MAX_LETTERS = 6.7, 21
 _BOX_GAP_PX, _LANE_PX, _ROW_GAP_PX, _MARGIN_PX = 16, 8, 40, 12
@@ -129,17 +127,11 @@ def _room_box(
     if not folders:
         return _leaf(room, purposes.get(prefix, ""), kind)
     part_of = {module: name.partition(".")[0] for module, name in below.items() if name}
-    roots = {module for module, part in part_of.items() if part not in folders}
-    above: set[str] = set()
-    while found := {
-        module
-        for module in roots - above
-        if any(name in above or part_of.get(name) in folders for name in imports[module])
-    }:
-        above |= found
-    part_of |= {module: _ABOVE if module in above else _BELOW for module in roots}
+    levels = _root_levels(part_of, set(folders), imports)
+    part_of |= {module: f"  {level}" for module, level in levels.items()}
+    top, *lower = sorted({f"  {level}" for level in levels.values()}, reverse=True) or [""]
     inner = []
-    for part in [_ABOVE, *folders, _BELOW]:
+    for part in [top, *folders, *lower]:
         names = [below[module] for module in modules if part_of.get(module) == part]
         if part in folders:
             inner.append(_leaf(part, purposes.get(f"{prefix}.{part}", ""), "inner"))
@@ -152,6 +144,19 @@ def _room_box(
         name=room, inside=inside, kind=kind,
         width=inside.width + 2 * _PAD_PX, height=inside.height + _TITLE_PX + 2 * _PAD_PX,
     )  # fmt: skip
+
+
+def _root_levels(
+    part_of: Mapping[str, str], folders: set[str], imports: Mapping[str, set[str]]
+) -> dict[str, int]:
+    """Return the level of each module at the root of a package: above how many rows of folders it stands."""
+    levels = dict.fromkeys(part_of.values(), 0)
+    for _ in levels:  # a longest way has no more steps than there are parts
+        for module, part in part_of.items():
+            for other in {part_of[name] for name in imports[module] if name in part_of} - {part}:
+                is_above = part not in folders and other in folders
+                levels[part] = max(levels[part], levels[other] + is_above)
+    return {module: levels[part] for module, part in part_of.items() if part not in folders}
 
 
 def _leaf(name: str, words: str, kind: str) -> Box:
