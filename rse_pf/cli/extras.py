@@ -120,6 +120,8 @@ VERBS_NEED: dict[str, tuple[str, ...]] = {
     "map localise": ("maps", "vision"),
     "map view": ("local",),
     "map view --browser": ("view",),
+    "map live": ("keys", "maps"),
+    "map publish": ("keys", "maps"),
     "audit": (),
     "camera": ("vision",),
     "cloud": ("aws",),

@@ -12,6 +12,7 @@ examples:
   rse-pf map localise kitchen recordings/kitchen:0-40 --store dir:objects
   rse-pf map view kitchen --out kitchen.png --store dir:objects
   rse-pf map diff kitchen 3f9bd1 head --store dir:objects
+  rse-pf map live list --store dir:objects
   rse-pf map export kitchen --format ply --out kitchen.ply --store dir:objects
 """
 
@@ -35,6 +36,7 @@ import numpy as np
 from rse_pf.audit.operator import record_map_change
 from rse_pf.aws.storage import open_data_store
 from rse_pf.cli.map_from_camera import add_from_camera_arguments, run_from_camera
+from rse_pf.cli.map_live import add_live_arguments, run_live, run_publish
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import CommandFailed, NotFound, UsageError
 from rse_pf.files import replace_file
@@ -70,6 +72,7 @@ _ACTIONS = {
         "write a version in the format of another program",
         "export kitchen --format ply --out kitchen.ply",
     ),
+    "publish": ("publish a live map as the next version of its map", "publish warehouse"),
 }
 """Name, one line of help, and an example."""
 
@@ -91,7 +94,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         )
         for name, (text, example) in _ACTIONS.items()
     }  # fmt: skip
-    for name in ("show", "view", "diff", "rollback", "export", "localise"):
+    for name in ("show", "view", "diff", "rollback", "export", "localise", "publish"):
         made[name].add_argument("name", metavar="MAP", help="name of the map")
     for name in ("show", "view", "export"):
         made[name].add_argument(
@@ -121,6 +124,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
             epilog="example:\n  rse-pf map from-camera 0 --intrinsics intrinsics.json --scale marker:100",
             formatter_class=argparse.RawDescriptionHelpFormatter,
         )
+    )  # fmt: skip
+    add_live_arguments(
+        actions.add_parser(
+            "live", help="list, show, start, stop and correct live maps",
+            description="List, show, start, stop and correct live maps.",
+            epilog="example:\n  rse-pf map live show warehouse --store dir:objects",
+            formatter_class=argparse.RawDescriptionHelpFormatter,
+        ),
+        common,
     )  # fmt: skip
     merge, localise = made["merge"], made["localise"]
     merge.add_argument(
@@ -161,6 +173,8 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
         record_map_change(chosen, action, name, version=made.id, number=made.number)
 
     _check_store(chosen.data.store)
+    if args.action in ("live", "publish"):
+        return (run_live if args.action == "live" else run_publish)(args, chosen)
     max_bytes = 4 * chosen.data.max_object_bytes
     maps = MapRegistry(open_data_store(chosen), args.tenant, max_bytes=max_bytes, on_change=record)
     actions = {

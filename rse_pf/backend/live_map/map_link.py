@@ -125,6 +125,7 @@ class MapLink:
         self._dead_epoch: int | None = None
         self._newest_map: dict[str, Any] = {}
         self._used_s = context.clock()
+        self._is_closed = False
         self._wake = asyncio.Event()
         self._task = asyncio.get_running_loop().create_task(self._run())
 
@@ -158,6 +159,7 @@ class MapLink:
 
     async def close(self) -> None:
         """Close the connection; what is waited for ends with Busy."""
+        self._is_closed = True  # a wait that ends as it is cancelled may ignore that (Python < 3.12)
         self._task.cancel()
         with contextlib.suppress(asyncio.CancelledError):
             await self._task
@@ -389,6 +391,8 @@ class MapLink:
             self._on_update(self._newest_map)
 
     def _is_needed(self) -> bool:
+        if self._is_closed:
+            return False
         if self._pending or self.is_watched:
             return True
         return self._context.clock() - self._used_s < _LINGER_S

@@ -97,17 +97,20 @@ class LiveLog:
         self._base = base
         self._keeps_all = keeps_all
 
-    def newest_snapshot(self) -> MapSnapshot | None:
-        """Return the newest snapshot that is whole, and continue after it; raises StoreError."""
+    def snapshots(self) -> Iterator[MapSnapshot]:
+        """Yield the snapshots that are whole, the newest first; `position` follows them, at last to the base.
+
+        Raises:
+            StoreError: The store fails.
+        """
         names = [info.name for info in self._store.list(self._snapshots, self._snapshot_name(self._base))]
         for name in reversed(names):
             with contextlib.suppress(NotFound, msgspec.MsgspecError):
                 stored = _decode_snapshot(self._store.get(name))
                 if digest_of(stored.data) == stored.digest:
                     self.position = _number_of(name)
-                    return MapSnapshot(position=self.position, unmeasured=stored.unmeasured, data=stored.data)
+                    yield MapSnapshot(position=self.position, unmeasured=stored.unmeasured, data=stored.data)
         self.position = self._base
-        return None
 
     def entries(self) -> Iterator[LogEntry]:
         """Yield the entries after `position`, which follows them.

@@ -189,9 +189,12 @@ class _Process:
         taking = asyncio.ensure_future(self._take_over())
         await asyncio.wait({renewing, taking}, return_when=asyncio.FIRST_COMPLETED)
         if not taking.done() or taking.exception() is not None:
+            error = taking.exception() if taking.done() else None
+            if error is not None and not isinstance(error, OwnershipLost):
+                traceback.print_exception(error)
+                self._log.error("live-map-unreadable", map=self._order.map_name, error=str(error))
+                self._log.close()
             self._worker.sendall(encode_message(["lost"]))
-            if taking.done() and not isinstance(taking.exception(), OwnershipLost):
-                await taking
             return
         renewing.cancel()
         await self._serve(*taking.result())

@@ -5,11 +5,13 @@ Two processes that read the same log hold the same map; `MapState.digest` shows 
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, Protocol
 
 from rse_pf.backend.live_map.owner.log import LiveLog, MapSnapshot, OwnershipLost, is_snapshot_due
+from rse_pf.errors import BadRequest
 from rse_pf.geometry import Camera
 from rse_pf.live_map.events import (
     Event,
@@ -25,7 +27,7 @@ from rse_pf.live_map.events import (
 from rse_pf.live_map.outcomes import Added, Alignment, Outcome
 from rse_pf.maps.format import MapVersion
 
-__all__ = ["Applied", "MapKind", "MapLogic", "MapState", "size_of", "take_over"]
+__all__ = ["Applied", "MapKind", "MapLogic", "MapState", "restore", "size_of", "take_over"]
 
 _UNCHANGING = (OwnerChanged, RobotLeft)
 
@@ -169,6 +171,14 @@ def size_of(value: Any) -> int:
     return value if isinstance(value, int) else len(value)
 
 
+def restore(log: LiveLog, kind: MapKind) -> MapState:
+    """Return the map that the log holds now, and write nothing; raises StoreError."""
+    state = _from_snapshot(log, kind)
+    for entry in log.entries():
+        state.apply(log.position, decode_events(entry.events))
+    return state
+
+
 def take_over(log: LiveLog, kind: MapKind, *, owner: str, epoch: int) -> MapState:
     """Return the map that the log holds, with the entry that says who owns it from here on.
 
@@ -178,9 +188,7 @@ def take_over(log: LiveLog, kind: MapKind, *, owner: str, epoch: int) -> MapStat
         OwnershipLost: A later owner has written.
         StoreError: The store fails, or the log is damaged.
     """
-    snapshot = log.newest_snapshot()
-    live_map = kind.empty() if snapshot is None else kind.restore(snapshot.data)
-    state = MapState(live_map, log.position, () if snapshot is None else snapshot.unmeasured)
+    state = _from_snapshot(log, kind)
     change = [OwnerChanged(owner=owner, epoch=epoch)]
     data = encode_events(change)
     while True:
@@ -193,3 +201,11 @@ def take_over(log: LiveLog, kind: MapKind, *, owner: str, epoch: int) -> MapStat
         except OwnershipLost:
             continue  # the previous owner has just written; read on
         return state
+
+
+def _from_snapshot(log: LiveLog, kind: MapKind) -> MapState:
+    """Return the map of the newest snapshot that this version can read, or an empty one."""
+    for snapshot in log.snapshots():
+        with contextlib.suppress(BadRequest):
+            return MapState(kind.restore(snapshot.data), snapshot.position, snapshot.unmeasured)
+    return MapState(kind.empty(), log.position)

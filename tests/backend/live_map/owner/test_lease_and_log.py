@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import msgspec
 import pytest
 
@@ -15,9 +17,12 @@ from rse_pf.backend.live_map.owner.link_security import (
 )
 from rse_pf.backend.live_map.owner.log import LiveLog, MapSnapshot, OwnershipLost
 from rse_pf.backend.live_map.owner.requests import begins_a_map, folders_of, shown_name
+from rse_pf.backend.live_map.owner.state import restore
 from rse_pf.errors import BadRequest, StoreError, Unauthorized
 from rse_pf.identity import RobotId
+from rse_pf.live_map.events import OwnerChanged, encode_events
 from rse_pf.object_store import MemoryStore
+from tests.backend.live_map.fake_map import FAKE_MAP, FakeMap
 from tests.backend.live_map.owner_bench import FOLDER, LEASE, HandClock
 
 LEASE_S = 1.5
@@ -144,14 +149,31 @@ def test_two_snapshots_are_kept_and_a_damaged_one_is_passed_over():
             log.write_snapshot(MapSnapshot(position=number, unmeasured=(number,), data=b"%d" % number))
 
     restored = log_of(store)
-    assert restored.newest_snapshot() == MapSnapshot(position=6, unmeasured=(6,), data=b"6")
+    assert next(restored.snapshots()) == MapSnapshot(position=6, unmeasured=(6,), data=b"6")
     assert restored.position == 6
     newest = f"{FOLDER}snapshot/{6:012d}"
     store.put(newest, store.get(newest)[:-1] + b"7")
-    assert restored.newest_snapshot() == MapSnapshot(position=4, unmeasured=(4,), data=b"4")
+    assert next(restored.snapshots()) == MapSnapshot(position=4, unmeasured=(4,), data=b"4")
     assert len(list(restored.entries())) == 2
     numbers = [int(info.name[-12:]) for info in store.list(f"{FOLDER}log/")]
     assert numbers == [5, 6]
+
+
+def test_a_snapshot_that_this_version_cannot_read_costs_time_and_no_map():
+    store = MemoryStore()
+    log = log_of(store, keeps_all=True)
+    for number in range(1, 5):
+        log.write(encode_events([OwnerChanged(owner="a", epoch=number)]))
+    log.write_snapshot(MapSnapshot(position=4, unmeasured=(), data=b"of another version"))
+
+    def refuse(data: bytes) -> FakeMap:
+        raise BadRequest("of another version")
+
+    kind = replace(FAKE_MAP, restore=refuse)
+    assert restore(log_of(store), kind).position == 4
+    store.delete(f"{FOLDER}log/{1:012d}")
+    with pytest.raises(StoreError, match="entry 1 of the log is missing"):
+        restore(log_of(store), kind)
 
 
 def test_a_log_that_experiments_replay_keeps_all_entries():
