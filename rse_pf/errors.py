@@ -8,6 +8,7 @@ one can use it.
 from __future__ import annotations
 
 import errno
+from pathlib import Path
 from typing import ClassVar
 
 __all__ = [
@@ -145,8 +146,24 @@ class MissingExtra(ConfigurationError, code="missing-extra"):
     def __init__(self, package: str, extra: str) -> None:
         super().__init__(
             f"{package} is not installed: it is in the extra {extra!r}",
-            hint=f"pip install 'rse-pf[{extra}]'",
+            hint=self.command(extra),
         )
+
+    @staticmethod
+    def command(*extras: str) -> str:
+        """Return what installs *extras* into this environment; rse-pf itself is on no package index.
+
+        pip takes the extras of an rse-pf that is installed, from a wheel or a checkout, from its metadata.
+        A checkout that is only on the path has none, so the command names it.
+        """
+        from importlib import metadata
+
+        chosen = f"[{','.join(extras)}]" if extras else ""
+        try:
+            metadata.distribution("rse-pf")
+        except metadata.PackageNotFoundError:
+            return f"pip install -e '{Path(__file__).parents[1]}{chosen}'"
+        return f"pip install 'rse-pf{chosen}'" if chosen else "pip install rse-pf"
 
 
 # --- authentication --------------------------------------------------------------------------------

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import errno
 import pickle
+from importlib import metadata
+from pathlib import Path
 
 import pytest
 
@@ -119,6 +121,23 @@ def test_a_missing_extra_names_the_extra_and_the_pip_command() -> None:
         "MissingExtra: picows is not installed: it is in the extra 'backend'\n"
         "  hint: pip install 'rse-pf[backend]'"
     )
+
+
+def test_a_checkout_that_is_not_installed_is_named_in_the_pip_command(
+    monkeypatch: pytest.MonkeyPatch, repository: Path
+) -> None:
+    def nothing(name: str) -> None:
+        raise metadata.PackageNotFoundError(name)
+
+    monkeypatch.setattr(metadata, "distribution", nothing)
+
+    assert MissingExtra("picows", "backend").hint == f"pip install -e '{repository}[backend]'"
+    assert MissingExtra.command() == f"pip install -e '{repository}'"
+
+
+def test_the_base_and_several_extras_have_a_command() -> None:
+    assert MissingExtra.command() == "pip install rse-pf"
+    assert MissingExtra.command("demo", "maps") == "pip install 'rse-pf[demo,maps]'"
 
 
 @pytest.mark.parametrize("error", [errors.Busy("m", hint="h", retry_after_ms=1.0), MissingExtra("a", "b")])

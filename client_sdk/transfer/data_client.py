@@ -45,6 +45,9 @@ _MAX_SINGLE_PUT_BYTES = 262_144
 _PIECE_BYTES = 1 << 20
 _PRESIGNED_TRIES = 3
 _REDIRECTED = 307
+_NO_UPSTREAM = b"no healthy upstream"
+"""The body of the load balancer's 503 while it knows no data server at all."""
+_NO_SERVICE_S = 5.0
 _RETRIED = {408, 429, 500, 502, 503, 504}
 _CONNECTIONS = {True: http.client.HTTPSConnection, False: http.client.HTTPConnection}
 
@@ -115,7 +118,7 @@ class DataClient:
         An earlier upload of the same bytes is resumed, also one by another process.
 
         Raises:
-            ConnectError: No progress for ``deadline_s``.
+            ConnectError: No progress for ``deadline_s``, or the platform has no data service for 5 s.
             StoreFull, QuotaExceeded, LimitExceeded, Unauthorized, Forbidden: The server refuses it.
             UsageError: The file cannot be read.
         """
@@ -287,7 +290,8 @@ class DataClient:
     ) -> Response:  # fmt: skip
         """Repeat a request until it succeeds or is refused; all requests of this class are idempotent."""
         options = self._options
-        end, pause = options.clock() + options.deadline_s, options.first_pause_s
+        begin, pause = options.clock(), options.first_pause_s
+        end = begin + options.deadline_s
         while True:
             error: RsePfError
             after_s = 0.0
@@ -305,6 +309,12 @@ class DataClient:
                 error = _error_of(status, content)
                 if status not in _RETRIED:
                     raise error
+                if content == _NO_UPSTREAM:
+                    end = min(end, begin + _NO_SERVICE_S)
+                    error = ConnectError(
+                        f"the platform at {self._host} has no data service",
+                        hint="start rse-pf local without --no-data; in a cloud, set data.enabled",
+                    )
                 retry_after = answer.get("Retry-After", "")
                 after_s = float(retry_after) if retry_after.isdecimal() else 0.0
             wait_s = max(after_s, pause * options.random.uniform(0.5, 1.0))

@@ -27,7 +27,7 @@ from pathlib import Path
 
 from rse_pf.cli.doctor import Finding, report
 from rse_pf.config import PlatformSettings
-from rse_pf.errors import RsePfError, UsageError
+from rse_pf.errors import MissingExtra, RsePfError, UsageError
 from rse_pf.terminal import counted, show
 
 __all__ = ["add_arguments", "check_tools", "run"]
@@ -123,7 +123,7 @@ def _cli(checkout: Path) -> Finding:
     try:
         writes = metadata.version("aws-cdk.cloud-assembly-schema")
     except metadata.PackageNotFoundError:
-        return Finding(grade="fail", what="aws-cdk-lib is not installed", fix="pip install 'rse-pf[infra]'")
+        return Finding(grade="fail", what="aws-cdk-lib is not installed", fix=MissingExtra.command("infra"))
     try:
         cli = json.loads((checkout / _CLI).read_text(encoding="utf-8"))
         pinned = json.loads((checkout / _PINNED).read_text(encoding="utf-8"))["devDependencies"]["aws-cdk"]

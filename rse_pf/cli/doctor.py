@@ -98,7 +98,7 @@ def _extras(settings: PlatformSettings) -> Iterator[Finding]:
         if missing and not extra.is_for_users:
             yield _finding(f"extra {name}: not installed, and only for developers: {extra.enables}")
             continue
-        fix = "pip install rse-pf" if name == "base" else f"pip install 'rse-pf[{name}]'"
+        fix = MissingExtra.command(*([] if name == "base" else [name]))
         what = f"extra {name}: {missing} cannot be imported" if missing else f"extra {name}"
         yield _finding(f"{what}; for {extra.enables}", fix if missing else "", is_required=extra.is_required)
     yield from _verbs(absent)
@@ -114,7 +114,7 @@ def _verbs(absent: set[str]) -> Iterator[Finding]:
         if lacks:
             missing = {module for extra in lacks for module in absent & modules_of(extra).keys()}
             what = f"rse-pf {verb} does not work here: it needs {', '.join(sorted(missing))}"
-            yield _finding(what, f"pip install 'rse-pf[{','.join(lacks)}]'")
+            yield _finding(what, MissingExtra.command(*lacks))
 
 
 def _native_library(settings: PlatformSettings) -> Iterator[Finding]:
@@ -141,7 +141,7 @@ def _engines(settings: PlatformSettings) -> Iterator[Finding]:
         else:
             needed = chosen == engine
             what = f"engine {engine} is not installed" + (" but needed by pnp.engine" if needed else "")
-            yield _finding(what, f"pip install 'rse-pf[{extra}]'", is_required=needed)
+            yield _finding(what, MissingExtra.command(extra), is_required=needed)
 
 
 def _isolation(settings: PlatformSettings) -> Iterator[Finding]:

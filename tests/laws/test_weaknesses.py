@@ -52,6 +52,12 @@ NO_SECRETS: Mapping[tuple[str, str], str] = {
     ("rse_pf/config/renamed.json", "Secret Keyword"): "the name of a module",
     ("tests/renamed.json", "Secret Keyword"): "the name of a test",
     ("tests/test_identity.py", "Base64 High Entropy String"): "the example of RFC 8037",
+    (
+        "examples/robots/object_recognition_service/requests/photo.json",
+        "Base64 High Entropy String",
+    ): "a photo",
+    ("tests/cli/local_platform/test_enrol.py", "Private Key"): "a heading without a key",
+    ("tests/client_sdk/test_first_contact.py", "Secret Keyword"): "made up, to be hidden in an error",
     ("tests/maps/test_format.py", "Hex High Entropy String"): "the sha256 of a map",
     ("tests/aws/storage/test_key_store.py", "Secret Keyword"): "made for moto",
     ("tests/client_sdk/test_dial_errors.py", "Basic Auth Credentials"): "made up, to be hidden in an error",

@@ -212,6 +212,24 @@ def test_retries_end_at_the_deadline(service: FakeService, robot: Robot) -> None
     assert max(robot.pauses) <= 5.0
 
 
+def test_a_platform_without_a_data_service_is_told_soon_and_with_a_hint(
+    service: FakeService, robot: Robot
+) -> None:
+    service.script = lambda *_: (503, {}, b"no healthy upstream")  # of Envoy without targets
+
+    with pytest.raises(ConnectError, match="has no data service") as told:
+        robot.client.upload(DATA)
+
+    assert 2.0 < robot.now <= 5.0
+    assert "--no-data" in told.value.hint
+
+
+def test_a_data_service_that_comes_within_seconds_is_waited_for(service: FakeService, robot: Robot) -> None:
+    service.script = once((503, {}, b"no healthy upstream"), "PUT")
+
+    assert robot.client.upload(b"small") in service.objects
+
+
 def test_a_retry_waits_as_long_as_the_server_asks(service: FakeService, robot: Robot) -> None:
     service.script = once(failure(503, "busy", **{"Retry-After": "7"}), "PUT")
 
