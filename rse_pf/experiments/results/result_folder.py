@@ -120,6 +120,7 @@ def write_json(path: Path, report: Mapping[str, Any]) -> None:
 
 
 def remove_keys(platform_folder: Path) -> None:
-    """Delete the signing keys of a platform that has ended: results never hold a secret."""
-    for file in platform_folder.glob("key*.json"):
-        file.unlink()
+    """Delete the keys of a platform that has ended, and of its live maps: results never hold a secret."""
+    for pattern in ("key*.json", "objects/live/key=*"):
+        for file in platform_folder.glob(pattern):
+            file.unlink()

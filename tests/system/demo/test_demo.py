@@ -24,13 +24,13 @@ WAIT_S = 60.0
 
 
 @contextlib.contextmanager
-def demo(out: Path, *options: str) -> Iterator[subprocess.Popen[str]]:
+def demo(out: Path, *options: str, within_s: float = WAIT_S) -> Iterator[subprocess.Popen[str]]:
     """Run the demo; what is left of it at the end is interrupted, then killed."""
     command = [sys.executable, "-u", "-m", "rse_pf.cli.main", "demo", "--out", str(out), *options]
     with subprocess.Popen(
         command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, start_new_session=True
     ) as process:
-        overdue = threading.Timer(WAIT_S, os.killpg, (process.pid, signal.SIGKILL))
+        overdue = threading.Timer(within_s, os.killpg, (process.pid, signal.SIGKILL))
         overdue.start()
         try:
             yield process
@@ -58,8 +58,8 @@ def read_until(process: subprocess.Popen[str], pattern: str) -> str:
     raise AssertionError(f"no {pattern!r} in:\n{heard}")
 
 
-def finish(process: subprocess.Popen[str], out: Path) -> dict[str, Any]:
-    rest, _ = process.communicate(timeout=WAIT_S)
+def finish(process: subprocess.Popen[str], out: Path, within_s: float = WAIT_S) -> dict[str, Any]:
+    rest, _ = process.communicate(timeout=within_s)
     assert process.returncode == 0, rest
     return json.loads((out / "report.json").read_text())
 
