@@ -17,7 +17,7 @@ import secrets
 import stat
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO, Protocol, TypeVar, runtime_checkable
@@ -386,17 +386,29 @@ class DirectoryStore:
                     path.parent.rmdir()
 
     def compare_and_swap(self, name: str, expected: bytes | None, data: bytes) -> None:
-        """Replace the object if it still holds *expected*; a lock file excludes other writers."""
+        """Replace the object if it still holds *expected*; a lock file excludes other writers.
+
+        The lock is held for a comparison and a rename, not while the disk writes: a process that is paused
+        hardly ever holds it.
+        """
+
+        def check() -> None:
+            try:
+                current = self.get(name)
+            except NotFound:
+                current = None
+            if current != expected:
+                raise Conflict(f"{name!r} was changed meanwhile", hint="read it again and retry")
 
         def swap(path: Path) -> None:
-            with _locked(path.with_name(f"{_LOCK}{path.name}")):
-                try:
-                    current = self.get(name)
-                except NotFound:
-                    current = None
-                if current != expected:
-                    raise Conflict(f"{name!r} was changed meanwhile", hint="read it again and retry")
-                replace_file(path, data, mode=OWNER_ONLY, is_durable=True)
+            check()
+            with (
+                _temporary(path, [data]) as temporary,
+                _locked(path.with_name(f"{_LOCK}{path.name}")),
+            ):
+                check()
+                os.replace(temporary, path)
+            sync_folder(path.parent)
 
         self._write(name, swap)
 
@@ -538,6 +550,14 @@ def _make_folder(folder: Path) -> None:
 
 
 def _replace_by_pieces(path: Path, pieces: Iterator[bytes]) -> None:
+    with _temporary(path, pieces) as temporary:
+        os.replace(temporary, path)
+    sync_folder(path.parent)
+
+
+@contextlib.contextmanager
+def _temporary(path: Path, pieces: Iterable[bytes]) -> Iterator[Path]:
+    """Write a file beside *path* durably; it is removed if the caller raises an error."""
     temporary = path.with_name(f"{TEMPORARY_PREFIX}{secrets.token_hex(8)}")
     handle = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, OWNER_ONLY)
     try:
@@ -546,11 +566,10 @@ def _replace_by_pieces(path: Path, pieces: Iterator[bytes]) -> None:
                 file.write(piece)
             file.flush()
             os.fsync(handle)
-        os.replace(temporary, path)
+        yield temporary
     except BaseException:
         temporary.unlink(missing_ok=True)
         raise
-    sync_folder(path.parent)
 
 
 @contextlib.contextmanager
