@@ -1,4 +1,4 @@
-"""rse-pf map live: what it shows of live maps that no server has now, and that it starts no owner for that."""
+"""rse-pf map live: what it shows of live maps that no server has now; it starts no owner for that."""
 
 from __future__ import annotations
 

@@ -12,7 +12,7 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
-from rse_pf.backend.live_map.children import OwnerChildren
+from rse_pf.backend.live_map.children import OwnerChild, OwnerChildren
 from rse_pf.backend.live_map.map_link import LinkContext, MapLink
 from rse_pf.backend.live_map.owner.lease import decode_lease, lease_name, tenant_folder
 from rse_pf.backend.live_map.owner.link_security import internal_key
@@ -127,6 +127,11 @@ class OwnerLinks:
     def give_up(self) -> None:
         """Let the owners that this worker started release their leases: the server drains."""
         self._children.release()
+
+    @property
+    def children(self) -> list[OwnerChild]:
+        """The owner processes that this worker has started and that claim or serve a map."""
+        return self._children.used
 
     async def close(self) -> None:
         """Release the leases of the owners that this worker started, and close all connections."""

@@ -62,7 +62,7 @@ _MAX_WAITING_EVENTS = 1024
 _FIRST_RETRY_S, _LAST_RETRY_S = 0.05, 1.0
 _SLOW_STORE_S = 1.0
 """A write that takes longer is told to the robots."""
-_SETTLED_S = 60.0
+_SETTLED_S = 5.0
 """An owner that served for this long did not die of its map."""
 _BUSY_RETRY_MS = 200.0
 _WAITING = "waiting for the store"

@@ -1,0 +1,178 @@
+"""Real owner processes, killed, stopped and released while a robot sends: nothing is lost or twice."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import signal
+import time
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from rse_pf.backend.live_map.children import OwnerChild
+from rse_pf.backend.live_map.link import OwnerLinks
+from rse_pf.backend.live_map.owner.lease import decode_lease, lease_name, map_folder
+from rse_pf.backend.live_map.owner.log import LiveLog
+from rse_pf.backend.live_map.owner.state import MapState
+from rse_pf.backend.log import JsonLog
+from rse_pf.config import PlatformSettings
+from rse_pf.errors import Conflict, NotFound
+from rse_pf.identity import RobotId
+from rse_pf.live_map.events import KeyframeAdded, decode_events
+from rse_pf.object_store import DirectoryStore
+from tests.backend.live_map.fake_map import FAKE_MAP, keyframe_payload
+
+MAP, ROBOT = "warehouse", RobotId("default", "robot-1")
+KIND = "tests.backend.live_map.fake_map:FAKE_MAP"
+PATIENT_S = 30.0
+pytestmark = [pytest.mark.slow, pytest.mark.system]
+
+
+@dataclass
+class Servers:
+    """The links of two servers, in one process and on one store."""
+
+    store: DirectoryStore
+    a: OwnerLinks
+    b: OwnerLinks
+    updates: list[dict[str, Any]]
+
+    async def send(self, links: OwnerLinks, number: int) -> dict[str, Any]:
+        return await links.request(
+            "default", MAP, ROBOT, "live-keyframe", keyframe_payload(number), PATIENT_S
+        )
+
+    async def show(self, links: OwnerLinks) -> dict[str, Any]:
+        return await links.request("default", MAP, ROBOT, "live-show", {}, PATIENT_S)
+
+    def owner(self) -> OwnerChild:
+        """Return the process that serves the map."""
+        name = lease_name("default", MAP)
+        epoch = decode_lease(name, self.store.get(name)).epoch
+        (child,) = (each for links in (self.a, self.b) for each in links.children if each.epoch == epoch)
+        return child
+
+    def replayed(self) -> tuple[MapState, list[int]]:
+        """Return the map that the whole log gives, and the numbers of the keyframes in it."""
+        log = LiveLog(self.store, map_folder("default", MAP), owner="", epoch=10**6)
+        state, numbers = MapState(FAKE_MAP.empty(), 0), []
+        for entry in log.entries():
+            events = decode_events(entry.events)
+            numbers += [event.number for event in events if isinstance(event, KeyframeAdded)]
+            state.apply(log.position, events)
+        return state, numbers
+
+
+@asynccontextmanager
+async def servers(folder: Path, **live: Any) -> AsyncIterator[Servers]:
+    settings = PlatformSettings.from_dict(
+        {"data": {"store": f"dir:{folder}"}, "live": {"keep_log": True, **live},
+         "serving": {"log_level": "error"}}
+    )  # fmt: skip
+    store, updates = DirectoryStore(folder), []  # type: tuple[DirectoryStore, list[dict[str, Any]]]
+    log = JsonLog(level="error", server="test", wall_clock=time.time)
+    made = [
+        OwnerLinks(
+            store=store, settings=settings, server_id=name, loop=asyncio.get_running_loop(), log=log,
+            on_update=lambda tenant, name, payload: updates.append(payload), kind=KIND,
+        )
+        for name in ("a", "b")
+    ]  # fmt: skip
+    try:
+        yield Servers(store, made[0], made[1], updates)
+    finally:
+        for links in made:
+            await links.close()
+        log.close()
+
+
+@pytest.mark.parametrize("fault", [signal.SIGKILL, signal.SIGSTOP])
+def test_a_server_that_dies_or_stands_still_loses_no_acknowledged_keyframe(
+    tmp_path: Path, fault: signal.Signals
+) -> None:
+    async def test() -> None:
+        async with servers(tmp_path) as both:
+            await both.send(both.a, 0)
+            number, took = 1, []
+            for _ in range(3):
+                for _ in range(12):
+                    await both.send(both.b, number)
+                    number += 1
+                owner = both.owner()
+                sent = asyncio.ensure_future(both.send(both.b, number))
+                await asyncio.sleep(0)
+                began = time.monotonic()
+                os.kill(owner.pid, fault)
+                assert (await sent)["number"] == number + 1
+                number += 1
+                await both.send(both.b, number)
+                number += 1
+                took.append(time.monotonic() - began)
+                if fault == signal.SIGSTOP:
+                    os.kill(owner.pid, signal.SIGCONT)
+                    assert await asyncio.wait_for(asyncio.shield(owner.ended), PATIENT_S) == 0
+            shown = await both.show(both.b)
+            assert shown["epoch"] == 4
+            state, numbers = both.replayed()
+            assert numbers == list(range(number))
+            assert state.keyframes == shown["keyframes"] == number
+            assert max(took) < 10.0  # 3 s on a machine that does nothing else; see docs/live_maps.md
+
+    asyncio.run(test())
+
+
+def test_a_drained_server_gives_its_maps_to_the_next_one_at_once(tmp_path: Path) -> None:
+    async def test() -> None:
+        async with servers(tmp_path) as both:
+            both.b.watch("default", MAP)
+            for number in range(5):
+                await both.send(both.a, number)
+            before = await both.show(both.a)
+            both.a.give_up()
+            assert (await both.send(both.b, 5))["number"] == 6
+            after = await both.show(both.b)
+            assert (before["server"], after["server"]) == ("a", "b")
+            assert after["epoch"] == 2
+            assert after["keyframes"] == 6
+            assert [each["state"] for each in both.updates if each["kind"] == "map"][-1] == "live"
+
+    asyncio.run(test())
+
+
+def test_two_servers_that_begin_a_map_at_the_same_time_share_one_owner(tmp_path: Path) -> None:
+    async def test() -> None:
+        async with servers(tmp_path) as both:
+            other = RobotId("default", "robot-2")
+            await asyncio.gather(
+                both.send(both.a, 0),
+                both.b.request("default", MAP, other, "live-keyframe", keyframe_payload(0), PATIENT_S),
+            )
+            one, two = await both.show(both.a), await both.show(both.b)
+            assert one["owner"] == two["owner"]
+            assert one["keyframes"] == 2
+            with pytest.raises(Conflict):
+                await both.send(both.b, 9)
+
+    asyncio.run(test())
+
+
+def test_a_stopped_map_refuses_later_keyframes_and_another_tenant_sees_nothing(tmp_path: Path) -> None:
+    async def test() -> None:
+        async with servers(tmp_path) as both:
+            await both.send(both.a, 0)
+            stranger = RobotId("other", "robot-1")
+            with pytest.raises(NotFound):
+                await both.b.request("other", MAP, stranger, "live-publish", {}, PATIENT_S)
+            assert await both.b.list_maps("other") == []
+            stopped = await both.b.request("default", MAP, ROBOT, "live-stop", {}, PATIENT_S)
+            assert stopped["keyframes"] == 1
+            with pytest.raises(Conflict, match="was stopped"):
+                await both.send(both.b, 1)
+            assert (await both.send(both.b, 0))["number"] == 1
+
+    asyncio.run(test())
