@@ -35,9 +35,10 @@ Rows = npt.NDArray[np.int64]
 
 _LEAST_STEP = 0.05
 _ITERATIONS = 6
-_CONVERGED_M, _CONVERGED_RAD = 5e-5, 5e-5
+_CONVERGED_M, _CONVERGED_RAD = 1e-3, 1e-3
 _LITTLE = 1e-3
-"""Share of the cost below which another step is not worth its time."""
+"""Share of the cost below which another step is not worth its time; after steps below a millimetre and a
+thousandth of a radian the next one would be a thousand times shorter."""
 _DAMPING = 1e-6
 """Of the diagonal; a free pose without an edge to a held one stays where it is."""
 

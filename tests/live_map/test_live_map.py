@@ -1,0 +1,347 @@
+"""The live map as a state machine: generated drives, whose true poses and wrong links are known."""
+
+from __future__ import annotations
+
+import copy as copy_module
+
+import numpy as np
+import pytest
+
+from benchmarks.generated_drives import GeneratedDrive, GeneratedWorld, circle, measured_link
+from rse_pf.errors import BadRequest
+from rse_pf.geometry import Array, exp_se3, inverse, pose_difference
+from rse_pf.live_map.events import (
+    Event,
+    KeyframeAdded,
+    LinksMeasured,
+    Optimised,
+    RobotForgotten,
+    RobotLeft,
+    decode_events,
+    encode_events,
+    matrix_bytes,
+)
+from rse_pf.live_map.live_map import LiveMap
+from rse_pf.live_map.outcomes import Added, Ambiguous, Corrected, Joined, LinkRemoved, Outcome, Unaligned
+from rse_pf.live_map.versions import started_from
+
+ROUND = circle(0.5, 1.2)
+
+
+class Run:
+    """A map, the events that made it, and what came of each."""
+
+    def __init__(self, world: GeneratedWorld) -> None:
+        self.world, self.map = world, LiveMap()
+        self.log: list[Event] = []
+        self.outcomes: list[tuple[int, Outcome]] = []
+
+    def apply(self, event: Event) -> list[Outcome]:
+        found = self.map.apply(event)
+        self.log.append(event)
+        self.outcomes += [(len(self.world.seen), each) for each in found]
+        return found
+
+    def play(self, drives: list[GeneratedDrive], wrong: float = 0.0) -> Run:
+        for event in self.world.play(drives, wrong):
+            self.apply(event)
+        return self
+
+    def of(self, kind: type[Outcome]) -> list[Outcome]:
+        return [each for _, each in self.outcomes if isinstance(each, kind)]
+
+    def worst_error(self, ids: range) -> tuple[float, float]:
+        """Return how far keyframes are from their true place relative to keyframe 0: metres, degrees."""
+        map_0, true_0 = inverse(self.map.pose(0)), inverse(self.world.seen[0])
+        apart = [pose_difference(map_0 @ self.map.pose(i), true_0 @ self.world.seen[i]) for i in ids]
+        return max(each[0] for each in apart), max(each[1] for each in apart)
+
+
+def two_robots(seed: int = 1, wrong: float = 0.0) -> Run:
+    world = GeneratedWorld(seed=seed)
+    return Run(world).play([world.drive("a", ROUND), world.drive("b", circle(0.5, 1.2, phase=3.0))], wrong)
+
+
+def copy_of(run: Run) -> Run:
+    """Return a run that goes on from *run* without changing it."""
+    copy = Run(copy_module.copy(run.world))
+    copy.world.seen = list(run.world.seen)
+    copy.map = LiveMap.restore(run.map.snapshot())
+    return copy
+
+
+@pytest.fixture(scope="module")
+def joined() -> Run:
+    return two_robots(wrong=0.3)
+
+
+def test_two_robots_in_one_place_share_one_frame(joined: Run) -> None:
+    metres, degrees = joined.worst_error(range(len(joined.world.seen)))
+
+    assert [each.robot for each in joined.of(Joined)] == ["a", "b"]
+    assert metres < 0.05
+    assert degrees < 2.0
+
+
+def test_random_wrong_links_are_not_believed(joined: Run) -> None:
+    true = joined.world
+    for link in joined.map._graph.links.values():
+        if link.state == "believed":
+            metres, degrees = pose_difference(link.T_a_b, inverse(true.seen[link.a]) @ true.seen[link.b])
+            assert metres < 0.2
+            assert degrees < 10.0
+
+
+def test_a_replay_is_equal_to_the_byte(joined: Run) -> None:
+    again = LiveMap()
+    for event in decode_events(encode_events(joined.log)):
+        again.apply(event)
+
+    assert again.digest() == joined.map.digest()
+    assert again.snapshot() == joined.map.snapshot()
+
+
+@pytest.mark.parametrize("share", [0.6, pytest.param(0.3, marks=pytest.mark.slow)])
+def test_a_snapshot_and_the_events_after_it_give_the_same_map(joined: Run, share: float) -> None:
+    half = int(share * len(joined.log))
+    first = LiveMap()
+    for event in joined.log[:half]:
+        first.apply(event)
+    second = LiveMap.restore(first.snapshot())
+    for event in joined.log[half:]:
+        second.apply(event)
+
+    assert second.digest() == joined.map.digest()
+
+
+def test_another_order_of_events_is_another_map(joined: Run) -> None:
+    one, other = LiveMap(), LiveMap()
+    log = joined.log[:8]
+    for event in log:
+        one.apply(event)
+    for event in [log[2], log[1], log[0], *log[3:]]:
+        other.apply(event)
+
+    assert one.digest() != other.digest()
+
+
+def test_a_damaged_snapshot_is_refused(joined: Run) -> None:
+    with pytest.raises(BadRequest):
+        LiveMap.restore(joined.map.snapshot()[:-100])
+
+
+def test_links_that_do_not_agree_join_nothing() -> None:
+    run, world = _two_apart()
+    rng = np.random.default_rng(3)
+    for k in range(12, 18):
+        off = exp_se3(np.r_[rng.uniform(-2, 2, 3), rng.uniform(-1, 1, 3)])
+        run.apply(LinksMeasured(keyframe=k, links=(measured_link(k - 12, world.step(k, k - 12) @ off),)))
+
+    assert [each.robot for each in run.of(Joined)] == ["a"]
+
+
+def test_links_from_one_keyframe_join_nothing() -> None:
+    run, world = _two_apart()
+    links = tuple(world.true_link(12, other) for other in (0, 1, 2, 3))
+    run.apply(LinksMeasured(keyframe=12, links=links))
+
+    assert run.of(Ambiguous) == []
+    assert [each.robot for each in run.of(Joined)] == ["a"]
+
+
+def test_robots_that_are_joined_already_need_one_link_only() -> None:
+    """Links are judged by component: c is known through b, so one link to a is enough."""
+    world = GeneratedWorld(seed=5, links=0)
+    drives = [world.drive(name, ROUND[:12]) for name in ("a", "b", "c")]
+    run = Run(world)
+    for drive in drives:
+        for number in range(12):
+            run.apply(world.keyframe(drive, number))
+    for k, others in ((12, range(4)), (24, range(12, 16))):
+        for step, other in enumerate(others):
+            run.apply(LinksMeasured(keyframe=k + step, links=(world.true_link(k + step, other),)))
+    believed = run.map.links_believed
+    run.apply(LinksMeasured(keyframe=27, links=(world.true_link(27, 3),)))
+
+    assert len(run.of(Joined)) == 3
+    assert run.map.links_believed == believed + 1
+
+
+def test_planted_links_are_removed_soon_after_contrary_evidence() -> None:
+    run, world = _two_apart()
+    wrong = exp_se3([1.5, 0.3, 0.0, 0.0, 0.4, 0.0])
+    for k in range(12, 16):
+        planted = inverse(world.seen[k]) @ _moved(world, wrong) @ world.seen[k - 12]
+        run.apply(LinksMeasured(keyframe=k, links=(measured_link(k - 12, planted),)))
+    assert [each.robot for each in run.of(Joined)] == ["a", "b"]
+    later = 0
+    while not run.of(LinkRemoved) and later < 20:
+        k = 16 + later
+        links = tuple(world.true_link(k, k - 12 + near) for near in (0, 1))
+        run.apply(LinksMeasured(keyframe=k, links=links))
+        later += 1
+
+    assert later <= 20
+    assert len(run.of(LinkRemoved)) == 4
+    assert run.worst_error(range(len(world.seen)))[0] < 0.1
+
+
+def test_a_segment_that_loses_its_links_is_told(joined: Run) -> None:
+    run = copy_of(joined)
+    told = run.apply(RobotForgotten(robot="a"))
+    aligned = {each.robot: each.aligned for each in run.map.alignments()}
+
+    assert aligned == {"b": True}  # the map's frame stays with what is left of it
+    assert not [each for each in told if isinstance(each, Unaligned)]
+    assert run.map.contributors == ("b",)
+
+
+def test_a_robot_that_drives_between_equal_rooms_proves_them_ambiguous() -> None:
+    world = GeneratedWorld(seed=2, twin_m=6.0, links=2)
+    way = np.column_stack([np.arange(0.0, 7.2, 0.1), np.zeros(72)])
+    run = Run(world).play([world.drive("a", way[:12]), world.drive("c", way), world.drive("b", way[60:])])
+    aligned = {each.robot: each for each in run.map.alignments()}
+
+    assert run.of(Ambiguous)
+    assert not aligned["b"].aligned
+    assert aligned["b"].reason.startswith("ambiguous")
+
+
+def test_a_keyframe_is_new_known_or_ahead() -> None:
+    world = GeneratedWorld(seed=1)
+    drive = world.drive("a", ROUND)
+    live = LiveMap()
+    first, second = world.keyframe(drive, 0), world.keyframe(drive, 1)
+
+    assert (live.judge(first), live.judge(second)) == ("new", "ahead")
+    live.apply(first)
+    assert (live.judge(first), live.judge(second)) == ("known", "new")
+    assert live.next_number("a") == 1
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"T_odom_camera": b"short"},
+        {"T_odom_camera": matrix_bytes(np.full((4, 4), np.nan))},
+        {"T_odom_camera": matrix_bytes(2.0 * np.eye(4))},
+        {"camera": (0.0, 1.0, 0.0, 0.0, 1, 1)},
+        {"features": b"\x00"},
+        {"timestamp_s": float("nan")},
+        {"segment": -1},
+    ],
+)
+def test_garbage_is_refused_before_it_is_logged(change: dict[str, object]) -> None:
+    world = GeneratedWorld(seed=1)
+    good = world.keyframe(world.drive("a", ROUND), 0)
+    live = LiveMap()
+    before = live.digest()
+    fields = {name: getattr(good, name) for name in good.__struct_fields__} | change
+
+    with pytest.raises(BadRequest):
+        live.judge(KeyframeAdded(**fields))
+    assert live.digest() == before
+
+
+def test_links_to_keyframes_that_were_forgotten_change_nothing(joined: Run) -> None:
+    run = copy_of(joined)
+    newest = len(run.world.seen) - 1
+    late = LinksMeasured(keyframe=newest, links=tuple(run.world.true_link(newest, i) for i in (0, 2, 4)))
+    run.apply(RobotForgotten(robot="b"))
+    believed = run.map.links_believed
+
+    measured = len(run.map._graph.links)
+    assert run.apply(late) == []
+    assert len(run.map._graph.links) == measured
+    assert run.apply(LinksMeasured(keyframe=10_000)) == []
+    assert run.map.links_believed == believed
+
+
+def test_a_forgotten_robot_that_drives_on_is_a_new_trajectory(joined: Run) -> None:
+    run = copy_of(joined)
+    number = run.map.next_number("b")
+    run.apply(RobotForgotten(robot="b"))
+    world = run.world
+    drive = world.drive("b", ROUND)
+    added = run.apply(world.keyframe(drive, 0, first=number))
+
+    assert isinstance(added[0], Added)
+    assert run.map.next_number("b") == number + 1
+
+
+def test_a_robot_that_left_has_no_alignment_but_stays_in_the_map(joined: Run) -> None:
+    run = copy_of(joined)
+    keyframes = run.map.keyframes
+    run.apply(RobotLeft(robot="b"))
+
+    assert [each.robot for each in run.map.alignments()] == ["a"]
+    assert run.map.keyframes == keyframes
+    assert run.map.contributors == ("a", "b")
+
+
+def test_an_optimisation_moves_later_keyframes_along(joined: Run) -> None:
+    run = copy_of(joined)
+    found = run.map.optimise()
+    ids, poses = found.ids[:-1], np.frombuffer(found.T_map_camera).reshape(-1, 4, 4)[:-1]
+    shifted = exp_se3([0.0, 0.0, 0.1, 0.0, 0.0, 0.0]) @ poses
+    old = run.map.pose(found.ids[-1])
+    told = run.apply(Optimised(up_to=found.up_to, ids=ids, T_map_camera=matrix_bytes(shifted)))
+
+    assert len([each for each in told if isinstance(each, Corrected)]) == 2
+    assert run.map.pose(found.ids[-1])[2, 3] - old[2, 3] == pytest.approx(0.1, abs=0.03)
+
+
+def test_a_map_goes_on_from_the_version_that_it_became(joined: Run) -> None:
+    run = copy_of(joined)
+    version = run.map.to_version()
+    started = LiveMap()
+    started.apply(started_from(version, "kitchen@1"))
+    newest = len(version.keyframes)
+    world = run.world
+    drive = world.drive("c", ROUND[:8])
+    again = Run(world)
+    again.map = started
+    held = [each.id for each in version.keyframes]
+    offset = len(world.seen)
+    for number in range(8):
+        again.apply(world.keyframe(drive, number))
+        here = world.seen[offset + number]
+        rows = sorted(range(newest), key=lambda row: _apart(world.seen[held[row]], here))[:3]
+        links = tuple(measured_link(row, inverse(here) @ world.seen[held[row]]) for row in rows)
+        again.apply(LinksMeasured(keyframe=newest + number, links=links))
+
+    assert [each.robot for each in again.of(Joined)] == ["c"]
+    assert started.alignment_of("c", 0).aligned
+    assert again.map.to_version().keyframes[0].robot == version.keyframes[0].robot
+
+
+@pytest.mark.slow
+def test_redundant_keyframes_lose_their_features_only() -> None:
+    world = GeneratedWorld(seed=4)
+    run = Run(world).play([world.drive("a", circle(0.3, 5.0))])
+
+    assert run.map.keyframes < 0.8 * len(world.seen)
+    assert run.worst_error(range(len(world.seen)))[0] < 0.05
+
+
+def _two_apart() -> tuple[Run, GeneratedWorld]:
+    """Return a map of two robots, 12 and 36 keyframes, without any link."""
+    world = GeneratedWorld(seed=5, links=0, drift_m=0.001, drift_deg=0.05)
+    run = Run(world)
+    a, b = world.drive("a", ROUND[:12]), world.drive("b", ROUND[:36])
+    for number in range(12):
+        run.apply(world.keyframe(a, number))
+    for number in range(36):
+        run.apply(world.keyframe(b, number))
+    return run, world
+
+
+def _moved(world: GeneratedWorld, off: Array) -> Array:
+    """Return the motion of the world that is *off* in the frame of its first keyframe."""
+    moved: Array = world.seen[0] @ off @ inverse(world.seen[0])
+    return moved
+
+
+def _apart(one: Array, other: Array) -> float:
+    metres, degrees = pose_difference(one, other)
+    return metres + 0.02 * degrees

@@ -1,0 +1,86 @@
+"""The smoother finds true poses from noisy edges, some of which are wrong, and holds what it must hold."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from rse_pf.geometry import Array, exp_se3
+from rse_pf.live_map.smoother import SmoothedPoses, exp_se3_many, log_se3_many, smooth
+from rse_pf.services.mapping.optimise import OptimiseOptions, optimise_graph
+from rse_pf.services.mapping.pose_graph import PoseGraph, inverses, log_se3
+
+FREE = 12
+
+
+def problem(seed: int) -> tuple[Array, Array, PoseGraph]:
+    """Return true poses, a start, and a graph: the last pose is to be held, and one loop is wrong."""
+    rng = np.random.default_rng(seed)
+    step = exp_se3([0.25, 0.0, 0.0, 0.0, 0.0, 0.3])
+    true = [np.eye(4)]
+    for _ in range(FREE):
+        true.append(true[-1] @ step)
+    T = np.array(true)
+    pairs = [(i, i + 1) for i in range(FREE)] + [(i, j) for i in range(0, FREE, 2) for j in (FREE, FREE - 3)]
+    pairs = [(i, j) for i, j in pairs if i < j]
+    a, b = np.array(pairs).T
+    measured = inverses(T[a]) @ T[b] @ exp_se3_many(0.004 * rng.normal(size=(len(a), 6)))
+    measured[-1] = measured[-1] @ exp_se3([1.0, -0.7, 0.4, 0.3, 0.0, 0.5])
+    start = T @ exp_se3_many(0.03 * rng.normal(size=(FREE + 1, 6)))
+    start[-1] = T[-1]
+    graph = PoseGraph(
+        T_world_pose=start, a=a, b=b, T_a_b=measured,
+        information=np.tile(np.eye(6) / 0.004**2, (len(a), 1, 1)),
+        robust=np.arange(len(a)) >= FREE, ids=np.arange(FREE + 1),
+    )  # fmt: skip
+    return T, start, graph
+
+
+def fit(graph: PoseGraph, start: Array) -> SmoothedPoses:
+    return smooth(
+        start, FREE, graph.a, graph.b, graph.T_a_b, graph.information, graph.robust, cauchy=3.0
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_a_wrong_link_does_not_move_the_poses(seed: int) -> None:
+    true, start, graph = problem(seed)
+
+    off = log_se3(inverses(true) @ fit(graph, start).T)
+
+    assert np.abs(off).max() < 0.03
+
+
+def test_poses_that_are_held_stay_to_the_byte() -> None:
+    _, start, graph = problem(1)
+
+    assert fit(graph, start).T[FREE:].tobytes() == start[FREE:].tobytes()
+
+
+def test_it_finds_what_the_optimiser_of_whole_graphs_finds() -> None:
+    pytest.importorskip("gtsam")
+    _, start, graph = problem(4)
+    ours = fit(graph, start).T
+
+    # Which holds the first pose, so the frames of both differ.
+    theirs = optimise_graph(graph, OptimiseOptions(cauchy=3.0)).T_world_pose
+    theirs = ours[-1] @ np.linalg.inv(theirs[-1]) @ theirs
+
+    assert np.abs(log_se3(inverses(theirs) @ ours)).max() < 1e-3
+
+
+def test_the_same_problem_has_the_same_bytes() -> None:
+    _, start, graph = problem(5)
+
+    assert fit(graph, start).T.tobytes() == fit(graph, start.copy()).T.tobytes()
+
+
+def test_exponential_and_logarithm_undo_each_other() -> None:
+    rng = np.random.default_rng(6)
+    xi = rng.normal(size=(200, 6)) * np.repeat([1e-9, 1e-4, 0.3, 0.9], 50)[:, None]
+
+    T = exp_se3_many(xi)
+
+    np.testing.assert_allclose(T[0], exp_se3(xi[0]), atol=1e-12)
+    np.testing.assert_allclose(T[199], exp_se3(xi[199]), atol=1e-12)
+    np.testing.assert_allclose(log_se3_many(T), xi, atol=1e-9)
