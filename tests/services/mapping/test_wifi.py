@@ -45,6 +45,7 @@ def located(building: Building, locator: Locator, scans: int, seed: int) -> tupl
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(400)
 def test_sixty_eight_in_a_hundred_lie_inside_the_stated_radius() -> None:
     inside = []
     for seed in range(4):
