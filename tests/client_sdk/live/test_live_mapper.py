@@ -264,7 +264,7 @@ def test_a_busy_map_is_asked_again_and_a_refused_keyframe_leaves_no_gap() -> Non
             await drive(mapper, range(1, 9))
             await robot.until(lambda: mapper.keyframes_waiting == 0)
 
-            assert [each.number for each in robot.kept] == [0, 1]
+            assert [(each.number, each.segment) for each in robot.kept] == [(0, 0), (1, 0)]
             assert [each.timestamp_s for each in robot.kept] == [0.0, 0.8]
             assert mapper.report()["live"]["keyframes_refused"] == 1
 

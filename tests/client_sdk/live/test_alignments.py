@@ -1,0 +1,61 @@
+"""What a robot knows of a live map, update by update."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from client_sdk.live.alignments import Alignments
+from rse_pf.errors import BadMessage
+from rse_pf.geometry import exp_se3
+from rse_pf.wire.live_map import RelocaliseReply
+from tests.client_sdk.live.fake_live_map import alignment
+
+FIRST, SECOND = exp_se3([1.0, 0, 0, 0, 0, 0]), exp_se3([1.1, 0, 0, 0, 0, 0])
+
+
+@pytest.fixture
+def known() -> Alignments:
+    alignments = Alignments()
+    alignments.know_myself("me", 3)
+    return alignments
+
+
+def test_only_a_change_of_the_alignment_is_a_correction(known: Alignments) -> None:
+    first = known.updated("alignment/me", alignment("me", FIRST, segment=3))
+    again = known.updated("alignment/me", alignment("me", FIRST, segment=3))
+    second = known.updated("alignment/me", alignment("me", SECOND, segment=3))
+    lost = known.updated("alignment/me", alignment("me", None, segment=3, reason="a link was removed"))
+
+    assert first is not None
+    assert again is None
+    assert second is not None
+    np.testing.assert_array_equal(second.before, FIRST)
+    np.testing.assert_array_equal(second.after, SECOND)
+    assert lost is not None
+    assert lost.after is None
+    assert known.of(0).reason == "a link was removed"
+
+
+def test_a_relocalisation_never_replaces_what_the_map_found(known: Alignments) -> None:
+    known.updated("alignment/me", alignment("me", FIRST, segment=3))
+
+    late = known.relocalised(0, np.eye(4), RelocaliseReply(verdict="ok", T_map_camera=SECOND.ravel()))
+
+    assert late is None
+    np.testing.assert_array_equal(known.of(0).T_map_odom, FIRST)
+
+
+def test_segments_of_an_earlier_run_and_of_others_are_not_mine(known: Alignments) -> None:
+    assert known.updated("alignment/me", alignment("me", FIRST, segment=2)) is None
+    assert known.updated("alignment/other", alignment("other", FIRST, segment=3)) is None
+    assert known.of(0).by == "nothing"
+
+
+def test_a_damaged_pose_changes_nothing(known: Alignments) -> None:
+    damaged = {**alignment("me", FIRST, segment=3), "T_map_odom": [1.0, 2.0]}
+
+    with pytest.raises(BadMessage, match="16 finite numbers"):
+        known.updated("alignment/me", damaged)
+
+    assert known.of(0).by == "nothing"
