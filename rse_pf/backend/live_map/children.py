@@ -55,6 +55,11 @@ class OwnerChild:
         """Of the process."""
         return self._process.pid
 
+    @property
+    def is_ready(self) -> bool:
+        """Whether it has imported all that it needs."""
+        return self._ready.done()
+
     async def claim(self, order: OwnerOrder) -> bool:
         """Let it claim a map; return whether it serves it now."""
         if not await asyncio.shield(self._ready):

@@ -217,7 +217,13 @@ class MapLink:
             tenant=self.tenant, map_name=self.map_name, server=self._context.server_id, known=self._watch.data
         )
         self.child = child
-        if not await child.claim(order):
+        silent_s, began_s, was_ready = self._watch.unchanged_s, self._context.clock(), child.is_ready
+        has_won = await child.claim(order)
+        self._context.log.info(
+            "live-map-claimed", map=self.map_name, tenant=self.tenant, has_won=has_won, was_ready=was_ready,
+            silent_s=round(silent_s, 3), seconds=round(self._context.clock() - began_s, 3),
+        )  # fmt: skip
+        if not has_won:
             child.kill()
 
     def _note_end(self, child: OwnerChild, code: int) -> None:

@@ -55,7 +55,7 @@ from rse_pf.live_map.outcomes import (
 )
 from rse_pf.maps.registry import MapRecord, MapRegistry
 
-__all__ = ["LiveOwner", "MapMoves", "OwnerContext"]
+__all__ = ["LiveOwner", "OwnerContext"]
 
 _MAX_ENTRY_EVENTS, _MAX_ENTRY_BYTES = 64, 4 << 20
 _MAX_WAITING_EVENTS = 1024
@@ -67,15 +67,6 @@ _SETTLED_S = 5.0
 _BUSY_RETRY_MS = 200.0
 _WAITING = "waiting for the store"
 _ALIGNING = (Joined, Corrected, Unaligned, Ambiguous, LinkRemoved)
-
-
-class MapMoves(Busy):
-    """The map is being given up: the worker sends the request to the next owner.
-
-    Cause: The server of the owner drains, or was paused.
-    Check: rse-pf map live list: which server owns the map.
-    Fix: Nothing; the worker repeats the request.
-    """
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -589,8 +580,8 @@ class LiveOwner:
         """Return the name under which the robot with this `RobotId.folder` is shown."""
         return self._names.get(folder) or requests.shown_name(folder)
 
-    def _moving(self) -> MapMoves:
-        return MapMoves(
+    def _moving(self) -> requests.MapMoves:
+        return requests.MapMoves(
             "the live map moves to another server", hint="try again", retry_after_ms=_BUSY_RETRY_MS
         )
 

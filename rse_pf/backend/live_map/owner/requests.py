@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 
 import msgspec
 
-from rse_pf.errors import BadRequest, message_of
+from rse_pf.errors import BadRequest, Busy, message_of
 from rse_pf.geometry import Camera
 from rse_pf.identity import RobotId
 from rse_pf.live_map.events import CameraNumbers, KeyframeAdded
@@ -25,6 +25,7 @@ __all__ = [
     "START",
     "STOP",
     "ForgetRequest",
+    "MapMoves",
     "RelocaliseRequest",
     "StartRequest",
     "begins_a_map",
@@ -39,6 +40,15 @@ KEYFRAME, RELOCALISE, LEAVE, SHOW = "live-keyframe", "live-relocalise", "live-le
 PUBLISH, STOP, FORGET, START = "live-publish", "live-stop", "live-forget", "live-start"
 
 _T = TypeVar("_T")
+
+
+class MapMoves(Busy):
+    """The map is being given up: the worker sends the request to the next owner.
+
+    Cause: The server of the owner drains, or was paused.
+    Check: rse-pf map live list: which server owns the map.
+    Fix: Nothing; the worker repeats the request.
+    """
 
 
 class _KeyframeRequest(msgspec.Struct, frozen=True, kw_only=True):
