@@ -17,7 +17,7 @@ from rse_pf.geometry import Array, exp_se3, inverse
 from rse_pf.live_map.events import KeyframeAdded, LinksMeasured, MeasuredLink, matrix_bytes
 from rse_pf.live_map.keyframe_code import encode_features
 
-__all__ = ["GeneratedDrive", "GeneratedWorld", "measured_link"]
+__all__ = ["GeneratedDrive", "GeneratedWorld", "circle", "meander", "measured_link", "straight"]
 
 CAMERA = (525.0, 525.0, 319.5, 239.5, 640, 480)
 STEP_M = 0.1
@@ -56,6 +56,7 @@ class GeneratedWorld:
         self.rng = np.random.default_rng(self.seed)
         descriptors = self.rng.integers(0, 256, (self.features, 32), dtype=np.uint8)
         self._descriptors = descriptors
+        self.wrong_sent = 0
 
     def drive(self, robot: str, positions: Array, segment: int = 0) -> GeneratedDrive:
         """Return a robot's drive through ``(n, 2)`` positions, looking where it goes."""
@@ -99,6 +100,7 @@ class GeneratedWorld:
                 links += self._links_to_twin(keyframe, poses, shift)
             if self.rng.uniform() < wrong:
                 other = int(self.rng.integers(0, keyframe))
+                self.wrong_sent += 1
                 off = exp_se3(np.r_[self.rng.uniform(-3, 3, 3), self.rng.uniform(-1.5, 1.5, 3)])
                 links.append(measured_link(other, self.step(keyframe, other) @ off))
         return LinksMeasured(keyframe=keyframe, links=tuple(links))
@@ -150,6 +152,12 @@ def circle(radius_m: float, rounds: float, phase: float = 0.0, x: float = 0.0, y
     count = int(2 * math.pi * radius_m * rounds / STEP_M)
     angles = phase + np.arange(count) * STEP_M / radius_m
     return np.column_stack([x + radius_m * np.cos(angles), y + radius_m * np.sin(angles)])
+
+
+def straight(begin_m: float, end_m: float) -> Array:
+    """Return ``(n, 2)`` positions, a step apart, along x."""
+    x = np.arange(begin_m, end_m, STEP_M)
+    return np.column_stack([x, np.zeros(len(x))])
 
 
 def meander(length_m: float, rows: int, apart_m: float = 3.0, x: float = 0.0) -> Array:

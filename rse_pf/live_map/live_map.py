@@ -107,6 +107,16 @@ class LiveMap:
         return len(self._graph.links) - len(self._graph.open)
 
     @property
+    def links_open(self) -> int:
+        """The number of measured links that are not believed, the newest of them."""
+        return len(self._graph.open)
+
+    def believed(self) -> list[tuple[int, int, Array]]:
+        """Return the believed links as keyframes a, b and the measured ``T_a_b``."""
+        links = self._graph.links.values()
+        return [(link.a, link.b, link.T_a_b) for link in links if link.state == "believed"]
+
+    @property
     def events(self) -> int:
         """The number of events that were applied."""
         return self._graph.events

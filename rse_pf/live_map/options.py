@@ -49,7 +49,7 @@ class LiveMapOptions:
     links_of_keyframe: int = 4
     spacing_m: float = 0.25
     spacing_deg: float = 15.0
-    drift: OdometryNoise = field(default_factory=lambda: OdometryNoise(step_m=0.007, step_deg=0.5))
+    drift: OdometryNoise = field(default_factory=lambda: OdometryNoise(step_m=0.007, step_deg=0.35))
     judged: OdometryNoise = field(default_factory=OdometryNoise)
     cauchy: float = 3.0
     windows: tuple[int, ...] = (20, 50, 120)
@@ -60,8 +60,8 @@ class LiveMapOptions:
     doubts: int = 8
     open_links: int = 400
     measured: MeasureOptions = field(default_factory=lambda: MeasureOptions(min_inliers=30))
-    candidates: int = 10
-    apart_steps: float = 1.5
+    candidates: int = 12
+    apart_steps: float = 0.8
     same_place_m: float = 0.12
     same_place_deg: float = 8.0
     same_place_most: int = 2
