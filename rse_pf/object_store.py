@@ -386,11 +386,7 @@ class DirectoryStore:
                     path.parent.rmdir()
 
     def compare_and_swap(self, name: str, expected: bytes | None, data: bytes) -> None:
-        """Replace the object if it still holds *expected*; a lock file excludes other writers.
-
-        The lock is held for a comparison and a rename, not while the disk writes: a process that is paused
-        hardly ever holds it.
-        """
+        """Replace the object if it still holds *expected*; a lock file excludes other writers."""
 
         def check() -> None:
             try:
@@ -402,10 +398,9 @@ class DirectoryStore:
 
         def swap(path: Path) -> None:
             check()
-            with (
-                _temporary(path, [data]) as temporary,
-                _locked(path.with_name(f"{_LOCK}{path.name}")),
-            ):
+            lock = path.with_name(f"{_LOCK}{path.name}")
+            # Written before it is locked: a process that is paused hardly ever holds the lock then.
+            with _temporary(path, [data]) as temporary, _locked(lock):
                 check()
                 os.replace(temporary, path)
             sync_folder(path.parent)

@@ -14,7 +14,7 @@ from rse_pf.backend.sandbox.ipc import FrameReader
 __all__ = ["ChildProcess", "OwnerChild", "OwnerChildren"]
 
 _READ_BYTES = 1 << 16
-_NEXT_SPARE_S = 10.0
+_NEXT_SPARE_S = 3.0
 """After a process was taken the next one is prepared so much later: a takeover needs the processors."""
 
 

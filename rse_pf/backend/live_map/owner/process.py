@@ -54,7 +54,6 @@ MAP_KIND = "rse_pf.backend.live_map.owner.map_kind:LIVE_MAP"
 _ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
 _READ_BYTES = 1 << 16
 _RETRY_S = 0.1
-_ANYWHERE = ("0.0.0.0", "::")
 _OUTSIDE = ("192.0.2.1", 9)
 """An address of documentation: nothing is sent there, but the route to it names the main interface."""
 _T = TypeVar("_T")
