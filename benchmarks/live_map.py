@@ -288,7 +288,7 @@ def growth(keyframes: int) -> None:
         memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
         print(
             f"{what}, {len(world.seen)} keyframes, {live_map.keyframes} kept: p50 {np.median(late):.1f} ms, "
-            f"{ratios[0]:.2f} times that of the tenth before; p95 {np.percentile(late, 95):.1f} ms, "
+            f"{ratios[0]:.2f} times that at a tenth of the map; p95 {np.percentile(late, 95):.1f} ms, "
             f"{ratios[1]:.2f} times; {memory:.2f} GiB in all"
         )
 
