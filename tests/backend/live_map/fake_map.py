@@ -64,9 +64,7 @@ class FakeMap:
     def apply(self, event: Event) -> list[Outcome]:
         if isinstance(event, KeyframeAdded) and event.features == b"defect":
             raise ZeroDivisionError
-        self._state["digest"] = hashlib.sha256(
-            self.digest().encode() + encode_events([event])
-        ).hexdigest()
+        self._state["digest"] = hashlib.sha256(self.digest().encode() + encode_events([event])).hexdigest()
         if isinstance(event, KeyframeAdded):
             self._state["keyframes"].append([event.robot, event.number, event.timestamp_s])
             self._state["numbers"][event.robot] = event.number + 1
@@ -77,9 +75,7 @@ class FakeMap:
             T = np.eye(4)
             T[0, 3] = len(self._state["keyframes"])
             return [
-                Corrected(
-                    robot=robot, segment=0, T_map_odom=T, covariance=np.eye(6), cause=(robot, number)
-                )
+                Corrected(robot=robot, segment=0, T_map_odom=T, covariance=np.eye(6), cause=(robot, number))
             ]
         if isinstance(event, MapStarted):
             self._state["keyframes"] += [[each.robot, -1, 0.0] for each in event.keyframes]
