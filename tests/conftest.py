@@ -14,8 +14,8 @@ from hypothesis import settings
 settings.register_profile("rse-pf", deadline=None)  # a crowded machine is no defect
 settings.load_profile("rse-pf")
 
-# moto makes 1,300 images, which no test looks at, for each of its EC2 regions: most of a second each time.
-os.environ.setdefault("MOTO_EC2_LOAD_DEFAULT_AMIS", "false")
+# moto makes 1,300 images for each of its EC2 regions, most of a second each time: one is enough.
+os.environ.setdefault("MOTO_AMIS_PATH", str(Path(__file__).parent / "aws" / "images.json"))
 
 # Programs that tests start and interrupt would ignore SIGINT, as they inherit it of a shell's background job.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:

@@ -107,7 +107,6 @@ def created(assembly: Assembly, monkeypatch: pytest.MonkeyPatch) -> Iterator[Cre
     for name in ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY", "AWS_SESSION_TOKEN"):
         monkeypatch.setenv(name, "testing")
     monkeypatch.setenv("AWS_DEFAULT_REGION", REGION)
-    monkeypatch.setenv("MOTO_EC2_LOAD_DEFAULT_AMIS", "true")  # servers start from one of them
     monkeypatch.delenv("AWS_PROFILE", raising=False)
     with moto.mock_aws(config={"lambda": {"use_docker": False}}):
         account = boto3.client("sts", region_name=REGION).get_caller_identity()["Account"]
