@@ -52,6 +52,7 @@ NO_SECRETS: Mapping[tuple[str, str], str] = {
     ("rse_pf/config/renamed.json", "Secret Keyword"): "the name of a module",
     ("tests/renamed.json", "Secret Keyword"): "the name of a test",
     ("tests/test_identity.py", "Base64 High Entropy String"): "the example of RFC 8037",
+    ("tests/live_map/test_place_index.py", "Hex High Entropy String"): "the digest of a vector",
     (
         "examples/robots/object_recognition_service/requests/photo.json",
         "Base64 High Entropy String",
