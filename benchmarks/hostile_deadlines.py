@@ -112,7 +112,7 @@ async def deadlines(folder: Path, seconds: float, *, row: str, payload_of: Calla
             for i in range(len(OTHERS))
         ]
         async with robot_of(server, "hostile", "robot-0") as robot:
-            await asyncio.sleep(attack_s - time.perf_counter())
+            await asyncio.sleep(attack_s - time.perf_counter())  # the others alone, to compare with
             number = 1000
             while time.perf_counter() < end_s:
                 number += 1

@@ -39,7 +39,7 @@ class FrontEndCore:
     ) -> None:
         self._describe = describe
         self._points_at = points_at
-        self._matcher = matcher
+        self.matches = matcher.matches
         self._workspace = Workspace()
 
     def describe(
@@ -125,22 +125,6 @@ class FrontEndCore:
             address_of(points_camera),
         )  # fmt: skip
         return None if done < 0 else points_camera
-
-    def matches(
-        self,
-        reference: npt.NDArray[np.uint8],
-        points_camera: Array,
-        descriptors: npt.NDArray[np.uint8],
-        pixels: Array,
-        frame_points: Array,
-        *,
-        ratio: float,
-        max_matches: int,
-    ) -> tuple[Array, Array, Array] | None:
-        """Match the points of a reference view to the pixels of a frame, as `MatchCore.matches` does."""
-        return self._matcher.matches(
-            reference, points_camera, descriptors, pixels, frame_points, ratio=ratio, max_matches=max_matches
-        )
 
 
 def _is(array: npt.NDArray[Any], kind: type, dimensions: int) -> bool:
