@@ -1,0 +1,183 @@
+"""What is in a recording: the names of channels, encodings, schemas and files, and how they are read back.
+
+A recording is one or more MCAP files.  Nothing here reads or writes one.
+
+Source:
+    MCAP specification, version 0 (mcap.dev/spec); Foxglove's message schemas (docs.foxglove.dev).
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from datetime import datetime, timezone
+from typing import Any, Final, Literal, NamedTuple
+
+import msgspec
+
+__all__ = [
+    "EVENTS_TOPIC", "EVENT_SCHEMA", "FORMAT_VERSION", "FRAMES_PREFIX", "IMAGE_SCHEMA", "JSON_ENCODING",
+    "JSON_SCHEMA_ENCODING", "LIBRARY", "MAP_TOPIC", "METADATA_NAME", "ODOMETRY_PREFIX", "ODOMETRY_SCHEMA",
+    "POINTS_SCHEMA", "POSES_PREFIX", "POSE_SCHEMA", "PROFILE", "SAMPLES_TOPIC", "SAMPLE_SCHEMA", "SCHEMAS",
+    "SUFFIX", "WIRE_ENCODING", "Direction", "FileName", "WireChannel", "encode_json", "wire_channel",
+    "wire_metadata", "wire_topic",
+]  # fmt: skip
+
+PROFILE: Final = "rse-pf"
+"""Profile of every file, in its header."""
+LIBRARY: Final = "rse-pf"
+"""The library in the header; a space and the version follow."""
+FORMAT_VERSION: Final = 1
+"""Version of what this module describes; a reader refuses newer ones."""
+METADATA_NAME: Final = "rse_pf"
+"""Name of the metadata record at the start of every file; all its values are texts."""
+SUFFIX: Final = ".mcap"
+
+WIRE_ENCODING: Final = "rse-pf-wire"
+"""Message encoding of channels that hold messages as they were on the wire, before they were decoded."""
+JSON_ENCODING: Final = "json"
+JSON_SCHEMA_ENCODING: Final = "jsonschema"
+
+EVENTS_TOPIC: Final = "/platform/events"
+SAMPLES_TOPIC: Final = "/platform/samples"
+POSES_PREFIX: Final = "/poses/"
+FRAMES_PREFIX: Final = "/frames/"
+ODOMETRY_PREFIX: Final = "/odometry/"
+MAP_TOPIC: Final = "/map"
+
+EVENT_SCHEMA: Final = "rse_pf.Event"
+SAMPLE_SCHEMA: Final = "rse_pf.Sample"
+ODOMETRY_SCHEMA: Final = "rse_pf.Odometry"
+POSE_SCHEMA: Final = "foxglove.PoseInFrame"
+POINTS_SCHEMA: Final = "foxglove.PointCloud"
+IMAGE_SCHEMA: Final = "foxglove.CompressedImage"
+
+Direction = Literal["up", "down"]
+"""``up``: from the robot to the server."""
+
+_WIRE_TOPIC = re.compile(r"/wire/([0-9a-f]{16})/(up|down)")
+_FILE_NAME = re.compile(r"(\d{8}T\d{6}Z)-(.+)-(\d{4,})")
+_NOT_FOR_A_FILE = re.compile(r"[^A-Za-z0-9_.-]")
+_MAX_SERVER_LETTERS = 64
+_TIME_FORMAT = "%Y%m%dT%H%M%SZ"
+
+
+class WireChannel(NamedTuple):
+    """One connection in one direction, as its channel names them.
+
+    Attributes:
+        connection: 16 hex digits, random, the same for both directions.
+        direction: ``up`` or ``down``.
+        codec: ``zlib``, ``json`` or ``bin``.
+        server: Identifier of the server; "" where it is not known.
+        robot: Pseudonym ``robot-XXXXXXXX``, the same for all connections of a robot in one recording.
+        tenant: Pseudonym ``tenant-XXXXXXXX``.
+    """
+
+    connection: str
+    direction: Direction
+    codec: str
+    server: str
+    robot: str
+    tenant: str
+
+
+class FileName(NamedTuple):
+    """The name of a recording's file: when its recorder started, of which server it is, and its number."""
+
+    started: datetime
+    server: str
+    number: int
+
+    def __str__(self) -> str:
+        """Return the name with its suffix, ``START-SERVER-NNNN.mcap``, START in UTC."""
+        started = self.started.astimezone(timezone.utc).strftime(_TIME_FORMAT)
+        server = _NOT_FOR_A_FILE.sub("_", self.server)[:_MAX_SERVER_LETTERS] or "_"
+        return f"{started}-{server}-{self.number:04d}{SUFFIX}"
+
+    @classmethod
+    def parse(cls, name: str) -> FileName | None:
+        """Return what *name* says, None if it is no such name."""
+        found = _FILE_NAME.fullmatch(name.removesuffix(SUFFIX)) if name.endswith(SUFFIX) else None
+        if found is None:
+            return None
+        try:
+            started = datetime.strptime(found[1], _TIME_FORMAT).replace(tzinfo=timezone.utc)
+        except ValueError:
+            return None
+        return cls(started, found[2], int(found[3]))
+
+
+def wire_topic(connection: str, direction: Direction) -> str:
+    """Return the topic of one direction of a *connection* (16 hex digits)."""
+    return f"/wire/{connection}/{direction}"
+
+
+def wire_metadata(channel: WireChannel) -> dict[str, str]:
+    """Return the metadata of the channel of a connection; its topic says the rest."""
+    return {
+        "codec": channel.codec,
+        "server": channel.server,
+        "robot": channel.robot,
+        "tenant": channel.tenant,
+    }
+
+
+def wire_channel(topic: str, metadata: dict[str, str]) -> WireChannel | None:
+    """Return which connection a channel with this *topic* and *metadata* holds, None for another channel."""
+    found = _WIRE_TOPIC.fullmatch(topic)
+    if found is None:
+        return None
+    direction: Direction = "up" if found[2] == "up" else "down"
+    codec, server = metadata.get("codec", ""), metadata.get("server", "")
+    robot, tenant = metadata.get("robot", ""), metadata.get("tenant", "")
+    return WireChannel(found[1], direction, codec, server, robot, tenant)
+
+
+def _schema(title: str, **properties: Any) -> bytes:
+    """Return a JSON schema of an object."""
+    return json.dumps({"title": title, "type": "object", "properties": properties}).encode()
+
+
+def _object(**properties: Any) -> dict[str, Any]:
+    return {"type": "object", "properties": properties}
+
+
+_NUMBER: Final = {"type": "number"}
+_INTEGER: Final = {"type": "integer"}
+_TEXT: Final = {"type": "string"}
+_BYTES: Final = {"type": "string", "contentEncoding": "base64"}
+_TIME: Final = _object(sec=_INTEGER, nsec=_INTEGER)
+_POSE: Final = _object(
+    position=_object(x=_NUMBER, y=_NUMBER, z=_NUMBER),
+    orientation=_object(x=_NUMBER, y=_NUMBER, z=_NUMBER, w=_NUMBER),
+)
+_FIELD: Final = _object(name=_TEXT, offset=_INTEGER, type=_INTEGER)
+
+SCHEMAS: Final[dict[str, bytes]] = {
+    EVENT_SCHEMA: _schema(EVENT_SCHEMA, time_s=_NUMBER, kind=_TEXT),
+    SAMPLE_SCHEMA: _schema(SAMPLE_SCHEMA, time_s=_NUMBER),
+    ODOMETRY_SCHEMA: _schema(
+        ODOMETRY_SCHEMA,
+        number=_INTEGER,
+        timestamp_s=_NUMBER,
+        T_odom_camera={"type": "array", "items": _NUMBER, "minItems": 16, "maxItems": 16},
+    ),
+    POSE_SCHEMA: _schema(POSE_SCHEMA, timestamp=_TIME, frame_id=_TEXT, pose=_POSE),
+    POINTS_SCHEMA: _schema(
+        POINTS_SCHEMA,
+        timestamp=_TIME,
+        frame_id=_TEXT,
+        pose=_POSE,
+        point_stride=_INTEGER,
+        fields={"type": "array", "items": _FIELD},
+        data=_BYTES,
+    ),
+    IMAGE_SCHEMA: _schema(IMAGE_SCHEMA, timestamp=_TIME, frame_id=_TEXT, data=_BYTES, format=_TEXT),
+}
+"""The JSON schemas of all channels that hold JSON, by name."""
+
+
+def encode_json(value: Any) -> bytes:
+    """Return *value* as the data of a message of a JSON channel."""
+    return msgspec.json.encode(value)
