@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import hashlib
 import math
+from collections.abc import Callable
 from typing import Literal
 
 import numpy as np
@@ -51,6 +52,7 @@ __all__ = ["LiveMap"]
 
 _MAX_M, _MAX_TIME_S = 1e6, 1e12
 _MAX_SEGMENT = 2**31
+_Stored = tuple[int, bytes, Camera]
 
 
 class LiveMap:
@@ -188,11 +190,17 @@ class LiveMap:
 
     def measure(self, keyframe: int) -> LinksMeasured:
         """Compare a keyframe with others that may show the same place; changes nothing."""
-        graph = self._graph
-        if graph.keyframes[keyframe].features is None:
-            return LinksMeasured(keyframe=keyframe)
-        others = [self._view(i) for i in self._candidates(keyframe)]
-        return measure_links(self._view(keyframe), others, self.options.measured)
+        return self.measuring(keyframe)()
+
+    def measuring(self, keyframe: int) -> Callable[[], LinksMeasured]:
+        """Return what does the work of `measure`; another thread may call it while the map changes."""
+        stored = self._stored(keyframe)
+        if stored is None:
+            return lambda: LinksMeasured(keyframe=keyframe)
+        found = [self._stored(i) for i in self._candidates(keyframe)]
+        others = [each for each in found if each is not None]
+        measured = self.options.measured
+        return lambda: measure_links(_decoded(stored), [_decoded(each) for each in others], measured)
 
     def optimise(self) -> Optimised:
         """Fit the whole graph to all links; changes nothing.
@@ -200,12 +208,20 @@ class LiveMap:
         Raises:
             MissingExtra: gtsam is not installed.
         """
+        return self.optimising()()
+
+    def optimising(self) -> Callable[[], Optimised]:
+        """Return what does the work of `optimise`; another thread may call it while the map changes."""
         graph, ids = whole_graph(self._graph, self.options)
-        found = optimise_graph(graph, OptimiseOptions(cauchy=self.options.cauchy))
-        poses = found.T_world_pose
-        anchor = ids.index(self._anchor(self._graph.root))
-        poses = graph.T_world_pose[anchor] @ inverse(poses[anchor]) @ poses
-        return Optimised(up_to=self._graph.events, ids=tuple(ids), T_map_camera=matrix_bytes(poses))
+        anchor, up_to = ids.index(self._anchor(self._graph.root)), self._graph.events
+        options = OptimiseOptions(cauchy=self.options.cauchy)
+
+        def fit() -> Optimised:
+            poses = optimise_graph(graph, options).T_world_pose
+            poses = graph.T_world_pose[anchor] @ inverse(poses[anchor]) @ poses
+            return Optimised(up_to=up_to, ids=tuple(ids), T_map_camera=matrix_bytes(poses))
+
+        return fit
 
     def relocalise(self, camera: Camera, features: bytes) -> Relocalised:
         """Find the place of a view in the map; changes nothing.
@@ -479,9 +495,14 @@ class LiveMap:
         return sorted(i for i, _ in found_here + found_there)
 
     def _view(self, i: int) -> tuple[int, KeyframeFeatures, Camera]:
-        keyframe, camera = self._graph.keyframes[i], self._graph.camera(i)
-        assert keyframe.features is not None
-        return i, decode_features(keyframe.features, camera), camera
+        stored = self._stored(i)
+        assert stored is not None
+        return _decoded(stored)
+
+    def _stored(self, i: int) -> _Stored | None:
+        """Return the features of a keyframe as they are kept, None if they are not."""
+        features = self._graph.keyframes[i].features
+        return None if features is None else (i, features, self._graph.camera(i))
 
     def _exists(self, i: int) -> bool:
         return 0 <= i < len(self._graph) and bool(self._graph.of_segment[i] >= 0)
@@ -515,6 +536,11 @@ class LiveMap:
             robot=segment.robot, segment=segment.segment, aligned=aligned, reason=segment.reason,
             T_map_odom=segment.told, covariance=segment.covariance if aligned else None,
         )  # fmt: skip
+
+
+def _decoded(stored: _Stored) -> tuple[int, KeyframeFeatures, Camera]:
+    number, features, camera = stored
+    return number, decode_features(features, camera), camera
 
 
 def _differs(old: Array, new: Array, options: LiveMapOptions) -> bool:
