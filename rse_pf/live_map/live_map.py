@@ -229,14 +229,23 @@ class LiveMap:
         Raises:
             BadRequest: The features are malformed.
         """
+        return self.relocalising(camera, features)()
+
+    def relocalising(self, camera: Camera, features: bytes) -> Callable[[], Relocalised]:
+        """Return what does the work of `relocalise`; another thread may call it while the map changes.
+
+        Raises:
+            BadRequest: The features are malformed.
+        """
         decoded = decode_features(features, camera)
         graph = self._graph
         aligned = np.flatnonzero(graph.held & self._aligned_mask())
         most = self.options.candidates
         # More are looked at, so that a second place that looks alike is compared, too.
         found = self._places.nearest(LivePlaceIndex.vector(decoded.descriptors), 6 * most, aligned)
-        chosen = spread_candidates(found, graph.T, most)
-        return relocalise([(*self._view(i), graph.T[i].copy()) for i in chosen], decoded, camera)
+        chosen = [(self._stored(i), graph.T[i].copy()) for i in spread_candidates(found, graph.T, most)]
+        views = [(stored, T) for stored, T in chosen if stored is not None]
+        return lambda: relocalise([(*_decoded(each), T) for each, T in views], decoded, camera)
 
     def alignments(self) -> list[Alignment]:
         """Return where the newest segment of each robot lies."""
@@ -493,11 +502,6 @@ class LiveMap:
         found_there = self._places.nearest(vector, most // 2, there)
         found_here = self._places.nearest(vector, most - len(found_there), here)
         return sorted(i for i, _ in found_here + found_there)
-
-    def _view(self, i: int) -> tuple[int, KeyframeFeatures, Camera]:
-        stored = self._stored(i)
-        assert stored is not None
-        return _decoded(stored)
 
     def _stored(self, i: int) -> _Stored | None:
         """Return the features of a keyframe as they are kept, None if they are not."""

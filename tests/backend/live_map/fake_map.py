@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Callable
 from typing import Any, Literal
 
 import msgspec
@@ -86,13 +87,13 @@ class FakeMap:
                 self._state[table].pop(event.robot, None)
         return []
 
-    def measure(self, keyframe: int) -> LinksMeasured:
-        return LinksMeasured(keyframe=keyframe)
+    def measuring(self, keyframe: int) -> Callable[[], LinksMeasured]:
+        return lambda: LinksMeasured(keyframe=keyframe)
 
-    def optimise(self) -> Optimised:
-        return Optimised(up_to=0, ids=(), T_map_camera=b"")
+    def optimising(self) -> Callable[[], Optimised]:
+        return lambda: Optimised(up_to=0, ids=(), T_map_camera=b"")
 
-    def relocalise(self, camera: Camera, features: bytes) -> Any:
+    def relocalising(self, camera: Camera, features: bytes) -> Callable[[], Any]:
         raise BadRequest("the fake map cannot relocalise")
 
     def alignments(self) -> list[Alignment]:

@@ -12,7 +12,7 @@ from rse_pf.backend.live_map.owner.lease import LeaseRecord, OwnerLease, decode_
 from rse_pf.backend.live_map.owner.live_owner import LiveOwner, OwnerContext
 from rse_pf.backend.live_map.owner.log import LiveLog
 from rse_pf.backend.live_map.owner.state import MapState, take_over
-from rse_pf.backend.live_map.owner.threads import Urgency
+from rse_pf.backend.live_map.owner.work.threads import Urgency
 from rse_pf.backend.log import JsonLog
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import NotFound, StoreError
@@ -68,7 +68,7 @@ class InlineThreads:
     async def store(self, act: Callable[[], _T]) -> _T:
         return act()
 
-    lease = background = store
+    look = lease = background = store
 
 
 class FailingStore(MemoryStore):

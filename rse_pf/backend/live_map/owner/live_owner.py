@@ -1,7 +1,7 @@
 """The owner of one live map: the only process that changes it, while it holds the lease.
 
-A keyframe is judged, logged, applied and then acknowledged; what arrives during a write shares the next
-entry.  Its links are measured afterwards and enter the log as events, too.  Nothing is applied before it is
+A keyframe is judged, logged, applied and then acknowledged.  Its links are measured afterwards, while the map
+goes on, and enter the log as events, too.  Nothing is applied before it is
 durable, and nothing is told unless the lease was renewed within ``live.lease_s``: who is paused for longer,
 or finds another's entry in the log, says nothing more and ends.
 """
@@ -11,38 +11,27 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import functools
-from collections import deque
 from collections.abc import Callable, Coroutine
 from dataclasses import dataclass
 from typing import Any
 
 from rse_pf.backend.live_map.owner import requests
 from rse_pf.backend.live_map.owner.lease import OwnerLease
-from rse_pf.backend.live_map.owner.log import LiveLog, MapSnapshot, OwnershipLost
-from rse_pf.backend.live_map.owner.publish import publish_version, version_to_start_from
+from rse_pf.backend.live_map.owner.log import LiveLog, MapSnapshot
+from rse_pf.backend.live_map.owner.publish import version_to_start_from
 from rse_pf.backend.live_map.owner.replies import relocalise_reply, show_reply, version_reply
 from rse_pf.backend.live_map.owner.state import Applied, MapKind, MapState
-from rse_pf.backend.live_map.owner.threads import Threads, Urgency
 from rse_pf.backend.live_map.owner.updates import UpdateBook
+from rse_pf.backend.live_map.owner.work.entries import BUSY_RETRY_MS, EntryWriter, Submitted
+from rse_pf.backend.live_map.owner.work.measuring import Measuring
+from rse_pf.backend.live_map.owner.work.publisher import Publisher
+from rse_pf.backend.live_map.owner.work.threads import Threads, Urgency
+from rse_pf.backend.live_map.owner.work.waits import FIRST_RETRY_S, Sleep, next_retry_s
 from rse_pf.backend.log import JsonLog
 from rse_pf.config import LiveSettings
-from rse_pf.errors import (
-    Busy,
-    Conflict,
-    InternalError,
-    NotFound,
-    RsePfError,
-    StoreError,
-    UnknownService,
-)
+from rse_pf.errors import Conflict, InternalError, NotFound, StoreError, UnknownService
 from rse_pf.identity import RobotId
-from rse_pf.live_map.events import (
-    Event,
-    KeyframeAdded,
-    RobotForgotten,
-    RobotLeft,
-    encode_events,
-)
+from rse_pf.live_map.events import Event, KeyframeAdded, RobotForgotten, RobotLeft
 from rse_pf.live_map.outcomes import (
     Added,
     Ambiguous,
@@ -50,21 +39,14 @@ from rse_pf.live_map.outcomes import (
     Joined,
     LinkRemoved,
     OptimiseWanted,
-    Outcome,
     Unaligned,
 )
-from rse_pf.maps.registry import MapRecord, MapRegistry
+from rse_pf.maps.registry import MapRegistry
 
 __all__ = ["LiveOwner", "OwnerContext"]
 
-_MAX_ENTRY_EVENTS, _MAX_ENTRY_BYTES = 64, 4 << 20
-_MAX_WAITING_EVENTS = 1024
-_FIRST_RETRY_S, _LAST_RETRY_S = 0.05, 1.0
-_SLOW_STORE_S = 1.0
-"""A write that takes longer is told to the robots."""
 _SETTLED_S = 5.0
 """An owner that served for this long did not die of its map."""
-_BUSY_RETRY_MS = 200.0
 _WAITING = "waiting for the store"
 _ALIGNING = (Joined, Corrected, Unaligned, Ambiguous, LinkRemoved)
 
@@ -88,17 +70,10 @@ class OwnerContext:
     maps: MapRegistry
     clock: Callable[[], float]
     wall_clock: Callable[[], float]
-    sleep: Callable[[float], Coroutine[Any, Any, None]]
+    sleep: Sleep
     log: JsonLog
     tell: Callable[[dict[str, Any]], None]
     on_beat: Callable[[int], None]
-
-
-@dataclass(slots=True, eq=False)
-class _Waiting:
-    event: Event
-    size: int
-    done: asyncio.Future[list[Outcome]]
 
 
 class LiveOwner:
@@ -119,19 +94,20 @@ class LiveOwner:
         self._lease = lease
         self._names: dict[str, str] = {}
         self._book = UpdateBook(self._name_of)
-        self._queue: deque[_Waiting] = deque()
-        self._queued = asyncio.Event()
+        self._writer = EntryWriter(
+            log, self, threads=context.threads, sleep=context.sleep, json_log=context.log,
+            name=context.map_name,
+        )  # fmt: skip
+        self._measuring = Measuring(state, context.threads, self._writer.submit)
+        self._publisher = Publisher(
+            state, context.maps, threads=context.threads, wall_clock=context.wall_clock,
+            json_log=context.log, name=context.map_name, author=f"live map on {lease.record.server}",
+        )  # fmt: skip
         self._adding: dict[tuple[str, int], asyncio.Task[None]] = {}
-        self._outstanding: set[asyncio.Future[list[Outcome]]] = set()
-        self._measurable = deque(state.unmeasured)
-        self._measuring = asyncio.Event()
-        self._optimise_wanted = False
         self._present: dict[str, None] = {}
         self._renewed = asyncio.Event()
         self._wrote_snapshot = 0
-        self._published = 0
         self._publish_due_s = context.clock() + (context.settings.publish_s or float("inf"))
-        self._last_record: MapRecord | None = None
         self._untold = False
         self._is_waiting_for_store = self._is_closing = False
         self._idle_since_s = self._began_s = context.clock()
@@ -154,8 +130,7 @@ class LiveOwner:
         alignments = await self._context.threads.compute(Urgency.APPLY, self._state.live_map.alignments)
         self._book.align(alignments, (), self._state.position)
         self._describe()
-        self._measuring.set()
-        for work in (self._write_on(), self._measure_on(), self._keep_lease()):
+        for work in (self._writer.run(), self._measuring.run(), self._keep_lease()):
             self._start(work)
         try:
             return await asyncio.shield(self._ended)
@@ -163,9 +138,7 @@ class LiveOwner:
             for task in self._tasks:
                 task.cancel()
             await asyncio.gather(*self._tasks, return_exceptions=True)
-            for future in list(self._outstanding):
-                if not future.done():
-                    future.set_exception(self._moving())
+            self._writer.refuse_all(self._moving)
 
     async def answer(self, robot: RobotId, operation: str, payload: dict[str, Any]) -> dict[str, Any]:
         """Do what a robot or an operator asks for.
@@ -206,7 +179,9 @@ class LiveOwner:
                     Urgency.ANSWER, functools.partial(self._shown, robot)
                 )
             case requests.PUBLISH:
-                return version_reply(self._context.map_name, await self._publish(f"published by {robot}"))
+                return version_reply(
+                    self._context.map_name, await self._publisher.publish(f"published by {robot}")
+                )
             case requests.STOP:
                 return await self._stop()
             case requests.FORGET:
@@ -234,7 +209,7 @@ class LiveOwner:
             if verdict == "known":
                 return
             if verdict == "new":
-                await asyncio.shield(self._submit(event, len(event.features)))
+                await asyncio.shield(self._writer.submit(event, len(event.features)))
                 return
             before = self._adding.get((event.robot, event.number - 1))
             if before is not None:
@@ -250,19 +225,21 @@ class LiveOwner:
     async def _relocalise(self, payload: dict[str, Any]) -> dict[str, Any]:
         request = requests.to_request(payload, requests.RelocaliseRequest)
         camera = requests.camera_of(request.camera)
-        found = await self._context.threads.compute(
-            Urgency.ANSWER, lambda: self._state.live_map.relocalise(camera, request.features)
+        threads, live_map = self._context.threads, self._state.live_map
+        look = await threads.compute(
+            Urgency.ANSWER, functools.partial(live_map.relocalising, camera, request.features)
         )
-        return relocalise_reply(found, self._state.position)
+        position = self._state.position
+        return relocalise_reply(await threads.look(look), position)
 
     async def _leave(self, robot: RobotId) -> dict[str, Any]:
         if robot.folder in await self._context.threads.compute(
             Urgency.ANSWER, lambda: self._state.live_map.robots
         ):
-            await asyncio.shield(self._submit(RobotLeft(robot=robot.folder)))
+            await asyncio.shield(self._writer.submit(RobotLeft(robot=robot.folder)))
         self._present.pop(robot.folder, None)
         if not self._present:
-            self._start(self._publish_quietly("the last robot left"))
+            self._start(self._publisher.publish_quietly("the last robot left"))
         return {}
 
     async def _forget(self, request: requests.ForgetRequest) -> dict[str, Any]:
@@ -276,7 +253,7 @@ class LiveOwner:
                 f"robot {request.robot[:80]!r} contributed nothing", hint="see rse-pf map live show MAP"
             )
         for folder in folders:
-            await asyncio.shield(self._submit(RobotForgotten(robot=folder)))
+            await asyncio.shield(self._writer.submit(RobotForgotten(robot=folder)))
         return {"forgotten": len(folders), "version": self._state.position}
 
     async def _start_from(self, request: requests.StartRequest) -> dict[str, Any]:
@@ -292,11 +269,11 @@ class LiveOwner:
             event = await self._context.threads.background(
                 lambda: self._context.kind.started_from(version, source)
             )
-            await asyncio.shield(self._submit(event))
+            await asyncio.shield(self._writer.submit(event))
         return {"keyframes": self._state.keyframes, "version": self._state.position}
 
     async def _stop(self) -> dict[str, Any]:
-        record = await self._publish("the live map was stopped") if self._state.keyframes else None
+        record = await self._publisher.publish("the live map was stopped") if self._state.keyframes else None
         await self._close(lambda: self._lease.stop(self._log.position), "stopped")
         with contextlib.suppress(StoreError):  # what is left is ignored, and deleted by the next owner
             await self._context.threads.background(
@@ -317,30 +294,17 @@ class LiveOwner:
 
     # --- the log ------------------------------------------------------------------------------------
 
-    def _submit(self, event: Event, size: int = 0) -> asyncio.Future[list[Outcome]]:
-        """Let *event* enter the log; the future holds its outcomes when it is durable and applied."""
-        if len(self._queue) >= _MAX_WAITING_EVENTS and isinstance(event, KeyframeAdded):
-            raise Busy("the live map cannot store more now", hint="wait", retry_after_ms=_BUSY_RETRY_MS)
-        waiting = _Waiting(event, size, asyncio.get_running_loop().create_future())
-        waiting.done.add_done_callback(lambda done: done.cancelled() or done.exception())
-        self._outstanding.add(waiting.done)
-        waiting.done.add_done_callback(self._outstanding.discard)
-        self._queue.append(waiting)
-        self._queued.set()
-        return waiting.done
-
-    async def _write_on(self) -> None:
-        while True:
-            await self._queued.wait()
-            batch = self._next_batch()
-            if not self._queue:
-                self._queued.clear()
-            events = [each.event for each in batch]
-            position = await self._make_durable(encode_events(events))
-            applied = await self._context.threads.compute(
-                Urgency.APPLY, functools.partial(self._apply, position, events)
-            )
-            self._take_applied(batch, *applied)
+    async def take_entry(self, position: int, batch: list[Submitted]) -> None:
+        """Apply the events of an entry that is durable, answer who waits for them, and tell what is new."""
+        events = [each.event for each in batch]
+        applied, told = await self._context.threads.compute(
+            Urgency.APPLY, functools.partial(self._apply, position, events)
+        )
+        self._settle(batch, applied)
+        for payload in told:
+            self._tell(payload)
+        if applied.snapshot is not None:
+            self._start(self._write_snapshot(applied.snapshot))
 
     def _apply(self, position: int, events: list[Event]) -> tuple[Applied, list[dict[str, Any]]]:
         """Apply an entry and note what to tell; in the thread of the map."""
@@ -358,52 +322,17 @@ class LiveOwner:
             told += self._book.place(event)
         return applied, told
 
-    def _take_applied(self, batch: list[_Waiting], applied: Applied, told: list[dict[str, Any]]) -> None:
+    def _settle(self, batch: list[Submitted], applied: Applied) -> None:
         for each, outcomes, defect in zip(batch, applied.outcomes, applied.defects, strict=True):
             if defect is not None:
                 self._context.log.error("live-map-defect", map=self._context.map_name, error=repr(defect))
                 each.done.set_exception(InternalError("the map failed on this event", hint="report it"))
             elif not each.done.done():
                 each.done.set_result(outcomes)
-            self._optimise_wanted |= any(isinstance(outcome, OptimiseWanted) for outcome in outcomes)
+            if any(isinstance(outcome, OptimiseWanted) for outcome in outcomes):
+                self._measuring.optimise()
             if isinstance(each.event, KeyframeAdded):
-                self._measurable += [outcome.id for outcome in outcomes if isinstance(outcome, Added)]
-        self._measuring.set()
-        for payload in told:
-            self._tell(payload)
-        if applied.snapshot is not None:
-            self._start(self._write_snapshot(applied.snapshot))
-
-    def _next_batch(self) -> list[_Waiting]:
-        batch = [self._queue.popleft()]
-        size = batch[0].size
-        while self._queue and len(batch) < _MAX_ENTRY_EVENTS:
-            size += self._queue[0].size
-            if size > _MAX_ENTRY_BYTES:
-                break
-            batch.append(self._queue.popleft())
-        return batch
-
-    async def _make_durable(self, data: bytes) -> int:
-        """Write the next entry, however long the store fails; the same bytes each time."""
-        wait_s = _FIRST_RETRY_S
-        while True:
-            write = asyncio.ensure_future(self._context.threads.store(lambda: self._log.write(data)))
-            try:
-                await asyncio.wait({write}, timeout=_SLOW_STORE_S)
-                self._note_store(is_waiting=not write.done())
-                position = await write
-            except OwnershipLost as error:
-                self._lose(error.message)
-                await asyncio.Event().wait()
-            except StoreError as error:
-                self._context.log.warning("live-log-retry", map=self._context.map_name, error=error.message)
-                self._note_store(is_waiting=wait_s > _FIRST_RETRY_S)
-                await self._context.sleep(wait_s)
-                wait_s = min(_LAST_RETRY_S, 2 * wait_s)
-            else:
-                self._note_store(is_waiting=False)
-                return position
+                self._measuring.measure(outcome.id for outcome in outcomes if isinstance(outcome, Added))
 
     async def _write_snapshot(self, snapshot: MapSnapshot) -> None:
         try:
@@ -412,58 +341,6 @@ class LiveOwner:
             self._context.log.warning("live-snapshot-failed", map=self._context.map_name, error=error.message)
         else:
             self._wrote_snapshot = snapshot.position
-
-    # --- background work ----------------------------------------------------------------------------
-
-    async def _measure_on(self) -> None:
-        compute, state = self._context.threads.compute, self._state
-        while True:
-            await self._measuring.wait()
-            if self._measurable:
-                keyframe = self._measurable.popleft()
-                self._submit(await compute(Urgency.MEASURE, functools.partial(state.measure, keyframe)))
-            elif self._optimise_wanted:
-                self._optimise_wanted = False
-                with contextlib.suppress(RsePfError):
-                    self._submit(await compute(Urgency.BACKGROUND, state.live_map.optimise))
-            else:
-                self._measuring.clear()
-
-    async def _publish(self, note: str) -> MapRecord:
-        """Publish the map unless its newest version was published already.
-
-        Raises:
-            NotFound: The map is empty.
-        """
-        changes = self._state.changes
-        if self._last_record is not None and changes == self._published:
-            return self._last_record
-        if not self._state.keyframes:
-            raise NotFound(f"the live map {self._context.map_name!r} is empty", hint="drive a robot first")
-        context = self._context
-        version = await context.threads.compute(Urgency.BACKGROUND, self._state.live_map.to_version)
-        record = await context.threads.background(
-            lambda: publish_version(
-                context.maps,
-                context.map_name,
-                version,
-                author=f"live map on {self._lease.record.server}",
-                created_s=context.wall_clock(),
-                note=note,
-            )
-        )
-        self._published, self._last_record = changes, record
-        context.log.info("live-map-published", map=context.map_name, id=record.id, number=record.number)
-        return record
-
-    async def _publish_quietly(self, note: str) -> None:
-        try:
-            if self._state.changes != self._published:
-                await self._publish(note)
-        except NotFound:
-            pass
-        except RsePfError as error:
-            self._context.log.warning("live-publish-failed", map=self._context.map_name, error=error.message)
 
     # --- the lease ----------------------------------------------------------------------------------
 
@@ -477,12 +354,12 @@ class LiveOwner:
                     functools.partial(self._lease.renew, is_settled=is_settled)
                 )
             except StoreError:
-                wait_s = min(wait_s, _FIRST_RETRY_S)
+                wait_s = min(wait_s, FIRST_RETRY_S)
             else:
                 if self._ended.done():
                     return
                 if not is_ours:
-                    self._lose("another process has taken the lease")
+                    self.lose("another process has taken the lease")
                     return
                 self._after_renewal()
             await self._context.sleep(wait_s)
@@ -500,7 +377,7 @@ class LiveOwner:
             return
         if now >= self._publish_due_s:
             self._publish_due_s = now + self._context.settings.publish_s
-            self._start(self._publish_quietly("live map"))
+            self._start(self._publisher.publish_quietly("live map"))
         if self.users:
             self._idle_since_s = now
         elif now - self._idle_since_s >= self._context.settings.idle_s:
@@ -508,7 +385,7 @@ class LiveOwner:
             self._start(self._end_idle())
 
     async def _end_idle(self) -> None:
-        await self._publish_quietly("nobody used the live map")
+        await self._publisher.publish_quietly("nobody used the live map")
         if not self.users:
             await self.release()
 
@@ -523,22 +400,22 @@ class LiveOwner:
             return
         self._is_closing = True
         self._describe()
-        if self._outstanding:
-            await asyncio.wait(set(self._outstanding))
+        await self._writer.wait_empty()
         snapshot = await self._context.threads.compute(Urgency.APPLY, self._state.snapshot)
         if how == "released" and snapshot.position > self._wrote_snapshot:
             await self._write_snapshot(snapshot)
-        wait_s = _FIRST_RETRY_S
+        wait_s = FIRST_RETRY_S
         while not self._ended.done():
             try:
                 is_ours = await self._context.threads.lease(give_up)
             except StoreError:
                 await self._context.sleep(wait_s)
-                wait_s = min(_LAST_RETRY_S, 2 * wait_s)
+                wait_s = next_retry_s(wait_s)
             else:
                 self._end(how if is_ours else "lost")
 
-    def _lose(self, reason: str) -> None:
+    def lose(self, reason: str) -> None:
+        """Take that another process owns the map: end, and tell nothing more."""
         self._context.log.warning("live-map-lost", map=self._context.map_name, reason=reason)
         self._end("lost")
 
@@ -571,7 +448,8 @@ class LiveOwner:
             return "moving"
         return _WAITING if self._is_waiting_for_store else "live"
 
-    def _note_store(self, *, is_waiting: bool) -> None:
+    def note_store(self, *, is_waiting: bool) -> None:
+        """Tell the robots that the store is slow or fails, or that it works again."""
         if is_waiting != self._is_waiting_for_store:
             self._is_waiting_for_store = is_waiting
             self._describe()
@@ -582,7 +460,7 @@ class LiveOwner:
 
     def _moving(self) -> requests.MapMoves:
         return requests.MapMoves(
-            "the live map moves to another server", hint="try again", retry_after_ms=_BUSY_RETRY_MS
+            "the live map moves to another server", hint="try again", retry_after_ms=BUSY_RETRY_MS
         )
 
     def _start(self, work: Coroutine[Any, Any, None]) -> None:

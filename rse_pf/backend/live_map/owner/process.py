@@ -38,7 +38,7 @@ from rse_pf.backend.live_map.owner.live_owner import LiveOwner, OwnerContext
 from rse_pf.backend.live_map.owner.log import LiveLog, OwnershipLost
 from rse_pf.backend.live_map.owner.server import OwnerServer, listen
 from rse_pf.backend.live_map.owner.state import MapKind, MapState, take_over
-from rse_pf.backend.live_map.owner.threads import OwnerThreads, Urgency
+from rse_pf.backend.live_map.owner.work.threads import OwnerThreads, Urgency
 from rse_pf.backend.log import JsonLog
 from rse_pf.backend.sandbox.ipc import FrameReader, encode_message, receive
 from rse_pf.config import PlatformSettings

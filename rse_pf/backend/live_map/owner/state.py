@@ -8,7 +8,7 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, Protocol
+from typing import Any, Literal, Protocol, TypeVar
 
 from rse_pf.backend.live_map.owner.log import LiveLog, MapSnapshot, OwnershipLost, is_snapshot_due
 from rse_pf.errors import BadRequest
@@ -29,6 +29,7 @@ from rse_pf.maps.format import MapVersion
 
 __all__ = ["Applied", "MapKind", "MapLogic", "MapState", "restore", "size_of", "take_over"]
 
+_T = TypeVar("_T")
 _UNCHANGING = (OwnerChanged, RobotLeft)
 
 
@@ -53,14 +54,14 @@ class MapLogic(Protocol):
     def apply(self, event: Event) -> list[Outcome]:
         """Change the map by an event of the log."""
 
-    def measure(self, keyframe: int) -> LinksMeasured:
-        """Look for links of a keyframe; changes nothing."""
+    def measuring(self, keyframe: int) -> Callable[[], LinksMeasured]:
+        """Return what looks for links of a keyframe, in any thread, while the map changes."""
 
-    def optimise(self) -> Optimised:
-        """Optimise the whole graph; changes nothing."""
+    def optimising(self) -> Callable[[], Optimised]:
+        """Return what optimises the whole graph, in any thread, while the map changes."""
 
-    def relocalise(self, camera: Camera, features: bytes) -> Any:
-        """Find where an image was taken; changes nothing."""
+    def relocalising(self, camera: Camera, features: bytes) -> Callable[[], Any]:
+        """Return what finds where an image was taken, in any thread, while the map changes."""
 
     def alignments(self) -> list[Alignment]:
         """Return where the newest segment of each robot lies."""
@@ -132,14 +133,14 @@ class MapState:
         snapshot = self.snapshot() if is_snapshot_due(position) else None
         return Applied(outcomes=outcomes, defects=defects, snapshot=snapshot)
 
-    def measure(self, keyframe: int) -> LinksMeasured:
-        """Return the links of a keyframe; after a defect none, with the reason ``defect``."""
-        try:
-            return self.live_map.measure(keyframe)
-        except MemoryError:
-            raise
-        except Exception:  # noqa: BLE001  the keyframe must not be measured again and again
-            return LinksMeasured(keyframe=keyframe, failed={"defect": 1})
+    def measuring(self, keyframe: int) -> Callable[[], LinksMeasured]:
+        """Return what measures the links of a keyframe, in any thread, while the map changes.
+
+        After a defect there are none, with the reason ``defect``.
+        """
+        measure = _guarded(lambda: self.live_map.measuring(keyframe))
+        defect = LinksMeasured(keyframe=keyframe, failed={"defect": 1})
+        return lambda: defect if measure is None else _guarded(measure) or defect
 
     def snapshot(self) -> MapSnapshot:
         """Return the snapshot after the last entry."""
@@ -164,6 +165,16 @@ class MapState:
             self.unmeasured.pop(event.keyframe, None)
         self.changes += not isinstance(event, _UNCHANGING)
         return outcomes, None
+
+
+def _guarded(act: Callable[[], _T]) -> _T | None:
+    """Return what *act* returns; None after a defect: a keyframe must not be measured again and again."""
+    try:
+        return act()
+    except MemoryError:
+        raise
+    except Exception:  # noqa: BLE001  whatever the defect is
+        return None
 
 
 def size_of(value: Any) -> int:

@@ -1,4 +1,4 @@
-"""The threads of an owner process: one that computes by urgency, and some that wait for the store."""
+"""The threads of an owner process: one that holds the map, some that look, some that wait for the store."""
 
 from __future__ import annotations
 
@@ -13,6 +13,8 @@ from typing import Any, Protocol, TypeVar
 
 __all__ = ["OwnerThreads", "Threads", "Urgency"]
 
+_LOOKING = 2
+"""One measures keyframes, the other may look for a robot that is lost; matching and solving free the GIL."""
 _T = TypeVar("_T")
 
 
@@ -27,10 +29,13 @@ class Urgency(enum.IntEnum):
 
 
 class Threads(Protocol):
-    """Where an owner computes and waits; each of the four does one thing at a time."""
+    """Where an owner computes and waits; each but `look` does one thing at a time."""
 
     def compute(self, urgency: Urgency, act: Callable[[], _T]) -> Awaitable[_T]:
         """Call *act* in the thread of the map."""
+
+    def look(self, act: Callable[[], _T]) -> Awaitable[_T]:
+        """Call *act*, which works on what the map's thread has handed out, while the map changes."""
 
     def store(self, act: Callable[[], _T]) -> Awaitable[_T]:
         """Call *act* in the thread that writes the log."""
@@ -49,6 +54,7 @@ class OwnerThreads:
         self._store, self._lease, self._background = (
             ThreadPoolExecutor(1, thread_name_prefix=name) for name in ("store", "lease", "background")
         )
+        self._look = ThreadPoolExecutor(_LOOKING, thread_name_prefix="look")
         self._waiting: PriorityQueue[tuple[int, int, Callable[[], None]]] = PriorityQueue()
         self._count = itertools.count()
         threading.Thread(target=self._compute_on, name="map", daemon=True).start()
@@ -67,6 +73,10 @@ class OwnerThreads:
 
         self._waiting.put((urgency, next(self._count), run))
         return asyncio.shield(asyncio.wrap_future(future))
+
+    def look(self, act: Callable[[], _T]) -> Awaitable[_T]:
+        """Call *act*, which works on what the map's thread has handed out, while the map changes."""
+        return self._run(self._look, act)
 
     def store(self, act: Callable[[], _T]) -> Awaitable[_T]:
         """Call *act* in the thread that writes the log."""

@@ -1,0 +1,59 @@
+"""Look for the links of each keyframe after it was applied, and fit the whole graph when that is wanted.
+
+What is found enters the log as events.  The map goes on meanwhile: its thread only hands out what is needed.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import functools
+from collections import deque
+from collections.abc import Callable, Iterable
+from typing import Any
+
+from rse_pf.backend.live_map.owner.state import MapState
+from rse_pf.backend.live_map.owner.work.threads import Threads, Urgency
+from rse_pf.errors import RsePfError
+from rse_pf.live_map.events import Event
+
+__all__ = ["Measuring"]
+
+
+class Measuring:
+    """Measures one keyframe at a time; its methods are called in the event loop."""
+
+    def __init__(self, state: MapState, threads: Threads, submit: Callable[[Event], Any]) -> None:
+        """Begin with what the last owner has left, at `run`; *submit* lets an event enter the log."""
+        self._state, self._threads, self._submit = state, threads, submit
+        self._waiting = deque(state.unmeasured)
+        self._wake = asyncio.Event()
+        self._wake.set()
+        self._optimise_wanted = False
+
+    def measure(self, keyframes: Iterable[int]) -> None:
+        """Measure these keyframes, too."""
+        self._waiting.extend(keyframes)
+        self._wake.set()
+
+    def optimise(self) -> None:
+        """Fit the whole graph when no keyframe waits."""
+        self._optimise_wanted = True
+        self._wake.set()
+
+    async def run(self) -> None:
+        """Work until cancelled."""
+        threads, state = self._threads, self._state
+        while True:
+            await self._wake.wait()
+            if self._waiting:
+                keyframe = self._waiting.popleft()
+                measure = await threads.compute(Urgency.MEASURE, functools.partial(state.measuring, keyframe))
+                self._submit(await threads.look(measure))
+            elif self._optimise_wanted:
+                self._optimise_wanted = False
+                with contextlib.suppress(RsePfError):
+                    fit = await threads.compute(Urgency.BACKGROUND, state.live_map.optimising)
+                    self._submit(await threads.look(fit))
+            else:
+                self._wake.clear()
