@@ -7,6 +7,8 @@ BIN := $(VENV)/bin
 # setup.sh prints one line with the fix when something is missing.
 SETUP := PYTHON=$(PYTHON) sh scripts/setup.sh
 PYTEST := $(BIN)/python -m pytest
+# One worker more than processors: many tests wait for processes.
+WORKERS ?= $(shell expr $$(nproc) + 1)
 # Tests start hundreds of processes: without this each of them compiles every module again where the variable is set.
 export PYTHONDONTWRITEBYTECODE :=
 
@@ -46,7 +48,7 @@ test: ## run what CI runs: lint, types, all tests but the slow ones
 	@$(SETUP) dev infra
 	@$(BIN)/ruff check . && $(BIN)/ruff format --check .
 	@$(BIN)/mypy
-	@$(PYTEST) -m "not slow" -n 2 --dist loadfile $(ARGS)
+	@$(PYTEST) -m "not slow" -n $(WORKERS) --dist loadfile $(ARGS)
 
 quick: ## run the pure tests only, in seconds
 	@$(SETUP) dev

@@ -109,6 +109,7 @@ def test_writes_a_map_for_each_robot_and_ends_every_process(tmp_path, gone):
         gone(pid)
 
 
+@pytest.mark.slow
 def test_a_killed_server_costs_no_command(tmp_path, gone):
     out = tmp_path / "out"
     with demo(out, "--robots", "2", "--frames", "12", "--rate", "5") as process:
