@@ -10,6 +10,7 @@ from typing import Any, Protocol
 from rse_pf.backend.log import JsonLog
 from rse_pf.backend.metrics import Metrics
 from rse_pf.config import PlatformSettings
+from rse_pf.recording.tap import RecordingTap
 
 __all__ = ["Clocks", "Log", "Wire", "WorkerContext"]
 
@@ -66,7 +67,10 @@ class Clocks:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class WorkerContext:
-    """What all parts of one worker share; ``server_id`` goes into welcomes and answers."""
+    """What all parts of one worker share; ``server_id`` goes into welcomes and answers.
+
+    ``tap`` takes the messages of all connections for a recording; None where nothing is recorded.
+    """
 
     settings: PlatformSettings
     server_id: str
@@ -74,3 +78,4 @@ class WorkerContext:
     loop: AbstractEventLoop
     log: JsonLog
     metrics: Metrics = field(default_factory=Metrics)
+    tap: RecordingTap | None = None

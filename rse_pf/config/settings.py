@@ -26,6 +26,7 @@ __all__ = [
     "LocalSettings",
     "PlatformSettings",
     "PnpSettings",
+    "RecordingSettings",
     "ScalingSettings",
     "ServiceSettings",
     "ServingSettings",
@@ -212,6 +213,15 @@ class LiveSettings:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class RecordingSettings:
+    """What robots and servers said, kept in files that rse-pf replay explains."""
+
+    folder: str = setting("", doc="folder of recordings; empty: nothing is recorded")
+    max_file_bytes: int = setting(268435456, unit="bytes", doc="size of a recording's file at which the next one begins", low=1048576)
+    max_bytes: int = setting(4294967296, unit="bytes", doc="size of all recordings of the folder above which the oldest files are deleted", low=1048576)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class LocalSettings:
     """The platform on one machine."""
 
@@ -262,6 +272,7 @@ class PlatformSettings:
     auth: AuthSettings = field(default_factory=AuthSettings)
     services: ServiceSettings = field(default_factory=ServiceSettings)
     live: LiveSettings = field(default_factory=LiveSettings)
+    recording: RecordingSettings = field(default_factory=RecordingSettings)
     local: LocalSettings = field(default_factory=LocalSettings)
     cloud: CloudSettings = field(default_factory=CloudSettings)
 
@@ -315,6 +326,7 @@ def _check_contradictions(s: PlatformSettings) -> None:
         ("session", "reconnect_base_s", "reconnect_max_s"),
         ("services", "scratch_bytes", "memory_bytes"),
         ("live", "heartbeat_s", "lease_s"),
+        ("recording", "max_file_bytes", "max_bytes"),
     ]
     for group, small, large in pairs:
         low, high = (getattr(getattr(s, group), name) for name in (small, large))

@@ -1,4 +1,4 @@
-"""Recordings of what robots and servers said: files of the format MCAP, which others read, too.
+"""Recordings of what robots and servers said: MCAP files, how they are written and read, and what they explain.
 
-`file_format` says what is in a file, `writer` writes one, `tap` and `recorder_process` record on a server.
+Decoding in the path of a command does not belong here, nor do sockets of robots.
 """

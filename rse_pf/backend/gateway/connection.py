@@ -78,7 +78,7 @@ class RobotConnection:
     __slots__ = (
         "_assembler", "_context", "_deferred", "_handler", "_wire", "allowed_s", "claims", "commands",
         "is_connected", "last_heard_s", "last_result", "moving_until_s", "number", "opened_s",
-        "robot", "session",
+        "recorded", "robot", "session", "tap",
     )  # fmt: skip
 
     def __init__(
@@ -116,6 +116,11 @@ class RobotConnection:
         self.is_connected = True
         self._handler = handler
         self._context = handler.context
+        self.tap = None if session is None else handler.context.tap
+        """Takes the messages for a recording, as those of the connection ``recorded``."""
+        self.recorded = 0
+        if self.tap is not None and session is not None:
+            self.recorded = self.tap.opened(session.codec.name, accepted.robot)
         self._wire = wire
         self._assembler = FrameAssembler(handler.context.settings.session)
         self._deferred: deque[tuple[bytes, bool, float]] | None = None
@@ -159,12 +164,16 @@ class RobotConnection:
             if not self._assembler.closed:
                 self._context.metrics.bytes_out += len(data)
                 self._wire.send(data, session.codec.is_text)
+                if self.tap is not None:
+                    self.tap.down(self.recorded, data)
 
     def write(self, data: bytes) -> None:
         """Write one message, unless the connection is closing."""
         if not self._assembler.closed:
             self._context.metrics.bytes_out += len(data)
             self._wire.send(data, self.session is not None and self.session.codec.is_text)
+            if self.tap is not None:
+                self.tap.down(self.recorded, data)
 
     def write_progress(self, progress: Progress) -> None:
         """Write how far a long command is, if the robot is still connected and understands it."""
@@ -205,6 +214,8 @@ class RobotConnection:
     def ended(self) -> None:
         """Note that the socket is gone."""
         self.is_connected = False
+        if self.tap is not None:
+            self.tap.closed(self.recorded)
         self._handler.disconnect(self)
 
     def _take(self, data: bytes, is_text: bool, now: float) -> None:
@@ -216,6 +227,8 @@ class RobotConnection:
             return
         metrics = self._context.metrics
         metrics.bytes_in += len(data)
+        if self.tap is not None:
+            self.tap.up(self.recorded, data)
         if session is None:
             metrics.bytes_out += len(data)
             self._wire.send(data, is_text)

@@ -361,6 +361,7 @@ class Dispatcher:
             "log_lines_dropped": float(self.context.log.dropped),
             **self._compute.report(),
             **self._live_maps.report(),
+            **({} if self.context.tap is None else {"recording_dropped": float(self.context.tap.dropped)}),
             **({"sandboxes": float(isolation["sandboxes"])} if isolation else {}),
         }
         self._lag_s = 0.0

@@ -17,7 +17,6 @@ import time
 from collections.abc import Awaitable, Callable, Mapping
 from contextlib import suppress
 from functools import partial
-from importlib import metadata
 from operator import attrgetter
 from pathlib import Path
 from typing import Any
@@ -42,6 +41,7 @@ from rse_pf.backend.supervisor.orders import (
     UnblockOrder,
 )
 from rse_pf.backend.supervisor.record_query import NOT_FOR_YOU, WRONG_RECORDING, may_record, record_query
+from rse_pf.backend.supervisor.server_recording import ServerRecording, server_version
 from rse_pf.backend.supervisor.session_registry import SessionRegistry
 from rse_pf.backend.supervisor.trust_poller import poll_trust
 from rse_pf.backend.supervisor.worker import WorkerPlan, run_in_loop
@@ -118,27 +118,29 @@ def serve(
     raise_descriptor_limit()
     count = settings.serving.workers or len(os.sched_getaffinity(0))
     slots = make_pipe(settings.serving.max_running_jobs)
-    plans = [
-        WorkerPlan(
-            settings=settings, keys=keys if settings.auth.required else None, server_id=server_id,
-            services=services, workers=count, index=index, job_slots=slots, supervisor=os.getpid(),
-            conformance_echo=conformance_echo, audit=audit is not None,
-        )
-        for index in range(count)
-    ]  # fmt: skip
-    with bound_socket(settings.serving.host, settings.serving.port) as listener:
-        workers = fork_workers(plans, listener=listener)
-        try:
-            with ServerAudit(audit, server_id) as records:
-                supervisor = _Supervisor(
-                    settings, workers=workers, trust=trust, server_id=server_id, announce=announce,
-                    listener=listener, digest=digest, records=records,
-                    control_token=control_token,
-                )  # fmt: skip
-                return run_in_loop(supervisor.run())
-        finally:
-            for worker in workers:
-                worker.kill()
+    with ServerRecording(settings, server_id, count) as recording:
+        plans = [
+            WorkerPlan(
+                settings=settings, keys=keys if settings.auth.required else None, server_id=server_id,
+                services=services, workers=count, index=index, job_slots=slots, supervisor=os.getpid(),
+                conformance_echo=conformance_echo, audit=audit is not None, recording=end,
+            )
+            for index, end in enumerate(recording.ends)
+        ]  # fmt: skip
+        with bound_socket(settings.serving.host, settings.serving.port) as listener:
+            workers = fork_workers(plans, listener=listener)
+            recording.handed_over()
+            try:
+                with ServerAudit(audit, server_id) as records:
+                    supervisor = _Supervisor(
+                        settings, workers=workers, trust=trust, server_id=server_id, announce=announce,
+                        listener=listener, digest=digest, records=records,
+                        control_token=control_token, others=recording.pids,
+                    )  # fmt: skip
+                    return run_in_loop(supervisor.run())
+            finally:
+                for worker in workers:
+                    worker.kill()
 
 
 class _Supervisor:
@@ -154,8 +156,9 @@ class _Supervisor:
         digest: str,
         records: ServerAudit,
         control_token: str | None,
+        others: list[int],
     ) -> None:
-        self._settings = settings
+        self._settings, self._others = settings, others
         self._digest = digest
         self._server_id = server_id
         self._records = records
@@ -384,7 +387,7 @@ class _Supervisor:
         return _json(
             {
                 "server": self._server_id,
-                "version": _version(),
+                "version": server_version(),
                 "settings": self._digest,
                 "uptime_s": round(time.monotonic() - self._began, 3),
             }
@@ -424,7 +427,7 @@ class _Supervisor:
         return _json(
             {
                 **self._identity(),
-                "version": _version(),
+                "version": server_version(),
                 "state": self._state,
                 "uptime_s": round(time.monotonic() - self._began, 3),
                 "robots": int(gauges.get("robots", 0)),
@@ -565,7 +568,7 @@ class _Supervisor:
         return merged
 
     def _pids(self) -> list[int]:
-        return [os.getpid(), *(worker.pid for worker in self._workers)]
+        return [os.getpid(), *(worker.pid for worker in self._workers), *self._others]
 
     def _cpu_s(self, gauges: Mapping[str, float]) -> float:
         """Return the CPU seconds of the server and of its limited processes, which the workers report."""
@@ -589,10 +592,3 @@ def _number(ask: ControlRequest, name: str, default: float, maximum: float) -> f
     if not 0 <= value <= maximum:
         raise ValueError(name)
     return value
-
-
-def _version() -> str:
-    try:
-        return metadata.version("rse-pf")
-    except metadata.PackageNotFoundError:
-        return "unknown"

@@ -73,6 +73,7 @@ from rse_pf.config import PlatformSettings
 from rse_pf.errors import MissingExtra
 from rse_pf.linux import die_with_parent, set_process_name
 from rse_pf.object_store import ObjectStore
+from rse_pf.recording.tap import RecordingTap
 from rse_pf.service import Registry
 from rse_pf.services.custom.installed import InstalledService, installed_services, published_services
 from rse_pf.services.loading import load_services
@@ -110,6 +111,8 @@ class WorkerPlan:
     supervisor: int
     conformance_echo: bool = False
     audit: bool = False
+    recording: int | None = None
+    """This worker's end of the pipe to the recorder; None where nothing is recorded."""
 
 
 def event_loop_maker() -> Callable[[], asyncio.AbstractEventLoop]:
@@ -183,6 +186,7 @@ class _Worker:
             clocks=Clocks(monotonic=time.monotonic, wall=time.time, cpu=time.process_time),
             loop=loop,
             log=self._log,
+            tap=self._tap(plan.recording),
         )
         connections = set[RobotConnection]()
         store = open_data_store(settings) if is_shared(settings) else None
@@ -235,6 +239,15 @@ class _Worker:
             workers=self._workers,
             new_name=self._new_name,
             recorder=self._recorder,
+        )
+
+    def _tap(self, fd: int | None) -> RecordingTap | None:
+        if fd is None:
+            return None
+        return RecordingTap(
+            fd,
+            call_later=self._loop.call_later,
+            on_dead=lambda: self._log.error("recorder-lost", hint="restart the server to record again"),
         )
 
     def _compute(
@@ -300,6 +313,9 @@ class _Worker:
                 break
         self._recorder.flush()
         self._robot_events.flush()
+        tap = self._dispatcher.context.tap
+        if tap is not None:
+            tap.hand_over()
         self._log.close()
         os._exit(0)  # nobody waits for the sockets and threads that are left
 

@@ -1,0 +1,144 @@
+"""Make the messages that Foxglove shows: poses, point clouds and images, after its schemas.
+
+Numbers only, without numpy: the recorder process calls this for every answer.
+
+Source:
+    Foxglove's message schemas PoseInFrame, PointCloud and CompressedImage (docs.foxglove.dev).
+"""
+
+from __future__ import annotations
+
+import base64
+import math
+import struct
+from collections.abc import Sequence
+from typing import Any
+
+import msgspec
+
+__all__ = ["WORLD_FRAME", "answered_pose", "image", "point_cloud", "pose_in_frame"]
+
+WORLD_FRAME = "world"
+"""The frame of the points of a robot's commands."""
+_FLOAT32 = 7
+"""Foxglove's NumericType."""
+_NS = 1_000_000_000
+_POINT_BYTES = 12
+_NUMBERS = {1: "f", 3: "d"}
+_NUMBER_BYTES = {1: 4, 3: 8}
+
+
+class _Pose(msgspec.Struct, frozen=True):
+    T_camera_world: Any = None
+
+
+class _PoseResult(msgspec.Struct, frozen=True):
+    reply: _Pose | None = None
+
+
+def _numbers(kind: int, data: memoryview) -> Any:
+    code = _NUMBERS.get(kind)
+    return None if code is None else struct.unpack(f"<{len(data) // _NUMBER_BYTES[kind]}{code}", data)
+
+
+_from_json = msgspec.json.Decoder(_PoseResult).decode
+_from_binary = msgspec.msgpack.Decoder(_PoseResult, ext_hook=_numbers).decode
+
+
+def answered_pose(text: bytes, *, is_binary: bool) -> Sequence[float] | None:
+    """Return the 16 numbers of ``T_camera_world`` (row-major) of a `pnp` result, None if it has none.
+
+    Args:
+        text: The message, inflated.
+        is_binary: Whether its codec is ``bin``.
+    """
+    try:
+        reply = (_from_binary if is_binary else _from_json)(text).reply
+    except (msgspec.DecodeError, struct.error):
+        return None
+    pose = None if reply is None else reply.T_camera_world
+    if not isinstance(pose, list | tuple) or len(pose) != 16:
+        return None
+    return pose if all(type(each) in (float, int) and math.isfinite(each) for each in pose) else None
+
+
+def pose_in_frame(T_frame_camera: Sequence[float], time_ns: int, frame: str = WORLD_FRAME) -> dict[str, Any]:
+    """Return the PoseInFrame of 16 numbers (row-major) that map the camera to *frame*."""
+    (a, b, c, x, d, e, f, y, g, h, i, z) = T_frame_camera[:12]
+    qx, qy, qz, qw = _quaternion(a, b, c, d, e, f, g, h, i)
+    return {
+        "timestamp": _time(time_ns),
+        "frame_id": frame,
+        "pose": {
+            "position": {"x": x, "y": y, "z": z},
+            "orientation": {"x": qx, "y": qy, "z": qz, "w": qw},
+        },
+    }
+
+
+def inverse(T: Sequence[float]) -> tuple[float, ...]:
+    """Return the inverse of a rigid motion of 16 numbers, row-major."""
+    (a, b, c, x, d, e, f, y, g, h, i, z) = T[:12]
+    return (
+        a, d, g, -(a * x + d * y + g * z),
+        b, e, h, -(b * x + e * y + h * z),
+        c, f, i, -(c * x + f * y + i * z),
+        0.0, 0.0, 0.0, 1.0,
+    )  # fmt: skip
+
+
+def point_cloud(points: bytes, time_ns: int, frame: str = WORLD_FRAME) -> dict[str, Any]:
+    """Return the PointCloud of *points*: x, y, z as little-endian float32, point after point, metres."""
+    names = ("x", "y", "z")
+    return {
+        "timestamp": _time(time_ns),
+        "frame_id": frame,
+        "pose": {
+            "position": {"x": 0.0, "y": 0.0, "z": 0.0},
+            "orientation": {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0},
+        },
+        "point_stride": _POINT_BYTES,
+        "fields": [{"name": each, "offset": 4 * k, "type": _FLOAT32} for k, each in enumerate(names)],
+        "data": base64.b64encode(points).decode("ascii"),
+    }
+
+
+def image(jpeg: bytes, time_ns: int, frame: str = "camera") -> dict[str, Any]:
+    """Return the CompressedImage of a JPEG picture."""
+    return {
+        "timestamp": _time(time_ns),
+        "frame_id": frame,
+        "data": base64.b64encode(jpeg).decode("ascii"),
+        "format": "jpeg",
+    }
+
+
+def _time(time_ns: int) -> dict[str, int]:
+    return {"sec": time_ns // _NS, "nsec": time_ns % _NS}
+
+
+def _quaternion(
+    a: float, b: float, c: float, d: float, e: float, f: float, g: float, h: float, i: float
+) -> tuple[float, float, float, float]:
+    """Return x, y, z, w of the rotation matrix with the rows a b c, d e f, g h i.
+
+    Source:
+        Shepperd, Quaternion from rotation matrix, 1978: the largest component is computed first.
+    """
+    trace = a + e + i
+    largest = max(trace, a, e, i)
+    if largest == trace:
+        w = math.sqrt(max(0.0, 1.0 + trace)) / 2
+        s = 1 / (4 * w)
+        return (h - f) * s, (c - g) * s, (d - b) * s, w
+    if largest == a:
+        x = math.sqrt(max(0.0, 1.0 + a - e - i)) / 2
+        s = 1 / (4 * x)
+        return x, (b + d) * s, (c + g) * s, (h - f) * s
+    if largest == e:
+        y = math.sqrt(max(0.0, 1.0 - a + e - i)) / 2
+        s = 1 / (4 * y)
+        return (b + d) * s, y, (f + h) * s, (c - g) * s
+    z = math.sqrt(max(0.0, 1.0 - a - e + i)) / 2
+    s = 1 / (4 * z)
+    return (c + g) * s, (f + h) * s, z, (d - b) * s

@@ -1,0 +1,251 @@
+"""The recorder of one server: reads what workers deliver, and writes it to files.
+
+It ends when no worker is left, after it finished its file.  It has a lower priority than the workers: robots
+come first, and what it cannot keep up with is dropped in the workers and counted.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import secrets
+import selectors
+import signal
+import struct
+import subprocess
+import sys
+import time
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from rse_pf.config import SessionSettings
+from rse_pf.identity import RobotId
+from rse_pf.linux import run_as_batch, set_process_name
+from rse_pf.recording.file_format import (
+    EVENT_SCHEMA,
+    EVENTS_TOPIC,
+    POSE_SCHEMA,
+    POSES_PREFIX,
+    WIRE_ENCODING,
+    Direction,
+    WireChannel,
+    wire_metadata,
+    wire_topic,
+)
+from rse_pf.recording.poses import answered_pose, inverse, pose_in_frame
+from rse_pf.recording.redact import KEY_BYTES, ConnectionRedactor, Kept, Pseudonyms
+from rse_pf.recording.tap import CLOSED, DOWN, LOST, OPENED, UP, Handed, PipeReader
+from rse_pf.recording.writer import RecordingWriter
+from rse_pf.wire import make_codec
+
+__all__ = ["MessageRecorder", "RecordedConnection", "RecorderPlan", "run_recorder", "start_recorder"]
+
+_READ_BYTES = 1 << 20
+_FLUSH_S = 0.2
+_NICE = 5
+_HEX_BYTES = 8
+
+
+class RecorderPlan(msgspec.Struct, frozen=True, kw_only=True):
+    """What a recorder process is told at its start; ``fds`` are its ends of the workers' pipes.
+
+    ``started_ns`` is Unix time; ``key`` is the file of the key of the pseudonyms, "" for one of its own.
+    """
+
+    folder: str
+    server: str
+    version: str
+    started_ns: int
+    fds: list[int]
+    max_file_bytes: int
+    max_bytes: int
+    session: dict[str, Any] = {}
+    metadata: dict[str, str] = {}
+    key: str = ""
+
+
+class RecordedConnection:
+    """One connection of a recording: its channels, and what may be stored of its messages."""
+
+    def __init__(self, redactor: ConnectionRedactor, *, identity: str, codec: str, server: str) -> None:
+        self.redactor = redactor
+        self.identity = identity
+        self.codec = codec
+        self.server = server
+        self.channels: dict[Direction, int] = {}
+
+    def wire_channel(self, direction: Direction) -> WireChannel:
+        """Return what the channel of one direction says."""
+        return WireChannel(
+            self.identity, direction, self.codec, self.server, self.redactor.robot, self.redactor.tenant
+        )
+
+
+class MessageRecorder:
+    """Writes messages of connections, and the poses that they tell, by a `RecordingWriter`."""
+
+    def __init__(
+        self, writer: RecordingWriter, pseudonyms: Pseudonyms, session: SessionSettings, server: str
+    ) -> None:
+        self.writer = writer
+        self.left_out = 0
+        """Messages that a recording does not hold by design."""
+        self._pseudonyms = pseudonyms
+        self._session = session
+        self._server = server
+        self._codecs: dict[str, Any] = {}
+
+    def open(self, codec: str, robot: RobotId, secrets_: tuple[str, ...] = ()) -> RecordedConnection:
+        """Return a new connection of *robot*; no message that holds one of *secrets_* is stored."""
+        if codec not in self._codecs:
+            self._codecs[codec] = make_codec(codec, self._session)
+        redactor = ConnectionRedactor(
+            self._codecs[codec], robot, self._pseudonyms,
+            max_inflated_bytes=self._session.max_inflated_bytes, secrets=secrets_,
+        )  # fmt: skip
+        identity = secrets.token_hex(_HEX_BYTES)
+        return RecordedConnection(redactor, identity=identity, codec=codec, server=self._server)
+
+    def take(self, connection: RecordedConnection, direction: Direction, time_ns: int, data: bytes) -> None:
+        """Write a message, unless it is one of those that are left out."""
+        redactor = connection.redactor
+        kept = redactor.up(data) if direction == "up" else redactor.down(data)
+        if kept is None:
+            self.left_out += 1
+            return
+        channel = connection.channels.get(direction)
+        if channel is None:
+            described = connection.wire_channel(direction)
+            channel = connection.channels[direction] = self.writer.channel(
+                wire_topic(connection.identity, direction), WIRE_ENCODING, wire_metadata(described)
+            )
+        self.writer.add(channel, time_ns, kept.data)
+        if kept.type == "result" and kept.service == "pnp":
+            self._add_pose(connection, time_ns, kept)
+
+    def close(self, connection: RecordedConnection) -> None:
+        """Take that a connection is over."""
+        for channel in connection.channels.values():
+            self.writer.forget(channel)
+
+    def event(self, time_ns: int, kind: str, **fields: Any) -> None:
+        """Write an event of the recording itself."""
+        value = {"time_s": time_ns / 1e9, "kind": kind, "server": self._server, **fields}
+        self.writer.add_json(EVENTS_TOPIC, EVENT_SCHEMA, time_ns, value)
+
+    def _add_pose(self, connection: RecordedConnection, time_ns: int, kept: Kept) -> None:
+        pose = answered_pose(kept.text, is_binary=connection.codec == "bin")
+        if pose is not None:
+            told = pose_in_frame(inverse(pose), time_ns)
+            self.writer.add_json(f"{POSES_PREFIX}{connection.redactor.robot}", POSE_SCHEMA, time_ns, told)
+
+
+class _Worker:
+    """One worker as its recorder sees it."""
+
+    def __init__(self, recorder: MessageRecorder) -> None:
+        self._recorder = recorder
+        self._reader = PipeReader()
+        self._connections: dict[int, RecordedConnection] = {}
+        self._lost = 0
+
+    def read(self, data: bytes) -> None:
+        for entry in self._reader.entries(data):
+            self._take(entry)
+
+    def end(self) -> None:
+        for connection in self._connections.values():
+            self._recorder.close(connection)
+
+    def _take(self, entry: Handed) -> None:
+        if entry.kind == OPENED:
+            codec, *robot = json.loads(entry.data)
+            self._connections[entry.connection] = self._recorder.open(codec, RobotId(*robot))
+        elif entry.kind == LOST:
+            (lost,) = struct.unpack("<Q", entry.data)
+            self._recorder.event(entry.time_ns, "recording-dropped", messages=lost - self._lost)
+            self._lost = lost
+        elif entry.kind == CLOSED:
+            connection = self._connections.pop(entry.connection, None)
+            if connection is not None:
+                self._recorder.close(connection)
+        elif entry.kind in (UP, DOWN):
+            connection = self._connections.get(entry.connection)
+            if connection is not None:
+                direction: Direction = "up" if entry.kind == UP else "down"
+                self._recorder.take(connection, direction, entry.time_ns, entry.data)
+
+
+def start_recorder(plan: RecorderPlan) -> subprocess.Popen[bytes]:
+    """Return the process of a new recorder, which holds the ends of pipes that *plan* names; raises OSError.
+
+    Its log lines go where those of this process go.
+    """
+    return subprocess.Popen(
+        [sys.executable, "-m", __name__, msgspec.json.encode(plan).decode()],
+        stdin=subprocess.DEVNULL,
+        pass_fds=plan.fds,
+    )
+
+
+def run_recorder(plan: RecorderPlan) -> None:
+    """Record until no worker is left."""
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, signal.SIG_IGN)
+    set_process_name("rse-pf recorder")
+    with suppress(OSError):
+        run_as_batch(os.getpid(), _NICE)
+    session = SessionSettings(**plan.session)
+    writer = RecordingWriter(
+        Path(plan.folder), plan.server, started_ns=plan.started_ns, max_file_bytes=plan.max_file_bytes,
+        max_bytes=plan.max_bytes, metadata=plan.metadata, version=plan.version,
+    )  # fmt: skip
+    recorder = MessageRecorder(writer, Pseudonyms(_key(plan.key)), session, plan.server)
+    recorder.event(plan.started_ns, "recording-started")
+    with selectors.DefaultSelector() as selector:
+        for fd in plan.fds:
+            selector.register(fd, selectors.EVENT_READ, _Worker(recorder))
+        _loop(selector, writer)
+    recorder.event(time.time_ns(), "recording-over", left_out=recorder.left_out)
+    writer.close()
+
+
+def _loop(selector: selectors.BaseSelector, writer: RecordingWriter) -> None:
+    problem = ""
+    while selector.get_map():
+        for key, _ in selector.select(_FLUSH_S):
+            data = os.read(key.fd, _READ_BYTES)
+            if data:
+                key.data.read(data)
+            else:
+                selector.unregister(key.fd)
+                key.data.end()
+        writer.flush(time.time_ns())
+        if writer.problem != problem:
+            problem = writer.problem
+            _log(problem, writer.dropped)
+
+
+def _log(problem: str, dropped: int) -> None:
+    """Write a log line about the disk; there is no reader for anything longer."""
+    event = "recording-stopped" if problem else "recording-resumed"
+    line = {"level": "warning", "event": event, "reason": problem, "dropped": dropped}
+    with suppress(OSError):
+        os.write(2, json.dumps(line).encode() + b"\n")
+
+
+def _key(file: str) -> bytes:
+    """Return the key of the pseudonyms of this recording."""
+    if file:
+        with suppress(OSError):
+            key = Path(file).read_bytes()
+            if len(key) >= KEY_BYTES:
+                return key
+    return secrets.token_bytes(KEY_BYTES)
+
+
+if __name__ == "__main__":
+    run_recorder(msgspec.json.decode(sys.argv[1], type=RecorderPlan))

@@ -1,0 +1,247 @@
+"""Decide which messages a recording holds, and take names out of them; tokens are never in one.
+
+Stored are commands of services whose messages have no place for a name, what answers them, and the messages
+that keep a connection alive.  Everything else, such as a renewal, an update or what cannot be decoded, is
+left out.  A free text that holds the name of the robot, its tenant or a secret is rewritten; all other
+messages stay as they were, to the byte.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import hmac
+import json
+import re
+import zlib
+from collections import OrderedDict
+from collections.abc import Iterable
+from typing import Any, NamedTuple
+
+import msgspec
+
+from rse_pf.errors import RsePfError
+from rse_pf.identity import DEFAULT_TENANT, RobotId
+from rse_pf.wire import Codec, Welcome
+from rse_pf.wire.envelope import peek
+
+__all__ = ["NAME_FREE_SERVICES", "ConnectionRedactor", "Kept", "Pseudonyms"]
+
+NAME_FREE_SERVICES = frozenset({"pnp", "icp"})
+"""Services whose requests and replies have no field for a name."""
+KEY_BYTES = 32
+_DIGITS = 8
+_MAX_OPEN = 4096
+_ALWAYS_UP = frozenset({"hello", "ping", "cancel"})
+_ALWAYS_DOWN = frozenset({"move", "pong", "renewed"})
+_TEXT_FIELDS = ("trace", "stream", "message", "hint", "what", "reason", "sdk")
+_VALUE_FIELDS = ("payload", "reply")
+PROTOCOL_WORDS = frozenset({
+    "camera", "points_world", "pixels", "options", "depths_m", "depth_noise", "T_camera_world", "inliers",
+    "rmse_px", "covariance", "verdict", "reason", "engine", "native", "poselib", "opencv", "ok", "weak",
+    "target", "source", "T_target_source", "overlap", "iterations",
+})  # fmt: skip
+"""Words of requests and replies: a robot that has one for a name is not looked for in them."""
+_UNDECODABLE = (msgspec.DecodeError, RecursionError, ValueError, TypeError, RsePfError)
+
+
+class _Head(msgspec.Struct, frozen=True):
+    """What every message says of itself."""
+
+    type: str
+    id: int | None = None
+    service: str = ""
+
+
+_json_head = msgspec.json.Decoder(_Head).decode
+_binary_head = msgspec.msgpack.Decoder(_Head).decode
+
+
+class Kept(NamedTuple):
+    """A message of a recording.
+
+    Attributes:
+        data: As it was on the wire, unless a name was taken out.
+        text: The same inflated, for the codec ``zlib``.
+        type: Of the message, such as ``result``.
+        service: Of the command, or of the command that it answers; "" where there is none.
+    """
+
+    data: bytes
+    text: bytes
+    type: str
+    service: str
+
+
+class Pseudonyms:
+    """Stable names for robots and tenants within one recording, which nobody can trace back to them."""
+
+    def __init__(self, key: bytes) -> None:
+        """Keep *key*: random, never written anywhere."""
+        self._key = key
+
+    def robot(self, robot: RobotId) -> str:
+        """Return ``robot-XXXXXXXX``."""
+        return f"robot-{self._digest(robot.folder)}"
+
+    def tenant(self, tenant: str) -> str:
+        """Return ``tenant-XXXXXXXX``."""
+        return f"tenant-{self._digest(f'tenant {tenant}')}"
+
+    def _digest(self, text: str) -> str:
+        return hmac.new(self._key, text.encode(), hashlib.sha256).hexdigest()[:_DIGITS]
+
+
+class ConnectionRedactor:
+    """Judges the messages of one connection, in the order in which they were taken."""
+
+    def __init__(
+        self,
+        codec: Codec,
+        robot: RobotId,
+        pseudonyms: Pseudonyms,
+        *,
+        max_inflated_bytes: int,
+        secrets: Iterable[str] = (),
+    ) -> None:
+        """Know what must not be in the recording.
+
+        Args:
+            codec: Of the connection.
+            robot: Who is connected.
+            pseudonyms: What stands for its names.
+            max_inflated_bytes: A message that is longer, inflated, is left out.
+            secrets: Further texts that no message may hold; one that does is left out.
+        """
+        self.robot = pseudonyms.robot(robot)
+        self.tenant = pseudonyms.tenant(robot.tenant)
+        self.left_out = 0
+        self._codec = codec
+        self._max_bytes = max_inflated_bytes
+        self._inflates = codec.name == "zlib"
+        self._head = _binary_head if codec.name == "bin" else _json_head
+        names = {robot.name: self.robot}
+        if robot.tenant != DEFAULT_TENANT:
+            names[robot.tenant] = self.tenant
+        names.pop("", None)
+        self._names = names
+        longest_first = sorted(names, key=len, reverse=True)
+        self._in_text = re.compile(_either(longest_first)) if names else None
+        forms = sorted({form for name in names for form in (name, json.dumps(name)[1:-1])}, key=len)
+        self._in_bytes = re.compile(_either(reversed(forms)).encode()) if names else None
+        self._secrets = [each.encode() for each in secrets if each]
+        self._open: OrderedDict[int, str] = OrderedDict()
+
+    def up(self, data: bytes) -> Kept | None:
+        """Return what is stored of a message of the robot, None if it is left out."""
+        try:
+            text = self._inflated(data)
+            found = peek(self._codec, text if self._codec.name != "zlib" else data)
+            if found is not None:
+                kind, identity, service = "command", found.id, found.service
+            else:
+                head = self._head(text)
+                kind, identity, service = head.type, head.id or 0, head.service
+            if kind == "command" and service in NAME_FREE_SERVICES:
+                self._remember(identity, service)
+            elif kind not in _ALWAYS_UP:
+                return self._left_out()
+            kept = self._without_names(data, text, kind, service, from_robot=True)
+        except _UNDECODABLE:
+            return self._left_out()
+        return kept or self._left_out()
+
+    def down(self, data: bytes) -> Kept | None:
+        """Return what is stored of a message of the server, None if it is left out."""
+        try:
+            text = self._inflated(data)
+            head = self._head(text)
+            service = ""
+            if head.type == "welcome":
+                return self._welcome(data)
+            if head.type in ("result", "progress") or (head.type == "failure" and head.id is not None):
+                service = self._open.get(head.id or 0, "")
+                if not service:
+                    return self._left_out()
+                if head.type != "progress":
+                    del self._open[head.id or 0]
+            elif head.type not in _ALWAYS_DOWN and head.type != "failure":
+                return self._left_out()
+            kept = self._without_names(data, text, head.type, service, from_robot=False)
+        except _UNDECODABLE:
+            return self._left_out()
+        return kept or self._left_out()
+
+    def _left_out(self) -> Kept | None:
+        self.left_out += 1
+        return None
+
+    def _remember(self, identity: int, service: str) -> None:
+        self._open[identity] = service
+        if len(self._open) > _MAX_OPEN:  # of a robot that sends more than it may
+            self._open.popitem(last=False)
+
+    def _inflated(self, data: bytes) -> bytes:
+        """Return the text of a message; raises ValueError if it is too long or damaged."""
+        if not self._inflates:
+            return data
+        stream = zlib.decompressobj()
+        try:
+            text = stream.decompress(data, self._max_bytes)
+        except zlib.error as error:
+            raise ValueError("not deflated") from error
+        if not stream.eof or stream.unused_data:
+            raise ValueError("longer than a message may be")
+        return text
+
+    def _without_names(
+        self, data: bytes, text: bytes, kind: str, service: str, *, from_robot: bool
+    ) -> Kept | None:
+        if any(each in text for each in self._secrets):
+            return None
+        if self._in_bytes is None or self._in_bytes.search(text) is None:
+            return Kept(data, text, kind, service)
+        decode = self._codec.decode_from_robot if from_robot else self._codec.decode_from_server
+        message: Any = decode(data)
+        changes = {}
+        for name in (*_TEXT_FIELDS, *_VALUE_FIELDS):
+            before = getattr(message, name, None)
+            after = self._replaced(before, PROTOCOL_WORDS if name in _VALUE_FIELDS else frozenset())
+            if after is not before:
+                changes[name] = after
+        if not changes:  # by chance, in a number or a word of the protocol
+            return Kept(data, text, kind, service)
+        changed = self._codec.encode(msgspec.structs.replace(message, **changes))
+        return Kept(changed, self._inflated(changed), kind, service)
+
+    def _replaced(self, value: Any, spared: frozenset[str]) -> Any:
+        """Return *value* with pseudonyms for names but for *spared* words; the same object if it has none."""
+        if isinstance(value, str):
+            if self._in_text is None or value in spared:
+                return value
+            text = self._in_text.sub(self._pseudonym, value)
+            return value if text == value else text
+        if isinstance(value, dict):
+            items = [
+                (self._replaced(key, spared), self._replaced(each, spared)) for key, each in value.items()
+            ]
+            is_same = all(a is c and b is d for (a, b), (c, d) in zip(value.items(), items, strict=True))
+            return value if is_same else dict(items)
+        if isinstance(value, list):
+            parts = [self._replaced(each, spared) for each in value]
+            return value if all(a is b for a, b in zip(value, parts, strict=True)) else parts
+        return value
+
+    def _pseudonym(self, found: re.Match[str]) -> str:
+        return self._names[found.group()]
+
+    def _welcome(self, data: bytes) -> Kept | None:
+        message = self._codec.decode_from_server(data)
+        if not isinstance(message, Welcome):
+            return None
+        changed = self._codec.encode(msgspec.structs.replace(message, robot=self.robot))
+        return Kept(changed, self._inflated(changed), "welcome", "")
+
+
+def _either(names: Iterable[str]) -> str:
+    """Return a pattern of any of *names* as a whole word."""
+    return f"(?<![A-Za-z0-9_])(?:{'|'.join(map(re.escape, names))})(?![A-Za-z0-9_])"

@@ -1,0 +1,200 @@
+"""Hand the messages of a worker over to the recorder process, so that a robot never waits for a recording.
+
+In the path of a command nothing happens but that bytes are appended to a list.  Every 50 ms the list goes
+into a pipe that never blocks.  While the recorder is slow or dead, messages are dropped and counted.
+"""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import json
+import os
+import struct
+import time
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from typing import NamedTuple
+
+from rse_pf.identity import RobotId
+
+__all__ = ["CLOSED", "DOWN", "LOST", "OPENED", "UP", "Handed", "PipeReader", "RecordingTap", "recording_pipe"]
+
+OPENED, UP, DOWN, CLOSED, LOST = 1, 2, 3, 4, 5
+"""What one entry of the pipe is about."""
+_ENTRY = struct.Struct("<BIQI")
+"""Kind, number of the connection, Unix time in ns, bytes of data that follow."""
+_HAND_OVER_S = 0.05
+_PIPE_BYTES = 1 << 20
+_MAX_WAITING_BYTES = 8 << 20
+"""Bytes of messages that wait in a worker for a slow recorder; more are dropped."""
+_COPIED_BYTES = 1 << 20
+
+
+def recording_pipe() -> tuple[int, int]:
+    """Return the ends of a pipe from a worker (the second end, which never blocks) to the recorder."""
+    ours, theirs = os.pipe()
+    with suppress(OSError, AttributeError):  # another limit, or Python 3.9: a shorter pipe does it, too
+        fcntl.fcntl(theirs, fcntl.F_SETPIPE_SZ, _PIPE_BYTES)
+    os.set_blocking(theirs, False)
+    return ours, theirs
+
+
+class RecordingTap:
+    """Where the connections of a worker put their messages."""
+
+    __slots__ = (
+        "_call_later",
+        "_connections",
+        "_entries",
+        "_fd",
+        "_is_waiting",
+        "_on_dead",
+        "_rest",
+        "_time_ns",
+        "_told",
+        "_waiting_bytes",
+        "dropped",
+        "is_dead",
+    )
+
+    def __init__(
+        self,
+        fd: int,
+        *,
+        call_later: Callable[[float, Callable[[], None]], object],
+        on_dead: Callable[[], None] = lambda: None,
+        time_ns: Callable[[], int] = time.time_ns,
+    ) -> None:
+        """Hand nothing over yet.
+
+        Args:
+            fd: The worker's end of a `recording_pipe`.
+            call_later: Of the event loop.
+            on_dead: Called once when the recorder is gone.
+            time_ns: Unix time.
+        """
+        self.dropped = 0
+        """Messages that no recording will hold."""
+        self.is_dead = False
+        self._fd = fd
+        self._call_later = call_later
+        self._on_dead = on_dead
+        self._time_ns = time_ns
+        self._connections = self._told = 0
+        self._entries: list[tuple[int, int, int, bytes]] = []
+        self._waiting_bytes = 0
+        self._rest = memoryview(b"")
+        self._is_waiting = False
+
+    def opened(self, codec: str, robot: RobotId) -> int:
+        """Return the number of a new connection, for the other calls."""
+        self._connections += 1
+        self._append(OPENED, self._connections, json.dumps([codec, *robot]).encode())
+        return self._connections
+
+    def closed(self, connection: int) -> None:
+        """Take that *connection* is over."""
+        self._append(CLOSED, connection, b"")
+
+    def up(self, connection: int, data: bytes) -> None:
+        """Take a message of the robot."""
+        if self._waiting_bytes < _MAX_WAITING_BYTES and not self.is_dead:
+            self._append(UP, connection, data)
+        else:
+            self.dropped += 1
+
+    def down(self, connection: int, data: bytes) -> None:
+        """Take a message to the robot."""
+        if self._waiting_bytes < _MAX_WAITING_BYTES and not self.is_dead:
+            self._append(DOWN, connection, data)
+        else:
+            self.dropped += 1
+
+    def hand_over(self) -> None:
+        """Write what waits into the pipe, as much as it takes now."""
+        self._is_waiting = False
+        try:
+            while True:
+                if self._rest:
+                    written = os.write(self._fd, self._rest)
+                    self._waiting_bytes -= written
+                    self._rest = self._rest[written:]
+                elif self._entries:
+                    self._rest = memoryview(self._packed())
+                else:
+                    return
+        except BlockingIOError:
+            self._wait()
+        except OSError as error:
+            if error.errno not in (errno.EPIPE, errno.EBADF):
+                raise
+            self._die()
+
+    def _append(self, kind: int, connection: int, data: bytes) -> None:
+        if self.is_dead:
+            return
+        self._entries.append((kind, connection, self._time_ns(), data))
+        self._waiting_bytes += _ENTRY.size + len(data)
+        if not self._is_waiting:
+            self._wait()
+
+    def _wait(self) -> None:
+        self._is_waiting = True
+        self._call_later(_HAND_OVER_S, self.hand_over)
+
+    def _packed(self) -> bytes:
+        """Return the next entries as they are in the pipe, a bounded copy of them."""
+        parts: list[bytes] = []
+        size = count = 0
+        for kind, connection, time_ns, data in self._entries:
+            parts += (_ENTRY.pack(kind, connection, time_ns, len(data)), data)
+            size += len(data)
+            count += 1
+            if size >= _COPIED_BYTES:
+                break
+        del self._entries[:count]
+        if self.dropped != self._told and not self._entries:
+            self._told = self.dropped
+            lost = _ENTRY.pack(LOST, 0, self._time_ns(), 8) + struct.pack("<Q", self.dropped)
+            self._waiting_bytes += len(lost)
+            parts.append(lost)
+        return b"".join(parts)
+
+    def _die(self) -> None:
+        self.is_dead = True
+        self.dropped += sum(kind in (UP, DOWN) for kind, _, _, _ in self._entries)
+        self._entries.clear()
+        self._rest = memoryview(b"")
+        self._waiting_bytes = 0
+        with suppress(OSError):
+            os.close(self._fd)
+        self._on_dead()
+
+
+class Handed(NamedTuple):
+    """One entry of the pipe: its kind, the number of the connection, Unix time in ns, and the bytes."""
+
+    kind: int
+    connection: int
+    time_ns: int
+    data: bytes
+
+
+class PipeReader:
+    """Cuts what comes out of a pipe into entries."""
+
+    def __init__(self) -> None:
+        self._left = b""
+
+    def entries(self, data: bytes) -> Iterator[Handed]:
+        """Yield the entries that *data* completes."""
+        whole = self._left + data if self._left else data
+        at, end, head = 0, len(whole), _ENTRY.size
+        while end - at >= head:
+            kind, connection, time_ns, size = _ENTRY.unpack_from(whole, at)
+            if end - at - head < size:
+                break
+            yield Handed(kind, connection, time_ns, whole[at + head : at + head + size])
+            at += head + size
+        self._left = whole[at:]
