@@ -1,0 +1,9 @@
+"""Why a pose is bad: pure functions from what was recorded to causes, likeliest first.
+
+Nothing is read, written or drawn here; the same input gives the same explanation.
+"""
+
+from rse_pf.recording.explain.causes import Cause, Explanation, MatchesLike, PastCommand, ReplyLike, Timing
+from rse_pf.recording.explain.explain import explain
+
+__all__ = ["Cause", "Explanation", "MatchesLike", "PastCommand", "ReplyLike", "Timing", "explain"]

@@ -1,0 +1,206 @@
+"""`explain`: from one recorded command to the causes that fit it, likeliest first.
+
+Nothing is measured here; each cause has a module of its own.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from rse_pf.errors import RsePfError
+from rse_pf.geometry import Array
+from rse_pf.pnp import PnpOptions, PnpSolution
+from rse_pf.recording.explain.causes import Cause, Explanation, MatchesLike, PastCommand, ReplyLike, Timing
+from rse_pf.recording.explain.clocks import late
+from rse_pf.recording.explain.fitting import Fit, Matches, fitted, solved
+from rse_pf.recording.explain.intrinsics import intrinsics
+from rse_pf.recording.explain.matches import (
+    distinct_rows,
+    duplicates,
+    mirrored,
+    outliers,
+    plane,
+    stale_map,
+)
+from rse_pf.recording.explain.motion import depth_against_map, motion_against_odometry
+from rse_pf.recording.explain.pictures import blur
+from rse_pf.recording.explain.row_order import row_order
+
+__all__ = ["explain"]
+
+_TIGHT_PX = 3.0
+_USUAL_WIDTH_PX = 640.0
+_MAX_ROWS = 1000
+_MAX_ABS = 1e6
+
+
+def explain(
+    matches: MatchesLike,
+    reply: ReplyLike | None,
+    *,
+    thumbnail: bytes | None = None,
+    history: Sequence[PastCommand] | None = None,
+    timing: Timing | None = None,
+    T_odom_camera: Array | None = None,
+) -> list[Explanation]:
+    """Return the causes that fit a bad pose, likeliest first; one of `Cause.NONE` where nothing is wrong.
+
+    Deterministic; at most 200 ms on one core.  What was not recorded is named in ``missing``.
+
+    Args:
+        matches: The command's payload, as it was sent.
+        reply: The answer; None where there was none or it was a failure.
+        thumbnail: A small picture of the frame, JPEG or PNG.
+        history: Earlier commands of the same robot, oldest first; 5 to 10 suffice.
+        timing: When command and answer were where.
+        T_odom_camera: ``(4, 4)``, the robot's own odometry at the frame.
+    """
+    history = history or ()
+    rows, options = _checked(matches)
+    found: list[Explanation] = []
+    missing: list[str] = []
+    found_late, lacks = late(timing)
+    missing += lacks
+    thumbnails = [each.thumbnail for each in history if each.thumbnail is not None]
+    usual = [each.matches for each in history if each.matches]
+    usual_matches = float(np.median(usual)) if usual else None
+    found_blur, lacks = blur(thumbnail, thumbnails, len(rows), usual_matches)
+    missing += lacks
+    found += [each for each in (found_late, found_blur) if each is not None]
+    if len(rows) >= 4:
+        more, lacks = _by_matches(rows, options, reply, history, T_odom_camera)
+        found += more
+        missing += lacks
+    found.sort(key=lambda each: -each.confidence)
+    if not found:
+        found = [_nothing_found(rows, reply)]
+    return [replace(each, missing=tuple(dict.fromkeys(missing))) for each in found]
+
+
+def _checked(matches: MatchesLike) -> tuple[Matches, PnpOptions]:
+    """Return the finite rows, at most a thousand of them, and the options."""
+    points = np.asarray(matches.points_world, dtype=np.float64).reshape(-1, 3)
+    pixels = np.asarray(matches.pixels, dtype=np.float64).reshape(-1, 2)
+    n = min(len(points), len(pixels))
+    points, pixels = points[:n], pixels[:n]
+    depths = _depths(matches.depths_m, n)
+    options = matches.options or PnpOptions()
+    with np.errstate(invalid="ignore"):
+        finite = (np.abs(points) <= _MAX_ABS).all(axis=1) & (np.abs(pixels) <= _MAX_ABS).all(axis=1)
+    keep = np.flatnonzero(finite)[:_MAX_ROWS]
+    scale = max(1.0, matches.camera.width / _USUAL_WIDTH_PX)
+    return Matches(
+        points=points[keep], pixels=pixels[keep], camera=matches.camera, inlier_px=options.inlier_px,
+        tight_px=min(options.inlier_px, _TIGHT_PX * scale), depths_m=None if depths is None else depths[keep],
+        left_out=n - int(np.count_nonzero(finite)),
+    ), options  # fmt: skip
+
+
+def _depths(depths_m: Any, n: int) -> Array | None:
+    if not isinstance(depths_m, np.ndarray) or depths_m.size != n:
+        return None
+    return np.nan_to_num(np.asarray(depths_m, dtype=np.float64).ravel(), posinf=0.0, neginf=0.0)
+
+
+def _by_matches(
+    rows: Matches, options: PnpOptions, reply: ReplyLike | None, history: Sequence[PastCommand],
+    T_odom_camera: Array | None,
+) -> tuple[list[Explanation], tuple[str, ...]]:  # fmt: skip
+    """Return what the matches and the motion show, and what was missing for it."""
+    distinct = rows.of(distinct_rows(rows))
+    start = None if reply is None else np.asarray(reply.T_camera_world, dtype=np.float64).reshape(4, 4)
+    base = fitted(distinct, iterations=1000, start=start)
+    count = 0 if base is None else base.count
+    is_pair = rows.depths_m is not None or _seen_from_origin(distinct)
+    found: list[Explanation | None] = [duplicates(len(rows), len(distinct), count)]
+    bad = count < 0.9 * len(distinct)
+    if bad:
+        reflected = mirrored(distinct, count)
+        if reflected is not None:
+            return [each for each in (*found, reflected) if each is not None], ()
+        found += _rivals(distinct, base, history, is_pair=is_pair)
+    elif base is not None:
+        freed = intrinsics(distinct, base, is_pair=is_pair)
+        found.append(None if freed is None else freed[0])
+    lacks: tuple[str, ...] = ()
+    if base is not None:
+        weakness, deviation_m = _weakness(rows, options, reply)
+        found.append(plane(distinct, base, weakness, deviation_m))
+        found.append(depth_against_map(distinct, base))
+        pose = base.T_camera_world if start is None else start
+        moved, lacks = motion_against_odometry(pose, T_odom_camera, history, is_pair=is_pair)
+        found.append(moved)
+    return [each for each in found if each is not None], lacks
+
+
+def _rivals(
+    rows: Matches, base: Fit | None, history: Sequence[PastCommand], *, is_pair: bool
+) -> list[Explanation | None]:
+    """Return the causes that may explain why rows disagree: of those, the one that explains most rows."""
+    priors = [np.eye(4)] if is_pair else []
+    past = [each.T_camera_world for each in history if each.T_camera_world is not None]
+    priors += past[-1:]
+    count = 0 if base is None else base.count
+    tried = [row_order(rows, base, priors), intrinsics(rows, base, is_pair=is_pair)]
+    if base is not None:
+        tried.append(stale_map(rows, base))
+    rivals = sorted((each for each in tried if each is not None), key=lambda each: -each[1])
+    result: list[Explanation | None] = [outliers(rows, base)]
+    for place, (explanation, explained) in enumerate(rivals):
+        lower = 0.0 if place == 0 else 0.15 + 0.3 * (rivals[0][1] - explained) / len(rows)
+        if explained > count:
+            result.append(replace(explanation, confidence=max(0.05, explanation.confidence - lower)))
+    return result
+
+
+def _seen_from_origin(rows: Matches) -> bool:
+    """Return whether the world looks like a reference camera: all points lie in its image."""
+    points = rows.points
+    if float(np.mean(points[:, 2] > 0.05)) < 0.98:
+        return False
+    camera = rows.camera
+    front = points[points[:, 2] > 0.05]
+    pixels = camera.project(front)
+    margin = 0.02 * camera.width
+    inside = (
+        (pixels[:, 0] > -margin)
+        & (pixels[:, 0] < camera.width + margin)
+        & (pixels[:, 1] > -margin)
+        & (pixels[:, 1] < camera.height + margin)
+    )
+    return bool(np.mean(inside) > 0.97)
+
+
+def _weakness(rows: Matches, options: PnpOptions, reply: ReplyLike | None) -> tuple[str, float]:
+    """Return why the pose is weak or was refused, and the deviation of its position, metres."""
+    answer = solved(rows, options)
+    if isinstance(answer, RsePfError):
+        return (answer.code if reply is None else reply.reason), math.inf
+    assert isinstance(answer, PnpSolution)
+    deviation_m = math.sqrt(max(0.0, float(np.trace(answer.covariance[:3, :3]))))
+    return (answer.reason if reply is None else reply.reason), deviation_m
+
+
+def _nothing_found(rows: Matches, reply: ReplyLike | None) -> Explanation:
+    n = len(rows)
+    evidence = {"matches": float(n)}
+    if reply is None:
+        text = f"{n} matches gave no pose, and no known cause explains it"
+        return Explanation(cause=Cause.UNKNOWN, confidence=0.3, sentence=text, evidence=evidence)
+    inliers = int(np.asarray(reply.inliers).size)
+    evidence |= {"inliers": float(inliers), "rmse_px": float(reply.rmse_px)}
+    if reply.verdict != "ok":
+        return Explanation(
+            cause=Cause.UNKNOWN, confidence=0.3,
+            sentence=f"the pose is weak ({reply.reason}), and no known cause explains it", evidence=evidence,
+        )  # fmt: skip
+    return Explanation(
+        cause=Cause.NONE, confidence=0.9,
+        sentence=f"nothing is wrong: {inliers} of {n} matches agree to {reply.rmse_px:.2f} px",
+        evidence=evidence,
+    )  # fmt: skip

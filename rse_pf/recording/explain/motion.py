@@ -1,0 +1,119 @@
+"""Depth scale and late frames: the motion that the poses tell against the robot's odometry."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from itertools import pairwise
+
+import numpy as np
+
+from rse_pf.geometry import Array, inverse, rotation_angle_deg, transform
+from rse_pf.recording.explain.causes import Cause, Explanation, PastCommand
+from rse_pf.recording.explain.fitting import Fit, Matches
+
+__all__ = ["depth_against_map", "motion_against_odometry"]
+
+_LEAST_SCALE = 0.10
+_LEAST_MOTION_M, _LEAST_TURN_DEG = 0.015, 1.0
+_STEPS = 10
+
+
+def depth_against_map(matches: Matches, base: Fit) -> Explanation | None:
+    """Return the explanation where the depths at the pixels are a constant multiple of the points' depths."""
+    if matches.depths_m is None:
+        return None
+    depths = transform(base.T_camera_world, matches.points)[:, 2]
+    rows = base.agrees & (matches.depths_m > 0) & (depths > 0.1)
+    if np.count_nonzero(rows) < 12:
+        return None
+    ratios = np.log(matches.depths_m[rows] / depths[rows])
+    centre = float(np.median(ratios))
+    spread = 1.4826 * float(np.median(np.abs(ratios - centre)))
+    scale = math.exp(centre)
+    if abs(centre) < 0.06 or abs(centre) < 2.0 * spread:
+        return None
+    return Explanation(
+        cause=Cause.DEPTH_SCALE,
+        confidence=min(0.95, 0.75 + abs(centre)),
+        sentence=(
+            f"the depths of this image are {scale:.2f} times those of the points in {np.count_nonzero(rows)} "
+            f"matches (spread {spread:.0%}): one of the two has a wrong depth scale"
+        ),
+        evidence={"depth_ratio": scale, "depth_ratio_spread": spread},
+    )
+
+
+def motion_against_odometry(
+    T_camera_world: Array, T_odom_camera: Array | None, history: Sequence[PastCommand], *, is_pair: bool
+) -> tuple[Explanation | None, tuple[str, ...]]:
+    """Return the explanation where steps are a constant multiple of the odometry's, and what was missing.
+
+    A wrong depth scale changes lengths and no angles.  A late frame changes both alike, and the present
+    step only.
+
+    Args:
+        T_camera_world: ``(4, 4)``, the pose of the command.
+        T_odom_camera: ``(4, 4)``, odometry at its frame; None if there is none.
+        history: Earlier commands of the robot, oldest first.
+        is_pair: Whether the world of each command is the frame before it.
+    """
+    if not history:
+        return None, ("earlier commands of the robot (they would show its motion)",)
+    steps = _steps(T_camera_world, T_odom_camera, history, is_pair=is_pair)
+    if not steps:
+        return None, ("the robot's odometry (it would show a wrong depth scale or a late frame)",)
+    by_pose, by_odom = (np.array([step[k][:3, 3] for step in steps]) for k in (0, 1))
+    moving = np.linalg.norm(by_odom, axis=1) > _LEAST_MOTION_M
+    if not moving.any():
+        return None, ("a motion of the robot (it stood still, so scale cannot be seen)",)
+    scale, spread = _scale(by_pose[moving], by_odom[moving])
+    turns = np.array([[rotation_angle_deg(step[k][:3, :3]) for k in (0, 1)] for step in steps])
+    turning = turns[:, 1] > _LEAST_TURN_DEG
+    turn_scale = float(turns[turning, 0].sum() / turns[turning, 1].sum()) if turning.any() else 1.0
+    count = int(np.count_nonzero(moving))
+    if abs(math.log(max(scale, 1e-3))) < _LEAST_SCALE or abs(scale - 1.0) < 2.5 * spread / math.sqrt(count):
+        return None, ()
+    if turning.any() and abs(turn_scale - 1.0) > 0.5 * abs(scale - 1.0):
+        return None, ()
+    moved_m, odom_m = (float(np.linalg.norm(each[moving], axis=1).sum()) for each in (by_pose, by_odom))
+    return Explanation(
+        cause=Cause.DEPTH_SCALE,
+        confidence=min(0.93, 0.7 + 0.5 * abs(math.log(max(scale, 1e-3)))),
+        sentence=(
+            f"over {count} step(s), the poses moved {moved_m:.2f} m where the odometry moved {odom_m:.2f} m: "
+            f"{scale:.2f} times as far along the same way, while turns agree: the depth scale is wrong by "
+            "that factor"
+        ),
+        evidence={
+            "scale": scale, "scale_spread": spread, "steps": float(count), "turn_scale": turn_scale,
+            "moved_by_poses_m": moved_m, "moved_by_odometry_m": odom_m,
+        },
+    ), ()  # fmt: skip
+
+
+def _steps(
+    T_camera_world: Array, T_odom_camera: Array | None, history: Sequence[PastCommand], *, is_pair: bool
+) -> list[tuple[Array, Array]]:
+    """Return pairs of motions from one frame to the next, by the poses and by the odometry."""
+    last = PastCommand(sent_s=0.0, T_camera_world=T_camera_world, T_odom_camera=T_odom_camera)
+    chain = [*history[-_STEPS:], last]
+    steps = []
+    for before, after in pairwise(chain):
+        if before.T_odom_camera is None or after.T_odom_camera is None or after.T_camera_world is None:
+            continue
+        odometry = inverse(after.T_odom_camera) @ before.T_odom_camera
+        if is_pair:
+            steps.append((after.T_camera_world, odometry))
+        elif before.T_camera_world is not None:
+            steps.append((after.T_camera_world @ inverse(before.T_camera_world), odometry))
+    return steps
+
+
+def _scale(by_pose: Array, by_odom: Array) -> tuple[float, float]:
+    """Return the factor from odometry to poses along the odometry's way, robust, and its spread per step."""
+    lengths = np.linalg.norm(by_odom, axis=1)
+    along = (by_pose * by_odom).sum(axis=1) / lengths**2
+    scale = float(np.median(along))
+    aside = np.linalg.norm(by_pose - scale * by_odom, axis=1) / lengths
+    return scale, float(np.median(aside))
