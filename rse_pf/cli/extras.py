@@ -116,6 +116,7 @@ VERBS_NEED: dict[str, tuple[str, ...]] = {
     "demo --merge": ("demo", "maps"),
     "experiment": ("experiments",),
     "local": ("local",),
+    "fleet": ("local",),
     "swarm": ("local",),
     "token": ("keys",),
     "robot": ("keys",),

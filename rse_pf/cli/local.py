@@ -28,6 +28,7 @@ import math
 import os
 import signal
 import time
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -92,6 +93,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--level", choices=("debug", "info", "warning", "error"), default="debug",
         help="logs: lines of at least this level (default: all)",
     )  # fmt: skip
+    parser.add_argument("--no-page", action="store_true", help="start no fleet page")
     parser.add_argument(
         "--no-data", action="store_true", help="start no data service (large data by HTTP under /data/)"
     )
@@ -128,7 +130,8 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
     chosen = settings.replace(local={name: value for name, value in wanted.items() if value is not None})
     chosen = _with_services(chosen, args)
     lan = chosen_address(args.lan)
-    return asyncio.run(_foreground(args.name, folder, chosen, data=not args.no_data, lan=lan))
+    page = not args.no_page
+    return asyncio.run(_foreground(args.name, folder, chosen, data=not args.no_data, lan=lan, page=page))
 
 
 def _with_services(settings: PlatformSettings, args: argparse.Namespace) -> PlatformSettings:
@@ -286,7 +289,10 @@ def _wait(end_s: float, seconds: float) -> bool:
     return signal.sigtimedwait(_STOPPERS, left_s) is not None or time.monotonic() >= end_s
 
 
-async def _foreground(name: str, folder: Any, settings: PlatformSettings, *, data: bool, lan: str) -> int:
+async def _foreground(
+    name: str, folder: Any, settings: PlatformSettings, *, data: bool, lan: str, page: bool
+) -> int:
+    from rse_pf.cli.local_platform.page import page_beside
     from rse_pf.local.control.control_plane import ControlOptions
     from rse_pf.local.control.platform import LocalPlatform
 
@@ -319,8 +325,10 @@ async def _foreground(name: str, folder: Any, settings: PlatformSettings, *, dat
         async with platform:
             ready = True
             _welcome(platform, name)
-            await stopped.wait()
-            show("", "stopping")
+            beside = page_beside(folder, settings.local.page_port, _show_page) if page else nullcontext()
+            async with beside:
+                await stopped.wait()
+                show("", "stopping")
     except asyncio.CancelledError:
         show("", "stopped before it was ready", error=True)
         return 130
@@ -343,6 +351,10 @@ def _welcome(platform: Any, name: str) -> None:
         f"logs and state      {platform.state}",
         "",
     )
+
+
+def _show_page(url: str) -> None:
+    show(f"fleet page          {url}")
 
 
 def _lan_lines(platform: Any, which: str) -> list[str]:

@@ -28,6 +28,7 @@ VERBS = {
     "demo": "let robots build point-cloud maps through the platform, on this machine",
     "experiment": "repeat the experiments of Section 6 of the paper, or verify a run from its records",
     "local": "run the platform on this machine: load balancer and backend servers",
+    "fleet": "print a new address of the fleet page, which shows a running platform in a browser",
     "swarm": "load a platform with many robots, and measure what they see",
     "token": "issue a robot's token, or show what one contains",
     "robot": "enrol robots with keys of their own, disable them, revoke tokens",

@@ -105,7 +105,7 @@ PACKAGES: dict[str, tuple[str, ...]] = {
         "rse_pf/data_server/",
         "rse_pf/local/control/federation.py",
     ),
-    "uvicorn": ("rse_pf/data_server/server.py",),
+    "uvicorn": ("rse_pf/data_server/server.py", "rse_pf/fleet_page/server.py"),
     "jwt": ("rse_pf/auth/tokens.py",),
     "cryptography": ("rse_pf/auth/tokens.py", "rse_pf/auth/certificates.py"),
     "boto3": ("rse_pf/aws/",),

@@ -1,16 +1,17 @@
 """The port of the control plane on loopback: its state, its metrics, and the operations of an operator.
 
 ``GET /status`` is JSON, ``GET /metrics`` is for Prometheus; ``POST /drain?server=NAME`` and ``POST /roll``
-are answered with the events of the operation, one JSON object a line, until it is over.  Every request needs
-the token of the control ports, and none may come from a web page.  A slow or malformed request ends its own
-connection only.
+are answered with the events of the operation, one JSON object a line, until it is over; ``GET /watch`` with
+what happens, in the same form, until the connection ends.  Every request needs the token of the control
+ports, and none may come from a web page.  A slow or malformed request ends its own connection only.
 """
 
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import json
-from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
+from collections.abc import AsyncGenerator, Awaitable, Callable, Mapping
 from typing import Any
 from urllib.parse import parse_qsl, urlsplit
 
@@ -22,8 +23,11 @@ __all__ = ["METRICS_TYPE", "Page", "serve_control_port"]
 METRICS_TYPE = "text/plain; version=0.0.4; charset=utf-8"
 Page = Callable[[], Awaitable[tuple[str, bytes]]]
 """Returns the media type and the body of a page."""
-Operation = Callable[[Mapping[str, str]], AsyncIterator[Mapping[str, Any]]]
-"""Begins an operation with the parameters of the request, and returns its events; raises RsePfError."""
+Operation = Callable[[Mapping[str, str]], AsyncGenerator[Mapping[str, Any], None]]
+"""Begins an operation with the parameters of the request, and returns its events; raises RsePfError.
+
+One that is asked with GET changes nothing, and goes on until the connection ends.
+"""
 
 _LOOPBACK = "127.0.0.1"
 _TIMEOUT_S = 5.0
@@ -31,7 +35,12 @@ _MAX_HEAD_BYTES = 16384
 
 
 async def serve_control_port(
-    pages: Mapping[str, Page], operations: Mapping[str, Operation], token: str, *, port: int = 0
+    pages: Mapping[str, Page],
+    operations: Mapping[str, Operation],
+    token: str,
+    *,
+    streams: Mapping[str, Operation] | None = None,
+    port: int = 0,
 ) -> asyncio.Server:
     """Listen on loopback; *pages* are asked with GET, *operations* with POST, by their paths.
 
@@ -39,6 +48,7 @@ async def serve_control_port(
         pages: What is shown.
         operations: What is done.
         token: That every request must carry.
+        streams: What is told for as long as somebody listens; asked with GET.
         port: 0 takes a free one.
 
     Raises:
@@ -48,7 +58,7 @@ async def serve_control_port(
     async def talk(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         try:
             head = await asyncio.wait_for(reader.readuntil(b"\r\n\r\n"), _TIMEOUT_S)
-            await _answer(writer, head.decode("latin-1"), pages, operations, token)
+            await _answer(writer, head.decode("latin-1"), pages, operations, streams or {}, token)
         except (OSError, ValueError, EOFError, asyncio.LimitOverrunError, asyncio.TimeoutError):
             pass  # see above
         finally:
@@ -62,6 +72,7 @@ async def _answer(
     head: str,
     pages: Mapping[str, Page],
     operations: Mapping[str, Operation],
+    streams: Mapping[str, Operation],
     token: str,
 ) -> None:
     request, *lines = head.split("\r\n")
@@ -79,7 +90,9 @@ async def _answer(
         await _send(writer, "200 OK", body, kind)
     elif method == "POST" and url.path in operations:
         await _operate(writer, operations[url.path], dict(parse_qsl(url.query)))
-    elif target in pages or url.path in operations:
+    elif method == "GET" and url.path in streams:
+        await _operate(writer, streams[url.path], dict(parse_qsl(url.query)))
+    elif target in pages or url.path in operations or url.path in streams:
         await _send(writer, "405 Method Not Allowed", _json({"code": "method"}))
     else:
         await _send(writer, "404 Not Found", _json({"code": "not-found"}))
@@ -94,9 +107,10 @@ async def _operate(writer: asyncio.StreamWriter, operation: Operation, query: Ma
         return
     head = "HTTP/1.1 200 OK\r\nContent-Type: application/jsonl\r\nCache-Control: no-store\r\n"
     writer.write(f"{head}Connection: close\r\n\r\n".encode())
-    async for event in events:
-        writer.write(_json(event))
-        await asyncio.wait_for(writer.drain(), _TIMEOUT_S)
+    async with contextlib.aclosing(events):
+        async for event in events:
+            writer.write(_json(event))
+            await asyncio.wait_for(writer.drain(), _TIMEOUT_S)
 
 
 async def _send(

@@ -7,7 +7,9 @@ servers from each other.
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator, Callable, Coroutine, Mapping
+import contextlib
+import time
+from collections.abc import AsyncGenerator, Callable, Coroutine, Mapping
 from typing import Any
 
 from rse_pf.errors import RsePfError, UsageError
@@ -17,6 +19,10 @@ __all__ = ["FAILED", "OVER", "Operations"]
 Event = Mapping[str, Any]
 OVER, FAILED = "operation-over", "operation-failed"
 """The last event of an operation."""
+_MAX_WATCHERS = 8
+_MAX_UNHEARD = 1000
+"""Events that wait for a slow watcher; newer ones are left out then, and it can tell by their numbers."""
+_LOOK_S = 1.0
 
 
 class Operations:
@@ -27,13 +33,14 @@ class Operations:
         self._keep = keep
         self._listeners: set[Callable[[Event], None]] = set()
         self._running = ""
+        self._watchers = 0
 
     def heard(self, event: Event) -> None:
         """Take an event of the platform, and pass it on to the commands that wait for an operation."""
         for listener in list(self._listeners):
             listener(event)
 
-    def begin(self, name: str, work: Callable[[], Coroutine[Any, Any, Any]]) -> AsyncIterator[Event]:
+    def begin(self, name: str, work: Callable[[], Coroutine[Any, Any, Any]]) -> AsyncGenerator[Event, None]:
         """Start *work*, and return the events of the platform until it ended, and how that was.
 
         Raises:
@@ -49,6 +56,45 @@ class Operations:
         self._keep(self._run(work, events))
         return self._until_over(events)
 
+    def watch(self, state: Callable[[], Event]) -> AsyncGenerator[Event, None]:
+        """Return the *state* of the platform once a second, and each event at once, without an end.
+
+        A state comes as ``{"state": {...}}``; an event has ``time_s``, Unix time, and ``number``.
+
+        Raises:
+            UsageError: `_MAX_WATCHERS` others watch.
+        """
+        if self._watchers >= _MAX_WATCHERS:
+            raise UsageError(f"{_MAX_WATCHERS} others watch already", hint="end one of them")
+        return self._watched(state)
+
+    async def _watched(self, state: Callable[[], Event]) -> AsyncGenerator[Event, None]:
+        loop = asyncio.get_running_loop()
+        events: asyncio.Queue[Event] = asyncio.Queue(_MAX_UNHEARD)
+        number = 0
+
+        def take(event: Event) -> None:
+            nonlocal number
+            number += 1
+            with contextlib.suppress(asyncio.QueueFull):
+                events.put_nowait({**event, "time_s": round(time.time(), 3), "number": number})
+
+        self._watchers += 1
+        self._listeners.add(take)
+        try:
+            due_s = loop.time()
+            while True:
+                left_s = due_s - loop.time()
+                if left_s <= 0 and events.empty():
+                    due_s = loop.time() + _LOOK_S
+                    yield {"state": state()}
+                    continue
+                with contextlib.suppress(asyncio.TimeoutError):
+                    yield await asyncio.wait_for(events.get(), max(left_s, 0.001))
+        finally:
+            self._watchers -= 1
+            self._listeners.discard(take)
+
     async def _run(self, work: Callable[[], Coroutine[Any, Any, Any]], events: asyncio.Queue[Event]) -> None:
         last: Event = {"event": FAILED, "message": "the platform ends", "hint": ""}
         try:
@@ -60,7 +106,7 @@ class Operations:
             self._running = ""
             events.put_nowait(last)
 
-    async def _until_over(self, events: asyncio.Queue[Event]) -> AsyncIterator[Event]:
+    async def _until_over(self, events: asyncio.Queue[Event]) -> AsyncGenerator[Event, None]:
         try:
             while True:
                 event = await events.get()

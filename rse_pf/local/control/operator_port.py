@@ -3,19 +3,24 @@
 from __future__ import annotations
 
 import asyncio
+import functools
 import json
-from collections.abc import AsyncIterator, Callable, Coroutine, Mapping, Sequence
+from collections.abc import AsyncGenerator, Callable, Coroutine, Mapping, Sequence
 from typing import Any, Protocol
 
-from rse_pf.errors import ConfigurationError
+from rse_pf.errors import ConfigurationError, UsageError
 from rse_pf.local.control.control_port import METRICS_TYPE, serve_control_port
 from rse_pf.local.control.federation import federated
-from rse_pf.local.control.operations import Operations
+from rse_pf.local.control.operations import OVER, Operations
 from rse_pf.local.servers.backend_servers import BackendServer
+from rse_pf.local.servers.control_client import ControlPort
 
 __all__ = ["OperatedPlatform", "OperatorPort"]
 
 Event = Mapping[str, Any]
+_MAX_MOVED = 10_000
+_SPREAD_S = 1.0
+_ASK_S = 2.0
 
 
 class OperatedPlatform(Protocol):
@@ -37,6 +42,15 @@ class OperatedPlatform(Protocol):
     async def roll(self) -> None:
         """Replace every server."""
 
+    def kill(self, name: str) -> None:
+        """End *name* as a crash would; raises UsageError."""
+
+    def pause(self, name: str) -> None:
+        """Stop the processes of *name*; raises UsageError."""
+
+    def resume(self, name: str) -> None:
+        """Let a paused server go on; raises UsageError."""
+
 
 class OperatorPort:
     """The port, closed at first.  ``port`` is 0 while it is closed."""
@@ -47,6 +61,7 @@ class OperatorPort:
         *,
         metrics: Callable[[BackendServer], Coroutine[Any, Any, str | None]],
         keep: Callable[[Coroutine[Any, Any, None]], None],
+        emit: Callable[..., None],
     ) -> None:
         """Describe the port.
 
@@ -54,9 +69,12 @@ class OperatorPort:
             platform: What it shows and operates.
             metrics: Returns the page of a server for Prometheus, None if it does not answer.
             keep: Lets work go on until it is done or the platform ends.
+            emit: Called with an event and its details.
         """
         self._platform = platform
         self._metrics_of = metrics
+        self._emit = emit
+        self._token = ""
         self._operations = Operations(keep)
         self._server: asyncio.Server | None = None
         self.heard = self._operations.heard
@@ -73,10 +91,19 @@ class OperatorPort:
             ConfigurationError: None is free.
         """
         pages = {"/status": self._status, "/metrics": self._metrics}
-        operations = {"/drain": self._drain, "/roll": self._roll}
+        operations: dict[str, Callable[[Mapping[str, str]], AsyncGenerator[Event, None]]] = {
+            "/drain": self._drain,
+            "/roll": self._roll,
+            "/move": self._move,
+            "/kill": functools.partial(self._at_once, self._platform.kill),
+            "/pause": functools.partial(self._at_once, self._platform.pause),
+            "/resume": functools.partial(self._at_once, self._platform.resume),
+        }
+        streams = {"/watch": self._watch}
+        self._token = token
         for port in ports:
             try:
-                self._server = await serve_control_port(pages, operations, token, port=port)
+                self._server = await serve_control_port(pages, operations, token, streams=streams, port=port)
                 return
             except OSError:
                 continue
@@ -99,10 +126,48 @@ class OperatorPort:
             {server.name: page for server, page in zip(servers, pages, strict=True)}
         )
 
-    def _drain(self, query: Mapping[str, str]) -> AsyncIterator[Event]:
+    def _drain(self, query: Mapping[str, str]) -> AsyncGenerator[Event, None]:
         name = query.get("server", "")
         self._platform.check_drain(name)
         return self._operations.begin("drain", lambda: self._platform.drain(name))
 
-    def _roll(self, query: Mapping[str, str]) -> AsyncIterator[Event]:
+    def _roll(self, query: Mapping[str, str]) -> AsyncGenerator[Event, None]:
         return self._operations.begin("roll", self._platform.roll)
+
+    def _move(self, query: Mapping[str, str]) -> AsyncGenerator[Event, None]:
+        name, robots = query.get("server", ""), _count(query.get("robots", ""))
+        found = next((server for server in self._platform.servers if server.name == name), None)
+        if found is None:
+            running = ", ".join(server.name for server in self._platform.servers) or "none"
+            raise UsageError(f"no server named {name[:80]!r} takes robots", hint=f"these do: {running}")
+        port = ControlPort(found.control_port, self._token)
+        return self._operations.begin("move", lambda: self._asked_to_move(name, port, robots))
+
+    async def _asked_to_move(self, name: str, port: ControlPort, robots: int) -> None:
+        target = f"/move?robots={robots}&spread_s={_SPREAD_S:g}"
+        reply = await port.ask_once(target, timeout_s=_ASK_S, method="POST")
+        told = {} if reply is None else reply.document()
+        if reply is None or reply.status >= 300 or told.get("under_way"):
+            raise UsageError(
+                f"{name} lets no robot move now",
+                hint="its robots move already, or it drains; see rse-pf local status",
+            )
+        self._emit("rebalance", server=name, robots=told["robots"], spread_s=told["spread_s"], reason="asked")
+
+    def _at_once(self, act: Callable[[str], None], query: Mapping[str, str]) -> AsyncGenerator[Event, None]:
+        act(query.get("server", ""))
+        return _over()
+
+    def _watch(self, query: Mapping[str, str]) -> AsyncGenerator[Event, None]:
+        return self._operations.watch(self._platform.status_document)
+
+
+async def _over() -> AsyncGenerator[Event, None]:
+    yield {"event": OVER}
+
+
+def _count(text: str) -> int:
+    """Return *text* as a number of robots; raises UsageError."""
+    if not (text.isascii() and text.isdigit() and 0 < int(text[:6]) <= _MAX_MOVED):
+        raise UsageError(f"{text[:20]!r} is no number of robots", hint=f"take one from 1 to {_MAX_MOVED}")
+    return int(text[:6])

@@ -147,7 +147,9 @@ class LocalPlatform:
             self.backend_servers, self.load_balancer, settings,
             compress=control.compress, emit=self._emit, changed=self._write_state,
         )  # fmt: skip
-        self._operator_port = OperatorPort(self, metrics=self.backend_servers.metrics, keep=self._fleet.keep)
+        self._operator_port = OperatorPort(
+            self, metrics=self.backend_servers.metrics, keep=self._fleet.keep, emit=self._emit
+        )
         self._control = ControlPlane(
             self._fleet, self.load_balancer, settings, _bounds(settings.scaling, self._count), control,
             emit=self._emit, changed=self._write_state,

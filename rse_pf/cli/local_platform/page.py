@@ -1,0 +1,90 @@
+"""The fleet page of a local platform: a process beside the control plane, and new addresses of it."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import http.client
+import json
+import os
+import sys
+from collections.abc import AsyncIterator, Callable
+from pathlib import Path
+from typing import Any
+
+from rse_pf.auth.control_token import bearer, read_control_token
+from rse_pf.errors import CommandFailed, UsageError
+from rse_pf.fleet_page.server import ANNOUNCEMENT, page_url
+from rse_pf.local.state import control_token_file
+
+__all__ = ["new_address", "page_beside"]
+
+_LOG = "fleet_page.log"
+_END_S = 3.0
+_TIMEOUT_S = 5.0
+
+
+@contextlib.asynccontextmanager
+async def page_beside(folder: Path, port: int, told: Callable[[str], None]) -> AsyncIterator[None]:
+    """Run the page of the platform in *folder*; its address is told when it serves.
+
+    The platform is not delayed by its page, and does not end with it.
+    """
+    with (folder / _LOG).open("ab") as log:
+        process = await asyncio.create_subprocess_exec(
+            sys.executable, "-m", "rse_pf.fleet_page", str(folder), "--port", str(port),
+            "--parent", str(os.getpid()), stdin=asyncio.subprocess.DEVNULL, stdout=asyncio.subprocess.PIPE,
+            stderr=log, start_new_session=True,
+        )  # fmt: skip
+    telling = asyncio.ensure_future(_tell(process, told))
+    try:
+        yield
+    finally:
+        telling.cancel()
+        with contextlib.suppress(ProcessLookupError):
+            process.terminate()
+        try:
+            await asyncio.wait_for(process.wait(), _END_S)
+        except asyncio.TimeoutError:
+            process.kill()
+            await process.wait()
+
+
+def new_address(folder: Path, role: str) -> str:
+    """Return a new address of the running page, with a key for *role*, ``view`` or ``operate``.
+
+    Raises:
+        UsageError: No page runs for this platform.
+        CommandFailed: It does not answer.
+    """
+    try:
+        port = int(json.loads((folder / ANNOUNCEMENT).read_text(encoding="utf-8"))["port"])
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise UsageError(
+            f"no fleet page runs for platform {folder.name!r}",
+            hint=f"start it: rse-pf local --name {folder.name}",
+        ) from error
+    token = read_control_token(control_token_file(folder))
+    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=_TIMEOUT_S)
+    try:
+        connection.request(
+            "POST", "/keys", json.dumps({"role": role}), headers={"Authorization": bearer(token)}
+        )
+        reply = connection.getresponse()
+        answer: dict[str, Any] = json.loads(reply.read())
+        if reply.status != 200:
+            raise CommandFailed(f"the fleet page answers {reply.status}", hint=str(answer.get("hint", "")))
+        return page_url(port, str(answer["key"]))
+    except (OSError, http.client.HTTPException, ValueError, KeyError) as error:
+        raise CommandFailed(
+            "the fleet page does not answer", hint=f"look at {folder / _LOG}, or start the platform again"
+        ) from error
+    finally:
+        connection.close()
+
+
+async def _tell(process: asyncio.subprocess.Process, told: Callable[[str], None]) -> None:
+    assert process.stdout is not None
+    line = await process.stdout.readline()
+    with contextlib.suppress(ValueError, KeyError):
+        told(str(json.loads(line)["url"]))

@@ -1,0 +1,84 @@
+"""Weak and failed commands as they come, from the logs that the servers of a local platform write anyway.
+
+Only the lines about commands are read.  The text in them may come from robots: it is escaped here.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+from rse_pf.terminal import printable
+
+__all__ = ["CommandLog"]
+
+_MAX_READ_BYTES = 1 << 20
+_TAIL_BYTES = 1 << 18
+_MARK = b'"command"'
+_FIELDS = ("robot", "service", "id", "trace", "code", "verdict", "reason", "queue_ms", "compute_ms", "server")
+_MAX_TEXT = 200
+_MAX_ROWS = 200
+
+
+class CommandLog:
+    """Reads what is appended to the logs of a folder, and first the end of what is there."""
+
+    def __init__(self, folder: Path) -> None:
+        """Read nothing yet."""
+        self._folder = folder
+        self._read: dict[Path, int] = {}
+        self._rest: dict[Path, bytes] = {}
+        self.skipped = 0
+        """Lines that came faster than they are shown."""
+
+    def new_rows(self) -> list[dict[str, Any]]:
+        """Return the commands that were written since the last call, oldest first."""
+        rows: list[dict[str, Any]] = []
+        for file in sorted(self._folder.glob("server-*.log")):
+            rows += self._rows_of(file)
+        rows.sort(key=lambda row: float(row["time_s"]))
+        self.skipped += max(len(rows) - _MAX_ROWS, 0)
+        return rows[-_MAX_ROWS:]
+
+    def _rows_of(self, file: Path) -> list[dict[str, Any]]:
+        try:
+            size = file.stat().st_size
+            start = self._read.get(file, max(0, size - _TAIL_BYTES))
+            if size < start:  # it was set aside, and begun anew
+                start, self._rest[file] = 0, b""
+            if size - start > _MAX_READ_BYTES:
+                start, self._rest[file] = size - _MAX_READ_BYTES, b""
+            if size == start:
+                self._read[file] = size
+                return []
+            with file.open("rb") as opened:
+                opened.seek(start)
+                data = opened.read(size - start)
+        except OSError:
+            return []
+        self._read[file] = start + len(data)
+        *lines, self._rest[file] = (self._rest.get(file, b"") + data).split(b"\n")
+        self._rest[file] = self._rest[file][-_TAIL_BYTES:]
+        return [row for row in map(_row, lines) if row is not None]
+
+
+def _row(line: bytes) -> dict[str, Any] | None:
+    """Return what is shown of one line; None if it tells of no weak or failed command."""
+    if _MARK not in line:
+        return None
+    try:
+        told = json.loads(line)
+    except ValueError:
+        return None
+    if not isinstance(told, dict) or told.get("event") != "command":
+        return None
+    row: dict[str, Any] = {name: told[name] for name in _FIELDS if name in told}
+    if row.get("code") in ("busy", "stale") or (row.get("code") == "ok" and row.get("verdict") != "weak"):
+        return None
+    time_s = told.get("time", told.get("t", 0.0))
+    row["time_s"] = time_s if isinstance(time_s, int | float) else 0.0
+    return {
+        name: value if isinstance(value, int | float) else printable(str(value)[:_MAX_TEXT])
+        for name, value in row.items()
+    }

@@ -1,0 +1,84 @@
+"""What an operator can do from the page: the operations of the control plane, by its operator's port."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlencode
+
+from rse_pf.auth.control_token import bearer, read_control_token
+from rse_pf.errors import BadRequest, Busy, CommandFailed, UsageError
+from rse_pf.local.processes import is_alive
+from rse_pf.local.state import read_state
+
+__all__ = ["ACTIONS", "LocalOperations"]
+
+ACTIONS = {
+    "kill": ("server",),
+    "pause": ("server",),
+    "resume": ("server",),
+    "drain": ("server",),
+    "move": ("server", "robots"),
+    "roll": (),
+}
+"""Action to its parameters."""
+_LOOPBACK = "127.0.0.1"
+_SILENCE_S = 300.0
+_MAX_LINE_BYTES = 1 << 20
+_FAILED = "operation-failed"
+
+
+class LocalOperations:
+    """Operates the platform whose state is in a folder."""
+
+    def __init__(self, folder: Path) -> None:
+        """Ask nothing yet."""
+        self._folder = folder
+
+    async def operate(self, action: str, parameters: Mapping[str, str]) -> Mapping[str, Any]:
+        """Do *action*, and return the last event when it is over.
+
+        Raises:
+            BadRequest: There is no such action, or a parameter is missing.
+            Busy: The control plane does not answer.
+            UsageError: It refuses.
+            CommandFailed: The operation failed.
+        """
+        if action not in ACTIONS or any(not parameters.get(name) for name in ACTIONS[action]):
+            raise BadRequest(
+                f"there is no action {action[:40]!r} like this", hint=f"there are {', '.join(ACTIONS)}"
+            )
+        state = await asyncio.to_thread(read_state, self._folder)
+        if state is None or not state.status_port or not is_alive(state.control_plane):
+            raise Busy("the control plane does not run", hint="start it: rse-pf local", retry_after_ms=1000)
+        token = read_control_token(Path(state.control_token_file))
+        query = urlencode({name: parameters[name] for name in ACTIONS[action]})
+        try:
+            return await self._asked(state.status_port, token, f"/{action}?{query}")
+        except (OSError, ValueError, EOFError, asyncio.TimeoutError) as error:
+            raise Busy(
+                "the control plane does not answer", hint="see rse-pf local status", retry_after_ms=1000
+            ) from error
+
+    async def _asked(self, port: int, token: str, target: str) -> Mapping[str, Any]:
+        reader, writer = await asyncio.open_connection(_LOOPBACK, port, limit=_MAX_LINE_BYTES)
+        try:
+            head = f"POST {target} HTTP/1.1\r\nHost: {_LOOPBACK}\r\nAuthorization: {bearer(token)}\r\n"
+            writer.write(f"{head}Content-Length: 0\r\n\r\n".encode())
+            status = int((await reader.readuntil(b"\r\n\r\n")).split(b" ", 2)[1])
+            last: Mapping[str, Any] = {}
+            while line := await asyncio.wait_for(reader.readline(), _SILENCE_S):
+                last = json.loads(line)
+        finally:
+            writer.close()
+        if status != 200:
+            raise UsageError(
+                str(last.get("message", f"the control plane answers {status}")),
+                hint=str(last.get("hint", "")),
+            )
+        if last.get("event") == _FAILED:
+            raise CommandFailed(str(last.get("message", "")), hint=str(last.get("hint", "")))
+        return last

@@ -1,0 +1,105 @@
+"""Who may look at the page and who may operate the platform from it: one-time keys, and sessions in memory.
+
+A key opens one session and is worth nothing afterwards.  Neither is ever written anywhere.  A browser keeps
+its session for one origin, port included, and sends it in a header: unlike a cookie, it reaches no other
+service of the same machine, and no other page can send it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+
+from rse_pf.errors import Forbidden, Unauthorized
+
+__all__ = ["KEY_LIFE_S", "MAX_SESSIONS", "PageSessions", "Role"]
+
+Role = Literal["view", "operate"]
+
+KEY_LIFE_S = 3600.0
+MAX_SESSIONS = 32
+_MAX_KEYS = 64
+_IDLE_S = 12 * 3600.0
+_NEW_KEY = "get a new address with: rse-pf fleet"
+_NEW_OPERATOR_KEY = "get one with: rse-pf fleet --operate"
+
+
+@dataclass(slots=True)
+class _Session:
+    role: Role
+    used_s: float
+
+
+class PageSessions:
+    """The keys that were given out, and the sessions that they opened; only digests are kept."""
+
+    def __init__(self, *, secret: Callable[[], str]) -> None:
+        """Know no session yet; *secret* returns a new random text each time."""
+        self._secret = secret
+        self._keys: dict[bytes, tuple[Role, float]] = {}
+        self._sessions: dict[bytes, _Session] = {}
+
+    def new_key(self, role: Role, *, now_s: float) -> str:
+        """Return a key that opens one session of *role* within `KEY_LIFE_S`."""
+        key = self._secret()
+        self._keys[_digest(key)] = (role, now_s + KEY_LIFE_S)
+        while len(self._keys) > _MAX_KEYS:
+            del self._keys[next(iter(self._keys))]
+        return key
+
+    def open(self, key: str, *, now_s: float) -> tuple[str, Role]:
+        """Return a new session and its role for a *key*, which is used up.
+
+        Raises:
+            Unauthorized: The key is unknown, was used, or is too old.
+        """
+        role = self._used_up(key, now_s)
+        if role is None:
+            raise Unauthorized("this key is unknown, was used already, or is too old", hint=_NEW_KEY)
+        session = self._secret()
+        self._sessions[_digest(session)] = _Session(role, now_s)
+        while len(self._sessions) > MAX_SESSIONS:
+            del self._sessions[min(self._sessions, key=lambda each: self._sessions[each].used_s)]
+        return session, role
+
+    def promote(self, session: str, key: str, *, now_s: float) -> None:
+        """Let a *session* operate, for a *key* of an operator, which is used up.
+
+        Raises:
+            Unauthorized: There is no such session, or no such key.
+            Forbidden: The key is for looking only.
+        """
+        self.role_of(session, now_s=now_s)
+        role = self._used_up(key, now_s)
+        if role is None:
+            raise Unauthorized("this key is unknown, was used already, or is too old", hint=_NEW_OPERATOR_KEY)
+        if role != "operate":
+            raise Forbidden("this key is for looking only", hint=_NEW_OPERATOR_KEY)
+        self._sessions[_digest(session)].role = "operate"
+
+    def role_of(self, session: str, *, now_s: float) -> Role:
+        """Return what a *session* may do; raises Unauthorized if there is none."""
+        found = self._sessions.get(_digest(session))
+        if found is not None and now_s - found.used_s > _IDLE_S:
+            del self._sessions[_digest(session)]
+            found = None
+        if found is None:
+            raise Unauthorized("this page has no session", hint=_NEW_KEY)
+        found.used_s = now_s
+        return found.role
+
+    def check_operator(self, session: str, *, now_s: float) -> None:
+        """Raise Forbidden if a *session* may only look, Unauthorized if there is none."""
+        if self.role_of(session, now_s=now_s) != "operate":
+            raise Forbidden("only an operator may do this", hint=_NEW_OPERATOR_KEY)
+
+    def _used_up(self, key: str, now_s: float) -> Role | None:
+        role, until_s = self._keys.pop(_digest(key), (None, 0.0))
+        return role if now_s <= until_s else None
+
+
+def _digest(text: str) -> bytes:
+    """Return the digest by which a secret is looked up, so that no comparison of it takes a telling time."""
+    return hashlib.sha256(text.encode("utf-8", "replace")).digest()

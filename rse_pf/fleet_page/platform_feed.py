@@ -1,0 +1,272 @@
+"""What the page knows of one local platform: read from its operator's port, its servers and its logs.
+
+The control plane is asked for one stream and nothing else; servers are asked only while somebody looks.
+Whatever does not answer is shown as silent, and asked again.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import os
+import time
+from collections import deque
+from collections.abc import Coroutine, Mapping
+from pathlib import Path
+from typing import Any
+
+from rse_pf.auth.control_token import bearer, read_control_token
+from rse_pf.config import PlatformSettings
+from rse_pf.errors import RsePfError
+from rse_pf.fleet_page.command_log import CommandLog
+from rse_pf.fleet_page.hub import Hub
+from rse_pf.fleet_page.percentiles import LastMinute, buckets_of
+from rse_pf.fleet_page.sentences import event_sentence, waiting_for
+from rse_pf.local.processes import is_alive, mark_of
+from rse_pf.local.servers.control_client import ControlPort
+from rse_pf.local.state import platform_settings, read_state
+from rse_pf.terminal import printable
+
+__all__ = ["LocalFeed", "fleet_document", "group_of", "moved_robots"]
+
+_LOOPBACK = "127.0.0.1"
+_ROBOTS_EVERY_S = 1.0
+_METRICS_EVERY_S = 5.0
+_LOGS_EVERY_S = 0.3
+_AGAIN_S = 0.5
+_ASK_S = 2.0
+_MAX_LINE_BYTES = 1 << 20
+_HISTORY = 600
+_MAX_TEXT = 300
+_MAX_TOLD_MOVES = 50
+_MAX_GONE = 500
+_TROUBLE = ("gone", "failed", "unhealthy", "crash", "silent", "down", "taken", "not-")
+_SCALING = frozenset(
+    ("grow", "shrink", "replace", "drain-start", "drain-over", "roll-step", "rebalance", "robot-moved")
+)
+
+
+class LocalFeed:
+    """Feeds a `Hub` with what one platform does."""
+
+    def __init__(self, hub: Hub, folder: Path) -> None:
+        """Read nothing yet; *folder* is that of the platform's state."""
+        self._hub = hub
+        self._folder = folder
+        self._settings = PlatformSettings()
+        self._log = CommandLog(folder)
+        self._minute = LastMinute()
+        self._percentiles: dict[str, Any] = {}
+        self._where: dict[str, str] = {}
+        self._history: deque[list[float | None]] = deque(maxlen=_HISTORY)
+        self._connected = False
+
+    async def run(self) -> None:
+        """Feed until cancelled."""
+        works: tuple[Coroutine[Any, Any, None], ...] = (
+            self._watch(), self._follow_robots(), self._follow_metrics(), self._follow_logs(),
+        )  # fmt: skip
+        tasks = [asyncio.ensure_future(work) for work in works]
+        try:
+            await asyncio.gather(*tasks)
+        finally:
+            for task in tasks:
+                task.cancel()
+
+    # --- the control plane -----------------------------------------------------------------------
+
+    async def _watch(self) -> None:
+        while True:
+            # It restarts, or has ended: asked again.
+            with contextlib.suppress(OSError, ValueError, EOFError, RsePfError, asyncio.TimeoutError):
+                await self._watch_once()
+            if self._connected:
+                self._connected = False
+                self._event({"event": "control-plane-silent", "time_s": time.time()})
+            self._hub.put("link", "control_plane", {"connected": False, "time_s": time.time()})
+            await asyncio.sleep(_AGAIN_S)
+
+    async def _watch_once(self) -> None:
+        state = await asyncio.to_thread(read_state, self._folder)
+        if state is None or not state.status_port or not is_alive(state.control_plane):
+            return
+        self._settings = platform_settings(self._folder) or PlatformSettings()
+        token = read_control_token(Path(state.control_token_file))
+        reader, writer = await asyncio.open_connection(_LOOPBACK, state.status_port, limit=_MAX_LINE_BYTES)
+        try:
+            writer.write(
+                f"GET /watch HTTP/1.1\r\nHost: {_LOOPBACK}\r\nAuthorization: {bearer(token)}\r\n\r\n".encode()
+            )
+            head = await asyncio.wait_for(reader.readuntil(b"\r\n\r\n"), _ASK_S)
+            if head.split(b" ", 2)[1] != b"200":
+                raise ConnectionError("the control plane refuses")
+            self._connected = True
+            self._hub.put("link", "control_plane", {"connected": True, "time_s": time.time()})
+            while True:
+                line = await asyncio.wait_for(reader.readline(), _ASK_S + 3.0)
+                if not line:
+                    return
+                told = json.loads(line)
+                if "state" in told:
+                    self._take(told["state"])
+                else:
+                    self._event(told)
+        finally:
+            writer.close()
+
+    def _take(self, state: Mapping[str, Any]) -> None:
+        now = time.time()
+        sample = state.get("sample") or {}
+        document = fleet_document(state, self._settings, time_s=now)
+        for server in document["servers"]:
+            server["age_s"] = _age_s(server["pid"])
+        document["percentiles"] = self._percentiles
+        document["pages"] = self._hub.pages
+        self._hub.put("fleet", "now", document)
+        row = [round(now, 2), sample.get("cpu_percent"), sample.get("requests"), sample.get("robots")]
+        self._history.append([*row, self._percentiles.get("p99_ms")])
+        self._hub.put("history", "minutes", [list(column) for column in zip(*self._history, strict=True)])
+
+    def _event(self, event: Mapping[str, Any]) -> None:
+        kind = str(event.get("event", ""))
+        told = {
+            "time_s": event.get("time_s", time.time()),
+            "kind": printable(kind),
+            "text": printable(event_sentence(event))[:_MAX_TEXT],
+            "server": printable(str(event.get("server", event.get("name", "")))),
+            "group": group_of(kind),
+        }
+        self._hub.append("event", told)
+
+    # --- servers and logs ------------------------------------------------------------------------
+
+    async def _follow_robots(self) -> None:
+        while True:
+            if self._hub.watches("robots"):
+                with contextlib.suppress(RsePfError, OSError):
+                    await self._read_robots()
+            await asyncio.sleep(_ROBOTS_EVERY_S)
+
+    async def _read_robots(self) -> None:
+        names, told = await self._ask_servers("/robots")
+        rows: list[list[Any]] = []
+        for name, page in zip(names, told, strict=True):
+            for row in json.loads(page).get("robots", []) if page else []:
+                robot = printable(f"{row['tenant']}/{row['robot']}" if row["tenant"] else str(row["robot"]))
+                last = printable(str(row["last_result"] or "-"))
+                rows.append([robot, name, row["codec"], row["connected_s"], row["commands"], last])
+        where = {str(row[0]): str(row[1]) for row in rows}
+        for robot, before, after in moved_robots(self._where, where)[:_MAX_TOLD_MOVES]:
+            self._event({"event": "robot-moved", "robot": robot, "before": before, "server": after})
+        # A robot that moves is on no server for a moment: those that are gone are forgotten later.
+        gone = [each for each in self._where.items() if each[0] not in where][-_MAX_GONE:]
+        self._where = {**dict(gone), **where}
+        self._hub.put("robots", "now", rows)
+
+    async def _follow_metrics(self) -> None:
+        while True:
+            if self._hub.watches("fleet"):
+                with contextlib.suppress(RsePfError, OSError):
+                    names, told = await self._ask_servers("/metrics")
+                    now_s = time.monotonic()
+                    for name, page in zip(names, told, strict=True):
+                        if page:
+                            self._minute.add(name, buckets_of(page.decode("utf-8", "replace")), now_s=now_s)
+                    self._percentiles = self._minute.document(now_s=now_s, servers=names)
+            await asyncio.sleep(_METRICS_EVERY_S)
+
+    async def _ask_servers(self, target: str) -> tuple[list[str], list[bytes | None]]:
+        state = await asyncio.to_thread(read_state, self._folder)
+        servers = [] if state is None else [each for each in state.servers if each.control_port]
+        if state is None or not servers:
+            return [], []
+        token = read_control_token(Path(state.control_token_file)) if state.control_token_file else None
+        replies = await asyncio.gather(
+            *(ControlPort(each.control_port, token).ask_once(target, timeout_s=_ASK_S) for each in servers)
+        )
+        pages = [None if reply is None or reply.status != 200 else reply.body for reply in replies]
+        return [each.name for each in servers], pages
+
+    async def _follow_logs(self) -> None:
+        while True:
+            for row in await asyncio.to_thread(self._log.new_rows):
+                self._hub.append("pose", row)
+            await asyncio.sleep(_LOGS_EVERY_S)
+
+
+def fleet_document(state: Mapping[str, Any], settings: PlatformSettings, *, time_s: float) -> dict[str, Any]:
+    """Return what the Fleet view shows of the control plane's *state*, every text escaped."""
+    sample = state.get("sample") or {}
+    policy = state.get("policy") or {}
+    servers = [_server(each) for each in state.get("servers", [])]
+    counted = sum(each["state"] in ("starting", "healthy", "unhealthy") for each in servers)
+    return {
+        "time_s": time_s,
+        "platform": printable(str(state.get("platform", ""))),
+        "url": printable(str(state.get("url", ""))),
+        "tls": str(state.get("url", "")).startswith("wss:"),
+        "balancer": bool((state.get("balancer") or {}).get("running")),
+        "robots": sample.get("robots", 0),
+        "requests": sample.get("requests", 0),
+        "cpu_percent": sample.get("cpu_percent"),
+        "queue_ms": sample.get("queue_ms", 0.0),
+        "bytes_in": sample.get("bytes_in", 0),
+        "bytes_out": sample.get("bytes_out", 0),
+        "servers": servers,
+        "data_servers": [_data_server(each) for each in _listed(state.get("data_servers"))],
+        "waiting": waiting_for(policy, settings.scaling, servers=counted),
+        "last_action": printable(str(((policy.get("last_action") or {}).get("reason")) or "")),
+        "min_servers": policy.get("min_servers"),
+        "max_servers": policy.get("max_servers"),
+        "busy_percent": settings.scaling.busy_cpu_percent,
+        "period_s": settings.scaling.period_s / float(policy.get("compress", 1.0)),
+    }
+
+
+def moved_robots(before: Mapping[str, str], after: Mapping[str, str]) -> list[tuple[str, str, str]]:
+    """Return robot, old server and new server of each robot that is elsewhere now."""
+    return [
+        (robot, before[robot], server)
+        for robot, server in after.items()
+        if robot in before and before[robot] != server
+    ]
+
+
+def group_of(kind: str) -> str:
+    """Return the filter under which an event of *kind* is found."""
+    if kind.startswith(("server-killed", "server-paused", "server-resumed", "balancer-killed", "fault")):
+        return "fault"
+    if kind.startswith("audit"):
+        return "audit"
+    if any(word in kind for word in _TROUBLE):
+        return "trouble"
+    return "scaling" if kind in _SCALING else "other"
+
+
+def _server(told: Mapping[str, Any]) -> dict[str, Any]:
+    numbers = ("cpu_percent", "robots", "requests", "queue", "queue_ms", "in_flight", "pid", "warming")
+    return {
+        "name": printable(str(told.get("name", ""))),
+        "state": printable(str(told.get("state", ""))),
+        **{name: told.get(name) for name in numbers},
+    }
+
+
+def _data_server(told: Mapping[str, Any]) -> dict[str, Any]:
+    return {"name": printable(str(told.get("name", ""))), "state": "runs" if told.get("running") else "gone"}
+
+
+def _age_s(pid: Any) -> float | None:
+    """Return for how long a process has run; None if there is none."""
+    mark = mark_of(pid) if isinstance(pid, int) else None
+    if mark is None:
+        return None
+    uptime_s = float(Path("/proc/uptime").read_text(encoding="ascii").split()[0])
+    return round(uptime_s - int(mark.began.partition("@")[0]) / os.sysconf("SC_CLK_TCK"), 1)
+
+
+def _listed(value: Any) -> list[Mapping[str, Any]]:
+    if isinstance(value, Mapping):
+        return [value]
+    return [each for each in value if isinstance(each, Mapping)] if isinstance(value, list | tuple) else []

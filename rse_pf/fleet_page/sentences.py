@@ -1,0 +1,153 @@
+"""What the scale modifier waits for and what an event means, in words; pure.
+
+The sentences follow `rse_pf.scaling.policy.decide`, whose result they announce: a test compares the two.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from rse_pf.config import ScalingSettings
+
+__all__ = ["event_sentence", "waiting_for"]
+
+_NUMBERS = ("no", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten")
+
+
+def waiting_for(policy: Mapping[str, Any], settings: ScalingSettings, *, servers: int) -> list[str]:
+    """Return what the scale modifier waits for, the most important first.
+
+    Args:
+        policy: Its part of the platform's status: ``elastic``, ``samples`` of whole periods, bounds.
+        settings: Group scaling of the platform.
+        servers: Those that start or serve.
+    """
+    if not policy.get("elastic"):
+        return ["the scale modifier is off: no server is added, removed or replaced by itself"]
+    said = (
+        ["servers end too soon after their start: the next start waits"] if policy.get("crash_loop") else []
+    )
+    samples = list(policy.get("samples", ()))
+    if not samples:
+        period_s = settings.period_s / float(policy.get("compress", 1.0))
+        return [*said, f"no whole period of {period_s:g} s was measured yet"]
+    busy = _busy(samples, policy, settings, servers)
+    idle = _idle(samples, policy, settings, servers)
+    return said + ([busy] if busy else [idle] if idle else ["the servers are neither busy nor idle"])
+
+
+def event_sentence(event: Mapping[str, Any]) -> str:
+    """Return *event* as a sentence; its kind and details if it has none of its own."""
+    kind = str(event.get("event", ""))
+    text = _EVENTS.get(kind)
+    values = {name: _shown(value) for name, value in event.items()}
+    if text is not None:
+        return text.format_map(_Missing(values))
+    told = [f"{name} {value}" for name, value in values.items() if name not in ("event", "time_s", "number")]
+    return f"{kind.replace('-', ' ')}: {', '.join(told)}" if told else kind.replace("-", " ")
+
+
+def _busy(
+    samples: Sequence[Mapping[str, Any]], policy: Mapping[str, Any], settings: ScalingSettings, servers: int
+) -> str:
+    limit, wanted = settings.busy_cpu_percent, settings.busy_periods
+    count = _last_that(samples, lambda each: float(each["cpu_percent"]) >= limit)
+    if not count:
+        return ""
+    newest = float(samples[-1]["cpu_percent"])
+    step = settings.big_step if newest >= settings.very_busy_cpu_percent else settings.step
+    most = int(policy.get("max_servers", settings.max_servers))
+    measured = f"{min(count, wanted)} of {wanted} samples above {limit:g} %"
+    if servers >= most:
+        return f"{measured}, but {servers} servers are the most that are allowed"
+    more = _servers(min(step, most - servers), more=True)
+    if count >= wanted:
+        return f"{measured}: {more} when the servers that start have warmed up"
+    return f"{measured}: {more} after {_counted(wanted - count, 'further such sample')}"
+
+
+def _idle(
+    samples: Sequence[Mapping[str, Any]], policy: Mapping[str, Any], settings: ScalingSettings, servers: int
+) -> str:
+    wanted = settings.idle_s // settings.period_s
+    limit = settings.idle_cpu_percent
+    count = _last_that(
+        samples, lambda each: float(each["requests"]) == 0 and float(each["cpu_percent"]) < limit
+    )
+    if not count:
+        return ""
+    measured = f"{min(count, wanted)} of {wanted} samples idle"
+    least = int(policy.get("min_servers", settings.min_servers))
+    if servers <= least:
+        return f"{measured}: nothing happens, {_servers(least)} are the fewest that are allowed"
+    if count >= wanted:
+        return f"{measured}: one server leaves now"
+    return f"{measured}: one server leaves after {_counted(wanted - count, 'further idle sample')}"
+
+
+def _last_that(samples: Sequence[Mapping[str, Any]], holds: Any) -> int:
+    count = 0
+    for each in reversed(samples):
+        if not holds(each):
+            break
+        count += 1
+    return count
+
+
+def _servers(count: int, *, more: bool = False) -> str:
+    word = _NUMBERS[count] if 0 <= count < len(_NUMBERS) else str(count)
+    plural = "" if count == 1 else "s"
+    if more:
+        return f"{word} more server{plural} start{'s' if count == 1 else ''}"
+    return f"{word} server{plural}"
+
+
+def _counted(count: int, what: str) -> str:
+    word = _NUMBERS[count] if 0 <= count < len(_NUMBERS) else str(count)
+    return f"{word} {what}{'' if count == 1 else 's'}"
+
+
+def _shown(value: Any) -> str:
+    return ", ".join(map(str, value)) if isinstance(value, list | tuple) else str(value)
+
+
+class _Missing(dict[str, str]):
+    def __missing__(self, key: str) -> str:
+        return "-"
+
+
+_EVENTS = {
+    "adopted": "servers of an earlier control plane were adopted: {servers}",
+    "balancer-back": "the load balancer is back after {seconds} s",
+    "balancer-failed": "the load balancer does not start: {reason}",
+    "balancer-gone": "the load balancer ended: {reason}",
+    "balancer-killed": "the load balancer was killed",
+    "certificate-renewed": "the certificate was renewed",
+    "crash-loop": "servers end too soon after their start: the next one starts in {wait_s} s",
+    "data-server-down": "data server {name} ended ({code})",
+    "data-server-failed": "data server {name} does not start: {error}",
+    "data-server-silent": "data server {name} does not answer and is killed",
+    "data-server-up": "data server {name} is ready",
+    "drain-over": "{server} has left after {seconds} s",
+    "drain-start": "{server} drains ({reason}); its robots move",
+    "grow": "{servers} more: {reason}",
+    "platform-gone": "the platform has ended",
+    "platform-ready": "the platform is ready after {seconds} s",
+    "rebalance": "{robots} robots of {server} are asked to move",
+    "replace": "{server} is replaced by {by}: {reason}",
+    "robot-moved": "{robot} moved from {before} to {server}",
+    "roll-step": "{server} is replaced ({number} of {of})",
+    "server-failed": "{server} did not start: {reason}",
+    "server-gone": "{server} ended (exit code {exit_code})",
+    "server-healthy": "{server} is healthy and takes robots",
+    "server-killed": "{server} was killed by the operator",
+    "server-launched": "{server} starts",
+    "server-out": "{server} gets no robots any more",
+    "server-paused": "{server} was paused by the operator",
+    "server-ready": "{server} is ready",
+    "server-resumed": "{server} goes on",
+    "server-unhealthy": "{server} is unhealthy: {reason}",
+    "shrink": "{servers} less: {reason}",
+    "standby-started": "a warm standby was started",
+}

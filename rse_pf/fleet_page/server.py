@@ -1,0 +1,109 @@
+"""Run the page: one process on loopback, which announces its port and ends with its parent."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import os
+import secrets
+import signal
+import socket
+import time
+from collections.abc import Callable, Coroutine
+from pathlib import Path
+from typing import Any
+
+from rse_pf.auth.control_token import read_control_token
+from rse_pf.errors import ConfigurationError, MissingExtra
+from rse_pf.files import replace_json
+from rse_pf.fleet_page.app import FleetApp, PageActions
+from rse_pf.fleet_page.hub import MAX_PAGES, Hub
+from rse_pf.fleet_page.page_sessions import PageSessions
+from rse_pf.fleet_page.static_files import page_files
+
+__all__ = ["ANNOUNCEMENT", "listen", "page_url", "serve_page"]
+
+ANNOUNCEMENT = "fleet_page.json"
+"""Beside the platform's state: pid and port of its page."""
+_LOOPBACK = "127.0.0.1"
+_MAX_CONNECTIONS = 4 * MAX_PAGES
+_LONGEST_END_S = 1
+
+
+def page_url(port: int, key: str) -> str:
+    """Return the address of the page; browsers send what follows ``#`` to nobody."""
+    return f"http://{_LOOPBACK}:{port}/#key={key}"
+
+
+def listen(port: int) -> socket.socket:
+    """Return a socket on loopback at *port*, or at a free one if that is taken or 0."""
+    for wanted in (port, 0):
+        with contextlib.suppress(OSError):
+            return socket.create_server((_LOOPBACK, wanted), backlog=64)
+    raise ConfigurationError("no port on loopback is free", hint="end other programs")
+
+
+def serve_page(
+    hub: Hub,
+    actions: PageActions,
+    *,
+    listening: socket.socket,
+    works: Callable[[], list[Coroutine[Any, Any, None]]],
+    token_file: Path | None,
+    announce: Path | None,
+    ready: Callable[[str], None],
+) -> int:
+    """Serve until SIGTERM or SIGINT; return the exit code.
+
+    Args:
+        hub: What is told to browsers.
+        actions: What browsers can ask for.
+        listening: Socket on loopback.
+        works: Returns what feeds the hub, to be run beside.
+        token_file: Token for which further keys are made; None makes none.
+        announce: File that gets pid and port; removed at the end.
+        ready: Called with the address that has the first key.
+
+    Raises:
+        MissingExtra: uvicorn is not installed.
+    """
+    try:
+        import uvicorn
+    except ImportError as error:
+        raise MissingExtra("uvicorn", "data") from error
+    port = int(listening.getsockname()[1])
+    sessions = PageSessions(secret=lambda: secrets.token_urlsafe(24))
+    hosts = frozenset((f"{_LOOPBACK}:{port}", f"localhost:{port}"))
+    fallback = secrets.token_hex(32)
+    app = FleetApp(
+        hub, sessions, page_files(), actions, hosts=lambda: hosts,
+        admin_token=lambda: fallback if token_file is None else read_control_token(token_file),
+    )  # fmt: skip
+    config = uvicorn.Config(
+        app, http="h11", ws="none", lifespan="off", access_log=False, log_level="critical",
+        limit_concurrency=_MAX_CONNECTIONS, server_header=False, date_header=False, proxy_headers=False,
+        timeout_keep_alive=10, timeout_graceful_shutdown=_LONGEST_END_S, h11_max_incomplete_event_size=16384,
+    )  # fmt: skip
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda number, frame: None)  # uvicorn repeats it to itself when it has ended
+
+    async def run() -> None:
+        server = uvicorn.Server(config)
+        tasks = [asyncio.ensure_future(work) for work in works()]
+        serving = asyncio.ensure_future(server.serve(sockets=[listening]))
+        try:
+            while not (server.started or serving.done()):
+                await asyncio.sleep(0.005)
+            if announce is not None:
+                replace_json(announce, {"pid": os.getpid(), "port": port})
+            ready(page_url(port, sessions.new_key("view", now_s=time.monotonic())))
+            await serving
+        finally:
+            for task in tasks:
+                task.cancel()
+            await asyncio.gather(*tasks, return_exceptions=True)
+            if announce is not None:
+                announce.unlink(missing_ok=True)
+
+    asyncio.run(run())
+    return 0

@@ -1,0 +1,224 @@
+// The Fleet view: the six boxes of the paper's Fig. 2, the servers, and where the robots are.
+
+import { chart } from "./charts.js";
+import { clock, confirmed, duration, element, number, setText, state, toast } from "./dom.js";
+import { isOperator, post } from "./session.js";
+
+const MAX_DOTS = 500;
+
+export function fleetView(root) {
+  const box = (title) => {
+    const big = element("div", { class: "big" }, "–");
+    const small = element("div", { class: "soft" });
+    return { panel: element("div", { class: "panel" }, element("h2", {}, title), big, small), big, small };
+  };
+  const boxes = {
+    robots: box("Robots"), firewall: box("Firewall"), balancer: box("Load balancer"),
+    servers: box("Backend servers"), monitor: box("Monitor"), modifier: box("Scale modifier"),
+  };
+  const waiting = element("div", {});
+  const waitingPanel = element("div", { class: "panel waiting", "aria-live": "polite" },
+    element("h2", {}, "What the scale modifier waits for"), waiting);
+  const charts = {};
+  const chartPanels = [
+    ["cpu", "CPU of the servers, %", { unit: "%", top: 100 }],
+    ["requests", "Commands a second", { unit: "commands" }],
+    ["p99", "Time to answer, 99 % within, ms", { unit: "ms", digits: 1 }],
+  ].map(([name, title, options]) => {
+    const place = element("div", { class: "chart" });
+    charts[name] = chart(place, { title, ...options });
+    return element("div", { class: "panel" }, element("h2", {}, title), place);
+  });
+  const rows = element("tbody");
+  const rollButton = element("button", { class: "danger", id: "do-roll", onclick: () => operate("roll") }, "Roll all…");
+  const rollBox = element("span", { class: "buttons", hidden: true }, rollButton);
+  const actionsHead = element("th", { hidden: true }, "Operate");
+  const serverPanel = element("div", { class: "panel" },
+    element("div", { class: "filters" }, element("h2", {}, "Servers"), rollBox),
+    element("div", { class: "scroll" }, element("table", {},
+      element("caption", { class: "hidden" }, "Backend servers"),
+      element("thead", {}, element("tr", {},
+        element("th", { scope: "col" }, "Server"), element("th", { scope: "col" }, "Health"),
+        element("th", { scope: "col" }, "CPU"), element("th", { scope: "col", class: "number" }, "Robots"),
+        element("th", { scope: "col", class: "number" }, "Commands/s"),
+        element("th", { scope: "col", class: "number" }, "Queue"), element("th", { scope: "col", class: "number" }, "Wait, ms"),
+        element("th", { scope: "col", class: "number" }, "Age"), actionsHead)), rows)));
+  const racks = element("div", { class: "racks" });
+  const racksNote = element("p", { class: "soft" });
+  const recent = element("div", {});
+  root.append(
+    element("div", { class: "grid" }, ...Object.values(boxes).map((each) => each.panel)),
+    waitingPanel,
+    serverPanel,
+    element("div", { class: "grid wide" }, ...chartPanels),
+    element("div", { class: "grid wide" },
+      element("div", { class: "panel" }, element("h2", {}, "Robots on their servers"), racks, racksNote),
+      element("div", { class: "panel" }, element("h2", {}, "Latest events"), recent)));
+
+  const lines = new Map();
+  const dots = new Map();
+  let history = null;
+  let latest = [];
+
+  function take(told) {
+    const rate = told.requests;
+    setText(boxes.robots.big, number(told.robots));
+    setText(boxes.robots.small, `${number(rate)} commands in the last second`);
+    setText(boxes.firewall.big, told.tls ? "TLS, tokens" : "loopback");
+    setText(boxes.firewall.small, told.url || "nobody can connect yet");
+    setText(boxes.balancer.big, told.balancer ? "runs" : "is down");
+    setText(boxes.balancer.small, `${megabytes(told.bytes_in)} in, ${megabytes(told.bytes_out)} out a second`);
+    const healthy = told.servers.filter((server) => server.state === "healthy").length;
+    setText(boxes.servers.big, `${healthy} of ${told.servers.length}`);
+    setText(boxes.servers.small, `healthy; data servers: ${told.data_servers.map((each) => `${each.name} ${each.state}`).join(", ") || "none"}`);
+    setText(boxes.monitor.big, told.cpu_percent === null ? "–" : `${number(told.cpu_percent)} % CPU`);
+    const p = told.percentiles ?? {};
+    setText(boxes.monitor.small, p.count
+      ? `last ${Math.round(p.covered_s)} s: p50 ${p.p50_ms}, p95 ${p.p95_ms}, p99 ${p.p99_ms} ms of ${p.count} commands`
+      : "no command in the last minute");
+    setText(boxes.modifier.big, `${told.min_servers ?? "–"} to ${told.max_servers ?? "–"}`);
+    setText(boxes.modifier.small, `servers; busy above ${number(told.busy_percent)} % CPU, judged each ${number(told.period_s)} s${told.last_action ? `; last: ${told.last_action}` : ""}`);
+    const said = told.waiting.map((text) => `${text[0].toUpperCase()}${text.slice(1)}.`);
+    if (waiting.dataset.text !== said.join("\n")) {
+      waiting.dataset.text = said.join("\n");
+      waiting.replaceChildren(...said.map((text) => element("p", {}, text)));
+    }
+    takeServers(told.servers);
+  }
+
+  function takeServers(servers) {
+    const names = new Set(servers.map((server) => server.name));
+    for (const [name, line] of lines) if (!names.has(name)) { line.row.remove(); lines.delete(name); }
+    for (const server of servers) {
+      let line = lines.get(server.name);
+      if (!line) {
+        line = newLine(server.name);
+        lines.set(server.name, line);
+        rows.append(line.row);
+      }
+      if (line.health.dataset.state !== server.state) {
+        line.health.dataset.state = server.state;
+        line.health.replaceChildren(state(server.state));
+      }
+      const cpu = server.cpu_percent;
+      line.fill.style.width = `${Math.min(cpu ?? 0, 100)}%`;
+      line.bar.dataset.level = cpu >= 70 ? "high" : "normal";
+      setText(line.cpu, cpu === null || cpu === undefined ? "–" : `${number(cpu)} %${server.warming ? " (warms up)" : ""}`);
+      setText(line.robots, number(server.robots));
+      setText(line.requests, number(server.requests));
+      setText(line.queue, number(server.queue));
+      setText(line.wait, number(server.queue_ms, 1));
+      setText(line.age, duration(server.age_s));
+    }
+    for (const name of racks.dataset.names ? JSON.parse(racks.dataset.names) : []) {
+      if (!names.has(name)) rackOf(name)?.closest(".rack").remove();
+    }
+    for (const name of names) if (!rackOf(name)) racks.append(newRack(name));
+    racks.dataset.names = JSON.stringify([...names]);
+  }
+
+  function newLine(name) {
+    const fill = element("i");
+    const line = {
+      health: element("td"), fill, bar: element("span", { class: "bar", "aria-hidden": "true" }, fill), cpu: element("span"),
+      robots: element("td", { class: "number" }), requests: element("td", { class: "number" }),
+      queue: element("td", { class: "number" }), wait: element("td", { class: "number" }), age: element("td", { class: "number" }),
+    };
+    line.actions = element("td", { hidden: !isOperator() }, element("div", { class: "buttons" },
+      ...["drain", "move", "pause", "resume", "kill"].map((action) => element("button", {
+        class: action === "kill" ? "danger" : null, "data-action": action, "data-server": name,
+        "aria-label": `${action} ${name}`, onclick: () => operate(action, name),
+      }, action === "resume" ? "Resume" : `${action[0].toUpperCase()}${action.slice(1)}…`))));
+    line.row = element("tr", { "data-server": name }, element("th", { scope: "row" }, name), line.health,
+      element("td", {}, line.bar, line.cpu), line.robots, line.requests, line.queue, line.wait, line.age, line.actions);
+    return line;
+  }
+
+  const rackOf = (name) => [...racks.children].find((each) => each.dataset.server === name)?.querySelector(".dots");
+
+  function newRack(name) {
+    return element("div", { class: "rack", "data-server": name },
+      element("h2", {}, name), element("div", { class: "dots", role: "img", "aria-label": `robots of ${name}` }));
+  }
+
+  function takeRobots(told) {
+    const present = new Set();
+    const counts = {};
+    for (const [robot, server, , , , last] of told.slice(0, MAX_DOTS)) {
+      present.add(robot);
+      counts[server] = (counts[server] ?? 0) + 1;
+      let dot = dots.get(robot);
+      if (!dot) { dot = element("span", { class: "dot" }); dots.set(robot, dot); }
+      dot.title = `${robot}: last answer ${last}`;
+      dot.dataset.last = last === "ok" || last === "-" ? "ok" : "bad";
+      const rack = rackOf(server);
+      if (rack && dot.parentElement !== rack) {
+        if (dot.parentElement) {
+          dot.dataset.moved = "";
+          setTimeout(() => delete dot.dataset.moved, 5000);
+        }
+        rack.append(dot);
+      }
+    }
+    for (const [robot, dot] of dots) if (!present.has(robot)) { dot.remove(); dots.delete(robot); }
+    for (const each of racks.children) {
+      each.querySelector(".dots").setAttribute("aria-label", `${counts[each.dataset.server] ?? 0} robots on ${each.dataset.server}`);
+    }
+    setText(racksNote, told.length > MAX_DOTS ? `${MAX_DOTS} of ${told.length} robots are drawn`
+      : told.length ? "One dot is one robot; an outline says that it has just moved, a square that its last command failed." : "No robot is connected.");
+  }
+
+  function takeEvent(event) {
+    latest = [event, ...latest].slice(0, 8);
+    recent.replaceChildren(...latest.map((each) => element("div", {},
+      element("time", { class: "soft" }, clock(each.time_s)), ` ${each.text}`)));
+  }
+
+  function takeHistory(columns) {
+    history = columns;
+    const [times, cpu, requests, , p99] = columns;
+    charts.cpu.set(times, cpu);
+    charts.requests.set(times, requests);
+    charts.p99.set(times, p99);
+  }
+
+  async function operate(action, server) {
+    const texts = {
+      kill: [`Kill ${server}?`, "Its processes end at once, as in a crash. Its robots connect to other servers, and it is replaced."],
+      pause: [`Pause ${server}?`, "Its processes stop, as in a hang. It is replaced when its health checks fail."],
+      drain: [`Drain ${server}?`, "Its robots move to other servers, then it ends."],
+      move: [`Move robots of ${server}?`, "They connect to other servers, if the load balancer sends them there."],
+      roll: ["Replace every server?", "One after the other: a new server serves before an old one is drained."],
+    };
+    let chosen = true;
+    if (texts[action]) {
+      chosen = await confirmed({
+        title: texts[action][0], text: texts[action][1], button: action[0].toUpperCase() + action.slice(1),
+        input: action === "move" ? { type: "number", min: "1", value: "10", "aria-label": "Robots" } : null,
+      });
+      if (!chosen) return;
+    }
+    toast(`${action}${server ? ` ${server}` : ""}: asked`);
+    try {
+      await post("/act", { action, ...(server ? { server } : {}), ...(action === "move" ? { robots: chosen } : {}) });
+      toast(`${action}${server ? ` ${server}` : ""}: done`);
+    } catch (error) {
+      toast(error.message);
+    }
+  }
+
+  return {
+    take, takeRobots, takeEvent, takeHistory,
+    reset() { latest = []; recent.replaceChildren(); },
+    shown() { if (history) takeHistory(history); },
+    themed() { for (const each of Object.values(charts)) each.themed(); },
+    operatorChanged() {
+      actionsHead.hidden = rollBox.hidden = !isOperator();
+      for (const line of lines.values()) line.actions.hidden = !isOperator();
+    },
+  };
+}
+
+function megabytes(bytes) {
+  return bytes < 1e6 ? `${number(bytes / 1e3)} kB` : `${number(bytes / 1e6, 1)} MB`;
+}
