@@ -20,6 +20,7 @@ from pathlib import Path
 from rse_pf.cli.extras import require
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import UsageError
+from rse_pf.recording.writer import recorded
 from rse_pf.terminal import counted, show
 
 __all__ = ["add_arguments", "run"]
@@ -30,8 +31,9 @@ _MAX_ROBOTS = 32
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument(
-        "--data", "--recording", type=Path, metavar="DIR", help="a recording in TUM layout, or NYU Depth V2"
-    )
+        "--data", "--recording", type=Path, metavar="DIR",
+        help="a recording in TUM layout, NYU Depth V2, or a ROS bag",
+    )  # fmt: skip
     parser.add_argument(
         "--robots",
         type=int,
@@ -73,6 +75,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--live", action="store_true", help="all robots make one live map, and correct each other at once"
     )
+    parser.add_argument(
+        "--record", type=Path, metavar="DIR",
+        help="record what robots and servers say in DIR, for rse-pf replay (recording.folder)",
+    )  # fmt: skip
     parser.add_argument("--quiet", action="store_true", help="no progress bars")
 
 
@@ -102,6 +108,7 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
     if args.live and args.merge:
         raise UsageError("--live and --merge exclude each other", hint="a live map needs no merge")
     require("demo --merge" if args.merge else "demo")
+    settings = recorded(settings, args.record)
     from rse_pf.experiments.demo.run import DemoOptions, run_demo
     from rse_pf.pnp import usable_engine
 

@@ -8,6 +8,7 @@ is stopped, slow or cut off for too long is replaced.
 examples:
   rse-pf local --servers 2
   rse-pf local --lan
+  rse-pf local --record recordings
   rse-pf local status
   rse-pf local robots
   rse-pf local logs --server server-1 --follow
@@ -98,6 +99,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--no-data", action="store_true", help="start no data service (large data by HTTP under /data/)"
     )
     parser.add_argument(
+        "--record", type=Path, metavar="DIR",
+        help="record what robots and servers say in DIR, for rse-pf replay (recording.folder)",
+    )  # fmt: skip
+    parser.add_argument(
         "--services", metavar="DIR", help="also run the services installed there (rse-pf service install)"
     )
     parser.add_argument(
@@ -125,10 +130,11 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
         return _on_running(args, folder)
     require("local")
     from rse_pf.cli.local_platform.lan import chosen_address
+    from rse_pf.recording.writer import recorded
 
     wanted = {"servers": args.servers, "port": args.port, "metrics_port": args.metrics_port}
     chosen = settings.replace(local={name: value for name, value in wanted.items() if value is not None})
-    chosen = _with_services(chosen, args)
+    chosen = recorded(_with_services(chosen, args), args.record)
     lan = chosen_address(args.lan)
     page = not args.no_page
     return asyncio.run(_foreground(args.name, folder, chosen, data=not args.no_data, lan=lan, page=page))
@@ -157,9 +163,11 @@ def _check(args: argparse.Namespace) -> None:
         raise UsageError(f"rse-pf local {args.action} takes no server", hint=hint)
     if args.action != "logs" and (args.of_server or args.follow):
         raise UsageError("--server and --follow are for logs", hint="see rse-pf local --help")
-    if args.action != "start" and (args.lan is not None or args.metrics_port is not None):
+    of_start = (args.lan, args.metrics_port, args.record)
+    if args.action != "start" and any(each is not None for each in of_start):
         raise UsageError(
-            "--lan and --metrics-port are for the start of a platform", hint="see rse-pf local --help"
+            "--lan, --metrics-port and --record are for the start of a platform",
+            hint="see rse-pf local --help",
         )
     if args.for_s is not None and (args.action not in ("pause", "slow", "partition") or not args.for_s > 0):
         raise UsageError(

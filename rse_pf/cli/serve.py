@@ -19,6 +19,7 @@ from rse_pf.auth.trust_store import TrustStore
 from rse_pf.config import PlatformSettings, setting_rows
 from rse_pf.config.placement import ServerPlacement
 from rse_pf.errors import UsageError
+from rse_pf.recording.writer import recorded
 
 __all__ = ["add_arguments", "run"]
 
@@ -55,6 +56,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--audit", type=Path, metavar="DIR", help="record accepted and refused robots in DIR")
     parser.add_argument(
+        "--record", type=Path, metavar="DIR",
+        help="record what robots and servers say in DIR, for rse-pf replay (recording.folder)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--record-key", type=Path, metavar="FILE",
+        help="key of the pseudonyms in recordings, the same for all servers (default: one of its own)",
+    )  # fmt: skip
+    parser.add_argument(
         "--services", type=Path, metavar="DIR", help="run the services installed in DIR (services.folder)"
     )
     parser.add_argument(
@@ -74,6 +83,8 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
     if args.accept_weak_isolation:
         services["accept_weak_isolation"] = True
     chosen = settings.replace(serving=_given(args, _SETTINGS), services=services)
+    if args.record is not None:
+        chosen = recorded(chosen, args.record)
     placement = ServerPlacement.read(args.settings, chosen, **_given(args, _PLACEMENT))
     server_id = f"server-{os.getpid()}" if args.server_id is None else args.server_id
     if not 0 < len(server_id) <= 64 or not server_id.isprintable():
@@ -96,6 +107,7 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
         conformance_echo=args.conformance_echo,
         audit=args.audit,
         control_token=token,
+        recording_key=args.record_key,
     )
 
 

@@ -70,6 +70,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--url", help="use the platform at this address, with --token-from")
     add("--token-from", metavar="NAME", help="with --url: sign tokens with the key of this local platform")
     add("--out", type=Path, default=Path("out-swarm"), metavar="DIR", help="records (default: out-swarm)")
+    add("--record", type=Path, metavar="DIR", help="record what robots and the started servers say in DIR")
     add("--quiet", action="store_true", help="print only the result")
 
 
@@ -77,6 +78,7 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
     """Check the options and run the swarm."""
     from rse_pf.experiments.load.run import run_swarm
     from rse_pf.experiments.load.swarm import SwarmOptions
+    from rse_pf.recording.writer import recorded
 
     if not (math.isfinite(args.seconds) and 0 < args.seconds <= _MAX_S):
         raise UsageError(
@@ -104,6 +106,13 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
                 "--servers needs a platform that is started for the run", hint="leave out --name and --url"
             )
         settings = settings.replace(local={"servers": args.servers})
+    if args.record is not None and platform is not None:
+        raise UsageError(
+            "--record needs a platform that is started for the run",
+            hint="start it with rse-pf local --record, or leave out --name and --url",
+        )
+    if platform is None:
+        settings = recorded(settings, args.record)
     return run_swarm(
         options,
         settings,

@@ -28,6 +28,7 @@ __all__ = [
     "control_token_file",
     "platform_settings",
     "read_state",
+    "recording_key_file",
     "remove_state",
     "settings_file",
     "state_file",
@@ -143,6 +144,11 @@ def state_folder(name: str, environment: Mapping[str, str]) -> Path:
 def control_token_file(folder: Path) -> Path:
     """Return the file of the token of the control ports."""
     return folder / "control.token"
+
+
+def recording_key_file(folder: Path) -> Path:
+    """Return the file of the key of pseudonyms, which is there while the platform records."""
+    return folder / "recording.key"
 
 
 def settings_file(folder: Path) -> Path:

@@ -179,5 +179,5 @@ SCHEMAS: Final[dict[str, bytes]] = {
 
 
 def encode_json(value: Any) -> bytes:
-    """Return *value* as the data of a message of a JSON channel."""
-    return msgspec.json.encode(value)
+    """Return *value* as the data of a message of a JSON channel; what JSON does not know becomes text."""
+    return msgspec.json.encode(value, enc_hook=str)

@@ -199,6 +199,8 @@ def run_recorder(plan: RecorderPlan) -> None:
     with suppress(OSError):
         run_as_batch(os.getpid(), _NICE)
     session = SessionSettings(**plan.session)
+    with suppress(OSError):  # the writer says why it cannot write
+        Path(plan.folder).mkdir(parents=True, exist_ok=True)
     writer = RecordingWriter(
         Path(plan.folder), plan.server, started_ns=plan.started_ns, max_file_bytes=plan.max_file_bytes,
         max_bytes=plan.max_bytes, metadata=plan.metadata, version=plan.version,

@@ -7,13 +7,15 @@ Nothing here runs in a process that serves robots.
 from __future__ import annotations
 
 import fcntl
+import importlib.util
 import os
 from collections.abc import Mapping
 from contextlib import suppress
 from datetime import datetime, timezone
 from pathlib import Path
 
-from rse_pf.errors import UsageError
+from rse_pf.config import PlatformSettings
+from rse_pf.errors import MissingExtra, UsageError
 from rse_pf.recording.file_format import (
     FORMAT_VERSION,
     JSON_ENCODING,
@@ -28,12 +30,27 @@ from rse_pf.recording.file_format import (
 )
 from rse_pf.recording.mcap_file import McapFile
 
-__all__ = ["RecordingWriter", "checked_folder"]
+__all__ = ["RecordingWriter", "checked_folder", "recorded"]
 
 _PRUNE_NS = 10_000_000_000
 _RETRY_NS = 5_000_000_000
 _MAX_CHANNELS = 50_000
 _OWNER_ONLY = 0o600
+
+
+def recorded(settings: PlatformSettings, folder: Path | None) -> PlatformSettings:
+    """Return *settings* with recordings in *folder*, unchanged if it is None and none are asked for.
+
+    Raises:
+        MissingExtra: mcap is not installed.
+        UsageError: Recordings cannot be written there.
+    """
+    chosen = settings.recording.folder if folder is None else str(folder)
+    if not chosen:
+        return settings
+    if importlib.util.find_spec("mcap") is None:
+        raise MissingExtra("mcap", "record")
+    return settings.replace(recording={"folder": str(checked_folder(Path(chosen)))})
 
 
 def checked_folder(folder: Path) -> Path:

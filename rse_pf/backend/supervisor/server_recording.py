@@ -12,6 +12,7 @@ import time
 from contextlib import suppress
 from dataclasses import asdict
 from importlib import metadata
+from pathlib import Path
 
 from rse_pf.config import PlatformSettings
 from rse_pf.recording.recorder_process import RecorderPlan, start_recorder
@@ -39,8 +40,11 @@ class ServerRecording:
     process of the recorder.
     """
 
-    def __init__(self, settings: PlatformSettings, server: str, workers: int) -> None:
-        """Start nothing yet."""
+    def __init__(
+        self, settings: PlatformSettings, server: str, workers: int, key: Path | None = None
+    ) -> None:
+        """Start nothing yet; *key* is the file of the key of pseudonyms, None for a key of its own."""
+        self._key = "" if key is None else str(key)
         self.ends: list[int | None] = [None] * workers
         self.pids: list[int] = []
         self._settings = settings
@@ -56,7 +60,7 @@ class ServerRecording:
         plan = RecorderPlan(
             folder=recording.folder, server=self._server, version=server_version(), started_ns=time.time_ns(),
             fds=[ours for ours, _ in pipes], max_file_bytes=recording.max_file_bytes,
-            max_bytes=recording.max_bytes, session=asdict(self._settings.session),
+            max_bytes=recording.max_bytes, session=asdict(self._settings.session), key=self._key,
             metadata={
                 "side": "server", "protocol": str(PROTOCOL_VERSION), "engine": self._settings.pnp.engine,
                 "pnp": json.dumps(asdict(self._settings.pnp)),

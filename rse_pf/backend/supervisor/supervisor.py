@@ -87,6 +87,7 @@ def serve(
     services: str = BUILTIN,
     audit: Path | None = None,
     control_token: str | None = None,
+    recording_key: Path | None = None,
 ) -> int:
     """Serve robots until a drain or a signal ends it; call it in the main thread of a process.
 
@@ -101,6 +102,7 @@ def serve(
         services: ``module:function`` that makes the registry of a worker from the settings.
         audit: Folder of the audit log; None records nothing.
         control_token: Token that the control port requires for all but its two health pages; None: no token.
+        recording_key: File of the key of pseudonyms in recordings; None makes one.
 
     Returns:
         0 after a drain or a signal, 1 when a worker was lost.
@@ -118,7 +120,7 @@ def serve(
     raise_descriptor_limit()
     count = settings.serving.workers or len(os.sched_getaffinity(0))
     slots = make_pipe(settings.serving.max_running_jobs)
-    with ServerRecording(settings, server_id, count) as recording:
+    with ServerRecording(settings, server_id, count, recording_key) as recording:
         plans = [
             WorkerPlan(
                 settings=settings, keys=keys if settings.auth.required else None, server_id=server_id,

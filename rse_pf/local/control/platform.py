@@ -31,6 +31,7 @@ from rse_pf.local.control.control_plane import ControlOptions, ControlPlane
 from rse_pf.local.control.federation import service_discovery
 from rse_pf.local.control.fleet import Fleet, Member
 from rse_pf.local.control.operator_port import OperatorPort
+from rse_pf.local.control.platform_recording import PlatformRecording
 from rse_pf.local.firewall import check_lan_settings, check_listener, ensure_key, key_file, robots_url
 from rse_pf.local.lan.listener import LanListener, authority_file
 from rse_pf.local.latest_file import LatestFile
@@ -105,7 +106,8 @@ class LocalPlatform:
             metrics_port: Port of the control plane on loopback: /metrics of all servers, /status; 0 takes a
                 free one, and so does a port that is taken, with the event ``metrics-port-taken``.
         """
-        control = control or ControlOptions()
+        self._recording = PlatformRecording(settings, state.absolute())
+        control = self._recording.watching(control or ControlOptions())
         self.events: list[Event] = []
         self.url = ""
         self.name = name or state.name
@@ -403,6 +405,7 @@ class LocalPlatform:
         self._key = ensure_key(self.state, seed=secrets.token_bytes(32), key_id=secrets.token_hex(4))
         token = ensure_control_token(control_token_file(self.state), seed=secrets.token_bytes(32))
         replace_json(settings_file(self.state), self._placement.document(self.settings), indent=1)
+        self._recording.begin()
         self._control.start_checks()
         if left is None:
             await self._begin(end)
@@ -561,6 +564,7 @@ class LocalPlatform:
                 if not self._adoptable:  # no one can adopt this platform: its tokens are worthless
                     key_file(self.state).unlink(missing_ok=True)
                     control_token_file(self.state).unlink(missing_ok=True)
+            self._recording.close()
             self._audit.close()
             self._lock.release()
         self._emit("platform-gone")
@@ -572,6 +576,7 @@ class LocalPlatform:
         entry = {"event": event, **details}
         self.events.append(entry)
         self._audit.record(entry)
+        self._recording.event(entry)
         self._operator_port.heard(entry)
         if self._on_event is not None:
             self._on_event(entry)

@@ -23,7 +23,7 @@ from rse_pf.local.firewall import key_set_file
 from rse_pf.local.processes import ProcessMark, ServerProcess, mark_of
 from rse_pf.local.servers.control_client import ControlPort
 from rse_pf.local.servers.warm_standby import STANDBY, WarmStandby
-from rse_pf.local.state import control_token_file, settings_file
+from rse_pf.local.state import control_token_file, recording_key_file, settings_file
 
 __all__ = ["RSE_PF", "BackendServer", "LocalBackendServers", "local_placement"]
 
@@ -88,6 +88,8 @@ class LocalBackendServers:
         command += ["--keys", str(key_set_file(self._folder)), "--announce", str(server.announcement)]
         command += ["--audit", str(audit_folder(self._folder))]
         command += ["--control-token", str(control_token_file(self._folder))]
+        if recording_key_file(self._folder).exists():
+            command += ["--record-key", str(recording_key_file(self._folder))]
         standby = self.standby.take(command, server.log)
         if standby is not None:
             server.use(standby)

@@ -1,0 +1,87 @@
+"""The control plane's part of a recording: a file of events of the platform and samples of its monitor.
+
+It also makes the key of the pseudonyms, which all servers of a recording share, and deletes it at the end.
+A disk that is full neither delays nor ends the platform.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import secrets
+import time
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+from rse_pf.config import PlatformSettings
+from rse_pf.files import create_private_file
+from rse_pf.local.control.control_plane import ControlOptions
+from rse_pf.local.state import recording_key_file
+from rse_pf.recording.file_format import EVENT_SCHEMA, EVENTS_TOPIC, SAMPLE_SCHEMA, SAMPLES_TOPIC
+from rse_pf.recording.writer import RecordingWriter
+
+__all__ = ["PlatformRecording"]
+
+_CONTROL_PLANE = "control-plane"
+_KEY_BYTES = 32
+_LEFT_OUT = ("robot", "robots_named", "tenant", "token", "url")
+"""Fields of events that may hold a name or an address."""
+
+
+class PlatformRecording:
+    """Events and samples of one platform; nothing at all where ``recording.folder`` is empty."""
+
+    def __init__(
+        self, settings: PlatformSettings, state: Path, time_ns: Callable[[], int] = time.time_ns
+    ) -> None:
+        self._recording = settings.recording
+        self._key = recording_key_file(state)
+        self._time_ns = time_ns
+        self._writer: RecordingWriter | None = None
+
+    def watching(self, options: ControlOptions) -> ControlOptions:
+        """Return *options* by which samples are recorded, too."""
+        if not self._recording.folder:
+            return options
+        before = options.on_sample
+
+        def on_sample(sample: Mapping[str, Any]) -> None:
+            self._write(SAMPLES_TOPIC, SAMPLE_SCHEMA, dict(sample))
+            if before is not None:
+                before(sample)
+
+        return dataclasses.replace(options, on_sample=on_sample)
+
+    def begin(self) -> None:
+        """Make the key of the pseudonyms, unless an earlier control plane left one; begin the file."""
+        recording = self._recording
+        if not recording.folder:
+            return
+        with suppress(FileExistsError):
+            create_private_file(self._key, secrets.token_hex(_KEY_BYTES))
+        self._writer = RecordingWriter(
+            Path(recording.folder), _CONTROL_PLANE, started_ns=self._time_ns(),
+            max_file_bytes=recording.max_file_bytes, max_bytes=recording.max_bytes,
+            metadata={"side": "platform"},
+        )  # fmt: skip
+
+    def event(self, event: Mapping[str, Any]) -> None:
+        """Record one event of the platform."""
+        told = {name: value for name, value in event.items() if name not in (*_LEFT_OUT, "event")}
+        self._write(EVENTS_TOPIC, EVENT_SCHEMA, {"kind": event["event"], **told})
+
+    def close(self) -> None:
+        """Finish the file, and throw the key away."""
+        if self._writer is not None:
+            self._writer.close()
+            self._writer = None
+            with suppress(OSError):
+                self._key.unlink(missing_ok=True)
+
+    def _write(self, topic: str, schema: str, value: dict[str, Any]) -> None:
+        writer = self._writer
+        if writer is not None:
+            now_ns = self._time_ns()
+            writer.add_json(topic, schema, now_ns, {"time_s": now_ns / 1e9, **value})
+            writer.flush(now_ns)
