@@ -20,7 +20,7 @@ from rse_pf.errors import BadRequest, message_of
 from rse_pf.geometry import Array, Camera
 from rse_pf.live_map.events import CameraNumbers
 
-__all__ = ["Graph", "LiveKeyframe", "LiveLink", "Segment", "camera_of"]
+__all__ = ["Graph", "LiveKeyframe", "LiveLink", "Segment", "camera_of", "variances_of"]
 
 LinkState = Literal["open", "believed", "removed"]
 
@@ -68,7 +68,8 @@ class Segment:
 class LiveLink:
     """A measured relative pose of keyframes ``a`` and ``b``; ``a`` is the one that was measured.
 
-    ``doubts`` counts the updates in a row in which the link contradicted the graph.
+    ``variances`` ``(6,)`` are of the twist (square metres, square radians); ``doubts`` counts the updates in
+    a row in which the link contradicted the graph.
     """
 
     a: int
@@ -77,14 +78,10 @@ class LiveLink:
     information: Array
     inliers: int
     matches: int
+    variances: Array
     fixed: bool = False
     state: LinkState = "open"
     doubts: int = 0
-    variances: Array = field(init=False)
-    """``(6,)``, of the twist (square metres, square radians)."""
-
-    def __post_init__(self) -> None:
-        self.variances = np.diag(np.linalg.inv(self.information))
 
 
 class Graph:
@@ -172,6 +169,11 @@ class Graph:
         """Forget what keyframe *i* saw; its pose and its links stay."""
         self.keyframes[i].features = None
         self._held[i] = False
+
+    def keep_features(self, i: int, features: bytes) -> None:
+        """Give keyframe *i* of a snapshot what it saw."""
+        self.keyframes[i].features = features
+        self._held[i] = True
 
     def add_link(self, link: LiveLink) -> int:
         """Keep *link*; return its number."""
@@ -328,13 +330,14 @@ class Graph:
         self._links_of.setdefault(link.a, []).append(number)
         self._links_of.setdefault(link.b, []).append(number)
 
-    def encode(self, extra: dict[str, bytes]) -> bytes:
+    def encode(self, extra: dict[str, bytes], with_features: bool = True) -> bytes:
         """Return everything as bytes, with *extra* byte strings beside it."""
         believed = {str(i): numbers for i, numbers in self._links_of.items() if numbers}
         packed = _Packed(
             version=_VERSION,
             keyframes=[
-                (k.robot, k.segment, k.number, k.timestamp_s, k.camera, k.features) for k in self.keyframes
+                (k.robot, k.segment, k.number, k.timestamp_s, k.camera, k.features if with_features else None)
+                for k in self.keyframes
             ],
             segments=[
                 (
@@ -405,10 +408,12 @@ class Graph:
             )
             for robot, segment, keyframes, component, told, covariance, reason, version in packed.segments
         ]  # fmt: skip
-        for number, a, b, step, information, inliers, matches, fixed, state, doubts in packed.links:
+        stack = np.frombuffer(b"".join(each[4] for each in packed.links), dtype="<f8").reshape(-1, 6, 6)
+        for each, information, variances in zip(packed.links, stack, variances_of(stack), strict=True):
+            number, a, b, step, _, inliers, matches, fixed, state, doubts = each
             graph.links[number] = LiveLink(
-                a=a, b=b, T_a_b=_matrix(step, 4), information=_matrix(information, 6), inliers=inliers,
-                matches=matches, fixed=fixed, state=state, doubts=doubts,
+                a=a, b=b, T_a_b=_matrix(step, 4), information=information, inliers=inliers,
+                matches=matches, variances=variances, fixed=fixed, state=state, doubts=doubts,
             )  # fmt: skip
         graph.open = packed.open
         graph.agreements = {(i, j): agrees for i, j, agrees in packed.agreements}
@@ -437,6 +442,12 @@ class _Packed(msgspec.Struct, kw_only=True):
     links_of: list[tuple[str, list[int]]]
     arrays: list[bytes]
     extra: list[tuple[str, bytes]]
+
+
+def variances_of(information: Array) -> Array:
+    """Return the ``(m, 6)`` variances of twists with the ``(m, 6, 6)`` *information*."""
+    variances: Array = np.diagonal(np.linalg.inv(information), axis1=1, axis2=2)
+    return variances
 
 
 def camera_of(numbers: CameraNumbers) -> Camera:

@@ -7,14 +7,14 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
 
 from rse_pf.errors import BadRequest, InvalidCamera
-from rse_pf.geometry import Array, Camera, inverse, pose_difference
+from rse_pf.geometry import Array, Camera, inverse
 from rse_pf.live_map.beliefs import Changes, judge_links, remove_doubted
 from rse_pf.live_map.events import (
     Event,
@@ -27,7 +27,8 @@ from rse_pf.live_map.events import (
     matrix_bytes,
     matrix_of,
 )
-from rse_pf.live_map.graph import Graph, LiveKeyframe, LiveLink, Segment, camera_of
+from rse_pf.live_map.feature_parts import FeatureParts, SnapshotParts
+from rse_pf.live_map.graph import Graph, LiveKeyframe, LiveLink, Segment, camera_of, variances_of
 from rse_pf.live_map.keyframe_code import KeyframeFeatures, decode_features
 from rse_pf.live_map.measure import measure_links
 from rse_pf.live_map.options import LiveMapOptions
@@ -47,6 +48,7 @@ from rse_pf.live_map.smoother import SmoothedWindows, odometry_step, smooth_arou
 from rse_pf.live_map.versions import version_of, whole_graph
 from rse_pf.maps.format import MapVersion
 from rse_pf.services.mapping.optimise import OptimiseOptions, optimise_graph
+from rse_pf.services.mapping.pose_graph import inverses
 
 __all__ = ["LiveMap"]
 
@@ -66,6 +68,7 @@ class LiveMap:
         self.options = options or LiveMapOptions()
         self._graph = Graph()
         self._places = LivePlaceIndex()
+        self._parts = FeatureParts()
 
     @classmethod
     def restore(cls, snapshot: bytes, options: LiveMapOptions | None = None) -> LiveMap:
@@ -82,6 +85,23 @@ class LiveMap:
     def snapshot(self) -> bytes:
         """Return all that the map knows."""
         return self._graph.encode({"places": self._places.to_bytes()})
+
+    @classmethod
+    def restore_parts(
+        cls, head: bytes, part: Callable[[str], bytes], options: LiveMapOptions | None = None
+    ) -> LiveMap:
+        """Return the map that `snapshot_parts` was called on; *part* returns the bytes of a part by name.
+
+        Raises:
+            BadRequest: The head or a part is damaged, or of another version.
+        """
+        restored = cls(options)
+        restored._graph, restored._places, restored._parts = FeatureParts.decode(head, part)
+        return restored
+
+    def snapshot_parts(self, known: Collection[str] = ()) -> SnapshotParts:
+        """Return all that the map knows, what keyframes saw in parts; *known* ones are not made again."""
+        return self._parts.encode(self._graph, self._places, known)
 
     def digest(self) -> str:
         """Return the SHA-256 of all that the map knows: equal for equal maps."""
@@ -287,24 +307,25 @@ class LiveMap:
         graph.newest[event.robot] = row
         if graph.root < 0:
             graph.root = row
-        return [Added(id=i), *self._tell((event.robot, event.number))]
+        # A keyframe goes on from the last one, so only the first of an aligned segment tells something.
+        is_told = segment.told is not None or not self._is_aligned(row)
+        return [Added(id=i), *(() if is_told else self._tell((event.robot, event.number)))]
 
     def _take_links(self, event: LinksMeasured) -> list[Outcome]:
         graph, k = self._graph, event.keyframe
         if not self._exists(k):
             return []
-        numbers = []
-        for link in event.links:
-            if link.other != k and self._exists(link.other):
-                numbers.append(
-                    graph.add_link(
-                        LiveLink(
-                            a=k, b=link.other, T_a_b=np.array(matrix_of(link.T_keyframe_other, 4, 4)),
-                            information=np.array(matrix_of(link.information, 6, 6)), inliers=link.inliers,
-                            matches=link.matches,
-                        )
-                    )
-                )  # fmt: skip
+        kept = [link for link in event.links if link.other != k and self._exists(link.other)]
+        information = np.array([matrix_of(link.information, 6, 6) for link in kept]).reshape(-1, 6, 6)
+        numbers = [
+            graph.add_link(
+                LiveLink(
+                    a=k, b=link.other, T_a_b=np.array(matrix_of(link.T_keyframe_other, 4, 4)),
+                    information=each, inliers=link.inliers, matches=link.matches, variances=variances,
+                )
+            )
+            for link, each, variances in zip(kept, information, variances_of(information), strict=True)
+        ]  # fmt: skip
         changes = judge_links(graph, k, numbers, self.options)
         window = self._smooth(changes)
         self._forget_old_links()
@@ -350,7 +371,9 @@ class LiveMap:
         graph = self._graph
         was_root = graph.segments[graph.root].component if graph.root >= 0 else -1
         beside = [row for row, each in enumerate(graph.segments) if each.component == was_root]
-        for i in graph.forget(robot):
+        gone = graph.forget(robot)
+        self._parts.forget(gone)
+        for i in gone:
             self._places.remove(i)
         graph.newest.pop(robot, None)
         if graph.root < 0 or not graph.segments[graph.root].keyframes:
@@ -376,12 +399,14 @@ class LiveMap:
             i = graph.add(keyframe, 0, T, T, 0.0)
             self._place(i)
             outcomes.append(Added(id=i))
-        for link in event.links:
+        information = np.array([matrix_of(link.information, 6, 6) for link in event.links]).reshape(-1, 6, 6)
+        for link, each_link, variances in zip(
+            event.links, information, variances_of(information), strict=True
+        ):
             graph.add_link(
                 LiveLink(
-                    a=link.a, b=link.b, T_a_b=np.array(matrix_of(link.T_a_b, 4, 4)),
-                    information=np.array(matrix_of(link.information, 6, 6)), inliers=0, matches=0, fixed=True,
-                    state="believed",
+                    a=link.a, b=link.b, T_a_b=np.array(matrix_of(link.T_a_b, 4, 4)), information=each_link,
+                    inliers=0, matches=0, fixed=True, state="believed", variances=variances,
                 )
             )  # fmt: skip
         graph.connect()
@@ -407,12 +432,10 @@ class LiveMap:
 
     def _tell(self, cause: tuple[str, int] | None, window: SmoothedWindows | None = None) -> list[Outcome]:
         """Return what robots must know about the alignments of their newest segments."""
-        graph, options = self._graph, self.options
+        graph = self._graph
         outcomes: list[Outcome] = []
-        for row in graph.newest.values():
+        for row, T_map_odom, is_new in self._told_anew():
             segment = graph.segments[row]
-            if not segment.keyframes:
-                continue
             if not self._is_aligned(row):
                 if segment.told is not None:
                     segment.told = None
@@ -422,11 +445,10 @@ class LiveMap:
                         Unaligned(robot=segment.robot, segment=segment.segment, reason=segment.reason)
                     )
                 continue
-            T_map_odom = self._T_map_odom(segment)
             if segment.told is None:
                 links = sum(len(each) for pair, each in graph.bridges().items() if row in pair)
                 outcomes.append(Joined(robot=segment.robot, segment=segment.segment, links=links))
-            elif not _differs(segment.told, T_map_odom, options):
+            elif not is_new:
                 continue
             segment.told, segment.reason = T_map_odom, ""
             covariance = window.covariance(graph, segment.keyframes[-1]) if window is not None else None
@@ -439,6 +461,23 @@ class LiveMap:
                 )
             )  # fmt: skip
         return outcomes
+
+    def _told_anew(self) -> list[tuple[int, Array, bool]]:
+        """Return row and alignment of the newest segments, and whether it changed since it was told."""
+        graph, options = self._graph, self.options
+        rows = [row for row in graph.newest.values() if graph.segments[row].keyframes]
+        newest = [graph.segments[row].keyframes[-1] for row in rows]
+        T = graph.T[newest] @ inverses(graph.T_odom[newest])
+        told = T.copy()
+        for place, row in enumerate(rows):
+            T_told = graph.segments[row].told
+            if T_told is not None:
+                told[place] = T_told
+        moved2_m2 = ((T[:, :3, 3] - told[:, :3, 3]) ** 2).sum(axis=1)
+        traces = (T[:, :3, :3] * told[:, :3, :3]).sum(axis=(1, 2))
+        least_trace = 1.0 + 2.0 * math.cos(math.radians(options.told_deg))
+        changed = (moved2_m2 > options.told_m**2) | (traces < least_trace)
+        return list(zip(rows, T, changed.tolist(), strict=True))
 
     def _cull(self, k: int) -> list[Outcome]:
         """Drop the features of the oldest keyframe at a place that enough others have seen."""
@@ -529,11 +568,6 @@ class LiveMap:
         mask: npt.NDArray[np.bool_] = aligned[graph.of_segment]
         return mask
 
-    def _T_map_odom(self, segment: Segment) -> Array:
-        newest = segment.keyframes[-1]
-        T_map_odom: Array = self._graph.T[newest] @ inverse(self._graph.T_odom[newest])
-        return T_map_odom
-
     def _alignment(self, segment: Segment) -> Alignment:
         aligned = segment.told is not None
         return Alignment(
@@ -545,11 +579,6 @@ class LiveMap:
 def _decoded(stored: _Stored) -> tuple[int, KeyframeFeatures, Camera]:
     number, features, camera = stored
     return number, decode_features(features, camera), camera
-
-
-def _differs(old: Array, new: Array, options: LiveMapOptions) -> bool:
-    moved_m, turned_deg = pose_difference(old, new)
-    return moved_m > options.told_m or turned_deg > options.told_deg
 
 
 def _check_rigid(T: Array) -> None:

@@ -35,10 +35,10 @@ Rows = npt.NDArray[np.int64]
 
 _LEAST_STEP = 0.05
 _ITERATIONS = 6
-_CONVERGED_M, _CONVERGED_RAD = 1e-3, 1e-3
+_CONVERGED_M, _CONVERGED_RAD = 6e-3, 6e-3
 _LITTLE = 1e-3
-"""Share of the cost below which another step is not worth its time; after steps below a millimetre and a
-thousandth of a radian the next one would be a thousand times shorter."""
+"""Share of the cost below which another step is not worth its time; after steps below 6 mm and 6 mrad the
+next one is ten times shorter, and the next keyframe's smoothing makes it."""
 _DAMPING = 1e-6
 """Of the diagonal; a free pose without an edge to a held one stays where it is."""
 
@@ -120,8 +120,9 @@ def smooth_around(
             if not len(edges.a):
                 break
             found, border, rows = _fit(graph, ids, edges, options)
-            if is_whole or not _is_moved(graph, border, found, rows, options) or size == options.windows[-1]:
-                done.strained |= not is_whole and _is_moved(graph, border, found, rows, options)
+            is_strained = not is_whole and _is_moved(graph, border, found, rows, options)
+            if not is_strained or size == options.windows[-1]:
+                done.strained |= is_strained
                 graph.T[ids] = found.T[: len(ids)]
                 squares = {
                     int(number): float(square)
@@ -195,16 +196,17 @@ def smooth(
     """
     T = T.copy()
     back = inverses(T_a_b)
-    error, squares = _residuals(T, a, b, back, information)
+    T_a_b_now, error, squares = _residuals(T, a, b, back, information)
     cost = _cost(squares, robust, cauchy)
     H = np.zeros((6 * free, 6 * free))
     for _ in range(_ITERATIONS):
-        H, gradient = _normal_equations(T, free, a, b, error, information, _weights(squares, robust, cauchy))
+        weights = _weights(squares, robust, cauchy)
+        H, gradient = _normal_equations(T_a_b_now, free, a, b, error, information, weights)
         step = _bounded(np.linalg.solve(H, -gradient).reshape(free, 6).astype(np.float64))
         for _ in range(4):
             moved = T.copy()
             moved[:free] = _orthonormal(T[:free] @ exp_se3_many(step))
-            new_error, new_squares = _residuals(moved, a, b, back, information)
+            T_moved, new_error, new_squares = _residuals(moved, a, b, back, information)
             new_cost = _cost(new_squares, robust, cauchy)
             if new_cost <= cost:
                 break
@@ -212,7 +214,7 @@ def smooth(
         else:
             break
         little = cost - new_cost <= _LITTLE * cost
-        T, error, squares, cost = moved, new_error, new_squares, new_cost
+        T, T_a_b_now, error, squares, cost = moved, T_moved, new_error, new_squares, new_cost
         moved_m, turned_rad = np.abs(step[:, :3]).max(), np.abs(step[:, 3:]).max()
         if little or (moved_m < _CONVERGED_M and turned_rad < _CONVERGED_RAD):
             break
@@ -281,44 +283,40 @@ def _window(graph: Graph, seeds: Sequence[int], size: int, held: set[int]) -> tu
 
 def _fit(
     graph: Graph, ids: list[int], edges: Edges, options: LiveMapOptions
-) -> tuple[SmoothedPoses, list[int], dict[int, int]]:
+) -> tuple[SmoothedPoses, Rows, dict[int, int]]:
     """Return the smoothed poses, the keyframes of the window that touch its border, and rows by id."""
-    rows = {i: row for row, i in enumerate(ids)}
-    border = []
-    beyond: list[int] = []
-    for one, other in zip(edges.a.tolist(), edges.b.tolist(), strict=True):
-        for inner, outer in ((one, other), (other, one)):
-            if inner in rows and rows[inner] < len(ids) and (outer not in rows or rows[outer] >= len(ids)):
-                border.append(inner)
-                if outer not in rows:
-                    rows[outer] = len(ids) + len(beyond)
-                    beyond.append(outer)
+    row_of = np.full(len(graph), -1, dtype=np.int64)
+    row_of[ids] = np.arange(len(ids))
+    a_inside, b_inside = row_of[edges.a] >= 0, row_of[edges.b] >= 0
+    border = np.concatenate([edges.a[a_inside & ~b_inside], edges.b[b_inside & ~a_inside]])
+    beyond = np.unique(np.concatenate([edges.b[a_inside & ~b_inside], edges.a[b_inside & ~a_inside]]))
+    row_of[beyond] = len(ids) + np.arange(len(beyond))
     found = smooth(
-        graph.T[ids + beyond], len(ids), np.array([rows[i] for i in edges.a.tolist()]),
-        np.array([rows[i] for i in edges.b.tolist()]), edges.T_a_b, edges.information, edges.numbers >= 0,
-        cauchy=options.cauchy,
+        graph.T[np.concatenate([ids, beyond])], len(ids), row_of[edges.a], row_of[edges.b], edges.T_a_b,
+        edges.information, edges.numbers >= 0, cauchy=options.cauchy,
     )  # fmt: skip
-    return found, border, {i: row for i, row in rows.items() if row < len(ids)}
+    return found, np.unique(border), {i: row for row, i in enumerate(ids)}
 
 
 def _is_moved(
-    graph: Graph, border: list[int], found: SmoothedPoses, rows: dict[int, int], options: LiveMapOptions
+    graph: Graph, border: Rows, found: SmoothedPoses, rows: dict[int, int], options: LiveMapOptions
 ) -> bool:
     """Return whether a keyframe at the border of the window moved by more than it may."""
-    if not border:
+    if not len(border):
         return False
-    old, new = graph.T[border], found.T[[rows[i] for i in border]]
-    off = log_se3_many(inverses(old) @ new)
-    return bool(
-        np.sqrt((off[:, :3] ** 2).sum(axis=1)).max() > options.border_m
-        or np.sqrt((off[:, 3:] ** 2).sum(axis=1)).max() > math.radians(options.border_deg)
-    )
+    old, new = graph.T[border], found.T[[rows[i] for i in border.tolist()]]
+    moved2_m2 = ((new[:, :3, 3] - old[:, :3, 3]) ** 2).sum(axis=1).max()
+    traces = (old[:, :3, :3] * new[:, :3, :3]).sum(axis=(1, 2))
+    least_trace = 1.0 + 2.0 * math.cos(math.radians(options.border_deg))
+    return bool(moved2_m2 > options.border_m**2 or traces.min() < least_trace)
 
 
-def _residuals(T: Array, a: Rows, b: Rows, back: Array, information: Array) -> tuple[Array, Array]:
-    error = log_se3_many(back @ inverses(T[a]) @ T[b])
+def _residuals(T: Array, a: Rows, b: Rows, back: Array, information: Array) -> tuple[Array, Array, Array]:
+    """Return ``T_a_b`` by the poses, its twist from the measured one, and the squared norm of that."""
+    T_a_b = inverses(T[a]) @ T[b]
+    error = log_se3_many(back @ T_a_b)
     weighted = (information @ error[:, :, None])[:, :, 0]
-    return error, (error * weighted).sum(axis=1)
+    return T_a_b, error, (error * weighted).sum(axis=1)
 
 
 def _weights(squares: Array, robust: npt.NDArray[np.bool_], cauchy: float) -> Array:
@@ -330,30 +328,30 @@ def _cost(squares: Array, robust: npt.NDArray[np.bool_], cauchy: float) -> float
 
 
 def _normal_equations(
-    T: Array, free: int, a: Rows, b: Rows, error: Array, information: Array, weights: Array
+    T_a_b: Array, free: int, a: Rows, b: Rows, error: Array, information: Array, weights: Array
 ) -> tuple[Array, Array]:
     """Return the matrix ``(6 f, 6 f)`` and the gradient ``(6 f,)`` of the free poses."""
     J_b = np.eye(6) + 0.5 * _small_adjoints(error)
-    J_a = -J_b @ _adjoints(inverses(T[b]) @ T[a])
-    W = weights[:, None, None] * information
-    WJ_a, WJ_b = W @ J_a, W @ J_b
-    Jt_a, Jt_b = np.swapaxes(J_a, 1, 2), np.swapaxes(J_b, 1, 2)
-    H = np.zeros((free, free, 6, 6))
-    gradient = np.zeros((free, 6))
-    column = error[:, :, None]
-    a_moves, b_moves = a < free, b < free
-    both = a_moves & b_moves
-    np.add.at(H, (a[a_moves], a[a_moves]), (Jt_a @ WJ_a)[a_moves])
-    np.add.at(H, (b[b_moves], b[b_moves]), (Jt_b @ WJ_b)[b_moves])
-    cross = (Jt_a @ WJ_b)[both]
-    np.add.at(H, (a[both], b[both]), cross)
-    np.add.at(H, (b[both], a[both]), np.swapaxes(cross, 1, 2))
-    np.add.at(gradient, a[a_moves], (np.swapaxes(WJ_a, 1, 2) @ column)[a_moves, :, 0])
-    np.add.at(gradient, b[b_moves], (np.swapaxes(WJ_b, 1, 2) @ column)[b_moves, :, 0])
-    flat = np.ascontiguousarray(H.transpose(0, 2, 1, 3)).reshape(6 * free, 6 * free)
+    J_a = -J_b @ _adjoints(inverses(T_a_b))
+    J = np.concatenate([J_a, J_b], axis=2)
+    WJ = (weights[:, None, None] * information) @ J
+    blocks = np.swapaxes(J, 1, 2) @ WJ
+    slopes = (np.swapaxes(WJ, 1, 2) @ error[:, :, None])[:, :, 0]
+    # Sums over the edges of a pose are products with ones and zeros, for the sake of time.
+    poses = np.arange(free)[:, None]
+    at_a, at_b = (a == poses).astype(np.float64), (b == poses).astype(np.float64)
+    own = at_a @ blocks[:, :6, :6].reshape(-1, 36) + at_b @ blocks[:, 6:, 6:].reshape(-1, 36)
+    both = np.flatnonzero((a < free) & (b < free))
+    across = 36 * (a[both] * free + b[both])[:, None] + np.arange(36)
+    summed = np.bincount(across.ravel(), weights=blocks[both, :6, 6:].ravel(), minlength=36 * free * free)
+    # It counts in integers where there is nothing to add.
+    half: Array = summed.astype(np.float64, copy=False).reshape(free, free, 6, 6)
+    half[np.arange(free), np.arange(free)] = 0.5 * own.reshape(free, 6, 6)
+    flat = np.ascontiguousarray(half.transpose(0, 2, 1, 3)).reshape(6 * free, 6 * free)
+    H = flat + flat.T
     diagonal = np.arange(6 * free)
-    flat[diagonal, diagonal] += _DAMPING * (flat[diagonal, diagonal] + 1.0)
-    return flat, gradient.reshape(-1)
+    H[diagonal, diagonal] += _DAMPING * (H[diagonal, diagonal] + 1.0)
+    return H, (at_a @ slopes[:, :6] + at_b @ slopes[:, 6:]).reshape(-1)
 
 
 def _bounded(step: Array) -> Array:

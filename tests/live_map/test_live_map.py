@@ -114,6 +114,43 @@ def test_a_snapshot_and_the_events_after_it_give_the_same_map(joined: Run, share
     assert second.digest() == joined.map.digest()
 
 
+def test_a_snapshot_in_parts_is_the_same_map_and_writes_what_is_new() -> None:
+    world = GeneratedWorld(seed=6)
+    run = _unmeasured(world, 135)
+    store: dict[str, bytes] = {}
+
+    first = run.map.snapshot_parts()
+    store |= {name: data for name, data in first.parts.items() if data is not None}
+    again = LiveMap.restore_parts(first.head, store.__getitem__)
+    late = world.drive("b", ROUND[:2])
+    run.apply(world.keyframe(late, 0))
+    again.apply(run.log[-1])
+    second = again.snapshot_parts(store)
+
+    assert again.snapshot() == run.map.snapshot()
+    assert [data is None for data in second.parts.values()] == [True, False]
+    assert len(first.parts) == 2
+
+
+def test_what_a_forgotten_robot_saw_is_in_no_part() -> None:
+    world = GeneratedWorld(seed=6)
+    run = _unmeasured(world, 130)
+    before = run.map.snapshot_parts()
+    run.apply(RobotForgotten(robot="a"))
+    after = run.map.snapshot_parts(before.parts)
+
+    assert not set(before.parts) & set(after.parts)
+    assert max(len(data) for data in after.parts.values() if data is not None) < 16
+
+
+def test_a_missing_or_damaged_part_is_refused(joined: Run) -> None:
+    whole = joined.map.snapshot_parts()
+    with pytest.raises(BadRequest):
+        LiveMap.restore_parts(whole.head, lambda name: b"\x90")
+    with pytest.raises(BadRequest):
+        LiveMap.restore_parts(whole.head[:-9], lambda name: whole.parts[name] or b"")
+
+
 def test_another_order_of_events_is_another_map(joined: Run) -> None:
     one, other = LiveMap(), LiveMap()
     log = joined.log[:8]
@@ -322,6 +359,14 @@ def test_redundant_keyframes_lose_their_features_only() -> None:
 
     assert run.map.keyframes < 0.8 * len(world.seen)
     assert run.worst_error(range(len(world.seen)))[0] < 0.05
+
+
+def _unmeasured(world: GeneratedWorld, count: int) -> Run:
+    """Return a map of one robot whose keyframes were never measured."""
+    run, drive = Run(world), world.drive("a", circle(0.8, 3.0)[:count])
+    for number in range(count):
+        run.apply(world.keyframe(drive, number))
+    return run
 
 
 def _two_apart() -> tuple[Run, GeneratedWorld]:
