@@ -92,6 +92,7 @@ class Mapper:
         map_options: MapOptions | None = None,
         T_world_start: Array | None = None,
         keyframes_of: str = "",
+        adds_frames: bool = True,
     ) -> None:
         """Start without frames.
 
@@ -106,6 +107,8 @@ class Mapper:
             T_world_start: ``(4, 4)``, pose of the first camera; None means the identity.
             keyframes_of: Name of the robot under which keyframes with depth are kept, about 50 kB each, for
                 `encoded_map`; empty keeps none.
+            adds_frames: Whether each frame with depth is added to the map; else the caller adds to `map`
+                what it wants.
         """
         self.camera = camera
         self._ask = ask
@@ -118,6 +121,7 @@ class Mapper:
         self._tracker: Tracker | MonocularTracker | None = None
         self._dense = PointMap(self._map_options)
         self._keyframes_of = keyframes_of
+        self._adds_frames = adds_frames
         self._kept: list[Keyframe] = []
         self._stamps: list[float] = []
         self._poses: list[Array] = []
@@ -331,7 +335,8 @@ class Mapper:
         if pose is not None:
             self._stamps.append(done.frame.timestamp_s)
             self._poses.append(pose)
-            self._dense.add(done.frame, pose)
+            if self._adds_frames:
+                self._dense.add(done.frame, pose)
             if done.keyframe and self._keyframes_of and tracker is not None:
                 self._keep(done, pose, tracker.keyframe_features)
         return done

@@ -75,7 +75,7 @@ class LiveOptions:
     keyframe_deg: float = 6.0
     features: int = 870
     segment_after: int = 5
-    relocalise_s: float = 2.0
+    relocalise_s: float = 0.5
     bytes_per_s: float = 262_144.0
     deadline_s: float = 5.0
     leave_s: float = 5.0
@@ -134,7 +134,7 @@ class LiveMapper:
                 keeps them in memory.
             options: Of the tracker.
             live: Of keyframes and their sending.
-            map_options: Density of the robot's own cloud.
+            map_options: Density of the robot's own cloud, to which keyframes are added.
             T_world_start: ``(4, 4)``, pose of the first camera in the odometry frame; None: the identity.
             clock: Seconds, monotonic.
         """
@@ -147,7 +147,7 @@ class LiveMapper:
         self._ask = ask
         self._mapper = Mapper(
             ask=self._ask_first, camera=camera, options=options, depth=True, map_options=map_options,
-            T_world_start=T_world_start,
+            T_world_start=T_world_start, adds_frames=False,
         )  # fmt: skip
         self._alignments = Alignments()
         self._segment = 0
@@ -162,6 +162,7 @@ class LiveMapper:
         self._listeners: list[asyncio.Queue[Correction | None]] = []
         self._corrections: deque[Correction] = deque(maxlen=_MAX_CORRECTIONS)
         self._tasks: list[asyncio.Task[None]] = []
+        self._adding: asyncio.Future[Any] | None = None
         self._trouble = ""
         self._one_frame = asyncio.Lock()
         self._is_known = False
@@ -206,6 +207,7 @@ class LiveMapper:
         """
         self._is_open = False
         try:
+            await self._added()
             if self._robot.connected and not isinstance(error, asyncio.CancelledError):
                 with contextlib.suppress(asyncio.TimeoutError):
                     await asyncio.wait_for(self._sender.wait_empty(), self.options.leave_s)
@@ -323,7 +325,7 @@ class LiveMapper:
 
     @property
     def map(self) -> PointMap:
-        """The robot's own cloud, in its odometry frame."""
+        """The robot's own cloud of its keyframes, in its odometry frame; the newest may be missing."""
         return self._mapper.map
 
     @property
@@ -441,12 +443,19 @@ class LiveMapper:
             features=data,
         )
         self._last_keyframe = pose
+        await self._added()
+        self._adding = asyncio.ensure_future(asyncio.to_thread(self.map.add, done.frame, pose))
         if not await asyncio.to_thread(waiting.add, keyframe):
             self._dropped += 1
             return
         self._made += 1
         self._sender.added()
         self._relocalise(keyframe, pose)
+
+    async def _added(self) -> None:
+        """Wait until the last keyframe is in the robot's own cloud."""
+        if self._adding is not None:
+            await self._adding
 
     def _encoded(self, features: Features) -> bytes:
         """Return the first features that have depth: those of the finest levels of the pyramid."""

@@ -7,6 +7,7 @@ time and warm-up (elasticity), and the duration of faults (robustness).
 examples:
   rse-pf experiment elasticity --speed 30 --robots 40 --out fig8
   rse-pf experiment live --data recordings/kitchen --fps 10 --out live
+  rse-pf experiment live --only none,kill,drain --frames 310 --out live-faults
   rse-pf experiment robustness --only kill,stop --repeat 3 --out faults
   rse-pf experiment verify fig8
 """
@@ -15,6 +16,7 @@ from __future__ import annotations
 
 import argparse
 import math
+from collections.abc import Collection
 from dataclasses import fields
 from pathlib import Path
 from typing import Any, TypeVar
@@ -52,8 +54,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--no-rebalance", action="store_true", help="connected robots stay on their servers"
     )
     elasticity.add_argument("--compare", action="store_true", help="with and without rebalancing, in one run")
-    robustness = parser.add_argument_group("robustness")
-    robustness.add_argument("--only", metavar="A,B", help="only these faults (default: all but random)")
+    robustness = parser.add_argument_group("robustness and live")
+    robustness.add_argument(
+        "--only", metavar="A,B", help="these faults (default: all but random; of a live map: none)"
+    )
     robustness.add_argument(
         "--repeat", type=int, default=1, metavar="N", help="runs of each fault (default: 1)"
     )
@@ -127,11 +131,16 @@ def _robustness(args: argparse.Namespace, settings: PlatformSettings) -> int:
     from rse_pf.experiments.paper.fault_scenarios import SCENARIOS
     from rse_pf.experiments.paper.robustness import RobustnessOptions, run_robustness
 
-    only = tuple(dict.fromkeys(word for word in (args.only or "").split(",") if word))
-    for word in only:
-        if word not in SCENARIOS:
-            raise UsageError(f"there is no fault {word!r}", hint=f"known are {', '.join(SCENARIOS)}")
-    return run_robustness(_options(RobustnessOptions, args, only=only), settings)
+    return run_robustness(_options(RobustnessOptions, args, only=_faults(args.only, SCENARIOS)), settings)
+
+
+def _faults(only: str | None, known: Collection[str]) -> tuple[str, ...]:
+    """Return the faults that the option ``--only`` names; raises UsageError for one that is none."""
+    chosen = tuple(dict.fromkeys(word for word in (only or "").split(",") if word))
+    for word in chosen:
+        if word not in known:
+            raise UsageError(f"there is no fault {word!r}", hint=f"known are {', '.join(known)}")
+    return chosen
 
 
 def _map(args: argparse.Namespace, settings: PlatformSettings) -> int:
@@ -143,9 +152,12 @@ def _map(args: argparse.Namespace, settings: PlatformSettings) -> int:
 
 def _live(args: argparse.Namespace, settings: PlatformSettings) -> int:
     from rse_pf.experiments.demo.run import DemoOptions
+    from rse_pf.experiments.paper.live_faults import LIVE_FAULTS, run_live_faults
     from rse_pf.experiments.paper.live_map import run_live
 
-    return run_live(_options(DemoOptions, args, rate_hz=args.fps, live=True, quiet=True), settings)
+    options = _options(DemoOptions, args, rate_hz=args.fps, live=True, quiet=True)
+    only = _faults(args.only, LIVE_FAULTS)
+    return run_live_faults(options, settings, only, args.repeat) if only else run_live(options, settings)
 
 
 def _options(kind: type[T], args: argparse.Namespace, **changed: Any) -> T:

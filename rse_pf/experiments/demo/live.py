@@ -19,7 +19,7 @@ from rse_pf.config import SessionSettings
 from rse_pf.errors import RsePfError
 from rse_pf.experiments.results.live_error import LIVE_MAP, LIVE_RECORDS, TRUTH
 
-__all__ = ["LIVE_NAME", "LiveRecorder", "fetch_live_map"]
+__all__ = ["LIVE_NAME", "LiveRecorder", "fetch_live_map", "show_live_map"]
 
 LIVE_NAME = "demo"
 """Of the live map."""
@@ -100,6 +100,25 @@ async def fetch_live_map(url: str, token: str, folder: Path, session: SessionSet
     except RsePfError as error:
         return f"{error.code}: {error.message}"
     return ""
+
+
+async def show_live_map(url: str, token: str, session: SessionSettings) -> dict[str, Any]:
+    """Return ``digest``, keyframes and log ``position`` of the map; or the ``trouble``."""
+    from client_sdk import connect
+
+    try:
+        async with connect(url, token=token, settings=session) as operator:
+            answer = await operator.call("live-show", {"map": LIVE_NAME}, deadline_s=_PUBLISH_S)
+    except RsePfError as error:
+        return {"trouble": f"{error.code}: {error.message}"}
+    reply = answer.reply
+    return {
+        "digest": reply["digest"],
+        "position": reply["version"],
+        "keyframes": reply["keyframes"],
+        "owner": reply["owner"],
+        "epoch": reply["epoch"],
+    }
 
 
 def _download(url: str, token: str, version: str, folder: Path) -> None:

@@ -22,6 +22,7 @@ from client_sdk.frontend import Frame, FrontEndOptions, PoseQuery, TrackedFrame
 from client_sdk.live import LiveMapper
 from client_sdk.mapper import Mapper, ask_robot
 from client_sdk.mapping import PointMap, Trajectory, write_ply, write_trajectory
+from client_sdk.offload import CloudFirst
 from client_sdk.robot import Robot
 from rse_pf.config import DataSettings, SessionSettings
 from rse_pf.errors import RsePfError, error_of_system
@@ -83,6 +84,8 @@ class RobotSpec:
     options: DemoOptions
     session: SessionSettings
     data_settings: DataSettings
+    has_offload: bool = False
+    """Whether it solves poses itself where the cloud does not answer, and keeps keyframes on its disk."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,7 +148,10 @@ async def _run(spec: RobotSpec, pipe: ParentPipe) -> None:
     async def token() -> str:
         return await asyncio.to_thread(pipe.fresh_token)
 
-    async with connect(spec.url, token=token, codec=options.codec, settings=spec.session) as robot:
+    offload = CloudFirst() if spec.has_offload else None
+    async with connect(
+        spec.url, token=token, codec=options.codec, settings=spec.session, offload=offload
+    ) as robot:
         began = planned = 0.0
         drive = _Drive()
 
@@ -155,7 +161,10 @@ async def _run(spec: RobotSpec, pipe: ParentPipe) -> None:
         mapper: Mapper | LiveMapper
         async with AsyncExitStack() as stack:
             if options.live:
-                shared = LiveMapper(robot, LIVE_NAME, ask=ask, options=options.frontend_options)
+                shared = LiveMapper(
+                    robot, LIVE_NAME, ask=ask, options=options.frontend_options,
+                    spool=spec.folder / "spool" if spec.has_offload else None,
+                )  # fmt: skip
                 mapper = await stack.enter_async_context(shared)
             else:
                 start = np.eye(4) if truth is None or options.merge else truth.T_world_camera[0]
@@ -165,9 +174,14 @@ async def _run(spec: RobotSpec, pipe: ParentPipe) -> None:
             collector = _collector(spec, pipe.token, lambda: drive.asking)
             recorder = LiveRecorder(shared, time.monotonic, began) if options.live else None
             first_s = time.monotonic()
-            for row, frame in enumerate(frames):
+            waiting = iter(frames)
+            following = asyncio.ensure_future(asyncio.to_thread(next, waiting, None))
+            for row in range(len(frames)):
+                frame = await following
                 planned = began + (row + spec.number / options.robots) / options.rate_hz
                 await asyncio.sleep(max(0.0, planned - time.monotonic()))
+                # The next frame is read while this one is tracked, as a camera's driver would.
+                following = asyncio.ensure_future(asyncio.to_thread(next, waiting, None))
                 done = await mapper.track(frame)
                 if recorder is not None:
                     recorder.frame(done)

@@ -10,6 +10,7 @@ import asyncio
 import contextlib
 import time
 from collections.abc import AsyncIterator, Callable
+from contextlib import AsyncExitStack
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -28,7 +29,8 @@ from rse_pf.experiments.child_process import (
     end_process,
     start_process,
 )
-from rse_pf.experiments.demo.live import fetch_live_map
+from rse_pf.experiments.demo.live import fetch_live_map, show_live_map
+from rse_pf.experiments.demo.live_faults import Disturbance, LiveFault
 from rse_pf.experiments.demo.merge import MERGED_MAP, merge_on_platform, print_tenths, write_merged
 from rse_pf.experiments.demo.report import closing_lines, demo_page, is_lost, make_report
 from rse_pf.experiments.demo.robot import DemoOptions, FrameDone, RobotFinished, RobotSpec, run_robot
@@ -70,8 +72,11 @@ class _Robot:
     finished: RobotFinished | None = None
 
 
-def run_demo(options: DemoOptions, settings: PlatformSettings) -> int:
-    """Run the demo; return 0 if every command was answered or failed, and most frames have poses."""
+def run_demo(options: DemoOptions, settings: PlatformSettings, fault: LiveFault | None = None) -> int:
+    """Run the demo, with a fault of a live map if there is one; return 0 if most frames have poses.
+
+    It returns 1, too, if a command neither was answered nor failed.
+    """
     folder = fresh_folder(
         options.out,
         [
@@ -82,19 +87,26 @@ def run_demo(options: DemoOptions, settings: PlatformSettings) -> int:
             MERGED_MAP,
             LIVE_MAP,
             "live.png",
+            "failing-store",
             "robot-[1-9]",
             "robot-[1-9][0-9]",
         ],
     )
     chosen = settings.replace(pnp={"engine": options.engine})
+    if fault is not None:
+        chosen = fault.settings(chosen)
     with (folder / EVENTS).open("w", encoding="utf-8") as file:
-        report = asyncio.run(_run(options, chosen, folder, EventLog(file)))
+        report = asyncio.run(_run(options, chosen, folder, EventLog(file), fault))
     show_page(closing_lines(report, folder))
     return 1 if is_lost(report) else 0
 
 
 async def _run(
-    options: DemoOptions, settings: PlatformSettings, folder: Path, events: EventLog
+    options: DemoOptions,
+    settings: PlatformSettings,
+    folder: Path,
+    events: EventLog,
+    fault: LiveFault | None,
 ) -> dict[str, Any]:
     before = environment(settings)
     origin = time.monotonic()
@@ -104,24 +116,46 @@ async def _run(
 
     with _progress_bars(options.quiet) as screen:
         screen.print("starting the platform: Envoy and two backend servers")
-        async with LocalPlatform(
-            settings,
-            port=0,
-            state=folder / "platform",
-            name="demo",
-            on_event=lambda event: events.copy(event, now()),
-            data=options.merge or options.live,
-        ) as platform:
+        async with AsyncExitStack() as stack:
+            if fault is not None:
+                stack.enter_context(fault.environment(folder / "failing-store"))
+            platform = await stack.enter_async_context(
+                LocalPlatform(
+                    settings,
+                    port=0,
+                    state=folder / "platform",
+                    name="demo",
+                    on_event=lambda event: events.copy(event, now()),
+                    data=options.merge or options.live,
+                )
+            )
+            disturbance = None
+            if fault is not None:
+                disturbance = await stack.enter_async_context(
+                    fault.disturb(
+                        platform, folder, lambda action, **more: events.write(now(), action, **more)
+                    )
+                )
             pids = ", ".join(f"{server.name} {server.pid}" for server in platform.servers)
             screen.print(f"running at {platform.url}: {pids}")
             screen.print("kill -9 one of these processes: the robots continue on the other server")
             samples = asyncio.create_task(_sample(platform, folder / SAMPLES, now))
             robots = [
-                _start(options, settings, folder, platform.url, number, screen)
+                _start(
+                    options,
+                    settings,
+                    folder,
+                    platform.url if disturbance is None else disturbance.url_of(number),
+                    number,
+                    screen,
+                    has_offload=fault is not None and fault.has_offload,
+                )
                 for number in range(options.robots)
             ]
             try:
-                await _follow(robots, platform, screen, events, now)
+                await _follow(robots, platform, screen, events, now, disturbance)
+                if disturbance is not None:
+                    await disturbance.finish()
             finally:
                 samples.cancel()
                 with contextlib.suppress(asyncio.CancelledError):
@@ -134,10 +168,12 @@ async def _run(
                 merged = await asyncio.to_thread(_merge, settings, folder, finished, platform, screen)
                 events.write(now(), "merged", joined=merged["joined"])
             if options.live:
+                token = platform.issue_token("operator")
+                if fault is not None:
+                    shown = await show_live_map(platform.url, token, settings.session)
+                    events.write(now(), "final-map", **shown)
                 screen.print("publishing the live map")
-                why = await fetch_live_map(
-                    platform.url, platform.issue_token("operator"), folder, settings.session
-                )
+                why = await fetch_live_map(platform.url, token, folder, settings.session)
                 events.write(now(), "published", trouble=why)
     remove_keys(folder / "platform")
     screen.print("drawing the maps")
@@ -145,8 +181,9 @@ async def _run(
 
 
 def _start(
-    options: DemoOptions, settings: PlatformSettings, folder: Path, url: str, number: int, screen: Progress
-) -> _Robot:
+    options: DemoOptions, settings: PlatformSettings, folder: Path, url: str, number: int, screen: Progress,
+    *, has_offload: bool,
+) -> _Robot:  # fmt: skip
     name = _name(number)
     (folder / name).mkdir()
     spec = RobotSpec(
@@ -157,6 +194,7 @@ def _start(
         options=options,
         session=settings.session,
         data_settings=settings.data,
+        has_offload=has_offload,
     )
     process, pipe = start_process(run_robot, spec, name)
     phase = "rendering the world" if options.data is None else "reading the recording"
@@ -170,6 +208,7 @@ async def _follow(
     screen: Progress,
     events: EventLog,
     now: Callable[[], float],
+    disturbance: Disturbance | None,
 ) -> None:
     """Wait until all robots are ready, start them together, and follow them to their end."""
     inboxes = [_messages(robot.pipe) for robot in robots]
@@ -180,6 +219,9 @@ async def _follow(
     began = time.monotonic() + start_after_s
     events.write(now(), "robots-start", robots=len(robots), after_s=start_after_s)
     screen.print("the robots start")
+    if disturbance is not None:
+        frames = max(message.frames for message in ready)
+        disturbance.begin(start_after_s, frames / robots[0].spec.options.rate_hz)
     for robot, message in zip(robots, ready, strict=True):
         screen.reset(robot.bar, description=f"{robot.spec.name}  mapping", total=message.frames)
         robot.pipe.send(began)

@@ -85,9 +85,15 @@ def frames_of(options: DemoOptions) -> dict[str, int]:
 
 
 def complete_records(
-    options: DemoOptions, settings: PlatformSettings, folder: Path, frames: dict[str, int], *, kind: str
+    options: DemoOptions,
+    settings: PlatformSettings,
+    folder: Path,
+    frames: dict[str, int],
+    *,
+    kind: str,
+    **more: Any,
 ) -> None:
-    """Write the parameters before the events of the demo, and its samples in the format of the monitor."""
+    """Write parameters with *more* of them before the events, and samples in the format of the monitor."""
     first = {
         "time": 0.0,
         "action": "experiment",
@@ -96,6 +102,7 @@ def complete_records(
         "fps": options.rate_hz,
         "frames": frames,
         **policy_parameters(settings, 1.0),
+        **more,
     }
     events = (folder / EVENTS).read_text(encoding="utf-8")
     (folder / EVENTS).write_text(json.dumps(first) + "\n" + events, encoding="utf-8")

@@ -18,6 +18,7 @@ from rse_pf.experiments.paper.latency import latency_figures
 from rse_pf.experiments.paper.live_map import live_experiment_figures
 from rse_pf.experiments.paper.mapping import map_figures
 from rse_pf.experiments.paper.robustness import robustness_figures
+from rse_pf.experiments.results.live_faults import live_fault_figures
 from rse_pf.experiments.results.records import (
     COMMANDS,
     EVENTS,
@@ -30,6 +31,8 @@ __all__ = ["FigureCheck", "broken_invariants", "figures_of", "run_folders", "ver
 
 _CLOCK_MS = 0.01
 _MAX_SHOWN = 60
+_OF_FRAMES = {"map", "live", "live-fault"}
+"""Kinds whose robots plan frames, not commands."""
 _HINT = "name the --out of an experiment"
 
 FIGURES: dict[str, Callable[[Records], dict[str, Any]]] = {
@@ -38,6 +41,7 @@ FIGURES: dict[str, Callable[[Records], dict[str, Any]]] = {
     "robustness": robustness_figures,
     "map": map_figures,
     "live": live_experiment_figures,
+    "live-fault": live_fault_figures,
 }
 
 
@@ -155,7 +159,7 @@ def _prefixed(name: str, check: FigureCheck) -> FigureCheck:
 
 
 def _wrong_round_trip(records: Records) -> str:
-    mapping = parameters_of(records)["kind"] in ("map", "live")  # a mapping robot plans frames, not commands
+    mapping = parameters_of(records)["kind"] in _OF_FRAMES
     for command in records.commands:
         if command.code != "ok" or command.answered is None or command.round_trip_ms is None:
             continue
