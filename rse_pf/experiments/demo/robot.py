@@ -175,9 +175,9 @@ async def _run(spec: RobotSpec, pipe: ParentPipe) -> None:
             recorder = LiveRecorder(shared, time.monotonic, began) if options.live else None
             first_s = time.monotonic()
             waiting = iter(frames)
-            following = asyncio.ensure_future(asyncio.to_thread(next, waiting, None))
+            following: asyncio.Future[Any] = asyncio.ensure_future(asyncio.to_thread(next, waiting, None))
             for row in range(len(frames)):
-                frame = await following
+                frame: Frame = await following
                 planned = began + (row + spec.number / options.robots) / options.rate_hz
                 await asyncio.sleep(max(0.0, planned - time.monotonic()))
                 # The next frame is read while this one is tracked, as a camera's driver would.
