@@ -124,6 +124,8 @@ VERBS_NEED: dict[str, tuple[str, ...]] = {
     "serve": ("backend",),
     "data": ("data",),
     "map": (),
+    "map from-bag": ("bags",),
+    "map to-bag": ("bags",),
     "map show --png": ("local",),
     "map merge": ("maps",),
     "map localise": ("maps", "vision"),
@@ -137,6 +139,8 @@ VERBS_NEED: dict[str, tuple[str, ...]] = {
     "settings": (),
     "doctor": (),
     "errors": (),
+    "replay": ("record", "solver"),
+    "replay --html": ("local",),
 }
 """Verb, with the action or option that needs more, to extras."""
 

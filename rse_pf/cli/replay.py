@@ -1,0 +1,300 @@
+"""Replay a recording: list what went wrong, solve commands again, and explain a bad pose.
+
+FILE is what rse-pf local --record wrote, a folder of such files, or a case.rsepf that somebody exported.
+Without --command it lists what went wrong, worst first, with the likeliest cause.  With --command, or for a
+case, it solves the very same bytes again, says whether the answer is equal to the byte, and explains it.
+--all solves everything again, as a test of this version, and exits with 1 if an answer is different.
+
+examples:
+  rse-pf replay recordings
+  rse-pf replay recordings --command 0123456789abcdef:42 --html pose.html
+  rse-pf replay recordings --command 0123456789abcdef:42 --export case.rsepf
+  rse-pf replay case.rsepf --inlier-px 4
+  rse-pf replay recordings --all --engine native --json
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import re
+from importlib import metadata
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from rse_pf.cli.extras import require
+from rse_pf.config import PlatformSettings
+from rse_pf.errors import UsageError
+from rse_pf.terminal import at_work, counted, show, show_json
+
+if TYPE_CHECKING:
+    from rse_pf.recording.replay.limited import LimitedReplay
+    from rse_pf.recording.replay.report import Attempt, CommandReport
+    from rse_pf.recording.replay.run import Overview
+    from rse_pf.recording.replay.solving import Overrides
+
+__all__ = ["add_arguments", "run"]
+
+_SHOWN, _IN_PAGE, _EXPLAINED_IN_JSON = 20, 5, 500
+_ENGINES = ("native", "poselib", "opencv")
+_IDENTITY = re.compile(r"([0-9a-f]{16}:)?\d{1,16}")
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    parser.add_argument("file", type=Path, metavar="FILE", help="a recording, a folder of them, or a case")
+    parser.add_argument(
+        "--command", metavar="ID", help="explain this command: CONNECTION:ID, or ID if it is clear"
+    )
+    parser.add_argument("--all", action="store_true", help="solve every command again and say what changed")
+    parser.add_argument(
+        "--engine", choices=_ENGINES, help="solve with this engine instead of the recorded one"
+    )
+    parser.add_argument("--inlier-px", type=float, metavar="PX", help="try another limit for inliers")
+    parser.add_argument(
+        "--max-iterations", type=int, metavar="N", help="try another number of RANSAC iterations"
+    )
+    parser.add_argument(
+        "--export", type=Path, metavar="CASE", help="write the command to a file without names: case.rsepf"
+    )
+    parser.add_argument("--html", type=Path, metavar="PAGE", help="write the report to one HTML file")
+    parser.add_argument("--json", action="store_true", help="print JSON; everything is solved again")
+
+
+def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
+    """List, solve again, explain or export; return 1 if an answer that should be equal is not."""
+    require("replay")
+    from rse_pf.recording.replay.limited import LimitedReplay
+
+    overrides = _overrides(args)
+    _check(args)
+    path: Path = args.file
+    with LimitedReplay(settings) as replay:
+        is_case = path.suffix == ".rsepf" and not args.all
+        if args.command is not None or is_case:
+            return _one(args, replay, overrides)
+        return _many(args, replay, overrides)
+
+
+def _check(args: argparse.Namespace) -> None:
+    """Raise UsageError for what contradicts itself, before any work."""
+    path: Path = args.file
+    if not path.exists():
+        raise UsageError(f"there is no file {path}", hint="give a file or a folder of rse-pf local --record")
+    if args.command is not None and args.all:
+        raise UsageError("--command is one command, and --all is all of them", hint="leave one of them out")
+    if args.command is not None and not _IDENTITY.fullmatch(args.command):
+        raise UsageError(
+            f"{args.command[:60]!r} is no command",
+            hint="write CONNECTION:ID, as rse-pf replay FILE lists them",
+        )
+    if args.export is not None and args.command is None and path.suffix != ".rsepf":
+        raise UsageError("--export writes one command", hint="name it with --command")
+    for name, file in (("--export", args.export), ("--html", args.html)):
+        if file is not None and not file.parent.is_dir():
+            raise UsageError(f"{name}: there is no folder {file.parent}", hint="create it, or choose another")
+        if file is not None and (file.is_dir() or (file.exists() and file.samefile(path))):
+            raise UsageError(f"{name}: {file} is a folder, or the recording", hint="choose another file")
+
+
+def _overrides(args: argparse.Namespace) -> Overrides:
+    """Return what is to be tried; raises UsageError for a number out of its range."""
+    from rse_pf.errors import BadRequest
+    from rse_pf.recording.replay.solving import Overrides
+
+    if args.inlier_px is not None and not math.isfinite(args.inlier_px):
+        raise UsageError(f"--inlier-px {args.inlier_px} is no number of pixels", hint="try 2, 4, 8 or 16")
+    chosen = Overrides(engine=args.engine, inlier_px=args.inlier_px, max_iterations=args.max_iterations)
+    try:
+        chosen.of(None)
+    except BadRequest as error:
+        raise UsageError(
+            f"--{error.message.replace('_', '-')}", hint="leave it out for the recorded one"
+        ) from None
+    return chosen
+
+
+# --- a whole recording ------------------------------------------------------------------------------------
+
+
+def _many(args: argparse.Namespace, replay: LimitedReplay, overrides: Overrides) -> int:
+    solve = bool(args.all or args.json or overrides.changes)
+    with at_work("reading the recording"):
+        seen = replay.overview(
+            args.file, solve=solve, overrides=overrides, worst=_EXPLAINED_IN_JSON if args.json else _SHOWN,
+            explain=_EXPLAINED_IN_JSON if args.json else _SHOWN,
+        )  # fmt: skip
+        reports = []
+        if args.html is not None:
+            reports = [replay.command(args.file, each.id, overrides) for each in seen.troubles[:_IN_PAGE]]
+    if args.html is not None:
+        _write_page(args.html, reports, seen, args.file.name)
+    if args.json:
+        show_json(_overview_json(seen), indent=2)
+    else:
+        _show_overview(seen, args)
+    return 1 if solve and seen.different and not overrides.changes else 0
+
+
+def _show_overview(seen: Overview, args: argparse.Namespace) -> None:
+    show(
+        f"{counted(seen.commands, 'command')} of {counted(seen.robots, 'robot')} in {seen.seconds:.1f} s, "
+        f"{counted(seen.files, 'file')}"
+    )
+    for name in seen.cut[:3]:
+        show(f"note: {name} is cut off or still being written; read up to its last whole chunk")
+    if seen.left_out:
+        show(f"note: {counted(seen.left_out, 'message')} cannot be read and was left out")
+    if seen.was_solved:
+        show(f"solved again: {seen.equal} equal to the byte, {seen.different} different")
+        for why, count in seen.not_solved.items():
+            show(f"not solved again: {count}: {why}")
+        for each in seen.changed[:_SHOWN]:
+            show(f"  {each.id}  {each.what}")
+        if len(seen.changed) > _SHOWN:
+            show(f"  and {seen.different - _SHOWN} more; --json lists them")
+    bad = sum(seen.by_kind.values())
+    if not bad:
+        show("nothing went wrong")
+        return
+    told = ", ".join(f"{count} {kind}" for kind, count in seen.by_kind.items())
+    show("", f"went wrong: {told}; worst first:")
+    for trouble in seen.troubles:
+        show(f"  {trouble.kind:<10} {trouble.id}  {trouble.robot}  {trouble.what}")
+        causes = seen.causes.get(trouble.id, ())
+        if causes and causes[0].cause != "none":
+            show(f"  {'':<10} {causes[0].cause}: {causes[0].sentence}")
+    if bad > len(seen.troubles):
+        show(f"  and {bad - len(seen.troubles)} more; --json lists up to {_EXPLAINED_IN_JSON}")
+    show("", f"explain one: rse-pf replay {args.file} --command {seen.troubles[0].id}")
+
+
+def _overview_json(seen: Overview) -> dict[str, Any]:
+    import msgspec
+
+    plain: dict[str, Any] = msgspec.to_builtins(seen)
+    explained: dict[str, Any] = plain.pop("causes")
+    causes: dict[str, int] = {}
+    for found in seen.causes.values():
+        if found:
+            causes[found[0].cause] = causes.get(found[0].cause, 0) + 1
+    ordered = sorted(causes, key=lambda each: (each == "none", -causes[each]))
+    findings = [{"id": name, "causes": found} for name, found in explained.items()]
+    return {**plain, "causes": ordered, "causes_count": causes, "findings": findings}
+
+
+# --- one command ------------------------------------------------------------------------------------------
+
+
+def _one(args: argparse.Namespace, replay: LimitedReplay, overrides: Overrides) -> int:
+    identity = args.command or ""
+    with at_work("solving the command again"):
+        seen = replay.command(args.file, identity, overrides, with_picture=args.html is not None)
+        exported = replay.case(args.file, identity) if args.export is not None else None
+    if exported is not None:
+        from rse_pf.recording.replay.case import write_case
+
+        size = write_case(
+            args.export, exported.parts, codec=exported.codec, number=exported.number,
+            metadata=exported.metadata, version=_version(),
+        )  # fmt: skip
+        if not args.json:
+            show(f"wrote {args.export}: {size} bytes, without names and tokens", "")
+    if args.html is not None:
+        _write_page(args.html, [seen], None, args.file.name)
+    if args.json:
+        show_json(_report_json(seen), indent=2)
+    else:
+        _show_report(seen)
+    return 1 if not seen.is_equal and not seen.why_not else 0
+
+
+def _show_report(seen: CommandReport) -> None:
+    verdict = f"{seen.verdict}: {seen.reason}" if seen.reason else seen.verdict
+    show(f"command {seen.id} of {seen.robot}, service {seen.service}: {verdict}")
+    if seen.hint:
+        show(f"  hint: {seen.hint}")
+    if seen.round_trip_ms is not None:
+        show(
+            f"answered in {seen.round_trip_ms:.1f} ms: {seen.queue_ms:.1f} ms in the queue, "
+            f"{seen.compute_ms:.1f} ms of work"
+        )
+    if seen.why_not:
+        show(f"cannot be solved again: {seen.why_not}")
+    elif seen.is_equal:
+        show("solved again: equal to the byte, but for times and places")
+    else:
+        show(f"solved again: DIFFERENT: {seen.difference}")
+    if seen.matches:
+        show(
+            f"{seen.matches} matches, {seen.inliers} inliers, {seen.rmse_px:.2f} px, "
+            f"engine {seen.engine or 'none'}"
+        )
+    if seen.causes:
+        show("", "why:")
+        for each in seen.causes:
+            show(f"  {each.cause:<12} {each.confidence:.2f}  {each.sentence}")
+        if seen.causes[0].missing:
+            show(f"  not recorded: {'; '.join(seen.causes[0].missing)}")
+    if seen.rules:
+        show("", "rules of the evidence:")
+        for rule in seen.rules:
+            says = "kept" if rule.is_kept else ("REFUSES" if rule.refuses else "WEAK")
+            relation = "at least" if rule.at_least else "at most"
+            unit = f" {rule.unit}" if rule.unit else ""
+            show(
+                f"  {says:<8} {rule.name:<18} {rule.about}: {rule.measured:.4g}{unit}, "
+                f"{relation} {rule.limit:.4g}{unit}"
+            )
+    if seen.tried is not None:
+        _show_attempts("what you asked for:", [seen.tried], seen.tried_name)
+    _show_attempts("engines:", seen.engines, "")
+    _show_attempts("other options:", seen.options, "")
+
+
+def _show_attempts(title: str, attempts: Any, name: str) -> None:
+    if not attempts:
+        return
+    show("", title)
+    for each in attempts:
+        show(f"  {each.name or name:<24} {_attempt(each)}")
+
+
+def _attempt(each: Attempt) -> str:
+    verdict = f"{each.verdict} ({each.reason})" if each.reason else each.verdict
+    if not each.inliers:
+        return verdict
+    moved = ""
+    if each.moved_m is not None and each.moved_deg is not None:
+        moved = f", {1e3 * each.moved_m:.3g} mm and {each.moved_deg:.3g} deg from the recorded pose"
+    return f"{verdict}, {each.inliers} inliers, {each.rmse_px:.2f} px{moved}"
+
+
+def _report_json(seen: CommandReport) -> dict[str, Any]:
+    import msgspec
+
+    plain: dict[str, Any] = msgspec.to_builtins(msgspec.structs.replace(seen, picture_png=b""))
+    plain.pop("picture_png")
+    explanations = plain.pop("causes")
+    was_solved = not seen.why_not
+    return {
+        "commands": 1, "equal": int(was_solved and seen.is_equal),
+        "different": int(was_solved and not seen.is_equal), "causes": [each.cause for each in seen.causes],
+        "explanations": explanations, **plain,
+    }  # fmt: skip
+
+
+def _write_page(path: Path, reports: Any, overview: Overview | None, name: str) -> None:
+    from rse_pf.recording.replay.page import html_page
+
+    try:
+        path.write_text(html_page(reports, overview=overview, title=f"Replay of {name}"), encoding="utf-8")
+    except OSError as error:
+        raise UsageError(f"{path} cannot be written: {error.strerror}", hint="choose another file") from error
+
+
+def _version() -> str:
+    try:
+        return metadata.version("rse-pf")
+    except metadata.PackageNotFoundError:
+        return ""

@@ -1,0 +1,515 @@
+"""Read a recording: the commands of robots with their answers, in the order in which they were answered.
+
+A recording is a file, or a folder of files that are read in the order of their times.  A file that was cut
+off is read up to its last whole chunk.  What is in a file may come from a stranger: sizes are judged before
+anything is decompressed or decoded.  Nothing here solves or writes.
+"""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import importlib
+import itertools
+import os
+import re
+import struct
+import zlib
+from collections import OrderedDict, deque
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from functools import cache, cached_property
+from pathlib import Path
+from typing import Any, NamedTuple, cast
+
+import msgspec
+import numpy as np
+
+from rse_pf.budget import Budget, check_size, inflate_within
+from rse_pf.config import SessionSettings
+from rse_pf.errors import BadMessage, BadRequest, LimitExceeded, RsePfError, UnsupportedProtocol, UsageError
+from rse_pf.geometry import Array
+from rse_pf.recording import file_format
+from rse_pf.wire import CODECS, Codec, Command, Failure, Result, make_codec
+
+__all__ = ["CASE_NAME", "Odometry", "RecordedCommand", "Recording", "open_recording"]
+
+CASE_NAME = "rse_pf_case"
+"""Metadata record of a file that was exported for one of its commands."""
+
+_MAX_RECORD_BYTES = 64 << 20
+_MAX_CHUNK_BYTES = 32 << 20
+"""Writers end a chunk at 1 MiB and one message."""
+_MAX_WAITING = 4096
+"""Commands without an answer that are kept in mind; of more, the oldest count as unanswered."""
+_MAX_CONNECTIONS = 100_000
+_KEPT_SIGHTS, _SIGHT_AGE_NS = 32, 500_000_000
+"""Thumbnails and poses of odometry of a robot, and how old the one of a command may be."""
+_COMMAND_ID = re.compile(r"[0-9a-f]{16}:\d{1,16}")
+
+
+class Odometry(msgspec.Struct, frozen=True, kw_only=True):
+    """Where a robot thought it was: ``T_odom_camera`` ``(4, 4)``, at *timestamp_s* of its own clock."""
+
+    number: int
+    timestamp_s: float
+    T_odom_camera: Array
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class RecordedCommand:
+    """One command and its answer, as they were on the wire.
+
+    Attributes:
+        id: ``CONNECTION:ID``.
+        robot: A pseudonym.
+        tenant: A pseudonym.
+        server: Which server wrote it down, "" where it is not known.
+        codec: ``zlib``, ``json`` or ``bin``.
+        sent_ns: When it was recorded, Unix time, nanoseconds.
+        answered_ns: When its answer was recorded, None if it has none.
+        thumbnail: A small JPEG of the frame, if the robot allowed it.
+        odometry: Of the frame, if the robot recorded it.
+    """
+
+    id: str
+    robot: str
+    tenant: str
+    server: str
+    codec: str
+    sent_ns: int
+    command_bytes: bytes
+    answered_ns: int | None = None
+    reply_bytes: bytes | None = None
+    thumbnail: bytes | None = None
+    odometry: Odometry | None = None
+    session: SessionSettings = field(default_factory=SessionSettings, repr=False)
+
+    @property
+    def sent_s(self) -> float:
+        """When it was recorded, Unix time."""
+        return self.sent_ns / 1e9
+
+    @property
+    def answered_s(self) -> float | None:
+        """When its answer was recorded, Unix time."""
+        return None if self.answered_ns is None else self.answered_ns / 1e9
+
+    @property
+    def round_trip_ms(self) -> float | None:
+        """Time to the answer, as the recording side saw it."""
+        return None if self.answered_ns is None else (self.answered_ns - self.sent_ns) / 1e6
+
+    @cached_property
+    def command(self) -> Command:
+        """The decoded command; raises BadMessage or LimitExceeded."""
+        message = _codec(self.codec, self.session).decode_from_robot(self.command_bytes)
+        if not isinstance(message, Command):
+            raise BadMessage("a recorded message is no command", hint="record again")
+        return message
+
+    @cached_property
+    def reply(self) -> Result | Failure | None:
+        """The decoded answer, None if there is none; raises BadMessage or LimitExceeded."""
+        if self.reply_bytes is None:
+            return None
+        message = _codec(self.codec, self.session).decode_from_server(self.reply_bytes)
+        if not isinstance(message, Result | Failure):
+            raise BadMessage("a recorded message is no answer", hint="record again")
+        return message
+
+
+class Recording:
+    """The files of one recording, and what is said about them at their start.
+
+    Attributes:
+        files: In the order in which they are read.
+        metadata: Of the first file: ``version``, ``side`` (``server`` or ``robot``), ``engine`` ...
+        case_id: Which command a case file is about, "" for recordings.
+        cut: Files that end within a record, once they have been read.
+        left_out: Messages that could not be decoded, or whose file has more connections than are read.
+    """
+
+    def __init__(self, files: tuple[Path, ...], session: SessionSettings) -> None:
+        self.files = files
+        self.metadata: dict[str, str] = {}
+        self.case_id = ""
+        self.cut: list[Path] = []
+        self.left_out = 0
+        self._session = session
+        self._budget = Budget.of_messages(session)
+
+    def read_head(self) -> None:
+        """Read what is said before the first message; raises what `commands` raises."""
+        from mcap.records import Chunk, Message, Metadata
+
+        for record in self._first_records():
+            if isinstance(record, Metadata):
+                if record.name == file_format.METADATA_NAME:
+                    self.metadata = dict(record.metadata)
+                elif record.name == CASE_NAME:
+                    self.case_id = record.metadata.get("command", "")
+            elif isinstance(record, Chunk | Message):
+                return
+
+    def _first_records(self) -> Iterator[Any]:
+        """Yield the records of the first file that was begun."""
+        for path in self.files[:-1]:
+            if path.stat().st_size:
+                return _records(path, [])
+        return _records(self.files[-1], [])
+
+    def commands(self) -> Iterator[RecordedCommand]:
+        """Yield every command when it was answered, and at the end those without an answer.
+
+        Raises:
+            BadRequest: A file is no recording.
+            UnsupportedProtocol: It is of a newer version.
+        """
+        self.cut, self.left_out = [], 0
+        waiting: OrderedDict[str, RecordedCommand] = OrderedDict()
+        sights: dict[str, _Sights] = {}
+        for path in self.files:
+            for sight in self._messages(path):
+                if isinstance(sight.of, file_format.WireChannel):
+                    yield from self._paired(sight, sight.of, waiting, sights)
+                elif len(sights) < _MAX_CONNECTIONS:
+                    sights.setdefault(sight.of[1], _Sights()).add(sight)
+        yield from (self._with_sights(each, sights) for each in waiting.values())
+
+    def find(self, identity: str) -> RecordedCommand:
+        """Return the command ``CONNECTION:ID``, or the only one whose name ends in *identity*.
+
+        Raises:
+            BadRequest: There is none, or there are several.
+        """
+        return self.find_with_history(identity, 0)[0]
+
+    def find_with_history(self, identity: str, count: int) -> tuple[RecordedCommand, list[RecordedCommand]]:
+        """Return a command, and up to *count* answered commands of its robot before it, oldest first."""
+        exact = bool(_COMMAND_ID.fullmatch(identity))
+        before: dict[str, deque[RecordedCommand]] = {}
+        found: list[tuple[RecordedCommand, list[RecordedCommand]]] = []
+        for each in self.commands():
+            if each.id == identity or (not exact and each.id.endswith(f":{identity}")):
+                found.append((each, list(before.get(each.robot, ()))))
+                if exact:
+                    break
+                if len(found) > 1:
+                    raise BadRequest(
+                        f"several commands are called {identity[:40]!r}",
+                        hint=f"give the connection, too: {found[0][0].id} or {each.id}",
+                    )
+            before.setdefault(each.robot, deque(maxlen=count)).append(each)
+        if not found:
+            raise BadRequest(
+                f"the recording has no command {identity[:40]!r}",
+                hint="rse-pf replay FILE lists those that went wrong",
+            )
+        return found[0]
+
+    def _messages(self, path: Path) -> Iterator[_Sight]:
+        """Yield the messages of one file; in a folder, one that was never begun does not end the others."""
+        try:
+            yield from _messages(path, self.cut)
+        except BadRequest:
+            if len(self.files) == 1:
+                raise
+            self.cut.append(path)
+
+    def _paired(
+        self,
+        message: _Sight,
+        channel: file_format.WireChannel,
+        waiting: OrderedDict[str, RecordedCommand],
+        sights: dict[str, _Sights],
+    ) -> Iterator[RecordedCommand]:
+        kind, number = self._envelope(channel.codec, message.data)
+        identity = f"{channel.connection}:{number}"
+        if channel.direction == "up" and kind == "command":
+            former = waiting.pop(identity, None)
+            if former is not None:
+                yield former
+            waiting[identity] = RecordedCommand(
+                id=identity, robot=channel.robot, tenant=channel.tenant, server=channel.server,
+                codec=channel.codec, sent_ns=message.time_ns, command_bytes=message.data,
+                session=self._session,
+            )  # fmt: skip
+            if len(waiting) > _MAX_WAITING:
+                yield self._with_sights(waiting.popitem(last=False)[1], sights)
+        elif channel.direction == "down" and kind in ("result", "failure") and identity in waiting:
+            asked = waiting.pop(identity)
+            yield self._with_sights(
+                replace(asked, answered_ns=message.time_ns, reply_bytes=message.data), sights
+            )
+
+    def _envelope(self, codec: str, data: bytes) -> tuple[str, int | None]:
+        """Return the type and the id of a message, "" for one that cannot be read."""
+        try:
+            if codec == "bin":
+                check_size(data, self._budget)
+                found = _decode_binary(data)
+            elif codec in CODECS:
+                check_size(data, self._budget)
+                found = _decode_json(inflate_within(data, self._budget) if codec == "zlib" else data)
+            else:
+                raise BadMessage(f"no codec named {codec[:20]!r}")
+        except (RsePfError, msgspec.DecodeError, ValueError, RecursionError):
+            self.left_out += 1
+            return "", None
+        return found.type, found.id
+
+    @staticmethod
+    def _with_sights(command: RecordedCommand, sights: dict[str, _Sights]) -> RecordedCommand:
+        seen = sights.get(command.robot)
+        if seen is None:
+            return command
+        return _seen(command, seen.of("frames", command), seen.of("odometry", command))
+
+
+def open_recording(path: Path, session: SessionSettings | None = None) -> Recording:
+    """Return the recording at *path*: a file, or a folder with files; nothing but its start is read.
+
+    Args:
+        path: Of a ``.mcap`` or ``.rsepf`` file, or of a folder.
+        session: Limits of messages, None for the defaults.
+
+    Raises:
+        UsageError: There is no such file, or no recording in the folder.
+        BadRequest: The first file is no recording.
+        UnsupportedProtocol: It is of a newer version.
+    """
+    if path.is_dir():
+        files = tuple(sorted(path.glob(f"*{file_format.SUFFIX}"), key=_file_order))
+        if not files:
+            raise UsageError(
+                f"there is no recording in {path}", hint=f"its files end in {file_format.SUFFIX}"
+            )
+    elif path.exists():
+        files = (path,)
+    else:
+        raise UsageError(f"there is no file {path}", hint="give a file or a folder of rse-pf local --record")
+    recording = Recording(files, session or SessionSettings())
+    recording.read_head()
+    return recording
+
+
+# --- files ------------------------------------------------------------------------------------------------
+
+
+class _Sight(NamedTuple):
+    """One message of a channel: a connection, or (``frames`` or ``odometry``, pseudonym of the robot)."""
+
+    of: file_format.WireChannel | tuple[str, str]
+    time_ns: int
+    data: bytes
+
+
+class _Sights:
+    """The newest thumbnails and poses of odometry of one robot."""
+
+    def __init__(self) -> None:
+        self._kept: dict[str, deque[_Sight]] = {}
+
+    def add(self, sight: _Sight) -> None:
+        self._kept.setdefault(sight.of[0], deque(maxlen=_KEPT_SIGHTS)).append(sight)
+
+    def of(self, kind: str, command: RecordedCommand) -> bytes | None:
+        """Return the JSON of what belongs to *command*: what names it, else the newest before it."""
+        kept = self._kept.get(kind, ())
+        mark = f'"command":"{command.id}"'.encode()
+        named = next((each.data for each in kept if mark in each.data), None)
+        if named is not None:
+            return named
+        near = [
+            each
+            for each in kept
+            if 0 <= command.sent_ns - each.time_ns <= _SIGHT_AGE_NS and b'"command":' not in each.data
+        ]
+        return max(near, key=lambda each: each.time_ns).data if near else None
+
+
+class _Envelope(msgspec.Struct):
+    type: str = ""
+    id: int | None = None
+
+
+class _Image(msgspec.Struct):
+    data: str
+
+
+class _Pose(msgspec.Struct):
+    T_odom_camera: list[float]
+    number: int = 0
+    timestamp_s: float = 0.0
+
+
+_decode_binary = msgspec.msgpack.Decoder(_Envelope).decode
+_decode_json = msgspec.json.Decoder(_Envelope).decode
+_decode_image = msgspec.json.Decoder(_Image).decode
+_decode_pose = msgspec.json.Decoder(_Pose).decode
+
+
+@cache
+def _codec(name: str, session: SessionSettings) -> Codec:
+    return make_codec(name, session)
+
+
+def _seen(command: RecordedCommand, image: bytes | None, pose: bytes | None) -> RecordedCommand:
+    """Return *command* with what was seen; what cannot be read is left out."""
+    thumbnail, odometry = None, None
+    try:
+        if image is not None:
+            thumbnail = base64.b64decode(_decode_image(image).data, validate=True)
+        if pose is not None:
+            read = _decode_pose(pose)
+            T_odom_camera = np.array(read.T_odom_camera)
+            if T_odom_camera.size == 16 and np.isfinite(T_odom_camera).all():
+                odometry = Odometry(
+                    number=read.number, timestamp_s=read.timestamp_s,
+                    T_odom_camera=T_odom_camera.reshape(4, 4),
+                )  # fmt: skip
+    except (msgspec.DecodeError, binascii.Error, RecursionError, ValueError):
+        pass
+    return replace(command, thumbnail=thumbnail, odometry=odometry)
+
+
+def _file_order(path: Path) -> tuple[str, str, int]:
+    name = file_format.FileName.parse(path.name)
+    return ("~", path.name, 0) if name is None else (name.started.isoformat(), name.server, name.number)
+
+
+def _messages(path: Path, cut: list[Path]) -> Iterator[_Sight]:
+    """Yield the messages of connections, thumbnails and odometry of one file."""
+    from mcap.records import Channel, Message
+
+    channels: dict[int, file_format.WireChannel | tuple[str, str]] = {}
+    for record in _flat(path, cut):
+        if isinstance(record, Message):
+            of = channels.get(record.channel_id)
+            if of is not None:
+                yield _Sight(of, record.log_time, record.data)
+        elif isinstance(record, Channel) and len(channels) < _MAX_CONNECTIONS:
+            of = _channel(record.topic, record.metadata)
+            if of is not None:
+                channels[record.id] = of
+
+
+def _channel(topic: str, metadata: dict[str, str]) -> file_format.WireChannel | tuple[str, str] | None:
+    for prefix in (file_format.FRAMES_PREFIX, file_format.ODOMETRY_PREFIX):
+        if topic.startswith(prefix):
+            return prefix.strip("/"), topic.removeprefix(prefix)
+    return file_format.wire_channel(topic, metadata)
+
+
+def _flat(path: Path, cut: list[Path]) -> Iterator[Any]:
+    """Yield the records of a file, those in its chunks included, up to where it is cut off."""
+    from mcap.exceptions import McapError
+    from mcap.records import Chunk
+    from mcap.stream_reader import breakup_chunk
+
+    for record in _records(path, cut):
+        if not isinstance(record, Chunk):
+            yield record
+            continue
+        try:
+            data = _opened(record)
+            record.compression, record.data = "", data
+            yield from cast("list[Any]", breakup_chunk(record))
+        except (McapError, struct.error, ValueError):
+            cut.append(path)
+            return
+
+
+def _opened(chunk: Any) -> bytes:
+    """Return the content of a chunk; raises ValueError if it is damaged, or longer than it may be."""
+    size: int = chunk.uncompressed_size
+    if size > _MAX_CHUNK_BYTES:
+        raise LimitExceeded(
+            f"a chunk of {size} bytes is above {_MAX_CHUNK_BYTES}", hint="this is no recording of rse-pf"
+        )
+    data: bytes = chunk.data
+    if chunk.compression == "lz4":
+        try:
+            data = (
+                importlib.import_module("lz4.frame")
+                .LZ4FrameDecompressor()
+                .decompress(data, max_length=size + 1)
+            )
+        except RuntimeError as error:
+            raise ValueError("a chunk is damaged") from error
+    elif chunk.compression:
+        raise LimitExceeded(
+            f"chunks compressed with {chunk.compression[:20]!r} are not read",
+            hint="convert the file to lz4 or none",
+        )
+    if len(data) != size or (chunk.uncompressed_crc and zlib.crc32(data) != chunk.uncompressed_crc):
+        raise ValueError("a chunk is damaged")
+    return data
+
+
+def _records(path: Path, cut: list[Path]) -> Iterator[Any]:
+    """Yield the records of a file with whole chunks; a file that ends within one ends there, too.
+
+    Raises:
+        BadRequest: It is no recording.
+        UnsupportedProtocol: It is of a newer version.
+    """
+    from mcap.exceptions import EndOfFile, InvalidMagic, McapError
+    from mcap.records import Footer, Header, Metadata
+    from mcap.stream_reader import StreamReader
+
+    if path.stat().st_size == 0:
+        raise BadRequest(f"{path} is empty", hint="record again; it holds nothing")
+    with path.open("rb") as file:
+        stream = cast("Any", _Bounded(file))
+        records = iter(StreamReader(stream, emit_chunks=True, record_size_limit=_MAX_RECORD_BYTES).records)
+        for count in itertools.count():
+            try:
+                record = next(records)
+            except StopIteration:
+                return
+            except (McapError, struct.error, ValueError) as error:
+                if count == 0 and isinstance(error, InvalidMagic | EndOfFile | struct.error):
+                    raise _no_recording(path) from None
+                cut.append(path)
+                return
+            if count == 0 and (not isinstance(record, Header) or record.profile != file_format.PROFILE):
+                raise _no_recording(path)
+            if isinstance(record, Metadata) and record.name == file_format.METADATA_NAME:
+                _check_version(path, record.metadata)
+            if isinstance(record, Footer):
+                return
+            yield record
+
+
+class _Bounded:
+    """A file whose reads ask for no more memory than the file has bytes."""
+
+    def __init__(self, file: Any) -> None:
+        self._file = file
+        self._left = os.fstat(file.fileno()).st_size
+
+    def read(self, size: int) -> bytes:
+        """Return the next bytes: *size*, or fewer at the end."""
+        data: bytes = self._file.read(min(size, self._left))
+        self._left -= len(data)
+        return data
+
+
+def _no_recording(path: Path) -> BadRequest:
+    return BadRequest(
+        f"{path} is not a recording of rse-pf",
+        hint="give a file that rse-pf local --record or rse-pf replay --export wrote",
+    )
+
+
+def _check_version(path: Path, metadata: dict[str, str]) -> None:
+    text = metadata.get("format", "1")
+    if not text.isascii() or not text.isdigit() or len(text) > 9:
+        raise _no_recording(path)
+    if int(text) > file_format.FORMAT_VERSION:
+        raise UnsupportedProtocol(
+            f"{path} has format {text}, and this version reads up to {file_format.FORMAT_VERSION}",
+            hint="install a newer rse-pf",
+        )

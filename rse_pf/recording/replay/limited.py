@@ -1,0 +1,154 @@
+"""Replay in a process with limits: a recording may come from a stranger.
+
+    with LimitedReplay(settings) as replay:
+        report = replay.command(path, "0123456789abcdef:42")
+
+What reads, decodes, solves, draws and explains runs there; the caller gets typed values.  A file that crashes
+that process, or takes all its memory or time, costs one error.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any, TypeVar
+
+import msgspec
+
+from rse_pf.config import PlatformSettings
+from rse_pf.errors import BadMessage, BadRequest, Crashed, InternalError, LimitExceeded
+from rse_pf.limited_process import Handler, LimitedProcesses, Overran
+from rse_pf.recording.replay import run
+from rse_pf.recording.replay.case import CASE_SUFFIX, MAX_CASE_BYTES
+from rse_pf.recording.replay.report import CommandReport
+from rse_pf.recording.replay.solving import Overrides
+
+__all__ = ["LimitedReplay", "replayer"]
+
+_MEMORY_BYTES = 1 << 30
+_MAX_REPLY_BYTES = 64 << 20
+_COMMAND_S, _RECORDING_S = 60.0, 6 * 3600.0
+"""CPU seconds, and seconds, for one command of a case, and for a whole recording."""
+_TARGET = "rse_pf.recording.replay.limited:replayer"
+
+T = TypeVar("T")
+
+
+class _Order(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """What the process is to do."""
+
+    do: str
+    path: str
+    identity: str = ""
+    overrides: Overrides = Overrides()
+    solve: bool = False
+    worst: int = 0
+    explain: int = 0
+    with_picture: bool = True
+    trace: str = ""
+    number: int = 0
+
+
+class LimitedReplay:
+    """Answers questions about recordings; nothing is started before the first one."""
+
+    def __init__(self, settings: PlatformSettings | None = None) -> None:
+        """Keep the limits of messages; *settings* are those of this machine."""
+        self._processes = LimitedProcesses(
+            _TARGET, memory_bytes=_MEMORY_BYTES, cpu_s=_RECORDING_S, max_reply_bytes=_MAX_REPLY_BYTES,
+            configuration=json.dumps((settings or PlatformSettings()).to_dict()), niceness=0,
+        )  # fmt: skip
+
+    def __enter__(self) -> LimitedReplay:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def overview(
+        self,
+        path: Path,
+        *,
+        solve: bool,
+        overrides: Overrides | None = None,
+        worst: int = 20,
+        explain: int = 20,
+    ) -> run.Overview:
+        """Return what `run.overview` returns; raises RsePfError."""
+        order = _Order(
+            do="overview", path=str(path), solve=solve, overrides=overrides or Overrides(), worst=worst,
+            explain=explain,
+        )  # fmt: skip
+        return self._ask(order, run.Overview)
+
+    def command(
+        self, path: Path, identity: str = "", overrides: Overrides | None = None, *, with_picture: bool = True
+    ) -> CommandReport:
+        """Return what `run.report` returns; raises RsePfError."""
+        order = _Order(
+            do="report", path=str(path), identity=identity, overrides=overrides or Overrides(),
+            with_picture=with_picture,
+        )  # fmt: skip
+        return self._ask(order, CommandReport)
+
+    def case(self, path: Path, identity: str = "") -> run.Exported:
+        """Return what `run.case_of` returns; raises RsePfError."""
+        return self._ask(_Order(do="case", path=str(path), identity=identity), run.Exported)
+
+    def find(self, path: Path, *, trace: str, id: int) -> str | None:
+        """Return ``CONNECTION:ID`` of the newest command with *trace* and *id*, None if there is none."""
+        return self._ask(_Order(do="find", path=str(path), trace=trace, number=id), str) or None
+
+    def close(self) -> None:
+        """End the process."""
+        self._processes.close()
+
+    def _ask(self, order: _Order, kind: type[T]) -> T:
+        path = Path(order.path)
+        is_case = path.suffix == CASE_SUFFIX
+        if is_case and path.is_file() and path.stat().st_size > MAX_CASE_BYTES:
+            raise LimitExceeded(
+                f"{path} has {path.stat().st_size} bytes, above {MAX_CASE_BYTES}",
+                hint="a case holds one command; name the file .mcap if it is a recording",
+            )
+        try:
+            data = self._processes.call(
+                msgspec.msgpack.encode(order), _COMMAND_S if is_case else _RECORDING_S
+            )
+            return msgspec.msgpack.decode(data, type=kind)
+        except Overran:
+            raise BadRequest(f"{path} takes too long to read", hint="replay one --command of it") from None
+        except Crashed as crash:
+            raise BadRequest(
+                f"{path} cannot be read within limits: {crash.message}", hint="do not trust this file"
+            ) from None
+        except msgspec.DecodeError as error:
+            raise InternalError("the process with limits replied with something else") from error
+
+
+def replayer(configuration: str) -> Handler:
+    """Return what answers orders in the process with limits; *configuration* is the settings in JSON."""
+    settings = PlatformSettings.from_dict(json.loads(configuration))
+
+    def answer(data: bytes) -> bytes:
+        order = msgspec.msgpack.decode(data, type=_Order)
+        path = Path(order.path)
+        found: Any
+        if order.do == "overview":
+            found = run.overview(
+                path, settings, solve=order.solve, overrides=order.overrides, worst=order.worst,
+                explain=order.explain,
+            )  # fmt: skip
+        elif order.do == "report":
+            found = run.report(
+                path, settings, order.identity, order.overrides, with_picture=order.with_picture
+            )
+        elif order.do == "case":
+            found = run.case_of(path, settings, order.identity)
+        elif order.do == "find":
+            found = run.find(path, settings, trace=order.trace, number=order.number)
+        else:
+            raise BadMessage(f"no order {order.do!r}")
+        return msgspec.msgpack.encode(found)
+
+    return answer

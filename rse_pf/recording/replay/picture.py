@@ -1,0 +1,142 @@
+"""The picture of a command's matches: inliers, outliers and where the pose puts the points.
+
+On the thumbnail of the frame if there is one.  Drawn with Pillow.  A thumbnail comes from a robot: it is
+opened in a process with limits only, and its size is judged before it is decoded.
+"""
+
+from __future__ import annotations
+
+import io
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from rse_pf.errors import BadRequest, MissingExtra
+from rse_pf.geometry import Array, Camera, transform
+
+__all__ = ["INLIER", "MAX_THUMBNAIL_PX", "OUTLIER", "match_picture", "plain_thumbnail"]
+
+INLIER, OUTLIER, MOVED = (0, 114, 178), (213, 94, 0), (230, 159, 0)
+"""Distinct for colour-blind readers as well; Okabe and Ito 2008."""
+MAX_THUMBNAIL_PX = 1 << 20
+_MAX_THUMBNAIL_BYTES = 1 << 20
+_WIDTH_PX, _MIN_HEIGHT_PX, _MAX_HEIGHT_PX = 960, 120, 1920
+_BACKGROUND, _PALE = (238, 240, 243), (255, 255, 255)
+_MAX_DRAWN = 5000
+_NEAR_M = 1e-6
+
+
+def match_picture(
+    *,
+    camera: Camera,
+    points_world: Array,
+    pixels: Array,
+    inliers: npt.NDArray[np.intp],
+    T_camera_world: Array | None,
+    thumbnail: bytes | None,
+) -> bytes:
+    """Return a PNG: a dot for an inlier, a cross for an outlier, a line to where the pose puts its point.
+
+    Args:
+        camera: Whose image is drawn.
+        points_world: ``(n, 3)``, metres.
+        pixels: ``(n, 2)``.
+        inliers: Rows that agree.
+        T_camera_world: ``(4, 4)``, the pose; None draws no lines.
+        thumbnail: JPEG of the frame, None for a plain background; one that cannot be read is left out.
+
+    Raises:
+        MissingExtra: Pillow is not installed.
+    """
+    image_module, draw_module = _pillow()
+    scale = _WIDTH_PX / camera.width
+    height = min(_MAX_HEIGHT_PX, max(_MIN_HEIGHT_PX, round(camera.height * scale)))
+    size = (_WIDTH_PX, height)
+    image = image_module.new("RGB", size, _BACKGROUND)
+    if thumbnail is not None:
+        try:
+            frame = _opened(thumbnail).convert("L").convert("RGB").resize(size)
+            image = image_module.blend(frame, image_module.new("RGB", size, _PALE), 0.35)
+        except BadRequest:
+            pass
+    draw = draw_module.Draw(image)
+    agrees = np.zeros(len(pixels), dtype=np.bool_)
+    agrees[inliers[inliers < len(pixels)]] = True
+    finite = np.isfinite(pixels).all(axis=1) & (np.abs(pixels) < 1e6).all(axis=1)
+    shown = np.flatnonzero(finite)[:_MAX_DRAWN]
+    if T_camera_world is not None:
+        _draw_lines(draw, shown, agrees, points_world, pixels, T_camera_world, camera, scale)
+    for row in shown[np.argsort(agrees[shown], kind="stable")]:  # inliers on top
+        u, v = pixels[row] * scale
+        if agrees[row]:
+            draw.ellipse((u - 4, v - 4, u + 4, v + 4), fill=INLIER, outline=_PALE)
+        else:
+            draw.line((u - 4, v - 4, u + 4, v + 4), fill=OUTLIER, width=2)
+            draw.line((u - 4, v + 4, u + 4, v - 4), fill=OUTLIER, width=2)
+    file = io.BytesIO()
+    image.save(file, format="PNG")
+    return file.getvalue()
+
+
+def plain_thumbnail(thumbnail: bytes) -> bytes:
+    """Return the JPEG again without anything that its maker wrote beside the picture.
+
+    Raises:
+        BadRequest: It is no JPEG, or larger than thumbnails are.
+    """
+    image = _opened(thumbnail)
+    image.info.clear()
+    file = io.BytesIO()
+    try:
+        image.save(file, format="JPEG", quality="keep", exif=b"", comment=b"")
+    except (OSError, ValueError) as error:
+        raise BadRequest("a thumbnail cannot be written again", hint="export without it") from error
+    return file.getvalue()
+
+
+def _draw_lines(
+    draw: Any,
+    rows: npt.NDArray[np.intp],
+    agrees: npt.NDArray[np.bool_],
+    points_world: Array,
+    pixels: Array,
+    T_camera_world: Array,
+    camera: Camera,
+    scale: float,
+) -> None:
+    """Draw from each pixel to the projection of its point, where that is in or near the image."""
+    with np.errstate(all="ignore"):
+        points_camera = transform(T_camera_world, points_world[rows])
+        in_front = points_camera[:, 2] > _NEAR_M
+        points_camera[~in_front] = 1.0
+        projected = camera.project(points_camera)
+    reach = 2.0 * max(camera.width, camera.height)
+    near = in_front & (np.abs(projected) < reach).all(axis=1)
+    for row, (u, v) in zip(rows[near], projected[near], strict=True):
+        at = pixels[row] * scale
+        colour = INLIER if agrees[row] else MOVED
+        draw.line((at[0], at[1], u * scale, v * scale), fill=colour, width=1)
+
+
+def _opened(thumbnail: bytes) -> Any:
+    """Return the decoded image; raises BadRequest if it is no small JPEG."""
+    image_module, _ = _pillow()
+    if len(thumbnail) > _MAX_THUMBNAIL_BYTES:
+        raise BadRequest(f"a thumbnail of {len(thumbnail)} bytes is too large", hint="record smaller ones")
+    try:
+        image = image_module.open(io.BytesIO(thumbnail), formats=("JPEG",))
+        if image.width * image.height > MAX_THUMBNAIL_PX:
+            raise BadRequest("a thumbnail is too large", hint="record smaller ones")
+        image.load()
+    except (OSError, ValueError, SyntaxError, EOFError) as error:
+        raise BadRequest("a thumbnail is no JPEG", hint="leave it out") from error
+    return image
+
+
+def _pillow() -> tuple[Any, Any]:
+    try:
+        from PIL import Image, ImageDraw
+    except ImportError as error:
+        raise MissingExtra("pillow", "local") from error
+    return Image, ImageDraw

@@ -1,0 +1,236 @@
+"""What a replay does with a recording: list what went wrong, solve everything again, report one command."""
+
+from __future__ import annotations
+
+import heapq
+from collections import Counter, deque
+from pathlib import Path
+
+import msgspec
+
+from rse_pf.config import PlatformSettings, PnpSettings
+from rse_pf.errors import BadRequest, RsePfError
+from rse_pf.recording.reader import RecordedCommand, Recording, open_recording
+from rse_pf.recording.replay.case import CasePart, case_parts
+from rse_pf.recording.replay.report import CauseFound, CommandReport, causes_of, report_of
+from rse_pf.recording.replay.solving import Overrides, Resolver
+from rse_pf.recording.replay.troubles import RobotHistory, Trouble
+
+__all__ = ["HISTORY", "Changed", "Exported", "Overview", "case_of", "find", "overview", "report"]
+
+HISTORY = 8
+"""Earlier commands of a robot that an explanation looks at."""
+_MAX_ROBOTS = 10_000
+_MAX_CHANGED = 1000
+
+
+class Changed(msgspec.Struct, frozen=True, kw_only=True):
+    """A command that was solved again with another answer."""
+
+    id: str
+    what: str
+
+
+class Overview(msgspec.Struct, frozen=True, kw_only=True):
+    """What is in a recording.
+
+    Attributes:
+        files: How many.
+        cut: Names of files that end within a record, and are read up to there.
+        commands: How many; ``robots`` and ``seconds`` say of whom, and over how long.
+        equal: Solved again with the recorded bytes, but for times and places; 0 where nothing was solved.
+        different: Solved again with others; the first of them are ``changed``.
+        not_solved: Why others could not be solved again, and how many.
+        troubles: What went wrong, worst first; ``by_kind`` counts all.
+        causes: Of the troubles, by the id of the command; ``explained`` says how many commands were looked
+            at for causes.
+    """
+
+    files: int
+    cut: tuple[str, ...]
+    version: str
+    side: str
+    commands: int
+    robots: int
+    seconds: float
+    left_out: int
+    equal: int = 0
+    different: int = 0
+    was_solved: bool = False
+    changed: tuple[Changed, ...] = ()
+    not_solved: dict[str, int] = {}
+    troubles: tuple[Trouble, ...] = ()
+    by_kind: dict[str, int] = {}
+    causes: dict[str, tuple[CauseFound, ...]] = {}
+    explained: int = 0
+
+
+class Exported(msgspec.Struct, frozen=True, kw_only=True):
+    """What `write_case` needs."""
+
+    parts: tuple[CasePart, ...]
+    codec: str
+    number: int
+    metadata: dict[str, str]
+
+
+class _Worst:
+    """The *count* worst troubles, with their commands and histories."""
+
+    def __init__(self, count: int) -> None:
+        self._count = count
+        self._heap: list[
+            tuple[tuple[float, ...], int, Trouble, RecordedCommand, tuple[RecordedCommand, ...]]
+        ] = []
+        self._added = 0
+
+    def add(self, trouble: Trouble, command: RecordedCommand, history: tuple[RecordedCommand, ...]) -> None:
+        self._added += 1
+        mildness = tuple(-each for each in trouble.order)
+        entry = mildness, -self._added, trouble, command, history
+        if len(self._heap) < self._count:
+            heapq.heappush(self._heap, entry)
+        elif self._count:
+            heapq.heappushpop(self._heap, entry)
+
+    def sorted(self) -> list[tuple[Trouble, RecordedCommand, tuple[RecordedCommand, ...]]]:
+        return [entry[2:] for entry in sorted(self._heap, key=lambda each: each[:2], reverse=True)]
+
+
+def overview(
+    path: Path,
+    settings: PlatformSettings,
+    *,
+    solve: bool,
+    overrides: Overrides | None = None,
+    worst: int = 20,
+    explain: int = 20,
+) -> Overview:
+    """Return what is in the recording at *path*, and what went wrong.
+
+    Args:
+        path: A file or a folder.
+        settings: The limits of messages; those of the solver are taken from the recording.
+        solve: Whether to solve every command again.
+        overrides: What to try instead of what was asked for.
+        worst: How many troubles are told.
+        explain: How many commands are looked at for causes: the worst troubles first, then the others.
+
+    Raises:
+        RsePfError: The recording cannot be read, or *overrides* name an engine that is not there.
+    """
+    recording = open_recording(path, settings.session)
+    resolver = _resolver(recording, settings)
+    robots: dict[str, tuple[RobotHistory, deque[RecordedCommand]]] = {}
+    kept = _Worst(max(worst, explain))
+    others: list[tuple[RecordedCommand, tuple[RecordedCommand, ...]]] = []
+    by_kind: Counter[str] = Counter()
+    not_solved: Counter[str] = Counter()
+    changed: list[Changed] = []
+    commands = equal = different = 0
+    first_s = last_s = None
+    for command in recording.commands():
+        commands += 1
+        first_s = command.sent_s if first_s is None else min(first_s, command.sent_s)
+        last_s = command.sent_s if last_s is None else max(last_s, command.sent_s)
+        if command.robot not in robots and len(robots) >= _MAX_ROBOTS:
+            robots.pop(next(iter(robots)))
+        judged, past = robots.setdefault(command.robot, (RobotHistory(), deque(maxlen=HISTORY)))
+        trouble = judged.judge(command)
+        if trouble is not None:
+            by_kind[trouble.kind] += 1
+            kept.add(trouble, command, tuple(past))
+        elif len(others) < explain:
+            others.append((command, tuple(past)))
+        past.append(command)
+        if not solve:
+            continue
+        again = resolver.again(command, overrides)
+        if again.why_not or command.reply_bytes is None:
+            not_solved[again.why_not or "no answer was recorded"] += 1
+        elif again.is_equal:
+            equal += 1
+        else:
+            different += 1
+            if len(changed) < _MAX_CHANGED:
+                changed.append(Changed(id=command.id, what=again.difference))
+    bad = kept.sorted()
+    looked_at = [*((command, past) for _, command, past in bad), *others][:explain]
+    side = recording.metadata.get("side", "server")
+    return Overview(
+        files=len(recording.files), cut=tuple(sorted({each.name for each in recording.cut})),
+        version=recording.metadata.get("version", ""), side=side, commands=commands, robots=len(robots),
+        seconds=0.0 if first_s is None or last_s is None else last_s - first_s, left_out=recording.left_out,
+        equal=equal, different=different, was_solved=solve, changed=tuple(changed),
+        not_solved=dict(not_solved.most_common(20)), by_kind=dict(by_kind),
+        troubles=tuple(trouble for trouble, _, _ in bad[:worst]),
+        causes={
+            command.id: causes_of(command, past, resolver, side=side) for command, past in looked_at
+        },
+        explained=len(looked_at),
+    )  # fmt: skip
+
+
+def report(
+    path: Path,
+    settings: PlatformSettings,
+    identity: str,
+    overrides: Overrides | None = None,
+    *,
+    with_picture: bool = True,
+) -> CommandReport:
+    """Return all that is known about one command; *identity* may be "" for the command of a case file.
+
+    Raises:
+        RsePfError: The recording cannot be read, has no such command, or *overrides* name an engine that is
+            not there.
+    """
+    recording = open_recording(path, settings.session)
+    command, history = recording.find_with_history(_identity(recording, identity), HISTORY)
+    return report_of(
+        command, history, _resolver(recording, settings), overrides,
+        version=recording.metadata.get("version", ""), side=recording.metadata.get("side", "server"),
+        with_picture=with_picture,
+    )  # fmt: skip
+
+
+def case_of(path: Path, settings: PlatformSettings, identity: str) -> Exported:
+    """Return the case of one command, to be written; raises what `report` raises."""
+    recording = open_recording(path, settings.session)
+    command, history = recording.find_with_history(_identity(recording, identity), HISTORY)
+    return Exported(
+        parts=tuple(case_parts(command, history)), codec=command.codec, number=command.command.id,
+        metadata=recording.metadata,
+    )  # fmt: skip
+
+
+def find(path: Path, settings: PlatformSettings, *, trace: str, number: int) -> str:
+    """Return ``CONNECTION:ID`` of the newest command with this *trace* and id, "" if there is none."""
+    found = ""
+    for command in open_recording(path, settings.session).commands():
+        if command.id.endswith(f":{number}"):
+            try:
+                if command.command.trace == trace:
+                    found = command.id
+            except RsePfError:
+                continue
+    return found
+
+
+def _identity(recording: Recording, identity: str) -> str:
+    if not identity and not recording.case_id:
+        raise BadRequest("this file is no case of one command", hint="name one with --command")
+    return identity or recording.case_id
+
+
+def _resolver(recording: Recording, settings: PlatformSettings) -> Resolver:
+    """Return what solves with the numbers of the server that recorded, as far as they are known."""
+    try:
+        given = msgspec.json.decode(recording.metadata.get("pnp", "{}"))
+        pnp = PnpSettings(
+            **{name: given[name] for name in ("engine", "max_correspondences", "max_iterations")}
+        )
+        settings = settings.replace(pnp=msgspec.to_builtins(pnp))
+    except (msgspec.DecodeError, RsePfError, KeyError, TypeError, ValueError):
+        settings = settings.replace(pnp=msgspec.to_builtins(PnpSettings()))
+    return Resolver(settings)
