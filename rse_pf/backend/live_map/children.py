@@ -60,6 +60,10 @@ class OwnerChild:
         """Whether it has imported all that it needs."""
         return self._ready.done()
 
+    async def wait_ready(self, within_s: float) -> None:
+        """Wait until it has imported all that it needs, or has ended, but no longer than *within_s*."""
+        await asyncio.wait({self._ready}, timeout=within_s)
+
     async def claim(self, order: OwnerOrder) -> bool:
         """Let it claim a map; return whether it serves it now."""
         if not await asyncio.shield(self._ready):
@@ -112,11 +116,11 @@ class OwnerChild:
 class OwnerChildren:
     """The owner processes of one worker: those in use, and one that waits for a map."""
 
-    def __init__(self, spawn: Callable[[], ChildProcess], *, max_owners: int, keeps_spare: bool) -> None:
+    def __init__(self, spawn: Callable[[bool], ChildProcess], *, max_owners: int, keeps_spare: bool) -> None:
         """Start none yet.
 
         Args:
-            spawn: Starts a process.
+            spawn: Starts a process; calmly, if nobody waits for it yet.
             max_owners: Of them are in use at the same time.
             keeps_spare: Whether one waits for a map as soon as `use` was called.
         """
@@ -144,11 +148,12 @@ class OwnerChildren:
             self._prepare_later()
         return child
 
-    def prepare(self) -> None:
-        """Start a process that waits for a map, if one more may be used."""
+    def prepare(self, *, calmly: bool = False) -> OwnerChild | None:
+        """Return the process that waits for a map, which is started if one more may be used."""
         if self._spare is None and len(self._used) < self._max_owners and not self.is_giving_up:
-            self._spare = OwnerChild(self._spawn())
+            self._spare = OwnerChild(self._spawn(calmly))
             self._spare.on_end = self._lose_spare
+        return self._spare
 
     def use(self, *, is_used: bool) -> None:
         """Keep a process ready while live maps are used, none otherwise."""
@@ -185,4 +190,4 @@ class OwnerChildren:
 
     def _prepare_now(self) -> None:
         self._timer = None
-        self.prepare()
+        self.prepare(calmly=True)

@@ -67,7 +67,7 @@ class OwnerLinks:
         self._key: bytes | None = None
         self._threads = ThreadPoolExecutor(_THREADS, thread_name_prefix="live-link")
         self._children = OwnerChildren(
-            lambda: OwnerProcess(settings, kind),
+            lambda calmly: OwnerProcess(settings, kind, calmly=calmly),
             max_owners=settings.live.max_owners,
             keeps_spare=settings.live.warm_standby,
         )

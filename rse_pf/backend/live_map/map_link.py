@@ -58,7 +58,7 @@ class LinkContext:
         key: Returns the key of the tokens between servers; blocking.
         take_child: Returns a process that may claim a map, None if this worker may start none; what is
             passed is called when it ends.
-        prepare: Starts a process that `take_child` will return, so that it is ready in time.
+        prepare: Returns the process that `take_child` will return, which is started if there is none yet.
         clock: Seconds, monotonic.
         wall_clock: Unix seconds.
         leeway_s: Of the clocks of two servers.
@@ -71,7 +71,7 @@ class LinkContext:
     call: Callable[[Callable[[], Any]], Awaitable[Any]]
     key: Callable[[], bytes]
     take_child: Callable[[Callable[[OwnerChild, int], None]], OwnerChild | None]
-    prepare: Callable[[], None]
+    prepare: Callable[[], OwnerChild | None]
     clock: Callable[[], float]
     wall_clock: Callable[[], float]
 
@@ -123,6 +123,7 @@ class MapLink:
         self._pending: dict[int, _Pending] = {}
         self._writer: asyncio.StreamWriter | None = None
         self._dead_epoch: int | None = None
+        self._welcomed = ""
         self._newest_map: dict[str, Any] = {}
         self._used_s = context.clock()
         self._is_closed = False
@@ -186,6 +187,8 @@ class MapLink:
         if record is None or record.state == "stopped":
             self._refuse_what_needs_a_map(is_stopped=record is not None)
             if not any(each.begins for each in self._pending.values()):
+                if self.is_watched and self._context.settings.warm_standby:
+                    self._context.prepare()  # robots join seconds before they drive
                 await self._pause(_WATCH_POLL_S)
                 return
         is_dead = record is not None and record.epoch == self._dead_epoch
@@ -198,7 +201,7 @@ class MapLink:
         elif verdict == "connect" and record is not None:
             if await self._use(record):
                 await asyncio.sleep(_RETRY_S)
-            else:
+            elif record.epoch != self._dead_epoch:
                 self._context.prepare()
                 await self._pause(_POLL_S)
         else:
@@ -206,8 +209,12 @@ class MapLink:
             await self._pause(_POLL_S)
 
     async def _take_over(self) -> None:
-        """Start an owner here, unless another process is first."""
+        """Let a process of this worker claim the map, unless another process is first."""
         self._tell_state("moving")
+        spare = self._context.prepare()
+        if spare is not None and not spare.is_ready:
+            await spare.wait_ready(_POLL_S)
+            return  # the lease is read again: meanwhile another process may serve the map
         child = self._context.take_child(self._note_end)
         if child is None:
             self._refuse_all(lambda _: self._no_owner("this server takes no further live map"))
@@ -217,10 +224,10 @@ class MapLink:
             tenant=self.tenant, map_name=self.map_name, server=self._context.server_id, known=self._watch.data
         )
         self.child = child
-        silent_s, began_s, was_ready = self._watch.unchanged_s, self._context.clock(), child.is_ready
+        silent_s, began_s = self._watch.unchanged_s, self._context.clock()
         has_won = await child.claim(order)
         self._context.log.info(
-            "live-map-claimed", map=self.map_name, tenant=self.tenant, has_won=has_won, was_ready=was_ready,
+            "live-map-claimed", map=self.map_name, tenant=self.tenant, has_won=has_won,
             silent_s=round(silent_s, 3), seconds=round(self._context.clock() - began_s, 3),
         )  # fmt: skip
         if not has_won:
@@ -266,7 +273,9 @@ class MapLink:
             reader, writer = await asyncio.wait_for(
                 asyncio.open_connection(record.address, record.port, ssl=client_context()), _CONNECT_S
             )
-        except (OSError, asyncio.TimeoutError):
+        except (OSError, asyncio.TimeoutError) as error:
+            if isinstance(error, ConnectionRefusedError) and self._welcomed == record.owner:
+                self._dead_epoch = record.epoch  # its port was open before: the process is gone
             return None
         try:
             check_certificate(writer.get_extra_info("ssl_object"), record.certificate)
@@ -279,6 +288,7 @@ class MapLink:
             frames = FrameReader(MAX_LINK_BYTES)
             welcome = await asyncio.wait_for(_next_messages(reader, frames), _CONNECT_S)
             if welcome[0] == ["welcome"]:
+                self._welcomed = record.owner
                 for message in welcome[1:]:
                     self._take(message)
                 return reader, writer, frames

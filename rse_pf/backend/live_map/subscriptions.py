@@ -23,7 +23,7 @@ from rse_pf.wire.server_session import ServerSession
 __all__ = ["Reader", "Subscriptions"]
 
 _GATHER_S = 0.01
-"""Values that arrive within this time leave together, and replace each other before they are encoded."""
+"""Values leave this long after the last ones, or at once; until then they replace each other."""
 _RETRY_S = 0.05
 """A reader whose socket is full is looked at again after this time."""
 _MAX_UNSENT_BYTES = 16_384
@@ -114,6 +114,7 @@ class Subscriptions:
         self._due: dict[_Subscription, None] = {}
         self._slow: dict[_Subscription, None] = {}
         self._is_sending = self._is_retrying = False
+        self._sent_s = float("-inf")
 
     def __len__(self) -> int:
         """Return how many subscriptions there are."""
@@ -196,10 +197,11 @@ class Subscriptions:
         self._due[subscription] = None
         if not self._is_sending:
             self._is_sending = True
-            self._loop.call_later(_GATHER_S, self._send)
+            self._loop.call_later(max(0.0, self._sent_s + _GATHER_S - self._loop.time()), self._send)
 
     def _send(self) -> None:
         """Send what is due, up to a bound; then the event loop serves the robots' commands first."""
+        self._sent_s = self._loop.time()
         left = _MAX_SENT_AT_ONCE
         while self._due and left > 0:
             subscription = next(iter(self._due))

@@ -37,6 +37,7 @@ from rse_pf.backend.live_map.owner.link_security import (
 from rse_pf.backend.live_map.owner.live_owner import LiveOwner, OwnerContext
 from rse_pf.backend.live_map.owner.log import LiveLog, OwnershipLost
 from rse_pf.backend.live_map.owner.server import OwnerServer, listen
+from rse_pf.backend.live_map.owner.start import CALMLY
 from rse_pf.backend.live_map.owner.state import MapKind, MapState, take_over
 from rse_pf.backend.live_map.owner.work.threads import OwnerThreads, Urgency
 from rse_pf.backend.log import JsonLog
@@ -54,6 +55,8 @@ MAP_KIND = "rse_pf.backend.live_map.owner.map_kind:LIVE_MAP"
 _ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
 _READ_BYTES = 1 << 16
 _RETRY_S = 0.1
+_SWITCH_S = 0.0005
+"""A thread that has something to do waits at most so long for the interpreter; by default 5 ms each time."""
 _OUTSIDE = ("192.0.2.1", 9)
 """An address of documentation: nothing is sent there, but the route to it names the main interface."""
 _T = TypeVar("_T")
@@ -71,11 +74,13 @@ class OwnerOrder(msgspec.Struct, frozen=True, kw_only=True):
 class OwnerProcess:
     """A started process and the socket to it; only for the main thread of a process, with which it ends."""
 
-    def __init__(self, settings: PlatformSettings, kind: str = MAP_KIND) -> None:
+    def __init__(self, settings: PlatformSettings, kind: str = MAP_KIND, *, calmly: bool = False) -> None:
+        """Start it; *calmly* if nobody waits for it yet."""
         self.connection, theirs = socket.socketpair()
         with theirs:
             self._process = subprocess.Popen(
-                [sys.executable, "-m", "rse_pf.backend.live_map.owner.process", str(theirs.fileno())],
+                [sys.executable, "-m", "rse_pf.backend.live_map.owner.start", str(theirs.fileno()),
+                 *([CALMLY] if calmly else [])],
                 pass_fds=(theirs.fileno(),), stdin=subprocess.DEVNULL, env={**os.environ, **_ONE_THREAD},
             )  # fmt: skip
         self.pid = self._process.pid
@@ -130,6 +135,7 @@ def main(arguments: list[str]) -> None:
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)
     set_process_name("rse-pf live map")
+    sys.setswitchinterval(_SWITCH_S)
     module, _, name = order["kind"].partition(":")
     kind: MapKind = getattr(importlib.import_module(module), name)
     store = open_data_store(settings)
@@ -287,7 +293,3 @@ class _Process:
             except StoreError as error:
                 self._log.warning("live-store-retry", map=self._order.map_name, error=error.message)
                 await asyncio.sleep(_RETRY_S)
-
-
-if __name__ == "__main__":
-    main(sys.argv[1:])

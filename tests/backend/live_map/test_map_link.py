@@ -1,0 +1,184 @@
+"""How a worker finds, starts and replaces the owner of a map, with processes that are only played."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import os
+import socket
+import time
+from collections.abc import Awaitable, Callable
+from typing import Any
+
+from rse_pf.backend.live_map.children import OwnerChild, OwnerChildren
+from rse_pf.backend.live_map.map_link import LinkContext, MapLink
+from rse_pf.backend.live_map.owner.lease import LeaseRecord, OwnerLease, decode_lease, lease_name
+from rse_pf.backend.live_map.owner.process import OwnerOrder
+from rse_pf.backend.log import JsonLog
+from rse_pf.backend.sandbox.ipc import encode_message
+from rse_pf.config import PlatformSettings
+from rse_pf.errors import Busy, NotFound
+from rse_pf.identity import RobotId
+from rse_pf.object_store import MemoryStore
+
+LEASE = lease_name("default", "warehouse")
+FIRST = {"number": 0, "segment": 0}
+ROBOT = RobotId("default", "robot-1")
+
+
+class PlayedProcess:
+    """A process that says what the test says, and claims a map as a real one does."""
+
+    def __init__(self, store: MemoryStore) -> None:
+        self.connection, self._theirs = socket.socketpair()
+        self.pid = 1
+        self.claims = 0
+        self._store = store
+
+    def say(self, *message: Any) -> None:
+        self._theirs.sendall(encode_message(list(message)))
+
+    def claim(self, order: OwnerOrder) -> None:
+        self.claims += 1
+        lease = OwnerLease(
+            self._store, LEASE, owner=f"owner-{id(self)}", server=order.server, clock=time.monotonic
+        )
+        if lease.claim(order.known) and lease.serve("127.0.0.1", 1, "c"):
+            self.say("serving", lease.record.epoch)
+        else:
+            self.say("lost")
+
+    def release(self) -> None: ...
+
+    def kill(self) -> int:
+        self.connection.close()
+        self._theirs.close()
+        return 0
+
+
+class Worker:
+    """The link of one worker to one map."""
+
+    def __init__(self) -> None:
+        self.store = MemoryStore()
+        self.started: list[PlayedProcess] = []
+        self.children = OwnerChildren(self._spawn, max_owners=2, keeps_spare=False)
+        self._null = os.open(os.devnull, os.O_WRONLY)
+        self._log = JsonLog(level="error", server="test", wall_clock=time.time, fd=self._null)
+        context = LinkContext(
+            store=self.store, settings=PlatformSettings().live, server_id="here", log=self._log,
+            call=self._call, key=lambda: b"k" * 32, take_child=self.children.take,
+            prepare=self.children.prepare, clock=time.monotonic, wall_clock=time.time,
+        )  # fmt: skip
+        self.link = MapLink(
+            context, "default", "warehouse", on_update=lambda payload: None, on_end=lambda link: None
+        )
+
+    def lease(self) -> LeaseRecord | None:
+        with contextlib.suppress(NotFound):
+            return decode_lease(LEASE, self.store.get(LEASE))
+        return None
+
+    async def close(self) -> None:
+        await self.link.close()
+        self.children.drop_spare()
+        for child in self.children.used:
+            child.kill()
+        self._log.close()
+        os.close(self._null)
+
+    def _spawn(self, calmly: bool) -> PlayedProcess:
+        self.started.append(PlayedProcess(self.store))
+        return self.started[-1]
+
+    async def _call(self, act: Callable[[], Any]) -> Any:
+        return act()
+
+
+def play(test: Callable[[Worker], Awaitable[None]]) -> None:
+    async def run() -> None:
+        worker = Worker()
+        try:
+            await asyncio.wait_for(test(worker), 20.0)
+        finally:
+            await worker.close()
+
+    asyncio.run(run())
+
+
+async def until(is_so: Callable[[], Any]) -> None:
+    while not is_so():
+        await asyncio.sleep(0)
+
+
+def test_a_process_is_started_as_soon_as_a_map_that_nobody_has_begun_is_watched() -> None:
+    async def test(worker: Worker) -> None:
+        worker.link.set_watched(True)
+        await until(lambda: worker.started)
+        worker.started[0].say("ready")
+        spare = worker.children.prepare()
+        assert isinstance(spare, OwnerChild)
+        await until(lambda: spare.is_ready)
+        assert worker.lease() is None  # the first keyframe begins the map
+
+        sent = asyncio.ensure_future(worker.link.request(ROBOT, "live-keyframe", FIRST, 5.0))
+        await until(lambda: (found := worker.lease()) is not None and found.state == "serving")
+        assert len(worker.started) == 1
+        sent.cancel()
+
+    play(test)
+
+
+def test_an_owner_elsewhere_is_used_before_the_own_process_is_ready() -> None:
+    """Else the robots of this server wait until its own process is started, for nothing."""
+
+    async def test(worker: Worker) -> None:
+        sent = asyncio.ensure_future(worker.link.request(ROBOT, "live-keyframe", FIRST, 5.0))
+        await until(lambda: worker.started)  # it never gets ready
+        with socket.create_server(("127.0.0.1", 0)) as listener:
+            listener.setblocking(False)
+            elsewhere = OwnerLease(worker.store, LEASE, owner="b", server="there", clock=time.monotonic)
+            assert elsewhere.claim(None)
+            assert elsewhere.serve("127.0.0.1", listener.getsockname()[1], "c")
+            connection, _ = await asyncio.get_running_loop().sock_accept(listener)
+            connection.close()
+        assert worker.started[0].claims == 0
+        sent.cancel()
+
+    play(test)
+
+
+def test_an_owner_whose_port_is_closed_is_replaced_at_once_by_those_who_were_connected() -> None:
+    async def test(worker: Worker) -> None:
+        elsewhere = OwnerLease(worker.store, LEASE, owner="b", server="there", clock=time.monotonic)
+        assert elsewhere.claim(None)
+        with socket.create_server(("127.0.0.1", 0)) as listener:
+            port = listener.getsockname()[1]
+        assert elsewhere.serve("127.0.0.1", port, "c")
+        worker.link._welcomed = "b"
+        began_s = time.monotonic()
+        sent = asyncio.ensure_future(worker.link.request(ROBOT, "live-keyframe", FIRST, 5.0))
+        await until(lambda: worker.started)
+        worker.started[0].say("ready")
+        await until(lambda: (found := worker.lease()) is not None and found.epoch == 2)
+        assert time.monotonic() - began_s < PlatformSettings().live.lease_s
+        sent.cancel()
+
+    play(test)
+
+
+def test_an_owner_whose_port_was_never_reached_keeps_its_lease() -> None:
+    """A firewall may refuse what the other servers can reach."""
+
+    async def test(worker: Worker) -> None:
+        elsewhere = OwnerLease(worker.store, LEASE, owner="b", server="there", clock=time.monotonic)
+        assert elsewhere.claim(None)
+        with socket.create_server(("127.0.0.1", 0)) as listener:
+            port = listener.getsockname()[1]
+        assert elsewhere.serve("127.0.0.1", port, "c")
+        sent = asyncio.ensure_future(worker.link.request(ROBOT, "live-keyframe", FIRST, 0.3))
+        await asyncio.wait({sent})
+        assert isinstance(sent.exception(), Busy)
+        assert decode_lease(LEASE, worker.store.get(LEASE)).epoch == 1
+
+    play(test)
