@@ -3,8 +3,15 @@
 Whatever yields a `Frame` belongs here; what a robot does with it does not.
 """
 
-from client_sdk.cameras.open_camera import open_camera
+from client_sdk.cameras.open_camera import open_camera, source_of_frames
 from client_sdk.cameras.source import FrameSource
 from client_sdk.datasets.intrinsics import Intrinsics, read_intrinsics, write_intrinsics
 
-__all__ = ["FrameSource", "Intrinsics", "open_camera", "read_intrinsics", "write_intrinsics"]
+__all__ = [
+    "FrameSource",
+    "Intrinsics",
+    "open_camera",
+    "read_intrinsics",
+    "source_of_frames",
+    "write_intrinsics",
+]

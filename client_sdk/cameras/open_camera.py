@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import replace
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -16,8 +15,9 @@ from client_sdk.datasets import open_dataset
 from client_sdk.datasets.intrinsics import Intrinsics, read_intrinsics
 from client_sdk.frontend import Frame
 from rse_pf.errors import UsageError
+from rse_pf.geometry import Camera
 
-__all__ = ["open_camera"]
+__all__ = ["open_camera", "source_of_frames"]
 
 _ROS = {".mcap", ".db3"}
 
@@ -57,7 +57,7 @@ def open_camera(
     if path.suffix in _ROS or (path / "metadata.yaml").is_file():
         raise UsageError(
             f"{word} is a ROS bag",
-            hint="read it with rse-pf map from-bag (extra bags), or convert it to a video",
+            hint="read it with rse-pf map from-bag (extra bags)",
         )
     if path.suffix == ".mat" or (path / "depth.txt").is_file() or any(path.glob("d-*.pgm")):
         return _recording(path, own, rate_hz, depth)
@@ -76,6 +76,25 @@ def open_camera(
     return RawSource(word, raw, own, has_depth=False, rate_hz=rate_hz, close=close)
 
 
+def source_of_frames(
+    name: str,
+    frames: Iterable[Frame],
+    camera: Camera,
+    *,
+    has_depth: bool,
+    rate_hz: float | None = None,
+    close: Callable[[], None] | None = None,
+) -> RawSource:
+    """Return frames that are undistorted and registered already as a source; *close* releases their file.
+
+    Raises:
+        UsageError: The rate is not above 0.
+    """
+    raw = _without_depth(map(_as_raw, frames), has_depth)
+    plain = Intrinsics(camera=camera)
+    return RawSource(name, raw, plain, has_depth=has_depth, rate_hz=rate_hz, close=close)
+
+
 def _recording(path: Path, own: Intrinsics | None, rate_hz: float | None, depth: bool) -> RawSource:
     """Return a recording; its frames are undistorted and registered already."""
     dataset = open_dataset(path)
@@ -83,9 +102,7 @@ def _recording(path: Path, own: Intrinsics | None, rate_hz: float | None, depth:
         raise UsageError(
             f"{path} has intrinsics of its own, and they differ", hint="leave --intrinsics out for recordings"
         )
-    plain = replace(own, distortion=()) if own is not None else Intrinsics(camera=dataset.camera)
-    raw: Iterator[RawFrame] = map(_as_raw, dataset)
-    return RawSource(str(path), _without_depth(raw, depth), plain, has_depth=depth, rate_hz=rate_hz)
+    return source_of_frames(str(path), dataset, dataset.camera, has_depth=depth, rate_hz=rate_hz)
 
 
 def _as_raw(frame: Frame) -> RawFrame:

@@ -1,4 +1,4 @@
-"""RGB-D recordings as frames: TUM folders, NYU Depth V2 (labelled file or raw dump).
+"""RGB-D recordings as frames: TUM folders, NYU Depth V2 (labelled file or raw dump), ROS bags.
 
 Every `Frame` is undistorted and registered, with depth in metres and colours in the order red, green, blue.
 An image is read only when its frame is needed.  A path that cannot be used is reported in one line.
@@ -15,6 +15,7 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 
+from client_sdk.bags import Bag, is_bag, open_bag
 from client_sdk.datasets import nyu
 from client_sdk.datasets.intrinsics import Intrinsics, Undistortion, read_intrinsics
 from client_sdk.frontend import Frame, load_opencv
@@ -22,7 +23,7 @@ from client_sdk.mapping import Trajectory, read_trajectory
 from rse_pf.errors import UsageError
 from rse_pf.geometry import Camera
 
-__all__ = ["Dataset", "associate_stamps", "open_dataset", "read_colour"]
+__all__ = ["Dataset", "associate_stamps", "dataset_of_bag", "open_dataset", "read_colour"]
 
 _MAX_STAMP_DIFFERENCE_S = 0.02
 # The raw dump's two streams run freely; the nearest images are at most half a period apart.
@@ -92,17 +93,19 @@ def open_dataset(path: Path | str, *, scene: str | None = None) -> Dataset:
     """Detect the format of *path* and return its frames; images are read later.
 
     Accepts a folder in TUM layout (``rgb.txt``, ``depth.txt``, with or without ``intrinsics.json``),
-    a raw NYU Depth V2 folder (``r-*.ppm``, ``d-*.pgm``), or its labelled ``.mat`` file, of which
-    *scene* picks one scene.
+    a raw NYU Depth V2 folder (``r-*.ppm``, ``d-*.pgm``), its labelled ``.mat`` file, of which
+    *scene* picks one scene, or a ROS bag.
 
     Raises:
         UsageError: The path is none of these, or a part is missing or broken.
-        MissingExtra: OpenCV or h5py is needed and not installed.
+        MissingExtra: OpenCV, h5py or rosbags is needed and not installed.
     """
     path = Path(path)
+    if scene is None and is_bag(path) and not (path / "rgb.txt").is_file():
+        return dataset_of_bag(open_bag(path))
     if path.is_file():
         if path.suffix != ".mat":
-            raise UsageError(f"{path} is not a recording", hint="name a folder, or the labelled .mat file")
+            raise UsageError(f"{path} is not a recording", hint="name a folder, a ROS bag or the .mat file")
         return _open_labelled(path, scene)
     if not path.is_dir():
         raise UsageError(f"no folder {path}", hint="name a folder in TUM layout: rgb.txt, depth.txt, images")
@@ -111,6 +114,20 @@ def open_dataset(path: Path | str, *, scene: str | None = None) -> Dataset:
     if not (path / "rgb.txt").exists() and any(path.glob("d-*.pgm")):
         return _open_raw(path)
     return _open_tum(path)
+
+
+def dataset_of_bag(bag: Bag) -> Dataset:
+    """Return the frames of an open bag as a recording; they can be read until the bag is closed."""
+    return Dataset(
+        name=bag.name,
+        camera=bag.camera,
+        timestamps_s=bag.timestamps_s,
+        truth=bag.truth,
+        truth_kind=bag.truth_kind,
+        rows=tuple(range(len(bag))),
+        read=bag.read,
+        notes=bag.notes,
+    )
 
 
 def read_colour(path: Path) -> npt.NDArray[np.uint8]:

@@ -126,6 +126,8 @@ VERBS_NEED: dict[str, tuple[str, ...]] = {
     "map": (),
     "map from-bag": ("bags",),
     "map to-bag": ("bags",),
+    "map from-bag": ("bags",),
+    "map to-bag": ("bags",),
     "map show --png": ("local",),
     "map merge": ("maps",),
     "map localise": ("maps", "vision"),

@@ -6,6 +6,7 @@ earlier version and deletes nothing.  Each action has its own help page: rse-pf 
 
 examples:
   rse-pf map from-camera 0 --intrinsics intrinsics.json --out out-camera
+  rse-pf map from-bag kitchen.bag --out out-bag
   rse-pf map list --store dir:objects
   rse-pf map show kitchen --store dir:objects --png kitchen.png
   rse-pf map merge robot-1 robot-2 robot-3 --into kitchen --store dir:objects
@@ -35,6 +36,7 @@ import numpy as np
 
 from rse_pf.audit.operator import record_map_change
 from rse_pf.aws.storage import open_data_store
+from rse_pf.cli.map_bags import BAG_ACTIONS, BAG_FORMAT, add_bag_actions, export_bag, run_bags
 from rse_pf.cli.map_from_camera import add_from_camera_arguments, run_from_camera
 from rse_pf.cli.map_live import add_live_arguments, run_live, run_publish
 from rse_pf.config import PlatformSettings
@@ -114,7 +116,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "after", nargs="?", default="head", metavar="AFTER", help="default: %(default)s"
     )
     made["rollback"].add_argument("version", metavar="VERSION", help="the version to go back to")
-    made["export"].add_argument("--format", choices=tuple(FORMATS), required=True, help="the format")
+    made["export"].add_argument("--format", choices=(*FORMATS, BAG_FORMAT), required=True, help="the format")
     made["export"].add_argument("--out", type=Path, required=True, metavar="FILE", help="the file to write")
     made["export"].add_argument("--robot", help="tum: only the keyframes of this robot")
     add_from_camera_arguments(
@@ -125,6 +127,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
             formatter_class=argparse.RawDescriptionHelpFormatter,
         )
     )  # fmt: skip
+    add_bag_actions(actions)
     add_live_arguments(
         actions.add_parser(
             "live", help="list, show, start, stop and correct live maps",
@@ -161,6 +164,8 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
     """Do one action and return the exit code."""
     if args.action == "from-camera":
         return run_from_camera(args, settings)
+    if args.action in BAG_ACTIONS:
+        return run_bags(args, settings)
     chosen = settings if args.store is None else settings.replace(data={"store": args.store})
     if chosen.data.store == "memory:":
         kept = state_folder("default", os.environ) / "objects"
@@ -388,9 +393,14 @@ def _rollback(args: argparse.Namespace, maps: MapRegistry) -> None:
 
 def _export(args: argparse.Namespace, maps: MapRegistry) -> None:
     _check_folder(args.out)
-    data = export_map(maps.load(args.name, args.version), args.format, args.robot)
-    replace_file(args.out, data)
-    _print(args, {"file": str(args.out), "bytes": len(data)}, f"{args.out}: {len(data)} bytes")
+    version = maps.load(args.name, args.version)
+    if args.format == BAG_FORMAT:
+        size = export_bag(args.out, version)
+    else:
+        data = export_map(version, args.format, args.robot)
+        replace_file(args.out, data)
+        size = len(data)
+    _print(args, {"file": str(args.out), "bytes": size}, f"{args.out}: {size} bytes")
 
 
 def _draw(args: argparse.Namespace, maps: MapRegistry, record: MapRecord) -> None:

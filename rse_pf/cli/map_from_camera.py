@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 import asyncio
 import contextlib
+import json
 import signal
 import time
 from collections.abc import AsyncIterator, Callable
@@ -19,14 +20,16 @@ from urllib.parse import urlsplit
 from rse_pf.cli.frame_table import FRAMES_FILE, FrameTable
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import CommandFailed, UsageError
+from rse_pf.files import replace_file
 from rse_pf.terminal import show, show_progress
 
 if TYPE_CHECKING:
     from client_sdk import MarkerScale, OdometryScale, Robot, TrackedFrame
     from client_sdk.cameras import FrameSource
     from client_sdk.mapper import Mapper
+    from client_sdk.mapping import Trajectory
 
-__all__ = ["add_from_camera_arguments", "run_from_camera"]
+__all__ = ["add_drive_arguments", "add_from_camera_arguments", "check_drive", "map_source", "run_from_camera"]
 
 _ROBOT = "camera"
 _MOST = 0.5
@@ -43,6 +46,12 @@ def add_from_camera_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="SOURCE",
         help="a device number (0), a video, a folder of images, a recording, or realsense",
     )
+    add_drive_arguments(parser, Path("out-camera"))
+
+
+def add_drive_arguments(parser: argparse.ArgumentParser, out: Path) -> None:
+    """Declare what all sources of frames share; *out* is the default folder of results."""
+    add = parser.add_argument
     add("--intrinsics", type=Path, metavar="FILE", help="of the camera: see rse-pf camera calibrate")
     add(
         "--scale",
@@ -52,7 +61,7 @@ def add_from_camera_arguments(parser: argparse.ArgumentParser) -> None:
     add("--no-depth", action="store_true", help="use the colours only")
     add("--rate", type=float, metavar="HZ", help="leave out frames beyond this rate")
     add("--frames", type=int, metavar="N", help="stop after so many frames")
-    add("--out", type=Path, default=Path("out-camera"), metavar="DIR", help="results (default: out-camera)")
+    add("--out", type=Path, default=out, metavar="DIR", help="results (default: %(default)s)")
     add("--url", help="use the platform at this address, with --token-file")
     add("--token-file", type=Path, metavar="FILE", help="with --url: file that holds the robot's token")
     add("--enrolment", type=Path, metavar="FILE", help="use the platform of rse-pf robot enrol --out FILE")
@@ -60,24 +69,37 @@ def add_from_camera_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run_from_camera(args: argparse.Namespace, settings: PlatformSettings) -> int:
     """Track the camera and write the results; the exit code is 1 if most frames have no pose."""
-    _check(args)
-    scale = _scale(args.scale)
+    scale = check_drive(args)
     from client_sdk.cameras import open_camera
 
     with open_camera(
         args.source, intrinsics=args.intrinsics, rate_hz=args.rate, depth=not args.no_depth
     ) as source:
-        if scale is not None and source.has_depth:
-            raise UsageError(
-                f"{args.source} has depth, so that its scale is known",
-                hint="leave out --scale, or add --no-depth",
-            )
-        from rse_pf.experiments.plots.map_image import RobotPath, draw_map
+        return map_source(args, settings, source, scale)
 
-        _make_folder(args.out)
-        frames = FrameTable()
-        mapper = asyncio.run(_drive(args, settings, source, scale, frames))
+
+def map_source(
+    args: argparse.Namespace,
+    settings: PlatformSettings,
+    source: FrameSource,
+    scale: OdometryScale | MarkerScale | None,
+    about: Callable[[Trajectory], dict[str, Any]] | None = None,
+) -> int:
+    """Track the frames of *source* and write the results; *about* adds to the report what it returns."""
+    if scale is not None and source.has_depth:
+        raise UsageError(
+            f"{args.source} has depth, so that its scale is known",
+            hint="leave out --scale, or add --no-depth",
+        )
+    from rse_pf.experiments.plots.map_image import RobotPath, draw_map
+
+    _make_folder(args.out)
+    frames = FrameTable()
+    mapper = asyncio.run(_drive(args, settings, source, scale, frames))
     report = mapper.save(args.out)
+    if about is not None:
+        report = {**report, **about(mapper.trajectory)}
+        replace_file(args.out / "report.json", (json.dumps(report, indent=2) + "\n").encode())
     frames.write(args.out / FRAMES_FILE)
     points, colours = mapper.map.points()
     path = mapper.trajectory
@@ -102,7 +124,8 @@ def run_from_camera(args: argparse.Namespace, settings: PlatformSettings) -> int
     return 0
 
 
-def _check(args: argparse.Namespace) -> None:
+def check_drive(args: argparse.Namespace) -> OdometryScale | MarkerScale | None:
+    """Refuse options that contradict each other, and return the scale; raises UsageError."""
     if args.frames is not None and args.frames < 2:
         raise UsageError(f"--frames {args.frames} is below 2", hint="leave it out to use all frames")
     if args.enrolment is not None and (args.url is not None or args.token_file is not None):
@@ -111,6 +134,7 @@ def _check(args: argparse.Namespace) -> None:
         raise UsageError("--url and --token-file need each other", hint="get a token: rse-pf token")
     if args.url is not None and urlsplit(args.url).scheme not in ("ws", "wss"):
         raise UsageError(f"{args.url!r} is not a WebSocket address", hint="write ws://HOST:PORT/ws")
+    return _scale(args.scale)
 
 
 def _scale(word: str | None) -> OdometryScale | MarkerScale | None:

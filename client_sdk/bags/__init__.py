@@ -1,0 +1,11 @@
+"""ROS bags without ROS: ROS 1 bag, ROS 2 sqlite3 and ROS 2 MCAP as frames, and maps written as bags.
+
+What knows a message of ROS belongs here; what a robot does with a frame does not.
+"""
+
+from client_sdk.bags.bag import Bag, BagOptions, open_bag
+from client_sdk.bags.bag_file import is_bag
+from client_sdk.bags.lens import Lens
+from client_sdk.bags.writer import BagKind, BagWriter, write_map_bag
+
+__all__ = ["Bag", "BagKind", "BagOptions", "BagWriter", "Lens", "is_bag", "open_bag", "write_map_bag"]

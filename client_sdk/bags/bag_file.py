@@ -1,0 +1,201 @@
+"""A ROS bag as a stream of raw messages: ROS 1 bag, ROS 2 sqlite3, ROS 2 MCAP, compressed or not.
+
+Every fault of a file becomes one named error.  It knows nothing of images, poses or cameras.
+"""
+
+from __future__ import annotations
+
+import struct
+import weakref
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+from client_sdk.bags.message_types import load_types
+from rse_pf.errors import MissingExtra, UsageError
+
+__all__ = ["BagFile", "BrokenMessage", "RawMessage", "Topic", "is_bag", "open_bag_file"]
+
+_ENDINGS = (".bag", ".db3", ".mcap")
+_FAULTS = (
+    ArithmeticError, AssertionError, AttributeError, EOFError, LookupError, OSError, RuntimeError,
+    TypeError, ValueError, struct.error,
+)  # fmt: skip
+"""What the readers raise, beside their own errors, where the bytes of a bag make no sense."""
+_REPAIR = "repair it: rosbag reindex (ROS 1), ros2 bag reindex, or mcap recover; or copy it again"
+
+
+class BrokenMessage(ValueError):
+    """A message whose bytes make no sense; the others of its bag may be good."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Topic:
+    """A topic of a bag: its name, the type of its messages as ROS 2 names it, and how many there are."""
+
+    name: str
+    kind: str
+    messages: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RawMessage:
+    """The bytes of a message, and when it was written to the bag, nanoseconds."""
+
+    topic: str
+    kind: str
+    log_ns: int
+    data: bytes
+
+
+def is_bag(path: Path) -> bool:
+    """Say whether a path is a ROS bag by its name, or a folder with one."""
+    if path.is_dir():
+        return (path / "metadata.yaml").is_file() or _only_bag_of(path) is not None
+    return path.suffix in _ENDINGS
+
+
+def open_bag_file(path: Path) -> BagFile:
+    """Open a ``.bag``, ``.db3`` or ``.mcap`` file, or the folder of a ROS 2 bag.
+
+    Raises:
+        UsageError: There is no such bag, or it cannot be read.
+        MissingExtra: ``rosbags`` is not installed.
+    """
+    if not path.exists():
+        raise UsageError(f"there is no bag {path}", hint="name a .bag, .db3 or .mcap file, or a bag's folder")
+    if not is_bag(path):
+        raise UsageError(
+            f"{path} is not a ROS bag", hint="name a .bag, .db3 or .mcap file, or a bag's folder"
+        )
+    if path.is_dir() and not (path / "metadata.yaml").is_file():
+        path = _only_bag_of(path) or path
+    is_ros1 = path.suffix == ".bag" and path.is_file()
+    store = load_types(is_ros1=is_ros1)
+    reader = _reader(path, is_ros1)
+    try:
+        reader.open()
+    except _all_faults() as error:
+        raise UsageError(
+            f"{path} cannot be read as a bag: {_said(error)}", hint=_hint(path, error)
+        ) from error
+    return BagFile(path, reader, store, is_ros1=is_ros1)
+
+
+class BagFile:
+    """An open bag; close it, or use it in ``with``."""
+
+    def __init__(self, path: Path, reader: Any, store: Any, *, is_ros1: bool) -> None:
+        self.path = path
+        self._reader = reader
+        self._release = weakref.finalize(self, reader.close)
+        self._store = store
+        self._is_ros1 = is_ros1
+        found: dict[tuple[str, str], int] = {}
+        for each in reader.connections:
+            key = (each.topic, each.msgtype)
+            found[key] = found.get(key, 0) + each.msgcount
+        self.topics = tuple(
+            Topic(name=name, kind=kind, messages=count) for (name, kind), count in sorted(found.items())
+        )
+
+    def messages(self, names: Collection[str], start_ns: int | None = None) -> Iterator[RawMessage]:
+        """Return the messages of some topics in the order of the bag, from a time of the bag on.
+
+        Only one of these iterators may be in use at a time.
+
+        Raises:
+            BrokenMessage: The bag cannot be read further.
+        """
+        wanted = [each for each in self._reader.connections if each.topic in names]
+        if not wanted:
+            return
+        try:
+            for connection, log_ns, data in self._reader.messages(wanted, start=start_ns):
+                yield RawMessage(topic=connection.topic, kind=connection.msgtype, log_ns=log_ns, data=data)
+        except _all_faults() as error:
+            raise BrokenMessage(_said(error)) from error
+
+    def stamp_ns(self, raw: RawMessage) -> int:
+        """Return the time stamp in the header of a message that begins with one, nanoseconds.
+
+        Raises:
+            BrokenMessage: The message is too short.
+        """
+        try:
+            if self._is_ros1:
+                seconds, nanoseconds = struct.unpack_from("<II", raw.data, 4)
+            else:
+                order = "<" if raw.data[1] & 1 else ">"
+                seconds, nanoseconds = struct.unpack_from(f"{order}iI", raw.data, 4)
+        except (struct.error, IndexError) as error:
+            raise BrokenMessage(f"a message of {len(raw.data)} bytes has no header") from error
+        return int(seconds) * 1_000_000_000 + int(nanoseconds)
+
+    def parse(self, raw: RawMessage) -> Any:
+        """Return a message with its fields; those of arrays are views of the bytes.
+
+        Raises:
+            BrokenMessage: The bytes are not such a message.
+        """
+        try:
+            if self._is_ros1:
+                return self._store.deserialize_ros1(raw.data, raw.kind)
+            return self._store.deserialize_cdr(raw.data, raw.kind)
+        except _all_faults() as error:
+            raise BrokenMessage(_said(error)) from error
+
+    def __enter__(self) -> BagFile:
+        """Return the bag."""
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        """Close the bag."""
+        self.close()
+
+    def close(self) -> None:
+        """Release the file; no message can be read any more."""
+        self._release()
+
+
+def _only_bag_of(folder: Path) -> Path | None:
+    """Return the one bag file of a folder without ``metadata.yaml``; None if there are none or several."""
+    found = [each for each in folder.iterdir() if each.suffix in _ENDINGS and each.is_file()]
+    return found[0] if len(found) == 1 else None
+
+
+def _reader(path: Path, is_ros1: bool) -> Any:
+    try:
+        from rosbags.rosbag1 import Reader as Reader1
+        from rosbags.rosbag2 import Reader as Reader2
+    except ImportError as error:
+        raise MissingExtra("rosbags", "bags") from error
+    return Reader1(path) if is_ros1 else Reader2(path)
+
+
+def _all_faults() -> tuple[type[Exception], ...]:
+    from apsw import Error
+    from rosbags.rosbag1 import ReaderError as ReaderError1
+    from rosbags.rosbag2 import ReaderError as ReaderError2
+    from rosbags.serde import SerdeError
+    from rosbags.typesys import TypesysError
+
+    return (*_FAULTS, ReaderError1, ReaderError2, SerdeError, TypesysError, Error)
+
+
+def _said(error: BaseException) -> str:
+    text = " ".join(str(each) for each in error.args) or type(error).__name__
+    return " ".join(text.split())[:160].rstrip(".")
+
+
+def _hint(path: Path, error: BaseException) -> str:
+    if path.suffix == ".mcap" and "rofile" in str(error):
+        return "a recording of this platform is read by rse-pf replay; ROS 1 in MCAP: convert it to .bag"
+    return _REPAIR

@@ -1,0 +1,105 @@
+"""The camera of a ROS ``CameraInfo`` message, and its images without the distortion of its lens."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from client_sdk.frontend import load_opencv
+from rse_pf.errors import InvalidCamera, UsageError
+from rse_pf.geometry import Camera
+
+__all__ = ["Lens", "Rectifier", "lens_of"]
+
+_BROWN = {"plumb_bob", "rational_polynomial", "rational_polynomial_thin_prism", "brown_conrady"}
+_FISHEYE = {"equidistant", "kannala_brandt4", "fisheye"}
+_HINT = "give the intrinsics yourself: --intrinsics intrinsics.json"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Lens:
+    """A camera and the distortion of its lens; ``is_fisheye``: by OpenCV's fisheye model of four numbers."""
+
+    camera: Camera
+    distortion: tuple[float, ...] = ()
+    is_fisheye: bool = False
+
+
+def lens_of(message: Any, topic: str, *, is_rectified: bool) -> Lens:
+    """Return the lens of a ``CameraInfo``; that of rectified images has the matrix P and no distortion.
+
+    Raises:
+        UsageError: The camera is not calibrated, or the model of its lens is unknown.
+    """
+    fields = {name: getattr(message, name, None) for name in ("k", "p", "d", "K", "P", "D")}
+    K, P, D = (np.ravel(_first(fields[low], fields[low.upper()])) for low in ("k", "p", "d"))
+    if is_rectified and np.any(P):
+        fx, cx, fy, cy = P[0], P[2], P[5], P[6]
+        D = np.zeros(0)
+    else:
+        fx, cx, fy, cy = K[0], K[2], K[4], K[5]
+    if message.binning_x > 1 or message.binning_y > 1 or message.roi.width or message.roi.height:
+        roi = message.roi
+        if (
+            message.binning_x > 1
+            or message.binning_y > 1
+            or (roi.width, roi.height) != (message.width, message.height)
+        ):
+            raise UsageError(
+                f"{topic} describes a part of the sensor (binning or region of interest)", hint=_HINT
+            )
+    model = str(message.distortion_model)
+    has_distortion = bool(np.any(D))
+    if has_distortion and model not in _BROWN | _FISHEYE:
+        raise UsageError(f"{topic} has a lens of the unknown model {model or '(none)'}", hint=_HINT)
+    is_fisheye = has_distortion and model in _FISHEYE
+    if has_distortion and (
+        len(D) not in ((4,) if is_fisheye else (4, 5, 8, 12, 14)) or not np.isfinite(D).all()
+    ):
+        raise UsageError(f"{topic} has {len(D)} distortion numbers for {model}", hint=_HINT)
+    try:
+        camera = Camera(
+            fx=float(fx), fy=float(fy), cx=float(cx), cy=float(cy),
+            width=int(message.width), height=int(message.height),
+        )  # fmt: skip
+    except InvalidCamera as error:
+        raise UsageError(f"{topic} holds no calibration: {error.message}", hint=_HINT) from error
+    distortion = tuple(float(each) for each in D) if has_distortion else ()
+    return Lens(camera=camera, distortion=distortion, is_fisheye=is_fisheye)
+
+
+class Rectifier:
+    """Map the images of a lens to a pinhole camera; with no distortion, images stay as they are."""
+
+    def __init__(self, lens: Lens, wanted: Camera) -> None:
+        self._maps: tuple[Any, Any] | None = None
+        if not lens.distortion and lens.camera == wanted:
+            return
+        cv2 = load_opencv()
+        size = (wanted.width, wanted.height)
+        undistort = cv2.fisheye.initUndistortRectifyMap if lens.is_fisheye else cv2.initUndistortRectifyMap
+        distortion = np.array(lens.distortion or (0.0, 0.0, 0.0, 0.0))
+        self._maps = undistort(lens.camera.matrix, distortion, np.eye(3), wanted.matrix, size, cv2.CV_32FC1)
+
+    def colour(self, rgb: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
+        """Return a colour image, interpolated."""
+        if self._maps is None:
+            return rgb
+        cv2 = load_opencv()
+        mapped: npt.NDArray[np.uint8] = cv2.remap(rgb, *self._maps, cv2.INTER_LINEAR)
+        return mapped
+
+    def depth(self, depth_m: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+        """Return a depth image with the nearest readings: a mean of two surfaces lies on neither."""
+        if self._maps is None:
+            return depth_m
+        cv2 = load_opencv()
+        mapped: npt.NDArray[np.float32] = cv2.remap(depth_m, *self._maps, cv2.INTER_NEAREST)
+        return mapped
+
+
+def _first(low: Any, high: Any) -> Any:
+    return low if low is not None else high

@@ -1,0 +1,104 @@
+"""The messages of ROS that bags are read and written with, as their definitions.
+
+They are the same in every distribution, so the definitions inside a bag are not needed, and a wrong one in
+a bag cannot stop the others.  ROS 1 differs in two of them: the header has a number, and the matrices of a
+camera have capital names.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from rse_pf.errors import MissingExtra
+
+__all__ = [
+    "CAMERA_INFO",
+    "COMPRESSED_IMAGE",
+    "IMAGE",
+    "ODOMETRY",
+    "PATH",
+    "POINT_CLOUD",
+    "POSE",
+    "POSE_WITH_COVARIANCE",
+    "TF",
+    "TF_OF_ROS1",
+    "load_types",
+]
+
+IMAGE = "sensor_msgs/msg/Image"
+COMPRESSED_IMAGE = "sensor_msgs/msg/CompressedImage"
+CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
+TF = "tf2_msgs/msg/TFMessage"
+TF_OF_ROS1 = "tf/msg/tfMessage"
+POSE = "geometry_msgs/msg/PoseStamped"
+POSE_WITH_COVARIANCE = "geometry_msgs/msg/PoseWithCovarianceStamped"
+ODOMETRY = "nav_msgs/msg/Odometry"
+PATH = "nav_msgs/msg/Path"
+POINT_CLOUD = "sensor_msgs/msg/PointCloud2"
+
+_HEADER = "time stamp\nstring frame_id"
+_COMMON = {
+    "builtin_interfaces/msg/Time": "int32 sec\nuint32 nanosec",
+    "geometry_msgs/msg/Vector3": "float64 x\nfloat64 y\nfloat64 z",
+    "geometry_msgs/msg/Point": "float64 x\nfloat64 y\nfloat64 z",
+    "geometry_msgs/msg/Quaternion": "float64 x\nfloat64 y\nfloat64 z\nfloat64 w",
+    "geometry_msgs/msg/Pose": "geometry_msgs/Point position\ngeometry_msgs/Quaternion orientation",
+    "geometry_msgs/msg/Transform": "geometry_msgs/Vector3 translation\ngeometry_msgs/Quaternion rotation",
+    "geometry_msgs/msg/Twist": "geometry_msgs/Vector3 linear\ngeometry_msgs/Vector3 angular",
+    "geometry_msgs/msg/PoseWithCovariance": "geometry_msgs/Pose pose\nfloat64[36] covariance",
+    "geometry_msgs/msg/TwistWithCovariance": "geometry_msgs/Twist twist\nfloat64[36] covariance",
+    "geometry_msgs/msg/TransformStamped": (
+        "std_msgs/Header header\nstring child_frame_id\ngeometry_msgs/Transform transform"
+    ),
+    POSE: "std_msgs/Header header\ngeometry_msgs/Pose pose",
+    POSE_WITH_COVARIANCE: "std_msgs/Header header\ngeometry_msgs/PoseWithCovariance pose",
+    ODOMETRY: (
+        "std_msgs/Header header\nstring child_frame_id\ngeometry_msgs/PoseWithCovariance pose\n"
+        "geometry_msgs/TwistWithCovariance twist"
+    ),
+    PATH: "std_msgs/Header header\ngeometry_msgs/PoseStamped[] poses",
+    TF: "geometry_msgs/TransformStamped[] transforms",
+    TF_OF_ROS1: "geometry_msgs/TransformStamped[] transforms",
+    IMAGE: (
+        "std_msgs/Header header\nuint32 height\nuint32 width\nstring encoding\nuint8 is_bigendian\n"
+        "uint32 step\nuint8[] data"
+    ),
+    COMPRESSED_IMAGE: "std_msgs/Header header\nstring format\nuint8[] data",
+    "sensor_msgs/msg/RegionOfInterest": (
+        "uint32 x_offset\nuint32 y_offset\nuint32 height\nuint32 width\nbool do_rectify"
+    ),
+    "sensor_msgs/msg/PointField": "string name\nuint32 offset\nuint8 datatype\nuint32 count",
+    POINT_CLOUD: (
+        "std_msgs/Header header\nuint32 height\nuint32 width\nsensor_msgs/PointField[] fields\n"
+        "bool is_bigendian\nuint32 point_step\nuint32 row_step\nuint8[] data\nbool is_dense"
+    ),
+}
+_CAMERA = (
+    "std_msgs/Header header\nuint32 height\nuint32 width\nstring distortion_model\nfloat64[] {d}\n"
+    "float64[9] {k}\nfloat64[9] {r}\nfloat64[12] {p}\nuint32 binning_x\nuint32 binning_y\n"
+    "sensor_msgs/RegionOfInterest roi"
+)
+
+
+def load_types(*, is_ros1: bool) -> Any:
+    """Return the `rosbags` type store of these messages.
+
+    Raises:
+        MissingExtra: ``rosbags`` is not installed.
+    """
+    try:
+        from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+    except ImportError as error:
+        raise MissingExtra("rosbags", "bags") from error
+    names = {"d": "D", "k": "K", "r": "R", "p": "P"} if is_ros1 else {name: name for name in "dkrp"}
+    texts = {
+        **_COMMON,
+        "std_msgs/msg/Header": f"uint32 seq\n{_HEADER}" if is_ros1 else _HEADER,
+        CAMERA_INFO: _CAMERA.format(**names),
+    }
+    store = get_typestore(Stores.EMPTY)
+    found: dict[str, Any] = {}
+    for name, text in texts.items():
+        found.update(get_types_from_msg(text, name))
+    store.register(found)
+    return store

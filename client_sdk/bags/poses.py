@@ -1,0 +1,182 @@
+"""The true path of the camera in a bag: from a topic of poses, or composed from the transforms of tf."""
+
+from __future__ import annotations
+
+from array import array
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from client_sdk.mapping import Trajectory
+from rse_pf.geometry import Array, from_quaternion, inverse
+
+__all__ = ["PoseTopic", "TransformTree"]
+
+_MAX_GAP_NS = 200_000_000
+"""No pose is given where the nearest transforms are further apart than this."""
+_MAX_DEPTH = 64
+
+
+@dataclass(slots=True)
+class _Edge:
+    """The transforms from a child frame to its parent, in the order of the bag: 7 numbers each."""
+
+    parent: str
+    is_static: bool
+    stamps_ns: array[int] = field(default_factory=lambda: array("q"))
+    values: array[float] = field(default_factory=lambda: array("d"))
+    ordered: tuple[npt.NDArray[np.int64], Array] | None = None
+
+    def add(self, stamp_ns: int, place: Any, turn: Any) -> None:
+        numbers = (place.x, place.y, place.z, turn.x, turn.y, turn.z, turn.w)
+        norm = sum(each * each for each in numbers[3:])
+        if not np.isfinite(numbers).all() or not 0.5 < norm < 2.0:
+            return
+        if self.is_static:  # the latest one counts
+            del self.stamps_ns[:]
+            del self.values[:]
+        self.stamps_ns.append(stamp_ns)
+        self.values.extend(numbers)
+
+    def at(self, stamp_ns: int) -> Array | None:
+        """Return ``T_parent_child`` at a time, interpolated; None where there is none near it."""
+        if not self.stamps_ns:
+            return None
+        if self.ordered is None:
+            unique, rows = np.unique(np.array(self.stamps_ns, dtype=np.int64), return_index=True)
+            self.ordered = (unique, np.array(self.values, dtype=np.float64).reshape(-1, 7)[rows])
+        stamps, values = self.ordered
+        if self.is_static:
+            return _pose(values[0])
+        after = int(np.searchsorted(stamps, stamp_ns))
+        if after < len(stamps) and stamps[after] == stamp_ns:
+            return _pose(values[after])
+        if after in (0, len(stamps)) or stamps[after] - stamps[after - 1] > _MAX_GAP_NS:
+            return None
+        share = float(stamp_ns - stamps[after - 1]) / float(stamps[after] - stamps[after - 1])
+        return _pose(_between(values[after - 1], values[after], share))
+
+
+class TransformTree:
+    """The frames of tf, and the pose of one of them in the root above it."""
+
+    def __init__(self) -> None:
+        self._edges: dict[str, _Edge] = {}
+
+    def add(self, message: Any, *, is_static: bool) -> None:
+        """Add a ``TFMessage``."""
+        for each in message.transforms:
+            parent, child = each.header.frame_id.strip("/"), each.child_frame_id.strip("/")
+            edge = self._edges.get(child)
+            if edge is None or edge.parent != parent:
+                edge = self._edges[child] = _Edge(parent=parent, is_static=is_static)
+            stamp = each.header.stamp
+            stamp_ns = int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
+            edge.add(stamp_ns, each.transform.translation, each.transform.rotation)
+
+    def root_of(self, frame: str) -> tuple[str, bool]:
+        """Return the frame above all others of *frame*, and whether it moves against it."""
+        frame, moves = frame.strip("/"), False
+        for _ in range(_MAX_DEPTH):
+            edge = self._edges.get(frame)
+            if edge is None:
+                break
+            moves = moves or not edge.is_static
+            frame = edge.parent
+        return frame, moves
+
+    def pose(self, frame: str, stamp_ns: int) -> Array | None:
+        """Return ``T_root_frame`` at a time; None where it is not known."""
+        T = np.eye(4)
+        frame = frame.strip("/")
+        for _ in range(_MAX_DEPTH):
+            edge = self._edges.get(frame)
+            if edge is None:
+                return T
+            T_parent_child = edge.at(stamp_ns)
+            if T_parent_child is None:
+                return None
+            T = T_parent_child @ T
+            frame = edge.parent
+        return None
+
+    def between(self, frame: str, other: str) -> Array | None:
+        """Return ``T_frame_other`` of two frames that are fixed to each other; None if they are not."""
+        if frame.strip("/") == other.strip("/"):
+            return np.eye(4)
+        ways = [self._fixed_way(each) for each in (frame, other)]
+        for common, T_common_frame in ways[0].items():
+            if common in ways[1]:
+                return inverse(T_common_frame) @ ways[1][common]
+        return None
+
+    def path(self, frame: str, stamps_ns: Sequence[int]) -> Trajectory | None:
+        """Return the poses of *frame* in its root at these times, where they are known."""
+        return _path((stamp_ns, self.pose(frame, stamp_ns)) for stamp_ns in stamps_ns)
+
+    def _fixed_way(self, frame: str) -> dict[str, Array]:
+        frame = frame.strip("/")
+        found = {frame: np.eye(4)}
+        T = np.eye(4)
+        for _ in range(_MAX_DEPTH):
+            edge = self._edges.get(frame)
+            T_parent_child = edge.at(0) if edge is not None and edge.is_static else None
+            if edge is None or T_parent_child is None:
+                break
+            T = T_parent_child @ T
+            frame = edge.parent
+            found[frame] = T
+        return found
+
+
+class PoseTopic:
+    """The poses of one topic: ``PoseStamped``, ``PoseWithCovarianceStamped`` or ``Odometry``."""
+
+    def __init__(self) -> None:
+        self._edge = _Edge(parent="", is_static=False)
+
+    def add(self, message: Any) -> None:
+        """Add a message."""
+        pose = message.pose
+        pose = getattr(pose, "pose", pose)
+        stamp = message.header.stamp
+        stamp_ns = int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
+        self._edge.add(stamp_ns, pose.position, pose.orientation)
+
+    def path(self, stamps_ns: Sequence[int]) -> Trajectory | None:
+        """Return the poses at these times, where they are known."""
+        return _path((stamp_ns, self._edge.at(stamp_ns)) for stamp_ns in stamps_ns)
+
+
+def _path(poses: Iterable[tuple[int, Array | None]]) -> Trajectory | None:
+    """Return the poses that are known, None if they are fewer than two."""
+    found = [(stamp_ns / 1e9, T) for stamp_ns, T in poses if T is not None]
+    if len(found) < 2:
+        return None
+    return Trajectory(np.array([stamp_s for stamp_s, _ in found]), np.stack([T for _, T in found]))
+
+
+def _pose(numbers: Array) -> Array:
+    T = np.eye(4)
+    T[:3, :3] = from_quaternion(numbers[3:])
+    T[:3, 3] = numbers[:3]
+    return T
+
+
+def _between(one: Array, other: Array, share: float) -> Array:
+    """Return positions and rotations between two, the rotations on the shortest arc."""
+    mixed = (1 - share) * one + share * other
+    q0 = one[3:] / np.linalg.norm(one[3:])
+    q1 = other[3:] / np.linalg.norm(other[3:])
+    cosine = float(q0 @ q1)
+    if cosine < 0:
+        q1, cosine = -q1, -cosine
+    angle = float(np.arccos(min(cosine, 1.0)))
+    if angle < 1e-6:
+        mixed[3:] = (1 - share) * q0 + share * q1
+    else:
+        mixed[3:] = (np.sin((1 - share) * angle) * q0 + np.sin(share * angle) * q1) / np.sin(angle)
+    return mixed

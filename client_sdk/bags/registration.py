@@ -1,0 +1,52 @@
+"""Move the readings of a depth camera into the image of a colour camera."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import numpy.typing as npt
+
+from rse_pf.geometry import Array, Camera, transform
+
+__all__ = ["register_depth"]
+
+_MIN_DEPTH_M = 0.01
+
+
+def register_depth(
+    depth_m: npt.NDArray[np.float32], depth_camera: Camera, T_colour_depth: Array, colour_camera: Camera
+) -> npt.NDArray[np.float32]:
+    """Return the depth as the colour camera would see it; where two readings meet, the nearer one counts.
+
+    A reading of a coarser depth camera fills the pixels of its area.
+
+    Args:
+        depth_m: ``(h, w)`` of *depth_camera*, metres, without distortion, 0 where there is no reading.
+        depth_camera: Its camera.
+        T_colour_depth: ``(4, 4)``, from the frame of the depth camera to that of the colour camera.
+        colour_camera: The camera whose pixels are wanted.
+    """
+    rows, columns = np.nonzero(depth_m)
+    depths = depth_m[rows, columns].astype(np.float64)
+    pixels = np.stack((columns, rows), axis=1).astype(np.float64)
+    points = transform(T_colour_depth, depth_camera.back_project(pixels, depths))
+    points = points[points[:, 2] > _MIN_DEPTH_M]
+    # The nearer one is written last, so it stays.
+    points = points[np.argsort(-points[:, 2], kind="stable")]
+    found = np.zeros((colour_camera.height, colour_camera.width), dtype=np.float32)
+    spread = max(1, math.ceil(colour_camera.fx / depth_camera.fx - 1e-6))
+    corner = np.round(colour_camera.project(points) - (spread - 1) / 2).astype(np.int64)
+    for across in range(spread):
+        for down in range(spread):
+            x, y = corner[:, 0] + across, corner[:, 1] + down
+            inside = (x >= 0) & (x < colour_camera.width) & (y >= 0) & (y < colour_camera.height)
+            seen = points[inside, 2].astype(np.float32)
+            if spread == 1:
+                found[y[inside], x[inside]] = seen
+                continue
+            # Between the areas of several readings the nearer one must win, whichever came last.
+            layer = np.zeros_like(found)
+            layer[y[inside], x[inside]] = seen
+            found = np.where((found == 0) | ((layer > 0) & (layer < found)), layer, found)
+    return found
