@@ -153,8 +153,8 @@ def test_after_late_answers_the_robot_starts_at_once_and_the_cloud_wins_again_wh
     async def test():
         async with FakePlatform() as platform, connect(platform, offload=OWN_ECHO) as robot:
             platform.hold = True
-            late = await robot.call("echo", {"value": 1}, deadline_s=0.3)
-            while "cloud takes" not in (await robot.call("echo", {"value": 2}, deadline_s=0.3)).why:
+            late = await robot.call("echo", {"value": 1}, deadline_s=1.5)
+            while "cloud takes" not in (await robot.call("echo", {"value": 2}, deadline_s=1.5)).why:
                 pass
             platform.hold = False
             sources = {(await robot.call("echo", {"value": 3}, deadline_s=5)).source for _ in range(3)}
