@@ -296,11 +296,11 @@ def test_cloud_first_answers_from_the_robot_when_the_cloud_is_late_and_says_so()
         server = FakeServer(answer=answer_nothing)
         async with server.running(), connect(server, offload=client_sdk.CloudFirst()) as robot:
             answer = await robot.solve_pnp(
-                problem.points_world, problem.pixels, problem.camera, deadline_s=0.3
+                problem.points_world, problem.pixels, problem.camera, deadline_s=1.0
             )
             assert answer.source == "robot"
             assert "did not answer in time" in answer.why
-            assert answer.round_trip_ms < 400
+            assert answer.round_trip_ms < 1300
             np.testing.assert_allclose(answer.solution.T_camera_world, problem.T_camera_world, atol=0.05)
             assert robot.stats.answered_by_robot == 1
 
@@ -316,7 +316,7 @@ def test_the_robot_and_the_cloud_solve_the_same_numbers() -> None:
             args = (problem.points_world, problem.pixels, problem.camera)
             cloud = await robot.solve_pnp(*args, deadline_s=5)
             server.answer = answer_nothing
-            own = await robot.solve_pnp(*args, deadline_s=0.3)
+            own = await robot.solve_pnp(*args, deadline_s=1.0)
         assert (cloud.source, own.source) == ("cloud", "robot")
         np.testing.assert_array_equal(cloud.solution.T_camera_world, own.solution.T_camera_world)
         np.testing.assert_array_equal(cloud.solution.inliers, own.solution.inliers)
