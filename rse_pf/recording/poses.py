@@ -16,7 +16,7 @@ from typing import Any
 
 import msgspec
 
-__all__ = ["WORLD_FRAME", "answered_pose", "image", "point_cloud", "pose_in_frame"]
+__all__ = ["WORLD_FRAME", "answered_pose", "image", "inverse", "point_cloud", "pose_in_frame"]
 
 WORLD_FRAME = "world"
 """The frame of the points of a robot's commands."""
@@ -29,11 +29,19 @@ _NUMBER_BYTES = {1: 4, 3: 8}
 
 
 class _Pose(msgspec.Struct, frozen=True):
-    T_camera_world: Any = None
+    T_camera_world: list[float] | None = None
 
 
 class _PoseResult(msgspec.Struct, frozen=True):
     reply: _Pose | None = None
+
+
+class _BinaryPose(msgspec.Struct, frozen=True):
+    T_camera_world: Any = None
+
+
+class _BinaryPoseResult(msgspec.Struct, frozen=True):
+    reply: _BinaryPose | None = None
 
 
 def _numbers(kind: int, data: memoryview) -> Any:
@@ -42,7 +50,7 @@ def _numbers(kind: int, data: memoryview) -> Any:
 
 
 _from_json = msgspec.json.Decoder(_PoseResult).decode
-_from_binary = msgspec.msgpack.Decoder(_PoseResult, ext_hook=_numbers).decode
+_from_binary = msgspec.msgpack.Decoder(_BinaryPoseResult, ext_hook=_numbers).decode
 
 
 def answered_pose(text: bytes, *, is_binary: bool) -> Sequence[float] | None:
@@ -54,12 +62,10 @@ def answered_pose(text: bytes, *, is_binary: bool) -> Sequence[float] | None:
     """
     try:
         reply = (_from_binary if is_binary else _from_json)(text).reply
-    except (msgspec.DecodeError, struct.error):
+        pose: Any = None if reply is None else reply.T_camera_world
+        return pose if pose is not None and len(pose) == 16 and math.isfinite(sum(pose)) else None
+    except (msgspec.DecodeError, struct.error, TypeError):
         return None
-    pose = None if reply is None else reply.T_camera_world
-    if not isinstance(pose, list | tuple) or len(pose) != 16:
-        return None
-    return pose if all(type(each) in (float, int) and math.isfinite(each) for each in pose) else None
 
 
 def pose_in_frame(T_frame_camera: Sequence[float], time_ns: int, frame: str = WORLD_FRAME) -> dict[str, Any]:

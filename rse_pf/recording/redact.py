@@ -21,7 +21,7 @@ import msgspec
 
 from rse_pf.errors import RsePfError
 from rse_pf.identity import DEFAULT_TENANT, RobotId
-from rse_pf.wire import Codec, Welcome
+from rse_pf.wire import Codec, Welcome, make_codec
 from rse_pf.wire.envelope import peek
 
 __all__ = ["NAME_FREE_SERVICES", "ConnectionRedactor", "Kept", "Pseudonyms"]
@@ -118,6 +118,7 @@ class ConnectionRedactor:
         self._codec = codec
         self._max_bytes = max_inflated_bytes
         self._inflates = codec.name == "zlib"
+        self._text_codec = make_codec("json") if self._inflates else codec
         self._head = _binary_head if codec.name == "bin" else _json_head
         names = {robot.name: self.robot}
         if robot.tenant != DEFAULT_TENANT:
@@ -126,8 +127,7 @@ class ConnectionRedactor:
         self._names = names
         longest_first = sorted(names, key=len, reverse=True)
         self._in_text = re.compile(_either(longest_first)) if names else None
-        forms = sorted({form for name in names for form in (name, json.dumps(name)[1:-1])}, key=len)
-        self._in_bytes = re.compile(_either(reversed(forms)).encode()) if names else None
+        self._forms = [form.encode() for form in {form for name in names for form in _written(name)}]
         self._secrets = [each.encode() for each in secrets if each]
         self._open: OrderedDict[int, str] = OrderedDict()
 
@@ -135,7 +135,7 @@ class ConnectionRedactor:
         """Return what is stored of a message of the robot, None if it is left out."""
         try:
             text = self._inflated(data)
-            found = peek(self._codec, text if self._codec.name != "zlib" else data)
+            found = peek(self._text_codec, text)
             if found is not None:
                 kind, identity, service = "command", found.id, found.service
             else:
@@ -198,7 +198,7 @@ class ConnectionRedactor:
     ) -> Kept | None:
         if any(each in text for each in self._secrets):
             return None
-        if self._in_bytes is None or self._in_bytes.search(text) is None:
+        if not any(form in text for form in self._forms):
             return Kept(data, text, kind, service)
         decode = self._codec.decode_from_robot if from_robot else self._codec.decode_from_server
         message: Any = decode(data)
@@ -240,6 +240,11 @@ class ConnectionRedactor:
             return None
         changed = self._codec.encode(msgspec.structs.replace(message, robot=self.robot))
         return Kept(changed, self._inflated(changed), "welcome", "")
+
+
+def _written(name: str) -> set[str]:
+    """Return *name* as MessagePack and JSON write it."""
+    return {name, json.dumps(name)[1:-1], json.dumps(name, ensure_ascii=False)[1:-1]}
 
 
 def _either(names: Iterable[str]) -> str:

@@ -51,6 +51,7 @@ class RecordingTap:
         "_is_waiting",
         "_on_dead",
         "_rest",
+        "_rest_messages",
         "_time_ns",
         "_told",
         "_waiting_bytes",
@@ -85,6 +86,7 @@ class RecordingTap:
         self._entries: list[tuple[int, int, int, bytes]] = []
         self._waiting_bytes = 0
         self._rest = memoryview(b"")
+        self._rest_messages = 0
         self._is_waiting = False
 
     def opened(self, codec: str, robot: RobotId) -> int:
@@ -146,14 +148,16 @@ class RecordingTap:
     def _packed(self) -> bytes:
         """Return the next entries as they are in the pipe, a bounded copy of them."""
         parts: list[bytes] = []
-        size = count = 0
+        size = count = messages = 0
         for kind, connection, time_ns, data in self._entries:
             parts += (_ENTRY.pack(kind, connection, time_ns, len(data)), data)
             size += len(data)
             count += 1
+            messages += kind in (UP, DOWN)
             if size >= _COPIED_BYTES:
                 break
         del self._entries[:count]
+        self._rest_messages = messages
         if self.dropped != self._told and not self._entries:
             self._told = self.dropped
             lost = _ENTRY.pack(LOST, 0, self._time_ns(), 8) + struct.pack("<Q", self.dropped)
@@ -164,6 +168,7 @@ class RecordingTap:
     def _die(self) -> None:
         self.is_dead = True
         self.dropped += sum(kind in (UP, DOWN) for kind, _, _, _ in self._entries)
+        self.dropped += self._rest_messages  # some of which it may have got
         self._entries.clear()
         self._rest = memoryview(b"")
         self._waiting_bytes = 0

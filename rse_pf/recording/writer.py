@@ -208,7 +208,12 @@ class RecordingWriter:
         self._fd, self._path = os.open(path, flags, _OWNER_ONLY), path
         fcntl.flock(self._fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
         file = McapFile(self._fd)
-        file.begin(PROFILE, self._library, {METADATA_NAME: {**self._metadata, "number": str(self._number)}})
+        try:
+            metadata = {**self._metadata, "number": str(self._number)}
+            file.begin(PROFILE, self._library, {METADATA_NAME: metadata})
+        except OSError:
+            path.unlink(missing_ok=True)
+            raise
         self._file = file
         self.problem = ""
         self._prune(now_ns)

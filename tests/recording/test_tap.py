@@ -1,0 +1,116 @@
+"""What a worker says reaches the recorder in order, and a recorder that does not read holds nobody up."""
+
+from __future__ import annotations
+
+import json
+import os
+import struct
+from collections.abc import Callable, Iterator
+
+import pytest
+
+from rse_pf.identity import RobotId
+from rse_pf.recording.tap import (
+    CLOSED,
+    DOWN,
+    LOST,
+    OPENED,
+    UP,
+    Handed,
+    PipeReader,
+    RecordingTap,
+    recording_pipe,
+)
+
+ROBOT = RobotId("default", "robot-1")
+
+
+class Loop:
+    """Calls what is due when it is told to."""
+
+    def __init__(self) -> None:
+        self.due: list[Callable[[], None]] = []
+
+    def call_later(self, seconds: float, call: Callable[[], None]) -> None:
+        self.due.append(call)
+
+    def turn(self) -> None:
+        due, self.due = self.due, []
+        for call in due:
+            call()
+
+
+@pytest.fixture
+def pipe() -> Iterator[tuple[int, int]]:
+    ends = recording_pipe()
+    os.set_blocking(ends[0], False)
+    yield ends
+    for end in ends:
+        try:
+            os.close(end)
+        except OSError:
+            continue
+
+
+def read(fd: int, reader: PipeReader) -> list[Handed]:
+    found: list[Handed] = []
+    try:
+        while data := os.read(fd, 10_007):
+            found += reader.entries(data)
+    except BlockingIOError:
+        pass
+    return found
+
+
+def test_all_entries_arrive_in_order_with_their_times(pipe: tuple[int, int]):
+    loop, times = Loop(), iter(range(100))
+    tap = RecordingTap(pipe[1], call_later=loop.call_later, time_ns=lambda: next(times))
+
+    number = tap.opened("bin", ROBOT)
+    tap.up(number, b"asks")
+    tap.down(number, b"")
+    tap.closed(number)
+    assert len(loop.due) == 1
+    loop.turn()
+
+    found = read(pipe[0], PipeReader())
+    assert [(each.kind, each.connection, each.time_ns) for each in found] == [
+        (OPENED, 1, 0), (UP, 1, 1), (DOWN, 1, 2), (CLOSED, 1, 3),
+    ]  # fmt: skip
+    assert json.loads(found[0].data) == ["bin", *ROBOT]
+    assert [each.data for each in found[1:]] == [b"asks", b"", b""]
+
+
+def test_a_recorder_that_does_not_read_costs_messages_and_no_time(pipe: tuple[int, int]):
+    loop = Loop()
+    tap = RecordingTap(pipe[1], call_later=loop.call_later)
+    number = tap.opened("bin", ROBOT)
+
+    for _ in range(150):
+        tap.up(number, bytes(100_000))
+        loop.turn()
+    assert 0 < tap.dropped < 150
+    reader, found = PipeReader(), list[Handed]()
+    for _ in range(400):
+        found += read(pipe[0], reader)
+        loop.turn()
+
+    assert sum(each.kind == UP for each in found) == 150 - tap.dropped
+    (lost,) = [each for each in found if each.kind == LOST]
+    assert struct.unpack("<Q", lost.data) == (tap.dropped,)
+
+
+def test_a_recorder_that_died_is_told_once_and_everything_goes_on(pipe: tuple[int, int]):
+    loop, told = Loop(), list[str]()
+    tap = RecordingTap(pipe[1], call_later=loop.call_later, on_dead=lambda: told.append("dead"))
+    number = tap.opened("bin", ROBOT)
+    tap.up(number, b"x")
+    os.close(pipe[0])
+
+    loop.turn()
+    for _ in range(3):
+        tap.down(number, b"x")
+        loop.turn()
+
+    assert told == ["dead"]
+    assert (tap.is_dead, tap.dropped, loop.due) == (True, 4, [])
