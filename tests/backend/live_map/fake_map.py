@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from typing import Any, Literal
 
 import msgspec
@@ -22,6 +22,7 @@ from rse_pf.live_map.events import (
     encode_events,
     matrix_bytes,
 )
+from rse_pf.live_map.feature_parts import SnapshotParts
 from rse_pf.live_map.outcomes import Added, Alignment, Corrected, Outcome
 from rse_pf.maps.format import Keyframe, MapVersion
 
@@ -37,13 +38,15 @@ class FakeMap:
         self._state: dict[str, Any] = {"digest": "", "keyframes": [], "numbers": {}, "segments": {}}
 
     @classmethod
-    def restore(cls, snapshot: bytes) -> FakeMap:
+    def restore(cls, head: bytes, part: Callable[[str], bytes]) -> FakeMap:
         restored = cls()
-        restored._state = msgspec.msgpack.decode(snapshot)
+        restored._state = msgspec.msgpack.decode(part(head.decode()))
         return restored
 
-    def snapshot(self) -> bytes:
-        return msgspec.msgpack.encode(self._state)
+    def snapshot_parts(self, known: Collection[str] = ()) -> SnapshotParts:
+        data = msgspec.msgpack.encode(self._state)
+        name = hashlib.sha256(data).hexdigest()
+        return SnapshotParts(head=name.encode(), parts={name: None if name in known else data})
 
     def digest(self) -> str:
         return str(self._state["digest"])

@@ -177,6 +177,8 @@ def test_an_owner_whose_port_was_never_reached_keeps_its_lease() -> None:
             port = listener.getsockname()[1]
         assert elsewhere.serve("127.0.0.1", port, "c")
         sent = asyncio.ensure_future(worker.link.request(ROBOT, "live-keyframe", FIRST, 0.3))
+        await until(lambda: worker.started)
+        worker.started[0].say("ready")
         await asyncio.wait({sent})
         assert isinstance(sent.exception(), Busy)
         assert decode_lease(LEASE, worker.store.get(LEASE)).epoch == 1

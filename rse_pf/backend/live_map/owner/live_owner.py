@@ -297,14 +297,13 @@ class LiveOwner:
     async def take_entry(self, position: int, batch: list[Submitted]) -> None:
         """Apply the events of an entry that is durable, answer who waits for them, and tell what is new."""
         events = [each.event for each in batch]
-        applied, told = await self._context.threads.compute(
-            Urgency.APPLY, functools.partial(self._apply, position, events)
-        )
+        compute = self._context.threads.compute
+        applied, told = await compute(Urgency.APPLY, functools.partial(self._apply, position, events))
         self._settle(batch, applied)
         for payload in told:
             self._tell(payload)
-        if applied.snapshot is not None:
-            self._start(self._write_snapshot(applied.snapshot))
+        if self._state.is_snapshot_due:
+            self._start(self._write_snapshot(await self._snapshot()))
 
     def _apply(self, position: int, events: list[Event]) -> tuple[Applied, list[dict[str, Any]]]:
         """Apply an entry and note what to tell; in the thread of the map."""
@@ -333,6 +332,11 @@ class LiveOwner:
                 self._measuring.optimise()
             if isinstance(each.event, KeyframeAdded):
                 self._measuring.measure(outcome.id for outcome in outcomes if isinstance(outcome, Added))
+
+    async def _snapshot(self) -> MapSnapshot:
+        return await self._context.threads.compute(
+            Urgency.APPLY, functools.partial(self._state.snapshot, self._log.stored_parts)
+        )
 
     async def _write_snapshot(self, snapshot: MapSnapshot) -> None:
         try:
@@ -401,7 +405,7 @@ class LiveOwner:
         self._is_closing = True
         self._describe()
         await self._writer.wait_empty()
-        snapshot = await self._context.threads.compute(Urgency.APPLY, self._state.snapshot)
+        snapshot = await self._snapshot()
         if how == "released" and snapshot.position > self._wrote_snapshot:
             await self._write_snapshot(snapshot)
         wait_s = FIRST_RETRY_S

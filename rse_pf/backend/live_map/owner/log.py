@@ -4,24 +4,26 @@ An entry is created by compare-and-swap, so that two owners never write one numb
 number taken is the owner no longer.  Nothing is changed after it was written.  Snapshots shorten a restart;
 entries before the older one are deleted.
 
-Layout, below ``live/TENANT/MAP/``: ``log/NUMBER`` from 1 on, ``snapshot/NUMBER`` after that entry.
+Layout, below ``live/TENANT/MAP/``: ``log/NUMBER`` from 1 on, ``snapshot/NUMBER`` after that entry, and
+``features/EPOCH-SHA256``, parts that snapshots share.  An owner deletes no part of a later owner, whose snapshot
+may not be written yet.
 """
 
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
 
 import msgspec
 
 from rse_pf.errors import Conflict, NotFound, StoreError
 from rse_pf.object_store import ObjectStore, digest_of
 
-__all__ = ["SNAPSHOT_ENTRIES", "LiveLog", "LogEntry", "MapSnapshot", "OwnershipLost", "is_snapshot_due"]
+__all__ = ["LiveLog", "LogEntry", "MapSnapshot", "OwnershipLost", "snapshot_entries"]
 
-SNAPSHOT_ENTRIES = 200
-"""A snapshot is made after each entry whose number is a multiple of this: by position, never by time."""
+_LEAST_ENTRIES, _MOST_ENTRIES = 40, 200
+_ENTRIES_OF_KEYFRAME = 0.25
 _KEPT_SNAPSHOTS = 2
 
 
@@ -45,16 +47,22 @@ class LogEntry(msgspec.Struct, frozen=True, array_like=True):
 class _Stored(msgspec.Struct, frozen=True, array_like=True):
     digest: str
     unmeasured: tuple[int, ...]
-    data: bytes
+    head: bytes
+    parts: dict[str, str] = {}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MapSnapshot:
-    """The map after the entry ``position``; ``unmeasured`` are its keyframes whose links are not logged."""
+    """The map after the entry ``position``.
+
+    ``unmeasured`` are its keyframes whose links are not logged.  ``parts`` are what ``head`` needs, by name;
+    those that the store has already are None.
+    """
 
     position: int
     unmeasured: tuple[int, ...]
-    data: bytes
+    head: bytes
+    parts: Mapping[str, bytes | None] = field(default_factory=dict)
 
 
 _encode = msgspec.msgpack.Encoder().encode
@@ -62,9 +70,12 @@ _decode_entry = msgspec.msgpack.Decoder(LogEntry).decode
 _decode_snapshot = msgspec.msgpack.Decoder(_Stored).decode
 
 
-def is_snapshot_due(position: int) -> bool:
-    """Return whether a snapshot follows the entry *position*."""
-    return position % SNAPSHOT_ENTRIES == 0
+def snapshot_entries(keyframes: int) -> int:
+    """Return how many entries after a snapshot of a map of *keyframes* the next one is made.
+
+    A restart reads them again, 2 to 4 ms each, and a snapshot costs more the larger the map is.
+    """
+    return round(min(_MOST_ENTRIES, max(_LEAST_ENTRIES, _ENTRIES_OF_KEYFRAME * keyframes)))
 
 
 class LiveLog:
@@ -91,8 +102,11 @@ class LiveLog:
             keeps_all: Delete no entry.
         """
         self.position = base
+        self.stored_parts: dict[str, str] = {}
+        """The objects of the parts of the newest snapshot that was read or written, by name."""
         self._store = store
         self._entries, self._snapshots = f"{folder}log/", f"{folder}snapshot/"
+        self._parts = f"{folder}features/"
         self._owner, self._epoch = owner, epoch
         self._base = base
         self._keeps_all = keeps_all
@@ -107,10 +121,18 @@ class LiveLog:
         for name in reversed(names):
             with contextlib.suppress(NotFound, msgspec.MsgspecError):
                 stored = _decode_snapshot(self._store.get(name))
-                if digest_of(stored.data) == stored.digest:
+                if digest_of(stored.head) == stored.digest:
                     self.position = _number_of(name)
-                    yield MapSnapshot(position=self.position, unmeasured=stored.unmeasured, data=stored.data)
-        self.position = self._base
+                    self.stored_parts = stored.parts
+                    yield MapSnapshot(
+                        position=self.position, unmeasured=stored.unmeasured, head=stored.head,
+                        parts=dict.fromkeys(stored.parts),
+                    )  # fmt: skip
+        self.position, self.stored_parts = self._base, {}
+
+    def part(self, name: str) -> bytes:
+        """Return a part of the snapshot that `snapshots` yielded last; raises NotFound and StoreError."""
+        return self._store.get(f"{self._parts}{self.stored_parts.get(name, name)}")
 
     def entries(self) -> Iterator[LogEntry]:
         """Yield the entries after `position`, which follows them.
@@ -151,12 +173,23 @@ class LiveLog:
 
     def write_snapshot(self, snapshot: MapSnapshot) -> None:
         """Write a snapshot durably, and delete what a restart no longer needs; raises StoreError."""
-        stored = _Stored(digest_of(snapshot.data), snapshot.unmeasured, snapshot.data)
+        parts: dict[str, str] = {}
+        for name, data in snapshot.parts.items():
+            if data is None:
+                if name not in self.stored_parts:
+                    raise StoreError("a part of the snapshot is not stored", hint="the next one has it")
+                parts[name] = self.stored_parts[name]
+            else:
+                parts[name] = f"{self._epoch:09d}-{name}"
+                self._store.put(f"{self._parts}{parts[name]}", data)
+        stored = _Stored(digest_of(snapshot.head), snapshot.unmeasured, snapshot.head, parts)
         self._store.put(self._snapshot_name(snapshot.position), _encode(stored))
         numbers = sorted(_number_of(info.name) for info in self._store.list(self._snapshots))
         kept = [number for number in numbers if number > self._base][-_KEPT_SNAPSHOTS:]
+        self.stored_parts = parts
         for number in set(numbers) - set(kept):
             self._store.delete(self._snapshot_name(number))
+        self._delete_parts(kept)
         if len(kept) == _KEPT_SNAPSHOTS:
             self._delete_entries(kept[0])
 
@@ -166,6 +199,18 @@ class LiveLog:
             for info in list(self._store.list(prefix)):
                 if _number_of(info.name) <= number:
                     self._store.delete(info.name)
+        self._delete_parts([])
+
+    def _delete_parts(self, snapshots: list[int]) -> None:
+        """Delete the parts that none of these snapshots needs."""
+        needed: set[str] = set()
+        for number in snapshots:
+            with contextlib.suppress(NotFound, msgspec.MsgspecError):
+                needed.update(_decode_snapshot(self._store.get(self._snapshot_name(number))).parts.values())
+        for info in list(self._store.list(self._parts)):
+            name = info.name.removeprefix(self._parts)
+            if name not in needed and int(name.partition("-")[0]) <= self._epoch:
+                self._store.delete(info.name)
 
     def _delete_entries(self, until: int) -> None:
         if self._keeps_all:

@@ -8,4 +8,4 @@ from rse_pf.live_map.versions import started_from
 
 __all__ = ["LIVE_MAP"]
 
-LIVE_MAP = MapKind(empty=LiveMap, restore=LiveMap.restore, started_from=started_from)
+LIVE_MAP = MapKind(empty=LiveMap, restore=LiveMap.restore_parts, started_from=started_from)

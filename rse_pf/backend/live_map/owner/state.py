@@ -6,12 +6,12 @@ Two processes that read the same log hold the same map; `MapState.digest` shows 
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, Protocol, TypeVar
 
-from rse_pf.backend.live_map.owner.log import LiveLog, MapSnapshot, OwnershipLost, is_snapshot_due
-from rse_pf.errors import BadRequest
+from rse_pf.backend.live_map.owner.log import LiveLog, MapSnapshot, OwnershipLost, snapshot_entries
+from rse_pf.errors import BadRequest, NotFound
 from rse_pf.geometry import Camera
 from rse_pf.live_map.events import (
     Event,
@@ -24,6 +24,7 @@ from rse_pf.live_map.events import (
     decode_events,
     encode_events,
 )
+from rse_pf.live_map.feature_parts import SnapshotParts
 from rse_pf.live_map.outcomes import Added, Alignment, Outcome
 from rse_pf.maps.format import MapVersion
 
@@ -36,8 +37,8 @@ _UNCHANGING = (OwnerChanged, RobotLeft)
 class MapLogic(Protocol):
     """What the owner needs of `rse_pf.live_map.live_map.LiveMap`."""
 
-    def snapshot(self) -> bytes:
-        """Return the whole state."""
+    def snapshot_parts(self, known: Collection[str] = ()) -> SnapshotParts:
+        """Return the whole state; parts that are *known* are not made again."""
 
     def digest(self) -> str:
         """Return the digest of the whole state."""
@@ -88,20 +89,19 @@ class MapLogic(Protocol):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MapKind:
-    """How a map is made: empty, from a snapshot, and from a version of the registry."""
+    """How a map is made: empty, from the head and parts of a snapshot, and from a version of the registry."""
 
     empty: Callable[[], MapLogic]
-    restore: Callable[[bytes], MapLogic]
+    restore: Callable[[bytes, Callable[[str], bytes]], MapLogic]
     started_from: Callable[[MapVersion, str], MapStarted]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Applied:
-    """What an entry changed: outcomes and defects by event, and the snapshot that is due after it."""
+    """What an entry changed: outcomes and defects by event."""
 
     outcomes: list[list[Outcome]]
     defects: list[Exception | None]
-    snapshot: MapSnapshot | None
 
 
 class MapState:
@@ -115,6 +115,7 @@ class MapState:
         self.changes = 0
         """How many events have changed the map since this object was made."""
         self.keyframes = size_of(live_map.keyframes)
+        self._snapshot_at = position
 
     def apply(self, position: int, events: Sequence[Event]) -> Applied:
         """Change the map by the entry *position*, which is durable.
@@ -130,8 +131,7 @@ class MapState:
             defects.append(defect)
         self.position = position
         self.keyframes = size_of(self.live_map.keyframes)
-        snapshot = self.snapshot() if is_snapshot_due(position) else None
-        return Applied(outcomes=outcomes, defects=defects, snapshot=snapshot)
+        return Applied(outcomes=outcomes, defects=defects)
 
     def measuring(self, keyframe: int) -> Callable[[], LinksMeasured]:
         """Return what measures the links of a keyframe, in any thread, while the map changes.
@@ -142,10 +142,17 @@ class MapState:
         defect = LinksMeasured(keyframe=keyframe, failed={"defect": 1})
         return lambda: defect if measure is None else _guarded(measure) or defect
 
-    def snapshot(self) -> MapSnapshot:
-        """Return the snapshot after the last entry."""
+    @property
+    def is_snapshot_due(self) -> bool:
+        """Whether so many entries were applied since the last snapshot that a restart takes long."""
+        return self.position - self._snapshot_at >= snapshot_entries(self.keyframes)
+
+    def snapshot(self, known: Collection[str]) -> MapSnapshot:
+        """Return the snapshot after the last entry; parts that are *known* are stored already."""
+        self._snapshot_at = self.position
+        made = self.live_map.snapshot_parts(known)
         return MapSnapshot(
-            position=self.position, unmeasured=tuple(self.unmeasured), data=self.live_map.snapshot()
+            position=self.position, unmeasured=tuple(self.unmeasured), head=made.head, parts=made.parts
         )
 
     def digest(self) -> str:
@@ -217,6 +224,7 @@ def take_over(log: LiveLog, kind: MapKind, *, owner: str, epoch: int) -> MapStat
 def _from_snapshot(log: LiveLog, kind: MapKind) -> MapState:
     """Return the map of the newest snapshot that this version can read, or an empty one."""
     for snapshot in log.snapshots():
-        with contextlib.suppress(BadRequest):
-            return MapState(kind.restore(snapshot.data), snapshot.position, snapshot.unmeasured)
+        with contextlib.suppress(BadRequest, NotFound):
+            live_map = kind.restore(snapshot.head, log.part)
+            return MapState(live_map, snapshot.position, snapshot.unmeasured)
     return MapState(kind.empty(), log.position)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import msgspec
@@ -15,9 +16,9 @@ from rse_pf.backend.live_map.owner.link_security import (
     internal_key,
     make_token,
 )
-from rse_pf.backend.live_map.owner.log import LiveLog, MapSnapshot, OwnershipLost
+from rse_pf.backend.live_map.owner.log import LiveLog, MapSnapshot, OwnershipLost, snapshot_entries
 from rse_pf.backend.live_map.owner.requests import begins_a_map, folders_of, shown_name
-from rse_pf.backend.live_map.owner.state import restore
+from rse_pf.backend.live_map.owner.state import MapState, restore
 from rse_pf.errors import BadRequest, StoreError, Unauthorized
 from rse_pf.identity import RobotId
 from rse_pf.live_map.events import OwnerChanged, encode_events
@@ -146,17 +147,76 @@ def test_two_snapshots_are_kept_and_a_damaged_one_is_passed_over():
     for number in range(1, 7):
         log.write(b"x")
         if number % 2 == 0:
-            log.write_snapshot(MapSnapshot(position=number, unmeasured=(number,), data=b"%d" % number))
+            log.write_snapshot(MapSnapshot(position=number, unmeasured=(number,), head=b"%d" % number))
 
     restored = log_of(store)
-    assert next(restored.snapshots()) == MapSnapshot(position=6, unmeasured=(6,), data=b"6")
+    assert next(restored.snapshots()) == MapSnapshot(position=6, unmeasured=(6,), head=b"6")
     assert restored.position == 6
     newest = f"{FOLDER}snapshot/{6:012d}"
     store.put(newest, store.get(newest)[:-1] + b"7")
-    assert next(restored.snapshots()) == MapSnapshot(position=4, unmeasured=(4,), data=b"4")
+    assert next(restored.snapshots()) == MapSnapshot(position=4, unmeasured=(4,), head=b"4")
     assert len(list(restored.entries())) == 2
     numbers = [int(info.name[-12:]) for info in store.list(f"{FOLDER}log/")]
     assert numbers == [5, 6]
+
+
+def parts_in(store: MemoryStore) -> list[str]:
+    """Return epoch and name of the parts of snapshots that are stored."""
+    found = [info.name.removeprefix(f"{FOLDER}features/") for info in store.list(f"{FOLDER}features/")]
+    return [f"{int(name[:9])}{name[9:]}" for name in found]
+
+
+def test_snapshots_share_their_parts_and_none_is_kept_that_no_snapshot_needs():
+    store = MemoryStore()
+    log = log_of(store)
+
+    def write(position: int, **parts: bytes | None) -> list[str]:
+        log.write(b"x")
+        log.write_snapshot(MapSnapshot(position=position, unmeasured=(), head=b"h", parts=parts))
+        return parts_in(store)
+
+    assert write(1, a=b"1", b=b"2") == ["1-a", "1-b"]
+    assert set(log.stored_parts) == {"a", "b"}
+    assert write(2, a=None, c=b"3") == ["1-a", "1-b", "1-c"]
+    assert write(3, a=None, d=b"4") == ["1-a", "1-c", "1-d"]
+    assert next(log_of(store).snapshots()).parts == {"a": None, "d": None}
+    log.delete_until(3)
+    assert list(store.list(FOLDER)) == []
+
+
+def test_an_old_owner_that_wakes_up_deletes_no_part_of_a_snapshot_that_the_new_one_is_writing():
+    store = MemoryStore()
+    old = log_of(store, 1)
+    old.write_snapshot(MapSnapshot(position=1, unmeasured=(), head=b"h", parts={"a": b"1", "b": b"2"}))
+    new = log_of(store, 2)
+    next(new.snapshots())
+    half = MapSnapshot(position=2, unmeasured=(), head=b"h", parts={"a": None, "c": b"3"})
+    store.put(f"{FOLDER}features/{2:09d}-c", b"3")  # the part of it, but not yet the snapshot
+
+    old.write_snapshot(MapSnapshot(position=2, unmeasured=(), head=b"o", parts={"a": None, "d": b"4"}))
+    old.write_snapshot(MapSnapshot(position=3, unmeasured=(), head=b"o", parts={"a": None, "d": None}))
+
+    assert parts_in(store) == ["1-a", "1-d", "2-c"]
+    new.write_snapshot(half)
+
+
+def test_a_snapshot_whose_part_is_missing_is_passed_over():
+    store = MemoryStore()
+    log, state = log_of(store, keeps_all=True), MapState(FAKE_MAP.empty(), 0)
+    change = [OwnerChanged(owner="a", epoch=1)]
+    newest = ""
+    for _ in range(2):
+        state.apply(log.write(encode_events(change)), change)
+        log.write_snapshot(state.snapshot(log.stored_parts))
+        (newest,) = log.stored_parts.values()
+    assert restore(log_of(store), FAKE_MAP).digest() == state.digest()
+    store.delete(f"{FOLDER}features/{newest}")
+
+    assert restore(log_of(store), FAKE_MAP).digest() == state.digest()
+
+
+def test_a_small_map_has_a_snapshot_after_40_entries_and_a_large_one_after_200():
+    assert [snapshot_entries(keyframes) for keyframes in (0, 100, 400, 10_000)] == [40, 40, 100, 200]
 
 
 def test_a_snapshot_that_this_version_cannot_read_costs_time_and_no_map():
@@ -164,9 +224,9 @@ def test_a_snapshot_that_this_version_cannot_read_costs_time_and_no_map():
     log = log_of(store, keeps_all=True)
     for number in range(1, 5):
         log.write(encode_events([OwnerChanged(owner="a", epoch=number)]))
-    log.write_snapshot(MapSnapshot(position=4, unmeasured=(), data=b"of another version"))
+    log.write_snapshot(MapSnapshot(position=4, unmeasured=(), head=b"of another version"))
 
-    def refuse(data: bytes) -> FakeMap:
+    def refuse(head: bytes, part: Callable[[str], bytes]) -> FakeMap:
         raise BadRequest("of another version")
 
     kind = replace(FAKE_MAP, restore=refuse)
@@ -181,7 +241,7 @@ def test_a_log_that_experiments_replay_keeps_all_entries():
     log = log_of(store, keeps_all=True)
     for number in range(1, 7):
         log.write(b"x")
-        log.write_snapshot(MapSnapshot(position=number, unmeasured=(), data=b""))
+        log.write_snapshot(MapSnapshot(position=number, unmeasured=(), head=b""))
 
     assert len(list(store.list(f"{FOLDER}log/"))) == 6
     assert len(list(store.list(f"{FOLDER}snapshot/"))) == 2
