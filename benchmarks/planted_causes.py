@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from client_sdk.datasets import open_dataset
-from client_sdk.frontend import Frame, FrontEndOptions, extract, load_opencv, match
+from client_sdk.frontend import Features, Frame, FrontEndOptions, extract, load_opencv, match
 from client_sdk.simulator import RATE_HZ, render_frames, true_trajectory
 from rse_pf.errors import RsePfError
 from rse_pf.geometry import Array, Camera, exp_se3, inverse, pose_difference, transform
@@ -40,6 +40,8 @@ class Sequence:
     frames: tuple[Frame, ...]
     T_world_camera: Array
     period_s: float
+    features: tuple[Features, ...]
+    thumbnails: tuple[bytes, ...]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -77,10 +79,7 @@ def rendered(seed: int) -> Sequence:
     robot, count = int(rng.integers(0, robots)), FRAMES * stride
     frames = list(render_frames(robot, robots, count, seed))[::stride]
     poses = true_trajectory(robot, robots, count, seed).T_world_camera[::stride]
-    return Sequence(
-        name=f"rendered {seed}", frames=tuple(frames), T_world_camera=np.asarray(poses),
-        period_s=stride / RATE_HZ,
-    )  # fmt: skip
+    return _sequence(f"rendered {seed}", tuple(frames), np.asarray(poses), stride / RATE_HZ)
 
 
 def recorded(folder: Path, seed: int, *, share: tuple[float, float]) -> Sequence:
@@ -95,10 +94,16 @@ def recorded(folder: Path, seed: int, *, share: tuple[float, float]) -> Sequence
     known = np.asarray(dataset.truth.timestamps_s)
     frames = tuple(dataset.read(row) for row in rows)
     nearest = [int(np.argmin(np.abs(known - frame.timestamp_s))) for frame in frames]
+    poses = np.asarray(dataset.truth.T_world_camera)[nearest]
+    period_s = float(np.median(np.diff([frame.timestamp_s for frame in frames])))
+    return _sequence(f"{folder.name} {start}+{stride}", frames, poses, period_s)
+
+
+def _sequence(name: str, frames: tuple[Frame, ...], T_world_camera: Array, period_s: float) -> Sequence:
     return Sequence(
-        name=f"{folder.name} {start}+{stride}", frames=frames,
-        T_world_camera=np.asarray(dataset.truth.T_world_camera)[nearest],
-        period_s=float(np.median(np.diff([frame.timestamp_s for frame in frames]))),
+        name=name, frames=frames, T_world_camera=T_world_camera, period_s=period_s,
+        features=tuple(extract(frame, _OPTIONS) for frame in frames),
+        thumbnails=tuple(map(_thumbnail, frames)),
     )  # fmt: skip
 
 
@@ -133,8 +138,10 @@ class _Recorder:
         sequence, rng = self.sequence, self.rng
         last = len(sequence.frames) - 1
         plant = _Plant(cause, severity, rng, self.is_pair)
-        frames = [*sequence.frames[:-1], plant.frame(sequence.frames[-1])]
-        features = [extract(frame, _OPTIONS) for frame in frames]
+        features, thumbnails = list(sequence.features), list(sequence.thumbnails)
+        if cause is Cause.BLUR:
+            blurred = plant.blurred(sequence.frames[-1])
+            features[-1], thumbnails[-1] = extract(blurred, _OPTIONS), _thumbnail(blurred)
         odometry = self._odometry()
         history: list[PastCommand] = []
         first_s = float(rng.uniform(1e3, 1e5))
@@ -146,7 +153,7 @@ class _Recorder:
             query = plant.query(query, is_last=k == last)
             reply = _answer(query)
             sent_s = first_s + k * sequence.period_s + float(rng.uniform(0.005, 0.04))
-            thumbnail = _thumbnail(frames[k])
+            thumbnail = thumbnails[k]
             if k < last:
                 history.append(PastCommand(
                     sent_s=sent_s, T_camera_world=None if reply is None else reply.T_camera_world,
@@ -234,10 +241,8 @@ class _Plant:
         elif cause is Cause.LATE:
             self.kind = str(rng.choice(["answer", "frame", "clock ahead"]))
 
-    def frame(self, frame: Frame) -> Frame:
-        """Return the last frame, blurred where that is planted."""
-        if self.cause is not Cause.BLUR:
-            return frame
+    def blurred(self, frame: Frame) -> Frame:
+        """Return the frame, blurred by a motion or out of focus."""
         cv2 = load_opencv()
         if self.kind == "focus":
             rgb = cv2.GaussianBlur(frame.rgb, (0, 0), (3.0, 5.0, 8.0)[self.level])

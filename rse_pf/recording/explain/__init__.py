@@ -4,6 +4,6 @@ Nothing is read, written or drawn here; the same input gives the same explanatio
 """
 
 from rse_pf.recording.explain.causes import Cause, Explanation, MatchesLike, PastCommand, ReplyLike, Timing
-from rse_pf.recording.explain.explain import explain
+from rse_pf.recording.explain.ranking import explain
 
 __all__ = ["Cause", "Explanation", "MatchesLike", "PastCommand", "ReplyLike", "Timing", "explain"]

@@ -8,6 +8,7 @@ __all__ = ["late"]
 
 _DEFAULT_PERIOD_S = 0.2
 _PERIODS = 1.25
+_LEAST_ALLOWED_S = 0.1
 # A robot's clock may differ from itself by this much between two threads that stamp.
 _EARLY_S = 0.005
 
@@ -17,7 +18,7 @@ def late(timing: Timing | None) -> tuple[Explanation | None, tuple[str, ...]]:
     if timing is None:
         return None, ("times (they would show a late frame or a late answer)",)
     missing = []
-    allowed_s = _PERIODS * (timing.period_s or _DEFAULT_PERIOD_S)
+    allowed_s = max(_LEAST_ALLOWED_S, _PERIODS * (timing.period_s or _DEFAULT_PERIOD_S))
     found: list[tuple[float, str, dict[str, float]]] = []
     if timing.sent_s is None:
         missing.append("the time of sending (it would show a late frame or a late answer)")

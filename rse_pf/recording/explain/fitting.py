@@ -16,7 +16,18 @@ from rse_pf.pnp import PnpOptions, PnpSolution, solve_pnp, usable_engine
 from rse_pf.pnp.engines import engine_for
 from rse_pf.pnp.evidence import log10_false_alarms
 
-__all__ = ["Fit", "Mask", "Matches", "errors_px", "fit_of", "fitted", "is_chance", "refined", "solved"]
+__all__ = [
+    "Fit",
+    "Mask",
+    "Matches",
+    "errors_px",
+    "fit_of",
+    "fitted",
+    "is_chance",
+    "refined",
+    "robust_cost",
+    "solved",
+]
 
 _LAST_ROW = np.array([[0.0, 0.0, 0.0, 1.0]])
 _NEAR_M = 1e-6
@@ -91,13 +102,16 @@ def fit_of(T_camera_world: Array, matches: Matches) -> Fit:
     return Fit(T_camera_world=T_camera_world, errors_px=errors, agrees=errors <= matches.tight_px)
 
 
-def fitted(matches: Matches, *, iterations: int = _ITERATIONS, start: Array | None = None) -> Fit | None:
+def fitted(
+    matches: Matches, *, iterations: int = _ITERATIONS, start: Array | None = None, polish: bool = False
+) -> Fit | None:
     """Return the pose that most matches agree with, None if there is none.
 
     Args:
         matches: Rows of any quality.
         iterations: The most that RANSAC takes.
         start: A pose that is a candidate, too.
+        polish: Whether each pose is refined by all matches, which takes 1 ms.
     """
     poses = [] if start is None else [start]
     if len(matches) >= 4:
@@ -111,9 +125,10 @@ def fitted(matches: Matches, *, iterations: int = _ITERATIONS, start: Array | No
             poses.append(np.vstack([found, _LAST_ROW]))
     best: Fit | None = None
     for pose in poses:
-        fit = fit_of(pose, matches)
-        better = fit_of(refined(pose, matches), matches)
-        for each in (fit, better):
+        tried = [fit_of(pose, matches)]
+        if polish:
+            tried.append(fit_of(refined(pose, matches), matches))
+        for each in tried:
             if best is None or each.count > best.count:
                 best = each
     return best
@@ -148,6 +163,13 @@ def refined(T_camera_world: Array, matches: Matches) -> Array:
         if float(np.abs(step).max()) < 1e-6:
             break
     return pose
+
+
+def robust_cost(matches: Matches, fit: Fit) -> float:
+    """Return the sum of Cauchy losses of all errors, px^2; beyond 50 px all errors are alike."""
+    limit2 = matches.tight_px**2
+    errors = np.minimum(fit.errors_px, 50.0)
+    return float(limit2 * np.log1p(errors * errors / limit2).sum())
 
 
 def is_chance(n: int, count: int, tight_px: float, camera: Camera) -> bool:

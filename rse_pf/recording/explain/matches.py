@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
 
 from rse_pf.geometry import Array, pose_difference, transform
 from rse_pf.recording.explain.causes import Cause, Explanation
-from rse_pf.recording.explain.fitting import Fit, Matches, fitted, is_chance
+from rse_pf.recording.explain.fitting import Fit, Matches, fitted, is_chance, robust_cost
 
 __all__ = ["distinct_rows", "duplicates", "mirrored", "outliers", "plane", "stale_map"]
 
@@ -18,6 +19,11 @@ _CELL_PX, _CELL_M = 0.5, 0.005
 _COPIES = 0.35
 _LEAST = 12
 _RIGHT_SHARE = 0.5
+# Log likelihood that the reflected world must gain.
+_REFLECTION_GAIN = 100.0
+# Deviation of the position above which a plane is called a cause.
+_LOOSE_M = 0.015
+_LEAST_SHIFT_M = 0.015
 
 
 def distinct_rows(matches: Matches) -> npt.NDArray[np.intp]:
@@ -54,25 +60,28 @@ def duplicates(n: int, distinct: int, inliers: int) -> Explanation | None:
     )
 
 
-def mirrored(matches: Matches, base: int) -> Explanation | None:
-    """Return the explanation where far more points agree after a reflection; *base* agree as they are."""
-    reflected = Matches(
-        points=-matches.points, pixels=matches.pixels, camera=matches.camera, inlier_px=matches.inlier_px,
-        tight_px=matches.tight_px, depths_m=None, left_out=0,
-    )  # fmt: skip
-    fit = fitted(reflected, iterations=1000)
-    if fit is None or fit.count < 1.6 * base or fit.count < _LEAST:
+def mirrored(matches: Matches, base: Fit | None) -> Explanation | None:
+    """Return the explanation where the points fit clearly better after a reflection than as they are."""
+    reflected = replace(matches, points=-matches.points)
+    fit = fitted(reflected, iterations=1000, polish=True)
+    if fit is None or fit.count < _LEAST:
         return None
-    if is_chance(len(matches), fit.count, matches.tight_px, matches.camera):
+    count = 0 if base is None else base.count
+    if is_chance(len(matches), fit.count, matches.tight_px, matches.camera) or fit.count <= count:
+        return None
+    # A plane seen through a mirror is a plane again: there, only the errors tell the two apart.
+    variance = max(1.0, float(np.mean(fit.errors_px[fit.agrees] ** 2)))
+    gain = math.inf if base is None else (robust_cost(matches, base) - robust_cost(matches, fit)) / variance
+    if fit.count < 1.6 * count and gain < _REFLECTION_GAIN:
         return None
     return Explanation(
         cause=Cause.MIRRORED,
         confidence=0.9 + 0.08 * fit.count / len(matches),
         sentence=(
-            f"{fit.count} of {len(matches)} matches agree when the world is mirrored, and only {base} as it "
+            f"{fit.count} of {len(matches)} matches agree when the world is mirrored, and only {count} as it "
             "is: one axis of the points, the sign of the depth or the image is reversed"
         ),
-        evidence={"inliers_mirrored": float(fit.count), "inliers": float(base)},
+        evidence={"inliers_mirrored": float(fit.count), "inliers": float(count)},
     )
 
 
@@ -101,7 +110,7 @@ def plane(matches: Matches, base: Fit, weakness: str, deviation_m: float) -> Exp
     geometric = weakness in (
         "ambiguous", "nearly-collinear", "poorly-constrained", "clustered", "degenerate_geometry",
     )  # fmt: skip
-    if not (geometric or deviation_m > 0.02):
+    if not (geometric or deviation_m > _LOOSE_M):
         return None
     where = "on one line or in one spot of the image" if small else "in one plane"
     return Explanation(
@@ -140,7 +149,7 @@ def stale_map(matches: Matches, base: Fit) -> tuple[Explanation, int] | None:
     rest = matches.of(~base.agrees)
     if base.count < _LEAST or len(rest) < _LEAST:
         return None
-    second = fitted(rest, iterations=1000)
+    second = fitted(rest, iterations=1000, polish=True)
     least = max(_LEAST, 0.3 * len(rest), 0.08 * len(matches))
     if second is None or second.count < least:
         return None
@@ -151,7 +160,7 @@ def stale_map(matches: Matches, base: Fit) -> tuple[Explanation, int] | None:
     moved_points = rest.points[second.agrees]
     shift_m = _median_shift(moved_points, base.T_camera_world, second.T_camera_world)
     apart = _apart(first, moved_points)
-    if shift_m < 0.015:
+    if shift_m < _LEAST_SHIFT_M:
         return None
     share = second.count / (second.count + base.count)
     found = Explanation(

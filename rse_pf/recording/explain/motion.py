@@ -14,7 +14,11 @@ from rse_pf.recording.explain.fitting import Fit, Matches
 
 __all__ = ["depth_against_map", "motion_against_odometry"]
 
-_LEAST_SCALE = 0.10
+# Least change of the scale (log), least factor, and by how many deviations it must differ from 1.
+_LEAST_SCALE, _LEAST_FACTOR, _CERTAIN = 0.10, 0.05, 4.0
+# Noise of a step, metres, however well few steps fit.
+_LEAST_NOISE_M = 0.005
+_TURN_NOISE_DEG = 0.3
 _LEAST_MOTION_M, _LEAST_TURN_DEG = 0.015, 1.0
 _STEPS = 10
 
@@ -67,26 +71,28 @@ def motion_against_odometry(
     moving = np.linalg.norm(by_odom, axis=1) > _LEAST_MOTION_M
     if not moving.any():
         return None, ("a motion of the robot (it stood still, so scale cannot be seen)",)
-    scale, spread = _scale(by_pose[moving], by_odom[moving])
+    scale, deviation = _scale(by_pose[moving], by_odom[moving])
     turns = np.array([[rotation_angle_deg(step[k][:3, :3]) for k in (0, 1)] for step in steps])
     turning = turns[:, 1] > _LEAST_TURN_DEG
     turn_scale = float(turns[turning, 0].sum() / turns[turning, 1].sum()) if turning.any() else 1.0
     count = int(np.count_nonzero(moving))
-    if abs(math.log(max(scale, 1e-3))) < _LEAST_SCALE or abs(scale - 1.0) < 2.5 * spread / math.sqrt(count):
+    differs = scale > _LEAST_FACTOR and abs(math.log(scale)) > _LEAST_SCALE
+    if not differs or abs(scale - 1.0) < _CERTAIN * deviation:
         return None, ()
-    if turning.any() and abs(turn_scale - 1.0) > 0.5 * abs(scale - 1.0):
+    turn_deviation = _TURN_NOISE_DEG * math.sqrt(count) / max(1e-9, float(turns[turning, 1].sum()))
+    if abs(turn_scale - 1.0) > max(0.5 * abs(scale - 1.0), 3.0 * turn_deviation):
         return None, ()
     moved_m, odom_m = (float(np.linalg.norm(each[moving], axis=1).sum()) for each in (by_pose, by_odom))
     return Explanation(
         cause=Cause.DEPTH_SCALE,
-        confidence=min(0.93, 0.7 + 0.5 * abs(math.log(max(scale, 1e-3)))),
+        confidence=min(0.93, 0.7 + 0.5 * abs(math.log(scale))),
         sentence=(
             f"over {count} step(s), the poses moved {moved_m:.2f} m where the odometry moved {odom_m:.2f} m: "
             f"{scale:.2f} times as far along the same way, while turns agree: the depth scale is wrong by "
             "that factor"
         ),
         evidence={
-            "scale": scale, "scale_spread": spread, "steps": float(count), "turn_scale": turn_scale,
+            "scale": scale, "scale_deviation": deviation, "steps": float(count), "turn_scale": turn_scale,
             "moved_by_poses_m": moved_m, "moved_by_odometry_m": odom_m,
         },
     ), ()  # fmt: skip
@@ -111,9 +117,9 @@ def _steps(
 
 
 def _scale(by_pose: Array, by_odom: Array) -> tuple[float, float]:
-    """Return the factor from odometry to poses along the odometry's way, robust, and its spread per step."""
-    lengths = np.linalg.norm(by_odom, axis=1)
-    along = (by_pose * by_odom).sum(axis=1) / lengths**2
-    scale = float(np.median(along))
-    aside = np.linalg.norm(by_pose - scale * by_odom, axis=1) / lengths
-    return scale, float(np.median(aside))
+    """Return the factor from odometry to poses by least squares, and its standard deviation."""
+    length2 = float(np.vdot(by_odom, by_odom))
+    scale = float(np.vdot(by_pose, by_odom)) / length2
+    rest = by_pose - scale * by_odom
+    variance = float(np.vdot(rest, rest)) / max(1, rest.size - 1)
+    return scale, max(math.sqrt(variance), _LEAST_NOISE_M) / math.sqrt(length2)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 import numpy.typing as npt
@@ -14,9 +14,10 @@ from rse_pf.recording.explain.fitting import Fit, Mask, Matches, fit_of, fitted,
 __all__ = ["row_order"]
 
 _SHIFTS = (1, -1, 2, -2, 3, -3)
-_LEAST, _LEAST_SHARE = 12, 0.35
+_LEAST, _LEAST_SHARE, _CLEAR_SHARE = 12, 0.35, 0.6
 _WINDOWS_PX = (40.0, 20.0, 10.0)
 _BIN_PX = 12.0
+_VOTERS = 100
 Rows = npt.NDArray[np.intp]
 
 
@@ -34,7 +35,7 @@ def row_order(matches: Matches, base: Fit | None, priors: Sequence[Array]) -> tu
         found = _found_elsewhere(matches, fit)
         if best is None or found > best[0]:
             best = (found, fit, how)
-        if best[0] > 0.8 * len(matches):
+        if found > max(_LEAST, _CLEAR_SHARE * np.count_nonzero(~fit.agrees)):
             break
     if best is None:
         return None
@@ -63,24 +64,22 @@ def row_order(matches: Matches, base: Fit | None, priors: Sequence[Array]) -> tu
     ), int(own + found)  # fmt: skip
 
 
-def _candidates(matches: Matches, base: Fit | None, priors: Sequence[Array]) -> list[tuple[Fit, str]]:
-    """Return poses under which the sets may agree, each with how it was found."""
+def _candidates(matches: Matches, base: Fit | None, priors: Sequence[Array]) -> Iterator[tuple[Fit, str]]:
+    """Yield poses under which the sets may agree, each with how it was found, cheap ones first."""
     n = len(matches)
-    fits: list[tuple[Fit, str]] = []
     if base is not None and not is_chance(n, base.count, matches.tight_px, matches.camera):
-        fits.append((base, "the other rows give the pose"))
+        yield base, "the other rows give the pose"
     rows = np.arange(n)
     orders = [(np.roll(rows, -shift), f"shifted by {shift}") for shift in _SHIFTS]
     orders.append((rows[::-1], "in reverse order"))
     for order, how in orders:
         fit = fitted(_reordered(matches, order), iterations=150)
         if fit is not None and not is_chance(n, fit.count, matches.tight_px, matches.camera):
-            fits.append((fit_of(fit.T_camera_world, matches), how))
+            yield fit_of(fit.T_camera_world, matches), how
     for prior in priors:
         fit = _aligned_sets(matches, prior)
         if fit is not None:
-            fits.append((fit, "the robot's past gives the pose"))
-    return fits
+            yield fit, "the robot's past gives the pose"
 
 
 def _reordered(matches: Matches, order: Rows) -> Matches:
@@ -164,7 +163,7 @@ def _aligned_sets(matches: Matches, prior: Array) -> Fit | None:
             inlier_px=matches.inlier_px, tight_px=max(matches.tight_px, window_px / 4.0), depths_m=None,
             left_out=0,
         )  # fmt: skip
-        found = fitted(paired, iterations=300)
+        found = fitted(paired, polish=window_px < 15.0)
         if found is None:
             return None
         fit = fit_of(found.T_camera_world, matches)
@@ -174,7 +173,8 @@ def _aligned_sets(matches: Matches, prior: Array) -> Fit | None:
 
 def _most_common_offset(first: Array, second: Array) -> Array:
     """Return the offset (pixels) from *first* to *second* that most pairs share."""
-    differences = (second[None] - first[:, None]).reshape(-1, 2)
+    some = first[:: max(1, len(first) // _VOTERS)]
+    differences = (second[None] - some[:, None]).reshape(-1, 2)
     near = np.abs(differences).max(axis=1) < 160.0
     cells = np.floor(differences[near] / _BIN_PX).astype(np.int64) + 20
     if not len(cells):

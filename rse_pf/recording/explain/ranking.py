@@ -37,6 +37,11 @@ _TIGHT_PX = 3.0
 _USUAL_WIDTH_PX = 640.0
 _MAX_ROWS = 1000
 _MAX_ABS = 1e6
+_MAX_THUMBNAILS = 5
+# Share of agreeing rows above which nothing but another camera is looked for in them.
+_HEALTHY_SHARE = 0.9
+# A wrong camera scatters the rows, and what is left of them may well lie in one plane.
+_BEHIND_CAMERA = 0.7
 
 
 def explain(
@@ -66,7 +71,7 @@ def explain(
     missing: list[str] = []
     found_late, lacks = late(timing)
     missing += lacks
-    thumbnails = [each.thumbnail for each in history if each.thumbnail is not None]
+    thumbnails = [each.thumbnail for each in history if each.thumbnail is not None][-_MAX_THUMBNAILS:]
     usual = [each.matches for each in history if each.matches]
     usual_matches = float(np.median(usual)) if usual else None
     found_blur, lacks = blur(thumbnail, thumbnails, len(rows), usual_matches)
@@ -114,27 +119,30 @@ def _by_matches(
     """Return what the matches and the motion show, and what was missing for it."""
     distinct = rows.of(distinct_rows(rows))
     start = None if reply is None else np.asarray(reply.T_camera_world, dtype=np.float64).reshape(4, 4)
-    base = fitted(distinct, iterations=1000, start=start)
+    base = fitted(distinct, iterations=1000, start=start, polish=True)
     count = 0 if base is None else base.count
     is_pair = rows.depths_m is not None or _seen_from_origin(distinct)
     found: list[Explanation | None] = [duplicates(len(rows), len(distinct), count)]
-    bad = count < 0.9 * len(distinct)
-    if bad:
-        reflected = mirrored(distinct, count)
-        if reflected is not None:
-            return [each for each in (*found, reflected) if each is not None], ()
+    reflected = mirrored(distinct, base)
+    if reflected is not None:
+        return [each for each in (*found, reflected) if each is not None], ()
+    if count < _HEALTHY_SHARE * len(distinct):
         found += _rivals(distinct, base, history, is_pair=is_pair)
     elif base is not None:
         freed = intrinsics(distinct, base, is_pair=is_pair)
         found.append(None if freed is None else freed[0])
+    other_camera = any(each is not None and each.cause is Cause.INTRINSICS for each in found)
     lacks: tuple[str, ...] = ()
     if base is not None:
         weakness, deviation_m = _weakness(rows, options, reply)
-        found.append(plane(distinct, base, weakness, deviation_m))
-        found.append(depth_against_map(distinct, base))
+        flat = plane(distinct, base, weakness, deviation_m)
+        if flat is not None and other_camera:
+            flat = replace(flat, confidence=_BEHIND_CAMERA * flat.confidence)
+        found.append(flat)
         pose = base.T_camera_world if start is None else start
         moved, lacks = motion_against_odometry(pose, T_odom_camera, history, is_pair=is_pair)
-        found.append(moved)
+        if not other_camera:  # which moves the camera along its axis, too
+            found += [moved, depth_against_map(distinct, base)]
     return [each for each in found if each is not None], lacks
 
 
@@ -190,7 +198,7 @@ def _nothing_found(rows: Matches, reply: ReplyLike | None) -> Explanation:
     n = len(rows)
     evidence = {"matches": float(n)}
     if reply is None:
-        text = f"{n} matches gave no pose, and no known cause explains it"
+        text = f"{n} matches gave no answer, and no known cause explains it"
         return Explanation(cause=Cause.UNKNOWN, confidence=0.3, sentence=text, evidence=evidence)
     inliers = int(np.asarray(reply.inliers).size)
     evidence |= {"inliers": float(inliers), "rmse_px": float(reply.rmse_px)}
