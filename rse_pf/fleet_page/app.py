@@ -35,7 +35,7 @@ _HEADERS = (
     (b"cross-origin-resource-policy", b"same-origin"),
 )
 _MAX_BODY_BYTES = 4096
-_TOPICS = frozenset(("fleet", "history", "robots", "event", "pose", "link", "cloud"))
+_TOPICS = frozenset(("fleet", "history", "robots", "event", "pose", "link", "maps"))
 _LIVE = "live/"
 _STATUS = {"unauthorized": 401, "forbidden": 403, "not-found": 404, "limit-exceeded": 413, "busy": 503}
 

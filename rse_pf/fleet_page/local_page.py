@@ -7,9 +7,12 @@ from pathlib import Path
 
 from rse_pf.errors import NotFound
 from rse_pf.fleet_page.app import PageActions
+from rse_pf.fleet_page.clouds import MapPages
+from rse_pf.fleet_page.feeds.live_feed import LiveFeed
+from rse_pf.fleet_page.feeds.platform_feed import LocalFeed
 from rse_pf.fleet_page.hub import Hub
 from rse_pf.fleet_page.operations import LocalOperations
-from rse_pf.fleet_page.platform_feed import LocalFeed
+from rse_pf.fleet_page.replays import Replays
 from rse_pf.fleet_page.server import ANNOUNCEMENT, listen, serve_page
 from rse_pf.local.state import control_token_file
 from rse_pf.terminal import show_json
@@ -20,17 +23,28 @@ __all__ = ["serve_local_page"]
 def serve_local_page(folder: Path, *, port: int) -> int:
     """Serve the page of the platform in *folder* until a signal; return the exit code."""
     hub = Hub()
-    feed = LocalFeed(hub, folder)
+    feed, live = LocalFeed(hub, folder), LiveFeed(hub, folder)
+    maps, replays = MapPages(folder), Replays(folder)
 
     async def page(name: str, query: Mapping[str, str]) -> tuple[str, bytes]:
+        if name == "maps":
+            return await maps.maps()
+        if name == "cloud":
+            return await maps.cloud(query)
+        if name == "replay":
+            return await replays.page(query)
         raise NotFound(f"there is no page {name[:40]!r}", hint="open /")
 
-    return serve_page(
-        hub,
-        PageActions(operate=LocalOperations(folder).operate, page=page),
-        listening=listen(port),
-        works=lambda: [feed.run()],
-        token_file=control_token_file(folder),
-        announce=folder / ANNOUNCEMENT,
-        ready=lambda url: show_json({"url": url}),
-    )
+    try:
+        return serve_page(
+            hub,
+            PageActions(operate=LocalOperations(folder).operate, page=page),
+            listening=listen(port),
+            works=lambda: [feed.run(), live.run()],
+            token_file=control_token_file(folder),
+            announce=folder / ANNOUNCEMENT,
+            ready=lambda url: show_json({"url": url}),
+        )
+    finally:
+        maps.close()
+        replays.close()

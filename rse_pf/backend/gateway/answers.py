@@ -124,17 +124,18 @@ class Answers:
         connection.answer(answer.data)
         connection.commands += 1
         connection.last_result = code
-        if code in _FREQUENT and not self._logs_frequent:
+        weak = _weakness(message)  # is logged as a failure is: an operator wants to know which poses are bad
+        if code in _FREQUENT and not weak and not self._logs_frequent:
             return
         log = self._context.log
-        level, write = ("debug", log.debug) if code in _FREQUENT else ("info", log.info)
+        level, write = ("debug", log.debug) if code in _FREQUENT and not weak else ("info", log.info)
         if log.writes(level):
             write(
                 "command", robot=queued.robot, service=service, id=queued.command.id,
                 trace=queued.command.trace, code=code,
                 queue_ms=round((queued.started_s or now) * 1e3 - queued.received_s * 1e3, 3),
                 compute_ms=round(message.compute_ms, 3) if isinstance(message, Result) else 0.0,
-                bytes_in=queued.size_bytes, bytes_out=len(answer.data),
+                bytes_in=queued.size_bytes, bytes_out=len(answer.data), **weak,
             )  # fmt: skip
 
     def send_message(self, queued: QueuedCommand, message: Result | Failure) -> None:
@@ -221,3 +222,11 @@ class Answers:
         self._context.log.error(
             "defect", service=command.service, id=command.id, trace=command.trace, traceback=text
         )
+
+
+def _weakness(message: Result | Failure) -> dict[str, str]:
+    """Return what the log says of a weak pose; empty for every other answer."""
+    reply = message.reply if isinstance(message, Result) else None
+    if getattr(reply, "verdict", "") != "weak":
+        return {}
+    return {"verdict": "weak", "reason": str(getattr(reply, "reason", ""))}

@@ -8,7 +8,7 @@ import { posesView } from "./poses.js";
 import { becomeOperator, follow, forget, isOperator, openSession } from "./session.js";
 
 const VIEWS = ["fleet", "map", "poses", "events"];
-const TOPICS = ["fleet", "history", "robots", "event", "pose", "link"];
+const TOPICS = ["fleet", "history", "robots", "event", "pose", "link", "maps"];
 const views = {
   fleet: fleetView(byId("view-fleet")),
   map: mapView(byId("view-map"), changeMap),
@@ -98,6 +98,7 @@ function take({ topic, key, value }) {
   else if (topic === "event") { views.events.take(value); views.fleet.takeEvent(value); }
   else if (topic === "pose") views.poses.take(value);
   else if (topic === "link") linked(value.connected, value.connected ? "live" : "the control plane does not answer");
+  else if (topic === "maps") views.map.takeMaps(value);
   else if (topic.startsWith("live/")) views.map.take(key, value);
 }
 

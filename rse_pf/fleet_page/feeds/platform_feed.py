@@ -19,10 +19,10 @@ from typing import Any
 from rse_pf.auth.control_token import bearer, read_control_token
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import RsePfError
-from rse_pf.fleet_page.command_log import CommandLog
+from rse_pf.fleet_page.feeds.command_log import CommandLog
+from rse_pf.fleet_page.feeds.percentiles import LastMinute, buckets_of
+from rse_pf.fleet_page.feeds.sentences import event_sentence, waiting_for
 from rse_pf.fleet_page.hub import Hub
-from rse_pf.fleet_page.percentiles import LastMinute, buckets_of
-from rse_pf.fleet_page.sentences import event_sentence, waiting_for
 from rse_pf.local.processes import is_alive, mark_of
 from rse_pf.local.servers.control_client import ControlPort
 from rse_pf.local.state import platform_settings, read_state

@@ -1,0 +1,1 @@
+"""What the page knows, and where it reads it: the control plane, servers, logs, live maps."""

@@ -1,0 +1,152 @@
+"""Live maps for the page: it subscribes to ``live/MAP`` as a robot does, while somebody looks.
+
+The token is issued here, from the platform's key, for reading live maps and nothing else.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import secrets
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from rse_pf.config import PlatformSettings
+from rse_pf.errors import RsePfError, UsageError
+from rse_pf.fleet_page.hub import Hub
+from rse_pf.local.firewall import read_key
+from rse_pf.local.state import PlatformState, platform_settings, read_state
+from rse_pf.terminal import printable
+
+__all__ = ["LIVE", "LiveFeed", "RobotPaths", "plain"]
+
+LIVE = "live/"
+_ROBOT = "fleet-page"
+_SCOPES = ("maps:live/*",)
+_TTL_S = 600.0
+_LOOK_S = 0.5
+_LIST_EVERY_S = 3.0
+_MAX_MAPS = 8
+_MAX_PATH = 2000
+
+
+class LiveFeed:
+    """Feeds a `Hub` with the live maps that pages ask for."""
+
+    def __init__(self, hub: Hub, folder: Path) -> None:
+        """Ask for nothing yet; *folder* is that of the platform's state."""
+        self._hub = hub
+        self._folder = folder
+        self._followed: dict[str, asyncio.Task[None]] = {}
+
+    async def run(self) -> None:
+        """Connect while a page looks at live maps, until cancelled."""
+        while True:
+            if self._hub.watches("maps"):
+                with contextlib.suppress(RsePfError, OSError):
+                    await self._connected()
+            await asyncio.sleep(_LOOK_S)
+
+    async def _connected(self) -> None:
+        from client_sdk import connect
+
+        state = await asyncio.to_thread(read_state, self._folder)
+        if state is None or not state.url or state.lan:
+            return  # by TLS with a private authority: see docs/fleet_page.md
+        settings = platform_settings(self._folder) or PlatformSettings()
+
+        async def token() -> str:
+            return _token(state, settings)
+
+        try:
+            async with connect(state.url, token=token, codec="json") as robot:
+                while self._hub.watches("maps"):
+                    await self._follow_asked(robot)
+        finally:
+            for task in self._followed.values():
+                task.cancel()
+            self._followed.clear()
+
+    async def _follow_asked(self, robot: Any) -> None:
+        listed = (await robot.call("live-list", {})).reply
+        names = [str(each["name"]) for each in listed.get("maps", [])]
+        self._hub.put("maps", "live", names)
+        for _ in range(round(_LIST_EVERY_S / _LOOK_S)):
+            for name in names[:_MAX_MAPS]:
+                if name not in self._followed and self._hub.watches(LIVE + name):
+                    self._followed[name] = asyncio.ensure_future(self._follow(robot, name))
+            await asyncio.sleep(_LOOK_S)
+
+    async def _follow(self, robot: Any, name: str) -> None:
+        paths = RobotPaths()
+        async for key, value in robot.subscribe(LIVE + name):
+            told = plain(value)
+            self._hub.put(LIVE + name, printable(str(key)), told)
+            path = paths.take(told)
+            if path is not None:
+                self._hub.put(LIVE + name, f"path/{told['robot']}", path)
+
+
+class RobotPaths:
+    """Where each robot of a live map has been, in its odometry frame, which corrections move as a whole."""
+
+    def __init__(self) -> None:
+        """Know no robot yet."""
+        self._T_map_odom: dict[str, tuple[Any, Any]] = {}
+        self._paths: dict[str, dict[str, Any]] = {}
+
+    def take(self, value: Mapping[str, Any]) -> dict[str, Any] | None:
+        """Take an alignment or a pose, and return the robot's path if it has grown."""
+        robot, segment = str(value.get("robot", "")), value.get("segment")
+        T_map_odom, T_map_camera = value.get("T_map_odom"), value.get("T_map_camera")
+        if value.get("kind") == "alignment" and value.get("aligned") and _is_matrix(T_map_odom):
+            self._T_map_odom[robot] = (segment, T_map_odom)
+        known = self._T_map_odom.get(robot)
+        if (
+            value.get("kind") != "pose"
+            or known is None
+            or known[0] != segment
+            or not _is_matrix(T_map_camera)
+        ):
+            return None
+        assert isinstance(T_map_camera, list)
+        path = self._paths.get(robot)
+        if path is None or path["segment"] != segment:
+            path = self._paths[robot] = {"segment": segment, "points": []}
+        path["points"] = [*path["points"], _in_odometry(known[1], T_map_camera)][-_MAX_PATH:]
+        return path
+
+
+def plain(value: Any) -> Any:
+    """Return *value* with arrays as lists and every text escaped."""
+    if isinstance(value, Mapping):
+        return {printable(str(name)): plain(each) for name, each in value.items()}
+    if isinstance(value, str):
+        return printable(value)
+    if hasattr(value, "tolist"):
+        return value.tolist()
+    return [plain(each) for each in value] if isinstance(value, list | tuple) else value
+
+
+def _is_matrix(value: Any) -> bool:
+    return isinstance(value, list) and len(value) == 16
+
+
+def _in_odometry(T_map_odom: Sequence[float], T_map_camera: Sequence[float]) -> list[float]:
+    """Return the position of the camera in the odometry frame, ``(3,)`` metres."""
+    moved = [T_map_camera[4 * row + 3] - T_map_odom[4 * row + 3] for row in range(3)]
+    return [
+        round(sum(T_map_odom[4 * row + column] * moved[row] for row in range(3)), 4) for column in range(3)
+    ]
+
+
+def _token(state: PlatformState, settings: PlatformSettings) -> str:
+    if not state.key_file:
+        raise UsageError("the platform has no key", hint="start it again")
+    key = read_key(Path(state.key_file))
+    return key.issue(
+        _ROBOT, now=time.time(), token_id=secrets.token_hex(8), settings=settings.auth,
+        ttl_s=min(_TTL_S, settings.auth.token_ttl_s), scopes=_SCOPES,
+    )  # fmt: skip

@@ -1,0 +1,229 @@
+// Draw a map with three.js: the cloud, trajectories, robots with their covariance; own camera control with keys.
+
+import {
+  BufferAttribute, BufferGeometry, Color, ColorManagement, Group, Line, LineBasicMaterial, LinearSRGBColorSpace, Matrix4, Mesh, MeshBasicMaterial,
+  PerspectiveCamera, Points, PointsMaterial, Scene, SphereGeometry, Spherical, Vector3, WebGLRenderer,
+} from "./vendor/three.module.js";
+
+// Okabe and Ito's colours, which colour-blind people tell apart; names stand beside them in any case.
+const COLOURS = ["#0072b2", "#e69f00", "#009e73", "#cc79a7", "#56b4e9", "#d55e00"];
+const MAX_FPS = 30;
+ColorManagement.enabled = false; // nothing is lit: the colours of cameras are shown as they are
+
+export class MapScene {
+  constructor(canvas, labels) {
+    this.canvas = canvas;
+    this.labels = labels;
+    this.renderer = new WebGLRenderer({ canvas, antialias: true, powerPreference: "low-power" });
+    this.renderer.outputColorSpace = LinearSRGBColorSpace;
+    this.scene = new Scene();
+    this.camera = new PerspectiveCamera(55, 1, 0.02, 2000);
+    this.world = new Group();
+    this.scene.add(this.world);
+    this.moving = new Group();
+    this.world.add(this.moving);
+    this.places = new Map();
+    this.target = new Vector3();
+    this.orbit = new Spherical(8, 1.0, 0.6);
+    this.radius = 4;
+    this.dirty = true;
+    this.frames = 0;
+    this.listen();
+    this.themed();
+    new ResizeObserver(() => { this.dirty = true; }).observe(canvas);
+  }
+
+  themed() {
+    this.scene.background = new Color(getComputedStyle(document.documentElement).getPropertyValue("--panel").trim());
+    this.dirty = true;
+  }
+
+  clear() {
+    this.world.clear();
+    this.moving = new Group();
+    this.world.add(this.moving);
+    this.places.clear();
+    this.labels.replaceChildren();
+    this.hasCloud = false;
+    this.dirty = true;
+  }
+
+  cloud(buffer, withPaths) {
+    const length = new DataView(buffer).getUint32(0, true);
+    const told = JSON.parse(new TextDecoder().decode(new Uint8Array(buffer, 4, length)));
+    const start = 4 + length;
+    const geometry = new BufferGeometry();
+    // Positions stay the 16-bit numbers that came: the object's matrix makes metres of them.
+    geometry.setAttribute("position", new BufferAttribute(new Uint16Array(buffer, start, 3 * told.points), 3));
+    geometry.setAttribute("color", new BufferAttribute(new Uint8Array(buffer, start + 6 * told.points, 3 * told.points), 3, true));
+    const points = new Points(geometry, new PointsMaterial({ size: 1.6, sizeAttenuation: false, vertexColors: true }));
+    points.matrixAutoUpdate = false;
+    points.matrix.makeScale(...told.step).setPosition(...told.low);
+    points.frustumCulled = false;
+    this.world.add(points);
+    this.turnUp(new Vector3(...told.up));
+    if (withPaths) Object.entries(told.robots).forEach(([name, path]) => this.path(this.world, name, path));
+    const low = new Vector3(...told.low);
+    const size = new Vector3(...told.step).multiplyScalar(65535);
+    this.centre = low.clone().addScaledVector(size, 0.5).applyMatrix4(this.world.matrix);
+    this.radius = Math.max(size.length() / 2, 0.5);
+    this.hasCloud = told.points > 0;
+    this.home();
+    return told;
+  }
+
+  turnUp(up) {
+    this.world.quaternion.setFromUnitVectors(up.lengthSq() > 1e-9 ? up.normalize() : new Vector3(0, -1, 0), new Vector3(0, 1, 0));
+    this.world.updateMatrix();
+  }
+
+  colour(name) {
+    if (!this.places.has(name)) this.places.set(name, { colour: COLOURS[this.places.size % COLOURS.length], label: null, at: null });
+    return this.places.get(name).colour;
+  }
+
+  path(parent, name, points) {
+    const geometry = new BufferGeometry().setFromPoints(points.map((each) => new Vector3(...each)));
+    const line = new Line(geometry, new LineBasicMaterial({ color: this.colour(name) }));
+    parent.add(line);
+    this.place(name, points.length ? new Vector3(...points[points.length - 1]) : null);
+    return line;
+  }
+
+  place(name, at) {
+    const known = this.places.get(name);
+    known.at = at;
+    if (!known.label) {
+      known.label = document.createElement("span");
+      known.label.textContent = name;
+      known.label.style.borderLeft = `4px solid ${known.colour}`;
+      this.labels.append(known.label);
+    }
+  }
+
+  update(state) {
+    for (const child of this.moving.children) { child.geometry?.dispose(); child.material?.dispose(); }
+    this.moving.clear();
+    const reach = [];
+    for (const [, value] of state) {
+      if (value.kind !== "alignment" || !value.aligned || !value.T_map_odom) continue;
+      const T = new Matrix4().set(...value.T_map_odom);
+      const path = state.get(`path/${value.robot}`);
+      const points = path && path.segment === value.segment ? path.points.map((each) => new Vector3(...each).applyMatrix4(T)) : [];
+      this.colour(value.robot);
+      if (points.length) this.moving.add(new Line(new BufferGeometry().setFromPoints(points), new LineBasicMaterial({ color: this.colour(value.robot) })));
+      const pose = state.get(`pose/${value.robot}`);
+      const at = pose ? new Vector3(pose.T_map_camera[3], pose.T_map_camera[7], pose.T_map_camera[11]) : points[points.length - 1];
+      if (!at) continue;
+      this.place(value.robot, at);
+      this.moving.add(this.robot(at, this.colour(value.robot), value.covariance));
+      reach.push(at, ...points);
+    }
+    if (!this.hasCloud && reach.length) {
+      if (!this.isTurned) { this.turnUp(new Vector3(0, -1, 0)); this.isTurned = true; }
+      const centre = reach.reduce((sum, each) => sum.add(each), new Vector3()).divideScalar(reach.length);
+      this.radius = Math.max(1.5, ...reach.map((each) => each.distanceTo(centre)));
+      this.centre = centre.applyMatrix4(this.world.matrix);
+      if (!this.touched) this.home();
+    }
+    this.dirty = true;
+  }
+
+  // A sphere of 4 cm, and around it the ellipsoid of three standard deviations along the map's axes.
+  robot(at, colour, covariance) {
+    const group = new Group();
+    group.position.copy(at);
+    group.add(new Mesh(new SphereGeometry(0.04, 12, 8), new MeshBasicMaterial({ color: colour })));
+    if (covariance) {
+      const sigma = [covariance[0], covariance[6], covariance[11]].map((each) => 3 * Math.sqrt(Math.max(each, 0)));
+      const around = new Mesh(new SphereGeometry(1, 20, 14), new MeshBasicMaterial({ color: colour, transparent: true, opacity: 0.22, depthWrite: false }));
+      around.scale.set(...sigma.map((each) => Math.min(Math.max(each, 0.045), 3)));
+      group.add(around);
+    }
+    return group;
+  }
+
+  home() {
+    this.target.copy(this.centre ?? new Vector3());
+    this.orbit.set(this.radius * 1.55, 0.95, 0.6);
+    this.touched = false;
+    this.dirty = true;
+  }
+
+  listen() {
+    const turn = (dx, dy) => {
+      this.orbit.theta -= dx;
+      this.orbit.phi = Math.min(Math.max(this.orbit.phi - dy, 0.05), Math.PI - 0.05);
+      this.dirty = this.touched = true;
+    };
+    const zoom = (factor) => { this.orbit.radius = Math.min(Math.max(this.orbit.radius * factor, 0.1), 1000); this.dirty = this.touched = true; };
+    const shift = (dx, dy) => {
+      const right = new Vector3().setFromMatrixColumn(this.camera.matrix, 0);
+      const up = new Vector3().setFromMatrixColumn(this.camera.matrix, 1);
+      this.target.addScaledVector(right, -dx * this.orbit.radius).addScaledVector(up, dy * this.orbit.radius);
+      this.dirty = this.touched = true;
+    };
+    const pointers = new Map();
+    this.canvas.addEventListener("pointerdown", (event) => { pointers.set(event.pointerId, event); this.canvas.setPointerCapture(event.pointerId); });
+    for (const name of ["pointerup", "pointercancel"]) this.canvas.addEventListener(name, (event) => pointers.delete(event.pointerId));
+    this.canvas.addEventListener("pointermove", (event) => {
+      const last = pointers.get(event.pointerId);
+      if (!last) return;
+      const [dx, dy] = [(event.clientX - last.clientX) / this.canvas.clientHeight, (event.clientY - last.clientY) / this.canvas.clientHeight];
+      if (pointers.size === 2) {
+        const other = [...pointers.values()].find((each) => each.pointerId !== event.pointerId);
+        const apart = (each) => Math.hypot(each.clientX - other.clientX, each.clientY - other.clientY) || 1;
+        zoom(apart(last) / apart(event));
+      } else if (event.shiftKey || event.buttons === 4) shift(dx, dy);
+      else turn(dx * 4, dy * 4);
+      pointers.set(event.pointerId, event);
+    });
+    this.canvas.addEventListener("wheel", (event) => { event.preventDefault(); zoom(Math.exp(event.deltaY / 700)); }, { passive: false });
+    this.canvas.addEventListener("keydown", (event) => {
+      const turns = { ArrowLeft: [-0.1, 0], ArrowRight: [0.1, 0], ArrowUp: [0, -0.1], ArrowDown: [0, 0.1] };
+      if (turns[event.key]) turn(...turns[event.key]);
+      else if (event.key === "+" || event.key === "=") zoom(0.85);
+      else if (event.key === "-") zoom(1.18);
+      else if (event.key === "Home") this.home();
+      else return;
+      event.preventDefault();
+    });
+  }
+
+  run(on) {
+    this.running = on;
+    if (on && !this.looping) { this.looping = true; this.dirty = true; this.loop(0); }
+  }
+
+  loop(now) {
+    if (!this.running) { this.looping = false; return; }
+    requestAnimationFrame((time) => this.loop(time));
+    if (!this.dirty || now - (this.drawn ?? 0) < 1000 / MAX_FPS) return;
+    this.drawn = now;
+    this.dirty = false;
+    this.draw();
+  }
+
+  draw() {
+    const [width, height] = [this.canvas.clientWidth, this.canvas.clientHeight];
+    if (!width || !height) return;
+    const ratio = Math.min(devicePixelRatio || 1, 2);
+    if (this.canvas.width !== Math.floor(width * ratio) || this.canvas.height !== Math.floor(height * ratio)) {
+      this.renderer.setPixelRatio(ratio);
+      this.renderer.setSize(width, height, false);
+    }
+    this.camera.aspect = width / height;
+    this.camera.updateProjectionMatrix();
+    this.camera.position.setFromSpherical(this.orbit).add(this.target);
+    this.camera.lookAt(this.target);
+    this.camera.updateMatrixWorld();
+    this.renderer.render(this.scene, this.camera);
+    this.frames += 1;
+    for (const [, { label, at }] of this.places) {
+      if (!label) continue;
+      const seen = at?.clone().applyMatrix4(this.world.matrix).project(this.camera);
+      label.hidden = !seen || seen.z > 1;
+      if (seen) { label.style.left = `${(seen.x + 1) / 2 * width + 8}px`; label.style.top = `${(1 - seen.y) / 2 * height - 20}px`; }
+    }
+  }
+}
