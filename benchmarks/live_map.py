@@ -32,7 +32,7 @@ from benchmarks.map_recordings import Run, ate_m, drive, frame_poses, red_kitche
 from client_sdk.datasets import Dataset, open_dataset
 from client_sdk.frontend import FrontEndOptions
 from rse_pf.geometry import Array, exp_se3, inverse
-from rse_pf.live_map.events import Event, KeyframeAdded, LinksMeasured, matrix_bytes
+from rse_pf.live_map.events import Event, KeyframeAdded, LinksMeasured, MapStarted, matrix_bytes
 from rse_pf.live_map.keyframe_code import encode_features
 from rse_pf.live_map.live_map import LiveMap
 from rse_pf.live_map.options import LiveMapOptions
@@ -233,21 +233,49 @@ def _planted(seed: int) -> int:
 
 
 def twins(runs: int) -> None:
-    """State what becomes of robots in two rooms that look the same; one may drive across."""
+    """State what becomes of robots in two rooms that look the same, which the map may know of."""
+    for told_m in (0.0, 4.0):
+        _twins(runs, told_m)
+        _one_building(runs, told_m)
+
+
+def _one_building(runs: int, told_m: float) -> None:
+    """State when two robots that drive the same way through unique rooms are joined."""
+    joined, at_m = 0, []
+    for seed in range(runs):
+        world = GeneratedWorld(seed=seed, links=2)
+        drives = [world.drive(name, straight(0.0, 9.0)) for name in ("a", "b")]
+        live_map = LiveMap()
+        live_map.apply(MapStarted(source="", keyframes=(), equal_rooms_m=told_m))
+        for event in world.play(drives):
+            for each in live_map.apply(event):
+                if isinstance(each, Joined) and each.robot == "b":
+                    joined += 1
+                    at_m.append(float(world.seen[-1][0, 3]))
+    print(
+        f"two robots on one way of 9 m, equal rooms of {told_m:g} m stated, {runs} seeds: {joined} joined, "
+        f"after {np.median(at_m):.1f} m (most {max(at_m):.1f})"
+    )  # fmt: skip
+
+
+def _twins(runs: int, told_m: float) -> None:
     for what in ("one robot in each room", "and one that drives from one to the other"):
-        wrong = ambiguous = 0
+        wrong = ambiguous = ever = 0
         for seed in range(runs):
             world = GeneratedWorld(seed=seed, twin_m=10.0, links=2)
             drives = [world.drive("a", straight(0.0, 3.0)), world.drive("b", straight(10.0, 13.0))]
             if what.startswith("and"):
                 drives.insert(1, world.drive("c", straight(0.0, 13.0)))
             live_map = LiveMap()
+            live_map.apply(MapStarted(source="", keyframes=(), equal_rooms_m=told_m))
             outcomes = [each for event in world.play(drives) for each in live_map.apply(event)]
+            ever += any(isinstance(each, Joined) and each.robot == "b" for each in outcomes)
             aligned = {each.robot: each.aligned for each in live_map.alignments()}
             wrong += aligned["b"]
             ambiguous += any(isinstance(each, Ambiguous) and each.robot == "b" for each in outcomes)
         print(
-            f"two equal rooms, {what}, {runs} seeds: at the end {wrong} joined, {ambiguous} called ambiguous"
+            f"two equal rooms, {told_m:g} m stated, {what}, {runs} seeds: {ever} joined at some time, "
+            f"{wrong} at the end, {ambiguous} called ambiguous"
         )
 
 

@@ -46,6 +46,9 @@ def agreeing_between(
         if number not in leave_out
         and {graph.component_of(graph.links[number].a), graph.component_of(graph.links[number].b)} == pair
     ]  # fmt: skip
+    if graph.equal_rooms_m:
+        # So that the links that are tested reach farther than a room.
+        numbers = _spread(graph, numbers, one, 3.0 * graph.equal_rooms_m / options.tested_links)
     numbers = _tested(graph, numbers, options)
     if len(numbers) < options.min_links:
         return []
@@ -145,6 +148,18 @@ def _tested(graph: Graph, numbers: list[int], options: LiveMapOptions) -> list[i
             count[link.b] += 1
             kept.append(number)
     return sorted(kept)[-options.tested_links :]
+
+
+def _spread(graph: Graph, numbers: list[int], one: int, least_m: float) -> list[int]:
+    """Return those of *numbers* whose end in component *one* is not close to that of the last one taken."""
+    taken: list[int] = []
+    last = np.full(3, np.inf)
+    for number in numbers:
+        here = graph.T[_ends_between(graph, number, one)[0], :3, 3]
+        if np.abs(here - last).max() >= least_m:
+            taken.append(number)
+            last = here
+    return taken
 
 
 def _compare(graph: Graph, number: int, others: list[int], one: int, options: LiveMapOptions) -> list[bool]:

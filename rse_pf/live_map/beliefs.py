@@ -212,6 +212,9 @@ def _ambiguity(graph: Graph, one: int, other: int, agreeing: list[int], options:
     telling = [number for number in agreeing if not _is_lookalike(graph, number)]
     if not has_enough_ends(graph, telling, options):
         return "ambiguous: what it sees is in the map at several places"
+    size_m = graph.equal_rooms_m
+    if size_m and min(_spread_m(graph, telling, side) for side in (one, other)) <= size_m:
+        return f"ambiguous: what it shares with others lies within {size_m:g} m, the size of equal rooms"
     rivals = agreeing_between(graph, one, other, options, frozenset(agreeing))
     if 2 * len(rivals) >= len(agreeing) and has_enough_ends(graph, rivals, options):
         first, second = (
@@ -220,6 +223,13 @@ def _ambiguity(graph: Graph, one: int, other: int, agreeing: list[int], options:
         if float(np.sqrt(((first - second)[:3, 3] ** 2).sum())) > options.lookalike_m:
             return f"ambiguous: {len(agreeing)} links say one place, {len(rivals)} another"
     return ""
+
+
+def _spread_m(graph: Graph, numbers: list[int], side: int) -> float:
+    """Return how far the keyframes of links in component *side* are apart at most."""
+    ends = [(graph.links[number].a, graph.links[number].b) for number in numbers]
+    at = graph.T[[a if graph.component_of(a) == side else b for a, b in ends], :3, 3]
+    return float(np.sqrt(((at[:, None] - at[None]) ** 2).sum(axis=2).max()))
 
 
 def _call_ambiguous(graph: Graph, numbers: list[int], reason: str, changes: Changes) -> None:

@@ -111,11 +111,16 @@ class StartLink(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class MapStarted(msgspec.Struct, frozen=True, kw_only=True, tag="started"):
-    """The map begins with the keyframes of a version; only the first event of a log may be this one."""
+    """The map begins with the keyframes of a version, or with none; it has no keyframes before.
+
+    ``equal_rooms_m`` is the size of rooms that look the same, 0 if every place is unique: what joins robots
+    must lie farther apart.
+    """
 
     source: str
     keyframes: tuple[StartKeyframe, ...]
     links: tuple[StartLink, ...] = ()
+    equal_rooms_m: float = 0.0
 
 
 class OwnerChanged(msgspec.Struct, frozen=True, kw_only=True, tag="owner"):

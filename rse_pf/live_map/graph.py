@@ -94,6 +94,7 @@ class Graph:
         of_segment: ``(n,)``, row of its segment, -1 when it was forgotten.
         held: ``(n,)``, whether its features are kept.
         links: By number, in the order in which they were measured; `open` are those not believed.
+        equal_rooms_m: What joins robots must lie farther apart than this.
         lookalikes: Keyframes at places of which the map knows another one that looks the same.
     """
 
@@ -112,6 +113,7 @@ class Graph:
         self.optimised_at = 0
         self.lookalikes: set[int] = set()
         self.source = ""
+        self.equal_rooms_m = 0.0
         self._links_of: dict[int, list[int]] = {}
         self._size = 0
         self._T = np.empty((64, 4, 4))
@@ -360,6 +362,7 @@ class Graph:
             newest=list(self.newest.items()),
             left=self.left,
             source=self.source,
+            equal_rooms_m=self.equal_rooms_m,
             lookalikes=sorted(self.lookalikes),
             links_of=list(believed.items()),
             arrays=[
@@ -421,6 +424,7 @@ class Graph:
         graph.next_numbers = dict(packed.next_numbers)
         graph.newest = dict(packed.newest)
         graph.left, graph.source = packed.left, packed.source
+        graph.equal_rooms_m = packed.equal_rooms_m
         graph.lookalikes = set(packed.lookalikes)
         graph._links_of = {int(i): numbers for i, numbers in packed.links_of}
         return graph, dict(packed.extra)
@@ -442,6 +446,7 @@ class _Packed(msgspec.Struct, kw_only=True):
     links_of: list[tuple[str, list[int]]]
     arrays: list[bytes]
     extra: list[tuple[str, bytes]]
+    equal_rooms_m: float = 0.0
 
 
 def variances_of(information: Array) -> Array:

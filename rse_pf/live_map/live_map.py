@@ -43,7 +43,7 @@ from rse_pf.live_map.outcomes import (
     Unaligned,
 )
 from rse_pf.live_map.place_index import LivePlaceIndex
-from rse_pf.live_map.relocalise import Relocalised, relocalise, spread_candidates
+from rse_pf.live_map.relocalise import Relocalised, RelocaliseOptions, relocalise, spread_candidates
 from rse_pf.live_map.smoother import SmoothedWindows, odometry_step, smooth_around
 from rse_pf.live_map.versions import version_of, whole_graph
 from rse_pf.maps.format import MapVersion
@@ -265,7 +265,8 @@ class LiveMap:
         found = self._places.nearest(LivePlaceIndex.vector(decoded.descriptors), 6 * most, aligned)
         chosen = [(self._stored(i), graph.T[i].copy()) for i in spread_candidates(found, graph.T, most)]
         views = [(stored, T) for stored, T in chosen if stored is not None]
-        return lambda: relocalise([(*_decoded(each), T) for each, T in views], decoded, camera)
+        options = RelocaliseOptions(has_equal_rooms=graph.equal_rooms_m > 0.0)
+        return lambda: relocalise([(*_decoded(each), T) for each, T in views], decoded, camera, options)
 
     def alignments(self) -> list[Alignment]:
         """Return where the newest segment of each robot lies."""
@@ -386,7 +387,9 @@ class LiveMap:
         graph = self._graph
         if len(graph):
             raise BadRequest("the map has keyframes already", hint="start a new map from the version")
-        graph.source = event.source
+        graph.source, graph.equal_rooms_m = event.source, event.equal_rooms_m
+        if not event.keyframes:
+            return []
         graph.segments.append(Segment(robot="", segment=-1, version=True))
         graph.root = 0
         outcomes: list[Outcome] = []

@@ -36,6 +36,8 @@ class RelocaliseOptions:
         place_m: Candidates closer than this,
         place_deg: and turned less than this, are of one place,
         of_place: of which so many are compared.
+        has_equal_rooms: Whether rooms may look the same; then a view, which shows less than a room, is never
+            enough.
     """
 
     measured: MeasureOptions = field(default_factory=lambda: MeasureOptions(min_inliers=30))
@@ -47,6 +49,7 @@ class RelocaliseOptions:
     place_m: float = 1.5
     place_deg: float = 45.0
     of_place: int = 4
+    has_equal_rooms: bool = False
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -161,6 +164,8 @@ def _weakness(
 ) -> str:
     """Return why the placement of *agreeing* (best first) is not ok, "" if it is."""
     best = agreeing[0].found
+    if options.has_equal_rooms:
+        return "ambiguous"
     if others and others[0].found.inliers >= options.rival * best.inliers:
         return "ambiguous"
     if best.inliers < options.measured.min_inliers:

@@ -14,6 +14,7 @@ from rse_pf.live_map.events import (
     Event,
     KeyframeAdded,
     LinksMeasured,
+    MapStarted,
     Optimised,
     RobotForgotten,
     RobotLeft,
@@ -242,6 +243,21 @@ def test_a_robot_that_drives_between_equal_rooms_proves_them_ambiguous() -> None
     assert run.of(Ambiguous)
     assert not aligned["b"].aligned
     assert aligned["b"].reason.startswith("ambiguous")
+
+
+def test_robots_in_rooms_that_may_be_equal_are_joined_by_more_than_a_room() -> None:
+    """The links of two equal rooms and those of one are the same numbers, so the map must be told."""
+    world = GeneratedWorld(seed=2, links=2)
+    way = np.column_stack([np.arange(0.0, 3.0, 0.1), np.zeros(30)])
+    run = Run(world)
+    run.apply(MapStarted(source="", keyframes=(), equal_rooms_m=1.5))
+    run.play([world.drive("a", way), world.drive("b", way)])
+    joined_m = [world.seen[at - 1][0, 3] for at, each in run.outcomes if isinstance(each, Joined)]
+
+    assert run.of(Ambiguous)[0].reason.endswith("within 1.5 m, the size of equal rooms")
+    assert len(joined_m) == 2
+    assert 1.5 < joined_m[1] < 2.2
+    assert LiveMap.restore(run.map.snapshot()).snapshot() == run.map.snapshot()
 
 
 def test_a_keyframe_is_new_known_or_ahead() -> None:
