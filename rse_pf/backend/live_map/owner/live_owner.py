@@ -46,7 +46,7 @@ from rse_pf.maps.registry import MapRegistry
 __all__ = ["LiveOwner", "OwnerContext"]
 
 _SETTLED_S = 5.0
-"""An owner that served for this long did not die of its map."""
+"""An owner that served for this long does not die of its map; nor one that has measured a keyframe."""
 _WAITING = "waiting for the store"
 _ALIGNING = (Joined, Corrected, Unaligned, Ambiguous, LinkRemoved)
 
@@ -351,7 +351,7 @@ class LiveOwner:
     async def _keep_lease(self) -> None:
         settings, clock = self._context.settings, self._context.clock
         while not self._ended.done():
-            is_settled = clock() - self._began_s >= _SETTLED_S
+            is_settled = self._measuring.is_proven or clock() - self._began_s >= _SETTLED_S
             wait_s = settings.heartbeat_s
             try:
                 is_ours = await self._context.threads.lease(

@@ -5,8 +5,8 @@ number taken is the owner no longer.  Nothing is changed after it was written.  
 entries before the older one are deleted.
 
 Layout, below ``live/TENANT/MAP/``: ``log/NUMBER`` from 1 on, ``snapshot/NUMBER`` after that entry, and
-``features/EPOCH-SHA256``, parts that snapshots share.  An owner deletes no part of a later owner, whose snapshot
-may not be written yet.
+``features/EPOCH-SHA256``, parts that snapshots share.  An owner deletes no part of a later owner, since its
+snapshot may not be written yet.
 """
 
 from __future__ import annotations

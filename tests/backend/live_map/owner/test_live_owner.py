@@ -298,6 +298,23 @@ def test_a_silent_lease_ends_what_is_told_until_it_is_renewed():
     bench.run(test)
 
 
+def test_an_owner_that_has_measured_a_keyframe_counts_no_longer_as_one_that_its_map_ended():
+    """Else a busy machine, on which leases end, waits for a minute as after crashes."""
+    bench = Bench()
+
+    async def test() -> None:
+        await bench.own("a")
+        bench.clock.now_s += 10.0
+        second = await bench.own("b")
+        await bench.clock.advance(1.0)
+        assert bench.lease().tries == 1
+        await second.keyframe(0)
+        await bench.clock.advance(1.0)
+        assert bench.lease().tries == 0
+
+    bench.run(test)
+
+
 def test_what_a_robot_contributed_can_be_taken_out_and_a_stranger_is_not_found():
     bench = Bench()
 

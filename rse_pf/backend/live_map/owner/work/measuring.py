@@ -30,6 +30,12 @@ class Measuring:
         self._wake = asyncio.Event()
         self._wake.set()
         self._optimise_wanted = False
+        self._has_measured = False
+
+    @property
+    def is_proven(self) -> bool:
+        """Whether a keyframe has gone the whole way, and none is left that may end the process."""
+        return self._has_measured and not self._state.unmeasured
 
     def measure(self, keyframes: Iterable[int]) -> None:
         """Measure these keyframes, too."""
@@ -50,6 +56,7 @@ class Measuring:
                 keyframe = self._waiting.popleft()
                 measure = await threads.compute(Urgency.MEASURE, functools.partial(state.measuring, keyframe))
                 self._submit(await threads.look(measure))
+                self._has_measured = True
             elif self._optimise_wanted:
                 self._optimise_wanted = False
                 with contextlib.suppress(RsePfError):
