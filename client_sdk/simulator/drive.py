@@ -1,7 +1,7 @@
 """Rendered frames with exact poses, for robots without a recording.
 
-Robots follow one loop through three furnished rooms; each starts at a different point of it, so their maps
-overlap.  The same arguments give the same frames.  No image library is needed.
+Robots follow one loop through three furnished rooms, or as many as are asked for; each starts at a different
+point of it, so their maps overlap.  The same arguments give the same frames.  No image library is needed.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import numpy as np
 from client_sdk.frontend import Frame
 from client_sdk.mapping import Trajectory
 from client_sdk.simulator.camera import Painter, add_depth_noise, add_image_noise
-from client_sdk.simulator.world import make_world
+from client_sdk.simulator.world import ROOM_M, ROOMS, make_world
 from rse_pf.errors import UsageError
 from rse_pf.geometry import Array, Camera
 
@@ -30,22 +30,23 @@ _OVERLAP_M = 0.6
 """Path that a robot drives beyond the start of the next one, so that their maps can be merged."""
 SIMULATED_CAMERA = Camera(fx=525.0, fy=525.0, cx=319.5, cy=239.5, width=640, height=480)
 
-# Corners of the loop: through both doors, around the tables of the outer rooms, and back.
-_WAYPOINTS_M = (
-    (5.0, 2.05), (6.4, 1.75), (7.5, 1.65), (8.6, 1.75), (10.0, 2.05), (11.3, 1.35), (12.5, 1.0), (13.6, 1.4),
-    (13.95, 2.3), (13.6, 3.2), (12.5, 3.45), (11.3, 3.2), (10.0, 2.55), (8.6, 2.8), (7.5, 2.9), (6.4, 2.8),
-    (5.0, 2.55), (3.7, 3.2), (2.5, 3.45), (1.4, 3.2), (1.05, 2.3), (1.4, 1.4), (2.5, 1.0), (3.7, 1.35),
-)  # fmt: skip
+# Corners of the loop, from the left wall of a room: through a room on the way there and back, past its table
+# if it has one, and around the middle of the last and the first room.
+_THERE_M = ((1.4, 1.75), (2.5, 1.65), (3.6, 1.75)), ((1.3, 1.35), (2.5, 1.0), (3.7, 1.35))
+_BACK_M = ((3.6, 2.8), (2.5, 2.9), (1.4, 2.8)), ((3.7, 3.2), (2.5, 3.45), (1.3, 3.2))
+_LAST_M = ((1.3, 1.35), (2.5, 1.0), (3.6, 1.4), (3.95, 2.3), (3.6, 3.2), (2.5, 3.45), (1.3, 3.2))
+_FIRST_M = ((3.7, 3.2), (2.5, 3.45), (1.4, 3.2), (1.05, 2.3), (1.4, 1.4), (2.5, 1.0), (3.7, 1.35))
+_IN_M, _OUT_M = (0.0, 2.05), (0.0, 2.55)
 
 
-def render_frames(robot: int, robots: int, frames: int, seed: int) -> Iterator[Frame]:
+def render_frames(robot: int, robots: int, frames: int, seed: int, rooms: int = ROOMS) -> Iterator[Frame]:
     """Yield the frames of robot 0, 1, ... of *robots*; frame *i* is seen from ``true_trajectory[i]``.
 
     Raises:
         UsageError: The robot is not one of *robots*, or there are no frames.
     """
-    truth = true_trajectory(robot, robots, frames, seed)
-    painter = Painter(make_world(seed), SIMULATED_CAMERA)
+    truth = true_trajectory(robot, robots, frames, seed, rooms)
+    painter = Painter(make_world(seed, rooms), SIMULATED_CAMERA)
     for row in range(len(truth)):
         rng = np.random.default_rng([seed, robots, robot, row])
         colour, depth_m, cosine = painter.draw(truth.T_world_camera[row])
@@ -57,38 +58,49 @@ def render_frames(robot: int, robots: int, frames: int, seed: int) -> Iterator[F
         )
 
 
-def true_trajectory(robot: int, robots: int, frames: int, seed: int) -> Trajectory:
+def true_trajectory(robot: int, robots: int, frames: int, seed: int, rooms: int = ROOMS) -> Trajectory:
     """Return the exact ``T_world_camera`` of `render_frames`; the world's z axis points up.
 
-    Robots are spread evenly over the loop of about 28 m; a robot takes 6.8 cm and at most 4 degrees
-    from one frame to the next, so 80 frames are a path of 5.4 m.
+    Robots are spread evenly over the loop, which in three rooms is about 28 m long; a robot takes 6.8 cm and
+    at most 4 degrees from one frame to the next, so 80 frames are a path of 5.4 m.
 
     Raises:
-        UsageError: The robot is not one of *robots*, or there are no frames.
+        UsageError: The robot is not one of *robots*, or there are no frames, or less than two rooms.
     """
     if not 0 <= robot < robots or frames < 1:
         raise UsageError(
             f"robot {robot} of {robots} with {frames} frames cannot be rendered",
             hint="count robots from 0, and ask for one frame or more",
         )
-    path, length_m = _loop()
+    path, length_m = _loop(rooms)
     phase = float(np.random.default_rng([seed, 7]).uniform(0.0, 2.0 * np.pi))
     travelled_m = STEP_M * np.arange(frames) + length_m * robot / robots
     poses = np.array([_pose_at(path, length_m, s, phase) for s in travelled_m])
     return Trajectory(np.arange(frames) / RATE_HZ, poses)
 
 
-def frames_to_overlap(robots: int) -> int:
+def frames_to_overlap(robots: int, rooms: int = ROOMS) -> int:
     """Return the frames with which each robot reaches the start of the next one, and drives past it.
 
     One robot alone reaches its own start.
     """
-    return math.ceil((_loop()[1] / robots + _OVERLAP_M) / STEP_M)
+    return math.ceil((_loop(rooms)[1] / robots + _OVERLAP_M) / STEP_M)
 
 
-def _loop() -> tuple[Array, float]:
+def _corners(rooms: int) -> list[tuple[float, float]]:
+    """Return the corners of the loop through a number of rooms."""
+    if rooms < 2:
+        raise UsageError(f"a loop needs two rooms, not {rooms}", hint="ask for two rooms or more")
+    between, last = range(1, rooms - 1), rooms - 1
+    there = [(room, (_IN_M, *_THERE_M[room % 2 == 0])) for room in between]
+    back = [(room, (*_BACK_M[room % 2 == 0], _OUT_M)) for room in reversed(between)]
+    parts = [*there, (last, (_IN_M, *_LAST_M, _OUT_M)), *back, (0, _FIRST_M)]
+    return [(round(room * ROOM_M + x, 2), y) for room, corners in parts for x, y in corners]
+
+
+def _loop(rooms: int) -> tuple[Array, float]:
     """Return the closed path as ``(n, 2)`` points one centimetre apart, and its length."""
-    corners = np.array(_WAYPOINTS_M)
+    corners = np.array(_corners(rooms))
     path = _resample(corners, 0.01)[0]
     for _ in range(2):
         path = _resample(_smooth(path, 45), 0.01)[0]

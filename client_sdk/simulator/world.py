@@ -1,6 +1,6 @@
-"""The rendered world: three furnished rooms in a row, as textured rectangles.
+"""The rendered world: furnished rooms in a row, as textured rectangles; three unless more are asked for.
 
-Everything is axis-aligned; z is up, metres; the rooms fill ``x 0..15, y 0..4.6, z 0..2.6``.
+Everything is axis-aligned; z is up, metres; three rooms fill ``x 0..15, y 0..4.6, z 0..2.6``.
 The same seed gives the same world; `client_sdk.simulator.camera` draws it.
 """
 
@@ -13,9 +13,10 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
-__all__ = ["DEPTH_M", "DOOR_Y_M", "HEIGHT_M", "ROOM_M", "Face", "World", "make_world"]
+__all__ = ["DEPTH_M", "DOOR_Y_M", "HEIGHT_M", "ROOMS", "ROOM_M", "Face", "World", "make_world"]
 
 ROOM_M, DEPTH_M, HEIGHT_M = 5.0, 4.6, 2.6
+ROOMS = 3
 DOOR_Y_M = (1.55, 3.05)
 _DOOR_HEIGHT_M = 2.1
 _WALL_M = 0.12
@@ -24,7 +25,7 @@ _Image = npt.NDArray[np.float32]
 _Colour = tuple[int, int, int]
 
 _OAK, _WALNUT, _WHITE, _CREAM = (196, 150, 98), (104, 66, 40), (244, 242, 236), (250, 244, 226)
-# Background and print of the wallpaper of each room.
+# Background and print of the wallpaper of each room; the fourth has that of the first.
 _PAPERS: tuple[tuple[_Colour, _Colour], ...] = (
     ((232, 222, 202), (150, 120, 92)),
     ((196, 214, 200), (74, 112, 104)),
@@ -83,6 +84,7 @@ class World:
 @dataclass(slots=True)
 class _Builder:
     rng: np.random.Generator
+    rooms: int = ROOMS
     faces: list[Face] = field(default_factory=list)
     textures: list[_Image] = field(default_factory=list)
 
@@ -104,33 +106,32 @@ class _Builder:
                 )  # fmt: skip
 
 
-def make_world(seed: int) -> World:
+def make_world(seed: int, rooms: int = ROOMS) -> World:
     """Return the world of *seed*: the rooms are fixed, textures and pictures depend on the seed."""
-    build = _Builder(np.random.default_rng([seed, 11]))
+    build = _Builder(np.random.default_rng([seed, 11]), rooms)
     floor = build.texture(_planks(build.rng))
     ceiling = build.texture(0.5 + 0.25 * _noise(build.rng, 1024, 4, 120, 0.6))
     wood = build.texture(_grain(build.rng))
     cloth = build.texture(_weave(build.rng))
-    for room in range(3):
+    for room in range(rooms):
+        papers = _PAPERS[room % len(_PAPERS)]
         paper = build.texture(_wallpaper(build.rng, room))
         x0, x1 = room * ROOM_M, (room + 1) * ROOM_M
         low, high = (x0, 0.0), (x1, DEPTH_M)
         build.faces.append(Face(2, 0.0, 1, low, high, floor, 0.004, _OAK, _WALNUT, room))
         build.faces.append(Face(2, HEIGHT_M, -1, low, high, ceiling, 0.005, _WHITE, (196, 194, 190), room))
         for sign, y in ((1, 0.0), (-1, DEPTH_M)):
-            build.faces.append(
-                Face(1, y, sign, (x0, 0.0), (x1, HEIGHT_M), paper, 0.004, *_PAPERS[room], room)
-            )
+            build.faces.append(Face(1, y, sign, (x0, 0.0), (x1, HEIGHT_M), paper, 0.004, *papers, room))
         for sign, x in ((1, x0), (-1, x1)):
-            outer = x in (0.0, 3 * ROOM_M)
+            outer = x in (0.0, rooms * ROOM_M)
             at = x if outer else x + sign * _WALL_M / 2
             for y_low, y_high, z_low in _wall_pieces(outer):
                 build.faces.append(
-                    Face(0, at, sign, (y_low, z_low), (y_high, HEIGHT_M), paper, 0.004, *_PAPERS[room], room)
+                    Face(0, at, sign, (y_low, z_low), (y_high, HEIGHT_M), paper, 0.004, *papers, room)
                 )
         _furnish(build, room, wood, cloth)
         _hang_pictures(build, room)
-    for door in (1, 2):
+    for door in range(1, rooms):
         _door_frame(build, door, wood)
     return World(tuple(build.faces), tuple(build.textures))
 
@@ -155,12 +156,13 @@ def _door_frame(build: _Builder, door: int, wood: int) -> None:
 
 
 def _furnish(build: _Builder, room: int, wood: int, cloth: int) -> None:
-    """Put a sofa, a sideboard, shelves and, in the outer rooms, a table into a room."""
+    """Put a sofa, a sideboard, shelves and, in every other room, a table into a room."""
     x = room * ROOM_M
     oak, walnut = (wood, 0.003), (wood, 0.004)
     fabric = (cloth, 0.003)
-    colours = _FABRICS[room]
-    if room == 1:
+    colours = _FABRICS[room % len(_FABRICS)]
+    has_table = room % 2 == 0
+    if not has_table:
         build.box((x + 1.5, 0.0, 0.0), (x + 3.4, 0.75, 0.42), room, fabric, colours)
         build.box((x + 1.5, 0.0, 0.42), (x + 3.4, 0.22, 0.86), room, fabric, colours)
         _shelf(build, room, (x + 0.5, DEPTH_M - 0.32), (x + 2.1, DEPTH_M), wood)
@@ -173,8 +175,8 @@ def _furnish(build: _Builder, room: int, wood: int, cloth: int) -> None:
         build.box((x + 1.4, DEPTH_M - 0.2, 0.42), (x + 3.2, DEPTH_M, 0.84), room, fabric, colours)
     for number in range(3):  # small boxes on the sideboard
         side = float(build.rng.uniform(0.12, 0.24))
-        left = x + (0.62, 1.05, 1.5)[number] + (2.5 if room == 1 else 0.0)
-        y, z = (DEPTH_M - 0.4, 0.8) if room == 1 else (0.06, 0.86)
+        left = x + (0.62, 1.05, 1.5)[number] + (0.0 if has_table else 2.5)
+        y, z = (0.06, 0.86) if has_table else (DEPTH_M - 0.4, 0.8)
         things = _POSTERS[int(build.rng.integers(len(_POSTERS)))]
         skin = (build.texture(_poster(build.rng, 64)), side / 64)
         build.box((left, y, z), (left + side, y + side, z + 1.3 * side), room, skin, things)
@@ -190,7 +192,9 @@ def _table(
             build.box((x, y, 0.0), (x + 0.08, y + 0.08, 0.68), room, skin, colours)
     bowl = (build.texture(_poster(build.rng, 64)), 0.3 / 64)
     corner = (low[0] + 0.3, low[1] + 0.25)
-    build.box((*corner, 0.74), (corner[0] + 0.3, corner[1] + 0.3, 0.9), room, bowl, _POSTERS[room])
+    build.box(
+        (*corner, 0.74), (corner[0] + 0.3, corner[1] + 0.3, 0.9), room, bowl, _POSTERS[room % len(_POSTERS)]
+    )
 
 
 def _shelf(
@@ -210,7 +214,7 @@ def _hang_pictures(build: _Builder, room: int) -> None:
     spots = [(1, 0.0, 1, x + 0.7, 1.35, 0.75), (1, DEPTH_M, -1, x + 1.6, 1.2, 0.9)]
     spots += [(1, DEPTH_M, -1, x + 3.5, 1.25, 0.7), (1, 0.0, 1, x + 2.2, 1.2, 0.7)]
     for x_wall, sign in ((x, 1), (x + ROOM_M, -1)):
-        at = x_wall if x_wall in (0.0, 3 * ROOM_M) else x_wall + sign * _WALL_M / 2
+        at = x_wall if x_wall in (0.0, build.rooms * ROOM_M) else x_wall + sign * _WALL_M / 2
         spots += [(0, at, sign, 0.4, 1.1, 0.8), (0, at, sign, 3.4, 1.15, 0.8)]
         if at == x_wall:
             spots.append((0, at, sign, 1.75, 1.0, 1.1))
@@ -248,7 +252,7 @@ def _wallpaper(rng: np.random.Generator, room: int) -> _Image:
             angle, size = rng.uniform(0, np.pi), rng.uniform(12, 26)
             cosine, sine = float(np.cos(angle) / size), float(np.sin(angle) / size)
             a, b = cosine * columns + sine * rows, cosine * rows - sine * columns
-            shape = _MOTIFS[room](a, b)
+            shape = _MOTIFS[room % len(_MOTIFS)](a, b)
             ink = np.clip((1.0 - shape) * size / 1.5, 0, 1) * rng.uniform(0.25, 0.75)
             at_y = (y + int(rng.integers(64)) + np.arange(-40, 41)) % n
             at_x = (x + int(rng.integers(64)) + np.arange(-40, 41)) % n

@@ -39,6 +39,7 @@ _EARLIEST, _LATEST = 0.16, 0.5
 """The moment of a fault as a share of the drive; a long fault begins in the first half of this."""
 _LONG_S = 20.0
 _WATCH_S = 0.02
+_OWNER_S = 20.0
 _CUT_ROBOT = 0
 _OFFLINE_ANSWER_S = 0.5
 """A robot whose Wi-Fi may fail answers itself after this."""
@@ -133,7 +134,7 @@ class Disturbance:
         name, seconds = self._fault.name, LIVE_FAULTS[self._fault.name]
         if name == "none":
             return
-        owner = self._owner()
+        owner = await self._owner()
         what = {"fault": name, "seconds": seconds}
         if name == "wifi":
             assert self._link is not None
@@ -176,10 +177,13 @@ class Disturbance:
         finally:
             set_failing_percent(folder, 0.0)
 
-    def _owner(self) -> LeaseRecord:
-        if self._lease is None or self._lease.state != "serving":
-            raise CommandFailed("no server owns the live map", hint="let the robots drive for longer")
-        return self._lease
+    async def _owner(self) -> LeaseRecord:
+        """Return who owns the map, once somebody does."""
+        for _ in range(round(_OWNER_S / _WATCH_S)):
+            if self._lease is not None and self._lease.state == "serving":
+                return self._lease
+            await asyncio.sleep(_WATCH_S)
+        raise CommandFailed("no server owns the live map", hint="let the robots drive for longer")
 
     async def _watch(self) -> None:
         """Record each change of the lease but for its renewals."""

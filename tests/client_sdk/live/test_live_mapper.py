@@ -68,6 +68,24 @@ def test_a_keyframe_each_10_cm_is_kept_by_the_map_in_order() -> None:
     run(work)
 
 
+def test_the_robots_own_cloud_is_made_of_its_keyframes_beside_its_frames() -> None:
+    async def work(robot: FakeLiveRobot) -> None:
+        async with live_map(robot) as mapper:
+            await drive(mapper, range(1))
+        of_one = len(mapper.map)
+        readings = mapper.map.add(frame_at(0, depth=True), np.eye(4))
+
+        async with live_map(robot) as mapper:
+            await drive(mapper, range(5))  # 4 steps are 12.8 cm: the last one is a keyframe
+        counts = len(mapper.map.points(min_readings=1)[0])
+
+        assert readings > 0
+        assert of_one > 0
+        assert of_one < counts < 2 * of_one
+
+    run(work)
+
+
 def test_an_alignment_is_an_event_before_a_pose_uses_it() -> None:
     async def work(robot: FakeLiveRobot) -> None:
         async with live_map(robot) as mapper:

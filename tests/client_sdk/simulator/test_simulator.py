@@ -13,7 +13,7 @@ from client_sdk.frontend import PoseQuery, Tracker
 from client_sdk.mapping import Trajectory
 from client_sdk.simulator import SIMULATED_CAMERA, frames_to_overlap, render_frames, true_trajectory
 from client_sdk.simulator.camera import Painter, add_depth_noise
-from client_sdk.simulator.world import DEPTH_M, HEIGHT_M, ROOM_M, make_world
+from client_sdk.simulator.world import DEPTH_M, DOOR_Y_M, HEIGHT_M, ROOM_M, make_world
 from rse_pf.errors import UsageError
 from rse_pf.experiments.results.trajectory_error import absolute_error
 from rse_pf.geometry import pose_difference, transform
@@ -47,6 +47,24 @@ def test_robots_move_smoothly_inside_the_rooms(robots: int, seed: int):
         assert (low > [0.5, 0.5, 1.0]).all()
         assert (high < [3 * ROOM_M - 0.5, DEPTH_M - 0.5, 1.5]).all()
         np.testing.assert_allclose(np.linalg.det(truth.T_world_camera[:, :3, :3]), 1.0)
+
+
+def test_ten_rooms_have_a_loop_through_all_doors_past_all_tables():
+    truth = true_trajectory(0, 1, 1500, 0, 10)
+    at = truth.positions
+    rooms = (at[:, 0] // ROOM_M).astype(int)
+    along = at[:, 0] % ROOM_M
+    at_table = (along > 2.0) & (along < 3.0) & (at[:, 1] > 1.85) & (at[:, 1] < 2.75)
+    at_door = ((along < 0.2) | (along > ROOM_M - 0.2)) & (at[:, 0] > 1.0)
+
+    assert frames_to_overlap(10, 10) == 158
+    assert max(np.linalg.norm(np.diff(at, axis=0), axis=1)) <= 0.08
+    assert set(rooms) == set(range(10))
+    assert not at_table[rooms % 2 == 0].any()
+    assert ((at[at_door, 1] > DOOR_Y_M[0] + 0.2) & (at[at_door, 1] < DOOR_Y_M[1] - 0.2)).all()
+    assert at_door.any()
+    with pytest.raises(UsageError, match="needs two rooms"):
+        true_trajectory(0, 1, 5, 0, 1)
 
 
 @pytest.mark.parametrize("robots", [1, 2, 3, 5])
