@@ -2,8 +2,8 @@
 
 Stored are commands of services whose messages have no place for a name, what answers them, and the messages
 that keep a connection alive.  Everything else, such as a renewal, an update or what cannot be decoded, is
-left out.  A free text that holds the name of the robot, its tenant or a secret is rewritten; all other
-messages stay as they were, to the byte.
+left out, and so is any message that holds a token or another secret.  A free text that holds the name of the
+robot or of its tenant is rewritten; all other messages stay as they were, to the byte.
 """
 
 from __future__ import annotations
@@ -41,6 +41,9 @@ PROTOCOL_WORDS = frozenset({
     "target", "source", "T_target_source", "overlap", "iterations",
 })  # fmt: skip
 """Words of requests and replies: a robot that has one for a name is not looked for in them."""
+_TOKEN_START = b"eyJ"
+_TOKEN = re.compile(rb"eyJ[A-Za-z0-9_-]{8,}\.[A-Za-z0-9_-]{8,}\.[A-Za-z0-9_-]{8,}")
+"""A JSON Web Token, wherever a robot put it."""
 _UNDECODABLE = (msgspec.DecodeError, RecursionError, ValueError, TypeError, RsePfError)
 
 
@@ -197,6 +200,8 @@ class ConnectionRedactor:
         self, data: bytes, text: bytes, kind: str, service: str, *, from_robot: bool
     ) -> Kept | None:
         if any(each in text for each in self._secrets):
+            return None
+        if _TOKEN_START in text and _TOKEN.search(text) is not None:
             return None
         if not any(form in text for form in self._forms):
             return Kept(data, text, kind, service)
