@@ -54,6 +54,10 @@ def add_live_arguments(parser: argparse.ArgumentParser, common: argparse.Argumen
                 "--from", dest="source", default="", metavar="VERSION",
                 help="MAP, MAP@VERSION, or a version of the map of the same name (default: an empty map)",
             )  # fmt: skip
+            made.add_argument(
+                "--equal-rooms-m", type=float, default=0.0, metavar="METRES",
+                help="size of rooms that look the same; what joins robots must reach farther (default: 0)",
+            )  # fmt: skip
         if name == "forget":
             made.add_argument("robot", metavar="ROBOT", help="name of the robot")
 
@@ -106,7 +110,7 @@ def _show(args: argparse.Namespace, settings: PlatformSettings) -> None:
 
 
 def _start(args: argparse.Namespace, settings: PlatformSettings) -> None:
-    reply = _ask(args, settings, "live-start", {"from": args.source})
+    reply = _ask(args, settings, "live-start", {"from": args.source, "equal_rooms_m": args.equal_rooms_m})
     _print(args, reply, f"{args.name} has begun with {counted(reply['keyframes'], 'keyframe')}")
 
 

@@ -103,10 +103,14 @@ class LiveForget(_Value, frozen=True, kw_only=True):
 
 
 class LiveStart(_Value, frozen=True, kw_only=True):
-    """``live-start``: begin the map with a version of the registry, NAME or NAME@VERSION."""
+    """``live-start``: begin the map, empty or with a version of the registry, NAME or NAME@VERSION.
+
+    ``equal_rooms_m`` is the size of rooms that look the same, 0 if every place is unique.
+    """
 
     map: _MapName
-    source: Annotated[str, msgspec.Meta(min_length=1, max_length=160)] = msgspec.field(name="from")
+    source: Annotated[str, msgspec.Meta(max_length=160)] = msgspec.field(name="from", default="")
+    equal_rooms_m: Annotated[float, msgspec.Meta(ge=0.0, le=100.0)] = 0.0
 
 
 class MapCause(_Value, frozen=True, kw_only=True):

@@ -15,6 +15,8 @@ from collections.abc import Callable, Coroutine
 from dataclasses import dataclass
 from typing import Any
 
+import msgspec
+
 from rse_pf.backend.live_map.owner import requests
 from rse_pf.backend.live_map.owner.lease import OwnerLease
 from rse_pf.backend.live_map.owner.log import LiveLog, MapSnapshot
@@ -31,7 +33,7 @@ from rse_pf.backend.log import JsonLog
 from rse_pf.config import LiveSettings
 from rse_pf.errors import Conflict, InternalError, NotFound, StoreError, UnknownService
 from rse_pf.identity import RobotId
-from rse_pf.live_map.events import Event, KeyframeAdded, RobotForgotten, RobotLeft
+from rse_pf.live_map.events import Event, KeyframeAdded, MapStarted, RobotForgotten, RobotLeft
 from rse_pf.live_map.outcomes import (
     Added,
     Ambiguous,
@@ -269,6 +271,10 @@ class LiveOwner:
             event = await self._context.threads.background(
                 lambda: self._context.kind.started_from(version, source)
             )
+        else:
+            event = MapStarted(source="", keyframes=())
+        if request.source or request.equal_rooms_m:
+            event = msgspec.structs.replace(event, equal_rooms_m=request.equal_rooms_m)
             await asyncio.shield(self._writer.submit(event))
         return {"keyframes": self._state.keyframes, "version": self._state.position}
 

@@ -5,7 +5,7 @@ The router of each worker has judged a robot's payload before; the owner does no
 
 from __future__ import annotations
 
-from typing import Any, TypeVar
+from typing import Annotated, Any, TypeVar
 
 import msgspec
 
@@ -74,9 +74,13 @@ class ForgetRequest(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class StartRequest(msgspec.Struct, frozen=True, kw_only=True, rename={"source": "from"}):
-    """Begin with a version of the registry: MAP, MAP@VERSION, or a version of the map of the same name."""
+    """Begin with a version of the registry: MAP, MAP@VERSION, or a version of the map of the same name.
+
+    ``equal_rooms_m`` is the size of rooms that look the same, 0 if every place is unique.
+    """
 
     source: str = ""
+    equal_rooms_m: Annotated[float, msgspec.Meta(ge=0.0, le=100.0)] = 0.0
 
 
 def to_request(payload: Any, kind: type[_T]) -> _T:

@@ -7,9 +7,11 @@ import asyncio
 import pytest
 
 from rse_pf.backend.live_map.owner.lease import verdict_on
+from rse_pf.backend.live_map.owner.log import LiveLog
 from rse_pf.backend.live_map.owner.requests import MapMoves
 from rse_pf.errors import BadRequest, Conflict, InternalError, NotFound, StoreError
 from rse_pf.identity import RobotId
+from rse_pf.live_map.events import MapStarted, decode_events
 from rse_pf.maps.registry import MapRegistry
 from rse_pf.object_store import MemoryStore
 from tests.backend.live_map.owner_bench import FOLDER, MAP, ROBOT, Bench, FailingStore, settle
@@ -392,6 +394,21 @@ def test_a_stopped_map_is_published_and_begins_anew_without_its_past():
         assert started["keyframes"] == 1
         with pytest.raises(Conflict, match="has begun already"):
             await new.ask("live-start", {"from": MAP})
+
+    bench.run(test)
+
+
+def test_an_empty_map_is_told_that_rooms_look_the_same():
+    bench = Bench()
+
+    async def test() -> None:
+        owner = await bench.own("a")
+        with pytest.raises(BadRequest):
+            await owner.ask("live-start", {"equal_rooms_m": -1.0})
+        await owner.ask("live-start", {"equal_rooms_m": 5.0})
+        log = LiveLog(bench.store, FOLDER, owner="replay", epoch=1)
+        events = [each for entry in log.entries() for each in decode_events(entry.events)]
+        assert [each.equal_rooms_m for each in events if isinstance(each, MapStarted)] == [5.0]
 
     bench.run(test)
 
