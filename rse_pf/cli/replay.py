@@ -79,8 +79,6 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
 def _check(args: argparse.Namespace) -> None:
     """Raise UsageError for what contradicts itself, before any work."""
     path: Path = args.file
-    if not path.exists():
-        raise UsageError(f"there is no file {path}", hint="give a file or a folder of rse-pf local --record")
     if args.command is not None and args.all:
         raise UsageError("--command is one command, and --all is all of them", hint="leave one of them out")
     if args.command is not None and not _IDENTITY.fullmatch(args.command):
@@ -93,7 +91,7 @@ def _check(args: argparse.Namespace) -> None:
     for name, file in (("--export", args.export), ("--html", args.html)):
         if file is not None and not file.parent.is_dir():
             raise UsageError(f"{name}: there is no folder {file.parent}", hint="create it, or choose another")
-        if file is not None and (file.is_dir() or (file.exists() and file.samefile(path))):
+        if file is not None and (file.is_dir() or (file.exists() and path.exists() and file.samefile(path))):
             raise UsageError(f"{name}: {file} is a folder, or the recording", hint="choose another file")
 
 

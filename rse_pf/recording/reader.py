@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import base64
 import binascii
+import heapq
 import importlib
 import itertools
 import os
@@ -16,7 +17,7 @@ import re
 import struct
 import zlib
 from collections import OrderedDict, deque
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
 from pathlib import Path
@@ -32,19 +33,24 @@ from rse_pf.geometry import Array
 from rse_pf.recording import file_format
 from rse_pf.wire import CODECS, Codec, Command, Failure, Result, make_codec
 
-__all__ = ["CASE_NAME", "Odometry", "RecordedCommand", "Recording", "open_recording"]
+__all__ = ["CASE_NAME", "Odometry", "RecordedCommand", "Recording", "open_recording", "recording_files"]
 
 CASE_NAME = "rse_pf_case"
 """Metadata record of a file that was exported for one of its commands."""
 
+_MAGIC = b"\x89MCAP0\r\n"
 _MAX_RECORD_BYTES = 64 << 20
 _MAX_CHUNK_BYTES = 32 << 20
 """Writers end a chunk at 1 MiB and one message."""
 _MAX_WAITING = 4096
 """Commands without an answer that are kept in mind; of more, the oldest count as unanswered."""
 _MAX_CONNECTIONS = 100_000
+_MAX_STREAMS = 128
+"""Recorders whose files are read at the same time."""
 _KEPT_SIGHTS, _SIGHT_AGE_NS = 32, 500_000_000
 """Thumbnails and poses of odometry of a robot, and how old the one of a command may be."""
+_DAMAGE = (struct.error, ValueError, OverflowError)
+"""What the library raises for records that are no records, beside its own errors."""
 _COMMAND_ID = re.compile(r"[0-9a-f]{16}:\d{1,16}")
 
 
@@ -70,6 +76,7 @@ class RecordedCommand:
         answered_ns: When its answer was recorded, None if it has none.
         thumbnail: A small JPEG of the frame, if the robot allowed it.
         odometry: Of the frame, if the robot recorded it.
+        about: What its file says of itself: ``version``, ``side`` (``server`` or ``robot``), ``engine`` ...
     """
 
     id: str
@@ -83,6 +90,7 @@ class RecordedCommand:
     reply_bytes: bytes | None = None
     thumbnail: bytes | None = None
     odometry: Odometry | None = None
+    about: Mapping[str, str] = field(default_factory=dict, repr=False)
     session: SessionSettings = field(default_factory=SessionSettings, repr=False)
 
     @property
@@ -124,7 +132,7 @@ class Recording:
 
     Attributes:
         files: In the order in which they are read.
-        metadata: Of the first file: ``version``, ``side`` (``server`` or ``robot``), ``engine`` ...
+        metadata: Of the first file of a server or robot: ``version``, ``side``, ``engine`` ...
         case_id: Which command a case file is about, "" for recordings.
         cut: Files that end within a record, once they have been read.
         left_out: Messages that could not be decoded, or whose file has more connections than are read.
@@ -141,23 +149,19 @@ class Recording:
 
     def read_head(self) -> None:
         """Read what is said before the first message; raises what `commands` raises."""
-        from mcap.records import Chunk, Message, Metadata
-
-        for record in self._first_records():
-            if isinstance(record, Metadata):
-                if record.name == file_format.METADATA_NAME:
-                    self.metadata = dict(record.metadata)
-                elif record.name == CASE_NAME:
-                    self.case_id = record.metadata.get("command", "")
-            elif isinstance(record, Chunk | Message):
+        for path in self.files:
+            try:
+                found = _head(path)
+            except BadRequest:
+                if len(self.files) == 1:
+                    raise
+                continue
+            about = found.get(file_format.METADATA_NAME, {})
+            self.case_id = self.case_id or found.get(CASE_NAME, {}).get("command", "")
+            if about.get("side") in ("server", "robot"):
+                self.metadata = about
                 return
-
-    def _first_records(self) -> Iterator[Any]:
-        """Yield the records of the first file that was begun."""
-        for path in self.files[:-1]:
-            if path.stat().st_size:
-                return _records(path, [])
-        return _records(self.files[-1], [])
+            self.metadata = self.metadata or about
 
     def commands(self) -> Iterator[RecordedCommand]:
         """Yield every command when it was answered, and at the end those without an answer.
@@ -169,12 +173,11 @@ class Recording:
         self.cut, self.left_out = [], 0
         waiting: OrderedDict[str, RecordedCommand] = OrderedDict()
         sights: dict[str, _Sights] = {}
-        for path in self.files:
-            for sight in self._messages(path):
-                if isinstance(sight.of, file_format.WireChannel):
-                    yield from self._paired(sight, sight.of, waiting, sights)
-                elif len(sights) < _MAX_CONNECTIONS:
-                    sights.setdefault(sight.of[1], _Sights()).add(sight)
+        for sight in self._merged():
+            if isinstance(sight.of, file_format.WireChannel):
+                yield from self._paired(sight, sight.of, waiting, sights)
+            elif len(sights) < _MAX_CONNECTIONS:
+                sights.setdefault(sight.of[1], _Sights()).add(sight)
         yield from (self._with_sights(each, sights) for each in waiting.values())
 
     def find(self, identity: str) -> RecordedCommand:
@@ -208,6 +211,14 @@ class Recording:
             )
         return found[0]
 
+    def _merged(self) -> Iterator[_Sight]:
+        """Yield the messages of all files; those of several recorders by their times."""
+        streams = [list(files) for _, files in itertools.groupby(self.files, key=_recorder)]
+        if len(streams) > _MAX_STREAMS:
+            streams = [list(self.files)]
+        each = [itertools.chain.from_iterable(map(self._messages, files)) for files in streams]
+        yield from heapq.merge(*each, key=lambda sight: sight.time_ns)
+
     def _messages(self, path: Path) -> Iterator[_Sight]:
         """Yield the messages of one file; in a folder, one that was never begun does not end the others."""
         try:
@@ -233,7 +244,7 @@ class Recording:
             waiting[identity] = RecordedCommand(
                 id=identity, robot=channel.robot, tenant=channel.tenant, server=channel.server,
                 codec=channel.codec, sent_ns=message.time_ns, command_bytes=message.data,
-                session=self._session,
+                about=message.about, session=self._session,
             )  # fmt: skip
             if len(waiting) > _MAX_WAITING:
                 yield self._with_sights(waiting.popitem(last=False)[1], sights)
@@ -279,19 +290,35 @@ def open_recording(path: Path, session: SessionSettings | None = None) -> Record
         BadRequest: The first file is no recording.
         UnsupportedProtocol: It is of a newer version.
     """
+    files = recording_files(path)
+    recording = Recording(files, session or SessionSettings())
+    recording.read_head()
+    return recording
+
+
+def recording_files(path: Path) -> tuple[Path, ...]:
+    """Return the files of the recording at *path* in their order; a file is opened only for its first bytes.
+
+    Raises:
+        UsageError: There is no such file, or no recording in the folder.
+        BadRequest: A file that is not in a folder of others is no recording.
+    """
     if path.is_dir():
         files = tuple(sorted(path.glob(f"*{file_format.SUFFIX}"), key=_file_order))
         if not files:
             raise UsageError(
                 f"there is no recording in {path}", hint=f"its files end in {file_format.SUFFIX}"
             )
-    elif path.exists():
-        files = (path,)
-    else:
+        return files
+    if not path.exists():
         raise UsageError(f"there is no file {path}", hint="give a file or a folder of rse-pf local --record")
-    recording = Recording(files, session or SessionSettings())
-    recording.read_head()
-    return recording
+    with path.open("rb") as file:
+        start = file.read(len(_MAGIC))
+    if not start:
+        raise BadRequest(f"{path} is empty", hint="record again; it holds nothing")
+    if start != _MAGIC:
+        raise _no_recording(path)
+    return (path,)
 
 
 # --- files ------------------------------------------------------------------------------------------------
@@ -303,6 +330,7 @@ class _Sight(NamedTuple):
     of: file_format.WireChannel | tuple[str, str]
     time_ns: int
     data: bytes
+    about: Mapping[str, str]
 
 
 class _Sights:
@@ -379,20 +407,42 @@ def _file_order(path: Path) -> tuple[str, str, int]:
     return ("~", path.name, 0) if name is None else (name.started.isoformat(), name.server, name.number)
 
 
+def _recorder(path: Path) -> tuple[str, str]:
+    """Return what is the same for the files that one recorder wrote one after the other."""
+    name = file_format.FileName.parse(path.name)
+    return ("", path.name) if name is None else (name.started.isoformat(), name.server)
+
+
+def _head(path: Path) -> dict[str, dict[str, str]]:
+    """Return the metadata of a file by name."""
+    from mcap.records import Chunk, Message, Metadata
+
+    found = {}
+    for record in _records(path, []):
+        if isinstance(record, Chunk | Message):
+            break
+        if isinstance(record, Metadata):
+            found[record.name] = dict(record.metadata)
+    return found
+
+
 def _messages(path: Path, cut: list[Path]) -> Iterator[_Sight]:
     """Yield the messages of connections, thumbnails and odometry of one file."""
-    from mcap.records import Channel, Message
+    from mcap.records import Channel, Message, Metadata
 
+    about: Mapping[str, str] = {}
     channels: dict[int, file_format.WireChannel | tuple[str, str]] = {}
     for record in _flat(path, cut):
         if isinstance(record, Message):
             of = channels.get(record.channel_id)
             if of is not None:
-                yield _Sight(of, record.log_time, record.data)
+                yield _Sight(of, record.log_time, record.data, about)
         elif isinstance(record, Channel) and len(channels) < _MAX_CONNECTIONS:
             of = _channel(record.topic, record.metadata)
             if of is not None:
                 channels[record.id] = of
+        elif isinstance(record, Metadata) and record.name == file_format.METADATA_NAME:
+            about = dict(record.metadata)
 
 
 def _channel(topic: str, metadata: dict[str, str]) -> file_format.WireChannel | tuple[str, str] | None:
@@ -416,7 +466,7 @@ def _flat(path: Path, cut: list[Path]) -> Iterator[Any]:
             data = _opened(record)
             record.compression, record.data = "", data
             yield from cast("list[Any]", breakup_chunk(record))
-        except (McapError, struct.error, ValueError):
+        except (McapError, *_DAMAGE):
             cut.append(path)
             return
 
@@ -455,7 +505,7 @@ def _records(path: Path, cut: list[Path]) -> Iterator[Any]:
         BadRequest: It is no recording.
         UnsupportedProtocol: It is of a newer version.
     """
-    from mcap.exceptions import EndOfFile, InvalidMagic, McapError
+    from mcap.exceptions import McapError
     from mcap.records import Footer, Header, Metadata
     from mcap.stream_reader import StreamReader
 
@@ -469,9 +519,9 @@ def _records(path: Path, cut: list[Path]) -> Iterator[Any]:
                 record = next(records)
             except StopIteration:
                 return
-            except (McapError, struct.error, ValueError) as error:
-                if count == 0 and isinstance(error, InvalidMagic | EndOfFile | struct.error):
-                    raise _no_recording(path) from None
+            except (McapError, *_DAMAGE) as error:
+                if count == 0:
+                    raise _no_recording(path) from error
                 cut.append(path)
                 return
             if count == 0 and (not isinstance(record, Header) or record.profile != file_format.PROFILE):

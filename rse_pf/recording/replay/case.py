@@ -9,7 +9,9 @@ from __future__ import annotations
 
 import base64
 import os
+import re
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,14 +19,15 @@ import msgspec
 import numpy as np
 
 from rse_pf.config import PnpSettings
-from rse_pf.errors import BadRequest, RsePfError, UsageError
+from rse_pf.errors import BadRequest, RsePfError, UsageError, error_from_code
 from rse_pf.geometry import Camera
 from rse_pf.pnp import DepthNoise, PnpOptions
+from rse_pf.pnp.engines import ENGINES
 from rse_pf.recording import file_format
 from rse_pf.recording.mcap_file import McapFile
 from rse_pf.recording.reader import CASE_NAME, RecordedCommand
 from rse_pf.recording.replay.picture import plain_thumbnail
-from rse_pf.recording.replay.solving import pnp_reply, solver_codes
+from rse_pf.recording.replay.solving import Resolver, pnp_reply
 from rse_pf.services.pnp import PnpReply, PnpRequest
 from rse_pf.wire import Command, Failure, Result, make_codec
 
@@ -36,7 +39,12 @@ MAX_CASE_BYTES = 8 << 20
 
 _CONNECTION, _ROBOT, _TENANT = "0" * 16, "robot-00000000", "tenant-00000000"
 _KEPT_METADATA = ("version", "protocol", "engine", "side")
-_MAX_METADATA = 64
+_WORD = re.compile("|".join((
+    "ok", "weak", "none", "few-inliers", "low-inlier-ratio", "clustered", "nearly-collinear", "ambiguous",
+    "poorly-constrained", *ENGINES,
+)))  # fmt: skip
+"""The words that a pose may hold."""
+_VERSION = re.compile(r"[0-9A-Za-z.+]{1,32}")
 
 
 class CasePart(msgspec.Struct, frozen=True, kw_only=True):
@@ -47,8 +55,12 @@ class CasePart(msgspec.Struct, frozen=True, kw_only=True):
     data: bytes
 
 
-def case_parts(command: RecordedCommand, history: Sequence[RecordedCommand]) -> list[CasePart]:
+def case_parts(
+    command: RecordedCommand, history: Sequence[RecordedCommand], resolver: Resolver
+) -> list[CasePart]:
     """Return the messages of the case of *command*, in their order; earlier ones of its connection only.
+
+    What a failure says is kept where *resolver* gives the same words for the command without names.
 
     Raises:
         BadRequest: It is no command of `pnp`, or its bytes cannot be read.
@@ -59,7 +71,7 @@ def case_parts(command: RecordedCommand, history: Sequence[RecordedCommand]) -> 
     parts: list[CasePart] = []
     for each in told:
         try:
-            parts += _parts(each, start_ns)
+            parts += _parts(each, start_ns, resolver)
         except RsePfError as error:
             if each is command:
                 raise BadRequest(
@@ -90,7 +102,7 @@ def write_case(
     Raises:
         UsageError: The file cannot be written.
     """
-    kept = {name: metadata[name][:_MAX_METADATA] for name in _KEPT_METADATA if name in metadata}
+    kept = {name: metadata[name] for name in _KEPT_METADATA if _VERSION.fullmatch(metadata.get(name, ""))}
     kept |= {"format": str(file_format.FORMAT_VERSION), **_settings_of(metadata)}
     about = {"command": f"{_CONNECTION}:{number}", "exported_by": version}
     try:
@@ -145,7 +157,7 @@ def _channel(file: McapFile, kind: str, codec: str) -> int:
     )  # fmt: skip
 
 
-def _parts(command: RecordedCommand, start_ns: int) -> list[CasePart]:
+def _parts(command: RecordedCommand, start_ns: int, resolver: Resolver) -> list[CasePart]:
     """Return one command and its answer, without names; times count from *start_ns*."""
     sent_ns = command.sent_ns - start_ns
     number = command.command.id
@@ -172,10 +184,11 @@ def _parts(command: RecordedCommand, start_ns: int) -> list[CasePart]:
             image |= {"format": "jpeg", "data": data}
             found.append(CasePart(kind="frames", time_ns=sent_ns, data=file_format.encode_json(image)))
     encode = make_codec(command.codec).encode
-    found.append(CasePart(kind="up", time_ns=sent_ns, data=encode(_nameless_command(command.command))))
+    asked = encode(_nameless_command(command.command))
+    found.append(CasePart(kind="up", time_ns=sent_ns, data=asked))
     reply = command.reply
     if reply is not None and command.answered_ns is not None:
-        answered = encode(_nameless_reply(reply))
+        answered = encode(_nameless_reply(reply, replace(command, command_bytes=asked), resolver))
         found.append(CasePart(kind="down", time_ns=command.answered_ns - start_ns, data=answered))
     return found
 
@@ -199,17 +212,20 @@ def _nameless_command(command: Command) -> Command:
     )  # fmt: skip
 
 
-def _nameless_reply(reply: Result | Failure) -> Result | Failure:
-    """Return *reply* without the server, and without words that are none of the solver's."""
+def _nameless_reply(reply: Result | Failure, asked: RecordedCommand, resolver: Resolver) -> Result | Failure:
+    """Return *reply* without the server, and without words that may be a robot's own."""
     if isinstance(reply, Failure):
-        if reply.code in solver_codes():
-            return msgspec.structs.replace(reply, server="", trace="")
-        return Failure(
-            id=reply.id, code=reply.code[:_MAX_METADATA], message="", retry_after_ms=reply.retry_after_ms
-        )
+        again = resolver.again(asked).answer
+        code = error_from_code(reply.code, "").code  # one of the platform's
+        if isinstance(again, Failure) and (again.message, again.hint) == (reply.message, reply.hint):
+            return msgspec.structs.replace(again, code=code, server="", trace="")
+        return Failure(id=reply.id, code=code, message="", retry_after_ms=reply.retry_after_ms)
     payload: Any = None
-    if pnp_reply(reply) is not None and isinstance(reply.reply, dict):
+    pose = pnp_reply(reply)
+    words = () if pose is None else (pose.verdict, pose.reason or "none", pose.engine)
+    if pose is not None and all(map(_WORD.fullmatch, words)) and isinstance(reply.reply, dict):
         payload = _only(reply.reply, PnpReply)
+        payload |= {name: _numbers(payload[name]) for name in ("T_camera_world", "inliers", "covariance")}
     return Result(
         id=reply.id, reply=payload, queue_ms=reply.queue_ms, compute_ms=reply.compute_ms,
         received_s=1.0, sent_s=1.0 + max(0.0, reply.sent_s - reply.received_s),
@@ -225,7 +241,7 @@ def _only(given: Mapping[str, Any], kind: type[msgspec.Struct]) -> dict[str, Any
 def _scalars(given: dict[str, Any], *, engine: bool) -> dict[str, Any]:
     """Return what is a number, and the name of an engine."""
     numbers = {name: each for name, each in given.items() if isinstance(each, int | float)}
-    if engine and given.get("engine") in ("native", "poselib", "opencv"):
+    if engine and given.get("engine") in ENGINES:
         numbers["engine"] = given["engine"]
     return {name: numbers[name] for name in given if name in numbers}
 

@@ -18,6 +18,7 @@ import msgspec
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import BadMessage, BadRequest, Crashed, InternalError, LimitExceeded
 from rse_pf.limited_process import Handler, LimitedProcesses, Overran
+from rse_pf.recording.reader import recording_files
 from rse_pf.recording.replay import run
 from rse_pf.recording.replay.case import CASE_SUFFIX, MAX_CASE_BYTES
 from rse_pf.recording.replay.report import CommandReport
@@ -105,6 +106,7 @@ class LimitedReplay:
 
     def _ask(self, order: _Order, kind: type[T]) -> T:
         path = Path(order.path)
+        recording_files(path)  # what is plainly wrong is told before a process is started
         is_case = path.suffix == CASE_SUFFIX
         if is_case and path.is_file() and path.stat().st_size > MAX_CASE_BYTES:
             raise LimitExceeded(

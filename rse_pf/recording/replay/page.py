@@ -48,8 +48,8 @@ table { border-collapse: collapse; width: 100%; font-variant-numeric: tabular-nu
 th, td { text-align: left; padding: .3rem .7rem .3rem 0; border-bottom: 1px solid var(--line);
   vertical-align: top; }
 th { font-weight: 600; } td.number, th.number { text-align: right; }
-code { font: .92em ui-monospace, monospace; overflow-wrap: anywhere; }
-svg { max-width: 100%; height: auto; } svg text { fill: var(--pale); font: 11px system-ui, sans-serif; }
+code { font: .92em ui-monospace, monospace; overflow-wrap: anywhere; } td code { white-space: nowrap; }
+svg { max-width: 100%; height: auto; } svg text { fill: var(--ink); font: 11px system-ui, sans-serif; }
 .i { fill: var(--inlier); } .o { fill: var(--outlier); } .axis { stroke: var(--line); }
 """
 

@@ -143,8 +143,6 @@ def report_of(
     resolver: Resolver,
     overrides: Overrides | None = None,
     *,
-    version: str = "",
-    side: str = "server",
     with_picture: bool = True,
 ) -> CommandReport:
     """Return all that is known about *command*; never raises for what is in it.
@@ -154,8 +152,6 @@ def report_of(
         history: Earlier commands of the same robot, oldest first.
         resolver: Solves again.
         overrides: What the caller wants to try.
-        version: Of the platform that recorded.
-        side: Which clock the times of the recording are of: ``server`` or ``robot``.
         with_picture: Whether to draw the matches.
 
     Raises:
@@ -167,7 +163,7 @@ def report_of(
     reply, service = _read(command)
     pose = pnp_reply(reply)
     problem = _problem(command, resolver, pose)
-    base = _base(command, again, reply, pose, service, version)
+    base = _base(command, again, reply, pose, service)
     if problem is None:
         return base
     tried = _attempt("", resolver.again(command, overrides), pose) if overrides.changes else None
@@ -181,7 +177,7 @@ def report_of(
     return msgspec.structs.replace(
         base,
         matches=len(problem.pixels),
-        causes=_causes(command, history, problem, reply, side),
+        causes=_causes(command, history, problem, reply),
         tried=tried,
         tried_name=_name_of(overrides),
         engines=_engines(command, resolver, pose),
@@ -196,12 +192,12 @@ def report_of(
 
 
 def causes_of(
-    command: RecordedCommand, history: Sequence[RecordedCommand], resolver: Resolver, *, side: str = "server"
+    command: RecordedCommand, history: Sequence[RecordedCommand], resolver: Resolver
 ) -> tuple[CauseFound, ...]:
     """Return why *command* went wrong, likeliest first; nothing for another service than `pnp`."""
     reply, _ = _read(command)
     problem = _problem(command, resolver, pnp_reply(reply))
-    return () if problem is None else _causes(command, history, problem, reply, side)
+    return () if problem is None else _causes(command, history, problem, reply)
 
 
 def _base(
@@ -210,7 +206,6 @@ def _base(
     reply: Result | Failure | None,
     pose: PnpReply | None,
     service: str,
-    version: str,
 ) -> CommandReport:
     verdict, reason, hint = "unanswered", "", ""
     if isinstance(reply, Failure):
@@ -221,7 +216,8 @@ def _base(
         verdict = "answered"
     result = reply if isinstance(reply, Result) else None
     return CommandReport(
-        id=command.id, robot=command.robot, server=command.server, version=version, service=service,
+        id=command.id, robot=command.robot, server=command.server,
+        version=command.about.get("version", ""), service=service,
         codec=command.codec, sent_s=command.sent_s, round_trip_ms=command.round_trip_ms,
         queue_ms=0.0 if result is None else _plain(result.queue_ms),
         compute_ms=0.0 if result is None else _plain(result.compute_ms),
@@ -280,7 +276,6 @@ def _causes(
     history: Sequence[RecordedCommand],
     problem: _Problem,
     reply: Result | Failure | None,
-    side: str,
 ) -> tuple[CauseFound, ...]:
     past = [each for each in map(_past, history) if each is not None]
     odometry = command.odometry
@@ -290,7 +285,7 @@ def _causes(
             problem.recorded,
             thumbnail=command.thumbnail,
             history=past or None,
-            timing=_timing(command, history, reply, side),
+            timing=_timing(command, history, reply),
             T_odom_camera=None if odometry is None else odometry.T_odom_camera,
         )
     return tuple(CauseFound.of(each) for each in found)
@@ -317,15 +312,17 @@ def _past(command: RecordedCommand) -> PastCommand | None:
 
 
 def _timing(
-    command: RecordedCommand, history: Sequence[RecordedCommand], reply: Result | Failure | None, side: str
+    command: RecordedCommand, history: Sequence[RecordedCommand], reply: Result | Failure | None
 ) -> Timing:
-    """Return when command and answer were where; *side* says whose clock the recording has."""
+    """Return when command and answer were where, by the clock of the server or robot that recorded."""
     sent = [each.sent_s for each in history] + [command.sent_s]
     gaps = np.diff(np.array(sent))
     period_s = float(np.median(gaps)) if len(gaps) > 1 else None
     deadline_ms = command.command.deadline_ms
     deadline_s = None if deadline_ms is None else deadline_ms / 1e3
-    if side != "robot":  # the robot saw a longer way, so that what is late here was late there
+    if (
+        command.about.get("side") != "robot"
+    ):  # the robot saw a longer way, so that what is late here was late there
         return Timing(
             sent_s=command.sent_s, answered_s=command.answered_s, received_s=command.sent_s,
             replied_s=command.answered_s, deadline_s=deadline_s, period_s=period_s,

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import dataclasses
 import heapq
 from collections import Counter, deque
 from pathlib import Path
+from typing import Any
 
 import msgspec
 
@@ -22,6 +24,7 @@ HISTORY = 8
 """Earlier commands of a robot that an explanation looks at."""
 _MAX_ROBOTS = 10_000
 _MAX_CHANGED = 1000
+_MAX_RESOLVERS = 16
 
 
 class Changed(msgspec.Struct, frozen=True, kw_only=True):
@@ -120,7 +123,7 @@ def overview(
         RsePfError: The recording cannot be read, or *overrides* name an engine that is not there.
     """
     recording = open_recording(path, settings.session)
-    resolver = _resolver(recording, settings)
+    resolvers = _Resolvers(settings)
     robots: dict[str, tuple[RobotHistory, deque[RecordedCommand]]] = {}
     kept = _Worst(max(worst, explain))
     others: list[tuple[RecordedCommand, tuple[RecordedCommand, ...]]] = []
@@ -145,7 +148,7 @@ def overview(
         past.append(command)
         if not solve:
             continue
-        again = resolver.again(command, overrides)
+        again = resolvers.of(command).again(command, overrides)
         if again.why_not or command.reply_bytes is None:
             not_solved[again.why_not or "no answer was recorded"] += 1
         elif again.is_equal:
@@ -156,16 +159,16 @@ def overview(
                 changed.append(Changed(id=command.id, what=again.difference))
     bad = kept.sorted()
     looked_at = [*((command, past) for _, command, past in bad), *others][:explain]
-    side = recording.metadata.get("side", "server")
     return Overview(
         files=len(recording.files), cut=tuple(sorted({each.name for each in recording.cut})),
-        version=recording.metadata.get("version", ""), side=side, commands=commands, robots=len(robots),
+        version=recording.metadata.get("version", ""), side=recording.metadata.get("side", ""),
+        commands=commands, robots=len(robots),
         seconds=0.0 if first_s is None or last_s is None else last_s - first_s, left_out=recording.left_out,
         equal=equal, different=different, was_solved=solve, changed=tuple(changed),
         not_solved=dict(not_solved.most_common(20)), by_kind=dict(by_kind),
         troubles=tuple(trouble for trouble, _, _ in bad[:worst]),
         causes={
-            command.id: causes_of(command, past, resolver, side=side) for command, past in looked_at
+            command.id: causes_of(command, past, resolvers.of(command)) for command, past in looked_at
         },
         explained=len(looked_at),
     )  # fmt: skip
@@ -187,11 +190,7 @@ def report(
     """
     recording = open_recording(path, settings.session)
     command, history = recording.find_with_history(_identity(recording, identity), HISTORY)
-    return report_of(
-        command, history, _resolver(recording, settings), overrides,
-        version=recording.metadata.get("version", ""), side=recording.metadata.get("side", "server"),
-        with_picture=with_picture,
-    )  # fmt: skip
+    return report_of(command, history, _Resolvers(settings).of(command), overrides, with_picture=with_picture)
 
 
 def case_of(path: Path, settings: PlatformSettings, identity: str) -> Exported:
@@ -199,9 +198,11 @@ def case_of(path: Path, settings: PlatformSettings, identity: str) -> Exported:
     recording = open_recording(path, settings.session)
     command, history = recording.find_with_history(_identity(recording, identity), HISTORY)
     return Exported(
-        parts=tuple(case_parts(command, history)), codec=command.codec, number=command.command.id,
-        metadata=recording.metadata,
-    )  # fmt: skip
+        parts=tuple(case_parts(command, history, _Resolvers(settings).of(command))),
+        codec=command.codec,
+        number=command.command.id,
+        metadata=dict(command.about),
+    )
 
 
 def find(path: Path, settings: PlatformSettings, *, trace: str, number: int) -> str:
@@ -223,14 +224,28 @@ def _identity(recording: Recording, identity: str) -> str:
     return identity or recording.case_id
 
 
-def _resolver(recording: Recording, settings: PlatformSettings) -> Resolver:
-    """Return what solves with the numbers of the server that recorded, as far as they are known."""
+class _Resolvers:
+    """What solves with the numbers of the server that recorded, as far as its file says them."""
+
+    def __init__(self, settings: PlatformSettings) -> None:
+        self._settings = settings
+        self._by_text: dict[str, Resolver] = {}
+
+    def of(self, command: RecordedCommand) -> Resolver:
+        text = command.about.get("pnp", "")
+        if text not in self._by_text:
+            if len(self._by_text) >= _MAX_RESOLVERS:
+                self._by_text.clear()
+            self._by_text[text] = Resolver(self._settings.replace(pnp=_pnp_settings(text)))
+        return self._by_text[text]
+
+
+def _pnp_settings(text: str) -> dict[str, Any]:
+    """Return the settings of the solver that *text* says, the defaults where it says none."""
+    defaults = dataclasses.asdict(PnpSettings())
     try:
-        given = msgspec.json.decode(recording.metadata.get("pnp", "{}"))
-        pnp = PnpSettings(
-            **{name: given[name] for name in ("engine", "max_correspondences", "max_iterations")}
-        )
-        settings = settings.replace(pnp=msgspec.to_builtins(pnp))
-    except (msgspec.DecodeError, RsePfError, KeyError, TypeError, ValueError):
-        settings = settings.replace(pnp=msgspec.to_builtins(PnpSettings()))
-    return Resolver(settings)
+        given = msgspec.json.decode(text, type=dict[str, Any])
+        PlatformSettings().replace(pnp=given)
+    except (msgspec.DecodeError, RsePfError, TypeError, ValueError):
+        return defaults
+    return {**defaults, **given}

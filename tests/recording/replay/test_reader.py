@@ -1,0 +1,238 @@
+"""Recordings are read in order, up to where they are cut off; what is no recording is told in one line."""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from mcap.writer import CompressionType, Writer
+from recording.replay.made import START_NS, Made, jpeg
+
+from rse_pf.errors import BadRequest, LimitExceeded, RsePfError, UnsupportedProtocol, UsageError
+from rse_pf.recording import file_format
+from rse_pf.recording.reader import open_recording
+from rse_pf.wire import Command, Result
+
+
+def test_commands_come_with_their_answers_in_the_order_in_which_they_were_answered(tmp_path: Path) -> None:
+    made = Made(tmp_path / "a")
+    slow = made.send(1, took_ns=500_000_000, is_answered=False)
+    fast = [made.send(seed, codec=codec) for seed, codec in ((2, "zlib"), (3, "json"))]
+
+    commands = list(open_recording(made.close()).commands())
+
+    assert [each.id for each in commands] == [*fast, slow]
+    assert [each.codec for each in commands] == ["zlib", "json", "bin"]
+    assert isinstance(commands[0].command, Command)
+    assert isinstance(commands[0].reply, Result)
+    assert commands[0].round_trip_ms == pytest.approx(3.0)
+    assert commands[0].sent_s == pytest.approx(START_NS / 1e9 + 0.4)
+    assert commands[2].reply is None
+    assert commands[2].round_trip_ms is None
+    assert commands[0].about["side"] == "server"
+
+
+def test_an_answer_in_the_next_file_is_found(tmp_path: Path) -> None:
+    made = Made(tmp_path / "a", max_file_bytes=1)
+    sent = [made.send(seed) for seed in range(3)]
+    assert len(list(made.close().glob("*.mcap"))) == 3
+
+    assert [each.id for each in open_recording(tmp_path / "a").commands() if each.reply_bytes] == sent
+
+
+def test_files_of_two_servers_are_read_by_their_times(tmp_path: Path) -> None:
+    first, second = (
+        Made(tmp_path / "a"),
+        Made(tmp_path / "a", server="server-2", start_ns=START_NS + 300_000_000),
+    )
+    for seed in range(4):
+        first.send(seed, robot=1)
+        second.send(seed, robot=2)
+    first.close()
+    second.close()
+
+    times = [each.sent_ns for each in open_recording(tmp_path / "a").commands()]
+
+    assert times == sorted(times)
+    assert len(times) == 8
+
+
+def test_a_thumbnail_and_odometry_belong_to_the_command_that_was_sent_next(tmp_path: Path) -> None:
+    made = Made(tmp_path / "a")
+    made.send(1, thumbnail=jpeg(), T_odom_camera=np.eye(4))
+    made.send(2)
+    made.send(3, robot=7, T_odom_camera=2 * np.eye(4))
+
+    with_both, later, other = open_recording(made.close()).commands()
+
+    assert with_both.thumbnail == jpeg()
+    assert with_both.odometry is not None
+    assert np.array_equal(with_both.odometry.T_odom_camera, np.eye(4))
+    assert later.odometry is None
+    assert other.thumbnail is None
+    assert other.odometry is not None
+
+
+@pytest.mark.parametrize("share", [0.2, 0.5, 0.9])
+def test_a_file_that_is_cut_off_is_read_up_to_its_last_whole_chunk(tmp_path: Path, share: float) -> None:
+    made = Made(tmp_path / "a")
+    sent = [made.send(seed) for seed in range(30)]
+    path = made.file()
+    data = path.read_bytes()
+    path.write_bytes(data[: int(share * len(data))])
+
+    recording = open_recording(path)
+    read = [each.id for each in recording.commands() if each.reply_bytes]
+
+    assert read == sent[: len(read)]
+    assert len(read) >= share * 30 - 6
+    assert recording.cut == [path]
+
+
+def test_a_damaged_chunk_ends_the_file(tmp_path: Path) -> None:
+    made = Made(tmp_path / "a")
+    for seed in range(30):
+        made.send(seed)
+    path = made.file()
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 0xFF
+    path.write_bytes(data)
+
+    recording = open_recording(path)
+
+    assert 0 < len(list(recording.commands())) < 30
+    assert recording.cut
+
+
+def test_a_file_that_another_library_wrote_is_read(tmp_path: Path) -> None:
+    made = Made(tmp_path / "a")
+    made.send(1)
+    (command,) = open_recording(made.file()).commands()
+    for compression in (CompressionType.NONE, CompressionType.LZ4):
+        path = tmp_path / f"{compression.name}.mcap"
+        with path.open("wb") as file:
+            writer = Writer(file, compression=compression)
+            writer.start(profile="rse-pf")
+            wire = file_format.WireChannel("0" * 16, "up", "bin", "", "robot-1", "tenant-1")
+            channel = writer.register_channel(
+                file_format.wire_topic("0" * 16, "up"), file_format.WIRE_ENCODING, 0,
+                file_format.wire_metadata(wire),
+            )  # fmt: skip
+            writer.add_message(channel, START_NS, command.command_bytes, START_NS)
+            writer.finish()
+
+        assert [each.command_bytes for each in open_recording(path).commands()] == [command.command_bytes]
+
+
+def _wrong(tmp_path: Path, name: str) -> Path:
+    """Return the path of a file that is no recording."""
+    path = tmp_path / name
+    if name == "folder":
+        path.mkdir()
+    elif name == "empty":
+        path.write_bytes(b"")
+    elif name == "text":
+        path.write_bytes(b"no recording")
+    elif name == "magic":
+        path.write_bytes(b"\x89MCAP0\r\n")
+    elif name == "length":
+        path.write_bytes(b"\x89MCAP0\r\n\x01" + struct.pack("<Q", 1 << 60))
+    elif name in ("profile", "newer", "zstd", "bomb"):
+        kind = CompressionType.ZSTD if name == "zstd" else CompressionType.LZ4
+        with path.open("wb") as file:
+            writer = Writer(file, compression=kind, chunk_size=1 << 30)
+            writer.start(profile="ros2" if name == "profile" else "rse-pf")
+            version = str(file_format.FORMAT_VERSION + 1) if name == "newer" else "1"
+            writer.add_metadata(file_format.METADATA_NAME, {"format": version})
+            channel = writer.register_channel("/wire/0000000000000000/up", "rse-pf-wire", 0)
+            writer.add_message(channel, 1, bytes(100_000_000 if name == "bomb" else 1000), 1)
+            writer.finish()
+    return path
+
+
+@pytest.mark.parametrize(
+    ("name", "kind", "says"),
+    [
+        ("missing", UsageError, "there is no file"),
+        ("folder", UsageError, "there is no recording in"),
+        ("empty", BadRequest, "is empty"),
+        ("text", BadRequest, "is not a recording"),
+        ("magic", BadRequest, "is not a recording"),
+        ("length", BadRequest, "is not a recording"),
+        ("profile", BadRequest, "is not a recording"),
+        ("newer", UnsupportedProtocol, "has format 2"),
+        ("zstd", LimitExceeded, "'zstd' are not read"),
+        ("bomb", LimitExceeded, "is above"),
+    ],
+)
+def test_what_is_no_recording_is_told_in_one_line(
+    tmp_path: Path, name: str, kind: type[RsePfError], says: str
+) -> None:
+    with pytest.raises(kind, match=says) as error:
+        list(open_recording(_wrong(tmp_path, name)).commands())
+
+    assert error.value.hint
+    assert "\n" not in error.value.message
+
+
+def test_a_file_that_was_never_begun_does_not_end_the_others(tmp_path: Path) -> None:
+    made = Made(tmp_path / "a")
+    made.send(1)
+    (made.close() / "20200101T000000Z-server-0-0001.mcap").write_bytes(b"")
+
+    recording = open_recording(tmp_path / "a")
+
+    assert len(list(recording.commands())) == 1
+    assert len(recording.cut) == 1
+
+
+def test_a_command_is_found_by_the_end_of_its_name_if_that_is_clear(tmp_path: Path) -> None:
+    made = Made(tmp_path / "a")
+    names = [made.send(seed, robot=seed) for seed in range(3)]
+    recording = open_recording(made.close())
+
+    assert recording.find(names[1]).id == names[1]
+    assert recording.find("1").id == names[1]
+    with pytest.raises(BadRequest, match="no command '9'"):
+        recording.find("9")
+
+
+def _without_checksums(path: Path) -> Path:
+    """Return a copy in which damage is not noticed by the checksums of chunks."""
+    copy = path.with_name("copy.mcap")
+    with path.open("rb") as source, copy.open("wb") as file:
+        writer = Writer(file, compression=CompressionType.NONE, enable_crcs=False)
+        writer.start(profile="rse-pf")
+        channels: dict[str, int] = {}
+        for _, channel, message in make_reader(source).iter_messages():
+            if channel.topic not in channels:
+                channels[channel.topic] = writer.register_channel(
+                    channel.topic, channel.message_encoding, 0, channel.metadata
+                )
+            writer.add_message(channels[channel.topic], message.log_time, message.data, message.publish_time)
+        writer.finish()
+    return copy
+
+
+@pytest.mark.slow
+def test_no_bytes_raise_anything_but_a_named_error(tmp_path: Path) -> None:
+    made = Made(tmp_path / "a")
+    for seed in range(4):
+        made.send(seed, codec=("bin", "zlib", "json")[seed % 3], thumbnail=jpeg(), T_odom_camera=np.eye(4))
+    good = _without_checksums(made.file()).read_bytes()
+    path, rng, read = tmp_path / "b.mcap", np.random.default_rng(1), 0
+    for _ in range(1500):
+        data = bytearray(good)
+        for _ in range(rng.integers(1, 5)):
+            data[rng.integers(len(data))] = rng.integers(256)
+        path.write_bytes(data[: rng.integers(len(data))] if rng.random() < 0.3 else data)
+        try:
+            for command in open_recording(path).commands():
+                read += bool(command.id)
+                _ = command.command, command.reply
+        except RsePfError:
+            continue
+    assert read > 500

@@ -1,0 +1,178 @@
+"""Commands that are solved again give the recorded bytes; what cannot be solved again says why."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+from recording.replay.made import START_NS, Made
+
+from rse_pf.config import PlatformSettings
+from rse_pf.errors import BadRequest
+from rse_pf.geometry import exp_se3, transform
+from rse_pf.pnp import available_engines, solver
+from rse_pf.pnp.problems import DEGENERATE, PnpProblem, make_degenerate, make_problem
+from rse_pf.recording.reader import RecordedCommand, open_recording
+from rse_pf.recording.replay import run
+from rse_pf.recording.replay.rules import LIMITS
+from rse_pf.recording.replay.solving import TIMES_AND_PLACES, Overrides, Resolver, pnp_reply
+from rse_pf.wire import Failure, Result, make_codec
+
+SETTINGS = PlatformSettings()
+ENGINES = available_engines()
+
+
+@pytest.mark.parametrize(
+    ("codec", "engine"), [("zlib", "native"), ("json", "native"), *(("bin", each) for each in ENGINES)]
+)
+def test_every_answer_is_equal_to_the_byte_with_the_engine_that_gave_it(
+    tmp_path: Path, codec: str, engine: str
+) -> None:
+    if engine not in ENGINES:
+        pytest.skip("the native core is not built")
+    made = Made(tmp_path / "a", settings=SETTINGS.replace(pnp={"engine": engine}))
+    for seed in range(4):
+        made.send(make_problem(seed=seed, n=80, outlier_ratio=0.3 * (seed % 3)), codec=codec)
+    for kind in DEGENERATE[:6]:
+        made.send(make_degenerate(kind, seed=1), codec=codec)
+
+    seen = run.overview(made.close(), SETTINGS, solve=True, explain=0)
+
+    assert (seen.commands, seen.equal, seen.different) == (10, 10, 0)
+
+
+def changed(command: RecordedCommand, **fields: object) -> RecordedCommand:
+    """Return *command* with fields of its reply changed."""
+    reply = command.reply
+    assert isinstance(reply, Result)
+    other = msgspec.structs.replace(reply, reply={**reply.reply, **fields})
+    return dataclasses.replace(command, reply_bytes=make_codec(command.codec).encode(other))
+
+
+def test_the_smallest_change_of_an_answer_is_noticed(tmp_path: Path) -> None:
+    made = Made(tmp_path / "a")
+    made.send(1)
+    (command,) = open_recording(made.close()).commands()
+    assert command.reply is not None
+    assert isinstance(command.reply, Result)
+    pose = np.array(command.reply.reply["T_camera_world"])
+    pose[3] = np.nextafter(pose[3], np.inf)
+    resolver = Resolver()
+
+    assert resolver.again(command).is_equal
+    assert not resolver.again(changed(command, T_camera_world=pose)).is_equal
+    assert "weak" in resolver.again(changed(command, verdict="weak", reason="few-inliers")).difference
+
+
+def test_times_and_places_may_differ(tmp_path: Path) -> None:
+    made = Made(tmp_path / "a")
+    made.send(1, codec="json")
+    (command,) = open_recording(made.close()).commands()
+    reply = command.reply
+    assert isinstance(reply, Result)
+    numbers = {"queue_ms": 7.5, "compute_ms": 0.25, "received_s": 1e5, "sent_s": 2e5, "server": "another"}
+    assert set(numbers) < set(TIMES_AND_PLACES)
+
+    data = make_codec("json").encode(msgspec.structs.replace(reply, **numbers))
+    elsewhere = dataclasses.replace(command, reply_bytes=data)
+
+    assert Resolver().again(elsewhere).is_equal
+
+
+def test_what_a_server_refused_or_never_answered_is_not_solved_again(tmp_path: Path) -> None:
+    made = Made(tmp_path / "a")
+    made.send(1, answer=Failure(id=0, code="busy", message="wait"))
+    made.send(2, is_answered=False)
+    made.send(3, service="warehouse")
+    made.send(4)
+
+    seen = run.overview(made.close(), SETTINGS, solve=True, explain=0)
+
+    assert (seen.commands, seen.equal, seen.different) == (4, 1, 0)
+    assert seen.not_solved == {
+        "the server did not solve it: busy": 1,
+        "no answer was recorded": 1,
+        "its service is installed on the server": 1,
+    }
+
+
+def test_other_options_are_tried_and_said(tmp_path: Path) -> None:
+    made = Made(tmp_path / "a")
+    made.send(make_problem(seed=5, n=80, noise_px=2.0))
+    (command,) = open_recording(made.close()).commands()
+    resolver = Resolver()
+
+    loose, tight = (
+        pnp_reply(resolver.again(command, Overrides(inlier_px=px, max_iterations=5000)).answer)
+        for px in (16.0, 1.0)
+    )
+
+    assert loose is not None
+    assert tight is not None
+    assert loose.inliers.size > tight.inliers.size
+    with pytest.raises(BadRequest, match="no engine named"):
+        resolver.again(command, Overrides(engine="magic"))
+
+
+def test_the_limits_of_the_server_that_recorded_hold_again(tmp_path: Path) -> None:
+    small = SETTINGS.replace(pnp={"max_correspondences": 50, "max_iterations": 40})
+    made = Made(tmp_path / "a", settings=small)
+    made.send(make_problem(seed=1, n=60))
+    made.send(make_problem(seed=2, n=40, outlier_ratio=0.7))
+
+    seen = run.overview(made.close(), SETTINGS, solve=True, explain=0)
+
+    assert (seen.equal, seen.different) == (2, 0)
+
+
+def test_the_rules_have_the_limits_of_the_solver() -> None:
+    for name, limit in LIMITS.items():
+        assert getattr(solver, f"_{name}") == limit, name
+
+
+def test_what_went_wrong_is_listed_worst_first(tmp_path: Path) -> None:
+    made = Made(tmp_path / "a")
+    problem = make_problem(seed=3, n=60, outlier_ratio=0.0)
+    made.send(problem)
+    late = made.send(problem, took_ns=900_000_000)
+    lost = made.send(problem, is_answered=False)
+    stale = made.send(problem, answer=Failure(id=3, code="stale", message="a newer one came"))
+    weak = made.send(make_problem(seed=9, n=60, outlier_ratio=0.8))
+    failed = made.send(make_degenerate("collinear", seed=1))
+    made.send(problem, robot=1, T_odom_camera=np.eye(4))
+    jump = made.send(seen_from_aside(problem), robot=1, T_odom_camera=np.eye(4))
+
+    seen = run.overview(made.close(), SETTINGS, solve=False)
+
+    assert [(each.kind, each.id) for each in seen.troubles] == [
+        ("failed", failed), ("jump", jump), ("unanswered", lost), ("expired", stale), ("weak", weak),
+        ("late", late),
+    ]  # fmt: skip
+    assert seen.causes[jump]
+    assert not seen.was_solved
+
+
+def seen_from_aside(problem: PnpProblem) -> PnpProblem:
+    """Return the same points as a camera sees them that is 0.9 m further to the side."""
+    T_moved = exp_se3([0.9, 0.0, 0.0, 0.0, 0.0, 0.0]) @ problem.T_camera_world
+    pixels = problem.camera.project(transform(T_moved, problem.points_world))
+    return dataclasses.replace(problem, pixels=pixels, T_camera_world=T_moved)
+
+
+@pytest.mark.slow
+def test_ten_thousand_commands_of_two_servers_are_equal_to_the_byte(tmp_path: Path) -> None:
+    for number, start_ns in enumerate((START_NS, START_NS + 3_600_000_000_000)):
+        made = Made(tmp_path / "a", server=f"server-{number}", start_ns=start_ns, max_file_bytes=8 << 20)
+        for seed in range(5000):
+            codec = ("bin", "zlib", "json")[seed % 3]
+            ratio = (0.2, 0.5, 0.7)[seed // 3 % 3]
+            made.send(make_problem(seed=seed, outlier_ratio=ratio), codec=codec, robot=seed % 3)
+        made.close()
+
+    seen = run.overview(tmp_path / "a", SETTINGS, solve=True, explain=0)
+
+    assert (seen.commands, seen.equal, seen.different) == (10_000, 10_000, 0)
+    assert seen.files > 2
