@@ -15,7 +15,7 @@ from typing import Any
 from urllib.parse import parse_qsl
 
 from rse_pf.auth.control_token import carries_token
-from rse_pf.errors import BadRequest, Forbidden, LimitExceeded, NotFound, RsePfError, Unauthorized
+from rse_pf.errors import BadRequest, Busy, Forbidden, LimitExceeded, NotFound, RsePfError, Unauthorized
 from rse_pf.fleet_page.hub import Hub
 from rse_pf.fleet_page.page_sessions import PageSessions, Role
 from rse_pf.fleet_page.static_files import StaticFile
@@ -37,7 +37,13 @@ _HEADERS = (
 _MAX_BODY_BYTES = 4096
 _TOPICS = frozenset(("fleet", "history", "robots", "event", "pose", "link", "maps"))
 _LIVE = "live/"
-_STATUS = {"unauthorized": 401, "forbidden": 403, "not-found": 404, "limit-exceeded": 413, "busy": 503}
+_STATUS = {
+    Unauthorized.code: 401,
+    Forbidden.code: 403,
+    NotFound.code: 404,
+    LimitExceeded.code: 413,
+    Busy.code: 503,
+}
 
 Scope = MutableMapping[str, Any]
 Receive = Callable[[], Awaitable[MutableMapping[str, Any]]]

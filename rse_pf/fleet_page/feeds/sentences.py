@@ -80,7 +80,8 @@ def _idle(
     measured = f"{min(count, wanted)} of {wanted} samples idle"
     least = int(policy.get("min_servers", settings.min_servers))
     if servers <= least:
-        return f"{measured}: nothing happens, {_servers(least)} are the fewest that are allowed"
+        verb = "is" if least == 1 else "are"
+        return f"{measured}: nothing happens, {_servers(least)} {verb} the fewest that are allowed"
     if count >= wanted:
         return f"{measured}: one server leaves now"
     return f"{measured}: one server leaves after {_counted(wanted - count, 'further idle sample')}"

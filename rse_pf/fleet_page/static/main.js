@@ -92,6 +92,7 @@ function take({ topic, key, value }) {
   if (topic === "fleet") {
     setText(byId("platform"), value.platform);
     document.title = `${value.platform}: ${value.robots} robots`;
+    byId("link").dataset.delayMs = String(Math.round(Date.now() - 1000 * value.time_s));
     views.fleet.take(value);
   } else if (topic === "history") views.fleet.takeHistory(value);
   else if (topic === "robots") views.fleet.takeRobots(value);

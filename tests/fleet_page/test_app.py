@@ -1,0 +1,212 @@
+"""The page refuses what has no key, other origins and other names; its files are a fixed table."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import itertools
+import json
+from collections.abc import Mapping
+from typing import Any
+
+import pytest
+
+from rse_pf.errors import UsageError
+from rse_pf.fleet_page.app import CONTENT_SECURITY_POLICY, FleetApp, PageActions
+from rse_pf.fleet_page.hub import MAX_PAGES, Hub
+from rse_pf.fleet_page.page_sessions import PageSessions
+from rse_pf.fleet_page.static_files import page_files
+
+HOST = "127.0.0.1:8701"
+ADMIN = "ab" * 32
+FILES = page_files()
+
+
+class Page:
+    """The application, asked without a socket."""
+
+    def __init__(self) -> None:
+        numbers = itertools.count()
+        self.hub = Hub()
+        self.sessions = PageSessions(secret=lambda: f"secret-{next(numbers)}")
+        self.done: list[tuple[str, dict[str, str]]] = []
+        self.app = FleetApp(
+            self.hub, self.sessions, FILES, PageActions(operate=self._operate, page=self._page),
+            admin_token=lambda: ADMIN, hosts=lambda: frozenset((HOST,)), clock=lambda: 0.0,
+        )  # fmt: skip
+
+    async def _operate(self, action: str, parameters: Mapping[str, str]) -> Mapping[str, Any]:
+        if action == "drain":
+            raise UsageError("\x1b it is the last", hint="no")
+        self.done.append((action, dict(parameters)))
+        return {"event": "operation-over"}
+
+    async def _page(self, name: str, query: Mapping[str, str]) -> tuple[str, bytes]:
+        return "application/json", json.dumps([name, query]).encode()
+
+    def session(self, role: Any = "view") -> dict[str, str]:
+        token, _ = self.sessions.open(self.sessions.new_key(role, now_s=0.0), now_s=0.0)
+        return {"authorization": f"Bearer {token}"}
+
+    def ask(
+        self, method: str, target: str, body: Any = None, headers: Mapping[str, str] | None = None
+    ) -> tuple[int, dict[str, str], bytes]:
+        sent, data = asyncio.run(self.sent(method, target, body, headers))
+        start = sent[0]
+        told = {name.decode(): value.decode() for name, value in start["headers"]}
+        return start["status"], told, data
+
+    async def sent(
+        self, method: str, target: str, body: Any, headers: Mapping[str, str] | None
+    ) -> tuple[list[Any], bytes]:
+        path, _, query = target.partition("?")
+        raw = body if isinstance(body, bytes) else json.dumps(body).encode()
+        given = {"host": HOST, **(headers or {})}
+        scope = {
+            "type": "http", "method": method, "path": path, "query_string": query.encode(),
+            "headers": [(name.encode(), value.encode("latin-1")) for name, value in given.items()],
+        }  # fmt: skip
+        sent: list[Any] = []
+
+        async def receive() -> Any:
+            return {"type": "http.request", "body": raw, "more_body": False}
+
+        async def send(message: Any) -> None:
+            sent.append(message)
+            if message.get("more_body") and len(sent) > 2:
+                raise OSError("the browser left")
+
+        with contextlib.suppress(OSError):
+            await self.app(scope, receive, send)
+        return sent, b"".join(each.get("body", b"") for each in sent)
+
+
+@pytest.mark.parametrize(
+    ("method", "target"),
+    [
+        ("GET", "/stream?topics=fleet"),
+        ("GET", "/page/maps"),
+        ("GET", "/page/replay?id=1"),
+        ("POST", "/act"),
+        ("POST", "/operator"),
+        ("POST", "/keys"),
+    ],
+)
+@pytest.mark.parametrize("headers", [{}, {"authorization": "Bearer guessed"}, {"cookie": "session=secret-1"}])
+def test_without_a_session_nothing_is_told_or_done(method: str, target: str, headers: dict[str, str]) -> None:
+    page = Page()
+    page.session()
+
+    status, _, body = page.ask(method, target, {"action": "kill", "server": "server-1", "key": "x"}, headers)
+
+    assert status == 401
+    assert json.loads(body)["code"] == "unauthorized"
+    assert page.done == []
+
+
+@pytest.mark.parametrize(
+    "headers",
+    [
+        {"origin": "http://evil.example"},
+        {"origin": "null"},
+        {"origin": "http://127.0.0.1:9999"},
+        {"sec-fetch-site": "cross-site"},
+        {"sec-fetch-site": "same-site"},
+        {"host": "rebound.example:8701"},
+        {"host": "127.0.0.1:80"},
+    ],
+)
+def test_other_origins_and_names_are_refused_even_with_a_session(headers: dict[str, str]) -> None:
+    page = Page()
+    session = page.session("operate")
+
+    for method, target in (("POST", "/act"), ("GET", "/stream?topics=fleet"), ("GET", "/main.js")):
+        status, _, _ = page.ask(method, target, {"action": "kill", "server": "s"}, {**session, **headers})
+        assert status == 403, (method, target)
+    assert page.done == []
+
+
+def test_a_key_that_was_used_is_refused() -> None:
+    page = Page()
+    _, _, body = page.ask("POST", "/keys", {"role": "view"}, {"authorization": f"Bearer {ADMIN}"})
+    key = json.loads(body)["key"]
+
+    assert page.ask("POST", "/session", {"key": key})[0] == 200
+    assert page.ask("POST", "/session", {"key": key})[0] == 401
+
+
+def test_only_an_operator_operates() -> None:
+    page = Page()
+    viewer, operator = page.session(), page.session("operate")
+    order = {"action": "kill", "server": "server-1"}
+
+    assert page.ask("POST", "/act", order, viewer)[0] == 403
+    assert page.done == []
+    assert page.ask("POST", "/act", order, operator)[0] == 200
+    assert page.done == [("kill", {"server": "server-1"})]
+    status, _, body = page.ask("POST", "/act", {"action": "drain"}, operator)
+    assert (status, json.loads(body)["message"]) == (400, r"\x1b it is the last")
+
+
+@pytest.mark.parametrize("body", [b"", b"[]", b"{" * 3000, b"\xff", {"key": 5}, {"key": ""}, b"[" * 4000])
+def test_a_body_that_is_none_is_refused(body: Any) -> None:
+    assert Page().ask("POST", "/session", body)[0] == 400
+
+
+def test_a_body_that_is_too_long_is_refused() -> None:
+    assert Page().ask("POST", "/session", {"key": "x" * 5000})[0] == 413
+
+
+@pytest.mark.parametrize(
+    "path",
+    ["/../app.py", "/vendor/vendored.json", "/static/main.js", "/%2e%2e/server.py", "//main.js", "/vendor"],
+)
+def test_only_the_files_of_the_table_are_served(path: str) -> None:
+    assert Page().ask("GET", path)[0] == 404
+
+
+def test_every_answer_has_the_policy_that_forbids_scripts_of_others() -> None:
+    page = Page()
+    for method, target in (
+        ("GET", "/"),
+        ("GET", "/style.css"),
+        ("GET", "/nowhere"),
+        ("POST", "/act"),
+    ):
+        _, headers, _ = page.ask(method, target, {})
+        assert headers["content-security-policy"] == CONTENT_SECURITY_POLICY
+        assert headers["x-content-type-options"] == "nosniff"
+    assert "default-src 'none'" in CONTENT_SECURITY_POLICY
+    assert "unsafe" not in CONTENT_SECURITY_POLICY
+
+
+def test_a_file_that_the_browser_has_is_not_sent_again() -> None:
+    page = Page()
+    _, headers, body = page.ask("GET", "/main.js")
+
+    status, _, again = page.ask("GET", "/main.js", None, {"if-none-match": headers["etag"]})
+
+    assert (status, again) == (304, b"")
+    assert body == FILES["/main.js"].data
+
+
+def test_a_session_reads_the_stream_and_too_many_pages_are_refused() -> None:
+    page = Page()
+    session = page.session()
+    page.hub.append("event", {"text": "happened"})
+
+    sent, data = asyncio.run(page.sent("GET", "/stream?topics=event", None, session))
+    assert sent[0]["status"] == 200
+    assert b"happened" in data
+    assert page.ask("GET", "/stream?topics=nothing", None, session)[0] == 400
+
+    async def many() -> list[int]:
+        held = [page.hub.messages(frozenset(("event",))) for _ in range(MAX_PAGES)]
+        for each in held:
+            await each.__anext__()
+        answers = [(await page.sent("GET", "/stream?topics=event", None, session))[0] for _ in range(168)]
+        for each in held:
+            await each.aclose()
+        return [each[0]["status"] for each in answers]
+
+    assert set(asyncio.run(many())) == {503}

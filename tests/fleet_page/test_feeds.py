@@ -1,0 +1,129 @@
+"""What the page makes of the control plane's words, of live maps and of recordings."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from typing import Any
+
+import numpy as np
+import pytest
+
+from rse_pf.config import PlatformSettings
+from rse_pf.errors import UsageError
+from rse_pf.fleet_page.clouds import packer
+from rse_pf.fleet_page.feeds.live_feed import RobotPaths, plain
+from rse_pf.fleet_page.feeds.platform_feed import fleet_document, group_of, moved_robots
+from rse_pf.geometry import Camera
+from rse_pf.local.control.operations import Operations
+from rse_pf.maps.format import Keyframe, MapVersion, encode_map
+
+
+def test_every_text_of_the_fleet_is_escaped() -> None:
+    state = {
+        "platform": "p\x1b", "url": "ws://h", "sample": None,
+        "servers": [{"name": "<b>\u202e", "state": "healthy", "cpu_percent": 5}],
+        "policy": {"elastic": True, "last_action": {"reason": "a\nb"}},
+    }  # fmt: skip
+
+    told = fleet_document(state, PlatformSettings(), time_s=1.0)
+
+    assert told["platform"] == r"p\x1b"
+    assert told["servers"][0]["name"] == r"<b>\u202e"
+    assert told["last_action"] == r"a\nb"
+    assert json.loads(json.dumps(told)) == told
+
+
+def test_robots_that_moved_are_found_and_new_ones_are_not() -> None:
+    before = {"a": "server-1", "b": "server-1"}
+
+    assert moved_robots(before, {"a": "server-2", "b": "server-1", "c": "server-2"}) == [
+        ("a", "server-1", "server-2")
+    ]
+
+
+@pytest.mark.parametrize(
+    ("kind", "group"),
+    [
+        ("server-killed", "fault"), ("server-gone", "trouble"), ("replace", "scaling"),
+        ("robot-moved", "scaling"), ("audit-token", "audit"), ("platform-ready", "other"),
+    ],
+)  # fmt: skip
+def test_events_are_found_under_their_filter(kind: str, group: str) -> None:
+    assert group_of(kind) == group
+
+
+def flat(x: float, angle: float = 0.0) -> list[float]:
+    T = np.eye(4)
+    T[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
+    T[0, 3] = x
+    return [float(each) for each in T.ravel()]
+
+
+def test_the_path_of_a_robot_lies_in_its_odometry_frame_so_that_corrections_move_all_of_it() -> None:
+    paths = RobotPaths()
+    aligned = {
+        "kind": "alignment",
+        "robot": "a",
+        "segment": 0,
+        "aligned": True,
+        "T_map_odom": flat(10.0, np.pi / 2),
+    }
+    pose = {"kind": "pose", "robot": "a", "segment": 0, "T_map_camera": flat(12.0)}
+
+    assert paths.take(pose) is None  # not aligned yet
+    paths.take(aligned)
+    told = paths.take(pose)
+
+    assert told is not None
+    np.testing.assert_allclose(told["points"], [[0.0, -2.0, 0.0]], atol=1e-3)
+    assert paths.take({**pose, "segment": 1}) is None
+
+
+def test_values_of_a_live_map_become_plain_and_escaped() -> None:
+    assert plain({"a\x1b": (np.float64(1.5), np.arange(3), "b\x07", None)}) == {
+        r"a\x1b": [1.5, [0, 1, 2], r"b\x07", None]
+    }
+
+
+def test_a_map_is_packed_within_a_fraction_of_a_millimetre() -> None:
+    camera = Camera(fx=500.0, fy=500.0, cx=320.0, cy=240.0, width=640, height=480)
+    keyframe = Keyframe(
+        id=0, robot="a\x1b", timestamp_s=0.0, T_world_camera=np.eye(4), camera=camera,
+        pixels=np.zeros((1, 2), np.float32), descriptors=np.zeros((1, 32), np.uint8),
+        points_camera=np.ones((1, 3), np.float32),
+    )  # fmt: skip
+    points = np.random.default_rng(1).uniform(-5, 5, (1000, 3)).astype(np.float32)
+    colours = np.full((1000, 3), 7, np.uint8)
+
+    data = packer("")(encode_map(MapVersion(keyframes=(keyframe,), points=points, colours=colours)))
+
+    length = int.from_bytes(data[:4], "little")
+    told = json.loads(data[4 : 4 + length])
+    numbers = np.frombuffer(data, "<u2", 3000, 4 + length).reshape(-1, 3)
+    back = np.array(told["low"]) + numbers * np.array(told["step"])
+    assert np.abs(back - points).max() < 2e-4
+    assert told["robots"] == {r"a\x1b": [[0.0, 0.0, 0.0]]}
+    assert data[4 + length + 6000 :] == b"\x07" * 3000
+
+
+def test_a_watcher_hears_states_and_events_and_watchers_are_bounded() -> None:
+    async def run() -> None:
+        kept: list[Any] = []
+        operations = Operations(kept.append)
+        watched = operations.watch(lambda: {"servers": 2})
+        assert await watched.__anext__() == {"state": {"servers": 2}}
+        operations.heard({"event": "server-killed", "server": "server-1"})
+        told = await asyncio.wait_for(watched.__anext__(), 2.0)
+        assert (told["event"], told["number"]) == ("server-killed", 1)
+
+        others = [operations.watch(dict) for _ in range(7)]
+        for each in others:
+            await each.__anext__()
+        with pytest.raises(UsageError):
+            operations.watch(dict)
+        for each in (watched, *others):
+            await each.aclose()
+        await operations.watch(dict).__anext__()
+
+    asyncio.run(run())
