@@ -43,6 +43,8 @@ _FINAL = (*REFUSALS, BadRequest, UnsupportedProtocol)
 _RETRY_S = 1.0
 _MAX_CORRECTIONS = 1000
 _MAX_SENT = 100_000
+_JSON_FEATURES = 650
+"""Plain JSON has bytes in base64, a third longer: 650 features and the rest of the message are 34 kB."""
 
 
 class LiveRobot(LiveCaller, Protocol):
@@ -63,7 +65,8 @@ class LiveOptions:
     Attributes:
         keyframe_m: A frame farther from the last keyframe becomes one,
         keyframe_deg: or turned further; the tracker's own keyframes are apart from these.
-        features: At most so many features of a keyframe are sent; 870 take 34 kB with zlib.
+        features: At most so many features of a keyframe are sent; 870 take 34 kB with zlib and bin, and
+            `sent_with` lowers them for json.
         segment_after: A new segment begins after so many lost frames in a row.
         relocalise_s: While a segment is not aligned, the robot asks for its place so often at most.
         bytes_per_s: Share of the link that keyframes may take.
@@ -87,6 +90,10 @@ class LiveOptions:
         )  # fmt: skip
         if min(numbers) <= 0 or self.leave_s < 0:
             raise UsageError("a number of LiveOptions is not above 0", hint="leave it out for the default")
+
+    def sent_with(self, codec: str) -> LiveOptions:
+        """Return these options with as many features as fit into 34 kB in *codec* of the connection."""
+        return replace(self, features=min(self.features, _JSON_FEATURES)) if codec == "json" else self
 
 
 @dataclass(frozen=True, slots=True)

@@ -19,7 +19,7 @@ import numpy as np
 
 from client_sdk.answers import PoseAnswer
 from client_sdk.frontend import Frame, FrontEndOptions, PoseQuery, TrackedFrame
-from client_sdk.live import LiveMapper
+from client_sdk.live import LiveMapper, LiveOptions
 from client_sdk.mapper import Mapper, ask_robot
 from client_sdk.mapping import PointMap, Trajectory, write_ply, write_trajectory
 from client_sdk.offload import CloudFirst
@@ -163,6 +163,7 @@ async def _run(spec: RobotSpec, pipe: ParentPipe) -> None:
             if options.live:
                 shared = LiveMapper(
                     robot, LIVE_NAME, ask=ask, options=options.frontend_options,
+                    live=LiveOptions().sent_with(options.codec),
                     spool=spec.folder / "spool" if spec.has_offload else None,
                 )  # fmt: skip
                 mapper = await stack.enter_async_context(shared)

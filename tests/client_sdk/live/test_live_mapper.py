@@ -13,10 +13,13 @@ import pytest
 from client_sdk.answers import PoseAnswer
 from client_sdk.frontend import Frame, PoseQuery, TrackedFrame
 from client_sdk.live import BlockingLiveMapper, Correction, LiveMapper, LiveOptions
-from client_sdk.live.waiting_keyframes import Base, WaitingKeyframes, rebased
+from client_sdk.live.sender import keyframe_request
+from client_sdk.live.waiting_keyframes import Base, KeyframeWaits, WaitingKeyframes, rebased
+from rse_pf.config import SessionSettings
 from rse_pf.errors import BadRequest, Busy, Forbidden, UsageError
 from rse_pf.geometry import exp_se3
-from rse_pf.live_map.keyframe_code import decode_features
+from rse_pf.live_map.keyframe_code import decode_features, encode_features
+from rse_pf.wire import Command, make_codec
 from tests.client_sdk.live.fake_live_map import FakeLiveRobot, alignment, failing, solve
 from tests.client_sdk.mapper.flat_world import CAMERA, STEP_M, frame_at
 
@@ -84,6 +87,28 @@ def test_the_robots_own_cloud_is_made_of_its_keyframes_beside_its_frames() -> No
         assert of_one < counts < 2 * of_one
 
     run(work)
+
+
+@pytest.mark.parametrize("codec", ["json", "zlib", "bin"])
+def test_the_largest_keyframe_takes_at_most_34_kb_in_every_codec(codec: str) -> None:
+    rng = np.random.default_rng(0)
+    count = LiveOptions().sent_with(codec).features
+    features = encode_features(
+        rng.uniform([0, 0], [640, 480], (count, 2)), rng.uniform(0.3, 8.0, count),
+        rng.integers(0, 256, (count, 32), dtype=np.uint8),
+    )  # fmt: skip
+    waits = KeyframeWaits(
+        index=10**6, segment=999, timestamp_s=1.8e9 + 0.123456789,
+        T_odom_camera=tuple(rng.uniform(-1e3, 1e3, 16).tolist()),
+        camera=(525.123456789, 525.123456789, 319.512345, 239.512345, 640, 480), features=features,
+    )  # fmt: skip
+    request = keyframe_request("warehouse", waits, Base(10**6, 10))
+
+    message = make_codec(codec, SessionSettings()).encode(
+        Command(id=10**6, service="live-keyframe", payload=request, deadline_ms=5000.0)
+    )
+
+    assert 30_000 < len(message) <= 34_000
 
 
 def test_an_alignment_is_an_event_before_a_pose_uses_it() -> None:
