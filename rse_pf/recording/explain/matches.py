@@ -9,10 +9,11 @@ import numpy as np
 import numpy.typing as npt
 
 from rse_pf.geometry import Array, pose_difference, transform
+from rse_pf.pnp.evidence import width_to_length
 from rse_pf.recording.explain.causes import Cause, Explanation
 from rse_pf.recording.explain.fitting import Fit, Matches, fitted, is_chance, robust_cost
 
-__all__ = ["distinct_rows", "duplicates", "mirrored", "outliers", "plane", "stale_map"]
+__all__ = ["distinct_rows", "duplicates", "line", "mirrored", "outliers", "plane", "stale_map"]
 
 # Rows that agree to half a pixel and to half a centimetre say the same thing.
 _CELL_PX, _CELL_M = 0.5, 0.005
@@ -24,6 +25,8 @@ _REFLECTION_GAIN = 100.0
 # Deviation of the position above which a plane is called a cause.
 _LOOSE_M = 0.015
 _LEAST_SHIFT_M = 0.015
+# Width over length of a line.
+_THIN = 0.03
 
 
 def distinct_rows(matches: Matches) -> npt.NDArray[np.intp]:
@@ -108,7 +111,7 @@ def plane(matches: Matches, base: Fit, weakness: str, deviation_m: float) -> Exp
     if share < 0.97 and not small:
         return None
     geometric = weakness in (
-        "ambiguous", "nearly-collinear", "poorly-constrained", "clustered", "degenerate_geometry",
+        "ambiguous", "nearly-collinear", "poorly-constrained", "clustered", "degenerate",
     )  # fmt: skip
     if not (geometric or deviation_m > _LOOSE_M):
         return None
@@ -118,15 +121,34 @@ def plane(matches: Matches, base: Fit, weakness: str, deviation_m: float) -> Exp
         confidence=0.85 if geometric else 0.6,
         sentence=(
             f"{share:.0%} of the matches that agree lie {where} ({1000 * thickness_m:.0f} mm thick, "
-            f"{spread_px:.0f} px wide, depth varies by {variation:.0%}): such points hold the position only "
-            f"to {1000 * deviation_m:.0f} mm"
+            f"{spread_px:.0f} px wide, depth varies by {variation:.0%}): such points hold the position "
+            + (f"only to {1000 * deviation_m:.0f} mm" if math.isfinite(deviation_m) else "not at all")
             + (f", and the solver called the pose {weakness}" if weakness else "")
         ),
         evidence={
             "planar_share": share, "thickness_m": thickness_m, "spread_px": spread_px,
-            "width_to_length": thinness, "depth_variation": variation, "position_deviation_m": deviation_m,
+            "width_to_length": thinness, "depth_variation": variation,
+            "position_deviation_m": deviation_m if math.isfinite(deviation_m) else -1.0,
         },
     )  # fmt: skip
+
+
+def line(matches: Matches, base: Fit | None) -> Explanation | None:
+    """Return the explanation where all points, or all pixels, lie on one line or coincide."""
+    if base is not None and not is_chance(len(matches), base.count, matches.tight_px, matches.camera):
+        return None
+    thinness = min(width_to_length(matches.points), width_to_length(matches.pixels))
+    if thinness > _THIN:
+        return None
+    return Explanation(
+        cause=Cause.PLANE,
+        confidence=0.85,
+        sentence=(
+            f"the points or pixels of all {len(matches)} matches lie on one line or in one spot (width over "
+            f"length {thinness:.3f}): no pose follows from them"
+        ),
+        evidence={"width_to_length": thinness, "matches": float(len(matches))},
+    )
 
 
 def _planar_share(points: Array, depths_m: Array) -> tuple[float, float]:

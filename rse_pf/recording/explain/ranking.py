@@ -6,9 +6,8 @@ Nothing is measured here; each cause has a module of its own.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
@@ -18,10 +17,18 @@ from rse_pf.pnp import PnpOptions, PnpSolution
 from rse_pf.recording.explain.causes import Cause, Explanation, MatchesLike, PastCommand, ReplyLike, Timing
 from rse_pf.recording.explain.clocks import late
 from rse_pf.recording.explain.fitting import Fit, Matches, fitted, solved
+from rse_pf.recording.explain.inputs import (
+    checked_history,
+    checked_matches,
+    checked_pose,
+    checked_reply,
+    checked_timing,
+)
 from rse_pf.recording.explain.intrinsics import intrinsics
 from rse_pf.recording.explain.matches import (
     distinct_rows,
     duplicates,
+    line,
     mirrored,
     outliers,
     plane,
@@ -33,11 +40,8 @@ from rse_pf.recording.explain.row_order import row_order
 
 __all__ = ["explain"]
 
-_TIGHT_PX = 3.0
-_USUAL_WIDTH_PX = 640.0
-_MAX_ROWS = 1000
-_MAX_ABS = 1e6
 _MAX_THUMBNAILS = 5
+_LEAST_ROWS = 4
 # Share of agreeing rows above which nothing but another camera is looked for in them.
 _HEALTHY_SHARE = 0.9
 # A wrong camera scatters the rows, and what is left of them may well lie in one plane.
@@ -65,51 +69,38 @@ def explain(
         timing: When command and answer were where.
         T_odom_camera: ``(4, 4)``, the robot's own odometry at the frame.
     """
-    history = history or ()
-    rows, options = _checked(matches)
-    found: list[Explanation] = []
-    missing: list[str] = []
-    found_late, lacks = late(timing)
-    missing += lacks
-    thumbnails = [each.thumbnail for each in history if each.thumbnail is not None][-_MAX_THUMBNAILS:]
+    with np.errstate(all="ignore"):
+        return _ranked(
+            matches, checked_reply(reply), thumbnail, checked_history(history), checked_timing(timing),
+            checked_pose(T_odom_camera),
+        )  # fmt: skip
+
+
+def _ranked(
+    matches: MatchesLike, reply: ReplyLike | None, thumbnail: bytes | None, history: Sequence[PastCommand],
+    timing: Timing | None, T_odom_camera: Array | None,
+) -> list[Explanation]:  # fmt: skip
+    rows, options = checked_matches(matches)
+    found_late, missing = late(timing)
+    thumbnails = [each.thumbnail for each in history if each.thumbnail is not None]
     usual = [each.matches for each in history if each.matches]
     usual_matches = float(np.median(usual)) if usual else None
-    found_blur, lacks = blur(thumbnail, thumbnails, len(rows), usual_matches)
+    found_blur, lacks = blur(thumbnail, thumbnails[-_MAX_THUMBNAILS:], len(rows), usual_matches)
     missing += lacks
-    found += [each for each in (found_late, found_blur) if each is not None]
-    if len(rows) >= 4:
+    found = [each for each in (found_late, found_blur) if each is not None]
+    if len(rows) >= _LEAST_ROWS:
         more, lacks = _by_matches(rows, options, reply, history, T_odom_camera)
         found += more
         missing += lacks
     found.sort(key=lambda each: -each.confidence)
     if not found:
         found = [_nothing_found(rows, reply)]
-    return [replace(each, missing=tuple(dict.fromkeys(missing))) for each in found]
+    lacking = tuple(dict.fromkeys(missing))
+    return [replace(each, evidence=_finite(each.evidence), missing=lacking) for each in found]
 
 
-def _checked(matches: MatchesLike) -> tuple[Matches, PnpOptions]:
-    """Return the finite rows, at most a thousand of them, and the options."""
-    points = np.asarray(matches.points_world, dtype=np.float64).reshape(-1, 3)
-    pixels = np.asarray(matches.pixels, dtype=np.float64).reshape(-1, 2)
-    n = min(len(points), len(pixels))
-    points, pixels = points[:n], pixels[:n]
-    depths = _depths(matches.depths_m, n)
-    options = matches.options or PnpOptions()
-    with np.errstate(invalid="ignore"):
-        finite = (np.abs(points) <= _MAX_ABS).all(axis=1) & (np.abs(pixels) <= _MAX_ABS).all(axis=1)
-    keep = np.flatnonzero(finite)[:_MAX_ROWS]
-    scale = max(1.0, matches.camera.width / _USUAL_WIDTH_PX)
-    return Matches(
-        points=points[keep], pixels=pixels[keep], camera=matches.camera, inlier_px=options.inlier_px,
-        tight_px=min(options.inlier_px, _TIGHT_PX * scale), depths_m=None if depths is None else depths[keep],
-        left_out=n - int(np.count_nonzero(finite)),
-    ), options  # fmt: skip
-
-
-def _depths(depths_m: Any, n: int) -> Array | None:
-    if not isinstance(depths_m, np.ndarray) or depths_m.size != n:
-        return None
-    return np.nan_to_num(np.asarray(depths_m, dtype=np.float64).ravel(), posinf=0.0, neginf=0.0)
+def _finite(evidence: Mapping[str, float]) -> dict[str, float]:
+    return {name: value for name, value in evidence.items() if math.isfinite(value)}
 
 
 def _by_matches(
@@ -118,11 +109,14 @@ def _by_matches(
 ) -> tuple[list[Explanation], tuple[str, ...]]:  # fmt: skip
     """Return what the matches and the motion show, and what was missing for it."""
     distinct = rows.of(distinct_rows(rows))
-    start = None if reply is None else np.asarray(reply.T_camera_world, dtype=np.float64).reshape(4, 4)
+    start = None if reply is None else checked_pose(reply.T_camera_world)
     base = fitted(distinct, iterations=1000, start=start, polish=True)
     count = 0 if base is None else base.count
     is_pair = rows.depths_m is not None or _seen_from_origin(distinct)
-    found: list[Explanation | None] = [duplicates(len(rows), len(distinct), count)]
+    found: list[Explanation | None] = [
+        duplicates(len(rows), len(distinct), count),
+        line(rows, base if len(distinct) >= _LEAST_ROWS else None),
+    ]
     reflected = mirrored(distinct, base)
     if reflected is not None:
         return [each for each in (*found, reflected) if each is not None], ()
@@ -196,7 +190,10 @@ def _weakness(rows: Matches, options: PnpOptions, reply: ReplyLike | None) -> tu
 
 def _nothing_found(rows: Matches, reply: ReplyLike | None) -> Explanation:
     n = len(rows)
-    evidence = {"matches": float(n)}
+    evidence = {"matches": float(n), "rows_left_out": float(rows.left_out)}
+    if n < _LEAST_ROWS:
+        text = f"only {n} of {n + rows.left_out} rows hold usable numbers, and a pose needs {_LEAST_ROWS}"
+        return Explanation(cause=Cause.UNKNOWN, confidence=0.5, sentence=text, evidence=evidence)
     if reply is None:
         text = f"{n} matches gave no answer, and no known cause explains it"
         return Explanation(cause=Cause.UNKNOWN, confidence=0.3, sentence=text, evidence=evidence)

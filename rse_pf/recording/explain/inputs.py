@@ -1,0 +1,107 @@
+"""What was recorded, made safe to compute with: a case may come from a stranger and hold any number.
+
+Nothing is refused here: what cannot be used counts as not recorded.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from rse_pf.geometry import Array
+from rse_pf.pnp import PnpOptions
+from rse_pf.recording.explain.causes import MatchesLike, PastCommand, ReplyLike, Timing
+from rse_pf.recording.explain.fitting import Matches
+
+__all__ = ["checked_history", "checked_matches", "checked_pose", "checked_reply", "checked_timing"]
+
+_TIGHT_PX = 3.0
+_USUAL_WIDTH_PX = 640.0
+_MAX_ROWS = 1000
+_MAX_ABS = 1e6
+_MAX_HISTORY = 20
+_RIGID = 1e-3
+_MAX_S = 1e11
+_LONGEST_S = 1e5
+
+
+def checked_matches(matches: MatchesLike) -> tuple[Matches, PnpOptions]:
+    """Return the finite rows, at most a thousand of them, and the options."""
+    points = _rows(matches.points_world, 3)
+    pixels = _rows(matches.pixels, 2)
+    n = min(len(points), len(pixels))
+    points, pixels = points[:n], pixels[:n]
+    depths = _depths(matches.depths_m, n)
+    options = matches.options or PnpOptions()
+    finite = (np.abs(points) <= _MAX_ABS).all(axis=1) & (np.abs(pixels) <= _MAX_ABS).all(axis=1)
+    keep = np.flatnonzero(finite)[:_MAX_ROWS]
+    scale = max(1.0, matches.camera.width / _USUAL_WIDTH_PX)
+    return Matches(
+        points=points[keep], pixels=pixels[keep], camera=matches.camera, inlier_px=options.inlier_px,
+        tight_px=min(options.inlier_px, _TIGHT_PX * scale), depths_m=None if depths is None else depths[keep],
+        left_out=n - int(np.count_nonzero(finite)),
+    ), options  # fmt: skip
+
+
+def _rows(numbers: Any, columns: int) -> Array:
+    flat = np.asarray(numbers, dtype=np.float64).ravel()
+    return flat[: len(flat) // columns * columns].reshape(-1, columns)
+
+
+def _depths(depths_m: Any, n: int) -> Array | None:
+    if not isinstance(depths_m, np.ndarray) or depths_m.size != n:
+        return None
+    depths = np.asarray(depths_m, dtype=np.float64).ravel()
+    known: Array = np.where((depths > 0.0) & (depths <= _MAX_ABS), depths, 0.0)
+    return known
+
+
+def checked_pose(pose: Any) -> Array | None:
+    """Return a ``(4, 4)`` rigid pose, None if *pose* is none."""
+    if pose is None:
+        return None
+    T = np.asarray(pose, dtype=np.float64)
+    if T.size != 16:
+        return None
+    T = T.reshape(4, 4)
+    rotation = T[:3, :3]
+    if not (np.abs(T) <= _MAX_ABS).all() or np.abs(rotation @ rotation.T - np.eye(3)).max() > _RIGID:
+        return None
+    return T if np.linalg.det(rotation) > 0.0 else None
+
+
+def checked_reply(reply: ReplyLike | None) -> ReplyLike | None:
+    """Return *reply*, None where its pose is no pose or its error no number."""
+    if reply is None or checked_pose(reply.T_camera_world) is None:
+        return None
+    return reply if 0.0 <= reply.rmse_px <= _MAX_ABS else None
+
+
+def checked_history(history: Sequence[PastCommand] | None) -> tuple[PastCommand, ...]:
+    """Return the last commands, each without what is no pose."""
+    return tuple(
+        replace(
+            each,
+            T_camera_world=checked_pose(each.T_camera_world),
+            T_odom_camera=checked_pose(each.T_odom_camera),
+        )
+        for each in (history or ())[-_MAX_HISTORY:]
+    )
+
+
+def checked_timing(timing: Timing | None) -> Timing | None:
+    """Return *timing* without what is no time."""
+    if timing is None:
+        return None
+    longest = {"deadline_s": _LONGEST_S, "period_s": _LONGEST_S}
+    changed: dict[str, float | None] = {}
+    for name in ("frame_s", "sent_s", "answered_s", "received_s", "replied_s", "deadline_s", "period_s"):
+        value: float | None = getattr(timing, name)
+        low, high = (1e-3, longest[name]) if name in longest else (-_MAX_S, _MAX_S)
+        if value is not None and not (math.isfinite(value) and low <= value <= high):
+            changed[name] = None
+    return replace(timing, **changed)
