@@ -48,6 +48,8 @@ class _Order(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     with_picture: bool = True
     trace: str = ""
     number: int = 0
+    near_s: float | None = None
+    command_bytes: int | None = None
 
 
 class LimitedReplay:
@@ -96,9 +98,20 @@ class LimitedReplay:
         """Return what `run.case_of` returns; raises RsePfError."""
         return self._ask(_Order(do="case", path=str(path), identity=identity), run.Exported)
 
-    def find(self, path: Path, *, trace: str, id: int) -> str | None:
-        """Return ``CONNECTION:ID`` of the newest command with *trace* and *id*, None if there is none."""
-        return self._ask(_Order(do="find", path=str(path), trace=trace, number=id), str) or None
+    def find(
+        self,
+        path: Path,
+        *,
+        trace: str,
+        id: int,
+        near_s: float | None = None,
+        command_bytes: int | None = None,
+    ) -> str | None:
+        """Return ``CONNECTION:ID`` of a command as `run.find` does, None if there is none."""
+        order = _Order(
+            do="find", path=str(path), trace=trace, number=id, near_s=near_s, command_bytes=command_bytes
+        )
+        return self._ask(order, str) or None
 
     def close(self) -> None:
         """End the process."""
@@ -148,7 +161,10 @@ def replayer(configuration: str) -> Handler:
         elif order.do == "case":
             found = run.case_of(path, settings, order.identity)
         elif order.do == "find":
-            found = run.find(path, settings, trace=order.trace, number=order.number)
+            found = run.find(
+                path, settings, trace=order.trace, number=order.number, near_s=order.near_s,
+                command_bytes=order.command_bytes,
+            )  # fmt: skip
         else:
             raise BadMessage(f"no order {order.do!r}")
         return msgspec.msgpack.encode(found)

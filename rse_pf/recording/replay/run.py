@@ -25,6 +25,7 @@ HISTORY = 8
 _MAX_ROBOTS = 10_000
 _MAX_CHANGED = 1000
 _MAX_RESOLVERS = 16
+_NEAR_S = 5.0
 
 
 class Changed(msgspec.Struct, frozen=True, kw_only=True):
@@ -205,16 +206,38 @@ def case_of(path: Path, settings: PlatformSettings, identity: str) -> Exported:
     )
 
 
-def find(path: Path, settings: PlatformSettings, *, trace: str, number: int) -> str:
-    """Return ``CONNECTION:ID`` of the newest command with this *trace* and id, "" if there is none."""
-    found = ""
+def find(
+    path: Path,
+    settings: PlatformSettings,
+    *,
+    trace: str,
+    number: int,
+    near_s: float | None = None,
+    command_bytes: int | None = None,
+) -> str:
+    """Return ``CONNECTION:ID`` of a command that a server's log tells of, "" if there is none.
+
+    Args:
+        path: A file or a folder.
+        settings: The limits of messages.
+        trace: Of the command; many robots send none.
+        number: Its id, which every connection counts on its own.
+        near_s: When it was answered, Unix time: the nearest within 5 s is taken; None for the newest.
+        command_bytes: The length of its message, None where it is not known.
+    """
+    found, nearest_s = "", _NEAR_S
     for command in open_recording(path, settings.session).commands():
-        if command.id.endswith(f":{number}"):
-            try:
-                if command.command.trace == trace:
-                    found = command.id
-            except RsePfError:
-                continue
+        if not command.id.endswith(f":{number}") or command_bytes not in (None, len(command.command_bytes)):
+            continue
+        answered_s = command.sent_s if command.answered_s is None else command.answered_s
+        apart_s = 0.0 if near_s is None else abs(answered_s - near_s)
+        if apart_s > nearest_s:
+            continue
+        try:
+            if command.command.trace == trace:
+                found, nearest_s = command.id, apart_s if near_s is not None else _NEAR_S
+        except RsePfError:
+            continue
     return found
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from pathlib import Path
 
 import msgspec
@@ -153,6 +154,24 @@ def test_what_went_wrong_is_listed_worst_first(tmp_path: Path) -> None:
     ]  # fmt: skip
     assert seen.causes[jump]
     assert not seen.was_solved
+
+
+def test_a_command_of_a_log_is_found_by_trace_id_and_time(tmp_path: Path) -> None:
+    made = Made(tmp_path / "a")
+    first = made.send(1, trace="t")
+    answered_s = made.now_ns / 1e9 + 0.003
+    made._ids = itertools.count()
+    made.now_ns += 60_000_000_000
+    second = made.send(2, trace="t", robot=1)
+    folder = made.close()
+
+    assert first.endswith(":0")
+    assert second.endswith(":0")
+    assert run.find(folder, SETTINGS, trace="t", number=0) == second
+    assert run.find(folder, SETTINGS, trace="t", number=0, near_s=answered_s) == first
+    assert run.find(folder, SETTINGS, trace="t", number=0, near_s=answered_s + 20.0) == ""
+    assert run.find(folder, SETTINGS, trace="other", number=0) == ""
+    assert run.find(folder, SETTINGS, trace="t", number=0, command_bytes=7) == ""
 
 
 def seen_from_aside(problem: PnpProblem) -> PnpProblem:
