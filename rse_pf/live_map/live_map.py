@@ -8,6 +8,7 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Callable, Collection
+from functools import partial
 from typing import Literal
 
 import numpy as np
@@ -29,8 +30,8 @@ from rse_pf.live_map.events import (
 )
 from rse_pf.live_map.feature_parts import FeatureParts, SnapshotParts
 from rse_pf.live_map.graph import Graph, LiveKeyframe, LiveLink, Segment, camera_of, variances_of
-from rse_pf.live_map.keyframe_code import KeyframeFeatures, decode_features
-from rse_pf.live_map.measure import measure_links
+from rse_pf.live_map.keyframe_code import decode_features
+from rse_pf.live_map.measure import StoredView, decoded_view, measure_stored
 from rse_pf.live_map.options import LiveMapOptions
 from rse_pf.live_map.outcomes import (
     Added,
@@ -54,7 +55,6 @@ __all__ = ["LiveMap"]
 
 _MAX_M, _MAX_TIME_S = 1e6, 1e12
 _MAX_SEGMENT = 2**31
-_Stored = tuple[int, bytes, Camera]
 
 
 class LiveMap:
@@ -210,17 +210,21 @@ class LiveMap:
 
     def measure(self, keyframe: int) -> LinksMeasured:
         """Compare a keyframe with others that may show the same place; changes nothing."""
-        return self.measuring(keyframe)()
+        return self.measuring(keyframe)[0]()
 
-    def measuring(self, keyframe: int) -> Callable[[], LinksMeasured]:
-        """Return what does the work of `measure`; another thread may call it while the map changes."""
+    def measuring(self, keyframe: int, pieces: int = 1) -> list[Callable[[], LinksMeasured]]:
+        """Return what does the work of `measure`; other threads may call it while the map changes.
+
+        The results of the pieces, one for each share of the candidates, are joined by `joined_links`.
+        """
         stored = self._stored(keyframe)
         if stored is None:
-            return lambda: LinksMeasured(keyframe=keyframe)
+            return [lambda: LinksMeasured(keyframe=keyframe)]
         found = [self._stored(i) for i in self._candidates(keyframe)]
         others = [each for each in found if each is not None]
-        measured = self.options.measured
-        return lambda: measure_links(_decoded(stored), [_decoded(each) for each in others], measured)
+        size = max(1, -(-len(others) // pieces))
+        shares = [others[begin : begin + size] for begin in range(0, max(1, len(others)), size)]
+        return [partial(measure_stored, stored, share, self.options.measured) for share in shares]
 
     def optimise(self) -> Optimised:
         """Fit the whole graph to all links; changes nothing.
@@ -266,7 +270,7 @@ class LiveMap:
         chosen = [(self._stored(i), graph.T[i].copy()) for i in spread_candidates(found, graph.T, most)]
         views = [(stored, T) for stored, T in chosen if stored is not None]
         options = RelocaliseOptions(has_equal_rooms=graph.equal_rooms_m > 0.0)
-        return lambda: relocalise([(*_decoded(each), T) for each, T in views], decoded, camera, options)
+        return lambda: relocalise([(*decoded_view(each), T) for each, T in views], decoded, camera, options)
 
     def alignments(self) -> list[Alignment]:
         """Return where the newest segment of each robot lies."""
@@ -488,9 +492,9 @@ class LiveMap:
         if not self.is_in_map(k):
             return []
         held = graph.held
-        near = np.flatnonzero(
-            held & (np.abs(graph.T[:, :3, 3] - graph.T[k, :3, 3]).max(axis=1) <= options.same_place_m)
-        )
+        near = np.flatnonzero(held & (np.abs(graph.T[:, 0, 3] - graph.T[k, 0, 3]) <= options.same_place_m))
+        off_m = np.abs(graph.T[near, :3, 3] - graph.T[k, :3, 3]).max(axis=1)
+        near = near[off_m <= options.same_place_m]
         turned = np.einsum("nij,ij->n", graph.T[near, :3, :3], graph.T[k, :3, :3])
         near = near[turned >= 1.0 + 2.0 * math.cos(math.radians(options.same_place_deg))]
         near = near[[self.is_in_map(int(i)) for i in near]] if len(near) else near
@@ -545,7 +549,7 @@ class LiveMap:
         found_here = self._places.nearest(vector, most - len(found_there), here)
         return sorted(i for i, _ in found_here + found_there)
 
-    def _stored(self, i: int) -> _Stored | None:
+    def _stored(self, i: int) -> StoredView | None:
         """Return the features of a keyframe as they are kept, None if they are not."""
         features = self._graph.keyframes[i].features
         return None if features is None else (i, features, self._graph.camera(i))
@@ -577,11 +581,6 @@ class LiveMap:
             robot=segment.robot, segment=segment.segment, aligned=aligned, reason=segment.reason,
             T_map_odom=segment.told, covariance=segment.covariance if aligned else None,
         )  # fmt: skip
-
-
-def _decoded(stored: _Stored) -> tuple[int, KeyframeFeatures, Camera]:
-    number, features, camera = stored
-    return number, decode_features(features, camera), camera
 
 
 def _check_rigid(T: Array) -> None:

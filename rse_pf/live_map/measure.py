@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -17,12 +17,22 @@ import numpy as np
 from rse_pf.errors import PnpError
 from rse_pf.geometry import Array, Camera, inverse
 from rse_pf.live_map.events import LinksMeasured, MeasuredLink, matrix_bytes
-from rse_pf.live_map.keyframe_code import KeyframeFeatures
+from rse_pf.live_map.keyframe_code import KeyframeFeatures, decode_features
 from rse_pf.native_matcher import match_core
 from rse_pf.pnp import PnpOptions, PnpSolution, refine_with_depth, solve_pnp
 from rse_pf.services.mapping.descriptors import hamming_matches
 
-__all__ = ["MeasureOptions", "MeasuredPose", "matched", "measure_links", "measure_pose"]
+__all__ = [
+    "MeasureOptions",
+    "MeasuredPose",
+    "StoredView",
+    "decoded_view",
+    "joined_links",
+    "matched",
+    "measure_links",
+    "measure_pose",
+    "measure_stored",
+]  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -57,6 +67,8 @@ class MeasuredPose:
 
 
 _DEFAULT = MeasureOptions()
+StoredView = tuple[int, bytes, Camera]
+"""Id, encoded features and camera of a keyframe."""
 
 
 def measure_links(
@@ -97,6 +109,29 @@ def measure_links(
             )
         )  # fmt: skip
     return LinksMeasured(keyframe=number, links=tuple(links), failed=dict(sorted(failed.items())))
+
+
+def measure_stored(
+    keyframe: StoredView, others: Sequence[StoredView], options: MeasureOptions = _DEFAULT
+) -> LinksMeasured:
+    """Return what `measure_links` does of keyframes as they are kept; raises BadRequest."""
+    return measure_links(decoded_view(keyframe), [decoded_view(each) for each in others], options)
+
+
+def decoded_view(stored: StoredView) -> tuple[int, KeyframeFeatures, Camera]:
+    """Return id, features and camera of a keyframe as it is kept; raises BadRequest."""
+    number, features, camera = stored
+    return number, decode_features(features, camera), camera
+
+
+def joined_links(keyframe: int, measured: Iterable[LinksMeasured]) -> LinksMeasured:
+    """Return what several calls of `measure_links` found for one keyframe, in their order."""
+    links: list[MeasuredLink] = []
+    failed: Counter[str] = Counter()
+    for each in measured:
+        links += each.links
+        failed.update(each.failed)
+    return LinksMeasured(keyframe=keyframe, links=tuple(links), failed=dict(sorted(failed.items())))
 
 
 def measure_pose(

@@ -7,9 +7,9 @@ import pytest
 
 import rse_pf.live_map.measure as measure
 from rse_pf.geometry import inverse, pose_difference
-from rse_pf.live_map.events import matrix_of
+from rse_pf.live_map.events import LinksMeasured, matrix_of
 from rse_pf.live_map.keyframe_code import KeyframeFeatures, decode_features, encode_features
-from rse_pf.live_map.measure import MeasureOptions, measure_links
+from rse_pf.live_map.measure import MeasureOptions, joined_links, measure_links
 from rse_pf.maps.format import Keyframe
 from rse_pf.services.synthetic_maps import make_world
 
@@ -58,6 +58,17 @@ def test_places_that_have_nothing_in_common_fail_with_their_reason():
 
     assert [link.other for link in found.links] == [1]
     assert found.failed == {"no-matches": 1}
+
+
+def test_candidates_that_are_measured_in_two_pieces_give_the_same_links_and_failures():
+    others = [numbered(3), numbered(1), numbered(2)]
+    whole = measure_links(numbered(0), others)
+
+    pieces = [measure_links(numbered(0), others[:2]), measure_links(numbered(0), others[2:])]
+
+    assert joined_links(0, pieces) == whole
+    assert len(whole.links) == 2
+    assert joined_links(0, [LinksMeasured(keyframe=0, failed={"a": 1})] * 2).failed == {"a": 2}
 
 
 def test_too_few_inliers_are_no_link():

@@ -90,8 +90,8 @@ class FakeMap:
                 self._state[table].pop(event.robot, None)
         return []
 
-    def measuring(self, keyframe: int) -> Callable[[], LinksMeasured]:
-        return lambda: LinksMeasured(keyframe=keyframe)
+    def measuring(self, keyframe: int, pieces: int = 1) -> list[Callable[[], LinksMeasured]]:
+        return [lambda: LinksMeasured(keyframe=keyframe)]
 
     def optimising(self) -> Callable[[], Optimised]:
         return lambda: Optimised(up_to=0, ids=(), T_map_camera=b"")

@@ -6,6 +6,7 @@ Two processes that read the same log hold the same map; `MapState.digest` shows 
 from __future__ import annotations
 
 import contextlib
+import functools
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, Protocol, TypeVar
@@ -55,8 +56,8 @@ class MapLogic(Protocol):
     def apply(self, event: Event) -> list[Outcome]:
         """Change the map by an event of the log."""
 
-    def measuring(self, keyframe: int) -> Callable[[], LinksMeasured]:
-        """Return what looks for links of a keyframe, in any thread, while the map changes."""
+    def measuring(self, keyframe: int, pieces: int = 1) -> list[Callable[[], LinksMeasured]]:
+        """Return what looks for links of a keyframe, piece by piece, in any thread, while the map changes."""
 
     def optimising(self) -> Callable[[], Optimised]:
         """Return what optimises the whole graph, in any thread, while the map changes."""
@@ -133,14 +134,16 @@ class MapState:
         self.keyframes = size_of(self.live_map.keyframes)
         return Applied(outcomes=outcomes, defects=defects)
 
-    def measuring(self, keyframe: int) -> Callable[[], LinksMeasured]:
+    def measuring(self, keyframe: int, pieces: int) -> list[Callable[[], LinksMeasured]]:
         """Return what measures the links of a keyframe, in any thread, while the map changes.
 
-        After a defect there are none, with the reason ``defect``.
+        `joined_links` joins what the pieces find.  After a defect there are none, with the reason ``defect``.
         """
-        measure = _guarded(lambda: self.live_map.measuring(keyframe))
         defect = LinksMeasured(keyframe=keyframe, failed={"defect": 1})
-        return lambda: defect if measure is None else _guarded(measure) or defect
+        found = _guarded(lambda: self.live_map.measuring(keyframe, pieces))
+        if found is None:
+            return [lambda: defect]
+        return [functools.partial(_links, measure, defect) for measure in found]
 
     @property
     def is_snapshot_due(self) -> bool:
@@ -182,6 +185,11 @@ def _guarded(act: Callable[[], _T]) -> _T | None:
         raise
     except Exception:  # noqa: BLE001  whatever the defect is
         return None
+
+
+def _links(measure: Callable[[], LinksMeasured], otherwise: LinksMeasured) -> LinksMeasured:
+    found = _guarded(measure)
+    return otherwise if found is None else found
 
 
 def size_of(value: Any) -> int:

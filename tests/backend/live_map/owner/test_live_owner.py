@@ -188,7 +188,7 @@ def test_keyframes_whose_links_were_not_logged_are_measured_by_the_next_owner():
 
     async def test() -> None:
         old = await bench.own("a")
-        old.state.measuring = lambda keyframe: (_ for _ in ()).throw(KeyError)  # type: ignore[method-assign]
+        old.state.measuring = lambda keyframe, pieces: (_ for _ in ()).throw(KeyError)  # type: ignore[method-assign]
         sent = asyncio.ensure_future(old.keyframe(0))
         await settle()
         assert sent.done()

@@ -16,8 +16,12 @@ from rse_pf.backend.live_map.owner.state import MapState
 from rse_pf.backend.live_map.owner.work.threads import Threads, Urgency
 from rse_pf.errors import RsePfError
 from rse_pf.live_map.events import Event
+from rse_pf.live_map.measure import joined_links
 
 __all__ = ["Measuring"]
+
+_PIECES = 2
+"""Threads that measure one keyframe."""
 
 
 class Measuring:
@@ -54,8 +58,11 @@ class Measuring:
             await self._wake.wait()
             if self._waiting:
                 keyframe = self._waiting.popleft()
-                measure = await threads.compute(Urgency.MEASURE, functools.partial(state.measuring, keyframe))
-                self._submit(await threads.look(measure))
+                pieces = await threads.compute(
+                    Urgency.MEASURE, functools.partial(state.measuring, keyframe, _PIECES)
+                )
+                begun = [threads.look(measure) for measure in pieces]
+                self._submit(joined_links(keyframe, [await each for each in begun]))
                 self._has_measured = True
             elif self._optimise_wanted:
                 self._optimise_wanted = False

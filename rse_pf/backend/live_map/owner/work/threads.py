@@ -13,8 +13,8 @@ from typing import Any, Protocol, TypeVar
 
 __all__ = ["OwnerThreads", "Threads", "Urgency"]
 
-_LOOKING = 2
-"""One measures keyframes, the other may look for a robot that is lost; matching and solving free the GIL."""
+_LOOKING = 3
+"""Two measure keyframes, one may look for a robot that is lost; matching and solving free the GIL."""
 _T = TypeVar("_T")
 
 
