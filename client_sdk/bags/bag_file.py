@@ -20,8 +20,8 @@ __all__ = ["BagFile", "BrokenMessage", "RawMessage", "Topic", "is_bag", "open_ba
 
 _ENDINGS = (".bag", ".db3", ".mcap")
 _FAULTS = (
-    ArithmeticError, AssertionError, AttributeError, EOFError, LookupError, OSError, RuntimeError,
-    TypeError, ValueError, struct.error,
+    ArithmeticError, AssertionError, AttributeError, EOFError, LookupError, MemoryError, OSError,
+    RuntimeError, TypeError, ValueError, struct.error,
 )  # fmt: skip
 """What the readers raise, beside their own errors, where the bytes of a bag make no sense."""
 _REPAIR = "repair it: rosbag reindex (ROS 1), ros2 bag reindex, or mcap recover; or copy it again"
@@ -184,10 +184,11 @@ def _all_faults() -> tuple[type[Exception], ...]:
     from apsw import Error
     from rosbags.rosbag1 import ReaderError as ReaderError1
     from rosbags.rosbag2 import ReaderError as ReaderError2
+    from rosbags.rosbag2.reader import zstd  # type: ignore[attr-defined]  # the one it reads with
     from rosbags.serde import SerdeError
     from rosbags.typesys import TypesysError
 
-    return (*_FAULTS, ReaderError1, ReaderError2, SerdeError, TypesysError, Error)
+    return (*_FAULTS, ReaderError1, ReaderError2, SerdeError, TypesysError, Error, zstd.ZstdError)
 
 
 def _said(error: BaseException) -> str:

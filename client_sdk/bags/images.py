@@ -108,9 +108,7 @@ def decode_colour(message: Any) -> npt.NDArray[np.uint8]:
     """
     cv2 = load_opencv()
     if not hasattr(message, "encoding"):
-        image = cv2.imdecode(np.asarray(message.data), cv2.IMREAD_COLOR)
-        if image is None:
-            raise BrokenMessage("an image cannot be decoded")
+        image = _decoded(cv2, np.asarray(message.data), cv2.IMREAD_COLOR)
         rgb: npt.NDArray[np.uint8] = cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
         return rgb
     bytes_per_px, conversion = _COLOUR[message.encoding]
@@ -147,15 +145,25 @@ def decode_depth(message: Any, depth_scale: float) -> npt.NDArray[np.float32]:
         _, a, b = _COMPRESSED_DEPTH_HEADER.unpack(data[: _COMPRESSED_DEPTH_HEADER.size].tobytes())
         data = data[_COMPRESSED_DEPTH_HEADER.size :]
         is_quantised = message.format.startswith("32FC1")
-    image = cv2.imdecode(data, cv2.IMREAD_UNCHANGED)
-    if image is None or image.ndim != 2 or image.dtype != np.uint16:
-        raise BrokenMessage("a depth image cannot be decoded")
+    image = _decoded(cv2, data, cv2.IMREAD_UNCHANGED)
+    if image.ndim != 2 or image.dtype != np.uint16:
+        raise BrokenMessage("a depth image does not hold 16 bits of one channel")
     if not is_quantised:
         return _metres_of_units(image, depth_scale)
     # compressed_depth_image_transport stores a / depth + b; 0 is "no reading".
     inverse = image.astype(np.float32) - np.float32(b)
     with np.errstate(divide="ignore", invalid="ignore"):
         return _metres_of_floats(np.where(image > 0, np.float32(a) / inverse, np.float32(0)))
+
+
+def _decoded(cv2: Any, data: npt.NDArray[np.uint8], flags: int) -> npt.NDArray[Any]:
+    try:
+        image: npt.NDArray[Any] | None = cv2.imdecode(data, flags)
+    except cv2.error as error:
+        raise BrokenMessage("an image cannot be decoded") from error
+    if image is None:
+        raise BrokenMessage("an image cannot be decoded")
+    return image
 
 
 def _rows(message: Any) -> npt.NDArray[np.uint8]:

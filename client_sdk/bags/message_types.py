@@ -7,6 +7,7 @@ camera have capital names.
 
 from __future__ import annotations
 
+import functools
 from typing import Any
 
 from rse_pf.errors import MissingExtra
@@ -80,6 +81,7 @@ _CAMERA = (
 )
 
 
+@functools.cache
 def load_types(*, is_ros1: bool) -> Any:
     """Return the `rosbags` type store of these messages.
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -139,7 +140,6 @@ def export_bag(file: Path, version: MapVersion) -> int:
     """Write a version of a map as one MCAP file that ROS 2 and Foxglove read; return its size, bytes.
 
     Raises:
-        UsageError: The file exists.
         MissingExtra: ``rosbags`` is not installed.
     """
     require("map to-bag")
@@ -151,10 +151,10 @@ def export_bag(file: Path, version: MapVersion) -> int:
         own = sorted((k for k in version.keyframes if k.robot == robot), key=lambda k: k.timestamp_s)
         poses = np.stack([k.T_world_camera for k in own])
         paths.append((robot, Trajectory(np.array([k.timestamp_s for k in own]), poses)))
-    target = file if file.suffix == ".mcap" else file.with_name(f"{file.name}.mcap")
-    write_map_bag(target, "mcap", paths, version.points, version.colours)
-    if target != file:
-        target.rename(file)
+    with TemporaryDirectory(prefix=".export-", dir=file.absolute().parent) as folder:
+        made = Path(folder) / "map.mcap"
+        write_map_bag(made, "mcap", paths, version.points, version.colours)
+        made.replace(file)
     return file.stat().st_size
 
 
