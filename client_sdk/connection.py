@@ -10,7 +10,7 @@ import asyncio
 import random as random_module
 import ssl
 from collections.abc import Awaitable, Callable, Coroutine, Iterable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
 from websockets.asyncio.client import ClientConnection
@@ -45,6 +45,9 @@ from rse_pf.wire.client_session import (
 )
 from rse_pf.wire.client_subscriptions import SubscriptionEnded, Updated
 from rse_pf.wire.server_session import CLOSE_RATE, CLOSE_REPLACED
+
+if TYPE_CHECKING:
+    from rse_pf.recording.robot_recorder import RobotRecorder
 
 __all__ = [
     "Connection",
@@ -106,7 +109,7 @@ class _Socket:
         self.dirty = asyncio.Event()
         self.tasks: list[asyncio.Task[None]] = []
         self.is_closing = False
-        self.bad_messages = 0
+        self.bad_messages = self.recorded = 0
 
 
 class Connection:
@@ -122,8 +125,11 @@ class Connection:
         clock: Callable[[], float],
         random: random_module.Random,
         on_change: OnChange = None,
+        recorder: RobotRecorder | None = None,
     ) -> None:
         self.url = url
+        self._recorder = recorder
+        self._used_token: str | None = None
         self.reconnects = 0
         self.moves = 0
         self.bytes_in = 0
@@ -290,6 +296,8 @@ class Connection:
             websocket = await self._handshake()
         socket = _Socket(websocket, self._session.open_connection(self._clock()))
         self._sockets.append(socket)
+        if self._recorder is not None:
+            socket.recorded = self._recorder.opened(self._session.codec, self._used_token)
         socket.tasks = [self._spawn(self._read(socket)), self._spawn(self._write(socket))]
         socket.dirty.set()
         try:
@@ -305,7 +313,7 @@ class Connection:
 
     async def _handshake(self) -> ClientConnection:
         subprotocol = SUBPROTOCOLS[self._session.codec.name]
-        token = await self._read_token()
+        token = self._used_token = await self._read_token()
         options = websocket_options(self._settings)
         if self._ssl_context is not None:
             options["ssl"] = self._ssl_context
@@ -371,6 +379,8 @@ class Connection:
             while True:
                 data = await socket.websocket.recv(decode=False)
                 self.bytes_in += len(data)
+                if self._recorder is not None:
+                    self._recorder.said(socket.recorded, "down", data)
                 self._receive(socket, data)
         except (ConnectionClosed, OSError):
             if socket.websocket.close_code == CLOSE_RATE:
@@ -408,6 +418,8 @@ class Connection:
                 while socket.state.outgoing:
                     data = socket.state.outgoing.pop(0)
                     self.bytes_out += len(data)
+                    if self._recorder is not None:
+                        self._recorder.said(socket.recorded, "up", data)
                     await socket.websocket.send(data, text=is_text)
         except (ConnectionClosed, OSError):
             return  # the reader handles the end, after the data that still arrived
@@ -463,6 +475,8 @@ class Connection:
             return
         socket.ended.set()
         self._sockets.remove(socket)
+        if self._recorder is not None:
+            self._recorder.closed(socket.recorded)
         if self._session.current is socket.state and not self._closed:
             self._on_change("link-lost", "closed")
         self._session.close_connection(socket.state)

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
 import numpy as np
+import numpy.typing as npt
 
 from client_sdk.answers import PoseAnswer
 from client_sdk.frontend import Features, Frame, FrontEndOptions, PoseQuery, TrackedFrame, Tracker
@@ -26,7 +27,7 @@ from rse_pf.geometry import Array, Camera
 from rse_pf.maps.format import Keyframe, MapVersion, encode_map
 from rse_pf.pnp import PnpOptions
 
-__all__ = ["AskPose", "BlockingMapper", "Mapper", "PoseSolver", "ask_robot"]
+__all__ = ["AskPose", "BlockingMapper", "FrameRecorder", "Mapper", "PoseSolver", "ask_robot"]
 
 T = TypeVar("T")
 
@@ -45,6 +46,16 @@ class PoseSolver(Protocol):
         depths_m: Array | None = None, deadline_s: float | None = None, keep: bool = False,
     ) -> PoseAnswer:  # fmt: skip
         """Estimate the camera pose of one frame."""
+
+
+class FrameRecorder(Protocol):
+    """What a mapper needs of the recorder of a robot."""
+
+    def frame(self, timestamp_s: float, rgb: npt.NDArray[np.uint8] | None = None) -> None:
+        """Record a thumbnail of an image, if the robot allows it."""
+
+    def map(self, points: npt.NDArray[np.float32]) -> None:
+        """Record the ``(n, 3)`` points of a map."""
 
 
 def ask_robot(robot: PoseSolver, deadline_s: float | None = None) -> AskPose:
@@ -93,6 +104,7 @@ class Mapper:
         T_world_start: Array | None = None,
         keyframes_of: str = "",
         adds_frames: bool = True,
+        recorder: FrameRecorder | None = None,
     ) -> None:
         """Start without frames.
 
@@ -109,6 +121,7 @@ class Mapper:
                 `encoded_map`; empty keeps none.
             adds_frames: Whether each frame with depth is added to the map; else the caller adds to `map`
                 what it wants.
+            recorder: Gets each frame before it is tracked, and the points of each map that is saved.
         """
         self.camera = camera
         self._ask = ask
@@ -122,6 +135,7 @@ class Mapper:
         self._dense = PointMap(self._map_options)
         self._keyframes_of = keyframes_of
         self._adds_frames = adds_frames
+        self._recorder = recorder
         self._kept: list[Keyframe] = []
         self._stamps: list[float] = []
         self._poses: list[Array] = []
@@ -143,6 +157,8 @@ class Mapper:
             ConfigurationError: The function that answers cannot work at all, such as without a package.
         """
         async with self._one_frame:
+            if self._recorder is not None:
+                self._recorder.frame(frame.timestamp_s, frame.rgb)
             tracker = self._tracker_for(frame)
             step = await asyncio.to_thread(tracker.prepare, frame)
             answer: PoseAnswer | None = None
@@ -274,6 +290,8 @@ class Mapper:
         least = 1 if isinstance(self._tracker, MonocularTracker) else _MIN_READINGS
         points, colours = self.map.points(min_readings=least)
         report["map_points"] = len(points)
+        if self._recorder is not None:
+            self._recorder.map(points)
         is_metric = self.scale != _UP_TO_SCALE
         try:
             folder.mkdir(parents=True, exist_ok=True)

@@ -10,7 +10,6 @@ import random as random_module
 import time
 from collections.abc import Callable, Coroutine, Generator
 from dataclasses import dataclass, replace
-from importlib import metadata
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -20,6 +19,7 @@ from client_sdk.connection import Connection, ForRobot, OnChange, Token, cancel_
 from client_sdk.enrolment import read_enrolment
 from client_sdk.local_services import LocalServices
 from client_sdk.offload import CloudFirst
+from client_sdk.recording import make_recorder, sdk_version
 from client_sdk.stats import Stats, StatsKeeper
 from client_sdk.updates import RobotSubscriptions, Updates
 from rse_pf.config import SessionSettings
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     import numpy as np
     import numpy.typing as npt
 
-    from client_sdk.frontend import FrontEndOptions
+    from client_sdk.frontend import Frame, FrontEndOptions
     from client_sdk.live.mapper import LiveMapper, LiveOptions
     from client_sdk.mapper import Mapper
     from client_sdk.mapping import MapOptions
@@ -79,6 +79,8 @@ class Robot:
         clock: Callable[[], float] = time.monotonic,
         random: random_module.Random | None = None,
         on_change: OnChange = None,
+        record: str | Path | None = None,
+        thumbnails: bool = False,
     ) -> None:
         """Describe a robot to be used as ``async with connect(...) as robot``, or awaited.
 
@@ -92,6 +94,8 @@ class Robot:
             clock: Seconds, monotonic.
             random: Source of the jitter of reconnects.
             on_change: Called with ``link-lost``, ``link-back`` or ``moved``, and the reason or the server.
+            record: Folder for a recording of what this robot says and hears, for rse-pf replay.
+            thumbnails: Whether small pictures of the frames of its `mapper` are recorded, too.
 
         Raises:
             UsageError: The address or the codec cannot be used, or there are an address and an enrolment.
@@ -105,8 +109,9 @@ class Robot:
             raise UsageError(f"no codec named {codec!r}", hint=f"choose one of {', '.join(CODECS)}")
         settings, random = settings or SessionSettings(), random or random_module.Random()
         self._session = ClientSession(
-            codec=make_codec(codec, settings), settings=settings, sdk=f"rse-pf-python/{_version()}"
+            codec=make_codec(codec, settings), settings=settings, sdk=f"rse-pf-python/{sdk_version()}"
         )
+        self._recorder = make_recorder(record, thumbnails, settings)
         self._connection = Connection(
             url,
             token=token,
@@ -115,6 +120,7 @@ class Robot:
             clock=clock,
             random=random,
             on_change=on_change,
+            recorder=self._recorder,
         )
         self._enrolment = enrolment
         self._offload = offload
@@ -137,6 +143,8 @@ class Robot:
             UsageError: The file of the enrolment cannot be used.
         """
         try:
+            if self._recorder is not None:
+                self._recorder.start()
             if self._enrolment is not None:
                 access = read_enrolment(self._enrolment)
                 self._connection.use(access.url, access.token, access.ssl_context)
@@ -171,6 +179,8 @@ class Robot:
         await cancel_all(self._tasks)
         if self._local is not None:
             self._local.close()
+        if self._recorder is not None:
+            await asyncio.to_thread(self._recorder.stop)
 
     async def solve_pnp(
         self,
@@ -297,7 +307,7 @@ class Robot:
         return Mapper(
             ask=ask_robot(self, deadline_s), camera=camera, options=bounded, monocular=monocular,
             depth=depth, scale=scale, map_options=map_options, T_world_start=T_world_start,
-            keyframes_of=keyframes_of,
+            keyframes_of=keyframes_of, recorder=self._recorder,
         )  # fmt: skip
 
     def live_map(
@@ -329,6 +339,14 @@ class Robot:
             spool=None if spool is None else Path(spool), map_options=map_options,
             T_world_start=T_world_start, clock=self._clock,
         )  # fmt: skip
+
+    def record_frame(self, frame: Frame, T_odom_camera: npt.NDArray[np.float64] | None = None) -> None:
+        """Record a thumbnail of *frame*, if allowed, and its pose ``(4, 4)`` by odometry, if there is one.
+
+        A `mapper` of this robot does the first by itself.  Without ``record`` nothing happens.
+        """
+        if self._recorder is not None:
+            self._recorder.frame(frame.timestamp_s, frame.rgb, T_odom_camera)
 
     @property
     def connected(self) -> bool:
@@ -579,10 +597,3 @@ class Robot:
 
 connect = Robot
 """Return a robot for ``async with connect(url, token=...) as robot``; its arguments are those of `Robot`."""
-
-
-def _version() -> str:
-    try:
-        return metadata.version("rse-pf")
-    except metadata.PackageNotFoundError:
-        return "0"
