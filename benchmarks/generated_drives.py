@@ -57,6 +57,8 @@ class GeneratedWorld:
         descriptors = self.rng.integers(0, 256, (self.features, 32), dtype=np.uint8)
         self._descriptors = descriptors
         self.wrong_sent = 0
+        self._stack: Array = np.empty((0, 4, 4))
+        self._stacked: tuple[list[Array], int] = ([], 0)
 
     def drive(self, robot: str, positions: Array, segment: int = 0) -> GeneratedDrive:
         """Return a robot's drive through ``(n, 2)`` positions, looking where it goes."""
@@ -87,7 +89,7 @@ class GeneratedWorld:
 
         *wrong* is the share of links, measured in addition, that are random.
         """
-        poses = np.array(self.seen[:keyframe])
+        poses = self._poses(keyframe)
         links = []
         if len(poses):
             apart = np.sqrt(((poses[:, :3, 3] - self.seen[keyframe][:3, 3]) ** 2).sum(axis=1))
@@ -104,6 +106,21 @@ class GeneratedWorld:
                 off = exp_se3(np.r_[self.rng.uniform(-3, 3, 3), self.rng.uniform(-1.5, 1.5, 3)])
                 links.append(measured_link(other, self.step(keyframe, other) @ off))
         return LinksMeasured(keyframe=keyframe, links=tuple(links))
+
+    def _poses(self, count: int) -> Array:
+        """Return the first poses of ``seen`` as an array, which grows with it."""
+        of, known = self._stacked
+        if of is not self.seen:  # a copy of a world drives on by itself
+            self._stack, known = np.empty((0, 4, 4)), 0
+        if count > len(self._stack):
+            grown = np.empty((max(64, 2 * count), 4, 4))
+            grown[:known] = self._stack[:known]
+            self._stack = grown
+        if count > known:
+            self._stack[known:count] = self.seen[known:count]
+            known = count
+        self._stacked = self.seen, known
+        return self._stack[:count]
 
     def _links_to_twin(self, keyframe: int, poses: Array, shift: float) -> list[MeasuredLink]:
         """Return links to keyframes of the place that looks like that of *keyframe*."""

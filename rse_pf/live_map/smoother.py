@@ -48,12 +48,12 @@ class SmoothedPoses:
     """The result of `smooth`.
 
     ``T`` ``(n, 4, 4)``; ``squares`` ``(m,)`` the squared Mahalanobis norm of each edge's residual;
-    ``information`` ``(6 f, 6 f)`` of the ``f`` free poses, of twists on the right of a pose.
+    ``covariances`` ``(w, 6, 6)`` of the wanted poses, of twists on the right of a pose, given the held ones.
     """
 
     T: Array
     squares: Array
-    information: Array
+    covariances: Array
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -78,23 +78,19 @@ class SmoothedWindows:
     strained: bool = False
     misfit: float = 0.0
     squares: dict[int, float] = field(default_factory=dict)
-    _information: list[tuple[dict[int, int], Array]] = field(default_factory=list)
+    _covariances: dict[int, Array] = field(default_factory=dict)
 
     def covariance(self, graph: Graph, keyframe: int) -> Array | None:
-        """Return the ``(6, 6)`` covariance of a pose that moved, given those that were held.
+        """Return the ``(6, 6)`` covariance of the newest pose of a segment, if it moved, given those held.
 
         It is of the twist (metres, radians) on the left of the pose, in the frame of the map.
         """
-        for rows, information in self._information:
-            row = rows.get(keyframe)
-            if row is not None:
-                unit = np.zeros((len(information), 6))
-                unit[6 * row : 6 * row + 6] = np.eye(6)
-                right = np.linalg.solve(information, unit)[6 * row : 6 * row + 6]
-                adjoint = _adjoints(graph.T[keyframe][None])[0]
-                left: Array = adjoint @ (0.5 * (right + right.T)) @ adjoint.T
-                return left
-        return None
+        right = self._covariances.get(keyframe)
+        if right is None:
+            return None
+        adjoint = _adjoints(graph.T[keyframe][None])[0]
+        left: Array = adjoint @ (0.5 * (right + right.T)) @ adjoint.T
+        return left
 
 
 def smooth_around(
@@ -111,6 +107,9 @@ def smooth_around(
         if graph.of_segment[i] >= 0:
             groups.setdefault(graph.component_of(i), []).append(i)
     total = 0.0
+    newest = [
+        graph.segments[row].keyframes[-1] for row in graph.newest.values() if graph.segments[row].keyframes
+    ]
     for _, seeds in sorted(groups.items()):
         for size in options.windows:
             ids, is_whole = _window(graph, seeds, size, held)
@@ -119,7 +118,9 @@ def smooth_around(
             edges = edges_of(graph, ids, options)
             if not len(edges.a):
                 break
-            found, border, rows = _fit(graph, ids, edges, options)
+            inside = set(ids)
+            told = [i for i in newest if i in inside]
+            found, border, rows = _fit(graph, ids, told, edges, options)
             is_strained = not is_whole and _is_moved(graph, border, found, rows, options)
             if not is_strained or size == options.windows[-1]:
                 done.strained |= is_strained
@@ -130,7 +131,7 @@ def smooth_around(
                 }  # fmt: skip
                 done.squares |= squares
                 total += sum(squares.values())
-                done._information.append((rows, found.information))
+                done._covariances |= dict(zip(told, found.covariances, strict=True))
                 break
     done.misfit = total / max(1, len(done.squares))
     return done
@@ -175,7 +176,7 @@ def odometry_step(T_from_to: Array, options: LiveMapOptions) -> float:
 
 def smooth(
     T: Array, free: int, a: Rows, b: Rows, T_a_b: Array, information: Array, robust: npt.NDArray[np.bool_],
-    *, cauchy: float,
+    *, cauchy: float, wanted: Rows | None = None,
 ) -> SmoothedPoses:  # fmt: skip
     """Fit the first *free* of the poses to the edges; the others are held.
 
@@ -190,6 +191,7 @@ def smooth(
         information: ``(m, 6, 6)``, of the twist (metres, radians).
         robust: ``(m,)``, whether the edge may be wrong.
         cauchy: Width of the kernel, standard deviations.
+        wanted: Rows of free poses whose covariance is asked for.
 
     Source:
         Dellaert and Kaess, Factor Graphs for Robot Perception (2017), chapter 6.
@@ -198,11 +200,15 @@ def smooth(
     back = inverses(T_a_b)
     T_a_b_now, error, squares = _residuals(T, a, b, back, information)
     cost = _cost(squares, robust, cauchy)
-    H = np.zeros((6 * free, 6 * free))
+    wanted = np.empty(0, dtype=np.int64) if wanted is None else wanted
+    units = np.zeros((6 * free, 6 * len(wanted)))
+    units[(6 * wanted[:, None] + np.arange(6)).ravel(), np.arange(6 * len(wanted))] = 1.0
+    solved: Array = np.empty((6 * free, 1 + 6 * len(wanted)))
     for _ in range(_ITERATIONS):
         weights = _weights(squares, robust, cauchy)
         H, gradient = _normal_equations(T_a_b_now, free, a, b, error, information, weights)
-        step = _bounded(np.linalg.solve(H, -gradient).reshape(free, 6).astype(np.float64))
+        solved = np.linalg.solve(H, np.column_stack([-gradient, units])).astype(np.float64, copy=False)
+        step = _bounded(solved[:, 0].reshape(free, 6))
         for _ in range(4):
             moved = T.copy()
             moved[:free] = _orthonormal(T[:free] @ exp_se3_many(step))
@@ -218,7 +224,9 @@ def smooth(
         moved_m, turned_rad = np.abs(step[:, :3]).max(), np.abs(step[:, 3:]).max()
         if little or (moved_m < _CONVERGED_M and turned_rad < _CONVERGED_RAD):
             break
-    return SmoothedPoses(T=T, squares=squares, information=H)
+    rows = 6 * wanted[:, None] + np.arange(6)
+    columns = 1 + 6 * np.arange(len(wanted))[:, None] + np.arange(6)
+    return SmoothedPoses(T=T, squares=squares, covariances=solved[rows[:, :, None], columns[:, None, :]])
 
 
 def exp_se3_many(xi: Array) -> Array:
@@ -282,7 +290,7 @@ def _window(graph: Graph, seeds: Sequence[int], size: int, held: set[int]) -> tu
 
 
 def _fit(
-    graph: Graph, ids: list[int], edges: Edges, options: LiveMapOptions
+    graph: Graph, ids: list[int], told: list[int], edges: Edges, options: LiveMapOptions
 ) -> tuple[SmoothedPoses, Rows, dict[int, int]]:
     """Return the smoothed poses, the keyframes of the window that touch its border, and rows by id."""
     row_of = np.full(len(graph), -1, dtype=np.int64)
@@ -293,7 +301,7 @@ def _fit(
     row_of[beyond] = len(ids) + np.arange(len(beyond))
     found = smooth(
         graph.T[np.concatenate([ids, beyond])], len(ids), row_of[edges.a], row_of[edges.b], edges.T_a_b,
-        edges.information, edges.numbers >= 0, cauchy=options.cauchy,
+        edges.information, edges.numbers >= 0, cauchy=options.cauchy, wanted=row_of[told],
     )  # fmt: skip
     return found, np.unique(border), {i: row for row, i in enumerate(ids)}
 
