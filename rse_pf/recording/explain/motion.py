@@ -19,6 +19,8 @@ _LEAST_SCALE, _LEAST_FACTOR, _CERTAIN = 0.10, 0.05, 4.0
 # Noise of a step, metres, however well few steps fit.
 _LEAST_NOISE_M = 0.005
 _TURN_NOISE_DEG = 0.3
+# What is the same factor, and how many steps must have it.
+_SAME_FACTOR, _MOST = 0.15, 0.7
 _LEAST_MOTION_M, _LEAST_TURN_DEG = 0.015, 1.0
 _STEPS = 10
 
@@ -60,7 +62,7 @@ def motion_against_odometry(
         T_camera_world: ``(4, 4)``, the pose of the command.
         T_odom_camera: ``(4, 4)``, odometry at its frame; None if there is none.
         history: Earlier commands of the robot, oldest first.
-        is_pair: Whether the world of each command is the frame before it.
+        is_pair: Whether the world of each command is a camera, as a rule that of the frame before.
     """
     if not history:
         return None, ("earlier commands of the robot (they would show its motion)",)
@@ -79,6 +81,8 @@ def motion_against_odometry(
     differs = scale > _LEAST_FACTOR and abs(math.log(scale)) > _LEAST_SCALE
     if not differs or abs(scale - 1.0) < _CERTAIN * deviation:
         return None, ()
+    if is_pair and not _alike(by_pose[moving], by_odom[moving], scale):
+        return None, ()
     turn_deviation = _TURN_NOISE_DEG * math.sqrt(count) / max(1e-9, float(turns[turning, 1].sum()))
     if abs(turn_scale - 1.0) > max(0.5 * abs(scale - 1.0), 3.0 * turn_deviation):
         return None, ()
@@ -96,6 +100,17 @@ def motion_against_odometry(
             "moved_by_poses_m": moved_m, "moved_by_odometry_m": odom_m,
         },
     ), ()  # fmt: skip
+
+
+def _alike(by_pose: Array, by_odom: Array, scale: float) -> bool:
+    """Return whether most single steps have the same factor.
+
+    Where the world of a command is an older keyframe, the factor is the number of frames since then.
+    """
+    lengths = np.linalg.norm(by_odom, axis=1)
+    factors = (by_pose * by_odom).sum(axis=1) / lengths**2
+    allowed = np.maximum(_SAME_FACTOR * scale, 3.0 * _LEAST_NOISE_M / lengths)
+    return bool(np.mean(np.abs(factors - scale) <= allowed) >= _MOST)
 
 
 def _steps(

@@ -44,6 +44,7 @@ _MAX_THUMBNAILS = 5
 _LEAST_ROWS = 4
 # Share of agreeing rows above which nothing but another camera is looked for in them.
 _HEALTHY_SHARE = 0.9
+_RIGHT_SHARE = 0.5
 # A wrong camera scatters the rows, and what is left of them may well lie in one plane.
 _BEHIND_CAMERA = 0.7
 
@@ -195,7 +196,14 @@ def _nothing_found(rows: Matches, reply: ReplyLike | None) -> Explanation:
         text = f"only {n} of {n + rows.left_out} rows hold usable numbers, and a pose needs {_LEAST_ROWS}"
         return Explanation(cause=Cause.UNKNOWN, confidence=0.5, sentence=text, evidence=evidence)
     if reply is None:
-        text = f"{n} matches gave no answer, and no known cause explains it"
+        fit = fitted(rows)
+        count = 0 if fit is None else fit.count
+        evidence["inliers"] = float(count)
+        text = (
+            f"there is no pose, although {count} of {n} matches agree: the refusal has another reason"
+            if count >= _RIGHT_SHARE * n
+            else f"{n} matches gave no pose, and no known cause explains it"
+        )
         return Explanation(cause=Cause.UNKNOWN, confidence=0.3, sentence=text, evidence=evidence)
     inliers = int(np.asarray(reply.inliers).size)
     evidence |= {"inliers": float(inliers), "rmse_px": float(reply.rmse_px)}
