@@ -79,6 +79,7 @@ docs: ## write the generated pages and the picture of the packages
 	@$(BIN)/rse-pf errors --markdown > docs/errors.md
 	@$(BIN)/rse-pf data --openapi > docs/openapi.json
 	@$(BIN)/python scripts/asyncapi.py
+	@$(BIN)/python scripts/grafana.py
 	@$(BIN)/python scripts/architecture.py
 
 site: ## build the documentation site into build/site; needs no network after setup
