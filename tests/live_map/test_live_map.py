@@ -133,6 +133,23 @@ def test_a_snapshot_in_parts_is_the_same_map_and_writes_what_is_new() -> None:
     assert len(first.parts) == 2
 
 
+def test_a_part_is_made_anew_when_half_of_it_is_gone() -> None:
+    run = _unmeasured(GeneratedWorld(seed=6), 128)
+    first = run.map.snapshot_parts()
+    for i in range(64):
+        run.map._graph.drop_features(i)
+        run.map._places.remove(i)
+    second = run.map.snapshot_parts(first.parts)
+    run.map._graph.drop_features(64)
+    run.map._places.remove(64)
+    third = run.map.snapshot_parts(first.parts)
+    again = LiveMap.restore_parts(second.head, lambda name: first.parts[name] or b"")
+
+    assert second.parts == dict.fromkeys(first.parts)
+    assert third.parts.keys() != first.parts.keys()
+    assert again.keyframes == 64
+
+
 def test_what_a_forgotten_robot_saw_is_in_no_part() -> None:
     world = GeneratedWorld(seed=6)
     run = _unmeasured(world, 130)

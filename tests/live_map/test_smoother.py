@@ -58,7 +58,7 @@ def test_a_wrong_link_does_not_move_the_poses(seed: int) -> None:
 def test_a_believed_link_that_is_wrong_does_not_move_the_map() -> None:
     """The map itself says which of its edges may be wrong."""
     world = GeneratedWorld(seed=3)
-    drive, live = world.drive("a", circle(0.5, 1.5)), LiveMap()
+    drive, live = world.drive("a", circle(0.3, 1.4)), LiveMap()
     for event in world.play([drive]):
         live.apply(event)
     graph, last = live._graph, len(world.seen) - 1
