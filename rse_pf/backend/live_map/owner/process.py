@@ -37,7 +37,6 @@ from rse_pf.backend.live_map.owner.link_security import (
 from rse_pf.backend.live_map.owner.live_owner import LiveOwner, OwnerContext
 from rse_pf.backend.live_map.owner.log import LiveLog, OwnershipLost
 from rse_pf.backend.live_map.owner.server import OwnerServer, listen
-from rse_pf.backend.live_map.owner.start import CALMLY
 from rse_pf.backend.live_map.owner.state import MapKind, MapState, take_over
 from rse_pf.backend.live_map.owner.work.threads import OwnerThreads, Urgency
 from rse_pf.backend.log import JsonLog
@@ -55,6 +54,7 @@ MAP_KIND = "rse_pf.backend.live_map.owner.map_kind:LIVE_MAP"
 _ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
 _READ_BYTES = 1 << 16
 _RETRY_S = 0.1
+_CALM_NICE = 10
 _SWITCH_S = 0.0005
 """A thread that has something to do waits at most so long for the interpreter; by default 5 ms each time."""
 _OUTSIDE = ("192.0.2.1", 9)
@@ -80,7 +80,7 @@ class OwnerProcess:
         with theirs:
             self._process = subprocess.Popen(
                 [sys.executable, "-m", "rse_pf.backend.live_map.owner.start", str(theirs.fileno()),
-                 *([CALMLY] if calmly else [])],
+                 str(_CALM_NICE if calmly else 0)],
                 pass_fds=(theirs.fileno(),), stdin=subprocess.DEVNULL, env={**os.environ, **_ONE_THREAD},
             )  # fmt: skip
         self.pid = self._process.pid

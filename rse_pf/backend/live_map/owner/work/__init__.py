@@ -1,5 +1,4 @@
-"""The parts of an owner that work beside its requests: threads, the log's writer, links and versions."""
+"""What works beside the requests of an owner: its threads, the writer of its log, measuring and publishing.
 
-from __future__ import annotations
-
-__all__: list[str] = []
+What a request means belongs to `LiveOwner`, and the map itself to `MapState`.
+"""
