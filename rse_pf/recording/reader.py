@@ -33,7 +33,9 @@ from rse_pf.geometry import Array
 from rse_pf.recording import file_format
 from rse_pf.wire import CODECS, Codec, Command, Failure, Result, make_codec
 
-__all__ = ["CASE_NAME", "Odometry", "RecordedCommand", "Recording", "open_recording", "recording_files"]
+__all__ = [
+    "CASE_NAME", "Odometry", "RecordedCommand", "WireRecording", "open_recording", "recording_files",
+]  # fmt: skip
 
 CASE_NAME = "rse_pf_case"
 """Metadata record of a file that was exported for one of its commands."""
@@ -127,7 +129,7 @@ class RecordedCommand:
         return message
 
 
-class Recording:
+class WireRecording:
     """The files of one recording, and what is said about them at their start.
 
     Attributes:
@@ -278,7 +280,7 @@ class Recording:
         return _seen(command, seen.of("frames", command), seen.of("odometry", command))
 
 
-def open_recording(path: Path, session: SessionSettings | None = None) -> Recording:
+def open_recording(path: Path, session: SessionSettings | None = None) -> WireRecording:
     """Return the recording at *path*: a file, or a folder with files; nothing but its start is read.
 
     Args:
@@ -291,7 +293,7 @@ def open_recording(path: Path, session: SessionSettings | None = None) -> Record
         UnsupportedProtocol: It is of a newer version.
     """
     files = recording_files(path)
-    recording = Recording(files, session or SessionSettings())
+    recording = WireRecording(files, session or SessionSettings())
     recording.read_head()
     return recording
 

@@ -12,7 +12,7 @@ import msgspec
 
 from rse_pf.config import PlatformSettings, PnpSettings
 from rse_pf.errors import BadRequest, RsePfError
-from rse_pf.recording.reader import RecordedCommand, Recording, open_recording
+from rse_pf.recording.reader import RecordedCommand, WireRecording, open_recording
 from rse_pf.recording.replay.case import CasePart, case_parts
 from rse_pf.recording.replay.report import CauseFound, CommandReport, causes_of, report_of
 from rse_pf.recording.replay.solving import Overrides, Resolver
@@ -241,7 +241,7 @@ def find(
     return found
 
 
-def _identity(recording: Recording, identity: str) -> str:
+def _identity(recording: WireRecording, identity: str) -> str:
     if not identity and not recording.case_id:
         raise BadRequest("this file is no case of one command", hint="name one with --command")
     return identity or recording.case_id
