@@ -33,7 +33,10 @@ def exported(folder: Path, identity: str) -> Path:
     return path
 
 
-@pytest.mark.parametrize("codec", ["zlib", "json", "bin"])
+@pytest.mark.parametrize(
+    "codec",
+    ["bin", pytest.param("zlib", marks=pytest.mark.slow), pytest.param("json", marks=pytest.mark.slow)],
+)
 def test_a_case_gives_the_same_bytes_and_the_same_report(tmp_path: Path, codec: str) -> None:
     made = Made(tmp_path / "a")
     for seed in range(3):

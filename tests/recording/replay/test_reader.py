@@ -148,7 +148,7 @@ def _wrong(tmp_path: Path, name: str) -> Path:
             version = str(file_format.FORMAT_VERSION + 1) if name == "newer" else "1"
             writer.add_metadata(file_format.METADATA_NAME, {"format": version})
             channel = writer.register_channel("/wire/0000000000000000/up", "rse-pf-wire", 0)
-            writer.add_message(channel, 1, bytes(100_000_000 if name == "bomb" else 1000), 1)
+            writer.add_message(channel, 1, bytes(34_000_000 if name == "bomb" else 1000), 1)
             writer.finish()
     return path
 
