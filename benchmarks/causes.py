@@ -30,7 +30,7 @@ from benchmarks.planted_causes import (
     recorded,
     rendered,
 )
-from rse_pf.recording.explain import Cause, Explanation, explain
+from rse_pf.recording.explain import Cause, PoseExplanation, explain
 
 __all__ = ["main"]
 
@@ -75,7 +75,7 @@ def cases_of(
     return [found[k] for k in order]
 
 
-def answers_of(cases: list[RecordedCase]) -> tuple[list[list[Explanation]], list[float]]:
+def answers_of(cases: list[RecordedCase]) -> tuple[list[list[PoseExplanation]], list[float]]:
     """Return the explanations of *cases*, which hold no labels, and the CPU of each in ms."""
     answers, spent_ms = [], []
     for case in cases:

@@ -3,7 +3,14 @@
 Nothing is read, written or drawn here; the same input gives the same explanation.
 """
 
-from rse_pf.recording.explain.causes import Cause, Explanation, MatchesLike, PastCommand, ReplyLike, Timing
+from rse_pf.recording.explain.causes import (
+    Cause,
+    MatchesLike,
+    PastCommand,
+    PoseExplanation,
+    ReplyLike,
+    Timing,
+)
 from rse_pf.recording.explain.ranking import explain
 
-__all__ = ["Cause", "Explanation", "MatchesLike", "PastCommand", "ReplyLike", "Timing", "explain"]
+__all__ = ["Cause", "PoseExplanation", "MatchesLike", "PastCommand", "ReplyLike", "Timing", "explain"]

@@ -15,7 +15,7 @@ import numpy.typing as npt
 from rse_pf.geometry import Array, Camera
 from rse_pf.pnp import PnpOptions
 
-__all__ = ["Cause", "Explanation", "MatchesLike", "PastCommand", "ReplyLike", "Timing"]
+__all__ = ["Cause", "PoseExplanation", "MatchesLike", "PastCommand", "ReplyLike", "Timing"]
 
 
 class Cause(str, enum.Enum):
@@ -36,7 +36,7 @@ class Cause(str, enum.Enum):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Explanation:
+class PoseExplanation:
     """One cause with what speaks for it.
 
     Attributes:

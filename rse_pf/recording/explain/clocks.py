@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from rse_pf.recording.explain.causes import Cause, Explanation, Timing
+from rse_pf.recording.explain.causes import Cause, PoseExplanation, Timing
 
 __all__ = ["late"]
 
@@ -13,7 +13,7 @@ _LEAST_ALLOWED_S = 0.1
 _EARLY_S = 0.005
 
 
-def late(timing: Timing | None) -> tuple[Explanation | None, tuple[str, ...]]:
+def late(timing: Timing | None) -> tuple[PoseExplanation | None, tuple[str, ...]]:
     """Return the explanation where the frame or the answer was late, and which times were missing."""
     if timing is None:
         return None, ("times (they would show a late frame or a late answer)",)
@@ -47,7 +47,7 @@ def late(timing: Timing | None) -> tuple[Explanation | None, tuple[str, ...]]:
     if not found:
         return None, tuple(missing)
     strength, sentence, evidence = max(found, key=lambda each: each[0])
-    explanation = Explanation(
+    explanation = PoseExplanation(
         cause=Cause.LATE, confidence=min(0.97, 0.75 + 0.08 * strength), sentence=sentence, evidence=evidence
     )
     return explanation, tuple(missing)

@@ -13,7 +13,7 @@ import numpy as np
 
 from rse_pf.errors import InvalidCamera
 from rse_pf.geometry import Array, Camera, exp_se3, transform
-from rse_pf.recording.explain.causes import Cause, Explanation
+from rse_pf.recording.explain.causes import Cause, PoseExplanation
 from rse_pf.recording.explain.fitting import Fit, Mask, Matches, fitted
 
 __all__ = ["intrinsics"]
@@ -39,7 +39,7 @@ class _Freed:
     cost: float
 
 
-def intrinsics(matches: Matches, base: Fit | None, *, is_pair: bool) -> tuple[Explanation, int] | None:
+def intrinsics(matches: Matches, base: Fit | None, *, is_pair: bool) -> tuple[PoseExplanation, int] | None:
     """Return the explanation where another camera fits clearly better, and how many matches agree then.
 
     Args:
@@ -218,7 +218,7 @@ def _project(matches: Matches, pose: Array, change: Array, *, pair: bool) -> Arr
 
 def _judged(
     matches: Matches, base: Fit | None, freed: _Freed, *, pair: bool
-) -> tuple[Explanation, int] | None:
+) -> tuple[PoseExplanation, int] | None:
     """Return the explanation if the other camera differs, is certain, and fits more or closer."""
     camera = matches.camera
     tight = matches.tight_px
@@ -253,7 +253,7 @@ def _judged(
     if not parts:
         parts = ["another camera, whose numbers these matches do not settle"]
     strength = min(1.0, max(gain, 2.0 * more))
-    return Explanation(
+    return PoseExplanation(
         cause=Cause.INTRINSICS,
         confidence=min(0.95, 0.62 + 0.35 * strength),
         sentence=(

@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from rse_pf.geometry import Array, pose_difference, transform
 from rse_pf.pnp.evidence import width_to_length
-from rse_pf.recording.explain.causes import Cause, Explanation
+from rse_pf.recording.explain.causes import Cause, PoseExplanation
 from rse_pf.recording.explain.fitting import Fit, Matches, fitted, is_chance, robust_cost
 
 __all__ = ["distinct_rows", "duplicates", "line", "mirrored", "outliers", "plane", "stale_map"]
@@ -41,7 +41,7 @@ def distinct_rows(matches: Matches) -> npt.NDArray[np.intp]:
     return best
 
 
-def duplicates(n: int, distinct: int, inliers: int) -> Explanation | None:
+def duplicates(n: int, distinct: int, inliers: int) -> PoseExplanation | None:
     """Return the explanation where many rows are copies of others.
 
     Args:
@@ -52,7 +52,7 @@ def duplicates(n: int, distinct: int, inliers: int) -> Explanation | None:
     share = 1.0 - distinct / n
     if share < _COPIES:
         return None
-    return Explanation(
+    return PoseExplanation(
         cause=Cause.DUPLICATES,
         confidence=min(0.97, 0.7 + 0.3 * share),
         sentence=(
@@ -63,7 +63,7 @@ def duplicates(n: int, distinct: int, inliers: int) -> Explanation | None:
     )
 
 
-def mirrored(matches: Matches, base: Fit | None) -> Explanation | None:
+def mirrored(matches: Matches, base: Fit | None) -> PoseExplanation | None:
     """Return the explanation where the points fit clearly better after a reflection than as they are."""
     reflected = replace(matches, points=-matches.points)
     fit = fitted(reflected, iterations=1000, polish=True)
@@ -77,7 +77,7 @@ def mirrored(matches: Matches, base: Fit | None) -> Explanation | None:
     gain = math.inf if base is None else (robust_cost(matches, base) - robust_cost(matches, fit)) / variance
     if fit.count < 1.6 * count and gain < _REFLECTION_GAIN:
         return None
-    return Explanation(
+    return PoseExplanation(
         cause=Cause.MIRRORED,
         confidence=0.9 + 0.08 * fit.count / len(matches),
         sentence=(
@@ -88,7 +88,7 @@ def mirrored(matches: Matches, base: Fit | None) -> Explanation | None:
     )
 
 
-def plane(matches: Matches, base: Fit, weakness: str, deviation_m: float) -> Explanation | None:
+def plane(matches: Matches, base: Fit, weakness: str, deviation_m: float) -> PoseExplanation | None:
     """Return the explanation where the matches that agree lie in one plane, or in a small part of the image.
 
     Args:
@@ -116,7 +116,7 @@ def plane(matches: Matches, base: Fit, weakness: str, deviation_m: float) -> Exp
     if not (geometric or deviation_m > _LOOSE_M):
         return None
     where = "on one line or in one spot of the image" if small else "in one plane"
-    return Explanation(
+    return PoseExplanation(
         cause=Cause.PLANE,
         confidence=0.85 if geometric else 0.6,
         sentence=(
@@ -133,14 +133,14 @@ def plane(matches: Matches, base: Fit, weakness: str, deviation_m: float) -> Exp
     )  # fmt: skip
 
 
-def line(matches: Matches, base: Fit | None) -> Explanation | None:
+def line(matches: Matches, base: Fit | None) -> PoseExplanation | None:
     """Return the explanation where all points, or all pixels, lie on one line or coincide."""
     if base is not None and not is_chance(len(matches), base.count, matches.tight_px, matches.camera):
         return None
     thinness = min(width_to_length(matches.points), width_to_length(matches.pixels))
     if thinness > _THIN:
         return None
-    return Explanation(
+    return PoseExplanation(
         cause=Cause.PLANE,
         confidence=0.85,
         sentence=(
@@ -166,7 +166,7 @@ def _planar_share(points: Array, depths_m: Array) -> tuple[float, float]:
     return float(np.mean(distance <= noise_m)), float(np.median(distance))
 
 
-def stale_map(matches: Matches, base: Fit) -> tuple[Explanation, int] | None:
+def stale_map(matches: Matches, base: Fit) -> tuple[PoseExplanation, int] | None:
     """Return the explanation where a second group of points fits a pose of its own, and all that fit one."""
     rest = matches.of(~base.agrees)
     if base.count < _LEAST or len(rest) < _LEAST:
@@ -185,7 +185,7 @@ def stale_map(matches: Matches, base: Fit) -> tuple[Explanation, int] | None:
     if shift_m < _LEAST_SHIFT_M:
         return None
     share = second.count / (second.count + base.count)
-    found = Explanation(
+    found = PoseExplanation(
         cause=Cause.STALE_MAP,
         confidence=min(0.93, 0.6 + 0.25 * second.count / len(rest) + 0.2 * max(0.0, apart - 0.5)),
         sentence=(
@@ -219,7 +219,7 @@ def _apart(first: Array, second: Array) -> float:
     return float((same[group].mean() + same[~group].mean()) / 2.0) if group.any() and not group.all() else 1.0
 
 
-def outliers(matches: Matches, base: Fit | None) -> Explanation | None:
+def outliers(matches: Matches, base: Fit | None) -> PoseExplanation | None:
     """Return the explanation where most matches agree with no common pose."""
     n, count = len(matches), 0 if base is None else base.count
     share = 1.0 - count / n
@@ -228,7 +228,7 @@ def outliers(matches: Matches, base: Fit | None) -> Explanation | None:
     chance = is_chance(n, count, matches.tight_px, matches.camera)
     errors = np.array([math.inf]) if base is None else base.errors_px[~base.agrees]
     median_px = float(np.median(errors))
-    return Explanation(
+    return PoseExplanation(
         cause=Cause.OUTLIERS,
         confidence=0.35 if chance else 0.4 + 0.4 * share,
         sentence=(

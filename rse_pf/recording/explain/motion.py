@@ -9,7 +9,7 @@ from itertools import pairwise
 import numpy as np
 
 from rse_pf.geometry import Array, inverse, rotation_angle_deg, transform
-from rse_pf.recording.explain.causes import Cause, Explanation, PastCommand
+from rse_pf.recording.explain.causes import Cause, PastCommand, PoseExplanation
 from rse_pf.recording.explain.fitting import Fit, Matches
 
 __all__ = ["depth_against_map", "motion_against_odometry"]
@@ -25,7 +25,7 @@ _LEAST_MOTION_M, _LEAST_TURN_DEG = 0.015, 1.0
 _STEPS = 10
 
 
-def depth_against_map(matches: Matches, base: Fit) -> Explanation | None:
+def depth_against_map(matches: Matches, base: Fit) -> PoseExplanation | None:
     """Return the explanation where the depths at the pixels are a constant multiple of the points' depths."""
     if matches.depths_m is None:
         return None
@@ -39,7 +39,7 @@ def depth_against_map(matches: Matches, base: Fit) -> Explanation | None:
     scale = math.exp(centre)
     if abs(centre) < 0.06 or abs(centre) < 2.0 * spread:
         return None
-    return Explanation(
+    return PoseExplanation(
         cause=Cause.DEPTH_SCALE,
         confidence=min(0.95, 0.75 + abs(centre)),
         sentence=(
@@ -52,7 +52,7 @@ def depth_against_map(matches: Matches, base: Fit) -> Explanation | None:
 
 def motion_against_odometry(
     T_camera_world: Array, T_odom_camera: Array | None, history: Sequence[PastCommand], *, is_pair: bool
-) -> tuple[Explanation | None, tuple[str, ...]]:
+) -> tuple[PoseExplanation | None, tuple[str, ...]]:
     """Return the explanation where steps are a constant multiple of the odometry's, and what was missing.
 
     A wrong depth scale changes lengths and no angles.  A late frame changes both alike, and the present
@@ -87,7 +87,7 @@ def motion_against_odometry(
     if abs(turn_scale - 1.0) > max(0.5 * abs(scale - 1.0), 3.0 * turn_deviation):
         return None, ()
     moved_m, odom_m = (float(np.linalg.norm(each[moving], axis=1).sum()) for each in (by_pose, by_odom))
-    return Explanation(
+    return PoseExplanation(
         cause=Cause.DEPTH_SCALE,
         confidence=min(0.93, 0.7 + 0.5 * abs(math.log(scale))),
         sentence=(

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from rse_pf.geometry import Array
-from rse_pf.recording.explain.causes import Cause, Explanation
+from rse_pf.recording.explain.causes import Cause, PoseExplanation
 
 __all__ = ["blur", "sharpness"]
 
@@ -69,7 +69,7 @@ def _second_difference(gray: Array, down: int, right: int) -> float:
 
 def blur(
     thumbnail: bytes | None, past: Sequence[bytes], matches: int, usual_matches: float | None
-) -> tuple[Explanation | None, tuple[str, ...]]:
+) -> tuple[PoseExplanation | None, tuple[str, ...]]:
     """Return the explanation where the image is less sharp than those before, and what was missing.
 
     Args:
@@ -94,7 +94,7 @@ def blur(
     fewer = f", with {matches} matches instead of {usual_matches:.0f}" if usual_matches else ""
     all_round = float(ratios.max()) < 1.3 * ratio
     direction = "in all directions" if all_round else f"along the {_ALONG[worst]} direction"
-    return Explanation(
+    return PoseExplanation(
         cause=Cause.BLUR,
         confidence=min(0.97, 0.78 + 0.3 * (_LOST_SHARPNESS - ratio)),
         sentence=(

@@ -14,7 +14,14 @@ import numpy as np
 from rse_pf.errors import RsePfError
 from rse_pf.geometry import Array
 from rse_pf.pnp import PnpOptions, PnpSolution
-from rse_pf.recording.explain.causes import Cause, Explanation, MatchesLike, PastCommand, ReplyLike, Timing
+from rse_pf.recording.explain.causes import (
+    Cause,
+    MatchesLike,
+    PastCommand,
+    PoseExplanation,
+    ReplyLike,
+    Timing,
+)
 from rse_pf.recording.explain.clocks import late
 from rse_pf.recording.explain.fitting import Fit, Matches, fitted, solved
 from rse_pf.recording.explain.inputs import (
@@ -57,7 +64,7 @@ def explain(
     history: Sequence[PastCommand] | None = None,
     timing: Timing | None = None,
     T_odom_camera: Array | None = None,
-) -> list[Explanation]:
+) -> list[PoseExplanation]:
     """Return the causes that fit a bad pose, likeliest first; one of `Cause.NONE` where nothing is wrong.
 
     Deterministic; at most 200 ms on one core.  What was not recorded is named in ``missing``.
@@ -80,7 +87,7 @@ def explain(
 def _ranked(
     matches: MatchesLike, reply: ReplyLike | None, thumbnail: bytes | None, history: Sequence[PastCommand],
     timing: Timing | None, T_odom_camera: Array | None,
-) -> list[Explanation]:  # fmt: skip
+) -> list[PoseExplanation]:  # fmt: skip
     rows, options = checked_matches(matches)
     found_late, missing = late(timing)
     thumbnails = [each.thumbnail for each in history if each.thumbnail is not None]
@@ -107,14 +114,14 @@ def _finite(evidence: Mapping[str, float]) -> dict[str, float]:
 def _by_matches(
     rows: Matches, options: PnpOptions, reply: ReplyLike | None, history: Sequence[PastCommand],
     T_odom_camera: Array | None,
-) -> tuple[list[Explanation], tuple[str, ...]]:  # fmt: skip
+) -> tuple[list[PoseExplanation], tuple[str, ...]]:  # fmt: skip
     """Return what the matches and the motion show, and what was missing for it."""
     distinct = rows.of(distinct_rows(rows))
     start = None if reply is None else checked_pose(reply.T_camera_world)
     base = fitted(distinct, iterations=1000, start=start, polish=True)
     count = 0 if base is None else base.count
     is_pair = rows.depths_m is not None or _seen_from_origin(distinct)
-    found: list[Explanation | None] = [
+    found: list[PoseExplanation | None] = [
         duplicates(len(rows), len(distinct), count),
         line(rows, base if len(distinct) >= _LEAST_ROWS else None),
     ]
@@ -143,7 +150,7 @@ def _by_matches(
 
 def _rivals(
     rows: Matches, base: Fit | None, history: Sequence[PastCommand], *, is_pair: bool
-) -> list[Explanation | None]:
+) -> list[PoseExplanation | None]:
     """Return the causes that may explain why rows disagree: of those, the one that explains most rows."""
     priors = [np.eye(4)] if is_pair else []
     past = [each.T_camera_world for each in history if each.T_camera_world is not None]
@@ -153,7 +160,7 @@ def _rivals(
     if base is not None:
         tried.append(stale_map(rows, base))
     rivals = sorted((each for each in tried if each is not None), key=lambda each: -each[1])
-    result: list[Explanation | None] = [outliers(rows, base)]
+    result: list[PoseExplanation | None] = [outliers(rows, base)]
     for place, (explanation, explained) in enumerate(rivals):
         lower = 0.0 if place == 0 else 0.15 + 0.3 * (rivals[0][1] - explained) / len(rows)
         if explained > count:
@@ -189,12 +196,12 @@ def _weakness(rows: Matches, options: PnpOptions, reply: ReplyLike | None) -> tu
     return (answer.reason if reply is None else reply.reason), deviation_m
 
 
-def _nothing_found(rows: Matches, reply: ReplyLike | None) -> Explanation:
+def _nothing_found(rows: Matches, reply: ReplyLike | None) -> PoseExplanation:
     n = len(rows)
     evidence = {"matches": float(n), "rows_left_out": float(rows.left_out)}
     if n < _LEAST_ROWS:
         text = f"only {n} of {n + rows.left_out} rows hold usable numbers, and a pose needs {_LEAST_ROWS}"
-        return Explanation(cause=Cause.UNKNOWN, confidence=0.5, sentence=text, evidence=evidence)
+        return PoseExplanation(cause=Cause.UNKNOWN, confidence=0.5, sentence=text, evidence=evidence)
     if reply is None:
         fit = fitted(rows)
         count = 0 if fit is None else fit.count
@@ -204,15 +211,15 @@ def _nothing_found(rows: Matches, reply: ReplyLike | None) -> Explanation:
             if count >= _RIGHT_SHARE * n
             else f"{n} matches gave no pose, and no known cause explains it"
         )
-        return Explanation(cause=Cause.UNKNOWN, confidence=0.3, sentence=text, evidence=evidence)
+        return PoseExplanation(cause=Cause.UNKNOWN, confidence=0.3, sentence=text, evidence=evidence)
     inliers = int(np.asarray(reply.inliers).size)
     evidence |= {"inliers": float(inliers), "rmse_px": float(reply.rmse_px)}
     if reply.verdict != "ok":
-        return Explanation(
+        return PoseExplanation(
             cause=Cause.UNKNOWN, confidence=0.3,
             sentence=f"the pose is weak ({reply.reason}), and no known cause explains it", evidence=evidence,
         )  # fmt: skip
-    return Explanation(
+    return PoseExplanation(
         cause=Cause.NONE, confidence=0.9,
         sentence=f"nothing is wrong: {inliers} of {n} matches agree to {reply.rmse_px:.2f} px",
         evidence=evidence,

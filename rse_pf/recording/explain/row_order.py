@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rse_pf.geometry import Array, Camera, transform
-from rse_pf.recording.explain.causes import Cause, Explanation
+from rse_pf.recording.explain.causes import Cause, PoseExplanation
 from rse_pf.recording.explain.fitting import Fit, Mask, Matches, fit_of, fitted, is_chance
 
 __all__ = ["row_order"]
@@ -21,7 +21,9 @@ _VOTERS = 100
 Rows = npt.NDArray[np.intp]
 
 
-def row_order(matches: Matches, base: Fit | None, priors: Sequence[Array]) -> tuple[Explanation, int] | None:
+def row_order(
+    matches: Matches, base: Fit | None, priors: Sequence[Array]
+) -> tuple[PoseExplanation, int] | None:
     """Return the explanation where points find their pixels in other rows, and how many do so in all.
 
     Args:
@@ -50,7 +52,7 @@ def row_order(matches: Matches, base: Fit | None, priors: Sequence[Array]) -> tu
     shift, with_shift = _shift_of(matches, fit)
     steady = with_shift > 0.5 * found
     text = f", most of them {abs(shift)} row(s) {'later' if shift > 0 else 'earlier'}" if steady else ""
-    return Explanation(
+    return PoseExplanation(
         cause=Cause.ROW_ORDER,
         confidence=min(0.96, 0.72 + 0.25 * found / max(1, strays)),
         sentence=(

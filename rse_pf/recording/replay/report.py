@@ -13,7 +13,7 @@ import numpy.typing as npt
 from rse_pf.errors import RsePfError
 from rse_pf.geometry import Array, pose_difference, transform
 from rse_pf.pnp import PnpOptions, evidence
-from rse_pf.recording.explain import Explanation, PastCommand, Timing, explain
+from rse_pf.recording.explain import PastCommand, PoseExplanation, Timing, explain
 from rse_pf.recording.reader import RecordedCommand
 from rse_pf.recording.replay.picture import match_picture
 from rse_pf.recording.replay.rules import Rule, proposed_pose, rules_of
@@ -64,7 +64,7 @@ class CauseFound(msgspec.Struct, frozen=True, kw_only=True):
     missing: tuple[str, ...] = ()
 
     @classmethod
-    def of(cls, found: Explanation) -> CauseFound:
+    def of(cls, found: PoseExplanation) -> CauseFound:
         """Return *found* as a value that travels between processes."""
         numbers = {name: _plain(value) for name, value in found.evidence.items()}
         return cls(

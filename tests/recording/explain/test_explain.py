@@ -13,7 +13,7 @@ from rse_pf.errors import RsePfError
 from rse_pf.geometry import Array, Camera, exp_se3, inverse, transform
 from rse_pf.pnp import PnpOptions, PnpSolution, solve_pnp
 from rse_pf.pnp.problems import DEGENERATE, KINECT, make_degenerate, make_problem
-from rse_pf.recording.explain import Cause, Explanation, PastCommand, Timing, explain
+from rse_pf.recording.explain import Cause, PastCommand, PoseExplanation, Timing, explain
 from rse_pf.services.pnp import PnpReply, make_request
 
 N = 200
@@ -48,7 +48,7 @@ def reply_to(command: Payload) -> PnpSolution | None:
         return None
 
 
-def explained(command: Payload, **recorded: Any) -> list[Explanation]:
+def explained(command: Payload, **recorded: Any) -> list[PoseExplanation]:
     """Return the explanations of a command with the reply that the service gives."""
     return explain(command, reply_to(command), **recorded)
 
