@@ -96,6 +96,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     parser.add_argument("--no-page", action="store_true", help="start no fleet page")
     parser.add_argument(
+        "--foxglove", action="store_true",
+        help="also export the platform to Foxglove, without a key, at a port on loopback "
+        f"(local.foxglove_port, default {defaults.foxglove_port})",
+    )  # fmt: skip
+    parser.add_argument(
         "--no-data", action="store_true", help="start no data service (large data by HTTP under /data/)"
     )
     parser.add_argument(
@@ -137,7 +142,13 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
     chosen = recorded(_with_services(chosen, args), args.record)
     lan = chosen_address(args.lan)
     page = not args.no_page
-    return asyncio.run(_foreground(args.name, folder, chosen, data=not args.no_data, lan=lan, page=page))
+    if args.foxglove:
+        require("local --foxglove")
+    return asyncio.run(
+        _foreground(
+            args.name, folder, chosen, data=not args.no_data, lan=lan, page=page, foxglove=args.foxglove
+        )
+    )
 
 
 def _with_services(settings: PlatformSettings, args: argparse.Namespace) -> PlatformSettings:
@@ -298,9 +309,9 @@ def _wait(end_s: float, seconds: float) -> bool:
 
 
 async def _foreground(
-    name: str, folder: Any, settings: PlatformSettings, *, data: bool, lan: str, page: bool
+    name: str, folder: Any, settings: PlatformSettings, *, data: bool, lan: str, page: bool, foxglove: bool
 ) -> int:
-    from rse_pf.cli.local_platform.page import page_beside
+    from rse_pf.cli.local_platform.page import page_beside, process_beside
     from rse_pf.local.control.control_plane import ControlOptions
     from rse_pf.local.control.platform import LocalPlatform
 
@@ -334,7 +345,11 @@ async def _foreground(
             ready = True
             _welcome(platform, name)
             beside = page_beside(folder, settings.local.page_port, _show_page) if page else nullcontext()
-            async with beside:
+            export = process_beside(
+                "rse_pf.fleet_page.foxglove_export", folder, settings.local.foxglove_port,
+                folder / "foxglove.log", lambda url: show(f"foxglove            {url}"),
+            )  # fmt: skip
+            async with beside, export if foxglove else nullcontext():
                 await stopped.wait()
                 show("", "stopping")
     except asyncio.CancelledError:
@@ -348,6 +363,7 @@ def _welcome(platform: Any, name: str) -> None:
 
     which = "" if name == DEFAULT_NAME else f" --name {name}"
     has_data = platform.data_servers.process.is_running()
+    recordings = platform.settings.recording.folder
     show(
         "",
         f"robots connect to   {platform.url}",
@@ -355,6 +371,7 @@ def _welcome(platform: Any, name: str) -> None:
         f"a robot's token     rse-pf token issue robot-1{which}",
         *_lan_lines(platform, which),
         f"metrics             {platform.metrics_url}",
+        *([f"recordings          {recordings}"] if recordings else []),
         f"to stop             Ctrl-C, or rse-pf local stop{which}",
         f"logs and state      {platform.state}",
         "",

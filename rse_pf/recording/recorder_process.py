@@ -210,12 +210,12 @@ def run_recorder(plan: RecorderPlan) -> None:
     with selectors.DefaultSelector() as selector:
         for fd in plan.fds:
             selector.register(fd, selectors.EVENT_READ, _Worker(recorder))
-        _loop(selector, writer)
+        _loop(selector, writer, plan)
     recorder.event(time.time_ns(), "recording-over", left_out=recorder.left_out)
     writer.close()
 
 
-def _loop(selector: selectors.BaseSelector, writer: RecordingWriter) -> None:
+def _loop(selector: selectors.BaseSelector, writer: RecordingWriter, plan: RecorderPlan) -> None:
     problem = ""
     while selector.get_map():
         for key, _ in selector.select(_FLUSH_S):
@@ -228,13 +228,16 @@ def _loop(selector: selectors.BaseSelector, writer: RecordingWriter) -> None:
         writer.flush(time.time_ns())
         if writer.problem != problem:
             problem = writer.problem
-            _log(problem, writer.dropped)
+            _log(plan.server, problem, writer.dropped)
 
 
-def _log(problem: str, dropped: int) -> None:
-    """Write a log line about the disk; there is no reader for anything longer."""
-    event = "recording-stopped" if problem else "recording-resumed"
-    line = {"level": "warning", "event": event, "reason": problem, "dropped": dropped}
+def _log(server: str, problem: str, dropped: int) -> None:
+    """Write a log line about the disk, as a server writes its own."""
+    line: dict[str, Any] = {"time": time.time(), "level": "warning", "event": "recording-resumed"}
+    line |= {"server": server, "dropped": dropped}
+    if problem:
+        hint = "robots are served on; free some space, or record to another folder"
+        line |= {"event": "recording-stopped", "reason": problem, "hint": hint}
     with suppress(OSError):
         os.write(2, json.dumps(line).encode() + b"\n")
 

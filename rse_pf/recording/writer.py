@@ -107,7 +107,7 @@ class RecordingWriter:
             version: Of the platform.
         """
         self.dropped = 0
-        self.written = 0
+        self._waiting = 0
         self.problem = ""
         self._folder = folder
         self._server = server
@@ -164,8 +164,11 @@ class RecordingWriter:
             if number is None:
                 topic, encoding, schema, metadata = self._known[channel]
                 number = self._numbers[channel] = file.channel(topic, encoding, schema, metadata)
+            self._waiting += 1
+            size = file.size_bytes
             file.add(number, time_ns, data)
-            self.written += 1
+            if file.size_bytes != size:
+                self._waiting = 0
         except OSError as error:
             self._fail(error, time_ns)
 
@@ -177,6 +180,7 @@ class RecordingWriter:
         try:
             if file.is_due(now_ns):
                 file.flush()
+                self._waiting = 0
             if file.size_bytes >= self._max_file_bytes or file.channels >= _MAX_CHANNELS:
                 self.close()
             if now_ns - self._pruned_ns >= _PRUNE_NS:
@@ -221,7 +225,8 @@ class RecordingWriter:
 
     def _fail(self, error: OSError, now_ns: int) -> None:
         """Give up the file, which is readable up to its last chunk, and try a new one later."""
-        self.dropped += 1
+        self.dropped += max(1, self._waiting)
+        self._waiting = 0
         if now_ns >= self._retry_ns:
             self.problem = error.strerror or str(error)
             self._retry_ns = now_ns + _RETRY_NS
