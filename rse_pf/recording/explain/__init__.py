@@ -13,4 +13,4 @@ from rse_pf.recording.explain.causes import (
 )
 from rse_pf.recording.explain.ranking import explain
 
-__all__ = ["Cause", "PoseExplanation", "MatchesLike", "PastCommand", "ReplyLike", "Timing", "explain"]
+__all__ = ["Cause", "MatchesLike", "PastCommand", "PoseExplanation", "ReplyLike", "Timing", "explain"]

@@ -15,7 +15,7 @@ import numpy.typing as npt
 from rse_pf.geometry import Array, Camera
 from rse_pf.pnp import PnpOptions
 
-__all__ = ["Cause", "PoseExplanation", "MatchesLike", "PastCommand", "ReplyLike", "Timing"]
+__all__ = ["Cause", "MatchesLike", "PastCommand", "PoseExplanation", "ReplyLike", "Timing"]
 
 
 class Cause(str, enum.Enum):
