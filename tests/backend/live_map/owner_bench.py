@@ -21,7 +21,7 @@ from rse_pf.maps.registry import MapRegistry
 from rse_pf.object_store import MemoryStore, ObjectStore
 from tests.backend.live_map.fake_map import FAKE_MAP
 
-__all__ = ["MAP", "ROBOT", "Bench", "FailingStore", "HandClock", "OwnerBench", "settle"]
+__all__ = ["MAP", "ROBOT", "Bench", "FailingStore", "HandClock", "InlineThreads", "OwnerBench", "settle"]
 
 MAP, TENANT = "warehouse", "default"
 ROBOT = RobotId("default", "robot-1")
@@ -114,7 +114,7 @@ class OwnerBench:
         self.state: MapState = take_over(self.log, FAKE_MAP, owner=name, epoch=record.epoch)
         assert self.lease.serve("127.0.0.1", 1, "c")
         context = OwnerContext(
-            map_name=MAP, settings=bench.settings.live, kind=FAKE_MAP, threads=InlineThreads(),
+            map_name=MAP, settings=bench.settings.live, kind=FAKE_MAP, threads=bench.threads,
             maps=MapRegistry(bench.store, TENANT), clock=bench.clock, wall_clock=lambda: 1000.0,
             sleep=bench.clock.sleep, log=bench.log, tell=self.told.append, on_beat=self.beats.append,
         )  # fmt: skip
@@ -143,6 +143,7 @@ class Bench:
         self.clock = HandClock()
         self.settings = PlatformSettings.from_dict({"live": live})
         self.keeps_all = keeps_all
+        self.threads = InlineThreads()
         self._null = os.open(os.devnull, os.O_WRONLY)
         self.log = JsonLog(level="error", server="test", wall_clock=lambda: 0.0, fd=self._null)
 

@@ -100,7 +100,9 @@ class LiveOwner:
             log, self, threads=context.threads, sleep=context.sleep, json_log=context.log,
             name=context.map_name,
         )  # fmt: skip
-        self._measuring = Measuring(state, context.threads, self._writer.submit)
+        self._measuring = Measuring(
+            state, context.threads, self._writer.submit, json_log=context.log, name=context.map_name
+        )
         self._publisher = Publisher(
             state, context.maps, threads=context.threads, wall_clock=context.wall_clock,
             json_log=context.log, name=context.map_name, author=f"live map on {lease.record.server}",

@@ -145,6 +145,11 @@ class MapState:
             return [lambda: defect]
         return [functools.partial(_links, measure, defect) for measure in found]
 
+    def optimising(self) -> Callable[[], Optimised | None]:
+        """Return what fits the whole graph, in any thread, while the map changes; None if that fails."""
+        fit = _guarded(self.live_map.optimising)
+        return lambda: None if fit is None else _guarded(fit)
+
     @property
     def is_snapshot_due(self) -> bool:
         """Whether so many entries were applied since the last snapshot that a restart takes long."""
@@ -178,7 +183,7 @@ class MapState:
 
 
 def _guarded(act: Callable[[], _T]) -> _T | None:
-    """Return what *act* returns; None after a defect: a keyframe must not be measured again and again."""
+    """Return what *act* returns; None after a defect: what only looks must not end the owner."""
     try:
         return act()
     except MemoryError:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Callable
+from typing import TypeVar
 
 import pytest
 
@@ -14,8 +16,9 @@ from rse_pf.identity import RobotId
 from rse_pf.live_map.events import MapStarted, decode_events
 from rse_pf.maps.registry import MapRegistry
 from rse_pf.object_store import MemoryStore
-from tests.backend.live_map.owner_bench import FOLDER, MAP, ROBOT, Bench, FailingStore, settle
+from tests.backend.live_map.owner_bench import FOLDER, MAP, ROBOT, Bench, FailingStore, InlineThreads, settle
 
+_T = TypeVar("_T")
 OTHER = RobotId("default", "robot-2", "thumb")
 
 
@@ -99,6 +102,45 @@ def test_keyframes_that_arrive_during_a_write_share_the_next_entry():
         await settle()
         assert owner.state.keyframes == 8
         assert owner.log.position - before < 8
+
+    bench.run(test)
+
+
+def test_keyframes_are_kept_while_the_links_of_an_earlier_one_are_measured():
+    bench = Bench()
+    may_look = asyncio.Event()
+
+    class Threads(InlineThreads):
+        async def look(self, act: Callable[[], _T]) -> _T:
+            await may_look.wait()
+            return act()
+
+    bench.threads = Threads()
+
+    async def test() -> None:
+        owner = await bench.own("a")
+        for number in range(3):
+            assert (await owner.keyframe(number))["number"] == number + 1
+        assert owner.state.keyframes == 3
+        assert list(owner.state.unmeasured) == [0, 1, 2]
+        may_look.set()
+        await settle()
+        assert not owner.state.unmeasured
+        assert bench.replayed().digest() == owner.state.digest()
+
+    bench.run(test)
+
+
+def test_an_optimisation_that_fails_is_no_defect_of_the_owner():
+    bench = Bench()
+
+    async def test() -> None:
+        owner = await bench.own("a")
+        owner.state.live_map.optimising = lambda: [].index(0)  # type: ignore[attr-defined]
+        owner.owner._measuring.optimise()
+        await settle()
+        assert not owner.run.done()
+        assert (await owner.keyframe(0))["number"] == 1
 
     bench.run(test)
 

@@ -6,7 +6,6 @@ What is found enters the log as events.  The map goes on meanwhile: its thread o
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import functools
 from collections import deque
 from collections.abc import Callable, Iterable
@@ -14,7 +13,7 @@ from typing import Any
 
 from rse_pf.backend.live_map.owner.state import MapState
 from rse_pf.backend.live_map.owner.work.threads import Threads, Urgency
-from rse_pf.errors import RsePfError
+from rse_pf.backend.log import JsonLog
 from rse_pf.live_map.events import Event
 from rse_pf.live_map.measure import joined_links
 
@@ -27,9 +26,26 @@ _PIECES = 2
 class Measuring:
     """Measures one keyframe at a time; its methods are called in the event loop."""
 
-    def __init__(self, state: MapState, threads: Threads, submit: Callable[[Event], Any]) -> None:
-        """Begin with what the last owner has left, at `run`; *submit* lets an event enter the log."""
+    def __init__(
+        self,
+        state: MapState,
+        threads: Threads,
+        submit: Callable[[Event], Any],
+        *,
+        json_log: JsonLog,
+        name: str,
+    ) -> None:
+        """Begin with what the last owner has left, at `run`.
+
+        Args:
+            state: The map.
+            threads: In which to look.
+            submit: Lets an event enter the log.
+            json_log: Of the server.
+            name: Of the map.
+        """
         self._state, self._threads, self._submit = state, threads, submit
+        self._json_log, self._name = json_log, name
         self._waiting = deque(state.unmeasured)
         self._wake = asyncio.Event()
         self._wake.set()
@@ -66,8 +82,11 @@ class Measuring:
                 self._has_measured = True
             elif self._optimise_wanted:
                 self._optimise_wanted = False
-                with contextlib.suppress(RsePfError):
-                    fit = await threads.compute(Urgency.BACKGROUND, state.live_map.optimising)
-                    self._submit(await threads.look(fit))
+                fit = await threads.compute(Urgency.BACKGROUND, state.optimising)
+                optimised = await threads.look(fit)
+                if optimised is None:
+                    self._json_log.warning("live-optimisation-failed", map=self._name)
+                else:
+                    self._submit(optimised)
             else:
                 self._wake.clear()
