@@ -13,7 +13,7 @@ WORKERS ?= $(shell expr $$(nproc) + 1)
 export PYTHONDONTWRITEBYTECODE :=
 
 .DEFAULT_GOAL := help
-.PHONY: help setup assets native sanitize synth demo test quick slow lint types bench docs site release lock fuzz sbom audit-deps clean
+.PHONY: help setup assets native sanitize synth demo test quick slow browser lint types bench docs site release lock fuzz sbom audit-deps clean
 
 help: ## show these targets
 	@awk -F':.*## ' '/^[a-z-]+:.*## /{printf "  make %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -58,6 +58,10 @@ slow: ## run what make test leaves out: conformance suites, recordings, a bare D
 	@$(SETUP) dev infra
 	@$(BIN)/python scripts/assets.py
 	@$(PYTEST) -m slow $(ARGS)
+
+browser: ## try the fleet page in Debian's Chromium, and save its pictures in docs/images
+	@$(SETUP) dev browser
+	@RSE_PF_SCREENSHOTS=docs/images $(PYTEST) -q -rs -s -n 0 -m slow tests/fleet_page/test_in_chromium.py $(ARGS)
 
 lint: ## run ruff, check only
 	@$(SETUP) dev

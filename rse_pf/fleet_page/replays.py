@@ -25,8 +25,6 @@ __all__ = ["Replays", "replay_document"]
 
 _WRITTEN_S = 2.0
 """A command is in the file after this time at the latest."""
-_OTHER_S = 5.0
-"""A command that was answered at a time that differs by more is another one with the same id."""
 _MAX_PICTURE_BYTES = 2 << 20
 
 
@@ -61,7 +59,11 @@ class Replays:
             age_s = self._wall_clock() - answered_s
             if 0 <= age_s < _WRITTEN_S:
                 await asyncio.sleep(_WRITTEN_S - age_s)
-            told = await asyncio.to_thread(self._replayed, trace, int(identity), answered_s)
+            size = query.get("bytes", "")
+            command_bytes = int(size) if size.isascii() and size.isdigit() and len(size) < 10 else None
+            told = await asyncio.to_thread(
+                self._replayed, trace, int(identity), answered_s, command_bytes or None
+            )
         return "application/json", json.dumps(told).encode()
 
     def close(self) -> None:
@@ -69,7 +71,9 @@ class Replays:
         if self._replay is not None:
             self._replay.close()
 
-    def _replayed(self, trace: str, identity: int, answered_s: float) -> dict[str, Any]:
+    def _replayed(
+        self, trace: str, identity: int, answered_s: float, command_bytes: int | None
+    ) -> dict[str, Any]:
         from rse_pf.recording.replay.limited import LimitedReplay
 
         settings = platform_settings(self._folder)
@@ -78,17 +82,15 @@ class Replays:
         path = Path(settings.recording.folder)
         if self._replay is None:
             self._replay = LimitedReplay(settings)
-        found = self._replay.find(path, trace=trace, id=identity)
+        found = self._replay.find(
+            path, trace=trace, id=identity, near_s=answered_s, command_bytes=command_bytes
+        )
         if found is None:
             raise NotFound(
                 "this command is not in the recording",
                 hint="it was deleted with the oldest files, or its service is not recorded",
             )
         report = self._replay.command(path, found)
-        if abs(report.sent_s + (report.round_trip_ms or 0.0) / 1e3 - answered_s) > _OTHER_S:
-            raise NotFound(
-                "this command is not in the recording", hint="it was deleted with the oldest files"
-            )
         return {"path": printable(str(path)), **replay_document(report)}
 
 

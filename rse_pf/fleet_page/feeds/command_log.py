@@ -16,7 +16,10 @@ __all__ = ["CommandLog"]
 _MAX_READ_BYTES = 1 << 20
 _TAIL_BYTES = 1 << 18
 _MARK = b'"command"'
-_FIELDS = ("robot", "service", "id", "trace", "code", "verdict", "reason", "queue_ms", "compute_ms", "server")
+_FIELDS = (
+    "robot", "service", "id", "trace", "code", "verdict", "reason", "queue_ms", "compute_ms", "bytes_in",
+    "server",
+)  # fmt: skip
 _MAX_TEXT = 200
 _MAX_ROWS = 200
 

@@ -12,7 +12,7 @@ import json
 import os
 import time
 from collections import deque
-from collections.abc import Coroutine, Mapping
+from collections.abc import Coroutine, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +23,7 @@ from rse_pf.fleet_page.feeds.command_log import CommandLog
 from rse_pf.fleet_page.feeds.percentiles import LastMinute, buckets_of
 from rse_pf.fleet_page.feeds.sentences import event_sentence, waiting_for
 from rse_pf.fleet_page.hub import Hub
+from rse_pf.identity import DEFAULT_TENANT
 from rse_pf.local.processes import is_alive, mark_of
 from rse_pf.local.servers.control_client import ControlPort
 from rse_pf.local.state import platform_settings, read_state
@@ -61,6 +62,7 @@ class LocalFeed:
         self._where: dict[str, str] = {}
         self._history: deque[list[float | None]] = deque(maxlen=_HISTORY)
         self._connected = False
+        self._sampled_s: float | None = -1.0
 
     async def run(self) -> None:
         """Feed until cancelled."""
@@ -121,10 +123,15 @@ class LocalFeed:
         document = fleet_document(state, self._settings, time_s=now)
         for server in document["servers"]:
             server["age_s"] = _age_s(server["pid"])
+        if sample:  # both processes read the clock of this machine
+            document["sample_age_s"] = round(time.monotonic() - float(sample["time"]), 3)
         document["percentiles"] = self._percentiles
         document["pages"] = self._hub.pages
         self._hub.put("fleet", "now", document)
-        row = [round(now, 2), sample.get("cpu_percent"), sample.get("requests"), sample.get("robots")]
+        if sample.get("time") == self._sampled_s:
+            return  # an event was the reason to tell the state again
+        self._sampled_s = sample.get("time")
+        row = [round(now, 2), document["cpu_percent"], sample.get("requests"), sample.get("robots")]
         self._history.append([*row, self._percentiles.get("p99_ms")])
         self._hub.put("history", "minutes", [list(column) for column in zip(*self._history, strict=True)])
 
@@ -153,7 +160,7 @@ class LocalFeed:
         rows: list[list[Any]] = []
         for name, page in zip(names, told, strict=True):
             for row in json.loads(page).get("robots", []) if page else []:
-                robot = printable(f"{row['tenant']}/{row['robot']}" if row["tenant"] else str(row["robot"]))
+                robot = _robot(str(row["tenant"]), str(row["robot"]))
                 last = printable(str(row["last_result"] or "-"))
                 rows.append([robot, name, row["codec"], row["connected_s"], row["commands"], last])
         where = {str(row[0]): str(row[1]) for row in rows}
@@ -209,7 +216,7 @@ def fleet_document(state: Mapping[str, Any], settings: PlatformSettings, *, time
         "balancer": bool((state.get("balancer") or {}).get("running")),
         "robots": sample.get("robots", 0),
         "requests": sample.get("requests", 0),
-        "cpu_percent": sample.get("cpu_percent"),
+        "cpu_percent": _mean_cpu(servers),
         "queue_ms": sample.get("queue_ms", 0.0),
         "bytes_in": sample.get("bytes_in", 0),
         "bytes_out": sample.get("bytes_out", 0),
@@ -242,6 +249,16 @@ def group_of(kind: str) -> str:
     if any(word in kind for word in _TROUBLE):
         return "trouble"
     return "scaling" if kind in _SCALING else "other"
+
+
+def _robot(tenant: str, name: str) -> str:
+    return printable(name if tenant in ("", DEFAULT_TENANT) else f"{tenant}/{name}")
+
+
+def _mean_cpu(servers: Sequence[Mapping[str, Any]]) -> float | None:
+    """Return the mean over all servers that told their CPU, those that warm up included."""
+    known = [float(each["cpu_percent"]) for each in servers if each["cpu_percent"] is not None]
+    return round(sum(known) / len(known), 1) if known else None
 
 
 def _server(told: Mapping[str, Any]) -> dict[str, Any]:

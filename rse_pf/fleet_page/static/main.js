@@ -92,7 +92,7 @@ function take({ topic, key, value }) {
   if (topic === "fleet") {
     setText(byId("platform"), value.platform);
     document.title = `${value.platform}: ${value.robots} robots`;
-    byId("link").dataset.delayMs = String(Math.round(Date.now() - 1000 * value.time_s));
+    byId("link").dataset.delayMs = String(Math.round(Date.now() - 1000 * value.time_s + 1000 * (value.sample_age_s ?? 0)));
     views.fleet.take(value);
   } else if (topic === "history") views.fleet.takeHistory(value);
   else if (topic === "robots") views.fleet.takeRobots(value);

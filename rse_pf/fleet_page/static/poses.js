@@ -45,7 +45,7 @@ export function posesView(root, count) {
       element("div", { class: "end" }, element("button", { onclick: () => dialog.close(), autofocus: true }, "Close")));
     dialog.showModal();
     try {
-      const told = await get(`/page/replay?${new URLSearchParams({ trace: row.trace ?? "", id: String(row.id ?? ""), time_s: String(row.time_s) })}`);
+      const told = await get(`/page/replay?${new URLSearchParams({ trace: row.trace ?? "", id: String(row.id ?? ""), time_s: String(row.time_s), bytes: String(row.bytes_in ?? 0) })}`);
       place.replaceChildren(...replayed(told));
     } catch (error) {
       place.replaceChildren(element("p", {}, error.message));

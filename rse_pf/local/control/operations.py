@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import math
 import time
 from collections.abc import AsyncGenerator, Callable, Coroutine, Mapping
 from typing import Any
@@ -22,7 +23,12 @@ OVER, FAILED = "operation-over", "operation-failed"
 _MAX_WATCHERS = 8
 _MAX_UNHEARD = 1000
 """Events that wait for a slow watcher; newer ones are left out then, and it can tell by their numbers."""
-_LOOK_S = 1.0
+_LOOK_S, _AFTER_S = 1.0, 0.15
+"""A state is told once a second, soon after the monitor took its sample at the full second."""
+_MAX_LATE = 5
+"""How often a second a state is told again because the monitor's sample is late."""
+_SOONEST_S = 0.1
+"""An event changes the state, which is then told this long after, and at most this often."""
 
 
 class Operations:
@@ -83,14 +89,23 @@ class Operations:
         self._listeners.add(take)
         try:
             due_s = loop.time()
+            sample: Any = None
+            late = 0
             while True:
                 left_s = due_s - loop.time()
                 if left_s <= 0 and events.empty():
-                    due_s = loop.time() + _LOOK_S
-                    yield {"state": state()}
+                    told = state()
+                    due_s = (math.floor((loop.time() - _AFTER_S) / _LOOK_S) + 1) * _LOOK_S + _AFTER_S
+                    if sample is not None and told.get("sample") == sample and late < _MAX_LATE:
+                        late += 1
+                        due_s = min(due_s, loop.time() + _SOONEST_S)
+                    else:
+                        sample, late = told.get("sample"), 0
+                    yield {"state": told}
                     continue
                 with contextlib.suppress(asyncio.TimeoutError):
                     yield await asyncio.wait_for(events.get(), max(left_s, 0.001))
+                    due_s = min(due_s, loop.time() + _SOONEST_S)
         finally:
             self._watchers -= 1
             self._listeners.discard(take)
