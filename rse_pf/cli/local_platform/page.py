@@ -17,7 +17,7 @@ from rse_pf.errors import CommandFailed, UsageError
 from rse_pf.fleet_page.server import ANNOUNCEMENT, page_url
 from rse_pf.local.state import control_token_file
 
-__all__ = ["new_address", "page_beside"]
+__all__ = ["new_address", "page_beside", "process_beside"]
 
 _LOG = "fleet_page.log"
 _END_S = 3.0
@@ -26,13 +26,22 @@ _TIMEOUT_S = 5.0
 
 @contextlib.asynccontextmanager
 async def page_beside(folder: Path, port: int, told: Callable[[str], None]) -> AsyncIterator[None]:
-    """Run the page of the platform in *folder*; its address is told when it serves.
+    """Run the page of the platform in *folder*; its address is told when it serves."""
+    async with process_beside("rse_pf.fleet_page", folder, port, folder / _LOG, told):
+        yield
 
-    The platform is not delayed by its page, and does not end with it.
+
+@contextlib.asynccontextmanager
+async def process_beside(
+    module: str, folder: Path, port: int, log_file: Path, told: Callable[[str], None]
+) -> AsyncIterator[None]:
+    """Run a module beside the platform in *folder*; it prints its address, which is told.
+
+    The platform is not delayed by it, and does not end with it.
     """
-    with (folder / _LOG).open("ab") as log:
+    with log_file.open("ab") as log:
         process = await asyncio.create_subprocess_exec(
-            sys.executable, "-m", "rse_pf.fleet_page", str(folder), "--port", str(port),
+            sys.executable, "-m", module, str(folder), "--port", str(port),
             "--parent", str(os.getpid()), stdin=asyncio.subprocess.DEVNULL, stdout=asyncio.subprocess.PIPE,
             stderr=log, start_new_session=True,
         )  # fmt: skip
