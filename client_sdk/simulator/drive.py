@@ -30,8 +30,8 @@ _OVERLAP_M = 0.6
 """Path that a robot drives beyond the start of the next one, so that their maps can be merged."""
 SIMULATED_CAMERA = Camera(fx=525.0, fy=525.0, cx=319.5, cy=239.5, width=640, height=480)
 
-# Corners of the loop, from the left wall of a room: through a room on the way there and back, past its table
-# if it has one, and around the middle of the last and the first room.
+# Corners of the loop through all doors, from the left wall of a room: on the way there and back, past its
+# table if it has one, and around the middle of the last and the first room.
 _THERE_M = ((1.4, 1.75), (2.5, 1.65), (3.6, 1.75)), ((1.3, 1.35), (2.5, 1.0), (3.7, 1.35))
 _BACK_M = ((3.6, 2.8), (2.5, 2.9), (1.4, 2.8)), ((3.7, 3.2), (2.5, 3.45), (1.3, 3.2))
 _LAST_M = ((1.3, 1.35), (2.5, 1.0), (3.6, 1.4), (3.95, 2.3), (3.6, 3.2), (2.5, 3.45), (1.3, 3.2))
