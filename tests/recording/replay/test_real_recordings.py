@@ -1,0 +1,89 @@
+"""Commands that real servers answered, before and after a restart, are equal to the byte; so are cases."""
+
+from __future__ import annotations
+
+import asyncio
+import zlib
+from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path
+
+import pytest
+from guarded_server import GuardedServer
+
+from client_sdk import connect
+from rse_pf.config import PlatformSettings
+from rse_pf.errors import RsePfError
+from rse_pf.pnp.problems import DEGENERATE, make_degenerate, make_problem
+from rse_pf.recording.reader import open_recording
+from rse_pf.recording.replay import run
+from rse_pf.recording.replay.case import write_case
+from rse_pf.recording.replay.limited import LimitedReplay
+from rse_pf.wire import CODECS
+
+pytestmark = [pytest.mark.slow, pytest.mark.system]
+
+SETTINGS = PlatformSettings()
+NAMES = ("käthe-the-robot", "r2d2-of-warehouse", "seventh")
+_EACH = 40
+
+
+async def drive(server: GuardedServer, name: str, codec: str, folder: Path, tokens: list[str]) -> None:
+    """Ask for poses of good, hard and impossible problems."""
+    tokens.append(server.token(name))
+    async with connect(server.url, token=tokens[-1], codec=codec, record=folder) as robot:
+        for seed in range(_EACH):
+            problem = (
+                make_degenerate(DEGENERATE[seed % 11], seed=seed)
+                if seed % 4 == 3
+                else make_problem(seed=seed, outlier_ratio=(0.2, 0.5, 0.75)[seed % 3])
+            )
+            with suppress(RsePfError):
+                await robot.solve_pnp(problem.points_world, problem.pixels, problem.camera, stream=name)
+
+
+def texts(case: Path) -> Iterator[bytes]:
+    """Yield the messages of a case, inflated."""
+    for command in open_recording(case).commands():
+        for data in (command.command_bytes, command.reply_bytes or b""):
+            yield zlib.decompress(data) if data and command.codec == "zlib" else data
+
+
+@pytest.mark.timeout(300)
+def test_commands_of_two_runs_of_a_server_and_their_cases_are_equal_to_the_byte(tmp_path: Path) -> None:
+    recordings, on_robots = tmp_path / "recordings", tmp_path / "robots"
+    tokens: list[str] = []
+
+    async def all_robots(server: GuardedServer) -> None:
+        await asyncio.gather(*(
+            drive(server, name, codec, on_robots, tokens) for name, codec in zip(NAMES, CODECS, strict=True)
+        ))  # fmt: skip
+
+    on_robots.mkdir()
+    for number in range(2):
+        home = tmp_path / str(number)
+        home.mkdir()
+        with GuardedServer(home, recording={"folder": str(recordings)}) as server:
+            asyncio.run(all_robots(server))
+
+    with LimitedReplay() as replay:
+        for folder in (recordings, on_robots):
+            seen = replay.overview(folder, solve=True, worst=40, explain=40)
+
+            assert seen.commands == 2 * len(NAMES) * _EACH
+            assert (seen.different, seen.changed) == (0, ())
+            assert seen.equal >= seen.commands - 6, seen.not_solved
+            assert seen.by_kind.get("failed", 0) >= 30
+            for trouble in seen.troubles[:10]:
+                case = tmp_path / "case.rsepf"
+                found = replay.case(folder, trouble.id)
+                write_case(
+                    case, found.parts, codec=found.codec, number=found.number, metadata=found.metadata,
+                    version="1.0",
+                )  # fmt: skip
+
+                assert replay.command(case).is_equal
+                data = case.read_bytes() + b"".join(texts(case))
+                for secret in (*NAMES, *tokens, "server-", "127.0.0.1"):
+                    assert secret.encode() not in data
+        assert run.overview(recordings, SETTINGS, solve=False, explain=0).robots == 2 * len(NAMES)
