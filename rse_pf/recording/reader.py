@@ -74,6 +74,7 @@ class RecordedCommand:
         tenant: A pseudonym.
         server: Which server wrote it down, "" where it is not known.
         codec: ``zlib``, ``json`` or ``bin``.
+        service: Which one was asked.
         sent_ns: When it was recorded, Unix time, nanoseconds.
         answered_ns: When its answer was recorded, None if it has none.
         thumbnail: A small JPEG of the frame, if the robot allowed it.
@@ -86,6 +87,7 @@ class RecordedCommand:
     tenant: str
     server: str
     codec: str
+    service: str
     sent_ns: int
     command_bytes: bytes
     answered_ns: int | None = None
@@ -191,13 +193,13 @@ class WireRecording:
         return self.find_with_history(identity, 0)[0]
 
     def find_with_history(self, identity: str, count: int) -> tuple[RecordedCommand, list[RecordedCommand]]:
-        """Return a command, and up to *count* answered commands of its robot before it, oldest first."""
+        """Return a command, and up to *count* of its robot and service before it, oldest first."""
         exact = bool(_COMMAND_ID.fullmatch(identity))
-        before: dict[str, deque[RecordedCommand]] = {}
+        before: dict[tuple[str, str], deque[RecordedCommand]] = {}
         found: list[tuple[RecordedCommand, list[RecordedCommand]]] = []
         for each in self.commands():
             if each.id == identity or (not exact and each.id.endswith(f":{identity}")):
-                found.append((each, list(before.get(each.robot, ()))))
+                found.append((each, list(before.get((each.robot, each.service), ()))))
                 if exact:
                     break
                 if len(found) > 1:
@@ -205,7 +207,7 @@ class WireRecording:
                         f"several commands are called {identity[:40]!r}",
                         hint=f"give the connection, too: {found[0][0].id} or {each.id}",
                     )
-            before.setdefault(each.robot, deque(maxlen=count)).append(each)
+            before.setdefault((each.robot, each.service), deque(maxlen=count)).append(each)
         if not found:
             raise BadRequest(
                 f"the recording has no command {identity[:40]!r}",
@@ -237,7 +239,7 @@ class WireRecording:
         waiting: OrderedDict[str, RecordedCommand],
         sights: dict[str, _Sights],
     ) -> Iterator[RecordedCommand]:
-        kind, number = self._envelope(channel.codec, message.data)
+        kind, number, service = self._envelope(channel.codec, message.data)
         identity = f"{channel.connection}:{number}"
         if channel.direction == "up" and kind == "command":
             former = waiting.pop(identity, None)
@@ -245,7 +247,7 @@ class WireRecording:
                 yield former
             waiting[identity] = RecordedCommand(
                 id=identity, robot=channel.robot, tenant=channel.tenant, server=channel.server,
-                codec=channel.codec, sent_ns=message.time_ns, command_bytes=message.data,
+                codec=channel.codec, service=service, sent_ns=message.time_ns, command_bytes=message.data,
                 about=message.about, session=self._session,
             )  # fmt: skip
             if len(waiting) > _MAX_WAITING:
@@ -256,8 +258,8 @@ class WireRecording:
                 replace(asked, answered_ns=message.time_ns, reply_bytes=message.data), sights
             )
 
-    def _envelope(self, codec: str, data: bytes) -> tuple[str, int | None]:
-        """Return the type and the id of a message, "" for one that cannot be read."""
+    def _envelope(self, codec: str, data: bytes) -> tuple[str, int | None, str]:
+        """Return the type, the id and the service of a message, "" for one that cannot be read."""
         try:
             if codec == "bin":
                 check_size(data, self._budget)
@@ -269,8 +271,8 @@ class WireRecording:
                 raise BadMessage(f"no codec named {codec[:20]!r}")
         except (RsePfError, msgspec.DecodeError, ValueError, RecursionError):
             self.left_out += 1
-            return "", None
-        return found.type, found.id
+            return "", None, ""
+        return found.type, found.id, found.service
 
     @staticmethod
     def _with_sights(command: RecordedCommand, sights: dict[str, _Sights]) -> RecordedCommand:
@@ -362,6 +364,7 @@ class _Sights:
 class _Envelope(msgspec.Struct):
     type: str = ""
     id: int | None = None
+    service: str = ""
 
 
 class _Image(msgspec.Struct):

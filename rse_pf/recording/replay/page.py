@@ -23,7 +23,8 @@ _POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'; base-ur
 _GRID_COLUMNS = 8
 _BARS_WIDTH, _BARS_HEIGHT, _LABEL_PX = 460, 170, 24
 _STYLE = """
-:root { --paper: #ffffff; --ink: #1e222a; --pale: #5b6472; --line: #d4d8de; --panel: #f4f6f8;
+:root { color-scheme: light dark;
+  --paper: #ffffff; --ink: #1e222a; --pale: #5b6472; --line: #d4d8de; --panel: #f4f6f8;
   --inlier: #0072b2; --outlier: #d55e00; --good: #00704f; --bad: #b34700; }
 @media (prefers-color-scheme: dark) { :root { --paper: #14171c; --ink: #e6e9ee; --pale: #a3acb9;
   --line: #353b45; --panel: #1d2128; --inlier: #56b4e9; --outlier: #f08a4b;
@@ -44,7 +45,7 @@ figure { margin: .5rem 0; } figcaption { color: var(--pale); font-size: .87rem; 
 img { max-width: 100%; height: auto; border: 1px solid var(--line); display: block; }
 .side { display: flex; flex-wrap: wrap; gap: 1.5rem; } .side figure { flex: 1 1 22rem; }
 .wide { overflow-x: auto; }
-table { border-collapse: collapse; width: 100%; font-variant-numeric: tabular-nums; }
+table { border-collapse: collapse; width: 100%; min-width: 44rem; font-variant-numeric: tabular-nums; }
 th, td { text-align: left; padding: .3rem .7rem .3rem 0; border-bottom: 1px solid var(--line);
   vertical-align: top; }
 th { font-weight: 600; } td.number, th.number { text-align: right; }
@@ -73,7 +74,7 @@ def html_page(
 
 def _overview(seen: Overview) -> str:
     told = [
-        f"{counted(seen.commands, 'command')} of {counted(seen.robots, 'robot')} in {seen.seconds:.0f} s",
+        f"{counted(seen.commands, 'command')} of {counted(seen.robots, 'robot')} in {seen.seconds:.1f} s",
         f"{counted(seen.files, 'file')}",
     ]
     if seen.cut:

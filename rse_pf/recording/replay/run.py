@@ -16,7 +16,7 @@ from rse_pf.recording.reader import RecordedCommand, WireRecording, open_recordi
 from rse_pf.recording.replay.case import CasePart, case_parts
 from rse_pf.recording.replay.report import CauseFound, CommandReport, causes_of, report_of
 from rse_pf.recording.replay.solving import Overrides, Resolver
-from rse_pf.recording.replay.troubles import RobotHistory, Trouble
+from rse_pf.recording.replay.troubles import KINDS, RobotHistory, Trouble
 
 __all__ = ["HISTORY", "Changed", "Exported", "Overview", "case_of", "find", "overview", "report"]
 
@@ -26,6 +26,7 @@ _MAX_ROBOTS = 10_000
 _MAX_CHANGED = 1000
 _MAX_RESOLVERS = 16
 _NEAR_S = 5.0
+_MAX_SERVICES = 64
 
 
 class Changed(msgspec.Struct, frozen=True, kw_only=True):
@@ -125,7 +126,7 @@ def overview(
     """
     recording = open_recording(path, settings.session)
     resolvers = _Resolvers(settings)
-    robots: dict[str, tuple[RobotHistory, deque[RecordedCommand]]] = {}
+    robots: dict[str, tuple[RobotHistory, dict[str, deque[RecordedCommand]]]] = {}
     kept = _Worst(max(worst, explain))
     others: list[tuple[RecordedCommand, tuple[RecordedCommand, ...]]] = []
     by_kind: Counter[str] = Counter()
@@ -139,7 +140,10 @@ def overview(
         last_s = command.sent_s if last_s is None else max(last_s, command.sent_s)
         if command.robot not in robots and len(robots) >= _MAX_ROBOTS:
             robots.pop(next(iter(robots)))
-        judged, past = robots.setdefault(command.robot, (RobotHistory(), deque(maxlen=HISTORY)))
+        judged, by_service = robots.setdefault(command.robot, (RobotHistory(), {}))
+        past = by_service.setdefault(command.service[:64], deque(maxlen=HISTORY))
+        if len(by_service) > _MAX_SERVICES:
+            by_service.clear()
         trouble = judged.judge(command)
         if trouble is not None:
             by_kind[trouble.kind] += 1
@@ -166,7 +170,8 @@ def overview(
         commands=commands, robots=len(robots),
         seconds=0.0 if first_s is None or last_s is None else last_s - first_s, left_out=recording.left_out,
         equal=equal, different=different, was_solved=solve, changed=tuple(changed),
-        not_solved=dict(not_solved.most_common(20)), by_kind=dict(by_kind),
+        not_solved=dict(not_solved.most_common(20)),
+        by_kind={kind: by_kind[kind] for kind in KINDS if kind in by_kind},
         troubles=tuple(trouble for trouble, _, _ in bad[:worst]),
         causes={
             command.id: causes_of(command, past, resolvers.of(command)) for command, past in looked_at
