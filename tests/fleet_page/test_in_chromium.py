@@ -52,11 +52,13 @@ class Running:
         self.folder = folder
         self.environment = {**os.environ, "XDG_STATE_HOME": str(folder)}
         self.log = folder / "local.log"
+        settings = folder / "settings.json"  # a machine that draws by software may starve a health check
+        settings.write_text(json.dumps({"context": {"rse-pf": {"health": {"unhealthy_checks": 10}}}}))
         with self.log.open("wb") as log:
             self.process = subprocess.Popen(
                 [
                     *self.program, "local", "--name", _NAME, "--port", "0", "--metrics-port", "0",
-                    "--servers", "2", "--record", str(folder / "recordings"),
+                    "--servers", "2", "--settings", str(settings), "--record", str(folder / "recordings"),
                 ],
                 stdout=log, stderr=log, env=self.environment,
             )  # fmt: skip
