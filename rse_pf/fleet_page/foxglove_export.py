@@ -1,7 +1,7 @@
 """Pass on what the fleet page knows to Foxglove, as channels of its WebSocket server on loopback.
 
-It subscribes to the same `Hub` as a browser window.  It serves viewers that name no key: whoever reaches the
-port of this machine can read it, so it is off by default, and it takes no orders.
+It subscribes to the same `Hub` as a browser window.  It serves viewers that name no key: all programs of this
+machine can read it, so it is off by default, and it takes no orders.
 """
 
 from __future__ import annotations

@@ -14,9 +14,10 @@ from client_sdk.bags.bag import Bag
 from client_sdk.bags.images import decode_colour, decode_depth
 from client_sdk.bags.index import pair_stamps
 from client_sdk.bags.message_types import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE, POSE, TF, load_types
+from client_sdk.bags.poses import PoseTopic
 from client_sdk.bags.registration import register_depth
 from client_sdk.datasets import open_dataset
-from rse_pf.geometry import Camera
+from rse_pf.geometry import Camera, rotation_angle_deg
 from tests.client_sdk.bags.small_bags import (
     COLOUR,
     CX,
@@ -136,6 +137,24 @@ def test_the_true_path_comes_from_tf_and_is_interpolated(tmp_path: Path) -> None
         np.testing.assert_allclose(
             bag.truth.positions, [[0.1 * row, 0, 1] for row in range(FRAMES)], atol=1e-9
         )
+
+
+def test_rotations_are_interpolated_on_the_shorter_arc() -> None:
+    """A quaternion and its negative are one rotation; the pose between 0 and 90 degrees is at 45."""
+    types = load_types(is_ros1=False).types
+    poses = PoseTopic()
+    for stamp, q in ((0, (0.0, 0.0, 0.0, 1.0)), (100_000_000, (0.0, 0.0, -(0.5**0.5), -(0.5**0.5)))):
+        turn = types["geometry_msgs/msg/Quaternion"](*q)
+        place = types["geometry_msgs/msg/Point"](stamp / 1e8, 0.0, 0.0)
+        header = types["std_msgs/msg/Header"](types["builtin_interfaces/msg/Time"](0, stamp), "world")
+        poses.add(types[POSE](header, types["geometry_msgs/msg/Pose"](place, turn)))
+
+    path = poses.path([0, 50_000_000, 100_000_000, 150_000_000])
+
+    assert path is not None
+    assert path.timestamps_s.tolist() == [0.0, 0.05, 0.1]  # nothing is known after the last pose
+    assert path.positions[:, 0].tolist() == [0.0, 0.5, 1.0]
+    assert [rotation_angle_deg(T[:3, :3]) for T in path.T_world_camera] == pytest.approx([0, 45, 90])
 
 
 def test_a_topic_of_poses_is_the_true_path_where_tf_does_not_move_the_camera(tmp_path: Path) -> None:
