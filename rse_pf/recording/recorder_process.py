@@ -43,7 +43,7 @@ from rse_pf.wire import make_codec
 
 __all__ = ["MessageRecorder", "RecordedConnection", "RecorderPlan", "run_recorder", "start_recorder"]
 
-_READ_BYTES = 1 << 20
+_READ_BYTES = 1 << 18
 _FLUSH_S = 0.2
 _NICE = 5
 _HEX_BYTES = 8
@@ -217,11 +217,16 @@ def run_recorder(plan: RecorderPlan) -> None:
 
 def _loop(selector: selectors.BaseSelector, writer: RecordingWriter, plan: RecorderPlan) -> None:
     problem = ""
+    buffer = bytearray(_READ_BYTES)  # a new one for each read would cost more than what it holds
+    view = memoryview(buffer)
     while selector.get_map():
         for key, _ in selector.select(_FLUSH_S):
-            data = os.read(key.fd, _READ_BYTES)
-            if data:
-                key.data.read(data)
+            try:
+                size = os.readv(key.fd, [buffer])
+            except ConnectionResetError:
+                size = 0
+            if size:
+                key.data.read(bytes(view[:size]))
             else:
                 selector.unregister(key.fd)
                 key.data.end()

@@ -1,15 +1,15 @@
 """Hand the messages of a worker over to the recorder process, so that a robot never waits for a recording.
 
 In the path of a command nothing happens but that bytes are appended to a list.  Every 50 ms the list goes
-into a pipe that never blocks.  While the recorder is slow or dead, messages are dropped and counted.
+into a channel that never blocks.  While the recorder is slow or dead, messages are dropped and counted.
 """
 
 from __future__ import annotations
 
 import errno
-import fcntl
 import json
 import os
+import socket
 import struct
 import time
 from collections.abc import Callable, Iterator
@@ -25,19 +25,25 @@ OPENED, UP, DOWN, CLOSED, LOST = 1, 2, 3, 4, 5
 _ENTRY = struct.Struct("<BIQI")
 """Kind, number of the connection, Unix time in ns, bytes of data that follow."""
 _HAND_OVER_S = 0.05
-_PIPE_BYTES = 1 << 20
+_RETRY_S = 0.005
+"""The kernel buffers 200 kB by default, which it may not take at once."""
+_BUFFER_BYTES = 1 << 20
 _MAX_WAITING_BYTES = 8 << 20
 """Bytes of messages that wait in a worker for a slow recorder; more are dropped."""
 _COPIED_BYTES = 1 << 20
 
 
 def recording_pipe() -> tuple[int, int]:
-    """Return the ends of a pipe from a worker (the second end, which never blocks) to the recorder."""
-    ours, theirs = os.pipe()
-    with suppress(OSError, AttributeError):  # another limit, or Python 3.9: a shorter pipe does it, too
-        fcntl.fcntl(theirs, fcntl.F_SETPIPE_SZ, _PIPE_BYTES)
-    os.set_blocking(theirs, False)
-    return ours, theirs
+    """Return the descriptors of the recorder's end and of a worker's end, which never blocks.
+
+    They are sockets: the writer of a pipe waits for a lock that its reader holds while it copies, and the
+    recorder, which has the lower priority, may be taken off the processor meanwhile.
+    """
+    ours, theirs = socket.socketpair()
+    theirs.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _BUFFER_BYTES)
+    theirs.setblocking(False)
+    ours.setblocking(True)
+    return ours.detach(), theirs.detach()
 
 
 class RecordingTap:
@@ -127,11 +133,12 @@ class RecordingTap:
                 else:
                     return
         except BlockingIOError:
-            self._wait()
+            self._wait(_RETRY_S)
         except OSError as error:
-            if error.errno not in (errno.EPIPE, errno.EBADF):
-                raise
-            self._die()
+            if error.errno == errno.ENOBUFS:
+                self._wait(_RETRY_S)
+            else:
+                self._die()
 
     def _append(self, kind: int, connection: int, data: bytes) -> None:
         if self.is_dead:
@@ -141,9 +148,9 @@ class RecordingTap:
         if not self._is_waiting:
             self._wait()
 
-    def _wait(self) -> None:
+    def _wait(self, seconds: float = _HAND_OVER_S) -> None:
         self._is_waiting = True
-        self._call_later(_HAND_OVER_S, self.hand_over)
+        self._call_later(seconds, self.hand_over)
 
     def _packed(self) -> bytes:
         """Return the next entries as they are in the pipe, a bounded copy of them."""
