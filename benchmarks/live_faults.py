@@ -6,7 +6,7 @@ One run takes about 75 s after the world was rendered once (five minutes, `bench
 Three robots drive 62 s at 5 Hz through three rooms; the fault comes at a moment that the seed draws:
 ``kill -9`` of the owner's server, SIGSTOP of all its processes for 10 s, a drain, a rolling replacement, 30 %
 of all operations on the store failing for 10 s, 30 s without Wi-Fi of one robot.  Prints one row of a table
-and the figures as JSON, and keeps all records in --out: ``rse-pf experiment verify DIR`` recomputes them.
+and the figures as JSON, and keeps all records in --out: ``rse-pf experiment verify OUT`` recomputes them.
 
 Defends: no acknowledged keyframe lost or twice, no frame lost, a new owner within 3 s, the map equal to the
 byte to a replay of its own log, and its error within 0.3 cm of runs without a fault.
@@ -50,10 +50,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
     load = os.getloadavg()[0]
     figures = run_live_fault(options, PlatformSettings(), LiveFault(name=chosen.fault, seed=chosen.seed))
     figures["load_average"] = [round(load, 2), round(os.getloadavg()[0], 2)]
-    runs_file = chosen.out / "runs.json"
-    runs = json.loads(runs_file.read_text(encoding="utf-8")) if runs_file.exists() else {}
+    report_file = chosen.out / "report.json"
+    report = json.loads(report_file.read_text(encoding="utf-8")) if report_file.exists() else {"runs": {}}
+    runs = report["runs"]
     runs[name] = figures
-    runs_file.write_text(json.dumps(runs, indent=1) + "\n", encoding="utf-8")
+    report_file.write_text(
+        json.dumps({"experiment": "live", "runs": runs}, indent=1) + "\n", encoding="utf-8"
+    )
     undisturbed = {each: run for each, run in runs.items() if run["fault"] == "none" and each != name}
     rows = fault_rows({**undisturbed, name: figures})
     print(json.dumps(figures))

@@ -1,10 +1,11 @@
 """Ten robots in one live map of ten rendered rooms, on two cores, and their poses without a live map.
 
-    python -m benchmarks.live_many prepare [--features DIR] [--robots 10] [--rooms 10] [--frames 158]
+    python -m benchmarks.live_many prepare [--features DIR] [--robots 10] [--rooms 10] [--frames 200]
     python -m benchmarks.live_many run [--features DIR] [--rounds 1] [--out DIR]
 
 ``prepare`` renders the drives and keeps the features of each frame (12 CPU minutes for ten rooms, 150 MB).
-``run`` lets the robots, a process each, play them at 5 Hz through `rse-pf local` with two servers: without a
+Each robot drives 3.5 m beyond the start of the next one: with the least overlap robots met in their last
+frames only.  ``run`` lets the robots, a process each, play them at 5 Hz through `rse-pf local` with two servers: without a
 live map, then with it, in turn.  Matching, poses, keyframes and corrections are real; only finding features
 and the robots' own clouds are left out, which in the field are the work of ten other computers.
 
@@ -169,7 +170,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--features", type=Path, default=Path("out-live-features"))
     parser.add_argument("--robots", type=int, default=10)
     parser.add_argument("--rooms", type=int, default=10)
-    parser.add_argument("--frames", type=int, default=158)
+    parser.add_argument("--frames", type=int, default=200)
     parser.add_argument("--processes", type=int, default=2)
     parser.add_argument("--rounds", type=int, default=1)
     parser.add_argument("--out", type=Path, default=Path("out-live-many"))

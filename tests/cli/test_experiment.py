@@ -17,6 +17,7 @@ from rse_pf.cli.main import main
         (["elasticity", "--emulated-cores", "0"], "--emulated-cores 0"),
         (["latency", "--link", "papre"], "no link named 'papre'"),
         (["robustness", "--only", "kill,fire"], "there is no fault 'fire'"),
+        (["live", "--only", "kill,balancer"], "there is no fault 'balancer'"),
         (["robustness", "--repeat", "0"], "--repeat 0"),
         (["map", "--robots", "33"], "--robots 33 is not within 1..32"),
         (["latency", "somewhere"], "latency takes no folder"),

@@ -50,6 +50,21 @@ def test_a_kill_under_load_loses_nothing(tmp_path):
     assert figures["replaced_in_s"] <= 10.0
 
 
+def test_a_live_map_loses_nothing_when_its_server_is_killed_or_its_store_fails(tmp_path):
+    code, report, differing = run(
+        tmp_path / "out", "live", "--only", "kill,store", "--robots", "2", "--frames", "60", "--fps", "3"
+    )
+
+    assert (code, differing) == (0, [])
+    for run_figures in report["runs"].values():
+        kept = run_figures["keyframes"]
+        assert kept["acknowledged"] == kept["in_log"] == kept["made"] >= 16
+        assert (kept["lost"], kept["twice"], kept["out_of_order"]) == (0, 0, 0)
+        assert run_figures["frames_lost"] == 0
+        assert run_figures["replay_equal"] == 1
+    assert report["runs"]["kill"]["owners"] == 2
+
+
 def test_latency_under_the_papers_link_is_the_link_and_little_more(tmp_path):
     code, report, differing = run(
         tmp_path / "out", "latency", "--robots", "10", "--seconds", "4", "--link", "paper"
