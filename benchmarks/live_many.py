@@ -3,11 +3,11 @@
     python -m benchmarks.live_many prepare [--features DIR] [--robots 10] [--rooms 10] [--frames 200]
     python -m benchmarks.live_many run [--features DIR] [--rounds 1] [--out DIR]
 
-``prepare`` renders the drives and keeps the features of each frame (12 CPU minutes for ten rooms, 150 MB).
+``prepare`` renders the drives and keeps the features of each frame (12 CPU minutes for ten rooms, 190 MB).
 Each robot drives 3.5 m beyond the start of the next one: with the least overlap robots met in their last
-frames only.  ``run`` lets the robots, a process each, play them at 5 Hz through `rse-pf local` with two servers: without a
-live map, then with it, in turn.  Matching, poses, keyframes and corrections are real; only finding features
-and the robots' own clouds are left out, which in the field are the work of ten other computers.
+frames only.  ``run`` lets the robots, a process each, play them at 5 Hz through a local platform with two
+servers: without a live map, then with it, in turn.  Matching, poses, keyframes and corrections are real; only
+finding features and the robots' own clouds are left out, which in the field is the work of other computers.
 
 Defends: all robots in one map, correction p99 <= 1 s, and p99 of poses <= 1.3 times that without a live map.
 """
