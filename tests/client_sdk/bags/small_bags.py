@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+import pytest
 
 from client_sdk.bags import BagKind, BagWriter
 from client_sdk.bags.message_types import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE, POSE, TF
@@ -21,6 +22,8 @@ START_NS = 1_700_000_000_000_000_000
 PERIOD_NS = 100_000_000
 COLOUR, DEPTH = "/camera/color/image_raw", "/camera/aligned_depth_to_color/image_raw"
 KINDS: tuple[BagKind, ...] = ("ros1", "sqlite3", "mcap")
+FIRST_KINDS = ("ros1", *(pytest.param(kind, marks=pytest.mark.slow) for kind in ("sqlite3", "mcap")))
+"""All kinds, of which the default suite tries the one that is written without YAML."""
 
 Message = tuple[str, str, int, Any]
 """Topic, type, time of writing, message."""
