@@ -11,6 +11,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from rse_pf.geometry import Array
 from rse_pf.pnp import PnpOptions
@@ -21,7 +22,7 @@ __all__ = ["checked_history", "checked_matches", "checked_pose", "checked_reply"
 
 _TIGHT_PX = 3.0
 _USUAL_WIDTH_PX = 640.0
-_MAX_ROWS = 1000
+_MAX_ROWS, _BLOCK_ROWS = 1000, 100
 _MAX_ABS = 1e6
 _MAX_HISTORY = 20
 _RIGID = 1e-3
@@ -30,7 +31,7 @@ _LONGEST_S = 1e5
 
 
 def checked_matches(matches: MatchesLike) -> tuple[Matches, PnpOptions]:
-    """Return the finite rows, at most a thousand of them, and the options."""
+    """Return the finite rows, a thousand of them at most, and the options."""
     points = _rows(matches.points_world, 3)
     pixels = _rows(matches.pixels, 2)
     n = min(len(points), len(pixels))
@@ -38,13 +39,22 @@ def checked_matches(matches: MatchesLike) -> tuple[Matches, PnpOptions]:
     depths = _depths(matches.depths_m, n)
     options = matches.options or PnpOptions()
     finite = (np.abs(points) <= _MAX_ABS).all(axis=1) & (np.abs(pixels) <= _MAX_ABS).all(axis=1)
-    keep = np.flatnonzero(finite)[:_MAX_ROWS]
+    keep = _some(np.flatnonzero(finite))
     scale = max(1.0, matches.camera.width / _USUAL_WIDTH_PX)
     return Matches(
         points=points[keep], pixels=pixels[keep], camera=matches.camera, inlier_px=options.inlier_px,
         tight_px=min(options.inlier_px, _TIGHT_PX * scale), depths_m=None if depths is None else depths[keep],
         left_out=n - int(np.count_nonzero(finite)),
     ), options  # fmt: skip
+
+
+def _some(rows: npt.NDArray[np.intp]) -> npt.NDArray[np.intp]:
+    """Return a thousand of *rows*: blocks of neighbours, since the order of rows may be what is wrong."""
+    if len(rows) <= _MAX_ROWS:
+        return rows
+    starts = np.linspace(0, len(rows) - _BLOCK_ROWS, _MAX_ROWS // _BLOCK_ROWS).astype(np.intp)
+    chosen: npt.NDArray[np.intp] = rows[(starts[:, None] + np.arange(_BLOCK_ROWS)).ravel()]
+    return chosen
 
 
 def _rows(numbers: Any, columns: int) -> Array:

@@ -24,8 +24,6 @@ _LEAST = 20
 # Least change of the camera that counts: focal length, principal point (share of the focal length), bending.
 _LEAST_FOCAL, _LEAST_CENTRE, _LEAST_BEND = 0.05, 0.05, 0.05
 _CERTAIN = 6.0
-# Where no single number is certain: share of the cost, and log likelihood, that another camera gains.
-_CLEAR_GAIN, _CLEAR_LIKELIHOOD = 0.15, 60.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -236,9 +234,7 @@ def _judged(
     after_px = _rms(freed.errors_px[freed.errors_px <= tight])
     gain = 1.0 - freed.cost / before_cost
     more = (now - count) / len(matches)
-    variance = max(1.0, float(np.mean(freed.errors_px[freed.errors_px <= tight] ** 2)))
-    unsaid = gain > _CLEAR_GAIN and (before_cost - freed.cost) / variance > _CLEAR_LIKELIHOOD
-    if not (differs or unsaid) or now < _LEAST or not (gain > 0.12 or more > 0.1) or now < 0.9 * count:
+    if not differs or now < _LEAST or not (gain > 0.12 or more > 0.1) or now < 0.9 * count:
         return None
     parts = []
     if ratio[0] > 1.0 and certain[0] > _CERTAIN:
@@ -250,8 +246,6 @@ def _judged(
         )
     if ratio[3] > 1.0 and certain[3] > _CERTAIN:
         parts.append(f"radial distortion of {freed.change[3]:+.2f} left in the pixels")
-    if not parts:
-        parts = ["another camera, whose numbers these matches do not settle"]
     strength = min(1.0, max(gain, 2.0 * more))
     return PoseExplanation(
         cause=Cause.INTRINSICS,

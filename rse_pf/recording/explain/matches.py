@@ -23,8 +23,9 @@ _RIGHT_SHARE = 0.5
 # Log likelihood that the reflected world must gain.
 _REFLECTION_GAIN = 100.0
 # Deviation of the position above which a plane is called a cause.
-_LOOSE_M = 0.015
-_LEAST_SHIFT_M = 0.015
+_LOOSE_M = 0.02
+# Less is the noise of a depth camera some metres away, which bends small groups of points alike.
+_LEAST_SHIFT_M, _NOISE_SHIFT_M, _LARGE_GROUP = 0.045, 0.015, 0.15
 # Width over length of a line.
 _THIN = 0.03
 
@@ -182,7 +183,8 @@ def stale_map(matches: Matches, base: Fit) -> tuple[PoseExplanation, int] | None
     moved_points = rest.points[second.agrees]
     shift_m = _median_shift(moved_points, base.T_camera_world, second.T_camera_world)
     apart = _apart(first, moved_points)
-    if shift_m < _LEAST_SHIFT_M:
+    small_group = second.count < _LARGE_GROUP * len(matches)
+    if shift_m < (_LEAST_SHIFT_M if small_group else _NOISE_SHIFT_M):
         return None
     share = second.count / (second.count + base.count)
     found = PoseExplanation(

@@ -73,15 +73,15 @@ def motion_against_odometry(
     moving = np.linalg.norm(by_odom, axis=1) > _LEAST_MOTION_M
     if not moving.any():
         return None, ("a motion of the robot (it stood still, so scale cannot be seen)",)
-    scale, deviation = _scale(by_pose[moving], by_odom[moving])
+    scale, deviation, alike = _scale(by_pose[moving], by_odom[moving])
+    if alike < _MOST:
+        return None, ()
     turns = np.array([[rotation_angle_deg(step[k][:3, :3]) for k in (0, 1)] for step in steps])
     turning = turns[:, 1] > _LEAST_TURN_DEG
     turn_scale = float(turns[turning, 0].sum() / turns[turning, 1].sum()) if turning.any() else 1.0
     count = int(np.count_nonzero(moving))
     differs = scale > _LEAST_FACTOR and abs(math.log(scale)) > _LEAST_SCALE
     if not differs or abs(scale - 1.0) < _CERTAIN * deviation:
-        return None, ()
-    if is_pair and not _alike(by_pose[moving], by_odom[moving], scale):
         return None, ()
     turn_deviation = _TURN_NOISE_DEG * math.sqrt(count) / max(1e-9, float(turns[turning, 1].sum()))
     if abs(turn_scale - 1.0) > max(0.5 * abs(scale - 1.0), 3.0 * turn_deviation):
@@ -102,17 +102,6 @@ def motion_against_odometry(
     ), ()  # fmt: skip
 
 
-def _alike(by_pose: Array, by_odom: Array, scale: float) -> bool:
-    """Return whether most single steps have the same factor.
-
-    Where the world of a command is an older keyframe, the factor is the number of frames since then.
-    """
-    lengths = np.linalg.norm(by_odom, axis=1)
-    factors = (by_pose * by_odom).sum(axis=1) / lengths**2
-    allowed = np.maximum(_SAME_FACTOR * scale, 3.0 * _LEAST_NOISE_M / lengths)
-    return bool(np.mean(np.abs(factors - scale) <= allowed) >= _MOST)
-
-
 def _steps(
     T_camera_world: Array, T_odom_camera: Array | None, history: Sequence[PastCommand], *, is_pair: bool
 ) -> list[tuple[Array, Array]]:
@@ -131,10 +120,22 @@ def _steps(
     return steps
 
 
-def _scale(by_pose: Array, by_odom: Array) -> tuple[float, float]:
-    """Return the factor from odometry to poses by least squares, and its standard deviation."""
-    length2 = float(np.vdot(by_odom, by_odom))
-    scale = float(np.vdot(by_pose, by_odom)) / length2
-    rest = by_pose - scale * by_odom
+def _scale(by_pose: Array, by_odom: Array) -> tuple[float, float, float]:
+    """Return the factor from odometry to poses, its standard deviation, and the share of steps that have it.
+
+    Single poses may be wrong, and where the world of a command is an older keyframe, the factor is the number
+    of frames since then: only steps that agree with the median are counted.
+    """
+    lengths = np.linalg.norm(by_odom, axis=1)
+    factors = (by_pose * by_odom).sum(axis=1) / lengths**2
+    median = float(np.median(factors))
+    allowed = np.maximum(_SAME_FACTOR * abs(median), 4.0 * _LEAST_NOISE_M / lengths)
+    alike = np.abs(factors - median) <= allowed
+    poses, odom = by_pose[alike], by_odom[alike]
+    if not len(odom):
+        return median, math.inf, 0.0
+    length2 = float(np.vdot(odom, odom))
+    scale = float(np.vdot(poses, odom)) / length2
+    rest = poses - scale * odom
     variance = float(np.vdot(rest, rest)) / max(1, rest.size - 1)
-    return scale, max(math.sqrt(variance), _LEAST_NOISE_M) / math.sqrt(length2)
+    return scale, max(math.sqrt(variance), _LEAST_NOISE_M) / math.sqrt(length2), float(np.mean(alike))

@@ -14,7 +14,7 @@ from rse_pf.recording.explain.causes import Cause, PoseExplanation
 __all__ = ["blur", "sharpness"]
 
 _MAX_PIXELS = 640 * 480
-_LOST_SHARPNESS = 0.55
+_LOST_SHARPNESS, _FEWER_MATCHES = 0.42, 0.65
 _DIRECTIONS = ((0, 1), (1, 0), (1, 1), (1, -1))
 _ALONG = ("horizontal", "vertical", "falling", "rising")
 _UNREADABLE = "thumbnail (it cannot be read)"
@@ -89,14 +89,15 @@ def blur(
     ratios = now / np.maximum(np.median(np.array(before), axis=0), 1e-9)
     worst = int(ratios.argmin())
     ratio = float(ratios[worst])
-    if ratio > _LOST_SHARPNESS:
+    # An image that still gives its usual matches is no cause, however soft it looks.
+    if ratio > _LOST_SHARPNESS or (usual_matches and matches > _FEWER_MATCHES * usual_matches):
         return None, ()
     fewer = f", with {matches} matches instead of {usual_matches:.0f}" if usual_matches else ""
     all_round = float(ratios.max()) < 1.3 * ratio
     direction = "in all directions" if all_round else f"along the {_ALONG[worst]} direction"
     return PoseExplanation(
         cause=Cause.BLUR,
-        confidence=min(0.97, 0.78 + 0.3 * (_LOST_SHARPNESS - ratio)),
+        confidence=min(0.97, 0.82 + 0.3 * (_LOST_SHARPNESS - ratio)),
         sentence=(
             f"the image is blurred {direction}: {ratio:.0%} of the fine contrast of the {len(before)} frames "
             f"before{fewer}"

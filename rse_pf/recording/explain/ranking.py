@@ -143,7 +143,8 @@ def _by_matches(
         found.append(flat)
         pose = base.T_camera_world if start is None else start
         moved, lacks = motion_against_odometry(pose, T_odom_camera, history, is_pair=is_pair)
-        if not other_camera:  # which moves the camera along its axis, too
+        # Another camera moves along its axis, too, and a pose of few rows moves anywhere.
+        if not other_camera and count >= _RIGHT_SHARE * len(distinct):
             found += [moved, depth_against_map(distinct, base)]
     return [each for each in found if each is not None], lacks
 

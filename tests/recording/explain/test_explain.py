@@ -292,6 +292,15 @@ def test_explains_any_input_with_finite_numbers(kind: str) -> None:
     assert np.isfinite([number for each in found for number in each.evidence.values()]).all()
 
 
+def test_judges_a_long_command_by_rows_from_all_of_it() -> None:
+    problem = make_problem(seed=1, n=3000, noise_px=0.7, outlier_ratio=0.05)
+    command = Payload(points_world=problem.points_world, pixels=np.roll(problem.pixels, 1, axis=0))
+
+    found = explain(command, None)[0]
+
+    assert (found.cause, found.evidence["row_shift"]) == (Cause.ROW_ORDER, 1.0)
+
+
 def test_says_so_where_too_few_rows_are_usable() -> None:
     found = explain(Payload(points_world=np.ones((3, 3)), pixels=np.ones((3, 2))), None)[0]
 
