@@ -21,7 +21,7 @@ _LEAST_NOISE_M = 0.005
 _TURN_NOISE_DEG = 0.3
 # What is the same factor, and how many steps must have it.
 _SAME_FACTOR, _MOST = 0.15, 0.7
-_LEAST_MOTION_M, _LEAST_TURN_DEG = 0.015, 1.0
+_LEAST_MOTION_M, _LEAST_TURN_DEG, _LEAST_WAY_M = 0.015, 1.0, 0.08
 _STEPS = 10
 
 
@@ -74,7 +74,7 @@ def motion_against_odometry(
     if not moving.any():
         return None, ("a motion of the robot (it stood still, so scale cannot be seen)",)
     scale, deviation, alike = _scale(by_pose[moving], by_odom[moving])
-    if alike < _MOST:
+    if alike < _MOST or float(np.linalg.norm(by_odom[moving], axis=1).sum()) < _LEAST_WAY_M:
         return None, ()
     turns = np.array([[rotation_angle_deg(step[k][:3, :3]) for k in (0, 1)] for step in steps])
     turning = turns[:, 1] > _LEAST_TURN_DEG
