@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from recording.replay.made import Made
 
 from rse_pf.audit.log import AuditLog, audit_folder
 from rse_pf.cli.main import VERBS, main
@@ -23,6 +24,7 @@ from rse_pf.maps.format import Keyframe, MapVersion, encode_map
 from rse_pf.maps.registry import MapRegistry
 from rse_pf.object_store import DirectoryStore
 from rse_pf.terminal import printable
+from rse_pf.wire import Failure
 
 HOSTILE = (
     "r\x1b[2J\x1b]52;c;eA==\x07\x9b31m\u202e\u2066\u200b\ufeff\r\nok: forged\x85\u2028\x00\x7f\U000e0041"
@@ -31,6 +33,7 @@ NAME = HOSTILE[:60]
 SHOWS_NO_TEXT_OF_ROBOTS = {
     "camera": "shows what was typed, and figures of its images",
     "errors": "shows texts of this package",
+    "fleet": "prints an address of this machine",
     "demo": "its robots have names that it makes itself",
     "swarm": "the same",
     "settings": "shows the operator's own file",
@@ -84,6 +87,9 @@ def place(platform: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         name="default", control_plane=gone, url=f"ws://{HOSTILE}/ws", settings_digest="", settings_file="",
         key_file="", servers=(ServerState(name=HOSTILE, process=gone),),
     ).write(platform)  # fmt: skip
+    made = Made(platform / "recording", server=HOSTILE)
+    made.send(1, answer=Failure(id=0, code=HOSTILE, message=HOSTILE, hint=HOSTILE), trace=HOSTILE[:64])
+    made.close()
     stranger = token({"sub": HOSTILE, "jti": HOSTILE, "exp": 4e9})
     monkeypatch.setattr("sys.stdin", io.StringIO(f"{stranger}\n"))
     return platform
@@ -131,6 +137,8 @@ CASES: list[Callable[[Path], tuple[str, ...]]] = [
     lambda place: ("service", "list", "--services", HOSTILE),
     lambda place: ("service", "new", HOSTILE),
     lambda place: ("experiment", "verify", str(place)),
+    lambda place: ("replay", HOSTILE),
+    lambda place: ("replay", str(place / "recording")),
     lambda place: (HOSTILE,),
     lambda place: ("map", HOSTILE),
 ]  # fmt: skip

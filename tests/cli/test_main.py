@@ -14,8 +14,8 @@ from rse_pf.cli.main import VERBS, main
 from rse_pf.config import PlatformSettings, settings_page
 
 EMPTY = [
-    "demo", "experiment", "local", "swarm", "token", "robot", "service", "serve", "data",
-    "camera", "map", "audit", "cloud", "settings", "doctor", "errors",
+    "demo", "experiment", "local", "fleet", "swarm", "token", "robot", "service", "serve", "data",
+    "camera", "map", "replay", "audit", "cloud", "settings", "doctor", "errors",
 ]  # fmt: skip
 HELP_S = 0.3
 
