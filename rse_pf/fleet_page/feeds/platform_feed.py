@@ -42,6 +42,8 @@ _HISTORY = 600
 _MAX_TEXT = 300
 _MAX_TOLD_MOVES = 50
 _MAX_GONE = 500
+_UNREADABLE = (RsePfError, OSError, ValueError, KeyError, TypeError)
+"""A server of another version, or one that is just killed, may answer anything: it is asked again."""
 _TROUBLE = ("gone", "failed", "unhealthy", "crash", "silent", "down", "taken", "not-")
 _SCALING = frozenset(
     ("grow", "shrink", "replace", "drain-start", "drain-over", "roll-step", "rebalance", "robot-moved")
@@ -151,7 +153,7 @@ class LocalFeed:
     async def _follow_robots(self) -> None:
         while True:
             if self._hub.watches("robots"):
-                with contextlib.suppress(RsePfError, OSError):
+                with contextlib.suppress(*_UNREADABLE):
                     await self._read_robots()
             await asyncio.sleep(_ROBOTS_EVERY_S)
 
@@ -174,7 +176,7 @@ class LocalFeed:
     async def _follow_metrics(self) -> None:
         while True:
             if self._hub.watches("fleet"):
-                with contextlib.suppress(RsePfError, OSError):
+                with contextlib.suppress(*_UNREADABLE):
                     names, told = await self._ask_servers("/metrics")
                     now_s = time.monotonic()
                     for name, page in zip(names, told, strict=True):
