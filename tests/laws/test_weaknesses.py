@@ -190,7 +190,19 @@ def test_every_locked_package_has_a_hash(repository: Path) -> None:
     locks = [file for file in (repository / "locks").glob("*.txt") if file.name != "constraints.txt"]
 
     assert {file.name: unhashed(file.read_text(encoding="utf-8")) for file in locks} == {
-        f"{name}.txt": [] for name in ("boot", "demo", "dev", "docs", "infra", "lambda", "native", "release")
+        f"{name}.txt": []
+        for name in (
+            "boot",
+            "browser",
+            "demo",
+            "dev",
+            "docs",
+            "foxglove",
+            "infra",
+            "lambda",
+            "native",
+            "release",
+        )
     }
     assert "--require-hashes" in (repository / "scripts/setup.sh").read_text(encoding="utf-8")
     assert unhashed("a==1 \\\n    --hash=sha256:0\nb==2 ; python_version > '3'\n") == ["b"]
