@@ -9,10 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from rse_pf.auth.roster import check_scopes, scopes_allow
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import UsageError
 from rse_pf.fleet_page.clouds import packer
-from rse_pf.fleet_page.feeds.live_feed import RobotPaths, plain
+from rse_pf.fleet_page.feeds.live_feed import SCOPES, RobotPaths, plain
 from rse_pf.fleet_page.feeds.platform_feed import fleet_document, group_of, moved_robots
 from rse_pf.geometry import Camera
 from rse_pf.local.control.operations import Operations
@@ -127,3 +128,11 @@ def test_a_watcher_hears_states_and_events_and_watchers_are_bounded() -> None:
         await operations.watch(dict).__anext__()
 
     asyncio.run(run())
+
+
+def test_the_page_may_read_every_live_map_and_do_nothing_else() -> None:
+    scopes = check_scopes(SCOPES)
+
+    assert scopes_allow(scopes, "maps:live", "warehouse")
+    assert not scopes_allow(scopes, "maps:write", "warehouse")
+    assert not scopes_allow(scopes, "services:pnp")

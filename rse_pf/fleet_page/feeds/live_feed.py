@@ -20,11 +20,12 @@ from rse_pf.local.firewall import read_key
 from rse_pf.local.state import PlatformState, platform_settings, read_state
 from rse_pf.terminal import printable
 
-__all__ = ["LIVE", "LiveFeed", "RobotPaths", "plain"]
+__all__ = ["LIVE", "SCOPES", "LiveFeed", "RobotPaths", "plain"]
 
 LIVE = "live/"
 _ROBOT = "fleet-page"
-_SCOPES = ("maps:live/*",)
+SCOPES = ("maps:live",)
+"""What the page's own token allows."""
 _TTL_S = 600.0
 _LOOK_S = 0.5
 _LIST_EVERY_S = 3.0
@@ -148,5 +149,5 @@ def _token(state: PlatformState, settings: PlatformSettings) -> str:
     key = read_key(Path(state.key_file))
     return key.issue(
         _ROBOT, now=time.time(), token_id=secrets.token_hex(8), settings=settings.auth,
-        ttl_s=min(_TTL_S, settings.auth.token_ttl_s), scopes=_SCOPES,
+        ttl_s=min(_TTL_S, settings.auth.token_ttl_s), scopes=SCOPES,
     )  # fmt: skip
