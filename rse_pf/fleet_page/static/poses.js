@@ -59,7 +59,8 @@ export function posesView(root, count) {
       parts.push(element("p", {}, element("strong", {}, `${each.cause} (${Math.round(each.confidence * 100)} %): `), each.sentence));
       if (each.missing?.length) parts.push(element("p", { class: "soft" }, `Evidence that is missing: ${each.missing.join(", ")}`));
     }
-    if (told.picture) parts.push(element("p", {}, element("img", { src: told.picture, alt: "matches: inliers and outliers" })));
+    if (told.picture) parts.push(element("p", {}, element("img", { src: told.picture, alt: "matches: inliers and outliers" })),
+      element("p", { class: "soft" }, "Blue dots agree with the pose, orange crosses do not; a line leads to where the pose puts the point."));
     for (const line of told.lines ?? []) parts.push(element("div", { class: "soft" }, line));
     if (told.command) parts.push(element("p", { class: "soft" }, "On the command line: ", element("code", {}, `rse-pf replay ${told.path} --command ${told.command}`)));
     return parts;
