@@ -18,6 +18,10 @@ from client_sdk.updates import BlockingUpdates, Updates
 from rse_pf.errors import Disconnected
 
 if TYPE_CHECKING:
+    import numpy as np
+    import numpy.typing as npt
+
+    from client_sdk.frontend import Frame
     from client_sdk.live.blocking import BlockingLiveMapper
     from client_sdk.live.mapper import LiveMapper
     from client_sdk.mapper import BlockingMapper, Mapper
@@ -117,6 +121,14 @@ class BlockingRobot:
             return self._robot.subscribe(topic)
 
         return BlockingUpdates(self._wait(begin()), self._wait)
+
+    def record_frame(self, frame: Frame, T_odom_camera: npt.NDArray[np.float64] | None = None) -> None:
+        """Record a thumbnail of *frame* and its pose by odometry, as `Robot.record_frame` does."""
+
+        async def record() -> None:
+            self._robot.record_frame(frame, T_odom_camera)
+
+        self._wait(record())
 
     @property
     def connected(self) -> bool:

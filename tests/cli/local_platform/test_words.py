@@ -80,7 +80,7 @@ def test_a_pause_may_last_until_the_control_plane_replaces_the_server() -> None:
         (("roll", "server-1"), "takes no server"),
         (("drain",), "drain needs a server"),
         (("status", "--follow"), "--server and --follow are for logs"),
-        (("status", "--lan", "10.1.2.3"), "--lan and --metrics-port are for the start"),
+        (("status", "--lan", "10.1.2.3"), "--lan, --metrics-port and --record are for the start"),
         (("--lan", "status"), "--lan status is not an address"),
         (("--lan", "127.0.0.1"), "no address that another machine can connect to"),
         (("robots",), "is not running"),
