@@ -60,16 +60,20 @@ class TokenWatch:
                 continue
             problem = claims_problem(claims, keys)
             if problem:
-                self._context.log.info("revoked", robot=connection.robot, reason=problem)
-                self._recorder.cut_off(claims, problem)
-                connection.close(CLOSE_REVOKED, "revoked")
+                self._revoke(connection, claims, problem)
             else:
                 connection.claims = renewed_claims(claims, keys)
 
     def connected(self, connection: RobotConnection, expires_s: float | None) -> None:
         """Know a connection whose handshake is done; its token ends at *expires_s*, s, monotonic."""
-        if connection.claims is not None:
+        claims, keys = connection.claims, self._handshake.keys
+        if claims is not None:
             self._by_number[connection.number] = connection
+            problem = "" if keys is None else claims_problem(claims, keys)
+            if problem:  # new keys came between the handshake and now
+                self._context.loop.call_soon(self._revoke, connection, claims, problem)
+            elif keys is not None:
+                connection.claims = renewed_claims(claims, keys)
         self._end_at(connection, expires_s)
 
     def arrived(self, connection: RobotConnection) -> None:
@@ -120,6 +124,12 @@ class TokenWatch:
         if expires_s is not None:
             left_s = max(0.0, expires_s - self._context.clocks.monotonic())
             self._timers[connection] = self._context.loop.call_later(left_s, partial(self._end, connection))
+
+    def _revoke(self, connection: RobotConnection, claims: Claims, problem: str) -> None:
+        if not connection.is_closing:
+            self._context.log.info("revoked", robot=connection.robot, reason=problem)
+            self._recorder.cut_off(claims, problem)
+            connection.close(CLOSE_REVOKED, "revoked")
 
     def _end(self, connection: RobotConnection) -> None:
         if not connection.is_closing:

@@ -35,14 +35,19 @@ class Worker(WorkerParts):
         now = self.clocks.wall()
         return KEY.issue(robot, now=now, token_id=token_id, settings=SETTINGS.auth, ttl_s=ttl_s, **more)
 
-    def robot(self, token: str) -> tuple[RobotConnection, FakeWire]:
-        """Connect a robot and let it say Hello."""
+    def judged(self, token: str) -> Accepted:
+        """Judge a handshake that is good."""
         accepted = self.handshake.judge(
             path=b"/ws", authorization=f"Bearer {token}", offered=[SUBPROTOCOLS["bin"]], is_full=False,
             anonymous="a", now_s=self.clocks.wall(),
         )  # fmt: skip
         assert isinstance(accepted, Accepted)
         self._number += 1
+        return accepted
+
+    def robot(self, token: str) -> tuple[RobotConnection, FakeWire]:
+        """Connect a robot and let it say Hello."""
+        accepted = self.judged(token)
         wire = FakeWire()
         connection = self.dispatcher.connect(wire, accepted, self._number)
         self.say(connection, Hello())
@@ -104,6 +109,18 @@ def test_a_token_of_another_robot_does_not_move_the_end(worker: Worker, wrong: s
     connection.last_heard_s = worker.loop.now + 1000.0
     worker.loop.advance(10.01)
     assert wire.closed == (4401, "token-over")
+
+
+def test_a_revocation_between_handshake_and_connection_ends_the_connection(worker: Worker):
+    mine, other = worker.judged(worker.token("r")), worker.judged(worker.token("s"))
+    worker.deny(DenyList().with_robot("default", "r", UNIX_S + 1))
+    wires = FakeWire(), FakeWire()
+
+    for number, (accepted, wire) in enumerate(zip((mine, other), wires, strict=True)):
+        worker.dispatcher.connect(wire, accepted, 100 + number)
+    worker.loop.advance(0.01)
+
+    assert [wire.closed for wire in wires] == [(4403, "revoked"), None]
 
 
 def test_a_revocation_ends_the_connections_of_its_robot_and_no_other(worker: Worker):
