@@ -145,8 +145,8 @@ def make_degenerate(kind: str, *, seed: int, n: int = 100, camera: Camera = KINE
             ray = camera.back_project(pixels[:1], np.ones(1))
             points = transform(inverse(T), ray * np.linspace(1, 5, n)[:, None])
             pixels = pixels[:1] + rng.normal(size=(n, 2)) * 0.5
-        case "noise":
-            pixels = rng.uniform(0, [camera.width, camera.height], (n, 2))
+        case "noise":  # of another stream: that of the seed has made the right pixels
+            pixels = np.random.default_rng([seed, 1]).uniform(0, [camera.width, camera.height], (n, 2))
         case "behind":
             T = np.diag([-1.0, -1.0, 1.0, 1.0]) @ T
             points = transform(inverse(T), camera.back_project(pixels, -rng.uniform(1, 5, n)))

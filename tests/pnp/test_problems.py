@@ -59,3 +59,13 @@ def test_every_degenerate_kind_has_the_shape_of_a_problem(kind):
 def test_an_unknown_degenerate_kind_is_refused():
     with pytest.raises(ValueError, match="unknown kind"):
         make_degenerate("round", seed=0)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_pixels_of_noise_are_not_the_right_ones_in_other_rows(seed):
+    noise, right = make_degenerate("noise", seed=seed), make_problem(seed=seed, n=100, outlier_ratio=0.0)
+
+    def median_px(shift):
+        return np.median(np.linalg.norm(np.roll(noise.pixels, shift, axis=0) - right.pixels, axis=1))
+
+    assert min(map(median_px, range(-9, 10))) > 100
