@@ -6,7 +6,7 @@ from itertools import count
 
 import pytest
 
-from benchmarks.capacity import MOST, PRECISION, SEARCH_S, CapacityStep, search
+from benchmarks.server.capacity import MOST, PRECISION, SEARCH_S, CapacityStep, search
 
 
 def step_of(robots: int, is_carried: bool) -> CapacityStep:

@@ -18,7 +18,7 @@ from websockets.asyncio.server import Server, ServerConnection, serve
 from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
 
-from benchmarks.load import (
+from benchmarks.server.load import (
     OUTCOMES,
     LoadPlan,
     LoadProcess,
@@ -138,7 +138,7 @@ def server() -> Iterator[ScriptedServer]:
 
 @pytest.fixture(autouse=True)
 def _compiled_here(program: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("benchmarks.load.compiled", lambda: program)
+    monkeypatch.setattr("benchmarks.server.load.compiled", lambda: program)
 
 
 def commands(folder: Path, codec_name: str, ids: int = IDS, payload: str = "") -> Path:

@@ -16,8 +16,8 @@ from typing import Any
 import pytest
 from guarded_server import GuardedServer
 
-from benchmarks import attacks
-from benchmarks.attacks import AttackTarget, Outcome
+from benchmarks.hostile import attacks
+from benchmarks.hostile.attacks import AttackTarget, Outcome
 from client_sdk import connect
 from rse_pf.wire import Command, Result
 

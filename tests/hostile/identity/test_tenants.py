@@ -11,8 +11,8 @@ from typing import Any
 import pytest
 from guarded_server import GuardedServer
 
-from benchmarks import tenants
-from benchmarks.attacks import AttackTarget
+from benchmarks.hostile import tenants
+from benchmarks.hostile.attacks import AttackTarget
 from rse_pf.auth.roster import EnrolledRobot, public_key_of
 from rse_pf.auth.tokens import SigningKey
 from rse_pf.identity import RobotId, object_name

@@ -1,0 +1,394 @@
+"""Poses of honest robots while others send hostile maps; and what limited processes cost an honest map.
+
+    python -m benchmarks.hostile.maps flood [--workers 1] [--robots 10] [--seconds 20] [--out FILE]
+    python -m benchmarks.hostile.maps honest --before DIR [--n 300] [--out FILE]
+
+``flood`` starts `rse-pf serve`.  Robots request 5 poses per second each; latency counts from the planned
+time.  After a quiet window, robots of their own identity each send every map of
+``tests/hostile/hostile_maps.py`` as a stored object to ``place`` and ``localise``, hostile clouds to ``icp``,
+and then the maps to the job ``merge``.  Memory is that of the supervisor and its workers without their
+limited processes and jobs, which are counted apart.
+
+``honest`` asks two servers in turns, in random order: one of this tree, one of the sources in DIR.
+
+Defends: others' p99 <= 1.5x of quiet and <= 100 ms, no 503, serving processes grow by <= 64 MiB.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import collections
+import contextlib
+import json
+import os
+import platform
+import random
+import re
+import runpy
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import client_sdk
+from benchmarks.hostile.robots import seen
+from rse_pf.auth.tokens import SigningKey
+from rse_pf.config import PlatformSettings
+from rse_pf.errors import RsePfError
+from rse_pf.experiments.load.swarm import Swarm, SwarmOptions
+from rse_pf.geometry import exp_se3
+from rse_pf.maps.format import Keyframe, encode_map
+from rse_pf.object_store import digest_of
+from rse_pf.services.synthetic_maps import make_room, make_world
+
+ROOT = Path(__file__).resolve().parents[2]
+CORPUS = ROOT / "tests" / "hostile" / "hostile_maps.py"
+KEY = SigningKey.from_seed(b"m" * 32, "bench-1")
+START_S, SETTLE_S, GRACE_S = 60.0, 3.0, 6.0
+ATTACKERS = 4
+P99_BAR, P99_BAR_MS, MEMORY_BAR_MIB = 1.5, 100.0, 64.0
+CLOUD_SIZES = (30_000, 60_000)
+QUANTILES = (50, 95, 99)
+
+
+_PUT = """
+import sys
+from rse_pf.identity import RobotId, object_name
+from rse_pf.object_store import open_store
+place, digest, *robots = sys.argv[1:]
+store, data = open_store(place), sys.stdin.buffer.read()
+for robot in robots:
+    store.put(object_name(RobotId("default", robot), digest), data)
+"""
+
+
+class Server:
+    """`rse-pf serve` of one tree of sources, with a store of its own."""
+
+    def __init__(self, folder: Path, *, workers: int, tree: Path = ROOT) -> None:
+        folder.mkdir(parents=True)
+        self.folder = folder
+        self._tree = tree
+        changes = {"serving": {"max_robots": 2000}, "session": {"max_commands_per_s": 0.0}}
+        (folder / "settings.json").write_text(json.dumps({"context": {"rse-pf": changes}}))
+        (folder / "keys.json").write_text(KEY.key_set().to_json())
+        announce = folder / "announce.json"
+        self._log = (folder / "server.log").open("wb")
+        self._process = subprocess.Popen(
+            [
+                sys.executable, "-m", "rse_pf.cli.main", "serve", "--settings", str(folder / "settings.json"),
+                "--keys", str(folder / "keys.json"), "--port", "0", "--control-port", "0",
+                "--workers", str(workers), "--server-id", "bench", "--announce", str(announce),
+                "--store", f"dir:{folder / 'objects'}",
+            ],
+            stdout=subprocess.DEVNULL, stderr=self._log, cwd=tree,
+            env={**os.environ, "PYTHONPATH": str(tree)},
+        )  # fmt: skip
+        end = time.monotonic() + START_S
+        while not announce.exists():
+            if self._process.poll() is not None or time.monotonic() > end:
+                raise SystemExit((folder / "server.log").read_text()[-2000:])
+            time.sleep(0.05)  # looks again, with a deadline: the file comes by rename
+        told = json.loads(announce.read_text())
+        self.url = f"ws://127.0.0.1:{told['port']}/ws"
+        self.serving = [self._process.pid, *told["workers"]]
+
+    def token(self, robot: str) -> str:
+        """Return a token that this server accepts."""
+        settings = PlatformSettings().auth
+        return KEY.issue(robot, now=time.time(), token_id=f"{robot}-{time.monotonic()}", settings=settings)
+
+    def put_all(self, robots: Iterable[str], data: bytes) -> dict[str, str]:
+        """Store *data* as an object of each of *robots*, and return the reference to it."""
+        place, digest = f"dir:{self.folder / 'objects'}", digest_of(data)
+        # Other sources may lay out their objects in another way, so they store them themselves.
+        subprocess.run(
+            [sys.executable, "-c", _PUT, place, digest, *robots], input=data, cwd=self._tree, check=True,
+            env={**os.environ, "PYTHONPATH": str(self._tree)},
+        )  # fmt: skip
+        return {"object": digest}
+
+    def robot(self, name: str) -> client_sdk.Robot:
+        """Return the robot *name*, to be connected."""
+        return client_sdk.connect(self.url, token=self.token(name), codec="bin")
+
+    def stop(self) -> None:
+        """End it at once."""
+        self._process.kill()
+        self._process.wait(30)
+        self._log.close()
+
+
+def main() -> None:
+    """Measure, print a table, write ``--out``."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("what", choices=("flood", "honest"))
+    parser.add_argument("--workers", type=int, default=1)
+    parser.add_argument("--robots", type=int, default=10)
+    parser.add_argument("--seconds", type=float, default=20.0, help="length of the quiet windows")
+    parser.add_argument("--n", type=int, default=300, help="commands of each kind with each server")
+    parser.add_argument("--rate", type=float, default=10.0, help="hostile commands per second, at most")
+    parser.add_argument("--only", default="", help="regular expression of the names of hostile maps")
+    parser.add_argument("--without-jobs", action="store_true")
+    parser.add_argument("--tree", type=Path, default=ROOT, help="sources of the server, or of the later one")
+    parser.add_argument("--before", type=Path, help="sources of the other server")
+    parser.add_argument("--out", type=Path, help="write the figures as JSON")
+    args = parser.parse_args()
+    report = {"machine": f"{platform.machine()}, {os.cpu_count()} cores", "load_before": os.getloadavg()}
+    with tempfile.TemporaryDirectory() as folder:
+        report |= asyncio.run(
+            (flood if args.what == "flood" else honest)(args, Path(folder))  # type: ignore[operator]
+        )
+    report["load_after"] = os.getloadavg()
+    if args.out:
+        args.out.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
+
+
+# --- hostile maps beside honest robots ------------------------------------------------------------------
+
+
+async def flood(args: argparse.Namespace, folder: Path) -> dict[str, Any]:
+    """Measure quiet, attacked by commands, quiet, attacked by jobs."""
+    server = Server(folder / "server", workers=args.workers, tree=args.tree.absolute())
+    origin = time.monotonic()
+    options = SwarmOptions(robots=args.robots, fps=5.0, seed=7)
+    windows: dict[str, tuple[float, float]] = {}
+    rows: dict[str, dict[str, Any]] = {}
+
+    def now() -> float:
+        return time.monotonic() - origin
+
+    try:
+        async with Swarm(
+            options, url=server.url, token_of=server.token, session=PlatformSettings().session, origin=origin
+        ) as swarm:  # fmt: skip
+            await swarm.start()
+            await swarm.wait_joined(START_S)
+            requests = hostile_requests(server, args.only)
+            for name in ("commands",) if args.without_jobs else ("commands", "jobs"):
+                mine = [each for each in requests if (each[1] == "merge") == (name == "jobs")]
+                await asyncio.sleep(SETTLE_S)
+                began = now()
+                await asyncio.sleep(args.seconds)
+                windows[f"quiet before {name}"] = began, now()
+                began = now()
+                rows[name] = await attack(server, mine, seconds=args.seconds, per_s=args.rate)
+                windows[name] = began, now()
+            result = await swarm.finish(GRACE_S)
+    finally:
+        server.stop()
+    others = {name: seen(result.commands, *window) for name, window in windows.items()}
+    show_flood(rows, others)
+    return {"attacks": rows, "others": others}
+
+
+def hostile_requests(server: Server, only: str) -> list[tuple[str, str, dict[str, Any]]]:
+    """Return a robot, a service and a payload for each hostile request; each map has a robot of its own."""
+    keyframe = honest_view()
+    view = {
+        "camera": keyframe.camera, "pixels": keyframe.pixels.ravel().astype(float),
+        "descriptors": keyframe.descriptors.tobytes(),
+    }  # fmt: skip
+    corpus = runpy.run_path(str(CORPUS))["hostile_maps"]()
+    chosen = [data for name, data in corpus.items() if re.search(only, name)]
+    made: list[tuple[str, str, dict[str, Any]]] = []
+    honest_map = encode_map(make_world(3).walk("honest", np.linspace(0, 0.2, 8), 3)[0])
+    beside = server.put_all([f"hostile-merge-{number}" for number in range(len(chosen))], honest_map)
+    for number, data in enumerate(chosen):
+        robots = {service: f"hostile-{service}-{number}" for service in ("place", "localise", "merge")}
+        reference = server.put_all(robots.values(), data)
+        for service, robot in robots.items():
+            payload = {"maps": [reference, beside]} if service == "merge" else {"map": reference, **view}
+            made.append((robot, service, payload))
+    for number, cloud in enumerate(hostile_clouds()):
+        request = {"target": cloud, "source": cloud, "T_target_source": np.eye(4).ravel()}
+        made.append((f"hostile-icp-{number}", "icp", request))
+    return made
+
+
+def hostile_clouds() -> Iterable[np.ndarray]:
+    """Yield clouds that are expensive or absurd: one point, one line, far apart, not numbers."""
+    rng = np.random.default_rng(5)
+    yield np.zeros(9_000)
+    yield np.repeat(np.linspace(0, 1e300, 3_000), 3)
+    yield rng.normal(size=9_000) * 1e12
+    yield np.full(9_000, 1e-300)
+    yield rng.normal(size=9_000)
+
+
+def honest_view() -> Keyframe:
+    """Return what a camera in the simulated hall sees."""
+    world = make_world(3)
+    return world.keyframe(0, "view", world.pose(0.05), world.pose(0.05), np.random.default_rng(9))
+
+
+async def attack(
+    server: Server, requests: list[tuple[str, str, dict[str, Any]]], *, seconds: float, per_s: float
+) -> dict[str, Any]:
+    """Send *requests*, several at a time, again and again for *seconds*, each at least once.
+
+    Returns:
+        How they ended, and by how much memory grew.
+    """
+    waiting = collections.deque(requests)
+    sent = 0
+    codes: collections.Counter[str] = collections.Counter()
+    slowest_s = 0.0
+    before, began = _own_mib(server.serving), time.monotonic()
+    most = {"serving": before, "all": _own_mib(_family(server.serving))}
+    all_before = most["all"]
+
+    async def work() -> None:
+        nonlocal slowest_s, sent
+        while sent < len(requests) or time.monotonic() < began + seconds:
+            robot_name, service, payload = waiting[0]
+            waiting.rotate(-1)
+            sent += 1
+            await asyncio.sleep(began + sent / per_s - time.monotonic())
+            asked = time.monotonic()
+            try:
+                async with server.robot(robot_name) as robot:
+                    if service == "merge":
+                        await robot.call(service, payload, on_progress=lambda done, what: None)
+                    else:
+                        await robot.call(service, payload)
+                codes[f"{service} ok"] += 1
+            except RsePfError as error:
+                codes[f"{service} {error.code}"] += 1
+            slowest_s = max(slowest_s, time.monotonic() - asked)
+
+    working = asyncio.gather(*(work() for _ in range(ATTACKERS)))
+    while not working.done():
+        await asyncio.wait({working}, timeout=0.05)
+        most["serving"] = max(most["serving"], _own_mib(server.serving))
+        most["all"] = max(most["all"], _own_mib(_family(server.serving)))
+    working.result()
+    return {
+        "n": sent, "codes": dict(sorted(codes.items())), "took_s": time.monotonic() - began,
+        "slowest_s": slowest_s, "grown_mib": most["serving"] - before,
+        "all_grown_mib": most["all"] - all_before, "kept_mib": _own_mib(server.serving) - before,
+    }  # fmt: skip
+
+
+def _family(pids: Sequence[int]) -> list[int]:
+    """Return these processes and all that they and their threads started."""
+    found = list(pids)
+    for pid in found:
+        for children in Path(f"/proc/{pid}/task").glob("*/children"):
+            with contextlib.suppress(OSError):
+                found += [int(child) for child in children.read_text().split() if int(child) not in found]
+    return found
+
+
+def _own_mib(pids: Iterable[int]) -> float:
+    """Return the resident memory of these processes alone, MiB."""
+    total = 0
+    for pid in pids:
+        with contextlib.suppress(OSError):
+            total += int(Path(f"/proc/{pid}/statm").read_text().split()[1])
+    return total * os.sysconf("SC_PAGE_SIZE") / 2**20
+
+
+def show_flood(rows: dict[str, dict[str, Any]], others: dict[str, dict[str, Any]]) -> None:
+    """Print what became of the attacks and of the others."""
+    print("| attack | n | took s | slowest s | serving MiB | all MiB | others | goodput | p50 ms | p99 ms |")
+    print("|---|---|---|---|---|---|---|---|---|---|")
+    for name, row in rows.items():
+        quiet, beside = others[f"quiet before {name}"], others[name]
+        ratio = beside["p99_ms"] / quiet["p99_ms"]
+        print(
+            f"| {name} | {row['n']} | {row['took_s']:.1f} | {row['slowest_s']:.1f} | "
+            f"{row['grown_mib']:+.1f} | "
+            f"{row['all_grown_mib']:+.0f} | {beside['n']} | {100 * beside['goodput']:.2f} % | "
+            f"{quiet['p50_ms']:.1f} -> {beside['p50_ms']:.1f} | "
+            f"{quiet['p99_ms']:.1f} -> {beside['p99_ms']:.1f} ({ratio:.2f}x) |"
+        )
+        is_good = (
+            (ratio <= P99_BAR and beside["p99_ms"] <= P99_BAR_MS)
+            and row["grown_mib"] <= MEMORY_BAR_MIB
+            and set(beside["codes"]) <= {"ok", ""}
+        )
+        print(f"  {'ok' if is_good else 'MISSED'}; others: {beside['codes']}; attack: {row['codes']}")
+
+
+# --- the cost of a limited process ----------------------------------------------------------------------
+
+
+async def honest(args: argparse.Namespace, folder: Path) -> dict[str, Any]:
+    """Ask two servers the same, in turns."""
+    trees = {"after": args.tree.absolute(), "before": args.before.absolute()}
+    servers = {name: Server(folder / name, workers=1, tree=tree) for name, tree in trees.items()}
+    draw, report = random.Random(7), {}
+    try:
+        for kind, (service, make) in HONEST.items():
+            payloads = {name: make(server) for name, server in servers.items()}
+            took: dict[str, list[float]] = {name: [] for name in servers}
+            robots = {name: await server.robot("honest").__aenter__() for name, server in servers.items()}
+            first = {}
+            for number in range(-5, args.n):
+                for name in draw.sample(sorted(servers), len(servers)):
+                    began = time.perf_counter()
+                    await robots[name].call(service, payloads[name], deadline_s=30.0)
+                    took_ms = (time.perf_counter() - began) * 1e3
+                    first.setdefault(name, took_ms)
+                    if number >= 0:
+                        took[name].append(took_ms)
+            for robot in robots.values():
+                await robot.close()
+            report[kind] = {
+                name: {"first_ms": first[name], **_quantiles(values)} for name, values in took.items()
+            }
+            before, after = report[kind]["before"], report[kind]["after"]
+            ratios = {f"p{q}": after[f"p{q}"] / before[f"p{q}"] for q in QUANTILES}
+            report[kind]["ratio"] = ratios
+            print(kind, json.dumps(report[kind]), flush=True)
+    finally:
+        for server in servers.values():
+            server.stop()
+    return {"n": args.n, "honest": report}
+
+
+def _quantiles(values: list[float]) -> dict[str, float]:
+    return {f"p{q}": round(float(np.percentile(values, q)), 3) for q in QUANTILES}
+
+
+def _place(keyframes: int, *, service_options: dict[str, Any]) -> Callable[..., Any]:
+    def make(server: Server) -> dict[str, Any]:
+        world = make_world(3)
+        version, _ = world.walk("honest", np.linspace(0, 1, keyframes), 3)
+        data, view = encode_map(version), honest_view()
+        return {
+            "map": server.put_all(["honest"], data), "camera": view.camera,
+            "pixels": view.pixels.ravel().astype(float), "descriptors": view.descriptors.tobytes(),
+            **service_options,
+        }  # fmt: skip
+
+    return make
+
+
+def _icp(server: Server) -> dict[str, Any]:
+    target = make_room(5, points=1000)
+    motion = exp_se3(np.array([0.03, -0.02, 0.01, 0.01, 0.0, 0.02]))
+    source = target @ motion[:3, :3].T + motion[:3, 3]
+    return {"target": target.ravel(), "source": source.ravel(), "T_target_source": np.eye(4).ravel()}
+
+
+HONEST: dict[str, tuple[str, Callable[..., Any]]] = {
+    "place, 20 keyframes": ("place", _place(20, service_options={})),
+    "place, unchecked": ("place", _place(20, service_options={"check": False})),
+    "localise, 20 keyframes": ("localise", _place(20, service_options={})),
+    "localise, 200 keyframes": ("localise", _place(200, service_options={})),
+    "icp, 3,000 points": ("icp", _icp),
+}
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,206 @@
+"""Robots in two rendered rooms of equal furniture and textures: whom does a live map join, and when?
+
+    python -m benchmarks.live.equal_rooms prepare [--features DIR] [--seeds 20]
+    python -m benchmarks.live.equal_rooms run [--features DIR] [--seeds 20]
+
+``prepare`` renders and tracks three robots for each seed (35 CPU seconds, 5 MB), and keeps their keyframes:
+one in each of two equal rooms with other rooms around them, and one that drives from the first through the
+room between into the second.  ``run`` plays them into a live map, without and with the robot that drives
+across, where nothing is stated and where the size of equal rooms is (15 CPU seconds for each seed).  The
+robots see rendered images by ORB.
+
+Defends: a robot in the second room is joined only through what a robot saw that drove there; else it is
+called ambiguous.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from multiprocessing import get_context
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.live.one_process import DENSE
+from benchmarks.maps.recordings import pose_answer
+from client_sdk.frontend import Frame, PoseQuery, Tracker, extract
+from client_sdk.simulator import (
+    SIMULATED_CAMERA,
+    loop_trajectory,
+    make_world,
+    render_along,
+    with_equal_rooms,
+)
+from rse_pf.geometry import Array, inverse
+from rse_pf.live_map.events import KeyframeAdded, MapStarted, matrix_bytes
+from rse_pf.live_map.keyframe_code import encode_features
+from rse_pf.live_map.live_map import LiveMap
+from rse_pf.live_map.outcomes import Added, Joined, OptimiseWanted
+
+__all__ = ["Drive", "Met", "main", "meet", "prepared"]
+
+ROOMS, EQUAL, APART_M = 5, (1, 3), 10.0
+STEP_M = 0.11
+WAYS = {"a": (0.6, 3.9), "c": (0.6, 13.9), "b": (10.6, 13.9)}
+"""Where on the loop each robot begins and ends: *a* in room 1, *b* in room 3, *c* from one to the other."""
+STATED_M = 5.0
+_WRONG_M = 1.0
+"""A robot that is off by more was joined to the wrong room: equal places are 10 m apart."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Drive:
+    """The keyframes of one robot: encoded features, and poses by odometry and in truth, ``(n, 4, 4)``."""
+
+    features: tuple[bytes, ...]
+    T_odom_camera: Array
+    T_world_camera: Array
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Met:
+    """What became of robot *b* (see `WAYS`).
+
+    ``ever`` and ``wrong_ever`` say whether it was joined at some time, and to a wrong place; ``aligned`` and
+    ``wrong`` likewise at the end; ``reason`` why it is not aligned at the end.
+    """
+
+    ever: bool
+    wrong_ever: bool
+    aligned: bool
+    wrong: bool
+    reason: str
+
+
+def prepared(folder: Path, seed: int) -> dict[str, Drive]:
+    """Return the drives of a seed; they are rendered, tracked and kept if they are not there."""
+    path = folder / f"equal-{seed}.npz"
+    if not path.exists():
+        folder.mkdir(parents=True, exist_ok=True)
+        _prepare(path, seed)
+    with np.load(path, allow_pickle=False) as held:
+        return {
+            name: Drive(
+                features=tuple(_split(held[f"{name}-features"], held[f"{name}-sizes"])),
+                T_odom_camera=held[f"{name}-odom"], T_world_camera=held[f"{name}-truth"],
+            )
+            for name in WAYS
+        }  # fmt: skip
+
+
+def meet(drives: dict[str, Drive], names: Sequence[str], stated_m: float) -> Met:
+    """Let robots drive at the same time into one live map; the first of *names* begins it."""
+    live_map = LiveMap()
+    live_map.apply(MapStarted(source="", keyframes=(), equal_rooms_m=stated_m))
+    first: dict[str, int] = {}
+    ever = wrong_ever = False
+    for number in range(max(len(drives[name].features) for name in names)):
+        for name in names:
+            drive = drives[name]
+            if number >= len(drive.features):
+                continue
+            outcomes = live_map.apply(_event(name, number, drive))
+            added = next(each.id for each in outcomes if isinstance(each, Added))
+            first.setdefault(name, added)
+            outcomes += live_map.apply(live_map.measure(added))
+            if any(isinstance(each, OptimiseWanted) for each in outcomes):
+                outcomes += live_map.apply(live_map.optimise())
+            joined = any(isinstance(each, Joined) and each.robot == "b" for each in outcomes)
+            if "b" in first:
+                ever |= joined
+                wrong_ever |= joined and _off_m(live_map, drives, names[0], first) > _WRONG_M
+    found = next(each for each in live_map.alignments() if each.robot == "b")
+    wrong = found.aligned and _off_m(live_map, drives, names[0], first) > _WRONG_M
+    return Met(ever=ever, wrong_ever=wrong_ever, aligned=found.aligned, wrong=wrong, reason=found.reason)
+
+
+def _off_m(live_map: LiveMap, drives: dict[str, Drive], root: str, first: dict[str, int]) -> float:
+    """Return how far the first keyframe of *b* is from its true place relative to that of *root*."""
+    pose = inverse(live_map.pose(first[root])) @ live_map.pose(first["b"])
+    true = inverse(drives[root].T_world_camera[0]) @ drives["b"].T_world_camera[0]
+    return float(np.linalg.norm(pose[:3, 3] - true[:3, 3]))
+
+
+def _event(name: str, number: int, drive: Drive) -> KeyframeAdded:
+    camera = SIMULATED_CAMERA
+    return KeyframeAdded(
+        robot=name, segment=0, number=number, timestamp_s=float(number),
+        T_odom_camera=matrix_bytes(drive.T_odom_camera[number]), features=drive.features[number],
+        camera=(camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height),
+    )  # fmt: skip
+
+
+def _prepare(path: Path, seed: int) -> None:
+    world = with_equal_rooms(make_world(seed, ROOMS), *EQUAL)
+    held: dict[str, Array] = {}
+    for place, (name, (begin_m, end_m)) in enumerate(WAYS.items()):
+        truth = loop_trajectory(begin_m, round((end_m - begin_m) / STEP_M), seed, ROOMS, step_m=STEP_M)
+        tracker = Tracker(DENSE)
+        features, odom, true = [], [], []
+        for frame, T_world_camera in zip(
+            render_along(truth, world, (seed, place)), truth.T_world_camera, strict=True
+        ):
+            T_odom_camera = _tracked(tracker, frame)
+            if T_odom_camera is not None:
+                features.append(_encoded(frame))
+                odom.append(T_odom_camera)
+                true.append(T_world_camera)
+        held[f"{name}-features"] = np.frombuffer(b"".join(features), dtype=np.uint8)
+        held[f"{name}-sizes"] = np.array([len(each) for each in features])
+        held[f"{name}-odom"], held[f"{name}-truth"] = np.array(odom), np.array(true)
+    part = path.with_suffix(".part.npz")
+    np.savez(part, **held)
+    part.replace(path)
+
+
+def _tracked(tracker: Tracker, frame: Frame) -> Array | None:
+    step = tracker.prepare(frame)
+    while isinstance(step, PoseQuery):
+        step = tracker.accept(step, *pose_answer(step))
+    return step.T_world_camera
+
+
+def _encoded(frame: Frame) -> bytes:
+    found = extract(frame, DENSE)
+    depths_m = found.points_camera[:, 2]
+    rows = np.flatnonzero(np.isfinite(depths_m))[:870]
+    return encode_features(found.pixels[rows], depths_m[rows], found.descriptors[rows])
+
+
+def _split(data: Array, sizes: Array) -> list[bytes]:
+    ends = np.cumsum(sizes)
+    return [data[end - size : end].tobytes() for end, size in zip(ends.tolist(), sizes.tolist(), strict=True)]
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Prepare the drives, or run and print what became of the robot in the second room."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.live.equal_rooms")
+    parser.add_argument("part", choices=("prepare", "run"))
+    parser.add_argument("--features", type=Path, default=Path("out-equal-rooms"))
+    parser.add_argument("--seeds", type=int, default=20)
+    parser.add_argument("--processes", type=int, default=2)
+    chosen = parser.parse_args(arguments)
+    if chosen.part == "prepare":
+        with get_context("spawn").Pool(chosen.processes) as pool:
+            pool.starmap(prepared, [(chosen.features, seed) for seed in range(chosen.seeds)], chunksize=1)
+        return
+    for names in (("a", "b"), ("a", "c", "b")):
+        for stated_m in (0.0, STATED_M):
+            found = [meet(prepared(chosen.features, seed), names, stated_m) for seed in range(chosen.seeds)]
+            figures = {
+                "robots": "".join(names), "stated_m": stated_m, "seeds": len(found),
+                "joined_ever": sum(each.ever for each in found),
+                "joined_wrongly_ever": sum(each.wrong_ever for each in found),
+                "joined": sum(each.aligned for each in found),
+                "joined_wrongly": sum(each.wrong for each in found),
+                "ambiguous": sum("ambiguous" in each.reason for each in found),
+                "reasons": sorted({each.reason for each in found}),
+            }  # fmt: skip
+            print(json.dumps(figures))
+
+
+if __name__ == "__main__":
+    main()

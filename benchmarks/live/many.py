@@ -1,0 +1,202 @@
+"""Ten robots in one live map of ten rendered rooms, on two cores, and their poses without a live map.
+
+    python -m benchmarks.live.many prepare [--features DIR] [--robots 10] [--rooms 10] [--frames 200]
+    python -m benchmarks.live.many run [--features DIR] [--rounds 1] [--out DIR]
+
+``prepare`` renders the drives and keeps the features of each frame (12 CPU minutes for ten rooms, 190 MB).
+Each robot drives 3.5 m beyond the start of the next one: with the least overlap robots met in their last
+frames only.  ``run`` lets the robots, a process each, play them at 5 Hz through a local platform with two
+servers: without a live map, then with it, in turn.  Matching, poses, keyframes and corrections are real; only
+finding features and the robots' own clouds are left out, which in the field is the work of other computers.
+
+Defends: all robots in one map, correction p99 <= 1 s, and p99 of poses <= 1.3 times that without a live map.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import multiprocessing
+import os
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import rse_pf.experiments.demo.robot as demo_robot
+import rse_pf.experiments.demo.run as demo_run
+from client_sdk import frontend, mapping
+from client_sdk.frontend import Features, Frame, FrontEndOptions
+from client_sdk.mapping import Trajectory
+from client_sdk.simulator import SIMULATED_CAMERA, render_frames, true_trajectory
+from rse_pf.config import PlatformSettings
+from rse_pf.experiments.demo.run import DemoOptions, RobotSpec, run_demo
+from rse_pf.experiments.results.records import read_commands
+
+__all__ = ["main", "prepare", "run"]
+
+SEED = 0
+RATE_HZ = 5.0
+CORRECTION_P99_MS, POSES_RATIO = 1000.0, 1.3
+_FEATURES = "RSE_PF_BENCHMARK_FEATURES"
+_ABOUT = "about.json"
+_OPTIONS = FrontEndOptions().sent_with("zlib")
+
+
+def prepare(folder: Path, robots: int, rooms: int, frames: int, processes: int = 2) -> None:
+    """Render the drives, and write the features of each robot's frames; robots that are there are kept."""
+    folder.mkdir(parents=True, exist_ok=True)
+    orders = [
+        (folder, robot, robots, rooms, frames)
+        for robot in range(robots)
+        if not _file_of(folder, robot).exists()
+    ]
+    with multiprocessing.get_context("spawn").Pool(processes) as pool:
+        pool.starmap(_prepare_robot, orders, chunksize=1)
+    about = {"robots": robots, "rooms": rooms, "frames": frames, "seed": SEED}
+    (folder / _ABOUT).write_text(json.dumps(about) + "\n", encoding="utf-8")
+
+
+def run(folder: Path, out: Path, rounds: int) -> dict[str, Any]:
+    """Play the robots without and with a live map in turn; return the figures of all rounds."""
+    about = json.loads((folder / _ABOUT).read_text(encoding="utf-8"))
+    os.environ[_FEATURES] = str(folder.resolve())
+    demo_run.run_robot = run_feature_robot  # type: ignore[attr-defined]
+    out.mkdir(parents=True, exist_ok=True)
+    found = []
+    for turn in range(rounds):
+        load = os.getloadavg()[0]
+        options = DemoOptions(
+            robots=about["robots"], rate_hz=RATE_HZ, frames=about["frames"], seed=SEED, quiet=True,
+            out=out / f"alone-{turn}",
+        )  # fmt: skip
+        run_demo(options, PlatformSettings())
+        alone = _poses_ms(options.out)
+        options = replace(options, out=out / f"live-{turn}", live=True)
+        run_demo(options, PlatformSettings())
+        beside = _poses_ms(options.out)
+        live = json.loads((options.out / "report.json").read_text(encoding="utf-8"))["live"]
+        found.append(
+            {
+                "load_average": [round(load, 2), round(os.getloadavg()[0], 2)],
+                "joined": live["joined"],
+                "join_frame": live["join_frame"],
+                "aligned_percent": live["aligned_percent"],
+                "final_ate_cm": live["final_ate_cm"],
+                "keyframes": live["keyframes"],
+                "keyframes_waiting": live["keyframes_waiting"],
+                "lost_frames": live["lost_frames"],
+                "correction_ms": live["correction_ms"],
+                "keyframe_kept_ms": live["keyframe_kept_ms"],
+                "poses_p99_ms": {"alone": _p99(alone), "beside": _p99(beside), "n": len(beside)},
+                "poses_p99_ratio": round(_p99(beside) / _p99(alone), 3),
+            }
+        )
+    return {**about, "rounds": found}
+
+
+def run_feature_robot(spec: RobotSpec, pipe: Connection) -> None:
+    """Run a robot of the demo on frames whose features were computed beforehand; entry point of a process."""
+    frames, features, truth = _read(Path(os.environ[_FEATURES]), spec.number)
+    frontend.extract = lambda frame, options: features[frame.timestamp_s]  # type: ignore[assignment]
+    mapping.PointMap.add = lambda *_: 0  # type: ignore[assignment, method-assign]
+    demo_robot._load = lambda *_: (frames, truth, "ground truth")  # type: ignore[assignment]
+    demo_robot.run_robot(spec, pipe)
+
+
+def _prepare_robot(folder: Path, robot: int, robots: int, rooms: int, frames: int) -> None:
+    found = [frontend.extract(each, _OPTIONS) for each in render_frames(robot, robots, frames, SEED, rooms)]
+    truth = true_trajectory(robot, robots, frames, SEED, rooms)
+    part = _file_of(folder, robot).with_suffix(".part.npz")
+    np.savez(
+        part,
+        counts=[len(each.pixels) for each in found],
+        pixels=np.concatenate([each.pixels for each in found]),
+        descriptors=np.concatenate([each.descriptors for each in found]),
+        points_camera=np.concatenate([each.points_camera for each in found]),
+        stamps=truth.timestamps_s,
+        poses=truth.T_world_camera,
+    )
+    part.replace(_file_of(folder, robot))
+
+
+def _read(folder: Path, robot: int) -> tuple[list[Frame], dict[float, Features], Trajectory]:
+    """Return frames without an image, the features of each by its time stamp, and the true trajectory."""
+    with np.load(_file_of(folder, robot)) as file:
+        held = {name: file[name] for name in file.files}
+    rgb = np.zeros((SIMULATED_CAMERA.height, SIMULATED_CAMERA.width, 3), dtype=np.uint8)
+    depth_m = np.ones((SIMULATED_CAMERA.height, SIMULATED_CAMERA.width), dtype=np.float32)
+    stamps = [float(stamp) for stamp in held["stamps"]]
+    frames = [Frame(timestamp_s=stamp, rgb=rgb, depth_m=depth_m, camera=SIMULATED_CAMERA) for stamp in stamps]
+    return (
+        frames,
+        dict(zip(stamps, _split(held), strict=True)),
+        Trajectory(held["stamps"], held["poses"]),
+    )
+
+
+def _split(held: dict[str, Any]) -> Iterator[Features]:
+    at = 0
+    for count in held["counts"].tolist():
+        rows = slice(at, at + count)
+        at += count
+        yield Features(
+            pixels=held["pixels"][rows],
+            descriptors=held["descriptors"][rows],
+            points_camera=held["points_camera"][rows],
+        )
+
+
+def _file_of(folder: Path, robot: int) -> Path:
+    return folder / f"robot-{robot + 1}.npz"
+
+
+def _poses_ms(out: Path) -> list[float]:
+    commands = read_commands(out / "commands.csv")
+    return [each.round_trip_ms for each in commands if each.round_trip_ms is not None]
+
+
+def _p99(values: Sequence[float]) -> float:
+    return round(float(np.percentile(values, 99)), 2)
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Prepare the features, or run and print the figures and what they miss."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.live.many")
+    parser.add_argument("part", choices=("prepare", "run"))
+    parser.add_argument("--features", type=Path, default=Path("out-live-features"))
+    parser.add_argument("--robots", type=int, default=10)
+    parser.add_argument("--rooms", type=int, default=10)
+    parser.add_argument("--frames", type=int, default=200)
+    parser.add_argument("--processes", type=int, default=2)
+    parser.add_argument("--rounds", type=int, default=1)
+    parser.add_argument("--out", type=Path, default=Path("out-live-many"))
+    chosen = parser.parse_args(arguments)
+    if chosen.part == "prepare":
+        prepare(chosen.features, chosen.robots, chosen.rooms, chosen.frames, chosen.processes)
+        return
+    figures = run(chosen.features, chosen.out, chosen.rounds)
+    print(json.dumps(figures))
+    for each in figures["rounds"]:
+        missed = [
+            what
+            for what, held in (
+                ("all joined", each["joined"] == figures["robots"]),
+                ("correction p99", (each["correction_ms"]["p99"] or 1e9) <= CORRECTION_P99_MS),
+                ("poses beside it", each["poses_p99_ratio"] <= POSES_RATIO),
+            )
+            if not held
+        ]
+        print(
+            f"{each['joined']} of {figures['robots']} joined, correction p50 {each['correction_ms']['p50']}, "
+            f"p99 {each['correction_ms']['p99']} ms (n {each['correction_ms']['n']}), poses p99 "
+            f"{each['poses_p99_ms']['beside']} ms, {each['poses_p99_ratio']} times that alone, ATE "
+            f"{each['final_ate_cm']} cm, load {each['load_average']}: {', '.join(missed) or 'all met'}"
+        )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,204 @@
+"""Measure what the depth of both images gives a pose, and what it costs.
+
+Defends: red kitchen at 10 Hz, ATE frame to frame <= 3.4 cm, with loops <= 3.0, merged in three <= 3.3; NYU,
+fr1 and redwood no worse than without depth; no lost frame; every command of every codec < 10 kB; mean
+normalised error squared near 6; the native core <= 60 us for 200 matches.  CPU figures are of this thread,
+native and numpy in turn; the load average stands beside them: discard those of a busy machine.
+
+    python -m benchmarks.maps.depth --recordings ../shared/data --out depth.json
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import platform
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks.maps.recordings import ate_m, truth_of
+from benchmarks.maps.services import joined_poses, robots_of
+from client_sdk.datasets import Dataset, open_dataset
+from client_sdk.frontend import FrontEndOptions, PoseQuery, Tracker, extract, match
+from rse_pf.errors import PnpError
+from rse_pf.geometry import Array, inverse, pose_difference
+from rse_pf.pnp import PnpOptions, PnpSolution, refine_with_depth, solve_pnp
+from rse_pf.pnp.depth_refinement import refine_by_numpy
+from rse_pf.pnp.problems import make_two_views
+from rse_pf.services.mapping.map_merge import merge_versions
+from rse_pf.services.pnp import make_request
+from rse_pf.wire import CODECS, Command, make_codec
+
+__all__ = ["main"]
+
+_RECORDINGS = {
+    "7scenes_redkitchen": FrontEndOptions(),
+    "tum_fr1_xyz_start": FrontEndOptions(),
+    "redwood_living_room": FrontEndOptions(),
+    "nyu_dining_room": FrontEndOptions.wide_baseline(),
+}
+
+
+def recording_row(dataset: Dataset, options: FrontEndOptions, *, with_depth: bool) -> dict[str, float]:
+    """Track every frame; return ATE, the error of steps, lost frames and the size of commands."""
+    codec, sizes, poses, stamps = make_codec("zlib"), [], [], []
+    tracker = Tracker(options)
+    for frame in dataset:
+        step = tracker.prepare(frame)
+        while isinstance(step, PoseQuery):
+            sizes.append(_command_bytes(codec, step, with_depth=with_depth))
+            step = tracker.accept(step, *_answer(step, with_depth=with_depth))
+        if step.T_world_camera is not None:
+            poses.append(step.T_world_camera)
+            stamps.append(frame.timestamp_s)
+    truth = truth_of(dataset, stamps)
+    steps = [
+        pose_difference(inverse(poses[k]) @ poses[k + 1], inverse(truth[k]) @ truth[k + 1])
+        for k in range(len(poses) - 1)
+    ]
+    metres, degrees = np.sqrt(np.square(steps).mean(axis=0))
+    return {
+        "ate_cm": 100 * ate_m(np.array(poses), truth),
+        "step_cm": 100 * metres,
+        "step_deg": degrees,
+        "lost": tracker.lost_frames,
+        "command_bytes_median": float(np.median(sizes)),
+        "command_bytes_max": max(sizes),
+    }
+
+
+def _answer(query: PoseQuery, *, with_depth: bool) -> tuple[Array | None, int]:
+    found = query.correspondences
+    options = PnpOptions(inlier_px=query.inlier_px, max_iterations=query.max_iterations)
+    try:
+        solution = solve_pnp(found.points_world, found.pixels, query.camera, options)
+    except PnpError:
+        return None, 0
+    if with_depth:
+        solution = refine_with_depth(solution, found.points_world, found.pixels, found.depths_m, query.camera)
+    return solution.T_camera_world, len(solution.inliers)
+
+
+def _command_bytes(codec: Any, query: PoseQuery, *, with_depth: bool) -> int:
+    found = query.correspondences
+    options = PnpOptions(inlier_px=query.inlier_px, max_iterations=query.max_iterations)
+    request = make_request(
+        found.points_world, found.pixels, query.camera, options,
+        depths_m=found.depths_m if with_depth else None,
+    )  # fmt: skip
+    return len(codec.encode(Command(id=1000, service="pnp", payload=request, stream="pose", keep=True)))
+
+
+def command_rows(dataset: Dataset) -> dict[str, dict[str, int]]:
+    """Return the most matches and bytes of a command; long recordings by every tenth step."""
+    found: dict[str, dict[str, int]] = {}
+    step = 1 if len(dataset) < 20 else 10
+    for preset, options in (("default", FrontEndOptions()), ("wide", FrontEndOptions.wide_baseline())):
+        for row in range(0, len(dataset) - 1, step):
+            before, frame = dataset.read(row), dataset.read(row + 1)
+            features = extract(before, options), extract(frame, options)
+            for codec in CODECS:
+                matches = match(*features, options.sent_with(codec))
+                request = make_request(
+                    matches.points_world, matches.pixels, frame.camera,
+                    PnpOptions(inlier_px=options.inlier_px, max_iterations=options.max_iterations),
+                    depths_m=matches.depths_m, binary=codec == "bin",
+                )  # fmt: skip
+                command = Command(id=1000, service="pnp", payload=request, stream="pose", keep=True)
+                sent = len(make_codec(codec).encode(command))
+                most = found.setdefault(f"{preset}, {codec}", {"matches": 0, "bytes": 0})
+                most["matches"] = max(most["matches"], len(matches))
+                most["bytes"] = max(most["bytes"], sent)
+    return found
+
+
+def map_rows(recordings: Path) -> dict[str, float]:
+    """Return the red kitchen's errors with loops, and merged in three."""
+    alone, three = robots_of(recordings, cuts=((0, 250),)), robots_of(recordings)
+    return {
+        f"{name}_ate_cm": 100
+        * robots.ate_m(joined_poses(robots.runs, merge_versions([run.version for run in robots.runs])))
+        for name, robots in (("with_loops", alone), ("merged_in_three", three))
+    }
+
+
+def consistency_row(n: int) -> dict[str, float]:
+    """Return the median errors, and the mean normalised error squared, 6 for an honest covariance."""
+    errors, squares = [], []
+    for seed in range(n):
+        views = make_two_views(seed=seed, n=200, outlier_ratio=0.3)
+        before = solve_pnp(views.points_reference, views.pixels, views.camera, PnpOptions(inlier_px=5.0))
+        after = refine_with_depth(before, views.points_reference, views.pixels, views.depths_m, views.camera)
+        both = (before, after)
+        errors.append([_error_m(each, views.T_camera_reference) for each in both])
+        squares.append([_normalised_error2(each, views.T_camera_reference) for each in both])
+    (before_m, after_m), (before_2, after_2) = np.median(errors, axis=0), np.mean(squares, axis=0)
+    return {
+        "n": n, "median_mm_pnp": 1e3 * before_m, "median_mm_depth": 1e3 * after_m,
+        "normalised_error2_pnp": before_2, "normalised_error2_depth": after_2,
+    }  # fmt: skip
+
+
+def _error_m(solution: PnpSolution, truth: Array) -> float:
+    return pose_difference(inverse(solution.T_camera_world), inverse(truth))[0]
+
+
+def _normalised_error2(solution: PnpSolution, truth: Array) -> float:
+    error = truth @ inverse(solution.T_camera_world)
+    R = error[:3, :3]
+    turned = 0.5 * np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
+    xi = np.concatenate([error[:3, 3], turned])
+    return float(xi @ np.linalg.solve(solution.covariance, xi))
+
+
+def cost_row(n: int) -> dict[str, Any]:
+    """Return the thread CPU of the refinement after `solve_pnp`, us, for 200 matches, 30 % wrong."""
+    ways: dict[str, Callable[..., PnpSolution]] = {"default": refine_with_depth, "numpy": refine_by_numpy}
+    spent: dict[str, list[float]] = {"solve_pnp": [], **{name: [] for name in ways}}
+    for seed in range(n):
+        views = make_two_views(seed=seed % 100, n=200, outlier_ratio=0.3)
+        begin = time.thread_time_ns()
+        solution = solve_pnp(views.points_reference, views.pixels, views.camera, PnpOptions(inlier_px=5.0))
+        spent["solve_pnp"].append((time.thread_time_ns() - begin) / 1e3)
+        for name, refine in ways.items():
+            begin = time.thread_time_ns()
+            refine(solution, views.points_reference, views.pixels, views.depths_m, views.camera)
+            spent[name].append((time.thread_time_ns() - begin) / 1e3)
+    return {
+        "n": n,
+        **{name: np.percentile(each, [50, 95, 99]).round(1).tolist() for name, each in spent.items()},
+    }
+
+
+def main() -> None:
+    """Measure and print; write JSON where asked."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
+    parser.add_argument("--recordings", type=Path, help="folder of recordings; without it they are left out")
+    parser.add_argument("--n", type=int, default=1000)
+    parser.add_argument("--out", type=Path)
+    arguments = parser.parse_args()
+    report: dict[str, Any] = {"machine": platform.processor() or platform.machine(), "load": os.getloadavg()}
+    report["cost_us_p50_p95_p99"] = cost_row(max(500, arguments.n // 2))
+    report["consistency"] = consistency_row(arguments.n)
+    if arguments.recordings:
+        for name, options in _RECORDINGS.items():
+            dataset = open_dataset(arguments.recordings / name)
+            report[name] = {
+                label: recording_row(dataset, options, with_depth=with_depth)
+                for label, with_depth in (("pnp", False), ("depth", True))
+            }
+            report[name]["commands"] = command_rows(dataset)
+        report["red_kitchen_maps"] = map_rows(arguments.recordings)
+    text = json.dumps(report, indent=1)
+    print(text)
+    if arguments.out:
+        arguments.out.write_text(text + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,166 @@
+"""Maps from a recording, as robots would upload them, and the error of a merged map.
+
+Poses are solved in this process, without a platform; ground truth is used for errors only.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from client_sdk.datasets import Dataset, open_dataset
+from client_sdk.frontend import FrontEndOptions, PoseQuery, Tracker, extract
+from client_sdk.mapping import MapOptions, PointMap
+from rse_pf.errors import PnpError
+from rse_pf.geometry import Array, inverse
+from rse_pf.maps.format import Keyframe, MapVersion
+from rse_pf.pnp import PnpOptions, refine_with_depth, solve_pnp
+
+__all__ = [
+    "Run",
+    "ate_m",
+    "cloud_of",
+    "drive",
+    "frame_poses",
+    "keyframe_of",
+    "pose_answer",
+    "red_kitchen",
+    "truth_of",
+]
+
+RED_KITCHEN = "7scenes_redkitchen"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Run:
+    """One robot's drive: its map, each frame's pose in the robot's own world, and its keyframe."""
+
+    version: MapVersion
+    stamps_s: tuple[float, ...]
+    T_world_camera: Array
+    keyframe_of_frame: npt.NDArray[np.int64]
+    """Row of the last keyframe at or before each frame."""
+    rows: tuple[int, ...]
+
+
+def red_kitchen(recordings: Path) -> Dataset:
+    """Return the red-kitchen recording, 250 frames at 10 Hz."""
+    return open_dataset(recordings / RED_KITCHEN)
+
+
+def drive(dataset: Dataset, rows: Sequence[int], robot: str, options: FrontEndOptions | None = None) -> Run:
+    """Track *rows* of *dataset* by visual odometry from the origin; return what the robot would have."""
+    options = options or FrontEndOptions()
+    tracker = Tracker(options)
+    keyframes: list[Keyframe] = []
+    poses, stamps, owner, kept = [], [], [], []
+    for row in rows:
+        frame = dataset.read(row)
+        step = tracker.prepare(frame)
+        while isinstance(step, PoseQuery):
+            step = tracker.accept(step, *pose_answer(step))
+        if step.T_world_camera is None:
+            continue
+        if step.keyframe:
+            found = extract(frame, options)
+            keyframes.append(
+                Keyframe(
+                    id=len(keyframes), robot=robot, timestamp_s=frame.timestamp_s,
+                    T_world_camera=step.T_world_camera, camera=frame.camera,
+                    pixels=found.pixels.astype(np.float32), descriptors=found.descriptors,
+                    points_camera=found.points_camera.astype(np.float32),
+                )
+            )  # fmt: skip
+        poses.append(step.T_world_camera)
+        stamps.append(frame.timestamp_s)
+        owner.append(len(keyframes) - 1)
+        kept.append(row)
+    return Run(
+        version=MapVersion(keyframes=tuple(keyframes), provenance={"robot": robot}),
+        stamps_s=tuple(stamps),
+        T_world_camera=np.array(poses),
+        keyframe_of_frame=np.array(owner),
+        rows=tuple(kept),
+    )
+
+
+def keyframe_of(dataset: Dataset, row: int, T_world_camera: Array, number: int) -> Keyframe:
+    """Return frame *row* as a keyframe at a given pose."""
+    frame = dataset.read(row)
+    found = extract(frame, FrontEndOptions())
+    return Keyframe(
+        id=number, robot="map", timestamp_s=frame.timestamp_s, T_world_camera=T_world_camera,
+        camera=frame.camera, pixels=found.pixels.astype(np.float32), descriptors=found.descriptors,
+        points_camera=found.points_camera.astype(np.float32),
+    )  # fmt: skip
+
+
+def truth_of(dataset: Dataset, stamps_s: Sequence[float]) -> Array:
+    """Return the ``(n, 4, 4)`` true poses nearest to *stamps_s*."""
+    assert dataset.truth is not None
+    known = np.asarray(dataset.truth.timestamps_s)
+    nearest = [int(np.argmin(np.abs(known - stamp))) for stamp in stamps_s]
+    return np.asarray(dataset.truth.T_world_camera)[nearest]
+
+
+def pose_answer(query: PoseQuery) -> tuple[Array | None, int]:
+    """Return ``T_camera_world`` of a query and its inliers, as the platform does; None and 0 without one."""
+    options = PnpOptions(inlier_px=query.inlier_px, max_iterations=query.max_iterations)
+    matches = query.correspondences
+    try:
+        found = solve_pnp(matches.points_world, matches.pixels, query.camera, options)
+    except PnpError:
+        return None, 0
+    found = refine_with_depth(found, matches.points_world, matches.pixels, matches.depths_m, query.camera)
+    return found.T_camera_world, len(found.inliers)
+
+
+def frame_poses(run: Run, T_world_keyframe: Array) -> Array:
+    """Return every frame's pose after its keyframes moved to ``(k, 4, 4)``.
+
+    A frame between two keyframes takes part of the correction of each, by its place between them.
+    """
+    old = np.array([keyframe.T_world_camera for keyframe in run.version.keyframes])
+    steps = np.array([inverse(each) for each in old]) @ run.T_world_camera[:, None]
+    moved = []
+    counts = np.bincount(run.keyframe_of_frame, minlength=len(old))
+    starts = np.concatenate([[0], np.cumsum(counts)[:-1]])
+    for place, k in enumerate(run.keyframe_of_frame):
+        first = T_world_keyframe[k] @ steps[place, k]
+        if k + 1 < len(old):
+            second = T_world_keyframe[k + 1] @ steps[place, k + 1]
+            share = (place - starts[k]) / counts[k]
+            moved.append(_between(first, second, share))
+        else:
+            moved.append(first)
+    return np.array(moved)
+
+
+def ate_m(T_estimate: Array, T_truth: Array) -> float:
+    """Return the rmse of positions after the best SE(3) alignment; Umeyama 1991 without scale."""
+    estimate, truth = T_estimate[:, :3, 3], T_truth[:, :3, 3]
+    a, b = estimate - estimate.mean(axis=0), truth - truth.mean(axis=0)
+    U, _, Vt = np.linalg.svd(b.T @ a)
+    rotation = U @ np.diag([1, 1, np.linalg.det(U @ Vt)]) @ Vt
+    return math.sqrt(float(((b - a @ rotation.T) ** 2).sum(axis=1).mean()))
+
+
+def cloud_of(dataset: Dataset, rows: Sequence[int], T_world_camera: Array, voxel_m: float = 0.01) -> PointMap:
+    """Return the cloud of *rows* seen from *T_world_camera*."""
+    cloud = PointMap(MapOptions(voxel_m=voxel_m))
+    for row, T in zip(rows, T_world_camera, strict=True):
+        cloud.add(dataset.read(row), T)
+    return cloud
+
+
+def _between(first: Array, second: Array, share: float) -> Array:
+    """Return a pose between two that are close: positions linearly, rotations by projection."""
+    mean = (1.0 - share) * first + share * second
+    U, _, Vt = np.linalg.svd(mean[:3, :3])
+    mean[:3, :3] = U @ Vt
+    return mean

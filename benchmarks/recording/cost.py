@@ -1,0 +1,237 @@
+"""What a recording costs: the same load on a platform that records and on one that does not, in turns.
+
+    python -m benchmarks.recording.cost [--seconds 60] [--rounds 3] [--robots 100] [--codec zlib] [--out FILE]
+
+Two platforms of the same build run at the same time (`rse-pf local`, two servers of one worker each, Envoy);
+only one of them records.  Robots request 5 poses a second each (200 matches, 30 % wrong, every frame kept)
+from one of them, then from the other: off, on, on, off ...  Latency counts from the planned time.  CPU time
+is that of the processes of the platform that is asked, within the window: its workers, and all of them (load
+balancer, control plane, supervisors, workers, recorders).  A ratio is the median over pairs of rounds.
+
+Defends: recording costs the workers <= 5 % of CPU time, the whole platform <= 20 %; p99 <= 1.1 times; a file
+has <= 12 kB for each command with its payload; no message is dropped.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import signal
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from benchmarks.server.load import LoadPlan, RobotGroup, compiled, hello_file, pnp_file, run_load
+from benchmarks.server.serving import machine, tree
+from rse_pf.config import PlatformSettings
+from rse_pf.errors import ConfigurationError
+from rse_pf.local.firewall import key_file, read_key
+from rse_pf.local.state import PlatformState, read_state, state_folder
+
+FRAMES_PER_S = 5.0
+"""The paper's rate (Sect. 6.2)."""
+BARS = {"workers": 1.05, "platform": 1.20, "p99": 1.1, "bytes": 12_000.0}
+SERVERS = 2
+SETTINGS: dict[str, dict[str, Any]] = {"local": {"start_timeout_s": 120.0}}
+"""A machine that is busy starts slowly; nothing else differs from the defaults."""
+_START_S, _STOP_S = 180.0, 30.0
+_LAST_CHUNK_S = 1.5
+"""After a window, the recorder has written what it got."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RecordingSite:
+    """One platform: its control plane, where robots connect, and its recordings, if it makes any."""
+
+    pid: int
+    state: PlatformState
+    tokens: Path
+    recordings: Path | None
+
+    def cpu_s(self) -> tuple[float, float, float]:
+        """Return the CPU seconds of the workers, of all processes, and of the recorders."""
+        of_all = {pid: _cpu_s(pid) for pid in tree(self.pid)}
+        of = {"rse-pf worker": 0.0, "rse-pf recorder": 0.0}
+        for pid, cpu_s in of_all.items():
+            of[_name(pid)] = of.get(_name(pid), 0.0) + cpu_s
+        return of["rse-pf worker"], sum(of_all.values()), of["rse-pf recorder"]
+
+    def recorded_bytes(self) -> int:
+        """Return the size of its recordings."""
+        return (
+            0 if self.recordings is None else sum(each.stat().st_size for each in self.recordings.iterdir())
+        )
+
+
+def _cpu_s(pid: int) -> float:
+    """Return the CPU seconds of one process by the scheduler's clock, which counts nanoseconds."""
+    total = 0
+    try:
+        for task in Path(f"/proc/{pid}/task").iterdir():
+            total += int((task / "schedstat").read_text().split()[0])
+    except OSError:  # it ended meanwhile
+        return 0.0
+    return total / 1e9
+
+
+def _name(pid: int) -> str:
+    try:
+        return Path(f"/proc/{pid}/comm").read_text().strip()
+    except OSError:
+        return ""
+
+
+@contextmanager
+def running(folder: Path, name: str, robots: int, recordings: Path | None) -> Iterator[RecordingSite]:
+    """Yield a platform called *name*, which records if it has a folder for that; end it with the block."""
+    environment = {**os.environ, "XDG_STATE_HOME": str(folder)}
+    command = [
+        sys.executable, "-m", "rse_pf.cli.main", "local", "--name", name, "--port", "0",
+        "--metrics-port", "0", "--servers", str(SERVERS), "--no-data", "--no-page",
+    ]  # fmt: skip
+    if recordings is not None:
+        command += ["--record", str(recordings)]
+    with (folder / f"{name}.log").open("wb") as log:
+        process = subprocess.Popen(command, env=environment, stdout=log, stderr=log, cwd=folder)
+    try:
+        state = _wait_state(state_folder(name, environment), process)
+        key = read_key(key_file(state_folder(name, environment)))
+        auth = PlatformSettings().auth
+        tokens = folder / f"{name}.tokens"
+        tokens.write_text(
+            "\n".join(
+                key.issue(f"robot-{k}", now=time.time(), token_id=f"t-{k}", settings=auth)
+                for k in range(robots)
+            )
+        )
+        yield RecordingSite(pid=process.pid, state=state, tokens=tokens, recordings=recordings)
+    finally:
+        process.send_signal(signal.SIGINT)
+        try:
+            process.wait(_STOP_S)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
+
+
+def _wait_state(folder: Path, process: subprocess.Popen[bytes]) -> PlatformState:
+    until = time.monotonic() + _START_S
+    while time.monotonic() < until and process.poll() is None:
+        state = read_state(folder)
+        if state is not None and len([each for each in state.servers if each.port]) == SERVERS:
+            return state
+        time.sleep(0.05)  # looks again, with a deadline
+    lines = (folder.parents[1] / f"{folder.name}.log").read_text(errors="replace").splitlines()
+    raise ConfigurationError("a platform did not start", hint=" ".join(lines[-3:]))
+
+
+def one_round(site: RecordingSite, folder: Path, asked: argparse.Namespace, seconds: float) -> dict[str, Any]:
+    """Return what one window of load cost *site*."""
+    marks: dict[str, tuple[float, float, float]] = {}
+    bytes_before = site.recorded_bytes()
+    group = RobotGroup(
+        name="robots", robots=asked.robots, mode="open", rate=FRAMES_PER_S,
+        payload=pnp_file(folder, asked.codec, 0.3),
+    )  # fmt: skip
+    plan = LoadPlan(
+        port=site.state.port, codec=asked.codec, hello=hello_file(folder, asked.codec), groups=(group,),
+        seconds=seconds, warm_up_s=0.5, drain_s=2.0, tokens=site.tokens, sources=8,
+    )  # fmt: skip
+    report = run_load(plan, lambda mark: marks.__setitem__(mark, site.cpu_s()))
+    time.sleep(_LAST_CHUNK_S if site.recordings else 0.0)
+    found = report.groups[0]
+    workers_s, all_s, recorders_s = (marks["end"][k] - marks["begin"][k] for k in range(3))
+    commands = max(1, found.ok + found.failed)
+    # The commands of the warm-up are in the file, too.
+    recorded = commands + asked.robots * FRAMES_PER_S * plan.warm_up_s
+    return {
+        "is_recording": site.recordings is not None, "commands": commands, "ok": found.ok,
+        "not_ok": found.failed + found.lost + found.unsent, "p50_ms": found.latency_ms.p50,
+        "p99_ms": found.latency_ms.p99, "workers_us": 1e6 * workers_s / commands,
+        "platform_us": 1e6 * all_s / commands, "recorders_us": 1e6 * recorders_s / commands,
+        "bytes": (site.recorded_bytes() - bytes_before) / recorded,
+    }  # fmt: skip
+
+
+def summary(rounds: list[dict[str, Any]]) -> dict[str, Any]:
+    """Return the ratios of recording to not recording: medians over pairs of rounds."""
+    off = [each for each in rounds if not each["is_recording"]]
+    on = [each for each in rounds if each["is_recording"]]
+    pairs = list(zip(on, off, strict=True))
+
+    def ratio(name: str) -> float:
+        return statistics.median(a[name] / b[name] for a, b in pairs)
+
+    row = {
+        "workers": ratio("workers_us"), "platform": ratio("platform_us"), "p99": ratio("p99_ms"),
+        "bytes": statistics.median(each["bytes"] for each in on),
+    }  # fmt: skip
+    return {**row, "holds": {name: row[name] <= bar for name, bar in BARS.items()}, "pairs": len(pairs)}
+
+
+def measure(asked: argparse.Namespace) -> dict[str, Any]:
+    """Run all rounds; return the report."""
+    report: dict[str, Any] = {"machine": machine(), "robots": asked.robots, "codec": asked.codec}
+    rounds: list[dict[str, Any]] = []
+    with tempfile.TemporaryDirectory(dir=asked.folder) as made, ExitStack() as stack:
+        folder = Path(made)
+        (folder / "cdk.json").write_text(json.dumps({"context": {"rse-pf": SETTINGS}}))
+        off = stack.enter_context(running(folder, "off", asked.robots, None))
+        on = stack.enter_context(running(folder, "on", asked.robots, folder / "recordings"))
+        for site in (off, on):
+            one_round(site, folder, asked, 2.0)  # warms it up
+        for number in range(asked.rounds):
+            for site in (off, on) if number % 2 == 0 else (on, off):
+                rounds.append(one_round(site, folder, asked, asked.seconds))
+                print_round(rounds[-1])
+    return {**report, "rounds": rounds, **summary(rounds), "load_average_after": machine()["load_average"]}
+
+
+def print_round(found: dict[str, Any]) -> None:
+    """Print one line for a round."""
+    print(
+        f"  {'recording' if found['is_recording'] else 'off':9} {found['commands']:6} commands, "
+        f"{found['not_ok']} not ok, p50 {found['p50_ms']:6.2f} p99 {found['p99_ms']:7.2f} ms; CPU a command: "
+        f"workers {found['workers_us']:6.1f}, platform {found['platform_us']:6.1f}, recorders "
+        f"{found['recorders_us']:.1f} us; "
+        f"{found['bytes'] / 1e3:.2f} kB recorded a command",
+        flush=True,
+    )
+
+
+def main() -> None:
+    """Read the command line, measure, print the figures."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--robots", type=int, default=100)
+    parser.add_argument("--seconds", type=float, default=60.0, help="of each round")
+    parser.add_argument("--rounds", type=int, default=3, help="pairs of rounds")
+    parser.add_argument("--codec", default="zlib", choices=("zlib", "json", "bin"))
+    parser.add_argument("--folder", type=Path, help="disk for recordings (default: that of temporary files)")
+    parser.add_argument("--out", type=Path, help="write the figures as JSON")
+    asked = parser.parse_args()
+    try:
+        compiled()
+        report = measure(asked)
+    except ConfigurationError as error:
+        print(f"skipped: {error.message} ({error.hint})")
+        return
+    for name, bar in BARS.items():
+        print(f"{name:9} {report[name]:9.3f} (bar {bar:g}): {'held' if report['holds'][name] else 'missed'}")
+    print(f"n = {report['pairs']} pairs; load average {report['machine']['load_average']} -> "
+          f"{report['load_average_after']}")  # fmt: skip
+    if asked.out is not None:
+        asked.out.write_text(json.dumps(report, indent=1), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

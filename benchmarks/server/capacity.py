@@ -1,0 +1,284 @@
+"""How many robots one server carries: at 5 frames a second each, and 10,000 of which few are active.
+
+    python -m benchmarks.server.capacity [--workers 1 2] [--codec bin] [--balancer] [--search-only]
+        [--out FILE]
+
+Real PnP (200 matches, 30 % wrong, every frame kept), open loop: send times are fixed before each step, and
+latency counts from the planned time.  A step carries its robots if every command of its window returned a
+pose, with p99 <= 150 ms.  The number is doubled until a step fails twice, and then bisected to 7 %.  Robots,
+server and load generator share the cores.  With ``--balancer`` the robots connect through Envoy to one server
+of one worker for each of *workers*, with tokens.
+
+Then 10,000 robots are connected, of which 500 send one frame a second and the others a ping every 2 s, as
+the SDK does; memory is that which only the server's processes use, growth since before the first robot.
+
+Defends: two workers on two cores carry >= 1,000 robots at 5 frames a second; 10,000 connected robots need
+<= 16 KiB each, and of the active ones none fails.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import contextlib
+import json
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from benchmarks.server.load import LoadPlan, RobotGroup, compiled, hello_file, ping_file, pnp_file, run_load
+from benchmarks.server.serving import BenchServer, cpu_of_tree_s, machine, private_bytes_of_tree
+from rse_pf.config import PlatformSettings
+from rse_pf.errors import ConfigurationError
+from rse_pf.local.control.platform import LocalPlatform
+
+SETTINGS: dict[str, dict[str, Any]] = {
+    "auth": {"required": False},
+    "serving": {
+        "max_robots": 12_000, "max_accepts_per_s": 0.0, "max_handshakes_per_source_per_s": 0.0,
+        "max_unauthenticated": 2000, "max_unauthenticated_per_source": 0,
+    },
+}  # fmt: skip
+"""Robots of a measurement come from few addresses and all at once; every other limit is the default."""
+
+FRAMES_PER_S = 5.0
+"""The paper's rate (Sect. 6.2)."""
+P99_BAR_MS, ROBOTS_BAR, KIB_BAR = 150.0, 1000, 16.0
+FIRST, MOST = 250, 8000
+PRECISION = 1.07
+CONNECTED, ACTIVE = 10_000, 500
+PING_EVERY_S = 2.0
+SOURCES = 8
+WARM_UP_S = 1.0
+DRAIN_S = 1.0
+SEARCH_S = 85.0
+"""No step begins after this time of a search."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ServingSite:
+    """Where robots connect, and how many processes serve them."""
+
+    port: int
+    path: str
+    workers: int
+    tokens: Path | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CapacityStep:
+    """What came of one number of robots."""
+
+    robots: int
+    ok: int
+    failed: int
+    lost: int
+    unsent: int
+    p50_ms: float
+    p99_ms: float
+    late_p99_ms: float
+    codes: dict[str, int]
+    generator_cores: float
+
+    @property
+    def is_carried(self) -> bool:
+        """Whether every command returned a pose in time."""
+        return self.ok > 0 and not (self.failed or self.lost or self.unsent) and self.p99_ms <= P99_BAR_MS
+
+
+def step(site: ServingSite, folder: Path, codec: str, robots: int, seconds: float) -> CapacityStep:
+    """Connect *robots*, let them send, return what came of it."""
+    group = RobotGroup(
+        name="robots", robots=robots, mode="open", rate=FRAMES_PER_S, payload=pnp_file(folder, codec, 0.3)
+    )
+    report = run_load(
+        LoadPlan(
+            port=site.port, path=site.path, codec=codec, hello=hello_file(folder, codec), groups=(group,),
+            seconds=seconds, warm_up_s=WARM_UP_S, drain_s=DRAIN_S, sources=SOURCES, tokens=site.tokens,
+            opening_s=30.0, seed=robots,
+        )
+    )  # fmt: skip
+    found = report.groups[0]
+    return CapacityStep(
+        robots=robots, ok=found.ok, failed=found.failed, lost=found.lost, unsent=found.unsent,
+        p50_ms=found.latency_ms.p50, p99_ms=found.latency_ms.p99, late_p99_ms=found.late_ms.p99,
+        codes=report.codes, generator_cores=report.cpu_s / seconds,
+    )  # fmt: skip
+
+
+def search(try_robots: Callable[[int], CapacityStep], clock: Callable[[], float]) -> list[CapacityStep]:
+    """Return every step on the way to the most robots that are carried; a failed step is tried twice."""
+    steps: list[CapacityStep] = []
+    until = clock() + SEARCH_S
+
+    def is_carried(robots: int) -> bool:
+        for _ in range(2):
+            steps.append(try_robots(robots))
+            print_step(steps[-1])
+            if steps[-1].is_carried or clock() > until:
+                break
+        return steps[-1].is_carried
+
+    carried, failed, robots = 0, 0, FIRST
+    while not failed and robots <= MOST and clock() < until:
+        if is_carried(robots):
+            carried, robots = robots, 2 * robots
+        else:
+            failed = robots
+    while failed > PRECISION * max(carried, 1) and failed > 1 and clock() < until:
+        robots = (carried + failed) // 2
+        if is_carried(robots):
+            carried = robots
+        else:
+            failed = robots
+    return steps
+
+
+def print_step(found: CapacityStep) -> None:
+    """Print one line for a step."""
+    verdict = "carried" if found.is_carried else f"not carried {found.codes or ''}"
+    print(
+        f"  {found.robots:6} robots: p50 {found.p50_ms:7.2f} p99 {found.p99_ms:7.2f} ms, {found.ok} ok, "
+        f"{found.failed} failed, {found.lost} lost, {found.unsent} unsent, late p99 {found.late_p99_ms:.2f} "
+        f"ms, generator {found.generator_cores:.2f} cores: {verdict}",
+        flush=True,
+    )
+
+
+def most_robots(workers: int, codec: str, seconds: float) -> dict[str, Any]:
+    """Search directly, without a balancer."""
+    with serving(workers) as (server, folder):
+        site = ServingSite(port=server.port, path="/ws", workers=workers)
+        return found(site, folder, codec, seconds)
+
+
+async def most_robots_behind_balancer(servers: int, codec: str, seconds: float) -> dict[str, Any]:
+    """Search through Envoy, with one server of one worker for each of *servers*."""
+    settings = PlatformSettings.from_dict({"serving": SETTINGS["serving"]})
+    with tempfile.TemporaryDirectory() as made:
+        folder = Path(made)
+        async with LocalPlatform(settings, state=folder / "state", port=0, servers=servers) as cloud:
+            tokens = folder / "tokens"
+            names = [cloud.issue_token(f"robot-{number}") for number in range(MOST)]
+            tokens.write_text("\n".join(names))
+            site = ServingSite(port=cloud.port, path="/ws", workers=servers, tokens=tokens)
+            return await asyncio.to_thread(found, site, folder, codec, seconds)
+
+
+def found(site: ServingSite, folder: Path, codec: str, seconds: float) -> dict[str, Any]:
+    """Return the most robots that *site* carries, and all steps."""
+    step(site, folder, codec, 20, 1.0)  # warms it up
+    steps = search(lambda robots: step(site, folder, codec, robots, seconds), time.monotonic)
+    most = max((each.robots for each in steps if each.is_carried), default=0)
+    return {"workers": site.workers, "robots": most, "steps": [asdict(each) for each in steps]}
+
+
+def connected(codec: str, seconds: float) -> dict[str, Any]:
+    """Return what 10,000 robots of which 500 are active need and see."""
+    memory: dict[str, int] = {}
+    cpu: dict[str, float] = {}
+    with serving(2) as (server, folder):
+        groups = (
+            RobotGroup(
+                name="idle", robots=CONNECTED - ACTIVE, mode="early", rate=1 / PING_EVERY_S,
+                payload=ping_file(folder, codec),
+            ),
+            RobotGroup(
+                name="active", robots=ACTIVE, mode="open", rate=1.0, payload=pnp_file(folder, codec, 0.3)
+            ),
+        )  # fmt: skip
+        site = ServingSite(port=server.port, path="/ws", workers=2)
+        step(site, folder, codec, 20, 1.0)  # warms it up
+        memory["before"] = private_bytes_of_tree(server.pid)
+
+        def at(mark: str) -> None:
+            memory[mark], cpu[mark] = private_bytes_of_tree(server.pid), cpu_of_tree_s(server.pid)
+
+        report = run_load(
+            LoadPlan(
+                port=server.port, codec=codec, hello=hello_file(folder, codec), groups=groups,
+                seconds=seconds, warm_up_s=2 * WARM_UP_S, drain_s=DRAIN_S, sources=2 * SOURCES,
+            ),
+            at,
+        )  # fmt: skip
+    idle, active = report.group("idle"), report.group("active")
+    return {
+        "robots": report.robots, "connected": report.connected, "opening_s": report.opening_s,
+        "kib_per_robot": (memory["end"] - memory["before"]) / report.robots / 1024,
+        "server_cores": (cpu["end"] - cpu["begin"]) / seconds, "generator_cores": report.cpu_s / seconds,
+        "active": asdict(active), "idle": asdict(idle), "closed": report.closed, "refused": report.refused,
+        "codes": report.codes,
+    }  # fmt: skip
+
+
+@contextlib.contextmanager
+def serving(workers: int) -> Iterator[tuple[BenchServer, Path]]:
+    """Yield a server of *workers* and a folder for files."""
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        BenchServer(Path(folder), workers=workers, **SETTINGS) as server,
+    ):
+        yield server, Path(folder)
+
+
+def print_connected(report: dict[str, Any]) -> None:
+    """Print what 10,000 robots need."""
+    active, idle = report["active"], report["idle"]
+    print(
+        f"{report['connected']} of {report['robots']} robots connected after {report['opening_s']:.1f} s, "
+        f"{report['kib_per_robot']:.1f} KiB each (bar {KIB_BAR:g}); server {report['server_cores']:.2f} "
+        f"cores, generator {report['generator_cores']:.2f}; closed {report['closed']}, "
+        f"failure codes {report['codes']}"
+    )
+    for about, group in (("active robots at 1 frame a second", active), ("other robots, pings", idle)):
+        latency = group["latency_ms"]
+        print(
+            f"{group['robots']} {about}: p50 {latency['p50']:.2f} p99 {latency['p99']:.2f} ms, {group['ok']} "
+            f"ok, {group['failed']} failed, {group['lost']} lost, {group['unsent']} unsent"
+        )
+
+
+def main() -> None:
+    """Read the command line, measure, print the figures."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--workers", type=int, nargs="+", default=[1, 2], help="workers of each search")
+    parser.add_argument("--codec", default="bin", choices=("zlib", "json", "bin"))
+    parser.add_argument("--balancer", action="store_true", help="through Envoy, with tokens")
+    parser.add_argument("--search-only", action="store_true", help="leave the 10,000 robots out")
+    parser.add_argument("--seconds", type=float, default=5.0, help="of each step")
+    parser.add_argument("--out", type=Path, help="write the figures as JSON")
+    asked = parser.parse_args()
+    settings = {"serving": SETTINGS["serving"]} if asked.balancer else SETTINGS
+    report: dict[str, Any] = {"machine": machine(), "settings": settings, "codec": asked.codec}
+    report |= {"balancer": asked.balancer, "seconds": asked.seconds, "searches": []}
+    try:
+        compiled()
+        print(f"{report['machine']}; settings {settings}; {asked.codec}, steps of {asked.seconds:g} s")
+        for workers in asked.workers:
+            print(f"{workers} workers{', through the balancer' if asked.balancer else ''}", flush=True)
+            if asked.balancer:
+                made = asyncio.run(most_robots_behind_balancer(workers, asked.codec, asked.seconds))
+            else:
+                made = most_robots(workers, asked.codec, asked.seconds)
+            report["searches"].append(made)
+            bar = f" (bar {ROBOTS_BAR})" if workers == 2 else ""
+            print(f"{workers} workers carry {made['robots']} robots at {FRAMES_PER_S:g} fps{bar}", flush=True)
+        if not asked.search_only:
+            report["connected"] = connected(asked.codec, 2 * asked.seconds)
+            print_connected(report["connected"])
+    except ConfigurationError as error:
+        print(f"skipped: {error.message} ({error.hint})")
+        report["skipped"] = error.message
+    report["load_average_after"] = machine()["load_average"]
+    print(f"load average {report['machine']['load_average']} -> {report['load_average_after']}")
+    if asked.out is not None:
+        asked.out.write_text(json.dumps(report, indent=1), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,341 @@
+"""The load generator `load.c` from Python: compile it at first use, write its files, run it, read its report.
+
+`compiled` raises ConfigurationError where there is no C compiler; a benchmark then says so and is skipped.
+`run_load` waits for a run of fixed length.  `LoadProcess` is one that a benchmark ends itself, and whose
+samples are cut into windows afterwards.  Both end with their caller, and connect to loopback only.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import shutil
+import signal
+import struct
+import subprocess
+import threading
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from rse_pf.errors import ConfigurationError
+from rse_pf.pnp.problems import make_problem
+from rse_pf.services.pnp import make_request
+from rse_pf.wire import SUBPROTOCOLS, Command, Hello, Message, Ping, make_codec
+
+__all__ = [
+    "OUTCOMES", "SAMPLE", "GroupReport", "LoadPlan", "LoadProcess", "LoadReport", "Percentiles", "RobotGroup",
+    "compiled", "hello_file", "ping_file", "pnp_file", "read_samples", "run_load", "write_messages",
+]  # fmt: skip
+
+Mode = Literal["open", "early", "closed", "idle", "silent"]
+
+SOURCE = Path(__file__).with_name("load.c")
+FLAGS = ("-O2", "-std=c11", "-Wall", "-Wextra", "-Werror")
+LIBRARIES = ("-lz", "-lm")
+PROBLEMS = 64
+"""Different problems of a payload file: enough that no cache answers."""
+
+SAMPLE = np.dtype(
+    [("planned_s", "<f8"), ("latency_s", "<f4"), ("late_s", "<f4"), ("group", "<u4"), ("outcome", "<u4")]
+)
+"""One message of a samples file; times by the monotonic clock, latency NaN where there was no answer."""
+OUTCOMES = ("ok", "failed", "lost", "unsent")
+"""What *outcome* of `SAMPLE` counts."""
+
+_BUILD = Path(__file__).resolve().parents[2] / "build" / "benchmarks"
+_COMPILE_S, _MARGIN_S = 60.0, 20.0
+_REPLIES = {"zlib": "zlib", "json": "json", "bin": "msgpack", "peer": "peer"}
+
+
+def compiled(folder: Path = _BUILD) -> Path:
+    """Return the compiled generator, compiling it where *folder* lacks this version.
+
+    Raises:
+        ConfigurationError: There is no C compiler, or it cannot compile the source.
+    """
+    digest = hashlib.sha256(SOURCE.read_bytes() + " ".join(FLAGS).encode()).hexdigest()[:16]
+    program = folder / f"load-{digest}"
+    if program.exists():
+        return program
+    compiler = shutil.which("cc")
+    if compiler is None:
+        raise ConfigurationError("the load generator needs a C compiler", hint="install gcc and zlib1g-dev")
+    folder.mkdir(parents=True, exist_ok=True)
+    made = folder / f"load-{digest}.{threading.get_ident()}.new"
+    command = [compiler, *FLAGS, str(SOURCE), "-o", str(made), *LIBRARIES]
+    ended = subprocess.run(command, capture_output=True, text=True, timeout=_COMPILE_S, check=False)
+    if ended.returncode:
+        raise ConfigurationError(
+            f"{compiler} cannot compile {SOURCE.name}",
+            hint=(ended.stderr.strip().splitlines() or ["no message"])[0] + "; zlib.h is in zlib1g-dev",
+        )
+    made.replace(program)
+    return program
+
+
+def write_messages(file: Path, messages: Iterable[bytes]) -> Path:
+    """Write *messages*, each after its length; message k must have the id k.  Return *file*."""
+    file.write_bytes(b"".join(struct.pack("<I", len(each)) + each for each in messages))
+    return file
+
+
+def hello_file(folder: Path, codec_name: str) -> Path:
+    """Write the first message of a robot; return its file."""
+    return _encoded(folder / f"hello.{codec_name}", codec_name, [Hello()])
+
+
+def ping_file(folder: Path, codec_name: str) -> Path:
+    """Write the ping of a robot; return its file."""
+    return _encoded(folder / f"ping.{codec_name}", codec_name, [Ping(sent_s=1.0)])
+
+
+def pnp_file(folder: Path, codec_name: str, outlier_ratio: float, **fields: Any) -> Path:
+    """Write `PROBLEMS` commands of 200 matches, every frame kept; return their file.
+
+    *fields* are those of a command, such as ``deadline_ms``.
+    """
+    commands: list[Command] = []
+    for seed in range(PROBLEMS):
+        p = make_problem(seed=seed, outlier_ratio=outlier_ratio)
+        request = make_request(p.points_world, p.pixels, p.camera, binary=codec_name == "bin")
+        commands.append(Command(id=seed, service="pnp", payload=request, keep=True, **fields))
+    file = folder / f"pnp-{round(100 * outlier_ratio)}.{codec_name}"
+    return _encoded(file, codec_name, commands)
+
+
+def _encoded(file: Path, codec_name: str, messages: Sequence[Message]) -> Path:
+    codec = make_codec(codec_name)
+    return write_messages(file, [codec.encode(each) for each in messages])
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RobotGroup:
+    """Robots that send alike: *rate* messages a second each (open loop), or as fast as they are answered."""
+
+    name: str
+    robots: int
+    mode: Mode
+    rate: float = 0.0
+    payload: Path | None = None
+
+    def option(self) -> str:
+        """Return the group as `load` reads it."""
+        return f"{self.name}:{self.robots}:{self.mode}:{self.rate:g}:{self.payload or '-'}"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LoadPlan:
+    """One run of the generator against one port of loopback.
+
+    *codec* is ``zlib``, ``json``, ``bin``, or ``peer`` for the paper's design, which has no sub-protocol.
+    The window begins *warm_up_s* after the last robot has connected, and unanswered messages are lost
+    *drain_s* after its end.  Connections come from *sources* addresses, in turn.
+    """
+
+    port: int
+    groups: tuple[RobotGroup, ...]
+    codec: str = "bin"
+    path: str = "/ws"
+    hello: Path | None = None
+    tokens: Path | None = None
+    seconds: float = 4.0
+    warm_up_s: float = 0.5
+    drain_s: float = 4.0
+    opening_s: float = 60.0
+    sources: int = 1
+    first_source: int = 1
+    at_once: int = 64
+    reopen_s: float = 0.0
+    seed: int = 1
+    samples: Path | None = None
+
+    def command(self, program: Path) -> list[str]:
+        """Return the command line."""
+        values: dict[str, object] = {
+            "port": self.port, "path": self.path, "reply": _REPLIES[self.codec], "seconds": self.seconds,
+            "warm-up": self.warm_up_s, "drain": self.drain_s, "opening": self.opening_s,
+            "sources": self.sources, "first-source": self.first_source, "at-once": self.at_once,
+            "reopen": self.reopen_s, "seed": self.seed, "hello": self.hello, "tokens": self.tokens,
+            "samples": self.samples, "subprotocol": SUBPROTOCOLS.get(self.codec),
+        }  # fmt: skip
+        made = [str(program)]
+        for name, value in values.items():
+            made += [] if value is None else [f"--{name}", str(value)]
+        for group in self.groups:
+            made += ["--group", group.option()]
+        return made
+
+
+@dataclass(frozen=True, slots=True)
+class Percentiles:
+    """Percentiles of times, ms; NaN without any."""
+
+    n: int
+    p50: float
+    p95: float
+    p99: float
+    p999: float
+    max: float
+
+    @classmethod
+    def of(cls, found: dict[str, Any]) -> Percentiles:
+        """Return what a report says."""
+        names = ("p50", "p95", "p99", "p999", "max")
+        return cls(found["n"], *(math.nan if found[name] is None else float(found[name]) for name in names))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class GroupReport:
+    """What came of the messages that one group planned within the window.
+
+    *lost* ones were sent and not answered, *unsent* ones found no open connection.  *late_ms* is how late
+    this generator itself sent.  *answered_in_window* counts answers by the time of their arrival.
+    """
+
+    name: str
+    robots: int
+    ok: int
+    failed: int
+    lost: int
+    unsent: int
+    answered_in_window: int
+    latency_ms: Percentiles
+    late_ms: Percentiles
+
+    @property
+    def is_clean(self) -> bool:
+        """Whether every message was answered by a result."""
+        return self.ok > 0 and not self.failed and not self.lost and not self.unsent
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LoadReport:
+    """What came of a run; *closed*, *refused* and *codes* count closes, handshake statuses, failure codes."""
+
+    robots: int
+    connected: int
+    opening_s: float
+    window_s: tuple[float, float]
+    cpu_s: float
+    timed_out: bool
+    unmatched: int
+    refused: dict[str, int]
+    closed: dict[str, int]
+    codes: dict[str, int]
+    groups: tuple[GroupReport, ...]
+
+    @classmethod
+    def from_json(cls, text: str) -> LoadReport:
+        """Read what the generator printed."""
+        found = json.loads(text)
+        groups = tuple(
+            GroupReport(
+                **{**each, "latency_ms": Percentiles.of(each["latency_ms"])}
+                | {"late_ms": Percentiles.of(each["late_ms"])}
+            )
+            for each in found.pop("groups")
+        )
+        return cls(**{**found, "window_s": tuple(found["window_s"]), "groups": groups})
+
+    def group(self, name: str) -> GroupReport:
+        """Return the report of one group."""
+        return next(each for each in self.groups if each.name == name)
+
+
+class LoadProcess:
+    """``with LoadProcess(plan) as load``: a generator that runs until `stop`, or for the plan's time.
+
+    *on_mark* is called in a thread with ``begin`` and ``end`` when the window begins and ends.  *prefix*
+    starts the generator, such as ``("nice", "-n", "19")``.
+    """
+
+    def __init__(
+        self,
+        plan: LoadPlan,
+        on_mark: Callable[[str], None] = lambda mark: None,
+        prefix: Sequence[str] = (),
+    ) -> None:
+        self.plan = plan
+        self._prefix = prefix
+        self._on_mark = on_mark
+        self._begun = threading.Event()
+        self._errors: list[str] = []
+
+    def __enter__(self) -> LoadProcess:
+        self._process = subprocess.Popen(
+            [*self._prefix, *self.plan.command(compiled())],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        self._marks = threading.Thread(target=self._read_marks, daemon=True)
+        self._marks.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._process.poll() is None:
+            self._process.kill()
+        self._process.wait()
+        self._marks.join(_MARGIN_S)
+        assert self._process.stdout is not None
+        self._process.stdout.close()
+
+    def wait_begun(self) -> None:
+        """Wait until the window begins; raises ConfigurationError if it does not in time."""
+        limit_s = self.plan.opening_s + self.plan.warm_up_s + _MARGIN_S
+        if not self._begun.wait(limit_s) or self._process.poll() not in (None, 0):
+            raise ConfigurationError("the load generator did not begin", hint=" ".join(self._errors)[-300:])
+
+    def result(self) -> LoadReport:
+        """Wait for the end of the plan's time and return the report."""
+        plan = self.plan
+        limit_s = plan.opening_s + plan.warm_up_s + plan.seconds + plan.drain_s + _MARGIN_S
+        try:
+            self._process.wait(limit_s)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+        assert self._process.stdout is not None
+        told = self._process.stdout.read()
+        self._marks.join(_MARGIN_S)
+        if self._process.wait() != 0 or not told:
+            raise ConfigurationError("the load generator failed", hint=" ".join(self._errors)[-300:])
+        return LoadReport.from_json(told)
+
+    def stop(self) -> LoadReport:
+        """End the window now and return the report."""
+        self._process.send_signal(signal.SIGTERM)
+        return self.result()
+
+    def _read_marks(self) -> None:
+        assert self._process.stderr is not None
+        with self._process.stderr as lines:
+            for line in lines:
+                mark = line.split(" ", 1)[0]
+                if mark in ("begin", "end"):
+                    self._on_mark(mark)
+                    self._begun.set()
+                else:
+                    self._errors.append(line.strip())
+        self._begun.set()
+
+
+def run_load(
+    plan: LoadPlan, on_mark: Callable[[str], None] = lambda mark: None, prefix: Sequence[str] = ()
+) -> LoadReport:
+    """Run *plan* to its end and return the report; raises ConfigurationError if the generator fails."""
+    with LoadProcess(plan, on_mark, prefix) as load:
+        return load.result()
+
+
+def read_samples(file: Path) -> npt.NDArray[np.void]:
+    """Return the messages of a run, an array of `SAMPLE`, in the order of their outcomes."""
+    return np.fromfile(file, dtype=SAMPLE)

@@ -1,0 +1,342 @@
+"""Our server beside the paper's own design (nginx, Lua, OpenCV), in one run, with one load generator.
+
+    python -m benchmarks.server.peer --peer FOLDER [--rounds 7] [--seconds 3.5] [--out FILE]
+
+*FOLDER* holds the sources of the paper's design, and its README says which packages it needs; without them,
+one line says what is missing and nothing is measured.  Two workers each, 200 matches, 30 and 50 % of them
+wrong, JSON+zlib and binary (the paper's design speaks JSON+zlib only): one robot in a closed loop, and 100
+robots at 5 frames a second in an open loop.  The servers take turns within each round, so that a slower
+machine slows both.  CPU is user and system time of the whole process tree over the answers that arrived
+meanwhile; the table shows medians of the rounds.
+
+Defends: CPU per request >= 10 times less (JSON+zlib) and 14 times (binary) at 30 %, 30 and 40 times at 50 %;
+p99 of 100 robots at 30 % >= 8 times (JSON+zlib) and 12 times (binary) better, and <= 4 times the own p50.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import itertools
+import json
+import math
+import shutil
+import socket
+import statistics
+import subprocess
+import tempfile
+import time
+import zlib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from benchmarks.server.load import (
+    LoadPlan,
+    RobotGroup,
+    compiled,
+    hello_file,
+    pnp_file,
+    run_load,
+    write_messages,
+)
+from benchmarks.server.serving import UNLIMITED, BenchServer, cpu_of_tree_s, machine
+from rse_pf.errors import ConfigurationError
+from rse_pf.pnp.problems import make_problem
+
+WORKERS = 2
+FRAMES_PER_S = 5.0
+"""The paper's rate (Sect. 6.2)."""
+MANY = 100
+OUTLIERS = (0.3, 0.5)
+CPU_BARS = {(0.3, "zlib"): 10.0, (0.3, "bin"): 14.0, (0.5, "zlib"): 30.0, (0.5, "bin"): 40.0}
+P99_BARS = {"zlib": 8.0, "bin": 12.0}
+SPREAD_BAR = 4.0
+"""Own p99 over own p50 of 100 robots at 30 %."""
+PEER, ZLIB, BINARY = "peer", "zlib", "bin"
+SYSTEMS = (PEER, ZLIB, BINARY)
+PROBLEMS = 64
+
+_FILES = ("nginx.conf.tmpl", "pnp.lua", "pnp_so.cpp", "pnpmod.lua", "resty")
+_MODULE = Path("/usr/lib/nginx/modules/ngx_http_lua_module.so")
+_HEADERS = Path("/usr/include/opencv4")
+_START_S, _COMPILE_S, _DRAIN_S = 10.0, 120.0, 1.5
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MeasuredServer:
+    """One side of the comparison: its port, its process, and how the generator talks to it."""
+
+    codec: str
+    port: int
+    pid: int
+    path: str
+    hello: Path | None
+    payloads: dict[float, Path]
+
+
+def missing(folder: Path | None) -> str:
+    """Return what the paper's design lacks on this machine, empty if nothing."""
+    if folder is None:
+        return "no --peer FOLDER with the paper's design"
+    lacks = [str(folder / name) for name in _FILES if not (folder / name).exists()]
+    lacks += ["nginx"] if _nginx() is None else []
+    lacks += [str(each) for each in (_MODULE, _HEADERS) if not each.exists()]
+    lacks += ["g++"] if shutil.which("g++") is None else []
+    return f"the paper's design lacks {', '.join(lacks)}" if lacks else ""
+
+
+def _nginx() -> str | None:
+    return shutil.which("nginx") or shutil.which("nginx", path="/usr/sbin")
+
+
+def _free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port: int = probe.getsockname()[1]
+    return port
+
+
+def peer_file(folder: Path, outlier_ratio: float) -> Path:
+    """Write the same problems as `pnp_file` in the words of the paper's design; return their file."""
+    messages = []
+    for seed in range(PROBLEMS):
+        p = make_problem(seed=seed, outlier_ratio=outlier_ratio)
+        document = {
+            "cmd": "pnp", "id": seed, "K": [p.camera.fx, p.camera.fy, p.camera.cx, p.camera.cy],
+            "p3": [round(float(v), 4) for v in p.points_world.ravel()],
+            "p2": [round(float(v), 2) for v in p.pixels.ravel()],
+        }  # fmt: skip
+        messages.append(zlib.compress(json.dumps(document).encode(), 6))
+    return write_messages(folder / f"peer-{round(100 * outlier_ratio)}", messages)
+
+
+@contextlib.contextmanager
+def paper_design(sources: Path, folder: Path) -> Iterator[tuple[int, int]]:
+    """Build and run the paper's design in *folder*; yield its port and process id.
+
+    Raises:
+        ConfigurationError: It cannot be compiled, or nginx does not start.
+    """
+    (folder / "lua").mkdir(parents=True)
+    shutil.copytree(sources / "resty", folder / "lua" / "resty")
+    shutil.copy(sources / "pnp.lua", folder)
+    module = (sources / "pnpmod.lua").read_text().replace("@D@", str(folder))
+    (folder / "lua" / "pnpmod.lua").write_text(module)
+    port, text = _free_port(), (sources / "nginx.conf.tmpl").read_text()
+    for mark, value in {"@D@": str(folder), "@PORT@": str(port), "@CACHE@": "on"}.items():
+        text = text.replace(mark, value)
+    (folder / "nginx.conf").write_text(text)
+    command = [
+        "g++", "-O2", "-shared", "-fPIC", f"-I{_HEADERS}", str(sources / "pnp_so.cpp"), "-o",
+        str(folder / "libpnp.so"), "-lopencv_calib3d", "-lopencv_core",
+    ]  # fmt: skip
+    ended = subprocess.run(command, capture_output=True, text=True, timeout=_COMPILE_S, check=False)
+    if ended.returncode:
+        raise ConfigurationError("the paper's design cannot be compiled", hint=ended.stderr[:300])
+    nginx = _nginx()
+    assert nginx is not None
+    with (folder / "output").open("wb") as output:
+        process = subprocess.Popen(
+            [nginx, "-c", folder / "nginx.conf", "-p", folder], stdout=output, stderr=output
+        )
+    try:
+        until = time.monotonic() + _START_S
+        while not _listens(port):
+            if process.poll() is not None or time.monotonic() > until:
+                told = (folder / "output").read_text(errors="replace")
+                raise ConfigurationError("nginx does not start", hint=told[-300:])
+            time.sleep(0.05)  # looks again, with a deadline
+        yield port, process.pid
+    finally:
+        process.terminate()
+        try:
+            process.wait(_START_S)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
+
+
+def _listens(port: int) -> bool:
+    try:
+        socket.create_connection(("127.0.0.1", port), 1.0).close()
+    except OSError:
+        return False
+    return True
+
+
+def measure(
+    server: MeasuredServer, outliers: float, robots: int, seconds: float, seed: int
+) -> dict[str, Any]:
+    """Return the figures of one run."""
+    cpu: dict[str, float] = {}
+    group = RobotGroup(
+        name="robots", robots=robots, mode="closed" if robots == 1 else "open",
+        rate=0.0 if robots == 1 else FRAMES_PER_S, payload=server.payloads[outliers],
+    )  # fmt: skip
+    plan = LoadPlan(
+        port=server.port, path=server.path, codec=server.codec, hello=server.hello, groups=(group,),
+        seconds=seconds, drain_s=_DRAIN_S, seed=seed,
+    )  # fmt: skip
+
+    def at(mark: str) -> None:
+        cpu[mark] = cpu_of_tree_s(server.pid)
+
+    report = run_load(plan, at)
+    if report.connected < robots:
+        raise ConfigurationError(f"{report.connected} of {robots} robots are connected", hint=str(report))
+    found = report.groups[0]
+    answers = found.answered_in_window
+    latency = found.latency_ms
+    return {
+        "system": server.codec, "outliers": outliers, "robots": robots, "ok": found.ok,
+        "failed": found.failed, "lost": found.lost, "unsent": found.unsent,
+        "cpu_us": 1e6 * (cpu["end"] - cpu["begin"]) / answers if answers else math.nan,
+        "p50_ms": latency.p50, "p99_ms": latency.p99, "late_p99_ms": found.late_ms.p99,
+        "generator_cpu_us": 1e6 * report.cpu_s / answers if answers else math.nan,
+    }  # fmt: skip
+
+
+def play(servers: list[MeasuredServer], rounds: int, seconds: float) -> list[dict[str, Any]]:
+    """Measure every row *rounds* times; the servers take turns, in changing order."""
+    rows = []
+    for number in range(rounds):
+        order = servers if number % 2 == 0 else servers[::-1]
+        for outliers in OUTLIERS:
+            for robots in (1, MANY):
+                rows += [
+                    {"round": number, **measure(server, outliers, robots, seconds, number + 1)}
+                    for server in order
+                ]
+    return rows
+
+
+def summarize(rounds: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Return one row for each load and system: medians of the rounds, and ratios to the paper's design."""
+    rows: list[dict[str, Any]] = []
+    for outliers, robots in itertools.product(OUTLIERS, (1, MANY)):
+        chosen = [each for each in rounds if (each["outliers"], each["robots"]) == (outliers, robots)]
+        peer = _medians(chosen, PEER)
+        for system in SYSTEMS:
+            row = _medians(chosen, system)
+            ratios = {
+                "cpu_ratio": peer["cpu_us"] / row["cpu_us"],
+                "p99_ratio": peer["p99_ms"] / row["p99_ms"],
+            }
+            rows.append({"outliers": outliers, "robots": robots, "system": system, **row, **ratios})
+    return rows
+
+
+def _medians(rounds: list[dict[str, Any]], system: str) -> dict[str, Any]:
+    chosen = [each for each in rounds if each["system"] == system]
+    times = ("cpu_us", "p50_ms", "p99_ms", "late_p99_ms", "generator_cpu_us")
+    row: dict[str, Any] = {name: statistics.median(each[name] for each in chosen) for name in times}
+    return row | {name: sum(each[name] for each in chosen) for name in ("ok", "failed", "lost", "unsent")}
+
+
+def bars(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Return each bar with what was measured and whether it holds."""
+    found = []
+
+    def bar(what: str, figure: float, limit: float, *, is_least: bool = True) -> None:
+        holds = figure >= limit if is_least else figure <= limit
+        sign = ">=" if is_least else "<="
+        found.append({"what": what, "figure": figure, "bar": f"{sign} {limit:g}", "holds": holds})
+
+    for row in rows:
+        system, outliers, robots = row["system"], row["outliers"], row["robots"]
+        if system == PEER:
+            continue
+        about = f"{system}, {round(100 * outliers)} % wrong, {robots} robots"
+        bar(f"CPU ratio, {about}", row["cpu_ratio"], CPU_BARS[outliers, system])
+        if robots == MANY and outliers == OUTLIERS[0]:
+            bar(f"p99 ratio, {about}", row["p99_ratio"], P99_BARS[system])
+            bar(f"own p99 / p50, {about}", row["p99_ms"] / row["p50_ms"], SPREAD_BAR, is_least=False)
+        bar(f"failed and lost, {about}", row["failed"] + row["lost"] + row["unsent"], 0, is_least=False)
+    return found
+
+
+def table(rows: list[dict[str, Any]]) -> str:
+    """Return the rows as Markdown."""
+    names = {PEER: "paper's design", ZLIB: "JSON+zlib", BINARY: "binary"}
+    lines = [
+        "| wrong | robots | server | CPU us | ratio | p50 ms | p99 ms | ratio | late, p99 ms | ok | not ok |",
+        "|---|---|---|---|---|---|---|---|---|---|---|",
+    ]
+    for row in rows:
+        late = "" if math.isnan(row["late_p99_ms"]) else f"{row['late_p99_ms']:.2f}"
+        lines.append(
+            f"| {round(100 * row['outliers'])} % | {row['robots']} | {names[row['system']]} | "
+            f"{row['cpu_us']:.0f} | {row['cpu_ratio']:.1f} | {row['p50_ms']:.2f} | {row['p99_ms']:.2f} | "
+            f"{row['p99_ratio']:.1f} | {late} | {row['ok']} | {row['failed'] + row['lost'] + row['unsent']} |"
+        )
+    return "\n".join(lines)
+
+
+def run(sources: Path, rounds: int, seconds: float) -> dict[str, Any]:
+    """Start both, measure, return the report; raises ConfigurationError where one does not start."""
+    compiled()
+    before = machine()
+    with tempfile.TemporaryDirectory() as made, contextlib.ExitStack() as stack:
+        folder = Path(made)
+        (folder / "ours").mkdir()
+        port, pid = stack.enter_context(paper_design(sources.resolve(), folder / "peer"))
+        ours = stack.enter_context(BenchServer(folder / "ours", workers=WORKERS, **UNLIMITED))
+        payloads = {outliers: peer_file(folder, outliers) for outliers in OUTLIERS}
+        servers = [MeasuredServer(codec=PEER, port=port, pid=pid, path="/pnp", hello=None, payloads=payloads)]
+        for codec in (ZLIB, BINARY):
+            payloads = {outliers: pnp_file(folder, codec, outliers) for outliers in OUTLIERS}
+            servers.append(
+                MeasuredServer(
+                    codec=codec, port=ours.port, pid=ours.pid, path="/ws", payloads=payloads,
+                    hello=hello_file(folder, codec),
+                )
+            )  # fmt: skip
+        for server in servers:
+            measure(server, OUTLIERS[0], 1, 0.5, 0)  # warms it up
+        began = time.monotonic()
+        found = play(servers, rounds, seconds)
+    rows = summarize(found)
+    return {
+        "machine": before, "load_average_after": machine()["load_average"], "workers": WORKERS,
+        "settings": UNLIMITED, "seconds": seconds, "took_s": round(time.monotonic() - began, 1),
+        "rows": rows, "bars": bars(rows), "rounds": found,
+    }  # fmt: skip
+
+
+def main() -> None:
+    """Read the command line, measure, print the table."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--peer", type=Path, metavar="FOLDER", help="sources of the paper's design")
+    parser.add_argument("--rounds", type=int, default=7)
+    parser.add_argument("--seconds", type=float, default=3.5, help="of each run")
+    parser.add_argument("--out", type=Path, help="write the figures as JSON")
+    asked = parser.parse_args()
+    reason, report = missing(asked.peer), {}
+    if not reason:
+        try:
+            report = run(asked.peer, asked.rounds, asked.seconds)
+        except ConfigurationError as error:
+            reason = f"{error.message} ({error.hint})"
+    if reason:
+        print(f"skipped: {reason}")
+        report = {"skipped": reason}
+    else:
+        print(
+            f"{report['machine']['cores']} cores, load {report['machine']['load_average'][0]} -> "
+            f"{report['load_average_after'][0]}; {asked.rounds} rounds of {asked.seconds:g} s a row, "
+            f"{WORKERS} workers each; {report['took_s']:g} s in all"
+        )
+        print(table(report["rows"]))
+        for each in report["bars"]:
+            verdict = "holds" if each["holds"] else "MISSED"
+            print(f"{each['what']:46} {each['figure']:8.2f}  {each['bar']:>6}  {verdict}")
+    if asked.out is not None:
+        asked.out.write_text(json.dumps(report, indent=1), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

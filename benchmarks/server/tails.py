@@ -1,0 +1,355 @@
+"""p99 of robots beside hostile or heavy neighbours, as a ratio to quiet windows of the same run.
+
+    python -m benchmarks.server.tails [--only bombs] [--rounds 7] [--out FILE]
+
+Robots request 5 poses a second each (200 matches, 30 % wrong, every frame kept), from one run of the load
+generator; quiet and loaded windows alternate, so that a slower machine slows both.  Latency counts from the
+planned time.  A row's ratio is the median of its loaded windows' p99 over that of its quiet ones.
+
+==========  ===========================================================================  ======
+row         beside the robots                                                            bar
+==========  ===========================================================================  ======
+bombs       20 robots; 1,000 messages of 255 KB that would inflate to 256 MiB            2
+rate        99 robots; one robot at 100 times their rate, back when it is cut off        1.5
+silent      100 robots; 1,000 TCP connections that say nothing, 50 from each address     2
+uploads     20 robots; objects of 1 MiB to the data service, which is killed meanwhile   1.1
+==========  ===========================================================================  ======
+
+The first three rows meet one server of two workers directly, the last one the whole platform through the load
+balancer.  The neighbours run at the lowest priority: in the field their work costs a server nothing.
+
+Defends: those bars, and that every command of the robots is answered by a pose.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import json
+import math
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from benchmarks.data.faults import UPLOADERS, Uploads, kill_during_uploads
+from benchmarks.hostile import attacks
+from benchmarks.server.load import (
+    LoadPlan,
+    LoadProcess,
+    RobotGroup,
+    compiled,
+    hello_file,
+    pnp_file,
+    read_samples,
+    run_load,
+)
+from benchmarks.server.serving import BenchServer, machine, private_bytes_of_tree
+from rse_pf.config import PlatformSettings
+from rse_pf.errors import ConfigurationError
+from rse_pf.local.control.control_plane import ControlOptions
+from rse_pf.local.control.platform import LocalPlatform
+
+CODEC = "bin"
+FRAMES_PER_S = 5.0
+"""The paper's rate (Sect. 6.2)."""
+SETTINGS: dict[str, dict[str, dict[str, Any]]] = {
+    "bombs": {}, "rate": {}, "silent": {"serving": {"trusted_proxies": 0}}, "uploads": {},
+}  # fmt: skip
+"""Settings of each row beside the defaults: without a proxy, limits for each address count."""
+BARS = {"bombs": 2.0, "rate": 1.5, "silent": 2.0, "uploads": 1.1}
+WORKERS = 2
+LONGEST_S = 600.0
+SETTLE_S, PAUSE_S = 1.0, 0.5
+NEIGHBOURS_FIRST_SOURCE = 100
+BOMBERS, BOMB_WINDOW_S, BOMB_ROUNDS = 100, 6.0, 5
+RATE_WINDOW_S, RATE_FACTOR, RATE_REOPEN_S = 4.0, 100.0, 0.1
+SILENT_WINDOW_S, SILENT, SILENT_SOURCES = 5.0, 1000, 20
+UPLOAD_WINDOW_S, UPLOADS, UPLOAD_ROUNDS, MIB = 5.0, 24, 5, 1 << 20
+_LOWEST_PRIORITY = ("nice", "-n", "19")
+_ATTACK_S = 60.0
+
+Neighbour = Callable[[], dict[str, Any]]
+"""What begins at once, and returns what came of it when it has ended."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LoadWindow:
+    """One window of a run, by the monotonic clock."""
+
+    is_loaded: bool
+    begin_s: float
+    end_s: float
+
+
+def seen(samples: npt.NDArray[np.void], windows: Sequence[LoadWindow]) -> list[dict[str, Any]]:
+    """Return what the robots saw in each window."""
+    rows = []
+    for window in windows:
+        planned = samples["planned_s"]
+        chosen = samples[(planned >= window.begin_s) & (planned < window.end_s)]
+        took_ms = 1e3 * chosen["latency_s"][chosen["outcome"] == 0]
+        p50, p99 = np.percentile(took_ms, [50, 99]) if len(took_ms) else (math.nan, math.nan)
+        rows.append(
+            {
+                "is_loaded": window.is_loaded, "seconds": window.end_s - window.begin_s, "n": len(chosen),
+                "not_ok": int(len(chosen) - len(took_ms)), "p50_ms": float(p50), "p99_ms": float(p99),
+            }
+        )  # fmt: skip
+    return rows
+
+
+def summary(name: str, windows: list[dict[str, Any]], outcomes: list[dict[str, Any]]) -> dict[str, Any]:
+    """Return one row of the table."""
+    row: dict[str, Any] = {"row": name, "bar": BARS[name], "outcomes": _added(outcomes), "windows": windows}
+    for kind, is_loaded in (("quiet", False), ("loaded", True)):
+        chosen = [each for each in windows if each["is_loaded"] == is_loaded]
+        row[kind] = {
+            "windows": len(chosen), "n": sum(each["n"] for each in chosen),
+            "not_ok": sum(each["not_ok"] for each in chosen),
+            "p50_ms": statistics.median(each["p50_ms"] for each in chosen),
+            "p99_ms": statistics.median(each["p99_ms"] for each in chosen),
+        }  # fmt: skip
+    row["ratio"] = row["loaded"]["p99_ms"] / row["quiet"]["p99_ms"]
+    row["holds"] = row["ratio"] <= row["bar"] and not row["loaded"]["not_ok"]
+    return row
+
+
+def _added(outcomes: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Return counts added up, and the largest of all other figures."""
+    made: dict[str, Any] = {}
+    for each in outcomes:
+        for name, value in each.items():
+            if isinstance(value, dict):
+                made[name] = dict(Counter(made.get(name, {})) + Counter(value))
+            elif isinstance(value, int):
+                made[name] = made.get(name, 0) + value
+            else:
+                made[name] = max(made.get(name, value), value)
+    return made
+
+
+def robots_of(name: str, count: int, folder: Path, token_of: Callable[[str], str], port: int) -> LoadPlan:
+    """Return the plan of the robots that are measured."""
+    group = RobotGroup(
+        name="robots", robots=count, mode="open", rate=FRAMES_PER_S, payload=pnp_file(folder, CODEC, 0.3)
+    )
+    tokens = folder / f"{name}.tokens"
+    tokens.write_text("\n".join(token_of(f"{name}-{number}") for number in range(count)))
+    return LoadPlan(
+        port=port, codec=CODEC, hello=hello_file(folder, CODEC), tokens=tokens, groups=(group,),
+        seconds=LONGEST_S, warm_up_s=SETTLE_S, drain_s=1.0, samples=folder / f"{name}.samples", sources=4,
+    )  # fmt: skip
+
+
+def alternate(
+    plan: LoadPlan, rounds: int, window_s: float, prepare: Callable[[int], Neighbour]
+) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
+    """Return what the robots saw in quiet and loaded windows in turn, and what came of the neighbours."""
+    windows: list[LoadWindow] = []
+    outcomes = []
+    with LoadProcess(plan) as load:
+        load.wait_begun()
+        for number in range(rounds):
+            neighbour = prepare(number)
+            time.sleep(PAUSE_S)  # pauses and windows are parameters of the measurement
+            began = time.monotonic()
+            time.sleep(window_s)
+            middle = time.monotonic()
+            outcomes.append(neighbour())
+            time.sleep(max(0.0, middle + window_s - time.monotonic()))
+            windows.append(LoadWindow(is_loaded=False, begin_s=began, end_s=middle))
+            windows.append(LoadWindow(is_loaded=True, begin_s=middle, end_s=time.monotonic()))
+        load.stop()
+    assert plan.samples is not None
+    return seen(read_samples(plan.samples), windows), outcomes
+
+
+@contextmanager
+def one_server(row: str) -> Iterator[tuple[BenchServer, Path]]:
+    """Yield a server that requires tokens, and a folder for files."""
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        BenchServer(Path(folder), workers=WORKERS, **SETTINGS[row]) as server,
+    ):
+        yield server, Path(folder)
+
+
+def bombs(rounds: int) -> dict[str, Any]:
+    """Measure 20 robots beside 1,000 zip bombs."""
+    with one_server("bombs") as (server, folder):
+        url = f"ws://127.0.0.1:{server.port}/ws"
+
+        def prepare(number: int) -> Neighbour:
+            tokens = json.dumps([server.token(f"hostile-{number}-{row}") for row in range(BOMBERS)])
+            process = subprocess.Popen(
+                [*_LOWEST_PRIORITY, sys.executable, attacks.__file__, "zip-bombs", url],
+                stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
+            )  # fmt: skip
+            assert process.stdin is not None
+            assert process.stdout is not None
+            process.stdin.write(tokens + "\n")
+            process.stdin.flush()
+            process.stdout.readline()
+            memory = private_bytes_of_tree(server.pid)
+
+            def go() -> dict[str, Any]:
+                try:
+                    told, _ = process.communicate("go\n", timeout=_ATTACK_S)
+                finally:
+                    process.kill()
+                    process.wait()
+                if not told:
+                    raise ConfigurationError("the process with the bombs failed", hint="see its output above")
+                found: dict[str, Any] = json.loads(told)
+                grown = private_bytes_of_tree(server.pid) - memory
+                return {name: found[name] for name in ("tried", "refused", "ends", "slowest_s")} | {
+                    "grown_mib": grown / MIB
+                }
+
+            return go
+
+        plan = robots_of("calm", 20, folder, server.token, server.port)
+        return summary("bombs", *alternate(plan, min(rounds, BOMB_ROUNDS), BOMB_WINDOW_S, prepare))
+
+
+def generator(plan: LoadPlan) -> dict[str, Any]:
+    """Run a second load generator at the lowest priority, and return its counts."""
+    report = run_load(plan, prefix=_LOWEST_PRIORITY)
+    found = report.groups[0]
+    return {
+        "ok": found.ok, "failed": found.failed, "lost": found.lost, "unsent": found.unsent,
+        "closed": report.closed, "refused": report.refused, "codes": report.codes,
+    }  # fmt: skip
+
+
+def rate(rounds: int) -> dict[str, Any]:
+    """Measure 99 robots beside one at 100 times their rate."""
+    with one_server("rate") as (server, folder):
+        group = RobotGroup(
+            name="fast", robots=1, mode="open", rate=RATE_FACTOR * FRAMES_PER_S,
+            payload=pnp_file(folder, CODEC, 0.3),
+        )  # fmt: skip
+
+        def prepare(number: int) -> Neighbour:
+            tokens = folder / "fast.tokens"
+            tokens.write_text(server.token(f"fast-{number}"))
+            plan = LoadPlan(
+                port=server.port, codec=CODEC, hello=hello_file(folder, CODEC), tokens=tokens,
+                groups=(group,), seconds=RATE_WINDOW_S, warm_up_s=0.0, drain_s=0.1, reopen_s=RATE_REOPEN_S,
+                first_source=NEIGHBOURS_FIRST_SOURCE,
+            )  # fmt: skip
+            return lambda: generator(plan)
+
+        plan = robots_of("calm", 99, folder, server.token, server.port)
+        return summary("rate", *alternate(plan, rounds, RATE_WINDOW_S, prepare))
+
+
+def silent(rounds: int) -> dict[str, Any]:
+    """Measure 100 robots beside 1,000 connections that say nothing."""
+    with one_server("silent") as (server, folder):
+        group = RobotGroup(name="silent", robots=SILENT, mode="silent")
+        neighbours = LoadPlan(
+            port=server.port, groups=(group,), seconds=SILENT_WINDOW_S, warm_up_s=0.0, drain_s=0.0,
+            sources=SILENT_SOURCES, first_source=NEIGHBOURS_FIRST_SOURCE, opening_s=SILENT_WINDOW_S,
+        )  # fmt: skip
+        plan = robots_of("calm", 100, folder, server.token, server.port)
+        found = alternate(plan, rounds, SILENT_WINDOW_S, lambda number: lambda: generator(neighbours))
+        return summary("silent", *found)
+
+
+async def uploads(rounds: int) -> dict[str, Any]:
+    """Measure 20 robots beside uploads to a data service that is killed."""
+    windows: list[LoadWindow] = []
+    outcomes: list[dict[str, Any]] = []
+    with tempfile.TemporaryDirectory() as made:
+        folder = Path(made)
+        async with LocalPlatform(
+            PlatformSettings(), state=folder / "state", port=0, servers=WORKERS, data=True,
+            control=ControlOptions(elastic=True),
+        ) as cloud:  # fmt: skip
+            plan = robots_of("calm", 20, folder, cloud.issue_token, cloud.port)
+            asked = argparse.Namespace(kills=1, uploads=UPLOADS)
+            with LoadProcess(plan) as load:
+                await asyncio.to_thread(load.wait_begun)
+                for number in range(rounds):
+                    numbers = list(range(number * UPLOADS, (number + 1) * UPLOADS))
+                    neighbour = Uploads(cloud, numbers, MIB)
+                    await asyncio.sleep(SETTLE_S + PAUSE_S)
+                    began = time.monotonic()
+                    await asyncio.sleep(UPLOAD_WINDOW_S)
+                    middle = time.monotonic()
+                    neighbour.begin()
+                    back_s = await kill_during_uploads(cloud, neighbour, asked)
+                    await neighbour.until(lambda: False)
+                    await asyncio.sleep(max(0.0, middle + UPLOAD_WINDOW_S - time.monotonic()))
+                    windows.append(LoadWindow(is_loaded=False, begin_s=began, end_s=middle))
+                    windows.append(LoadWindow(is_loaded=True, begin_s=middle, end_s=time.monotonic()))
+                    neighbour.close()
+                    outcomes.append(
+                        {"acknowledged": len(neighbour.acknowledged), "ready_after_s": max(back_s)}
+                    )
+                await asyncio.to_thread(load.stop)
+            assert plan.samples is not None
+            return summary("uploads", seen(read_samples(plan.samples), windows), outcomes)
+
+
+ROWS: dict[str, Callable[[int], dict[str, Any]]] = {
+    "bombs": bombs,
+    "rate": rate,
+    "silent": silent,
+    "uploads": lambda rounds: asyncio.run(uploads(min(rounds, UPLOAD_ROUNDS))),
+}
+
+
+def print_row(row: dict[str, Any]) -> None:
+    """Print one row."""
+    quiet, loaded = row["quiet"], row["loaded"]
+    print(
+        f"{row['row']:8} p99 {quiet['p99_ms']:.2f} -> {loaded['p99_ms']:.2f} ms, {row['ratio']:.2f} x (bar "
+        f"{row['bar']:g}); p50 {quiet['p50_ms']:.2f} -> {loaded['p50_ms']:.2f} ms; n {quiet['n']}, "
+        f"{loaded['n']} in {quiet['windows']} windows each; without a pose {quiet['not_ok']}, "
+        f"{loaded['not_ok']}: {'holds' if row['holds'] else 'MISSED'}"
+    )
+    print(f"         neighbours: {row['outcomes']}", flush=True)
+
+
+def main() -> None:
+    """Read the command line, measure, print the rows."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--only", choices=tuple(ROWS), action="append", help="measure this row only")
+    parser.add_argument("--rounds", type=int, default=7, help="of the short rows; the others have five")
+    parser.add_argument("--out", type=Path, help="write the figures as JSON")
+    asked = parser.parse_args()
+    report: dict[str, Any] = {"machine": machine(), "settings": SETTINGS, "rows": []}
+    began = time.monotonic()
+    try:
+        compiled()
+        print(f"{report['machine']}; settings {SETTINGS}; {CODEC}; {UPLOADERS} uploaders", flush=True)
+        for name in asked.only or ROWS:
+            report["rows"].append(ROWS[name](asked.rounds))
+            print_row(report["rows"][-1])
+    except ConfigurationError as error:
+        print(f"skipped: {error.message} ({error.hint})")
+        report["skipped"] = error.message
+    report |= {"load_average_after": machine()["load_average"], "took_s": round(time.monotonic() - began, 1)}
+    before, after = report["machine"]["load_average"], report["load_average_after"]
+    print(f"load average {before} -> {after}; {report['took_s']:g} s")
+    if asked.out is not None:
+        asked.out.write_text(json.dumps(report, indent=1), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

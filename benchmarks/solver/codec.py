@@ -1,0 +1,168 @@
+"""Measure the codecs, and the handler against the bare solver.
+
+    python -m benchmarks.solver.codec [--n 500] [--out FILE]
+
+For each codec and 200 and 300 matches: bytes, encode and decode (to float64 arrays), thread-CPU
+microseconds.  Then one request, bytes in to bytes out (decode, dispatch, encode), over one
+`solve_pnp` on ready arrays, interleaved.  Defends: JSON+zlib <= 2.2 x, binary <= 1.3 x of the native solver,
+which takes a tenth of the time that PoseLib takes.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import platform
+import time
+from collections.abc import Callable
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rse_pf.config import PlatformSettings
+from rse_pf.pnp import solve_pnp
+from rse_pf.pnp.problems import PnpProblem, make_problem
+from rse_pf.service import Registry, dispatch
+from rse_pf.services.builtin import builtin_services
+from rse_pf.services.pnp import PnpReply, PnpRequest, make_request, wire_types
+from rse_pf.wire import CODECS, Command, Result, as_type, make_codec
+
+__all__ = ["main", "measure"]
+
+MATCHES = (200, 300)
+BARS = {"zlib": 2.2, "json": 2.2, "bin": 1.3}
+PROBLEMS = 32
+PERCENTILES = (50, 95, 99)
+
+
+def main() -> None:
+    """Measure, print the tables, write the report."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--n", type=int, default=500, help="samples of each figure")
+    parser.add_argument("--out", type=Path, help="write the figures as JSON")
+    args = parser.parse_args()
+    report = measure(args.n)
+    print(f"{report['machine']}, {report['versions']}, n {args.n}, load {report['load_before'][0]:.2f}")
+    print(f"{'codec':6}{'matches':>8}{'up B':>7}{'down B':>7}", *(f"{name:>22}" for name in STAGES))
+    for row in report["codecs"]:
+        shown = (" / ".join(f"{row[name][f'p{p}']:.0f}" for p in PERCENTILES) for name in STAGES)
+        print(
+            f"{row['codec']:6}{row['matches']:8}{row['command_bytes']:7}{row['result_bytes']:7}",
+            *(f"{cell:>22}" for cell in shown),
+        )
+    print(f"\n{'codec':6}{'matches':>8}{'solver us':>11}{'handler us':>11}{'ratio':>7}{'bar':>6}")
+    for row in report["handler"]:
+        print(
+            f"{row['codec']:6}{row['matches']:8}{row['solver']['p50']:11.0f}{row['handler']['p50']:11.0f}"
+            f"{row['ratio']:7.2f}{row['bar']:6.2f}  {'held' if row['ratio'] <= row['bar'] else 'BROKEN'}"
+        )
+    if args.out:
+        args.out.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
+
+
+STAGES = ("robot encodes", "server decodes", "server encodes", "robot decodes")
+
+
+def measure(n: int) -> dict[str, Any]:
+    """Return all figures of *n* samples each."""
+    load_before = os.getloadavg()
+    registry = builtin_services(PlatformSettings())
+    codecs, handler = [], []
+    for matches in MATCHES:
+        problems = [make_problem(seed=seed, n=matches) for seed in range(PROBLEMS)]
+        codecs += [_codec_row(name, problems, registry, n) for name in CODECS]
+        handler += _handler_rows(problems, registry, n)
+    return {
+        "machine": f"{platform.machine()} x {os.cpu_count()}, Python {platform.python_version()}",
+        "versions": ", ".join(f"{name} {version(name)}" for name in ("numpy", "msgspec", "poselib")),
+        "n": n,
+        "load_before": load_before,
+        "load_after": os.getloadavg(),
+        "unit": "thread-CPU us",
+        "codecs": codecs,
+        "handler": handler,
+    }
+
+
+def _codec_row(name: str, problems: list[PnpProblem], registry: Registry, n: int) -> dict[str, Any]:
+    codec = make_codec(name, pnp=wire_types(registry))
+    commands = [_command(problem, name) for problem in problems]
+    sent = [codec.encode(command) for command in commands]
+    results = [dispatch(registry, codec.decode_from_robot(data), time.monotonic) for data in sent]  # type: ignore[arg-type]
+    answered = [codec.encode(result) for result in results]
+    stages: dict[str, Callable[[int], Any]] = {
+        "robot encodes": lambda i: codec.encode(commands[i]),
+        "server decodes": lambda i: as_type(codec.decode_from_robot(sent[i]).payload, PnpRequest),  # type: ignore[union-attr]
+        "server encodes": lambda i: codec.encode(results[i]),
+        "robot decodes": lambda i: as_type(codec.decode_from_server(answered[i]).reply, PnpReply),  # type: ignore[union-attr]
+    }
+    times = _interleaved(list(stages.values()), n)
+    return {
+        "codec": name,
+        "matches": len(problems[0].pixels),
+        "command_bytes": round(float(np.median([len(data) for data in sent]))),
+        "result_bytes": round(float(np.median([len(data) for data in answered]))),
+        **{stage: _percentiles(each) for stage, each in zip(stages, times, strict=True)},
+    }
+
+
+def _handler_rows(problems: list[PnpProblem], registry: Registry, n: int) -> list[dict[str, Any]]:
+    def handler(name: str) -> Callable[[int], Any]:
+        codec = make_codec(name, pnp=wire_types(registry))
+        sent = [codec.encode(_command(problem, name)) for problem in problems]
+
+        def handle(i: int) -> bytes:
+            command = codec.decode_from_robot(sent[i])
+            assert isinstance(command, Command)
+            result = dispatch(registry, command, time.monotonic)
+            assert isinstance(result, Result)
+            return codec.encode(result)
+
+        return handle
+
+    requests = [_command(problem, "json").payload for problem in problems]
+
+    def solver(i: int) -> Any:
+        return solve_pnp(requests[i].points_world, requests[i].pixels, requests[i].camera)
+
+    solved, *handled = _interleaved([solver, *(handler(name) for name in CODECS)], n)
+    return [
+        {
+            "codec": name,
+            "matches": len(problems[0].pixels),
+            "solver": _percentiles(solved),
+            "handler": _percentiles(each),
+            "ratio": float(np.median(each) / np.median(solved)),
+            "bar": BARS[name],
+        }
+        for name, each in zip(CODECS, handled, strict=True)
+    ]
+
+
+def _command(problem: PnpProblem, codec: str) -> Command:
+    request = make_request(problem.points_world, problem.pixels, problem.camera, binary=codec == "bin")
+    return Command(id=1, service="pnp", payload=request, stream="front", seq=1, deadline_ms=250.0)
+
+
+def _interleaved(calls: list[Callable[[int], Any]], n: int) -> list[list[float]]:
+    """Return *n* times of each call, in microseconds; A B C A B C, so that neighbours hit all alike."""
+    times: list[list[float]] = [[] for _ in calls]
+    for i in range(n + PROBLEMS):
+        for call, kept in zip(calls, times, strict=True):
+            started = time.thread_time_ns()
+            call(i % PROBLEMS)
+            kept.append((time.thread_time_ns() - started) / 1e3)
+    return [kept[PROBLEMS:] for kept in times]
+
+
+def _percentiles(times: list[float]) -> dict[str, float]:
+    return {f"p{p}": float(np.percentile(times, p)) for p in PERCENTILES}
+
+
+if __name__ == "__main__":
+    main()
