@@ -60,6 +60,10 @@ EXTRAS: dict[str, Extra] = {
     "foxglove": Extra(
         modules={"foxglove": "foxglove-sdk"}, enables="the live view in Foxglove", includes=("local",)
     ),
+    "ros": Extra(modules={}, enables="robots of ROS: rse-pf-ros", includes=("bags", "keys")),
+    "ros-dds": Extra(
+        modules=_same("cyclonedds"), enables="robots of ROS 2 over DDS, without ROS", includes=("ros",)
+    ),
     "browser": Extra(modules=_same("playwright"), enables="make browser", is_for_users=False),
     "solver": Extra(modules=_same("poselib"), enables="poses without the native core"),
     "native": Extra(
@@ -118,6 +122,7 @@ VERBS_NEED: dict[str, tuple[str, ...]] = {
     "local": ("local",),
     "local --foxglove": ("foxglove",),
     "fleet": ("local",),
+    "fleet --cloud": ("aws", "data"),
     "swarm": ("local",),
     "token": ("keys",),
     "robot": ("keys",),

@@ -1,6 +1,6 @@
 """Run one verb of the command line: find it, read the settings, print an error as two lines.
 
-A verb is the module ``rse_pf.cli.VERB``: its docstring is its help page, ``add_arguments(parser)`` declares
+A verb is a module, see `verb_module`: its docstring is its help page, ``add_arguments(parser)`` declares
 its options and ``run(args, settings)`` returns the exit code.  Only the module of the verb is imported.
 Exit codes: 0 done, 1 failed, 2 wrong call or settings, 130 interrupted.  Named errors print no traceback.
 """
@@ -22,7 +22,7 @@ from rse_pf.config.validation import did_you_mean
 from rse_pf.errors import ConfigurationError, RsePfError, SettingsError, UsageError, error_of_system
 from rse_pf.terminal import show, show_error, show_page
 
-__all__ = ["VERBS", "Parser", "main"]
+__all__ = ["VERBS", "Parser", "main", "parser_of", "verb_module"]
 
 VERBS = {
     "demo": "let robots build point-cloud maps through the platform, on this machine",
@@ -45,6 +45,15 @@ VERBS = {
     "errors": "explain an error by its code: cause, check, fix",
 }
 """Verb and one line of help."""
+
+_FOLDERS = {
+    "local": "local_platform", "fleet": "local_platform",
+    "token": "access", "robot": "access", "audit": "access",
+    "service": "services",
+    "serve": "servers", "data": "servers",
+    "camera": "maps", "map": "maps",
+}  # fmt: skip
+"""Folder of a verb whose module does not lie beside this one."""
 
 _EXIT_OK, _EXIT_FAILED, _EXIT_USAGE, _EXIT_INTERRUPTED, _EXIT_PIPE = 0, 1, 2, 130, 141
 _REFUSED = re.compile(r"[a-z]+\.(?P<name>[a-z_]+) = .* is (below|above|not one of) ")
@@ -98,6 +107,28 @@ def main(argv: Sequence[str] | None = None) -> int:
     return code
 
 
+def verb_module(name: str) -> Any:
+    """Import and return the module of the verb *name*."""
+    package = f"rse_pf.cli.{_FOLDERS[name]}" if name in _FOLDERS else "rse_pf.cli"
+    return importlib.import_module(f"{package}.{name}")
+
+
+def parser_of(name: str) -> Parser:
+    """Return the parser of the verb *name*, with its help page and all of its options."""
+    verb = verb_module(name)
+    parser = Parser(
+        prog=f"rse-pf {name}",
+        description=(verb.__doc__ or "").strip(),
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        allow_abbrev=False,
+    )
+    parser.add_argument(
+        "--settings", type=Path, metavar="FILE", help="read settings from FILE (default: ./cdk.json, if any)"
+    )
+    verb.add_arguments(parser)
+    return parser
+
+
 def _run(words: list[str]) -> int:
     if not words or words[0] in ("-h", "--help", "help"):
         show_page(_front_page())
@@ -112,17 +143,7 @@ def _run(words: list[str]) -> int:
         )
     if name not in VERBS:
         raise UsageError(f"there is no verb {name!r}", hint=did_you_mean(name, VERBS))
-    verb: Any = importlib.import_module(f"rse_pf.cli.{name}")
-    parser = Parser(
-        prog=f"rse-pf {name}",
-        description=(verb.__doc__ or "").strip(),
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-        allow_abbrev=False,
-    )
-    parser.add_argument(
-        "--settings", type=Path, metavar="FILE", help="read settings from FILE (default: ./cdk.json, if any)"
-    )
-    verb.add_arguments(parser)
+    verb, parser = verb_module(name), parser_of(name)
     try:
         args = parser.parse_args(rest)
     except SystemExit as over:  # --help has printed its page

@@ -1,4 +1,4 @@
-"""The actions of the verb local that show or change a platform that runs: logs, robots, drain, roll, LAN.
+"""The verbs local and fleet: start a platform on this machine, show it and change it while it runs.
 
 What a person reads and types belongs here; what it does is in `rse_pf.local`.
 """

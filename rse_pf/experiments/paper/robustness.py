@@ -20,6 +20,7 @@ from rse_pf.experiments.paper.elasticity import crashes, slowest_replacement_s
 from rse_pf.experiments.paper.fault_scenarios import SCENARIOS
 from rse_pf.experiments.paper.harness import Harness, generator_of
 from rse_pf.experiments.plots.figures import draw_robustness, require_matplotlib
+from rse_pf.experiments.results.bars import with_bars
 from rse_pf.experiments.results.markdown import about_run, failures, number, page, slashed, table
 from rse_pf.experiments.results.records import CommandRecord, Event, Records, parameters_of, read_records
 from rse_pf.experiments.results.result_folder import RUN_FILES, finish_report, fresh_folder, load_average
@@ -207,7 +208,7 @@ def robustness_figures(records: Records) -> dict[str, Any]:
         **_scenario_figures(scenario, records, faults),
     }
     bars = BARS.get(scenario, _NO_LOSS)
-    return {**figures, "bars": {name: _bar(figures, name, *bar) for name, bar in bars.items()}}
+    return with_bars(figures, bars)
 
 
 def missed_bars(figures: Mapping[str, Any]) -> list[str]:
@@ -412,11 +413,3 @@ def _after(events: Sequence[Event], first: str, then: str) -> float | None:
             waits.append(float(event["time"]) - began)
             began = None
     return round(max(waits), 3) if waits and began is None else None
-
-
-def _bar(figures: Mapping[str, Any], name: str, bar: float, sense: str) -> dict[str, Any]:
-    value: Any = figures
-    for step in name.split("/"):
-        value = value[step]
-    held = value is not None and (value <= bar if sense == "<=" else value >= bar)
-    return {"value": value, "bar": f"{sense} {bar:g}", "held": held}

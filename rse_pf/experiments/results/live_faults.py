@@ -20,6 +20,7 @@ from rse_pf.backend.live_map.owner.map_kind import LIVE_MAP
 from rse_pf.backend.live_map.owner.requests import shown_name
 from rse_pf.backend.live_map.owner.state import MapState
 from rse_pf.errors import RsePfError, UsageError
+from rse_pf.experiments.results.bars import with_bars
 from rse_pf.experiments.results.live_error import LiveDrive, live_figures, read_live_drives, read_live_map
 from rse_pf.experiments.results.markdown import number, slashed
 from rse_pf.experiments.results.records import CommandRecord, Event, Records, parameters_of
@@ -128,7 +129,7 @@ def live_fault_figures(records: Records) -> dict[str, Any]:
         "live": live_figures(drives, read_live_map(records.folder)),
     }
     bars = LIVE_FAULT_BARS.get(fault, _NO_LOSS)
-    return {**figures, "bars": {name: _bar(figures, name, *bar) for name, bar in bars.items()}}
+    return with_bars(figures, bars)
 
 
 def fault_rows(runs: Mapping[str, Mapping[str, Any]]) -> list[list[str]]:
@@ -237,11 +238,3 @@ def _longest_wait_s(drives: Sequence[LiveDrive]) -> float | None:
     """Return the longest time from the sending of a keyframe to its acknowledgement."""
     waits = [float(each["kept"]) - float(each["sent"]) for drive in drives for each in drive.keyframes]
     return round(max(waits), 3) if waits else None
-
-
-def _bar(figures: Mapping[str, Any], name: str, bar: float, sense: str) -> dict[str, Any]:
-    value: Any = figures
-    for step in name.split("/"):
-        value = value[step]
-    held = value is not None and (value <= bar if sense == "<=" else value >= bar)
-    return {"value": value, "bar": f"{sense} {bar:g}", "held": held}

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rse_pf.cli.extras import require
-from rse_pf.cli.map_from_camera import add_drive_arguments, check_drive, map_source
+from rse_pf.cli.maps.from_camera import add_drive_arguments, check_drive, map_source
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import UsageError
 from rse_pf.terminal import at_work, counted, show

@@ -32,7 +32,7 @@ from typing import TYPE_CHECKING, Any
 from rse_pf.auth.roster import check_robot, check_tenant
 from rse_pf.auth.tokens import KeySet, SigningKey, unverified_parts
 from rse_pf.auth.trust_store import AccessControlStore
-from rse_pf.cli.robot import add_place, max_token_s, open_access_control, record_action
+from rse_pf.cli.access.robot import add_place, max_token_s, open_access_control, record_action
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import ConfigurationError, Unauthorized, UsageError
 from rse_pf.files import OWNER_ONLY, replace_file

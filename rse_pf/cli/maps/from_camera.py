@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
-from rse_pf.cli.frame_table import FRAMES_FILE, FrameTable
+from rse_pf.cli.maps.frame_table import FRAMES_FILE, FrameTable
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import CommandFailed, UsageError
 from rse_pf.files import replace_file

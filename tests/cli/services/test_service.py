@@ -143,7 +143,7 @@ def test_what_an_installation_compiled_among_the_templates_is_not_copied(
     compiled.mkdir(exist_ok=True)
     (compiled / "service.cpython-311.pyc").write_bytes(b"\xff\x00")
     (installed / "templates" / "python" / "service.pyc").write_bytes(b"\xff\x00")
-    monkeypatch.setattr("rse_pf.cli.service.INCLUDE_FOLDER", installed / "include")
+    monkeypatch.setattr("rse_pf.cli.services.service.INCLUDE_FOLDER", installed / "include")
 
     assert main(["service", "new", "mine"]) == 0
     assert sorted(each.name for each in Path("mine").iterdir()) == [

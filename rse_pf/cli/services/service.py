@@ -43,11 +43,11 @@ from typing import Any
 
 from rse_pf.cli.extras import require
 from rse_pf.cli.local_platform.logs import LogFollower, LogLine
-from rse_pf.cli.service_blocks import add_block_arguments, chosen_servers, show_blocks, unblock
-from rse_pf.cli.service_tools.building import build_service, built_service, changed_s, lock_service
-from rse_pf.cli.service_tools.debugging import DebugOptions, debug_service
-from rse_pf.cli.service_tools.recorder import RecordLimits, record_service
-from rse_pf.cli.service_tools.replaying import Recorded, plain, recorded_requests, replay, requests_of
+from rse_pf.cli.services.blocks import add_block_arguments, chosen_servers, show_blocks, unblock
+from rse_pf.cli.services.building import build_service, built_service, changed_s, lock_service
+from rse_pf.cli.services.debugging import DebugOptions, debug_service
+from rse_pf.cli.services.recorder import RecordLimits, record_service
+from rse_pf.cli.services.replaying import Recorded, plain, recorded_requests, replay, requests_of
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import RsePfError, UsageError
 from rse_pf.local.state import read_state, state_folder

@@ -8,7 +8,7 @@ import pytest
 from fake_data_service import Service, small_settings
 
 from rse_pf.auth.roster import EnrolledRobot, public_key_of
-from rse_pf.cli.adopt import adopt
+from rse_pf.cli.access.adopt import adopt
 from rse_pf.cli.main import main
 from rse_pf.identity import RobotId, object_name, state_name
 from rse_pf.maps.charges import charge_name

@@ -44,7 +44,7 @@ from rse_pf.auth.roster import (
     public_key_of,
 )
 from rse_pf.auth.trust_store import AccessControlStore
-from rse_pf.cli.robot_enrolment import enrolment_lines, make_enrolment
+from rse_pf.cli.access.enrolment import enrolment_lines, make_enrolment
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import UsageError
 from rse_pf.terminal import show, show_json
@@ -126,7 +126,7 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
     if args.action == "enrol":
         return _enrol(args, access, now, settings)
     if args.action == "adopt":
-        from rse_pf.cli.adopt import run_adopt
+        from rse_pf.cli.access.adopt import run_adopt
 
         adopted = run_adopt(args, settings, access.roster())
         record_action(

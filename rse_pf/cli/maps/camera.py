@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rse_pf.cli.frame_table import named_frames
+from rse_pf.cli.maps.frame_table import named_frames
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import UsageError
 from rse_pf.terminal import show, show_json, show_progress

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import urlencode
 
-from rse_pf.cli.service_blocks import Server
+from rse_pf.cli.services.blocks import Server
 from rse_pf.errors import CommandFailed, RsePfError, UsageError
 from rse_pf.local.servers.control_client import ControlPort
 from rse_pf.services.custom.recording import RecordedCall, recorded_calls

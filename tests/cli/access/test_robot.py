@@ -114,7 +114,7 @@ def test_a_disabled_robot_is_refused_whoever_signed_and_an_enabled_one_needs_a_f
     said(capsys, "robot", "disable", "robot-1")
     assert [problem(platform, token) for token in before] == ["disabled", "disabled"]
     assert "robot-1  disabled" in said(capsys, "robot", "list")
-    monkeypatch.setattr("rse_pf.cli.robot.time.time", lambda: _issued_s(before[0]) + 5.0)
+    monkeypatch.setattr("rse_pf.cli.access.robot.time.time", lambda: _issued_s(before[0]) + 5.0)
     said(capsys, "robot", "enable", "robot-1")
 
     assert [problem(platform, token) for token in before] == ["issued-too-early"] * 2

@@ -36,9 +36,9 @@ import numpy as np
 
 from rse_pf.audit.operator import record_map_change
 from rse_pf.aws.storage import open_data_store
-from rse_pf.cli.map_bags import BAG_ACTIONS, BAG_FORMAT, add_bag_actions, export_bag, run_bags
-from rse_pf.cli.map_from_camera import add_from_camera_arguments, run_from_camera
-from rse_pf.cli.map_live import add_live_arguments, run_live, run_publish
+from rse_pf.cli.maps.bags import BAG_ACTIONS, BAG_FORMAT, add_bag_actions, export_bag, run_bags
+from rse_pf.cli.maps.from_camera import add_from_camera_arguments, run_from_camera
+from rse_pf.cli.maps.live import add_live_arguments, run_live, run_publish
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import CommandFailed, NotFound, UsageError
 from rse_pf.files import replace_file

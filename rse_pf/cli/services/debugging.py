@@ -23,8 +23,8 @@ from typing import Any
 
 import msgspec
 
-from rse_pf.cli.service_tools.building import built_service
-from rse_pf.cli.service_tools.replaying import plain, requests_of
+from rse_pf.cli.services.building import built_service
+from rse_pf.cli.services.replaying import plain, requests_of
 from rse_pf.errors import InternalError, RsePfError, UsageError
 from rse_pf.services.custom.installed import InstalledService
 from rse_pf.services.custom.runtime import Runtime, open_runtime

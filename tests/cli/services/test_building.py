@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from rse_pf.cli.main import main
-from rse_pf.cli.service_tools import building
+from rse_pf.cli.services import building
 from rse_pf.services.custom.dependencies import Dependencies, LockedRequirement, tree_digest
 
 HASH = "--hash=sha256:" + "a" * 64

@@ -1,9 +1,9 @@
 """A warm standby: it has imported what `rse-pf serve` needs, and becomes a server when it gets its arguments.
 
-Started by the local platform as ``python -m rse_pf.cli.standby``.  It imports in a thread of low priority,
-because servers work beside it, and prints a line when it is warm.  One JSON line on its standard input holds
-the arguments and the log of the server; from then on it works at full priority.  It ends when that input
-ends without a line.
+Started by the local platform as ``python -m rse_pf.cli.servers.standby``.  It imports in a thread of low
+priority, because servers work beside it, and prints a line when it is warm.  One JSON line on its standard
+input holds the arguments and the log of the server; from then on it works at full priority.  It ends when
+that input ends without a line.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ __all__ = ["main"]
 
 _MODULES = (
     "numpy", "jwt", "cryptography.hazmat.primitives.asymmetric.ed25519", "uvloop", "picows",
-    "prometheus_client", "rse_pf.cli.main", "rse_pf.cli.serve", "rse_pf.backend.supervisor",
+    "prometheus_client", "rse_pf.cli.main", "rse_pf.cli.servers.serve", "rse_pf.backend.supervisor",
 )  # fmt: skip
 """In the order of their imports, so that the thread can stop between any two of them."""
 _NICENESS = 3

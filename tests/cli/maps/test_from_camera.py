@@ -19,9 +19,9 @@ from client_sdk.datasets.intrinsics import Intrinsics, write_intrinsics
 from client_sdk.frontend import TrackedFrame
 from client_sdk.mapper import Mapper, ask_robot
 from client_sdk.mapping import Trajectory, read_ply, read_trajectory, write_trajectory
-from rse_pf.cli import map_from_camera
-from rse_pf.cli.frame_table import FrameTable
 from rse_pf.cli.main import main
+from rse_pf.cli.maps import from_camera
+from rse_pf.cli.maps.frame_table import FrameTable
 from rse_pf.pnp import refine_with_depth, solve_pnp
 from tests.client_sdk.mapper.flat_world import CAMERA, STEP_M, frame_at
 
@@ -155,7 +155,7 @@ def tracked(reason: str, pose: Any) -> TrackedFrame:
 def test_a_pipe_gets_a_line_of_progress_every_five_seconds(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    status = map_from_camera._Status(now=iter([0.0, 4.9, 5.0, 5.0, 9.9, 10.0, 10.0]).__next__)
+    status = from_camera._Status(now=iter([0.0, 4.9, 5.0, 5.0, 9.9, 10.0, 10.0]).__next__)
     mapper = Mapper(ask=ask_robot(SolvingRobot()))
     done = asyncio.run(mapper.track(frame_at(0, depth=True)))
 

@@ -1,0 +1,88 @@
+"""Print a new address of the fleet page, which shows a running platform in a browser on this machine.
+
+rse-pf local starts the page.  An address has a key that works once, within an hour, in one browser.
+--operate makes a key with which the page may kill, pause, drain, move and roll servers; it can also be typed
+into a page that is open.  --cloud runs the page of the deployment on AWS here, with your credentials, until
+Ctrl-C: it only reads, and opens no port there.  With --costs it also asks AWS what was spent this month, for
+which AWS charges 0.01 USD or more at the start and each six hours.
+
+examples:
+  rse-pf fleet
+  rse-pf fleet --operate
+  rse-pf fleet --cloud
+  rse-pf fleet --cloud --costs --port 8702
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+
+from rse_pf.cli.extras import require
+from rse_pf.cli.local_platform.local import DEFAULT_NAME
+from rse_pf.config import PlatformSettings
+from rse_pf.errors import UsageError
+from rse_pf.terminal import show, show_json
+
+__all__ = ["add_arguments", "run"]
+
+_MAX_PORT = 65535
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    parser.add_argument(
+        "--name", default=DEFAULT_NAME, help=f"name of the platform (default: {DEFAULT_NAME})"
+    )
+    parser.add_argument("--operate", action="store_true", help="the page may operate the platform")
+    parser.add_argument("--json", action="store_true", help="print JSON")
+    parser.add_argument("--cloud", action="store_true", help="the deployment on AWS in cloud.region")
+    parser.add_argument(
+        "--costs",
+        action="store_true",
+        help="with --cloud: costs of this month (AWS charges 0.01 USD a request)",
+    )
+    parser.add_argument(
+        "--port", type=int, metavar="PORT", help="with --cloud: port on loopback (default: a free one)"
+    )
+
+
+def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
+    """Print the address; with --cloud, serve the page until a signal."""
+    if args.cloud:
+        return _run_cloud(args, settings)
+    if args.costs or args.port is not None:
+        raise UsageError(
+            "--costs and --port are for --cloud", hint="the port of a local page: local.page_port"
+        )
+    require("fleet")
+    from rse_pf.cli.local_platform.page import new_address
+    from rse_pf.local.state import state_folder
+
+    url = new_address(state_folder(args.name, os.environ), "operate" if args.operate else "view")
+    if args.json:
+        show_json({"url": url})
+    else:
+        show(f"fleet page  {url}", "the key works once, within an hour")
+    return 0
+
+
+def _run_cloud(args: argparse.Namespace, settings: PlatformSettings) -> int:
+    require("fleet --cloud")
+    from rse_pf.aws.account import open_account
+    from rse_pf.fleet_page.cloud_page import serve_cloud_page
+
+    if args.operate:
+        raise UsageError("--operate is for a local platform", hint="see docs/operations.md")
+    if args.port is not None and not 0 <= args.port <= _MAX_PORT:
+        raise UsageError(f"--port {args.port} is not within 0..{_MAX_PORT}", hint="0 takes a free one")
+
+    def ready(url: str) -> None:
+        if args.json:
+            show_json({"url": url})
+        else:
+            show(f"fleet page  {url}", "the key works once, within an hour; Ctrl-C ends the page")
+
+    return serve_cloud_page(
+        open_account(settings.cloud.region), settings, port=args.port or 0, asks_costs=args.costs, ready=ready
+    )
