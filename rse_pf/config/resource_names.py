@@ -15,6 +15,7 @@ __all__ = [
     "KEYS_NAME",
     "READY_PATH",
     "ROBOTS_NAME",
+    "ROSBRIDGE_PATH",
 ]
 
 GROUP = "rse-pf"
@@ -25,6 +26,8 @@ HEALTH_PATH = "/healthz"
 """At the robots' port; it tells everybody that robots are served, and nothing else."""
 READY_PATH = "/readyz"
 """At the control port, and below ``/data`` at the data service; load balancers ask it."""
+ROSBRIDGE_PATH = "/rosbridge"
+"""At the robots' port, where ``serving.rosbridge`` is on."""
 DATA_STACK = "RsePf-Data"
 KEYS_NAME = "keys.json"
 """Of the public key set in the artifact bucket."""

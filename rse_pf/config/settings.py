@@ -14,7 +14,15 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from rse_pf.config.validation import WHERE, SettingRow, check_range, hint_for_unknown, setting, typed
+from rse_pf.config.validation import (
+    WHERE,
+    SettingRow,
+    check_origin,
+    check_range,
+    hint_for_unknown,
+    setting,
+    typed,
+)
 from rse_pf.errors import SettingsError
 
 __all__ = [
@@ -44,6 +52,7 @@ class ServingSettings:
     control_host: str = setting("127.0.0.1", doc="address of the control port")
     control_port: int = setting(8766, doc="port of /healthz, /readyz, /metrics and drain; 0 takes a free one", low=0, high=65535)
     path: str = setting("/ws", doc="path of the robots' WebSocket")
+    rosbridge: bool = setting(False, doc="also serve rosbridge v2 clients, on the path /rosbridge")
     workers: int = setting(0, doc="worker processes; 0 means one per core", low=0, high=256)
     solver_threads: int = setting(1, doc="solver threads of each worker", low=1, high=64)
     max_robots: int = setting(10000, unit="robots", doc="connections of one server; more are refused with 503", low=1)
@@ -55,6 +64,7 @@ class ServingSettings:
     max_handshakes_per_source_per_s: float = setting(200.0, unit="handshakes/s", doc="handshakes of one source address; more are refused with 429; 0 is off", low=0)
     handshake_burst: int = setting(1000, unit="handshakes", doc="burst of max_handshakes_per_source_per_s and of max_accepts_per_s", low=1)
     trusted_proxies: int = setting(1, unit="proxies", doc="load balancers that append to x-forwarded-for; 0: robots connect directly", low=0, high=8)
+    allowed_origins: str = setting("", doc="origins of web pages that may connect, such as https://robots.example.org, with spaces between; pages of the platform itself always may")
     write_buffer_bytes: int = setting(262144, unit="bytes", doc="unsent bytes above which a client counts as a slow reader", low=4096)
     slow_reader_timeout_s: float = setting(1.0, unit="s", doc="a slow reader is disconnected after this", low=0.05)
     max_unread_bytes: int = setting(16777216, unit="bytes", doc="long messages that wait for the decoder thread of a worker; more are refused", low=262144)
@@ -343,6 +353,8 @@ def _check_contradictions(s: PlatformSettings) -> None:
             f"{s.local.private_key!r}",
             hint=f"set both files or neither {WHERE}",
         )
+    for origin in s.serving.allowed_origins.split():
+        check_origin("serving.allowed_origins", origin)
     if s.scaling.idle_s % s.scaling.period_s:
         raise SettingsError(
             f"scaling.idle_s = {s.scaling.idle_s} is no multiple of scaling.period_s = {s.scaling.period_s}",

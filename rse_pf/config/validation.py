@@ -6,6 +6,7 @@ Every error names the setting, the value and its limit, and says what to do.
 from __future__ import annotations
 
 import difflib
+import re
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any
@@ -13,9 +14,19 @@ from typing import Any
 from rse_pf.config.renames import hint_for_old_setting
 from rse_pf.errors import SettingsError
 
-__all__ = ["WHERE", "SettingRow", "check_range", "did_you_mean", "hint_for_unknown", "setting", "typed"]
+__all__ = [
+    "WHERE",
+    "SettingRow",
+    "check_origin",
+    "check_range",
+    "did_you_mean",
+    "hint_for_unknown",
+    "setting",
+    "typed",
+]
 
 _LARGEST = 1e15
+_ORIGIN = re.compile(r"[a-z][a-z0-9+.-]*://(?:[a-z0-9._-]+|\[[0-9a-f:.]+\])(?::[0-9]{1,5})?", re.IGNORECASE)
 WHERE = 'in cdk.json, context."rse-pf"'
 
 
@@ -87,6 +98,15 @@ def check_range(row: SettingRow) -> None:
     if row.high is not None and not row.value <= row.high:
         raise SettingsError(
             f"{row.group}.{row.name} = {row.value} is above {row.high:g}", hint=f"lower it {WHERE}"
+        )
+
+
+def check_origin(name: str, origin: str) -> None:
+    """Raise SettingsError if *origin* is not one that a browser sends: a scheme, a host, perhaps a port."""
+    if _ORIGIN.fullmatch(origin) is None:
+        raise SettingsError(
+            f"{name} has {_shown(origin)}, which is no origin of a web page",
+            hint=f"write it as https://robots.example.org or http://localhost:9000 {WHERE}",
         )
 
 

@@ -17,9 +17,11 @@ from typing import Any
 
 from rse_pf.audit.chain import Note, RefusalLimiter
 from rse_pf.audit.log import AuditLog
+from rse_pf.auth.origins import AllowedOrigins
 from rse_pf.auth.roster import scopes_allow
 from rse_pf.auth.tokens import Claims, KeySet, token_problem, verify_token
 from rse_pf.config import PlatformSettings
+from rse_pf.data_server.cross_origin import is_preflight, preflight_reply, shared_reply
 from rse_pf.data_server.handlers import Handler, Handlers
 from rse_pf.data_server.http import (
     HttpReply,
@@ -96,6 +98,7 @@ class DataServer:
         self._wall_clock = wall_clock
         self._pause = pause
         self._limits = RequestLimits(settings.data)
+        self._origins = AllowedOrigins(settings.serving.allowed_origins)
         self._closing = contextlib.ExitStack()
         if describe is None:
             describer = MapDescriber(settings, store, clock)
@@ -147,7 +150,10 @@ class DataServer:
     async def _reply(
         self, request: HttpRequest, line: dict[str, Any], admitted: contextlib.ExitStack
     ) -> HttpReply:
+        origin, shared_with = request.headers.get("origin", ""), ""
         try:
+            self._origins.check(origin, request.headers.get("host", ""))
+            shared_with = origin
             reply = await self._handle(request, line, admitted)
         except Disconnected:
             raise
@@ -163,12 +169,15 @@ class DataServer:
             reply.status == _REQUEST_TIMEOUT or not await request.drain(self._settings.data.part_bytes)
         ):
             reply = dataclasses.replace(reply, headers={**reply.headers, "Connection": "close"})
-        return reply
+        return shared_reply(reply, shared_with)
 
     async def _handle(
         self, request: HttpRequest, line: dict[str, Any], admitted: contextlib.ExitStack
     ) -> HttpReply:
         """Reply to a request; what *admitted* gets is given back when the reply was sent."""
+        if is_preflight(request):
+            line["operation"] = "preflight"
+            return preflight_reply(self._methods(request.path))
         route, handler, path = self._find(request)
         line["operation"] = route.operation
         if route.scope is None:
@@ -186,16 +195,18 @@ class DataServer:
         return await handler(request, claims, path)
 
     def _find(self, request: HttpRequest) -> tuple[Route, Handler, dict[str, str]]:
-        allowed = []
         for pattern, route, handler in self._routes:
             found = pattern.fullmatch(request.path)
             if found and route.method == request.method:
                 return route, handler, found.groupdict()
-            if found:
-                allowed.append(route.method)
-        if allowed:
-            raise MethodNotAllowed(", ".join(allowed))
-        raise NotFound("no such path", hint="see /data/openapi.json")
+        raise MethodNotAllowed(", ".join(self._methods(request.path)))
+
+    def _methods(self, path: str) -> list[str]:
+        """Return the methods of *path*; raises NotFound if it has none."""
+        methods = [route.method for pattern, route, _ in self._routes if pattern.fullmatch(path)]
+        if not methods:
+            raise NotFound("no such path", hint="see /data/openapi.json")
+        return methods
 
     def _claims(self, request: HttpRequest, scope: str, name: str, line: dict[str, Any]) -> Claims:
         kind, _, token = request.headers.get("authorization", "").partition(" ")

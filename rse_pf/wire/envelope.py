@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 import zlib
+from collections.abc import Callable
 from typing import NamedTuple
 
 import msgspec
@@ -44,6 +45,9 @@ class Envelope(NamedTuple):
 
 def peek(codec: Codec, data: bytes) -> Envelope | None:
     """Return id and service of the command in *data*, None if they are not at its start."""
+    own: Callable[[bytes], Envelope | None] | None = getattr(codec, "peek", None)
+    if own is not None:  # its messages do not begin like a command
+        return own(data)
     if codec.name == "bin":
         try:
             command = _decode_binary(data)

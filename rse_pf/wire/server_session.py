@@ -6,7 +6,7 @@ Messages and the time go in, decisions come out (`Send`, `Submit`, `Close` ...).
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Any, Literal
 
 import msgspec
 
@@ -36,7 +36,6 @@ from rse_pf.wire.messages import (
     Move,
     Ping,
     Pong,
-    Renew,
     Renewed,
     Result,
     Subscribe,
@@ -57,6 +56,8 @@ __all__ = [
     "PROGRESS",
     "RENEWAL_PAUSE_S",
     "UPDATES",
+    "AskTopics",
+    "Authenticate",
     "BeginUpdates",
     "Close",
     "Decision",
@@ -136,7 +137,19 @@ class EndUpdates(msgspec.Struct, frozen=True, gc=False):
     id: int
 
 
-Decision = Send | Submit | Withdraw | Renewal | Close | BeginUpdates | EndUpdates
+class Authenticate(msgspec.Struct, frozen=True, gc=False):
+    """Verify this token of a rosbridge client that showed none in its handshake."""
+
+    token: str
+
+
+class AskTopics(msgspec.Struct, frozen=True):
+    """Execute this operation of a rosbridge client on its topics."""
+
+    op: Any
+
+
+Decision = Send | Submit | Withdraw | Renewal | Close | BeginUpdates | EndUpdates | Authenticate | AskTopics
 
 
 class ServerSession:
@@ -148,7 +161,12 @@ class ServerSession:
         hears_updates: Whether it announced the capability `UPDATES`.
         topics: The topic of each live subscription, by its id.
         bad_messages: How many invalid messages arrived; a long one counts several times.
+        is_pinged: Whether the server asks a silent client by WebSocket pings, because it sends none itself.
+        ends_when_idle: Whether the connection ends with the answer to its last command.
     """
+
+    is_pinged = False
+    ends_when_idle = False
 
     def __init__(
         self, *, codec: Codec, robot: str, server: str, session: str, limits: SessionSettings
@@ -210,7 +228,10 @@ class ServerSession:
             case Unsubscribe():
                 return [] if self.topics.pop(message.id, None) is None else [EndUpdates(message.id)]
             case _:
-                return self._renew(message, now)
+                return self._renew(message.token, now)
+
+    def answered(self, command_id: int) -> None:
+        """Forget what only a rosbridge client's session keeps of a command that has its final answer."""
 
     def answer(self, message: Result | Failure) -> Send:
         """Return the message with the final answer to a command that was submitted.
@@ -269,7 +290,7 @@ class ServerSession:
         self.topics[message.id] = message.topic
         return [*ended, BeginUpdates(message.id, message.topic)]
 
-    def _renew(self, message: Renew, now: float) -> list[Decision]:
+    def _renew(self, token: str, now: float) -> list[Decision]:
         if now < self._next_renewal_s:
             error = Busy(
                 "a fresh token was sent a moment ago",
@@ -278,7 +299,7 @@ class ServerSession:
             )
             return [self._send(self._failure(error))]
         self._next_renewal_s = now + RENEWAL_PAUSE_S
-        return [Renewal(message.token)]
+        return [Renewal(token)]
 
     def _failure(self, error: RsePfError, *, identity: int | None = None, trace: str = "") -> Failure:
         return Failure(
@@ -331,11 +352,14 @@ class ServerSession:
         return [Submit(command)]
 
     def _count_bad_message(self, error: ProtocolError, size_bytes: int) -> list[Decision]:
+        return self._count([self._send(self._failure(error))], size_bytes)
+
+    def _count(self, sent: list[Decision], size_bytes: int) -> list[Decision]:
+        """Count a bad message that *sent* answers."""
         self.bad_messages += 1 + size_bytes // _BAD_MESSAGE_BYTES
-        sent = self._send(self._failure(error))
         if self.bad_messages > self._limits.max_bad_messages:
-            return [sent, *self._close(CLOSE_PROTOCOL, "too many bad messages")]
-        return [sent]
+            return [*sent, *self._close(CLOSE_PROTOCOL, "too many bad messages")]
+        return sent
 
     def _close(self, code: int, reason: str) -> list[Decision]:
         self.state = "closed"

@@ -79,6 +79,8 @@ def test_a_contradiction_is_refused_with_both_numbers(overrides: dict[str, Any],
         ({"auth": {"issuer": None}}, "auth.issuer = None is not of type str", "correct it"),
         ({"scaling": {"busy_cpu_percent": 101}}, "busy_cpu_percent = 101.0 is above 100", "lower it"),
         ({"serving": {"port": -1}}, "serving.port = -1 is below 0", "raise it"),
+        ({"serving": {"allowed_origins": "https://a.example *"}}, "'*', which is no origin", "write it"),
+        ({"serving": {"allowed_origins": "https://a.example/"}}, "is no origin", "write it"),
         ({"serving": {"log_level": "loud"}}, "is not one of debug, info", "choose"),
         ({"scaling": {"busy_cpu_percent": float("nan")}}, "not a finite number", "correct it"),
         ({"session": {"max_inflate_ratio": float("inf")}}, "not a finite number", "correct it"),
@@ -114,6 +116,7 @@ def test_the_digest_changes_with_every_setting(row: SettingRow) -> None:
         "allow_insecure": {"certificate_arn": "arn", "domain_name": "robots.example"},
         "certificate": {"private_key": "key.pem"},
         "private_key": {"certificate": "chain.pem"},
+        "allowed_origins": {"allowed_origins": "https://robots.example.org"},
     }
     values = {row.name: other(row), **companions.get(row.name, {})}
 

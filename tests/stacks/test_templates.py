@@ -360,3 +360,14 @@ def test_missing_packages_are_one_line_and_a_hint(tmp_path: Path) -> None:
 
     assert told.value.hint == "run make assets"
     assert "\n" not in told.value.message
+
+
+def test_the_firewall_keeps_no_samples_of_requests(assembly: Assembly) -> None:
+    (acl,) = [
+        each["Properties"]
+        for each in assembly.templates["RsePf-Backend"]["Resources"].values()
+        if each["Type"] == "AWS::WAFv2::WebACL"
+    ]
+
+    seen = [acl["VisibilityConfig"], *(rule["VisibilityConfig"] for rule in acl["Rules"])]
+    assert [each["SampledRequestsEnabled"] for each in seen] == [False] * len(seen)
