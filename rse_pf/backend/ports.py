@@ -12,7 +12,7 @@ from rse_pf.backend.metrics import Metrics
 from rse_pf.config import PlatformSettings
 from rse_pf.recording.tap import RecordingTap
 
-__all__ = ["Clocks", "Log", "Wire", "WorkerContext"]
+__all__ = ["Clocks", "Log", "SlowReader", "Wire", "WorkerContext"]
 
 
 class Wire(Protocol):
@@ -30,6 +30,9 @@ class Wire(Protocol):
     def send_pong(self, data: bytes) -> None:
         """Write one pong frame."""
 
+    def send_ping(self) -> None:
+        """Write one ping frame; does nothing on a socket that ended."""
+
     def pause(self, seconds: float) -> None:
         """Read nothing more for *seconds*."""
 
@@ -41,6 +44,22 @@ class Wire(Protocol):
 
     def close(self, code: int, reason: str) -> None:
         """Write a close frame and end the connection."""
+
+
+class SlowReader(Protocol):
+    """A connection to which messages are written only as fast as its other end reads them."""
+
+    is_connected: bool
+
+    @property
+    def unsent_bytes(self) -> int:
+        """How much was written that the kernel has not taken."""
+
+    def bound_unsent(self, max_bytes: int) -> None:
+        """Let the kernel take no more than *max_bytes* that the network has not taken."""
+
+    def write(self, data: bytes) -> None:
+        """Write one message."""
 
 
 class Log(Protocol):

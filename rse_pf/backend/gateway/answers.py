@@ -9,6 +9,7 @@ from __future__ import annotations
 import traceback
 
 import msgspec
+import numpy as np
 
 from rse_pf.auth.roster import scopes_allow
 from rse_pf.backend.gateway.admission import UnreadRefusal
@@ -17,6 +18,7 @@ from rse_pf.backend.object_refs import ObjectRefs, takes_objects
 from rse_pf.backend.ports import WorkerContext
 from rse_pf.backend.scheduling.scheduler import QueuedCommand, RefusedCommand
 from rse_pf.errors import Busy, InternalError, LimitExceeded, RsePfError, UnknownService
+from rse_pf.recording.tap import RecordingTap
 from rse_pf.service import Registry, dispatch, failure_of, unknown_service
 from rse_pf.wire import Codec, Command, Failure, Result
 from rse_pf.wire.envelope import Envelope, encode_refusal
@@ -121,7 +123,9 @@ class Answers:
         service = self.label(queued.command.service)
         self._context.metrics.answered(service, code, now - queued.received_s)
         connection: RobotConnection = queued.owner
-        connection.answer(answer.data)
+        connection.answer(answer.data, queued.command.id)
+        if connection.tap is not None and isinstance(queued.command.payload, msgspec.Struct):
+            _tell_pose(connection.tap, message, answer.data)
         connection.commands += 1
         connection.last_result = code
         weak = _weakness(message)  # is logged as a failure is: an operator wants to know which poses are bad
@@ -222,6 +226,13 @@ class Answers:
         self._context.log.error(
             "defect", service=command.service, id=command.id, trace=command.trace, traceback=text
         )
+
+
+def _tell_pose(tap: RecordingTap, message: Result | Failure, data: bytes) -> None:
+    """Tell a recording the pose in *data*, the answer to a command that the native core read."""
+    pose = getattr(message.reply, "T_camera_world", None) if isinstance(message, Result) else None
+    if isinstance(message, Result) and isinstance(pose, np.ndarray) and pose.dtype == np.float64:
+        tap.has_pose(data, message.id, pose.tobytes())
 
 
 def _weakness(message: Result | Failure) -> dict[str, str]:

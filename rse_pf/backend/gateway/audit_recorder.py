@@ -63,13 +63,13 @@ class AuditRecorder:
         self._next: TimerHandle | None = None
         self._sum: TimerHandle | None = None
 
-    def judged(self, verdict: Accepted | Rejected, source: str, authorization: str) -> None:
-        """Record the verdict on a handshake from the address *source*."""
+    def judged(self, verdict: Accepted | Rejected, source: str, token: str) -> None:
+        """Record the verdict on a handshake with *token* from the address *source*."""
         if isinstance(verdict, Accepted):
             if verdict.claims is not None:
                 self._note("auth.accepted", str(verdict.claims.robot), **_of(verdict.claims), source=source)
         elif verdict.status == _UNAUTHORIZED and self._may_record(verdict.reason):
-            self._note("auth.refused", "", reason=verdict.reason, source=source, **_claimed(authorization))
+            self._note("auth.refused", "", reason=verdict.reason, source=source, **_claimed(token))
 
     def renewed(self, before: Claims, claims: Claims) -> None:
         """Record the fresh token of a live connection; the same token again is not recorded."""
@@ -164,9 +164,9 @@ class _Claimed(msgspec.Struct):
     jti: str = ""
 
 
-def _claimed(authorization: str) -> Mapping[str, str]:
+def _claimed(token: str) -> Mapping[str, str]:
     try:
-        _, payload, _ = authorization.split(".")
+        _, payload, _ = token.split(".")
         claimed = msgspec.json.decode(base64.urlsafe_b64decode(payload + "=="), type=_Claimed)
     except (ValueError, msgspec.MsgspecError, RecursionError):
         return {}

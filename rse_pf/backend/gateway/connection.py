@@ -7,7 +7,9 @@ The connection knows no socket library, and takes nothing more once it is closin
 from __future__ import annotations
 
 from collections import deque
-from typing import Protocol
+from typing import Any, Protocol
+
+from msgspec import Struct
 
 from rse_pf.auth.tokens import Claims
 from rse_pf.backend.gateway.decoder_thread import DecoderThread
@@ -16,12 +18,15 @@ from rse_pf.backend.gateway.handshake import Accepted
 from rse_pf.backend.gateway.rate_limits import RobotRates
 from rse_pf.backend.ports import Wire, WorkerContext
 from rse_pf.errors import ProtocolError, RsePfError
-from rse_pf.wire import Command, Progress
+from rse_pf.wire import CODECS, Command, Progress
 from rse_pf.wire.messages import FromRobot
 from rse_pf.wire.server_session import (
+    CLOSE_GOING_AWAY,
+    Authenticate,
     BeginUpdates,
     Close,
     Decision,
+    EndUpdates,
     Renewal,
     Send,
     ServerSession,
@@ -31,6 +36,7 @@ from rse_pf.wire.server_session import (
 
 __all__ = ["CommandHandler", "RobotConnection"]
 
+_PONG = 10
 _BAD_MESSAGE_PAUSE_S = 0.1
 """After an undecodable message its socket is not read for this, times their number."""
 
@@ -65,6 +71,12 @@ class CommandHandler(Protocol):
     def unsubscribe(self, connection: RobotConnection, identity: int) -> None:
         """End a subscription."""
 
+    def authenticate(self, connection: RobotConnection, token: str) -> None:
+        """Judge the token of a rosbridge client that showed none in its handshake."""
+
+    def ask_topics(self, connection: RobotConnection, op: Any) -> None:
+        """Execute an operation of a rosbridge client on its topics."""
+
     def opened(self, connection: RobotConnection, now: float) -> None:
         """Take that the robot said Hello."""
 
@@ -78,7 +90,7 @@ class RobotConnection:
     __slots__ = (
         "_assembler", "_context", "_deferred", "_handler", "_wire", "allowed_s", "claims", "commands",
         "is_connected", "last_heard_s", "last_result", "moving_until_s", "number", "opened_s",
-        "recorded", "robot", "session", "tap",
+        "pinged_s", "recorded", "robot", "session", "tap",
     )  # fmt: skip
 
     def __init__(
@@ -106,7 +118,7 @@ class RobotConnection:
         """What the robot's token says; None where no token is required."""
         self.session = session
         self.number = number
-        self.opened_s = self.last_heard_s = now
+        self.opened_s = self.last_heard_s = self.pinged_s = now
         self.allowed_s: float | None = None
         """Time that the last command had, from its arrival to its deadline."""
         self.commands = 0
@@ -116,7 +128,8 @@ class RobotConnection:
         self.is_connected = True
         self._handler = handler
         self._context = handler.context
-        self.tap = None if session is None else handler.context.tap
+        # A recording knows the platform's own codecs only.
+        self.tap = None if session is None or session.codec.name not in CODECS else handler.context.tap
         """Takes the messages for a recording, as those of the connection ``recorded``."""
         self.recorded = 0
         if self.tap is not None and session is not None:
@@ -147,6 +160,8 @@ class RobotConnection:
         if self._assembler.is_whole(opcode, fin, rsv, len(payload)):
             self._take(payload, False, now)
             return
+        if opcode == _PONG and self.session is not None and self.session.is_pinged:
+            self.last_heard_s = now
         decision = self._assembler.receive(opcode, fin, rsv, payload, now)
         if isinstance(decision, Received):
             self._take(decision.data, decision.is_text, now)
@@ -156,16 +171,20 @@ class RobotConnection:
             self._context.metrics.closed[f"frames-{decision.code}"] += 1
             self._wire.close(decision.code, decision.reason)
 
-    def answer(self, data: bytes) -> None:
+    def answer(self, data: bytes, command_id: int) -> None:
         """Write the final answer to a command; does nothing if the socket is gone."""
         session = self.session
         if self.is_connected and session is not None:
             session.in_flight -= 1
+            if session.is_pinged:
+                session.answered(command_id)
             if not self._assembler.closed:
                 self._context.metrics.bytes_out += len(data)
                 self._wire.send(data, session.codec.is_text)
                 if self.tap is not None:
                     self.tap.down(self.recorded, data)
+                if session.ends_when_idle and not session.in_flight:
+                    self.close(CLOSE_GOING_AWAY, "moving")
 
     def write(self, data: bytes) -> None:
         """Write one message, unless the connection is closing."""
@@ -199,6 +218,14 @@ class RobotConnection:
         if self.session is not None:
             self.moving_until_s = now + within_ms / 1e3
             self._execute(self.session.move(reason, within_ms), now)
+            if self.session.ends_when_idle and not self.session.in_flight and not self.is_closing:
+                self.close(CLOSE_GOING_AWAY, "moving")
+
+    def ping(self, now: float) -> None:
+        """Ask a silent client by a WebSocket ping whether it is there."""
+        self.pinged_s = now
+        if not self.is_closing:
+            self._wire.send_ping()
 
     def renewed(self, token_s: float | None, now: float) -> None:
         """Tell the robot for how many seconds its fresh token is valid; None: it was refused."""
@@ -240,7 +267,11 @@ class RobotConnection:
         if len(data) <= decoder.short_bytes:
             decisions = session.receive_short(data, now, decoder.short_inflated_bytes)
         if decisions is not None and len(decisions) == 1 and type(decisions[0]) is Submit:
-            handler.submit(self, decisions[0].command, len(data), now)
+            command = decisions[0].command
+            if self.tap is not None and isinstance(command.payload, Struct):
+                # Read by the native core, which takes known fields only.
+                self.tap.is_plain(data, command.id, f"{command.stream} {command.trace}")
+            handler.submit(self, command, len(data), now)
         elif decisions is not None:
             self._follow(session, decisions, len(data), now, state, bad_messages)
         elif not handler.refuses_long(self, session, data):
@@ -282,7 +313,7 @@ class RobotConnection:
             # Refusing a bad message costs as much as reading it, so the socket is read more and more rarely.
             self._context.metrics.shed["bad-message"] += 1
             self._wire.pause(session.bad_messages * _BAD_MESSAGE_PAUSE_S)
-        elif state == "opening" and session.state == "open":
+        elif state == "opening" and session.state == "open" and not session.is_pinged:
             self._handler.opened(self, now)
 
     def _execute(self, decisions: list[Decision], now: float, size_bytes: int = 0) -> None:
@@ -300,5 +331,9 @@ class RobotConnection:
                 self.close(decision.code, decision.reason)
             elif isinstance(decision, BeginUpdates):
                 handler.subscribe(self, decision.id, decision.topic)
-            else:
+            elif isinstance(decision, EndUpdates):
                 handler.unsubscribe(self, decision.id)
+            elif isinstance(decision, Authenticate):
+                handler.authenticate(self, decision.token)
+            else:
+                handler.ask_topics(self, decision.op)

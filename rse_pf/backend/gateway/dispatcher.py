@@ -18,12 +18,17 @@ from rse_pf.backend.gateway.connection import RobotConnection
 from rse_pf.backend.gateway.decoder_thread import DecoderThread
 from rse_pf.backend.gateway.handshake import Accepted
 from rse_pf.backend.gateway.idle_timeouts import IdleTimeouts
-from rse_pf.backend.gateway.rate_limits import CUT_OFF
+from rse_pf.backend.gateway.rate_limits import CUT_OFF, PendingHandshakes
 from rse_pf.backend.gateway.token_watch import TokenWatch
 from rse_pf.backend.jobs.manager import JobManager
 from rse_pf.backend.live_map.router import LIVE_SERVICES, LiveMapRouter
 from rse_pf.backend.metrics import LongestRecently
 from rse_pf.backend.ports import Wire, WorkerContext
+from rse_pf.backend.rosbridge.codec import CODEC as ROSBRIDGE
+from rse_pf.backend.rosbridge.codec import RosbridgeCodec
+from rse_pf.backend.rosbridge.session import RosbridgeSession
+from rse_pf.backend.rosbridge.topics import RosbridgeTopics
+from rse_pf.backend.rosbridge.waiting import AwaitedTokens
 from rse_pf.backend.sandbox.manager import SandboxManager
 from rse_pf.backend.scheduling.cpu_throttle import BATCH_S, CpuThrottle
 from rse_pf.backend.scheduling.scheduler import (
@@ -40,9 +45,9 @@ from rse_pf.service import Registry
 from rse_pf.services.pnp import wire_types
 from rse_pf.wire import CODECS, Codec, Command, make_codec
 from rse_pf.wire.envelope import Envelope, peek
-from rse_pf.wire.server_session import CLOSE_GOING_AWAY, CLOSE_RATE, ServerSession
+from rse_pf.wire.server_session import CLOSE_GOING_AWAY, CLOSE_RATE, CLOSE_TOKEN_OVER, ServerSession
 
-__all__ = ["ComputeQueue", "Dispatcher", "JobQueue", "LiveMapQueue", "NoQueue", "SandboxQueue"]
+__all__ = ["ComputeQueue", "Dispatcher", "JobQueue", "LiveMapQueue", "NoQueue", "SandboxQueue", "TopicQueue"]
 
 _DECODER_RETRY_MS = 500.0
 _UNMEASURED_TURN_S = 0.125
@@ -82,6 +87,9 @@ class NoQueue:
         error = NotFound("this server offers no updates", hint="the operator has switched live maps off")
         connection.refuse_updates(identity, error)
 
+    def execute(self, connection: RobotConnection, session: RosbridgeSession, op: Any) -> None:
+        """Do nothing: without rosbridge nobody asks."""
+
     def ignore(self, *_: Any) -> None:
         """Do nothing."""
 
@@ -93,6 +101,7 @@ ComputeQueue = ComputeLane[EncodedAnswer] | NoQueue
 SandboxQueue = SandboxManager | NoQueue
 JobQueue = JobManager | NoQueue
 LiveMapQueue = LiveMapRouter | NoQueue
+TopicQueue = RosbridgeTopics | NoQueue
 
 
 class Dispatcher:
@@ -114,6 +123,7 @@ class Dispatcher:
         sandboxes: SandboxQueue,
         jobs: JobQueue,
         live_maps: LiveMapQueue,
+        topics: TopicQueue,
         token_watch: TokenWatch,
     ) -> None:
         """Take no connection yet; start the solver threads and the timer of idle connections.
@@ -132,6 +142,7 @@ class Dispatcher:
             sandboxes: Runs installed services.
             jobs: Runs long services.
             live_maps: Takes commands and subscriptions to live maps.
+            topics: Of rosbridge clients.
             token_watch: Ends connections whose token is no longer valid.
         """
         settings, monotonic = context.settings, context.clocks.monotonic
@@ -149,10 +160,16 @@ class Dispatcher:
         self._sandboxes = sandboxes
         self._jobs = jobs
         self._live_maps = live_maps
+        self._topics = topics
         self._token_watch = token_watch
         self._codecs: dict[str, Codec] = {
             name: make_codec(name, settings.session, pnp=wire_types(registry)) for name in CODECS
         }
+        serving = settings.serving
+        line: PendingHandshakes[RobotConnection] = PendingHandshakes(
+            serving.max_unauthenticated, serving.max_unauthenticated_per_source
+        )
+        self._awaited = AwaitedTokens(line, loop=context.loop, close_code=CLOSE_TOKEN_OVER)
         self._threads = SolverThreads(
             settings.serving.solver_threads,
             answers.compute,
@@ -200,8 +217,10 @@ class Dispatcher:
         expires_s = (
             None if accepted.expires_s is None else now + accepted.expires_s - self.context.clocks.wall()
         )
-        session = None
-        if accepted.codec:
+        session: ServerSession | None = None
+        if accepted.codec == ROSBRIDGE:
+            session = self._rosbridge_session(accepted)
+        elif accepted.codec:
             session = ServerSession(
                 codec=self._codecs[accepted.codec],
                 robot=accepted.robot.name,
@@ -211,10 +230,49 @@ class Dispatcher:
             )
             session.ends_s = expires_s
         connection = RobotConnection(self, wire, session, accepted, now=now, number=number)
+        if accepted.awaits_token:
+            self._awaited.enter(connection, accepted.source)
+        else:
+            self._connected(connection, expires_s, now)
+        return connection
+
+    def _rosbridge_session(self, accepted: Accepted) -> RosbridgeSession:
+        limits = self.context.settings.session
+        return RosbridgeSession(
+            codec=RosbridgeCodec(limits, self._codecs["json"]),
+            server=self.context.server_id, limits=limits, is_open=not accepted.awaits_token,
+        )  # fmt: skip
+
+    def _connected(self, connection: RobotConnection, expires_s: float | None, now: float) -> None:
+        """Take a connection whose robot is known; its token ends at *expires_s*, s, monotonic."""
         self.connections.add(connection)
         self._token_watch.connected(connection, expires_s)
         self._sandboxes.connected(connection.robot)
-        return connection
+        if connection.may_move:  # a rosbridge client says no Hello
+            self.opened(connection, now)
+
+    def authenticate(self, connection: RobotConnection, token: str) -> None:
+        """Judge the token of a rosbridge client that showed none in its handshake."""
+        source = self._awaited.leave(connection)
+        session, clocks = connection.session, self.context.clocks
+        if source is None or not isinstance(session, RosbridgeSession):
+            return
+        now = clocks.monotonic()
+        accepted = self._token_watch.judge(token, connection.robot, source)
+        if accepted is None or self.rates.banned_s(accepted.robot, now) > 0:
+            for send in session.refused():
+                connection.write(send.data)
+            connection.close(CLOSE_TOKEN_OVER if accepted is None else CLOSE_RATE, "unauthenticated")
+            return
+        connection.robot, connection.claims = accepted.robot, accepted.claims
+        session.opened()
+        ends_s = accepted.expires_s
+        self._connected(connection, None if ends_s is None else now + ends_s - clocks.wall(), now)
+
+    def ask_topics(self, connection: RobotConnection, op: Any) -> None:
+        """Execute an operation of a rosbridge client on its topics."""
+        if isinstance(connection.session, RosbridgeSession):
+            self._topics.execute(connection, connection.session, op)
 
     def disconnect(self, connection: RobotConnection) -> None:
         """Forget a connection whose socket ended, and what it still waited for."""
@@ -224,6 +282,8 @@ class Dispatcher:
         self._token_watch.left(connection)
         self._jobs.left(connection)
         self._live_maps.left(connection)
+        self._topics.left(connection)
+        self._awaited.leave(connection)
         for queued in self._scheduler.leave(connection) + self._compute.leave(connection):
             self.context.metrics.requests[self._answers.label(queued.command.service), "disconnected"] += 1
         self.context.log.debug("disconnected", robot=connection.robot)
@@ -248,6 +308,7 @@ class Dispatcher:
         """Close every socket; what is held is lost, so wait for `held` to be 0 first."""
         for connection in list(self.connections):
             connection.close(CLOSE_GOING_AWAY, "leaving")
+        self._awaited.close_all()
         self._threads.close()
         self.decoder.close()
         self._jobs.close()
@@ -361,6 +422,7 @@ class Dispatcher:
             "log_lines_dropped": float(self.context.log.dropped),
             **self._compute.report(),
             **self._live_maps.report(),
+            **self._topics.report(),
             **({} if self.context.tap is None else {"recording_dropped": float(self.context.tap.dropped)}),
             **({"sandboxes": float(isolation["sandboxes"])} if isolation else {}),
         }

@@ -14,9 +14,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from http import HTTPStatus
 
+from rse_pf.auth.origins import ORIGIN_HINT, AllowedOrigins, carried_token
 from rse_pf.auth.tokens import Claims, KeySet, token_problem, verify_token
+from rse_pf.backend.rosbridge.codec import CODEC as ROSBRIDGE
 from rse_pf.config import PlatformSettings
-from rse_pf.config.resource_names import HEALTH_PATH
+from rse_pf.config.resource_names import HEALTH_PATH, ROSBRIDGE_PATH
 from rse_pf.errors import Unauthorized
 from rse_pf.identity import DEFAULT_TENANT, RobotId
 from rse_pf.wire import SUBPROTOCOLS, codec_for
@@ -41,13 +43,19 @@ _TOO_LONG = b"HTTP/1.1 431 Request Header Fields Too Large\r\nConnection: close\
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Accepted:
-    """A robot that may upgrade to WebSocket.  ``expires_s`` is Unix time; None never expires."""
+    """A robot that may upgrade to WebSocket.  ``expires_s`` is Unix time; None never expires.
+
+    One that ``awaits_token`` is nobody yet: a rosbridge client, which shows its token in its first message.
+    ``source`` is the address that it came from.
+    """
 
     robot: RobotId
     codec: str
     subprotocol: str
     expires_s: float | None = None
     claims: Claims | None = field(default=None, compare=False)
+    awaits_token: bool = False
+    source: str = field(default="", compare=False)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -120,11 +128,6 @@ class RequestHead:
         return key if is_upgrade else b""
 
 
-def _offered_token(offered: list[str]) -> str:
-    """Return the token among the offered sub-protocols, as the header has it; a browser sets no header."""
-    return next((f"Bearer {each[7:]}" for each in offered if each.startswith("bearer.")), "")
-
-
 def _rejection(status: int, code: str, message: str, hint: str, **headers: str) -> Rejected:
     body = json.dumps({"code": code, "message": message, "hint": hint}, separators=(",", ":")).encode()
     return _answered(status, code, body, {**_JSON, **{k.replace("_", "-"): v for k, v in headers.items()}})
@@ -148,6 +151,8 @@ class HandshakePolicy:
         self._conformance_echo = conformance_echo
         path = settings.serving.path
         self._path = path.encode()
+        self._rosbridge = ROSBRIDGE_PATH.encode() if settings.serving.rosbridge else None
+        self._origins = AllowedOrigins(settings.serving.allowed_origins)
         self._healthy = _answered(200, HEALTH, b'{"status":"ok"}', _JSON)
         self.defect = _rejection(500, "internal", "the handshake failed", "try again")
         self._not_found = _rejection(404, "not-found", "nothing is served here", f"connect to {path}")
@@ -163,6 +168,9 @@ class HandshakePolicy:
             401, "unauthorized", "the token is missing or not valid",
             "issue one with rse-pf token issue ROBOT", WWW_Authenticate="Bearer",
         )  # fmt: skip
+        self._forbidden = _rejection(
+            403, "forbidden", "web pages of this origin are not allowed", ORIGIN_HINT
+        )
         self.no_request = _rejection(
             400, "bad-message", "this is not a request for a WebSocket", "send an upgrade as in RFC 6455"
         )
@@ -181,6 +189,8 @@ class HandshakePolicy:
         is_full: bool,
         anonymous: str,
         now_s: float,
+        origin: str = "",
+        host: str = "",
     ) -> Accepted | Rejected:
         """Return which robot is accepted, or the HTTP answer that rejects it.
 
@@ -191,31 +201,45 @@ class HandshakePolicy:
             is_full: Whether the worker has as many robots as it may.
             anonymous: Name of a robot where no token is required.
             now_s: Unix seconds.
+            origin: The header that browsers send, "" if absent.
+            host: The header, "" if absent.
         """
         unnamed = RobotId(DEFAULT_TENANT, anonymous)
         if self._conformance_echo:
             return Accepted(robot=unnamed, codec="", subprotocol="")
         if path == HEALTH_PATH.encode():
             return self._healthy
-        if path.split(b"?")[0] != self._path:
+        asked = path.split(b"?")[0]
+        if asked not in (self._path, self._rosbridge):
             return self._not_found
+        if not self._origins.allows(origin, host):
+            return self._forbidden
         if is_full:
             return self._full
-        claims = None
+        codec = ROSBRIDGE if asked == self._rosbridge else codec_for(offered)
+        token = carried_token(authorization, offered)
+        accepted = Accepted(robot=unnamed, codec=codec or "", subprotocol=SUBPROTOCOLS.get(codec or "", ""))
         if self.keys is not None:
-            scheme, _, token = (authorization or _offered_token(offered)).partition(" ")
-            verified = self.verified(token.strip(), now_s) if scheme.lower() == "bearer" else "unknown"
-            if isinstance(verified, str):
-                return replace(self._no_token, reason=verified)
-            claims = verified
-        codec = codec_for(offered)
-        if codec is None:
-            return self._no_subprotocol
-        accepted = Accepted(robot=unnamed, codec=codec, subprotocol=SUBPROTOCOLS[codec])
-        if claims is None:
-            return accepted
-        expires_s = self.ends_s(claims, now_s)
-        return replace(accepted, robot=claims.robot, expires_s=expires_s, claims=claims)
+            if codec == ROSBRIDGE and not authorization and not token:
+                return replace(accepted, awaits_token=True)
+            judged = self.with_token(accepted, token, now_s)
+            if isinstance(judged, Rejected):
+                return judged
+            accepted = judged
+        return self._no_subprotocol if codec is None else accepted
+
+    def with_token(self, accepted: Accepted, token: str, now_s: float) -> Accepted | Rejected:
+        """Return *accepted* as the robot that *token* names at *now_s*, Unix s, or the refusal."""
+        claims = self.verified(token, now_s)
+        if isinstance(claims, str):
+            return replace(self._no_token, reason=claims)
+        return replace(
+            accepted,
+            robot=claims.robot,
+            expires_s=self.ends_s(claims, now_s),
+            claims=claims,
+            awaits_token=False,
+        )
 
     def ends_s(self, claims: Claims, now_s: float) -> float:
         """Return when a connection with *claims* ends, in Unix seconds; an expired token has its leeway."""

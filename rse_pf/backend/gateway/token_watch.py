@@ -12,8 +12,10 @@ from functools import partial
 from rse_pf.auth.tokens import Claims, KeySet, claims_problem, renewed_claims
 from rse_pf.backend.gateway.audit_recorder import AuditRecorder
 from rse_pf.backend.gateway.connection import RobotConnection
-from rse_pf.backend.gateway.handshake import HandshakePolicy
+from rse_pf.backend.gateway.handshake import Accepted, HandshakePolicy
 from rse_pf.backend.ports import WorkerContext
+from rse_pf.backend.rosbridge.codec import CODEC as ROSBRIDGE
+from rse_pf.identity import RobotId
 from rse_pf.wire.server_session import CLOSE_REPLACED, CLOSE_REVOKED, CLOSE_TOKEN_OVER
 
 __all__ = ["TokenWatch"]
@@ -97,6 +99,19 @@ class TokenWatch:
             return
         self._context.log.info("replaced", robot=connection.robot)
         connection.close(CLOSE_REPLACED, "replaced")
+
+    def judge(self, token: str, unnamed: RobotId, source: str) -> Accepted | None:
+        """Judge and record the token that a rosbridge client from *source* showed after its handshake."""
+        metrics, now_s = self._context.metrics, self._context.clocks.wall()
+        waiting = Accepted(robot=unnamed, codec=ROSBRIDGE, subprotocol="", source=source)
+        verdict = self._handshake.with_token(waiting, token, now_s)
+        self._recorder.judged(verdict, source, token)
+        if isinstance(verdict, Accepted):
+            metrics.handshakes["ok"] += 1
+            return verdict
+        metrics.handshakes[verdict.result] += 1
+        self._context.log.info("refused", result=verdict.result, reason=verdict.reason)
+        return None
 
     def renew(self, connection: RobotConnection, token: str) -> None:
         """Judge a fresh token of a live connection, and move the connection's end or leave it."""

@@ -11,8 +11,10 @@ import asyncio
 import contextlib
 import socket
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
+from rse_pf.auth.origins import carried_token
 from rse_pf.backend.gateway.audit_recorder import AuditRecorder
 from rse_pf.backend.gateway.connection import RobotConnection
 from rse_pf.backend.gateway.dispatcher import Dispatcher
@@ -240,12 +242,12 @@ class RobotSockets:
             verdict: Accepted | Rejected = self._handshake.no_request
             if head is not None:
                 verdict = self._verdict(pending, head)
-        except Exception as error:  # noqa: BLE001  see above
+        except Exception as error:  # noqa: BLE001  the worker serves on
             self._context.log.error("defect", at="handshake", traceback=repr(error))
             verdict = self._handshake.defect
         if isinstance(verdict, Accepted):
             assert head is not None
-            self._context.metrics.handshakes["ok"] += 1
+            self._context.metrics.handshakes["no-token-yet" if verdict.awaits_token else "ok"] += 1
             self._serve(pending, verdict, (_UPGRADE % head.websocket_key, rest))
         else:
             self._refuse(pending, verdict)
@@ -290,21 +292,25 @@ class RobotSockets:
         source = self._sources.source(pending.peer, head.text(b"x-forwarded-for"))
         if self._sources.wait_s(source, now) > 0:
             return self._handshake.too_fast
-        authorization = head.text(b"authorization")
+        authorization, offered = head.text(b"authorization"), head.words(b"sec-websocket-protocol")
         verdict = self._handshake.judge(
             path=head.path,
             authorization=authorization,
-            offered=head.words(b"sec-websocket-protocol"),
+            offered=offered,
             is_full=len(self._dispatcher.connections) >= self._max_robots,
             anonymous=self._new_name(),
             now_s=self._context.clocks.wall(),
+            origin=head.text(b"origin"),
+            host=head.text(b"host"),
         )
         if isinstance(verdict, Accepted):
             if self._dispatcher.rates.banned_s(verdict.robot, now) > 0:
                 verdict = self._handshake.too_fast
             elif not head.websocket_key:
                 verdict = self._handshake.no_request
-        self._recorder.judged(verdict, source, authorization)
+            elif verdict.awaits_token:
+                verdict = replace(verdict, source=source)
+        self._recorder.judged(verdict, source, carried_token(authorization, offered))
         return verdict
 
 
@@ -445,6 +451,9 @@ def listener_type(picows: Any, loop: asyncio.AbstractEventLoop, serving: Serving
 
         def send_pong(self, data: bytes) -> None:
             self._transport.send_pong(data)
+
+        def send_ping(self) -> None:
+            self._transport.send_ping()
 
         def pause(self, seconds: float) -> None:
             self.hold()

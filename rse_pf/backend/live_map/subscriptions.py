@@ -13,7 +13,7 @@ from typing import Any, Protocol
 
 import msgspec
 
-from rse_pf.backend.ports import Log
+from rse_pf.backend.ports import Log, SlowReader
 from rse_pf.errors import BadMessage, RsePfError
 from rse_pf.wire import Update
 from rse_pf.wire.live_map import live_topic
@@ -35,21 +35,10 @@ _MAX_KEYS = 1024
 _MAX_VALUE_BYTES = 65_536
 
 
-class Reader(Protocol):
+class Reader(SlowReader, Protocol):
     """What is needed of a robot's connection."""
 
     session: ServerSession | None
-    is_connected: bool
-
-    @property
-    def unsent_bytes(self) -> int:
-        """How much was written that the kernel has not taken."""
-
-    def bound_unsent(self, max_bytes: int) -> None:
-        """Let the kernel take no more than *max_bytes* that the network has not taken."""
-
-    def write(self, data: bytes) -> None:
-        """Write one message."""
 
     def refuse_updates(self, identity: int, error: RsePfError) -> None:
         """Write that a subscription ends because of *error*."""

@@ -1,4 +1,4 @@
-"""The recording of one server: pipes from its workers to a recorder process, which ends with the last one.
+"""The recording of one server: a recorder process, which ends with the last worker, and is restarted before.
 
 A server serves robots whether it can record or not.
 """
@@ -7,22 +7,41 @@ from __future__ import annotations
 
 import json
 import os
-import subprocess
+import secrets
+import socket
+import threading
 import time
+from collections import deque
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import asdict
 from importlib import metadata
 from pathlib import Path
+from typing import Protocol
+
+import msgspec
 
 from rse_pf.config import PlatformSettings
 from rse_pf.recording.recorder_process import RecorderPlan, start_recorder
-from rse_pf.recording.tap import recording_pipe
+from rse_pf.recording.redact import KEY_BYTES
 from rse_pf.wire import PROTOCOL_VERSION
 
-__all__ = ["ServerRecording", "server_version"]
+__all__ = ["RecorderProcess", "ServerRecording", "server_version"]
 
 _FINISH_S = 3.0
 """Time that the recorder has to finish its file when the workers are gone."""
+_MOST_RESTARTS, _WITHIN_S = 5, 600.0
+
+
+class RecorderProcess(Protocol):
+    """What is asked of a recorder's process."""
+
+    @property
+    def pid(self) -> int:
+        """Return its number."""
+
+    def wait(self) -> int:
+        """Return its exit code, negative for a signal, when it has ended."""
 
 
 def server_version() -> str:
@@ -34,55 +53,128 @@ def server_version() -> str:
 
 
 class ServerRecording:
-    """The pipes and the recorder of one server; both are there inside of ``with``, before workers are forked.
+    """The recorder of one server, inside of ``with``; it is there before workers are forked.
 
-    ``ends`` are the workers' ends of the pipes, None for each where nothing is recorded; ``pids`` has the
-    process of the recorder.
+    A recorder that ended, although there are workers, is started again up to five times in ten minutes.
+    Workers send it the ends of their pipes by the socket ``to_recorder``, None where nothing is recorded;
+    ``pids`` has its process.
     """
 
     def __init__(
-        self, settings: PlatformSettings, server: str, workers: int, key: Path | None = None
+        self,
+        settings: PlatformSettings,
+        server: str,
+        key: Path | None = None,
+        *,
+        start: Callable[[RecorderPlan, bytes], RecorderProcess] = start_recorder,
+        restart_s: float = 0.5,
+        clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        """Start nothing yet; *key* is the file of the key of pseudonyms, None for a key of its own."""
+        """Start nothing yet.
+
+        Args:
+            settings: Of the server.
+            server: Its name.
+            key: File of the key of pseudonyms, None for a key of its own.
+            start: Starts a recorder with its key.
+            restart_s: Delay of the first restart; each one doubles it.
+            clock: Seconds of restarts.
+        """
         self._key = "" if key is None else str(key)
-        self.ends: list[int | None] = [None] * workers
+        self.to_recorder: int | None = None
         self.pids: list[int] = []
         self._settings = settings
         self._server = server
-        self._process: subprocess.Popen[bytes] | None = None
+        self._start, self._restart_s, self._clock = start, restart_s, clock
+        self._random_key = secrets.token_bytes(KEY_BYTES)
+        self._from_workers: socket.socket | None = None
+        self._to_recorder: socket.socket | None = None
+        self._process: RecorderProcess | None = None
+        self._watching: threading.Thread | None = None
+        self._is_over = threading.Event()
 
     def __enter__(self) -> ServerRecording:
         """Start the recorder, if ``recording.folder`` is set."""
         recording = self._settings.recording
         if not recording.folder:
             return self
-        pipes = [recording_pipe() for _ in self.ends]
+        self._from_workers, self._to_recorder = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        self._to_recorder.setblocking(False)
+        self.to_recorder = self._to_recorder.fileno()
         plan = RecorderPlan(
             folder=recording.folder, server=self._server, version=server_version(), started_ns=time.time_ns(),
-            fds=[ours for ours, _ in pipes], max_file_bytes=recording.max_file_bytes,
+            from_workers=self._from_workers.fileno(), max_file_bytes=recording.max_file_bytes,
             max_bytes=recording.max_bytes, session=asdict(self._settings.session), key=self._key,
             metadata={
                 "side": "server", "protocol": str(PROTOCOL_VERSION), "engine": self._settings.pnp.engine,
                 "pnp": json.dumps(asdict(self._settings.pnp)),
             },
         )  # fmt: skip
-        self._process = start_recorder(plan)
+        self._process = self._start(plan, self._random_key)
         self.pids = [self._process.pid]
-        self.ends = [theirs for _, theirs in pipes]
-        for ours, _ in pipes:
-            os.close(ours)
+        self._watching = threading.Thread(
+            target=self._watch, args=(plan, self._process), name="recorder", daemon=True
+        )
         return self
 
     def handed_over(self) -> None:
-        """Close the workers' ends in this process, so that the recorder sees the end of the workers."""
-        for fd in self.ends:
-            if fd is not None:
-                os.close(fd)
-        self.ends = [None] * len(self.ends)
+        """Leave the socket to the workers, so that the recorder sees their end, and watch the recorder.
+
+        Nothing may be forked afterwards: there is a thread.
+        """
+        if self._to_recorder is not None:
+            self._to_recorder.close()
+            self._to_recorder = self.to_recorder = None
+        if self._watching is not None and self._watching.ident is None and not self._is_over.is_set():
+            self._watching.start()
 
     def __exit__(self, *_: object) -> None:
         """Wait until the recorder has finished its file; all workers are gone."""
+        if self._watching is None:
+            return
         self.handed_over()
-        if self._process is not None:
-            with suppress(subprocess.TimeoutExpired):
-                self._process.wait(_FINISH_S)
+        self._is_over.set()
+        self._watching.join(_FINISH_S)
+        if self._from_workers is not None:
+            self._from_workers.close()
+
+    def _watch(self, plan: RecorderPlan, process: RecorderProcess) -> None:
+        """Start the recorder again until the workers or this server end; *process* is the first one."""
+        ends: deque[float] = deque()
+        while process.wait() != 0 and not self._is_over.is_set():  # with 0 the workers are gone
+            now = self._clock()
+            ends.append(now)
+            while ends[0] < now - _WITHIN_S:
+                ends.popleft()
+            if len(ends) > _MOST_RESTARTS:
+                _log(self._server, "recorder-given-up", "restart the server to record again", len(ends))
+                break
+            if self._is_over.wait(self._restart_s * 2 ** (len(ends) - 1)):
+                return
+            try:
+                plan = msgspec.structs.replace(plan, restarts=plan.restarts + 1)
+                process = self._start(plan, self._random_key)
+            except OSError as error:
+                _log(self._server, "recorder-given-up", str(error), len(ends))
+                break
+            self.pids[:] = [process.pid]
+            _log(self._server, "recorder-restarted", "see why it ended", len(ends))
+        else:
+            return
+        self.pids.clear()
+        if self._from_workers is not None:
+            self._from_workers.close()  # so that workers see that there will be no recorder
+
+
+def _log(server: str, event: str, hint: str, ends: int) -> None:
+    """Write a log line, as the server writes its own."""
+    line = {
+        "time": time.time(),
+        "level": "error",
+        "event": event,
+        "server": server,
+        "ends": ends,
+        "hint": hint,
+    }
+    with suppress(OSError):
+        os.write(2, json.dumps(line).encode() + b"\n")

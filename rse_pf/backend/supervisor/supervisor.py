@@ -29,6 +29,7 @@ from rse_pf.backend.gateway.migration import plan
 from rse_pf.backend.jobs.slots import make_pipe
 from rse_pf.backend.log import JsonLog
 from rse_pf.backend.metrics import merge, merge_isolation, render
+from rse_pf.backend.rosbridge.peers import peer_channels
 from rse_pf.backend.supervisor.control_http import ControlReply, ControlRequest, serve_control
 from rse_pf.backend.supervisor.listener import bound_socket, check_authentication
 from rse_pf.backend.supervisor.orders import (
@@ -120,14 +121,16 @@ def serve(
     raise_descriptor_limit()
     count = settings.serving.workers or len(os.sched_getaffinity(0))
     slots = make_pipe(settings.serving.max_running_jobs)
-    with ServerRecording(settings, server_id, count, recording_key) as recording:
+    peers = peer_channels(count if settings.serving.rosbridge else 0) or [(-1, ())] * count
+    with ServerRecording(settings, server_id, recording_key) as recording:
         plans = [
             WorkerPlan(
                 settings=settings, keys=keys if settings.auth.required else None, server_id=server_id,
                 services=services, workers=count, index=index, job_slots=slots, supervisor=os.getpid(),
-                conformance_echo=conformance_echo, audit=audit is not None, recording=end,
+                conformance_echo=conformance_echo, audit=audit is not None,
+                recording=recording.to_recorder, peers=peers[index],
             )
-            for index, end in enumerate(recording.ends)
+            for index in range(count)
         ]  # fmt: skip
         with bound_socket(settings.serving.host, settings.serving.port) as listener:
             workers = fork_workers(plans, listener=listener)

@@ -48,6 +48,8 @@ from rse_pf.backend.log import JsonLog
 from rse_pf.backend.object_refs import ObjectRefs
 from rse_pf.backend.ports import Clocks, WorkerContext
 from rse_pf.backend.robot_store import is_shared
+from rse_pf.backend.rosbridge.peers import NoPeers, PeerChannels, WorkerPeers
+from rse_pf.backend.rosbridge.topics import RosbridgeTopics
 from rse_pf.backend.sandbox.circuit_breaker import Block
 from rse_pf.backend.sandbox.manager import SandboxManager
 from rse_pf.backend.scheduling.cpu_throttle import CpuThrottle
@@ -73,7 +75,7 @@ from rse_pf.config import PlatformSettings
 from rse_pf.errors import MissingExtra
 from rse_pf.linux import die_with_parent, set_process_name
 from rse_pf.object_store import ObjectStore
-from rse_pf.recording.tap import RecordingTap
+from rse_pf.recording.tap import RecordingTap, hand_pipe
 from rse_pf.service import Registry
 from rse_pf.services.custom.installed import InstalledService, installed_services, published_services
 from rse_pf.services.loading import load_services
@@ -111,8 +113,10 @@ class WorkerPlan:
     supervisor: int
     conformance_echo: bool = False
     audit: bool = False
+    peers: PeerChannels = (-1, ())
+    """This worker's way to the others, for topics of rosbridge clients."""
     recording: int | None = None
-    """This worker's end of the pipe to the recorder; None where nothing is recorded."""
+    """Socket on which the recorder takes the ends of pipes; None where nothing is recorded."""
 
 
 def event_loop_maker() -> Callable[[], asyncio.AbstractEventLoop]:
@@ -228,6 +232,7 @@ class _Worker:
             sandboxes=self._sandboxes or NoQueue(),
             jobs=self._jobs(plan, answers) if settings.serving.max_running_jobs else NoQueue(),
             live_maps=self._live_maps or NoQueue(),
+            topics=self._topics(plan, registry.names) if settings.serving.rosbridge else NoQueue(),
             token_watch=self._token_watch,
         )
         self._migration = Migration(connections, loop=loop, now=time.monotonic, choose=secrets.choice)
@@ -244,10 +249,20 @@ class _Worker:
     def _tap(self, fd: int | None) -> RecordingTap | None:
         if fd is None:
             return None
+        hint = "a new one is started; restart the server if none is"
+
+        def renew() -> int | None:
+            self._log.error("recorder-lost", hint=hint)
+            return hand_pipe(fd)
+
+        pipe = hand_pipe(fd)
+        if pipe is None:
+            return None
         return RecordingTap(
-            fd,
+            pipe,
             call_later=self._loop.call_later,
-            on_dead=lambda: self._log.error("recorder-lost", hint="restart the server to record again"),
+            on_dead=lambda: self._log.error("recording-over", hint="restart the server to record again"),
+            renew=renew,
         )
 
     def _compute(
@@ -281,6 +296,17 @@ class _Worker:
             log=self._log,
             answer=answers.send_message,
         )
+
+    def _topics(self, plan: WorkerPlan, services: Sequence[str]) -> RosbridgeTopics:
+        read, _ = plan.peers
+        peers = WorkerPeers(plan.peers, plan.index, loop=self._loop, log=self._log) if read >= 0 else None
+        topics = RosbridgeTopics(
+            loop=self._loop, clock=time.monotonic, peers=peers or NoPeers(),
+            services=(*services, *(LIVE_SERVICES if self._live_maps else ())),
+        )  # fmt: skip
+        if peers is not None:
+            peers.begin(arrived=topics.arrived, wanted=topics.wanted)
+        return topics
 
     def _jobs(self, plan: WorkerPlan, answers: Answers) -> JobManager:
         settings = plan.settings

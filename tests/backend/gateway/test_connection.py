@@ -118,9 +118,9 @@ def test_an_answer_is_written_once_and_only_while_the_socket_exists(worker: Work
     assert connection.session is not None
     connection.session.in_flight = 2
 
-    connection.answer(answer)
+    connection.answer(answer, 1)
     connection.ended()
-    connection.answer(answer)
+    connection.answer(answer, 1)
 
     assert answered(wire) == [1]
     assert connection.session.in_flight == 1

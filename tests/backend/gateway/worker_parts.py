@@ -23,6 +23,7 @@ from rse_pf.backend.gateway.dispatcher import (
     LiveMapQueue,
     NoQueue,
     SandboxQueue,
+    TopicQueue,
 )
 from rse_pf.backend.gateway.handshake import Accepted, HandshakePolicy
 from rse_pf.backend.gateway.token_watch import TokenWatch
@@ -58,6 +59,7 @@ class WorkerParts:
         sandboxes: SandboxQueue | None = None,
         jobs: JobQueue | None = None,
         live_maps: Callable[[WorkerContext, Answers], LiveMapQueue] | None = None,
+        topics: Callable[[WorkerContext], TopicQueue] | None = None,
         processes: LimitedProcesses | None = None,
         emulated_cores: float = 0.0,
     ) -> None:
@@ -112,6 +114,7 @@ class WorkerParts:
             sandboxes=sandboxes or NoQueue(),
             jobs=jobs or NoQueue(),
             live_maps=NoQueue() if live_maps is None else live_maps(self.context, self.answers),
+            topics=NoQueue() if topics is None else topics(self.context),
             token_watch=self.token_watch,
         )
 

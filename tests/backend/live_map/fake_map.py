@@ -10,6 +10,7 @@ import msgspec
 import numpy as np
 
 from rse_pf.backend.live_map.owner.state import MapKind
+from rse_pf.backend.live_map.owner.work.whole_fit import WholeFit
 from rse_pf.errors import BadRequest
 from rse_pf.geometry import Camera
 from rse_pf.live_map.events import (
@@ -90,10 +91,12 @@ class FakeMap:
                 self._state[table].pop(event.robot, None)
         return []
 
-    def measuring(self, keyframe: int, pieces: int = 1) -> list[Callable[[], LinksMeasured]]:
+    def measuring(
+        self, keyframe: int, pieces: int = 1, candidates: int | None = None
+    ) -> list[Callable[[], LinksMeasured]]:
         return [lambda: LinksMeasured(keyframe=keyframe)]
 
-    def optimising(self) -> Callable[[], Optimised]:
+    def optimising(self, solve: WholeFit | None = None) -> Callable[[], Optimised]:
         return lambda: Optimised(up_to=0, ids=(), T_map_camera=b"")
 
     def relocalising(self, camera: Camera, features: bytes) -> Callable[[], Any]:

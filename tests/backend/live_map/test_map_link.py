@@ -148,13 +148,18 @@ def test_an_owner_elsewhere_is_used_before_the_own_process_is_ready() -> None:
     play(test)
 
 
+def owner_on_a_closed_port(worker: Worker) -> None:
+    """Let another server have the lease, with a port where nobody listens."""
+    elsewhere = OwnerLease(worker.store, LEASE, owner="b", server="there", clock=time.monotonic)
+    assert elsewhere.claim(None)
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        port = listener.getsockname()[1]
+    assert elsewhere.serve("127.0.0.1", port, "c")
+
+
 def test_an_owner_whose_port_is_closed_is_replaced_at_once_by_those_who_were_connected() -> None:
     async def test(worker: Worker) -> None:
-        elsewhere = OwnerLease(worker.store, LEASE, owner="b", server="there", clock=time.monotonic)
-        assert elsewhere.claim(None)
-        with socket.create_server(("127.0.0.1", 0)) as listener:
-            port = listener.getsockname()[1]
-        assert elsewhere.serve("127.0.0.1", port, "c")
+        owner_on_a_closed_port(worker)
         worker.link._welcomed = "b"
         began_s = time.monotonic()
         sent = asyncio.ensure_future(worker.link.request(ROBOT, "live-keyframe", FIRST, 5.0))
@@ -171,11 +176,7 @@ def test_an_owner_whose_port_was_never_reached_keeps_its_lease() -> None:
     """A firewall may refuse what the other servers can reach."""
 
     async def test(worker: Worker) -> None:
-        elsewhere = OwnerLease(worker.store, LEASE, owner="b", server="there", clock=time.monotonic)
-        assert elsewhere.claim(None)
-        with socket.create_server(("127.0.0.1", 0)) as listener:
-            port = listener.getsockname()[1]
-        assert elsewhere.serve("127.0.0.1", port, "c")
+        owner_on_a_closed_port(worker)
         sent = asyncio.ensure_future(worker.link.request(ROBOT, "live-keyframe", FIRST, 0.3))
         await until(lambda: worker.started)
         worker.started[0].say("ready")

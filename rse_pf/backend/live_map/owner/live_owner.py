@@ -29,6 +29,7 @@ from rse_pf.backend.live_map.owner.work.measuring import Measuring
 from rse_pf.backend.live_map.owner.work.publisher import Publisher
 from rse_pf.backend.live_map.owner.work.threads import Threads, Urgency
 from rse_pf.backend.live_map.owner.work.waits import FIRST_RETRY_S, Sleep, next_retry_s
+from rse_pf.backend.live_map.owner.work.whole_fit import WholeFit, fit_here
 from rse_pf.backend.log import JsonLog
 from rse_pf.config import LiveSettings
 from rse_pf.errors import Conflict, InternalError, NotFound, StoreError, UnknownService
@@ -63,6 +64,7 @@ class OwnerContext:
         sleep: Waits for seconds.
         tell: Gets each new payload.
         on_beat: Gets the number of each renewal of the lease.
+        fit: Fits a whole graph.
     """
 
     map_name: str
@@ -76,6 +78,7 @@ class OwnerContext:
     log: JsonLog
     tell: Callable[[dict[str, Any]], None]
     on_beat: Callable[[int], None]
+    fit: WholeFit = fit_here
 
 
 class LiveOwner:
@@ -101,8 +104,9 @@ class LiveOwner:
             name=context.map_name,
         )  # fmt: skip
         self._measuring = Measuring(
-            state, context.threads, self._writer.submit, json_log=context.log, name=context.map_name
-        )
+            state, context.threads, self._writer.submit, fit=context.fit, json_log=context.log,
+            name=context.map_name,
+        )  # fmt: skip
         self._publisher = Publisher(
             state, context.maps, threads=context.threads, wall_clock=context.wall_clock,
             json_log=context.log, name=context.map_name, author=f"live map on {lease.record.server}",

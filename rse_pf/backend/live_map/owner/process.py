@@ -39,6 +39,7 @@ from rse_pf.backend.live_map.owner.log import LiveLog, OwnershipLost
 from rse_pf.backend.live_map.owner.server import OwnerServer, listen
 from rse_pf.backend.live_map.owner.state import MapKind, MapState, take_over
 from rse_pf.backend.live_map.owner.work.threads import OwnerThreads, Urgency
+from rse_pf.backend.live_map.owner.work.whole_fit import fit_apart
 from rse_pf.backend.log import JsonLog
 from rse_pf.backend.sandbox.ipc import FrameReader, encode_message, receive
 from rse_pf.config import PlatformSettings
@@ -272,7 +273,7 @@ class _Process:
         return OwnerContext(
             map_name=self._order.map_name, settings=self._settings.live, kind=self._kind,
             threads=self._threads, maps=maps, clock=time.monotonic, wall_clock=time.time,
-            sleep=asyncio.sleep, log=self._log, tell=tell, on_beat=on_beat,
+            sleep=asyncio.sleep, log=self._log, tell=tell, on_beat=on_beat, fit=fit_apart,
         )  # fmt: skip
 
     async def _obey(self, owner: LiveOwner) -> None:

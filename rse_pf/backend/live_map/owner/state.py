@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import Any, Literal, Protocol, TypeVar
 
 from rse_pf.backend.live_map.owner.log import LiveLog, MapSnapshot, OwnershipLost, snapshot_entries
+from rse_pf.backend.live_map.owner.work.whole_fit import WholeFit
 from rse_pf.errors import BadRequest, NotFound
 from rse_pf.geometry import Camera
 from rse_pf.live_map.events import (
@@ -56,10 +57,12 @@ class MapLogic(Protocol):
     def apply(self, event: Event) -> list[Outcome]:
         """Change the map by an event of the log."""
 
-    def measuring(self, keyframe: int, pieces: int = 1) -> list[Callable[[], LinksMeasured]]:
+    def measuring(
+        self, keyframe: int, pieces: int = 1, candidates: int | None = None
+    ) -> list[Callable[[], LinksMeasured]]:
         """Return what looks for links of a keyframe, piece by piece, in any thread, while the map changes."""
 
-    def optimising(self) -> Callable[[], Optimised]:
+    def optimising(self, solve: WholeFit | None = None) -> Callable[[], Optimised]:
         """Return what optimises the whole graph, in any thread, while the map changes."""
 
     def relocalising(self, camera: Camera, features: bytes) -> Callable[[], Any]:
@@ -134,20 +137,23 @@ class MapState:
         self.keyframes = size_of(self.live_map.keyframes)
         return Applied(outcomes=outcomes, defects=defects)
 
-    def measuring(self, keyframe: int, pieces: int) -> list[Callable[[], LinksMeasured]]:
+    def measuring(
+        self, keyframe: int, pieces: int, candidates: int | None = None
+    ) -> list[Callable[[], LinksMeasured]]:
         """Return what measures the links of a keyframe, in any thread, while the map changes.
 
-        `joined_links` joins what the pieces find.  After a defect there are none, with the reason ``defect``.
+        It is compared with *candidates*, None for as many as the map likes.  `joined_links` joins what the
+        pieces find.  After a defect there are none, with the reason ``defect``.
         """
         defect = LinksMeasured(keyframe=keyframe, failed={"defect": 1})
-        found = _guarded(lambda: self.live_map.measuring(keyframe, pieces))
+        found = _guarded(lambda: self.live_map.measuring(keyframe, pieces, candidates))
         if found is None:
             return [lambda: defect]
         return [functools.partial(_links, measure, defect) for measure in found]
 
-    def optimising(self) -> Callable[[], Optimised | None]:
+    def optimising(self, solve: WholeFit) -> Callable[[], Optimised | None]:
         """Return what fits the whole graph, in any thread, while the map changes; None if that fails."""
-        fit = _guarded(self.live_map.optimising)
+        fit = _guarded(lambda: self.live_map.optimising(solve))
         return lambda: None if fit is None else _guarded(fit)
 
     @property

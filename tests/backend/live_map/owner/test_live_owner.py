@@ -136,7 +136,7 @@ def test_an_optimisation_that_fails_is_no_defect_of_the_owner():
 
     async def test() -> None:
         owner = await bench.own("a")
-        owner.state.live_map.optimising = lambda: [].index(0)  # type: ignore[attr-defined]
+        owner.state.live_map.optimising = lambda solve: [].index(0)  # type: ignore[attr-defined]
         owner.owner._measuring.optimise()
         await settle()
         assert not owner.run.done()

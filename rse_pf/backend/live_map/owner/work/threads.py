@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import enum
 import itertools
+import os
 import threading
 from collections.abc import Awaitable, Callable
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -15,6 +16,8 @@ __all__ = ["OwnerThreads", "Threads", "Urgency"]
 
 _LOOKING = 3
 """Two measure keyframes, one may look for a robot that is lost; matching and solving free the GIL."""
+_CALM_NICE = 10
+"""Of threads whose work poses do not wait for."""
 _T = TypeVar("_T")
 
 
@@ -51,10 +54,11 @@ class OwnerThreads:
     """Real threads; they end with the process."""
 
     def __init__(self) -> None:
-        self._store, self._lease, self._background = (
-            ThreadPoolExecutor(1, thread_name_prefix=name) for name in ("store", "lease", "background")
+        self._store, self._lease = (
+            ThreadPoolExecutor(1, thread_name_prefix=name) for name in ("store", "lease")
         )
-        self._look = ThreadPoolExecutor(_LOOKING, thread_name_prefix="look")
+        self._background = ThreadPoolExecutor(1, thread_name_prefix="background", initializer=_calm)
+        self._look = ThreadPoolExecutor(_LOOKING, thread_name_prefix="look", initializer=_calm)
         self._waiting: PriorityQueue[tuple[int, int, Callable[[], None]]] = PriorityQueue()
         self._count = itertools.count()
         threading.Thread(target=self._compute_on, name="map", daemon=True).start()
@@ -96,3 +100,8 @@ class OwnerThreads:
     def _compute_on(self) -> None:
         while True:
             self._waiting.get()[2]()
+
+
+def _calm() -> None:
+    """Lower the priority of the calling thread, which Linux has for each thread."""
+    os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _CALM_NICE)

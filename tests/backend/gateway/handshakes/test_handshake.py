@@ -60,15 +60,50 @@ def test_the_first_offered_subprotocol_that_the_server_speaks_is_chosen():
 
 
 def test_a_browser_may_offer_its_token_as_a_subprotocol_which_is_never_selected():
-    offered = [SUBPROTOCOLS["json"], f"bearer.{token()}"]
+    offered = [SUBPROTOCOLS["json"], f"rse-pf.token.{token()}"]
 
     accepted = judge(authorization="", offered=offered)
-    wrong = judge(authorization="", offered=[SUBPROTOCOLS["json"], f"bearer.{token()}x"])
+    wrong = judge(authorization="", offered=[SUBPROTOCOLS["json"], f"rse-pf.token.{token()}x"])
 
     assert isinstance(accepted, Accepted)
     assert (accepted.robot, accepted.subprotocol) == (RobotId("default", "robot-1"), SUBPROTOCOLS["json"])
     assert isinstance(wrong, Rejected)
     assert wrong.body == judge(authorization="").body
+
+
+def test_the_header_counts_where_a_subprotocol_carries_another_token():
+    refused = judge(authorization="Bearer x", offered=[SUBPROTOCOLS["json"], f"rse-pf.token.{token()}"])
+
+    assert (refused.status, refused.result) == (401, "unauthorized")
+
+
+PAGE = "https://robots.example.org"
+LISTED = PlatformSettings.from_dict({"serving": {"allowed_origins": f"{PAGE} http://10.0.0.5:9000"}})
+
+
+@pytest.mark.parametrize(
+    ("origin", "is_allowed"),
+    [
+        ("", True), (PAGE, True), (PAGE.upper(), True), ("http://10.0.0.5:9000", True),
+        ("http://platform:8700", True), ("https://platform:8700", True),
+        ("null", False), ("http://platform", False), ("http://platform:8701", False),
+        ("http://10.0.0.5", False),
+        ("http://robots.example.org", False), (f"{PAGE}.evil.example", False), (f"{PAGE}, {PAGE}", False),
+        ("file://platform:8700", False), (f"{PAGE}/", False),
+    ],
+)  # fmt: skip
+def test_a_web_page_connects_from_the_platform_itself_or_from_a_listed_origin(origin, is_allowed):
+    policy = HandshakePolicy(LISTED, KEY.key_set())
+
+    verdict = judge(policy, origin=origin, host="platform:8700")
+
+    assert isinstance(verdict, Accepted) == is_allowed
+    if isinstance(verdict, Rejected):
+        assert (verdict.status, json.loads(verdict.body)["code"]) == (403, "forbidden")
+
+
+def test_no_origin_is_listed_by_default():
+    assert isinstance(judge(origin=PAGE, host="platform"), Rejected)
 
 
 @pytest.mark.parametrize(

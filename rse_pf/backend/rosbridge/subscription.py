@@ -1,0 +1,92 @@
+"""What one rosbridge client still has to get of one topic: the newest messages, not faster than it asked for.
+
+Times and messages go in, the messages that are due come out: there is no clock, no loop and no socket here.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import Any
+
+from rse_pf.backend.rosbridge.codec import publication
+
+__all__ = ["MAX_QUEUE_LENGTH", "Subscription", "TopicMessage"]
+
+MAX_QUEUE_LENGTH = 100
+_MAX_QUEUE_BYTES = 1 << 20
+"""Messages that wait for one subscription, all together; the newest is kept in any case."""
+
+
+class TopicMessage:
+    """The JSON that a client published, and what its subscribers get, made once for each spelling."""
+
+    __slots__ = ("_encoded", "data")
+
+    def __init__(self, data: bytes) -> None:
+        self.data = data
+        self._encoded: dict[str, bytes] = {}
+
+    def encoded(self, topic: str) -> bytes:
+        """Return the WebSocket message for who spells the topic so."""
+        found = self._encoded.get(topic)
+        if found is None:
+            found = self._encoded[topic] = publication(topic, self.data)
+        return found
+
+
+class Subscription:
+    """One client's subscription to one topic, however many times it subscribed.
+
+    Attributes:
+        owner: The client's connection.
+        spelling: The topic as the client wrote it first.
+        requests: The shortest pause in s and the queue length of each request, by its id.
+        replaced: How many messages newer ones replaced.
+    """
+
+    __slots__ = ("_bytes", "_next_s", "_waiting", "owner", "replaced", "requests", "spelling")
+
+    def __init__(self, owner: Any, spelling: str) -> None:
+        self.owner = owner
+        self.spelling = spelling
+        self.requests: dict[str | int | None, tuple[float, int]] = {}
+        self.replaced = 0
+        self._waiting: deque[TopicMessage] = deque()
+        self._bytes = 0
+        self._next_s = float("-inf")
+
+    def __len__(self) -> int:
+        """Return how many messages wait."""
+        return len(self._waiting)
+
+    @property
+    def pause_s(self) -> float:
+        """The pause between two messages: the shortest that was asked for."""
+        return min(pause_s for pause_s, _ in self.requests.values())
+
+    def put(self, message: TopicMessage) -> None:
+        """Add *message*; the oldest ones are dropped above the longest queue that there is."""
+        self._waiting.append(message)
+        self._bytes += len(message.data)
+        self._bound(MAX_QUEUE_LENGTH)
+
+    def bound(self) -> None:
+        """Drop the oldest messages above the queue that was asked for: the client has to wait now."""
+        self._bound(max(length for _, length in self.requests.values()))
+
+    def wait_s(self, now: float) -> float:
+        """Return 0 if a message may be sent at *now* (s), else the seconds until then."""
+        return max(0.0, self._next_s - now)
+
+    def take(self, now: float) -> bytes:
+        """Return the WebSocket message that is sent at *now* (s)."""
+        message = self._waiting.popleft()
+        self._bytes -= len(message.data)
+        self._next_s = now + self.pause_s
+        return message.encoded(self.spelling)
+
+    def _bound(self, length: int) -> None:
+        waiting = self._waiting
+        while len(waiting) > length or (len(waiting) > 1 and self._bytes > _MAX_QUEUE_BYTES):
+            self._bytes -= len(waiting.popleft().data)
+            self.replaced += 1

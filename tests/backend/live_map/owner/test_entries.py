@@ -1,0 +1,82 @@
+"""Entries of the log are bounded, and so is what waits for a store."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Awaitable, Callable
+from typing import Any, cast
+
+import numpy as np
+import pytest
+
+from rse_pf.backend.live_map.owner.work.entries import EntryWriter, Submitted
+from rse_pf.errors import Busy
+from rse_pf.live_map.events import Event, KeyframeAdded, RobotLeft
+
+
+class Taker:
+    """Holds no map; notes how many events each entry had."""
+
+    def __init__(self) -> None:
+        self.sizes: list[int] = []
+
+    async def take_entry(self, position: int, batch: list[Submitted]) -> None:
+        self.sizes.append(len(batch))
+        for each in batch:
+            each.done.set_result([])
+
+    def note_store(self, *, is_waiting: bool) -> None:
+        pass
+
+
+class Store:
+    """Writes at once, as a thread and a log do."""
+
+    def store(self, act: Callable[[], int]) -> Awaitable[int]:
+        async def done() -> int:
+            return act()
+
+        return done()
+
+    def write(self, data: bytes) -> int:
+        return 1
+
+
+def keyframe(number: int) -> Event:
+    return KeyframeAdded(
+        robot="r", number=number, segment=0, timestamp_s=0.0, T_odom_camera=np.eye(4).tobytes(),
+        camera=(1.0, 1.0, 1.0, 1.0, 2, 2), features=b"",
+    )  # fmt: skip
+
+
+def writer(taker: Taker) -> EntryWriter:
+    store = cast(Any, Store())
+    return EntryWriter(
+        store, cast(Any, taker), threads=store, sleep=asyncio.sleep, json_log=cast(Any, None), name="m"
+    )
+
+
+def test_an_entry_holds_no_more_than_four_mebibytes() -> None:
+    async def test() -> list[int]:
+        entries = writer(taker := Taker())
+        for number in range(5):
+            entries.submit(keyframe(number), 2 << 20)
+        running = asyncio.ensure_future(entries.run())
+        await entries.wait_empty()
+        running.cancel()
+        return taker.sizes
+
+    assert asyncio.run(test()) == [2, 2, 1]
+
+
+def test_a_keyframe_too_many_is_refused_and_who_leaves_is_not() -> None:
+    async def test() -> None:
+        entries = writer(Taker())
+        for number in range(1024):
+            entries.submit(keyframe(number))
+
+        with pytest.raises(Busy):
+            entries.submit(keyframe(1024))
+        entries.submit(RobotLeft(robot="r"))
+
+    asyncio.run(test())
