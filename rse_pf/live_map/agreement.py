@@ -24,8 +24,6 @@ __all__ = ["agreeing_between", "agreeing_by_odometry", "has_enough_ends", "judge
 
 _CHI2_3_99 = 11.345
 """99 % of the squared Mahalanobis norms of a 3-vector lie below."""
-_WIDE_STEPS = 12.0
-"""Beyond so many steps, the graph is too vague to confirm a single link."""
 _CONTRARY_LINKS = 24
 
 
@@ -108,7 +106,7 @@ def judge_within(
     )
     return [
         "contrary" if not ok else "vague" if far else "agrees"
-        for ok, far in zip(agrees.tolist(), (steps > _WIDE_STEPS).tolist(), strict=True)
+        for ok, far in zip(agrees.tolist(), (steps > options.vague_steps).tolist(), strict=True)
     ]
 
 

@@ -92,7 +92,10 @@ def _judge_within(graph: Graph, numbers: list[int], options: LiveMapOptions, cha
 
 
 def _refute(graph: Graph, number: int, options: LiveMapOptions, changes: Changes) -> None:
-    """Remove believed links that fewer links support than those that agree with the contrary *number*."""
+    """Remove believed links that fewer links support than those that agree with the contrary *number*.
+
+    Where many support both, what two robots saw together is at two places that look the same.
+    """
     agreeing = agreeing_by_odometry(graph, number, _open_beside(graph, number), options)
     if not has_enough_ends(graph, agreeing, options):
         return
@@ -124,6 +127,10 @@ def _refute(graph: Graph, number: int, options: LiveMapOptions, changes: Changes
         refuted = True
     if refuted and graph.segments[one].component != graph.segments[other].component:
         _try_join(graph, graph.segments[one].component, graph.segments[other].component, options, changes)
+    elif not refuted and len(agreeing) >= options.lookalike_links:
+        apart_m, walked = _off_m(graph, number), graph.walks(link.a, [link.b])[link.b]
+        if apart_m > max(options.lookalike_m, walked * options.spacing_m * options.worst_drift):
+            _note_lookalikes(graph, agreeing, apart_m, options, changes)
 
 
 def _loops(graph: Graph, row: int) -> list[int]:
@@ -139,6 +146,13 @@ def _apart_m(graph: Graph, number: int) -> float:
     """Return by how much odometry contradicts a link within a segment."""
     link = graph.links[number]
     off = inverse(link.T_a_b) @ inverse(graph.T_odom[link.a]) @ graph.T_odom[link.b]
+    return float(np.sqrt((off[:3, 3] ** 2).sum()))
+
+
+def _off_m(graph: Graph, number: int) -> float:
+    """Return by how much the graph contradicts a link."""
+    link = graph.links[number]
+    off = inverse(link.T_a_b) @ inverse(graph.T[link.a]) @ graph.T[link.b]
     return float(np.sqrt((off[:3, 3] ** 2).sum()))
 
 

@@ -26,12 +26,14 @@ __all__ = [
     "RobotLeft",
     "StartKeyframe",
     "StartLink",
+    "check_rigid",
     "decode_events",
     "encode_events",
     "matrix_bytes",
     "matrix_of",
 ]
 
+_MAX_M = 1e6
 CameraNumbers = tuple[float, float, float, float, int, int]
 """fx fy cx cy (pixels), width, height."""
 
@@ -173,3 +175,14 @@ def matrix_of(data: bytes, rows: int, columns: int) -> Array:
         )
     matrix: Array = np.frombuffer(data, dtype="<f8").reshape(rows, columns)
     return matrix
+
+
+def check_rigid(T: Array) -> None:
+    """Refuse a ``(4, 4)`` matrix that is no rigid motion of sensible size, metres; raises BadRequest."""
+    R = T[:3, :3]
+    is_rigid = (
+        bool((np.abs(T) <= _MAX_M).all()) and np.array_equal(T[3], (0.0, 0.0, 0.0, 1.0))
+        and float(np.abs(R @ R.T - np.eye(3)).max()) <= 1e-4 and float(np.linalg.det(R)) > 0
+    )  # fmt: skip
+    if not is_rigid:
+        raise BadRequest("T_odom_camera is not a rigid motion", hint="send a (4, 4) matrix of finite numbers")

@@ -25,6 +25,7 @@ from rse_pf.live_map.events import (
     Optimised,
     RobotForgotten,
     RobotLeft,
+    check_rigid,
     matrix_bytes,
     matrix_of,
 )
@@ -49,11 +50,11 @@ from rse_pf.live_map.smoother import SmoothedWindows, odometry_step, smooth_arou
 from rse_pf.live_map.versions import version_of, whole_graph
 from rse_pf.maps.format import MapVersion
 from rse_pf.services.mapping.optimise import OptimiseOptions, optimise_graph
-from rse_pf.services.mapping.pose_graph import inverses
+from rse_pf.services.mapping.pose_graph import PoseGraph, inverses
 
 __all__ = ["LiveMap"]
 
-_MAX_M, _MAX_TIME_S = 1e6, 1e12
+_MAX_TIME_S = 1e12
 _MAX_SEGMENT = 2**31
 
 
@@ -179,7 +180,7 @@ class LiveMap:
             )
         if not abs(event.timestamp_s) <= _MAX_TIME_S:
             raise BadRequest("the time of the keyframe is absurd", hint="send seconds since 1970")
-        _check_rigid(matrix_of(event.T_odom_camera, 4, 4))
+        check_rigid(matrix_of(event.T_odom_camera, 4, 4))
         try:
             camera = camera_of(event.camera)
         except InvalidCamera as error:
@@ -212,15 +213,18 @@ class LiveMap:
         """Compare a keyframe with others that may show the same place; changes nothing."""
         return self.measuring(keyframe)[0]()
 
-    def measuring(self, keyframe: int, pieces: int = 1) -> list[Callable[[], LinksMeasured]]:
+    def measuring(
+        self, keyframe: int, pieces: int = 1, candidates: int | None = None
+    ) -> list[Callable[[], LinksMeasured]]:
         """Return what does the work of `measure`; other threads may call it while the map changes.
 
-        The results of the pieces, one for each share of the candidates, are joined by `joined_links`.
+        The results of the pieces, one for each share of the candidates, are joined by `joined_links`.  Less
+        *candidates* than those of the options are for an owner that is behind.
         """
         stored = self._stored(keyframe)
         if stored is None:
             return [lambda: LinksMeasured(keyframe=keyframe)]
-        found = [self._stored(i) for i in self._candidates(keyframe)]
+        found = [self._stored(i) for i in self._candidates(keyframe, candidates)]
         others = [each for each in found if each is not None]
         size = max(1, -(-len(others) // pieces))
         shares = [others[begin : begin + size] for begin in range(0, max(1, len(others)), size)]
@@ -234,14 +238,19 @@ class LiveMap:
         """
         return self.optimising()()
 
-    def optimising(self) -> Callable[[], Optimised]:
-        """Return what does the work of `optimise`; another thread may call it while the map changes."""
+    def optimising(
+        self, solve: Callable[[PoseGraph, OptimiseOptions], Array] | None = None
+    ) -> Callable[[], Optimised]:
+        """Return what does the work of `optimise`; another thread may call it while the map changes.
+
+        *solve* returns the poses that `optimise_graph` does, in a process of its own for example.
+        """
         graph, ids = whole_graph(self._graph, self.options)
         anchor, up_to = ids.index(self._anchor(self._graph.root)), self._graph.events
         options = OptimiseOptions(cauchy=self.options.cauchy)
 
         def fit() -> Optimised:
-            poses = optimise_graph(graph, options).T_world_pose
+            poses = solve(graph, options) if solve else optimise_graph(graph, options).T_world_pose
             poses = graph.T_world_pose[anchor] @ inverse(poses[anchor]) @ poses
             return Optimised(up_to=up_to, ids=tuple(ids), T_map_camera=matrix_bytes(poses))
 
@@ -532,8 +541,11 @@ class LiveMap:
         features = decode_features(keyframe.features, self._graph.camera(i))
         self._places.add(i, LivePlaceIndex.vector(features.descriptors))
 
-    def _candidates(self, k: int) -> list[int]:
-        """Return the keyframes to compare with *k*: some of its own component, some of others."""
+    def _candidates(self, k: int, most: int | None = None) -> list[int]:
+        """Return the keyframes to compare with *k*: some of its own component, some of others.
+
+        With *most*, those that its robot has seen just before are left out: they join nothing.
+        """
         graph, options = self._graph, self.options
         vector = self._places.vector_of(k)
         component = np.array([segment.component for segment in graph.segments])[graph.of_segment]
@@ -541,10 +553,11 @@ class LiveMap:
         held = graph.held.copy()
         held[k] = False
         close = graph.of_segment == graph.of_segment[k]
-        close &= np.abs(graph.way - graph.way[k]) < options.apart_steps
+        apart = options.apart_steps if most is None else max(options.apart_steps, options.vague_steps)
+        close &= np.abs(graph.way - graph.way[k]) < apart
         here = np.flatnonzero(held & own & ~close)
         there = np.flatnonzero(held & ~own)
-        most = options.candidates
+        most = options.candidates if most is None else most
         found_there = self._places.nearest(vector, most // 2, there)
         found_here = self._places.nearest(vector, most - len(found_there), here)
         return sorted(i for i, _ in found_here + found_there)
@@ -581,14 +594,3 @@ class LiveMap:
             robot=segment.robot, segment=segment.segment, aligned=aligned, reason=segment.reason,
             T_map_odom=segment.told, covariance=segment.covariance if aligned else None,
         )  # fmt: skip
-
-
-def _check_rigid(T: Array) -> None:
-    """Raise BadRequest unless *T* is a rigid motion of sensible size."""
-    R = T[:3, :3]
-    is_rigid = (
-        bool((np.abs(T) <= _MAX_M).all()) and np.array_equal(T[3], (0.0, 0.0, 0.0, 1.0))
-        and float(np.abs(R @ R.T - np.eye(3)).max()) <= 1e-4 and float(np.linalg.det(R)) > 0
-    )  # fmt: skip
-    if not is_rigid:
-        raise BadRequest("T_odom_camera is not a rigid motion", hint="send a (4, 4) matrix of finite numbers")

@@ -1,4 +1,4 @@
-"""The numbers of a live map; each was measured with `benchmarks/live_map.py`."""
+"""The numbers of a live map; each was measured with `benchmarks/live/one_process.py`."""
 
 from __future__ import annotations
 
@@ -34,11 +34,13 @@ class LiveMapOptions:
         measured: What a measured relative pose needs to become a link.
         candidates: So many keyframes are compared with a new one.
         apart_steps: Keyframes of one segment that are closer than this along the way are no loop.
+        vague_steps: Beyond so many steps the graph is too vague to confirm a single link.
         same_place_m: Keyframes closer than this,
         same_place_deg: and turned less than this,
         same_place_most: of which there are more than so many, are redundant.
         lookalike_m: Two places that look the same are told apart from this distance on.
         lookalike_most_m: What is nearer to them than this may look like something else, too.
+        lookalike_links: So many links that agree prove it between two robots, against believed ones.
         worst_drift: Share of the way that odometry may be wrong by; beyond it, a place is another one.
         optimise_every: A whole optimisation is wanted at most once in so many keyframes.
     """
@@ -62,11 +64,13 @@ class LiveMapOptions:
     measured: MeasureOptions = field(default_factory=lambda: MeasureOptions(min_inliers=30))
     candidates: int = 12
     apart_steps: float = 0.8
+    vague_steps: float = 12.0
     same_place_m: float = 0.12
     same_place_deg: float = 8.0
     same_place_most: int = 2
     lookalike_m: float = 1.0
     lookalike_most_m: float = 5.0
+    lookalike_links: int = 12
     worst_drift: float = 0.15
     optimise_every: int = 20
 

@@ -7,7 +7,7 @@ import copy as copy_module
 import numpy as np
 import pytest
 
-from benchmarks.generated_drives import GeneratedDrive, GeneratedWorld, circle, measured_link
+from benchmarks.live.generated_drives import GeneratedDrive, GeneratedWorld, circle, measured_link, straight
 from rse_pf.errors import BadRequest
 from rse_pf.geometry import Array, exp_se3, inverse, pose_difference
 from rse_pf.live_map.events import (
@@ -23,6 +23,7 @@ from rse_pf.live_map.events import (
     matrix_bytes,
 )
 from rse_pf.live_map.live_map import LiveMap
+from rse_pf.live_map.options import LiveMapOptions
 from rse_pf.live_map.outcomes import Added, Ambiguous, Corrected, Joined, LinkRemoved, Outcome, Unaligned
 from rse_pf.live_map.versions import started_from
 
@@ -262,6 +263,34 @@ def test_a_robot_that_drives_between_equal_rooms_proves_them_ambiguous() -> None
     assert aligned["b"].reason.startswith("ambiguous")
 
 
+def test_a_robot_that_meets_in_the_second_of_equal_rooms_whom_it_met_in_the_first_proves_it() -> None:
+    """Its new views match those of the other robot, not its own of the first room."""
+    world = GeneratedWorld(seed=3, links=0)
+    c, b = world.drive("c", straight(0.0, 8.0)), world.drive("b", straight(6.0, 8.0))
+    steps = len(b.T_world_camera)
+    live_map, outcomes = LiveMap(), list[Outcome]()
+    for drive, count in ((c, len(c.T_world_camera)), (b, steps)):
+        for number in range(count):
+            live_map.apply(world.keyframe(drive, number))
+    first_b, in_second = len(c.T_world_camera), len(c.T_world_camera) - steps
+    shift = world.seen[0] @ inverse(world.seen[in_second])
+    for near in range(3 * steps):  # more than are ever compared at once
+        k = first_b + near % steps
+        other = (near % steps + near // steps) % steps
+        link = measured_link(other, inverse(world.seen[k]) @ inverse(shift) @ world.seen[other])
+        live_map.apply(LinksMeasured(keyframe=k, links=(link,)))
+    assert live_map.alignment_of("b", 0).aligned  # type: ignore[union-attr]
+    for number in range(steps):
+        link = world.true_link(in_second + number, first_b + number)
+        outcomes += live_map.apply(LinksMeasured(keyframe=in_second + number, links=(link,)))
+
+    found = live_map.alignment_of("b", 0)
+    assert found is not None
+    assert not found.aligned
+    assert found.reason.startswith("ambiguous")
+    assert any(isinstance(each, Unaligned) for each in outcomes)
+
+
 def test_robots_in_rooms_that_may_be_equal_are_joined_by_more_than_a_room() -> None:
     """The links of two equal rooms and those of one are the same numbers, so the map must be told."""
     world = GeneratedWorld(seed=2, links=2)
@@ -275,6 +304,15 @@ def test_robots_in_rooms_that_may_be_equal_are_joined_by_more_than_a_room() -> N
     assert len(joined_m) == 2
     assert 1.5 < joined_m[1] < 2.2
     assert LiveMap.restore(run.map.snapshot()).snapshot() == run.map.snapshot()
+
+
+def test_an_owner_that_is_behind_compares_a_keyframe_with_few_and_none_of_just_before() -> None:
+    world = GeneratedWorld(seed=1)
+    live_map, drive = LiveMap(LiveMapOptions(candidates=1000)), world.drive("a", straight(0.0, 9.0))
+    for number in range(60):
+        live_map.apply(world.keyframe(drive, number))
+    assert len(live_map.measuring(59, 100, 4)) == 4
+    assert max(live_map._candidates(59)) > 50 > max(live_map._candidates(59, 1000))
 
 
 def test_a_keyframe_is_new_known_or_ahead() -> None:

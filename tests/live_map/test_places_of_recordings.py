@@ -1,4 +1,4 @@
-"""Places of the recordings: the bars of `benchmarks/live_places.py` that take seconds, not minutes."""
+"""Places of the recordings: the bars of `benchmarks/live/places.py` that take seconds, not minutes."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.live_places import (
+from benchmarks.live.places import (
     SMALL,
     PlacedMap,
     View,
@@ -18,7 +18,7 @@ from benchmarks.live_places import (
     verdicts_of,
     views_of,
 )
-from benchmarks.map_recordings import RED_KITCHEN
+from benchmarks.maps.recordings import RED_KITCHEN
 from client_sdk.datasets import open_dataset
 from rse_pf.live_map.keyframe_code import MAX_FEATURES_BYTES
 

@@ -32,6 +32,8 @@ TURNS = (0.0, 0.02, 0.05, 0.3, 0.6)
 MAP = candidates_of(3, TURNS)
 _, VIEW, CAMERA, T_VIEW = candidates_of(3, (0.0, 0.035))[1]
 ELSEWHERE = exp_se3([12.0, 1.0, 0.0, 0.0, 0.0, 1.0])
+TURNED = T_VIEW @ exp_se3([0.0, 0.0, 0.0, 0.0, 1.0, 0.0]) @ inverse(T_VIEW)
+"""About the view, which stays where it is."""
 
 
 def renumbered(candidates, first: int):
@@ -76,8 +78,9 @@ def test_a_foreign_view_has_no_place():
     assert (found.verdict, found.reason, found.T_map_camera) == ("none", "no-pose", None)
 
 
-def test_two_places_that_look_alike_are_ambiguous():
-    twice = MAP + renumbered([(n, f, c, ELSEWHERE @ T) for n, f, c, T in MAP], 10)
+@pytest.mark.parametrize("other", [ELSEWHERE, TURNED], ids=["elsewhere", "turned"])
+def test_two_places_that_look_alike_are_ambiguous(other):
+    twice = MAP + renumbered([(n, f, c, other @ T) for n, f, c, T in MAP], 10)
 
     found = relocalise(twice, VIEW, CAMERA)
 

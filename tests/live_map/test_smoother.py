@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from benchmarks.generated_drives import INFORMATION, GeneratedWorld, circle
+from benchmarks.live.generated_drives import INFORMATION, GeneratedWorld, circle
 from rse_pf.geometry import Array, exp_se3
 from rse_pf.live_map.graph import LiveLink, variances_of
 from rse_pf.live_map.live_map import LiveMap
