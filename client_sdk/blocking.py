@@ -9,9 +9,9 @@ import asyncio
 import functools
 import threading
 from collections.abc import Callable, Coroutine
-from types import TracebackType
 from typing import TYPE_CHECKING, Any, Concatenate, ParamSpec, TypeVar
 
+from client_sdk.closing import Closing
 from client_sdk.robot import Robot, connect
 from client_sdk.stats import Stats
 from client_sdk.updates import BlockingUpdates, Updates
@@ -72,7 +72,7 @@ def _blocking_live_map(
     return live_map
 
 
-class BlockingRobot:
+class BlockingRobot(Closing):
     """A `Robot` whose methods block until their answers arrive."""
 
     def __init__(self, robot: Robot) -> None:
@@ -91,15 +91,6 @@ class BlockingRobot:
             self._end()
             raise
         return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        """Close the connection."""
-        self.close()
 
     def close(self) -> None:
         """Close the connection and end the thread."""

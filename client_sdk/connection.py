@@ -44,7 +44,7 @@ from rse_pf.wire.client_session import (
     Welcomed,
 )
 from rse_pf.wire.client_subscriptions import SubscriptionEnded, Updated
-from rse_pf.wire.server_session import CLOSE_RATE, CLOSE_REPLACED
+from rse_pf.wire.server_session import CLOSE_RATE, CLOSE_REPLACED, CLOSE_REVOKED
 
 if TYPE_CHECKING:
     from rse_pf.recording.robot_recorder import RobotRecorder
@@ -385,15 +385,13 @@ class Connection:
         except (ConnectionClosed, OSError):
             if socket.websocket.close_code == CLOSE_RATE:
                 self.last_error = "the server closed the connection: this robot exceeds its rate"
+            elif socket.websocket.close_code == CLOSE_REVOKED and not callable(self._token):
+                self._end(Unauthorized("the token was revoked, or the robot was disabled", hint=_ISSUE))
             is_replaced = socket.websocket.close_code == CLOSE_REPLACED
             by_itself = self._move_request is not None or self._clock() < self._late_welcome_until
             if is_replaced and self._session.current is socket.state and not by_itself:
-                self._end(
-                    Conflict(
-                        "another connection of this robot replaced this one",
-                        hint="give every robot a token of its own",
-                    )
-                )
+                message = "another connection of this robot replaced this one"
+                self._end(Conflict(message, hint="give every robot a token of its own"))
         finally:
             self._forget(socket)
 

@@ -11,6 +11,7 @@ from collections.abc import AsyncIterator, Callable, Coroutine, Iterator
 from types import TracebackType
 from typing import Any
 
+from client_sdk.closing import Closing
 from rse_pf.errors import RsePfError, error_from_code
 from rse_pf.wire.client_session import ClientSession
 from rse_pf.wire.client_subscriptions import SubscriptionEnded, Updated
@@ -151,7 +152,7 @@ class RobotSubscriptions:
             )
 
 
-class BlockingUpdates:
+class BlockingUpdates(Closing):
     """`Updates` for programs without asyncio; it waits for each value."""
 
     def __init__(self, updates: Updates, wait: Callable[[Coroutine[Any, Any, Any]], Any]) -> None:
@@ -170,18 +171,6 @@ class BlockingUpdates:
     def close(self) -> None:
         """End the subscription."""
         self._wait(self._close())
-
-    def __enter__(self) -> BlockingUpdates:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        """End the subscription."""
-        self.close()
 
     async def _next(self) -> tuple[str, Any] | None:
         try:

@@ -10,7 +10,6 @@ import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from types import TracebackType
 from typing import Literal
 
 import numpy as np
@@ -30,6 +29,7 @@ from client_sdk.bags.lens import Lens, Rectifier, lens_of
 from client_sdk.bags.message_types import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE, POSE
 from client_sdk.bags.registration import register_depth
 from client_sdk.bags.stream import ImageStream
+from client_sdk.closing import Closing
 from client_sdk.frontend import Frame
 from client_sdk.mapping import Trajectory
 from rse_pf.errors import UsageError
@@ -75,7 +75,7 @@ class BagOptions:
 
 
 @dataclass(slots=True, eq=False)
-class Bag:
+class Bag(Closing):
     """The frames of a bag: iterate over it, or read one by its row; close it, or use it in ``with``.
 
     ``notes`` are sentences for the user: which topics were taken, and what was left out.  ``truth_kind`` is
@@ -128,19 +128,6 @@ class Bag:
         if self._registration is None:
             return depth_m
         return register_depth(depth_m, *self._registration, self.camera)
-
-    def __enter__(self) -> Bag:
-        """Return the bag."""
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        """Close the bag."""
-        self.close()
 
     def close(self) -> None:
         """Release the file; no frame can be read any more."""

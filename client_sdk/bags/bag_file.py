@@ -10,10 +10,10 @@ import weakref
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 from client_sdk.bags.message_types import load_types
+from client_sdk.closing import Closing
 from rse_pf.errors import MissingExtra, UsageError
 
 __all__ = ["BagFile", "BrokenMessage", "RawMessage", "Topic", "is_bag", "open_bag_file"]
@@ -84,7 +84,7 @@ def open_bag_file(path: Path) -> BagFile:
     return BagFile(path, reader, store, is_ros1=is_ros1)
 
 
-class BagFile:
+class BagFile(Closing):
     """An open bag; close it, or use it in ``with``."""
 
     def __init__(self, path: Path, reader: Any, store: Any, *, is_ros1: bool) -> None:
@@ -143,22 +143,10 @@ class BagFile:
         try:
             if self._is_ros1:
                 return self._store.deserialize_ros1(raw.data, raw.kind)
-            return self._store.deserialize_cdr(raw.data, raw.kind)
+            # A view: the library would copy the bytes behind their head.
+            return self._store.deserialize_cdr(memoryview(raw.data), raw.kind)
         except _all_faults() as error:
             raise BrokenMessage(_said(error)) from error
-
-    def __enter__(self) -> BagFile:
-        """Return the bag."""
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        """Close the bag."""
-        self.close()
 
     def close(self) -> None:
         """Release the file; no message can be read any more."""

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from client_sdk.frontend import load_opencv
+from client_sdk.image_map import ImageMap
 from rse_pf.errors import InvalidCamera, UsageError
 from rse_pf.geometry import Camera
 
@@ -71,34 +71,20 @@ def lens_of(message: Any, topic: str, *, is_rectified: bool) -> Lens:
     return Lens(camera=camera, distortion=distortion, is_fisheye=is_fisheye)
 
 
-class Rectifier:
+class Rectifier(ImageMap):
     """Map the images of a lens to a pinhole camera; with no distortion, images stay as they are."""
 
     def __init__(self, lens: Lens, wanted: Camera) -> None:
-        self._maps: tuple[Any, Any] | None = None
         if not lens.distortion and lens.camera == wanted:
+            super().__init__(None)
             return
         cv2 = load_opencv()
         size = (wanted.width, wanted.height)
         undistort = cv2.fisheye.initUndistortRectifyMap if lens.is_fisheye else cv2.initUndistortRectifyMap
         distortion = np.array(lens.distortion or (0.0, 0.0, 0.0, 0.0))
-        self._maps = undistort(lens.camera.matrix, distortion, np.eye(3), wanted.matrix, size, cv2.CV_32FC1)
-
-    def colour(self, rgb: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
-        """Return a colour image, interpolated."""
-        if self._maps is None:
-            return rgb
-        cv2 = load_opencv()
-        mapped: npt.NDArray[np.uint8] = cv2.remap(rgb, *self._maps, cv2.INTER_LINEAR)
-        return mapped
-
-    def depth(self, depth_m: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
-        """Return a depth image with the nearest readings: a mean of two surfaces lies on neither."""
-        if self._maps is None:
-            return depth_m
-        cv2 = load_opencv()
-        mapped: npt.NDArray[np.float32] = cv2.remap(depth_m, *self._maps, cv2.INTER_NEAREST)
-        return mapped
+        super().__init__(
+            undistort(lens.camera.matrix, distortion, np.eye(3), wanted.matrix, size, cv2.CV_32FC1)
+        )
 
 
 def _first(low: Any, high: Any) -> Any:

@@ -15,6 +15,7 @@ from rse_pf.errors import MissingExtra
 __all__ = [
     "CAMERA_INFO",
     "COMPRESSED_IMAGE",
+    "DIAGNOSTICS",
     "IMAGE",
     "ODOMETRY",
     "PATH",
@@ -36,6 +37,7 @@ POSE_WITH_COVARIANCE = "geometry_msgs/msg/PoseWithCovarianceStamped"
 ODOMETRY = "nav_msgs/msg/Odometry"
 PATH = "nav_msgs/msg/Path"
 POINT_CLOUD = "sensor_msgs/msg/PointCloud2"
+DIAGNOSTICS = "diagnostic_msgs/msg/DiagnosticArray"
 
 _HEADER = "time stamp\nstring frame_id"
 _COMMON = {
@@ -68,11 +70,20 @@ _COMMON = {
     "sensor_msgs/msg/RegionOfInterest": (
         "uint32 x_offset\nuint32 y_offset\nuint32 height\nuint32 width\nbool do_rectify"
     ),
-    "sensor_msgs/msg/PointField": "string name\nuint32 offset\nuint8 datatype\nuint32 count",
+    "sensor_msgs/msg/PointField": (
+        "uint8 INT8=1\nuint8 UINT8=2\nuint8 INT16=3\nuint8 UINT16=4\nuint8 INT32=5\nuint8 UINT32=6\n"
+        "uint8 FLOAT32=7\nuint8 FLOAT64=8\nstring name\nuint32 offset\nuint8 datatype\nuint32 count"
+    ),
     POINT_CLOUD: (
         "std_msgs/Header header\nuint32 height\nuint32 width\nsensor_msgs/PointField[] fields\n"
         "bool is_bigendian\nuint32 point_step\nuint32 row_step\nuint8[] data\nbool is_dense"
     ),
+    "diagnostic_msgs/msg/KeyValue": "string key\nstring value",
+    "diagnostic_msgs/msg/DiagnosticStatus": (
+        "byte OK=0\nbyte WARN=1\nbyte ERROR=2\nbyte STALE=3\nbyte level\nstring name\nstring message\n"
+        "string hardware_id\ndiagnostic_msgs/KeyValue[] values"
+    ),
+    DIAGNOSTICS: "std_msgs/Header header\ndiagnostic_msgs/DiagnosticStatus[] status",
 }
 _CAMERA = (
     "std_msgs/Header header\nuint32 height\nuint32 width\nstring distortion_model\nfloat64[] {d}\n"

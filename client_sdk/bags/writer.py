@@ -8,38 +8,36 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from types import TracebackType
 from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
 
-from client_sdk.bags.message_types import PATH, POINT_CLOUD, POSE, TF, load_types
+from client_sdk.bags.message_maker import MessageMaker
+from client_sdk.bags.message_types import PATH, POINT_CLOUD, POSE, TF
+from client_sdk.closing import Closing
 from client_sdk.mapping import Trajectory
 from rse_pf.errors import MissingExtra, UsageError
-from rse_pf.geometry import Array, to_quaternion
 
 __all__ = ["BagKind", "BagWriter", "write_map_bag"]
 
 BagKind = Literal["ros1", "sqlite3", "mcap"]
 _FILE_ENDINGS = {"sqlite3": ".db3", "mcap": ".mcap"}
-_FLOAT32, _UINT32 = 7, 6
-"""Kinds of a field in ``sensor_msgs/PointField``."""
 
 
-class BagWriter:
+class BagWriter(MessageMaker, Closing):
     """A new bag; use it in ``with``.
 
     ``ros1`` writes one ``.bag`` file, ``sqlite3`` and ``mcap`` the folder of a ROS 2 bag.
     """
 
     def __init__(self, path: Path, kind: BagKind, *, is_compressed: bool = False) -> None:
+        super().__init__(is_ros1=kind == "ros1")
         self.path = path
         self.kind: BagKind = kind
         self._is_compressed = is_compressed
         self._writer: Any = None
         self._connections: dict[str, Any] = {}
-        self.types: Any = load_types(is_ros1=kind == "ros1")
 
     def __enter__(self) -> BagWriter:
         """Make the bag; raises UsageError where that is not possible."""
@@ -54,34 +52,13 @@ class BagWriter:
             ) from error
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def close(self) -> None:
         """Finish the bag."""
         self._writer.close()
 
-    def make(self, kind: str, **fields: Any) -> Any:
-        """Return a message of a type; a header gets its number where ROS 1 has one."""
-        if kind == "std_msgs/msg/Header" and self.kind == "ros1":
-            fields = {"seq": 0, **fields}
-        if kind == "sensor_msgs/msg/CameraInfo" and self.kind == "ros1":
-            fields = {name.upper() if name in "dkrp" else name: value for name, value in fields.items()}
-        return self.types.types[kind](**fields)
-
-    def header(self, stamp_ns: int, frame: str) -> Any:
-        """Return the header of a message."""
-        stamp = self.make(
-            "builtin_interfaces/msg/Time", sec=stamp_ns // 1_000_000_000, nanosec=stamp_ns % 1_000_000_000
-        )
-        return self.make("std_msgs/msg/Header", stamp=stamp, frame_id=frame)
-
     def write(self, topic: str, kind: str, log_ns: int, message: Any) -> None:
         """Write a message at a time of the bag, nanoseconds."""
-        serialise = self.types.serialize_ros1 if self.kind == "ros1" else self.types.serialize_cdr
-        self.write_bytes(topic, kind, log_ns, bytes(serialise(message, kind)))
+        self.write_bytes(topic, kind, log_ns, self.encode(kind, message))
 
     def write_bytes(self, topic: str, kind: str, log_ns: int, data: bytes) -> None:
         """Write the bytes of a message as they are."""
@@ -164,80 +141,19 @@ def _write_map(
             topic = "".join(letter if letter.isascii() and letter.isalnum() else "_" for letter in name)
             stamps = [round(1e9 * float(stamp)) for stamp in each.timestamps_s]
             poses = [
-                _pose(writer, stamp, frame, T) for stamp, T in zip(stamps, each.T_world_camera, strict=True)
+                writer.pose(stamp, frame, T) for stamp, T in zip(stamps, each.T_world_camera, strict=True)
             ]
             for stamp, T, pose in zip(stamps, each.T_world_camera, poses, strict=True):
-                moved = _transform(writer, stamp, frame, f"{topic}_camera", T)
+                moved = writer.transform(stamp, frame, f"{topic}_camera", T)
                 events.append((stamp, f"/{topic}/pose", POSE, pose))
                 events.append((stamp, "/tf", TF, writer.make(TF, transforms=[moved])))
             if stamps:
-                whole = writer.make(PATH, header=writer.header(stamps[-1], frame), poses=poses)
+                whole = writer.path_of(stamps[-1], frame, poses)
                 events.append((stamps[-1], f"/{topic}/path", PATH, whole))
         end_ns = max(ends, default=0)
-        cloud = _cloud(writer, end_ns, frame, points, colours)
+        cloud = writer.cloud(end_ns, frame, points, colours)
         events.append((max(end_ns, min(starts, default=0)), "/map", POINT_CLOUD, cloud))
         for stamp, topic, message_kind, message in sorted(events, key=lambda each: each[0]):
             writer.write(topic, message_kind, stamp, message)
             count += 1
     return count
-
-
-def _numbers(writer: BagWriter, kind: str, values: Array, names: str) -> Any:
-    fields = {name: float(value) for name, value in zip(names, values, strict=True)}
-    return writer.make(f"geometry_msgs/msg/{kind}", **fields)
-
-
-def _pose(writer: BagWriter, stamp_ns: int, frame: str, T: Array) -> Any:
-    pose = writer.make(
-        "geometry_msgs/msg/Pose",
-        position=_numbers(writer, "Point", T[:3, 3], "xyz"),
-        orientation=_numbers(writer, "Quaternion", to_quaternion(T[:3, :3]), "xyzw"),
-    )
-    return writer.make(POSE, header=writer.header(stamp_ns, frame), pose=pose)
-
-
-def _transform(writer: BagWriter, stamp_ns: int, frame: str, child: str, T: Array) -> Any:
-    moved = writer.make(
-        "geometry_msgs/msg/Transform",
-        translation=_numbers(writer, "Vector3", T[:3, 3], "xyz"),
-        rotation=_numbers(writer, "Quaternion", to_quaternion(T[:3, :3]), "xyzw"),
-    )
-    header = writer.header(stamp_ns, frame)
-    return writer.make(
-        "geometry_msgs/msg/TransformStamped", header=header, child_frame_id=child, transform=moved
-    )
-
-
-def _cloud(
-    writer: BagWriter,
-    stamp_ns: int,
-    frame: str,
-    points: npt.NDArray[np.float32],
-    colours: npt.NDArray[np.uint8],
-) -> Any:
-    """Return a ``PointCloud2``: x, y, z as float32, and rgb packed as ROS tools expect it."""
-    layout = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("rgb", "<u4")])
-    rows = np.empty(len(points), dtype=layout)
-    for column, name in enumerate("xyz"):
-        rows[name] = points[:, column]
-    wide = colours.astype(np.uint32)
-    rows["rgb"] = (wide[:, 0] << 16) | (wide[:, 1] << 8) | wide[:, 2]
-    fields = [
-        writer.make(
-            "sensor_msgs/msg/PointField", name=name, offset=4 * place, count=1,
-            datatype=_UINT32 if name == "rgb" else _FLOAT32,
-        )
-        for place, name in enumerate(("x", "y", "z", "rgb"))
-    ]  # fmt: skip
-    return writer.make(
-        POINT_CLOUD,
-        header=writer.header(stamp_ns, frame),
-        height=1,
-        width=len(rows),
-        fields=fields,
-        is_bigendian=False,
-        point_step=layout.itemsize,
-        row_step=layout.itemsize * len(rows),
-        data=np.frombuffer(rows.tobytes(), dtype=np.uint8),
-        is_dense=True,
-    )

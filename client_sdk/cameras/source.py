@@ -8,12 +8,12 @@ from __future__ import annotations
 import asyncio
 import math
 from collections.abc import Callable, Iterator
-from types import TracebackType
 from typing import Protocol, runtime_checkable
 
 import numpy as np
 import numpy.typing as npt
 
+from client_sdk.closing import Closing
 from client_sdk.datasets.intrinsics import Intrinsics, Undistortion
 from client_sdk.frontend import Frame
 from rse_pf.errors import UsageError
@@ -47,7 +47,7 @@ class FrameSource(Protocol):
         """Release the device or file."""
 
 
-class RawSource:
+class RawSource(Closing):
     """A `FrameSource` over raw images: checks their size, undistorts them and thins them out."""
 
     def __init__(
@@ -113,19 +113,6 @@ class RawSource:
             depth_m=self._no_depth if depth_m is None else self._undistortion.depth(depth_m),
             camera=self.camera,
         )
-
-    def __enter__(self) -> RawSource:
-        """Return the source."""
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        """Close the source."""
-        self.close()
 
     def close(self) -> None:
         """Release the device or file; the iterator is then at its end."""

@@ -18,9 +18,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from client_sdk.frontend import load_opencv
+from client_sdk.image_map import ImageMap
 from rse_pf.errors import InvalidCamera, UsageError
 from rse_pf.geometry import Camera
 
@@ -112,31 +112,16 @@ def write_intrinsics(path: Path | str, intrinsics: Intrinsics) -> None:
         raise UsageError(f"cannot write {path}: {error.strerror}", hint="name another file") from error
 
 
-class Undistortion:
+class Undistortion(ImageMap):
     """Map images of a distorted lens to the pinhole camera of the same intrinsics."""
 
     def __init__(self, intrinsics: Intrinsics) -> None:
-        self._maps: tuple[Any, Any] | None = None
+        maps: tuple[Any, Any] | None = None
         camera = intrinsics.camera
         if any(intrinsics.distortion):
             cv2 = load_opencv()
-            self._maps = cv2.initUndistortRectifyMap(
+            maps = cv2.initUndistortRectifyMap(
                 camera.matrix, np.array(intrinsics.distortion), None, camera.matrix,
                 (camera.width, camera.height), cv2.CV_32FC1,
             )  # fmt: skip
-
-    def colour(self, rgb: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
-        """Return a colour image, interpolated."""
-        if self._maps is None:
-            return rgb
-        cv2 = load_opencv()
-        mapped: npt.NDArray[np.uint8] = cv2.remap(rgb, *self._maps, cv2.INTER_LINEAR)
-        return mapped
-
-    def depth(self, depth_m: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
-        """Return a depth image with the nearest readings: a mean of two surfaces lies on neither."""
-        if self._maps is None:
-            return depth_m
-        cv2 = load_opencv()
-        mapped: npt.NDArray[np.float32] = cv2.remap(depth_m, *self._maps, cv2.INTER_NEAREST)
-        return mapped
+        super().__init__(maps)

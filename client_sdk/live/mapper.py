@@ -45,6 +45,8 @@ _MAX_CORRECTIONS = 1000
 _MAX_SENT = 100_000
 _JSON_FEATURES = 650
 """Plain JSON has bytes in base64, a third longer: 650 features and the rest of the message are 34 kB."""
+_OFTEN_IN_VAIN, _RARELY = 6, 4.0
+"""After so many answers without a place a robot asks so many times as rarely."""
 
 
 class LiveRobot(LiveCaller, Protocol):
@@ -68,7 +70,8 @@ class LiveOptions:
         features: At most so many features of a keyframe are sent; 870 take 34 kB with zlib and bin, and
             `sent_with` lowers them for json.
         segment_after: A new segment begins after so many lost frames in a row.
-        relocalise_s: While a segment is not aligned, the robot asks for its place so often at most.
+        relocalise_s: While a segment is not aligned, the robot asks for its place so often at most; after six
+            answers without any place, a quarter as often, since the map tries each of its keyframes, too.
         bytes_per_s: Share of the link that keyframes may take.
         deadline_s: Of one attempt to send a keyframe, and of a relocalisation.
         leave_s: How long leaving waits until the map has every keyframe.
@@ -165,6 +168,7 @@ class LiveMapper:
         self._made, self._dropped = 0, 0
         self._verdicts: Counter[str] = Counter()
         self._relocalised_at = float("-inf")
+        self._asked_in_vain = 0
         self._relocalising: asyncio.Task[None] | None = None
         self._listeners: list[asyncio.Queue[Correction | None]] = []
         self._corrections: deque[Correction] = deque(maxlen=_MAX_CORRECTIONS)
@@ -428,7 +432,7 @@ class LiveMapper:
         self._segment += 1
         self._sender.current_segment = self._segment
         self._last_keyframe, self._lost_in_a_row = None, 0
-        self._relocalised_at = float("-inf")
+        self._relocalised_at, self._asked_in_vain = float("-inf"), 0
 
     def _is_keyframe(self, pose: Array) -> bool:
         if self._last_keyframe is None:
@@ -477,12 +481,17 @@ class LiveMapper:
             self.aligned
             or not self._robot.connected
             or self._alignments.map_keyframes <= len(self.sent_keyframes)
-            or now < self._relocalised_at + self.options.relocalise_s
+            or now < self._relocalised_at + self._relocalise_pause_s()
             or (self._relocalising is not None and not self._relocalising.done())
         ):
             return
         self._relocalised_at = now
         self._relocalising = asyncio.create_task(self._ask_place(keyframe, pose))
+
+    def _relocalise_pause_s(self) -> float:
+        """Return how long to wait between two questions: longer where no other robot seems to have been."""
+        is_alone = self._asked_in_vain >= _OFTEN_IN_VAIN
+        return self.options.relocalise_s * (_RARELY if is_alone else 1.0)
 
     async def _ask_place(self, keyframe: KeyframeWaits, pose: Array) -> None:
         request = {
@@ -493,6 +502,7 @@ class LiveMapper:
                 "live-relocalise", request, RelocaliseReply, deadline_s=self.options.deadline_s, keep=True
             )
             self._verdicts[answer.reply.verdict] += 1
+            self._asked_in_vain = self._asked_in_vain + 1 if answer.reply.verdict == "none" else 0
             self._announce(self._alignments.relocalised(keyframe.segment, pose, answer.reply))
         except RsePfError as error:
             self._verdicts[error.code] += 1

@@ -8,15 +8,23 @@ from client_sdk.simulator.drive import (
     SIMULATED_CAMERA,
     STEP_M,
     frames_to_overlap,
+    loop_trajectory,
+    render_along,
     render_frames,
     true_trajectory,
 )
+from client_sdk.simulator.world import World, make_world, with_equal_rooms
 
 __all__ = [
     "RATE_HZ",
     "SIMULATED_CAMERA",
     "STEP_M",
+    "World",
     "frames_to_overlap",
+    "loop_trajectory",
+    "make_world",
+    "render_along",
     "render_frames",
     "true_trajectory",
+    "with_equal_rooms",
 ]

@@ -7,19 +7,20 @@ point of it, so their maps overlap.  The same arguments give the same frames.  N
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
 from client_sdk.frontend import Frame
 from client_sdk.mapping import Trajectory
 from client_sdk.simulator.camera import Painter, add_depth_noise, add_image_noise
-from client_sdk.simulator.world import ROOM_M, ROOMS, make_world
+from client_sdk.simulator.world import ROOM_M, ROOMS, World, make_world
 from rse_pf.errors import UsageError
 from rse_pf.geometry import Array, Camera
 
 __all__ = [
-    "RATE_HZ", "SIMULATED_CAMERA", "STEP_M", "frames_to_overlap", "render_frames", "true_trajectory"
+    "RATE_HZ", "SIMULATED_CAMERA", "STEP_M", "frames_to_overlap", "loop_trajectory", "render_along",
+    "render_frames", "true_trajectory",
 ]  # fmt: skip
 
 RATE_HZ = 5.0
@@ -46,9 +47,14 @@ def render_frames(robot: int, robots: int, frames: int, seed: int, rooms: int = 
         UsageError: The robot is not one of *robots*, or there are no frames.
     """
     truth = true_trajectory(robot, robots, frames, seed, rooms)
-    painter = Painter(make_world(seed, rooms), SIMULATED_CAMERA)
+    yield from render_along(truth, make_world(seed, rooms), (seed, robots, robot))
+
+
+def render_along(truth: Trajectory, world: World, noise: Sequence[int]) -> Iterator[Frame]:
+    """Yield the frames of a camera on *truth* in *world*; the numbers *noise* seed that of its sensor."""
+    painter = Painter(world, SIMULATED_CAMERA)
     for row in range(len(truth)):
-        rng = np.random.default_rng([seed, robots, robot, row])
+        rng = np.random.default_rng([*noise, row])
         colour, depth_m, cosine = painter.draw(truth.T_world_camera[row])
         yield Frame(
             timestamp_s=float(truth.timestamps_s[row]),
@@ -72,10 +78,19 @@ def true_trajectory(robot: int, robots: int, frames: int, seed: int, rooms: int 
             f"robot {robot} of {robots} with {frames} frames cannot be rendered",
             hint="count robots from 0, and ask for one frame or more",
         )
+    return loop_trajectory(_loop(rooms)[1] * robot / robots, frames, seed, rooms)
+
+
+def loop_trajectory(
+    begin_m: float, frames: int, seed: int, rooms: int = ROOMS, *, step_m: float = STEP_M
+) -> Trajectory:
+    """Return *frames* exact poses ``T_world_camera`` on the loop, from *begin_m* on.
+
+    The loop begins at the door of room 1, and leads through each of the rooms before the last one in 5 m.
+    """
     path, length_m = _loop(rooms)
     phase = float(np.random.default_rng([seed, 7]).uniform(0.0, 2.0 * np.pi))
-    travelled_m = STEP_M * np.arange(frames) + length_m * robot / robots
-    poses = np.array([_pose_at(path, length_m, s, phase) for s in travelled_m])
+    poses = np.array([_pose_at(path, length_m, begin_m + step_m * row, phase) for row in range(frames)])
     return Trajectory(np.arange(frames) / RATE_HZ, poses)
 
 

@@ -23,7 +23,9 @@ MAX_CHUNK_NS = 500_000_000
 """A chunk is written when it is this long or this old, by the time of its first message."""
 _MAGIC = b"\x89MCAP0\r\n"
 _MESSAGE = struct.Struct("<BQHIQQ")
-_MESSAGE_FIELDS = _MESSAGE.size - 9
+_MESSAGE_BYTES = _MESSAGE.size
+_MESSAGE_FIELDS = _MESSAGE_BYTES - 9
+_pack_message = _MESSAGE.pack
 _CHUNK = struct.Struct("<BQQQQIIQ")
 _CHUNK_FIELDS = _CHUNK.size - 9
 _INDEX = struct.Struct("<BQHI")
@@ -46,7 +48,7 @@ class McapFile:
         self._fd = fd
         self._parts: list[bytes] = []
         self._chunk_bytes = 0
-        self._first_ns = self._last_ns = 0
+        self._first_ns = 0
         self._offsets: dict[int, list[int]] = {}
         self._chunk_indexes: list[bytes] = []
         self._schemas: dict[str, Any] = {}
@@ -103,22 +105,20 @@ class McapFile:
         """Add a message, and write the chunk if it is long or old enough."""
         offsets = self._offsets.get(channel)
         if offsets is None:
+            if not self._offsets:
+                self._first_ns = time_ns
             offsets = self._offsets[channel] = []
-        if len(self._offsets) == 1 and not offsets:
-            self._first_ns = self._last_ns = time_ns
-        elif time_ns < self._first_ns:
-            self._first_ns = time_ns
-        elif time_ns > self._last_ns:
-            self._last_ns = time_ns
-        offsets += (time_ns, self._chunk_bytes)
-        number = self._counts[channel]
-        self._counts[channel] = number + 1
-        head = _MESSAGE.pack(
-            _OP_MESSAGE, _MESSAGE_FIELDS + len(data), channel, number & 0xFFFFFFFF, time_ns, time_ns
+        number = self._counts[channel] + len(offsets) // 2
+        at, size = self._chunk_bytes, len(data)
+        offsets += (time_ns, at)
+        self._parts += (
+            _pack_message(
+                _OP_MESSAGE, _MESSAGE_FIELDS + size, channel, number & 0xFFFFFFFF, time_ns, time_ns
+            ),
+            data,
         )
-        self._parts += (head, data)
-        self._chunk_bytes += len(head) + len(data)
-        if self._chunk_bytes >= MAX_CHUNK_BYTES:
+        self._chunk_bytes = at = at + _MESSAGE_BYTES + size
+        if at >= MAX_CHUNK_BYTES:
             self.flush()
 
     def is_due(self, now_ns: int) -> bool:
@@ -130,21 +130,24 @@ class McapFile:
         if not self._offsets:
             return
         records = b"".join(self._parts)
+        span = (
+            min(min(offsets[::2]) for offsets in self._offsets.values()),
+            max(max(offsets[::2]) for offsets in self._offsets.values()),
+        )
         chunk = _CHUNK.pack(
-            _OP_CHUNK, _CHUNK_FIELDS + len(records), self._first_ns, self._last_ns, len(records),
-            zlib.crc32(records), 0, len(records),
-        )  # fmt: skip
+            _OP_CHUNK, _CHUNK_FIELDS + len(records), *span, len(records), zlib.crc32(records), 0, len(records)
+        )
         chunk_bytes = len(chunk) + len(records)
         places: list[bytes] = []
         indexes: list[bytes] = []
         index_bytes = 0
         for channel, offsets in self._offsets.items():
             places.append(_OFFSET.pack(channel, self.size_bytes + chunk_bytes + index_bytes))
+            self._counts[channel] += len(offsets) // 2
             index = struct.pack(f"<{len(offsets)}Q", *offsets)
             indexes += (_INDEX.pack(_OP_INDEX, 6 + len(index), channel, len(index)), index)
             index_bytes += _INDEX.size + len(index)
         start = self.size_bytes
-        span = self._first_ns, self._last_ns
         self._forget()
         self._write(b"".join((chunk, records, *indexes)))
         found = b"".join(places)

@@ -19,7 +19,7 @@ import zlib
 from collections import OrderedDict, deque
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from functools import cache, cached_property
+from functools import cache, cached_property, partial
 from pathlib import Path
 from typing import Any, NamedTuple, cast
 
@@ -31,6 +31,7 @@ from rse_pf.config import SessionSettings
 from rse_pf.errors import BadMessage, BadRequest, LimitExceeded, RsePfError, UnsupportedProtocol, UsageError
 from rse_pf.geometry import Array
 from rse_pf.recording import file_format
+from rse_pf.recording.summary import ChunkPlan, Wanted, plan_of, robot_of
 from rse_pf.wire import CODECS, Codec, Command, Failure, Result, make_codec
 
 __all__ = [
@@ -167,8 +168,11 @@ class WireRecording:
                 return
             self.metadata = self.metadata or about
 
-    def commands(self) -> Iterator[RecordedCommand]:
+    def commands(self, wanted: Wanted | None = None) -> Iterator[RecordedCommand]:
         """Yield every command when it was answered, and at the end those without an answer.
+
+        With *wanted*, parts of finished files that hold nothing of it are not read; commands of other times
+        may be among those that are yielded.
 
         Raises:
             BadRequest: A file is no recording.
@@ -177,7 +181,7 @@ class WireRecording:
         self.cut, self.left_out = [], 0
         waiting: OrderedDict[str, RecordedCommand] = OrderedDict()
         sights: dict[str, _Sights] = {}
-        for sight in self._merged():
+        for sight in self._merged(wanted):
             if isinstance(sight.of, file_format.WireChannel):
                 yield from self._paired(sight, sight.of, waiting, sights)
             elif len(sights) < _MAX_CONNECTIONS:
@@ -197,7 +201,7 @@ class WireRecording:
         exact = bool(_COMMAND_ID.fullmatch(identity))
         before: dict[tuple[str, str], deque[RecordedCommand]] = {}
         found: list[tuple[RecordedCommand, list[RecordedCommand]]] = []
-        for each in self.commands():
+        for each in self.commands(self._wanted(identity) if exact else None):
             if each.id == identity or (not exact and each.id.endswith(f":{identity}")):
                 found.append((each, list(before.get((each.robot, each.service), ()))))
                 if exact:
@@ -215,18 +219,26 @@ class WireRecording:
             )
         return found[0]
 
-    def _merged(self) -> Iterator[_Sight]:
+    def _wanted(self, identity: str) -> Wanted | None:
+        """Return what is read to find a command and its history, None if no summary knows its robot."""
+        topic = file_format.wire_topic(identity.partition(":")[0], "up")
+        robots = (robot_of(path, topic) for path in self.files)
+        robot = next((each for each in robots if each), None)
+        return None if robot is None else Wanted(robot=robot)
+
+    def _merged(self, wanted: Wanted | None) -> Iterator[_Sight]:
         """Yield the messages of all files; those of several recorders by their times."""
         streams = [list(files) for _, files in itertools.groupby(self.files, key=_recorder)]
         if len(streams) > _MAX_STREAMS:
             streams = [list(self.files)]
-        each = [itertools.chain.from_iterable(map(self._messages, files)) for files in streams]
+        of_file = partial(self._messages, wanted=wanted)
+        each = [itertools.chain.from_iterable(map(of_file, files)) for files in streams]
         yield from heapq.merge(*each, key=lambda sight: sight.time_ns)
 
-    def _messages(self, path: Path) -> Iterator[_Sight]:
+    def _messages(self, path: Path, wanted: Wanted | None) -> Iterator[_Sight]:
         """Yield the messages of one file; in a folder, one that was never begun does not end the others."""
         try:
-            yield from _messages(path, self.cut)
+            yield from _messages(path, self.cut, wanted)
         except BadRequest:
             if len(self.files) == 1:
                 raise
@@ -431,23 +443,35 @@ def _head(path: Path) -> dict[str, dict[str, str]]:
     return found
 
 
-def _messages(path: Path, cut: list[Path]) -> Iterator[_Sight]:
+def _messages(path: Path, cut: list[Path], wanted: Wanted | None) -> Iterator[_Sight]:
     """Yield the messages of connections, thumbnails and odometry of one file."""
     from mcap.records import Channel, Message, Metadata
 
     about: Mapping[str, str] = {}
     channels: dict[int, file_format.WireChannel | tuple[str, str]] = {}
-    for record in _flat(path, cut):
+
+    def add(number: int, topic: str, metadata: dict[str, str]) -> None:
+        of = _channel(topic, metadata) if len(channels) < _MAX_CONNECTIONS else None
+        if of is not None and (wanted is None or wanted.robot in ("", _robot_of(topic, metadata))):
+            channels[number] = of
+
+    plan = None if wanted is None else plan_of(path, wanted, _robot_of)
+    for number, each in ({} if plan is None else plan.channels).items():
+        add(number, *each)
+    for record in _flat(path, cut, plan):
         if isinstance(record, Message):
             of = channels.get(record.channel_id)
             if of is not None:
                 yield _Sight(of, record.log_time, record.data, about)
-        elif isinstance(record, Channel) and len(channels) < _MAX_CONNECTIONS:
-            of = _channel(record.topic, record.metadata)
-            if of is not None:
-                channels[record.id] = of
+        elif isinstance(record, Channel):
+            add(record.id, record.topic, record.metadata)
         elif isinstance(record, Metadata) and record.name == file_format.METADATA_NAME:
             about = dict(record.metadata)
+
+
+def _robot_of(topic: str, metadata: dict[str, str]) -> str | None:
+    of = _channel(topic, metadata)
+    return of.robot if isinstance(of, file_format.WireChannel) else of and of[1]
 
 
 def _channel(topic: str, metadata: dict[str, str]) -> file_format.WireChannel | tuple[str, str] | None:
@@ -457,15 +481,18 @@ def _channel(topic: str, metadata: dict[str, str]) -> file_format.WireChannel | 
     return file_format.wire_channel(topic, metadata)
 
 
-def _flat(path: Path, cut: list[Path]) -> Iterator[Any]:
-    """Yield the records of a file, those in its chunks included, up to where it is cut off."""
+def _flat(path: Path, cut: list[Path], plan: ChunkPlan | None) -> Iterator[Any]:
+    """Yield the records of a file, those in its chunks of *plan* included, up to where it is cut off."""
     from mcap.exceptions import McapError
     from mcap.records import Chunk
     from mcap.stream_reader import breakup_chunk
 
+    is_read = itertools.chain(() if plan is None else plan.is_read, itertools.repeat(True))
     for record in _records(path, cut):
         if not isinstance(record, Chunk):
             yield record
+            continue
+        if not next(is_read):
             continue
         try:
             data = _opened(record)

@@ -11,10 +11,12 @@ import os
 import secrets
 import selectors
 import signal
+import socket
 import struct
 import subprocess
 import sys
 import time
+from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -37,29 +39,53 @@ from rse_pf.recording.file_format import (
 )
 from rse_pf.recording.poses import answered_pose, inverse, pose_in_frame
 from rse_pf.recording.redact import KEY_BYTES, ConnectionRedactor, Kept, Pseudonyms
-from rse_pf.recording.tap import CLOSED, DOWN, LOST, OPENED, UP, Handed, PipeReader
+from rse_pf.recording.tap import (
+    CLOSED,
+    DOWN,
+    LOST,
+    OPENED,
+    PLAIN,
+    POSE,
+    UP,
+    Handed,
+    PipeReader,
+    plain_parts,
+    pose_parts,
+)
 from rse_pf.recording.writer import RecordingWriter
 from rse_pf.wire import make_codec
 
-__all__ = ["MessageRecorder", "RecordedConnection", "RecorderPlan", "run_recorder", "start_recorder"]
+__all__ = [
+    "MessageRecorder", "PipeRecorder", "RecordedConnection", "RecorderPlan", "run_recorder", "start_recorder",
+]  # fmt: skip
 
-_READ_BYTES = 1 << 18
+_READ_BYTES = 1 << 15
+"""Read at a time: half a millisecond of work, after which a robot's command may have the processor."""
+_GATHER_S = 0.1
+"""To be woken and to find cold caches costs more than what a few messages do."""
 _FLUSH_S = 0.2
+_MOST_FDS = 4
 _NICE = 5
+_TOLD = frozenset({PLAIN, POSE})
 _HEX_BYTES = 8
 
 
 class RecorderPlan(msgspec.Struct, frozen=True, kw_only=True):
-    """What a recorder process is told at its start; ``fds`` are its ends of the workers' pipes.
+    """What a recorder process is told at its start.
 
-    ``started_ns`` is Unix time; ``key`` is the file of the key of the pseudonyms, "" for one of its own.
+    Attributes:
+        started_ns: When the server's first recorder was started, Unix time.
+        from_workers: Socket from which it takes its ends of the workers' pipes, until no worker is left.
+        restarts: How many recorders of this server ended before.
+        key: File of the key of the pseudonyms, "" for the one that stands on standard input.
     """
 
     folder: str
     server: str
     version: str
     started_ns: int
-    fds: list[int]
+    from_workers: int
+    restarts: int = 0
     max_file_bytes: int
     max_bytes: int
     session: dict[str, Any] = {}
@@ -113,6 +139,25 @@ class MessageRecorder:
         """Write a message, unless it is one of those that are left out."""
         redactor = connection.redactor
         kept = redactor.up(data) if direction == "up" else redactor.down(data)
+        self._write(connection, direction, time_ns, kept)
+        if kept is not None and kept.type == "result" and kept.service == "pnp":
+            self._add_pose(connection, time_ns, answered_pose(kept.text, is_binary=connection.codec == "bin"))
+
+    def take_plain(self, connection: RecordedConnection, time_ns: int, data: bytes) -> None:
+        """Write a command that its server has read, the data of a ``PLAIN`` entry."""
+        self._write(connection, "up", time_ns, connection.redactor.plain(*plain_parts(data)))
+
+    def take_pose(self, connection: RecordedConnection, time_ns: int, data: bytes) -> None:
+        """Write an answer whose pose its server told, the data of a ``POSE`` entry."""
+        identity, pose, message = pose_parts(data)
+        kept = connection.redactor.pose(identity, message)
+        self._write(connection, "down", time_ns, kept)
+        if kept is not None:
+            self._add_pose(connection, time_ns, pose)
+
+    def _write(
+        self, connection: RecordedConnection, direction: Direction, time_ns: int, kept: Kept | None
+    ) -> None:
         if kept is None:
             self.left_out += 1
             return
@@ -123,8 +168,6 @@ class MessageRecorder:
                 wire_topic(connection.identity, direction), WIRE_ENCODING, wire_metadata(described)
             )
         self.writer.add(channel, time_ns, kept.data)
-        if kept.type == "result" and kept.service == "pnp":
-            self._add_pose(connection, time_ns, kept)
 
     def close(self, connection: RecordedConnection) -> None:
         """Take that a connection is over."""
@@ -136,32 +179,42 @@ class MessageRecorder:
         value = {"time_s": time_ns / 1e9, "kind": kind, "server": self._server, **fields}
         self.writer.add_json(EVENTS_TOPIC, EVENT_SCHEMA, time_ns, value)
 
-    def _add_pose(self, connection: RecordedConnection, time_ns: int, kept: Kept) -> None:
-        pose = answered_pose(kept.text, is_binary=connection.codec == "bin")
-        if pose is not None:
-            told = pose_in_frame(inverse(pose), time_ns)
-            self.writer.add_json(f"{POSES_PREFIX}{connection.redactor.robot}", POSE_SCHEMA, time_ns, told)
+    def _add_pose(
+        self, connection: RecordedConnection, time_ns: int, T_camera_world: Sequence[float] | None
+    ) -> None:
+        if T_camera_world is not None:
+            told = pose_in_frame(inverse(T_camera_world), time_ns)
+            topic = f"{POSES_PREFIX}{connection.redactor.robot}"
+            self.writer.add_json(topic, POSE_SCHEMA, time_ns, told)
 
 
-class _Worker:
-    """One worker as its recorder sees it."""
+class PipeRecorder:
+    """Records what comes out of the pipe of one worker."""
 
     def __init__(self, recorder: MessageRecorder) -> None:
+        """Know no connection yet."""
         self._recorder = recorder
         self._reader = PipeReader()
         self._connections: dict[int, RecordedConnection] = {}
         self._lost = 0
 
     def read(self, data: bytes) -> None:
+        """Take the next bytes of the pipe."""
         for entry in self._reader.entries(data):
             self._take(entry)
 
     def end(self) -> None:
+        """Take that the worker is gone."""
         for connection in self._connections.values():
             self._recorder.close(connection)
 
     def _take(self, entry: Handed) -> None:
-        if entry.kind == OPENED:
+        if entry.kind in _TOLD:
+            connection = self._connections.get(entry.connection)
+            take = self._recorder.take_plain if entry.kind == PLAIN else self._recorder.take_pose
+            if connection is not None:
+                take(connection, entry.time_ns, entry.data)
+        elif entry.kind == OPENED:
             codec, *robot = json.loads(entry.data)
             self._connections[entry.connection] = self._recorder.open(codec, RobotId(*robot))
         elif entry.kind == LOST:
@@ -179,16 +232,20 @@ class _Worker:
                 self._recorder.take(connection, direction, entry.time_ns, entry.data)
 
 
-def start_recorder(plan: RecorderPlan) -> subprocess.Popen[bytes]:
-    """Return the process of a new recorder, which holds the ends of pipes that *plan* names; raises OSError.
+def start_recorder(plan: RecorderPlan, key: bytes) -> subprocess.Popen[bytes]:
+    """Return the process of a new recorder with the key of its pseudonyms; raises OSError.
 
     Its log lines go where those of this process go.
     """
-    return subprocess.Popen(
+    process = subprocess.Popen(
         [sys.executable, "-m", __name__, msgspec.json.encode(plan).decode()],
-        stdin=subprocess.DEVNULL,
-        pass_fds=plan.fds,
+        stdin=subprocess.PIPE,
+        pass_fds=(plan.from_workers,),
     )
+    assert process.stdin is not None
+    with suppress(OSError), process.stdin:  # it may have ended already
+        process.stdin.write(key)
+    return process
 
 
 def run_recorder(plan: RecorderPlan) -> None:
@@ -206,34 +263,67 @@ def run_recorder(plan: RecorderPlan) -> None:
         max_bytes=plan.max_bytes, metadata=plan.metadata, version=plan.version,
     )  # fmt: skip
     recorder = MessageRecorder(writer, Pseudonyms(_key(plan.key)), session, plan.server)
-    recorder.event(plan.started_ns, "recording-started")
-    with selectors.DefaultSelector() as selector:
-        for fd in plan.fds:
-            selector.register(fd, selectors.EVENT_READ, _Worker(recorder))
-        _loop(selector, writer, plan)
+    recorder.event(time.time_ns(), "recording-started", restarts=plan.restarts)
+    with (
+        selectors.DefaultSelector() as selector,
+        socket.socket(fileno=plan.from_workers) as from_workers,
+    ):
+        from_workers.setblocking(False)
+        selector.register(from_workers, selectors.EVENT_READ)
+        _loop(selector, from_workers, recorder, plan)
     recorder.event(time.time_ns(), "recording-over", left_out=recorder.left_out)
     writer.close()
 
 
-def _loop(selector: selectors.BaseSelector, writer: RecordingWriter, plan: RecorderPlan) -> None:
-    problem = ""
+def _loop(
+    selector: selectors.BaseSelector,
+    from_workers: socket.socket,
+    recorder: MessageRecorder,
+    plan: RecorderPlan,
+) -> None:
+    writer, problem = recorder.writer, ""
     buffer = bytearray(_READ_BYTES)  # a new one for each read would cost more than what it holds
     view = memoryview(buffer)
     while selector.get_map():
+        has_more = False
         for key, _ in selector.select(_FLUSH_S):
+            if key.fileobj is from_workers:
+                _take_pipes(selector, from_workers, recorder)
+                continue
             try:
                 size = os.readv(key.fd, [buffer])
             except ConnectionResetError:
                 size = 0
             if size:
                 key.data.read(bytes(view[:size]))
+                has_more = has_more or size == _READ_BYTES
+                os.sched_yield()
             else:
                 selector.unregister(key.fd)
+                os.close(key.fd)
                 key.data.end()
         writer.flush(time.time_ns())
         if writer.problem != problem:
             problem = writer.problem
             _log(plan.server, problem, writer.dropped)
+        if not has_more:
+            time.sleep(_GATHER_S)
+
+
+def _take_pipes(
+    selector: selectors.BaseSelector, from_workers: socket.socket, recorder: MessageRecorder
+) -> None:
+    """Take the ends of pipes that workers sent; leave *selector* once there is no worker any more."""
+    try:
+        data, fds, _, _ = socket.recv_fds(from_workers, 1, _MOST_FDS)
+    except BlockingIOError:
+        return
+    except OSError:
+        data, fds = b"", []
+    for fd in fds:
+        selector.register(fd, selectors.EVENT_READ, PipeRecorder(recorder))
+    if not data:
+        selector.unregister(from_workers)
 
 
 def _log(server: str, problem: str, dropped: int) -> None:
@@ -254,7 +344,8 @@ def _key(file: str) -> bytes:
             key = Path(file).read_bytes()
             if len(key) >= KEY_BYTES:
                 return key
-    return secrets.token_bytes(KEY_BYTES)
+    key = sys.stdin.buffer.read(KEY_BYTES)
+    return key if len(key) == KEY_BYTES else secrets.token_bytes(KEY_BYTES)
 
 
 if __name__ == "__main__":

@@ -44,6 +44,8 @@ PROTOCOL_WORDS = frozenset({
 _TOKEN_START = b"eyJ"
 _TOKEN = re.compile(rb"eyJ[A-Za-z0-9_-]{8,}\.[A-Za-z0-9_-]{8,}\.[A-Za-z0-9_-]{8,}")
 """A JSON Web Token, wherever a robot put it."""
+_RESULT = re.compile(rb'\{"type":"result","id":([1-9][0-9]{0,15}|0),"reply":')
+"""How a server's answer begins; its other fields need not be read."""
 _UNDECODABLE = (msgspec.DecodeError, RecursionError, ValueError, TypeError, RsePfError)
 
 
@@ -120,7 +122,7 @@ class ConnectionRedactor:
         self.left_out = 0
         self._codec = codec
         self._max_bytes = max_inflated_bytes
-        self._inflates = codec.name == "zlib"
+        self._inflates, self._is_text = codec.name == "zlib", codec.name != "bin"
         self._text_codec = make_codec("json") if self._inflates else codec
         self._head = _binary_head if codec.name == "bin" else _json_head
         names = {robot.name: self.robot}
@@ -132,6 +134,7 @@ class ConnectionRedactor:
         self._in_text = re.compile(_either(longest_first)) if names else None
         self._forms = [form.encode() for form in {form for name in names for form in _written(name)}]
         self._secrets = [each.encode() for each in secrets if each]
+        self._marks = (_TOKEN_START, *self._secrets, *self._forms)
         self._open: OrderedDict[int, str] = OrderedDict()
 
     def up(self, data: bytes) -> Kept | None:
@@ -153,11 +156,31 @@ class ConnectionRedactor:
             return self._left_out()
         return kept or self._left_out()
 
+    def plain(self, identity: int, words: bytes, data: bytes) -> Kept | None:
+        """Return what is stored of a `pnp` command that its server has read already.
+
+        Args:
+            identity: Of the command.
+            words: All its texts that the protocol does not fix; the rest of it is numbers in known fields.
+            data: As on the wire; it is inflated only if the words hold a name or a token.
+        """
+        text = words if self._is_text else words + data
+        if self._is_clean(text):
+            self._remember(identity, "pnp")
+            return Kept(data, b"", "command", "pnp")
+        return self.up(data)
+
+    def pose(self, identity: int, data: bytes) -> Kept | None:
+        """Return what is stored of the answer to command *identity*, in which no text is a robot's."""
+        service = self._open.pop(identity, "")
+        return Kept(data, b"", "result", service) if service else self._left_out()
+
     def down(self, data: bytes) -> Kept | None:
         """Return what is stored of a message of the server, None if it is left out."""
         try:
             text = self._inflated(data)
-            head = self._head(text)
+            found = _RESULT.match(text) if self._is_text else None
+            head = self._head(text) if found is None else _Head("result", int(found[1]))
             service = ""
             if head.type == "welcome":
                 return self._welcome(data)
@@ -199,12 +222,12 @@ class ConnectionRedactor:
     def _without_names(
         self, data: bytes, text: bytes, kind: str, service: str, *, from_robot: bool
     ) -> Kept | None:
+        if self._is_clean(text):
+            return Kept(data, text, kind, service)
         if any(each in text for each in self._secrets):
             return None
-        if _TOKEN_START in text and _TOKEN.search(text) is not None:
+        if _TOKEN.search(text) is not None:
             return None
-        if not any(form in text for form in self._forms):
-            return Kept(data, text, kind, service)
         decode = self._codec.decode_from_robot if from_robot else self._codec.decode_from_server
         message: Any = decode(data)
         changes = {}
@@ -238,6 +261,13 @@ class ConnectionRedactor:
 
     def _pseudonym(self, found: re.Match[str]) -> str:
         return self._names[found.group()]
+
+    def _is_clean(self, text: bytes) -> bool:
+        """Return whether *text* has nothing that might be a token, a secret or a name."""
+        for each in self._marks:  # noqa: SIM110  a generator costs more than the search
+            if each in text:
+                return False
+        return True
 
     def _welcome(self, data: bytes) -> Kept | None:
         message = self._codec.decode_from_server(data)

@@ -18,12 +18,21 @@ from typing import NamedTuple
 
 from rse_pf.identity import RobotId
 
-__all__ = ["CLOSED", "DOWN", "LOST", "OPENED", "UP", "Handed", "PipeReader", "RecordingTap", "recording_pipe"]
+__all__ = [
+    "CLOSED", "DOWN", "LOST", "OPENED", "PLAIN", "POSE", "UP", "Handed", "PipeReader", "RecordingTap",
+    "hand_pipe", "plain_parts", "pose_parts", "recording_pipe",
+]  # fmt: skip
 
-OPENED, UP, DOWN, CLOSED, LOST = 1, 2, 3, 4, 5
-"""What one entry of the pipe is about."""
+OPENED, UP, DOWN, CLOSED, LOST, PLAIN, POSE = 1, 2, 3, 4, 5, 6, 7
+"""What one entry of the pipe is about; ``PLAIN`` is an ``UP``, ``POSE`` a ``DOWN``, whose content is told."""
 _ENTRY = struct.Struct("<BIQI")
 """Kind, number of the connection, Unix time in ns, bytes of data that follow."""
+_PLAIN = struct.Struct("<QB")
+"""Id of the command, and bytes of its words; both and the message follow."""
+_MAX_WORDS_BYTES = 255
+_POSE = struct.Struct("<Q16d")
+"""Id of the command, and ``T_camera_world``, row-major; the message follows."""
+_MESSAGES = frozenset({UP, DOWN, PLAIN, POSE})
 _HAND_OVER_S = 0.05
 _RETRY_S = 0.005
 """The kernel buffers 200 kB by default, which it may not take at once."""
@@ -46,6 +55,24 @@ def recording_pipe() -> tuple[int, int]:
     return ours.detach(), theirs.detach()
 
 
+def hand_pipe(to_recorder: int) -> int | None:
+    """Return a worker's end of a new `recording_pipe` whose other end the recorder gets, None if it cannot.
+
+    Args:
+        to_recorder: Socket on which a recorder takes its ends, also one that is yet to start.
+    """
+    ours, theirs = recording_pipe()
+    try:
+        with socket.socket(fileno=os.dup(to_recorder)) as sending:
+            socket.send_fds(sending, [b"+"], [ours])
+    except OSError:  # there will be no recorder any more
+        os.close(theirs)
+        return None
+    finally:
+        os.close(ours)
+    return theirs
+
+
 class RecordingTap:
     """Where the connections of a worker put their messages."""
 
@@ -56,6 +83,8 @@ class RecordingTap:
         "_fd",
         "_is_waiting",
         "_on_dead",
+        "_open",
+        "_renew",
         "_rest",
         "_rest_messages",
         "_time_ns",
@@ -71,6 +100,7 @@ class RecordingTap:
         *,
         call_later: Callable[[float, Callable[[], None]], object],
         on_dead: Callable[[], None] = lambda: None,
+        renew: Callable[[], int | None] = lambda: None,
         time_ns: Callable[[], int] = time.time_ns,
     ) -> None:
         """Hand nothing over yet.
@@ -78,7 +108,9 @@ class RecordingTap:
         Args:
             fd: The worker's end of a `recording_pipe`.
             call_later: Of the event loop.
-            on_dead: Called once when the recorder is gone.
+            on_dead: Called once when the recorder is gone, and there will be no other.
+            renew: Returns the worker's end of a pipe to the next recorder when one is gone, None if there
+                will be none.
             time_ns: Unix time.
         """
         self.dropped = 0
@@ -86,7 +118,8 @@ class RecordingTap:
         self.is_dead = False
         self._fd = fd
         self._call_later = call_later
-        self._on_dead = on_dead
+        self._on_dead, self._renew = on_dead, renew
+        self._open: dict[int, bytes] = {}
         self._time_ns = time_ns
         self._connections = self._told = 0
         self._entries: list[tuple[int, int, int, bytes]] = []
@@ -98,11 +131,13 @@ class RecordingTap:
     def opened(self, codec: str, robot: RobotId) -> int:
         """Return the number of a new connection, for the other calls."""
         self._connections += 1
-        self._append(OPENED, self._connections, json.dumps([codec, *robot]).encode())
+        described = self._open[self._connections] = json.dumps([codec, *robot]).encode()
+        self._append(OPENED, self._connections, described)
         return self._connections
 
     def closed(self, connection: int) -> None:
         """Take that *connection* is over."""
+        self._open.pop(connection, None)
         self._append(CLOSED, connection, b"")
 
     def up(self, connection: int, data: bytes) -> None:
@@ -112,12 +147,44 @@ class RecordingTap:
         else:
             self.dropped += 1
 
+    def is_plain(self, data: bytes, identity: int, words: str) -> None:
+        """Take what *data*, the message that was taken last, was read as, so that nobody inflates it again.
+
+        Args:
+            data: The same object.
+            identity: Of the `pnp` command that it is.
+            words: All its texts that the protocol does not fix; the rest of it is numbers in known fields.
+        """
+        text = words.encode()
+        if len(text) <= _MAX_WORDS_BYTES:
+            self._tell(PLAIN, data, _PLAIN.pack(identity, len(text)) + text)
+
     def down(self, connection: int, data: bytes) -> None:
         """Take a message to the robot."""
         if self._waiting_bytes < _MAX_WAITING_BYTES and not self.is_dead:
             self._append(DOWN, connection, data)
         else:
             self.dropped += 1
+
+    def has_pose(self, data: bytes, identity: int, T_camera_world: bytes) -> None:
+        """Take what *data*, the message that was given last, says, so that nobody inflates it.
+
+        Args:
+            data: The same object; no text in it comes from a robot.
+            identity: Of the `pnp` command that it answers.
+            T_camera_world: 16 doubles, row-major.
+        """
+        if len(T_camera_world) == _POSE.size - 8:
+            self._tell(POSE, data, identity.to_bytes(8, "little") + T_camera_world)
+
+    def _tell(self, kind: int, data: bytes, head: bytes) -> None:
+        """Put *head* before the newest entry, if that is *data*."""
+        if not self._entries:
+            return
+        _, connection, time_ns, taken = self._entries[-1]
+        if taken is data:
+            self._entries[-1] = kind, connection, time_ns, head + data
+            self._waiting_bytes += len(head)
 
     def hand_over(self) -> None:
         """Write what waits into the pipe, as much as it takes now."""
@@ -160,7 +227,7 @@ class RecordingTap:
             parts += (_ENTRY.pack(kind, connection, time_ns, len(data)), data)
             size += len(data)
             count += 1
-            messages += kind in (UP, DOWN)
+            messages += kind in _MESSAGES
             if size >= _COPIED_BYTES:
                 break
         del self._entries[:count]
@@ -173,14 +240,25 @@ class RecordingTap:
         return b"".join(parts)
 
     def _die(self) -> None:
-        self.is_dead = True
-        self.dropped += sum(kind in (UP, DOWN) for kind, _, _, _ in self._entries)
+        """Go on with the next recorder, which knows no connection yet, or with none."""
         self.dropped += self._rest_messages  # some of which it may have got
-        self._entries.clear()
-        self._rest = memoryview(b"")
-        self._waiting_bytes = 0
+        self._rest, self._rest_messages = memoryview(b""), 0
         with suppress(OSError):
             os.close(self._fd)
+        fd = self._renew()
+        if fd is not None:
+            self._fd = fd
+            now = self._time_ns()
+            waiting = [each for each in self._entries if each[0] != OPENED or each[1] not in self._open]
+            self._entries = [(OPENED, number, now, data) for number, data in self._open.items()] + waiting
+            self._waiting_bytes = sum(_ENTRY.size + len(data) for _, _, _, data in self._entries)
+            self._wait(_RETRY_S)
+            return
+        self.is_dead = True
+        self.dropped += sum(kind in _MESSAGES for kind, _, _, _ in self._entries)
+        self._entries.clear()
+        self._open.clear()
+        self._waiting_bytes = 0
         self._on_dead()
 
 
@@ -191,6 +269,19 @@ class Handed(NamedTuple):
     connection: int
     time_ns: int
     data: bytes
+
+
+def plain_parts(data: bytes) -> tuple[int, bytes, bytes]:
+    """Return the id, the words and the message of a ``PLAIN`` entry."""
+    identity, size = _PLAIN.unpack_from(data)
+    end = _PLAIN.size + size
+    return identity, data[_PLAIN.size : end], data[end:]
+
+
+def pose_parts(data: bytes) -> tuple[int, tuple[float, ...], bytes]:
+    """Return the id, ``T_camera_world`` and the message of a ``POSE`` entry."""
+    identity, *pose = _POSE.unpack_from(data)
+    return identity, tuple(pose), data[_POSE.size :]
 
 
 class PipeReader:

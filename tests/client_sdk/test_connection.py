@@ -22,7 +22,7 @@ from rse_pf.errors import (
     UnsupportedProtocol,
     UsageError,
 )
-from rse_pf.wire.server_session import CLOSE_REPLACED, CLOSE_TOKEN_OVER
+from rse_pf.wire.server_session import CLOSE_REPLACED, CLOSE_REVOKED, CLOSE_TOKEN_OVER
 
 pytestmark = pytest.mark.system
 
@@ -255,6 +255,21 @@ def test_a_token_that_is_refused_later_ends_the_robot_with_a_typed_error():
                     await waiting
                 with pytest.raises(Unauthorized):
                     await ask(a_robot, 2)
+
+    run(test())
+
+
+def test_a_robot_that_is_revoked_does_not_come_back_to_a_server_that_has_not_heard_of_it():
+    async def test():
+        async with FakePlatform() as platform, robot(platform.url, token="revoked") as a_robot:
+            platform.hold = True
+            waiting = ask(a_robot, 1, deadline_s=10)
+            await platform.until(lambda: platform.sockets[0].commands)
+            await platform.sockets[0].websocket.close(CLOSE_REVOKED, "revoked")
+
+            with pytest.raises(Unauthorized, match="revoked"):
+                await waiting
+            assert platform.tokens_seen == ["revoked"]
 
     run(test())
 

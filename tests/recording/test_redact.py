@@ -92,6 +92,7 @@ def test_an_answer_to_a_command_that_was_left_out_is_left_out(codec: str):
     [
         command(trace="müller-7", stream="of acme works"),
         Command(id=1, service="pnp", payload={**POSE, "note": ["I am müller-7"]}),
+        Command(id=1, service="pnp", payload={**POSE, "seen by müller-7": 1}),
         Hello(sdk="müller-7"),
     ],
 )

@@ -17,6 +17,7 @@ from rse_pf.recording.replay.case import CasePart, case_parts
 from rse_pf.recording.replay.report import CauseFound, CommandReport, causes_of, report_of
 from rse_pf.recording.replay.solving import Overrides, Resolver
 from rse_pf.recording.replay.troubles import KINDS, RobotHistory, Trouble
+from rse_pf.recording.summary import Wanted
 
 __all__ = ["HISTORY", "Changed", "Exported", "Overview", "case_of", "find", "overview", "report"]
 
@@ -26,6 +27,9 @@ _MAX_ROBOTS = 10_000
 _MAX_CHANGED = 1000
 _MAX_RESOLVERS = 16
 _NEAR_S = 5.0
+_LONGEST_S = 10.0
+"""Of a `pnp` command, from its arrival to its answer."""
+_LATEST_S = 9e9
 _MAX_SERVICES = 64
 
 
@@ -231,7 +235,11 @@ def find(
         command_bytes: The length of its message, None where it is not known.
     """
     found, nearest_s = "", _NEAR_S
-    for command in open_recording(path, settings.session).commands():
+    wanted = None
+    if near_s is not None and 0.0 < near_s < _LATEST_S:
+        begin_s, end_s = near_s - _NEAR_S - _LONGEST_S, near_s + _NEAR_S
+        wanted = Wanted(begin_ns=round(1e9 * begin_s), end_ns=round(1e9 * end_s))
+    for command in open_recording(path, settings.session).commands(wanted):
         if not command.id.endswith(f":{number}") or command_bytes not in (None, len(command.command_bytes)):
             continue
         answered_s = command.sent_s if command.answered_s is None else command.answered_s

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import struct
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,8 @@ import pytest
 
 from client_sdk.bags import BagKind, BagOptions, BagWriter, open_bag
 from client_sdk.bags.bag import Bag
-from client_sdk.bags.images import decode_colour, decode_depth
+from client_sdk.bags.bag_file import BrokenMessage
+from client_sdk.bags.images import ImageFormat, check_image, decode_colour, decode_depth
 from client_sdk.bags.index import pair_stamps
 from client_sdk.bags.message_types import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE, POSE, TF, load_types
 from client_sdk.bags.poses import PoseTopic
@@ -156,6 +158,36 @@ def test_rotations_are_interpolated_on_the_shorter_arc() -> None:
     assert path.timestamps_s.tolist() == [0.0, 0.05, 0.1]  # nothing is known after the last pose
     assert path.positions[:, 0].tolist() == [0.0, 0.5, 1.0]
     assert [rotation_angle_deg(T[:3, :3]) for T in path.T_world_camera] == pytest.approx([0, 45, 90])
+
+
+def test_a_jpeg_without_its_end_is_broken() -> None:
+    whole = np.frombuffer(b"\xff\xd8" + bytes(500) + b"\xff\xd9", np.uint8)
+    expected = ImageFormat(holds="colour", encoding="jpeg", frame="eye", size=None)
+
+    check_image(SimpleNamespace(data=whole), expected)
+    with pytest.raises(BrokenMessage):
+        check_image(SimpleNamespace(data=whole[:-1]), expected)
+
+
+def test_no_pose_is_made_up_between_two_that_are_far_apart() -> None:
+    poses = posed_at(0, 200_000_000, 400_000_001, 500_000_000)
+
+    path = poses.path([100_000_000, 300_000_000, 450_000_000])
+
+    assert path is not None
+    assert path.timestamps_s.tolist() == [0.1, 0.45]
+
+
+def posed_at(*stamps_ns: int) -> PoseTopic:
+    """Return poses at these times, all of them the identity."""
+    types = load_types(is_ros1=False).types
+    poses = PoseTopic()
+    for stamp_ns in stamps_ns:
+        turn = types["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0)
+        place = types["geometry_msgs/msg/Point"](0.0, 0.0, 0.0)
+        header = types["std_msgs/msg/Header"](types["builtin_interfaces/msg/Time"](0, stamp_ns), "world")
+        poses.add(types[POSE](header, types["geometry_msgs/msg/Pose"](place, turn)))
+    return poses
 
 
 def test_a_topic_of_poses_is_the_true_path_where_tf_does_not_move_the_camera(tmp_path: Path) -> None:
@@ -345,7 +377,7 @@ def message_of(pixels: np.ndarray[Any, Any], encoding: str) -> Any:
 def test_the_kitchen_as_a_bag_gives_the_frames_of_the_folder(
     recordings: Path, tmp_path: Path, kind: BagKind
 ) -> None:
-    from benchmarks.bags import write_recording
+    from benchmarks.maps.bags import write_recording
 
     folder = recordings / "7scenes_redkitchen"
     for is_raw in (True, False):

@@ -282,6 +282,24 @@ def test_a_lost_robot_begins_a_segment_and_asks_where_it_is() -> None:
     run(work)
 
 
+def test_a_robot_that_asks_in_vain_asks_more_rarely_until_its_next_segment() -> None:
+    async def work(robot: FakeLiveRobot) -> None:
+        robot.foreign_keyframes = 50
+        async with live_map(robot) as mapper:
+            for row in range(30):
+                if mapper._asked_in_vain == 6:
+                    break
+                assert mapper._relocalise_pause_s() == QUICK.relocalise_s
+                await drive(mapper, range(row, row + 1))
+                asking = mapper._relocalising
+                await robot.until(lambda: asking is None or asking.done())  # noqa: B023
+            assert mapper._relocalise_pause_s() == 4 * QUICK.relocalise_s
+            mapper._begin_segment()
+            assert mapper._relocalise_pause_s() == QUICK.relocalise_s
+
+    run(work)
+
+
 def test_an_ambiguous_place_ends_a_relocalisation() -> None:
     async def work(robot: FakeLiveRobot) -> None:
         robot.foreign_keyframes = 50

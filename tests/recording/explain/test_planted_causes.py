@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from benchmarks.planted_causes import PLANTED, healthy_case, planted_case, rendered
+from benchmarks.recording.planted_causes import PLANTED, healthy_case, planted_case, rendered
 from rse_pf.recording.explain import Cause, explain
 
 pytestmark = pytest.mark.slow

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import struct
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,8 +13,9 @@ from mcap.writer import CompressionType, Writer
 from recording.replay.made import START_NS, Made, jpeg
 
 from rse_pf.errors import BadRequest, LimitExceeded, RsePfError, UnsupportedProtocol, UsageError
-from rse_pf.recording import file_format
+from rse_pf.recording import file_format, reader
 from rse_pf.recording.reader import open_recording
+from rse_pf.recording.summary import Wanted
 from rse_pf.wire import Command, Result
 
 
@@ -198,6 +200,58 @@ def test_a_command_is_found_by_the_end_of_its_name_if_that_is_clear(tmp_path: Pa
     assert recording.find("1").id == names[1]
     with pytest.raises(BadRequest, match="no command '9'"):
         recording.find("9")
+
+
+@pytest.mark.parametrize("is_finished", [True, False])
+def test_a_command_is_found_without_opening_the_chunks_of_other_robots(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, is_finished: bool
+) -> None:
+    made = Made(tmp_path / "a")
+    names = [
+        made.send(seed, robot=seed // 20, thumbnail=jpeg() if seed == 50 else None) for seed in range(60)
+    ]
+    folder = made.close()
+    if not is_finished:
+        (file,) = folder.iterdir()
+        file.write_bytes(file.read_bytes()[:-1])
+    opened: list[int] = []
+    original = reader._opened
+
+    def noting(chunk: Any) -> bytes:
+        opened.append(1)
+        return original(chunk)
+
+    monkeypatch.setattr(reader, "_opened", noting)
+    recording = open_recording(folder)
+    expected = {each.id: each for each in recording.commands()}
+    every = len(opened)
+    opened.clear()
+
+    found, history = recording.find_with_history(names[50], 3)
+
+    assert (found.command_bytes, found.reply_bytes) == (
+        expected[names[50]].command_bytes, expected[names[50]].reply_bytes
+    )  # fmt: skip
+    assert found.thumbnail == expected[names[50]].thumbnail is not None
+    assert [each.id for each in history] == names[47:50]
+    assert (len(opened) < every / 2) == is_finished
+    with pytest.raises(BadRequest, match="no command"):
+        recording.find(f"{names[50].partition(':')[0]}:7")
+
+
+def test_what_is_asked_of_a_time_is_read_and_little_else(tmp_path: Path) -> None:
+    made = Made(tmp_path / "a")
+    names = [made.send(seed, robot=seed % 3) for seed in range(60)]
+    recording = open_recording(made.close())
+    every = list(recording.commands())
+    asked = every[30]
+
+    found = [
+        each.id for each in recording.commands(Wanted(begin_ns=asked.sent_ns, end_ns=asked.answered_ns or 0))
+    ]
+
+    assert asked.id in found
+    assert len(found) < 10 < len(every) == len(names)
 
 
 def _without_checksums(path: Path) -> Path:

@@ -1,0 +1,183 @@
+"""Messages of ROS as objects: made from poses, paths and clouds, and to and from their bytes.
+
+It knows no bag and no node: what writes bags and what talks to ROS make the same messages.
+"""
+
+from __future__ import annotations
+
+import struct
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from client_sdk.bags.bag_file import BrokenMessage
+from client_sdk.bags.message_types import (
+    DIAGNOSTICS,
+    PATH,
+    POINT_CLOUD,
+    POSE,
+    POSE_WITH_COVARIANCE,
+    TF,
+    load_types,
+)
+from rse_pf.geometry import Array, to_quaternion
+
+__all__ = ["MessageMaker"]
+
+_FAULTS = (
+    ArithmeticError, AssertionError, AttributeError, LookupError, MemoryError, TypeError, ValueError,
+    struct.error,
+)  # fmt: skip
+_FLOAT32, _UINT32 = 7, 6
+"""Kinds of a field in ``sensor_msgs/PointField``."""
+
+
+class MessageMaker:
+    """Makes the messages of ROS 1 or of ROS 2, and their bytes: ROS 1's own format, or CDR."""
+
+    def __init__(self, *, is_ros1: bool) -> None:
+        """Take the definitions of one of both.
+
+        Raises:
+            MissingExtra: ``rosbags`` is not installed.
+        """
+        self.is_ros1 = is_ros1
+        self.types: Any = load_types(is_ros1=is_ros1)
+
+    def encode(self, kind: str, message: Any) -> bytes:
+        """Return the bytes of a message."""
+        serialise = self.types.serialize_ros1 if self.is_ros1 else self.types.serialize_cdr
+        return bytes(serialise(message, kind))
+
+    def decode(self, kind: str, data: bytes | memoryview) -> Any:
+        """Return the message that bytes hold; large fields are views into them.
+
+        Raises:
+            BrokenMessage: The bytes are not such a message.
+        """
+        from rosbags.serde import SerdeError
+        from rosbags.typesys import TypesysError
+
+        parse = self.types.deserialize_ros1 if self.is_ros1 else self.types.deserialize_cdr
+        try:
+            return parse(data, kind)
+        except (*_FAULTS, SerdeError, TypesysError) as error:
+            text = " ".join(str(each) for each in error.args) or type(error).__name__
+            raise BrokenMessage(text) from error
+
+    def make(self, kind: str, **fields: Any) -> Any:
+        """Return a message of a type; a header gets its number where ROS 1 has one."""
+        if kind == "std_msgs/msg/Header" and self.is_ros1:
+            fields = {"seq": 0, **fields}
+        if kind == "sensor_msgs/msg/CameraInfo" and self.is_ros1:
+            fields = {name.upper() if name in "dkrp" else name: value for name, value in fields.items()}
+        return self.types.types[kind](**fields)
+
+    def header(self, stamp_ns: int, frame: str) -> Any:
+        """Return the header of a message."""
+        stamp = self.make(
+            "builtin_interfaces/msg/Time", sec=stamp_ns // 1_000_000_000, nanosec=stamp_ns % 1_000_000_000
+        )
+        return self.make("std_msgs/msg/Header", stamp=stamp, frame_id=frame)
+
+    def pose(self, stamp_ns: int, frame: str, T: Array) -> Any:
+        """Return a ``PoseStamped`` of a ``(4, 4)`` pose in *frame*."""
+        return self.make(POSE, header=self.header(stamp_ns, frame), pose=self._pose(T))
+
+    def pose_with_covariance(self, stamp_ns: int, frame: str, T: Array, covariance: Array) -> Any:
+        """Return a ``PoseWithCovarianceStamped``.
+
+        Args:
+            stamp_ns: Time stamp.
+            frame: That the pose is in.
+            T: ``(4, 4)``.
+            covariance: ``(6, 6)`` as ROS defines it: position, then rotation about the axes of *frame*.
+        """
+        pose = self.make(
+            "geometry_msgs/msg/PoseWithCovariance",
+            pose=self._pose(T),
+            covariance=np.ascontiguousarray(covariance, dtype=np.float64).ravel(),
+        )
+        return self.make(POSE_WITH_COVARIANCE, header=self.header(stamp_ns, frame), pose=pose)
+
+    def path_of(self, stamp_ns: int, frame: str, poses: list[Any]) -> Any:
+        """Return a ``Path`` of messages of `pose`."""
+        return self.make(PATH, header=self.header(stamp_ns, frame), poses=poses)
+
+    def transform(self, stamp_ns: int, frame: str, child: str, T: Array) -> Any:
+        """Return a ``TransformStamped``: *T* ``(4, 4)`` is the pose of *child* in *frame*."""
+        moved = self.make(
+            "geometry_msgs/msg/Transform",
+            translation=self._numbers("Vector3", T[:3, 3], "xyz"),
+            rotation=self._numbers("Quaternion", to_quaternion(T[:3, :3]), "xyzw"),
+        )
+        return self.make(
+            "geometry_msgs/msg/TransformStamped",
+            header=self.header(stamp_ns, frame),
+            child_frame_id=child,
+            transform=moved,
+        )
+
+    def transforms(self, moved: list[Any]) -> Any:
+        """Return a ``TFMessage`` of messages of `transform`."""
+        return self.make(TF, transforms=moved)
+
+    def cloud(
+        self, stamp_ns: int, frame: str, points: npt.NDArray[np.float32], colours: npt.NDArray[np.uint8]
+    ) -> Any:
+        """Return a ``PointCloud2``: x, y, z as float32, and rgb packed as ROS tools expect it.
+
+        Args:
+            stamp_ns: Time stamp.
+            frame: That the points are in.
+            points: ``(n, 3)``, metres.
+            colours: ``(n, 3)``, red first.
+        """
+        layout = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("rgb", "<u4")])
+        rows = np.empty(len(points), dtype=layout)
+        for column, name in enumerate("xyz"):
+            rows[name] = points[:, column]
+        wide = colours.astype(np.uint32)
+        rows["rgb"] = (wide[:, 0] << 16) | (wide[:, 1] << 8) | wide[:, 2]
+        fields = [
+            self.make(
+                "sensor_msgs/msg/PointField", name=name, offset=4 * place, count=1,
+                datatype=_UINT32 if name == "rgb" else _FLOAT32,
+            )
+            for place, name in enumerate(("x", "y", "z", "rgb"))
+        ]  # fmt: skip
+        return self.make(
+            POINT_CLOUD,
+            header=self.header(stamp_ns, frame),
+            height=1,
+            width=len(rows),
+            fields=fields,
+            is_bigendian=False,
+            point_step=layout.itemsize,
+            row_step=layout.itemsize * len(rows),
+            data=np.frombuffer(rows.tobytes(), dtype=np.uint8),
+            is_dense=True,
+        )
+
+    def diagnostics(self, stamp_ns: int, name: str, level: int, text: str, values: dict[str, str]) -> Any:
+        """Return a ``DiagnosticArray`` with one status: *level* 0 is well, 1 a warning, 2 an error."""
+        pairs = [
+            self.make("diagnostic_msgs/msg/KeyValue", key=key, value=value) for key, value in values.items()
+        ]
+        status = self.make(
+            "diagnostic_msgs/msg/DiagnosticStatus",
+            level=level, name=name, message=text, hardware_id="", values=pairs,
+        )  # fmt: skip
+        return self.make(DIAGNOSTICS, header=self.header(stamp_ns, ""), status=[status])
+
+    def _pose(self, T: Array) -> Any:
+        return self.make(
+            "geometry_msgs/msg/Pose",
+            position=self._numbers("Point", T[:3, 3], "xyz"),
+            orientation=self._numbers("Quaternion", to_quaternion(T[:3, :3]), "xyzw"),
+        )
+
+    def _numbers(self, kind: str, values: Array, names: str) -> Any:
+        fields = {name: float(value) for name, value in zip(names, values, strict=True)}
+        return self.make(f"geometry_msgs/msg/{kind}", **fields)

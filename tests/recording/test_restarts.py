@@ -1,0 +1,171 @@
+"""A recorder that ended is followed by another one, a bounded number of times, and workers go on with it."""
+
+from __future__ import annotations
+
+import json
+import os
+import socket
+import threading
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from rse_pf.backend.supervisor.server_recording import ServerRecording
+from rse_pf.config import PlatformSettings
+from rse_pf.identity import RobotId
+from rse_pf.recording.recorder_process import RecorderPlan
+from rse_pf.recording.tap import LOST, OPENED, UP, Handed, PipeReader, RecordingTap, hand_pipe
+
+ROBOT = RobotId("default", "robot-1")
+_DEADLINE_S = 10.0
+
+
+class FakeProcess:
+    """A recorder that ends when it is told to."""
+
+    def __init__(self, pid: int) -> None:
+        self.pid = pid
+        self.code = 0
+        self._ended = threading.Event()
+
+    def end(self, code: int) -> None:
+        self.code = code
+        self._ended.set()
+
+    def wait(self) -> int:
+        assert self._ended.wait(_DEADLINE_S)
+        return self.code
+
+
+class FakeRecorders:
+    """Starts recorders, and tells of them."""
+
+    def __init__(self) -> None:
+        self.plans: list[RecorderPlan] = []
+        self.keys: set[bytes] = set()
+        self.processes: list[FakeProcess] = []
+        self._started = threading.Condition()
+
+    def start(self, plan: RecorderPlan, key: bytes) -> FakeProcess:
+        with self._started:
+            self.plans.append(plan)
+            self.keys.add(key)
+            self.processes.append(FakeProcess(100 + len(self.plans)))
+            self._started.notify_all()
+            return self.processes[-1]
+
+    def wait_for(self, count: int) -> FakeProcess:
+        with self._started:
+            assert self._started.wait_for(lambda: len(self.processes) >= count, _DEADLINE_S)
+            return self.processes[count - 1]
+
+
+def recording(folder: Path, recorders: FakeRecorders) -> ServerRecording:
+    settings = PlatformSettings().replace(recording={"folder": str(folder)})
+    return ServerRecording(settings, "server-1", start=recorders.start, restart_s=0.0, clock=lambda: 1.0)
+
+
+def test_a_recorder_that_is_killed_is_started_again_five_times_with_the_same_key(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+):
+    recorders = FakeRecorders()
+
+    with recording(tmp_path, recorders) as recorded:
+        assert recorded.to_recorder is not None
+        worker = os.dup(recorded.to_recorder)
+        recorded.handed_over()
+        for count in range(1, 7):
+            recorders.wait_for(count).end(-9)
+        watching = next(each for each in threading.enumerate() if each.name == "recorder")
+        watching.join(_DEADLINE_S)
+        is_over = hand_pipe(worker)
+    os.close(worker)
+
+    assert [each.restarts for each in recorders.plans] == [0, 1, 2, 3, 4, 5]
+    assert len(recorders.keys) == 1
+    assert is_over is None
+    assert recorded.pids == []
+    events = [json.loads(line)["event"] for line in capfd.readouterr().err.splitlines()]
+    assert events == ["recorder-restarted"] * 5 + ["recorder-given-up"]
+
+
+def test_a_recorder_that_ended_because_the_workers_are_gone_is_not_started_again(tmp_path: Path):
+    recorders = FakeRecorders()
+
+    with recording(tmp_path, recorders) as recorded:
+        recorded.handed_over()
+        recorders.wait_for(1).end(0)
+
+    assert len(recorders.plans) == 1
+
+
+def test_without_a_folder_nothing_is_started():
+    recorders = FakeRecorders()
+
+    with ServerRecording(PlatformSettings(), "server-1", start=recorders.start) as recorded:
+        recorded.handed_over()
+
+    assert recorders.plans == []
+    assert recorded.to_recorder is None
+
+
+def entries(end: int) -> list[Handed]:
+    return list(PipeReader().entries(os.read(end, 1 << 20)))
+
+
+def test_the_next_recorder_learns_of_open_connections_and_gets_what_waited():
+    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    due: list[Callable[[], None]] = []
+    first = hand_pipe(theirs.fileno())
+    assert first is not None
+    tap = RecordingTap(
+        first, call_later=lambda seconds, call: due.append(call), renew=lambda: hand_pipe(theirs.fileno())
+    )
+    kept, gone = tap.opened("bin", ROBOT), tap.opened("zlib", ROBOT)
+    _, (end,), _, _ = socket.recv_fds(ours, 1, 4)
+    due.pop()()
+    assert [each.kind for each in entries(end)] == [OPENED, OPENED]
+    tap.closed(gone)
+    tap.up(kept, b"asks")
+    os.close(end)
+
+    due.pop()()  # finds that nobody reads, and has another pipe
+    tap.up(kept, b"asks again")
+    late = tap.opened("bin", ROBOT)
+    due.pop()()
+
+    _, (end,), _, _ = socket.recv_fds(ours, 1, 4)
+    found = entries(end)
+    assert [(each.kind, each.connection) for each in found] == [
+        (OPENED, kept), (UP, kept), (OPENED, late), (LOST, 0)
+    ]  # fmt: skip
+    assert json.loads(found[0].data) == ["bin", *ROBOT]
+    assert found[1].data == b"asks again"
+    assert tap.dropped == 1
+    assert not tap.is_dead
+    tap.hand_over()
+    os.close(end)
+    theirs.close()
+    ours.close()
+
+
+def test_what_waits_for_the_next_recorder_stays_within_its_bound():
+    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    due: list[Callable[[], None]] = []
+    tap = RecordingTap(
+        hand_pipe(theirs.fileno()) or -1, call_later=lambda seconds, call: due.append(call),
+        renew=lambda: hand_pipe(theirs.fileno()),
+    )  # fmt: skip
+    number = tap.opened("bin", ROBOT)
+    _, (end,), _, _ = socket.recv_fds(ours, 1, 4)
+    os.close(end)
+
+    for _ in range(200):
+        tap.up(number, bytes(100_000))
+        if due:
+            due.pop()()
+
+    assert 0 < 200 - tap.dropped < 110
+    ours.close()
+    theirs.close()

@@ -1,0 +1,151 @@
+"""What a worker tells of messages that it has read saves the recorder work, and changes nothing recorded."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from backend.gateway.worker_parts import worker_parts
+from mcap.reader import make_reader
+
+from rse_pf.config import PlatformSettings, SessionSettings
+from rse_pf.identity import RobotId
+from rse_pf.pnp.problems import make_problem
+from rse_pf.recording.recorder_process import MessageRecorder
+from rse_pf.recording.redact import ConnectionRedactor, Pseudonyms
+from rse_pf.recording.tap import DOWN, PLAIN, POSE, UP, Handed, PipeReader, RecordingTap, recording_pipe
+from rse_pf.recording.writer import RecordingWriter
+from rse_pf.service import Registry
+from rse_pf.services import pnp
+from rse_pf.wire import CODECS, Command, Ping, make_codec
+from rse_pf.wire.native_codec import native_codec
+
+ROBOT = RobotId("default", "robot-seven")
+TOKEN = "eyJhbGciOiJFZERTQSJ9.eyJzdWIiOiJyIn0.c2lnbmF0dXJl"
+PAIRS = {PLAIN: UP, POSE: DOWN}
+needs_core = pytest.mark.skipif(native_codec() is None, reason="the native core is not built: make -C native")
+
+
+def register(registry: Registry) -> None:
+    pnp.register(registry, PlatformSettings().pnp)
+
+
+def command(codec: str, **fields: Any) -> Command:
+    p = make_problem(seed=1, n=60)
+    request = pnp.make_request(p.points_world, p.pixels, p.camera, binary=codec == "bin")
+    return Command(id=5, service="pnp", payload=request, **fields)
+
+
+@pytest.fixture
+def pipe() -> Iterator[tuple[int, int]]:
+    ends = recording_pipe()
+    os.set_blocking(ends[0], False)
+    yield ends
+    for end in ends:
+        os.close(end)
+
+
+def handed(pipe: tuple[int, int], codec: str, *messages: Any) -> list[Handed]:
+    """Return what a worker hands over while a robot sends *messages*."""
+    tap = RecordingTap(pipe[1], call_later=lambda seconds, call: None)
+    with worker_parts(codec=codec, register=register) as worker:
+        worker.dispatcher.context = dataclasses.replace(worker.context, tap=tap)
+        connection, _ = worker.join(ROBOT.name)
+        for message in messages:
+            worker.say(connection, message)
+        tap.hand_over()
+    return list(PipeReader().entries(os.read(pipe[0], 1 << 20)))
+
+
+def recorded(folder: Path, entries: list[Handed], codec: str) -> list[tuple[str, int, bytes]]:
+    """Return the messages of a recording of *entries*; the topics of connections without their numbers."""
+    folder.mkdir()
+    writer = RecordingWriter(folder, "s", started_ns=1, max_file_bytes=1 << 30, max_bytes=1 << 30)
+    recorder = MessageRecorder(writer, Pseudonyms(b"k" * 32), SessionSettings(), "s")
+    connection = recorder.open(codec, ROBOT)
+    for kind, _, time_ns, data in entries:
+        if kind == PLAIN:
+            recorder.take_plain(connection, time_ns, data)
+        elif kind == POSE:
+            recorder.take_pose(connection, time_ns, data)
+        elif kind in (UP, DOWN):
+            recorder.take(connection, "up" if kind == UP else "down", time_ns, data)
+    writer.close()
+    (file,) = folder.iterdir()
+    with file.open("rb") as stream:
+        return [
+            (channel.topic.replace(connection.identity, "X"), message.log_time, message.data)
+            for _, channel, message in make_reader(stream).iter_messages()
+        ]
+
+
+@needs_core
+@pytest.mark.parametrize("codec", CODECS)
+def test_a_command_that_was_read_and_its_answer_are_recorded_as_if_nothing_had_been_told(
+    codec: str, pipe: tuple[int, int], tmp_path: Path
+):
+    told = handed(pipe, codec, command(codec, stream="pose", keep=True), Ping(sent_s=1.0))
+    heads = {PLAIN: 9 + len("pose "), POSE: 8 + 16 * 8}
+    plain = [Handed(PAIRS.get(kind, kind), n, at, data[heads.get(kind, 0) :]) for kind, n, at, data in told]
+
+    assert [each.kind for each in told] == [1, UP, DOWN, PLAIN, POSE, UP, DOWN]
+    found = recorded(tmp_path / "told", told, codec)
+    assert len(found) == 7
+    assert found == recorded(tmp_path / "plain", plain, codec)
+
+
+@needs_core
+@pytest.mark.parametrize("codec", CODECS)
+@pytest.mark.parametrize(
+    "payload", [{"note": "robot-seven"}, "robot-seven", None, [1.0], {"camera": "robot-seven"}]
+)
+def test_nothing_is_told_of_a_command_that_the_core_did_not_read(
+    codec: str, payload: Any, pipe: tuple[int, int]
+):
+    told = handed(pipe, codec, Command(id=5, service="pnp", payload=payload))
+
+    assert [each.kind for each in told[3:]] == [UP, DOWN]
+
+
+@pytest.mark.parametrize("codec", CODECS)
+@pytest.mark.parametrize("words", ["robot-seven", TOKEN])
+def test_a_name_or_a_token_in_the_words_of_a_command_is_not_recorded(codec: str, words: str):
+    data = make_codec(codec).encode(command(codec, trace=words))
+    redactor = ConnectionRedactor(make_codec(codec), ROBOT, Pseudonyms(b"k" * 32), max_inflated_bytes=1 << 20)
+
+    kept = redactor.plain(5, f" {words}".encode(), data)
+
+    if words == TOKEN:
+        assert kept is None
+    else:
+        assert kept is not None
+        assert words.encode() not in kept.text
+        assert make_codec(codec).decode_from_robot(kept.data).trace == redactor.robot
+
+
+def test_the_pose_of_a_command_that_was_left_out_is_left_out():
+    redactor = ConnectionRedactor(make_codec("bin"), ROBOT, Pseudonyms(b"k" * 32), max_inflated_bytes=1 << 20)
+
+    assert redactor.pose(5, b"answer") is None
+    assert redactor.left_out == 1
+
+
+def test_only_the_newest_message_of_a_tap_can_be_told(pipe: tuple[int, int]):
+    tap = RecordingTap(pipe[1], call_later=lambda seconds, call: None)
+    number = tap.opened("bin", ROBOT)
+    first, second = b"first", b"second"
+    tap.up(number, first)
+    tap.up(number, second)
+
+    tap.is_plain(first, 1, "")
+    tap.has_pose(second, 1, b"too short")
+    tap.is_plain(second, 2, "x" * 300)
+    tap.hand_over()
+    tap.is_plain(second, 2, "")
+
+    found = list(PipeReader().entries(os.read(pipe[0], 1 << 20)))
+    assert [(each.kind, each.data) for each in found[1:]] == [(UP, first), (UP, second)]
