@@ -35,7 +35,7 @@ _HEADERS = (
     (b"cross-origin-resource-policy", b"same-origin"),
 )
 _MAX_BODY_BYTES = 4096
-_TOPICS = frozenset(("fleet", "history", "robots", "event", "pose", "link", "maps"))
+_TOPICS = frozenset(("fleet", "history", "robots", "event", "audit", "pose", "link", "maps"))
 _LIVE = "live/"
 _STATUS = {
     Unauthorized.code: 401,

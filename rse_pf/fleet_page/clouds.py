@@ -7,21 +7,33 @@ from __future__ import annotations
 
 import asyncio
 import json
+import math
+import threading
+from collections import OrderedDict
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rse_pf.aws.storage import open_data_store
 from rse_pf.config import PlatformSettings
-from rse_pf.errors import BadRequest, NotFound
+from rse_pf.errors import NotFound, RsePfError
 from rse_pf.limited_process import Handler, LimitedProcesses
 from rse_pf.local.servers.backend_servers import local_placement
 from rse_pf.local.state import platform_settings
 from rse_pf.maps.registry import MapRegistry
 
-__all__ = ["MAX_POINTS", "MapPages", "packer"]
+if TYPE_CHECKING:
+    import numpy as np
+    import numpy.typing as npt
+
+__all__ = ["BLOCK_POINTS", "MAX_POINTS", "MapPages", "packer", "spread_order"]
 
 MAX_POINTS = 1_000_000
+BLOCK_POINTS = 50_000
+"""Points of a block; the first one is a sample of the whole cloud, which a browser draws at once."""
+_KEPT_BYTES = 32 << 20
+"""Of clouds that are ready: three of a million points."""
 _MEMORY_BYTES = 2 << 30
 _MAX_REPLY_BYTES = 32 << 20
 _CPU_S = 30.0
@@ -39,10 +51,19 @@ class MapPages:
             "rse_pf.fleet_page.clouds:packer", memory_bytes=_MEMORY_BYTES, cpu_s=_CPU_S,
             max_reply_bytes=_MAX_REPLY_BYTES,
         )  # fmt: skip
+        self._ready: OrderedDict[tuple[str, str], bytes] = OrderedDict()
+        self._packing = threading.Lock()
+        self._preparing: asyncio.Task[None] | None = None
 
     async def maps(self) -> tuple[str, bytes]:
-        """Return the maps that have versions, newest version first, as JSON."""
-        return "application/json", json.dumps(await asyncio.to_thread(self._maps)).encode()
+        """Return the maps that have versions, newest version first, as JSON.
+
+        The cloud that the page shows first, the newest one of the first map, is packed meanwhile.
+        """
+        found = await asyncio.to_thread(self._maps)
+        if found and (self._preparing is None or self._preparing.done()):
+            self._preparing = asyncio.create_task(self._prepare({"map": found[0]["map"]}))
+        return "application/json", json.dumps(found).encode()
 
     async def cloud(self, query: Mapping[str, str]) -> tuple[str, bytes]:
         """Return what `packer` packs of the version ``version`` of the map ``map``.
@@ -52,6 +73,10 @@ class MapPages:
             RsePfError: The map cannot be read within limits.
         """
         return "application/octet-stream", await asyncio.to_thread(self._cloud, query)
+
+    async def _prepare(self, query: Mapping[str, str]) -> None:
+        with suppress(RsePfError, OSError):  # the page is told when it asks for this cloud
+            await asyncio.to_thread(self._cloud, query)
 
     def close(self) -> None:
         """End the processes."""
@@ -80,14 +105,38 @@ class MapPages:
         name = query.get("map", "")
         if name not in registry.names():
             raise NotFound("there is no such map", hint="see rse-pf map list")
-        return self._processes.call(registry.data(name, query.get("version") or "head"), _CPU_S)
+        key = name, registry.record(name, query.get("version") or "head").id
+        with self._packing:
+            packed = self._ready.get(key)
+            if packed is None:
+                packed = self._processes.call(registry.data(*key), _CPU_S)
+                self._ready[key] = packed
+            self._ready.move_to_end(key)
+            while len(self._ready) > 1 and sum(map(len, self._ready.values())) > _KEPT_BYTES:
+                self._ready.popitem(last=False)
+        return packed
+
+
+def spread_order(count: int) -> npt.NDArray[np.int64]:
+    """Return the rows below *count* in an order whose beginning, of any length, is a sample of all.
+
+    Steps of the golden ratio leave the most even gaps; neighbours in a cloud mostly are neighbours in space.
+    """
+    import numpy as np
+
+    rows = max(1, count)
+    while math.gcd(stride := round(rows * 0.6180339887498949), rows) > 1:
+        rows += 1
+    order = np.arange(rows, dtype=np.int64) * stride % rows
+    return order[order < count]
 
 
 def packer(configuration: str) -> Handler:
-    """Return what packs an encoded map: a length, JSON, positions as ``<u2``, colours as bytes.
+    """Return what packs an encoded map: a length, JSON, and blocks of points.
 
-    The JSON holds ``points`` and ``robots`` (name to the positions of its keyframes, metres); a position is
-    ``low + number * step``, by axis.
+    The JSON holds ``points``, ``block`` and ``robots`` (name to the positions of its keyframes, metres).  A
+    block has ``block`` points, the last one the rest: positions as ``<u2``, then colours as bytes.  A
+    position is ``low + number * step``, by axis.  Points stand in `spread_order`.
     """
     import numpy as np
 
@@ -96,29 +145,30 @@ def packer(configuration: str) -> Handler:
 
     def pack(data: bytes) -> bytes:
         version = decode_map(data, _MEMORY_BYTES // 2)
-        every = max(1, -(-len(version.points) // MAX_POINTS))
-        points = np.asarray(version.points, dtype=np.float64)[::every]
-        colours = np.asarray(version.colours, dtype=np.uint8)[::every]
-        whole = np.asarray(np.isfinite(points).all(axis=1))
-        points = points[whole]
-        colours = colours[whole] if len(colours) == len(whole) else np.full((len(points), 3), 150, np.uint8)
-        low = points.min(axis=0) if len(points) else np.zeros(3)
-        step = (np.maximum(points.max(axis=0) - low, 1e-6) if len(points) else np.ones(3)) / 65535
+        order = spread_order(len(version.points))[:MAX_POINTS]
+        points = version.points.copy().take(order, axis=0)  # the map's own may lie at any address: slow
+        colours = version.colours.take(order, axis=0)
+        low = np.array([points[:, axis].min() if len(points) else 0.0 for axis in range(3)], np.float32)
+        high = np.array([points[:, axis].max() if len(points) else 0.0 for axis in range(3)], np.float32)
+        step = np.maximum(high.astype(np.float64) - low, 1e-6) / 65535
         robots: dict[str, list[list[float]]] = {}
         for keyframe in sorted(version.keyframes, key=lambda each: each.timestamp_s):
             place = [round(float(value), 4) for value in keyframe.T_world_camera[:3, 3]]
             robots.setdefault(printable(keyframe.robot), []).append(place)
         down = np.array([each.T_world_camera[:3, 1] for each in version.keyframes]).reshape(-1, 3)
         told = {
-            "points": len(points), "all_points": len(version.points), "low": low.tolist(),
-            "step": step.tolist(), "robots": robots,
+            "points": len(points), "all_points": len(version.points), "block": BLOCK_POINTS,
+            "low": low.tolist(), "step": step.tolist(), "robots": robots,
             "up": (-down.mean(axis=0)).tolist() if len(down) else [0.0, -1.0, 0.0],
         }  # fmt: skip
         head = json.dumps(told).encode()
         head += b" " * (-(4 + len(head)) % 4)
-        if not np.isfinite(low).all():
-            raise BadRequest("the cloud of this map has no bounds", hint="publish it again")
-        numbers = np.round((points - low) / step).astype("<u2") if len(points) else np.empty((0, 3), "<u2")
-        return len(head).to_bytes(4, "little") + head + numbers.tobytes() + colours.tobytes()
+        numbers = ((points - low) * (1 / step).astype(np.float32) + np.float32(0.5)).clip(0, 65535)
+        numbers = numbers.astype("<u2")
+        parts = [len(head).to_bytes(4, "little"), head]
+        for at in range(0, len(points), BLOCK_POINTS):
+            block = slice(at, at + BLOCK_POINTS)
+            parts += (numbers[block].tobytes(), colours[block].tobytes())
+        return b"".join(parts)
 
     return pack

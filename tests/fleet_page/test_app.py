@@ -14,7 +14,7 @@ import pytest
 from rse_pf.errors import UsageError
 from rse_pf.fleet_page.app import CONTENT_SECURITY_POLICY, FleetApp, PageActions
 from rse_pf.fleet_page.hub import MAX_PAGES, Hub
-from rse_pf.fleet_page.page_sessions import PageSessions
+from rse_pf.fleet_page.page_sessions import MAX_SESSIONS, PageSessions
 from rse_pf.fleet_page.static_files import page_files
 
 HOST = "127.0.0.1:8701"
@@ -210,3 +210,32 @@ def test_a_session_reads_the_stream_and_too_many_pages_are_refused() -> None:
         return [each[0]["status"] for each in answers]
 
     assert set(asyncio.run(many())) == {503}
+
+
+def test_a_stream_ends_with_its_session() -> None:
+    page = Page()
+    session = page.session()
+    for number in range(3):
+        page.hub.append("event", {"text": f"event-{number}"})
+    seen: list[bytes] = []
+
+    async def send(message: Any) -> None:
+        seen.append(message.get("body", b""))
+        if b"event-0" in seen[-1]:  # other pages take the place of the session that was used longest ago
+            for _ in range(MAX_SESSIONS):
+                page.sessions.open(page.sessions.new_key("view", now_s=1.0), now_s=1.0)
+        if b"event-2" in seen[-1]:
+            raise OSError("the browser left")
+
+    async def receive() -> Any:
+        raise AssertionError("a stream has no body")
+
+    scope = {
+        "type": "http", "method": "GET", "path": "/stream", "query_string": b"topics=event",
+        "headers": [(b"host", HOST.encode()), (b"authorization", session["authorization"].encode())],
+    }  # fmt: skip
+    with contextlib.suppress(OSError):
+        asyncio.run(page.app(scope, receive, send))
+
+    assert any(b"event-0" in each for each in seen)
+    assert not any(b"event-1" in each or b"event-2" in each for each in seen)

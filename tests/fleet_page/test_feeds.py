@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,12 +13,15 @@ import pytest
 from rse_pf.auth.roster import check_scopes, scopes_allow
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import UsageError
-from rse_pf.fleet_page.clouds import packer
+from rse_pf.fleet_page import clouds
 from rse_pf.fleet_page.feeds.live_feed import SCOPES, RobotPaths, plain
 from rse_pf.fleet_page.feeds.platform_feed import fleet_document, group_of, moved_robots
 from rse_pf.geometry import Camera
+from rse_pf.limited_process import LimitedProcesses
 from rse_pf.local.control.operations import Operations
 from rse_pf.maps.format import Keyframe, MapVersion, encode_map
+from rse_pf.maps.registry import MapRegistry
+from rse_pf.object_store import DirectoryStore
 
 
 def test_every_text_of_the_fleet_is_escaped() -> None:
@@ -87,7 +91,10 @@ def test_values_of_a_live_map_become_plain_and_escaped() -> None:
     }
 
 
-def test_a_map_is_packed_within_a_fraction_of_a_millimetre() -> None:
+def test_a_map_is_packed_within_a_fraction_of_a_millimetre_and_its_first_points_are_a_sample(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(clouds, "BLOCK_POINTS", 400)
     camera = Camera(fx=500.0, fy=500.0, cx=320.0, cy=240.0, width=640, height=480)
     keyframe = Keyframe(
         id=0, robot="a\x1b", timestamp_s=0.0, T_world_camera=np.eye(4), camera=camera,
@@ -95,17 +102,64 @@ def test_a_map_is_packed_within_a_fraction_of_a_millimetre() -> None:
         points_camera=np.ones((1, 3), np.float32),
     )  # fmt: skip
     points = np.random.default_rng(1).uniform(-5, 5, (1000, 3)).astype(np.float32)
-    colours = np.full((1000, 3), 7, np.uint8)
+    points[:, 0] = np.linspace(-5, 5, 1000)
+    colours = np.repeat(np.arange(1000) // 4, 3).reshape(-1, 3).astype(np.uint8)
 
-    data = packer("")(encode_map(MapVersion(keyframes=(keyframe,), points=points, colours=colours)))
+    data = clouds.packer("")(encode_map(MapVersion(keyframes=(keyframe,), points=points, colours=colours)))
 
     length = int.from_bytes(data[:4], "little")
     told = json.loads(data[4 : 4 + length])
-    numbers = np.frombuffer(data, "<u2", 3000, 4 + length).reshape(-1, 3)
-    back = np.array(told["low"]) + numbers * np.array(told["step"])
-    assert np.abs(back - points).max() < 2e-4
+    blocks, at = [], 4 + length
+    for count in (400, 400, 200):
+        numbers = np.frombuffer(data, "<u2", 3 * count, at).reshape(-1, 3)
+        shades = np.frombuffer(data, "u1", 3 * count, at + 6 * count).reshape(-1, 3)
+        blocks.append((np.array(told["low"]) + numbers * np.array(told["step"]), shades))
+        at += 9 * count
+    back, shades = (np.concatenate(each) for each in zip(*blocks, strict=True))
+    order = np.argsort(back[:, 0])
+    assert (told["points"], told["block"], at) == (1000, 400, len(data))
+    assert np.abs(back[order] - points).max() < 2e-4
+    assert np.abs(shades[order].astype(int) - colours).max() <= 1
+    assert np.abs(np.quantile(blocks[0][0][:, 0], [0.25, 0.5, 0.75]) - [-2.5, 0.0, 2.5]).max() < 0.6
     assert told["robots"] == {r"a\x1b": [[0.0, 0.0, 0.0]]}
-    assert data[4 + length + 6000 :] == b"\x07" * 3000
+
+
+@pytest.mark.parametrize("count", [0, 1, 2, 3, 10, 997, 1000, 4096])
+def test_any_beginning_of_the_order_of_points_is_spread_over_all(count: int) -> None:
+    order = clouds.spread_order(count)
+
+    assert sorted(order) == list(range(count))
+    for length in (1, count // 7, count // 2):
+        gaps = np.diff([-1, *sorted(order[:length]), count])
+        assert gaps.max() <= 4 * count / (length + 1) + 1
+
+
+def test_the_cloud_that_a_page_shows_first_is_packed_once_and_before_it_is_asked_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    registry = MapRegistry(DirectoryStore(tmp_path / "objects"))
+    version = MapVersion(keyframes=(), points=np.ones((3, 3), np.float32), colours=np.ones((3, 3), np.uint8))
+    record = registry.commit("hall", encode_map(version), parent=None, author="r", created_s=1.0)
+    packed: list[int] = []
+
+    def call(self: Any, data: bytes, timeout_s: float) -> bytes:
+        packed.append(len(data))
+        return clouds.packer("")(data)
+
+    monkeypatch.setattr(LimitedProcesses, "call", call)
+    pages = clouds.MapPages(tmp_path)
+
+    async def run() -> tuple[bytes, bytes]:
+        assert json.loads((await pages.maps())[1])[0]["map"] == "hall"
+        while not packed:
+            await asyncio.sleep(0)
+        head = (await pages.cloud({"map": "hall", "version": ""}))[1]
+        return head, (await pages.cloud({"map": "hall", "version": record.id}))[1]
+
+    head, same = asyncio.run(asyncio.wait_for(run(), 10.0))
+
+    assert head == same
+    assert len(packed) == 1
 
 
 def test_a_watcher_hears_states_and_events_and_watchers_are_bounded() -> None:

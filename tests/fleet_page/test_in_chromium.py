@@ -53,7 +53,15 @@ class Running:
         self.environment = {**os.environ, "XDG_STATE_HOME": str(folder)}
         self.log = folder / "local.log"
         settings = folder / "settings.json"  # a machine that draws by software may starve a health check
-        settings.write_text(json.dumps({"context": {"rse-pf": {"health": {"unhealthy_checks": 10}}}}))
+        settings.write_text(
+            json.dumps(
+                {
+                    "context": {
+                        "rse-pf": {"health": {"unhealthy_checks": 10}, "local": {"start_timeout_s": 60}}
+                    }
+                }
+            )
+        )
         with self.log.open("wb") as log:
             self.process = subprocess.Popen(
                 [
@@ -92,6 +100,7 @@ class Running:
                 "--quiet", *words,
             ],
             stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=self.environment,
+            cwd=self.folder,
         )  # fmt: skip
 
     def close(self) -> None:
@@ -237,6 +246,79 @@ def test_a_server_killed_by_a_click_is_seen_within_a_second_and_no_command_is_lo
     page.close()
 
 
+def chosen(page: Any, action: str, server: str, *, robots: int = 0) -> None:
+    """Press a button of *server*, confirm it, and wait until the page says that it is done."""
+    page.locator(f"[data-action={action}][data-server={server}]").click()
+    if action != "resume":
+        if robots:
+            page.locator("#dialog-input").fill(str(robots))
+        page.locator("#dialog-do").click()
+    page.locator("#toast", has_text=f"{action} {server}: done").wait_for(timeout=90_000)
+
+
+MOST_ROBOTS = """() => {
+    const isHealthy = (name) => document.querySelector(`tr[data-server="${name}"] [data-state=healthy]`);
+    const racks = [...document.querySelectorAll(".rack")].filter((rack) => isHealthy(rack.dataset.server));
+    const count = (rack) => rack.querySelectorAll(".dot").length;
+    return racks.sort((a, b) => count(b) - count(a))[0].dataset.server;
+}"""
+
+
+def most_robots(page: Any) -> str:
+    """Return the server with the most robots of those that are healthy."""
+    return str(page.evaluate(MOST_ROBOTS))
+
+
+def healthy(page: Any, servers: int) -> None:
+    """Wait until so many servers are healthy."""
+    wanted = "(n) => document.querySelectorAll('tr[data-server] [data-state=healthy] .state').length >= n"
+    page.wait_for_function(wanted, arg=servers, timeout=90_000)
+
+
+def test_pause_move_drain_and_roll_by_a_click_lose_no_command(
+    browser: Any, running: Running, tmp_path: Path
+) -> None:
+    window = Window(browser)
+    page = window.page
+    page.goto(running.url("--operate"))
+    page.locator("[data-action=pause]").first.wait_for(timeout=60_000)
+    healthy(page, 2)
+    swarm = running.swarm(20, 60, "--fps", "2", "--out", str(tmp_path / "swarm"))
+    page.locator("#view-fleet .dot").nth(19).wait_for(timeout=60_000)
+    page.locator(f"[data-action=drain][data-server={most_robots(page)}]").click()
+    page.get_by_role("button", name="Cancel").click()
+    page.wait_for_timeout(500)
+    assert page.locator("#toast").inner_text() == ""  # what is not confirmed is not done
+
+    name = most_robots(page)
+    chosen(page, "pause", name)
+    page.get_by_text(f"{name} was paused by the operator").first.wait_for(timeout=10_000)
+    chosen(page, "resume", name)
+    page.get_by_text(f"{name} goes on").first.wait_for(timeout=10_000)
+    healthy(page, 2)
+    name = most_robots(page)
+    chosen(page, "move", name, robots=5)
+    page.get_by_text(f"moved from {name} to").first.wait_for(timeout=30_000)
+    chosen(page, "drain", name)
+    page.get_by_text(f"{name} has left").first.wait_for(timeout=60_000)
+    healthy(page, 2)
+    window.save("operate")
+    names = {each.get_attribute("data-server") for each in page.locator("tr[data-server]").all()}
+    page.locator("#do-roll").click()
+    page.locator("#dialog-do").click()
+    page.locator("#toast", has_text="roll: done").wait_for(timeout=150_000)
+    healthy(page, 2)
+    output, _ = swarm.communicate(timeout=180)
+    print(f"load {os.getloadavg()[0]:.1f}\n{output}")
+
+    left = {each.get_attribute("data-server") for each in page.locator("tr[data-server]").all()}
+    assert not names & left
+    assert swarm.returncode == 0, output
+    assert " 0 lost" in output
+    assert window.wrong == []
+    page.close()
+
+
 MAKE_MAP = """
 import sys, time
 from pathlib import Path
@@ -290,6 +372,16 @@ async def drive():
 asyncio.run(drive())
 """
 _POINTS = 1_000_000
+TURN = """async () => {
+    const canvas = document.querySelector("#view-map canvas");
+    const began = performance.now();
+    let frames = 0;
+    for (; performance.now() - began < 3000; frames += 1) {
+        canvas.dispatchEvent(new KeyboardEvent("keydown", { key: "ArrowRight" }));
+        await new Promise((next) => requestAnimationFrame(next));
+    }
+    return 1000 * frames / (performance.now() - began);
+}"""
 
 
 def test_a_map_of_a_million_points_and_the_replay_of_a_weak_pose_are_shown(
@@ -318,12 +410,20 @@ def test_a_map_of_a_million_points_and_the_replay_of_a_weak_pose_are_shown(
     page.keyboard.press("4")
     page.wait_for_timeout(500)
     window.save("events")
+    page.evaluate("() => { window.askedMs = performance.now(); }")
     page.keyboard.press("2")
     page.locator("#view-map .filters .soft", has_text="1,000,000 points").wait_for(timeout=90_000)
+    asked_ms = page.evaluate("window.askedMs")
+    marks = page.evaluate("performance.getEntriesByType('mark').map((each) => [each.name, each.startTime])")
+    frames = page.evaluate(TURN)
     page.wait_for_timeout(3000)
     window.save("map")
+    sample_ms, whole_ms = (at - asked_ms for name, at in marks if name in ("map-sample", "map-whole"))
+    print(f"a sample of the map {sample_ms:.0f} ms after it was asked for, the whole {whole_ms:.0f} ms; "
+          f"turned at {frames:.1f} frames a second by software; load {os.getloadavg()[0]:.1f}")  # fmt: skip
 
     assert window.wrong == []
+    assert sample_ms <= whole_ms
     assert page.locator(".maplabels span").count() == 3
     page.close()
 

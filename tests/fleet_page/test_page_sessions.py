@@ -76,6 +76,15 @@ def test_sessions_are_bounded_and_the_one_that_was_used_longest_ago_ends() -> No
         page.role_of(opened[1], now_s=102.0)
 
 
+def test_keys_that_nobody_uses_are_bounded_and_the_oldest_is_forgotten() -> None:
+    page = sessions()
+    keys = [page.new_key("view", now_s=0.0) for _ in range(65)]
+
+    with pytest.raises(Unauthorized):
+        page.open(keys[0], now_s=1.0)
+    assert page.open(keys[1], now_s=1.0)[1] == "view"
+
+
 def test_a_session_that_nobody_uses_ends() -> None:
     page = sessions()
     session, _ = page.open(page.new_key("operate", now_s=0.0), now_s=0.0)

@@ -5,7 +5,7 @@ Nothing is changed.  A number that no agent published is None, never zero.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import datetime, timedelta
 
 from rse_pf.aws.account import Account
@@ -34,13 +34,15 @@ class Server:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AutoScalingGroup:
-    """Everything `rse-pf cloud status` shows."""
+    """Everything `rse-pf cloud status` shows, and why each alarm has its state."""
 
     min_servers: int
     wanted_servers: int
     max_servers: int
     servers: tuple[Server, ...]
     alarms: dict[str, str]
+    reasons: dict[str, str] = field(default_factory=dict)
+    target_groups: tuple[str, ...] = ()
 
     @property
     def robots(self) -> tuple[float, ...]:
@@ -54,8 +56,16 @@ class AutoScalingGroup:
         return len(healthy) >= self.wanted_servers
 
 
-def read_group(account: Account, settings: PlatformSettings, *, now: datetime) -> AutoScalingGroup:
+def read_group(
+    account: Account, settings: PlatformSettings, *, now: datetime, asks_robots: bool = True
+) -> AutoScalingGroup:
     """Return the state of the group at *now*, in UTC.
+
+    Args:
+        account: Whose group.
+        settings: Of the platform.
+        now: In UTC.
+        asks_robots: Whether the metrics are asked, too, which AWS charges for.
 
     Raises:
         ConfigurationError: There is no group in the region, or AWS refused.
@@ -71,7 +81,7 @@ def read_group(account: Account, settings: PlatformSettings, *, now: datetime) -
     group = found[0]
     health = [_target_health(account, arn) for arn in group["TargetGroupARNs"]]
     names = [each["InstanceId"] for each in group["Instances"]]
-    robots = _robots(account, names, settings.scaling.period_s, now)
+    robots = _robots(account, names, settings.scaling.period_s, now) if asks_robots else {}
     alarms = account.pages("cloudwatch", "describe_alarms", "MetricAlarms", AlarmNamePrefix=_ALARMS)
     return AutoScalingGroup(
         min_servers=group["MinSize"],
@@ -88,6 +98,10 @@ def read_group(account: Account, settings: PlatformSettings, *, now: datetime) -
             for each in sorted(group["Instances"], key=lambda one: str(one["InstanceId"]))
         ),
         alarms={each["AlarmName"].removeprefix(_ALARMS): each["StateValue"] for each in alarms},
+        reasons={
+            each["AlarmName"].removeprefix(_ALARMS): str(each.get("StateReason", "")) for each in alarms
+        },
+        target_groups=tuple(group["TargetGroupARNs"]),
     )
 
 

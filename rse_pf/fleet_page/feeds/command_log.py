@@ -9,12 +9,11 @@ import json
 from pathlib import Path
 from typing import Any
 
+from rse_pf.fleet_page.feeds.file_tail import FileTail
 from rse_pf.terminal import printable
 
 __all__ = ["CommandLog"]
 
-_MAX_READ_BYTES = 1 << 20
-_TAIL_BYTES = 1 << 18
 _MARK = b'"command"'
 _FIELDS = (
     "robot", "service", "id", "trace", "code", "verdict", "reason", "queue_ms", "compute_ms", "bytes_in",
@@ -30,8 +29,7 @@ class CommandLog:
     def __init__(self, folder: Path) -> None:
         """Read nothing yet."""
         self._folder = folder
-        self._read: dict[Path, int] = {}
-        self._rest: dict[Path, bytes] = {}
+        self._tail = FileTail()
         self.skipped = 0
         """Lines that came faster than they are shown."""
 
@@ -45,24 +43,7 @@ class CommandLog:
         return rows[-_MAX_ROWS:]
 
     def _rows_of(self, file: Path) -> list[dict[str, Any]]:
-        try:
-            size = file.stat().st_size
-            start = self._read.get(file, max(0, size - _TAIL_BYTES))
-            if size < start:  # it was set aside, and begun anew
-                start, self._rest[file] = 0, b""
-            if size - start > _MAX_READ_BYTES:
-                start, self._rest[file] = size - _MAX_READ_BYTES, b""
-            if size == start:
-                self._read[file] = size
-                return []
-            with file.open("rb") as opened:
-                opened.seek(start)
-                data = opened.read(size - start)
-        except OSError:
-            return []
-        self._read[file] = start + len(data)
-        *lines, self._rest[file] = (self._rest.get(file, b"") + data).split(b"\n")
-        self._rest[file] = self._rest[file][-_TAIL_BYTES:]
+        lines = self._tail.new_lines(file)
         return [row for row in map(_row, lines) if row is not None]
 
 

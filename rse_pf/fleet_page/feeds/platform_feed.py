@@ -9,16 +9,19 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
+import math
 import os
 import time
 from collections import deque
-from collections.abc import Coroutine, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from rse_pf.audit.chain import Entry
 from rse_pf.auth.control_token import bearer, read_control_token
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import RsePfError
+from rse_pf.fleet_page.feeds.audit_log import AuditRows
 from rse_pf.fleet_page.feeds.command_log import CommandLog
 from rse_pf.fleet_page.feeds.percentiles import LastMinute, buckets_of
 from rse_pf.fleet_page.feeds.sentences import event_sentence, waiting_for
@@ -27,6 +30,7 @@ from rse_pf.identity import DEFAULT_TENANT
 from rse_pf.local.processes import is_alive, mark_of
 from rse_pf.local.servers.control_client import ControlPort
 from rse_pf.local.state import platform_settings, read_state
+from rse_pf.local.together import run_together
 from rse_pf.terminal import printable
 
 __all__ = ["LocalFeed", "fleet_document", "group_of", "moved_robots"]
@@ -35,6 +39,7 @@ _LOOPBACK = "127.0.0.1"
 _ROBOTS_EVERY_S = 1.0
 _METRICS_EVERY_S = 5.0
 _LOGS_EVERY_S = 0.3
+_AUDIT_EVERY_S = 0.5
 _AGAIN_S = 0.5
 _ASK_S = 2.0
 _MAX_LINE_BYTES = 1 << 20
@@ -59,6 +64,8 @@ class LocalFeed:
         self._folder = folder
         self._settings = PlatformSettings()
         self._log = CommandLog(folder)
+        self._audit = AuditRows(folder)
+        self._watched_s = (math.inf, math.inf)
         self._minute = LastMinute()
         self._percentiles: dict[str, Any] = {}
         self._where: dict[str, str] = {}
@@ -68,15 +75,10 @@ class LocalFeed:
 
     async def run(self) -> None:
         """Feed until cancelled."""
-        works: tuple[Coroutine[Any, Any, None], ...] = (
+        await run_together(
             self._watch(), self._follow_robots(), self._follow_metrics(), self._follow_logs(),
+            self._follow_audit(),
         )  # fmt: skip
-        tasks = [asyncio.ensure_future(work) for work in works]
-        try:
-            await asyncio.gather(*tasks)
-        finally:
-            for task in tasks:
-                task.cancel()
 
     # --- the control plane -----------------------------------------------------------------------
 
@@ -87,6 +89,7 @@ class LocalFeed:
                 await self._watch_once()
             if self._connected:
                 self._connected = False
+                self._watched_s = (self._watched_s[0], time.time())
                 self._event({"event": "control-plane-silent", "time_s": time.time()})
             self._hub.put("link", "control_plane", {"connected": False, "time_s": time.time()})
             await asyncio.sleep(_AGAIN_S)
@@ -106,6 +109,7 @@ class LocalFeed:
             if head.split(b" ", 2)[1] != b"200":
                 raise ConnectionError("the control plane refuses")
             self._connected = True
+            self._watched_s = (time.time(), math.inf)
             self._hub.put("link", "control_plane", {"connected": True, "time_s": time.time()})
             while True:
                 line = await asyncio.wait_for(reader.readline(), _ASK_S + 3.0)
@@ -202,6 +206,21 @@ class LocalFeed:
             for row in await asyncio.to_thread(self._log.new_rows):
                 self._hub.append("pose", row)
             await asyncio.sleep(_LOGS_EVERY_S)
+
+    async def _follow_audit(self) -> None:
+        while True:
+            rows, events = await asyncio.to_thread(
+                self._audit.new_rows, now_s=time.time(), is_told=self._was_watched
+            )
+            for row in rows:
+                self._hub.append("audit", row)
+            for event in events:
+                self._event(event)
+            await asyncio.sleep(_AUDIT_EVERY_S)
+
+    def _was_watched(self, entry: Entry) -> bool:
+        """Return whether the control plane told of *entry* itself; what it did before is in the log only."""
+        return self._watched_s[0] <= entry.time <= self._watched_s[1]
 
 
 def fleet_document(state: Mapping[str, Any], settings: PlatformSettings, *, time_s: float) -> dict[str, Any]:

@@ -78,10 +78,12 @@ export function eventsView(root, count) {
 
   return {
     take(event) {
-      events.push(event);
+      let at = events.length;  // rows of the audit log come a little later than events
+      while (at > 0 && events[at - 1].time_s > event.time_s) at -= 1;
+      events.splice(at, 0, event);
       if (events.length > KEPT) events = events.slice(-KEPT);
-      if (root.hidden) count.textContent = String(++unseen);
-      else if (!due) { due = true; requestAnimationFrame(draw); }
+      if (root.hidden && event.group !== "audit") count.textContent = String(++unseen);
+      else if (!root.hidden && !due) { due = true; requestAnimationFrame(draw); }
     },
     reset() { events = []; unseen = 0; count.textContent = ""; },
     shown() { unseen = 0; count.textContent = ""; draw(); },

@@ -46,13 +46,19 @@ export function fleetView(root) {
   const racks = element("div", { class: "racks" });
   const racksNote = element("p", { class: "soft" });
   const recent = element("div", {});
+  const racksPanel = element("div", { class: "panel" }, element("h2", {}, "Robots on their servers"), racks, racksNote);
+  const costs = element("div", {});
+  const unknown = element("ul", { class: "soft" });
+  const cloudPanels = element("div", { class: "grid wide", hidden: true },
+    element("div", { class: "panel" }, element("h2", {}, "Costs of this month"), costs),
+    element("div", { class: "panel" }, element("h2", {}, "What AWS does not tell"), unknown));
   root.append(
     element("div", { class: "grid" }, ...Object.values(boxes).map((each) => each.panel)),
     waitingPanel,
     serverPanel,
+    cloudPanels,
     element("div", { class: "grid wide" }, ...chartPanels),
-    element("div", { class: "grid wide" },
-      element("div", { class: "panel" }, element("h2", {}, "Robots on their servers"), racks, racksNote),
+    element("div", { class: "grid wide" }, racksPanel,
       element("div", { class: "panel" }, element("h2", {}, "Latest events"), recent)));
 
   const lines = new Map();
@@ -63,19 +69,19 @@ export function fleetView(root) {
   function take(told) {
     const rate = told.requests;
     setText(boxes.robots.big, number(told.robots));
-    setText(boxes.robots.small, `${number(rate)} commands in the last second`);
-    setText(boxes.firewall.big, told.tls ? "TLS, tokens" : "loopback");
+    setText(boxes.robots.small, told.cloud ? `${number(rate, 1)} commands a second in the last minute` : `${number(rate)} commands in the last second`);
+    setText(boxes.firewall.big, told.tls ? "TLS, tokens" : told.cloud ? told.protocols.join(", ") || "not known" : "loopback");
     setText(boxes.firewall.small, told.url || "nobody can connect yet");
-    setText(boxes.balancer.big, told.balancer ? "runs" : "is down");
+    setText(boxes.balancer.big, told.balancer ? "runs" : told.cloud ? told.balancer_state : "is down");
     setText(boxes.balancer.small, `${megabytes(told.bytes_in)} in, ${megabytes(told.bytes_out)} out a second`);
     const healthy = told.servers.filter((server) => server.state === "healthy").length;
     setText(boxes.servers.big, `${healthy} of ${told.servers.length}`);
-    setText(boxes.servers.small, `healthy; data servers: ${told.data_servers.map((each) => `${each.name} ${each.state}`).join(", ") || "none"}`);
+    setText(boxes.servers.small, told.cloud ? `healthy; the group wants ${told.wanted_servers}` : `healthy; data servers: ${told.data_servers.map((each) => `${each.name} ${each.state}`).join(", ") || "none"}`);
     setText(boxes.monitor.big, told.cpu_percent === null ? "–" : `${number(told.cpu_percent)} % CPU`);
     const p = told.percentiles ?? {};
     setText(boxes.monitor.small, p.count
       ? `last ${Math.round(p.covered_s)} s: p50 ${p.p50_ms}, p95 ${p.p95_ms}, p99 ${p.p99_ms} ms of ${p.count} commands`
-      : "no command in the last minute");
+      : told.cloud ? "no answer times were published" : "no command in the last minute");
     setText(boxes.modifier.big, `${told.min_servers ?? "–"} to ${told.max_servers ?? "–"}`);
     setText(boxes.modifier.small, `servers; busy above ${number(told.busy_percent)} % CPU, judged each ${number(told.period_s)} s${told.last_action ? `; last: ${told.last_action}` : ""}`);
     const said = told.waiting.map((text) => `${text[0].toUpperCase()}${text.slice(1)}.`);
@@ -84,6 +90,29 @@ export function fleetView(root) {
       waiting.replaceChildren(...said.map((text) => element("p", {}, text)));
     }
     takeServers(told.servers);
+    cloudPanels.hidden = !told.cloud;
+    racksPanel.hidden = Boolean(told.cloud);
+    if (told.cloud) takeCloud(told);
+  }
+
+  function takeCloud(told) {
+    const text = JSON.stringify([told.costs, told.unknown]);
+    if (costs.dataset.told === text) return;
+    costs.dataset.told = text;
+    unknown.replaceChildren(...told.unknown.map((each) => element("li", {}, `${each[0].toUpperCase()}${each.slice(1)}.`)));
+    costs.replaceChildren(...costsOf(told.costs));
+  }
+
+  function costsOf(told) {
+    if (!told.asked) return [element("p", { class: "soft" }, "AWS is not asked, since it charges 0.01 USD for each request: rse-pf fleet --cloud --costs asks. An estimate: rse-pf cloud cost.")];
+    if (told.problem) return [element("p", { class: "soft" }, told.problem)];
+    if (told.since === undefined) return [element("p", { class: "soft" }, "asking")];
+    const money = (amount) => `${amount.toFixed(2)} ${told.currency}`;
+    const said = told.is_ours ? `of this platform since ${told.since}; the whole account: ${money(told.account_total)}`
+      : `of the whole account since ${told.since}: no cost has the tag rse-pf yet; activate it under Billing, Cost allocation tags`;
+    return [element("div", { class: "big" }, money(told.total)), element("p", { class: "soft" }, `${said}. About a day late.`),
+      element("table", {}, element("caption", { class: "hidden" }, "Costs by service"), element("tbody", {},
+        ...told.services.map(([name, amount]) => element("tr", {}, element("th", { scope: "row" }, name), element("td", { class: "number" }, money(amount))))))];
   }
 
   function takeServers(servers) {
@@ -100,6 +129,7 @@ export function fleetView(root) {
         line.health.dataset.state = server.state;
         line.health.replaceChildren(state(server.state));
       }
+      line.health.title = server.note ?? "";
       const cpu = server.cpu_percent;
       line.fill.style.width = `${Math.min(cpu ?? 0, 100)}%`;
       line.bar.dataset.level = cpu >= 70 ? "high" : "normal";
@@ -220,5 +250,6 @@ export function fleetView(root) {
 }
 
 function megabytes(bytes) {
+  if (bytes === null || bytes === undefined) return "–";
   return bytes < 1e6 ? `${number(bytes / 1e3)} kB` : `${number(bytes / 1e6, 1)} MB`;
 }

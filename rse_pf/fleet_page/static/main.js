@@ -8,7 +8,8 @@ import { posesView } from "./poses.js";
 import { becomeOperator, follow, forget, isOperator, openSession } from "./session.js";
 
 const VIEWS = ["fleet", "map", "poses", "events"];
-const TOPICS = ["fleet", "history", "robots", "event", "pose", "link", "maps"];
+const isShown = (name) => !byId(`tab-${name}`).hidden;
+const TOPICS = ["fleet", "history", "robots", "event", "audit", "pose", "link", "maps"];
 const views = {
   fleet: fleetView(byId("view-fleet")),
   map: mapView(byId("view-map"), changeMap),
@@ -35,8 +36,9 @@ for (const name of VIEWS) byId(`tab-${name}`).addEventListener("click", () => sh
 document.querySelector("nav").addEventListener("keydown", (event) => {
   const step = { ArrowRight: 1, ArrowLeft: -1 }[event.key];
   if (!step) return;
-  const at = VIEWS.findIndex((name) => byId(`tab-${name}`) === document.activeElement);
-  const next = VIEWS[(at + step + VIEWS.length) % VIEWS.length];
+  const shown = VIEWS.filter(isShown);
+  const at = shown.findIndex((name) => byId(`tab-${name}`) === document.activeElement);
+  const next = shown[(at + step + shown.length) % shown.length];
   show(next);
   byId(`tab-${next}`).focus();
 });
@@ -44,7 +46,7 @@ document.addEventListener("keydown", (event) => {
   const typing = /^(INPUT|SELECT|TEXTAREA)$/.test(event.target.tagName) || byId("dialog").open;
   if (typing || event.ctrlKey || event.altKey || event.metaKey) return;
   const name = VIEWS["1234".indexOf(event.key)];
-  if (name && "1234".includes(event.key)) show(name);
+  if (name && "1234".includes(event.key) && isShown(name)) show(name);
   if (event.key === "t") switchTheme();
 });
 
@@ -91,16 +93,26 @@ function take({ topic, key, value }) {
   lastHeard = performance.now();
   if (topic === "fleet") {
     setText(byId("platform"), value.platform);
-    document.title = `${value.platform}: ${value.robots} robots`;
+    document.title = `${value.platform}: ${value.robots ?? "?"} robots`;
+    if (value.cloud) onlyCloud();
     byId("link").dataset.delayMs = String(Math.round(Date.now() - 1000 * value.time_s + 1000 * (value.sample_age_s ?? 0)));
     views.fleet.take(value);
   } else if (topic === "history") views.fleet.takeHistory(value);
   else if (topic === "robots") views.fleet.takeRobots(value);
   else if (topic === "event") { views.events.take(value); views.fleet.takeEvent(value); }
+  else if (topic === "audit") views.events.take(value);
   else if (topic === "pose") views.poses.take(value);
-  else if (topic === "link") linked(value.connected, value.connected ? "live" : "the control plane does not answer");
+  else if (topic === "link") linked(value.connected, value.connected ? "live" : value.text ?? "the control plane does not answer");
   else if (topic === "maps") views.map.takeMaps(value);
   else if (topic.startsWith("live/")) views.map.take(key, value);
+}
+
+function onlyCloud() {
+  // Maps and poses stay on the servers, and this page changes nothing there.
+  if (!isShown("map")) return;
+  for (const name of ["map", "poses"]) byId(`tab-${name}`).hidden = true;
+  byId("operate").hidden = true;
+  if (!byId("view-map").hidden || !byId("view-poses").hidden) show("fleet");
 }
 
 function changeMap(name) {

@@ -1,7 +1,10 @@
 // The Map view: a live map as it grows, or a version; three.js is loaded when the view is shown first.
 
-import { clock, element, setText } from "./dom.js";
+import { byId, clock, element, setText } from "./dom.js";
 import { ask, get } from "./session.js";
+
+const PREPARE_MS = 300; // after the first view has been filled
+const STATE_MS = 1500; // so long after the stream began, what is told is the state, not news
 
 export function mapView(root, changeMap) {
   const choice = element("select", { "aria-label": "Map", onchange: choose });
@@ -20,22 +23,38 @@ export function mapView(root, changeMap) {
         element("caption", { class: "hidden" }, "Robots of the map"), robots)),
       element("div", { class: "panel" }, element("h2", {}, "Joins and corrections"), log))));
 
+  let readCloud = null;
+  let preparing = null;
+  let isLoaded = false;
   let scene = null;
   let visible = false;
   let known = { live: [], maps: [] };
   let chosen = "";
   let state = new Map();
   let entries = [];
+  let openedAt = 0;
+  let due = false;
 
   async function shown() {
     visible = true;
-    await readMaps();
-    if (!scene) {
-      const { MapScene } = await import("./scene.js");
+    await Promise.all([readMaps(), prepared()]);
+    scene.run(visible);
+    if (chosen && !isLoaded) await load();
+  }
+
+  // What only this view needs is made ready when the page has shown another one.
+  function prepared() {
+    preparing ??= Promise.all([import("./scene.js"), import("./cloud.js")]).then(([{ MapScene }, cloud]) => {
+      ({ readCloud } = cloud);
       scene = new MapScene(canvas, labels);
-      if (chosen) await load();
-    }
-    scene.run(true);
+      scene.warmUp();
+    });
+    return preparing;
+  }
+
+  async function prepare() {
+    if (preparing || byId("tab-map").hidden) return;
+    await Promise.all([prepared(), get("/page/maps")]); // whose server packs the first map meanwhile
   }
 
   async function readMaps() {
@@ -65,31 +84,49 @@ export function mapView(root, changeMap) {
 
   async function choose() {
     chosen = choice.value;
+    isLoaded = false;
     state = new Map();
     entries = [];
     log.replaceChildren();
     robots.replaceChildren();
     changeMap(chosen.startsWith("live:") ? chosen.slice(5) : "");
-    await load();
+    await load().catch((error) => setText(note, error.message));
   }
 
   async function load() {
     empty.hidden = chosen !== "";
     if (!scene || !chosen) return;
+    isLoaded = true;
     scene.clear();
     const [kind, map, version] = chosen.split(":");
     const has = known.maps.find((each) => each.map === map);
     if (kind === "live" && !has) { setText(note, "The cloud comes with the first version: rse-pf map publish."); return; }
     setText(note, "loading");
     const began = performance.now();
+    const seconds = () => ((performance.now() - began) / 1000).toFixed(1);
+    const wanted = chosen;
     const answer = await ask(`/page/cloud?${new URLSearchParams({ map, version: version ?? "" })}`);
     if (!answer.ok) { setText(note, (await answer.json()).message); return; }
-    const told = scene.cloud(await answer.arrayBuffer(), kind === "version");
+    let sample = null;
+    const told = await readCloud(answer, () => chosen === wanted, (head) => {
+      scene.begin(head, kind === "version");
+      sample = scene.drawn(Math.min(head.points, head.block)).then(() => {
+        performance.mark("map-sample");
+        if (note.dataset.points !== "all") setText(note, `a sample in ${seconds()} s, loading`);
+      });
+      note.dataset.points = "some";
+      if (kind === "version") {
+        robots.replaceChildren(...Object.entries(head.robots).map(([name, path]) => row(name, `${path.length} keyframes`)));
+      }
+    }, (bytes, count) => scene.more(bytes, count));
+    if (!told) return;
+    await sample;
+    await scene.drawn(told.points);
+    if (chosen !== wanted) return;
+    performance.mark("map-whole");
+    note.dataset.points = "all";
     const all = told.all_points > told.points ? ` of ${told.all_points.toLocaleString("en")}` : "";
-    setText(note, `${told.points.toLocaleString("en")}${all} points in ${((performance.now() - began) / 1000).toFixed(1)} s`);
-    if (kind === "version") {
-      robots.replaceChildren(...Object.entries(told.robots).map(([name, path]) => row(name, `${path.length} keyframes`)));
-    }
+    setText(note, `${told.points.toLocaleString("en")}${all} points in ${seconds()} s`);
   }
 
   const row = (name, text) => element("tr", {}, element("th", { scope: "row" },
@@ -106,25 +143,41 @@ export function mapView(root, changeMap) {
     state.set(key, value);
     if (value.kind === "alignment") {
       const moved = before && before.segment === value.segment && before.T_map_odom && value.T_map_odom ? distance(before.T_map_odom, value.T_map_odom) : null;
-      if (value.aligned && !before?.aligned) tell(`${value.robot} joined the map`);
+      const isNews = before !== undefined || performance.now() - openedAt > STATE_MS;
+      if (value.aligned && !before?.aligned) { if (isNews) tell(`${value.robot} joined the map`); }
       else if (!value.aligned && before?.aligned) tell(`${value.robot} left the map: ${value.reason}`);
-      else if (moved > 0.001) tell(`${value.robot} was moved by ${(moved * 100).toFixed(1)} cm${value.cause ? `, by a keyframe of ${value.cause.robot}` : ""}`);
+      else if (moved > 0.001) tellCorrection(value.robot, value.cause?.robot, moved);
     }
-    if (value.kind === "map") setText(note, `${value.keyframes} keyframes, ${value.state}${value.owner ? `, owner ${value.owner}` : ""}`);
+    if (value.kind === "map") setText(note, `${value.keyframes} keyframes, ${value.state}${value.owner ? `, owner ${value.owner}` : ""}${scene?.hasCloud ? "" : "; squares of 1 m"}`);
+    if (!due) { due = true; requestAnimationFrame(drawState); }
+  }
+
+  function drawState() {
+    due = false;
     scene?.update(state);
     if (visible) draw();
   }
 
   function draw() {
     const rows = [...state].filter(([, value]) => value.kind === "alignment").map(([, value]) => {
-      const spread = value.covariance ? `± ${(100 * Math.sqrt(Math.max(value.covariance[0], value.covariance[6], value.covariance[11]))).toFixed(1)} cm` : "";
+      const spread = value.covariance ? `± ${(100 * Math.sqrt(Math.max(value.covariance[0], value.covariance[6], value.covariance[11]))).toFixed(1)}\u00a0cm` : "";
       return row(value.robot, value.aligned ? `in the map ${spread}` : `outside: ${value.reason || "not joined yet"}`);
     });
     robots.replaceChildren(...rows);
   }
 
-  function tell(text) {
-    entries = [{ text, time: Date.now() / 1000 }, ...entries].slice(0, 12);
+  // Corrections of one robot by one other within a minute are one line, so that joins stay in sight.
+  function tellCorrection(robot, cause, moved) {
+    const same = entries.find((each) => each.robot === robot && each.cause === cause && Date.now() / 1000 - each.time < 60);
+    const [count, most] = [(same?.count ?? 0) + 1, Math.max(same?.most ?? 0, moved)];
+    entries = entries.filter((each) => each !== same);
+    const times = count === 1 ? "was moved by" : `was moved ${count} times, by at most`;
+    const by = cause ? `, by ${count === 1 ? "a keyframe" : "keyframes"} of ${cause === robot ? "its own" : cause}` : "";
+    tell(`${robot} ${times} ${(most * 100).toFixed(1)}\u00a0cm${by}`, { robot, cause, count, most });
+  }
+
+  function tell(text, more = {}) {
+    entries = [{ text, time: Date.now() / 1000, ...more }, ...entries].slice(0, 12);
     log.replaceChildren(...entries.map((each) => element("div", {}, element("time", { class: "soft" }, clock(each.time)), ` ${each.text}`)));
   }
 
@@ -134,7 +187,11 @@ export function mapView(root, changeMap) {
     shown() { shown().catch((error) => setText(note, error.message)); },
     hidden() { visible = false; scene?.run(false); },
     themed() { scene?.themed(); },
-    reset() { state = new Map(); },
+    reset() {
+      state = new Map();
+      openedAt = performance.now();
+      setTimeout(() => { prepare().catch((error) => setText(note, error.message)); }, PREPARE_MS);
+    },
   };
 }
 

@@ -1,20 +1,26 @@
 // Draw a map with three.js: the cloud, trajectories, robots with their covariance; own camera control with keys.
 
+import { Cloud } from "./cloud.js";
 import {
-  BufferAttribute, BufferGeometry, Color, ColorManagement, Group, Line, LineBasicMaterial, LinearSRGBColorSpace, Matrix4, Mesh, MeshBasicMaterial,
+  BufferGeometry, Color, ColorManagement, GridHelper, Group, Line, LineBasicMaterial, LinearSRGBColorSpace, Matrix4, Mesh, MeshBasicMaterial,
   PerspectiveCamera, Points, PointsMaterial, Scene, SphereGeometry, Spherical, Vector3, WebGLRenderer,
 } from "./vendor/three.module.js";
 
 // Okabe and Ito's colours, which colour-blind people tell apart; names stand beside them in any case.
 const COLOURS = ["#0072b2", "#e69f00", "#009e73", "#cc79a7", "#56b4e9", "#d55e00"];
 const MAX_FPS = 30;
+const FEWEST_POINTS = 50_000;
+const FILLING_POINTS = 200_000; // at least, in a frame while nothing moves
+const SLOW_MS = 70; // a frame takes so long: the next one draws fewer points
+const FAST_MS = 40;
+const CLOUD_LAYER = 1;
 ColorManagement.enabled = false; // nothing is lit: the colours of cameras are shown as they are
 
 export class MapScene {
   constructor(canvas, labels) {
     this.canvas = canvas;
     this.labels = labels;
-    this.renderer = new WebGLRenderer({ canvas, antialias: true, powerPreference: "low-power" });
+    this.renderer = new WebGLRenderer({ canvas, context: contextOf(canvas) });
     this.renderer.outputColorSpace = LinearSRGBColorSpace;
     this.scene = new Scene();
     this.camera = new PerspectiveCamera(55, 1, 0.02, 2000);
@@ -28,13 +34,31 @@ export class MapScene {
     this.radius = 4;
     this.dirty = true;
     this.frames = 0;
+    this.shown = null;
+    this.waiting = [];
+    this.budget = FEWEST_POINTS;
+    this.isFilling = false; // whether the newest frame added points to the one before
+    this.count = 0; // points of the cloud that are in the picture
     this.listen();
     this.themed();
     new ResizeObserver(() => { this.dirty = true; }).observe(canvas);
   }
 
+  // Have the programs compiled that draw a cloud, which takes longer than drawing it.
+  warmUp() {
+    const cloud = new Cloud({ points: 1, step: [1, 1, 1], low: [0, 0, 0] });
+    cloud.take(new Uint8Array(9), 1);
+    cloud.show(0, 1);
+    this.world.add(cloud.points);
+    this.renderer.setSize(16, 16, false);
+    this.renderer.render(this.scene, this.camera);
+    this.world.remove(cloud.points);
+    cloud.dispose();
+  }
+
   themed() {
-    this.scene.background = new Color(getComputedStyle(document.documentElement).getPropertyValue("--panel").trim());
+    // A background of the scene would be painted over what was drawn before.
+    this.renderer.setClearColor(new Color(getComputedStyle(document.documentElement).getPropertyValue("--panel").trim()), 1);
     this.dirty = true;
   }
 
@@ -45,22 +69,16 @@ export class MapScene {
     this.places.clear();
     this.labels.replaceChildren();
     this.hasCloud = false;
+    this.dropCloud();
     this.dirty = true;
   }
 
-  cloud(buffer, withPaths) {
-    const length = new DataView(buffer).getUint32(0, true);
-    const told = JSON.parse(new TextDecoder().decode(new Uint8Array(buffer, 4, length)));
-    const start = 4 + length;
-    const geometry = new BufferGeometry();
-    // Positions stay the 16-bit numbers that came: the object's matrix makes metres of them.
-    geometry.setAttribute("position", new BufferAttribute(new Uint16Array(buffer, start, 3 * told.points), 3));
-    geometry.setAttribute("color", new BufferAttribute(new Uint8Array(buffer, start + 6 * told.points, 3 * told.points), 3, true));
-    const points = new Points(geometry, new PointsMaterial({ size: 1.6, sizeAttenuation: false, vertexColors: true }));
-    points.matrixAutoUpdate = false;
-    points.matrix.makeScale(...told.step).setPosition(...told.low);
-    points.frustumCulled = false;
-    this.world.add(points);
+  // Prepare for the cloud of which *told* is the head; its blocks follow by more().
+  begin(told, withPaths) {
+    this.dropCloud();
+    this.shown = new Cloud(told);
+    this.shown.points.layers.enable(CLOUD_LAYER);
+    this.world.add(this.shown.points);
     this.turnUp(new Vector3(...told.up));
     if (withPaths) Object.entries(told.robots).forEach(([name, path]) => this.path(this.world, name, path));
     const low = new Vector3(...told.low);
@@ -69,7 +87,21 @@ export class MapScene {
     this.radius = Math.max(size.length() / 2, 0.5);
     this.hasCloud = told.points > 0;
     this.home();
-    return told;
+  }
+
+  more(bytes, count) {
+    this.shown.take(bytes, count);
+  }
+
+  dropCloud() {
+    this.shown?.dispose();
+    this.shown = null;
+  }
+
+  // Return when a picture with *count* points of the cloud has been drawn, or the cloud is no longer shown.
+  drawn(count) {
+    const cloud = this.shown;
+    return new Promise((resolve) => { this.waiting.push({ cloud, count, resolve }); });
   }
 
   turnUp(up) {
@@ -102,7 +134,7 @@ export class MapScene {
   }
 
   update(state) {
-    for (const child of this.moving.children) { child.geometry?.dispose(); child.material?.dispose(); }
+    this.moving.traverse((each) => { each.geometry?.dispose(); each.material?.dispose(); });
     this.moving.clear();
     const reach = [];
     for (const [, value] of state) {
@@ -111,7 +143,7 @@ export class MapScene {
       const path = state.get(`path/${value.robot}`);
       const points = path && path.segment === value.segment ? path.points.map((each) => new Vector3(...each).applyMatrix4(T)) : [];
       this.colour(value.robot);
-      if (points.length) this.moving.add(new Line(new BufferGeometry().setFromPoints(points), new LineBasicMaterial({ color: this.colour(value.robot) })));
+      if (points.length) this.moving.add(...this.drive(points, this.colour(value.robot)));
       const pose = state.get(`pose/${value.robot}`);
       const at = pose ? new Vector3(pose.T_map_camera[3], pose.T_map_camera[7], pose.T_map_camera[11]) : points[points.length - 1];
       if (!at) continue;
@@ -122,11 +154,27 @@ export class MapScene {
     if (!this.hasCloud && reach.length) {
       if (!this.isTurned) { this.turnUp(new Vector3(0, -1, 0)); this.isTurned = true; }
       const centre = reach.reduce((sum, each) => sum.add(each), new Vector3()).divideScalar(reach.length);
-      this.radius = Math.max(1.5, ...reach.map((each) => each.distanceTo(centre)));
+      this.radius = Math.max(0.8, ...reach.map((each) => each.distanceTo(centre)));
       this.centre = centre.applyMatrix4(this.world.matrix);
+      this.moving.add(this.grid(centre, reach));
       if (!this.touched) this.home();
     }
     this.dirty = true;
+  }
+
+  // A line, and a dot for each pose, since a line of WebGL is one pixel wide.
+  drive(points, color) {
+    const geometry = new BufferGeometry().setFromPoints(points);
+    return [new Line(geometry, new LineBasicMaterial({ color })), new Points(geometry, new PointsMaterial({ color, size: 5, sizeAttenuation: false }))];
+  }
+
+  // Squares of 1 m below the robots, which tell the scale as long as there is no cloud.
+  grid(centre, reach) {
+    const metres = 2 * Math.ceil(this.radius + 1);
+    const line = getComputedStyle(document.documentElement).getPropertyValue("--line").trim();
+    const grid = new GridHelper(metres, metres, line, line);
+    grid.position.set(Math.round(centre.x), Math.max(...reach.map((each) => each.y)) + 0.3, Math.round(centre.z));
+    return grid;
   }
 
   // A sphere of 4 cm, and around it the ellipsoid of three standard deviations along the map's axes.
@@ -198,12 +246,17 @@ export class MapScene {
   loop(now) {
     if (!this.running) { this.looping = false; return; }
     requestAnimationFrame((time) => this.loop(time));
-    if (!this.dirty || now - (this.drawn ?? 0) < 1000 / MAX_FPS) return;
-    this.drawn = now;
-    this.dirty = false;
+    const since = now - (this.drawnAt ?? 0);
+    const isWhole = this.count >= (this.shown?.ready ?? 0);
+    if ((!this.dirty && isWhole) || since < 1000 / MAX_FPS) return;
+    // Frames that follow each other tell how long one takes.
+    if (since < FAST_MS) this.budget = Math.min(this.budget * 1.2, 1e9);
+    else if (since > SLOW_MS && since < 1000 && !this.isFilling) this.budget = Math.max(FEWEST_POINTS, this.budget * 0.7);
+    this.drawnAt = now;
     this.draw();
   }
 
+  // Draw a new picture if something changed, else put the next points of the cloud into the one that is there.
   draw() {
     const [width, height] = [this.canvas.clientWidth, this.canvas.clientHeight];
     if (!width || !height) return;
@@ -211,14 +264,22 @@ export class MapScene {
     if (this.canvas.width !== Math.floor(width * ratio) || this.canvas.height !== Math.floor(height * ratio)) {
       this.renderer.setPixelRatio(ratio);
       this.renderer.setSize(width, height, false);
+      this.dirty = true;
     }
+    if (this.dirty) this.count = 0;
+    this.renderer.autoClear = this.dirty;
+    this.camera.layers.set(this.dirty ? 0 : CLOUD_LAYER);
+    this.isFilling = !this.dirty;
+    this.dirty = false;
     this.camera.aspect = width / height;
     this.camera.updateProjectionMatrix();
     this.camera.position.setFromSpherical(this.orbit).add(this.target);
     this.camera.lookAt(this.target);
     this.camera.updateMatrixWorld();
+    this.count += this.shown?.show(this.count, this.isFilling ? Math.max(this.budget, FILLING_POINTS) : this.budget) ?? 0;
     this.renderer.render(this.scene, this.camera);
     this.frames += 1;
+    this.tell();
     for (const [, { label, at }] of this.places) {
       if (!label) continue;
       const seen = at?.clone().applyMatrix4(this.world.matrix).project(this.camera);
@@ -226,4 +287,21 @@ export class MapScene {
       if (seen) { label.style.left = `${(seen.x + 1) / 2 * width + 8}px`; label.style.top = `${(1 - seen.y) / 2 * height - 20}px`; }
     }
   }
+
+  // Tell those that wait for a picture with *count* points, once it is on the canvas.
+  tell() {
+    const done = this.waiting.filter((each) => each.cloud !== this.shown || this.count >= each.count);
+    if (!done.length) return;
+    const gl = this.renderer.getContext();
+    gl.readPixels(0, 0, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, new Uint8Array(4)); // waits until it is drawn
+    this.waiting = this.waiting.filter((each) => !done.includes(each));
+    for (const each of done) each.resolve();
+  }
+}
+
+// Smooth edges only where a graphics card draws: a processor would take four times as long.
+function contextOf(canvas) {
+  const wanted = { alpha: true, depth: true, stencil: false, powerPreference: "low-power", preserveDrawingBuffer: true };
+  return canvas.getContext("webgl2", { ...wanted, antialias: true, failIfMajorPerformanceCaveat: true })
+    ?? canvas.getContext("webgl2", { ...wanted, antialias: false });
 }

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from rse_pf.config import PlatformSettings
-from rse_pf.config.resource_names import HEALTH_PATH, READY_PATH
+from rse_pf.config.resource_names import HEALTH_PATH, READY_PATH, ROSBRIDGE_PATH
 from rse_pf.local.lan.connect_page import connect_page, page_headers
 from rse_pf.local.lan.listener import CERTIFICATE_NAME, LanListener, secret_file
 from rse_pf.scaling.health import HEALTHY_CHECKS, LOCAL_INTERVAL_S, LOCAL_TIMEOUT_S
@@ -246,6 +246,7 @@ def _virtual_host(settings: PlatformSettings, lan: LanListener | None) -> dict[s
         "domains": ["*"],
         "routes": [
             {"match": {"path": settings.serving.path}, "route": route},
+            *(({"match": {"path": ROSBRIDGE_PATH}, "route": route},) if settings.serving.rosbridge else ()),
             {"match": {"path": HEALTH_PATH}, "route": {**route, "timeout": timeout}},
             # Each would ask the store; the balancer's own checks do not pass the listener.
             {"match": {"path": _DATA_READY}, "direct_response": {"status": 404}},

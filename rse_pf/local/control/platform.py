@@ -53,6 +53,7 @@ from rse_pf.local.state import (
     settings_file,
     state_file,
 )
+from rse_pf.local.together import run_together
 
 __all__ = ["LocalPlatform"]
 
@@ -410,7 +411,7 @@ class LocalPlatform:
         if left is None:
             await self._begin(end)
         else:
-            await _all(self._adopt(left, end), self._adopt_data(left.data_server))
+            await run_together(self._adopt(left, end), self._adopt_data(left.data_server))
         self.url = robots_url(self.settings, self.port, self.lan)
         await self._open_operator_port(token, 0 if left is None else left.status_port)
         self._fleet.keep(self._audit.watch())
@@ -424,7 +425,7 @@ class LocalPlatform:
     async def _begin(self, end: float) -> None:
         self.load_balancer.launch()
         members = [self._fleet.launch() for _ in range(self._count)]
-        await _all(
+        await run_together(
             self.load_balancer.wait_live(end - time.monotonic()),
             *(self._fleet.bring_up(member, end - time.monotonic()) for member in members),
             *((self.data_servers.start(),) if self._has_data else ()),
@@ -587,14 +588,3 @@ def _bounds(scaling: ScalingSettings, count: int) -> ScalingSettings:
     return dataclasses.replace(
         scaling, min_servers=min(scaling.min_servers, count), max_servers=max(scaling.max_servers, count)
     )
-
-
-async def _all(*works: Any) -> None:
-    """Wait for all of *works*; after the first failure, cancel the others."""
-    tasks = [asyncio.ensure_future(work) for work in works]
-    try:
-        await asyncio.gather(*tasks)
-    finally:
-        for task in tasks:
-            task.cancel()
-        await asyncio.gather(*tasks, return_exceptions=True)

@@ -18,7 +18,7 @@ const camera = navigator.mediaDevices ? "this page may ask for the camera" : "no
 function test(token) {
   said.textContent = "connecting";
   const url = "wss://" + location.host + document.documentElement.dataset.path;
-  const socket = new WebSocket(url, ["rse-pf.v1.json", "bearer." + token]);
+  const socket = new WebSocket(url, ["rse-pf.v1.json", "rse-pf.token." + token]);
   let isWelcome = false;
   socket.onopen = () => socket.send(JSON.stringify({type: "hello"}));
   socket.onmessage = event => {

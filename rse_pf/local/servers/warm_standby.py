@@ -23,7 +23,7 @@ from rse_pf.local.processes import spawn
 __all__ = ["STANDBY", "WarmStandby"]
 
 _LOOK_AGAIN_S = 0.01
-STANDBY = (sys.executable, "-m", "rse_pf.cli.standby")
+STANDBY = (sys.executable, "-m", "rse_pf.cli.servers.standby")
 """The program; it reads its arguments from standard input."""
 
 

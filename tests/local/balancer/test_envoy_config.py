@@ -101,6 +101,17 @@ def test_only_the_path_of_the_robots_leads_to_a_server() -> None:
     assert only_route(config(serving={"path": "/robots"}))["match"] == {"path": "/robots"}
 
 
+def test_rosbridge_has_a_way_to_the_servers_if_it_is_switched_on() -> None:
+    (rosbridge,) = [
+        each
+        for each in routes(config(serving={"rosbridge": True}))
+        if each["match"] == {"path": "/rosbridge"}
+    ]
+
+    assert rosbridge["route"] == only_route(config())["route"]
+    assert not [each for each in routes(config()) if each["match"] == {"path": "/rosbridge"}]
+
+
 def test_headers_are_bounded_in_number_size_and_time() -> None:
     made = manager(config(serving={"handshake_timeout_s": 1.5, "max_handshake_bytes": 4096}))
 

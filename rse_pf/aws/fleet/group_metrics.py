@@ -1,0 +1,118 @@
+"""Read what CloudWatch knows of the group and its servers over the last hour, in one request.
+
+AWS charges 0.01 USD for 1000 metrics of such requests.  A number that nobody published is None, never zero.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from datetime import datetime, timedelta
+from typing import Any
+
+from rse_pf.aws.account import Account
+from rse_pf.aws.fleet.metrics import ROBOTS, dimensions_of
+from rse_pf.config import PlatformSettings
+from rse_pf.config.resource_names import GROUP
+from rse_pf.scaling.alarms import NAMESPACE
+
+__all__ = ["PERIODS", "GroupMetrics", "read_group_metrics"]
+
+PERIODS = 60
+_FRESH_PERIODS = 3
+_MAX_SERVERS = 200
+_EC2 = "AWS/EC2"
+_GROUP_SERIES = {
+    "cpu_percent": (_EC2, "CPUUtilization", "Average"),
+    "requests": (NAMESPACE, "Requests", "Sum"),
+    "queue_ms": (NAMESPACE, "QueueMs", "Maximum"),
+    "bytes_in": (NAMESPACE, "BytesIn", "Sum"),
+    "bytes_out": (NAMESPACE, "BytesOut", "Sum"),
+    "p50_ms": (NAMESPACE, "AnswerMs", "p50"),
+    "p95_ms": (NAMESPACE, "AnswerMs", "p95"),
+    "p99_ms": (NAMESPACE, "AnswerMs", "p99"),
+    "answers": (NAMESPACE, "AnswerMs", "SampleCount"),
+}
+_SERVER_SERIES = {
+    "cpu_percent": (_EC2, "CPUUtilization", "Average"),
+    "robots": (NAMESPACE, ROBOTS, "Maximum"),
+}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class GroupMetrics:
+    """Numbers of the last `PERIODS` complete periods of ``period_s`` seconds.
+
+    ``times_s`` are the ends of the periods in Unix seconds; ``series`` maps a name to one number for each of
+    them.  ``servers`` maps an instance to its newest numbers, of the last three periods.
+    """
+
+    period_s: int
+    times_s: tuple[int, ...] = ()
+    series: Mapping[str, tuple[float | None, ...]] = field(default_factory=dict)
+    servers: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+
+    def newest(self, name: str) -> float | None:
+        """Return the newest number of a series, if it is of the last three periods."""
+        known = [each for each in self.series.get(name, ())[-_FRESH_PERIODS:] if each is not None]
+        return known[-1] if known else None
+
+
+def read_group_metrics(
+    account: Account, settings: PlatformSettings, servers: Sequence[str], *, now: datetime
+) -> GroupMetrics:
+    """Return the numbers of the group and of *servers* until *now*, in UTC.
+
+    The current period is left out: some agents may not have published theirs yet.
+
+    Raises:
+        ConfigurationError: AWS refused.
+        StoreError: AWS does not answer.
+    """
+    period_s = settings.scaling.period_s
+    end_s = int(now.timestamp()) // period_s * period_s
+    times_s = tuple(end_s - period_s * back for back in range(PERIODS - 1, -1, -1))
+    asked = [("", name, what) for name, what in _GROUP_SERIES.items()]
+    asked += [
+        (server, name, what) for server in servers[:_MAX_SERVERS] for name, what in _SERVER_SERIES.items()
+    ]
+    end = datetime.fromtimestamp(end_s, now.tzinfo)
+    rows = account.pages(
+        "cloudwatch", "get_metric_data", "MetricDataResults",
+        MetricDataQueries=[
+            _query(f"q{at}", server, what, period_s) for at, (server, _, what) in enumerate(asked)
+        ],
+        ScanBy="TimestampAscending", StartTime=end - timedelta(seconds=PERIODS * period_s), EndTime=end,
+    )  # fmt: skip
+    found: dict[int, dict[int, float]] = {}
+    for row in rows:
+        values = found.setdefault(int(row["Id"].removeprefix("q")), {})
+        for begin, value in zip(row["Timestamps"], row["Values"], strict=False):
+            values[int(begin.timestamp()) // period_s * period_s + period_s] = float(value)
+    series: dict[str, tuple[float | None, ...]] = {}
+    newest: dict[str, dict[str, float]] = {}
+    for at, (server, name, _) in enumerate(asked):
+        numbers = tuple(found.get(at, {}).get(time_s) for time_s in times_s)
+        known = [each for each in numbers[-_FRESH_PERIODS:] if each is not None]
+        if not server:
+            series[name] = numbers
+        elif known:
+            newest.setdefault(server, {})[name] = known[-1]
+    return GroupMetrics(period_s=period_s, times_s=times_s, series=series, servers=newest)
+
+
+def _query(identity: str, server: str, what: tuple[str, str, str], period_s: int) -> dict[str, Any]:
+    namespace, metric, statistic = what
+    dimensions = (
+        [{"Name": "InstanceId", "Value": server}]
+        if server and namespace == _EC2
+        else dimensions_of(GROUP, server)
+    )
+    return {
+        "Id": identity,
+        "MetricStat": {
+            "Metric": {"Namespace": namespace, "MetricName": metric, "Dimensions": dimensions},
+            "Period": period_s,
+            "Stat": statistic,
+        },
+    }

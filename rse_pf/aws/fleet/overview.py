@@ -1,0 +1,144 @@
+"""Read what AWS knows of a deployment at one moment: the group, its load balancer, and what it did last.
+
+Nothing is changed, and nothing here is charged for.  Of the parts, only the group must be readable: what AWS
+refuses beside it is a sentence in `CloudOverview.problems`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from datetime import datetime
+from typing import TypeVar
+
+from rse_pf.aws.account import Account
+from rse_pf.aws.fleet.group import AutoScalingGroup, read_group
+from rse_pf.config import PlatformSettings
+from rse_pf.config.resource_names import GROUP
+from rse_pf.errors import RsePfError
+
+__all__ = ["CloudBalancer", "CloudOverview", "ScalingActivity", "read_overview"]
+
+_ACTIVITIES = 50
+_FAILED = ("Failed", "Cancelled")
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CloudBalancer:
+    """The load balancer: its ``state``, its ``address``, and the protocols of its listeners."""
+
+    state: str
+    address: str
+    protocols: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ScalingActivity:
+    """What the group did, or tries to do; ``began_s`` is in Unix seconds."""
+
+    id: str
+    began_s: float
+    status: str
+    text: str
+    cause: str
+
+    @property
+    def has_failed(self) -> bool:
+        """Whether it ended without what it was for."""
+        return self.status in _FAILED
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CloudOverview:
+    """A deployment at one moment.
+
+    ``launched_s`` maps an instance to the Unix seconds of its launch; ``activities`` are the newest, oldest
+    first; ``problems`` say what could not be read.
+    """
+
+    group: AutoScalingGroup
+    balancer: CloudBalancer | None
+    launched_s: dict[str, float]
+    activities: tuple[ScalingActivity, ...]
+    problems: tuple[str, ...] = ()
+
+
+def read_overview(account: Account, settings: PlatformSettings, *, now: datetime) -> CloudOverview:
+    """Return the state of the deployment at *now*, in UTC, without the robots.
+
+    Raises:
+        ConfigurationError: There is no group in the region, or AWS refuses to describe it.
+        StoreError: AWS does not answer.
+    """
+    group = read_group(account, settings, now=now, asks_robots=False)
+    problems: list[str] = []
+    names = [each.name for each in group.servers]
+    return CloudOverview(
+        group=group,
+        balancer=_or_problem(problems, None, lambda: _balancer(account, group.target_groups)),
+        launched_s=_or_problem(problems, {}, lambda: _launched_s(account, names)),
+        activities=_or_problem(problems, (), lambda: _activities(account)),
+        problems=tuple(problems),
+    )
+
+
+def _or_problem(problems: list[str], otherwise: T, read: Callable[[], T]) -> T:
+    try:
+        return read()
+    except RsePfError as error:
+        problems.append(error.message)
+        return otherwise
+
+
+def _balancer(account: Account, target_groups: tuple[str, ...]) -> CloudBalancer | None:
+    if not target_groups:
+        return None
+    groups = account.pages(
+        "elbv2", "describe_target_groups", "TargetGroups", TargetGroupArns=list(target_groups)
+    )
+    arns = sorted({arn for each in groups for arn in each["LoadBalancerArns"]})
+    if not arns:
+        return None
+    found = account.pages("elbv2", "describe_load_balancers", "LoadBalancers", LoadBalancerArns=arns[:1])
+    listeners = account.pages("elbv2", "describe_listeners", "Listeners", LoadBalancerArn=arns[0])
+    return CloudBalancer(
+        state=str(found[0]["State"]["Code"]),
+        address=str(found[0]["DNSName"]),
+        protocols=tuple(sorted({str(each["Protocol"]) for each in listeners})),
+    )
+
+
+def _launched_s(account: Account, names: list[str]) -> dict[str, float]:
+    if not names:
+        return {}
+    # By a filter: an id that is gone would be an error.
+    rows = account.pages(
+        "ec2", "describe_instances", "Reservations", Filters=[{"Name": "instance-id", "Values": names[:200]}]
+    )
+    return {
+        str(each["InstanceId"]): each["LaunchTime"].timestamp() for row in rows for each in row["Instances"]
+    }
+
+
+def _activities(account: Account) -> tuple[ScalingActivity, ...]:
+    found = account.find(
+        "autoscaling", "describe_scaling_activities", AutoScalingGroupName=GROUP, MaxRecords=_ACTIVITIES
+    )
+    rows = (found or {}).get("Activities", ())
+    return tuple(
+        sorted(
+            (
+                ScalingActivity(
+                    id=str(row["ActivityId"]),
+                    began_s=row["StartTime"].timestamp(),
+                    status=str(row["StatusCode"]),
+                    text=str(row.get("Description", "")),
+                    cause=str(row.get("Cause", "")),
+                )
+                for row in rows
+            ),
+            key=lambda each: (each.began_s, each.id),
+        )
+    )

@@ -1,0 +1,218 @@
+"""The page of a deployment on AWS: what it makes of AWS's words, and what it says when AWS refuses."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import dataclasses
+import json
+from typing import Any
+
+import pytest
+
+from rse_pf.aws.account import Account
+from rse_pf.aws.fleet.group import AutoScalingGroup, Server
+from rse_pf.aws.fleet.group_metrics import PERIODS, GroupMetrics
+from rse_pf.aws.fleet.overview import CloudBalancer, CloudOverview, ScalingActivity
+from rse_pf.config import PlatformSettings
+from rse_pf.errors import BadRequest, ConfigurationError
+from rse_pf.fleet_page.cloud_page import serve_cloud_page
+from rse_pf.fleet_page.feeds.cloud_feed import CloudFeed, cloud_document, new_events
+from rse_pf.fleet_page.hub import Hub
+
+SETTINGS = PlatformSettings()
+NOW_S = 6000.0
+HEALTHY = Server(name="i-1", zone="a", state="InService", targets=("healthy",), robots=None)
+
+
+def overview(*servers: Server, wanted: int | None = None, **group: Any) -> CloudOverview:
+    return CloudOverview(
+        group=AutoScalingGroup(
+            min_servers=1, wanted_servers=len(servers) if wanted is None else wanted, max_servers=4,
+            servers=servers, alarms=group.pop("alarms", {"busy": "OK", "idle": "OK"}), **group,
+        ),
+        balancer=CloudBalancer(state="active", address="lb.example", protocols=("TLS",)),
+        launched_s={"i-1": NOW_S - 90.0},
+        activities=(),
+    )  # fmt: skip
+
+
+def metrics(cpu: tuple[float | None, ...], **servers: dict[str, float]) -> GroupMetrics:
+    times_s = tuple(int(NOW_S) - 60 * back for back in range(PERIODS - 1, -1, -1))
+    missing = (None,) * (PERIODS - len(cpu))
+    return GroupMetrics(
+        period_s=60, times_s=times_s, servers=servers,
+        series={"cpu_percent": missing + cpu, "requests": (None,) * (PERIODS - 1) + (600.0,)},
+    )  # fmt: skip
+
+
+def test_the_boxes_show_what_aws_knows_and_say_what_it_does_not() -> None:
+    second = dataclasses.replace(HEALTHY, name="i-2")
+    numbers = metrics((20.0,), **{"i-1": {"robots": 7.0, "cpu_percent": 31.25}})
+
+    told = cloud_document(overview(HEALTHY, second), numbers, SETTINGS, time_s=NOW_S, region="r")
+
+    assert [(each["name"], each["robots"], each["cpu_percent"]) for each in told["servers"]] == [
+        ("i-1", 7, 31.2), ("i-2", None, None),
+    ]  # fmt: skip
+    assert [each["age_s"] for each in told["servers"]] == [90.0, None]
+    assert (told["robots"], told["requests"], told["percentiles"], told["bytes_in"]) == (7, 10.0, {}, None)
+    assert (told["tls"], told["balancer"], told["url"]) == (True, True, "lb.example")
+    assert told["unknown"][0] == "1 of 2 servers did not tell their robots"
+    assert json.loads(json.dumps(told)) == told
+
+
+def test_without_any_number_nothing_is_zero() -> None:
+    told = cloud_document(overview(HEALTHY), GroupMetrics(period_s=60), SETTINGS, time_s=NOW_S)
+
+    assert [told[name] for name in ("robots", "requests", "cpu_percent", "queue_ms")] == [None] * 4
+    assert told["waiting"] == ["no whole period of 60 s was measured yet"]
+
+
+@pytest.mark.parametrize(
+    ("state", "targets", "shown"),
+    [
+        ("InService", ("healthy", "healthy"), "healthy"),
+        ("InService", ("healthy", "unhealthy"), "unhealthy"),
+        ("InService", ("initial",), "starting"),
+        ("InService", ("absent",), "starting"),
+        ("Pending:Wait", (), "starting"),
+        ("Terminating:Wait", ("draining",), "draining"),
+        ("Standby", (), "Standby"),
+    ],
+)
+def test_the_states_of_aws_are_told_in_the_words_of_a_local_platform(
+    state: str, targets: tuple[str, ...], shown: str
+) -> None:
+    server = dataclasses.replace(HEALTHY, state=state, targets=targets)
+
+    (told,) = cloud_document(overview(server), metrics((1.0,)), SETTINGS, time_s=NOW_S)["servers"]
+
+    assert told["state"] == shown
+
+
+@pytest.mark.parametrize(
+    ("cpu", "first"),
+    [
+        ((75.0, 76.0, None), "2 of 2 samples above 70 %: one more server starts"),
+        ((75.0, None, 76.0), "1 of 2 samples above 70 %: one more server starts after one further such"),
+        ((75.0, 76.0, None, None, None), "no whole period of 60 s was measured yet"),
+        ((30.0,), "the servers are neither busy nor idle"),
+    ],
+)
+def test_the_alarms_wait_for_what_the_policy_waits_for(cpu: tuple[float | None, ...], first: str) -> None:
+    told = cloud_document(overview(HEALTHY), metrics(cpu), SETTINGS, time_s=NOW_S)["waiting"]
+
+    assert told[0].startswith(first)
+
+
+def test_an_alarm_and_a_missing_server_are_told_with_the_runbook() -> None:
+    alarmed = overview(HEALTHY, wanted=2, alarms={"silent": "ALARM"}, reasons={"silent": "no data\x1b"})
+
+    told = cloud_document(alarmed, metrics((30.0,)), SETTINGS, time_s=NOW_S)["waiting"]
+
+    assert told[0] == "the group wants 2 servers and has 1"
+    assert told[-1] == r"alarm silent is in state ALARM: no data\x1b (docs/operations.md#silent)"
+
+
+def test_what_happened_between_two_looks_is_told_once() -> None:
+    launch = ScalingActivity(id="1", began_s=5.0, status="InProgress", text="Launching i-2.", cause="busy")
+    first = dataclasses.replace(overview(HEALTHY), activities=(launch,))
+    failed = dataclasses.replace(launch, status="Failed")
+    sick = dataclasses.replace(HEALTHY, targets=("unhealthy",))
+    then = dataclasses.replace(overview(sick, alarms={"silent": "ALARM", "busy": "OK"}), activities=(failed,))
+
+    assert [each["kind"] for each in new_events(None, first, time_s=9.0)] == ["group-activity"]
+    told = new_events(first, then, time_s=9.0)
+    assert [(each["kind"], each["group"], each["time_s"]) for each in told] == [
+        ("group-activity", "trouble", 5.0),
+        ("alarm-silent", "trouble", 9.0),
+        ("server-unhealthy", "trouble", 9.0),
+    ]
+    assert new_events(then, then, time_s=10.0) == []
+    assert [each["text"] for each in new_events(then, overview(alarms=then.group.alarms), time_s=10.0)] == [
+        "i-1 has left the group"
+    ]
+
+
+class Refusing(Account):
+    """An account whose credentials have expired."""
+
+    def find(self, service: str, method: str, **arguments: Any) -> dict[str, Any] | None:
+        raise ConfigurationError(f"AWS refuses {service} {method}: ExpiredToken", hint="sign in again")
+
+    def pages(self, service: str, method: str, rows: str, **arguments: Any) -> list[Any]:
+        if method == "get_metric_data":
+            return [{"Id": "q0"}]  # as no answer of AWS is
+        self.find(service, method)
+        return []
+
+
+def told_by_a_feed(account: Account, *, asks_costs: bool) -> dict[str, Any]:
+    hub, newest = Hub(), dict[str, Any]()
+    feed = CloudFeed(
+        hub, account, SETTINGS, overview(HEALTHY), asks_costs=asks_costs, wall_clock=lambda: NOW_S
+    )
+
+    async def listen() -> None:
+        wanted = {"state", "metrics"} | ({"costs"} if asks_costs else set())
+        async with contextlib.aclosing(hub.messages(frozenset(("fleet", "link")))) as messages:
+            async for message in messages:
+                if message.startswith(b"data: "):
+                    value = json.loads(message[6:])
+                    newest[value["topic"]] = value["value"]
+                    wanted -= set(problems_in(newest))
+                if not wanted:
+                    return
+
+    async def both() -> None:
+        running = asyncio.ensure_future(feed.run())
+        try:
+            await asyncio.wait_for(listen(), 10.0)
+        finally:
+            running.cancel()
+            await asyncio.gather(running, return_exceptions=True)
+
+    asyncio.run(both())
+    return newest
+
+
+def problems_in(newest: dict[str, Any]) -> list[str]:
+    fleet = newest.get("fleet", {})
+    found = {
+        "state": not newest.get("link", {}).get("connected", True),
+        "metrics": any("not understood" in each for each in fleet.get("unknown", ())),
+        "costs": bool(fleet.get("costs", {}).get("problem")),
+    }
+    return [name for name, is_there in found.items() if is_there]
+
+
+def test_credentials_that_expire_are_told_on_the_page_and_end_nothing() -> None:
+    told = told_by_a_feed(Refusing("ap-northeast-2"), asks_costs=True)
+
+    refused = "AWS refuses autoscaling describe_auto_scaling_groups: ExpiredToken (sign in again)"
+    assert (told["link"]["connected"], told["link"]["text"]) == (False, refused)
+    assert told["fleet"]["costs"]["problem"].startswith("AWS refuses ce get_cost_and_usage: ExpiredToken")
+    assert [each["name"] for each in told["fleet"]["servers"]] == ["i-1"]
+
+
+def test_costs_are_not_asked_unless_the_operator_wants_them() -> None:
+    told = told_by_a_feed(Refusing("ap-northeast-2"), asks_costs=False)
+
+    assert told["fleet"]["costs"] == {"asked": False, "problem": ""}
+
+
+def test_wrong_credentials_are_an_error_before_a_page_is_served() -> None:
+    with pytest.raises(ConfigurationError, match="ExpiredToken") as told:
+        serve_cloud_page(
+            Refusing("ap-northeast-2"), SETTINGS, port=0, asks_costs=False,
+            ready=lambda url: pytest.fail("it was served"),
+        )  # fmt: skip
+    assert told.value.hint == "sign in again"
+
+
+def test_the_page_of_the_cloud_changes_nothing() -> None:
+    from rse_pf.fleet_page.cloud_page import _operate
+
+    with pytest.raises(BadRequest, match="only shows"):
+        asyncio.run(_operate("kill", {"server": "i-1"}))
